@@ -1,0 +1,94 @@
+"""Eager checks of what a user passes in.
+
+They look at concrete values only. Inside a compiled program a value is a tracer and cannot raise; there, a bad value
+gives a log likelihood of minus infinity instead.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from typing import Any
+
+import jax
+import numpy as np
+
+
+def concrete(value: Any) -> np.ndarray | None:
+    """Return ``value`` as a NumPy array, or None where it is (or contains) a tracer."""
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree_util.tree_leaves(value)):
+        return None
+    return np.asarray(value)
+
+
+def positive(name: str, value: Any, remedy: str = "") -> None:
+    """Raise ValueError unless every entry of ``value`` is finite and above zero."""
+    array = _numeric(name, value)
+    if array is not None and not np.all(np.isfinite(array) & (array > 0)):
+        raise ValueError(_message(name, "finite and greater than zero", array, remedy))
+
+
+def positive_integer(name: str, value: Any, remedy: str = "") -> None:
+    """Raise unless ``value`` is a whole number of at least one."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+        raise TypeError(f"{name} must be a whole number, got {value!r}. {remedy}".strip())
+    if value < 1:
+        raise ValueError(_message(name, "at least 1", value, remedy))
+
+
+def finite(name: str, value: Any, remedy: str = "") -> None:
+    """Raise ValueError where an entry of ``value`` is NaN or infinite, and name the entry."""
+    array = _numeric(name, value)
+    if array is not None and not np.all(np.isfinite(array)):
+        row = np.argwhere(~np.isfinite(array))[0].tolist()
+        where = f" at index {row}" if row else ""
+        raise ValueError(_message(name, f"finite{where}", array, remedy))
+
+
+def one_of(name: str, value: str, choices: Iterable[str]) -> None:
+    """Raise ValueError unless ``value`` is among ``choices``; name the nearest ones."""
+    choices = list(choices)
+    if value not in choices:
+        raise ValueError(unknown(name, value, choices))
+
+
+def unknown(kind: str, value: str, choices: Iterable[str]) -> str:
+    """Return the message for an unknown name, with the nearest known ones."""
+    choices = list(choices)
+    near = difflib.get_close_matches(str(value), choices, n=3, cutoff=0.4)
+    hint = f" Did you mean {' or '.join(repr(n) for n in near)}?" if near else ""
+    return f"unknown {kind} {value!r}.{hint} Known: {', '.join(choices) or 'none'}."
+
+
+def covariance_matrix(name: str, value: Any) -> None:
+    """Raise ValueError unless ``value`` is a finite, symmetric, positive semi-definite matrix or a vector of variances."""
+    array = _numeric(name, value)
+    if array is None:
+        return
+    finite(name, array)
+    if array.ndim == 1:
+        if np.any(array < 0):
+            index = int(np.argmin(array))
+            raise ValueError(f"{name} has a negative variance {array[index]:g} at index {index}; variances are >= 0.")
+        return
+    if array.ndim != 2 or array.shape[0] != array.shape[1]:
+        raise ValueError(f"{name} must be a vector of variances (D,) or a matrix (D, D), got shape {array.shape}.")
+    scale = np.abs(array).max(initial=0.0)
+    if np.abs(array - array.T).max(initial=0.0) > 1e-8 * scale:
+        raise ValueError(f"{name} is not symmetric: the largest |C - C'| is {np.abs(array - array.T).max():g}. "
+                         "Use 0.5 * (C + C.T) if the difference is rounding.")
+    smallest = np.linalg.eigvalsh(array).min(initial=0.0)
+    if smallest < -1e-8 * scale:
+        raise ValueError(f"{name} is not positive semi-definite: its smallest eigenvalue is {smallest:g}.")
+
+
+def _numeric(name: str, value: Any) -> np.ndarray | None:
+    array = concrete(value)
+    if array is not None and array.dtype.kind not in "biuf":
+        raise TypeError(f"{name} must be numeric, got {value!r} of type {type(value).__name__}.")
+    return array
+
+
+def _message(name: str, expected: str, got: Any, remedy: str) -> str:
+    text = np.array2string(np.asarray(got), threshold=6, precision=6)
+    return f"{name} must be {expected}, got {text}. {remedy}".strip()
