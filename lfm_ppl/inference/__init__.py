@@ -1,0 +1,1 @@
+"""Marginal likelihoods, samplers and modes: from a model with data to a posterior."""

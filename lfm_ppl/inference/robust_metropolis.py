@@ -1,0 +1,178 @@
+"""One step of robust adaptive Metropolis, as a pure function of its state."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+
+
+class RAMState(NamedTuple):
+    """What the chain carries. Every field can be collected with ``extra_fields`` of ``MCMC.run``.
+
+    Attributes:
+        i: number of steps taken, warm-up included.
+        z: unconstrained parameters, a pytree (a dict of sites for a NumPyro model).
+        potential_energy: minus the log density at ``z``; never NaN.
+        accept_prob: acceptance probability of the last proposal, in [0, 1].
+        accepted: whether the last proposal was taken.
+        mean_accept_prob: mean of ``accept_prob`` over the present phase (warm-up or sampling).
+        step_size: geometric mean of the proposal's scales, ``det(S)^(1/d)``.
+        chol_proposal: Cholesky factor ``S`` of the proposal covariance, (d, d), in flat order.
+        num_warmup: length of the warm-up.
+        rng_key: random key of the next step.
+    """
+
+    i: jax.Array
+    z: Any
+    potential_energy: jax.Array
+    accept_prob: jax.Array
+    accepted: jax.Array
+    mean_accept_prob: jax.Array
+    step_size: jax.Array
+    chol_proposal: jax.Array
+    num_warmup: jax.Array
+    rng_key: jax.Array
+
+
+def initial_state(
+    z: Any, potential_energy: jax.Array, rng_key: jax.Array, chol: jax.Array, num_warmup: int
+) -> RAMState:
+    """Return the state before the first step, with proposal factor ``chol`` of shape (d, d)."""
+    flat, _ = ravel_pytree(z)
+    chol = chol.astype(flat.dtype)
+    zero = jnp.zeros((), flat.dtype)
+    return RAMState(
+        i=jnp.array(0),
+        z=z,
+        potential_energy=potential_energy,
+        accept_prob=zero,
+        accepted=jnp.array(False),
+        mean_accept_prob=zero,
+        step_size=_geometric_mean_scale(chol),
+        chol_proposal=chol,
+        num_warmup=jnp.array(num_warmup),
+        rng_key=rng_key,
+    )
+
+
+def step(
+    potential: Callable[[Any], jax.Array],
+    target_accept_prob: float | None,
+    exponent: float,
+    throughout: bool,
+    state: RAMState,
+) -> RAMState:
+    """Propose, accept or reject, and adapt.
+
+    Args:
+        potential: minus the log density, a function of ``state.z``. NaN or an infinity rejects.
+        target_accept_prob: ``alpha*``; None for 0.44 in one dimension and 0.234 otherwise.
+        exponent: ``gamma`` of the adaptation steps ``min(1, d n^-gamma)``.
+        throughout: adapt after the warm-up as well.
+        state: the state ``n - 1``.
+
+    Returns:
+        The state ``n``.
+    """
+    rng_key, key_noise, key_accept = jax.random.split(state.rng_key, 3)
+    flat, unravel = ravel_pytree(state.z)
+    noise = jax.random.normal(key_noise, flat.shape, flat.dtype)
+    proposal = unravel(flat + state.chol_proposal @ noise)
+    energy = potential(proposal)
+    energy = jnp.where(jnp.isfinite(energy), energy, jnp.inf)
+    # inf - inf, where both points are impossible, is NaN and counts as a rejection
+    ratio = jnp.exp(jnp.minimum(state.potential_energy - energy, 0.0))
+    accept_prob = jnp.where(jnp.isnan(ratio), 0.0, ratio).astype(flat.dtype)
+    accepted = jax.random.uniform(key_accept, (), flat.dtype) < accept_prob
+
+    i = state.i + 1
+    warming_up = i <= state.num_warmup
+    eta = jnp.minimum(1.0, flat.size * i.astype(flat.dtype) ** -exponent)
+    eta = jnp.where(warming_up | throughout, eta, 0.0)
+    target = target_accept_prob or (0.44 if flat.size == 1 else 0.234)
+    chol = adapt(state.chol_proposal, noise, eta * (accept_prob - target))
+    in_phase = jnp.where(warming_up, i, i - state.num_warmup)
+    return RAMState(
+        i=i,
+        z=jax.tree_util.tree_map(partial(jnp.where, accepted), proposal, state.z),
+        potential_energy=jnp.where(accepted, energy, state.potential_energy),
+        accept_prob=accept_prob,
+        accepted=accepted,
+        mean_accept_prob=state.mean_accept_prob + (accept_prob - state.mean_accept_prob) / in_phase,
+        step_size=_geometric_mean_scale(chol),
+        chol_proposal=chol,
+        num_warmup=state.num_warmup,
+        rng_key=rng_key,
+    )
+
+
+def adapt(chol: jax.Array, noise: jax.Array, weight: jax.Array) -> jax.Array:
+    r"""Return the proposal's Cholesky factor after one step of robust adaptation.
+
+        S_{n+1} S_{n+1}' = S_n (I + w U U' / |U|^2) S_n',    w = eta_n (alpha_n - alpha*)
+
+    A step that would overflow or underflow the factor (on a flat or a collapsed target) is left
+    out, so that the factor is always finite with a positive diagonal.
+
+    Args:
+        chol: factor ``S_n`` of shape (d, d); the proposal was ``x + S_n U``.
+        noise: the draw ``U`` of shape (d,).
+        weight: ``w`` above -1: the step times the excess of the acceptance probability over its
+            target. Zero returns the factor unchanged, to the last bit.
+
+    Returns:
+        Factor ``S_{n+1}`` of shape (d, d).
+
+    Source:
+        Vihola (2012), Robust adaptive Metropolis algorithm with coerced acceptance rate, Statistics
+        and Computing 22, 997-1008, equation (1).
+    """
+    tiny = jnp.finfo(chol.dtype).tiny
+    direction = noise / jnp.sqrt(jnp.maximum(jnp.sum(noise**2), tiny))
+    updated = rank_one_update(chol, direction, weight)
+    usable = jnp.all(jnp.isfinite(updated)) & jnp.all(jnp.diagonal(updated) > tiny)
+    return jnp.where(usable, updated, chol)
+
+
+def rank_one_update(chol: jax.Array, direction: jax.Array, weight: jax.Array) -> jax.Array:
+    r"""Return the Cholesky factor of ``S (I + c u u') S'`` in O(d^2).
+
+    The factor is ``S T`` with ``T`` the Cholesky factor of ``I + c u u'``, which has a closed form.
+    With ``t_j = 1 + c sum_{i<=j} u_i^2`` and ``t_0 = 1``,
+
+        T_jj = sqrt(t_j / t_{j-1}),    T_ij = c u_i u_j / sqrt(t_j t_{j-1})   for i > j,
+
+    so that column ``j`` of ``S T`` is
+    ``S_j T_jj + c u_j / sqrt(t_j t_{j-1}) sum_{i>j} S_i u_i``: two running sums and no loop. Both
+    signs of ``c`` are the same formula. Every ``t_j`` lies between 1 and ``1 + c |u|^2``, hence a
+    downdate is as stable as an update and the diagonal stays positive; a ``c`` that would make the
+    matrix indefinite is treated as one that makes it all but singular.
+
+    Args:
+        chol: lower triangular factor ``S`` of shape (d, d) with a positive diagonal.
+        direction: vector ``u`` of shape (d,), in the coordinates of the standardised space.
+        weight: scalar ``c``, above ``-1 / |u|^2``.
+
+    Returns:
+        Lower triangular factor of shape (d, d) with a positive diagonal.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> rank_one_update(jnp.eye(2), jnp.array([1.0, 0.0]), 3.0).tolist()
+        [[2.0, 0.0], [0.0, 1.0]]
+    """
+    pivots = jnp.maximum(1.0 + weight * jnp.cumsum(direction**2), jnp.finfo(chol.dtype).eps)
+    previous = jnp.concatenate([jnp.ones_like(pivots[:1]), pivots[:-1]])
+    terms = (chol * direction)[:, 1:]
+    later_columns = jnp.pad(jax.lax.cumsum(terms, axis=1, reverse=True), ((0, 0), (0, 1)))
+    below = weight * direction / jnp.sqrt(pivots * previous)
+    return chol * jnp.sqrt(pivots / previous) + later_columns * below
+
+
+def _geometric_mean_scale(chol: jax.Array) -> jax.Array:
+    return jnp.exp(jnp.mean(jnp.log(jnp.diagonal(chol))))

@@ -1,0 +1,69 @@
+"""The unconstrained parameters of a NumPyro model: their sites and the names of coordinates."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import numpy as np
+from numpyro import handlers
+from numpyro.infer import init_to_uniform
+
+
+def check_latent_sites(
+    model: Callable, args: tuple, kwargs: Mapping[str, Any], rng_key: jax.Array, user: str
+) -> None:
+    """Raise ValueError unless every latent site of a model is continuous and there is at least one.
+
+    Args:
+        model: a NumPyro model.
+        args: its positional arguments.
+        kwargs: its keyword arguments.
+        rng_key: key for the values of the latent sites.
+        user: who asks, for the message.
+
+    Raises:
+        ValueError: a latent site is discrete, or no latent site is left to sample.
+    """
+    # init_to_uniform also serves improper priors, from which nothing can be drawn
+    drawn = handlers.substitute(handlers.seed(model, rng_key), substitute_fn=init_to_uniform)
+    trace = handlers.trace(drawn).get_trace(*args, **kwargs)
+    latent = [s for s in trace.values() if s["type"] == "sample" and not s["is_observed"]]
+    discrete = [site["name"] for site in latent if site["fn"].support.is_discrete]
+    if discrete:
+        raise ValueError(
+            f"{user} needs continuous parameters, but the model has discrete latent sites: "
+            f"{', '.join(map(repr, discrete))}. Sum over their values inside the model (for "
+            "example with dist.MixtureSameFamily), or condition on them with numpyro.handlers."
+        )
+    if not latent:
+        raise ValueError(
+            f"{user} found no latent site in the model: every sample site is observed or "
+            "substituted. Give at least one parameter a prior with numpyro.sample(name, "
+            "distribution), without obs."
+        )
+
+
+def coordinate_names(position: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the name of every coordinate of the flattened unconstrained parameters.
+
+    The flat order is that of ``jax.flatten_util.ravel_pytree``: sites sorted by name, each in C
+    order. Covariances of the unconstrained parameters are laid out in it.
+
+    Args:
+        position: site name -> unconstrained value.
+
+    Returns:
+        One name for each coordinate: the site's name, with the index in brackets unless the value
+        is a scalar.
+
+    Example:
+        >>> coordinate_names({"noise": 0.1, "decay": [1.0, 2.0]})
+        ('decay[0]', 'decay[1]', 'noise')
+    """
+    names = []
+    for site in sorted(position):
+        for index in np.ndindex(np.shape(position[site])):
+            names.append(f"{site}[{','.join(map(str, index))}]" if index else site)
+    return tuple(names)
