@@ -1,0 +1,177 @@
+"""The force protocol: a Gaussian process prior written as a linear SDE."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from lfm_ppl.forces.discretise import discretise_dispersion
+
+
+class Force(eqx.Module):
+    """A Gaussian process u(t) with a state-space form, the prior of an unobserved force.
+
+        u(t) = mean(t) + H(t) z(t),    dz = F z dt + L dbeta,    z(t0) ~ N(0, P0),
+
+    with a standard Brownian motion ``beta``. A subclass says ``initial_covariance`` (P0),
+    ``feedback`` (F), ``dispersion`` (L, spectral density folded in) and its dimensions; everything
+    else has a default. It may replace ``discretise`` by a closed form, the measurement by one that
+    depends on time, and add jumps of the state at given times.
+
+    A force is a pytree: parameters are its array leaves, so that it passes through ``jax.jit``,
+    ``jax.vmap`` and ``jax.grad``. Constructors check concrete parameters and let tracers pass.
+
+    Attributes:
+        mean: a number, or a function of time that returns a number; added to the process.
+    """
+
+    mean: eqx.AbstractVar[Any]
+
+    @property
+    def state_dim(self) -> int:
+        """Number n of states."""
+        raise NotImplementedError
+
+    @property
+    def noise_dim(self) -> int:
+        """Number S of independent Brownian motions that drive the states."""
+        raise NotImplementedError
+
+    @property
+    def stationary(self) -> bool:
+        """Whether P0 is the stationary covariance and H does not depend on time."""
+        return False
+
+    def initial_covariance(self) -> jax.Array:
+        """Return P0 (n, n), the covariance of the state at the model's initial time."""
+        raise NotImplementedError
+
+    def feedback(self) -> jax.Array:
+        """Return F (n, n)."""
+        raise NotImplementedError
+
+    def dispersion(self) -> jax.Array:
+        """Return L (n, S)."""
+        raise NotImplementedError
+
+    def discretise(self, dt: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return transition (n, n) and process noise (n, n) over a step of length dt >= 0."""
+        return discretise_dispersion(self.feedback(), self.dispersion(), dt)
+
+    def transition(self, dt: jax.Array) -> jax.Array:
+        """Return exp(F dt) (n, n)."""
+        return self.discretise(dt)[0]
+
+    def process_noise(self, dt: jax.Array) -> jax.Array:
+        """Return the covariance (n, n) that a step of length dt adds, exact for any dt."""
+        return self.discretise(dt)[1]
+
+    def measurement(self, t: jax.Array) -> jax.Array:
+        """Return H(t) (n,); the first state by default."""
+        return jnp.zeros(self.state_dim).at[0].set(1.0)
+
+    def mean_at(self, t: jax.Array) -> jax.Array:
+        """Return the mean of the force at time t, a scalar."""
+        value = jnp.asarray(self.mean(t) if callable(self.mean) else self.mean)
+        if value.shape != ():
+            raise ValueError(f"mean must return one number, got an array of shape {value.shape}.")
+        return value
+
+    def covariance(self, t: jax.Array, s: jax.Array = 0.0) -> jax.Array:
+        """Return the closed-form covariance of u(t) and u(s), elementwise.
+
+        For a stationary force only ``t - s`` matters, so that ``covariance(lag)`` is its kernel.
+        Forces that are not stationary count both times from the model's initial time.
+
+        Raises:
+            NotImplementedError: where no closed form is known.
+        """
+        raise NotImplementedError(
+            f"{type(self).__name__} has no closed-form covariance; `sde_covariance` computes it "
+            "from the state-space form."
+        )
+
+    def spectral_density(self, omega: jax.Array) -> jax.Array:
+        """Return the closed-form spectral density S(omega), elementwise.
+
+        It is two-sided in angular frequency: ``covariance(0) = 1/(2 pi) int S(omega) domega``.
+
+        Raises:
+            NotImplementedError: where no closed form is known or no spectral density exists.
+        """
+        raise NotImplementedError(
+            f"{type(self).__name__} has no closed-form spectral density; for a stationary force "
+            "`sde_spectral_density` computes it from the state-space form."
+        )
+
+    def sde_covariance(self, t: jax.Array, s: jax.Array = 0.0) -> jax.Array:
+        """Return the covariance of u(t) and u(s) that the state-space form has, elementwise.
+
+        ``H(t) exp(F (t - s)) P(s) H(s)'`` for t >= s. It equals ``covariance`` for an exact form
+        and shows the approximation otherwise. Times as in ``covariance``.
+
+        Raises:
+            NotImplementedError: for a force with jumps.
+        """
+        if self.jump_times:
+            raise NotImplementedError(
+                "the covariance of a force with jumps is not available between arbitrary times; "
+                "simulate a model with this force instead."
+            )
+        return jnp.vectorize(self._sde_covariance)(t, s)
+
+    def _sde_covariance(self, t, s):
+        late, early = jnp.maximum(t, s), jnp.minimum(t, s)
+        variance = self.initial_covariance()
+        if not self.stationary:
+            transition, noise = self.discretise(early)
+            variance = transition @ variance @ transition.T + noise
+        row = self.measurement(late) @ self.transition(late - early)
+        return row @ variance @ self.measurement(early)
+
+    def sde_spectral_density(self, omega: jax.Array) -> jax.Array:
+        """Return the spectral density ``|H (i omega - F)^-1 L|^2`` of the state-space form.
+
+        Raises:
+            NotImplementedError: for a force that is not stationary.
+        """
+        if not self.stationary:
+            raise NotImplementedError(
+                f"{type(self).__name__} is not stationary, so it has no spectral density; "
+                "use `sde_covariance`."
+            )
+        feedback, dispersion = self.feedback(), self.dispersion()
+
+        def density(w):
+            resolvent = 1j * w * jnp.eye(self.state_dim) - feedback
+            gain = self.measurement(0.0) @ jnp.linalg.solve(resolvent, dispersion + 0j)
+            return (jnp.abs(gain) ** 2).sum()
+
+        return jnp.vectorize(density)(omega)
+
+    @property
+    def jump_times(self) -> tuple[float, ...]:
+        """Increasing times at which the state jumps; none by default. They are static."""
+        return ()
+
+    def jump(self, index: int) -> tuple[jax.Array, jax.Array]:
+        """Return G (n, n) and Q (n, n) of the jump ``z <- G z + N(0, Q)`` at ``jump_times[index]``.
+
+        Args:
+            index: a Python int, so that each jump may have matrices of its own making.
+
+        Raises:
+            IndexError: where there is no such jump.
+        """
+        count = len(self.jump_times)
+        raise IndexError(f"{type(self).__name__} has {count} jumps, so none at index {index}.")
+
+    def __add__(self, other: Force) -> Force:
+        """Return the force that is the sum of two independent forces."""
+        # The sum is itself a force, so its module imports this one.
+        from lfm_ppl.forces.sum import Sum
+
+        return Sum((self, other)) if isinstance(other, Force) else NotImplemented

@@ -1,0 +1,111 @@
+"""Integrated Brownian motion: a force whose velocity is a Wiener process."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lfm_ppl import checks
+from lfm_ppl.forces.parameters import mean_parameter, positive_parameter, scalar_parameter
+from lfm_ppl.forces.sde import Force
+
+
+class WienerVelocity(Force):
+    """Integrated Brownian motion, ``d(du/dt) = scale dbeta``: smooth and without a lengthscale.
+
+    The state is ``(u, u')``. With independent ``u(t0) ~ N(0, initial_value_sd^2)`` and
+    ``u'(t0) ~ N(0, initial_velocity_sd^2)``, and with times t >= s counted from the model's
+    initial time t0,
+
+        cov(u(t), u(s)) = initial_value_sd^2 + initial_velocity_sd^2 t s
+                          + scale^2 (s^3 / 3 + s^2 (t - s) / 2).
+
+    It is not stationary: its variance grows with time, and it has no spectral density. Without
+    initial variance its posterior mean is a cubic spline.
+
+    Args:
+        scale: standard deviation that the velocity gains, in force units / time^(3/2); > 0.
+        initial_value_sd: standard deviation of u at the initial time; >= 0.
+        initial_velocity_sd: standard deviation of u' at the initial time, in force units / time;
+            >= 0.
+        mean: a number, or a function of time.
+
+    Raises:
+        ValueError: for a scale that is not positive, or a negative standard deviation.
+
+    Example:
+        >>> force = WienerVelocity(scale=1.0, initial_value_sd=2.0)
+        >>> round(float(force.covariance(3.0, 3.0)), 6)
+        13.0
+    """
+
+    scale: jax.Array
+    initial_value_sd: jax.Array
+    initial_velocity_sd: jax.Array
+    mean: Any
+
+    def __init__(
+        self,
+        scale: Any,
+        initial_value_sd: Any = 0.0,
+        initial_velocity_sd: Any = 0.0,
+        mean: Any = 0.0,
+    ):
+        self.scale = positive_parameter("scale", scale)
+        self.initial_value_sd = _standard_deviation("initial_value_sd", initial_value_sd)
+        self.initial_velocity_sd = _standard_deviation("initial_velocity_sd", initial_velocity_sd)
+        self.mean = mean_parameter(mean)
+
+    @property
+    def state_dim(self) -> int:
+        """Two states, value and velocity."""
+        return 2
+
+    @property
+    def noise_dim(self) -> int:
+        """One Brownian motion."""
+        return 1
+
+    def initial_covariance(self) -> jax.Array:
+        """Return the covariance (2, 2) at the model's initial time."""
+        return jnp.diag(jnp.stack([self.initial_value_sd, self.initial_velocity_sd]) ** 2)
+
+    def feedback(self) -> jax.Array:
+        """Return F (2, 2), nilpotent."""
+        return jnp.array([[0.0, 1.0], [0.0, 0.0]])
+
+    def dispersion(self) -> jax.Array:
+        """Return L (2, 1)."""
+        return self.scale * np.array([[0.0], [1.0]])
+
+    def discretise(self, dt: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return transition (2, 2) and process noise (2, 2) over a step of length dt >= 0."""
+        dt = jnp.asarray(dt, self.scale.dtype)
+        transition = np.eye(2) + dt * np.eye(2, k=1)
+        noise = jnp.stack([dt**3 / 3.0, dt**2 / 2.0, dt**2 / 2.0, dt]).reshape(2, 2)
+        return transition, self.scale**2 * noise
+
+    def covariance(self, t: jax.Array, s: jax.Array = 0.0) -> jax.Array:
+        """Return the covariance of u(t) and u(s), both counted from the initial time."""
+        late, early = jnp.maximum(t, s), jnp.minimum(t, s)
+        driven = early**3 / 3.0 + early**2 * (late - early) / 2.0
+        initial = self.initial_value_sd**2 + self.initial_velocity_sd**2 * late * early
+        return initial + self.scale**2 * driven
+
+    def spectral_density(self, omega: jax.Array) -> jax.Array:
+        """Raise NotImplementedError: integrated Brownian motion is not stationary."""
+        raise NotImplementedError(
+            "WienerVelocity is not stationary, so it has no spectral density; use `covariance(t, "
+            "s)`, or a Matern force with a long lengthscale."
+        )
+
+
+def _standard_deviation(name, value):
+    deviation = scalar_parameter(name, value)
+    concrete = checks.concrete(deviation)
+    if concrete is not None and concrete < 0:
+        raise ValueError(f"{name} is a standard deviation and must be >= 0, got {concrete:g}.")
+    return deviation
