@@ -16,9 +16,12 @@ import numpy as np
 
 def concrete(value: Any) -> np.ndarray | None:
     """Return ``value`` as a NumPy array, or None where it is (or contains) a tracer."""
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree_util.tree_leaves(value)):
-        return None
-    return np.asarray(value)
+    return None if traced(value) else np.asarray(value)
+
+
+def traced(tree: Any) -> bool:
+    """Whether a leaf of ``tree`` is a tracer."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree_util.tree_leaves(tree))
 
 
 def positive(name: str, value: Any, remedy: str = "") -> None:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 _FUSED_SIZE = 8
 """Largest dimension that is multiplied by broadcasting; XLA's CPU dot wins above it."""
@@ -31,3 +34,124 @@ def matmul(a: jax.Array, b: jax.Array) -> jax.Array:
     if max(*a.shape[-2:], *b.shape[-2:]) > _FUSED_SIZE:
         return jnp.matmul(a, b)
     return (a[..., :, :, None] * b[..., None, :, :]).sum(-2)
+
+
+def outer_square(a: jax.Array) -> jax.Array:
+    """Return ``A A'`` for matrices of shape (..., n, k), symmetric to the last bit."""
+    return matmul(a, jnp.swapaxes(a, -1, -2))
+
+
+def congruence(a: jax.Array, p: jax.Array) -> jax.Array:
+    """Return the symmetric matrix ``A P A'`` for ``A`` (..., n, k) and a symmetric ``P`` (..., k, k)."""
+    return symmetric(matmul(matmul(a, p), jnp.swapaxes(a, -1, -2)))
+
+
+def symmetric(a: jax.Array) -> jax.Array:
+    """Return ``(A + A') / 2``, which removes the rounding error of a congruence."""
+    return 0.5 * (a + jnp.swapaxes(a, -1, -2))
+
+
+def safe_sqrt(x: jax.Array) -> jax.Array:
+    """Return the square root of max(x, 0), with a zero gradient where x <= 0."""
+    positive = x > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
+
+
+class Factor(NamedTuple):
+    """A lower triangular factor ``L`` with ``P = L L'``, and the pivots that were not positive.
+
+    Attributes:
+        chol: (n, n), lower triangular.
+        degenerate: (n,), True where the pivot was at or below its floor.
+    """
+
+    chol: jax.Array
+    degenerate: jax.Array
+
+
+def cholesky(p: jax.Array, floor: jax.Array | float = 0.0, keep: bool = True) -> Factor:
+    """Factorise a positive semi-definite matrix column by column, in plain operations.
+
+    LAPACK's routine is a call that XLA cannot fuse and gives NaN, in value or gradient, for a singular matrix. Here a
+    pivot at or below its floor is replaced, so that values and gradients stay finite.
+
+    Args:
+        p: (n, n), symmetric.
+        floor: scalar or (n,), at or below which a pivot (a conditional variance) counts as degenerate.
+        keep: a degenerate pivot is replaced by its floor (by 1 where that is zero); if False its column is zero,
+            which gives the semi-definite factor.
+
+    Returns:
+        The factor and its degenerate pivots.
+    """
+    size = p.shape[-1]
+    floor = jnp.broadcast_to(jnp.asarray(floor, p.dtype), (size,))
+    rows = np.arange(size)
+    columns: list[jax.Array] = []
+    degenerate = []
+    for j in range(size):
+        column = p[:, j]
+        for previous in columns:
+            column = column - previous * previous[j]
+        positive = column[j] > floor[j]
+        degenerate.append(~positive)
+        replacement = jnp.where(floor[j] > 0, floor[j], 1.0)
+        root = jnp.sqrt(jnp.where(positive, column[j], replacement))
+        diagonal = root if keep else jnp.where(positive, root, 0.0)
+        below = jnp.where(positive, column / root, 0.0)
+        columns.append(jnp.where(rows > j, below, jnp.where(rows == j, diagonal, 0.0)))
+    return Factor(jnp.stack(columns, axis=-1), jnp.stack(degenerate))
+
+
+def solve_lower(chol: jax.Array, b: jax.Array) -> jax.Array:
+    """Solve ``L X = B`` for a lower triangular ``L`` (n, n) and ``B`` (n,) or (n, m), in plain operations.
+
+    A zero on the diagonal (a semi-definite factor) gives a zero row of ``X``.
+    """
+    rows: list[jax.Array] = []
+    for j in range(chol.shape[-1]):
+        value = b[j]
+        for k, row in enumerate(rows):
+            value = value - chol[j, k] * row
+        rows.append(_divide(value, chol[j, j]))
+    return jnp.stack(rows)
+
+
+def solve_upper(chol: jax.Array, b: jax.Array) -> jax.Array:
+    """Solve ``L' X = B`` for a lower triangular ``L`` (n, n); zeros on the diagonal as in `solve_lower`."""
+    size = chol.shape[-1]
+    rows: dict[int, jax.Array] = {}
+    for j in reversed(range(size)):
+        value = b[j]
+        for k in range(j + 1, size):
+            value = value - chol[k, j] * rows[k]
+        rows[j] = _divide(value, chol[j, j])
+    return jnp.stack([rows[j] for j in range(size)])
+
+
+def solve_semidefinite(p: jax.Array, b: jax.Array, tolerance: float = 1e-14) -> jax.Array:
+    """Solve ``P X = B`` for a positive semi-definite ``P`` (n, n) and ``B`` (n, m) in the range of ``P``.
+
+    The matrix is scaled to unit diagonal first, and directions whose conditional variance is below ``tolerance`` of
+    their marginal variance carry no information: they get zero weight.
+    """
+    variance = jnp.diagonal(p)
+    live = variance > 0
+    scale = jnp.where(live, 1.0 / jnp.sqrt(jnp.where(live, variance, 1.0)), 0.0)
+    factor = cholesky(p * scale[:, None] * scale[None, :], floor=tolerance, keep=False)
+    scaled = b * (scale[:, None] if b.ndim > 1 else scale)
+    solution = solve_upper(factor.chol, solve_lower(factor.chol, scaled))
+    return solution * (scale[:, None] if b.ndim > 1 else scale)
+
+
+def semidefinite_root(p: jax.Array, tolerance: float = 1e-14) -> jax.Array:
+    """Return a lower triangular ``L`` with ``L L' = P`` for a positive semi-definite ``P``; null directions are zero."""
+    variance = jnp.diagonal(p)
+    live = variance > 0
+    sd = jnp.where(live, jnp.sqrt(jnp.where(live, variance, 1.0)), 0.0)
+    inverse = jnp.where(live, 1.0 / jnp.where(live, sd, 1.0), 0.0)
+    return sd[:, None] * cholesky(p * inverse[:, None] * inverse[None, :], floor=tolerance, keep=False).chol
+
+
+def _divide(a: jax.Array, b: jax.Array) -> jax.Array:
+    return jnp.where(b != 0, a / jnp.where(b != 0, b, 1.0), 0.0)

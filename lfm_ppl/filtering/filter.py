@@ -1,0 +1,262 @@
+"""THE filter: one forward scan over the rows, for any rule and any model."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lfm_ppl import checks
+from lfm_ppl.filtering.predict import Moments, predict_exact, predict_row
+from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays, schedule
+from lfm_ppl.filtering.transition import constant_slope, exact, integrating_factor, linear_part
+from lfm_ppl.filtering.update import linearise_observation, update
+from lfm_ppl.linalg import congruence, matmul, solve_lower
+from lfm_ppl.linearisation.rule import Rule
+from lfm_ppl.linearisation.sigma_points import Cubature
+from lfm_ppl.model.augment import StateSpaceModel, state_space
+from lfm_ppl.model.latent_force_model import LatentForceModel
+
+
+class Pass(NamedTuple):
+    """What a forward scan leaves, one entry a row; ``None`` where it was not asked for.
+
+    Attributes:
+        log_likelihood: (N,) of each row's observation, zero without one.
+        predicted, filtered: moments (N, n), (N, n, n) at the row's end, before and after the observation.
+        phi, noise: (N, n, n), the affine map of the row.
+        innovation, chol, gain, slope: of the update, (N, D), (N, D, D), (N, n, D), (N, D, n).
+    """
+
+    log_likelihood: jax.Array
+    predicted: Any = None
+    filtered: Any = None
+    phi: Any = None
+    noise: Any = None
+    innovation: Any = None
+    chol: Any = None
+    gain: Any = None
+    slope: Any = None
+
+
+class FilterState(NamedTuple):
+    """Where a filter stands: the time and the moments of the joint state, to pass on as ``start``."""
+
+    time: jax.Array
+    mean: jax.Array
+    covariance: jax.Array
+
+
+class FilterResult(eqx.Module):
+    """The outcome of `filter`.
+
+    Attributes:
+        times: (T,).
+        log_likelihood: (T,), log p(y_k | y_1:k-1) of the entries that are present.
+        predicted_mean, predicted_covariance: (T, n), (T, n, n) of the joint state, before each observation.
+        filtered_mean, filtered_covariance: after it.
+        residual: (T, D), innovations whitened by their Cholesky factor: independent standard normals for a true
+            linear model; NaN where missing.
+        state: time and moments after the last observation.
+    """
+
+    times: jax.Array
+    log_likelihood: jax.Array
+    predicted_mean: jax.Array
+    predicted_covariance: jax.Array
+    filtered_mean: jax.Array
+    filtered_covariance: jax.Array
+    residual: jax.Array
+    state: FilterState
+
+
+def forward(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, *, start: Moments | None = None,
+            about: Moments | None = None, keep: str = "likelihood") -> Pass:
+    """Run the one forward scan.
+
+    Args:
+        ssm: the model.
+        rule: the linearisation rule.
+        plan: the rows.
+        y: (T, D), NaN where missing.
+        start: moments at the initial time; the model's by default.
+        about: linearise about these moments, (N + 1, ...) at the start and at each row's end.
+        keep: "likelihood" (log likelihoods only), "moments" (and the moments), "all" (what the smoother needs).
+    """
+    rows = as_arrays(plan.rows)
+    linear = linear_part(ssm, jnp.asarray(plan.initial_time, float))
+    invariant = ssm.time_invariant
+    slope = _observation_slope(ssm, plan)
+
+    def prepare(length: jax.Array) -> Any:
+        if invariant:
+            return exact(ssm, linear, length, plan.steps)
+        return integrating_factor(ssm, linear, length / plan.steps)
+
+    table = None if plan.lengths is None else jax.vmap(prepare)(jnp.asarray(plan.lengths))
+    jumps = _jump_table(ssm)
+    padded = jnp.concatenate([jnp.asarray(y, float), jnp.full((1, ssm.output_dim), jnp.nan)])
+
+    def step(moments: Moments, inputs: tuple[Rows, jax.Array, Any]) -> tuple[Moments, Pass]:
+        row, observed, nearby = inputs
+        prepared = prepare(row.length) if table is None else jax.tree_util.tree_map(lambda a: a[row.kind], table)
+        if invariant:
+            one = predict_exact(ssm, prepared, plan.steps, row.start, row.length, moments)
+        else:
+            one = predict_row(ssm, rule, linear, prepared, plan.steps, row.start, row.length, moments, nearby,
+                              flow=keep == "all")
+        predicted, phi, noise = one
+        if jumps is not None:
+            predicted, phi, noise = _jump(ssm, jumps, row.jump, predicted, phi, noise, keep == "all" or invariant)
+        affine = linearise_observation(ssm, rule, slope, row.start + row.length, jnp.maximum(row.observation, 0),
+                                       predicted, None if nearby is None else nearby[1])
+        new = update(ssm, affine, observed, jnp.isfinite(observed), predicted)
+        out = Pass(new.log_likelihood)
+        if keep != "likelihood":
+            out = out._replace(predicted=predicted, filtered=new.moments, innovation=new.innovation, chol=new.chol)
+        if keep == "all":
+            out = out._replace(phi=phi, noise=noise, gain=new.gain, slope=new.slope)
+        return new.moments, out
+
+    nearby = None
+    if about is not None:
+        nearby = (jax.tree_util.tree_map(lambda a: a[:-1], about), jax.tree_util.tree_map(lambda a: a[1:], about))
+    first = Moments(*ssm.initial()) if start is None else start
+    _, passed = jax.lax.scan(jax.checkpoint(step), first, (rows, padded[rows.observation], nearby))
+    return passed
+
+
+def _observation_slope(ssm: StateSpaceModel, plan: Schedule) -> jax.Array:
+    """The constant part of the observation's Jacobian; the same at every point and time."""
+    t = jnp.asarray(plan.initial_time, float)
+    matrix, offset = ssm.input_map(t)
+    w = matmul(matrix, ssm.initial()[0][:, None])[:, 0] + offset
+    return constant_slope(lambda v: (ssm.observe(v, t), ()), w, ssm.observation_structure, ssm.output_dim)
+
+
+def _jump_table(ssm: StateSpaceModel) -> tuple[jax.Array, jax.Array] | None:
+    count = len(ssm.stack.jump_times)
+    if count == 0:
+        return None
+    pairs = [ssm.stack.jump(index) for index in range(count)]
+    nothing = (jnp.eye(ssm.force_dim), jnp.zeros((ssm.force_dim, ssm.force_dim)))
+    # The last entry, which index -1 selects, is no jump.
+    return tuple(jnp.stack([pair[part] for pair in (*pairs, nothing)]) for part in (0, 1))  # type: ignore[return-value]
+
+
+def _jump(ssm: StateSpaceModel, jumps: tuple[jax.Array, jax.Array], index: jax.Array, moments: Moments, phi: Any,
+          noise: Any, flow: bool) -> tuple[Moments, Any, Any]:
+    size = ssm.physical_dim
+    transition = jax.scipy.linalg.block_diag(jnp.eye(size), jumps[0][index])
+    added = jax.scipy.linalg.block_diag(jnp.zeros((size, size)), jumps[1][index])
+    moments = Moments(matmul(transition, moments.mean[:, None])[:, 0],
+                      congruence(transition, moments.covariance) + added)
+    return moments, *((matmul(transition, phi), congruence(transition, noise) + added) if flow else (phi, noise))
+
+
+def check_observations(y: Any, count: int, outputs: int) -> jax.Array:
+    """Return y as an array (T, D) after checking it.
+
+    Raises:
+        ValueError: a wrong shape, infinite entries, or nothing observed at all.
+    """
+    shape = np.shape(y)
+    if shape == (count,) and outputs == 1:
+        y, shape = jnp.reshape(jnp.asarray(y), (count, 1)), (count, 1)
+    if shape != (count, outputs):
+        raise ValueError(f"y must have one row for each of the {count} times and one column for each of the {outputs} "
+                         f"outputs, shape ({count}, {outputs}); got {shape}.")
+    known = checks.concrete(y)
+    if known is not None:
+        if known.dtype.kind not in "biuf":
+            raise TypeError(f"y must be numeric, got dtype {known.dtype}.")
+        if np.isinf(known).any():
+            row, column = np.argwhere(np.isinf(known))[0]
+            raise ValueError(f"y[{row}, {column}] is infinite; use NaN for a missing entry.")
+        if np.isnan(known).all():
+            raise ValueError("every entry of y is missing (NaN); there is nothing to learn from.")
+    return jnp.asarray(y, float)
+
+
+def filter(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None, steps: int = 10,
+           max_step: float | None = None, start: FilterState | None = None) -> FilterResult:
+    """Run the continuous-discrete Gaussian filter.
+
+    Between observations the moments obey dm/dt = E[f], dP/dt = A P + P A' + E[G G'] with the rule's A; at an
+    observation they are conditioned on it.
+
+    Args:
+        model: the latent force model.
+        times: (T,), non-decreasing; equal times are replicates.
+        y: (T, D), NaN where missing.
+        rule: linearisation rule; `Cubature()` by default.
+        steps: integration steps between two consecutive times.
+        max_step: longest step, in units of time; longer intervals get more steps.
+        start: the ``state`` of an earlier result, to go on with new observations; times continue from there.
+
+    Returns:
+        Log likelihoods, moments and residuals, by observation.
+
+    Raises:
+        ValueError, TypeError: unsorted times, a wrong shape of y, and so on; each says what to do.
+
+    Example:
+        >>> import jax.numpy as jnp, lfm_ppl as lfm
+        >>> model = lfm.LatentForceModel(
+        ...     lambda x, u, t: u - x, {"u": lfm.Matern(1.0, 1.0)},
+        ...     lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
+        >>> lfm.filter(model, jnp.arange(3.0), jnp.zeros((3, 1))).log_likelihood.shape
+        (3,)
+
+    Source: Särkkä and Sarmavuori (2013), Signal Processing 93; Hartikainen et al. (2012), section 4.
+    """
+    rule = as_rule(rule)
+    ssm = state_space(model)
+    plan = schedule(ssm, times, steps, max_step, initial_time=None if start is None else start.time)
+    model.check_at(plan.initial_time)
+    y = check_observations(y, len(plan.observed), ssm.output_dim)
+    warn_single_precision()
+    begin = None if start is None else Moments(start.mean, start.covariance)
+    return _run_filter(ssm, rule, plan, y, jnp.asarray(times, float), begin)
+
+
+@eqx.filter_jit
+def _run_filter(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, times: jax.Array,
+                begin: Moments | None) -> FilterResult:
+    passed = forward(ssm, rule, plan, y, start=begin, keep="moments")
+    at = jax.tree_util.tree_map(lambda a: a[jnp.asarray(plan.observed)], passed)
+    state = FilterState(times[-1], at.filtered.mean[-1], at.filtered.covariance[-1])
+    return FilterResult(times, at.log_likelihood, at.predicted.mean, at.predicted.covariance, at.filtered.mean,
+                        at.filtered.covariance, standardised(at, y), state)
+
+
+def standardised(passed: Pass, y: jax.Array) -> jax.Array:
+    """Return innovations whitened by their Cholesky factor, (T, D), NaN where missing."""
+    return jnp.where(jnp.isfinite(y), jax.vmap(solve_lower)(passed.chol, passed.innovation), jnp.nan)
+
+
+def as_rule(rule: Any) -> Rule:
+    """Return the rule, `Cubature()` for None; raise TypeError for anything else."""
+    if rule is None:
+        return Cubature()
+    if not isinstance(rule, Rule):
+        hint = " Call it: lfm.Cubature()." if isinstance(rule, type) else ""
+        raise TypeError(f"rule must be a linearisation rule such as lfm.Cubature(), got {rule!r}.{hint}")
+    return rule
+
+
+_warned = False
+
+
+def warn_single_precision() -> None:
+    """Warn once when JAX runs in single precision."""
+    global _warned
+    if not _warned and jnp.result_type(float) != jnp.float64:
+        import warnings
+
+        _warned = True
+        warnings.warn("JAX runs in single precision (float32), in which filters lose most of their digits. Call "
+                      'jax.config.update("jax_enable_x64", True) before anything else.', stacklevel=3)

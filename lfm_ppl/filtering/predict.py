@@ -1,0 +1,281 @@
+r"""Prediction: the mean and the flow of the linearised system over one row of the scan.
+
+The filter's moments obey dm/dt = E[f] and dP/dt = A P + P A' + E[G G']. The covariance is carried as
+
+    P(t) = Phi(t) (P0 + W(t)) Phi(t)',    dPhi/dt = A Phi,    dW/dt = Phi^-1 D Phi^-T,
+
+and (m, Phi, W) is what the classical Runge-Kutta method integrates. Its weights are positive, so W, and with it P,
+is positive semi-definite at every stage and at the end, and the order is four. The linear part of the model
+(`transition`) is removed from A by its exact exponential, an integrating factor. The forces' own noise is exact: the
+noise that reaches x through the nodes is regressed on it, plus a semi-definite remainder.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from lfm_ppl.filtering.transition import Exact, Factor, LinearPart
+from lfm_ppl.linalg import congruence, matmul, outer_square, safe_sqrt
+from lfm_ppl.linearisation.rule import Inputs, Rule, selection
+from lfm_ppl.linearisation.sigma_points import SigmaPointRule
+from lfm_ppl.model.augment import InputStructure, StateSpaceModel
+
+
+class Moments(NamedTuple):
+    """Mean (n,) and covariance (n, n) of the joint state."""
+
+    mean: jax.Array
+    covariance: jax.Array
+
+
+class Prediction(NamedTuple):
+    """The affine map of a row, s -> phi s + ... + N(0, noise), and the moments at its end."""
+
+    moments: Moments
+    phi: jax.Array
+    noise: jax.Array
+
+
+class _Stage(NamedTuple):
+    """What the dynamics gives at a Runge-Kutta node, the linear part removed."""
+
+    rest: jax.Array
+    slope: jax.Array
+    diffusion: jax.Array | None
+
+
+def predict_exact(ssm: StateSpaceModel, transition: Exact, steps: int, start: jax.Array, length: jax.Array,
+                  moments: Moments) -> Prediction:
+    """Predict through the exact transition of a linear time-invariant model."""
+    offset = transition.offset
+    if not ssm.mean_invariant and ssm.physical_dim:
+        offset = _integrated_offset(ssm, transition, steps, start, length / steps)
+    phi, noise = transition.phi, transition.noise
+    mean = matmul(phi, moments.mean[:, None])[:, 0] + offset
+    return Prediction(Moments(mean, congruence(phi, moments.covariance) + noise), phi, noise)
+
+
+def _integrated_offset(ssm: StateSpaceModel, transition: Exact, steps: int, start: jax.Array,
+                       h: jax.Array) -> jax.Array:
+    """Integrate E(H - s) c(s) by Simpson's rule, c the additive terms of the mean."""
+    size = ssm.physical_dim
+
+    def constant(t: jax.Array) -> jax.Array:
+        return jnp.zeros((ssm.state_dim, 1)).at[:size, 0].set(ssm.drift(ssm.input_map(t)[1], t))
+
+    def step(offset: jax.Array, index: jax.Array) -> tuple[jax.Array, None]:
+        t = start + index * h
+        first = matmul(transition.full, offset + h / 6 * constant(t))
+        return first + h / 6 * (4 * matmul(transition.half, constant(t + 0.5 * h)) + constant(t + h)), None
+
+    offset, _ = jax.lax.scan(step, jnp.zeros((ssm.state_dim, 1)), jnp.arange(steps))
+    return offset[:, 0]
+
+
+def predict_row(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Factor, steps: int, start: jax.Array,
+                length: jax.Array, moments: Moments, about: tuple[Moments, Moments] | None = None,
+                flow: bool = False) -> Prediction:
+    """Predict over a row in ``steps`` Runge-Kutta steps.
+
+    Args:
+        ssm: the model.
+        rule: the linearisation rule.
+        linear: its constant linear part.
+        factor: the integrating factor of one step.
+        steps: number of steps.
+        start: time at the row's start.
+        length: of the row.
+        moments: at its start.
+        about: linearise about these moments, at the row's start and end, and not about the filter's own.
+        flow: whether phi and noise of the whole row are wanted (for the smoother).
+    """
+    h = length / steps
+    spread = _smallest_spread(ssm, rule, factor, start, h, moments)
+    size = ssm.state_dim
+    empty = jnp.zeros((size, size))
+
+    def step(carry: tuple, index: jax.Array) -> tuple[tuple, None]:
+        now, phi, noise = carry
+        nodes = None if about is None else _between(about, index / steps, (index + 1) / steps)
+        one = _step(ssm, rule, linear, factor, start + index * h, h, now, spread, nodes)
+        if flow:
+            phi, noise = matmul(one.phi, phi), congruence(one.phi, noise) + one.noise
+        return (one.moments, phi, noise), None
+
+    carry = (moments, jnp.eye(size), empty) if flow else (moments, 0.0, 0.0)
+    (moments, phi, noise), _ = jax.lax.scan(step, carry, jnp.arange(steps), unroll=min(steps, 2))
+    return Prediction(moments, phi, noise)
+
+
+def _between(about: tuple[Moments, Moments], *fractions: jax.Array) -> list[Moments]:
+    """Moments at the first, the middle and the last of two fractions of a row, linear in between."""
+    first, last = fractions
+    return [jax.tree_util.tree_map(lambda a, b: a + share * (b - a), *about)  # noqa: B023
+            for share in (first, 0.5 * (first + last), last)]
+
+
+def _smallest_spread(ssm: StateSpaceModel, rule: Rule, factor: Factor, t: jax.Array, h: jax.Array,
+                     moments: Moments) -> jax.Array:
+    """The standard deviation below which a coordinate counts as known: 1e-6 of what it is or becomes in a step."""
+    size = ssm.physical_dim
+    matrix, offset = ssm.input_map(t)
+    w = matmul(matrix, moments.mean[:, None])[:, 0] + offset
+    change = jnp.abs(ssm.drift(w, t)) * h
+    if (dispersion := ssm.dispersion(w, t)) is not None:
+        change = change + jnp.sqrt(h * (dispersion**2).sum(1) + 1e-300)
+    forces = jnp.sqrt(jnp.diagonal(factor.noise_full) + 1e-300)
+    if isinstance(rule, SigmaPointRule) and rule.full_state:
+        scale = jnp.abs(moments.mean) + jnp.concatenate([change, forces])
+    else:
+        outputs = jnp.sqrt(jnp.diagonal(congruence(matrix[size:, size:], factor.noise_full)) + 1e-300)
+        scale = (jnp.abs(w) + jnp.concatenate([change, outputs]))[jnp.asarray(ssm.drift_structure.points, int)]
+    scale = jnp.where(jnp.isfinite(scale), scale, 0.0)
+    return jax.lax.stop_gradient(1e-6 * scale + 1e-150)
+
+
+def linearise_state(ssm: StateSpaceModel, rule: Rule, function: Any, structure: InputStructure, slope: jax.Array,
+                    t: jax.Array, mean: jax.Array, covariance: Any, spread: jax.Array) -> Any:
+    """Linearise a function of w = K s + k about a Gaussian in s; the slope that comes back is (D, n).
+
+    ``covariance`` is a function of a matrix C that returns C P C', so that only what the rule needs is formed.
+    """
+    matrix, offset = ssm.input_map(t)
+    if isinstance(rule, SigmaPointRule) and rule.full_state:
+        total = ssm.state_dim
+        everything = InputStructure(tuple(range(total)), (), (), (), True)
+        inputs = Inputs(mean, covariance(jnp.eye(total), False), spread)
+        on_state = lambda s: function(matmul(matrix, s[:, None])[:, 0] + offset)  # noqa: E731
+        return rule.linearise(on_state, inputs, everything, jnp.zeros((slope.shape[0], total)))
+    chosen = (*structure.points, *structure.averaged)
+    needed = isinstance(rule, SigmaPointRule) and bool(structure.points)
+    rows = matmul(jnp.asarray(selection(chosen, ssm.input_dim).T), matrix) if chosen else matrix[:0]
+    of_forces = all(index >= ssm.physical_dim for index in chosen)
+    spread_covariance = covariance(rows, of_forces) if needed else jnp.zeros((0, 0))
+    w = matmul(matrix, mean[:, None])[:, 0] + offset
+    affine = rule.linearise(function, Inputs(w, spread_covariance, spread), structure, slope)
+    return affine._replace(slope=matmul(affine.slope, matrix))
+
+
+def covariance_of(moments: Moments) -> Any:
+    """Return the function C -> C P C' of given moments."""
+    return lambda rows, of_forces: congruence(rows, moments.covariance)
+
+
+def _step(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Factor, t: jax.Array, h: jax.Array,
+          moments: Moments, spread: jax.Array, about: list[Moments] | None) -> Prediction:
+    m, p = moments
+    size = ssm.physical_dim
+    half, full, back_half, back_full = factor.half, factor.full, factor.back_half, factor.back_full
+    half_x, full_x = half[:size], full[:size]
+    identity = jnp.eye(ssm.state_dim)
+
+    def stage(index: int, time: jax.Array, mean: jax.Array, covariance: Any) -> _Stage:
+        node = None if about is None else about[(0, 1, 1, 2)[index]]
+        return _stage(ssm, rule, linear, time, mean, covariance, spread, node)
+
+    # Increments of the mean and of the flow are columns of one matrix (M, n + 1).
+    def increment(node: _Stage, flow: jax.Array) -> jax.Array:
+        return jnp.concatenate([matmul(node.slope, flow), node.rest[:, None]], axis=1)
+
+    start = jnp.concatenate([identity, m[:, None]], axis=1)
+    at_half, at_full = matmul(half, start), matmul(full, start)
+
+    def node(base: jax.Array, change: jax.Array) -> tuple[jax.Array, jax.Array]:
+        state = jnp.concatenate([base[:size] + change, base[size:]])
+        return state[:, :-1], state[:, -1]
+
+    one = stage(0, t, m, covariance_of(moments))
+    k1 = increment(one, identity)
+    flow2, m2 = node(at_half, 0.5 * h * matmul(half[:size, :size], k1))
+    q2 = lambda: _noise(factor, 0, [flow2[:size]], [one.diffusion], [0.5 * h], size)  # noqa: E731
+    two = stage(1, t + 0.5 * h, m2, _propagated(p, flow2, q2, factor.noise_half, size))
+    k2 = increment(two, flow2)
+    z2 = 0.5 * h * one.slope
+
+    flow3, m3 = node(at_half, 0.5 * h * k2)
+    transport3 = identity[:size] + matmul(_less(flow3[:size] - half_x, flow3, z2, size), back_half)
+    q3 = lambda: _noise(factor, 1, [transport3], [two.diffusion], [0.5 * h], size)  # noqa: E731
+    three = stage(2, t + 0.5 * h, m3, _propagated(p, flow3, q3, factor.noise_half, size))
+    k3 = increment(three, flow3)
+    z3 = _inverse_flow(0.5 * h, z2, back_half, two.slope, half, size)
+
+    flow4, m4 = node(at_full, h * matmul(half[:size, :size], k3))
+    transport4 = half_x + matmul(_less(flow4[:size] - full_x, flow4, z3, size), back_half)
+    q4 = lambda: _noise(factor, 2, [transport4], [three.diffusion], [h], size)  # noqa: E731
+    four = stage(3, t + h, m4, _propagated(p, flow4, q4, factor.noise_full, size))
+    k4 = increment(four, flow4)
+    z4 = _inverse_flow(h, z3, back_half, three.slope, half, size)
+
+    weighted = matmul(full[:size, :size], k1) + 2.0 * matmul(half[:size, :size], k2 + k3) + k4
+    flow, mean = node(at_full, h / 6 * weighted)
+    change = flow[:size] - full_x
+    transports = [flow[:size], half_x + matmul(_less(change, flow, z2, size), back_half),
+                  half_x + matmul(_less(change, flow, z3, size), back_half),
+                  identity[:size] + matmul(_less(change, flow, z4, size), back_full)]
+    diffusions = [node.diffusion for node in (one, two, three, four)]
+    noise = _noise(factor, 3, transports, diffusions, [h / 6, h / 3, h / 3, h / 6], size)
+    return Prediction(Moments(mean, congruence(flow, p) + noise), flow, noise)
+
+
+def _stage(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, t: jax.Array, mean: jax.Array, covariance: Any,
+           spread: jax.Array, about: Moments | None) -> _Stage:
+    """Linearise the dynamics at a node about the filter's moments, or about those of ``about``."""
+
+    def function(w: jax.Array) -> tuple[jax.Array, Any]:
+        dispersion = ssm.dispersion(w, t)
+        return ssm.drift(w, t), () if dispersion is None else outer_square(dispersion)
+
+    centre, known = (mean, covariance) if about is None else (about.mean, covariance_of(about))
+    affine = linearise_state(ssm, rule, function, ssm.drift_structure, linear.slope, t, centre, known, spread)
+    drift = affine.value
+    if about is not None:
+        drift = drift + matmul(affine.slope, (mean - centre)[:, None])[:, 0]
+    rest = drift - matmul(linear.rows, mean[:, None])[:, 0]
+    return _Stage(rest, affine.slope - linear.rows, affine.extra if isinstance(affine.extra, jax.Array) else None)
+
+
+def _propagated(p: jax.Array, flow: jax.Array, noise: Any, force_noise: jax.Array, size: int) -> Any:
+    """Return the function C -> C (Phi P Phi' + Q) C' of a stage."""
+
+    def covariance(rows: jax.Array, of_forces: bool) -> jax.Array:
+        if of_forces:
+            inner = rows[:, size:]
+            return congruence(matmul(inner, flow[size:, size:]), p[size:, size:]) + congruence(inner, force_noise)
+        return congruence(matmul(rows, flow), p) + congruence(rows, noise())
+
+    return covariance
+
+
+def _less(change: jax.Array, flow: jax.Array, inverse: jax.Array, size: int) -> jax.Array:
+    """Rows of E(c_i) (Phi~_i Psi~_j - I): the change of the flow less what happened before the node j."""
+    return change - matmul(flow[:size, :size], inverse)
+
+
+def _inverse_flow(scale: jax.Array, before: jax.Array, back: jax.Array, slope: jax.Array, half: jax.Array,
+                  size: int) -> jax.Array:
+    """Next stage of Z, where Psi~ = I - Z is the inverse flow in the interaction picture."""
+    pulled = matmul(back[:size, :size], matmul(slope, half))
+    return scale * (pulled - matmul(before[:, :size], pulled))
+
+
+def _noise(factor: Factor, stage: int, transports: list[jax.Array], diffusions: list[jax.Array | None],
+           weights: list[jax.Array], size: int) -> jax.Array:
+    """Return Q (n, n): noise at the nodes, carried on by ``transports`` (M, n), the forces' own part exact.
+
+    The forces' noise at the nodes, ``columns``, is only a quadrature of the exact noise, but what reaches x together
+    with it can be regressed on the exact one: N_x = G N_z + remainder, semi-definite for any G.
+    """
+    exact = factor.noise_full if stage >= 2 else factor.noise_half
+    through = jnp.concatenate([safe_sqrt(weight) * matmul(transport[:, size:], factor.inputs)
+                               for transport, weight in zip(transports, weights, strict=True)], axis=1)
+    gain = matmul(through, factor.regressions[stage])
+    on_states = congruence(gain, exact) + outer_square(through - matmul(gain, factor.columns[stage]))
+    for transport, diffusion, weight in zip(transports, diffusions, weights, strict=True):
+        if diffusion is not None:
+            on_states = on_states + weight * congruence(transport[:, :size], diffusion)
+    cross = matmul(gain, exact)
+    return jnp.concatenate([jnp.concatenate([on_states, cross], axis=1),
+                            jnp.concatenate([cross.T, exact], axis=1)])

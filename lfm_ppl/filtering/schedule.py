@@ -1,0 +1,170 @@
+"""From times to the rows of the one forward scan, decided before compilation."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lfm_ppl import checks
+from lfm_ppl.model.augment import StateSpaceModel, check_times
+
+_LARGEST_TABLE = 1024
+"""Most interval lengths whose transitions are tabulated ahead of the scan; more are computed row by row."""
+
+
+class Rows(NamedTuple):
+    """One row of the scan: a prediction over an interval, perhaps a jump, perhaps an observation.
+
+    Attributes:
+        start: (N,) time at which the interval starts.
+        length: (N,) its length, >= 0.
+        observation: (N,) index of the observation at its end, -1 where there is none.
+        jump: (N,) index of the jump of the forces at its end, before the observation; -1 where there is none.
+        kind: (N,) index of its length in `Schedule.lengths`; zero where that is None.
+    """
+
+    start: Any
+    length: Any
+    observation: Any
+    jump: Any
+    kind: Any
+
+
+class Schedule(NamedTuple):
+    """The rows, and where results are found among them.
+
+    Attributes:
+        rows: the scan's rows.
+        lengths: (U,) distinct lengths, None where there are too many or they are traced.
+        observed: (T,) row of each observation.
+        requested: (K,) row of each requested time.
+        requested_times: (K,).
+        steps: integration steps in each row.
+        initial_time: when the scan starts.
+    """
+
+    rows: Rows
+    lengths: Any
+    observed: Any
+    requested: Any
+    requested_times: Any
+    steps: int
+    initial_time: Any
+
+
+def schedule(ssm: StateSpaceModel, times: Any, steps: int, max_step: float | None = None, at: Any = None,
+             initial_time: Any = None, row_per_step: bool = False) -> Schedule:
+    """Plan the scan.
+
+    Args:
+        ssm: the model; its forces' jump times become rows.
+        times: (T,) observation times, non-decreasing.
+        steps: integration steps between two consecutive times.
+        max_step: longest step; a longer interval gets more steps, in rows of ``steps`` each.
+        at: (K,) further times at which the state is wanted, in any order.
+        initial_time: overrides the model's (when the scan starts from a filter's state).
+        row_per_step: give every integration step a row of its own, so that the smoother reaches each.
+
+    Raises:
+        ValueError, TypeError: see `lfm_ppl.model.augment.check_times`; non-positive steps; a requested time before
+            the initial time; traced times together with what needs them concrete.
+    """
+    checks.positive_integer("steps", steps, "It is the number of integration steps between two times.")
+    if max_step is not None:
+        checks.positive("max_step", max_step)
+    initial_time = ssm.model.initial_time if initial_time is None else initial_time
+    known = check_times(times, initial_time)
+    start = known[0] if initial_time is None and known is not None else initial_time
+    origin = None if start is None else checks.concrete(start)
+    if known is None or origin is None:
+        return _traced(ssm, times, steps, max_step, at, initial_time, row_per_step)
+    return _concrete(known, float(origin), ssm.stack.jump_times, steps, max_step, at, row_per_step)
+
+
+def _traced(ssm: StateSpaceModel, times: Any, steps: int, max_step: Any, at: Any, initial_time: Any,
+            row_per_step: bool) -> Schedule:
+    if max_step is not None or at is not None or ssm.stack.jump_times:
+        raise ValueError("max_step, requested times and forces with jumps need times (and initial_time) that are known "
+                         "before compilation; pass NumPy arrays rather than traced values.")
+    times = jnp.asarray(times, float)
+    origin = times[:1] if initial_time is None else jnp.reshape(jnp.asarray(initial_time, float), (1,))
+    start = jnp.concatenate([origin, times[:-1]])
+    pieces = steps if row_per_step else 1
+    width = jnp.repeat((times - start) / pieces, pieces)
+    start = jnp.repeat(start, pieces) + width * np.tile(np.arange(pieces), times.shape[0])
+    observation = np.full(times.shape[0] * pieces, -1)
+    ends = np.arange(times.shape[0]) * pieces + pieces - 1
+    observation[ends] = np.arange(times.shape[0])
+    rows = Rows(start, width, observation, np.full(observation.shape, -1), np.zeros_like(observation))
+    return Schedule(rows, None, ends, ends, times, 1 if row_per_step else steps, origin[0])
+
+
+def _concrete(times: np.ndarray, origin: float, jumps: tuple[float, ...], steps: int, max_step: float | None,
+              at: Any, row_per_step: bool) -> Schedule:
+    requested = times if at is None else _requested(at, origin)
+    # A row ends at each observation, each jump after the origin, and each requested time that is neither.
+    extra = np.setdiff1d(requested, times)
+    end = max(times[-1], requested.max(initial=-np.inf))
+    jump_index = [index for index, jump in enumerate(jumps) if origin < jump <= end]
+    extra = np.setdiff1d(extra, [jumps[index] for index in jump_index])
+    time = np.concatenate([np.asarray(jumps, float)[jump_index], times, extra])
+    # At equal times a jump comes before an observation.
+    rank = np.repeat([0, 1, 2], [len(jump_index), len(times), len(extra)])
+    observation = np.concatenate([np.full(len(jump_index), -1), np.arange(len(times)), np.full(len(extra), -1)])
+    jump = np.concatenate([jump_index, np.full(len(times) + len(extra), -1)]).astype(int)
+    order = np.lexsort((observation, rank, time))
+    time, observation, jump = time[order], observation[order], jump[order]
+    gap = np.diff(time, prepend=origin)
+    pieces = np.ones(len(time), int)
+    if max_step is not None:
+        pieces = np.maximum(1, np.ceil(gap / (max_step * steps) * (1 - 1e-12)).astype(int))
+    if row_per_step:
+        pieces = np.where(gap > 0, pieces * steps, 1)
+        steps = 1
+    event = np.repeat(np.arange(len(time)), pieces)
+    piece = np.arange(len(event)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    width = (gap / pieces)[event]
+    last = piece == pieces[event] - 1
+    lengths, kind = _distinct(width, max(abs(time[-1]), abs(origin)))
+    rows = Rows((time - gap)[event] + piece * width, width, np.where(last, observation[event], -1),
+                np.where(last, jump[event], -1), kind)
+    row_of_event = np.flatnonzero(last)
+    observed = np.empty(len(times), int)
+    observed[observation[observation >= 0]] = row_of_event[observation >= 0]
+    found = observed if at is None else row_of_event[np.searchsorted(time, requested, side="right") - 1]
+    return Schedule(rows, lengths, observed, found, requested, steps, np.asarray(origin))
+
+
+def _requested(at: Any, origin: float) -> np.ndarray:
+    known = checks.concrete(at)
+    if known is None:
+        raise ValueError("the requested times `at` must be known before compilation; pass a NumPy array.")
+    known = np.atleast_1d(known).astype(float)
+    checks.finite("at", known)
+    if known.ndim != 1 or known.size == 0:
+        raise ValueError(f"at must be a vector of at least one time, got shape {known.shape}.")
+    if known.min() < origin:
+        raise ValueError(f"at[{int(known.argmin())}] = {known.min():g} lies before the initial time {origin:g}; set "
+                         "the model's initial_time earlier to look further back.")
+    return known
+
+
+def _distinct(length: np.ndarray, scale: float) -> tuple[np.ndarray | None, np.ndarray]:
+    """Group lengths that differ by the rounding of the times they are differences of."""
+    tolerance = 8 * np.finfo(float).eps * scale
+    order = np.argsort(length, kind="stable")
+    new = np.concatenate([[True], np.diff(length[order]) > tolerance])
+    kind = np.empty(len(length), int)
+    kind[order] = np.cumsum(new) - 1
+    lengths = length[order][new]
+    if len(lengths) > _LARGEST_TABLE:
+        return None, np.zeros_like(kind)
+    return lengths, kind
+
+
+def as_arrays(rows: Rows) -> Rows:
+    """Return the rows as JAX arrays, which a scan can run over."""
+    return jax.tree_util.tree_map(jnp.asarray, rows)

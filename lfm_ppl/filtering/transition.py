@@ -1,0 +1,159 @@
+"""Exact transitions of the linear part of a model, computed once for every interval length.
+
+The joint linear part
+
+    d(x, z) = Lin (x, z) dt + noise,    Lin = [[J, B], [0, F]],
+
+holds the constant linear part of the dynamics and the forces. `exact` gives the transition of a model that has no
+other part. `integrating_factor` gives what one Runge-Kutta step over the rest needs.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lfm_ppl.forces.discretise import discretise
+from lfm_ppl.linalg import congruence, matmul, safe_sqrt, solve_semidefinite
+from lfm_ppl.linearisation.rule import Function, partial_jacobian, selection
+from lfm_ppl.model.augment import InputStructure, StateSpaceModel
+
+
+class LinearPart(NamedTuple):
+    """The constant linear part of the dynamics.
+
+    Attributes:
+        slope: (M, M + R), Jacobian in the constant inputs, zero in the others.
+        rows: (M, n), the rows [J, B] of ``Lin``.
+    """
+
+    slope: jax.Array
+    rows: jax.Array
+
+
+class Exact(NamedTuple):
+    """Transition of a linear time-invariant model over a row: s -> phi s + offset + N(0, noise)."""
+
+    phi: jax.Array
+    noise: jax.Array
+    offset: jax.Array
+    half: jax.Array
+    full: jax.Array
+
+
+class Factor(NamedTuple):
+    """What a Runge-Kutta step of length h needs of the linear part.
+
+    ``half`` and ``full`` are E(h/2) and E(h), the exponential of ``Lin``. ``back_half`` and ``back_full`` approximate
+    their inverses by 4 - 6 E + 4 E^2 - E^3 and its square: to the order of the step where it resolves ``Lin``, and
+    bounded where it does not, while the true inverses of fast decays overflow. ``noise_half`` and ``noise_full`` are
+    the exact covariances of the forces' noise, ``inputs`` (nz, S) its dispersion. ``columns_*`` (nz, K) stand for the forces' noise at the nodes of each
+    stage and of the whole step; ``regression_*`` (K, nz) regresses them on the exact noise.
+    """
+
+    half: jax.Array
+    full: jax.Array
+    back_half: jax.Array
+    back_full: jax.Array
+    noise_half: jax.Array
+    noise_full: jax.Array
+    inputs: jax.Array
+    columns: tuple[jax.Array, jax.Array, jax.Array, jax.Array]
+    regressions: tuple[jax.Array, jax.Array, jax.Array, jax.Array]
+
+
+def constant_slope(function: Function, point: jax.Array, structure: InputStructure, outputs: int) -> jax.Array:
+    """Return the Jacobian (D, N) in the constant inputs, zero elsewhere; it is the same at every point."""
+    if not structure.constant:
+        return jnp.zeros((outputs, point.shape[0]))
+    part = partial_jacobian(function, point, structure.constant)
+    return matmul(part, jnp.asarray(selection(structure.constant, point.shape[0]).T))
+
+
+def linear_part(ssm: StateSpaceModel, t: jax.Array) -> LinearPart:
+    """Return the constant linear part of the dynamics; ``t`` is any time."""
+    mean, _ = ssm.initial()
+    matrix, offset = ssm.input_map(t)
+    function = lambda w: (ssm.drift(w, t), ())  # noqa: E731
+    slope = constant_slope(function, matmul(matrix, mean[:, None])[:, 0] + offset, ssm.drift_structure,
+                           ssm.physical_dim)
+    usable = slope if ssm.constant_measurement else slope * (np.arange(ssm.input_dim) < ssm.physical_dim)
+    return LinearPart(slope, matmul(usable, matrix) if ssm.physical_dim else jnp.zeros((0, ssm.state_dim)))
+
+
+def feedback(ssm: StateSpaceModel, linear: LinearPart) -> jax.Array:
+    """Return ``Lin`` (n, n)."""
+    size = ssm.physical_dim
+    below = jnp.concatenate([jnp.zeros((ssm.force_dim, size)), ssm.stack.feedback()], axis=1)
+    return jnp.concatenate([linear.rows, below])
+
+
+def exact(ssm: StateSpaceModel, linear: LinearPart, length: jax.Array, steps: int) -> Exact:
+    """Return the transition of a linear time-invariant model over a row of ``length``.
+
+    The offset is exact where the mean is invariant; otherwise zero, and the filter integrates it with E(h/2), E(h).
+    """
+    size, total = ssm.physical_dim, ssm.state_dim
+    if size == 0:
+        phi, noise = ssm.stack.discretise(length)
+        return Exact(phi, noise, jnp.zeros(total), phi, phi)
+    t = jnp.zeros(())
+    matrix, shift = ssm.input_map(t)
+    constant = jnp.zeros(total).at[:size].set(ssm.drift(shift, t)) if ssm.mean_invariant else jnp.zeros(total)
+    lin = feedback(ssm, linear)
+    dispersion = ssm.model.process_noise
+    diffusion = jax.scipy.linalg.block_diag(
+        jnp.zeros((size, size)) if dispersion is None else matmul(dispersion, dispersion.T),
+        matmul(ssm.stack.dispersion(), ssm.stack.dispersion().T), jnp.zeros((1, 1)))
+    # One more state that is constantly one carries the offset.
+    augmented = jnp.zeros((total + 1, total + 1)).at[:total, :total].set(lin).at[:total, total].set(constant)
+    phi, noise = discretise(augmented, diffusion, length)
+    forces, force_noise = ssm.stack.discretise(length)
+    phi = phi.at[size:total, size:total].set(forces)
+    noise = noise.at[size:total, size:total].set(force_noise) if size else noise
+    half = full = phi[:total, :total]
+    if not ssm.mean_invariant:
+        half, _ = discretise(lin, jnp.zeros_like(lin), 0.5 * length / steps)
+        full = matmul(half, half)
+    return Exact(phi[:total, :total], noise[:total, :total], phi[:total, total], half, full)
+
+
+def integrating_factor(ssm: StateSpaceModel, linear: LinearPart, step: jax.Array) -> Factor:
+    """Return what a step of length ``step`` needs of the linear part."""
+    half, noise_half = _half_step(ssm, linear, 0.5 * step)
+    full = matmul(half, half)
+    identity = jnp.eye(ssm.state_dim)
+    back_half = 4.0 * identity - 6.0 * half + 4.0 * full - matmul(full, half)
+    size = ssm.physical_dim
+    half_z, full_z = half[size:, size:], full[size:, size:]
+    noise_full = congruence(half_z, noise_half) + noise_half
+    inputs = ssm.stack.dispersion()
+    at_half, at_full = matmul(half_z, inputs), matmul(full_z, inputs)
+    root = lambda weight: safe_sqrt(weight * step)  # noqa: E731
+    columns = (root(0.5) * at_half, root(0.5) * inputs, root(1.0) * at_half,
+               jnp.concatenate([root(1 / 6) * at_full, root(1 / 3) * at_half, root(1 / 3) * at_half,
+                                root(1 / 6) * inputs], axis=1))
+    if ssm.force_dim == 0:
+        regressions = tuple(c.T for c in columns)
+    else:
+        regressions = tuple(solve_semidefinite(noise, c).T for noise, c in
+                            zip((noise_half, noise_half, noise_full, noise_full), columns, strict=True))
+    return Factor(half, full, back_half, matmul(back_half, back_half), noise_half, noise_full, inputs, columns, regressions)
+
+
+def _half_step(ssm: StateSpaceModel, linear: LinearPart, dt: jax.Array) -> tuple[jax.Array, jax.Array]:
+    size = ssm.physical_dim
+    forces, noise = ssm.stack.discretise(dt)
+    pattern = np.array(ssm.drift_structure.jacobian, bool).reshape(size, ssm.input_dim).copy()
+    pattern[:, [j for j in range(ssm.input_dim) if j not in ssm.drift_structure.constant]] = False
+    coupled = pattern[:, size:].any() and ssm.constant_measurement
+    inside = pattern[:, :size]
+    if coupled or inside[~np.eye(size, dtype=bool)].any():
+        lin = feedback(ssm, linear)
+        phi, _ = discretise(lin, jnp.zeros_like(lin), dt)
+        return phi.at[size:, size:].set(forces), noise
+    diagonal = jnp.exp(jnp.diagonal(linear.rows[:, :size]) * dt) if inside.any() else jnp.ones(size)
+    return jax.scipy.linalg.block_diag(jnp.diag(diagonal), forces), noise

@@ -1,0 +1,101 @@
+"""Update: condition the state on one observation."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lfm_ppl.filtering.predict import Moments, covariance_of, linearise_state
+from lfm_ppl.linalg import cholesky, congruence, matmul, solve_lower, solve_upper
+from lfm_ppl.linearisation.rule import Rule
+from lfm_ppl.linearisation.sigma_points import SigmaPointRule
+from lfm_ppl.model.augment import StateSpaceModel
+
+_LOG_2PI = float(np.log(2.0 * np.pi))
+
+
+class Linearised(NamedTuple):
+    """An observation as an affine map of the state: y ~ value + slope (s - mean) + N(0, noise)."""
+
+    value: jax.Array
+    slope: jax.Array
+    noise: jax.Array
+
+
+class Update(NamedTuple):
+    """The filtered moments and what the smoother and the diagnostics need.
+
+    Attributes:
+        moments: given the observation.
+        log_likelihood: log density of the observation's present entries, given the past.
+        innovation: (D,), zero where missing.
+        chol: (D, D), Cholesky factor of the innovation covariance, the identity where missing.
+        gain: (n, D).
+        slope: (D, n), zero rows where missing.
+    """
+
+    moments: Moments
+    log_likelihood: jax.Array
+    innovation: jax.Array
+    chol: jax.Array
+    gain: jax.Array
+    slope: jax.Array
+
+
+def linearise_observation(ssm: StateSpaceModel, rule: Rule, slope: jax.Array, t: jax.Array, row: jax.Array,
+                          moments: Moments, about: Moments | None = None) -> Linearised:
+    """Linearise the observation about the predicted moments, or about those of ``about``."""
+    centre = moments if about is None else about
+
+    def function(w: jax.Array) -> tuple[jax.Array, Any]:
+        return ssm.observe(w, t), ssm.noise_covariance(w, t, row)
+
+    affine = linearise_state(ssm, rule, function, ssm.observation_structure, slope, t, centre.mean,
+                             covariance_of(centre), _spread(ssm, rule, t, centre))
+    value = affine.value
+    if about is not None:
+        value = value + matmul(affine.slope, (moments.mean - about.mean)[:, None])[:, 0]
+    return Linearised(value, affine.slope, affine.residual + affine.extra)
+
+
+def _spread(ssm: StateSpaceModel, rule: Rule, t: jax.Array, moments: Moments) -> jax.Array:
+    """As in the prediction: the standard deviation below which a coordinate counts as known."""
+    if isinstance(rule, SigmaPointRule) and rule.full_state:
+        scale = moments.mean
+    else:
+        matrix, offset = ssm.input_map(t)
+        w = matmul(matrix, moments.mean[:, None])[:, 0] + offset
+        scale = w[jnp.asarray(ssm.observation_structure.points, int)]
+    # Next to a state that is exactly zero and known, one unit is as good a scale as any.
+    return jax.lax.stop_gradient(1e-6 * jnp.where(scale == 0, 1e-3, jnp.abs(scale)))
+
+
+def update(ssm: StateSpaceModel, observation: Linearised, y: jax.Array, present: jax.Array,
+           moments: Moments) -> Update:
+    """Condition on the present entries of ``y`` (D,), with the covariance in Joseph's form.
+
+    The log likelihood is -inf where the innovation covariance is not positive definite.
+    """
+    mean, covariance = moments
+    slope = jnp.where(present[:, None], observation.slope, 0.0)
+    residual = jnp.where(present, y, 0.0) - observation.value
+    for index in ssm.model.observation.angular:
+        wrapped = jnp.arctan2(jnp.sin(residual[index]), jnp.cos(residual[index]))
+        residual = residual.at[index].set(wrapped)
+    innovation = jnp.where(present, residual, 0.0)
+    both = present[:, None] & present[None, :]
+    noise = jnp.where(both, observation.noise, jnp.eye(y.shape[0]))
+    cross = matmul(covariance, slope.T)
+    factor = cholesky(matmul(slope, cross) + noise)
+    chol = factor.chol
+    gain = solve_upper(chol, solve_lower(chol, cross.T)).T
+    white = solve_lower(chol, innovation)
+    diagonal = jnp.diagonal(chol)
+    log_likelihood = -0.5 * ((white**2).sum() + present.sum() * _LOG_2PI) - jnp.log(diagonal).sum()
+    kept = jnp.eye(mean.shape[0]) - matmul(gain, slope)
+    return Update(
+        Moments(mean + matmul(gain, innovation[:, None])[:, 0], congruence(kept, covariance) + congruence(gain, noise)),
+        jnp.where(factor.degenerate.any(), -jnp.inf, log_likelihood), innovation, chol, gain, slope)

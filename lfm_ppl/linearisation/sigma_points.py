@@ -1,0 +1,277 @@
+"""Sigma-point rules: statistical linear regression on a handful of points."""
+
+from __future__ import annotations
+
+import itertools
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lfm_ppl import checks
+from lfm_ppl.linalg import cholesky, congruence, matmul, outer_square, solve_lower, solve_upper
+from lfm_ppl.linearisation.rule import Affine, Function, Inputs, Rule, partial_jacobian, selection
+from lfm_ppl.model.augment import InputStructure
+
+
+class UnitPoints(NamedTuple):
+    """Points of a rule for N(0, I) in ``dim`` dimensions.
+
+    Attributes:
+        nodes: (p, dim).
+        weights: (p,), for expectations and for the regression on the nodes; they integrate linear functions exactly.
+        residual_weights: (p, p), symmetric: the residual covariance is E' W E for residuals E (p, D).
+    """
+
+    nodes: np.ndarray
+    weights: np.ndarray
+    residual_weights: np.ndarray
+
+
+class SigmaPointRule(Rule):
+    """Base of the rules with points.
+
+    With nodes ``xi_i`` and weights ``w_i`` of the standard Gaussian and ``P = L L'``, at ``v_i = m + L xi_i``,
+
+        b = sum w_i f(v_i),    A = (sum w_i f(v_i) xi_i') L^-1,    Omega = Cov(f) - A P A'.
+
+    The points lie in the non-linear inputs alone. Inputs that are linear given these follow them by their conditional
+    mean, and their slope is the expectation of the Jacobian (Stein's lemma).
+
+    Attributes:
+        full_state: whether the points lie in the whole joint state, as in the papers, and not in the non-linear
+            inputs only.
+    """
+
+    full_state: bool = eqx.field(static=True, default=False, kw_only=True)
+
+    def points(self, dim: int) -> UnitPoints:
+        """Return nodes and weights for ``dim`` >= 1 dimensions."""
+        raise NotImplementedError
+
+    def linearise(self, function: Function, inputs: Inputs, structure: InputStructure, slope: jax.Array) -> Affine:
+        """See `Rule.linearise`."""
+        if not structure.points:
+            return _without_points(function, inputs, structure, slope)
+        unit = self.points(len(structure.points))
+        nodes, weights = jnp.asarray(unit.nodes), jnp.asarray(unit.weights)
+        count, size = len(structure.points), inputs.mean.shape[0]
+        chol = cholesky(inputs.covariance[:count, :count], inputs.spread**2).chol
+        # Averaged coordinates given the points: rho = m_rho + gain xi, gain = P_rho,alpha L^-T.
+        gain = _times_inverse_transpose(chol, inputs.covariance[count:, :count])
+        root = jnp.concatenate([chol, gain]) if structure.averaged else chol
+        place = jnp.asarray(selection((*structure.points, *structure.averaged), size))
+        spread = matmul(place, root)
+        at = inputs.mean + matmul(nodes, spread.T)
+        values, extras = jax.vmap(function)(at)
+        value = (weights[:, None] * values).sum(0)
+        regression = matmul((weights[:, None] * values).T, nodes)
+        if structure.averaged:
+            jacobians = jax.vmap(lambda v: partial_jacobian(function, v, structure.averaged))(at)
+            average = (weights[:, None, None] * jacobians).sum(0)
+            slope = slope + matmul(average, jnp.asarray(selection(structure.averaged, size).T))
+            regression_on_points = regression - matmul(average, gain)
+        else:
+            jacobians, average, regression_on_points = None, None, regression
+        on_points = _times_inverse(chol, regression_on_points)
+        slope = slope + matmul(on_points, jnp.asarray(selection(structure.points, size).T))
+        errors = values - value - matmul(nodes, regression.T)
+        residual = matmul(matmul(errors.T, jnp.asarray(unit.residual_weights)), errors)
+        if jacobians is not None:
+            rest = inputs.covariance[count:, count:] - outer_square(gain)
+            deviations = jax.vmap(lambda j: congruence(j - average, rest))(jacobians)
+            residual = residual + (weights[:, None, None] * deviations).sum(0)
+        return Affine(value, slope, residual, self._expectation(function, inputs, weights, unit, extras))
+
+    def _expectation(self, function: Function, inputs: Inputs, weights: jax.Array, unit: UnitPoints, extras):
+        # With a negative weight the average of covariances need not be one: take the value at the mean.
+        if np.all(unit.weights >= 0):
+            return jax.tree_util.tree_map(lambda e: jnp.tensordot(weights, e, axes=1), extras)
+        return function(inputs.mean)[1]
+
+
+def _times_inverse_transpose(chol: jax.Array, b: jax.Array) -> jax.Array:
+    """Return ``B L^-T`` (m, n)."""
+    return solve_lower(chol, b.T).T
+
+
+def _times_inverse(chol: jax.Array, b: jax.Array) -> jax.Array:
+    """Return ``B L^-1`` (m, n)."""
+    return solve_upper(chol, b.T).T
+
+
+def _without_points(function: Function, inputs: Inputs, structure: InputStructure, slope: jax.Array) -> Affine:
+    """A function that is linear at every time: exact."""
+    value, extra = function(inputs.mean)
+    if structure.averaged:
+        part = partial_jacobian(function, inputs.mean, structure.averaged)
+        slope = slope + matmul(part, jnp.asarray(selection(structure.averaged, inputs.mean.shape[0]).T))
+    return Affine(value, slope, jnp.zeros((value.shape[0],) * 2), extra)
+
+
+class Unscented(SigmaPointRule):
+    """The unscented transform (Julier and Uhlmann).
+
+    ``2 a + 1`` points, exact to degree 3: ``m`` and ``m +- sqrt(a + lambda) L_i``, ``lambda = alpha^2 (a + kappa) - a``.
+
+    Args:
+        alpha: spread of the points, > 0.
+        beta: weight of the centre in the covariance; 2 suits a Gaussian.
+        kappa: second spread parameter, > -a for a inputs.
+        full_state: points in the whole state.
+
+    Example:
+        >>> Unscented(1.0, 0.0, 0.0).points(1).weights.tolist()
+        [0.0, 0.5, 0.5]
+
+    Source: Särkkä (2007), IEEE Transactions on Automatic Control 52(9); Hartikainen (2013), section 2.4.
+    """
+
+    alpha: float = eqx.field(static=True, default=1.0)
+    beta: float = eqx.field(static=True, default=0.0)
+    kappa: float = eqx.field(static=True, default=2.0)
+
+    def __check_init__(self):
+        checks.positive("alpha", self.alpha)
+        checks.finite("beta", self.beta)
+        checks.finite("kappa", self.kappa)
+
+    def points(self, dim: int) -> UnitPoints:
+        """See `SigmaPointRule.points`."""
+        scale = self.alpha**2 * (dim + self.kappa)
+        if scale <= 0:
+            raise ValueError(f"Unscented needs alpha^2 (n + kappa) > 0; with kappa = {self.kappa:g} and {dim} "
+                             "non-linear inputs it is not. Raise kappa.")
+        nodes = np.concatenate([np.zeros((1, dim)), np.sqrt(scale) * np.eye(dim), -np.sqrt(scale) * np.eye(dim)])
+        weights = np.full(2 * dim + 1, 0.5 / scale)
+        weights[0] = (scale - dim) / scale
+        centre = weights[0] + 1.0 - self.alpha**2 + self.beta
+        return UnitPoints(nodes, weights, np.diag(np.concatenate([[centre], weights[1:]])))
+
+
+class Cubature(SigmaPointRule):
+    """The spherical cubature rule of degree 3: ``m +- sqrt(a) L_i``, equal weights.
+
+    Args:
+        full_state: points in the whole state, as in the paper.
+
+    Example:
+        >>> Cubature().points(2).weights.tolist()
+        [0.25, 0.25, 0.25, 0.25]
+
+    Source: Arasaratnam, Haykin and Hurd (2010), IEEE Transactions on Signal Processing 58(10).
+    """
+
+
+    def points(self, dim: int) -> UnitPoints:
+        """See `SigmaPointRule.points`."""
+        nodes = np.sqrt(dim) * np.concatenate([np.eye(dim), -np.eye(dim)])
+        weights = np.full(2 * dim, 0.5 / dim)
+        return UnitPoints(nodes, weights, np.diag(weights))
+
+
+class GaussHermite(SigmaPointRule):
+    """Tensor product of Gauss-Hermite rules: ``order`` points an input, exact to degree ``2 order - 1``.
+
+    Args:
+        order: points in each non-linear input, at least 2. There are ``order^a`` points for ``a`` inputs.
+        full_state: points in the whole state.
+
+    Example:
+        >>> GaussHermite(3).points(1).nodes.ravel().round(4).tolist()
+        [-1.7321, 0.0, 1.7321]
+
+    Source: Ito and Xiong (2000), IEEE Transactions on Automatic Control 45(5).
+    """
+
+    order: int = eqx.field(static=True, default=5)
+
+    def __check_init__(self):
+        checks.positive_integer("order", self.order)
+        if self.order < 2:
+            raise ValueError("order must be at least 2: one point has no slope; lfm.Taylor() is the rule with one.")
+
+    def points(self, dim: int) -> UnitPoints:
+        """See `SigmaPointRule.points`."""
+        if self.order**dim > 200_000:
+            raise ValueError(f"GaussHermite({self.order}) in {dim} dimensions has {self.order}^{dim} points; use "
+                             "lfm.Cubature() or lfm.Unscented(), whose number of points is linear in the dimension.")
+        line, mass = np.polynomial.hermite_e.hermegauss(self.order)
+        nodes = np.array(list(itertools.product(line, repeat=dim)))
+        weights = np.prod(list(itertools.product(mass / mass.sum(), repeat=dim)), axis=1)
+        return UnitPoints(nodes, weights, np.diag(weights))
+
+
+class CentralDifference(SigmaPointRule):
+    """Stirling's interpolation to second order: the central difference (divided difference) filter.
+
+    Derivatives are replaced by central differences over ``step`` standard deviations.
+
+    Args:
+        step: in standard deviations, at least 1; sqrt(3) matches the fourth moment of a Gaussian.
+        full_state: points in the whole state.
+
+    Example:
+        >>> CentralDifference(2.0).points(1).weights.tolist()
+        [0.75, 0.125, 0.125]
+
+    Source: Nørgaard, Poulsen and Ravn (2000), Automatica 36(11); Ito and Xiong (2000).
+    """
+
+    step: float = eqx.field(static=True, default=float(np.sqrt(3.0)))
+
+    def __check_init__(self):
+        checks.positive("step", self.step)
+        if self.step < 1:
+            raise ValueError(f"step must be at least 1, got {self.step:g}: below it the covariance of the residual is "
+                             "not positive semi-definite.")
+
+    def points(self, dim: int) -> UnitPoints:
+        """See `SigmaPointRule.points`."""
+        square = self.step**2
+        nodes = self.step * np.concatenate([np.zeros((1, dim)), np.eye(dim), -np.eye(dim)])
+        weights = np.full(2 * dim + 1, 0.5 / square)
+        weights[0] = (square - dim) / square
+        # Cov(f) = sum_i (f+ - f-)^2 / 4 h^2 + (h^2 - 1)(f+ + f- - 2 f0)^2 / 4 h^4; the first term is A P A'.
+        second = np.zeros((dim, 2 * dim + 1))
+        second[:, 0] = -2.0
+        second[np.arange(dim), 1 + np.arange(dim)] = 1.0
+        second[np.arange(dim), 1 + dim + np.arange(dim)] = 1.0
+        return UnitPoints(nodes, weights, (square - 1.0) / (4.0 * square**2) * second.T @ second)
+
+
+class MonteCarlo(SigmaPointRule):
+    """Random points, drawn once: the Monte Carlo Kalman filter.
+
+    The draws are antithetic and whitened, so that their mean is zero and their covariance the identity: a linear
+    function is treated exactly. The likelihood is a smooth, deterministic function of the parameters.
+
+    Args:
+        samples: number of points, even, above twice the number of non-linear inputs.
+        seed: of the draws.
+        full_state: points in the whole state.
+
+    Example:
+        >>> MonteCarlo(100, seed=1).points(2).nodes.shape
+        (100, 2)
+    """
+
+    samples: int = eqx.field(static=True, default=1000)
+    seed: int = eqx.field(static=True, default=0)
+
+    def __check_init__(self):
+        checks.positive_integer("samples", self.samples)
+        if self.samples % 2:
+            raise ValueError(f"samples must be even (the draws are antithetic), got {self.samples}.")
+
+    def points(self, dim: int) -> UnitPoints:
+        """See `SigmaPointRule.points`."""
+        if self.samples < 2 * dim + 2:
+            raise ValueError(f"MonteCarlo needs more than {2 * dim + 1} samples for {dim} inputs, got {self.samples}.")
+        half = np.random.default_rng(self.seed).standard_normal((self.samples // 2, dim))
+        chol = np.linalg.cholesky(half.T @ half / half.shape[0])
+        half = np.linalg.solve(chol, half.T).T
+        weights = np.full(self.samples, 1.0 / self.samples)
+        return UnitPoints(np.concatenate([half, -half]), weights, np.diag(weights))

@@ -1,0 +1,32 @@
+"""First-order Taylor expansion: the extended Kalman filter."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from lfm_ppl.linearisation.rule import Affine, Function, Inputs, Rule, partial_jacobian, selection
+from lfm_ppl.model.augment import InputStructure
+
+
+class Taylor(Rule):
+    """Value and Jacobian at the mean: the extended Kalman filter.
+
+    ``E[f] ~ f(m)``, ``A = f'(m)``, ``Omega = 0``. It ignores the spread of the state, and so underestimates the
+    variance where the function bends within it.
+
+    Example:
+        >>> Taylor().name
+        'Taylor()'
+
+    Source: Hartikainen (2013), section 2.3; Jazwinski (1970).
+    """
+
+    def linearise(self, function: Function, inputs: Inputs, structure: InputStructure, slope: jax.Array) -> Affine:
+        """See `Rule.linearise`."""
+        value, extra = function(inputs.mean)
+        varying = (*structure.points, *structure.averaged)
+        if varying:
+            part = partial_jacobian(function, inputs.mean, varying)
+            slope = slope + part @ jnp.asarray(selection(varying, inputs.mean.shape[0]).T)
+        return Affine(value, slope, jnp.zeros((value.shape[0],) * 2), extra)

@@ -1,0 +1,197 @@
+"""The latent force model as its user writes it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lfm_ppl import checks
+from lfm_ppl.forces.sde import Force
+from lfm_ppl.model.observation import Gaussian, GaussianObservation
+
+
+class LatentForceModel(eqx.Module):
+    r"""A mechanistic model pushed by unobserved forces.
+
+        dx = f(x, u(t), t) dt + G(x, u(t), t) dB,    u_r(t) ~ GP,    y_k = h(x, u, t_k) + r_k.
+
+    Args:
+        dynamics: ``f(x, u, t) -> (M,)``; a function or an Equinox module. ``x`` is (M,), ``u`` is (R,) in the order
+            of ``forces``.
+        forces: name -> force; empty is legal. A sequence of (name, force) pairs is accepted too.
+        observation: what is measured.
+        initial_state: distribution of x at the initial time; zero covariance is legal.
+        process_noise: the dispersion G (M, S) of a unit Brownian motion on x, or a function ``(x, u, t) -> (M, S)``.
+        initial_time: when the initial state holds; None: the first time of the data.
+        nonlinear_inputs: names of the states and forces that enter f non-linearly. None: found from f itself.
+        state_names: M names, for results and plots.
+        output_names: D names of the components of y.
+        units: unit of "time", of states, outputs and forces, by name.
+
+    Raises:
+        ValueError, TypeError: f returns a wrong shape, or NaN at the prior mean; names repeat or are of a wrong
+            number; the process noise has a wrong shape.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import lfm_ppl as lfm
+        >>> model = lfm.LatentForceModel(
+        ...     dynamics=lambda x, u, t: u - 0.5 * x,
+        ...     forces={"drive": lfm.Matern(1.0, 2.0)},
+        ...     observation=lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.01])),
+        ...     initial_state=lfm.Gaussian(jnp.zeros(1), jnp.eye(1)),
+        ... )
+        >>> model.state_names
+        ('x0',)
+
+    Source: Hartikainen, Seppänen and Särkkä (2012), section 3.
+    """
+
+    dynamics: Callable[..., jax.Array]
+    forces: dict[str, Force]
+    observation: GaussianObservation
+    initial_state: Gaussian
+    process_noise: Any
+    initial_time: Any
+    force_names: tuple[str, ...] = eqx.field(static=True)
+    nonlinear_inputs: tuple[str, ...] | None = eqx.field(static=True)
+    state_names: tuple[str, ...] = eqx.field(static=True)
+    output_names: tuple[str, ...] = eqx.field(static=True)
+    unit_items: tuple[tuple[str, str], ...] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        dynamics: Callable[..., jax.Array],
+        forces: Mapping[str, Force] | Sequence[tuple[str, Force]],
+        observation: GaussianObservation,
+        initial_state: Gaussian,
+        process_noise: Any = None,
+        initial_time: Any = None,
+        nonlinear_inputs: Sequence[str] | None = None,
+        state_names: Sequence[str] | None = None,
+        output_names: Sequence[str] | None = None,
+        units: Mapping[str, str] | None = None,
+    ):
+        _check_types(dynamics, observation, initial_state)
+        self.force_names, self.forces = _named_forces(forces)
+        self.dynamics, self.observation, self.initial_state = dynamics, observation, initial_state
+        if initial_time is not None:
+            checks.finite("initial_time", initial_time)
+        self.initial_time = None if initial_time is None else jnp.asarray(initial_time, float)
+        size = initial_state.mean.shape[0]
+        self.state_names = _names("state_names", state_names, size, "x")
+        if overlap := set(self.state_names) & set(self.force_names):
+            raise ValueError(f"the name {sorted(overlap)[0]!r} is used for a state and for a force; rename one.")
+        self.process_noise = process_noise if callable(process_noise) else _dispersion(process_noise, size)
+        self._check_dynamics(size)
+        self.output_names = _names("output_names", output_names, self._outputs(size), "y")
+        self.unit_items = tuple((units or {}).items())
+        self.nonlinear_inputs = None if nonlinear_inputs is None else tuple(nonlinear_inputs)
+        for name in self.nonlinear_inputs or ():
+            checks.one_of("name in nonlinear_inputs", name, (*self.state_names, *self.force_names))
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Units by name."""
+        return dict(self.unit_items)
+
+    @property
+    def force_list(self) -> tuple[Force, ...]:
+        """The forces in their order."""
+        return tuple(self.forces[name] for name in self.force_names)
+
+    def _check_dynamics(self, size: int) -> None:
+        u = jax.ShapeDtypeStruct((len(self.force_names),), jnp.result_type(float))
+        x, t = self.initial_state.mean, jnp.zeros(())
+        found = jax.eval_shape(self.dynamics, x, u, t)
+        if getattr(found, "shape", None) != (size,):
+            raise ValueError(f"dynamics must return one derivative for each of the {size} entries of "
+                             f"initial_state.mean, shape ({size},); it returned {getattr(found, 'shape', found)}.")
+        if not callable(self.process_noise) and self.process_noise is not None:
+            return
+        if callable(self.process_noise):
+            found = jax.eval_shape(self.process_noise, x, u, t)
+            if len(found.shape) != 2 or found.shape[0] != size:
+                raise ValueError(f"process_noise must return a dispersion matrix ({size}, S), got {found.shape}.")
+
+    def _outputs(self, size: int) -> int:
+        u = jax.ShapeDtypeStruct((len(self.force_names),), jnp.result_type(float))
+        arguments = (self.initial_state.mean, u, jnp.zeros(()))
+        found = jax.eval_shape(self.observation.function, *arguments)
+        if len(found.shape) != 1:
+            raise ValueError(f"the observation function must return a vector (D,), got shape {found.shape}. "
+                             "For one output, return x[:1] or jnp.array([...]).")
+        outputs = found.shape[0]
+        covariance = jax.eval_shape(self.observation.covariance_at, *arguments, 0)
+        if covariance.shape != (outputs, outputs):
+            raise ValueError(f"the observation has {outputs} components, so its covariance must be ({outputs},) or "
+                             f"({outputs}, {outputs}); it is {covariance.shape}.")
+        if any(not 0 <= index < outputs for index in self.observation.angular):
+            raise ValueError(f"angular indices must lie in 0..{outputs - 1}, got {self.observation.angular}.")
+        return outputs
+
+    def check_at(self, time: Any) -> None:
+        """Raise ValueError where the dynamics or the observation is not finite at the prior mean at ``time``."""
+        x = self.initial_state.mean
+        if checks.traced((self, time)):
+            return
+        u = jnp.asarray([force.mean_at(time) for force in self.force_list], float)
+        for label, function, names in (("dynamics", self.dynamics, self.state_names),
+                                       ("observation function", self.observation.function, self.output_names)):
+            value = checks.concrete(function(x, u, jnp.asarray(time, float)))
+            if value is not None and not np.all(np.isfinite(value)):
+                name = names[int(np.argmin(np.isfinite(value)))]
+                raise ValueError(f"the {label} returned {value} at the prior mean x = {np.asarray(x)}, "
+                                 f"u = {np.asarray(u)}, t = {float(time):g}: the entry for {name!r} is not finite. "
+                                 "Change initial_state.mean, or guard the expression (for example jnp.maximum).")
+
+
+def _check_types(dynamics: Any, observation: Any, initial_state: Any) -> None:
+    if not callable(dynamics):
+        raise TypeError(f"dynamics must be callable as f(x, u, t), got {type(dynamics).__name__}.")
+    if not isinstance(observation, GaussianObservation):
+        raise TypeError(f"observation must be an lfm.GaussianObservation, got {type(observation).__name__}. Wrap the "
+                        "function: lfm.GaussianObservation(lambda x, u, t: x, variances).")
+    if not isinstance(initial_state, Gaussian):
+        raise TypeError(f"initial_state must be an lfm.Gaussian, got {type(initial_state).__name__}.")
+
+
+def _named_forces(forces: Any) -> tuple[tuple[str, ...], dict[str, Force]]:
+    items = list(forces.items()) if isinstance(forces, Mapping) else list(forces)
+    for item in items:
+        if not (isinstance(item, tuple) and len(item) == 2 and isinstance(item[0], str)):
+            raise TypeError('forces must map names to forces, for example {"p53": lfm.Matern(1.0, 2.0)}; '
+                            f"got {item!r}.")
+        if not isinstance(item[1], Force):
+            raise TypeError(f"the force {item[0]!r} must be a force such as lfm.Matern, got {type(item[1]).__name__}.")
+    names = tuple(name for name, _ in items)
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"the force name {name!r} repeats; every force needs a name of its own.")
+    return names, dict(items)
+
+
+def _names(argument: str, given: Sequence[str] | None, size: int, prefix: str) -> tuple[str, ...]:
+    if given is None:
+        return tuple(f"{prefix}{index}" for index in range(size))
+    if isinstance(given, str) or len(given) != size:
+        raise ValueError(f"{argument} must hold {size} names, got {given!r}.")
+    if len(set(given)) != size:
+        raise ValueError(f"{argument} must not repeat, got {tuple(given)}.")
+    return tuple(str(name) for name in given)
+
+
+def _dispersion(value: Any, size: int) -> jax.Array | None:
+    if value is None:
+        return None
+    checks.finite("process_noise", value)
+    value = jnp.asarray(value, float)
+    if value.ndim != 2 or value.shape[0] != size:
+        raise ValueError(f"process_noise must be a dispersion matrix ({size}, S), one row for each state, got shape "
+                         f"{value.shape}. For independent noises use jnp.diag(standard_deviations).")
+    return value

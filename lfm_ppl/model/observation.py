@@ -1,0 +1,101 @@
+"""What is measured: y_k = h(x(t_k), u(t_k), t_k) + r_k with Gaussian noise r_k."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lfm_ppl import checks
+
+
+class Gaussian(eqx.Module):
+    """A Gaussian distribution N(mean, covariance) of the physical state at the initial time.
+
+    Args:
+        mean: (M,).
+        covariance: (M, M), or a vector of M variances; zero (a known state) is legal.
+
+    Raises:
+        ValueError: the shapes disagree, or the covariance is not symmetric and positive semi-definite.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> Gaussian(jnp.zeros(2), jnp.zeros((2, 2))).covariance.shape
+        (2, 2)
+    """
+
+    mean: jax.Array
+    covariance: jax.Array
+
+    def __init__(self, mean: Any, covariance: Any):
+        checks.finite("initial_state.mean", mean)
+        checks.covariance_matrix("initial_state.covariance", covariance)
+        self.mean = jnp.atleast_1d(jnp.asarray(mean, float))
+        if self.mean.ndim != 1:
+            raise ValueError(f"initial_state.mean must be a vector (M,), got shape {self.mean.shape}.")
+        covariance = jnp.asarray(covariance, float)
+        self.covariance = jnp.diag(covariance) if covariance.ndim == 1 else covariance
+        size = self.mean.shape[0]
+        if self.covariance.shape != (size, size):
+            raise ValueError(f"initial_state.covariance must have shape ({size}, {size}) or ({size},) to go with a "
+                             f"mean of {size} entries, got {covariance.shape}.")
+
+
+class GaussianObservation(eqx.Module):
+    """Gaussian measurements of the joint state.
+
+    ``y_k = h(x, u, t_k) + r_k``,  ``r_k ~ N(0, R_k)``.
+
+    Args:
+        function: ``h(x, u, t) -> (D,)``; ``x`` (M,), ``u`` (R,) in the order of the forces.
+        covariance: ``R``: variances (D,), a matrix (D, D), one matrix an observation (T, D, D), or a function
+            ``(x, u, t)`` that returns (D,) or (D, D).
+        angular: indices of components that are angles in radians; their residual is taken on the circle.
+
+    Raises:
+        ValueError: the covariance is not symmetric, not positive semi-definite, or of a wrong shape.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> GaussianObservation(lambda x, u, t: x[:1], jnp.array([0.01])).angular
+        ()
+
+    Source: Hartikainen, Seppänen and Särkkä (2012), equation 4.
+    """
+
+    function: Callable[..., jax.Array]
+    covariance: Any
+    angular: tuple[int, ...] = eqx.field(static=True)
+
+    def __init__(self, function: Callable[..., jax.Array], covariance: Any, angular: Any = ()):
+        if not callable(function):
+            raise TypeError(f"observation function must be callable as h(x, u, t), got {type(function).__name__}.")
+        self.function = function
+        self.angular = tuple(int(index) for index in np.atleast_1d(np.asarray(angular, int)))
+        if callable(covariance):
+            self.covariance = covariance
+            return
+        values = checks.concrete(covariance)
+        for index, matrix in enumerate(values) if values is not None and values.ndim == 3 else ():
+            checks.covariance_matrix(f"observation covariance of row {index}", matrix)
+        if values is not None and values.ndim != 3:
+            checks.covariance_matrix("observation covariance", np.atleast_1d(values))
+        self.covariance = jnp.atleast_1d(jnp.asarray(covariance, float))
+
+    @property
+    def varies_with_state(self) -> bool:
+        """Whether the covariance is a function of (x, u, t)."""
+        return callable(self.covariance)
+
+    def covariance_at(self, x: jax.Array, u: jax.Array, t: jax.Array, row: jax.Array) -> jax.Array:
+        """Return R (D, D) at a state, a time and a row of the observations."""
+        value = self.covariance(x, u, t) if callable(self.covariance) else self.covariance
+        value = jnp.atleast_1d(jnp.asarray(value, float))
+        if value.ndim == 3:
+            return value[row]
+        return jnp.diag(value) if value.ndim == 1 else value
