@@ -1,0 +1,143 @@
+"""Data files: what is read, and what a user is told about a file that cannot be."""
+
+import numpy as np
+import pytest
+
+from lfm_ppl.data import Data, read_csv, read_truth, write_csv, write_truth
+
+P53 = """time_h,replicate,DDB2,CDKN1A
+0,1,211.6,5.9
+0,2,168.002,
+2,1,482.582,117.017
+"""
+
+
+@pytest.fixture
+def read(tmp_path):
+    """Write a text to a file and read it."""
+
+    def write_and_read(text, **options):
+        path = tmp_path / "data.csv"
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return read_csv(path, **options)
+
+    return write_and_read
+
+
+def test_reads_times_values_missing_cells_and_the_unit(read):
+    data = read(P53)
+    np.testing.assert_array_equal(data.times, [0.0, 0.0, 2.0])
+    np.testing.assert_array_equal(data.y, [[211.6, 5.9], [168.002, np.nan], [482.582, 117.017]])
+    assert data.outputs == ("DDB2", "CDKN1A")
+    assert data.units == {"time": "h"}
+
+
+def test_reads_named_outputs_in_the_order_asked_for(read):
+    data = read(P53, outputs=("CDKN1A", "replicate"))
+    assert data.outputs == ("CDKN1A", "replicate")
+    np.testing.assert_array_equal(data.y[:, 1], [1, 2, 1])
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "\ufefftime,x\n0,1\n1,2\n".encode(),  # byte-order mark of a spreadsheet
+        b"time,x\r\n0,1\r\n1,2\r\n",
+        b"# comment, with a comma\n time , x \n0, 1\n\n1,2\n",
+        b'"Time","x"\n"0","1"\n"1","2"',
+        b"t,x\n0,1\n1,2\n",
+        b"when,x\n0,1\n1,2\n",
+        b"time,x\n0,1\n1,2\n,\n",  # empty rows that a spreadsheet leaves at the end
+    ],
+)
+def test_reads_files_as_programs_write_them(read, text):
+    data = read(text, time_column="when" if text.startswith(b"when") else None)
+    np.testing.assert_array_equal(data.times, [0, 1])
+    np.testing.assert_array_equal(data.y, [[1], [2]])
+    assert data.outputs == ("x",)
+
+
+@pytest.mark.parametrize("cell", ["", "NA", "nan", "NaN", " "])
+def test_missing_cells(read, cell):
+    data = read(f"time,x,z\n0,{cell},1\n1,2,1\n")
+    assert np.isnan(data.y[0, 0]) and data.y[1, 0] == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "message"),
+    [
+        (b"", {}, r"data\.csv is empty; expected a header row"),
+        (b"\n\n", {}, r"data\.csv is empty"),
+        (b"time,x\n", {}, r"data\.csv has a header and no rows"),
+        (b"hour,x\n0,1\n", {}, r"no time column; expected .* got the columns hour, x\. Name it"),
+        (b"time,t,x\n0,0,1\n", {}, r"several time columns: time, t"),
+        (b"time,x\n0,1\n", {"time_column": "tine"}, r"unknown time column 'tine'.*'time'"),
+        (b"time,x\n0,1\n1,high\n", {}, r"row 3, column 'x': expected a number .* got 'high'"),
+        (b"# note\ntime,x\n0,1\n1,high\n", {}, r"row 4, column 'x'"),
+        (b"time,x\n0,1\nlate,2\n", {}, r"row 3, column 'time': expected a number"),
+        (b"time,x\n0,1\n,2\n", {}, r"row 3, column 'time': the time is missing"),
+        (b"time,x\n0,1\ninf,2\n", {}, r"row 3, column 'time': expected a finite number, got 'inf'"),
+        (b"time,x\n0,1\n1,inf\n", {}, r"row 3, column 'x': expected a finite number"),
+        (b"time,x\n0,1\n4,1\n2,1\n", {}, r"row 4: the time goes back from 4 to 2\. Sort"),
+        (b"time,x,x\n0,1,2\n", {}, r"row 1: the column name 'x' stands 2 times \(columns 2, 3\)"),
+        (b"time,x\n0,\n1,NA\n", {}, r"every value of x is missing"),
+        (b"time,x\n0,1,5\n", {}, r"row 2: 3 cells, but the header has 2 columns"),
+        (b"time;x\n0;1,5\n", {}, r"separated by semicolons; expected commas"),
+        (b"time\tx\n0\t1\n", {}, r"separated by tabs"),
+        (b"time,replicate\n0,1\n", {}, r"no column beside the time 'time'"),
+        (b"time,DDB2\n0,1\n", {"outputs": ["DDB3"]}, r"unknown output column 'DDB3'.*'DDB2'"),
+        (b"PK\x03\x04\xff\xfe\x00", {}, r"is not a comma-separated text file"),
+    ],
+)
+def test_complaints_name_the_place_and_the_remedy(read, text, options, message):
+    with pytest.raises(ValueError, match=message):
+        read(text, **options)
+
+
+def test_a_folder_and_a_missing_file(tmp_path):
+    with pytest.raises(ValueError, match="is a folder, not a CSV file"):
+        read_csv(tmp_path)
+    with pytest.raises(FileNotFoundError):
+        read_csv(tmp_path / "absent.csv")
+
+
+def test_what_is_written_is_read_back(tmp_path):
+    y = np.array([[0.1, np.nan], [1 / 3, 2e-300], [np.pi, -1.0]])
+    truth = {
+        "times": np.linspace(0, 1, 3),
+        "forces": {"p53": np.array([1 / 3, 2.0, 3.0])},
+        "state": np.ones((3, 2)),
+        "parameters": {"decay": np.array([0.8, 0.5]), "scale": 1.0},
+    }
+    data = Data([0, 0, 1 / 7], y, ("a", "b"), units={"time": "h"}, truth=truth)
+    write_csv(data, tmp_path / "d.csv")
+    write_truth(data, tmp_path / "d.json")
+    back = read_csv(tmp_path / "d.csv")
+    np.testing.assert_array_equal(back.times, data.times)
+    np.testing.assert_array_equal(back.y, y)
+    assert (back.outputs, back.units) == (data.outputs, data.units)
+    read = read_truth(tmp_path / "d.json")
+    assert read.keys() == truth.keys()
+    np.testing.assert_array_equal(read["forces"]["p53"], truth["forces"]["p53"])
+    np.testing.assert_array_equal(read["parameters"]["decay"], [0.8, 0.5])
+
+
+def test_truth_that_is_not_there(tmp_path):
+    with pytest.raises(ValueError, match="no truth to write"):
+        write_truth(Data([0.0], [[1.0]], ("x",)), tmp_path / "t.json")
+    (tmp_path / "t.json").write_text("time,x\n")
+    with pytest.raises(ValueError, match="is not a truth file"):
+        read_truth(tmp_path / "t.json")
+
+
+@pytest.mark.parametrize(
+    ("times", "y", "message"),
+    [
+        ([0, 1], [[1.0]], r"shape \(times, outputs\) = \(2, 1\), got \(1, 1\)"),
+        ([1, 0], [[1.0], [2.0]], r"must not go back, got 0 after 1 at index 1"),
+        ([0, np.nan], [[1.0], [2.0]], "times must be finite"),
+    ],
+)
+def test_data_checks_its_parts(times, y, message):
+    with pytest.raises(ValueError, match=message):
+        Data(times, y, ("x",))
