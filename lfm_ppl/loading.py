@@ -1,0 +1,249 @@
+"""Find, load and check model files: the shipped ones by name, a user's own by path.
+
+A model file is an ordinary Python file. It must define
+
+    model(times, y=None, **options)     the NumPyro model, with one site ``y``
+
+and may define, each with a sensible default,
+
+    simulate(seed=0, **options) -> lfm.Data     its default data
+    prepare(data) -> lfm.Data                   turns a user's file into what ``model`` takes
+    anchors(data) -> dict                       parameters that are fixed for such data unless freed
+    OUTPUTS      names of the outputs; None: any number, ``model`` then takes ``outputs=`` names
+    UNITS        name -> unit
+    OPTIONS      option -> (default, tuple of choices or a type, help)
+    PARAMETERS   name of a sample site -> help, with its unit
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import sys
+import traceback
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from lfm_ppl import checks
+from lfm_ppl.data import Data
+
+
+@dataclass(frozen=True)
+class ModelFile:
+    """A model file that has been loaded and checked.
+
+    Attributes:
+        name: ``ginzburg-landau`` for ``ginzburg_landau.py``.
+        path: where it is.
+        summary: the first line of its docstring.
+        description: the whole docstring.
+        model: the NumPyro model function.
+        outputs: names of the outputs, or None for any number of them.
+        units: name -> unit.
+        options: option -> (default, tuple of choices or a type, help).
+        parameters: name of a sample site -> help.
+    """
+
+    name: str
+    path: Path
+    summary: str
+    description: str
+    model: Callable[..., None]
+    outputs: tuple[str, ...] | None
+    units: Mapping[str, str]
+    options: Mapping[str, tuple[Any, Any, str]]
+    parameters: Mapping[str, str]
+    _simulate: Callable[..., Data] | None = None
+    _prepare: Callable[[Data], Data] | None = None
+    _anchors: Callable[[Data], Mapping[str, float]] | None = None
+
+    def simulate(self, seed: int = 0, **options: Any) -> Data:
+        """Return the model's simulated default data, with its truth.
+
+        Raises:
+            ValueError: if the file defines no ``simulate``.
+        """
+        if self._simulate is None:
+            raise ValueError(
+                f"{self.path} defines no simulate(seed=0, **options), so it has no data of its "
+                "own. Give a data file with --data FILE, or add the function."
+            )
+        data = self._simulate(seed=seed, **options)
+        if not isinstance(data, Data):
+            raise TypeError(f"simulate in {self.path} must return lfm.Data, got {_type(data)}.")
+        return self._with_units(data)
+
+    def prepare(self, data: Data) -> Data:
+        """Return a user's data in the form that the model takes; ``note`` says what was done."""
+        if self._prepare is not None:
+            data = self._prepare(data)
+            if not isinstance(data, Data):
+                raise TypeError(f"prepare in {self.path} must return lfm.Data, got {_type(data)}.")
+        return self._with_units(data)
+
+    def anchors(self, data: Data) -> dict[str, float]:
+        """Return the parameters that are fixed for this data unless the user frees them."""
+        return dict(self._anchors(data)) if self._anchors is not None else {}
+
+    def keywords(self, data: Data, options: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the keyword arguments of ``model`` for this data and these options."""
+        keywords = {name: default for name, (default, _, _) in self.options.items()} | dict(options)
+        return keywords | ({"outputs": data.outputs} if self.outputs is None else {})
+
+    def option(self, name: str, text: str) -> Any:
+        """Return the value of option ``name`` that ``text`` stands for.
+
+        Raises:
+            ValueError: for an unknown option, or a value that it does not take.
+        """
+        if name not in self.options:
+            raise ValueError(checks.unknown(f"option of {self.name}", name, self.options))
+        _, accepted, _ = self.options[name]
+        if isinstance(accepted, tuple):
+            known = {str(choice): choice for choice in accepted}
+            if text not in known:
+                raise ValueError(checks.unknown(f"value of option {name}", text, known))
+            return known[text]
+        try:
+            return _convert(accepted, text)
+        except ValueError:
+            raise ValueError(
+                f"option {name} of {self.name} takes a value of type {accepted.__name__}, "
+                f"got {text!r}."
+            ) from None
+
+    def _with_units(self, data: Data) -> Data:
+        return replace(data, units={**self.units, **data.units})
+
+
+def models_folder() -> Path:
+    """Return the folder of the shipped model files: in a wheel, or in the checkout."""
+    package = Path(__file__).resolve().parent
+    installed = package / "_models"
+    return installed if installed.is_dir() else package.parent / "models"
+
+
+def available() -> dict[str, Path]:
+    """Return the shipped models: name -> file."""
+    files = sorted(models_folder().glob("*.py"))
+    return {_name(path): path for path in files if not path.name.startswith("_")}
+
+
+def load(name: str) -> ModelFile:
+    """Load a model by name or by path, and check what it defines.
+
+    Args:
+        name: a shipped model (``ginzburg-landau``, dashes or underscores), or the path of a Python
+            file (anything that ends in .py or contains a path separator).
+
+    Returns:
+        The model file.
+
+    Raises:
+        ValueError: for an unknown name (with the nearest ones), a file that is missing, does not
+            run, or lacks what it must define.
+
+    Example:
+        >>> load("ginzburg-landau").name
+        'ginzburg-landau'
+    """
+    if name.endswith(".py") or os.sep in name:
+        path = Path(name).expanduser()
+        if not path.is_file():
+            raise ValueError(f"there is no model file {name}.")
+        return _checked(path.resolve(), _execute(path.resolve()))
+    shipped = available()
+    wanted = name.replace("_", "-")
+    if wanted not in shipped:
+        message = checks.unknown("model", name, shipped)
+        raise ValueError(f"{message} A model of your own is given by its path, as in ./{name}.py.")
+    return _checked(shipped[wanted], _execute(shipped[wanted]))
+
+
+def _execute(path: Path) -> ModuleType:
+    """Run a file as a module of its own, named so that it cannot hide another module."""
+    name = f"_lfm_ppl_model_{path.stem}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise ValueError(f"{path} is not a Python file.")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # a dataclass or an equinox Module looks itself up there
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        del sys.modules[name]
+        raise ValueError(f"{path} does not run: {_where(error, path)}") from error
+    return module
+
+
+def _checked(path: Path, module: ModuleType) -> ModelFile:
+    functions = {
+        key: value
+        for key, value in vars(module).items()
+        if callable(value) and getattr(value, "__module__", "") == module.__name__
+    }
+    if "model" not in functions:
+        raise ValueError(
+            f"{path} defines no function model(times, y=None, **options); its own functions are: "
+            f"{', '.join(functions) or 'none'}. Rename the NumPyro model function to `model`."
+        )
+    for name in ("simulate", "prepare", "anchors"):
+        if not callable(getattr(module, name, print)):
+            raise ValueError(f"{path}: {name} must be a function, got {getattr(module, name)!r}.")
+    description = (module.__doc__ or "").strip()
+    outputs = getattr(module, "OUTPUTS", None)
+    if isinstance(outputs, str):
+        raise ValueError(f'{path}: OUTPUTS must be a tuple of names, as in ("{outputs}",).')
+    return ModelFile(
+        name=_name(path),
+        path=path,
+        summary=description.partition("\n")[0],
+        description=description,
+        model=functions["model"],
+        outputs=None if outputs is None else tuple(outputs),
+        units=dict(getattr(module, "UNITS", {})),
+        options=_checked_options(path, getattr(module, "OPTIONS", {})),
+        parameters=dict(getattr(module, "PARAMETERS", {})),
+        _simulate=getattr(module, "simulate", None),
+        _prepare=getattr(module, "prepare", None),
+        _anchors=getattr(module, "anchors", None),
+    )
+
+
+def _checked_options(path: Path, options: Mapping[str, Any]) -> dict[str, tuple[Any, Any, str]]:
+    for name, entry in options.items():
+        valid = isinstance(entry, tuple) and len(entry) == 3 and isinstance(entry[1], tuple | type)
+        if not valid:
+            raise ValueError(
+                f"{path}: OPTIONS[{name!r}] must be (default, tuple of choices or a type, help), "
+                f"got {entry!r}."
+            )
+    return dict(options)
+
+
+def _convert(kind: type, text: str) -> Any:
+    if kind is bool:
+        known = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
+        if text.lower() not in known:
+            raise ValueError(text)
+        return known[text.lower()]
+    return kind(text)
+
+
+def _where(error: Exception, path: Path) -> str:
+    """Return the error in one line, with the last line of ``path`` that led to it."""
+    lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == str(path)]
+    line = error.lineno if isinstance(error, SyntaxError) else (lines[-1] if lines else None)
+    place = f"line {line}: " if line else ""
+    return f"{place}{type(error).__name__}: {error}"
+
+
+def _name(path: Path) -> str:
+    return path.stem.replace("_", "-")
+
+
+def _type(value: Any) -> str:
+    return type(value).__name__
