@@ -1,0 +1,293 @@
+"""The posterior mode of a NumPyro model, and the Gaussian (Laplace) approximation around it."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpyro.infer import init_to_median, init_to_sample
+
+from lfm_ppl import checks
+from lfm_ppl.inference.optimise import Minimum, Objective, newton, quasi_newton
+from lfm_ppl.inference.unconstrained import (
+    UnconstrainedModel,
+    check_latent_sites,
+    coordinate_names,
+)
+
+_HESSIANS = ("autodiff", "finite-differences")
+_ATTEMPTS = 20
+_REMEDY = (
+    "Try more restarts, a starting point of your own (init={'site': value}), more max_iterations, "
+    "or a prior that says more about these parameters."
+)
+
+
+@dataclass(frozen=True, eq=False)
+class MAPResult:
+    """A posterior mode with its Laplace approximation ``z ~ N(mode, covariance)``.
+
+    Attributes:
+        parameters: site name -> value at the mode, in the constrained space of the model.
+        deterministic: name of a deterministic site -> value at the mode.
+        unconstrained: site name -> unconstrained value; ``init_params`` for ``MCMC.run``.
+        mode: the unconstrained parameters as one vector, (d,), in flat order.
+        coordinates: names of the entries of ``mode``, in flat order: sites sorted by name, each in
+            C order.
+        covariance: inverse Hessian of minus the log density at the mode, (d, d), unconstrained, in
+            flat order; positive definite; NaN where no finite Hessian exists.
+        log_density: log joint density at the mode: of the unconstrained parameters (with the
+            Jacobian), or of the constrained ones with ``jacobian=False``.
+        log_evidence: Laplace approximation of the log marginal likelihood; exact if the posterior
+            is Gaussian in the space whose mode this is.
+        converged: whether the search ended at a minimum.
+        message: how the search ended.
+        unidentified: coordinates along which the density is flat; their variances stand for "large"
+            and have no other meaning.
+        restart_log_densities: log density reached from each start, (restarts,); -inf where no
+            possible starting point was found. Different values mean several modes.
+        evaluations: number of gradients that were computed.
+    """
+
+    parameters: dict[str, np.ndarray]
+    deterministic: dict[str, np.ndarray]
+    unconstrained: dict[str, np.ndarray]
+    mode: np.ndarray
+    coordinates: tuple[str, ...]
+    covariance: np.ndarray
+    log_density: float
+    log_evidence: float
+    converged: bool
+    message: str
+    unidentified: tuple[str, ...]
+    restart_log_densities: np.ndarray
+    evaluations: int
+    _factor: np.ndarray = field(repr=False)
+    _constrain: Callable = field(repr=False)
+
+    def sample(self, key: jax.Array, n: int) -> dict[str, jax.Array]:
+        """Return ``n`` draws from the Laplace approximation, in constrained space.
+
+        Args:
+            key: random key.
+            n: number of draws.
+
+        Returns:
+            Site name -> draws of shape (n, ...), deterministic sites included.
+
+        Raises:
+            ValueError: the covariance is not finite, or ``n`` is not positive.
+        """
+        checks.positive_integer("n", n)
+        if not np.all(np.isfinite(self._factor)):
+            raise ValueError(
+                "there is no Laplace approximation to draw from: the Hessian at the mode is not "
+                "finite. Use hessian='finite-differences', or sample the posterior with MCMC."
+            )
+        noise = jax.random.normal(key, (n, self.mode.size))
+        return jax.jit(jax.vmap(self._constrain))(self.mode + noise @ self._factor.T)
+
+
+def map_estimate(
+    model: Callable,
+    *args: Any,
+    init: Callable | Mapping[str, Any] | None = None,
+    restarts: int = 4,
+    seed: int = 0,
+    model_kwargs: Mapping[str, Any] | None = None,
+    jacobian: bool = True,
+    hessian: str = "autodiff",
+    forward_mode: bool = False,
+    max_iterations: int = 1000,
+) -> MAPResult:
+    r"""Return the posterior mode of a NumPyro model and the Laplace approximation around it.
+
+    With ``theta = T(z)``, ``z`` unconstrained, the mode maximises
+
+        log p(y, T(z)) + log |dT/dz|     (jacobian=True, the default)
+        log p(y, theta)                  (jacobian=False)
+
+    The first is the mode of the density that MCMC explores. It is NOT the mode of the density of
+    ``theta``, which depends on the parametrisation; the second is. The covariance is the inverse
+    Hessian over ``z`` of minus the maximised function. Several starts go through L-BFGS; the best
+    end point is polished by Newton's method.
+
+    Args:
+        model: a NumPyro model whose latent sites are continuous.
+        *args: its positional arguments, data included.
+        init: where the first start lies: a NumPyro strategy, or site name -> constrained value (the
+            prior median elsewhere); by default ``init_to_median``. The other starts are prior
+            draws.
+        restarts: number of starts, at least one.
+        seed: seed of the starts, a whole number.
+        model_kwargs: keyword arguments of the model.
+        jacobian: which mode, see above.
+        hessian: ``"autodiff"``, or ``"finite-differences"`` of the gradient, which needs no second
+            derivatives and has fewer digits.
+        forward_mode: take derivatives in forward mode: faster with a handful of parameters, and the
+            only one where the model loops with ``jax.lax.while_loop``.
+        max_iterations: of L-BFGS, for each start.
+
+    Returns:
+        The mode, with ``parameters``, ``covariance``, ``log_evidence``, ``sample(key, n)``.
+
+    Raises:
+        ValueError: a discrete latent site or none at all, an unknown site in ``init``, a start or
+            every prior draw with density zero, an unknown ``hessian``.
+
+    Warns:
+        UserWarning: the search did not converge; the density is flat in some direction; JAX runs in
+            float32.
+
+    Example:
+        >>> import numpyro, numpyro.distributions as dist
+        >>> def model(y):
+        ...     mean = numpyro.sample("mean", dist.Normal(0.0, 1.0))
+        ...     numpyro.sample("y", dist.Normal(mean, 1.0), obs=y)
+        >>> result = map_estimate(model, 3.0)
+        >>> round(float(result.parameters["mean"]), 3), round(float(result.covariance[0, 0]), 3)
+        (1.5, 0.5)
+
+    Source:
+        Tierney and Kadane (1986), Accurate approximations for posterior moments and marginal
+        densities, Journal of the American Statistical Association 81, 82-86.
+    """
+    checks.positive_integer("restarts", restarts)
+    checks.positive_integer("max_iterations", max_iterations)
+    checks.one_of("hessian", hessian, _HESSIANS)
+    if jnp.result_type(float) != jnp.float64:
+        warnings.warn(
+            "map_estimate runs in float32, which is too coarse for a Hessian. Call "
+            "numpyro.enable_x64() before anything else.",
+            stacklevel=2,
+        )
+    check_latent_sites(model, args, model_kwargs or {}, jax.random.key(seed), "map_estimate")
+    problem = UnconstrainedModel(model, args, model_kwargs or {}, jax.random.key(seed))
+    starts = _starts(problem, init, restarts)
+    target = problem.potential if jacobian else problem.constrained_potential
+    objective = Objective(target, forward_mode, hessian == "autodiff")
+    ends = [quasi_newton(objective, start, max_iterations) for start in starts if start is not None]
+    reached = iter([-objective.value(end) for end in ends])
+    densities = np.array([-np.inf if start is None else next(reached) for start in starts])
+    minimum = newton(objective, min(ends, key=objective.value))
+    return _result(problem, objective, minimum, densities)
+
+
+def _starts(model: UnconstrainedModel, init: Any, restarts: int) -> list[np.ndarray | None]:
+    """Return one vector (d,) of finite density for each start, None where there is none."""
+    first, attempts = init or init_to_median, _ATTEMPTS
+    if isinstance(init, Mapping):
+        for name in init:
+            if name not in model.sites:
+                raise ValueError(checks.unknown("site in init", name, model.sites))
+        first, attempts = partial(_init_to_given, init), 1
+    finite = jax.jit(lambda flat: jnp.isfinite(model.potential(flat)))
+    first_key, *keys = jax.random.split(model.key, restarts)
+    start = _possible_start(model, first_key, first, finite, attempts)
+    if isinstance(init, Mapping) and start is None:
+        raise ValueError(
+            f"the density is zero or not finite at init={dict(init)!r}. Give values inside the "
+            "support of their priors at which the model can produce the data."
+        )
+    found = [start]
+    found += [_possible_start(model, k, init_to_sample, finite, _ATTEMPTS) for k in keys]
+    if all(start is None for start in found):
+        raise ValueError(
+            f"found no point of finite density in {restarts} x {_ATTEMPTS} draws from the prior. "
+            "Give a starting point, init={'site': value}, or check the model: its log density is "
+            "-inf or NaN."
+        )
+    return found
+
+
+def _possible_start(
+    model: UnconstrainedModel, key: jax.Array, strategy: Callable, finite: Callable, attempts: int
+) -> np.ndarray | None:
+    for attempt in range(attempts):
+        flat = model.draw(jax.random.fold_in(key, attempt), strategy)
+        if finite(flat):
+            return np.asarray(flat, float)
+    return None
+
+
+def _init_to_given(values: Mapping[str, Any], site: dict) -> Any:
+    if site["type"] != "sample" or site["is_observed"] or site["name"] not in values:
+        return init_to_median(site)
+    shape = tuple(site["kwargs"].get("sample_shape") or ()) + tuple(site["fn"].shape())
+    value = np.asarray(values[site["name"]], float)
+    try:
+        return jnp.asarray(np.broadcast_to(value, shape))
+    except ValueError:
+        raise ValueError(
+            f"init[{site['name']!r}] must be of shape {shape}, got shape {value.shape}."
+        ) from None
+
+
+def _result(
+    problem: UnconstrainedModel, objective: Objective, minimum: Minimum, densities: np.ndarray
+) -> MAPResult:
+    point, curvature = minimum.point, minimum.curvature
+    unconstrained = {k: np.asarray(v) for k, v in problem.unravel(jnp.asarray(point)).items()}
+    values = {k: np.asarray(v) for k, v in jax.jit(problem.constrain)(jnp.asarray(point)).items()}
+    names = coordinate_names(unconstrained)
+    factor, log_determinant, unidentified = np.full((point.size,) * 2, np.nan), math.nan, ()
+    if curvature is not None:
+        factor, log_determinant = curvature.factor, curvature.log_determinant
+        unidentified = tuple(names[i] for i in curvature.coordinates(curvature.flat))
+    message = _verdict(minimum, names)
+    if message:
+        warnings.warn(f"map_estimate did not converge: {message} {_REMEDY}", stacklevel=3)
+    elif unidentified:
+        warnings.warn(
+            f"the posterior is flat at its mode in a direction of {', '.join(unidentified)}: their "
+            "Laplace variances and the evidence mean nothing. Give these parameters an "
+            "informative prior, or fix one of them.",
+            stacklevel=3,
+        )
+    # The Jacobian belongs to the evidence whichever mode was asked for: the Hessian is over z.
+    energy = float(jax.jit(problem.potential)(jnp.asarray(point)))
+    return MAPResult(
+        parameters={k: v for k, v in values.items() if k in unconstrained},
+        deterministic={k: v for k, v in values.items() if k not in unconstrained},
+        unconstrained=unconstrained,
+        mode=point,
+        coordinates=names,
+        covariance=factor @ factor.T,
+        log_density=-minimum.value,
+        log_evidence=-energy + 0.5 * (point.size * math.log(2 * math.pi) - log_determinant),
+        converged=not message,
+        message=message or "converged",
+        unidentified=unidentified,
+        restart_log_densities=densities,
+        evaluations=objective.evaluations,
+        _factor=factor,
+        _constrain=problem.constrain,
+    )
+
+
+def _verdict(minimum: Minimum, names: tuple[str, ...]) -> str:
+    """Return why the point is not a minimum, an empty string if it is one."""
+    curvature = minimum.curvature
+    if curvature is None:
+        return "the derivatives are not finite at the end of the search."
+    negative = curvature.values < -curvature.floor
+    if np.any(negative):
+        where = ", ".join(names[i] for i in curvature.coordinates(negative))
+        return f"the search ended at a saddle point, in a direction of {where}."
+    away = np.abs(minimum.step) > 1e-3 * (1.0 + np.abs(minimum.point))
+    if np.any(away):
+        where = ", ".join(np.array(names)[away])
+        return f"{where} runs away; the mode may lie at the edge of the support or at infinity."
+    tolerance = 1e-6 if jnp.result_type(float) == jnp.float64 else 1e-3
+    slope = curvature.flat_slope(minimum.gradient)
+    if minimum.decrement > tolerance or slope > tolerance * max(1.0, abs(minimum.value)):
+        left = max(minimum.decrement, slope)
+        return f"the log density still rises by about {left:.1e} within one step."
+    return ""
