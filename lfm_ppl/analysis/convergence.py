@@ -1,0 +1,83 @@
+"""What a summary table says about convergence, in words and with a remedy."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pandas as pd
+
+MAX_R_HAT = 1.01
+MIN_ESS_PER_CHAIN = 100
+_NAMED = 5
+
+
+def messages(summary: pd.DataFrame, chains: int, draws: int, divergences: int) -> list[str]:
+    """Return one message for each way in which the draws cannot be trusted.
+
+    Args:
+        summary: table with columns sd, ess_bulk, ess_tail and r_hat, one row per scalar.
+        chains: number of chains.
+        draws: number of draws per chain.
+        divergences: number of divergent transitions after warm-up.
+
+    Returns:
+        Messages that name parameters, values and a remedy; empty where nothing is wrong.
+        Rows that do not vary (fixed or derived from fixed values) are passed over.
+        Source of the thresholds: Vehtari et al. (2021), Bayesian Analysis 16(2).
+    """
+    varying = summary[summary["sd"] != 0.0]
+    broken = varying.index[~np.isfinite(varying["mean"])]
+    sound = varying.drop(broken)
+    found = []
+    if len(broken):
+        found.append(
+            f"draws are not finite for {_listed(list(broken))}: nothing computed from them "
+            "holds. Tighten the priors, or choose starting values where the model is finite."
+        )
+    if chains < 2:
+        found.append(
+            "R-hat needs at least two chains and there is one: agreement between chains was not "
+            "checked. Run with chains=4."
+        )
+    elif draws < 4:
+        found.append(f"{draws} draws per chain are too few for R-hat and ESS. Raise samples.")
+    high = sound["r_hat"][sound["r_hat"] > MAX_R_HAT].sort_values(ascending=False)
+    if len(high):
+        found.append(
+            f"R-hat is above {MAX_R_HAT} for {_listed(_with_values(high, '.3f'))}: the chains have "
+            "not reached the same distribution. Run longer (warmup, samples); if it stays, look "
+            "at the trace plot for several modes and for parameters that the data do not identify."
+        )
+    for column, what in (("ess_bulk", "centre"), ("ess_tail", "tails")):
+        found += _low_ess(sound[column], column.removeprefix("ess_"), what, chains)
+    if divergences:
+        share = 100.0 * divergences / (chains * draws)
+        found.append(
+            f"{divergences} of {chains * draws} transitions diverged ({share:.2g}%): draws may "
+            "miss a narrow region. Raise target_accept_prob (0.95 or 0.99), or reparameterise "
+            "where the pairs plot marks them."
+        )
+    return found
+
+
+def _low_ess(ess: pd.Series, kind: str, what: str, chains: int) -> list[str]:
+    needed = MIN_ESS_PER_CHAIN * chains
+    low = ess[ess < needed].sort_values()
+    if not len(low):
+        return []
+    factor = math.ceil(needed / max(low.iloc[0], 1.0))
+    return [
+        f"{kind} effective sample size is below {needed} ({MIN_ESS_PER_CHAIN} per chain) for "
+        f"{_listed(_with_values(low, '.0f'))}: the {what} of the posterior is known too roughly. "
+        f"Raise samples about {factor}-fold, or lower the correlation between parameters."
+    ]
+
+
+def _with_values(values: pd.Series, form: str) -> list[str]:
+    return [f"{label} ({value:{form}})" for label, value in values.items()]
+
+
+def _listed(names: list[str]) -> str:
+    more = len(names) - _NAMED
+    return ", ".join(names[:_NAMED]) + (f" and {more} more" if more > 0 else "")

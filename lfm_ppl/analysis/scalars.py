@@ -1,0 +1,128 @@
+"""Named scalar parameters and units of the variables of a result."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import xarray as xr
+
+from lfm_ppl.checks import unknown
+
+SAMPLE_DIMS = ("chain", "draw")
+
+
+def scalar_draws(dataset: xr.Dataset) -> dict[str, np.ndarray]:
+    """Return every scalar of ``dataset`` by name: vector entries as ``decay[CDKN1A]``.
+
+    Args:
+        dataset: variables of dimensions (chain, draw, ...).
+
+    Returns:
+        Label -> draws of shape (chain, draw), in the order of the variables.
+    """
+    draws = {}
+    for name, variable in dataset.data_vars.items():
+        # Variables without both dimensions, such as a shared mass matrix, are not draws.
+        if not set(SAMPLE_DIMS) <= set(variable.dims):
+            continue
+        variable = variable.transpose(*SAMPLE_DIMS, ...)
+        flat = variable.values.reshape(*variable.shape[:2], -1)
+        for index, label in enumerate(_labels(str(name), variable)):
+            draws[label] = flat[..., index]
+    return draws
+
+
+def choose(draws: Mapping[str, np.ndarray], names: str | Sequence[str] | None) -> list[str]:
+    """Return the labels that ``names`` ask for: ``decay`` stands for all of ``decay[...]``.
+
+    Args:
+        draws: what ``scalar_draws`` returned.
+        names: labels or names of parameters; None for all that vary.
+
+    Returns:
+        Labels, in the order asked for, without repetition.
+
+    Raises:
+        ValueError: a name is unknown.
+    """
+    if names is None:
+        return [label for label, values in draws.items() if np.ptp(values) != 0.0]
+    chosen: dict[str, None] = {}
+    for name in [names] if isinstance(names, str) else names:
+        found = [label for label in draws if label == name or label.partition("[")[0] == name]
+        if not found:
+            sites = dict.fromkeys(label.partition("[")[0] for label in draws)
+            raise ValueError(unknown("parameter", name, [*sites, *(d for d in draws if "[" in d)]))
+        chosen.update(dict.fromkeys(found))
+    return list(chosen)
+
+
+def scalar_truth(posterior: xr.Dataset, truth: xr.Dataset) -> dict[str, float]:
+    """Return the true value of each scalar of ``posterior`` that ``truth`` knows, by label."""
+    values: dict[str, float] = {}
+    for name, variable in posterior.data_vars.items():
+        if name not in truth.data_vars or not set(SAMPLE_DIMS) <= set(variable.dims):
+            continue
+        labels = _labels(str(name), variable)
+        known = truth[name]
+        if known.size == 1:  # one value for every entry of a vector
+            values.update(dict.fromkeys(labels, known.item()))
+        elif set(known.dims) <= set(known.coords):
+            named = zip(_labels(str(name), known), known.values.ravel(), strict=True)
+            values.update({label: float(v) for label, v in named if label in labels})
+        elif known.size == len(labels):
+            values.update(zip(labels, map(float, known.values.ravel()), strict=True))
+    return values
+
+
+def units_attribute(names: Sequence[str], units: Mapping[str, str] | str | None) -> dict[str, str]:
+    """Return the attribute that gives a variable its unit, or one unit for each of ``names``.
+
+    The attribute is a plain string where all units agree, else a JSON object, because netCDF
+    attributes cannot be dicts. ``unit_of`` reads both.
+
+    Example:
+        >>> units_attribute(["x", "v"], {"x": "m", "v": "m/s"})
+        {'units': '{"x": "m", "v": "m/s"}'}
+        >>> units_attribute(["x", "y"], {"x": "m", "y": "m"})
+        {'units': 'm'}
+        >>> units_attribute(["x"], None)
+        {}
+    """
+    if isinstance(units, str):
+        return {"units": units} if units else {}
+    known = {name: units[name] for name in names if units.get(name)} if units else {}
+    if not known:
+        return {}
+    if set(known) == set(names) and len(set(known.values())) == 1:
+        return {"units": next(iter(known.values()))}
+    return {"units": json.dumps(known)}
+
+
+def unit_of(variable: xr.DataArray, name: str | None = None) -> str:
+    """Return the unit of ``variable``, or of its entry ``name``; empty where it is not known."""
+    units = variable.attrs.get("units", "")
+    if isinstance(units, str) and units.startswith("{"):
+        try:
+            units = json.loads(units)
+        except json.JSONDecodeError:
+            return str(units)
+    if isinstance(units, Mapping):
+        units = units.get(name, "")
+    return str(units or "")
+
+
+def _labels(name: str, variable: xr.DataArray) -> list[str]:
+    dims = [dim for dim in variable.dims if dim not in SAMPLE_DIMS]
+    if not dims:
+        return [name]
+    ticks = [
+        variable[dim].values if dim in variable.coords else np.arange(variable.sizes[dim])
+        for dim in dims
+    ]
+    return [
+        f"{name}[{','.join(str(tick[i]) for tick, i in zip(ticks, index, strict=True))}]"
+        for index in np.ndindex(*(len(tick) for tick in ticks))
+    ]
