@@ -28,7 +28,7 @@ class Pass(NamedTuple):
         log_likelihood: (N,) of each row's observation, zero without one.
         predicted, filtered: moments (N, n), (N, n, n) at the row's end, before and after the observation.
         phi, noise: (N, n, n), the affine map of the row.
-        innovation, chol, gain, slope: of the update, (N, D), (N, D, D), (N, n, D), (N, D, n).
+        innovation, present, chol, gain, slope: of the update, (N, D), (N, D), (N, D, D), (N, n, D), (N, D, n).
     """
 
     log_likelihood: jax.Array
@@ -37,6 +37,7 @@ class Pass(NamedTuple):
     phi: Any = None
     noise: Any = None
     innovation: Any = None
+    present: Any = None
     chol: Any = None
     gain: Any = None
     slope: Any = None
@@ -116,7 +117,8 @@ def forward(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, *, s
         new = update(ssm, affine, observed, jnp.isfinite(observed), predicted)
         out = Pass(new.log_likelihood)
         if keep != "likelihood":
-            out = out._replace(predicted=predicted, filtered=new.moments, innovation=new.innovation, chol=new.chol)
+            out = out._replace(predicted=predicted, filtered=new.moments, innovation=new.innovation,
+                               present=jnp.isfinite(observed), chol=new.chol)
         if keep == "all":
             out = out._replace(phi=phi, noise=noise, gain=new.gain, slope=new.slope)
         return new.moments, out

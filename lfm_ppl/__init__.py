@@ -1,0 +1,52 @@
+"""Bayesian inference in latent force models, on NumPyro."""
+
+from lfm_ppl.filtering.filter import FilterResult, FilterState, filter
+from lfm_ppl.filtering.smoother import SmootherResult, smooth
+from lfm_ppl.forces import Constant, Force, Matern, SquaredExponential, WienerVelocity
+from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, panel
+from lfm_ppl.linearisation.rule import Rule
+from lfm_ppl.linearisation.sigma_points import (
+    CentralDifference,
+    Cubature,
+    GaussHermite,
+    MonteCarlo,
+    Unscented,
+)
+from lfm_ppl.linearisation.taylor import Taylor
+from lfm_ppl.model.augment import StateSpaceModel, state_space
+from lfm_ppl.model.known_input import Input
+from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.observation import Gaussian, GaussianObservation
+from lfm_ppl.model.simulate import Simulation, simulate
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "CentralDifference",
+    "Constant",
+    "Cubature",
+    "FilterResult",
+    "FilterState",
+    "Force",
+    "GaussHermite",
+    "Gaussian",
+    "GaussianObservation",
+    "Input",
+    "LatentForceModel",
+    "MarginalLikelihood",
+    "Matern",
+    "MonteCarlo",
+    "Rule",
+    "Simulation",
+    "SmootherResult",
+    "SquaredExponential",
+    "StateSpaceModel",
+    "Taylor",
+    "Unscented",
+    "WienerVelocity",
+    "filter",
+    "panel",
+    "simulate",
+    "smooth",
+    "state_space",
+]

@@ -1,0 +1,234 @@
+"""The marginal likelihood of a latent force model as one NumPyro distribution."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro.distributions as dist
+from numpyro.distributions import constraints
+
+from lfm_ppl import checks
+from lfm_ppl.filtering.filter import as_rule, check_observations, forward, warn_single_precision
+from lfm_ppl.filtering.predict import Moments
+from lfm_ppl.filtering.schedule import Schedule, schedule
+from lfm_ppl.filtering.smoother import SmootherResult, check_iterations, posterior_linearisation, smooth_on
+from lfm_ppl.gradients import finite_or_minus_infinity
+from lfm_ppl.linearisation.rule import Rule
+from lfm_ppl.model.augment import StateSpaceModel, state_space
+from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.simulate import simulate_on
+
+_SIMULATION_STEPS = 5
+"""Steps of the simulator for one integration step of the filter: its paths are rougher than moments."""
+
+
+class MarginalLikelihood(dist.Distribution):
+    """Distribution of a whole sequence of observations, state and forces integrated out.
+
+        log p(y_1:T | theta) = sum_k log N(y_k; mu_k, S_k),
+
+    with the innovations' moments from the Gaussian filter. It is exact for a linear model, and the Gaussian filter's
+    approximation otherwise; with ``iterations`` > 0 it is the likelihood of the model linearised about the smoothed
+    marginals.
+
+    ``sample`` simulates the real, non-linear model: in NumPyro's ``Predictive`` it gives the prior predictive, and with
+    posterior draws of the parameters the predictive of a NEW realisation of the forces. The posterior predictive given
+    the data, along the smoothed forces, is what `lfm_ppl.fit` stores.
+
+    Args:
+        model: the latent force model; it may hold traced parameters.
+        times: (T,), non-decreasing.
+        rule: linearisation rule; `Cubature()` by default.
+        steps: integration steps between two consecutive times.
+        max_step: longest step; longer intervals get more.
+        iterations: of posterior linearisation; 0 for none.
+        damping: share of each new iterate that is taken.
+
+    Raises:
+        ValueError, TypeError: as `lfm_ppl.filter`. In compiled code a failure is a log density of -inf.
+
+    Example:
+        >>> import jax.numpy as jnp, lfm_ppl as lfm
+        >>> model = lfm.LatentForceModel(
+        ...     lambda x, u, t: u - x, {"u": lfm.Matern(1.0, 1.0)},
+        ...     lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
+        >>> lfm.MarginalLikelihood(model, jnp.arange(3.0)).event_shape
+        (3, 1)
+
+    Source: Hartikainen et al. (2012), section 4; Singer (2011), AStA 95.
+    """
+
+    support = constraints.real_matrix
+    pytree_data_fields = ("model", "times")
+    pytree_aux_fields = ("rule", "steps", "max_step", "iterations", "damping", "_ssm", "_plan")
+
+    def __init__(self, model: LatentForceModel, times: Any, rule: Rule | None = None, steps: int = 10,
+                 max_step: float | None = None, iterations: int = 0, damping: float = 0.7, *,
+                 validate_args: bool | None = None):
+        if not isinstance(model, LatentForceModel):
+            raise TypeError(f"model must be an lfm.LatentForceModel, got {type(model).__name__}.")
+        check_iterations(iterations, damping)
+        self.model, self.times = model, times
+        self.rule, self.steps, self.max_step = as_rule(rule), steps, max_step
+        self.iterations, self.damping = iterations, damping
+        self._ssm = state_space(model)
+        self._plan = schedule(self._ssm, times, steps, max_step, row_per_step=iterations > 0)
+        model.check_at(self._plan.initial_time)
+        warn_single_precision()
+        super().__init__((), (np.shape(times)[0], self._ssm.output_dim), validate_args=False)
+
+    @property
+    def ssm(self) -> StateSpaceModel:
+        """The state-space model."""
+        return self._ssm
+
+    @property
+    def plan(self) -> Schedule:
+        """The rows of the scan."""
+        return self._plan
+
+    def log_prob_per_observation(self, value: Any) -> jax.Array:
+        """Return (T,): log p(y_k | y_1:k-1) of the present entries of each observation."""
+        y = check_observations(value, *self.event_shape)
+
+        def evaluate(y: jax.Array) -> jax.Array:
+            start = Moments(*self._ssm.initial())
+            about = None
+            if self.iterations:
+                about, _ = posterior_linearisation(self._ssm, self.rule, self._plan, y, start, self.iterations,
+                                                   self.damping)
+            passed = forward(self._ssm, self.rule, self._plan, y, start=start, about=about)
+            return passed.log_likelihood[jnp.asarray(self._plan.observed)]
+
+        return finite_or_minus_infinity(evaluate, y)
+
+    def log_prob(self, value: Any) -> jax.Array:
+        """Return the log marginal likelihood of ``value`` (T, D), NaN where missing; batch dimensions may lead."""
+        value = jnp.asarray(value, float)
+        if value.ndim > 2:
+            return jax.vmap(self.log_prob)(value)
+        return self.log_prob_per_observation(value).sum()
+
+    def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
+        """Simulate the real model: (*sample_shape, T, D)."""
+        start = jnp.asarray(self._plan.initial_time, float)
+        run = lambda k: simulate_on(self._ssm, k, jnp.asarray(self.times, float), start,  # noqa: E731
+                                    _SIMULATION_STEPS * self.steps).y
+        if not sample_shape:
+            return run(key)
+        keys = jax.random.split(key, int(np.prod(sample_shape)))
+        return jax.vmap(run)(keys).reshape(*sample_shape, *self.event_shape)
+
+    def smooth(self, y: Any, at: Any = None) -> SmootherResult:
+        """Smooth with this distribution's settings; see `lfm_ppl.smooth`."""
+        plan = schedule(self._ssm, self.times, self.steps, self.max_step, at, row_per_step=self.iterations > 0)
+        y = check_observations(y, *self.event_shape)
+        return smooth_on(self._ssm, self.rule, plan, y, self.iterations, self.damping)
+
+
+class Panel(dist.Distribution):
+    """Many independent series as one distribution with a batch shape; made by `panel`."""
+
+    support = constraints.real_matrix
+    pytree_data_fields = ("parameters", "times")
+    pytree_aux_fields = ("build", "settings")
+
+    def __init__(self, build: Callable[..., LatentForceModel], parameters: Any, times: Any, settings: dict[str, Any]):
+        leaves = jax.tree_util.tree_leaves(parameters)
+        if not leaves:
+            raise ValueError("parameters must hold at least one array with a leading axis for the series.")
+        sizes = {np.shape(leaf)[0] if np.ndim(leaf) else None for leaf in leaves}
+        if len(sizes) > 1 or None in sizes:
+            shapes = [np.shape(leaf) for leaf in leaves]
+            raise ValueError(f"every array in parameters needs the same leading axis, one entry a series; got {shapes}. "
+                             "Repeat a shared parameter with jnp.broadcast_to, or close over it in build.")
+        self.build, self.parameters, self.times, self.settings = build, parameters, times, settings
+        (count,) = sizes
+        self._series_times = np.ndim(times) == 2
+        if self._series_times and np.shape(times)[0] != count:
+            raise ValueError(f"times has {np.shape(times)[0]} rows for {count} series; give one row a series, or one "
+                             "vector for all.")
+        one = jax.eval_shape(lambda p, t: jnp.zeros(self._one(p, t).event_shape),
+                             jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf)[0], parameters),
+                             jnp.zeros(np.shape(times)[-1]))
+        if not self._series_times:
+            self._one(jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf)[0], parameters), times)
+        super().__init__((count,), one.shape, validate_args=False)
+
+    def _one(self, parameters: Any, times: Any) -> MarginalLikelihood:
+        return MarginalLikelihood(self.build(parameters), times, **self.settings)
+
+    def _mapped(self, function: Callable[..., jax.Array], *arguments: Any) -> jax.Array:
+        times = jnp.asarray(self.times, float) if self._series_times else None
+        call = lambda p, t, *rest: function(  # noqa: E731
+            self._one(p, self.times if t is None else t), *rest)
+        return jax.vmap(call, in_axes=(0, None if times is None else 0, *(0 for _ in arguments)))(
+            self.parameters, times, *arguments)
+
+    def log_prob_per_observation(self, value: Any) -> jax.Array:
+        """Return (B, T): the one-step-ahead log densities of each series."""
+        return self._mapped(lambda one, y: one.log_prob_per_observation(y), self._checked(value))
+
+    def log_prob(self, value: Any) -> jax.Array:
+        """Return (B,): the log marginal likelihood of each series; zero where a series is all missing."""
+        value = jnp.asarray(value, float)
+        if value.ndim > 3:
+            return jax.vmap(self.log_prob)(value)
+        return self.log_prob_per_observation(value).sum(-1)
+
+    def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
+        """Simulate every series: (*sample_shape, B, T, D)."""
+
+        def draw(key: jax.Array) -> jax.Array:
+            keys = jax.random.split(key, self.batch_shape[0])
+            return self._mapped(lambda one, k: one.sample(k), keys)
+
+        if not sample_shape:
+            return draw(key)
+        keys = jax.random.split(key, int(np.prod(sample_shape)))
+        return jax.vmap(draw)(keys).reshape(*sample_shape, *self.batch_shape, *self.event_shape)
+
+    def _checked(self, value: Any) -> jax.Array:
+        expected = (*self.batch_shape, *self.event_shape)
+        if np.shape(value) != expected:
+            raise ValueError(f"y must have shape {expected} (series, times, outputs), got {np.shape(value)}; pad a "
+                             "shorter series with NaN.")
+        known = checks.concrete(value)
+        if known is not None and np.isinf(known).any():
+            raise ValueError("y has infinite entries; use NaN for a missing entry.")
+        return jnp.asarray(value, float)
+
+
+def panel(build: Callable[..., LatentForceModel], parameters: Any, times: Any, rule: Rule | None = None,
+          steps: int = 10, max_step: float | None = None, iterations: int = 0, damping: float = 0.7) -> Panel:
+    """Return many independent series as one distribution, for use inside ``numpyro.plate``.
+
+    Args:
+        build: maps the parameters of ONE series to its `LatentForceModel`; it may close over shared parameters.
+        parameters: pytree of arrays with a leading axis (B,), one entry a series.
+        times: (T,) for all, or (B, T); ragged series are padded: NaN in y, and times that repeat the last one.
+        rule, steps, max_step, iterations, damping: as `MarginalLikelihood`.
+
+    Returns:
+        A distribution with batch shape (B,) and event shape (T, D).
+
+    Raises:
+        ValueError: arrays without a common leading axis; a wrong number of rows of times.
+
+    Example:
+        >>> import jax.numpy as jnp, lfm_ppl as lfm
+        >>> def build(p):
+        ...     return lfm.LatentForceModel(
+        ...         lambda x, u, t: u - p["rate"] * x, {"u": lfm.Matern(1.0, 1.0)},
+        ...         lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
+        >>> lfm.panel(build, {"rate": jnp.array([0.5, 1.0])}, jnp.arange(3.0)).batch_shape
+        (2,)
+    """
+    settings = {"rule": as_rule(rule), "steps": steps, "max_step": max_step, "iterations": iterations,
+                "damping": damping}
+    return Panel(build, parameters, times, settings)

@@ -1,0 +1,141 @@
+"""Simulation of the real, non-linear model."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from lfm_ppl import checks
+from lfm_ppl.linalg import matmul, semidefinite_root
+from lfm_ppl.model.augment import StateSpaceModel, check_times, state_space
+from lfm_ppl.model.latent_force_model import LatentForceModel
+
+
+class Simulation(NamedTuple):
+    """A simulated data set.
+
+    Attributes:
+        times: (T,).
+        state: (T, M), the physical state.
+        forces: name -> (T,).
+        y: (T, D).
+    """
+
+    times: jax.Array
+    state: jax.Array
+    forces: dict[str, jax.Array]
+    y: jax.Array
+
+
+def simulate(key: jax.Array, model: LatentForceModel, times: Any, steps: int = 50) -> Simulation:
+    """Simulate a latent force model.
+
+    The forces are exact at every integration step. Without process noise the state follows by Heun's method along the
+    sampled force path; with process noise by its stochastic form (Stratonovich-free: the noise enters each step with
+    the dispersion at its start, so the scheme is the Ito one, of strong order 1 for additive noise).
+
+    Args:
+        key: a JAX random key.
+        model: the latent force model.
+        times: (T,), non-decreasing; equal times get the same state and independent observations.
+        steps: integration steps between two consecutive times.
+
+    Returns:
+        Times, state, forces and observations.
+
+    Raises:
+        ValueError: unsorted times, times before the initial time, non-positive steps.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, lfm_ppl as lfm
+        >>> model = lfm.LatentForceModel(
+        ...     lambda x, u, t: u - x, {"u": lfm.Matern(1.0, 1.0)},
+        ...     lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
+        >>> lfm.simulate(jax.random.key(0), model, jnp.arange(4.0)).y.shape
+        (4, 1)
+
+    Source: Kloeden and Platen (1992), section 9.1.
+    """
+    checks.positive_integer("steps", steps)
+    ssm = state_space(model)
+    check_times(times, model.initial_time)
+    times = jnp.asarray(times, float)
+    start = times[0] if model.initial_time is None else jnp.asarray(model.initial_time, float)
+    run = lambda key, times, start: simulate_on(ssm, key, times, start, steps)  # noqa: E731
+    traced = checks.traced((model, times, key))
+    return (run if traced else jax.jit(run))(key, times, start)
+
+
+def simulate_on(ssm: StateSpaceModel, key: jax.Array, times: jax.Array, start: jax.Array, steps: int) -> Simulation:
+    """The same for a state-space model, without checks; for compiled code."""
+    initial, path, noise = jax.random.split(key, 3)
+    mean, covariance = ssm.initial()
+    first = mean + matmul(semidefinite_root(covariance), jax.random.normal(initial, (ssm.state_dim, 1)))[:, 0]
+    starts = jnp.concatenate([jnp.reshape(start, (1,)), times[:-1]])
+    jumps = jnp.asarray(ssm.stack.jump_times, float)
+
+    def row(state: jax.Array, inputs: tuple) -> tuple[jax.Array, jax.Array]:
+        begin, end, row_key = inputs
+        h = (end - begin) / steps
+        transition, covariance = ssm.stack.discretise(h)
+        root = semidefinite_root(covariance)
+
+        def step(state: jax.Array, index: jax.Array) -> tuple[jax.Array, None]:
+            keys = jax.random.fold_in(row_key, index)
+            state = _simulation_step(ssm, state, begin + index * h, h, transition, root, keys)
+            return _cross_jumps(ssm, jumps, state, begin + index * h, begin + (index + 1) * h, keys), None
+
+        state, _ = jax.lax.scan(step, state, jnp.arange(steps))
+        return state, state
+
+    _, states = jax.lax.scan(row, first, (starts, times, jax.random.split(path, times.shape[0])))
+    matrix, offset = jax.vmap(ssm.input_map)(times)
+    inputs = matmul(matrix, states[..., None])[..., 0] + offset
+    y = jax.vmap(lambda w, t, k, index: _observe(ssm, w, t, k, index))(
+        inputs, times, jax.random.split(noise, times.shape[0]), jnp.arange(times.shape[0]))
+    size = ssm.physical_dim
+    forces = {name: inputs[:, size + index] for index, name in enumerate(ssm.model.force_names)}
+    return Simulation(times, inputs[:, :size], forces, y)
+
+
+def _simulation_step(ssm: StateSpaceModel, state: jax.Array, t: jax.Array, h: jax.Array, transition: jax.Array,
+                     root: jax.Array, key: jax.Array) -> jax.Array:
+    size = ssm.physical_dim
+    force_key, state_key = jax.random.split(key)
+    draw = jax.random.normal(force_key, (ssm.force_dim, 1))
+    forces = (matmul(transition, state[size:, None]) + matmul(root, draw))[:, 0]
+
+    def inputs(x: jax.Array, z: jax.Array, time: jax.Array) -> jax.Array:
+        matrix, offset = ssm.input_map(time)
+        return matmul(matrix, jnp.concatenate([x, z])[:, None])[:, 0] + offset
+
+    x = state[:size]
+    now = inputs(x, state[size:], t)
+    slope = ssm.drift(now, t)
+    dispersion = ssm.dispersion(now, t)
+    kick = jnp.zeros(size)
+    if dispersion is not None:
+        kick = jnp.sqrt(h) * matmul(dispersion, jax.random.normal(state_key, (dispersion.shape[1], 1)))[:, 0]
+    after = ssm.drift(inputs(x + h * slope + kick, forces, t + h), t + h)
+    return jnp.concatenate([x + 0.5 * h * (slope + after) + kick, forces])
+
+
+def _cross_jumps(ssm: StateSpaceModel, jumps: jax.Array, state: jax.Array, begin: jax.Array, end: jax.Array,
+                 key: jax.Array) -> jax.Array:
+    """Apply the forces' jumps that fall into (begin, end], at the step's end."""
+    size = ssm.physical_dim
+    for index in range(len(ssm.stack.jump_times)):
+        transition, covariance = ssm.stack.jump(index)
+        draw = jax.random.normal(jax.random.fold_in(key, index + 1), (ssm.force_dim, 1))
+        jumped = (matmul(transition, state[size:, None]) + matmul(semidefinite_root(covariance), draw))[:, 0]
+        crossed = (jumps[index] > begin) & (jumps[index] <= end)
+        state = state.at[size:].set(jnp.where(crossed, jumped, state[size:]))
+    return state
+
+
+def _observe(ssm: StateSpaceModel, w: jax.Array, t: jax.Array, key: jax.Array, index: jax.Array) -> jax.Array:
+    covariance = ssm.noise_covariance(w, t, index)
+    draw = jax.random.normal(key, (covariance.shape[0], 1))
+    return ssm.observe(w, t) + matmul(semidefinite_root(covariance), draw)[:, 0]
