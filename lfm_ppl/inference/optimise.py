@@ -38,7 +38,7 @@ class Objective:
 
     def value(self, point: np.ndarray) -> float:
         """Return the value, infinite where it is not finite."""
-        value = float(self._value(jnp.asarray(point)))
+        value, _ = self.value_and_gradient(point)  # one program to compile instead of two
         return value if np.isfinite(value) else np.inf
 
     def value_and_gradient(self, point: np.ndarray) -> tuple[float, np.ndarray]:
@@ -56,10 +56,6 @@ class Objective:
             gradient = lambda x: self.value_and_gradient(x)[1]  # noqa: E731
             hessian, noise = finite_difference_hessian(gradient, point), _DIFFERENCE_NOISE
         return decompose(hessian, noise) if np.all(np.isfinite(hessian)) else None
-
-    @cached_property
-    def _value(self) -> Callable:
-        return jax.jit(self.function)
 
     @cached_property
     def _value_and_gradient(self) -> Callable:
