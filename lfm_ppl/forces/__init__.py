@@ -1,7 +1,6 @@
 """Forces: Gaussian process priors in state-space form."""
 
 from lfm_ppl.forces.constant import Constant
-from lfm_ppl.forces.discretise import discretise
 from lfm_ppl.forces.matern import Matern
 from lfm_ppl.forces.sde import Force
 from lfm_ppl.forces.squared_exponential import SquaredExponential
@@ -16,5 +15,4 @@ __all__ = [
     "Stack",
     "Sum",
     "WienerVelocity",
-    "discretise",
 ]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +14,7 @@ SUBSTEP = 0.5
 """Largest size of F h at which the power series starts; 13 terms of it are exact to rounding."""
 
 
+@functools.partial(jax.jit, static_argnames="max_doublings")
 def discretise(
     feedback: jax.Array, diffusion: jax.Array, dt: jax.Array, max_doublings: int = 32
 ) -> tuple[jax.Array, jax.Array]:
@@ -50,13 +53,14 @@ def discretise(
     """
     feedback, diffusion, dt = _as_arrays(feedback, diffusion, dt)
     series, step, doublings = _start(feedback, dt)
-    nodes, weights = gauss_legendre(_node_count(feedback.shape[0]))
+    nodes, weights = _quadrature(series)
     flow = (powers(nodes, len(series))[:, :, None, None] * series).sum(1)
     spread = matmul(matmul(flow, diffusion), flow.mT)
     noise = step * (weights[:, None, None] * spread).sum(0)
     return double(series.sum(0), noise, doublings, max_doublings)
 
 
+@functools.partial(jax.jit, static_argnames="max_doublings")
 def discretise_dispersion(
     feedback: jax.Array, dispersion: jax.Array, dt: jax.Array, max_doublings: int = 32
 ) -> tuple[jax.Array, jax.Array]:
@@ -84,6 +88,7 @@ def discretise_dispersion(
     return discretise_series(series, dispersion, step, doublings, max_doublings)
 
 
+@functools.partial(jax.jit, static_argnames="max_doublings")
 def discretise_series(
     series: jax.Array,
     dispersion: jax.Array,
@@ -103,10 +108,10 @@ def discretise_series(
     Returns:
         ``Phi`` (n, n) and ``Q`` (n, n) of the long step.
     """
-    nodes, weights = gauss_legendre(_node_count(series.shape[-1]))
+    nodes, weights = _quadrature(series)
     columns = matmul(series, dispersion)
     columns = (powers(nodes, len(series))[:, :, None, None] * columns).sum(1)
-    columns = jnp.moveaxis(columns * np.sqrt(weights)[:, None, None], 0, 1)
+    columns = jnp.moveaxis(columns * jnp.sqrt(weights)[:, None, None], 0, 1)
     columns = columns.reshape(series.shape[-1], -1)
     noise = step * (columns[:, None, :] * columns[None, :, :]).sum(-1)
     return double(series.sum(0), noise, doublings, max_doublings)
@@ -192,28 +197,34 @@ def _start(feedback, dt):
     doublings = doublings_for(_growth(jax.lax.stop_gradient(feedback * dt)))
     step = dt * jnp.exp2(-doublings)
     scaled = feedback * step
-    term = jnp.eye(feedback.shape[0], dtype=feedback.dtype)
-    series = [term]
-    for k in range(1, term_count(feedback.shape[0])):
-        term = matmul(scaled, term) / k
-        series.append(term)
-    return jnp.stack(series), step, doublings
+
+    def body(term, k):
+        return matmul(scaled, term) / k, term
+
+    orders = jnp.arange(1, 1 + term_count(feedback.shape[0]), dtype=feedback.dtype)
+    _, series = jax.lax.scan(body, jnp.eye(feedback.shape[0], dtype=feedback.dtype), orders)
+    return series, step, doublings
 
 
 def _growth(matrix):
-    """Return the largest of ``||X^2||^(1/2)`` and ``||X^3||^(1/3)``.
+    """Return the larger of ``||X^3||^(1/3)`` and ``||X^4||^(1/4)``.
 
-    It bounds the power series as the norm of X does, and is much smaller where coordinates have
-    different units, and zero where X is nilpotent: fewer doublings, and less rounding.
+    It bounds the terms of order 6 and more of the power series as the norm of X does, and is much
+    smaller where coordinates have different units, and zero for short chains of integrators: fewer
+    doublings, and less rounding.
     """
-    norm = jnp.abs(matrix).sum(-2).max(initial=0.0)
+    norm = _norm(matrix)
     unit = matrix / jnp.where(norm > 0.0, norm, 1.0)
     square = matmul(unit, unit)
-    second = jnp.abs(square).sum(-2).max(initial=0.0)
-    third = jnp.abs(matmul(square, unit)).sum(-2).max(initial=0.0)
-    return norm * jnp.maximum(jnp.sqrt(second), jnp.cbrt(third))
+    third, fourth = _norm(matmul(square, unit)), _norm(matmul(square, square))
+    return norm * jnp.maximum(jnp.cbrt(third), jnp.sqrt(jnp.sqrt(fourth)))
 
 
-def _node_count(state_dim):
+def _norm(matrix):
+    return jnp.abs(matrix).sum(-2).max(initial=0.0)
+
+
+def _quadrature(series):
     # m nodes are exact to degree 2m - 1; a chain of n states has an integrand of order s^(2n-2).
-    return min(max(6, state_dim + 3), 12)
+    rule = gauss_legendre(min(max(6, series.shape[-1] + 3), 12))
+    return tuple(jnp.asarray(part, series.dtype) for part in rule)

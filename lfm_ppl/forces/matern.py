@@ -192,6 +192,6 @@ def _short_noise(x, constants):
     """Return ``c int_0^x v(y) v(y)' dy`` (n, n), where v(y) is the last column of the flow."""
     y = x * constants.nodes
     last = constants.polynomial[:, :, -1]
-    column = (powers(y, len(last))[:, :, None] * last).sum(1) * jnp.exp(-y)[:, None]
-    weight = constants.density * x * constants.weights
-    return (weight[:, None, None] * column[:, :, None] * column[:, None, :]).sum(0)
+    weight = np.sqrt(constants.density * constants.weights)
+    column = (powers(y, len(last))[:, :, None] * last).sum(1) * (jnp.exp(-y) * weight)[:, None]
+    return x * (column[:, :, None] * column[:, None, :]).sum(0)

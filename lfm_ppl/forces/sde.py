@@ -1,7 +1,5 @@
 """The force protocol: a Gaussian process prior written as a linear SDE."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import equinox as eqx
@@ -169,7 +167,7 @@ class Force(eqx.Module):
         count = len(self.jump_times)
         raise IndexError(f"{type(self).__name__} has {count} jumps, so none at index {index}.")
 
-    def __add__(self, other: Force) -> Force:
+    def __add__(self, other: "Force") -> "Force":
         """Return the force that is the sum of two independent forces."""
         # The sum is itself a force, so its module imports this one.
         from lfm_ppl.forces.sum import Sum

@@ -136,7 +136,7 @@ class _Constants(NamedTuple):
     dispersion: np.ndarray  # (n, 1)
     covariance: np.ndarray  # (n, n) stationary
     series: np.ndarray  # (K, n, n): F^k / k!
-    growth: float  # ||F^2||^(1/2), which bounds the series as ||F|| does
+    growth: float  # bounds the series as ||F|| does, more closely
     max_doublings: int  # enough to reach _FAR
 
 
@@ -153,7 +153,8 @@ def _constants(order: int) -> _Constants:
     for k in range(1, term_count(order)):
         term = feedback @ term / k
         series.append(term)
-    growth = float(np.sqrt(np.linalg.norm(feedback @ feedback, 1)))
+    cube = np.linalg.matrix_power(feedback, 3)
+    growth = max(np.linalg.norm(cube, 1) ** (1 / 3), np.linalg.norm(cube @ feedback, 1) ** (1 / 4))
     return _Constants(
         rate=rate,
         feedback=feedback,

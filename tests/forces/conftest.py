@@ -1,0 +1,123 @@
+"""The list of forces that the contract tests run over, and an exact reference."""
+
+from __future__ import annotations
+
+from decimal import Decimal, localcontext
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lfm_ppl.forces import Constant, Force, Matern, SquaredExponential, WienerVelocity
+
+# Functions of (scale, lengthscale). A new force is covered by a line here.
+FORCES = {
+    **{f"matern_{p}": lambda s, ell, p=p: Matern(s, ell, order=p) for p in range(6)},
+    **{
+        f"squared_exponential_{n}": lambda s, ell, n=n: SquaredExponential(s, ell, order=n)
+        for n in (2, 4, 6, 8)
+    },
+    "wiener_velocity": lambda s, ell: WienerVelocity(s, 0.5 * s, 2.0 * s / ell, mean=0.5),
+    "constant": lambda s, ell: Constant(s),
+    "sum": lambda s, ell: Matern(s, ell, order=1, mean=1.0) + Constant(2.0 * s),
+    "nested_sum": lambda s, ell: Matern(s, ell, order=2) + (Matern(s, ell, 0) + Matern(s, ell, 0)),
+    "oscillator": lambda s, ell: Oscillator(s, ell),
+    "jumping_sum": lambda s, ell: Oscillator(s, ell, (1.0, 3.0)) + Matern(s, ell),
+}
+# Forces whose state-space form has exactly the covariance that they state in closed form.
+EXACT = [name for name in FORCES if not name.startswith(("squared", "oscillator", "jumping"))]
+
+
+class Oscillator(Force):
+    """A critically damped oscillator that says the least possible, so that the defaults are used.
+
+    The state (u, u'/w) has the stationary covariance scale^2 I. At each jump the velocity turns
+    round and gains variance.
+    """
+
+    scale: jax.Array
+    lengthscale: jax.Array
+    jumps: tuple[float, ...] = eqx.field(static=True, default=())
+    mean: Any = 0.0
+
+    state_dim = 2
+    noise_dim = 1
+
+    @property
+    def stationary(self):
+        return not self.jumps
+
+    def initial_covariance(self):
+        return self.scale**2 * jnp.eye(2)
+
+    def feedback(self):
+        return jnp.array([[0.0, 1.0], [-1.0, -2.0]]) / self.lengthscale
+
+    def dispersion(self):
+        return jnp.array([[0.0], [1.0]]) * self.scale * 2.0 / jnp.sqrt(self.lengthscale)
+
+    @property
+    def jump_times(self):
+        return self.jumps
+
+    def jump(self, index):
+        if index >= len(self.jumps):
+            return super().jump(index)
+        return jnp.diag(jnp.array([1.0, -1.0])), jnp.diag(jnp.array([0.0, 0.1 * (index + 1.0)]))
+
+
+@pytest.fixture(params=FORCES)
+def build(request):
+    """Each force in turn, as a function of (scale, lengthscale)."""
+    return FORCES[request.param]
+
+
+@pytest.fixture(params=EXACT)
+def build_exact(request):
+    return FORCES[request.param]
+
+
+@pytest.fixture
+def oscillator():
+    return Oscillator
+
+
+@pytest.fixture
+def exact_step():
+    return _exact_step
+
+
+def _exact_step(feedback, dispersion, dt, digits=150):
+    """Return exp(F dt) and the process noise from their Taylor series in 150-digit arithmetic.
+
+    Q' = F Q + Q F' + L L', so that Q = sum_k M_k dt^(k+1) / (k+1)!, M_0 = L L',
+    M_(k+1) = F M_k + M_k F'. Meant for |F dt| up to about 20.
+    """
+
+    def exact(matrix):
+        array = np.asarray(matrix, dtype=float)
+        return np.array([Decimal(float(x)) for x in array.ravel()], dtype=object).reshape(
+            array.shape
+        )
+
+    with localcontext() as context:
+        context.prec = digits
+        step = exact(feedback) * Decimal(float(dt))
+        column = exact(dispersion)
+        n = len(step)
+        term, transition = exact(np.eye(n)), exact(np.zeros((n, n)))
+        moment = (
+            column.dot(column.T) * Decimal(float(dt)) if column.size else exact(np.zeros((n, n)))
+        )
+        noise = exact(np.zeros((n, n)))
+        for k in range(1, 1000):
+            transition, noise = transition + term, noise + moment
+            term = step.dot(term) / k
+            moment = (step.dot(moment) + moment.dot(step.T)) / (k + 1)
+            size = max(abs(x) for x in [*term.ravel(), *moment.ravel()])
+            if k > 3 * n and size < Decimal(10) ** (20 - digits):
+                return transition.astype(float), noise.astype(float)
+    raise AssertionError("the Taylor series did not converge")

@@ -1,0 +1,159 @@
+"""What every force must satisfy; the list of forces is in conftest.py."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.linalg import expm
+
+SCALE, LENGTHSCALE = 1.3, 0.7
+EXTREME_LENGTHSCALES = (1e-8, 1.0, 1e8)
+
+
+@jax.jit
+def steps(force, dts):
+    return jax.vmap(force.discretise)(dts)
+
+
+def entrywise_error(noise, expected):
+    """The error of each covariance relative to its own two standard deviations."""
+    sd = np.sqrt(np.diagonal(expected, axis1=-2, axis2=-1))
+    sd = np.where(sd > 0, sd, 1.0)
+    return np.abs((noise - expected) / sd[..., :, None] / sd[..., None, :]).max()
+
+
+def test_shapes(build):
+    force = build(SCALE, LENGTHSCALE)
+    n, s = force.state_dim, force.noise_dim
+    assert force.initial_covariance().shape == (n, n)
+    assert force.feedback().shape == (n, n)
+    assert force.dispersion().shape == (n, s)
+    assert force.transition(0.1).shape == force.process_noise(0.1).shape == (n, n)
+    assert force.measurement(0.0).shape == (n,)
+    assert force.mean_at(0.0).shape == ()
+    for index in range(len(force.jump_times)):
+        assert [m.shape for m in force.jump(index)] == [(n, n), (n, n)]
+    with pytest.raises(IndexError):
+        force.jump(len(force.jump_times))
+
+
+def test_transition_is_the_matrix_exponential(build):
+    force = build(SCALE, LENGTHSCALE)
+    for dt in (1e-3, 0.2, 1.0, 5.0):
+        assert_allclose(force.transition(dt), expm(np.asarray(force.feedback()) * dt), atol=1e-12)
+
+
+def test_step_equals_the_taylor_series_in_high_precision(build, exact_step):
+    force = build(SCALE, LENGTHSCALE)
+    feedback, dispersion = force.feedback(), force.dispersion()
+    dts = LENGTHSCALE * np.array([1e-8, 1e-3, 0.1, 0.5, 3.0])
+    transitions, noises = steps(force, dts)
+    for dt, transition, noise in zip(dts, transitions, noises, strict=True):
+        expected_transition, expected_noise = exact_step(feedback, dispersion, dt)
+        assert_allclose(transition, expected_transition, atol=1e-13 * force.state_dim)
+        assert entrywise_error(noise, expected_noise) < 1e-12
+
+
+def test_no_time_no_change(build):
+    force = build(SCALE, LENGTHSCALE)
+    assert_array_equal(force.transition(0.0), np.eye(force.state_dim))
+    assert_array_equal(force.process_noise(0.0), np.zeros((force.state_dim, force.state_dim)))
+
+
+def test_two_steps_are_one(build):
+    force = build(SCALE, LENGTHSCALE)
+    for first, second in ((1e-6, 1e-7), (0.3, 0.4), (0.5, 40.0)):
+        (a, b, whole), (qa, qb, q) = steps(force, jnp.array([first, second, first + second]))
+        assert_allclose(b @ a, whole, atol=1e-13 * max(1.0, np.abs(whole).max()))
+        assert entrywise_error(b @ qa @ b.T + qb, q) < 1e-12
+
+
+def test_stationary_covariance(build):
+    force = build(SCALE, LENGTHSCALE)
+    if not force.stationary:
+        pytest.skip("not stationary")
+    p, f, column = force.initial_covariance(), force.feedback(), force.dispersion()
+    lyapunov = f @ p + p @ f.T + column @ column.T
+    assert np.abs(lyapunov).max() <= 1e-14 * np.abs(f).max() * np.abs(p).max() * force.state_dim
+    dts = LENGTHSCALE * np.logspace(-8, 6, 29)
+    transition, noise = steps(force, dts)
+    assert_allclose(
+        transition @ p @ transition.mT + noise, np.broadcast_to(p, noise.shape), atol=1e-13
+    )
+
+
+def test_process_noise_is_semidefinite(build):
+    for lengthscale in EXTREME_LENGTHSCALES:
+        force = build(SCALE, lengthscale)
+        transition, noise = steps(force, lengthscale * np.logspace(-8, 6, 57))
+        assert np.isfinite(transition).all()
+        assert_array_equal(noise, noise.mT)
+        eigenvalues = np.linalg.eigvalsh(noise)
+        assert (eigenvalues[:, 0] >= -1e-13 * eigenvalues[:, -1]).all()
+
+
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.grad])
+def test_gradients_are_finite(build, mode):
+    def total(scale, ell, dt):
+        force = build(scale, ell)
+        transition, noise = force.discretise(dt)
+        return transition.sum() + noise.sum() + force.initial_covariance().sum()
+
+    gradient = jax.jit(jax.vmap(mode(total, (0, 1, 2)), (None, None, 0)))
+    for lengthscale in EXTREME_LENGTHSCALES:
+        dts = lengthscale * jnp.array([0.0, 1e-8, 1.0, 30.0, 1e3, 1e6])
+        for value in gradient(SCALE, lengthscale, dts):
+            assert np.isfinite(value).all()
+
+
+def test_gradient_equals_finite_differences(build):
+    def parts(point):
+        scale, ell, dt = point
+        transition, noise = build(scale, ell).discretise(dt)
+        return jnp.stack([transition, noise])
+
+    h = 1e-5
+    # Among the steps are some on either side of where the Matern noise changes its formula.
+    points = np.array([[SCALE, LENGTHSCALE, x * LENGTHSCALE] for x in (0.01, 0.6, 4.0, 9.0)])
+    gradient = jax.jit(jax.vmap(jax.jacfwd(parts)))(points)
+    assert_allclose(gradient, jax.jit(jax.vmap(jax.jacrev(parts)))(points), rtol=1e-12, atol=1e-14)
+    parts = jax.jit(jax.vmap(parts))
+    for i, unit in enumerate(np.eye(3)):
+        difference = (parts(points + h * unit) - parts(points - h * unit)) / (2 * h)
+        assert_allclose(gradient[..., i], difference, rtol=1e-6, atol=3e-7)
+
+
+def test_covariance_of_the_sde_is_the_closed_form(build_exact):
+    force = build_exact(SCALE, LENGTHSCALE)
+    t, s = np.meshgrid(
+        LENGTHSCALE * np.array([0.0, 1e-6, 0.1, 0.5, 1.0, 3.0, 20.0]), [0.0, 0.4, 2.0]
+    )
+    covariance = force.covariance(t, s)
+    assert_allclose(force.sde_covariance(t, s), covariance, rtol=1e-12, atol=1e-12)
+    assert_allclose(force.covariance(s, t), covariance, rtol=1e-13)
+    if force.stationary:
+        assert_allclose(force.covariance(t - s), covariance, rtol=1e-12)
+
+
+def test_covariance_has_a_finite_gradient_at_lag_zero(build_exact):
+    def covariance(scale, ell, lag):
+        return build_exact(scale, ell).covariance(lag)
+
+    for lag in (0.0, 1e6 * LENGTHSCALE):
+        gradient = jax.grad(covariance, (0, 1, 2))(SCALE, LENGTHSCALE, lag)
+        assert np.isfinite(gradient).all()
+
+
+def test_jit_and_vmap_over_parameters(build):
+    scales, lengthscales = jnp.array([0.5, 2.0]), jnp.array([0.3, 4.0])
+    forces = jax.vmap(build)(scales, lengthscales)
+    noise = jax.jit(jax.vmap(lambda force: force.process_noise(0.6)))(forces)
+    for i in range(2):
+        expected = build(scales[i], lengthscales[i]).process_noise(0.6)
+        assert_allclose(noise[i], expected, rtol=1e-12, atol=1e-15)
+
+
+def test_constructors_take_tracers_of_any_value(build):
+    value = jax.jit(lambda s, ell: build(s, ell).initial_covariance())(-1.0, jnp.nan)
+    assert value.ndim == 2
