@@ -1,9 +1,14 @@
 """Bayesian inference in latent force models, on NumPyro."""
 
+from lfm_ppl.data import Data, read_csv
 from lfm_ppl.filtering.filter import FilterResult, FilterState, filter
 from lfm_ppl.filtering.smoother import SmootherResult, smooth
 from lfm_ppl.forces import Constant, Force, Matern, SquaredExponential, WienerVelocity
+from lfm_ppl.inference.fit import ConvergenceWarning, fit
+from lfm_ppl.inference.fixing import fix
+from lfm_ppl.inference.map import MAPResult, map_estimate
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, panel
+from lfm_ppl.inference.ram import RAM
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.linearisation.sigma_points import (
     CentralDifference,
@@ -24,7 +29,9 @@ __version__ = "0.1.0"
 __all__ = [
     "CentralDifference",
     "Constant",
+    "ConvergenceWarning",
     "Cubature",
+    "Data",
     "FilterResult",
     "FilterState",
     "Force",
@@ -33,9 +40,11 @@ __all__ = [
     "GaussianObservation",
     "Input",
     "LatentForceModel",
+    "MAPResult",
     "MarginalLikelihood",
     "Matern",
     "MonteCarlo",
+    "RAM",
     "Rule",
     "Simulation",
     "SmootherResult",
@@ -45,7 +54,11 @@ __all__ = [
     "Unscented",
     "WienerVelocity",
     "filter",
+    "fit",
+    "fix",
+    "map_estimate",
     "panel",
+    "read_csv",
     "simulate",
     "smooth",
     "state_space",

@@ -157,13 +157,20 @@ class Panel(dist.Distribution):
                              jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf)[0], parameters),
                              jnp.zeros(np.shape(times)[-1]))
         if not self._series_times:
-            self._one(jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf)[0], parameters), times)
+            _ = self.first  # eager checks, where the values are concrete
         super().__init__((count,), one.shape, validate_args=False)
 
     def _one(self, parameters: Any, times: Any) -> MarginalLikelihood:
         return MarginalLikelihood(self.build(parameters), times, **self.settings)
 
-    def _mapped(self, function: Callable[..., jax.Array], *arguments: Any) -> jax.Array:
+    @property
+    def first(self) -> MarginalLikelihood:
+        """The distribution of the first series."""
+        times = jnp.asarray(self.times, float)[0] if self._series_times else self.times
+        return self._one(jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf)[0], self.parameters), times)
+
+    def mapped(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Return ``function(distribution of a series, *its arguments)``, with the series as leading axis."""
         times = jnp.asarray(self.times, float) if self._series_times else None
         call = lambda p, t, *rest: function(  # noqa: E731
             self._one(p, self.times if t is None else t), *rest)
@@ -172,7 +179,7 @@ class Panel(dist.Distribution):
 
     def log_prob_per_observation(self, value: Any) -> jax.Array:
         """Return (B, T): the one-step-ahead log densities of each series."""
-        return self._mapped(lambda one, y: one.log_prob_per_observation(y), self._checked(value))
+        return self.mapped(lambda one, y: one.log_prob_per_observation(y), self.checked(value))
 
     def log_prob(self, value: Any) -> jax.Array:
         """Return (B,): the log marginal likelihood of each series; zero where a series is all missing."""
@@ -186,14 +193,15 @@ class Panel(dist.Distribution):
 
         def draw(key: jax.Array) -> jax.Array:
             keys = jax.random.split(key, self.batch_shape[0])
-            return self._mapped(lambda one, k: one.sample(k), keys)
+            return self.mapped(lambda one, k: one.sample(k), keys)
 
         if not sample_shape:
             return draw(key)
         keys = jax.random.split(key, int(np.prod(sample_shape)))
         return jax.vmap(draw)(keys).reshape(*sample_shape, *self.batch_shape, *self.event_shape)
 
-    def _checked(self, value: Any) -> jax.Array:
+    def checked(self, value: Any) -> jax.Array:
+        """Return ``value`` as an array (B, T, D) after checking it."""
         expected = (*self.batch_shape, *self.event_shape)
         if np.shape(value) != expected:
             raise ValueError(f"y must have shape {expected} (series, times, outputs), got {np.shape(value)}; pad a "

@@ -1,0 +1,360 @@
+"""From a NumPyro model and data to a posterior: one call."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from datetime import UTC, datetime
+from importlib import metadata
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+from numpyro.infer import MCMC, NUTS, init_to_median
+from numpyro.infer.util import initialize_model
+
+from lfm_ppl import checks
+from lfm_ppl.analysis import arviz_data
+from lfm_ppl.analysis.scalars import units_attribute
+from lfm_ppl.filtering.filter import check_observations
+from lfm_ppl.inference.fixing import fix
+from lfm_ppl.inference.map import map_estimate
+from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
+from lfm_ppl.inference.posterior import LikelihoodSite, likelihood_site, scores, trajectories
+from lfm_ppl.inference.ram import RAM
+
+SAMPLERS = ("nuts", "ram", "map")
+
+_FORWARD_MODE_LIMIT = 10
+"""Most unconstrained parameters for which forward-mode gradients are the faster ones."""
+
+_GRID = 200
+"""Number of grid points of trajectories where no times are asked for."""
+
+_EXTRA_FIELDS = {
+    "nuts": {"diverging": "diverging", "accept_prob": "acceptance_rate", "num_steps": "n_steps", "energy": "energy",
+             "adapt_state.step_size": "step_size", "potential_energy": "lp"},
+    "ram": {"accept_prob": "acceptance_rate", "accepted": "accepted", "potential_energy": "lp"},
+}
+
+
+class ConvergenceWarning(UserWarning):
+    """A diagnostic says that the draws do not represent the posterior yet."""
+
+
+def fit(
+    numpyro_model: Callable,
+    times: Any,
+    y: Any,
+    *,
+    sampler: str = "nuts",
+    chains: int = 4,
+    warmup: int = 1000,
+    samples: int = 1000,
+    seed: int = 0,
+    at: Any = None,
+    trajectory_draws: int = 400,
+    model_kwargs: Mapping[str, Any] | None = None,
+    fixed: Mapping[str, Any] | None = None,
+    init: Any = None,
+    sampler_options: Mapping[str, Any] | None = None,
+    chain_method: str | None = None,
+    progress: bool = True,
+    truth: Mapping[str, Any] | None = None,
+    name: str | None = None,
+) -> Any:
+    """Fit a latent force model: sample its parameters, then its forces given them.
+
+    Args:
+        numpyro_model: ``model(times, y=None, **model_kwargs)`` with one site
+            ``numpyro.sample(name, lfm.MarginalLikelihood(...), obs=y)``, or a `lfm.panel` in a plate.
+        times: (T,), non-decreasing.
+        y: (T, D), NaN where missing; (B, T, D) for a panel.
+        sampler: "nuts", "ram" (robust adaptive Metropolis), or "map" (posterior mode; the draws come from its
+            Laplace approximation).
+        chains, warmup, samples: number of chains, and of warm-up steps and draws in each.
+        seed: of everything random.
+        at: times of the trajectories; by default a grid over the data. Times after the last are forecasts.
+        trajectory_draws: number of posterior draws, spread over the chains, for which trajectories are drawn; 0: none.
+        model_kwargs: keyword arguments of the model.
+        fixed: parameters that are not learnt: name -> value, ``{"decay": 0.8}`` or ``{"decay[CDKN1A]": 0.8}``.
+        init: starting points: None for the prior median, "map" for the posterior mode, or a NumPyro strategy.
+        sampler_options: further arguments of NUTS or RAM, for example ``{"target_accept_prob": 0.95}``.
+        chain_method: "parallel", "vectorized" or "sequential"; by default parallel where there are as many devices as
+            chains (``numpyro.set_host_device_count(chains)`` before JAX starts), sequential otherwise.
+        progress: show a progress bar.
+        truth: of simulated data (``lfm.Data.truth``), stored beside the results for plots.
+        name: of the model, for the record.
+
+    Returns:
+        An ArviZ object (``InferenceData`` on ArviZ 0.23, ``xarray.DataTree`` on 1.x) with the groups
+
+        - ``posterior``: parameters, with coordinates;
+        - ``sample_stats``;
+        - ``log_likelihood``: leave-one-out conditionals log p(y_k | y_-k, theta), which make ``az.loo`` right for
+          dependent data;
+        - ``one_step_ahead``: log p(y_k | y_1:k-1, theta) and standardised residuals;
+        - ``trajectories``: forces, states and noise-free outputs at ``at``, given the data;
+        - ``posterior_predictive``: replicated data along these trajectories. (``numpyro.infer.Predictive`` with the
+          same draws simulates NEW forces instead.)
+        - ``observed_data``, and ``truth`` where known.
+
+    Raises:
+        ValueError, TypeError: unknown sampler, wrong shapes, parameters to fix that do not exist, and so on.
+
+    Warns:
+        ConvergenceWarning: R-hat above 1.01, fewer than 100 effective draws a chain, divergences; each with a remedy.
+
+    Example:
+        >>> import jax.numpy as jnp, numpyro, numpyro.distributions as dist, lfm_ppl as lfm
+        >>> def model(times, y=None):
+        ...     rate = numpyro.sample("rate", dist.LogNormal(0.0, 0.5))
+        ...     lfmodel = lfm.LatentForceModel(
+        ...         lambda x, u, t: u - rate * x, {"u": lfm.Matern(1.0, 1.0)},
+        ...         lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
+        ...     numpyro.sample("y", lfm.MarginalLikelihood(lfmodel, times), obs=y)
+        >>> times = np.arange(5.0)
+        >>> result = lfm.fit(model, times, np.sin(times)[:, None], sampler="map", samples=50, progress=False)
+        >>> result["posterior"]["rate"].shape
+        (1, 50)
+    """
+    started = time.perf_counter()
+    checks.one_of("sampler", sampler, SAMPLERS)
+    for label, value in (("chains", chains), ("samples", samples)):
+        checks.positive_integer(label, value)
+    if warmup != 0:
+        checks.positive_integer("warmup", warmup)
+    if trajectory_draws != 0:
+        checks.positive_integer("trajectory_draws", trajectory_draws)
+    keywords = dict(model_kwargs or {})
+    key = jax.random.key(seed)
+    keys = jax.random.split(key, 5)
+    arguments = (times, y)
+    site = likelihood_site(numpyro_model, (times,), keywords, keys[0])
+    y = _checked(site, y)
+    outputs = site.example.ssm.model.output_names
+    model = fix(numpyro_model, fixed, labels=outputs) if fixed else numpyro_model
+    arguments = (times, y)
+    if sampler == "map":
+        draws, stats, remarks = _mode(model, arguments, keywords, keys[1], samples, seed, init)
+        chains = 1
+    else:
+        strategy = _strategy(init, model, arguments, keywords, seed)
+        kernel = _kernel(sampler, model, arguments, keywords, strategy, sampler_options, keys[2])
+        draws, stats = _sample(kernel, sampler, arguments, keywords, keys[1], chains, warmup, samples, chain_method,
+                               progress)
+        remarks = {}
+    flat = {label: value.reshape(-1, *value.shape[2:]) for label, value in draws.items()}
+    latent = _latent(model, arguments, keywords, keys[0], flat)
+    rated = scores(model, arguments, keywords, latent, y)
+    chosen, paths, grid = _paths(model, arguments, keywords, latent, site, y, at, trajectory_draws, chains, samples,
+                                 keys[3])
+    groups = _groups(site, draws, stats, rated, paths, chosen, grid, times, y, truth, chains, samples)
+    attrs = {
+        "model": name or getattr(numpyro_model, "__name__", "model"), "rule": site.example.rule.name,
+        "steps": site.example.steps, "max_step": site.example.max_step, "iterations": site.example.iterations,
+        "sampler": sampler, "seed": seed, "chains": chains, "warmup": warmup if sampler != "map" else 0,
+        "samples": samples, "fixed": json.dumps({k: np.asarray(v).tolist() for k, v in (fixed or {}).items()}),
+        "wall_time_s": round(time.perf_counter() - started, 3), "versions": json.dumps(_versions()),
+        "created_at": datetime.now(UTC).isoformat(timespec="seconds"), **remarks,
+    }
+    result = arviz_data.build(groups, {k: v for k, v in attrs.items() if v is not None})
+    if sampler != "map":
+        for message in arviz_data.convergence_warnings(result):
+            warnings.warn(message, ConvergenceWarning, stacklevel=2)
+    return result
+
+
+def _checked(site: LikelihoodSite, y: Any) -> jax.Array:
+    if isinstance(site.distribution, Panel):
+        return site.distribution.checked(y)
+    return check_observations(y, *site.distribution.event_shape)
+
+
+def _strategy(init: Any, model: Callable, arguments: tuple, keywords: dict, seed: int) -> Any:
+    if init is None:
+        return init_to_median(num_samples=15)
+    if isinstance(init, str):
+        checks.one_of("init", init, ("map", "median"))
+        if init == "median":
+            return init_to_median(num_samples=15)
+        from numpyro.infer import init_to_value
+
+        mode = map_estimate(model, *arguments, seed=seed, model_kwargs=keywords)
+        return init_to_value(values=mode.parameters)
+    if not callable(init):
+        raise TypeError('init must be None, "map", "median" or a NumPyro strategy such as '
+                        f"numpyro.infer.init_to_uniform, got {init!r}.")
+    return init
+
+
+def _kernel(sampler: str, model: Callable, arguments: tuple, keywords: dict, strategy: Any,
+            options: Mapping[str, Any] | None, key: jax.Array) -> Any:
+    options = dict(options or {})
+    if sampler == "ram":
+        return RAM(model, init_strategy=strategy, **options)
+    info = initialize_model(key, model, model_args=arguments, model_kwargs=keywords, init_strategy=strategy,
+                            validate_grad=False)
+    size = sum(np.size(leaf) for leaf in jax.tree_util.tree_leaves(info.param_info.z))
+    if size == 0:
+        raise ValueError("the model has no parameters to sample; use lfm.smooth for the forces of a known model.")
+    options.setdefault("forward_mode_differentiation", size <= _FORWARD_MODE_LIMIT)
+    return NUTS(model, init_strategy=strategy, **options)
+
+
+def _sample(kernel: Any, sampler: str, arguments: tuple, keywords: dict, key: jax.Array, chains: int, warmup: int,
+            samples: int, chain_method: str | None, progress: bool) -> tuple[dict, dict]:
+    if chain_method is None:
+        chain_method = "parallel" if jax.local_device_count() >= chains else "sequential"
+    checks.one_of("chain_method", chain_method, ("parallel", "vectorized", "sequential"))
+    mcmc = MCMC(kernel, num_warmup=warmup, num_samples=samples, num_chains=chains, chain_method=chain_method,
+                progress_bar=progress)
+    mcmc.run(key, *arguments, extra_fields=tuple(_EXTRA_FIELDS[sampler]), **keywords)
+    extra = mcmc.get_extra_fields(group_by_chain=True)
+    stats = {new: np.asarray(extra[old]) for old, new in _EXTRA_FIELDS[sampler].items()}
+    stats["lp"] = -stats["lp"]
+    if "n_steps" in stats:
+        stats["tree_depth"] = np.ceil(np.log2(stats["n_steps"] + 1)).astype(int)
+    draws = {label: np.asarray(value) for label, value in mcmc.get_samples(group_by_chain=True).items()}
+    return draws, stats
+
+
+def _mode(model: Callable, arguments: tuple, keywords: dict, key: jax.Array, samples: int, seed: int,
+          init: Any) -> tuple[dict, dict, dict]:
+    if isinstance(init, str):
+        checks.one_of("init", init, ("map", "median"))
+        init = None
+    mode = map_estimate(model, *arguments, seed=seed, model_kwargs=keywords, init=init)
+    draws = {label: np.asarray(value)[None] for label, value in mode.sample(key, samples).items()}
+    remarks = {"map_converged": int(mode.converged), "map_message": mode.message,
+               "map_log_density": float(mode.log_density), "log_evidence": float(mode.log_evidence)}
+    return draws, {}, remarks
+
+
+def _latent(model: Callable, arguments: tuple, keywords: dict, key: jax.Array, flat: dict) -> dict:
+    """The draws without deterministic sites, which the model computes itself."""
+    from numpyro import handlers
+
+    trace = handlers.trace(handlers.seed(model, key)).get_trace(*arguments, **keywords)
+    return {label: value for label, value in flat.items() if trace.get(label, {}).get("type") == "sample"}
+
+
+def _paths(model: Callable, arguments: tuple, keywords: dict, latent: dict, site: LikelihoodSite, y: Any, at: Any,
+           count: int, chains: int, samples: int, key: jax.Array) -> tuple[np.ndarray, dict | None, np.ndarray | None]:
+    """Draw trajectories for draws that are spread evenly over each chain."""
+    per_chain = min(samples, -(-count // chains))
+    if per_chain == 0:
+        return np.array([], int), None, None
+    chosen = np.unique(np.linspace(0, samples - 1, per_chain).round().astype(int))
+    rows = (np.arange(chains)[:, None] * samples + chosen).ravel()
+    times = np.asarray(arguments[0], float)
+    grid = None
+    if times.ndim == 1:
+        origin = float(site.example.plan.initial_time)
+        grid = (np.union1d(np.linspace(min(origin, times[0]), times[-1], _GRID), times) if at is None
+                else np.atleast_1d(np.asarray(at, float)))
+    elif at is not None:
+        raise ValueError("`at` needs one vector of times for all series; this panel has times of its own for each.")
+    subset = {label: value[rows] for label, value in latent.items()}
+    paths = trajectories(model, arguments, keywords, subset, y, grid, key)
+    return chosen, {k: v.reshape(chains, len(chosen), *v.shape[1:]) for k, v in paths.items()}, grid
+
+
+def _groups(site: LikelihoodSite, draws: dict, stats: dict, rated: dict, paths: dict | None, chosen: np.ndarray,
+            grid: np.ndarray | None, times: Any, y: Any, truth: Mapping[str, Any] | None, chains: int,
+            samples: int) -> dict[str, xr.Dataset]:
+    model = site.example.ssm.model
+    units = model.units
+    panel = ("series",) if isinstance(site.distribution, Panel) else ()
+    times = np.asarray(times, float)
+    per_series = times.ndim == 2
+    along = ("series", "time") if panel else ("time",)
+    coords: dict[str, Any] = {"chain": np.arange(chains), "draw": np.arange(samples)}
+    clock: dict[str, Any] = {} if per_series else {"time": ("time", times, units_attribute(["time"], units))}
+    named = {"output": list(model.output_names), "state": list(model.state_names), "force": list(model.force_names)}
+
+    def variable(dims: Sequence[str], values: Any, names: Sequence[str] = ()) -> tuple:
+        return tuple(dims), np.asarray(values), units_attribute(names, units)
+
+    split = {label: value.reshape(chains, samples, *value.shape[1:]) for label, value in rated.items()}
+    sample = ("chain", "draw", *along)
+    observed_coords = {**clock, "output": named["output"]}
+    groups = {
+        "posterior": _posterior(draws, coords, named["output"]),
+        "sample_stats": xr.Dataset({k: (("chain", "draw"), v) for k, v in stats.items()}, coords),
+        "log_likelihood": xr.Dataset({site.name: variable(sample, split["leave_one_out"])}, {**coords, **clock}),
+        "one_step_ahead": xr.Dataset(
+            {"log_density": variable(sample, split["one_step_ahead"]),
+             "residual": variable((*sample, "output"), split["residual"])}, {**coords, **observed_coords}),
+        "observed_data": xr.Dataset({site.name: variable((*along, "output"), y, named["output"])}, observed_coords),
+    }
+    if per_series:
+        groups["observed_data"] = groups["observed_data"].assign(times=(along, times))
+    if paths is not None:
+        thinned = {"chain": np.arange(chains), "draw": chosen}
+        groups["posterior_predictive"] = xr.Dataset(
+            {site.name: variable((*sample, "output"), paths["y"], named["output"])}, {**thinned, **observed_coords})
+        place = ("chain", "draw", *panel, "at")
+        at = {} if grid is None else {"at": ("at", grid, units_attribute(["time"], units))}
+        groups["trajectories"] = xr.Dataset(
+            {f"{kind}s": variable((*place, kind), paths[kind], named[kind]) for kind in named if paths[kind].shape[-1]},
+            {**thinned, **at, **{kind: named[kind] for kind in named if named[kind]}})
+    if truth:
+        groups["truth"] = _truth(truth, named, units, draws)
+    return groups
+
+
+def _posterior(draws: dict, coords: dict, outputs: list[str]) -> xr.Dataset:
+    variables, extra = {}, {}
+    for label, value in draws.items():
+        dims = []
+        for axis, size in enumerate(value.shape[2:]):
+            if size == len(outputs) and axis == 0 and value.ndim == 3 and size > 1:
+                dims.append("output")
+                extra["output"] = outputs
+            else:
+                dims.append(f"{label}_dim_{axis}")
+                extra[dims[-1]] = np.arange(size)
+        variables[label] = (("chain", "draw", *dims), value)
+    return xr.Dataset(variables, {**coords, **extra})
+
+
+def _truth(truth: Mapping[str, Any], named: dict, units: Mapping[str, str], draws: dict) -> xr.Dataset:
+    variables: dict[str, Any] = {}
+    coords: dict[str, Any] = {}
+    if truth.get("times") is not None:
+        coords["at_truth"] = ("at_truth", np.asarray(truth["times"], float), units_attribute(["time"], units))
+    forces = truth.get("forces") or {}
+    known = [label for label in named["force"] if label in forces]
+    if known:
+        coords["force"] = known
+        variables["forces"] = (("at_truth", "force"), np.stack([np.asarray(forces[n]) for n in known], axis=1),
+                              units_attribute(known, units))
+    if truth.get("state") is not None and np.ndim(truth["state"]) == 2:
+        coords["state"] = named["state"]
+        variables["states"] = (("at_truth", "state"), np.asarray(truth["state"]), units_attribute(named["state"], units))
+    for label, value in (truth.get("parameters") or {}).items():
+        value = np.asarray(value, float)
+        dims = ["output"] if value.shape == (len(named["output"]),) and value.size > 1 else \
+            [f"{label}_dim_{axis}" for axis in range(value.ndim)]
+        if dims == ["output"]:
+            coords["output"] = named["output"]
+        if label in draws:
+            variables[label] = (tuple(dims), value)
+    return xr.Dataset(variables, coords)
+
+
+def _versions() -> dict[str, str]:
+    names = ("lfm_ppl", "jax", "jaxlib", "numpyro", "arviz", "numpy", "equinox")
+    found = {"python": sys.version.split()[0]}
+    for name in names:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = "not installed"
+    return found

@@ -1,0 +1,145 @@
+"""What follows from draws of the parameters: predictive densities, residuals and trajectories."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpyro import handlers
+
+from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
+from lfm_ppl.linalg import matmul, semidefinite_root
+
+_BATCH_NUMBERS = 2_000_000
+"""Numbers that the smoother may hold for one batch of draws; more draws go one batch after another."""
+
+
+class LikelihoodSite(NamedTuple):
+    """The likelihood site of a NumPyro model.
+
+    Attributes:
+        name: of the site.
+        distribution: the `MarginalLikelihood` or the panel.
+    """
+
+    name: str
+    distribution: MarginalLikelihood | Panel
+
+    @property
+    def example(self) -> MarginalLikelihood:
+        """The distribution of one series."""
+        if isinstance(self.distribution, Panel):
+            return self.distribution.first
+        return self.distribution
+
+
+def likelihood_site(model: Callable, arguments: tuple, keywords: Mapping[str, Any], key: jax.Array,
+                    parameters: Mapping[str, Any] | None = None) -> LikelihoodSite:
+    """Run a NumPyro model and return its one likelihood site.
+
+    Raises:
+        ValueError: the model has no such site, or several.
+    """
+    seeded = handlers.seed(handlers.substitute(model, data=dict(parameters or {})), key)
+    trace = handlers.trace(seeded).get_trace(*arguments, **keywords)
+    found = []
+    for name, site in trace.items():
+        distribution = site.get("fn")
+        # Masks and expansions wrap the distribution.
+        while hasattr(distribution, "base_dist") and not isinstance(distribution, (MarginalLikelihood, Panel)):
+            distribution = distribution.base_dist
+        if isinstance(distribution, (MarginalLikelihood, Panel)):
+            found.append(LikelihoodSite(name, distribution))
+    if len(found) != 1:
+        names = ", ".join(site.name for site in found) or "none"
+        raise ValueError("the model must have exactly one site numpyro.sample(name, lfm.MarginalLikelihood(...), "
+                         f"obs=y) (or lfm.panel); found {names}.")
+    return found[0]
+
+
+def scores(model: Callable, arguments: tuple, keywords: Mapping[str, Any], draws: Mapping[str, Any],
+           y: Any) -> dict[str, np.ndarray]:
+    """Score the observations under each draw.
+
+    Returns:
+        ``leave_one_out`` (S, ..., T), ``one_step_ahead`` (S, ..., T), ``residual`` (S, ..., T, D); the series of a panel
+        come after the draws.
+    """
+
+    def one(distribution: MarginalLikelihood, y: jax.Array) -> dict[str, jax.Array]:
+        result = distribution.smooth(y)
+        return {"leave_one_out": result.leave_one_out, "one_step_ahead": result.log_likelihood,
+                "residual": result.residual}
+
+    def per_draw(parameters: Any, key: jax.Array) -> dict[str, jax.Array]:
+        site = likelihood_site(model, arguments, keywords, key, parameters)
+        return _each(site.distribution, one, jnp.asarray(y, float))
+
+    return _over_draws(model, arguments, keywords, per_draw, draws, jax.random.key(0), len(np.ravel(arguments[0])))
+
+
+def trajectories(model: Callable, arguments: tuple, keywords: Mapping[str, Any], draws: Mapping[str, Any], y: Any,
+                 at: Any, key: jax.Array) -> dict[str, np.ndarray]:
+    """Draw one trajectory for each draw of the parameters, given the data, and replicate the data along it.
+
+    Args:
+        model, arguments, keywords: the NumPyro model and its arguments.
+        draws: site name -> (S, ...).
+        y: (T, D), or (B, T, D) for a panel.
+        at: (K,) times of the trajectories, or None for the observation times.
+        key: a JAX random key.
+
+    Returns:
+        ``state`` (S, ..., K, M), ``force`` (S, ..., K, R), ``output`` (S, ..., K, D) free of noise, and ``y``
+        (S, ..., T, D), the posterior predictive at the observation times.
+    """
+    count = 0 if at is None else len(at)
+
+    def one(distribution: MarginalLikelihood, y: jax.Array, key: jax.Array) -> dict[str, jax.Array]:
+        ssm = distribution.ssm
+        times = jnp.asarray(distribution.times, float)
+        both = None if at is None else np.concatenate([at, np.asarray(distribution.times, float)])
+        path_key, noise_key = jax.random.split(key)
+        result = distribution.smooth(y, both)
+        path = result.sample(path_key, 1)
+        forces = [path.forces[name][0] for name in ssm.model.force_names]
+        w = jnp.concatenate([path.state[0], *(force[:, None] for force in forces)], axis=1)
+        output = jax.vmap(ssm.observe)(w, result.times)
+        row = jnp.arange(times.shape[0])
+        covariance = jax.vmap(ssm.noise_covariance)(w[count:], times, row)
+        noise = jax.random.normal(noise_key, (*output[count:].shape, 1))
+        replicated = output[count:] + matmul(jax.vmap(semidefinite_root)(covariance), noise)[..., 0]
+        stop = count or None
+        size = ssm.physical_dim
+        return {"state": w[:stop, :size], "force": w[:stop, size:], "output": output[:stop], "y": replicated}
+
+    def per_draw(parameters: Any, key: jax.Array) -> dict[str, jax.Array]:
+        site_key, key = jax.random.split(key)
+        site = likelihood_site(model, arguments, keywords, site_key, parameters)
+        observed = jnp.asarray(y, float)
+        keys = jax.random.split(key, observed.shape[0]) if isinstance(site.distribution, Panel) else key
+        return _each(site.distribution, one, observed, keys)
+
+    rows = count + len(np.ravel(arguments[0]))
+    return _over_draws(model, arguments, keywords, per_draw, draws, key, rows)
+
+
+def _each(distribution: MarginalLikelihood | Panel, function: Callable, *arguments: Any) -> Any:
+    if isinstance(distribution, Panel):
+        return distribution.mapped(function, *arguments)
+    return function(distribution, *arguments)
+
+
+def _over_draws(model: Callable, arguments: tuple, keywords: Mapping[str, Any], per_draw: Callable,
+                draws: Mapping[str, Any], key: jax.Array, rows: int) -> dict[str, np.ndarray]:
+    """Map over draws, in batches that bound the memory."""
+    draws = {name: jnp.asarray(value) for name, value in draws.items()}
+    count = next(iter(draws.values())).shape[0]
+    example = likelihood_site(model, arguments, keywords, key, {n: v[0] for n, v in draws.items()})
+    numbers = rows * example.example.ssm.state_dim**2 * 6
+    batch = int(np.clip(_BATCH_NUMBERS // max(numbers, 1), 1, count))
+    run = jax.jit(lambda d, k: jax.lax.map(lambda pair: per_draw(*pair), (d, k), batch_size=batch))
+    return jax.tree_util.tree_map(np.asarray, run(draws, jax.random.split(key, count)))
