@@ -16,8 +16,6 @@ from lfm_ppl.inference.map import map_estimate
 from lfm_ppl.inference.optimise import Objective, newton, quasi_newton
 from lfm_ppl.inference.ram import RAM
 
-jax.config.update("jax_enable_x64", True)
-
 RNG = np.random.default_rng(0)
 DESIGN = RNG.normal(size=(12, 3))
 DATA = RNG.normal(size=12)
