@@ -33,6 +33,7 @@ def format_number(value: Any, digits: int = 3) -> str:
         return str(value)
     if isinstance(value, (int, np.integer)):
         return str(value)
+    value = float(value)
     if not math.isfinite(value):
         return "inf" if value > 0 else "-inf"
     if value == 0.0:
@@ -97,7 +98,7 @@ def markdown_table(frame: pd.DataFrame, digits: int = 3) -> str:
     columns += [[_escaped(str(name)), *map(_escaped, body[name])] for name in frame.columns]
     right = [False, *(pd.api.types.is_numeric_dtype(frame[name]) for name in frame.columns)]
     sizes = [max(4, *map(len, column)) for column in columns]
-    lines = []
+    lines: list[str] = []
     for row in zip(*columns, strict=True):
         cells = [
             cell.rjust(size) if number and lines else cell.ljust(size)

@@ -168,3 +168,89 @@ def datasets():
 def result(datasets):
     attrs = {"model": "transcription", "sampler": "nuts", "seed": 3, "wall_time_s": 1.5}
     return arviz_data.build(datasets, attrs)
+
+
+def drawn_texts(figure):
+    """Every text that a figure shows, with its box in pixels: (text, size, box)."""
+    texts = [figure._suptitle, figure._supxlabel, figure._supylabel]
+    texts += [text for legend in figure.legends for text in legend.get_texts()]
+    for axes in figure.axes:
+        texts += [axes.title, axes._left_title, axes.xaxis.label, axes.yaxis.label]
+        for axis in (axes.xaxis, axes.yaxis):
+            texts.append(axis.get_offset_text())
+            low, high = sorted(axis.get_view_interval())
+            slack = 1e-9 * (high - low)
+            texts += [
+                label
+                for place, label in zip(axis.get_ticklocs(), axis.get_ticklabels(), strict=False)
+                if low - slack <= place <= high + slack
+            ]
+    return [
+        (text.get_text(), text.get_fontsize(), text.get_window_extent())
+        for text in texts
+        if text is not None and text.get_visible() and text.get_text().strip()
+    ]
+
+
+def assert_readable(figure):
+    """No text below 7 pt, none cut off by the figure's edge, none on top of another."""
+    shown = drawn_texts(figure)
+    assert shown
+    width, height = figure.bbox.width, figure.bbox.height
+    for text, size, box in shown:
+        assert size >= 7.0, (text, size)
+        assert -1 <= box.x0 and box.x1 <= width + 1, (text, "beyond the sides", box)
+        assert -1 <= box.y0 and box.y1 <= height + 1, (text, "beyond top or bottom", box)
+    for number, (text, _, box) in enumerate(shown):
+        for other, _, box_of_other in shown[number + 1 :]:
+            across = min(box.x1, box_of_other.x1) - max(box.x0, box_of_other.x0)
+            down = min(box.y1, box_of_other.y1) - max(box.y0, box_of_other.y0)
+            # Boxes hold room for accents and descenders that is rarely used.
+            assert across < 1 or down < 3, (text, other, "overlap", across, down)
+
+
+@pytest.fixture
+def readable():
+    return assert_readable
+
+
+@pytest.fixture
+def crowded():
+    """Many outputs and parameters with long names, extreme sizes, many draws and times."""
+    rng = np.random.default_rng(0)
+    names = [f"sensor_{k}_temperature" for k in range(15)]
+    time, at = np.linspace(0.0, 5e4, 300), np.linspace(0.0, 5e4, 40)
+    wave = [1e-4 * np.sin(t[:, None] / 6e3 + np.arange(15)) for t in (time, at)]
+    y = wave[0] + 2e-5 * rng.normal(size=wave[0].shape)
+    y[rng.random(y.shape) < 0.1] = np.nan
+    sample = ("chain", "draw")
+    draws = rng.normal(size=(4, 1000, 20))
+    posterior = xr.Dataset(
+        {
+            "sensitivity": ((*sample, "sensor"), 3e5 * np.exp(0.3 * draws), {"units": "nM/h"}),
+            "a_parameter_with_a_long_name": (sample, 2e-5 + 1e-6 * draws[..., 0]),
+            "offset": (sample, 1e5 + draws[..., 1]),
+        },
+        coords={"sensor": names + [f"s{k}" for k in range(5)]},
+    )
+    noisy = np.where(np.isnan(y), np.nan, rng.normal(size=(4, 25, *y.shape)))
+    over = {"time": ("time", time, {"units": "s"}), "output": names}
+    units = {"units": "kg m/s²"}
+    return arviz_data.build(
+        {
+            "posterior": posterior,
+            "observed_data": xr.Dataset({"y": (("time", "output"), y, units)}, coords=over),
+            "trajectories": xr.Dataset(
+                {
+                    "outputs": (
+                        (*sample, "at", "output"),
+                        wave[1] + 1e-5 * rng.normal(size=(4, 25, 1, 15)),
+                    )
+                },
+                coords={"at": at, "output": names},
+            ),
+            "one_step_ahead": xr.Dataset(
+                {"residual": ((*sample, "time", "output"), noisy)}, coords=over
+            ),
+        }
+    )

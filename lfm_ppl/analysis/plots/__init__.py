@@ -1,0 +1,17 @@
+"""Figures of a result, at the sizes of a paper. Nothing here touches pyplot or the global style."""
+
+from lfm_ppl.analysis.plots.chains import plot_trace
+from lfm_ppl.analysis.plots.pairs import plot_pairs
+from lfm_ppl.analysis.plots.residuals import plot_residuals
+from lfm_ppl.analysis.plots.saving import save_figures
+from lfm_ppl.analysis.plots.trajectories import plot_fit, plot_forces, plot_states
+
+__all__ = [
+    "plot_fit",
+    "plot_forces",
+    "plot_pairs",
+    "plot_residuals",
+    "plot_states",
+    "plot_trace",
+    "save_figures",
+]

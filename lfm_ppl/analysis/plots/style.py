@@ -1,0 +1,238 @@
+"""One look for all figures: sizes of a paper, colours that colour-blind readers can tell apart."""
+
+from __future__ import annotations
+
+import functools
+import io
+import itertools
+import math
+import re
+import textwrap
+from collections.abc import Callable, Sequence
+from typing import Any, ParamSpec
+
+import matplotlib.style
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+from matplotlib.ticker import Formatter, MaxNLocator
+
+WIDTHS = {"column": 3.4, "full": 7.0}  # inches: one column of a two-column paper, and both
+
+# Okabe & Ito (2008), Color Universal Design.
+BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
+YELLOW, BLUE, VERMILLION, PURPLE = "#F0E442", "#0072B2", "#D55E00", "#CC79A7"
+GREY = "#707070"
+CHAIN_COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, BLACK, YELLOW)
+
+SMALL = 7.0
+STYLE = {
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],
+    "font.size": 7.5,
+    "axes.labelsize": 7.5,
+    "axes.titlesize": 7.5,
+    "axes.titlelocation": "left",
+    "axes.titlepad": 3.0,
+    "axes.labelpad": 2.0,
+    "legend.fontsize": SMALL,
+    "legend.frameon": False,
+    "legend.handlelength": 1.4,
+    "legend.columnspacing": 1.2,
+    "xtick.labelsize": SMALL,
+    "ytick.labelsize": SMALL,
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "lines.linewidth": 1.1,
+    "figure.constrained_layout.h_pad": 0.03,
+    "figure.constrained_layout.w_pad": 0.03,
+    "figure.dpi": 150.0,
+    "savefig.dpi": 300.0,
+    "pdf.fonttype": 42,  # text that editors can change
+    "svg.fonttype": "none",
+}
+
+P = ParamSpec("P")
+
+
+class Drawing(Figure):
+    """A figure outside pyplot, which a notebook shows once and nothing keeps in memory."""
+
+    def _repr_png_(self) -> bytes:
+        with io.BytesIO() as buffer:
+            self.savefig(buffer, format="png", dpi=150)
+            return buffer.getvalue()
+
+
+def in_style() -> Any:
+    """Return the context in which figures are made and saved; the global style stays as it is."""
+    return matplotlib.style.context(["default", STYLE])
+
+
+def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
+    """Make the figure function ``draw`` work in our style and leave the global one alone."""
+
+    @functools.wraps(draw)
+    def wrapper(*args: P.args, **kwargs: P.kwargs) -> Figure:
+        with in_style():
+            figure = draw(*args, **kwargs)
+            # Ticks are made when first drawn, from the style of that moment.
+            figure.draw_without_rendering()
+        return figure
+
+    return wrapper
+
+
+def inches(width: str | float) -> float:
+    """Return the width of a figure in inches: of "column", "full", or a number of inches."""
+    if isinstance(width, str):
+        if width not in WIDTHS:
+            raise ValueError(
+                f"width must be {' or '.join(map(repr, WIDTHS))} or a number of inches, "
+                f"got {width!r}."
+            )
+        return WIDTHS[width]
+    if not (math.isfinite(width) and width >= 2.0):
+        raise ValueError(f"width must be at least 2 inches, got {width!r}.")
+    return float(width)
+
+
+def is_narrow(width: str | float) -> bool:
+    """Return whether there is room for the layout of one column only."""
+    return inches(width) < 5.0
+
+
+def new_figure(width: str | float, height: float) -> Figure:
+    """Return an empty figure, ``width`` as in ``inches`` and ``height`` in inches."""
+    return Drawing(figsize=(inches(width), height), layout="constrained")
+
+
+def tidy(axes: Axes, x_ticks: int = 5, y_ticks: int = 4) -> None:
+    """Give ``axes`` small ticks that keep their size, and at most so many intervals."""
+    axes.tick_params(labelsize=SMALL, length=2.5, width=0.6, pad=2.0)
+    axes.xaxis.set_major_locator(MaxNLocator(x_ticks, steps=[1, 2, 2.5, 5, 10]))
+    axes.yaxis.set_major_locator(MaxNLocator(y_ticks, steps=[1, 2, 2.5, 5, 10]))
+
+
+class PlainNumbers(Formatter):
+    """Tick labels in units of a power of ten, with as many decimals as tell them apart."""
+
+    def __init__(self, power: int) -> None:
+        self.unit = 10.0**power
+
+    def __call__(self, x: float, pos: int | None = None) -> str:
+        """Return the label of one number by itself."""
+        return self.format_ticks([x])[0]
+
+    def format_ticks(self, values: Sequence[float]) -> list[str]:
+        """Return the labels of ticks, all with the same number of decimals."""
+        ticks = [float(value) / self.unit for value in values]
+        step = min((b - a for a, b in itertools.pairwise(ticks)), default=0.0) or 1.0
+        decimals = 0
+        while decimals < 12 and any(abs(t - round(t, decimals)) > 1e-3 * step for t in ticks):
+            decimals += 1
+        labels = [f"{round(tick, decimals) + 0.0:.{decimals}f}" for tick in ticks]
+        return [label.replace("-", "\N{MINUS SIGN}") for label in labels]
+
+
+def scale(axis: Axis) -> str:
+    """Label the ticks of ``axis`` in units of a power of ten that keeps them short.
+
+    Returns:
+        The power, such as ``10⁻⁵``, to stand before the unit in the label of the axis; empty where
+        the numbers are of ordinary size.
+    """
+    largest = max(map(abs, axis.get_view_interval()))
+    power = math.floor(math.log10(largest)) if largest > 0 and math.isfinite(largest) else 0
+    if -2 <= power <= 3:
+        power = 0
+    axis.set_major_formatter(PlainNumbers(power))
+    raised = str(power).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+    return f"10{raised}" if power else ""
+
+
+def small_multiples(width: str | float, count: int, height: float) -> tuple[Figure, list[Axes]]:
+    """Return a figure of ``count`` panels over one common x axis.
+
+    Args:
+        width: of the figure.
+        count: number of panels, at least one.
+        height: of a panel, in inches.
+
+    Returns:
+        The figure, and its axes row by row. Only the lowest panel of a column shows tick labels.
+    """
+    limits = (3, 2) if is_narrow(width) else (4, 3)
+    columns = 1 if is_narrow(width) and count <= limits[0] else min(count, limits[1])
+    rows = math.ceil(count / columns)
+    figure = new_figure(width, height * rows + 0.55)
+    grid = figure.subplots(rows, columns, sharex=True, squeeze=False)
+    panels = list(grid.flat)
+    for spare in panels[count:]:
+        spare.remove()
+    for index, axes in enumerate(panels[:count]):
+        tidy(axes)
+        axes.tick_params(labelbottom=index + columns >= count)
+    return figure, panels[:count]
+
+
+def label_time(panels: Sequence[Axes], unit: str) -> None:
+    """Write "time" and its unit under the panels that show x tick labels."""
+    for axes in panels:
+        power = scale(axes.xaxis)
+        if axes.xaxis.get_tick_params()["labelbottom"]:
+            axes.set_xlabel(with_unit("time", f"{power} {unit}".strip(), 40))
+
+
+def label_values(axes: Axes, name: str, unit: str) -> None:
+    """Write ``name (unit)`` along the y axis."""
+    axes.set_ylabel(with_unit(name, f"{scale(axes.yaxis)} {unit}".strip()))
+
+
+def legend_above(figure: Figure, handles: Sequence[Any]) -> None:
+    """Put one legend for all panels on top of ``figure``, in as many rows as it needs."""
+    for rows in range(1, len(handles) + 1):
+        columns = math.ceil(len(handles) / rows)
+        legend = figure.legend(handles=handles, loc="outside upper center", ncols=columns)
+        if columns == 1 or legend.get_window_extent().width <= figure.bbox.width:
+            return
+        legend.remove()
+
+
+def note_below(figure: Figure, text: str) -> None:
+    """Write a remark under ``figure``."""
+    lines = textwrap.wrap(text, int(figure.get_figwidth() * 17))
+    figure.supxlabel("\n".join(lines), fontsize=SMALL, color=GREY)
+
+
+def with_unit(name: str, unit: str, room: int = 18) -> str:
+    """Return ``name (unit)``, in lines of ``room`` characters at most where it can be broken."""
+    if unit and len(name) + len(unit) + 3 <= room:
+        return f"{name} ({unit})"
+    return "\n".join([*wrapped(name, room), f"({unit})"] if unit else wrapped(name, room))
+
+
+def wrapped(name: str, room: int) -> list[str]:
+    """Break a name such as ``basal_rate[CDKN1A]`` before brackets and after underscores."""
+    lines = [""]
+    for piece in re.findall(r"\[[^_]*_?|[^_\[]+_?|_", name):
+        if lines[-1] and len(lines[-1]) + len(piece) > room:
+            lines.append("")
+        lines[-1] += piece
+    return [part for line in lines for part in textwrap.wrap(line, room)]
+
+
+def first_of(
+    names: Sequence[str], wanted: Sequence[str] | None, limit: int, argument: str
+) -> tuple[list[str], str]:
+    """Cut ``names`` to ``limit`` unless the caller chose them, and say what was left out.
+
+    Returns:
+        The names to draw, and a remark for the figure (empty where nothing is left out).
+    """
+    if wanted is not None or len(names) <= limit:
+        return list(names), ""
+    return list(names[:limit]), (
+        f"The first {limit} of {len(names)} {argument}; choose others with {argument}=[...]."
+    )
