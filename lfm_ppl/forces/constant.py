@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 
 from lfm_ppl.forces.parameters import mean_parameter, positive_parameter
 from lfm_ppl.forces.sde import Force
@@ -63,21 +64,21 @@ class Constant(Force):
         """Return L (1, 0)."""
         return jnp.zeros((1, 0))
 
-    def discretise(self, dt: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def discretise(self, dt: ArrayLike) -> tuple[jax.Array, jax.Array]:
         """Return transition (1, 1), one, and process noise (1, 1), zero."""
         return jnp.ones((1, 1)), jnp.zeros((1, 1))
 
-    def covariance(self, t: jax.Array, s: jax.Array = 0.0) -> jax.Array:
+    def covariance(self, t: ArrayLike, s: ArrayLike = 0.0) -> jax.Array:
         """Return scale^2 for every pair of times."""
         return self.scale**2 * jnp.ones(jnp.broadcast_shapes(jnp.shape(t), jnp.shape(s)))
 
-    def spectral_density(self, omega: jax.Array) -> jax.Array:
+    def spectral_density(self, omega: ArrayLike) -> jax.Array:
         """Raise NotImplementedError: all the power sits at frequency zero."""
         raise NotImplementedError(
             "a Constant force has all its power at frequency zero, so its spectral density is "
             "not a function; use `covariance`."
         )
 
-    def sde_spectral_density(self, omega: jax.Array) -> jax.Array:
+    def sde_spectral_density(self, omega: ArrayLike) -> jax.Array:
         """Raise NotImplementedError, as `spectral_density` does."""
         return self.spectral_density(omega)

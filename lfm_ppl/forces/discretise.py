@@ -7,6 +7,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from lfm_ppl.linalg import matmul
 
@@ -16,7 +17,7 @@ SUBSTEP = 0.5
 
 @functools.partial(jax.jit, static_argnames="max_doublings")
 def discretise(
-    feedback: jax.Array, diffusion: jax.Array, dt: jax.Array, max_doublings: int = 32
+    feedback: jax.Array, diffusion: jax.Array, dt: ArrayLike, max_doublings: int = 32
 ) -> tuple[jax.Array, jax.Array]:
     """Return transition matrix and process noise of a linear SDE over one step.
 
@@ -62,7 +63,7 @@ def discretise(
 
 @functools.partial(jax.jit, static_argnames="max_doublings")
 def discretise_dispersion(
-    feedback: jax.Array, dispersion: jax.Array, dt: jax.Array, max_doublings: int = 32
+    feedback: jax.Array, dispersion: jax.Array, dt: ArrayLike, max_doublings: int = 32
 ) -> tuple[jax.Array, jax.Array]:
     """Return the same as `discretise`, from the dispersion ``L`` in place of ``D = L L'``.
 
@@ -92,7 +93,7 @@ def discretise_dispersion(
 def discretise_series(
     series: jax.Array,
     dispersion: jax.Array,
-    step: jax.Array,
+    step: ArrayLike,
     doublings: jax.Array,
     max_doublings: int,
 ) -> tuple[jax.Array, jax.Array]:
@@ -113,7 +114,7 @@ def discretise_series(
     columns = (powers(nodes, len(series))[:, :, None, None] * columns).sum(1)
     columns = jnp.moveaxis(columns * jnp.sqrt(weights)[:, None, None], 0, 1)
     columns = columns.reshape(series.shape[-1], -1)
-    noise = step * (columns[:, None, :] * columns[None, :, :]).sum(-1)
+    noise = jnp.asarray(step) * (columns[:, None, :] * columns[None, :, :]).sum(-1)
     return double(series.sum(0), noise, doublings, max_doublings)
 
 
@@ -144,14 +145,15 @@ def double(
 
 
 def step_tangent(
-    feedback: jax.Array, dispersion: jax.Array, transition: jax.Array, tangent: jax.Array
+    feedback: ArrayLike, dispersion: ArrayLike, transition: jax.Array, tangent: ArrayLike
 ) -> tuple[jax.Array, jax.Array]:
     """Return the derivatives ``F Phi`` and ``Phi L L' Phi'`` in dt, times ``tangent``.
 
     They are exact and much cheaper than to differentiate the way in which Phi and Q are computed.
     """
-    column = matmul(transition, dispersion)
-    return tangent * matmul(feedback, transition), tangent * matmul(column, column.mT)
+    column = matmul(transition, jnp.asarray(dispersion))
+    rate = jnp.asarray(tangent)
+    return rate * matmul(jnp.asarray(feedback), transition), rate * matmul(column, column.mT)
 
 
 def doublings_for(size: jax.Array) -> jax.Array:
@@ -166,7 +168,7 @@ def gauss_legendre(count: int) -> tuple[np.ndarray, np.ndarray]:
     return 0.5 * (nodes + 1.0), 0.5 * weights
 
 
-def powers(base: jax.Array, count: int) -> jax.Array:
+def powers(base: ArrayLike, count: int) -> jax.Array:
     """Return ``base^k`` for k = 0, ..., count - 1 in a new last axis.
 
     By multiplication, so that every derivative at zero is finite.

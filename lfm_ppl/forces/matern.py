@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from lfm_ppl.forces.discretise import gauss_legendre, powers, step_tangent
 from lfm_ppl.forces.parameters import mean_parameter, positive_parameter, static_order
@@ -96,19 +97,19 @@ class Matern(Force):
         """Return L (n, 1)."""
         return self.scale * jnp.sqrt(self.rate) * _constants(self.order).dispersion
 
-    def discretise(self, dt: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def discretise(self, dt: ArrayLike) -> tuple[jax.Array, jax.Array]:
         """Return transition (n, n) and process noise (n, n) over a step of length dt >= 0."""
         # Beyond _FAR nothing is left to change; clipping keeps the powers of x finite.
         transition, noise = _discretise(self.order, jnp.minimum(self.rate * dt, _FAR))
         return transition, self.scale**2 * noise
 
-    def covariance(self, t: jax.Array, s: jax.Array = 0.0) -> jax.Array:
+    def covariance(self, t: ArrayLike, s: ArrayLike = 0.0) -> jax.Array:
         """Return k(t - s), elementwise."""
         x = jnp.minimum(self.rate * jnp.abs(jnp.asarray(t) - s), _FAR)
         kernel = _constants(self.order).kernel
         return self.scale**2 * jnp.exp(-x) * (powers(x, self.state_dim) * kernel).sum(-1)
 
-    def spectral_density(self, omega: jax.Array) -> jax.Array:
+    def spectral_density(self, omega: ArrayLike) -> jax.Array:
         """Return S(omega), elementwise."""
         ratio = jnp.asarray(omega) / self.rate
         density = _constants(self.order).density * self.scale**2 / self.rate
@@ -174,7 +175,7 @@ def _discretise(order, x):
     monomials = powers(x, order + 1)[:, None, None]
     transition = jnp.exp(-x) * (monomials * constants.polynomial).sum(0)
     # P - A P A' cancels on short steps, the quadrature fails on long ones.
-    propagated = matmul(transition, constants.chol_covariance)
+    propagated = matmul(transition, jnp.asarray(constants.chol_covariance))
     long = constants.covariance - matmul(propagated, propagated.T)
     short = _short_noise(jnp.minimum(x, constants.switch), constants)
     return transition, jnp.where(x < constants.switch, short, long)

@@ -5,6 +5,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 
 from lfm_ppl.forces.discretise import discretise_dispersion
 
@@ -55,30 +56,30 @@ class Force(eqx.Module):
         """Return L (n, S)."""
         raise NotImplementedError
 
-    def discretise(self, dt: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def discretise(self, dt: ArrayLike) -> tuple[jax.Array, jax.Array]:
         """Return transition (n, n) and process noise (n, n) over a step of length dt >= 0."""
         return discretise_dispersion(self.feedback(), self.dispersion(), dt)
 
-    def transition(self, dt: jax.Array) -> jax.Array:
+    def transition(self, dt: ArrayLike) -> jax.Array:
         """Return exp(F dt) (n, n)."""
         return self.discretise(dt)[0]
 
-    def process_noise(self, dt: jax.Array) -> jax.Array:
+    def process_noise(self, dt: ArrayLike) -> jax.Array:
         """Return the covariance (n, n) that a step of length dt adds, exact for any dt."""
         return self.discretise(dt)[1]
 
-    def measurement(self, t: jax.Array) -> jax.Array:
+    def measurement(self, t: ArrayLike) -> jax.Array:
         """Return H(t) (n,); the first state by default."""
         return jnp.zeros(self.state_dim).at[0].set(1.0)
 
-    def mean_at(self, t: jax.Array) -> jax.Array:
+    def mean_at(self, t: ArrayLike) -> jax.Array:
         """Return the mean of the force at time t, a scalar."""
         value = jnp.asarray(self.mean(t) if callable(self.mean) else self.mean)
         if value.shape != ():
             raise ValueError(f"mean must return one number, got an array of shape {value.shape}.")
         return value
 
-    def covariance(self, t: jax.Array, s: jax.Array = 0.0) -> jax.Array:
+    def covariance(self, t: ArrayLike, s: ArrayLike = 0.0) -> jax.Array:
         """Return the closed-form covariance of u(t) and u(s), elementwise.
 
         For a stationary force only ``t - s`` matters, so that ``covariance(lag)`` is its kernel.
@@ -92,7 +93,7 @@ class Force(eqx.Module):
             "from the state-space form."
         )
 
-    def spectral_density(self, omega: jax.Array) -> jax.Array:
+    def spectral_density(self, omega: ArrayLike) -> jax.Array:
         """Return the closed-form spectral density S(omega), elementwise.
 
         It is two-sided in angular frequency: ``covariance(0) = 1/(2 pi) int S(omega) domega``.
@@ -105,7 +106,7 @@ class Force(eqx.Module):
             "`sde_spectral_density` computes it from the state-space form."
         )
 
-    def sde_covariance(self, t: jax.Array, s: jax.Array = 0.0) -> jax.Array:
+    def sde_covariance(self, t: ArrayLike, s: ArrayLike = 0.0) -> jax.Array:
         """Return the covariance of u(t) and u(s) that the state-space form has, elementwise.
 
         ``H(t) exp(F (t - s)) P(s) H(s)'`` for t >= s. It equals ``covariance`` for an exact form
@@ -119,18 +120,9 @@ class Force(eqx.Module):
                 "the covariance of a force with jumps is not available between arbitrary times; "
                 "simulate a model with this force instead."
             )
-        return jnp.vectorize(self._sde_covariance)(t, s)
+        return _covariance(self, t, s)
 
-    def _sde_covariance(self, t, s):
-        late, early = jnp.maximum(t, s), jnp.minimum(t, s)
-        variance = self.initial_covariance()
-        if not self.stationary:
-            transition, noise = self.discretise(early)
-            variance = transition @ variance @ transition.T + noise
-        row = self.measurement(late) @ self.transition(late - early)
-        return row @ variance @ self.measurement(early)
-
-    def sde_spectral_density(self, omega: jax.Array) -> jax.Array:
+    def sde_spectral_density(self, omega: ArrayLike) -> jax.Array:
         """Return the spectral density ``|H (i omega - F)^-1 L|^2`` of the state-space form.
 
         Raises:
@@ -141,14 +133,7 @@ class Force(eqx.Module):
                 f"{type(self).__name__} is not stationary, so it has no spectral density; "
                 "use `sde_covariance`."
             )
-        feedback, dispersion = self.feedback(), self.dispersion()
-
-        def density(w):
-            resolvent = 1j * w * jnp.eye(self.state_dim) - feedback
-            gain = self.measurement(0.0) @ jnp.linalg.solve(resolvent, dispersion + 0j)
-            return (jnp.abs(gain) ** 2).sum()
-
-        return jnp.vectorize(density)(omega)
+        return _spectral_density(self, omega)
 
     @property
     def jump_times(self) -> tuple[float, ...]:
@@ -173,3 +158,29 @@ class Force(eqx.Module):
         from lfm_ppl.forces.sum import Sum
 
         return Sum((self, other)) if isinstance(other, Force) else NotImplemented
+
+
+@eqx.filter_jit
+def _covariance(force, t, s):
+    def between(t, s):
+        late, early = jnp.maximum(t, s), jnp.minimum(t, s)
+        variance = force.initial_covariance()
+        if not force.stationary:
+            transition, noise = force.discretise(early)
+            variance = transition @ variance @ transition.T + noise
+        row = force.measurement(late) @ force.transition(late - early)
+        return row @ variance @ force.measurement(early)
+
+    return jnp.vectorize(between)(t, s)
+
+
+@eqx.filter_jit
+def _spectral_density(force, omega):
+    feedback, dispersion = force.feedback(), force.dispersion()
+
+    def density(w):
+        resolvent = 1j * w * jnp.eye(force.state_dim) - feedback
+        gain = force.measurement(0.0) @ jnp.linalg.solve(resolvent, dispersion + 0j)
+        return (jnp.abs(gain) ** 2).sum()
+
+    return jnp.vectorize(density)(omega)

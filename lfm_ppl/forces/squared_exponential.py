@@ -10,6 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from lfm_ppl.forces.discretise import (
     SUBSTEP,
@@ -112,17 +113,17 @@ class SquaredExponential(Force):
         """Return L (n, 1)."""
         return self.scale * jnp.sqrt(self.rate) * _constants(self.order).dispersion
 
-    def discretise(self, dt: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def discretise(self, dt: ArrayLike) -> tuple[jax.Array, jax.Array]:
         """Return transition (n, n) and process noise (n, n) over a step of length dt >= 0."""
         transition, noise = _discretise(self.order, jnp.minimum(self.rate * dt, _FAR))
         return transition, self.scale**2 * noise
 
-    def covariance(self, t: jax.Array, s: jax.Array = 0.0) -> jax.Array:
+    def covariance(self, t: ArrayLike, s: ArrayLike = 0.0) -> jax.Array:
         """Return k(t - s) of the exact process, elementwise."""
         lag = (jnp.asarray(t) - s) / self.lengthscale
         return self.scale**2 * jnp.exp(-0.5 * lag**2)
 
-    def spectral_density(self, omega: jax.Array) -> jax.Array:
+    def spectral_density(self, omega: ArrayLike) -> jax.Array:
         """Return S(omega) of the exact process, elementwise."""
         ratio = jnp.asarray(omega) * self.lengthscale
         return self.scale**2 * np.sqrt(2 * np.pi) * self.lengthscale * jnp.exp(-0.5 * ratio**2)
@@ -161,7 +162,7 @@ def _constants(order: int) -> _Constants:
         dispersion=dispersion,
         covariance=_stationary_covariance(characteristic, density),
         series=np.array(series),
-        growth=growth,
+        growth=float(growth),
         max_doublings=ceil(log2(growth * _FAR / SUBSTEP)),
     )
 

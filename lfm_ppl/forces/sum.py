@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 
 from lfm_ppl.forces.sde import Force
 
@@ -48,16 +50,16 @@ class Stack(eqx.Module):
         """Return L (n, S)."""
         return block_diagonal([force.dispersion() for force in self.forces])
 
-    def discretise(self, dt: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def discretise(self, dt: ArrayLike) -> tuple[jax.Array, jax.Array]:
         """Return transition (n, n) and process noise (n, n) over a step of length dt >= 0."""
         pairs = [force.discretise(dt) for force in self.forces]
         return block_diagonal([p[0] for p in pairs]), block_diagonal([p[1] for p in pairs])
 
-    def measurement(self, t: jax.Array) -> jax.Array:
+    def measurement(self, t: ArrayLike) -> jax.Array:
         """Return H(t) (R, n), one row for each force."""
         return block_diagonal([force.measurement(t)[None, :] for force in self.forces])
 
-    def mean_at(self, t: jax.Array) -> jax.Array:
+    def mean_at(self, t: ArrayLike) -> jax.Array:
         """Return the means (R,) at time t."""
         return jnp.asarray([force.mean_at(t) for force in self.forces], dtype=float)
 
@@ -110,8 +112,8 @@ class Sum(Force):
         """The forces that are added."""
         return self.stack.forces
 
-    @property
-    def mean(self) -> Callable[[jax.Array], jax.Array]:
+    @property  # type: ignore[misc]  # Equinox lets a property fill in an abstract field
+    def mean(self) -> Callable[[ArrayLike], jax.Array]:
         """The sum of the means, as a function of time."""
         return self.mean_at
 
@@ -142,25 +144,25 @@ class Sum(Force):
         """Return L (n, S), block-diagonal."""
         return self.stack.dispersion()
 
-    def discretise(self, dt: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def discretise(self, dt: ArrayLike) -> tuple[jax.Array, jax.Array]:
         """Return transition (n, n) and process noise (n, n), block-diagonal."""
         return self.stack.discretise(dt)
 
-    def measurement(self, t: jax.Array) -> jax.Array:
+    def measurement(self, t: ArrayLike) -> jax.Array:
         """Return H(t) (n,), the measurements of the terms one after the other."""
         return self.stack.measurement(t).sum(0)
 
-    def mean_at(self, t: jax.Array) -> jax.Array:
+    def mean_at(self, t: ArrayLike) -> jax.Array:
         """Return the sum of the means at time t."""
         return self.stack.mean_at(t).sum()
 
-    def covariance(self, t: jax.Array, s: jax.Array = 0.0) -> jax.Array:
+    def covariance(self, t: ArrayLike, s: ArrayLike = 0.0) -> jax.Array:
         """Return the sum of the closed-form covariances."""
-        return sum(force.covariance(t, s) for force in self.forces)
+        return functools.reduce(jnp.add, [force.covariance(t, s) for force in self.forces])
 
-    def spectral_density(self, omega: jax.Array) -> jax.Array:
+    def spectral_density(self, omega: ArrayLike) -> jax.Array:
         """Return the sum of the closed-form spectral densities."""
-        return sum(force.spectral_density(omega) for force in self.forces)
+        return functools.reduce(jnp.add, [f.spectral_density(omega) for f in self.forces])
 
     @property
     def jump_times(self) -> tuple[float, ...]:

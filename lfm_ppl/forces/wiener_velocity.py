@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from lfm_ppl import checks
 from lfm_ppl.forces.parameters import mean_parameter, positive_parameter, scalar_parameter
@@ -81,21 +82,21 @@ class WienerVelocity(Force):
         """Return L (2, 1)."""
         return self.scale * np.array([[0.0], [1.0]])
 
-    def discretise(self, dt: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def discretise(self, dt: ArrayLike) -> tuple[jax.Array, jax.Array]:
         """Return transition (2, 2) and process noise (2, 2) over a step of length dt >= 0."""
         dt = jnp.asarray(dt, self.scale.dtype)
-        transition = np.eye(2) + dt * np.eye(2, k=1)
+        transition = jnp.eye(2) + dt * jnp.eye(2, k=1)
         noise = jnp.stack([dt**3 / 3.0, dt**2 / 2.0, dt**2 / 2.0, dt]).reshape(2, 2)
         return transition, self.scale**2 * noise
 
-    def covariance(self, t: jax.Array, s: jax.Array = 0.0) -> jax.Array:
+    def covariance(self, t: ArrayLike, s: ArrayLike = 0.0) -> jax.Array:
         """Return the covariance of u(t) and u(s), both counted from the initial time."""
         late, early = jnp.maximum(t, s), jnp.minimum(t, s)
         driven = early**3 / 3.0 + early**2 * (late - early) / 2.0
         initial = self.initial_value_sd**2 + self.initial_velocity_sd**2 * late * early
         return initial + self.scale**2 * driven
 
-    def spectral_density(self, omega: jax.Array) -> jax.Array:
+    def spectral_density(self, omega: ArrayLike) -> jax.Array:
         """Raise NotImplementedError: integrated Brownian motion is not stationary."""
         raise NotImplementedError(
             "WienerVelocity is not stationary, so it has no spectral density; use `covariance(t, "

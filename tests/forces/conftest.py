@@ -80,6 +80,11 @@ def build_exact(request):
     return FORCES[request.param]
 
 
+@pytest.fixture(params=[name for name in FORCES if FORCES[name](1.0, 1.0).stationary])
+def build_stationary(request):
+    return FORCES[request.param]
+
+
 @pytest.fixture
 def oscillator():
     return Oscillator

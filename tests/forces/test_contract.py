@@ -11,8 +11,14 @@ SCALE, LENGTHSCALE = 1.3, 0.7
 EXTREME_LENGTHSCALES = (1e-8, 1.0, 1e8)
 
 
-@jax.jit
 def steps(force, dts):
+    """Transitions and noises over several steps, in one compiled program per kind of force."""
+    transition, noise = _steps(force, np.resize(dts, 64))
+    return transition[: len(dts)], noise[: len(dts)]
+
+
+@jax.jit
+def _steps(force, dts):
     return jax.vmap(force.discretise)(dts)
 
 
@@ -26,12 +32,17 @@ def entrywise_error(noise, expected):
 def test_shapes(build):
     force = build(SCALE, LENGTHSCALE)
     n, s = force.state_dim, force.noise_dim
-    assert force.initial_covariance().shape == (n, n)
-    assert force.feedback().shape == (n, n)
-    assert force.dispersion().shape == (n, s)
-    assert force.transition(0.1).shape == force.process_noise(0.1).shape == (n, n)
-    assert force.measurement(0.0).shape == (n,)
-    assert force.mean_at(0.0).shape == ()
+    for method, arguments, shape in (
+        ("initial_covariance", (), (n, n)),
+        ("feedback", (), (n, n)),
+        ("dispersion", (), (n, s)),
+        ("transition", (0.1,), (n, n)),
+        ("process_noise", (0.1,), (n, n)),
+        ("measurement", (0.0,), (n,)),
+        ("mean_at", (0.0,), ()),
+    ):
+        result = jax.eval_shape(getattr(force, method), *arguments)
+        assert (result.shape, result.dtype) == (shape, jnp.float64), method
     for index in range(len(force.jump_times)):
         assert [m.shape for m in force.jump(index)] == [(n, n), (n, n)]
     with pytest.raises(IndexError):
@@ -40,8 +51,9 @@ def test_shapes(build):
 
 def test_transition_is_the_matrix_exponential(build):
     force = build(SCALE, LENGTHSCALE)
-    for dt in (1e-3, 0.2, 1.0, 5.0):
-        assert_allclose(force.transition(dt), expm(np.asarray(force.feedback()) * dt), atol=1e-12)
+    dts = np.array([1e-3, 0.2, 1.0, 5.0])
+    for dt, transition in zip(dts, steps(force, dts)[0], strict=True):
+        assert_allclose(transition, expm(np.asarray(force.feedback()) * dt), atol=1e-12)
 
 
 def test_step_equals_the_taylor_series_in_high_precision(build, exact_step):
@@ -57,22 +69,21 @@ def test_step_equals_the_taylor_series_in_high_precision(build, exact_step):
 
 def test_no_time_no_change(build):
     force = build(SCALE, LENGTHSCALE)
-    assert_array_equal(force.transition(0.0), np.eye(force.state_dim))
-    assert_array_equal(force.process_noise(0.0), np.zeros((force.state_dim, force.state_dim)))
+    transition, noise = steps(force, np.zeros(1))
+    assert_array_equal(transition[0], np.eye(force.state_dim))
+    assert_array_equal(noise[0], np.zeros((force.state_dim, force.state_dim)))
 
 
 def test_two_steps_are_one(build):
     force = build(SCALE, LENGTHSCALE)
     for first, second in ((1e-6, 1e-7), (0.3, 0.4), (0.5, 40.0)):
-        (a, b, whole), (qa, qb, q) = steps(force, jnp.array([first, second, first + second]))
+        (a, b, whole), (qa, qb, q) = steps(force, np.array([first, second, first + second]))
         assert_allclose(b @ a, whole, atol=1e-13 * max(1.0, np.abs(whole).max()))
         assert entrywise_error(b @ qa @ b.T + qb, q) < 1e-12
 
 
-def test_stationary_covariance(build):
-    force = build(SCALE, LENGTHSCALE)
-    if not force.stationary:
-        pytest.skip("not stationary")
+def test_stationary_covariance(build_stationary):
+    force = build_stationary(SCALE, LENGTHSCALE)
     p, f, column = force.initial_covariance(), force.feedback(), force.dispersion()
     lyapunov = f @ p + p @ f.T + column @ column.T
     assert np.abs(lyapunov).max() <= 1e-14 * np.abs(f).max() * np.abs(p).max() * force.state_dim
