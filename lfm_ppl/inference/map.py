@@ -129,8 +129,9 @@ def map_estimate(
         seed: seed of the starts, a whole number.
         model_kwargs: keyword arguments of the model.
         jacobian: which mode, see above.
-        hessian: ``"autodiff"``, or ``"finite-differences"`` of the gradient, which needs no second
-            derivatives and has fewer digits.
+        hessian: ``"autodiff"``, or ``"finite-differences"`` of the gradient: about 9 digits instead
+            of 15, no second derivatives, and for a latent force model less than half the time to
+            compile.
         forward_mode: take derivatives in forward mode: faster with a handful of parameters, and the
             only one where the model loops with ``jax.lax.while_loop``.
         max_iterations: of L-BFGS, for each start.
