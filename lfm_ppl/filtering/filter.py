@@ -127,7 +127,7 @@ def forward(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, *, s
     if about is not None:
         nearby = (jax.tree_util.tree_map(lambda a: a[:-1], about), jax.tree_util.tree_map(lambda a: a[1:], about))
     first = Moments(*ssm.initial()) if start is None else start
-    _, passed = jax.lax.scan(jax.checkpoint(step), first, (rows, padded[rows.observation], nearby))
+    _, passed = jax.lax.scan(jax.checkpoint(step, prevent_cse=False), first, (rows, padded[rows.observation], nearby))
     return passed
 
 

@@ -106,7 +106,7 @@ def predict_row(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Fa
         return (one.moments, phi, noise), None
 
     carry = (moments, jnp.eye(size), empty) if flow else (moments, 0.0, 0.0)
-    (moments, phi, noise), _ = jax.lax.scan(step, carry, jnp.arange(steps), unroll=min(steps, 2))
+    (moments, phi, noise), _ = jax.lax.scan(jax.checkpoint(step, prevent_cse=False), carry, jnp.arange(steps))
     return Prediction(moments, phi, noise)
 
 
