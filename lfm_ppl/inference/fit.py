@@ -12,6 +12,7 @@ from importlib import metadata
 from typing import Any
 
 import jax
+import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
@@ -134,8 +135,7 @@ def fit(
     keywords = dict(model_kwargs or {})
     key = jax.random.key(seed)
     keys = jax.random.split(key, 5)
-    arguments = (times, y)
-    site = likelihood_site(numpyro_model, (times,), keywords, keys[0])
+    site = likelihood_site(numpyro_model, (times, y), keywords, keys[0])
     y = _checked(site, y)
     outputs = site.example.ssm.model.output_names
     model = fix(numpyro_model, fixed, labels=outputs) if fixed else numpyro_model
@@ -145,13 +145,13 @@ def fit(
         chains = 1
     else:
         strategy = _strategy(init, model, arguments, keywords, seed)
-        kernel = _kernel(sampler, model, arguments, keywords, strategy, sampler_options, keys[2])
+        kernel, first = _kernel(sampler, model, arguments, keywords, strategy, sampler_options, keys[2], seed, chains)
         draws, stats = _sample(kernel, sampler, arguments, keywords, keys[1], chains, warmup, samples, chain_method,
-                               progress)
+                               progress, first)
         remarks = {}
     flat = {label: value.reshape(-1, *value.shape[2:]) for label, value in draws.items()}
     latent = _latent(model, arguments, keywords, keys[0], flat)
-    rated = scores(model, arguments, keywords, latent, y)
+    rated = scores(model, arguments, keywords, latent, y, site.example.ssm.state_dim)
     chosen, paths, grid = _paths(model, arguments, keywords, latent, site, y, at, trajectory_draws, chains, samples,
                                  keys[3])
     groups = _groups(site, draws, stats, rated, paths, chosen, grid, times, y, truth, chains, samples)
@@ -194,27 +194,45 @@ def _strategy(init: Any, model: Callable, arguments: tuple, keywords: dict, seed
 
 
 def _kernel(sampler: str, model: Callable, arguments: tuple, keywords: dict, strategy: Any,
-            options: Mapping[str, Any] | None, key: jax.Array) -> Any:
+            options: Mapping[str, Any] | None, key: jax.Array, seed: int, chains: int) -> tuple[Any, Any]:
+    """Return the kernel and, for RAM, starting points."""
     options = dict(options or {})
-    if sampler == "ram":
-        return RAM(model, init_strategy=strategy, **options)
     info = initialize_model(key, model, model_args=arguments, model_kwargs=keywords, init_strategy=strategy,
                             validate_grad=False)
     size = sum(np.size(leaf) for leaf in jax.tree_util.tree_leaves(info.param_info.z))
     if size == 0:
         raise ValueError("the model has no parameters to sample; use lfm.smooth for the forces of a known model.")
-    options.setdefault("forward_mode_differentiation", size <= _FORWARD_MODE_LIMIT)
-    return NUTS(model, init_strategy=strategy, **options)
+    few = size <= _FORWARD_MODE_LIMIT
+    if sampler == "nuts":
+        options.setdefault("forward_mode_differentiation", few)
+        return NUTS(model, init_strategy=strategy, **options), None
+    if "initial_covariance" in options:
+        return RAM(model, init_strategy=strategy, **options), None
+    # A random walk that starts with the shape of the posterior needs no gradient afterwards, but learning that shape
+    # by rejection takes thousands of steps. The mode gives it; chains start at draws from its Laplace approximation.
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        mode = map_estimate(model, *arguments, seed=seed, model_kwargs=keywords, restarts=2,
+                            hessian="finite-differences", forward_mode=few)
+    if mode.unidentified or not np.all(np.isfinite(mode.covariance)):
+        return RAM(model, init_strategy=strategy, **options), None
+    _, unravel = jax.flatten_util.ravel_pytree(mode.unconstrained)
+    root = np.linalg.cholesky(mode.covariance)
+    points = mode.mode + np.asarray(jax.random.normal(key, (chains, size))) @ root.T
+    possible = np.isfinite(np.asarray(jax.jit(jax.vmap(lambda p: info.potential_fn(unravel(p))))(jnp.asarray(points))))
+    points = jnp.asarray(np.where(possible[:, None], points, mode.mode))
+    kernel = RAM(model, init_strategy=strategy, initial_covariance=mode.covariance, **options)
+    return kernel, jax.vmap(unravel)(points) if chains > 1 else unravel(points[0])
 
 
 def _sample(kernel: Any, sampler: str, arguments: tuple, keywords: dict, key: jax.Array, chains: int, warmup: int,
-            samples: int, chain_method: str | None, progress: bool) -> tuple[dict, dict]:
+            samples: int, chain_method: str | None, progress: bool, first: Any) -> tuple[dict, dict]:
     if chain_method is None:
         chain_method = "parallel" if jax.local_device_count() >= chains else "sequential"
     checks.one_of("chain_method", chain_method, ("parallel", "vectorized", "sequential"))
     mcmc = MCMC(kernel, num_warmup=warmup, num_samples=samples, num_chains=chains, chain_method=chain_method,
                 progress_bar=progress)
-    mcmc.run(key, *arguments, extra_fields=tuple(_EXTRA_FIELDS[sampler]), **keywords)
+    mcmc.run(key, *arguments, extra_fields=tuple(_EXTRA_FIELDS[sampler]), init_params=first, **keywords)
     extra = mcmc.get_extra_fields(group_by_chain=True)
     stats = {new: np.asarray(extra[old]) for old, new in _EXTRA_FIELDS[sampler].items()}
     stats["lp"] = -stats["lp"]
@@ -261,7 +279,7 @@ def _paths(model: Callable, arguments: tuple, keywords: dict, latent: dict, site
     elif at is not None:
         raise ValueError("`at` needs one vector of times for all series; this panel has times of its own for each.")
     subset = {label: value[rows] for label, value in latent.items()}
-    paths = trajectories(model, arguments, keywords, subset, y, grid, key)
+    paths = trajectories(model, arguments, keywords, subset, y, grid, key, site.example.ssm.state_dim)
     return chosen, {k: v.reshape(chains, len(chosen), *v.shape[1:]) for k, v in paths.items()}, grid
 
 
@@ -281,13 +299,15 @@ def _groups(site: LikelihoodSite, draws: dict, stats: dict, rated: dict, paths: 
     def variable(dims: Sequence[str], values: Any, names: Sequence[str] = ()) -> tuple:
         return tuple(dims), np.asarray(values), units_attribute(names, units)
 
+    # A time at which nothing was observed has no predictive density to compare.
+    seen = np.flatnonzero(np.isfinite(np.asarray(y)).any(axis=-1).reshape(-1, np.shape(y)[-2]).any(axis=0))
     split = {label: value.reshape(chains, samples, *value.shape[1:]) for label, value in rated.items()}
     sample = ("chain", "draw", *along)
     observed_coords = {**clock, "output": named["output"]}
     groups = {
         "posterior": _posterior(draws, coords, named["output"]),
         "sample_stats": xr.Dataset({k: (("chain", "draw"), v) for k, v in stats.items()}, coords),
-        "log_likelihood": xr.Dataset({site.name: variable(sample, split["leave_one_out"])}, {**coords, **clock}),
+        "log_likelihood": xr.Dataset({site.name: variable(sample, split["leave_one_out"])}, {**coords, **clock}).isel(time=seen),
         "one_step_ahead": xr.Dataset(
             {"log_density": variable(sample, split["one_step_ahead"]),
              "residual": variable((*sample, "output"), split["residual"])}, {**coords, **observed_coords}),

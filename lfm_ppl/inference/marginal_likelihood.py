@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -65,7 +65,7 @@ class MarginalLikelihood(dist.Distribution):
 
     support = constraints.real_matrix
     pytree_data_fields = ("model", "times")
-    pytree_aux_fields = ("rule", "steps", "max_step", "iterations", "damping", "_ssm", "_plan")
+    pytree_aux_fields = ("rule", "steps", "max_step", "iterations", "damping")
 
     def __init__(self, model: LatentForceModel, times: Any, rule: Rule | None = None, steps: int = 10,
                  max_step: float | None = None, iterations: int = 0, damping: float = 0.7, *,
@@ -76,48 +76,46 @@ class MarginalLikelihood(dist.Distribution):
         self.model, self.times = model, times
         self.rule, self.steps, self.max_step = as_rule(rule), steps, max_step
         self.iterations, self.damping = iterations, damping
-        self._ssm = state_space(model)
-        self._plan = schedule(self._ssm, times, steps, max_step, row_per_step=iterations > 0)
-        model.check_at(self._plan.initial_time)
+        model.check_at(self.plan.initial_time)
         warn_single_precision()
-        super().__init__((), (np.shape(times)[0], self._ssm.output_dim), validate_args=False)
+        super().__init__((), (np.shape(times)[0], self.ssm.output_dim), validate_args=False)
 
-    @property
+    # Both follow from the fields above, and are made again in a copy that JAX rebuilds from other leaves.
+    @functools.cached_property
     def ssm(self) -> StateSpaceModel:
         """The state-space model."""
-        return self._ssm
+        return state_space(self.model)
 
-    @property
+    @functools.cached_property
     def plan(self) -> Schedule:
         """The rows of the scan."""
-        return self._plan
+        return schedule(self.ssm, self.times, self.steps, self.max_step, row_per_step=self.iterations > 0)
 
     def log_prob_per_observation(self, value: Any) -> jax.Array:
         """Return (T,): log p(y_k | y_1:k-1) of the present entries of each observation."""
-        y = check_observations(value, *self.event_shape)
-
-        def evaluate(y: jax.Array) -> jax.Array:
-            start = Moments(*self._ssm.initial())
-            about = None
-            if self.iterations:
-                about, _ = posterior_linearisation(self._ssm, self.rule, self._plan, y, start, self.iterations,
-                                                   self.damping)
-            passed = forward(self._ssm, self.rule, self._plan, y, start=start, about=about)
-            return passed.log_likelihood[jnp.asarray(self._plan.observed)]
-
-        return finite_or_minus_infinity(evaluate, y)
+        return finite_or_minus_infinity(self._one_step_ahead, check_observations(value, *self.event_shape))
 
     def log_prob(self, value: Any) -> jax.Array:
         """Return the log marginal likelihood of ``value`` (T, D), NaN where missing; batch dimensions may lead."""
         value = jnp.asarray(value, float)
         if value.ndim > 2:
             return jax.vmap(self.log_prob)(value)
-        return self.log_prob_per_observation(value).sum()
+        # One failure makes the sum -inf, and with it the derivatives of the other terms zero.
+        return finite_or_minus_infinity(lambda y: self._one_step_ahead(y).sum(),
+                                        check_observations(value, *self.event_shape))
+
+    def _one_step_ahead(self, y: jax.Array) -> jax.Array:
+        start = Moments(*self.ssm.initial())
+        about = None
+        if self.iterations:
+            about, _ = posterior_linearisation(self.ssm, self.rule, self.plan, y, start, self.iterations, self.damping)
+        passed = forward(self.ssm, self.rule, self.plan, y, start=start, about=about)
+        return passed.log_likelihood[jnp.asarray(self.plan.observed)]
 
     def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
         """Simulate the real model: (*sample_shape, T, D)."""
-        start = jnp.asarray(self._plan.initial_time, float)
-        run = lambda k: simulate_on(self._ssm, k, jnp.asarray(self.times, float), start,  # noqa: E731
+        start = jnp.asarray(self.plan.initial_time, float)
+        run = lambda k: simulate_on(self.ssm, k, jnp.asarray(self.times, float), start,  # noqa: E731
                                     _SIMULATION_STEPS * self.steps).y
         if not sample_shape:
             return run(key)
@@ -126,9 +124,9 @@ class MarginalLikelihood(dist.Distribution):
 
     def smooth(self, y: Any, at: Any = None) -> SmootherResult:
         """Smooth with this distribution's settings; see `lfm_ppl.smooth`."""
-        plan = schedule(self._ssm, self.times, self.steps, self.max_step, at, row_per_step=self.iterations > 0)
+        plan = schedule(self.ssm, self.times, self.steps, self.max_step, at, row_per_step=self.iterations > 0)
         y = check_observations(y, *self.event_shape)
-        return smooth_on(self._ssm, self.rule, plan, y, self.iterations, self.damping)
+        return smooth_on(self.ssm, self.rule, plan, y, self.iterations, self.damping)
 
 
 class Panel(dist.Distribution):
@@ -149,7 +147,6 @@ class Panel(dist.Distribution):
                              "Repeat a shared parameter with jnp.broadcast_to, or close over it in build.")
         self.build, self.parameters, self.times, self.settings = build, parameters, times, settings
         (count,) = sizes
-        self._series_times = np.ndim(times) == 2
         if self._series_times and np.shape(times)[0] != count:
             raise ValueError(f"times has {np.shape(times)[0]} rows for {count} series; give one row a series, or one "
                              "vector for all.")
@@ -159,6 +156,10 @@ class Panel(dist.Distribution):
         if not self._series_times:
             _ = self.first  # eager checks, where the values are concrete
         super().__init__((count,), one.shape, validate_args=False)
+
+    @property
+    def _series_times(self) -> bool:
+        return np.ndim(self.times) == 2
 
     def _one(self, parameters: Any, times: Any) -> MarginalLikelihood:
         return MarginalLikelihood(self.build(parameters), times, **self.settings)
@@ -186,7 +187,7 @@ class Panel(dist.Distribution):
         value = jnp.asarray(value, float)
         if value.ndim > 3:
             return jax.vmap(self.log_prob)(value)
-        return self.log_prob_per_observation(value).sum(-1)
+        return self.mapped(lambda one, y: one.log_prob(y), self.checked(value))
 
     def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
         """Simulate every series: (*sample_shape, B, T, D)."""

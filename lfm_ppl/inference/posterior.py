@@ -61,8 +61,8 @@ def likelihood_site(model: Callable, arguments: tuple, keywords: Mapping[str, An
 
 
 def scores(model: Callable, arguments: tuple, keywords: Mapping[str, Any], draws: Mapping[str, Any],
-           y: Any) -> dict[str, np.ndarray]:
-    """Score the observations under each draw.
+           y: Any, state_dim: int) -> dict[str, np.ndarray]:
+    """Score the observations under each draw; ``state_dim`` bounds the memory.
 
     Returns:
         ``leave_one_out`` (S, ..., T), ``one_step_ahead`` (S, ..., T), ``residual`` (S, ..., T, D); the series of a panel
@@ -78,11 +78,11 @@ def scores(model: Callable, arguments: tuple, keywords: Mapping[str, Any], draws
         site = likelihood_site(model, arguments, keywords, key, parameters)
         return _each(site.distribution, one, jnp.asarray(y, float))
 
-    return _over_draws(model, arguments, keywords, per_draw, draws, jax.random.key(0), len(np.ravel(arguments[0])))
+    return _over_draws(per_draw, draws, jax.random.key(0), len(np.ravel(arguments[0])), state_dim)
 
 
 def trajectories(model: Callable, arguments: tuple, keywords: Mapping[str, Any], draws: Mapping[str, Any], y: Any,
-                 at: Any, key: jax.Array) -> dict[str, np.ndarray]:
+                 at: Any, key: jax.Array, state_dim: int) -> dict[str, np.ndarray]:
     """Draw one trajectory for each draw of the parameters, given the data, and replicate the data along it.
 
     Args:
@@ -91,6 +91,7 @@ def trajectories(model: Callable, arguments: tuple, keywords: Mapping[str, Any],
         y: (T, D), or (B, T, D) for a panel.
         at: (K,) times of the trajectories, or None for the observation times.
         key: a JAX random key.
+        state_dim: of the joint state; bounds the memory.
 
     Returns:
         ``state`` (S, ..., K, M), ``force`` (S, ..., K, R), ``output`` (S, ..., K, D) free of noise, and ``y``
@@ -124,7 +125,7 @@ def trajectories(model: Callable, arguments: tuple, keywords: Mapping[str, Any],
         return _each(site.distribution, one, observed, keys)
 
     rows = count + len(np.ravel(arguments[0]))
-    return _over_draws(model, arguments, keywords, per_draw, draws, key, rows)
+    return _over_draws(per_draw, draws, key, rows, state_dim)
 
 
 def _each(distribution: MarginalLikelihood | Panel, function: Callable, *arguments: Any) -> Any:
@@ -133,13 +134,15 @@ def _each(distribution: MarginalLikelihood | Panel, function: Callable, *argumen
     return function(distribution, *arguments)
 
 
-def _over_draws(model: Callable, arguments: tuple, keywords: Mapping[str, Any], per_draw: Callable,
-                draws: Mapping[str, Any], key: jax.Array, rows: int) -> dict[str, np.ndarray]:
+def _over_draws(per_draw: Callable, draws: Mapping[str, Any], key: jax.Array, rows: int,
+                state_dim: int) -> dict[str, np.ndarray]:
     """Map over draws, in batches that bound the memory."""
     draws = {name: jnp.asarray(value) for name, value in draws.items()}
     count = next(iter(draws.values())).shape[0]
-    example = likelihood_site(model, arguments, keywords, key, {n: v[0] for n, v in draws.items()})
-    numbers = rows * example.example.ssm.state_dim**2 * 6
-    batch = int(np.clip(_BATCH_NUMBERS // max(numbers, 1), 1, count))
-    run = jax.jit(lambda d, k: jax.lax.map(lambda pair: per_draw(*pair), (d, k), batch_size=batch))
-    return jax.tree_util.tree_map(np.asarray, run(draws, jax.random.split(key, count)))
+    batch = int(np.clip(_BATCH_NUMBERS // max(rows * state_dim**2 * 6, 1), 1, count))
+    batches = -(-count // batch)
+    # Repeat the last draws so that all batches are full: one shape, one compilation.
+    index = np.minimum(np.arange(batches * batch), count - 1).reshape(batches, batch)
+    run = jax.jit(lambda d, k: jax.lax.map(lambda pair: jax.vmap(per_draw)(*pair), (d, k)))
+    found = run({name: value[index] for name, value in draws.items()}, jax.random.split(key, count)[index])
+    return jax.tree_util.tree_map(lambda a: np.asarray(a).reshape(-1, *a.shape[2:])[:count], found)
