@@ -1,0 +1,280 @@
+"""Linear models against dense Gaussian process algebra."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from references import LinearLFM, Regression, added, complex_step, matern
+from systems import Linear, Outputs
+
+import lfm_ppl as lfm
+
+NAN = np.nan
+
+
+@dataclasses.dataclass
+class Case:
+    model: lfm.LatentForceModel
+    reference: Regression
+    times: np.ndarray
+    y: np.ndarray
+    steps: int = 3
+
+
+def smooth_wave(t):
+    return 0.5 * jnp.sin(1.1 * t) + 0.2
+
+
+def wave_numpy(t):
+    return 0.5 * np.sin(1.1 * t) + 0.2
+
+
+def scaled_wave(t):
+    return jnp.array([1.0, -0.5]) * jnp.cos(0.7 * t)
+
+
+# Gaps, replicates, observations at and after the initial time.
+TIMES = np.array([0.5, 0.5, 0.9, 1.0, 2.2, 2.2, 2.2, 3.0, 6.5, 6.6])
+
+
+def data(outputs: int, seed: int = 0) -> np.ndarray:
+    y = np.random.default_rng(seed).normal(size=(len(TIMES), outputs))
+    y[3, 0] = y[6] = y[8, -1] = NAN
+    return y
+
+
+def linear_case(j, b, forces, kernels, *, output, start=0.0, variance=None, noise=0.04, constant=0.0, additive=None,
+                means=None, reference_additive=None, dispersion=None, steps=3, mean=None, breaks=()) -> Case:
+    j, b, output = (np.atleast_2d(np.asarray(a, float)) for a in (j, b, output))
+    size, count = b.shape
+    mean = 0.3 * np.arange(1, size + 1) if mean is None else mean
+    covariance = np.zeros((size, size)) if variance is None else np.asarray(variance, float)
+    outputs = output.shape[0]
+    constant = np.broadcast_to(constant, (size,))
+    model = lfm.LatentForceModel(
+        Linear(jnp.asarray(j), jnp.asarray(b), jnp.asarray(constant), additive), forces,
+        lfm.GaussianObservation(Outputs(jnp.asarray(output)), noise * jnp.ones(outputs)),
+        lfm.Gaussian(jnp.asarray(mean), jnp.asarray(covariance)), initial_time=start,
+        process_noise=None if dispersion is None else jnp.asarray(dispersion))
+    add = lambda t: constant + (0.0 if reference_additive is None else reference_additive(t))  # noqa: E731
+    process = LinearLFM(j, b, kernels, start, mean, covariance, means, add, dispersion, breaks=breaks)
+    return Case(model, Regression(process, output, noise * np.ones(outputs)), TIMES, data(outputs), steps)
+
+
+def regression(order: int) -> Case:
+    kernel = matern(1.2, 0.8, order)
+    empty = np.zeros((0, 0))
+    model = lfm.LatentForceModel(
+        Linear(jnp.zeros((0, 0)), jnp.zeros((0, 1)), jnp.zeros(0)), {"u": lfm.Matern(1.2, 0.8, order)},
+        lfm.GaussianObservation(Outputs(jnp.ones((1, 1))), jnp.array([0.04])), lfm.Gaussian(jnp.zeros(0), empty),
+        initial_time=0.5)
+    process = LinearLFM(empty, np.zeros((0, 1)), [kernel], 0.5, np.zeros(0), empty)
+    y = data(1)
+    y[3] = 0.4
+    return Case(model, Regression(process, np.ones((1, 1)), np.array([0.04])), TIMES, y)
+
+
+def heater() -> lfm.Input:
+    return lfm.Input([0.5, 1.0, 3.0, 6.5], [0.0, 2.0, -1.0, 0.5], "linear")
+
+
+class Heated(eqx.Module):
+    signal: Any
+
+    def __call__(self, t):
+        return jnp.array([1.0, 0.0]) * self.signal(t)
+
+
+GENES = np.diag([-0.7, -1.1])
+SENSITIVITY = np.array([[1.0], [0.5]])
+SPRING = np.array([[0, 1, 0, 0], [-2.0, -0.4, 0, 0], [0, 0, 0, 1], [0, 0, -0.6, -1.0]])
+SPRING_INPUT = np.array([[0.0], [1.0], [0.0], [0.5]])
+STATES = np.eye(2, 3)
+
+
+def _cases() -> dict[str, Any]:
+    m = lfm.Matern
+    genes = {"j": GENES, "b": SENSITIVITY, "output": STATES}
+    one = {"forces": {"u": m(1.0, 1.3, 1)}, "kernels": [matern(1.0, 1.3, 1)]}
+    positions = np.array([[1.0, 0, 0, 0, 0], [0, 0, 1, 0, 0]])
+    heated = {"constant": 0.2, "additive": Heated(heater()), "breaks": (0.5, 1.0, 3.0, 6.5),
+              "reference_additive": lambda t: np.array([np.interp(t, [0.5, 1.0, 3.0, 6.5], [0.0, 2.0, -1.0, 0.5]), 0])}
+    return {
+        **{f"matern {p}": lambda p=p: regression(p) for p in range(6)},
+        "motif, known start": lambda: linear_case(**genes, **one, constant=0.3),
+        "motif, uncertain start": lambda: linear_case(**genes, **one, variance=[[0.5, 0.2], [0.2, 0.3]], start=-1.0),
+        "motif, rough force and process noise": lambda: linear_case(
+            **genes, forces={"u": m(1.0, 1.3, 0)}, kernels=[matern(1.0, 1.3, 0)],
+            dispersion=np.array([[0.3, 0.0], [0.1, 0.2]]), variance=np.eye(2)),
+        "spring": lambda: linear_case(SPRING, SPRING_INPUT, {"u": m(1.0, 2.0, 2)}, [matern(1.0, 2.0, 2)],
+                                      output=positions, variance=np.eye(4)),
+        "two forces, one a sum": lambda: linear_case(
+            GENES, [[1.0, 0.3], [0.5, -0.4]], {"a": m(1.0, 1.3, 1), "b": m(0.7, 0.6, 2) + m(0.5, 3.0, 0)},
+            [matern(1.0, 1.3, 1), added(matern(0.7, 0.6, 2), matern(0.5, 3.0, 0))],
+            output=[[1.0, 0, 0, 0], [0, 1.0, 0, 0.5]]),
+        "constant mean": lambda: linear_case(
+            **genes, forces={"u": m(1.0, 1.3, 1, mean=1.5)}, kernels=one["kernels"],
+            means=[lambda t: np.full_like(t, 1.5)], variance=np.eye(2)),
+        "mean function": lambda: linear_case(
+            **genes, forces={"u": m(1.0, 1.3, 1, mean=smooth_wave)}, kernels=one["kernels"], means=[wave_numpy],
+            steps=100),
+        "additive function": lambda: linear_case(
+            **genes, **one, additive=scaled_wave, steps=100,
+            reference_additive=lambda t: np.array([1.0, -0.5]) * np.cos(0.7 * t)),
+        # The filter's rows end at the kinks of the input.
+        "known input": lambda: linear_case(**genes, **one, **heated, steps=100),
+    }
+
+
+CASES = _cases()
+
+
+@pytest.fixture(scope="module", params=CASES)
+def case(request):
+    return CASES[request.param]()
+
+
+AT = np.array([7.4, 0.5, 1.6, 2.2, 3.0, 9.0])  # between, on and after the observations, in any order
+
+
+@pytest.fixture(scope="module")
+def smoothed(case):
+    return lfm.smooth(case.model, case.times, case.y, steps=case.steps, at=AT)
+
+
+def close(found, expected, tolerance=1e-8):
+    """Relative to the largest entry."""
+    found, expected = np.asarray(found), np.asarray(expected)
+    assert found.shape == expected.shape
+    assert np.abs(found - expected).max() <= tolerance * np.abs(expected).max()
+
+
+def test_log_likelihood(case, smoothed):
+    close(smoothed.log_likelihood.sum(), case.reference.log_likelihood(case.times, case.y))
+    missing = np.isnan(case.y).all(axis=1)
+    assert missing.any() and not np.asarray(smoothed.log_likelihood)[missing].any()
+
+
+def test_smoother_and_forecast(case, smoothed):
+    mean, covariance = case.reference.posterior(case.times, case.y, AT)
+    close(smoothed.input_mean, mean)
+    close(smoothed.input_covariance, covariance[np.arange(len(AT)), np.arange(len(AT))])
+
+
+def test_leave_one_out(case, smoothed):
+    close(smoothed.leave_one_out, case.reference.leave_one_out(case.times, case.y))
+
+
+@pytest.mark.parametrize("name", ["matern 2", "motif, uncertain start", "spring", "two forces, one a sum",
+                                  "mean function"])
+def test_filter(name):
+    case = CASES[name]()
+    found = lfm.filter(case.model, case.times, case.y, steps=case.steps)
+    mean, covariance = case.reference.filtered(case.times, case.y)
+    ssm = lfm.state_space(case.model)
+    matrix, offset = jax.vmap(ssm.input_map)(jnp.asarray(case.times))
+    close(jnp.einsum("kwn,kn->kw", matrix, found.filtered_mean) + offset, mean)
+    close(jnp.einsum("kwn,knm,kvm->kwv", matrix, found.filtered_covariance, matrix), covariance)
+    close(found.log_likelihood.sum(), case.reference.log_likelihood(case.times, case.y))
+    present = np.isfinite(case.y)
+    # Whitened residuals are another way to write the same quadratic form.
+    assert np.array_equal(np.isfinite(found.residual), present)
+    whole = case.reference.joint(case.times, case.y)
+    residual, k = whole[1][present.ravel()], whole[2][np.ix_(present.ravel(), present.ravel())]
+    close(np.nansum(np.asarray(found.residual) ** 2), residual @ np.linalg.solve(k, residual))
+
+
+def test_initial_time_defaults_to_the_first_observation():
+    times = TIMES
+    given = CASES["motif, uncertain start"]().model
+    model = lfm.LatentForceModel(given.dynamics, given.forces, given.observation, given.initial_state)
+    moved = CASES["motif, uncertain start"]().reference
+    moved.process.start = times[0]
+    y = data(2)
+    close(lfm.filter(model, times, y).log_likelihood.sum(), moved.log_likelihood(times, y))
+
+
+def build_motif(theta):
+    return lfm.LatentForceModel(
+        Linear(-jnp.diag(theta[:2]), theta[2:4, None], theta[4:6]), {"u": lfm.Matern(theta[6], theta[7], 1)},
+        lfm.GaussianObservation(Outputs(jnp.asarray(STATES)), theta[8] * jnp.ones(2)),
+        lfm.Gaussian(theta[9] * jnp.ones(2), theta[10] * jnp.eye(2)), initial_time=0.0)
+
+
+def dense_motif(theta):
+    process = LinearLFM(-np.diag(theta[:2]), theta[2:4, None], [matern(theta[6], theta[7], 1)], 0.0,
+                        theta[9] * np.ones(2), theta[10] * np.eye(2), None, lambda t: theta[4:6])
+    return Regression(process, STATES, theta[8] * np.ones(2))
+
+
+def build_spring(theta):
+    system = jnp.asarray(SPRING).at[1, 0].set(-theta[0]).at[1, 1].set(-theta[1])
+    return lfm.LatentForceModel(
+        Linear(system, theta[2] * jnp.asarray(SPRING_INPUT)), {"u": lfm.Matern(1.0, theta[3], 2)},
+        lfm.GaussianObservation(lambda x, u, t: x[::2], theta[4] * jnp.ones(2)),
+        lfm.Gaussian(jnp.zeros(4), jnp.zeros((4, 4))), initial_time=0.0)
+
+
+def dense_spring(theta):
+    system = SPRING.astype(complex)
+    system[1, :2] = -theta[:2]
+    process = LinearLFM(system, theta[2] * SPRING_INPUT, [matern(1.0, theta[3], 2)], 0.0, np.zeros(4),
+                        np.zeros((4, 4)))
+    return Regression(process, np.array([[1.0, 0, 0, 0, 0], [0, 0, 1, 0, 0]]), theta[4] * np.ones(2))
+
+
+GRADIENTS = {
+    "motif": (build_motif, dense_motif, [0.7, 1.1, 1.0, 0.5, 0.3, 0.2, 1.2, 1.3, 0.04, 0.4, 0.2]),
+    # A decay that equals the force's rate: repeated roots.
+    "motif, repeated roots": (build_motif, dense_motif,
+                              [np.sqrt(3) / 1.3, 1.1, 1.0, 0.5, 0.3, 0.2, 1.2, 1.3, 0.04, 0.4, 0.2]),
+    "spring": (build_spring, dense_spring, [2.0, 0.4, 1.0, 2.0, 0.04]),
+    # Critical damping, of an oscillator as fast as the force; then none.
+    "spring, critical": (build_spring, dense_spring, [1.25, 2 * np.sqrt(1.25), 1.0, 2.0, 0.04]),
+    "spring, undamped": (build_spring, dense_spring, [2.0, 0.0, 1.0, 2.0, 0.04]),
+}
+
+
+@pytest.fixture(scope="module")
+def derivatives():
+    """Value, reverse-mode and forward-mode gradient of each builder, compiled once."""
+    y = jnp.asarray(data(2))
+    made = {}
+
+    def derivative(build):
+        if build not in made:
+            value = lambda theta: lfm.MarginalLikelihood(build(theta), TIMES, steps=2).log_prob(y)  # noqa: E731
+            made[build] = jax.jit(lambda theta: (value(theta), jax.grad(value)(theta), jax.jacfwd(value)(theta)))
+        return made[build]
+
+    return derivative
+
+
+@pytest.mark.parametrize("name", GRADIENTS)
+def test_gradient(derivatives, name):
+    build, dense, theta = GRADIENTS[name]
+    value, reverse, forward = derivatives(build)(jnp.asarray(theta))
+    y = data(2)
+    close(value, dense(np.asarray(theta)).log_likelihood(TIMES, y))
+    expected = complex_step(lambda p: dense(p).log_likelihood(TIMES, y), theta)
+    close(reverse, expected)
+    close(forward, expected)
+
+
+def test_integrated_path_agrees_with_the_exact_one():
+    """Declared non-linear, the same model is integrated by Runge-Kutta steps; they converge with order four."""
+    case = CASES["motif, uncertain start"]()
+    exact = lfm.filter(case.model, case.times, case.y).log_likelihood.sum()
+    model = lfm.LatentForceModel(
+        case.model.dynamics, case.model.forces, case.model.observation, case.model.initial_state,
+        initial_time=case.model.initial_time, nonlinear_inputs=("x0", "x1", "u"))
+    error = [float(abs(lfm.filter(model, case.times, case.y, steps=n).log_likelihood.sum() - exact))
+             for n in (16, 32)]
+    assert 3.7 < np.log2(error[0] / error[1]) < 4.5
+    assert error[1] < 1e-4
