@@ -85,6 +85,8 @@ def cholesky(p: jax.Array, floor: jax.Array | float = 0.0, keep: bool = True) ->
         The factor and its degenerate pivots.
     """
     size = p.shape[-1]
+    if size == 0:
+        return Factor(p, jnp.zeros(0, bool))
     floor = jnp.broadcast_to(jnp.asarray(floor, p.dtype), (size,))
     rows = np.arange(size)
     columns: list[jax.Array] = []
@@ -108,6 +110,8 @@ def solve_lower(chol: jax.Array, b: jax.Array) -> jax.Array:
 
     A zero on the diagonal (a semi-definite factor) gives a zero row of ``X``.
     """
+    if chol.shape[-1] == 0:
+        return b
     rows: list[jax.Array] = []
     for j in range(chol.shape[-1]):
         value = b[j]
@@ -120,6 +124,8 @@ def solve_lower(chol: jax.Array, b: jax.Array) -> jax.Array:
 def solve_upper(chol: jax.Array, b: jax.Array) -> jax.Array:
     """Solve ``L' X = B`` for a lower triangular ``L`` (n, n); zeros on the diagonal as in `solve_lower`."""
     size = chol.shape[-1]
+    if size == 0:
+        return b
     rows: dict[int, jax.Array] = {}
     for j in reversed(range(size)):
         value = b[j]

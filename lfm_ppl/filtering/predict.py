@@ -32,11 +32,11 @@ class Moments(NamedTuple):
 
 
 class Prediction(NamedTuple):
-    """The affine map of a row, s -> phi s + ... + N(0, noise), and the moments at its end."""
+    """The moments at the end of a row, and its affine map s -> phi s + ... + N(0, noise) where that was asked for."""
 
     moments: Moments
-    phi: jax.Array
-    noise: jax.Array
+    phi: Any
+    noise: Any
 
 
 class _Stage(NamedTuple):
@@ -105,9 +105,9 @@ def predict_row(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Fa
             phi, noise = matmul(one.phi, phi), congruence(one.phi, noise) + one.noise
         return (one.moments, phi, noise), None
 
-    carry = (moments, jnp.eye(size), empty) if flow else (moments, 0.0, 0.0)
-    (moments, phi, noise), _ = jax.lax.scan(jax.checkpoint(step, prevent_cse=False), carry, jnp.arange(steps))
-    return Prediction(moments, phi, noise)
+    carry = (moments, jnp.eye(size), empty) if flow else (moments, jnp.zeros(0), jnp.zeros(0))
+    (moments, whole, added), _ = jax.lax.scan(jax.checkpoint(step, prevent_cse=False), carry, jnp.arange(steps))
+    return Prediction(moments, whole, added)
 
 
 def _between(about: tuple[Moments, Moments], *fractions: jax.Array) -> list[Moments]:

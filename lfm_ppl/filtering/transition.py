@@ -50,8 +50,8 @@ class Factor(NamedTuple):
     ``half`` and ``full`` are E(h/2) and E(h), the exponential of ``Lin``. ``back_half`` and ``back_full`` approximate
     their inverses by 4 - 6 E + 4 E^2 - E^3 and its square: to the order of the step where it resolves ``Lin``, and
     bounded where it does not, while the true inverses of fast decays overflow. ``noise_half`` and ``noise_full`` are
-    the exact covariances of the forces' noise, ``inputs`` (nz, S) its dispersion. ``columns_*`` (nz, K) stand for the forces' noise at the nodes of each
-    stage and of the whole step; ``regression_*`` (K, nz) regresses them on the exact noise.
+    the exact covariances of the forces' noise, ``inputs`` (nz, S) its dispersion. ``columns`` (nz, K) stand for the forces' noise at the nodes
+    of each later stage and of the whole step; ``regressions`` (K, nz) regress them on the exact noise.
     """
 
     half: jax.Array
@@ -61,8 +61,8 @@ class Factor(NamedTuple):
     noise_half: jax.Array
     noise_full: jax.Array
     inputs: jax.Array
-    columns: tuple[jax.Array, jax.Array, jax.Array, jax.Array]
-    regressions: tuple[jax.Array, jax.Array, jax.Array, jax.Array]
+    columns: tuple[jax.Array, ...]
+    regressions: tuple[jax.Array, ...]
 
 
 def constant_slope(function: Function, point: jax.Array, structure: InputStructure, outputs: int) -> jax.Array:

@@ -151,9 +151,10 @@ def fit(
         remarks = {}
     flat = {label: value.reshape(-1, *value.shape[2:]) for label, value in draws.items()}
     latent = _latent(model, arguments, keywords, keys[0], flat)
-    rated = scores(model, arguments, keywords, latent, y, site.example.ssm.state_dim)
-    chosen, paths, grid = _paths(model, arguments, keywords, latent, site, y, at, trajectory_draws, chains, samples,
-                                 keys[3])
+    rated = _kept("scores of the observations", lambda: scores(
+        model, arguments, keywords, latent, y, site.example.ssm.state_dim), None)
+    chosen, paths, grid = _kept("trajectories", lambda: _paths(
+        model, arguments, keywords, latent, site, y, at, trajectory_draws, chains, samples, keys[3]), (None, None, None))
     groups = _groups(site, draws, stats, rated, paths, chosen, grid, times, y, truth, chains, samples)
     attrs = {
         "model": name or getattr(numpyro_model, "__name__", "model"), "rule": site.example.rule.name,
@@ -168,6 +169,15 @@ def fit(
         for message in arviz_data.convergence_warnings(result):
             warnings.warn(message, ConvergenceWarning, stacklevel=2)
     return result
+
+
+def _kept(what: str, compute: Callable[[], Any], otherwise: Any) -> Any:
+    """Compute something from the draws; a failure must not lose the draws, which took the time."""
+    try:
+        return compute()
+    except (RuntimeError, FloatingPointError, MemoryError) as error:
+        warnings.warn(f"the {what} could not be computed and are left out of the result: {error}", stacklevel=3)
+        return otherwise
 
 
 def _checked(site: LikelihoodSite, y: Any) -> jax.Array:
@@ -283,7 +293,7 @@ def _paths(model: Callable, arguments: tuple, keywords: dict, latent: dict, site
     return chosen, {k: v.reshape(chains, len(chosen), *v.shape[1:]) for k, v in paths.items()}, grid
 
 
-def _groups(site: LikelihoodSite, draws: dict, stats: dict, rated: dict, paths: dict | None, chosen: np.ndarray,
+def _groups(site: LikelihoodSite, draws: dict, stats: dict, rated: dict | None, paths: dict | None, chosen: Any,
             grid: np.ndarray | None, times: Any, y: Any, truth: Mapping[str, Any] | None, chains: int,
             samples: int) -> dict[str, xr.Dataset]:
     model = site.example.ssm.model
@@ -301,20 +311,22 @@ def _groups(site: LikelihoodSite, draws: dict, stats: dict, rated: dict, paths: 
 
     # A time at which nothing was observed has no predictive density to compare.
     seen = np.flatnonzero(np.isfinite(np.asarray(y)).any(axis=-1).reshape(-1, np.shape(y)[-2]).any(axis=0))
-    split = {label: value.reshape(chains, samples, *value.shape[1:]) for label, value in rated.items()}
     sample = ("chain", "draw", *along)
     observed_coords = {**clock, "output": named["output"]}
     groups = {
         "posterior": _posterior(draws, coords, named["output"]),
         "sample_stats": xr.Dataset({k: (("chain", "draw"), v) for k, v in stats.items()}, coords),
-        "log_likelihood": xr.Dataset({site.name: variable(sample, split["leave_one_out"])}, {**coords, **clock}).isel(time=seen),
-        "one_step_ahead": xr.Dataset(
-            {"log_density": variable(sample, split["one_step_ahead"]),
-             "residual": variable((*sample, "output"), split["residual"])}, {**coords, **observed_coords}),
         "observed_data": xr.Dataset({site.name: variable((*along, "output"), y, named["output"])}, observed_coords),
     }
     if per_series:
         groups["observed_data"] = groups["observed_data"].assign(times=(along, times))
+    if rated is not None:
+        split = {label: value.reshape(chains, samples, *value.shape[1:]) for label, value in rated.items()}
+        left_out = xr.Dataset({site.name: variable(sample, split["leave_one_out"])}, {**coords, **clock})
+        groups["log_likelihood"] = left_out.isel(time=seen)
+        groups["one_step_ahead"] = xr.Dataset(
+            {"log_density": variable(sample, split["one_step_ahead"]),
+             "residual": variable((*sample, "output"), split["residual"])}, {**coords, **observed_coords})
     if paths is not None:
         thinned = {"chain": np.arange(chains), "draw": chosen}
         groups["posterior_predictive"] = xr.Dataset(
@@ -330,7 +342,8 @@ def _groups(site: LikelihoodSite, draws: dict, stats: dict, rated: dict, paths: 
 
 
 def _posterior(draws: dict, coords: dict, outputs: list[str]) -> xr.Dataset:
-    variables, extra = {}, {}
+    variables: dict[str, Any] = {}
+    extra: dict[str, Any] = {}
     for label, value in draws.items():
         dims = []
         for axis, size in enumerate(value.shape[2:]):

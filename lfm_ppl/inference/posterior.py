@@ -145,4 +145,4 @@ def _over_draws(per_draw: Callable, draws: Mapping[str, Any], key: jax.Array, ro
     index = np.minimum(np.arange(batches * batch), count - 1).reshape(batches, batch)
     run = jax.jit(lambda d, k: jax.lax.map(lambda pair: jax.vmap(per_draw)(*pair), (d, k)))
     found = run({name: value[index] for name, value in draws.items()}, jax.random.split(key, count)[index])
-    return jax.tree_util.tree_map(lambda a: np.asarray(a).reshape(-1, *a.shape[2:])[:count], found)
+    return jax.tree_util.tree_map(lambda a: np.asarray(a).reshape(a.shape[0] * a.shape[1], *a.shape[2:])[:count], found)

@@ -270,7 +270,7 @@ class MonteCarlo(SigmaPointRule):
         """See `SigmaPointRule.points`."""
         if self.samples < 2 * dim + 2:
             raise ValueError(f"MonteCarlo needs more than {2 * dim + 1} samples for {dim} inputs, got {self.samples}.")
-        half = np.random.default_rng(self.seed).standard_normal((self.samples // 2, dim))
+        half: np.ndarray = np.random.default_rng(self.seed).standard_normal((self.samples // 2, dim))
         chol = np.linalg.cholesky(half.T @ half / half.shape[0])
         half = np.linalg.solve(chol, half.T).T
         weights = np.full(self.samples, 1.0 / self.samples)

@@ -168,7 +168,7 @@ def state_space(model: LatentForceModel) -> StateSpaceModel:
 
 
 def _dependence(function: Callable[[jax.Array], jax.Array], total: int) -> tuple[int, ...]:
-    found = pattern(function, total + 1).jacobian.any(axis=0)
+    found = np.asarray(pattern(function, total + 1).jacobian.any(axis=0))
     return tuple(int(index) for index in np.flatnonzero(found[:total]))
 
 

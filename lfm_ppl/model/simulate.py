@@ -33,8 +33,8 @@ def simulate(key: jax.Array, model: LatentForceModel, times: Any, steps: int = 5
     """Simulate a latent force model.
 
     The forces are exact at every integration step. Without process noise the state follows by Heun's method along the
-    sampled force path; with process noise by its stochastic form (Stratonovich-free: the noise enters each step with
-    the dispersion at its start, so the scheme is the Ito one, of strong order 1 for additive noise).
+    sampled force path. Process noise enters each step with the dispersion at its start, as Ito's integral has it: the
+    scheme is then of strong order 1 for additive noise, 1/2 otherwise.
 
     Args:
         key: a JAX random key.

@@ -56,7 +56,7 @@ def pattern(function: Callable[[jax.Array], jax.Array], inputs: int) -> Pattern:
     jaxpr = jax.make_jaxpr(function)(jax.ShapeDtypeStruct((inputs,), jnp.result_type(float)))
     argument = _Value(np.eye(inputs, dtype=bool), np.zeros((inputs, inputs, inputs), bool))
     (output,) = _propagate(jaxpr.jaxpr, jaxpr.consts, [argument], inputs)
-    return Pattern(output.first, output.second.any(axis=0))
+    return Pattern(output.first, np.asarray(output.second.any(axis=0)))
 
 
 def _constant(shape: tuple[int, ...], inputs: int, known: Any = None) -> _Value:
