@@ -1,0 +1,51 @@
+"""The command line, ``lfm-ppl``: one module for the arguments, one for each command."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Sequence
+
+from lfm_ppl.cli.arguments import parser
+
+_INTERRUPTED = 130
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        argv: the arguments without the program's name; None: those of the process.
+
+    Returns:
+        0 after success, 1 where results were saved and a figure could not be drawn, 2 after an
+        error, which is one line on standard error unless ``--debug`` is given.
+    """
+    arguments = parser().parse_args(argv)
+    warnings.showwarning = _show_warning
+    try:
+        return int(arguments.run(arguments))
+    except KeyboardInterrupt:
+        print("lfm-ppl: interrupted", file=sys.stderr)
+        return _INTERRUPTED
+    except BrokenPipeError:  # the reader of a pipe, such as `head`, has seen enough
+        sys.stderr.close()
+        return 0
+    except Exception as error:
+        if arguments.debug:
+            raise
+        print(f"lfm-ppl: error: {_one_line(error)}", file=sys.stderr)
+        return 2
+
+
+def _one_line(error: Exception) -> str:
+    text = " ".join(str(error).split()) or type(error).__name__
+    if isinstance(error, FileNotFoundError) and error.filename:
+        return f"there is no file {error.filename}."
+    if isinstance(error, (ValueError, TypeError, OSError)):
+        return text
+    return f"{type(error).__name__}: {text} (--debug shows where)"
+
+
+def _show_warning(message, category, filename, lineno, file=None, line=None) -> None:
+    print(f"lfm-ppl: warning: {' '.join(str(message).split())}", file=sys.stderr)

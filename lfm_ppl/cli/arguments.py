@@ -1,0 +1,189 @@
+"""What can be typed after ``lfm-ppl``."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from typing import Any, NoReturn
+
+from lfm_ppl import checks
+from lfm_ppl.cli import fit, models, plot, simulate, version
+from lfm_ppl.cli.choices import RULES, SAMPLERS
+
+MODEL_HELP = "a shipped model (see `lfm-ppl models`) or the path of a Python file"
+OPTION_HELP = "a choice that the model offers, see `lfm-ppl models MODEL`; may be repeated"
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose complaint is one line."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print the complaint and end the process."""
+        print(f"lfm-ppl: error: {message} (see `{self.prog} --help`)", file=sys.stderr)
+        raise SystemExit(2)
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the whole command line."""
+    top = Parser(
+        prog="lfm-ppl",
+        description="Latent force models: from a model and data to a posterior.",
+        epilog="Start with: lfm-ppl fit ginzburg-landau",
+    )
+    top.set_defaults(debug=False)
+    commands = top.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    for add in (_add_models, _add_simulate, _add_fit, _add_plot, _add_version):
+        add(commands)
+    return top
+
+
+def _command(commands: Any, name: str, run: Callable[..., int], help_: str, examples: str) -> Any:
+    command = commands.add_parser(
+        name,
+        help=help_,
+        description=help_[0].upper() + help_[1:] + ".",
+        epilog=f"examples:\n{examples}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    command.set_defaults(run=run)
+    command.add_argument("--debug", action="store_true", help="show where an error comes from")
+    return command
+
+
+def _add_models(commands: Any) -> None:
+    examples = "  lfm-ppl models\n  lfm-ppl models transcription"
+    command = _command(commands, "models", models.run, "list the models, or describe one", examples)
+    command.add_argument("model", nargs="?", metavar="MODEL", help=MODEL_HELP)
+
+
+def _add_simulate(commands: Any) -> None:
+    examples = (
+        "  lfm-ppl simulate transcription --seed 3 --out genes.csv\n"
+        "  lfm-ppl fit transcription --data genes.csv --truth genes.truth.json"
+    )
+    help_ = "write a model's simulated data as a CSV file, with the truth beside it"
+    command = _command(commands, "simulate", simulate.run, help_, examples)
+    command.add_argument("model", metavar="MODEL", help=MODEL_HELP)
+    command.add_argument("--out", metavar="FILE", help="CSV file to write (default: MODEL.csv)")
+    command.add_argument("--seed", type=_whole(0), default=0, help="random seed (default: 0)")
+    command.add_argument("--option", action="append", default=[], metavar="NAME=VALUE", help=OPTION_HELP)
+    command.add_argument("--overwrite", action="store_true", help="replace files that exist")
+
+
+def _add_plot(commands: Any) -> None:
+    examples = (
+        "  lfm-ppl plot lfm-results/spring-001 --overwrite\n  lfm-ppl plot posterior.nc --out figures --format pdf"
+    )
+    help_ = "draw the figures of a saved result again"
+    command = _command(commands, "plot", plot.run, help_, examples)
+    command.add_argument("result", metavar="RESULT", help="a results folder or a posterior.nc")
+    command.add_argument("--out", metavar="DIR", help="folder for the figures (default: RESULT's)")
+    command.add_argument(
+        "--format",
+        choices=("png", "pdf", "svg"),
+        default="png",
+        help="kind of the figures (default: png)",
+    )
+    command.add_argument("--overwrite", action="store_true", help="replace figures that exist")
+
+
+def _add_version(commands: Any) -> None:
+    help_ = "print the versions of lfm_ppl and of what it stands on"
+    _command(commands, "version", version.run, help_, "  lfm-ppl version")
+
+
+def _add_fit(commands: Any) -> None:
+    examples = (
+        "  lfm-ppl fit ginzburg-landau\n"
+        "  lfm-ppl fit transcription --data genes.csv --option link=saturation\n"
+        "  lfm-ppl fit transcription --data p53.csv --set 'decay[CDKN1A]=0.8'\n"
+        "  lfm-ppl fit my_model.py --data mine.csv --rule gauss-hermite --steps 20 --out result"
+    )
+    help_ = "infer parameters and forces, and write posterior, summary and figures"
+    command = _command(commands, "fit", fit.run, help_, examples)
+    command.add_argument("model", metavar="MODEL", help=MODEL_HELP)
+    _add_data(command.add_argument_group("data"))
+    _add_inference(command.add_argument_group("inference"))
+    _add_approximation(command.add_argument_group("approximation (default: the model's own)"))
+    out = command.add_argument_group("results")
+    out.add_argument("--out", metavar="DIR", help="folder to write (default: lfm-results/MODEL-001, -002, ...)")
+    out.add_argument("--overwrite", action="store_true", help="write into a folder with files")
+    out.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def _add_data(group: Any) -> None:
+    group.add_argument(
+        "--data",
+        metavar="FILE",
+        help="CSV: a time column, one column per output, empty cells missing, repeated times for "
+        "replicates (default: the model's simulated data)",
+    )
+    group.add_argument("--time-column", metavar="NAME", help="the time column (default: time, t or time_h)")
+    group.add_argument("--outputs", metavar="A,B,...", help="the columns to use (default: those of the model)")
+    group.add_argument("--truth", metavar="FILE", help="the truth that `simulate` wrote, to be drawn in figures")
+
+
+def _add_inference(group: Any) -> None:
+    group.add_argument(
+        "--sampler",
+        type=_one_of("sampler", SAMPLERS),
+        default="nuts",
+        metavar="|".join(SAMPLERS),
+        help="default: nuts",
+    )
+    group.add_argument("--chains", type=_whole(1), default=4, help="default: 4")
+    group.add_argument("--warmup", type=_whole(0), default=1000, help="per chain (default: 1000)")
+    group.add_argument("--samples", type=_whole(1), default=1000, help="per chain (default: 1000)")
+    group.add_argument("--seed", type=_whole(0), default=0, help="random seed (default: 0)")
+    group.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="fix a parameter, `decay=0.8`, or an element of it, `decay[CDKN1A]=0.8`; "
+        "`NAME=free` frees what the model fixes itself; may be repeated",
+    )
+    group.add_argument("--option", action="append", default=[], metavar="NAME=VALUE", help=OPTION_HELP)
+
+
+def _add_approximation(group: Any) -> None:
+    group.add_argument(
+        "--rule",
+        type=_one_of("rule", RULES),
+        metavar="RULE",
+        help=f"how functions are linearised: {', '.join(RULES)}",
+    )
+    group.add_argument("--steps", type=_whole(1), metavar="N", help="integration steps between observations")
+    group.add_argument("--max-step", type=_positive, metavar="TIME", help="longest integration step")
+    group.add_argument("--iterations", type=_whole(0), metavar="N", help="of posterior linearisation")
+
+
+def _one_of(kind: str, choices: Any) -> Callable[[str], str]:
+    def convert(text: str) -> str:
+        if text not in choices:
+            raise argparse.ArgumentTypeError(checks.unknown(kind, text, choices))
+        return text
+
+    return convert
+
+
+def _whole(least: int) -> Callable[[str], int]:
+    def convert(text: str) -> int:
+        if not text.isascii() or not text.isdigit() or int(text) < least:
+            message = f"expected a whole number of at least {least}, got {text!r}"
+            raise argparse.ArgumentTypeError(message)
+        return int(text)
+
+    return convert
+
+
+def _positive(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"expected a number above zero, got {text!r}")
+    return value

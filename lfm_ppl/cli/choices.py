@@ -1,0 +1,79 @@
+"""What the user's words stand for: rules, samplers, fixed parameters, options."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from lfm_ppl import checks
+from lfm_ppl.loading import ModelFile
+
+# word on the command line -> name in lfm_ppl
+RULES = {
+    "cubature": "Cubature",
+    "taylor": "Taylor",
+    "unscented": "Unscented",
+    "gauss-hermite": "GaussHermite",
+    "central-difference": "CentralDifference",
+    "monte-carlo": "MonteCarlo",
+}
+SAMPLERS = ("nuts", "ram", "map")
+FREE = "free"
+
+
+def options(model: ModelFile, given: Sequence[str]) -> dict[str, Any]:
+    """Return the values of ``--option NAME=VALUE``, checked against what the model offers."""
+    pairs = [_pair("--option", text) for text in given]
+    return {name: model.option(name, value) for name, value in pairs}
+
+
+def fixed(given: Sequence[str], anchors: Mapping[str, float]) -> dict[str, Any]:
+    """Return the parameters to fix: name -> value.
+
+    Args:
+        given: ``NAME=VALUE``, ``NAME[ELEMENT]=VALUE``, ``NAME=V1,V2,...`` or ``NAME=free``.
+        anchors: what the model fixes for this data. What the user says of an element replaces the
+            anchor of that element, what the user says of a whole parameter all anchors of it.
+
+    Raises:
+        ValueError: for what does not have one of these forms.
+    """
+    chosen = dict(anchors)
+    for text in given:
+        name, value = _pair("--set", text)
+        for anchor in list(chosen):
+            if anchor == name or anchor.partition("[")[0] == name:
+                del chosen[anchor]
+        if value != FREE:
+            chosen[name] = _number(name, value)
+        elif not any(anchor == name or anchor.partition("[")[0] == name for anchor in anchors):
+            known = ", ".join(anchors) or "none"
+            raise ValueError(f"--set {text}: the model does not fix {name}; it fixes: {known}.")
+    return chosen
+
+
+def rule(word: str | None) -> Any:
+    """Return the linearisation rule that a word stands for; None: the model's own."""
+    import lfm_ppl
+
+    return None if word is None else getattr(lfm_ppl, RULES[word])()
+
+
+def _pair(flag: str, text: str) -> tuple[str, str]:
+    name, equals, value = text.partition("=")
+    if not equals or not name.strip() or not value.strip():
+        raise ValueError(f"{flag} takes NAME=VALUE, got {text!r}.")
+    return name.strip(), value.strip()
+
+
+def _number(name: str, text: str) -> Any:
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        raise ValueError(
+            f"--set {name}: expected a number, numbers separated by commas, or {FREE!r}, got {text!r}."
+        ) from None
+    checks.finite(f"--set {name}", np.array(values))
+    return values[0] if len(values) == 1 else values

@@ -1,0 +1,141 @@
+"""``lfm-ppl fit``: from a model and data to posterior, summary and figures."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import shutil
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lfm_ppl import data, loading
+from lfm_ppl.cli import choices, results, session
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Fit, print the summary, and write the results; the posterior is on disk before any figure."""
+    session.start(arguments.chains)
+    model = loading.load(arguments.model)
+    options = choices.options(model, arguments.option)
+    observed = _observed(arguments, model, options)
+    fixed = choices.fixed(arguments.set, model.anchors(observed))
+    with results.folder(model.name, arguments.out, arguments.overwrite) as folder:
+        _print_task(arguments, model, observed, options, fixed)
+        started = time.perf_counter()
+        posterior = _fit(arguments, model, observed, options, fixed)
+        seconds = time.perf_counter() - started
+        return _report(posterior, folder, seconds, arguments.overwrite)
+
+
+def _observed(arguments: argparse.Namespace, model: loading.ModelFile, options: dict[str, Any]) -> data.Data:
+    """Return the data to fit: the user's file as the model takes it, or the model's own."""
+    if arguments.data is None:
+        for flag in ("outputs", "time_column", "truth"):
+            if getattr(arguments, flag) is not None:
+                flag = flag.replace("_", "-")
+                raise ValueError(f"--{flag} says how to read a data file; give one with --data.")
+        return model.simulate(**options)
+    columns = model.outputs
+    if arguments.outputs is not None:
+        columns = tuple(name.strip() for name in arguments.outputs.split(","))
+        if model.outputs is not None and len(columns) != len(model.outputs):
+            raise ValueError(
+                f"{model.name} has {len(model.outputs)} outputs ({', '.join(model.outputs)}); "
+                f"--outputs names {len(columns)} columns."
+            )
+    observed = data.read_csv(arguments.data, columns, arguments.time_column)
+    if model.outputs is not None:
+        observed = dataclasses.replace(observed, outputs=model.outputs)
+    if arguments.truth is not None:
+        observed = dataclasses.replace(observed, truth=data.read_truth(arguments.truth))
+    return model.prepare(observed)
+
+
+def _print_task(
+    arguments: argparse.Namespace,
+    model: loading.ModelFile,
+    observed: data.Data,
+    options: dict[str, Any],
+    fixed: dict[str, Any],
+) -> None:
+    source = arguments.data or "simulated by the model"
+    missing = int(np.isnan(observed.y).sum())
+    size = f"{len(observed.times)} rows of {', '.join(observed.outputs)}"
+    print(f"model    {model.name}: {model.summary}")
+    print(f"data     {source}: {size}" + (f"; {missing} values missing" if missing else ""))
+    if options:
+        print("options  " + ", ".join(f"{name} = {value}" for name, value in options.items()))
+    anchors = model.anchors(observed)
+    for name, value in fixed.items():
+        own = name in anchors and anchors[name] == value
+        free = f" by the model; --set {name}=free frees it" if own else ""
+        print(f"fixed    {name} = {value}{free}")
+    if observed.note:
+        print(f"note     {observed.note}")
+    sys.stdout.flush()
+
+
+def _fit(
+    arguments: argparse.Namespace,
+    model: loading.ModelFile,
+    observed: data.Data,
+    options: dict[str, Any],
+    fixed: dict[str, Any],
+) -> Any:
+    import lfm_ppl
+    from lfm_ppl.inference.settings import approximate
+
+    numpyro_model = approximate(
+        model.model,
+        rule=choices.rule(arguments.rule),
+        steps=arguments.steps,
+        max_step=arguments.max_step,
+        iterations=arguments.iterations,
+    )
+    posterior = lfm_ppl.fit(
+        numpyro_model,
+        observed.times,
+        observed.y,
+        sampler=arguments.sampler,
+        chains=arguments.chains,
+        warmup=arguments.warmup,
+        samples=arguments.samples,
+        seed=arguments.seed,
+        model_kwargs=model.keywords(observed, options),
+        fixed=fixed,
+        truth=observed.truth,
+        progress=not arguments.quiet,
+        name=model.name,
+    )
+    posterior.attrs["options"] = json.dumps(options)
+    posterior.attrs["data"] = arguments.data or "simulated"
+    if observed.note:
+        posterior.attrs["note"] = observed.note
+    return posterior
+
+
+def _report(posterior: Any, folder: Path, seconds: float, overwrite: bool) -> int:
+    """Write and print everything; return 1 where a figure could not be drawn."""
+    from lfm_ppl.analysis import arviz_data, tables
+    from lfm_ppl.analysis.plots import save_figures
+
+    written = [arviz_data.save(posterior, folder / results.POSTERIOR, overwrite)]
+    table = arviz_data.summary(posterior)
+    written.append(tables.write_csv(table, folder / results.SUMMARY, overwrite))
+    print(f"\n{tables.text_table(table, width=shutil.get_terminal_size().columns)}\n")
+    status = 0
+    try:
+        written += save_figures(posterior, folder, overwrite=overwrite)
+    except Exception as error:  # the draws are safe; a figure is no reason to end with an error
+        print(f"lfm-ppl: the figures could not be drawn: {error}", file=sys.stderr)
+        print(f"         try again with: lfm-ppl plot {folder} --overwrite", file=sys.stderr)
+        status = 1
+    print(f"time     {seconds:.0f} s")
+    for path in written:
+        print(f"wrote    {path}")
+    return status

@@ -1,0 +1,56 @@
+"""``lfm-ppl models``: list the shipped models, or describe one."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from lfm_ppl import loading
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print the list, or the description of ``arguments.model``."""
+    if arguments.model is None:
+        _list()
+    else:
+        _describe(loading.load(arguments.model))
+    return 0
+
+
+def _list() -> None:
+    shipped = [loading.load(name) for name in loading.available()]
+    width = max(len(model.name) for model in shipped)
+    for model in shipped:
+        print(f"{model.name:<{width}}  {model.summary}")
+    print("\n`lfm-ppl models NAME` describes one, `lfm-ppl fit NAME` runs it on simulated data.")
+
+
+def _describe(model: loading.ModelFile) -> None:
+    print(f"{model.name}  ({model.path})\n\n{model.description}\n")
+    print(f"outputs: {_outputs(model)}\n")
+    rows = [(name, help_) for name, help_ in model.parameters.items()]
+    _table("parameters (fix one with --set NAME=VALUE)", rows)
+    rows = [(name, _option(*entry)) for name, entry in model.options.items()]
+    _table("options (choose with --option NAME=VALUE)", rows)
+
+
+def _outputs(model: loading.ModelFile) -> str:
+    if model.outputs is None:
+        return "any number, the columns of the data file"
+    return ", ".join(f"{name} ({unit})" if (unit := model.units.get(name)) else name for name in model.outputs)
+
+
+def _option(default: Any, accepted: tuple[Any, ...] | type, help_: str) -> str:
+    if isinstance(accepted, tuple):
+        values = ", ".join(str(value) for value in accepted)
+    else:
+        values = {float: "a number", int: "a whole number", bool: "true or false"}.get(accepted, "text")
+    return f"{help_}: {values} (default: {default})"
+
+
+def _table(title: str, rows: list[tuple[str, str]]) -> None:
+    print(f"{title}:")
+    width = max((len(name) for name, _ in rows), default=0)
+    for name, help_ in rows:
+        print(f"  {name:<{width}}  {help_}")
+    print("" if rows else "  none\n")

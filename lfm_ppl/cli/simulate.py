@@ -1,0 +1,33 @@
+"""``lfm-ppl simulate``: a model's simulated data as files."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+
+from lfm_ppl import data, loading
+from lfm_ppl.analysis import files
+from lfm_ppl.cli import choices, session
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Write FILE.csv and, where the truth is known, FILE.truth.json."""
+    model = loading.load(arguments.model)
+    options = choices.options(model, arguments.option)
+    table = files.refuse_existing(arguments.out or f"{model.name}.csv", arguments.overwrite)
+    beside = files.refuse_existing(table.with_suffix(".truth.json"), arguments.overwrite)
+    session.start(chains=1)
+    simulated = model.simulate(seed=arguments.seed, **options)
+    with files.writing(table, arguments.overwrite) as temporary:
+        data.write_csv(simulated, temporary)
+    print(f"wrote {table}: {len(simulated.times)} times of {', '.join(simulated.outputs)}")
+    words = ["lfm-ppl", "fit", arguments.model, "--data", str(table)]
+    if simulated.truth is not None:
+        with files.writing(beside, arguments.overwrite) as temporary:
+            data.write_truth(simulated, temporary)
+        print(f"wrote {beside}: what it was simulated from")
+        words += ["--truth", str(beside)]
+    for option in arguments.option:
+        words += ["--option", option]
+    print(f"infer it back with: {shlex.join(words)}")
+    return 0
