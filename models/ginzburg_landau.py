@@ -1,0 +1,87 @@
+"""Ginzburg-Landau: diffusion in a double-well potential, no latent force.
+
+The state x follows the stochastic differential equation
+
+    dx = -(alpha x + beta x^3) dt + sigma dB,        y_k = x(t_k) + e_k,    e_k ~ N(0, noise_sd^2),
+
+whose potential alpha x^2 / 2 + beta x^4 / 4 has two minima, at +-sqrt(-alpha / beta), where alpha
+is negative. The unknown parameters are alpha, beta and sigma; the standard deviation of the
+observation noise is known, as in the source. The default data are simulated with alpha = -1,
+beta = 0.1 and sigma = 2: the state, observed every 2 units of time, jumps between the wells at
+-3.16 and 3.16.
+
+The priors, alpha ~ N(0, 1), beta ~ LogNormal(-2, 0.8) and sigma ~ LogNormal(0.5, 0.5), are for
+states of a few units that move within a few units of time: rescale data of another size. They are
+narrow enough to say that the state relaxes between observations at a rate of order one. Without
+them the data would not: when the relaxation is fast, observations are independent draws from the
+stationary density, and only alpha / sigma^2 and beta / sigma^2 are identified.
+
+The prior of the state at the first observation is N(0, 10), the width of the stationary density.
+
+Sources: J. Hartikainen, Sequential Inference for Latent Temporal Gaussian Process Models (2013),
+section 2.7.1; H. Singer, Parameter estimation of nonlinear stochastic differential equations,
+Journal of Computational and Graphical Statistics 11 (2002).
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+
+import lfm_ppl as lfm
+
+OUTPUTS = ("x",)
+UNITS: dict[str, str] = {}
+OPTIONS = {"noise_sd": (0.1, float, "standard deviation of the observation noise, known")}
+PARAMETERS = {
+    "alpha": "linear coefficient of the drift; below zero there are two wells (1/time)",
+    "beta": "cubic coefficient of the drift, above zero (1/(time x^2))",
+    "sigma": "dispersion of the Brownian motion, above zero (x/sqrt(time))",
+}
+TRUTH = {"alpha": -1.0, "beta": 0.1, "sigma": 2.0}
+STEPS = 20  # between observations: the moments move fast where the wells are steep
+
+
+def build(alpha: float, beta: float, sigma: float, noise_sd: float) -> lfm.LatentForceModel:
+    """Return the double well with these parameters."""
+    return lfm.LatentForceModel(
+        dynamics=lambda x, u, t: -(alpha * x + beta * x**3),
+        forces={},
+        process_noise=sigma * jnp.ones((1, 1)),
+        observation=lfm.GaussianObservation(lambda x, u, t: x, noise_sd**2 * jnp.ones(1)),
+        initial_state=lfm.Gaussian(jnp.zeros(1), 10.0 * jnp.eye(1)),
+        state_names=("x",),
+        output_names=OUTPUTS,
+    )
+
+
+def model(times, y=None, noise_sd: float = 0.1) -> None:
+    """Sample alpha, beta and sigma, and score the observations.
+
+    Args:
+        times: observation times, shape (T,).
+        y: observations of x, shape (T, 1); NaN is missing, None draws from the prior predictive.
+        noise_sd: standard deviation of the observation noise.
+    """
+    alpha = numpyro.sample("alpha", dist.Normal(0.0, 1.0))
+    beta = numpyro.sample("beta", dist.LogNormal(-2.0, 0.8))
+    sigma = numpyro.sample("sigma", dist.LogNormal(0.5, 0.5))
+    system = build(alpha, beta, sigma, noise_sd)
+    numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=STEPS), obs=y)
+
+
+def simulate(seed: int = 0, noise_sd: float = 0.1) -> lfm.Data:
+    """Simulate t in [0, 50] with the source's parameters, observed every 2 units of time."""
+    grid = np.linspace(0.0, 50.0, 501)
+    observed = np.arange(0, 501, 20)
+    drawn = lfm.simulate(jax.random.key(seed), build(**TRUTH, noise_sd=noise_sd), grid, steps=10)
+    return lfm.Data(
+        times=grid[observed],
+        y=drawn.y[observed],
+        outputs=OUTPUTS,
+        units=UNITS,
+        truth={"times": grid, "forces": {}, "state": drawn.state, "parameters": TRUTH},
+    )
