@@ -19,7 +19,7 @@ from lfm_ppl.filtering.schedule import Schedule, schedule
 from lfm_ppl.filtering.smoother import SmootherResult, check_iterations, posterior_linearisation, smooth_on
 from lfm_ppl.gradients import finite_or_minus_infinity
 from lfm_ppl.linearisation.rule import Rule
-from lfm_ppl.model.augment import StateSpaceModel, state_space
+from lfm_ppl.model.augment import StateSpaceModel, check_times, state_space
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.simulate import simulate_on
 
@@ -143,13 +143,19 @@ class Panel(dist.Distribution):
         sizes = {np.shape(leaf)[0] if np.ndim(leaf) else None for leaf in leaves}
         if len(sizes) > 1 or None in sizes:
             shapes = [np.shape(leaf) for leaf in leaves]
-            raise ValueError(f"every array in parameters needs the same leading axis, one entry a series; got {shapes}. "
-                             "Repeat a shared parameter with jnp.broadcast_to, or close over it in build.")
+            raise ValueError("every array in parameters needs the same leading axis, one entry a series; got "
+                             f"{shapes}. Repeat a shared parameter with jnp.broadcast_to, or close over it in build.")
         self.build, self.parameters, self.times, self.settings = build, parameters, times, settings
         (count,) = sizes
         if self._series_times and np.shape(times)[0] != count:
             raise ValueError(f"times has {np.shape(times)[0]} rows for {count} series; give one row a series, or one "
                              "vector for all.")
+        known = checks.concrete(times)
+        for series, row in enumerate(known) if self._series_times and known is not None else ():
+            try:
+                check_times(row, None)
+            except ValueError as error:
+                raise ValueError(f"series {series}: {error}") from None
         one = jax.eval_shape(lambda p, t: jnp.zeros(self._one(p, t).event_shape),
                              jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf)[0], parameters),
                              jnp.zeros(np.shape(times)[-1]))
@@ -221,7 +227,11 @@ def panel(build: Callable[..., LatentForceModel], parameters: Any, times: Any, r
         build: maps the parameters of ONE series to its `LatentForceModel`; it may close over shared parameters.
         parameters: pytree of arrays with a leading axis (B,), one entry a series.
         times: (T,) for all, or (B, T); ragged series are padded: NaN in y, and times that repeat the last one.
-        rule, steps, max_step, iterations, damping: as `MarginalLikelihood`.
+        rule: as in `MarginalLikelihood`, and so are the next four.
+        steps: integration steps between two consecutive times.
+        max_step: longest step.
+        iterations: of posterior linearisation.
+        damping: share of each new iterate that is taken.
 
     Returns:
         A distribution with batch shape (B,) and event shape (T, D).
@@ -234,7 +244,8 @@ def panel(build: Callable[..., LatentForceModel], parameters: Any, times: Any, r
         >>> def build(p):
         ...     return lfm.LatentForceModel(
         ...         lambda x, u, t: u - p["rate"] * x, {"u": lfm.Matern(1.0, 1.0)},
-        ...         lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
+        ...         lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        ...         lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
         >>> lfm.panel(build, {"rate": jnp.array([0.5, 1.0])}, jnp.arange(3.0)).batch_shape
         (2,)
     """

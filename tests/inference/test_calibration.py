@@ -1,0 +1,71 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
+from numpyro.infer import NUTS
+
+import lfm_ppl as lfm
+from tests import calibration
+
+TIMES = np.linspace(0.0, 6.0, 10)
+DRAWS = 63
+
+
+def motif(times, y=None, link=lambda u: u, steps=10):
+    """One gene, one force: dx/dt = sensitivity link(u) - decay x, from a known start."""
+    decay = numpyro.sample("decay", dist.LogNormal(-0.3, 0.4))
+    sensitivity = numpyro.sample("sensitivity", dist.LogNormal(0.0, 0.4))
+    lengthscale = numpyro.sample("lengthscale", dist.LogNormal(0.5, 0.3))
+    noise_sd = numpyro.sample("noise_sd", dist.LogNormal(-1.2, 0.3))
+    system = lfm.LatentForceModel(
+        lambda x, u, t: sensitivity * link(u) - decay * x,
+        {"u": lfm.Matern(1.0, lengthscale, order=1)},
+        lfm.GaussianObservation(lambda x, u, t: x, noise_sd**2 * jnp.ones(1)),
+        lfm.Gaussian(jnp.zeros(1), jnp.zeros((1, 1))),
+    )
+    numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=steps), obs=y)
+
+
+def softplus(times, y=None):
+    motif(times, y, jax.nn.softplus, steps=4)
+
+
+def assert_uniform(found, bins):
+    """No statistic of any scalar is rarer than one in a thousand under uniform ranks."""
+    values = {name: calibration.p_values(rank, DRAWS, bins) for name, rank in found.items()}
+    print(values)
+    assert min(min(pair.values()) for pair in values.values()) > 0.001, values
+
+
+def test_ram_is_calibrated_on_the_linear_motif():
+    found = calibration.ranks(motif, TIMES, lfm.RAM, jax.random.key(11), data_sets=40, draws=DRAWS, thin=40,
+                              warmup=1000)
+    calibration.save("small_ram_linear", found, DRAWS)
+    assert set(found) == {"decay", "sensitivity", "lengthscale", "noise_sd", "log likelihood"}
+    assert_uniform(found, bins=8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", [motif, softplus], ids=["linear", "softplus"])
+@pytest.mark.parametrize("sampler", ["nuts", "ram"])
+def test_samplers_are_calibrated(sampler, model):
+    settings = {
+        "nuts": {"kernel": lambda m: NUTS(m, forward_mode_differentiation=True), "thin": 3, "warmup": 300, "batch": 20},
+        "ram": {"kernel": lfm.RAM, "thin": 60, "warmup": 2000},
+    }[sampler]
+    found = calibration.ranks(model, TIMES, key=jax.random.key(12), data_sets=240, draws=DRAWS, **settings)
+    calibration.save(f"{sampler}_{model.__name__}", found, DRAWS)
+    assert_uniform(found, bins=16)
+
+
+@pytest.mark.parametrize("shape", [(0.7, 0.7), (1.5, 1.5), (1.5, 1.0)], ids=["too narrow", "too wide", "shifted"])
+def test_the_statistics_see_miscalibration(shape):
+    bad = np.random.default_rng(0).beta(*shape, size=1000)
+    assert min(calibration.p_values((bad * (DRAWS + 1)).astype(int), DRAWS, 16, 4000).values()) < 0.001
+
+
+def test_the_statistics_accept_uniform_ranks():
+    uniform = np.random.default_rng(0).integers(0, DRAWS + 1, 1000)
+    assert min(calibration.p_values(uniform, DRAWS, 16, 4000).values()) > 0.01
