@@ -257,11 +257,12 @@ def central_difference(n: int, step: float) -> Points:
 
 
 def moments(drift: Callable, diffusion: Callable, points: Points | None, mean, covariance, span,
-            jacobian: Callable | None = None):
+            jacobian: Callable | None = None, average_jacobian: bool = False):
     """Integrate dm/dt = E f, dP/dt = Cov(f, x) + Cov(x, f) + E D by DOP853 and return (m, P) at span[1].
 
     ``drift(x, t)`` and ``diffusion(x, t)`` (D = G G') take one point; without points the moments are
-    those of the Taylor expansion at the mean, with ``jacobian(x, t)``.
+    those of the Taylor expansion at the mean, with ``jacobian(x, t)``. ``average_jacobian`` takes
+    Cov(f, x) = E[f'] P, by Stein's lemma.
     """
     n = len(mean)
 
@@ -274,7 +275,10 @@ def moments(drift: Callable, diffusion: Callable, points: Points | None, mean, c
             x = m + points.nodes @ chol.T
             values = np.stack([drift(v, t) for v in x])
             f = points.weights @ values
-            cross = (points.weights[:, None] * values).T @ (x - m)
+            if average_jacobian:
+                cross = np.einsum("p,pij->ij", points.weights, np.stack([jacobian(v, t) for v in x])) @ p
+            else:
+                cross = (points.weights[:, None] * values).T @ (x - m)
             d = np.einsum("p,pij->ij", points.weights, np.stack([diffusion(v, t) for v in x]))
         return np.concatenate([f, (cross + cross.T + d).ravel()])
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -47,6 +47,11 @@ class SigmaPointRule(Rule):
 
     full_state: bool = eqx.field(static=True, default=False, kw_only=True)
 
+    regresses: ClassVar[bool] = True
+    """Whether the slope in the points' coordinates is the regression on the nodes; if not, it is the average Jacobian.
+    The two agree in expectation (Stein's lemma), but a regression on nodes that are correlated beyond second order
+    divides their sampling error by the standard deviation of the input, however small that is."""
+
     def points(self, dim: int) -> UnitPoints:
         """Return nodes and weights for ``dim`` >= 1 dimensions."""
         raise NotImplementedError
@@ -67,15 +72,18 @@ class SigmaPointRule(Rule):
         at = inputs.mean + matmul(nodes, spread.T)
         values, extras = jax.vmap(function)(at)
         value = (weights[:, None] * values).sum(0)
-        regression = matmul((weights[:, None] * values).T, nodes)
         if structure.averaged:
-            jacobians = jax.vmap(lambda v: partial_jacobian(function, v, structure.averaged))(at)
-            average = (weights[:, None, None] * jacobians).sum(0)
+            jacobians, average = _average_jacobian(function, at, weights, structure.averaged)
             slope = slope + matmul(average, jnp.asarray(selection(structure.averaged, size).T))
-            regression_on_points = regression - matmul(average, gain)
+            through_averaged = matmul(average, gain)
         else:
-            jacobians, average, regression_on_points = None, None, regression
-        on_points = _times_inverse(chol, regression_on_points)
+            jacobians, average, through_averaged = None, None, 0.0
+        if self.regresses:
+            regression = matmul((weights[:, None] * values).T, nodes)
+            on_points = _times_inverse(chol, regression - through_averaged)
+        else:
+            _, on_points = _average_jacobian(function, at, weights, structure.points)
+            regression = matmul(on_points, chol) + through_averaged
         slope = slope + matmul(on_points, jnp.asarray(selection(structure.points, size).T))
         errors = values - value - matmul(nodes, regression.T)
         residual = matmul(matmul(errors.T, jnp.asarray(unit.residual_weights)), errors)
@@ -90,6 +98,13 @@ class SigmaPointRule(Rule):
         if np.all(unit.weights >= 0):
             return jax.tree_util.tree_map(lambda e: jnp.tensordot(weights, e, axes=1), extras)
         return function(inputs.mean)[1]
+
+
+def _average_jacobian(function: Function, at: jax.Array, weights: jax.Array,
+                      indices: tuple[int, ...]) -> tuple[jax.Array, jax.Array]:
+    """Return the Jacobians (p, D, len(indices)) at the points and their average."""
+    jacobians = jax.vmap(lambda v: partial_jacobian(function, v, indices))(at)
+    return jacobians, (weights[:, None, None] * jacobians).sum(0)
 
 
 def _times_inverse_transpose(chol: jax.Array, b: jax.Array) -> jax.Array:
@@ -246,7 +261,8 @@ class MonteCarlo(SigmaPointRule):
     """Random points, drawn once: the Monte Carlo Kalman filter.
 
     The draws are antithetic and whitened, so that their mean is zero and their covariance the identity: a linear
-    function is treated exactly. The likelihood is a smooth, deterministic function of the parameters.
+    function is treated exactly. The slope is the average Jacobian over the draws, so that a known or nearly known
+    state does no harm. The likelihood is a smooth, deterministic function of the parameters.
 
     Args:
         samples: number of points, even, above twice the number of non-linear inputs.
@@ -257,6 +273,8 @@ class MonteCarlo(SigmaPointRule):
         >>> MonteCarlo(100, seed=1).points(2).nodes.shape
         (100, 2)
     """
+
+    regresses: ClassVar[bool] = False
 
     samples: int = eqx.field(static=True, default=1000)
     seed: int = eqx.field(static=True, default=0)

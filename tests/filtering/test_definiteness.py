@@ -1,0 +1,116 @@
+"""Covariances stay positive semi-definite, and forces stationary, however coarse the integration."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from references import LinearLFM, Regression, matern
+from systems import Linear, Oscillator, Outputs, double_well, first_state, identity, motif, softplus
+
+import lfm_ppl as lfm
+from lfm_ppl.filtering.filter import forward
+from lfm_ppl.filtering.predict import Moments
+from lfm_ppl.filtering.schedule import schedule
+from lfm_ppl.filtering.smoother import backward
+
+TIMES = np.array([0.0, 0.01, 0.5, 0.5, 1.2, 2.0])
+Y = np.array([0.4, 0.40002, 0.43, 0.43, np.nan, 0.3])[:, None]
+
+
+def first_order(order, linear, variance, noise):
+    return lfm.LatentForceModel(
+        motif(identity if linear else softplus, genes=1, order=order).dynamics,
+        {"u": lfm.Matern(1.0, 1.3, order)}, lfm.GaussianObservation(first_state, noise * jnp.ones(1)),
+        lfm.Gaussian(jnp.array([0.4]), variance * jnp.eye(1)))
+
+
+def second_order(order, linear, variance, noise):
+    return lfm.LatentForceModel(
+        Oscillator(1.0, 0.3, 0.0 if linear else 0.5), {"u": lfm.Matern(1.0, 1.3, order)},
+        lfm.GaussianObservation(first_state, noise * jnp.ones(1)),
+        lfm.Gaussian(jnp.array([0.4, 0.0]), variance * jnp.eye(2)),
+        nonlinear_inputs=None if linear else ("x0",))
+
+
+@eqx.filter_jit
+def passes(model, variance, noise):
+    """All covariances that occur: predicted, filtered, smoothed."""
+    model = eqx.tree_at(lambda m: (m.initial_state.covariance, m.observation.covariance), model,
+                        (variance * jnp.eye(len(model.state_names)), noise * jnp.ones(1)))
+    ssm = lfm.state_space(model)
+    plan = schedule(ssm, TIMES, 1)
+    passed = forward(ssm, lfm.Cubature(), plan, jnp.asarray(Y), keep="all")
+    smoothed = backward(passed, Moments(*ssm.initial()), plan)
+    return (passed.predicted.covariance, passed.filtered.covariance, passed.noise, smoothed.moments.covariance,
+            smoothed.conditional), passed.log_likelihood, smoothed.leave_one_out
+
+
+@pytest.mark.parametrize("linear", [True, False], ids=["linear", "non-linear"])
+@pytest.mark.parametrize("build", [first_order, second_order])
+@pytest.mark.parametrize("order", [0, 1, 2])
+def test_smallest_eigenvalue(build, order, linear):
+    model = build(order, linear, 0.0, 1.0)
+    for variance in (0.0, 1e-12, 1.0):
+        for noise in (1e-20, 1e-10, 1.0):
+            covariances, log_likelihood, left_out = passes(model, jnp.asarray(variance), jnp.asarray(noise))
+            assert np.isfinite(log_likelihood).all() and np.isfinite(left_out).all()
+            for label, covariance in zip(("predicted", "filtered", "noise", "smoothed", "conditional"), covariances,
+                                         strict=True):
+                assert np.isfinite(covariance).all()
+                eigenvalues = np.linalg.eigvalsh(covariance)
+                assert (eigenvalues[:, 0] >= -1e-13 * eigenvalues[:, -1]).all(), (label, variance, noise)
+                assert np.abs(covariance - np.swapaxes(covariance, 1, 2)).max() <= 1e-15 * np.abs(covariance).max()
+
+
+@pytest.mark.parametrize("steps", [1, 7])
+@pytest.mark.parametrize("link", [identity, softplus])
+def test_the_force_keeps_its_stationary_distribution(link, steps):
+    """Nothing is learnt from the observation of an output that the force does not reach."""
+    model = motif(link, order=2)
+    model = eqx.tree_at(lambda m: m.dynamics.sensitivity, model, jnp.zeros(2))
+    found = lfm.smooth(model, [0.3, 1.0, 50.0], np.ones((3, 2)), steps=steps, at=[0.1, 0.9, 50.0, 2000.0])
+    stationary = np.asarray(lfm.Matern(1.0, 1.3, 2).initial_covariance())
+    assert np.abs(found.covariance[:, 2:, 2:] - stationary).max() < 1e-10
+    assert np.abs(found.mean[:, 2:]).max() < 1e-10
+
+
+def test_stationary_in_prediction():
+    """Predicted moments before the first observation: exact for the force's block, also when it drives x."""
+    model = motif(softplus, order=1)
+    for length in (1e-9, 0.3, 10.0, 1300.0):
+        found = lfm.filter(model, [length], [[0.3, 0.2]], steps=1)
+        stationary = np.asarray(lfm.Matern(1.0, 1.3, 1).initial_covariance())
+        assert np.abs(found.predicted_covariance[0, 2:, 2:] - stationary).max() < 1e-10
+
+
+def test_a_gap_of_a_thousand_lengthscales():
+    """The right value where the model is linear, a finite one where it is not."""
+    times, y = np.array([0.5, 1.0, 1301.0, 1301.5]), np.array([[0.4], [0.7], [-0.2], [0.3]])
+    model = lfm.LatentForceModel(
+        Linear(-0.8 * jnp.eye(1), jnp.ones((1, 1))), {"u": lfm.Matern(1.0, 1.3, 1)},
+        lfm.GaussianObservation(Outputs(jnp.eye(1, 2)), jnp.array([0.01])),
+        lfm.Gaussian(jnp.ones(1), jnp.zeros((1, 1))), initial_time=0.0)
+    # 40 e-folds before the second pair everything is forgotten: the two pairs are independent.
+    def dense(start, mean, part):
+        process = LinearLFM(-0.8 * np.eye(1), np.ones((1, 1)), [matern(1.0, 1.3, 1)], start, mean, np.zeros((1, 1)))
+        return Regression(process, np.eye(1, 2), np.array([0.01])).log_likelihood(times[part], y[part])
+
+    expected = dense(0.0, np.ones(1), slice(0, 2)) + dense(1251.0, np.zeros(1), slice(2, 4))
+    found = lfm.filter(model, times, y).log_likelihood.sum()
+    assert abs(found - expected) < 1e-8 * abs(expected)
+    for build in (motif(genes=1, order=0), motif(genes=1, order=2, variance=1.0), double_well()):
+        coarse = lfm.filter(build, [0.5, 1.0, 1301.0, 1301.5] if build.forces else [0.1, 0.2, 1.0, 1.2], y)
+        assert np.isfinite(coarse.log_likelihood).all()
+
+
+@pytest.mark.parametrize("variance", [0.0, 1e-300, 1e-30])
+def test_known_initial_state(variance):
+    """A known state moves on as if its variance were tiny."""
+    found = lfm.filter(motif(variance=variance), [0.0, 0.0, 0.4], np.array([[0.4, 0.25]] * 3))
+    nearby = lfm.filter(motif(variance=1e-16), [0.0, 0.0, 0.4], np.array([[0.4, 0.25]] * 3))
+    for a, b in zip(jax.tree_util.tree_leaves(found), jax.tree_util.tree_leaves(nearby), strict=True):
+        assert np.isfinite(a).all()
+        assert np.allclose(a, b, rtol=1e-8, atol=1e-12)

@@ -1,0 +1,77 @@
+"""Small matrices: against NumPy, and where matrices are singular."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lfm_ppl.linalg import (
+    cholesky,
+    congruence,
+    matmul,
+    outer_square,
+    safe_sqrt,
+    semidefinite_root,
+    solve_lower,
+    solve_semidefinite,
+    solve_upper,
+)
+
+
+def definite(size, rank=None, seed=0):
+    root = np.random.default_rng(seed).normal(size=(size, size if rank is None else rank))
+    return root @ root.T
+
+
+@pytest.mark.parametrize("shapes", [((3, 4), (4, 2)), ((5, 2, 3), (3, 6)), ((12, 9), (9, 11)), ((0, 0), (0, 1)),
+                                    ((2, 0), (0, 3))])
+def test_products(shapes):
+    a, b = (np.random.default_rng(i).normal(size=shape) for i, shape in enumerate(shapes))
+    assert np.allclose(matmul(jnp.asarray(a), jnp.asarray(b)), a @ b, rtol=1e-13)
+    p = definite(shapes[0][-1])
+    assert np.allclose(congruence(jnp.asarray(a), jnp.asarray(p)), a @ p @ np.swapaxes(a, -1, -2), rtol=1e-12)
+    square = outer_square(jnp.asarray(a))
+    assert np.array_equal(square, np.swapaxes(square, -1, -2))
+
+
+@pytest.mark.parametrize("size", [1, 2, 5, 9])
+def test_cholesky_and_triangular_solves(size):
+    p, b = definite(size), np.random.default_rng(1).normal(size=(size, 3))
+    factor = cholesky(jnp.asarray(p))
+    assert np.allclose(factor.chol, np.linalg.cholesky(p), rtol=1e-10) and not factor.degenerate.any()
+    assert np.allclose(solve_lower(factor.chol, jnp.asarray(b)), np.linalg.solve(np.asarray(factor.chol), b))
+    assert np.allclose(solve_upper(factor.chol, jnp.asarray(b)), np.linalg.solve(np.asarray(factor.chol).T, b))
+    assert np.allclose(solve_semidefinite(jnp.asarray(p), jnp.asarray(b)), np.linalg.solve(p, b), rtol=1e-7)
+    assert np.allclose(solve_semidefinite(jnp.asarray(p), jnp.asarray(b[:, 0])), np.linalg.solve(p, b[:, 0]), rtol=1e-7)
+
+
+@pytest.mark.parametrize("rank", [0, 1, 3])
+@pytest.mark.parametrize("scale", [np.ones(5), np.array([1e-9, 1.0, 1e6, 1e-3, 1e9])])
+def test_singular_matrices(rank, scale):
+    """P X = B for B in the range of P; directions that are null are zero in the root."""
+    p = definite(5, rank) * scale[:, None] * scale
+    target = p @ np.random.default_rng(2).normal(size=(5, 2))
+    solution = np.asarray(solve_semidefinite(jnp.asarray(p), jnp.asarray(target)))
+    assert np.allclose(p @ solution / scale[:, None], target / scale[:, None], rtol=1e-6, atol=1e-6)
+    root = np.asarray(semidefinite_root(jnp.asarray(p)))
+    assert np.allclose(root @ root.T / scale[:, None] / scale, p / scale[:, None] / scale, atol=1e-12)
+    assert (np.linalg.matrix_rank(root / scale[:, None], tol=1e-6) == rank)
+
+
+def test_degenerate_pivots_are_reported_and_replaced():
+    p = jnp.diag(jnp.array([2.0, 0.0, -1.0, 1e-3]))
+    kept = cholesky(p, floor=1e-2)
+    assert kept.degenerate.tolist() == [False, True, True, True]
+    assert np.allclose(jnp.diagonal(kept.chol), np.sqrt([2.0, 1e-2, 1e-2, 1e-2]))
+    assert jnp.diagonal(cholesky(p).chol)[1] == 1.0
+    assert jnp.diagonal(cholesky(p, keep=False).chol)[1] == 0.0
+
+
+def test_gradients_stay_finite_where_nothing_varies():
+    grad = jax.grad(lambda s: semidefinite_root(s * jnp.eye(2)).sum() + safe_sqrt(s))
+    assert np.isfinite(grad(0.0)) and np.isclose(grad(4.0), 0.75)
+    assert jax.grad(safe_sqrt)(0.0) == 0.0 and jax.grad(safe_sqrt)(-1.0) == 0.0
+    solve = jax.grad(lambda s: solve_semidefinite(s * jnp.ones((2, 2)), s * jnp.ones(2)).sum())
+    assert np.isfinite(solve(0.0)) and np.isfinite(solve(1.0))
