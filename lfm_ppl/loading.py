@@ -60,8 +60,8 @@ class ModelFile:
     _prepare: Callable[[Data], Data] | None = None
     _anchors: Callable[[Data], Mapping[str, float]] | None = None
 
-    def simulate(self, seed: int = 0, **options: Any) -> Data:
-        """Return the model's simulated default data, with its truth.
+    def simulate(self, seed: int | None = None, **options: Any) -> Data:
+        """Return simulated data with its truth; the model's default data where seed is None.
 
         Raises:
             ValueError: if the file defines no ``simulate``.
@@ -71,7 +71,8 @@ class ModelFile:
                 f"{self.path} defines no simulate(seed=0, **options), so it has no data of its "
                 "own. Give a data file with --data FILE, or add the function."
             )
-        data = self._simulate(seed=seed, **options)
+        seeded = {} if seed is None else {"seed": seed}
+        data = self._simulate(**seeded, **options)
         if not isinstance(data, Data):
             raise TypeError(f"simulate in {self.path} must return lfm.Data, got {_type(data)}.")
         return self._with_units(data)

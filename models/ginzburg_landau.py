@@ -7,8 +7,8 @@ The state x follows the stochastic differential equation
 whose potential alpha x^2 / 2 + beta x^4 / 4 has two minima, at +-sqrt(-alpha / beta), where alpha
 is negative. The unknown parameters are alpha, beta and sigma; the standard deviation of the
 observation noise is known, as in the source. The default data are simulated with alpha = -1,
-beta = 0.1 and sigma = 2: the state, observed every 2 units of time, jumps between the wells at
--3.16 and 3.16.
+beta = 0.1 and sigma = 2: the state starts in the right well, at 3.16, is observed every 2 units of
+time, and jumps between the wells.
 
 The priors, alpha ~ N(0, 1), beta ~ LogNormal(-2, 0.8) and sigma ~ LogNormal(0.5, 0.5), are for
 states of a few units that move within a few units of time: rescale data of another size. They are
@@ -45,14 +45,23 @@ TRUTH = {"alpha": -1.0, "beta": 0.1, "sigma": 2.0}
 STEPS = 20  # between observations: the moments move fast where the wells are steep
 
 
-def build(alpha: float, beta: float, sigma: float, noise_sd: float) -> lfm.LatentForceModel:
-    """Return the double well with these parameters."""
+def build(alpha, beta, sigma, noise_sd, start=None) -> lfm.LatentForceModel:
+    """Return the double well with these parameters.
+
+    Args:
+        alpha: see PARAMETERS.
+        beta: see PARAMETERS.
+        sigma: see PARAMETERS.
+        noise_sd: standard deviation of the observation noise.
+        start: the initial state where it is known; None: N(0, 10).
+    """
+    unknown = start is None
     return lfm.LatentForceModel(
         dynamics=lambda x, u, t: -(alpha * x + beta * x**3),
         forces={},
         process_noise=sigma * jnp.ones((1, 1)),
         observation=lfm.GaussianObservation(lambda x, u, t: x, noise_sd**2 * jnp.ones(1)),
-        initial_state=lfm.Gaussian(jnp.zeros(1), 10.0 * jnp.eye(1)),
+        initial_state=lfm.Gaussian([0.0 if unknown else start], [10.0 if unknown else 0.0]),
         state_names=("x",),
         output_names=OUTPUTS,
     )
@@ -73,11 +82,17 @@ def model(times, y=None, noise_sd: float = 0.1) -> None:
     numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=STEPS), obs=y)
 
 
-def simulate(seed: int = 0, noise_sd: float = 0.1) -> lfm.Data:
-    """Simulate t in [0, 50] with the source's parameters, observed every 2 units of time."""
+def simulate(seed: int = 2, noise_sd: float = 0.1) -> lfm.Data:
+    """Simulate t in [0, 50] with the source's parameters, observed every 2 units of time.
+
+    Args:
+        seed: of the path and the noise; with the default one it visits both wells several times.
+        noise_sd: standard deviation of the observation noise.
+    """
     grid = np.linspace(0.0, 50.0, 501)
     observed = np.arange(0, 501, 20)
-    drawn = lfm.simulate(jax.random.key(seed), build(**TRUTH, noise_sd=noise_sd), grid, steps=10)
+    system = build(**TRUTH, noise_sd=noise_sd, start=np.sqrt(10.0))
+    drawn = lfm.simulate(jax.random.key(seed), system, grid, steps=10)
     return lfm.Data(
         times=grid[observed],
         y=drawn.y[observed],

@@ -67,7 +67,7 @@ def _add_simulate(commands: Any) -> None:
     command = _command(commands, "simulate", simulate.run, help_, examples)
     command.add_argument("model", metavar="MODEL", help=MODEL_HELP)
     command.add_argument("--out", metavar="FILE", help="CSV file to write (default: MODEL.csv)")
-    command.add_argument("--seed", type=_whole(0), default=0, help="random seed (default: 0)")
+    command.add_argument("--seed", type=_whole(0), help="random seed (default: that of the model's default data)")
     command.add_argument("--option", action="append", default=[], metavar="NAME=VALUE", help=OPTION_HELP)
     command.add_argument("--overwrite", action="store_true", help="replace files that exist")
 
@@ -136,7 +136,7 @@ def _add_inference(group: Any) -> None:
     group.add_argument("--chains", type=_whole(1), default=4, help="default: 4")
     group.add_argument("--warmup", type=_whole(0), default=1000, help="per chain (default: 1000)")
     group.add_argument("--samples", type=_whole(1), default=1000, help="per chain (default: 1000)")
-    group.add_argument("--seed", type=_whole(0), default=0, help="random seed (default: 0)")
+    group.add_argument("--seed", type=_whole(0), default=0, help="random seed of the sampler (default: 0)")
     group.add_argument(
         "--set",
         action="append",

@@ -27,7 +27,7 @@ def run(arguments: argparse.Namespace) -> int:
     with results.folder(model.name, arguments.out, arguments.overwrite) as folder:
         _print_task(arguments, model, observed, options, fixed)
         started = time.perf_counter()
-        posterior = _fit(arguments, model, observed, options, fixed)
+        posterior = sample(arguments, model, observed, options, fixed)
         seconds = time.perf_counter() - started
         return _report(posterior, folder, seconds, arguments.overwrite)
 
@@ -80,13 +80,22 @@ def _print_task(
     sys.stdout.flush()
 
 
-def _fit(
+def sample(
     arguments: argparse.Namespace,
     model: loading.ModelFile,
     observed: data.Data,
     options: dict[str, Any],
     fixed: dict[str, Any],
 ) -> Any:
+    """Return the ArviZ object of a fit, with a record of the options and the data.
+
+    Args:
+        arguments: the sampler's and the approximation's settings.
+        model: what to fit.
+        observed: the data, as the model takes them.
+        options: the model's options.
+        fixed: parameters that are not learnt.
+    """
     import lfm_ppl
     from lfm_ppl.inference.settings import approximate
 
