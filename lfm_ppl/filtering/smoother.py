@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import checks
+from lfm_ppl.filtering.between import Places, marginals_between, places
 from lfm_ppl.filtering.filter import (
     Pass,
     as_rule,
@@ -33,6 +34,9 @@ from lfm_ppl.linalg import (
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.augment import StateSpaceModel, state_space
 from lfm_ppl.model.latent_force_model import LatentForceModel
+
+_LONGEST_FORECAST = 10_000
+"""Most rows of a forecast; a longer one gets a long last row (or `max_step`)."""
 
 _LOG_2PI = float(np.log(2.0 * np.pi))
 
@@ -287,33 +291,81 @@ def smooth(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
     rule = as_rule(rule)
     check_iterations(iterations, damping)
     ssm = state_space(model)
-    plan = schedule(ssm, times, steps, max_step, at, row_per_step=iterations > 0)
-    model.check_at(plan.initial_time)
-    y = check_observations(y, len(plan.observed), ssm.output_dim)
+    plans = smoothing_plans(ssm, times, steps, max_step, at, iterations)
+    model.check_at(plans.rows.initial_time)
+    y = check_observations(y, len(plans.rows.observed), ssm.output_dim)
     warn_single_precision()
-    return _run_smoother(ssm, rule, plan, y, iterations, damping)
+    return _run_smoother(ssm, rule, plans, y, iterations, damping)
 
 
-def smooth_on(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, iterations: int,
+class Plans(NamedTuple):
+    """The scans of a smoother.
+
+    Attributes:
+        rows: of the likelihood and the marginals.
+        joint: for draws of trajectories, with rows that end at the requested times too; None where ``rows`` serves:
+            without requested times, and for a model whose rows are exact whatever their length.
+        where: the requested times among ``rows``; None where ``joint`` is.
+        times: (K,) requested times.
+    """
+
+    rows: Schedule
+    joint: Schedule | None
+    where: Places | None
+    times: Any
+
+
+def smoothing_plans(ssm: StateSpaceModel, times: Any, steps: int, max_step: float | None, at: Any,
+                    iterations: int) -> Plans:
+    """Plan a smoother's scans; a forecast goes on in rows as long as the data's median interval."""
+    fine = iterations > 0
+    joint = schedule(ssm, times, steps, max_step, at, row_per_step=fine)
+    if at is None or ssm.time_invariant:
+        return Plans(joint, None, None, joint.requested_times)
+    known = np.asarray(times, float)
+    beyond = np.array([])
+    if joint.requested_times.max() > known[-1]:
+        gaps = np.diff(known)
+        gap = np.median(gaps[gaps > 0]) if np.any(gaps > 0) else joint.requested_times.max() - known[-1]
+        count = int(np.ceil((joint.requested_times.max() - known[-1]) / gap * (1 - 1e-12)))
+        beyond = known[-1] + gap * np.arange(1, min(count, _LONGEST_FORECAST) + 1)
+        beyond[-1] = max(beyond[-1], joint.requested_times.max())
+    base = schedule(ssm, times, steps, max_step, np.append(known[-1:], beyond), row_per_step=fine)
+    return Plans(base, joint, places(base, joint.requested_times), joint.requested_times)
+
+
+def smooth_on(ssm: StateSpaceModel, rule: Rule, plans: Plans, y: jax.Array, iterations: int,
               damping: float) -> SmootherResult:
-    """The same on a plan, without checks; for compiled code."""
+    """The same on plans, without checks; for compiled code."""
+    plan = plans.rows
     start = Moments(*ssm.initial())
-    about, change = None, jnp.asarray(jnp.nan)
-    if iterations:
-        about, change = posterior_linearisation(ssm, rule, plan, y, start, iterations, damping)
-    passed = forward(ssm, rule, plan, y, start=start, about=about, keep="all")
-    smoothed = backward(passed, start, plan)
-    requested = jnp.asarray(plan.requested)
-    times = jnp.asarray(plan.requested_times, float)
-    mean, covariance = (a[requested + 1] for a in smoothed.moments)
+    passed, smoothed, about, change = _smooth_rows(ssm, rule, plan, y, start, iterations, damping)
+    drawn, pieces, requested = passed, smoothed, plan.requested
+    times = jnp.asarray(plans.times, float)
+    if plans.joint is None or plans.where is None:
+        mean, covariance = (a[jnp.asarray(plan.requested) + 1] for a in smoothed.moments)
+    else:
+        drawn, pieces, _, _ = _smooth_rows(ssm, rule, plans.joint, y, start, iterations, damping)
+        requested = plans.joint.requested
+        mean, covariance = marginals_between(ssm, rule, plan, start, passed.filtered, smoothed.moments, about,
+                                             plans.where)
     matrix, offset = jax.vmap(ssm.input_map)(times)
     observed = jnp.asarray(plan.observed)
     at_data = jax.tree_util.tree_map(lambda a: a[observed], passed)
     return SmootherResult(
         times, mean, covariance, matmul(matrix, mean[..., None])[..., 0] + offset, congruence(matrix, covariance),
         at_data.log_likelihood, smoothed.leave_one_out[observed], standardised(at_data, y), change,
-        (requested, passed.filtered, passed.predicted, smoothed), (matrix, offset),
+        (jnp.asarray(requested), drawn.filtered, drawn.predicted, pieces), (matrix, offset),
         ssm.model.state_names, ssm.model.force_names)
+
+
+def _smooth_rows(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, start: Moments, iterations: int,
+                 damping: float) -> tuple[Pass, Smoothed, Moments | None, jax.Array]:
+    about, change = None, jnp.asarray(jnp.nan)
+    if iterations:
+        about, change = posterior_linearisation(ssm, rule, plan, y, start, iterations, damping)
+    passed = forward(ssm, rule, plan, y, start=start, about=about, keep="all")
+    return passed, backward(passed, start, plan), about, change
 
 
 _run_smoother = eqx.filter_jit(smooth_on)

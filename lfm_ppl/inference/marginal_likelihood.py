@@ -16,7 +16,13 @@ from lfm_ppl import checks
 from lfm_ppl.filtering.filter import as_rule, check_observations, forward, warn_single_precision
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.schedule import Schedule, schedule
-from lfm_ppl.filtering.smoother import SmootherResult, check_iterations, posterior_linearisation, smooth_on
+from lfm_ppl.filtering.smoother import (
+    SmootherResult,
+    check_iterations,
+    posterior_linearisation,
+    smooth_on,
+    smoothing_plans,
+)
 from lfm_ppl.gradients import finite_or_minus_infinity
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.augment import StateSpaceModel, check_times, state_space

@@ -1,0 +1,107 @@
+"""Smoothed marginals between the nodes of a scan, which they leave alone."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lfm_ppl.filtering.predict import Moments, Prediction, predict_row
+from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays
+from lfm_ppl.filtering.transition import integrating_factor, linear_part
+from lfm_ppl.linalg import congruence, matmul, solve_semidefinite
+from lfm_ppl.linearisation.rule import Rule
+from lfm_ppl.model.augment import StateSpaceModel
+
+
+class Places(NamedTuple):
+    """Where requested times lie among the rows.
+
+    Attributes:
+        row: (K,) the row that contains the time.
+        time: (K,).
+        at_end: (K,) whether it is the row's end.
+    """
+
+    row: Any
+    time: Any
+    at_end: Any
+
+
+def places(plan: Schedule, times: Any) -> Places:
+    """Find times among the rows of a plan that is known before compilation."""
+    times = np.asarray(times, float)
+    ends = np.append(np.asarray(plan.rows.start)[1:], plan.rows.start[-1] + plan.rows.length[-1])
+    tolerance = 1e-13 * (1.0 + np.abs(times))
+    row = np.minimum(np.searchsorted(ends, times - tolerance, side="left"), len(ends) - 1)
+    at_end = np.abs(times - ends[row]) <= tolerance
+    # Of several rows that end at this time (replicates), the last.
+    last = np.searchsorted(ends, ends[row] + tolerance, side="right") - 1
+    return Places(np.where(at_end, last, row), times, at_end)
+
+
+def marginals_between(ssm: StateSpaceModel, rule: Rule, plan: Schedule, start: Moments, filtered: Moments,
+                      smoothed: Moments, about: Moments | None, where: Places) -> Moments:
+    """Return smoothed moments at any times within the rows.
+
+    Each time branches off on its own: the filter's moments at the start of its row are predicted up to it, and on to
+    the end of the row, whose smoothed moments come back through the gain of the second piece. The steps of the scan
+    itself are not cut, so that asking for times changes nothing, neither there nor at other requested times.
+
+    Args:
+        ssm: the model.
+        rule: the linearisation rule.
+        plan: the rows.
+        start: moments at the initial time.
+        filtered: (N, ...) at the rows' ends.
+        smoothed: (N + 1, ...) at the nodes.
+        about: (N + 1, ...) moments to linearise about, or None.
+        where: the requested times.
+    """
+    linear = linear_part(ssm, jnp.asarray(plan.initial_time, float))
+    before = jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a[None], b[:-1]]), start, filtered)
+    rows = as_arrays(plan.rows)
+    jumps = [ssm.stack.jump(index) for index in range(len(ssm.stack.jump_times))]
+
+    def piece(begin: jax.Array, length: jax.Array, moments: Moments, nearby: Any, flow: bool) -> Prediction:
+        factor = integrating_factor(ssm, linear, length / plan.steps)
+        return predict_row(ssm, rule, linear, factor, plan.steps, begin, length, moments, nearby, flow)
+
+    def one(index: jax.Array, t: jax.Array, exactly: jax.Array) -> Moments:
+        here: Rows = jax.tree_util.tree_map(lambda a: a[index], rows)
+        first, last = (jax.tree_util.tree_map(lambda a: a[index + offset], smoothed) for offset in (0, 1))
+        length = jnp.clip(t - here.start, 0.0, here.length)
+        nearby: tuple[Any, Any] = (None, None)
+        if about is not None:
+            left, right = (jax.tree_util.tree_map(lambda a: a[index + offset], about) for offset in (0, 1))
+            share = jnp.where(here.length > 0, length / jnp.where(here.length > 0, here.length, 1.0), 0.0)
+            middle = jax.tree_util.tree_map(lambda a, b: a + share * (b - a), left, right)
+            nearby = ((left, middle), (middle, right))
+        at = jax.tree_util.tree_map(lambda a: a[index], before)
+        now = piece(here.start, length, at, nearby[0], False).moments
+        rest = piece(here.start + length, here.length - length, now, nearby[1], True)
+        rest = _through_jump(ssm, jumps, here.jump, rest)
+        gain = solve_semidefinite(rest.moments.covariance, matmul(rest.phi, now.covariance)).T
+        kept = jnp.eye(ssm.state_dim) - matmul(gain, rest.phi)
+        mean = now.mean + matmul(gain, (last.mean - rest.moments.mean)[:, None])[:, 0]
+        covariance = congruence(kept, now.covariance) + congruence(gain, rest.noise + last.covariance)
+        begins = length == 0
+        return jax.tree_util.tree_map(
+            lambda inside, node, end: jnp.where(exactly, end, jnp.where(begins, node, inside)),
+            Moments(mean, covariance), first, last)
+
+    return jax.vmap(one)(*(jnp.asarray(a) for a in where))
+
+
+def _through_jump(ssm: StateSpaceModel, jumps: list, index: jax.Array, one: Prediction) -> Prediction:
+    size = ssm.physical_dim
+    for number, (transition, covariance) in enumerate(jumps):
+        whole = jax.scipy.linalg.block_diag(jnp.eye(size), transition)
+        added = jax.scipy.linalg.block_diag(jnp.zeros((size, size)), covariance)
+        jumped = Prediction(
+            Moments(matmul(whole, one.moments.mean[:, None])[:, 0], congruence(whole, one.moments.covariance) + added),
+            matmul(whole, one.phi), congruence(whole, one.noise) + added)
+        one = jax.tree_util.tree_map(lambda a, b: jnp.where(index == number, a, b), jumped, one)  # noqa: B023
+    return one
