@@ -17,17 +17,18 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 from numpyro.infer import MCMC, NUTS, init_to_median
-from numpyro.infer.util import initialize_model
 
 from lfm_ppl import checks
 from lfm_ppl.analysis import arviz_data
 from lfm_ppl.analysis.scalars import units_attribute
 from lfm_ppl.filtering.filter import check_observations
+from lfm_ppl.filtering.schedule import schedule
 from lfm_ppl.inference.fixing import fix
 from lfm_ppl.inference.map import map_estimate
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
 from lfm_ppl.inference.posterior import LikelihoodSite, likelihood_site, scores, trajectories
 from lfm_ppl.inference.ram import RAM
+from lfm_ppl.inference.unconstrained import UnconstrainedModel
 
 SAMPLERS = ("nuts", "ram", "map")
 
@@ -78,13 +79,16 @@ def fit(
         y: (T, D), NaN where missing; (B, T, D) for a panel.
         sampler: "nuts", "ram" (robust adaptive Metropolis), or "map" (posterior mode; the draws come from its
             Laplace approximation).
-        chains, warmup, samples: number of chains, and of warm-up steps and draws in each.
+        chains: number of chains.
+        warmup: number of warm-up steps in each.
+        samples: number of draws in each; for "map", in all.
         seed: of everything random.
         at: times of the trajectories; by default a grid over the data. Times after the last are forecasts.
         trajectory_draws: number of posterior draws, spread over the chains, for which trajectories are drawn; 0: none.
         model_kwargs: keyword arguments of the model.
         fixed: parameters that are not learnt: name -> value, ``{"decay": 0.8}`` or ``{"decay[CDKN1A]": 0.8}``.
-        init: starting points: None for the prior median, "map" for the posterior mode, or a NumPyro strategy.
+        init: starting points: "map" for the posterior mode, "median" for the prior median, or a NumPyro strategy; by
+            default the prior median for NUTS, and draws from the Laplace approximation at the mode for RAM.
         sampler_options: further arguments of NUTS or RAM, for example ``{"target_accept_prob": 0.95}``.
         chain_method: "parallel", "vectorized" or "sequential"; by default parallel where there are as many devices as
             chains (``numpyro.set_host_device_count(chains)`` before JAX starts), sequential otherwise.
@@ -117,7 +121,8 @@ def fit(
         ...     rate = numpyro.sample("rate", dist.LogNormal(0.0, 0.5))
         ...     lfmodel = lfm.LatentForceModel(
         ...         lambda x, u, t: u - rate * x, {"u": lfm.Matern(1.0, 1.0)},
-        ...         lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
+        ...         lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        ...         lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
         ...     numpyro.sample("y", lfm.MarginalLikelihood(lfmodel, times), obs=y)
         >>> times = np.arange(5.0)
         >>> result = lfm.fit(model, times, np.sin(times)[:, None], sampler="map", samples=50, progress=False)
@@ -137,6 +142,7 @@ def fit(
     keys = jax.random.split(key, 5)
     site = likelihood_site(numpyro_model, (times, y), keywords, keys[0])
     y = _checked(site, y)
+    _check_requested(site.example, times, at)
     outputs = site.example.ssm.model.output_names
     model = fix(numpyro_model, fixed, labels=outputs) if fixed else numpyro_model
     arguments = (times, y)
@@ -145,7 +151,8 @@ def fit(
         chains = 1
     else:
         strategy = _strategy(init, model, arguments, keywords, seed)
-        kernel, first = _kernel(sampler, model, arguments, keywords, strategy, sampler_options, keys[2], seed, chains)
+        kernel, first = _kernel(sampler, model, arguments, keywords, strategy, sampler_options, keys[2], seed, chains,
+                                init is not None)
         draws, stats = _sample(kernel, sampler, arguments, keywords, keys[1], chains, warmup, samples, chain_method,
                                progress, first)
         remarks = {}
@@ -154,7 +161,8 @@ def fit(
     rated = _kept("scores of the observations", lambda: scores(
         model, arguments, keywords, latent, y, site.example.ssm.state_dim), None)
     chosen, paths, grid = _kept("trajectories", lambda: _paths(
-        model, arguments, keywords, latent, site, y, at, trajectory_draws, chains, samples, keys[3]), (None, None, None))
+        model, arguments, keywords, latent, site, y, at, trajectory_draws, chains, samples, keys[3]),
+        (None, None, None))
     groups = _groups(site, draws, stats, rated, paths, chosen, grid, times, y, truth, chains, samples)
     attrs = {
         "model": name or getattr(numpyro_model, "__name__", "model"), "rule": site.example.rule.name,
@@ -186,6 +194,15 @@ def _checked(site: LikelihoodSite, y: Any) -> jax.Array:
     return check_observations(y, *site.distribution.event_shape)
 
 
+def _check_requested(example: MarginalLikelihood, times: Any, at: Any) -> None:
+    """Raise before sampling what would stop the trajectories after it."""
+    if at is None:
+        return
+    if np.ndim(times) != 1:
+        raise ValueError("`at` needs one vector of times for all series; this panel has times of its own for each.")
+    schedule(example.ssm, times, example.steps, example.max_step, at)
+
+
 def _strategy(init: Any, model: Callable, arguments: tuple, keywords: dict, seed: int) -> Any:
     if init is None:
         return init_to_median(num_samples=15)
@@ -204,17 +221,18 @@ def _strategy(init: Any, model: Callable, arguments: tuple, keywords: dict, seed
 
 
 def _kernel(sampler: str, model: Callable, arguments: tuple, keywords: dict, strategy: Any,
-            options: Mapping[str, Any] | None, key: jax.Array, seed: int, chains: int) -> tuple[Any, Any]:
-    """Return the kernel and, for RAM, starting points."""
+            options: Mapping[str, Any] | None, key: jax.Array, seed: int, chains: int,
+            chosen_start: bool) -> tuple[Any, Any]:
+    """Return the kernel and, for RAM unless the user chose where to start, starting points."""
     options = dict(options or {})
-    info = initialize_model(key, model, model_args=arguments, model_kwargs=keywords, init_strategy=strategy,
-                            validate_grad=False)
-    size = sum(np.size(leaf) for leaf in jax.tree_util.tree_leaves(info.param_info.z))
+    space = UnconstrainedModel(model, arguments, keywords, key)
+    size = space.draw(key, init_to_median).size
     if size == 0:
         raise ValueError("the model has no parameters to sample; use lfm.smooth for the forces of a known model.")
     few = size <= _FORWARD_MODE_LIMIT
     if sampler == "nuts":
         options.setdefault("forward_mode_differentiation", few)
+        options.setdefault("dense_mass", few)  # a full mass matrix is cheap to learn for a handful of parameters
         return NUTS(model, init_strategy=strategy, **options), None
     if "initial_covariance" in options:
         return RAM(model, init_strategy=strategy, **options), None
@@ -226,13 +244,14 @@ def _kernel(sampler: str, model: Callable, arguments: tuple, keywords: dict, str
                             hessian="finite-differences", forward_mode=few)
     if mode.unidentified or not np.all(np.isfinite(mode.covariance)):
         return RAM(model, init_strategy=strategy, **options), None
-    _, unravel = jax.flatten_util.ravel_pytree(mode.unconstrained)
+    kernel = RAM(model, init_strategy=strategy, initial_covariance=mode.covariance, **options)
+    if chosen_start:
+        return kernel, None
     root = np.linalg.cholesky(mode.covariance)
     points = mode.mode + np.asarray(jax.random.normal(key, (chains, size))) @ root.T
-    possible = np.isfinite(np.asarray(jax.jit(jax.vmap(lambda p: info.potential_fn(unravel(p))))(jnp.asarray(points))))
+    possible = np.isfinite(np.asarray(jax.jit(jax.vmap(space.potential))(jnp.asarray(points))))
     points = jnp.asarray(np.where(possible[:, None], points, mode.mode))
-    kernel = RAM(model, init_strategy=strategy, initial_covariance=mode.covariance, **options)
-    return kernel, jax.vmap(unravel)(points) if chains > 1 else unravel(points[0])
+    return kernel, jax.vmap(space.unravel)(points) if chains > 1 else space.unravel(points[0])
 
 
 def _sample(kernel: Any, sampler: str, arguments: tuple, keywords: dict, key: jax.Array, chains: int, warmup: int,
@@ -286,8 +305,6 @@ def _paths(model: Callable, arguments: tuple, keywords: dict, latent: dict, site
         origin = float(site.example.plan.initial_time)
         grid = (np.union1d(np.linspace(min(origin, times[0]), times[-1], _GRID), times) if at is None
                 else np.atleast_1d(np.asarray(at, float)))
-    elif at is not None:
-        raise ValueError("`at` needs one vector of times for all series; this panel has times of its own for each.")
     subset = {label: value[rows] for label, value in latent.items()}
     paths = trajectories(model, arguments, keywords, subset, y, grid, key, site.example.ssm.state_dim)
     return chosen, {k: v.reshape(chains, len(chosen), *v.shape[1:]) for k, v in paths.items()}, grid
@@ -370,7 +387,8 @@ def _truth(truth: Mapping[str, Any], named: dict, units: Mapping[str, str], draw
                               units_attribute(known, units))
     if truth.get("state") is not None and np.ndim(truth["state"]) == 2:
         coords["state"] = named["state"]
-        variables["states"] = (("at_truth", "state"), np.asarray(truth["state"]), units_attribute(named["state"], units))
+        variables["states"] = (("at_truth", "state"), np.asarray(truth["state"]),
+                               units_attribute(named["state"], units))
     for label, value in (truth.get("parameters") or {}).items():
         value = np.asarray(value, float)
         dims = ["output"] if value.shape == (len(named["output"]),) and value.size > 1 else \

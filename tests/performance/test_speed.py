@@ -1,0 +1,107 @@
+"""Speed against the stated bounds. Run with ``-m performance`` on an idle machine."""
+
+import timeit
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lfm_ppl as lfm
+
+pytestmark = pytest.mark.performance
+
+
+def double_well(theta):
+    """25 observations, 20 steps each."""
+    alpha, beta, sigma = theta
+    times = np.arange(0.0, 50.0, 2.0)
+    y = 3.0 * np.sign(np.sin(times / 5.0 + 0.1))[:, None] + 0.1 * np.cos(7.0 * times)[:, None]
+    model = lfm.LatentForceModel(
+        lambda x, u, t: -(alpha * x + beta * x**3), {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.01])),
+        lfm.Gaussian(jnp.zeros(1), 10.0 * jnp.eye(1)), process_noise=sigma * jnp.ones((1, 1)))
+    return lfm.MarginalLikelihood(model, times, steps=20).log_prob(y)
+
+
+def transcription(theta):
+    """13 observations of 3 genes, 10 steps each, 5 states."""
+    basal, sensitivity, decay, lengthscale = theta[:3], theta[3:6], theta[6:9], theta[9]
+    times = np.linspace(0.0, 15.0, 13)
+    y = np.abs(np.sin(times[:, None] / 3.0 + np.arange(3.0)))
+    model = lfm.LatentForceModel(
+        lambda x, u, t: basal + sensitivity * jax.nn.softplus(u[0]) - decay * x,
+        {"factor": lfm.Matern(1.0, lengthscale, order=1)},
+        lfm.GaussianObservation(lambda x, u, t: x, 0.01 * jnp.ones(3)), lfm.Gaussian(basal / decay, jnp.zeros((3, 3))))
+    return lfm.MarginalLikelihood(model, times, steps=10).log_prob(y)
+
+
+def forward(function):
+    """Value and gradient in forward mode."""
+
+    def both(theta):
+        values, gradient = jax.vmap(lambda direction: jax.jvp(function, (theta,), (direction,)))(jnp.eye(theta.size))
+        return values[0], gradient
+
+    return both
+
+
+SYSTEMS = {
+    "double well": (double_well, np.array([-1.0, 0.1, 2.0])),
+    "transcription": (transcription, np.array([0.1, 0.1, 0.1, 0.7, 0.5, 0.4, 0.5, 1.0, 1.5, 2.0])),
+}
+BOUNDS = {  # milliseconds
+    ("double well", "value"): 0.3,
+    ("double well", "gradient"): 1.5,
+    ("transcription", "value"): 0.8,
+    ("transcription", "gradient"): 4.0,
+}
+
+
+def best(benchmark, run):
+    """Best time of one call, in milliseconds."""
+    run()
+    benchmark.pedantic(run, rounds=200, iterations=5, warmup_rounds=20)
+    return 1e3 * benchmark.stats.stats.min
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_value(benchmark, system):
+    function, theta = SYSTEMS[system]
+    compiled, theta = jax.jit(function), jnp.asarray(theta)
+    took = best(benchmark, lambda: compiled(theta).block_until_ready())
+    assert np.isfinite(compiled(theta))
+    assert took < BOUNDS[system, "value"]
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_value_and_gradient(benchmark, system):
+    """The better one of the two modes: a sampler may choose."""
+    function, theta = SYSTEMS[system]
+    theta = jnp.asarray(theta)
+    modes = [jax.jit(jax.value_and_grad(function)), jax.jit(forward(function))]
+    values = [mode(theta) for mode in modes]
+    np.testing.assert_allclose(values[0][1], values[1][1], rtol=1e-8)
+
+    def once(mode):
+        return min(timeit.repeat(lambda: jax.block_until_ready(mode(theta)), number=1, repeat=50))
+
+    faster = min(modes, key=once)
+    assert best(benchmark, lambda: jax.block_until_ready(faster(theta))) < BOUNDS[system, "gradient"]
+
+
+@pytest.mark.parametrize("count", [100_000, 200_000])
+def test_long_regression(benchmark, count):
+    """Matern-3/2 regression: some microseconds an observation, linear in their number."""
+    times = 0.01 * np.arange(count)
+    y = np.sin(times)[:, None]
+
+    @jax.jit
+    def density(lengthscale, noise):
+        model = lfm.LatentForceModel(
+            lambda x, u, t: jnp.zeros(0), {"u": lfm.Matern(1.0, lengthscale, order=1)},
+            lfm.GaussianObservation(lambda x, u, t: u, noise[None]), lfm.Gaussian(jnp.zeros(0), jnp.zeros((0, 0))))
+        return lfm.MarginalLikelihood(model, times).log_prob(y)
+
+    assert np.isfinite(density(1.0, jnp.asarray(0.1)))
+    benchmark.pedantic(lambda: density(1.0, jnp.asarray(0.1)).block_until_ready(), rounds=3)
+    assert 1e6 * benchmark.stats.stats.min / count < 20.0
