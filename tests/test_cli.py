@@ -151,7 +151,7 @@ def test_fit_with_everything_said(run, motif, tmp_path):
     )
     code, out, err = run(
         f"fit {motif} --data d.csv --outputs A,B --set 'decay[b]=0.8' --set noise_sd=0.2 "
-        "--option order=1 --rule unscented --steps 3 --max-step 0.5 --iterations 1 "
+        "--option order=1 --rule unscented --steps 3 --max-step 0.5 "
         "--sampler ram --chains 2 --warmup 50 --samples 50 --quiet"
     )
     assert code == 0, err
@@ -165,7 +165,7 @@ def test_fit_with_everything_said(run, motif, tmp_path):
     assert float(draws["decay"].sel(output="a").std()) > 0
     attributes = arviz_data.attributes(posterior)
     assert attributes["rule"].startswith("Unscented") and attributes["steps"] == 3
-    assert (attributes["iterations"], attributes["sampler"]) == (1, "ram")
+    assert (attributes["max_step"], attributes["sampler"]) == (0.5, "ram")
     assert json.loads(attributes["options"]) == {"order": 1}
     observed = arviz_data.group(posterior, "observed_data")["y"]
     np.testing.assert_array_equal(observed.sel(output="a"), [0.1, 0.2, 0.4, np.nan])
