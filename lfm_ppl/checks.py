@@ -64,7 +64,7 @@ def unknown(kind: str, value: str, choices: Iterable[str]) -> str:
 
 
 def covariance_matrix(name: str, value: Any) -> None:
-    """Raise ValueError unless ``value`` is a finite, symmetric, positive semi-definite matrix or a vector of variances."""
+    """Raise ValueError unless ``value`` is a symmetric, positive semi-definite matrix or a vector of variances."""
     array = _numeric(name, value)
     if array is None:
         return

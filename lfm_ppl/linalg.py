@@ -151,7 +151,7 @@ def solve_semidefinite(p: jax.Array, b: jax.Array, tolerance: float = 1e-14) -> 
 
 
 def semidefinite_root(p: jax.Array, tolerance: float = 1e-14) -> jax.Array:
-    """Return a lower triangular ``L`` with ``L L' = P`` for a positive semi-definite ``P``; null directions are zero."""
+    """Return a lower triangular ``L`` with ``L L' = P`` for a semi-definite ``P``; null directions are zero."""
     variance = jnp.diagonal(p)
     live = variance > 0
     sd = jnp.where(live, jnp.sqrt(jnp.where(live, variance, 1.0)), 0.0)

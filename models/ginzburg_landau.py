@@ -6,7 +6,10 @@ The state x follows the stochastic differential equation
 
 whose potential alpha x^2 / 2 + beta x^4 / 4 has two minima, at +-sqrt(-alpha / beta), where alpha
 is negative. The unknown parameters are alpha, beta and sigma; the standard deviation of the
-observation noise is known, as in the source. The default data are simulated with alpha = -1,
+observation noise is known, as in the source. What is sampled is sigma, alpha / sigma^2 and
+beta / sigma^2: the latter two are the shape of the stationary density exp(-(2 alpha x^2 + beta x^4)
+/ (2 sigma^2)) and sigma the speed of time, and the data tell them apart much better than alpha and
+beta, which follow. The default data are simulated with alpha = -1,
 beta = 0.1 and sigma = 2: the state starts in the right well, at 3.16, is observed every 2 units of
 time, and jumps between the wells.
 
@@ -37,21 +40,21 @@ OUTPUTS = ("x",)
 UNITS: dict[str, str] = {}
 OPTIONS = {"noise_sd": (0.1, float, "standard deviation of the observation noise, known")}
 PARAMETERS = {
-    "alpha": "linear coefficient of the drift; below zero there are two wells (1/time)",
-    "beta": "cubic coefficient of the drift, above zero (1/(time x^2))",
     "sigma": "dispersion of the Brownian motion, above zero (x/sqrt(time))",
+    "linear": "alpha / sigma^2; below zero there are two wells (1/x^2)",
+    "cubic": "beta / sigma^2, above zero (1/x^4)",
 }
 TRUTH = {"alpha": -1.0, "beta": 0.1, "sigma": 2.0}
-STEPS = 20  # between observations: the moments move fast where the wells are steep
+STEPS = 40  # between observations: after one that lies outside the wells, the mean moves fast
 
 
 def build(alpha, beta, sigma, noise_sd, start=None) -> lfm.LatentForceModel:
     """Return the double well with these parameters.
 
     Args:
-        alpha: see PARAMETERS.
-        beta: see PARAMETERS.
-        sigma: see PARAMETERS.
+        alpha: linear coefficient of the drift (1/time).
+        beta: cubic coefficient of the drift (1/(time x^2)).
+        sigma: dispersion (x/sqrt(time)).
         noise_sd: standard deviation of the observation noise.
         start: the initial state where it is known; None: N(0, 10).
     """
@@ -75,9 +78,11 @@ def model(times, y=None, noise_sd: float = 0.1) -> None:
         y: observations of x, shape (T, 1); NaN is missing, None draws from the prior predictive.
         noise_sd: standard deviation of the observation noise.
     """
-    alpha = numpyro.sample("alpha", dist.Normal(0.0, 1.0))
-    beta = numpyro.sample("beta", dist.LogNormal(-2.0, 0.8))
     sigma = numpyro.sample("sigma", dist.LogNormal(0.5, 0.5))
+    linear = numpyro.sample("linear", dist.Normal(0.0, 0.5))
+    cubic = numpyro.sample("cubic", dist.LogNormal(-3.0, 1.0))
+    alpha = numpyro.deterministic("alpha", linear * sigma**2)
+    beta = numpyro.deterministic("beta", cubic * sigma**2)
     system = build(alpha, beta, sigma, noise_sd)
     numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=STEPS), obs=y)
 
@@ -95,8 +100,13 @@ def simulate(seed: int = 2, noise_sd: float = 0.1) -> lfm.Data:
     drawn = lfm.simulate(jax.random.key(seed), system, grid, steps=10)
     return lfm.Data(
         times=grid[observed],
-        y=drawn.y[observed],
+        y=np.asarray(drawn.y)[observed],
         outputs=OUTPUTS,
         units=UNITS,
-        truth={"times": grid, "forces": {}, "state": drawn.state, "parameters": TRUTH},
+        truth={"times": grid, "forces": {}, "state": drawn.state, "parameters": _true_parameters()},
     )
+
+
+def _true_parameters() -> dict[str, float]:
+    square = TRUTH["sigma"] ** 2
+    return {**TRUTH, "linear": TRUTH["alpha"] / square, "cubic": TRUTH["beta"] / square}

@@ -87,7 +87,7 @@ def simulate(seed: int = 0) -> lfm.Data:
     drawn = lfm.simulate(jax.random.key(seed), build(**TRUTH), grid)
     return lfm.Data(
         times=grid[observed],
-        y=drawn.y[observed],
+        y=np.asarray(drawn.y)[observed],
         outputs=OUTPUTS,
         units=UNITS,
         truth={"times": grid, "forces": drawn.forces, "state": drawn.state, "parameters": TRUTH},

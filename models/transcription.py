@@ -32,6 +32,7 @@ al., Genome Biology 7:R25 (2006).
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -154,7 +155,7 @@ def simulate(seed: int = 0, link: str = "softplus", gamma: float = 0.5) -> lfm.D
     """
     random = np.random.default_rng(seed)
     outputs = ("gene 1", "gene 2", "gene 3")
-    truth = {
+    truth: dict[str, Any] = {
         "basal": random.uniform(0.0, 0.1, 3),
         "decay": random.uniform(0.0, 2.0, 3),
         "sensitivity": random.uniform(0.0, 1.0, 3),
@@ -169,7 +170,7 @@ def simulate(seed: int = 0, link: str = "softplus", gamma: float = 0.5) -> lfm.D
     drawn = lfm.simulate(jax.random.key(seed), system, grid)
     return lfm.Data(
         times=grid[observed],
-        y=drawn.y[observed],
+        y=np.asarray(drawn.y)[observed],
         outputs=outputs,
         units=UNITS,
         truth={"times": grid, "forces": drawn.forces, "state": drawn.state, "parameters": truth},

@@ -1,0 +1,1 @@
+"""The forward scan, the backward scan, and what happens in a row."""

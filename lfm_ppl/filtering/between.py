@@ -70,17 +70,16 @@ def marginals_between(ssm: StateSpaceModel, rule: Rule, plan: Schedule, start: M
         return predict_row(ssm, rule, linear, factor, plan.steps, begin, length, moments, nearby, flow)
 
     def one(index: jax.Array, t: jax.Array, exactly: jax.Array) -> Moments:
-        here: Rows = jax.tree_util.tree_map(lambda a: a[index], rows)
-        first, last = (jax.tree_util.tree_map(lambda a: a[index + offset], smoothed) for offset in (0, 1))
+        here: Rows = _entry(rows, index)
+        first, last = _entry(smoothed, index), _entry(smoothed, index + 1)
         length = jnp.clip(t - here.start, 0.0, here.length)
         nearby: tuple[Any, Any] = (None, None)
         if about is not None:
-            left, right = (jax.tree_util.tree_map(lambda a: a[index + offset], about) for offset in (0, 1))
+            left, right = _entry(about, index), _entry(about, index + 1)
             share = jnp.where(here.length > 0, length / jnp.where(here.length > 0, here.length, 1.0), 0.0)
             middle = jax.tree_util.tree_map(lambda a, b: a + share * (b - a), left, right)
             nearby = ((left, middle), (middle, right))
-        at = jax.tree_util.tree_map(lambda a: a[index], before)
-        now = piece(here.start, length, at, nearby[0], False).moments
+        now = piece(here.start, length, _entry(before, index), nearby[0], False).moments
         rest = piece(here.start + length, here.length - length, now, nearby[1], True)
         rest = _through_jump(ssm, jumps, here.jump, rest)
         gain = solve_semidefinite(rest.moments.covariance, matmul(rest.phi, now.covariance)).T
@@ -93,6 +92,10 @@ def marginals_between(ssm: StateSpaceModel, rule: Rule, plan: Schedule, start: M
             Moments(mean, covariance), first, last)
 
     return jax.vmap(one)(*(jnp.asarray(a) for a in where))
+
+
+def _entry(tree: Any, index: jax.Array) -> Any:
+    return jax.tree_util.tree_map(lambda a: a[index], tree)
 
 
 def _through_jump(ssm: StateSpaceModel, jumps: list, index: jax.Array, one: Prediction) -> Prediction:

@@ -221,7 +221,11 @@ def posterior_linearisation(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y:
     """Iterate: smooth, linearise about the smoothed marginals, smooth again.
 
     Args:
+        ssm: the model.
+        rule: the linearisation rule.
         plan: with a row for each integration step.
+        y: (T, D), NaN where missing.
+        start: moments at the initial time.
         iterations: fixed number, so that the result is a smooth function of the parameters.
         damping: share of the new marginals that is taken, in (0, 1].
 

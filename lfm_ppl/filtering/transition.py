@@ -50,8 +50,9 @@ class Factor(NamedTuple):
     ``half`` and ``full`` are E(h/2) and E(h), the exponential of ``Lin``. ``back_half`` and ``back_full`` approximate
     their inverses by 4 - 6 E + 4 E^2 - E^3 and its square: to the order of the step where it resolves ``Lin``, and
     bounded where it does not, while the true inverses of fast decays overflow. ``noise_half`` and ``noise_full`` are
-    the exact covariances of the forces' noise, ``inputs`` (nz, S) its dispersion. ``columns`` (nz, K) stand for the forces' noise at the nodes
-    of each later stage and of the whole step; ``regressions`` (K, nz) regress them on the exact noise.
+    the exact covariances of the forces' noise, ``inputs`` (nz, S) its dispersion. ``columns`` (nz, K) stand for the
+    forces' noise at the nodes of each later stage and of the whole step; ``regressions`` (K, nz) regress them on the
+    exact noise.
     """
 
     half: jax.Array
@@ -141,7 +142,8 @@ def integrating_factor(ssm: StateSpaceModel, linear: LinearPart, step: jax.Array
     else:
         regressions = tuple(solve_semidefinite(noise, c).T for noise, c in
                             zip((noise_half, noise_half, noise_full, noise_full), columns, strict=True))
-    return Factor(half, full, back_half, matmul(back_half, back_half), noise_half, noise_full, inputs, columns, regressions)
+    back_full = matmul(back_half, back_half)
+    return Factor(half, full, back_half, back_full, noise_half, noise_full, inputs, columns, regressions)
 
 
 def _half_step(ssm: StateSpaceModel, linear: LinearPart, dt: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -130,9 +130,9 @@ class MarginalLikelihood(dist.Distribution):
 
     def smooth(self, y: Any, at: Any = None) -> SmootherResult:
         """Smooth with this distribution's settings; see `lfm_ppl.smooth`."""
-        plan = schedule(self.ssm, self.times, self.steps, self.max_step, at, row_per_step=self.iterations > 0)
+        plans = smoothing_plans(self.ssm, self.times, self.steps, self.max_step, at, self.iterations)
         y = check_observations(y, *self.event_shape)
-        return smooth_on(self.ssm, self.rule, plan, y, self.iterations, self.damping)
+        return smooth_on(self.ssm, self.rule, plans, y, self.iterations, self.damping)
 
 
 class Panel(dist.Distribution):

@@ -65,8 +65,8 @@ def scores(model: Callable, arguments: tuple, keywords: Mapping[str, Any], draws
     """Score the observations under each draw; ``state_dim`` bounds the memory.
 
     Returns:
-        ``leave_one_out`` (S, ..., T), ``one_step_ahead`` (S, ..., T), ``residual`` (S, ..., T, D); the series of a panel
-        come after the draws.
+        ``leave_one_out`` (S, ..., T), ``one_step_ahead`` (S, ..., T), ``residual`` (S, ..., T, D); the series of a
+        panel come after the draws.
     """
 
     def one(distribution: MarginalLikelihood, y: jax.Array) -> dict[str, jax.Array]:
@@ -86,7 +86,9 @@ def trajectories(model: Callable, arguments: tuple, keywords: Mapping[str, Any],
     """Draw one trajectory for each draw of the parameters, given the data, and replicate the data along it.
 
     Args:
-        model, arguments, keywords: the NumPyro model and its arguments.
+        model: the NumPyro model.
+        arguments: its positional arguments, times first.
+        keywords: its keyword arguments.
         draws: site name -> (S, ...).
         y: (T, D), or (B, T, D) for a panel.
         at: (K,) times of the trajectories, or None for the observation times.

@@ -1,0 +1,1 @@
+"""Rules that turn a function and a Gaussian into an affine map."""

@@ -77,7 +77,7 @@ class SigmaPointRule(Rule):
             slope = slope + matmul(average, jnp.asarray(selection(structure.averaged, size).T))
             through_averaged = matmul(average, gain)
         else:
-            jacobians, average, through_averaged = None, None, 0.0
+            jacobians, average, through_averaged = None, None, jnp.zeros(())
         if self.regresses:
             regression = matmul((weights[:, None] * values).T, nodes)
             on_points = _times_inverse(chol, regression - through_averaged)
@@ -129,7 +129,8 @@ def _without_points(function: Function, inputs: Inputs, structure: InputStructur
 class Unscented(SigmaPointRule):
     """The unscented transform (Julier and Uhlmann).
 
-    ``2 a + 1`` points, exact to degree 3: ``m`` and ``m +- sqrt(a + lambda) L_i``, ``lambda = alpha^2 (a + kappa) - a``.
+    ``2 a + 1`` points, exact to degree 3: ``m`` and ``m +- sqrt(a + lambda) L_i``, ``lambda = alpha^2 (a + kappa)
+    - a``.
 
     Args:
         alpha: spread of the points, > 0.

@@ -127,7 +127,25 @@ def _fallback(equation: Any, operands: list[_Value]) -> list[_Value]:
             for v in equation.outvars]
 
 
+def _aligned(equation: Any, operands: list[_Value]) -> list[_Value]:
+    """Operands of an elementwise primitive, broadcast to its output: scalars and axes of length one are repeated."""
+    shape = equation.outvars[0].aval.shape
+    aligned = []
+    for variable, operand in zip(equation.invars, operands, strict=True):
+        own = variable.aval.shape
+        if own == shape:
+            aligned.append(operand)
+            continue
+        index = np.broadcast_to(np.arange(int(np.prod(own))).reshape(own), shape).ravel()
+        aligned.append(_Value(operand.first[index], operand.second[index]))
+    return aligned
+
+
 def _union(equation: Any, operands: list[_Value]) -> _Value:
+    return _joint(_aligned(equation, operands))
+
+
+def _joint(operands: list[_Value]) -> _Value:
     first, second = operands[0].first, operands[0].second
     for operand in operands[1:]:
         first, second = first | operand.first, second | operand.second
@@ -140,14 +158,15 @@ def _nonlinear(equation: Any, operands: list[_Value]) -> _Value:
 
 
 def _product(equation: Any, operands: list[_Value]) -> _Value:
-    joint = _union(equation, operands)
-    return _Value(joint.first, joint.second | _outer(operands[0].first, operands[1].first))
+    left, right = _aligned(equation, operands)
+    joint = _joint([left, right])
+    return _Value(joint.first, joint.second | _outer(left.first, right.first))
 
 
 def _quotient(equation: Any, operands: list[_Value]) -> _Value:
-    joint = _union(equation, operands)
-    denominator = operands[1].first
-    pairs = _outer(operands[0].first, denominator) | _outer(denominator, denominator)
+    numerator, denominator = _aligned(equation, operands)
+    joint = _joint([numerator, denominator])
+    pairs = _outer(numerator.first, denominator.first) | _outer(denominator.first, denominator.first)
     return _Value(joint.first, joint.second | pairs)
 
 
@@ -156,11 +175,25 @@ def _power(equation: Any, operands: list[_Value]) -> _Value:
 
 
 def _select(equation: Any, operands: list[_Value]) -> _Value:
-    predicate, *cases = operands
-    joint = _union(equation, cases)
-    if predicate.constant:
-        return joint
-    return _nonlinear(equation, [joint, _Value(predicate.first, np.zeros_like(joint.second))])
+    """A choice between cases: each keeps its own pattern, and bends where the predicate changes."""
+    predicate, *cases = _aligned(equation, operands)
+    joint = _joint(cases)
+    pairs = _outer(predicate.first, predicate.first | joint.first)
+    return _Value(joint.first | predicate.first, joint.second | pairs)
+
+
+def _scatter_add(equation: Any, operands: list[_Value]) -> _Value | None:
+    """The operand plus the updates, each where its index says."""
+    operand, indices, updates = operands
+    if indices.known is None:
+        return None
+    shapes = [variable.aval.shape for variable in equation.invars]
+    with jax.ensure_compile_time_eval():
+        place = lambda u: equation.primitive.bind(jnp.zeros(shapes[0]), indices.known, u, **equation.params)  # noqa: E731
+        landed = np.asarray(jax.jacfwd(place)(jnp.zeros(shapes[2]))) != 0
+    landed = landed.reshape(operand.first.shape[0], updates.first.shape[0])
+    return _Value(operand.first | np.einsum("ou,uk->ok", landed, updates.first),
+                  operand.second | np.einsum("ou,ukl->okl", landed, updates.second))
 
 
 def _moved(equation: Any, operands: list[_Value]) -> list[_Value] | None:
@@ -226,11 +259,12 @@ _RULES: dict[str, Callable[[Any, list[_Value]], _Value | list[_Value] | None]] =
     **dict.fromkeys(["add", "sub", "add_any", "neg", "copy", "copy_p", "convert_element_type", "real",
                      "reduce_precision"], _union),
     **dict.fromkeys(["reshape", "squeeze", "broadcast_in_dim", "transpose", "rev", "slice", "concatenate", "pad",
-                     "stack", "unstack", "split", "tile", "expand_dims", "gather", "dynamic_slice", "dynamic_update_slice", "scatter"], _moved),
+                     "stack", "unstack", "split", "tile", "expand_dims", "gather", "dynamic_slice",
+                     "dynamic_update_slice", "scatter"], _moved),
     **dict.fromkeys(["exp", "exp2", "log", "log1p", "expm1", "sin", "cos", "tan", "tanh", "sinh", "cosh", "asin",
                      "acos", "atan", "atan2", "logistic", "sqrt", "rsqrt", "cbrt", "abs", "sign", "erf", "erfc",
                      "pow", "max", "min", "square", "clamp", "lgamma", "digamma", "rem", "floor", "ceil", "round",
                      "is_finite", "gt", "lt", "ge", "le", "eq", "ne", "and", "or", "not"], _nonlinear),
     "mul": _product, "div": _quotient, "integer_pow": _power, "select_n": _select, "reduce_sum": _summed,
-    "dot_general": _dot,
+    "dot_general": _dot, "scatter-add": _scatter_add, "scatter_add": _scatter_add,
 }
