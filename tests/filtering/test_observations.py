@@ -1,0 +1,228 @@
+"""Observations of every kind, jumps of forces, and posterior linearisation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from references import LinearLFM, Regression, gauss_hermite, matern
+from systems import Linear, Outputs, double_well, first_state, identity, motif, softplus
+
+import lfm_ppl as lfm
+
+TIMES = np.array([0.3, 1.0, 1.0, 2.5])
+Y = np.array([0.4, 0.6, 0.5, 0.1])[:, None]
+PRIOR = lfm.Gaussian(jnp.array([0.2]), jnp.array([0.3]))
+ONE = (Linear(-0.7 * jnp.eye(1), jnp.ones((1, 1))), {"u": lfm.Matern(1.0, 1.3, 1)})
+
+
+def dense(noise):
+    process = LinearLFM(-0.7 * np.eye(1), np.ones((1, 1)), [matern(1.0, 1.3, 1)], 0.0, np.array([0.2]),
+                        np.array([[0.3]]))
+    return Regression(process, np.eye(1, 2), noise)
+
+
+def test_covariance_for_each_time():
+    noise = np.array([0.1, 0.2, 0.01, 0.4])[:, None]
+    model = lfm.LatentForceModel(*ONE, lfm.GaussianObservation(first_state, jnp.asarray(noise)[:, :, None]), PRIOR,
+                                 initial_time=0.0)
+    found = lfm.smooth(model, TIMES, Y, at=[1.5])  # a requested time shifts the rows, not the covariances
+    assert np.isclose(found.log_likelihood.sum(), dense(noise).log_likelihood(TIMES, Y), rtol=1e-10)
+
+
+def test_full_covariance_and_missing_entries():
+    """Correlated errors of two outputs; where one is missing the other has its marginal."""
+    covariance = np.array([[0.2, 0.1], [0.1, 0.3]])
+    model = lfm.LatentForceModel(*ONE, lfm.GaussianObservation(Outputs(jnp.eye(2)), jnp.asarray(covariance)), PRIOR,
+                                 initial_time=0.0)
+    y = np.c_[Y, [[0.1], [np.nan], [0.3], [0.0]]]
+    y[3, 0] = np.nan
+    mean, cov = dense(np.ones(1)).process.moments(TIMES)
+    k = cov.transpose(0, 2, 1, 3).reshape(8, 8) + np.kron(np.eye(4), covariance)
+    present = np.isfinite(y).ravel()
+    residual, k = (y - mean).ravel()[present], k[np.ix_(present, present)]
+    expected = -0.5 * (residual @ np.linalg.solve(k, residual) + np.linalg.slogdet(k)[1]
+                       + len(residual) * np.log(2 * np.pi))
+    assert np.isclose(lfm.filter(model, TIMES, y).log_likelihood.sum(), expected, rtol=1e-10)
+
+
+@pytest.mark.parametrize("rule, points", [(lfm.GaussHermite(5), gauss_hermite(1, 5)), (lfm.Taylor(), None)])
+def test_covariance_that_depends_on_the_state(rule, points):
+    """One update by hand: R is averaged over the points, or taken at the mean."""
+    model = lfm.LatentForceModel(
+        *ONE, lfm.GaussianObservation(first_state, lambda x, u, t: 0.1 + 0.5 * x**2 + t), PRIOR)
+    found = lfm.filter(model, [0.0], [[0.7]], rule=rule)
+    at = np.array([0.2]) if points is None else 0.2 + np.sqrt(0.3) * points.nodes[:, 0]
+    noise = (np.ones(1) if points is None else points.weights) @ (0.1 + 0.5 * at**2)
+    s = 0.3 + noise
+    assert np.isclose(found.log_likelihood[0], -0.5 * (0.25 / s + np.log(2 * np.pi * s)), rtol=1e-10)
+    assert np.isclose(found.filtered_mean[0, 0], 0.2 + 0.3 / s * 0.5, rtol=1e-10)
+
+
+@pytest.mark.parametrize("turns", [-2, 0, 3])
+def test_angles_are_compared_on_the_circle(turns):
+    """Whole turns of the data change nothing, in the residual and beyond."""
+    model = lambda angular: lfm.LatentForceModel(  # noqa: E731
+        *ONE, lfm.GaussianObservation(first_state, jnp.array([0.1]), angular=angular), PRIOR, initial_time=0.0)
+    plain = lfm.filter(model(()), TIMES, Y)
+    turned = lfm.filter(model((0,)), TIMES, Y + 2 * np.pi * turns)
+    assert np.allclose(plain.log_likelihood, turned.log_likelihood, rtol=1e-10)
+    assert np.allclose(plain.filtered_mean, turned.filtered_mean, atol=1e-12)
+
+
+def square_observed(x, u, t):
+    return x**2 + 0.5 * u
+
+
+def test_non_linear_observation_by_points():
+    """Moments of y = x^2 + u / 2 under the prior, in closed form."""
+    model = lfm.LatentForceModel(*ONE, lfm.GaussianObservation(square_observed, jnp.array([0.1])), PRIOR)
+    found = lfm.filter(model, [0.0], [[0.7]], rule=lfm.GaussHermite(3))
+    m, v = 0.2, 0.3
+    mean, variance = m**2 + v, 4 * m**2 * v + 2 * v**2 + 0.25 + 0.1
+    assert np.isclose(found.log_likelihood[0], -0.5 * ((0.7 - mean) ** 2 / variance + np.log(2 * np.pi * variance)),
+                      rtol=1e-10)
+    assert np.isclose(found.filtered_mean[0, 0], m + 2 * m * v / variance * (0.7 - mean), rtol=1e-10)
+
+
+class Kicked(lfm.Matern):
+    """At each time in ``kicks`` the force keeps ``share`` of itself and draws the rest anew."""
+
+    share: Any = 0.3
+    kicks: tuple = eqx.field(static=True, default=())
+
+    def __init__(self, share, kicks, *args):
+        super().__init__(*args)
+        self.share, self.kicks = share, kicks
+
+    @property
+    def jump_times(self):
+        return self.kicks
+
+    def jump(self, index):
+        return self.share * jnp.eye(self.state_dim), (1 - self.share**2) * self.initial_covariance()
+
+
+@pytest.mark.parametrize("link", [identity, softplus])
+def test_jumps(link):
+    """Across a jump the covariance function shrinks by the share; a jump comes before an observation at its time."""
+    kicks, share = (0.6, 1.0, 2.0, 9.0), 0.3
+    force = Kicked(share, kicks, 1.0, 1.3, 1)
+
+    def kernel(t, s):
+        crossed = sum(((np.minimum(t, s) < kick) & (kick <= np.maximum(t, s))) * 1.0 for kick in kicks)
+        return matern(1.0, 1.3, 1)(t, s) * share**crossed
+
+    model = lfm.LatentForceModel(ONE[0], {"u": force}, lfm.GaussianObservation(first_state, jnp.array([0.1])), PRIOR,
+                                 initial_time=0.0)
+    if link is identity:
+        at = np.array([0.5, 0.6, 1.7, 2.0, 3.0])
+        reference = dense(np.array([0.1]))
+        reference.process.kernels, reference.process.breaks = [kernel], kicks[:3]
+        found = lfm.smooth(model, TIMES, Y, at=at)
+        mean, cov = reference.posterior(TIMES, Y, at)
+        assert np.isclose(found.log_likelihood.sum(), reference.log_likelihood(TIMES, Y), rtol=1e-9)
+        assert np.allclose(found.input_mean, mean, atol=1e-9)
+        assert np.allclose(found.input_covariance, cov[np.arange(5), np.arange(5)], atol=1e-9)
+        assert np.allclose(found.leave_one_out, reference.leave_one_out(TIMES, Y), rtol=1e-8)
+    else:
+        nonlinear = eqx.tree_at(lambda m: m.forces["u"], motif(softplus, genes=1), force)
+        # Without memory a jump makes everything that the force knew irrelevant.
+        found = lfm.filter(nonlinear, TIMES, Y)
+        other = lfm.filter(motif(softplus, genes=1), TIMES, Y)
+        assert np.isclose(found.log_likelihood[0], other.log_likelihood[0], rtol=1e-10)  # before any jump
+        assert abs(found.log_likelihood[3] - other.log_likelihood[3]) > 1e-3
+        stationary = np.asarray(force.initial_covariance())
+        alone = lfm.filter(nonlinear, [5.0], [[0.4]])
+        assert np.abs(alone.predicted_covariance[0, 1:, 1:] - stationary).max() < 1e-10
+
+
+def test_iterations_change_nothing_on_a_linear_model():
+    model = motif(identity, genes=1)
+    plain, iterated = (lfm.smooth(model, TIMES, Y, at=[0.0, 1.5, 4.0], iterations=n) for n in (0, 2))
+    for name in ("mean", "covariance", "log_likelihood", "leave_one_out"):
+        assert np.allclose(getattr(plain, name), getattr(iterated, name), atol=1e-9), name
+    assert iterated.change < 1e-9 and np.isnan(plain.change)
+
+
+def exponential_of_force(x, u, t):
+    return jnp.exp(u)
+
+
+def test_iterations_find_the_posterior_linearisation_of_dense_algebra():
+    """y = exp(u) + e: each y linearised about its posterior marginal, and the Gaussian process conditioned on all."""
+    empty = jnp.zeros((0, 0))
+    model = lfm.LatentForceModel(
+        Linear(empty, jnp.zeros((0, 1)), jnp.zeros(0)), {"u": lfm.Matern(0.8, 1.0, 1)},
+        lfm.GaussianObservation(exponential_of_force, jnp.array([0.05])), lfm.Gaussian(jnp.zeros(0), empty),
+        initial_time=0.0)
+    y = np.array([1.5, 0.8, 0.7, 2.0])
+    k = matern(0.8, 1.0, 1)(TIMES[:, None], TIMES)
+    mean, variance = np.zeros(4), np.diag(k)
+    for _ in range(300):
+        value = np.exp(mean + variance / 2)  # E exp(u); A = E exp(u), Cov = (exp(v) - 1) value^2
+        residual = value**2 * (np.exp(variance) - 1 - variance)
+        a = np.diag(value)
+        s = a @ k @ a + np.diag(residual + 0.05)
+        innovation = y - value + value * mean
+        gain = np.linalg.solve(s, a @ k).T
+        mean = 0.5 * mean + 0.5 * gain @ innovation
+        variance = 0.5 * variance + 0.5 * np.diag(k - gain @ a @ k)
+    log_likelihood = -0.5 * (innovation @ np.linalg.solve(s, innovation) + np.linalg.slogdet(s)[1]
+                             + 4 * np.log(2 * np.pi))
+    found = lfm.smooth(model, TIMES, y[:, None], rule=lfm.GaussHermite(15), steps=1, iterations=200, damping=0.5)
+    assert found.change < 1e-8
+    assert np.allclose(found.force("u").mean, mean, atol=1e-7)
+    assert np.allclose(found.force("u").sd ** 2, variance, atol=1e-7)
+    assert np.isclose(found.log_likelihood.sum(), log_likelihood, rtol=1e-7)
+
+
+def test_iterations_converge_on_a_non_linear_drift():
+    model = motif(softplus, genes=1, noise_sd=0.05, scale=2.0, lengthscale=0.8)
+    times = np.linspace(0.25, 3.0, 12)
+    truth = lfm.simulate(jax.random.key(3), model, times)
+    changes = [float(lfm.smooth(model, times, truth.y, steps=4, iterations=n).change) for n in (4, 16)]
+    assert changes[1] < 0.05 * changes[0] and changes[1] < 1e-3
+    found = lfm.smooth(model, times, truth.y, steps=4, iterations=16)
+    # Honest: the truth lies within the band of +-4 sd at every time.
+    error = np.abs(found.force("u").mean - truth.forces["u"]) / found.force("u").sd
+    assert error.max() < 4.0
+
+
+@pytest.fixture(scope="module")
+def draws():
+    model = lfm.LatentForceModel(*ONE, lfm.GaussianObservation(first_state, jnp.array([0.1])), PRIOR, initial_time=0.0)
+    at = np.array([0.0, 0.7, 1.0, 1.8, 4.0])
+    found = lfm.smooth(model, TIMES, Y, at=at)
+    sample = found.sample(jax.random.key(0), 4000)
+    return at, np.concatenate([sample.state, sample.forces["u"][:, :, None]], axis=2)
+
+
+def test_trajectories_have_the_joint_posterior(draws):
+    """Mean, and covariance between all times, of x and u, within the Monte Carlo error."""
+    at, sample = draws
+    mean, cov = dense(np.array([0.1])).posterior(TIMES, Y, at)
+    flat = sample.reshape(len(sample), -1)
+    expected = cov.transpose(0, 2, 1, 3).reshape(flat.shape[1], -1)
+    sd = np.sqrt(np.diag(expected))
+    count = len(flat)
+    z = (flat.mean(0) - mean.ravel()) / (sd / np.sqrt(count))
+    assert np.abs(z).max() < 4.5  # of 10 standard normals, p < 1e-4
+    variance_of_entry = (expected**2 + np.outer(sd, sd) ** 2) / count
+    z = (np.cov(flat.T) - expected) / np.sqrt(variance_of_entry)
+    assert np.abs(z).max() < 4.5
+
+
+def test_double_well_trajectories_are_marginally_the_smoother():
+    model = double_well()
+    found = lfm.smooth(model, TIMES, Y, at=[0.0, 0.5, 2.5])
+    sample = found.sample(jax.random.key(1), 2000)
+    assert sample.state.shape == (2000, 3, 1) and sample.forces == {}
+    z = (sample.state[:, :, 0].mean(0) - found.state("x0").mean) / (found.state("x0").sd / np.sqrt(2000))
+    assert np.abs(z).max() < 4.5
+    ratio = sample.state[:, :, 0].var(0) / found.state("x0").sd ** 2
+    assert np.abs(ratio - 1).max() < 4.5 * np.sqrt(2 / 2000)

@@ -1,0 +1,97 @@
+"""Errors of the model's constructors: the argument, what came, the remedy."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from systems import whole_state
+
+import lfm_ppl as lfm
+
+OBSERVATION = lfm.GaussianObservation(whole_state, jnp.ones(2))
+PRIOR = lfm.Gaussian(jnp.zeros(2), jnp.eye(2))
+FORCE = {"u": lfm.Matern(1.0, 1.0)}
+
+
+def make(dynamics=lambda x, u, t: -x, forces=FORCE, observation=OBSERVATION, initial_state=PRIOR, **options):
+    return lfm.LatentForceModel(dynamics, forces, observation, initial_state, **options)
+
+
+@pytest.mark.parametrize("options, message", [
+    ({"dynamics": lambda x, u, t: x[0]}, r"dynamics must return.*shape \(2,\); it returned \(\)"),
+    ({"dynamics": lambda x, u, t: jnp.ones(3)}, r"it returned \(3,\)"),
+    ({"forces": [("u", lfm.Matern(1.0, 1.0)), ("u", lfm.Constant(1.0))]}, "force name 'u' repeats"),
+    ({"forces": {"x0": lfm.Matern(1.0, 1.0)}}, "'x0' is used for a state and for a force; rename"),
+    ({"state_names": ("a",)}, r"state_names must hold 2 names, got \('a',\)"),
+    ({"state_names": "ab"}, "state_names must hold 2 names, got 'ab'"),
+    ({"state_names": ("a", "a")}, "state_names must not repeat"),
+    ({"output_names": ("a", "b", "c")}, "output_names must hold 2 names"),
+    ({"process_noise": jnp.ones(2)}, r"process_noise must be a dispersion matrix \(2, S\).*got shape \(2,\).*jnp.diag"),
+    ({"process_noise": jnp.full((2, 1), jnp.nan)}, "process_noise must be finite"),
+    ({"process_noise": lambda x, u, t: jnp.ones(3)}, r"process_noise must return a dispersion matrix.*got \(3,\)"),
+    ({"initial_time": np.inf}, "initial_time must be finite"),
+    ({"nonlinear_inputs": ("y",)}, "unknown name in nonlinear_inputs 'y'"),
+    ({"observation": lfm.GaussianObservation(lambda x, u, t: x[0], jnp.ones(1))},
+     r"must return a vector \(D,\), got shape \(\)"),
+    ({"observation": lfm.GaussianObservation(whole_state, jnp.ones(3))},
+     r"2 components.*must be \(2,\) or \(2, 2\); it is \(3, 3\)"),
+    ({"observation": lfm.GaussianObservation(whole_state, jnp.ones(2), angular=(2,))}, "angular indices must lie in 0..1"),
+])
+def test_model_values(options, message):
+    with pytest.raises(ValueError, match=message):
+        make(**options)
+
+
+@pytest.mark.parametrize("options, message", [
+    ({"dynamics": 3.0}, "dynamics must be callable as f\\(x, u, t\\), got float"),
+    ({"observation": jnp.ones(2)}, "observation must be an lfm.GaussianObservation.*Wrap"),
+    ({"initial_state": jnp.zeros(2)}, "initial_state must be an lfm.Gaussian"),
+    ({"forces": {"u": 1.0}}, "force 'u' must be a force such as lfm.Matern, got float"),
+    ({"forces": [lfm.Matern(1.0, 1.0)]}, "forces must map names to forces"),
+])
+def test_model_types(options, message):
+    with pytest.raises(TypeError, match=message):
+        make(**options)
+
+
+@pytest.mark.parametrize("call, message", [
+    (lambda: lfm.Gaussian(jnp.zeros(2), jnp.array([[1.0, 0.5], [0.2, 1.0]])),
+     "initial_state.covariance is not symmetric: the largest.*0.3.*Use 0.5"),
+    (lambda: lfm.Gaussian(jnp.zeros(2), jnp.array([[1.0, 2.0], [2.0, 1.0]])),
+     "initial_state.covariance is not positive semi-definite: its smallest eigenvalue is -1"),
+    (lambda: lfm.Gaussian(jnp.zeros(2), jnp.array([1.0, -1.0])), "negative variance -1 at index 1"),
+    (lambda: lfm.Gaussian(jnp.zeros(2), jnp.eye(3)), r"must have shape \(2, 2\) or \(2,\).*got \(3, 3\)"),
+    (lambda: lfm.Gaussian(jnp.zeros((2, 1)), jnp.eye(2)), r"initial_state.mean must be a vector \(M,\)"),
+    (lambda: lfm.Gaussian(jnp.array([jnp.nan]), jnp.eye(1)), r"initial_state.mean must be finite at index \[0\]"),
+    (lambda: lfm.GaussianObservation(whole_state, jnp.array([0.1, -0.1])), "observation covariance has a negative"),
+    (lambda: lfm.GaussianObservation(whole_state, jnp.stack([jnp.eye(2), -jnp.eye(2)])),
+     "observation covariance of row 1 is not positive semi-definite"),
+    (lambda: lfm.Input([0.0, 1.0, 1.0], [1.0, 2.0, 3.0]), r"input times must increase; row 2 \(1\) does not"),
+    (lambda: lfm.Input([0.0, 1.0], [1.0, 2.0, 3.0]), "one row a time"),
+    (lambda: lfm.Input([0.0, np.nan], [1.0, 2.0]), "input times must be finite"),
+    (lambda: lfm.Input([0.0, 1.0], [1.0, np.inf]), "input values must be finite"),
+    (lambda: lfm.Input([0.0, 1.0], [1.0, 2.0], "linaer"), "unknown interpolation 'linaer'. Did you mean 'linear'"),
+    (lambda: lfm.simulate(jax.random.key(0), make(), [2.0, 1.0]), "times must not go back"),
+    (lambda: lfm.simulate(jax.random.key(0), make(), [1.0], steps=0), "steps must be at least 1"),
+    (lambda: lfm.simulate(jax.random.key(0), make(initial_time=2.0), [1.0]), "lies before the model's initial_time = 2"),
+    (lambda: lfm.state_space(lfm.LatentForceModel(
+        lambda x, u, t: x, {}, lfm.GaussianObservation(lambda x, u, t: jnp.ones(1), jnp.ones(1)),
+        lfm.Gaussian(jnp.zeros(0), jnp.zeros((0, 0))))), "neither states nor forces"),
+])
+def test_parts(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+def test_observation_function_must_be_callable():
+    with pytest.raises(TypeError, match="observation function must be callable as h"):
+        lfm.GaussianObservation(jnp.ones(1), jnp.ones(1))
+
+
+def test_names_units_and_defaults():
+    model = make(units={"time": "h", "u": "mol"}, state_names=("a", "b"))
+    assert model.units == {"time": "h", "u": "mol"} and model.output_names == ("y0", "y1")
+    assert model.force_names == ("u",) and model.state_names == ("a", "b")
+    assert make(forces={}).force_names == ()
