@@ -168,3 +168,15 @@ def test_traced_times(model):
     start = lfm.LatentForceModel(model.dynamics, model.forces, model.observation, model.initial_state,
                                  initial_time=0.0)
     same(found, lfm.filter(start, TIMES, Y).log_likelihood, 1e-10)
+
+
+def test_more_interval_lengths_than_are_tabulated():
+    """Their transitions are then computed row by row; two shorter series have their own tables."""
+    model = motif(identity, genes=1, variance=0.1)
+    times = np.cumsum(np.random.default_rng(2).uniform(0.01, 0.1, size=1300))
+    y = np.sin(times)[:, None]
+    whole = lfm.filter(model, times, y)
+    first = lfm.filter(model, times[:650], y[:650])
+    second = lfm.filter(model, times[650:], y[650:], start=first.state)
+    same(whole.log_likelihood, jnp.concatenate([first.log_likelihood, second.log_likelihood]), 1e-10)
+    same(whole.state, second.state, 1e-10)

@@ -37,7 +37,8 @@ def make(dynamics=lambda x, u, t: -x, forces=FORCE, observation=OBSERVATION, ini
      r"must return a vector \(D,\), got shape \(\)"),
     ({"observation": lfm.GaussianObservation(whole_state, jnp.ones(3))},
      r"2 components.*must be \(2,\) or \(2, 2\); it is \(3, 3\)"),
-    ({"observation": lfm.GaussianObservation(whole_state, jnp.ones(2), angular=(2,))}, "angular indices must lie in 0..1"),
+    ({"observation": lfm.GaussianObservation(whole_state, jnp.ones(2), angular=(2,))},
+     "angular indices must lie in 0..1"),
 ])
 def test_model_values(options, message):
     with pytest.raises(ValueError, match=message):
@@ -75,7 +76,8 @@ def test_model_types(options, message):
     (lambda: lfm.Input([0.0, 1.0], [1.0, 2.0], "linaer"), "unknown interpolation 'linaer'. Did you mean 'linear'"),
     (lambda: lfm.simulate(jax.random.key(0), make(), [2.0, 1.0]), "times must not go back"),
     (lambda: lfm.simulate(jax.random.key(0), make(), [1.0], steps=0), "steps must be at least 1"),
-    (lambda: lfm.simulate(jax.random.key(0), make(initial_time=2.0), [1.0]), "lies before the model's initial_time = 2"),
+    (lambda: lfm.simulate(jax.random.key(0), make(initial_time=2.0), [1.0]),
+     "lies before the model's initial_time = 2"),
     (lambda: lfm.state_space(lfm.LatentForceModel(
         lambda x, u, t: x, {}, lfm.GaussianObservation(lambda x, u, t: jnp.ones(1), jnp.ones(1)),
         lfm.Gaussian(jnp.zeros(0), jnp.zeros((0, 0))))), "neither states nor forces"),
