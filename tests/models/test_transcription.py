@@ -1,0 +1,150 @@
+"""Gene expression: links, scaling, anchors, and the p53 data."""
+
+import os
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lfm_ppl as lfm
+from lfm_ppl import loading
+from lfm_ppl.analysis.arviz_data import group, summary
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+P53 = Path(os.environ.get("LFM_DATA", ROOT.parent / "shared" / "data")) / "p53" / "p53_targets.csv"
+needs_p53 = pytest.mark.skipif(not P53.is_file(), reason=f"{P53} is not there; LFM_DATA says where")
+
+
+@pytest.fixture(scope="module")
+def file():
+    return loading.load("transcription")
+
+
+@pytest.fixture(scope="module")
+def genes(file):
+    """The simulated default data."""
+    return file.simulate()
+
+
+@pytest.fixture
+def activity(file):
+    return file.model.__globals__["activity"]
+
+
+@pytest.mark.parametrize("gamma", [0.1, 0.5, 1.0])
+def test_links_are_those_of_the_papers(activity, gamma):
+    u = np.linspace(-8.0, 8.0, 33)
+    expected = {
+        "linear": u,
+        "softplus": np.log1p(np.exp(u)),
+        "exponential": np.exp(u),
+        "saturation": np.exp(u) / (gamma + np.exp(u)),
+        "repression": 1.0 / (gamma + np.exp(u)),
+    }
+    for link, values in expected.items():
+        np.testing.assert_allclose(activity(jnp.array(u), link, gamma), values, rtol=1e-12)
+    far = jnp.array([-800.0, 800.0])
+    for link in ("softplus", "saturation", "repression"):
+        slope = jax.vmap(jax.grad(lambda v, link=link: activity(v, link, gamma)))(far)
+        assert np.all(np.isfinite(activity(far, link, gamma))) and np.all(np.isfinite(slope))
+    with pytest.raises(ValueError, match="link must be one of softplus, linear"):
+        activity(u, "sigmoid", gamma)
+
+
+def test_files_are_scaled_gene_by_gene_and_the_truth_with_them(file, genes):
+    data = genes
+    raw = replace(data, y=data.y * np.array([100.0, 3.0, 0.1]))
+    raw = replace(
+        raw,
+        truth={
+            "times": data.truth["times"],
+            "forces": data.truth["forces"],
+            "state": data.truth["state"] * np.array([100.0, 3.0, 0.1]),
+            "parameters": {"basal": data.truth["parameters"]["basal"] * [100.0, 3.0, 0.1]},
+        },
+    )
+    prepared = file.prepare(raw)
+    np.testing.assert_allclose(prepared.y.max(axis=0), 1.0)
+    largest = data.y.max(axis=0)
+    np.testing.assert_allclose(prepared.y, data.y / largest)
+    np.testing.assert_allclose(prepared.truth["state"], data.truth["state"] / largest)
+    expected = data.truth["parameters"]["basal"] / largest
+    np.testing.assert_allclose(prepared.truth["parameters"]["basal"], expected)
+    assert "divided by its largest value" in prepared.note and "gene 1" in prepared.note
+
+
+def test_a_gene_that_cannot_be_scaled_is_named(file):
+    data = lfm.Data([0.0, 1.0], [[1.0, -1.0], [2.0, np.nan]], ("a", "b"))
+    with pytest.raises(ValueError, match="gene 'b' has no positive value"):
+        file.prepare(data)
+
+
+def test_anchors_need_the_gene_and_hours(file):
+    times, y = [0.0, 1.0], [[1.0, 2.0], [2.0, 3.0]]
+    hours = lfm.Data(times, y, ("DDB2", "CDKN1A"), units={"time": "h"})
+    assert file.anchors(hours) == {"sensitivity[CDKN1A]": 1.0, "decay[CDKN1A]": 0.8}
+    assert file.anchors(replace(hours, units={"time": "min"})) == {}
+    assert file.anchors(replace(hours, outputs=("DDB2", "BIK"))) == {}
+
+
+def test_priors_follow_the_duration(file, genes):
+    """The same expression on another clock has the same density, up to the change of units."""
+    from numpyro.infer.util import log_density
+
+    data, keywords = genes, file.keywords(genes, {})
+    truth = {key: np.asarray(data.truth["parameters"][key]) for key in file.parameters}
+    per_hour = log_density(file.model, (data.times, data.y), keywords, truth)[0]
+    minutes = dict(truth)
+    for name in ("basal", "sensitivity", "decay"):
+        minutes[name] = truth[name] / 60.0
+    minutes["lengthscale"] = truth["lengthscale"] * 60.0
+    per_minute = log_density(file.model, (data.times * 60.0, data.y), keywords, minutes)[0]
+    # densities of nine rates per minute and one lengthscale in minutes
+    np.testing.assert_allclose(per_minute, per_hour + 8 * np.log(60.0), rtol=1e-8)
+
+
+@needs_p53
+def test_p53_data_are_read_as_they_are(file):
+    data = lfm.read_csv(P53)
+    assert data.outputs == ("DDB2", "BIK", "TNFRSF10b", "SESN1", "CDKN1A")
+    assert data.units == {"time": "h"} and data.y.shape == (21, 5)
+    np.testing.assert_array_equal(np.unique(data.times), [0, 2, 4, 6, 8, 10, 12])
+    assert set(file.anchors(data)) == {"sensitivity[CDKN1A]", "decay[CDKN1A]"}
+    assert data.y[0, 0] == 211.6
+
+
+@needs_p53
+@pytest.mark.slow
+def test_p53_posterior(file):
+    """NUTS converges, RAM agrees, and the activity peaks in the first half of the experiment."""
+    data = file.prepare(lfm.read_csv(P53))
+    task = dict(model_kwargs=file.keywords(data, {}), fixed=file.anchors(data), progress=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", lfm.ConvergenceWarning)
+        nuts = lfm.fit(file.model, data.times, data.y, **task)
+    table = summary(nuts)
+    free = table[table["sd"] > 0]
+    assert len(free) == 20
+    assert free["r_hat"].max() <= 1.01 and free["ess_bulk"].min() >= 400
+    assert table.loc["decay[CDKN1A]", "mean"] == 0.8
+
+    ram = summary(
+        lfm.fit(
+            file.model, data.times, data.y, sampler="ram", warmup=20_000, samples=20_000,
+            trajectory_draws=0, **task
+        )
+    )  # fmt: skip
+    error = np.hypot(free["mcse_mean"], ram.loc[free.index, "mcse_mean"])
+    z = (free["mean"] - ram.loc[free.index, "mean"]) / error
+    # 20 parameters: |z| < 4 for all of them holds with probability 0.999
+    assert z.abs().max() < 4.0, z.round(1).to_dict()
+
+    forces = group(nuts, "trajectories")["forces"].isel(force=0)
+    peak = forces["at"].values[forces.mean(["chain", "draw"]).values.argmax()]
+    assert peak < 6.0
+    each = forces["at"].values[forces.values.argmax(axis=forces.dims.index("at"))]
+    assert np.mean(each < 6.0) > 0.9
