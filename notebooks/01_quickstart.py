@@ -1,0 +1,137 @@
+# ---
+# jupyter:
+#   jupytext:
+#     formats: ipynb,py:percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # Quickstart: from a latent force model to a posterior
+#
+# A gene's expression $x$ is produced at a rate set by a transcription factor and decays:
+#
+# $$\frac{dx}{dt} = s\,\log(1 + e^{u(t)}) - d\,x, \qquad y_k = x(t_k) + e_k.$$
+#
+# Nobody measured the factor. We say of $u(t)$ only that it is smooth, by a Gaussian process prior,
+# and ask for everything at once: the decay rate $d$, the noise, and $u(t)$ itself.
+
+# %%
+import os
+
+import numpyro
+
+numpyro.set_host_device_count(4)  # chains run side by side
+numpyro.enable_x64()
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro.distributions as dist
+
+import lfm_ppl as lfm
+from lfm_ppl.analysis import plots, tables
+from lfm_ppl.analysis.arviz_data import group, summary
+
+quick = bool(os.environ.get("LFM_QUICK"))
+size = dict(chains=2, warmup=50, samples=50) if quick else dict(chains=4, warmup=1000, samples=1000)
+
+# %% [markdown]
+# ## The model
+#
+# `LatentForceModel` reads like the equations. The NumPyro model puts priors on what is unknown, and
+# ends in one likelihood, in which state and force are integrated out.
+
+
+# %%
+def build(decay, lengthscale, noise_sd):
+    return lfm.LatentForceModel(
+        dynamics=lambda x, u, t: jax.nn.softplus(u) - decay * x,
+        forces={"factor": lfm.Matern(scale=1.5, lengthscale=lengthscale, order=1)},
+        observation=lfm.GaussianObservation(lambda x, u, t: x, noise_sd**2 * jnp.ones(1)),
+        initial_state=lfm.Gaussian(jnp.ones(1), jnp.eye(1)),
+        state_names=["expression"],
+        output_names=["expression"],
+        units={"time": "h"},
+    )
+
+
+def motif(times, y=None):
+    decay = numpyro.sample("decay", dist.LogNormal(-0.5, 0.7))
+    lengthscale = numpyro.sample("lengthscale", dist.LogNormal(0.7, 0.5))
+    noise_sd = numpyro.sample("noise_sd", dist.HalfNormal(0.3))
+    model = build(decay, lengthscale, noise_sd)
+    numpyro.sample("y", lfm.MarginalLikelihood(model, times, steps=5), obs=y)
+
+
+# %% [markdown]
+# ## Data
+#
+# We simulate a day, observed every hour, lose three values, and keep the truth for later.
+
+# %%
+truth = {"decay": 0.6, "lengthscale": 3.0, "noise_sd": 0.1}
+grid = np.linspace(0.0, 24.0, 241)
+drawn = lfm.simulate(jax.random.key(4), build(**truth), grid)
+times, y = grid[::10], np.array(drawn.y[::10])
+y[[6, 7, 15]] = np.nan
+
+# %% [markdown]
+# ## Posterior
+#
+# `lfm.fit` samples the parameters with NUTS, then draws forces and states given them. `at` are the
+# times at which we want these, here up to three hours after the last observation. The result is an
+# ArviZ object.
+
+# %%
+at = np.linspace(0.0, 27.0, 136)
+known = {"times": grid, "forces": drawn.forces, "state": drawn.state, "parameters": truth}
+result = lfm.fit(motif, times, y, at=at, truth=known, progress=False, **size)
+print(tables.text_table(summary(result)))
+
+# %% [markdown]
+# ## What the data say
+#
+# The data with the posterior of what was measured: the dark band is the expression itself, the light
+# band new measurements of it. Missing values need no special treatment.
+
+# %%
+plots.plot_fit(result, width="full")
+
+# %% [markdown]
+# The force that nobody measured. After the last observation its uncertainty grows back to the prior.
+
+# %%
+plots.plot_forces(result, width="full")
+
+# %% [markdown]
+# ## Can we believe it?
+#
+# Chains that agree, and residuals that look like independent standard normal numbers: what is left
+# after predicting each observation from those before it.
+
+# %%
+plots.plot_trace(result, width="full")
+
+# %%
+plots.plot_residuals(result, width="full")
+
+# %% [markdown]
+# ## How much does the approximation matter?
+#
+# The model is not linear, so the filter replaces $\log(1 + e^u)$ by an affine function at every step.
+# Rules differ in how they choose it. Taylor takes the tangent (the extended Kalman filter), the
+# others average over the force's uncertainty. If they agree, so does the answer.
+
+# %%
+at_mean = {name: float(group(result, "posterior")[name].mean()) for name in truth}
+rules = {
+    "Taylor": lfm.Taylor(),
+    "cubature": lfm.Cubature(),
+    "Gauss-Hermite, 9 points": lfm.GaussHermite(9),
+}
+for name, rule in rules.items():
+    likelihood = lfm.MarginalLikelihood(build(**at_mean), times, rule=rule, steps=20)
+    print(f"{name:25} log likelihood at the posterior mean: {float(likelihood.log_prob(y)):.3f}")

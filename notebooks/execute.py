@@ -1,0 +1,89 @@
+"""Make the notebooks from their Python files and run them.
+
+Every notebook is written as a Python file with cells (jupytext's percent format), which is what is
+read and reviewed. This script turns each into an .ipynb, runs it from top to bottom, and keeps the
+result with its pictures beside the source.
+
+    python notebooks/execute.py                    all of them
+    python notebooks/execute.py 01_quickstart      one
+    LFM_QUICK=1 python notebooks/execute.py --check    run all in quick mode, write nothing
+
+With LFM_QUICK=1 the notebooks draw few samples: it shows that they run, and no more. An error in a
+cell ends the script.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import jupytext
+import nbformat
+from nbclient import NotebookClient
+
+FOLDER = Path(__file__).resolve().parent
+CELL_TIMEOUT_S = 3600
+
+
+def sources() -> list[Path]:
+    """Return the Python files that are notebooks."""
+    return sorted(FOLDER.glob("[0-9][0-9]_*.py"))
+
+
+def execute(source: Path, folder: Path) -> nbformat.NotebookNode:
+    """Return the notebook of a Python file, run in `folder`."""
+    notebook = jupytext.read(source)
+    client = NotebookClient(
+        notebook,
+        timeout=CELL_TIMEOUT_S,
+        kernel_name="python3",
+        resources={"metadata": {"path": str(folder)}},
+    )
+    client.execute()
+    return tidy(notebook)
+
+
+def tidy(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:
+    """Drop what differs between two runs of the same notebook or names this machine."""
+    kernel = {"display_name": "Python 3", "language": "python", "name": "python3"}
+    notebook.metadata = nbformat.from_dict({"kernelspec": kernel})
+    for number, cell in enumerate(notebook.cells):
+        cell.id = f"cell-{number}"
+        cell.metadata = nbformat.from_dict({})
+        if cell.cell_type == "code":
+            cell.outputs = [
+                output for output in cell.outputs if not (output.output_type == "stream" and output.name == "stderr")
+            ]
+    return notebook
+
+
+def main() -> int:
+    """Run the notebooks that the command line names."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("names", nargs="*", help="such as 01_quickstart; default: all")
+    parser.add_argument("--check", action="store_true", help="write nothing")
+    arguments = parser.parse_args()
+    wanted = [path for path in sources() if not arguments.names or path.stem in arguments.names]
+    if not wanted:
+        known = ", ".join(path.stem for path in sources())
+        print(f"no notebook {' '.join(arguments.names)}; there are: {known}", file=sys.stderr)
+        return 2
+    if not arguments.check and os.environ.get("LFM_QUICK"):
+        print("LFM_QUICK is for --check: quick results are not to be kept", file=sys.stderr)
+        return 2
+    for source in wanted:
+        started = time.perf_counter()
+        with tempfile.TemporaryDirectory() as scratch:
+            notebook = execute(source, Path(scratch))
+        if not arguments.check:
+            nbformat.write(notebook, source.with_suffix(".ipynb"))
+        print(f"{source.stem}: {time.perf_counter() - started:.0f} s")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
