@@ -16,8 +16,9 @@ DRAWS = 1000
 CHECKED = 8
 CASES = {"ginzburg-landau": {}, "spring": {}, "transcription": {"link": "softplus"}}
 OTHER_LINKS = ("linear", "saturation", "repression", "exponential")
-# Explicit integration with the model's own 20 steps is unstable in the stiffest wells: 188 of these draws.
-MOST_FAILURES = {"ginzburg-landau": 200}
+# Explicit integration with the model's own 20 steps is unstable in the stiffest wells: at 141 of these draws, and the
+# bound is 3 binomial standard errors above.
+MOST_FAILURES = {"ginzburg-landau": 174}
 
 
 @pytest.fixture(
@@ -63,11 +64,17 @@ def test_shorter_steps_leave_no_failure():
     """The double well fails where it is stiff, and there only."""
     file = loading.load("ginzburg-landau")
     data = file.simulate(seed=1)
-    finer = settings.approximate(file.model, steps=80)
     draws = Predictive(handlers.block(file.model, hide=["y"]), num_samples=DRAWS)(jax.random.key(7), data.times, data.y)
     parameters = {name: draws[name] for name in file.parameters}
-    density = jax.jit(jax.vmap(lambda theta: log_density(finer, (data.times, data.y), {}, theta)[0]))
-    assert np.all(np.isfinite(density(parameters)))
+    failed = {}
+    for steps in (20, 640):
+        finer = settings.approximate(file.model, steps=steps)
+        density = jax.jit(jax.vmap(lambda theta, m=finer: log_density(m, (data.times, data.y), {}, theta)[0]))
+        failed[steps] = np.isneginf(density(parameters))
+        # Only what fails is tried again
+        parameters = {name: value[failed[steps]] for name, value in parameters.items()}
+    assert failed[20].any()
+    assert not failed[640].any()
 
 
 def test_gradients_equal_finite_differences(drawn):
