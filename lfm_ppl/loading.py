@@ -9,15 +9,19 @@ and may define, each with a sensible default,
     simulate(seed=0, **options) -> lfm.Data     its default data
     prepare(data) -> lfm.Data                   turns a user's file into what ``model`` takes
     anchors(data) -> dict                       parameters that are fixed for such data unless freed
-    OUTPUTS      names of the outputs; None: any number, ``model`` then takes ``outputs=`` names
+    OUTPUTS      names of the outputs; None: any number of them, the columns of the data file
     UNITS        name -> unit
     OPTIONS      option -> (default, tuple of choices or a type, help)
     PARAMETERS   name of a sample site -> help, with its unit
+
+A ``model`` that has an argument ``outputs`` or ``units`` is told the names of the outputs and the
+units of the data, for ``LatentForceModel(..., output_names=outputs, units=units)``.
 """
 
 from __future__ import annotations
 
 import importlib.util
+import inspect
 import os
 import sys
 import traceback
@@ -92,7 +96,9 @@ class ModelFile:
     def keywords(self, data: Data, options: Mapping[str, Any]) -> dict[str, Any]:
         """Return the keyword arguments of ``model`` for this data and these options."""
         keywords = {name: default for name, (default, _, _) in self.options.items()} | dict(options)
-        return keywords | ({"outputs": data.outputs} if self.outputs is None else {})
+        taken = inspect.signature(self.model).parameters
+        told = {"outputs": data.outputs, "units": dict(data.units)}
+        return keywords | {name: value for name, value in told.items() if name in taken}
 
     def option(self, name: str, text: str) -> Any:
         """Return the value of option ``name`` that ``text`` stands for.

@@ -6,18 +6,15 @@ The state x follows the stochastic differential equation
 
 whose potential alpha x^2 / 2 + beta x^4 / 4 has two minima, at +-sqrt(-alpha / beta), where alpha
 is negative. The unknown parameters are alpha, beta and sigma; the standard deviation of the
-observation noise is known, as in the source. What is sampled is sigma, alpha / sigma^2 and
-beta / sigma^2: the latter two are the shape of the stationary density exp(-(2 alpha x^2 + beta x^4)
-/ (2 sigma^2)) and sigma the speed of time, and the data tell them apart much better than alpha and
-beta, which follow. The default data are simulated with alpha = -1,
+observation noise is known, as in the source. The default data are simulated with alpha = -1,
 beta = 0.1 and sigma = 2: the state starts in the right well, at 3.16, is observed every 2 units of
 time, and jumps between the wells.
 
-The priors, alpha ~ N(0, 1), beta ~ LogNormal(-2, 0.8) and sigma ~ LogNormal(0.5, 0.5), are for
-states of a few units that move within a few units of time: rescale data of another size. They are
-narrow enough to say that the state relaxes between observations at a rate of order one. Without
-them the data would not: when the relaxation is fast, observations are independent draws from the
-stationary density, and only alpha / sigma^2 and beta / sigma^2 are identified.
+What is sampled is sigma, linear = alpha / sigma^2 and cubic = beta / sigma^2; alpha and beta follow.
+The stationary density is proportional to exp(-linear x^2 - cubic x^4 / 2), so that linear and cubic
+are its shape and sigma the speed of time. Observations far apart are independent draws from this
+density: they tell its shape, and of the speed only that it is fast. The priors are for states of a
+few units; rescale data of another size.
 
 The prior of the state at the first observation is N(0, 10), the width of the stationary density.
 
@@ -48,7 +45,7 @@ TRUTH = {"alpha": -1.0, "beta": 0.1, "sigma": 2.0}
 STEPS = 40  # between observations: after one that lies outside the wells, the mean moves fast
 
 
-def build(alpha, beta, sigma, noise_sd, start=None) -> lfm.LatentForceModel:
+def build(alpha, beta, sigma, noise_sd, units=None, start=None) -> lfm.LatentForceModel:
     """Return the double well with these parameters.
 
     Args:
@@ -56,6 +53,7 @@ def build(alpha, beta, sigma, noise_sd, start=None) -> lfm.LatentForceModel:
         beta: cubic coefficient of the drift (1/(time x^2)).
         sigma: dispersion (x/sqrt(time)).
         noise_sd: standard deviation of the observation noise.
+        units: name -> unit.
         start: the initial state where it is known; None: N(0, 10).
     """
     unknown = start is None
@@ -67,23 +65,25 @@ def build(alpha, beta, sigma, noise_sd, start=None) -> lfm.LatentForceModel:
         initial_state=lfm.Gaussian([0.0 if unknown else start], [10.0 if unknown else 0.0]),
         state_names=("x",),
         output_names=OUTPUTS,
+        units=units,
     )
 
 
-def model(times, y=None, noise_sd: float = 0.1) -> None:
+def model(times, y=None, noise_sd: float = 0.1, units=None) -> None:
     """Sample alpha, beta and sigma, and score the observations.
 
     Args:
         times: observation times, shape (T,).
         y: observations of x, shape (T, 1); NaN is missing, None draws from the prior predictive.
         noise_sd: standard deviation of the observation noise.
+        units: name -> unit, for plots.
     """
     sigma = numpyro.sample("sigma", dist.LogNormal(0.5, 0.5))
     linear = numpyro.sample("linear", dist.Normal(0.0, 0.5))
     cubic = numpyro.sample("cubic", dist.LogNormal(-3.0, 1.0))
     alpha = numpyro.deterministic("alpha", linear * sigma**2)
     beta = numpyro.deterministic("beta", cubic * sigma**2)
-    system = build(alpha, beta, sigma, noise_sd)
+    system = build(alpha, beta, sigma, noise_sd, units)
     numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=STEPS), obs=y)
 
 

@@ -45,7 +45,7 @@ TRUTH = {
 }
 
 
-def build(damping, stiffness, sensitivity, lengthscale, noise_sd) -> lfm.LatentForceModel:
+def build(damping, stiffness, sensitivity, lengthscale, noise_sd, units=None) -> lfm.LatentForceModel:
     """Return the two oscillators with these parameters."""
 
     def dynamics(x, u, t):
@@ -60,15 +60,17 @@ def build(damping, stiffness, sensitivity, lengthscale, noise_sd) -> lfm.LatentF
         initial_state=lfm.Gaussian(jnp.zeros(4), jnp.eye(4)),
         state_names=("position 1", "velocity 1", "position 2", "velocity 2"),
         output_names=OUTPUTS,
+        units=units,
     )
 
 
-def model(times, y=None) -> None:
+def model(times, y=None, units=None) -> None:
     """Sample the parameters of the oscillators and of the force, and score the observations.
 
     Args:
         times: observation times, shape (T,).
         y: the two positions, shape (T, 2); NaN is missing, None draws from the prior predictive.
+        units: name -> unit, for plots.
     """
     pair = dist.LogNormal(jnp.zeros(2), 1.0).to_event(1)
     damping = numpyro.sample("damping", pair)
@@ -76,7 +78,7 @@ def model(times, y=None) -> None:
     sensitivity = numpyro.sample("sensitivity", pair)
     lengthscale = numpyro.sample("lengthscale", dist.LogNormal(0.5, 0.7))
     noise_sd = numpyro.sample("noise_sd", dist.HalfNormal(0.2))
-    system = build(damping, stiffness, sensitivity, lengthscale, noise_sd)
+    system = build(damping, stiffness, sensitivity, lengthscale, noise_sd, units)
     numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
 
 

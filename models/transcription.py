@@ -87,6 +87,7 @@ def build(
     outputs,
     link="softplus",
     gamma=0.5,
+    units=None,
     start=None,
 ) -> lfm.LatentForceModel:
     """Return the model of the genes `outputs`.
@@ -101,6 +102,7 @@ def build(
         outputs: names of the N genes.
         link: the activity of the factor.
         gamma: saturation constant.
+        units: name -> unit.
         start: initial expression (N,) where it is known; None: near rest.
     """
     size = len(outputs)
@@ -112,16 +114,18 @@ def build(
         initial_state=rest if start is None else lfm.Gaussian(start, jnp.zeros((size, size))),
         state_names=outputs,
         output_names=outputs,
+        units=units,
     )
 
 
-def model(times, y=None, outputs=None, link: str = "softplus", gamma: float = 0.5) -> None:
+def model(times, y=None, outputs=None, units=None, link="softplus", gamma=0.5) -> None:
     """Sample the rates of all genes, the force's parameters and the noise, and score expression.
 
     Args:
         times: observation times, shape (T,).
         y: expression, shape (T, N), of order one; NaN is missing, None draws from the prior.
         outputs: the names of the N genes; needed where y is None.
+        units: name -> unit, for plots.
         link: the activity of the factor, see the module.
         gamma: saturation constant.
     """

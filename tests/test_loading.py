@@ -75,13 +75,21 @@ def test_a_complete_file(model_file):
 
 
 def test_a_file_with_the_model_alone(model_file):
-    loaded = loading.load(model_file("def model(times, y=None, outputs=()):\n    return outputs\n"))
+    loaded = loading.load(model_file("def model(times, y=None): ..."))
     data = Data([0.0], [[1.0, 2.0]], ("a", "b"))
     assert loaded.prepare(data).y is data.y
     assert loaded.anchors(data) == {}
-    assert loaded.keywords(data, {}) == {"outputs": ("a", "b")}
+    assert loaded.keywords(data, {}) == {}
     with pytest.raises(ValueError, match=r"defines no simulate.*--data FILE"):
         loaded.simulate()
+
+
+def test_a_model_is_told_names_and_units_where_it_takes_them(model_file):
+    data = Data([0.0], [[1.0, 2.0]], ("a", "b"), units={"time": "h"})
+    names = loading.load(model_file("def model(times, y=None, outputs=()): ..."))
+    assert names.keywords(data, {}) == {"outputs": ("a", "b")}
+    both = loading.load(model_file("def model(times, y=None, *, units=None, outputs=()): ..."))
+    assert both.keywords(data, {}) == {"outputs": ("a", "b"), "units": {"time": "h"}}
 
 
 def test_options_are_converted_and_have_defaults(model_file):
