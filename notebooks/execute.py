@@ -54,10 +54,6 @@ def tidy(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:
     for number, cell in enumerate(notebook.cells):
         cell.id = f"cell-{number}"
         cell.metadata = nbformat.from_dict({})
-        if cell.cell_type == "code":
-            cell.outputs = [
-                output for output in cell.outputs if not (output.output_type == "stream" and output.name == "stderr")
-            ]
     return notebook
 
 
