@@ -89,16 +89,19 @@ def test_replicates_in_any_order(model):
 
 
 def test_an_interval_in_two_pieces(model):
-    """Requested times in the middle of every interval, with half of the steps each."""
+    """A row without observations in the middle of every interval, with half of the steps on each side."""
     times = np.array([0.0, 1.0, 2.5, 3.0])
     y = Y[[0, 1, 3, 4]]
+    cut = np.sort(np.r_[times, 0.5 * (times[1:] + times[:-1])])
+    padded = np.full((len(cut), y.shape[1]), np.nan)
+    padded[::2] = y
     whole = lfm.smooth(model, times, y, steps=6)
-    halves = lfm.smooth(model, times, y, steps=3, at=np.sort(np.r_[times, 0.5 * (times[1:] + times[:-1])]))
-    same((whole.log_likelihood, whole.leave_one_out), (halves.log_likelihood, halves.leave_one_out), 1e-8)
+    halves = lfm.smooth(model, cut, padded, steps=3)
+    same((whole.log_likelihood, whole.leave_one_out), (halves.log_likelihood[::2], halves.leave_one_out[::2]), 1e-8)
     same((whole.mean, whole.covariance), (halves.mean[::2], halves.covariance[::2]), 1e-8)
 
 
-@pytest.mark.parametrize("link, steps", [(identity, 2), (softplus, 60)])
+@pytest.mark.parametrize("link, steps", [(identity, 2), (softplus, 2)])
 def test_requested_times_change_nothing_elsewhere(link, steps):
     model = motif(link, variance=0.1)
     plain = lfm.smooth(model, TIMES, Y, steps=steps, at=TIMES)
