@@ -1,9 +1,17 @@
-"""Settings that every test needs: double precision, and compiled programs kept between runs."""
+"""Settings that every test needs: double precision, compiled programs kept between runs, and processes to run in."""
 
+import gc
 import os
 from pathlib import Path
 
 import jax
+import jaxlib.version
+import pytest
+
+# Set before a backend exists. XLA's older emitters compile these small loops in half the time. Newer versions lack the
+# switch, and XLA ends the process at a switch that it does not know.
+if jaxlib.version.__version_info__ < (0, 11):
+    os.environ["XLA_FLAGS"] = "--xla_cpu_use_fusion_emitters=false " + os.environ.get("XLA_FLAGS", "")
 
 jax.config.update("jax_enable_x64", True)
 
@@ -12,3 +20,18 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     root = Path(__file__).resolve().parent.parent
     jax.config.update("jax_compilation_cache_dir", str(root / ".jax_cache"))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+
+
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """A worker per core up to four, each needs 2 GiB; one process where speed is measured."""
+    if "performance" in config.option.markexpr and "not performance" not in config.option.markexpr:
+        return 0
+    return min(os.cpu_count() or 1, 4)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def release_compiled_programs():
+    """Forget a file's compiled programs after it: each takes memory mappings, and Linux allows a process 65,530."""
+    yield
+    jax.clear_caches()
+    gc.collect()
