@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import checks
-from lfm_ppl.filtering.predict import Moments, predict_exact, predict_row
+from lfm_ppl.filtering.predict import Moments, predict_exact, predict_row, unmoved
 from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays, schedule
 from lfm_ppl.filtering.transition import constant_slope, exact, integrating_factor, linear_part
 from lfm_ppl.filtering.update import linearise_observation, update
@@ -107,8 +107,10 @@ def forward(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, *, s
         if invariant:
             one = predict_exact(ssm, prepared, plan.steps, row.start, row.length, moments)
         else:
-            one = predict_row(ssm, rule, linear, prepared, plan.steps, row.start, row.length, moments, nearby,
-                              flow=keep == "all")
+            move = lambda: predict_row(  # noqa: E731
+                ssm, rule, linear, prepared, plan.steps, row.start, row.length, moments, nearby, flow=keep == "all")
+            stay = lambda: unmoved(moments, flow=keep == "all")  # noqa: E731
+            one = jax.lax.cond(row.length > 0, move, stay) if plan.replicated else move()
         predicted, phi, noise = one
         if jumps is not None:
             predicted, phi, noise = _jump(ssm, jumps, row.jump, predicted, phi, noise, keep == "all" or invariant)

@@ -94,8 +94,6 @@ def predict_row(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Fa
     """
     h = length / steps
     spread = _smallest_spread(ssm, rule, factor, start, h, moments)
-    size = ssm.state_dim
-    empty = jnp.zeros((size, size))
 
     def step(carry: tuple, index: jax.Array) -> tuple[tuple, None]:
         now, phi, noise = carry
@@ -105,9 +103,16 @@ def predict_row(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Fa
             phi, noise = matmul(one.phi, phi), congruence(one.phi, noise) + one.noise
         return (one.moments, phi, noise), None
 
-    carry = (moments, jnp.eye(size), empty) if flow else (moments, jnp.zeros(0), jnp.zeros(0))
+    carry = tuple(unmoved(moments, flow))
     (moments, whole, added), _ = jax.lax.scan(jax.checkpoint(step, prevent_cse=False), carry, jnp.arange(steps))
     return Prediction(moments, whole, added)
+
+
+def unmoved(moments: Moments, flow: bool) -> Prediction:
+    """Predict over a row of length zero; the same structure as what `predict_row` returns."""
+    size = moments.mean.shape[0]
+    return (Prediction(moments, jnp.eye(size), jnp.zeros((size, size))) if flow
+            else Prediction(moments, jnp.zeros(0), jnp.zeros(0)))
 
 
 def _between(about: tuple[Moments, Moments], *fractions: jax.Array) -> list[Moments]:

@@ -14,6 +14,9 @@ from lfm_ppl.model.augment import StateSpaceModel, check_times
 _LARGEST_TABLE = 1024
 """Most interval lengths whose transitions are tabulated ahead of the scan; more are computed row by row."""
 
+_REPLICATED = 0.2
+"""Share of rows of length zero from which a branch costs less than the predictions that it saves."""
+
 
 class Rows(NamedTuple):
     """One row of the scan: a prediction over an interval, perhaps a jump, perhaps an observation.
@@ -44,6 +47,7 @@ class Schedule(NamedTuple):
         requested_times: (K,).
         steps: integration steps in each row.
         initial_time: when the scan starts.
+        replicated: whether so many rows have length zero that it pays to branch around their prediction.
     """
 
     rows: Rows
@@ -53,6 +57,7 @@ class Schedule(NamedTuple):
     requested_times: Any
     steps: int
     initial_time: Any
+    replicated: bool = False
 
 
 def schedule(ssm: StateSpaceModel, times: Any, steps: int, max_step: float | None = None, at: Any = None,
@@ -135,7 +140,8 @@ def _concrete(times: np.ndarray, origin: float, jumps: tuple[float, ...], steps:
     observed = np.empty(len(times), int)
     observed[observation[observation >= 0]] = row_of_event[observation >= 0]
     found = observed if at is None else row_of_event[np.searchsorted(time, requested, side="right") - 1]
-    return Schedule(rows, lengths, observed, found, requested, steps, np.asarray(origin))
+    replicated = bool(np.mean(width == 0) >= _REPLICATED)
+    return Schedule(rows, lengths, observed, found, requested, steps, np.asarray(origin), replicated)
 
 
 def _requested(at: Any, origin: float) -> np.ndarray:

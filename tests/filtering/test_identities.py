@@ -110,6 +110,34 @@ def test_requested_times_change_nothing_elsewhere(link, steps):
     same((plain.mean, plain.covariance), (extra.mean[1:6], extra.covariance[1:6]), 1e-8)
 
 
+def test_replicates_are_one_observation_of_several_outputs():
+    """Three values at each time, row by row or as three outputs: predictions of length zero are passed over."""
+    times, y = np.array([0.5, 1.0, 2.2]), np.random.default_rng(3).normal(0.6, 0.3, size=(3, 3))
+
+    def build(theta, observe, count):
+        return lfm.LatentForceModel(
+            Motif(theta[0], theta[1], 0.3, softplus), {"u": lfm.Matern(1.0, theta[2], 1)},
+            lfm.GaussianObservation(observe, 0.04 * jnp.ones(count)),
+            lfm.Gaussian(jnp.array([0.4]), 0.1 * jnp.eye(1)), initial_time=0.0)
+
+    def rows(theta):
+        result = lfm.filter(build(theta, first_state, 1), np.repeat(times, 3), y.reshape(9, 1))
+        return result.log_likelihood.sum(), result.state
+
+    def outputs(theta):
+        result = lfm.filter(build(theta, three_times, 3), times, y)
+        return result.log_likelihood.sum(), result.state
+
+    theta = jnp.array([0.8, 1.1, 1.3])
+    (one, one_state), slope = jax.value_and_grad(rows, has_aux=True)(theta)
+    (other, other_state), other_slope = jax.value_and_grad(outputs, has_aux=True)(theta)
+    same((one, one_state, slope), (other, other_state, other_slope), 1e-9)
+
+
+def three_times(x, u, t):
+    return jnp.repeat(x[:1], 3)
+
+
 def test_steps_follow_max_step(model):
     coarse = lfm.filter(model, TIMES, Y, steps=8)
     # At most 0.1: the longest interval, of 1.2, needs 12 steps.
