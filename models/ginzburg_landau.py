@@ -1,4 +1,4 @@
-"""Ginzburg-Landau: diffusion in a double-well potential, no latent force.
+"""Diffusion in a double-well potential (Ginzburg-Landau), no latent force.
 
 The state x follows the stochastic differential equation
 
@@ -42,7 +42,7 @@ PARAMETERS = {
     "cubic": "beta / sigma^2, above zero (1/x^4)",
 }
 TRUTH = {"alpha": -1.0, "beta": 0.1, "sigma": 2.0}
-STEPS = 40  # between observations: after one that lies outside the wells, the mean moves fast
+STEPS = 60  # between observations: after one that lies outside the wells, the mean moves fast
 
 
 def build(alpha, beta, sigma, noise_sd, units=None, start=None) -> lfm.LatentForceModel:
