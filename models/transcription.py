@@ -147,7 +147,7 @@ def model(times, y=None, outputs=None, units=None, link="softplus", gamma=0.5) -
     scale = numpyro.sample("scale", dist.LogNormal(0.0, 0.5))
     lengthscale = numpyro.sample("lengthscale", dist.LogNormal(jnp.log(2.0 / rate), 0.5))
     noise_sd = per_gene("noise_sd", 0.1, 0.7)
-    system = build(basal, sensitivity, decay, scale, lengthscale, noise_sd, outputs, link=link, gamma=gamma)
+    system = build(basal, sensitivity, decay, scale, lengthscale, noise_sd, outputs, link, gamma, units)
     numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=STEPS), obs=y)
 
 

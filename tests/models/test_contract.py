@@ -3,6 +3,7 @@
 import functools
 import itertools
 import re
+from dataclasses import replace
 
 import jax
 import numpy as np
@@ -14,6 +15,7 @@ from numpyro.infer.util import log_density
 from lfm_ppl import loading
 from lfm_ppl.data import Data, read_csv, write_csv
 from lfm_ppl.filtering.filter import check_observations
+from lfm_ppl.inference.posterior import likelihood_site
 
 MODELS = sorted(loading.available())
 
@@ -132,3 +134,11 @@ def test_default_data_survive_a_file(name, tmp_path):
     assert np.all(np.isnan(prepared.y) == np.isnan(data.y))
     if not prepared.note:
         np.testing.assert_array_equal(prepared.y, data.y)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_units_of_the_data_reach_the_model(name):
+    file = loading.load(name)
+    data = replace(simulated(name), units={**file.units, "time": "fortnight"})
+    site = likelihood_site(file.model, (data.times, data.y), file.keywords(data, {}), jax.random.key(0))
+    assert site.example.ssm.model.units["time"] == "fortnight"
