@@ -262,7 +262,9 @@ def _diagnostic(
 
 
 def _sd(values: np.ndarray) -> float:
-    return float(values.std(ddof=1)) if values.size > 1 and np.isfinite(values).all() else np.nan
+    if values.size < 2 or not np.isfinite(values).all():
+        return np.nan
+    return 0.0 if np.ptp(values) == 0.0 else float(values.std(ddof=1))  # the mean of equal numbers may be rounded
 
 
 def _checked(name: str, dataset: Any) -> xr.Dataset:

@@ -379,3 +379,14 @@ def test_units_of_several_names():
     assert unit_of(xr.DataArray(0.0, attrs={"units": "{braces} are no JSON"})).startswith(
         "{braces}"
     )
+
+
+def test_equal_draws_have_no_spread_and_give_no_warning():
+    """The mean of 4,000 times 0.8 is not 0.8 in floating point."""
+    draws = np.full((4, 1000), 0.8)
+    varying = np.random.default_rng(0).normal(size=(4, 1000))
+    posterior = xr.Dataset({"fixed": (("chain", "draw"), draws), "free": (("chain", "draw"), varying)})
+    result = arviz_data.build({"posterior": posterior})
+    assert draws.std(ddof=1) != 0.0
+    assert arviz_data.summary(result)["sd"]["fixed"] == 0.0
+    assert arviz_data.convergence_warnings(result) == []
