@@ -152,7 +152,7 @@ def test_fit_with_everything_said(run, motif, tmp_path):
     code, out, err = run(
         f"fit {motif} --data d.csv --outputs A,B --set 'decay[b]=0.8' --set noise_sd=0.2 "
         "--option order=1 --rule unscented --steps 3 --max-step 0.5 "
-        "--sampler ram --chains 2 --warmup 50 --samples 50 --quiet"
+        "--sampler ram --chains 2 --warmup 50 --samples 50 --target-accept 0.3 --thin 2 --until 5 --quiet"
     )
     assert code == 0, err
     assert "d.csv: 4 rows of a, b; 2 values missing" in out
@@ -165,8 +165,10 @@ def test_fit_with_everything_said(run, motif, tmp_path):
     assert float(draws["decay"].sel(output="a").std()) > 0
     attributes = arviz_data.attributes(posterior)
     assert attributes["rule"].startswith("Unscented") and attributes["steps"] == 3
-    assert (attributes["max_step"], attributes["sampler"]) == (0.5, "ram")
+    assert (attributes["max_step"], attributes["sampler"], attributes["thin"]) == (0.5, "ram", 2)
     assert json.loads(attributes["options"]) == {"order": 1}
+    at = arviz_data.group(posterior, "trajectories")["at"].values
+    assert at[0] == 0.0 and at[-1] == 5.0 and {1.0, 3.5} <= set(at)
     observed = arviz_data.group(posterior, "observed_data")["y"]
     np.testing.assert_array_equal(observed.sel(output="a"), [0.1, 0.2, 0.4, np.nan])
     np.testing.assert_array_equal(observed.sel(output="b"), [np.nan, 0.3, 0.5, 0.1])
@@ -245,6 +247,10 @@ def test_folders_are_numbered_and_not_left_empty(monkeypatch, tmp_path):
         ("fit MOTIF --rule cubatur", "unknown rule 'cubatur'. Did you mean 'cubature'"),
         ("fit MOTIF --chains 0", "expected a whole number of at least 1, got '0'"),
         ("fit MOTIF --max-step -1", "expected a number above zero, got '-1'"),
+        ("fit MOTIF --target-accept 1.5", "expected a number between 0 and 1, got '1.5'"),
+        ("fit MOTIF --target-accept 0.9 --sampler map", "--target-accept is for the samplers nuts and ram"),
+        ("fit MOTIF --until 3", "--until takes a time after the last observation, at 7, got 3"),
+        ("fit MOTIF --until nan", "--until takes a time after the last observation, at 7, got nan"),
         ("fit MOTIF --data absent.csv", "there is no file absent.csv"),
         ("fit MOTIF --data empty.csv", "empty.csv is empty"),
         ("fit MOTIF --data other.csv", "unknown output column 'a'"),

@@ -55,8 +55,9 @@ def messages(summary: pd.DataFrame, chains: int, draws: int, divergences: int) -
         share = 100.0 * divergences / (chains * draws)
         found.append(
             f"{divergences} of {chains * draws} transitions diverged ({share:.2g}%): draws may "
-            "miss a narrow region. Raise target_accept_prob (0.95 or 0.99), or reparameterise "
-            "where the pairs plot marks them."
+            "miss a narrow region. Raise target_accept_prob to 0.95 or 0.99 (--target-accept), take "
+            "more steps where the integration breaks down, or reparameterise where the pairs plot "
+            "marks them."
         )
     return found
 
@@ -69,8 +70,8 @@ def _low_ess(ess: pd.Series, kind: str, what: str, chains: int) -> list[str]:
     factor = math.ceil(needed / max(low.iloc[0], 1.0))
     return [
         f"{kind} effective sample size is below {needed} ({MIN_ESS_PER_CHAIN} per chain) for "
-        f"{_listed(_with_values(low, '.0f'))}: the {what} of the posterior is known too roughly. "
-        f"Raise samples about {factor}-fold, or lower the correlation between parameters."
+        f"{_listed(_with_values(low, '.0f'))}: too little is known of the {what} of the posterior. "
+        f"Raise samples (or thin) about {factor}-fold, or lower the correlation between parameters."
     ]
 
 

@@ -99,6 +99,7 @@ def _add_fit(commands: Any) -> None:
         "  lfm-ppl fit ginzburg-landau\n"
         "  lfm-ppl fit transcription --data genes.csv --option link=saturation\n"
         "  lfm-ppl fit transcription --data p53.csv --set 'decay[CDKN1A]=0.8'\n"
+        "  lfm-ppl fit spring --until 40 --target-accept 0.95\n"
         "  lfm-ppl fit my_model.py --data mine.csv --rule gauss-hermite --steps 20 --out result"
     )
     help_ = "infer parameters and forces, and write posterior, summary and figures"
@@ -109,8 +110,9 @@ def _add_fit(commands: Any) -> None:
     _add_approximation(command.add_argument_group("approximation (default: the model's own)"))
     out = command.add_argument_group("results")
     out.add_argument("--out", metavar="DIR", help="folder to write (default: lfm-results/MODEL-001, -002, ...)")
+    out.add_argument("--until", type=float, metavar="TIME", help="forecast to this time (default: none)")
     out.add_argument("--overwrite", action="store_true", help="write into a folder with files")
-    out.add_argument("--quiet", action="store_true", help="no progress bar")
+    out.add_argument("--quiet", action="store_true", help="no progress bar (there is none without a terminal)")
 
 
 def _add_data(group: Any) -> None:
@@ -136,7 +138,16 @@ def _add_inference(group: Any) -> None:
     group.add_argument("--chains", type=_whole(1), default=4, help="default: 4")
     group.add_argument("--warmup", type=_whole(0), default=1000, help="per chain (default: 1000)")
     group.add_argument("--samples", type=_whole(1), default=1000, help="per chain (default: 1000)")
+    group.add_argument(
+        "--thin", type=_whole(1), help="steps that make one draw (default: 1 for nuts, 5 per parameter for ram)"
+    )
     group.add_argument("--seed", type=_whole(0), default=0, help="random seed of the sampler (default: 0)")
+    group.add_argument(
+        "--target-accept",
+        type=_fraction,
+        metavar="P",
+        help="acceptance to aim at (default: 0.8 for nuts; for ram 0.234, or 0.44 for one parameter)",
+    )
     group.add_argument(
         "--set",
         action="append",
@@ -180,10 +191,18 @@ def _whole(least: int) -> Callable[[str], int]:
 
 
 def _positive(text: str) -> float:
+    return _between(text, float("inf"), "a number above zero")
+
+
+def _fraction(text: str) -> float:
+    return _between(text, 1.0, "a number between 0 and 1")
+
+
+def _between(text: str, end: float, expected: str) -> float:
     try:
         value = float(text)
     except ValueError:
         value = -1.0
-    if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"expected a number above zero, got {text!r}")
+    if not 0 < value < end:
+        raise argparse.ArgumentTypeError(f"expected {expected}, got {text!r}")
     return value

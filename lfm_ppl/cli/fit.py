@@ -16,6 +16,9 @@ import numpy as np
 from lfm_ppl import data, loading
 from lfm_ppl.cli import choices, results, session
 
+_GRID = 241
+"""Times of the trajectories with --until, besides those of the data: enough for a smooth line."""
+
 
 def run(arguments: argparse.Namespace) -> int:
     """Fit, print the summary, and write the results; the posterior is on disk before any figure."""
@@ -24,10 +27,13 @@ def run(arguments: argparse.Namespace) -> int:
     options = choices.options(model, arguments.option)
     observed = _observed(arguments, model, options)
     fixed = choices.fixed(arguments.set, model.anchors(observed))
+    at = _requested(observed.times, arguments.until)
+    if arguments.target_accept is not None and arguments.sampler == "map":
+        raise ValueError("--target-accept is for the samplers nuts and ram; map accepts and rejects nothing.")
     with results.folder(model.name, arguments.out, arguments.overwrite) as folder:
         _print_task(arguments, model, observed, options, fixed)
         started = time.perf_counter()
-        posterior = sample(arguments, model, observed, options, fixed)
+        posterior = sample(arguments, model, observed, options, fixed, at)
         seconds = time.perf_counter() - started
         return _report(posterior, folder, seconds, arguments.overwrite)
 
@@ -56,6 +62,15 @@ def _observed(arguments: argparse.Namespace, model: loading.ModelFile, options: 
     return model.prepare(observed)
 
 
+def _requested(times: np.ndarray, until: float | None) -> np.ndarray | None:
+    """Return the times of the trajectories where they go beyond the data; None: the library's own grid."""
+    if until is None:
+        return None
+    if not (np.isfinite(until) and until > times[-1]):
+        raise ValueError(f"--until takes a time after the last observation, at {times[-1]:g}, got {until:g}.")
+    return np.union1d(np.linspace(times[0], until, _GRID), times)
+
+
 def _print_task(
     arguments: argparse.Namespace,
     model: loading.ModelFile,
@@ -77,6 +92,9 @@ def _print_task(
         print(f"fixed    {name} = {value}{free}")
     if observed.note:
         print(f"note     {observed.note}")
+    if arguments.sampler != "map":
+        size = f"{arguments.chains} chains of {arguments.warmup} warm-up and {arguments.samples} kept draws"
+        print(f"sampler  {arguments.sampler}, {size}")
     sys.stdout.flush()
 
 
@@ -86,6 +104,7 @@ def sample(
     observed: data.Data,
     options: dict[str, Any],
     fixed: dict[str, Any],
+    at: np.ndarray | None = None,
 ) -> Any:
     """Return the ArviZ object of a fit, with a record of the options and the data.
 
@@ -95,6 +114,7 @@ def sample(
         observed: the data, as the model takes them.
         options: the model's options.
         fixed: parameters that are not learnt.
+        at: times of the trajectories; None: a grid over the data.
     """
     import lfm_ppl
     from lfm_ppl.inference.settings import approximate
@@ -114,11 +134,14 @@ def sample(
         chains=arguments.chains,
         warmup=arguments.warmup,
         samples=arguments.samples,
+        thin=arguments.thin,
         seed=arguments.seed,
+        at=at,
+        sampler_options=None if arguments.target_accept is None else {"target_accept_prob": arguments.target_accept},
         model_kwargs=model.keywords(observed, options),
         fixed=fixed,
         truth=observed.truth,
-        progress=not arguments.quiet,
+        progress=not arguments.quiet and sys.stderr.isatty(),  # in a log file a bar is noise
         name=model.name,
     )
     posterior.attrs["options"] = json.dumps(options)

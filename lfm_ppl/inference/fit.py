@@ -35,6 +35,9 @@ SAMPLERS = ("nuts", "ram", "map")
 _FORWARD_MODE_LIMIT = 10
 """Most unconstrained parameters for which forward-mode gradients are the faster ones."""
 
+_RAM_STEPS = 5
+"""Steps of RAM for each parameter that make one draw: a random walk in d dimensions forgets in some multiple of d."""
+
 _GRID = 200
 """Number of grid points of trajectories where no times are asked for."""
 
@@ -58,6 +61,7 @@ def fit(
     chains: int = 4,
     warmup: int = 1000,
     samples: int = 1000,
+    thin: int | None = None,
     seed: int = 0,
     at: Any = None,
     trajectory_draws: int = 400,
@@ -82,6 +86,8 @@ def fit(
         chains: number of chains.
         warmup: number of warm-up steps in each.
         samples: number of draws in each; for "map", in all.
+        thin: steps of the chain that make one draw, in the warm-up too. By default 1 for NUTS, and 5 for each
+            parameter for RAM, whose steps are cheap and short.
         seed: of everything random.
         at: times of the trajectories; by default a grid over the data. Times after the last are forecasts.
         trajectory_draws: number of posterior draws, spread over the chains, for which trajectories are drawn; 0: none.
@@ -135,6 +141,8 @@ def fit(
         checks.positive_integer(label, value)
     if warmup != 0:
         checks.positive_integer("warmup", warmup)
+    if thin is not None:
+        checks.positive_integer("thin", thin)
     if trajectory_draws != 0:
         checks.positive_integer("trajectory_draws", trajectory_draws)
     keywords = dict(model_kwargs or {})
@@ -148,14 +156,15 @@ def fit(
     arguments = (times, y)
     if sampler == "map":
         draws, stats, remarks = _mode(model, arguments, keywords, keys[1], samples, seed, init)
-        chains = 1
+        chains, warmup = 1, 0
     else:
         strategy = _strategy(init, model, arguments, keywords, seed)
-        kernel, first = _kernel(sampler, model, arguments, keywords, strategy, sampler_options, keys[2], seed, chains,
-                                init is not None)
-        draws, stats = _sample(kernel, sampler, arguments, keywords, keys[1], chains, warmup, samples, chain_method,
-                               progress, first)
-        remarks = {}
+        kernel, first, size = _kernel(sampler, model, arguments, keywords, strategy, sampler_options, keys[2], seed,
+                                      chains, init is not None)
+        thin = thin or (_RAM_STEPS * size if sampler == "ram" else 1)
+        draws, stats = _sample(kernel, sampler, arguments, keywords, keys[1], chains, warmup, samples, thin,
+                               chain_method, progress, first)
+        remarks = {"thin": thin}
     flat = {label: value.reshape(-1, *value.shape[2:]) for label, value in draws.items()}
     latent = _latent(model, arguments, keywords, keys[0], flat)
     rated = _kept("scores of the observations", lambda: scores(
@@ -167,7 +176,7 @@ def fit(
     attrs = {
         "model": name or getattr(numpyro_model, "__name__", "model"), "rule": site.example.rule.name,
         "steps": site.example.steps, "max_step": site.example.max_step, "iterations": site.example.iterations,
-        "sampler": sampler, "seed": seed, "chains": chains, "warmup": warmup if sampler != "map" else 0,
+        "sampler": sampler, "seed": seed, "chains": chains, "warmup": warmup,
         "samples": samples, "fixed": json.dumps({k: np.asarray(v).tolist() for k, v in (fixed or {}).items()}),
         "wall_time_s": round(time.perf_counter() - started, 3), "versions": json.dumps(_versions()),
         "created_at": datetime.now(UTC).isoformat(timespec="seconds"), **remarks,
@@ -222,8 +231,8 @@ def _strategy(init: Any, model: Callable, arguments: tuple, keywords: dict, seed
 
 def _kernel(sampler: str, model: Callable, arguments: tuple, keywords: dict, strategy: Any,
             options: Mapping[str, Any] | None, key: jax.Array, seed: int, chains: int,
-            chosen_start: bool) -> tuple[Any, Any]:
-    """Return the kernel and, for RAM unless the user chose where to start, starting points."""
+            chosen_start: bool) -> tuple[Any, Any, int]:
+    """Return the kernel, for RAM unless the user chose where to start starting points, and the number of parameters."""
     options = dict(options or {})
     space = UnconstrainedModel(model, arguments, keywords, key)
     size = space.draw(key, init_to_median).size
@@ -233,9 +242,9 @@ def _kernel(sampler: str, model: Callable, arguments: tuple, keywords: dict, str
     if sampler == "nuts":
         options.setdefault("forward_mode_differentiation", few)
         options.setdefault("dense_mass", few)  # a full mass matrix is cheap to learn for a handful of parameters
-        return NUTS(model, init_strategy=strategy, **options), None
+        return NUTS(model, init_strategy=strategy, **options), None, size
     if "initial_covariance" in options:
-        return RAM(model, init_strategy=strategy, **options), None
+        return RAM(model, init_strategy=strategy, **options), None, size
     # A random walk that starts with the shape of the posterior needs no gradient afterwards, but learning that shape
     # by rejection takes thousands of steps. The mode gives it; chains start at draws from its Laplace approximation.
     with warnings.catch_warnings():
@@ -243,24 +252,24 @@ def _kernel(sampler: str, model: Callable, arguments: tuple, keywords: dict, str
         mode = map_estimate(model, *arguments, seed=seed, model_kwargs=keywords, restarts=2,
                             hessian="finite-differences", forward_mode=few)
     if mode.unidentified or not np.all(np.isfinite(mode.covariance)):
-        return RAM(model, init_strategy=strategy, **options), None
+        return RAM(model, init_strategy=strategy, **options), None, size
     kernel = RAM(model, init_strategy=strategy, initial_covariance=mode.covariance, **options)
     if chosen_start:
-        return kernel, None
+        return kernel, None, size
     root = np.linalg.cholesky(mode.covariance)
     points = mode.mode + np.asarray(jax.random.normal(key, (chains, size))) @ root.T
     possible = np.isfinite(np.asarray(jax.jit(jax.vmap(space.potential))(jnp.asarray(points))))
     points = jnp.asarray(np.where(possible[:, None], points, mode.mode))
-    return kernel, jax.vmap(space.unravel)(points) if chains > 1 else space.unravel(points[0])
+    return kernel, jax.vmap(space.unravel)(points) if chains > 1 else space.unravel(points[0]), size
 
 
 def _sample(kernel: Any, sampler: str, arguments: tuple, keywords: dict, key: jax.Array, chains: int, warmup: int,
-            samples: int, chain_method: str | None, progress: bool, first: Any) -> tuple[dict, dict]:
+            samples: int, thin: int, chain_method: str | None, progress: bool, first: Any) -> tuple[dict, dict]:
     if chain_method is None:
         chain_method = "parallel" if jax.local_device_count() >= chains else "sequential"
     checks.one_of("chain_method", chain_method, ("parallel", "vectorized", "sequential"))
-    mcmc = MCMC(kernel, num_warmup=warmup, num_samples=samples, num_chains=chains, chain_method=chain_method,
-                progress_bar=progress)
+    mcmc = MCMC(kernel, num_warmup=warmup * thin, num_samples=samples * thin, thinning=thin, num_chains=chains,
+                chain_method=chain_method, progress_bar=progress)
     mcmc.run(key, *arguments, extra_fields=tuple(_EXTRA_FIELDS[sampler]), init_params=first, **keywords)
     extra = mcmc.get_extra_fields(group_by_chain=True)
     stats = {new: np.asarray(extra[old]) for old, new in _EXTRA_FIELDS[sampler].items()}

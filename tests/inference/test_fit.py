@@ -353,6 +353,7 @@ def test_the_same_seed_gives_the_same_result(y):
         assert not group(other, name).equals(group(first, name))
     attrs = arviz_data.attributes(first)
     assert attrs["model"] == "one_parameter"
+    assert attrs["thin"] == 5, "for each parameter"
     assert attrs["seed"] == 0
 
 
@@ -364,6 +365,7 @@ def test_the_same_seed_gives_the_same_result(y):
     ({"sampler": "hmc"}, ValueError, "unknown sampler 'hmc'.*Known: nuts, ram, map"),
     ({"chains": 0}, ValueError, "chains must be at least 1"),
     ({"samples": 2.5}, TypeError, "samples must be a whole number, got 2.5"),
+    ({"thin": 0}, ValueError, "thin must be at least 1"),
     ({"warmup": -1}, ValueError, "warmup must be at least 1"),
     ({"trajectory_draws": -3}, ValueError, "trajectory_draws must be at least 1"),
     ({"init": "mode"}, ValueError, "unknown init 'mode'.*Known: map, median"),

@@ -43,7 +43,7 @@ def test_double_well_in_a_few_draws():
 @pytest.mark.parametrize("sampler", ["nuts", "ram"])
 @pytest.mark.parametrize("name", ["ginzburg-landau", "transcription", "spring"])
 def test_posteriors_converge_and_hold_the_truth(name, sampler):
-    draws = {"nuts": {"warmup": 600, "samples": 600}, "ram": {"warmup": 4000, "samples": 20_000}}[sampler]
+    draws = {"nuts": {"warmup": 600, "samples": 600}, "ram": {"warmup": 1000, "samples": 1000}}[sampler]
     result = fitted(name, sampler=sampler, trajectory_draws=200, **draws)
     assert_complete(result, name)
     summary = arviz_data.summary(result)
