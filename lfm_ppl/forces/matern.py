@@ -5,24 +5,22 @@ from __future__ import annotations
 import functools
 from fractions import Fraction
 from math import comb, factorial
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
 from lfm_ppl.forces.discretise import gauss_legendre, powers, step_tangent
-from lfm_ppl.forces.parameters import mean_parameter, positive_parameter, static_order
-from lfm_ppl.forces.sde import Force
+from lfm_ppl.forces.stretched import Stretched, covariance_of_derivatives
 from lfm_ppl.linalg import matmul
 
 _FAR = 750.0
 """Number of e-folds beyond which exp(-x) is zero in float64."""
 
 
-class Matern(Force):
+class Matern(Stretched):
     """A Matern process with smoothness nu = order + 1/2.
 
     With p = `order`, ``lam = sqrt(2 p + 1) / lengthscale`` and ``x = lam |lag|``,
@@ -54,16 +52,15 @@ class Matern(Force):
         Hartikainen, Seppanen and Sarkka (2012), ICML, section 3.
     """
 
-    scale: jax.Array
-    lengthscale: jax.Array
-    order: int = eqx.field(static=True)
-    mean: Any
+    orders: ClassVar[range] = range(6)
 
     def __init__(self, scale: Any, lengthscale: Any, order: int = 1, mean: Any = 0.0):
-        self.scale = positive_parameter("scale", scale)
-        self.lengthscale = positive_parameter("lengthscale", lengthscale)
-        self.order = static_order(order, range(6))
-        self.mean = mean_parameter(mean)
+        super().__init__(scale, lengthscale, order, mean)
+
+    @property
+    def unit(self) -> _Constants:
+        """The matrices of the unit process; the feedback has the single eigenvalue -1."""
+        return _constants(self.order)
 
     @property
     def rate(self) -> jax.Array:
@@ -75,28 +72,6 @@ class Matern(Force):
         """Number of states, order + 1."""
         return self.order + 1
 
-    @property
-    def noise_dim(self) -> int:
-        """One Brownian motion."""
-        return 1
-
-    @property
-    def stationary(self) -> bool:
-        """True."""
-        return True
-
-    def initial_covariance(self) -> jax.Array:
-        """Return the stationary covariance (n, n)."""
-        return self.scale**2 * _constants(self.order).covariance
-
-    def feedback(self) -> jax.Array:
-        """Return F (n, n), with the single eigenvalue -lam."""
-        return self.rate * _constants(self.order).feedback
-
-    def dispersion(self) -> jax.Array:
-        """Return L (n, 1)."""
-        return self.scale * jnp.sqrt(self.rate) * _constants(self.order).dispersion
-
     def discretise(self, dt: ArrayLike) -> tuple[jax.Array, jax.Array]:
         """Return transition (n, n) and process noise (n, n) over a step of length dt >= 0."""
         # Beyond _FAR nothing is left to change; clipping keeps the powers of x finite.
@@ -106,13 +81,13 @@ class Matern(Force):
     def covariance(self, t: ArrayLike, s: ArrayLike = 0.0) -> jax.Array:
         """Return k(t - s), elementwise."""
         x = jnp.minimum(self.rate * jnp.abs(jnp.asarray(t) - s), _FAR)
-        kernel = _constants(self.order).kernel
+        kernel = self.unit.kernel
         return self.scale**2 * jnp.exp(-x) * (powers(x, self.state_dim) * kernel).sum(-1)
 
     def spectral_density(self, omega: ArrayLike) -> jax.Array:
         """Return S(omega), elementwise."""
         ratio = jnp.asarray(omega) / self.rate
-        density = _constants(self.order).density * self.scale**2 / self.rate
+        density = self.unit.density * self.scale**2 / self.rate
         return density * (1.0 + ratio**2) ** -(self.order + 1)
 
 
@@ -138,14 +113,10 @@ def _constants(p: int) -> _Constants:
     feedback[-1] = [-comb(n, k) for k in range(n)]
     nilpotent = feedback + np.eye(n, dtype=int)
     polynomial = [np.linalg.matrix_power(nilpotent, k) / factorial(k) for k in range(n)]
-    # E[u^(i) u^(j)] = (-1)^((i - j)/2) m_((i + j)/2), with the spectral moments m_k.
     moment = [Fraction(1)]
     for k in range(p):
         moment.append(moment[k] * Fraction(2 * k + 1, 2 * p - 1 - 2 * k))
-    covariance = np.zeros((n, n))
-    for i in range(n):
-        for j in range(i % 2, n, 2):
-            covariance[i, j] = (-1) ** ((i - j) // 2) * moment[(i + j) // 2]
+    covariance = covariance_of_derivatives(moment)
     kernel = [
         Fraction(factorial(p) * factorial(2 * p - k) * 2**k)
         / (factorial(2 * p) * factorial(p - k) * factorial(k))

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import functools
 from math import ceil, factorial, log2
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,15 +19,13 @@ from lfm_ppl.forces.discretise import (
     step_tangent,
     term_count,
 )
-from lfm_ppl.forces.parameters import mean_parameter, positive_parameter, static_order
-from lfm_ppl.forces.sde import Force
+from lfm_ppl.forces.stretched import Stretched, covariance_of_derivatives
 
-_ORDERS = (2, 4, 6, 8)
 _FAR = 100.0
 """Dimensionless time lam dt after which nothing is left: every mode decays by exp(-64) or more."""
 
 
-class SquaredExponential(Force):
+class SquaredExponential(Stretched):
     """A squared exponential (Gaussian, RBF) process, as a linear SDE of even order.
 
         k(lag) = scale^2 exp(-lag^2 / (2 lengthscale^2)),
@@ -70,48 +67,25 @@ class SquaredExponential(Force):
         Hartikainen, Seppanen and Sarkka (2012), ICML, section 3.
     """
 
-    scale: jax.Array
-    lengthscale: jax.Array
-    order: int = eqx.field(static=True)
-    mean: Any
+    orders: ClassVar[tuple[int, ...]] = (2, 4, 6, 8)
 
     def __init__(self, scale: Any, lengthscale: Any, order: int = 6, mean: Any = 0.0):
-        self.scale = positive_parameter("scale", scale)
-        self.lengthscale = positive_parameter("lengthscale", lengthscale)
-        self.order = static_order(order, _ORDERS)
-        self.mean = mean_parameter(mean)
+        super().__init__(scale, lengthscale, order, mean)
+
+    @property
+    def unit(self) -> _Constants:
+        """The matrices of the unit process."""
+        return _constants(self.order)
 
     @property
     def rate(self) -> jax.Array:
         """The rate lam, the geometric mean of the roots' moduli, in 1/time."""
-        return _constants(self.order).rate / self.lengthscale
+        return self.unit.rate / self.lengthscale
 
     @property
     def state_dim(self) -> int:
         """Number of states, the order."""
         return self.order
-
-    @property
-    def noise_dim(self) -> int:
-        """One Brownian motion."""
-        return 1
-
-    @property
-    def stationary(self) -> bool:
-        """True."""
-        return True
-
-    def initial_covariance(self) -> jax.Array:
-        """Return the stationary covariance (n, n) of the SDE."""
-        return self.scale**2 * _constants(self.order).covariance
-
-    def feedback(self) -> jax.Array:
-        """Return F (n, n)."""
-        return self.rate * _constants(self.order).feedback
-
-    def dispersion(self) -> jax.Array:
-        """Return L (n, 1)."""
-        return self.scale * jnp.sqrt(self.rate) * _constants(self.order).dispersion
 
     def discretise(self, dt: ArrayLike) -> tuple[jax.Array, jax.Array]:
         """Return transition (n, n) and process noise (n, n) over a step of length dt >= 0."""
@@ -199,9 +173,9 @@ def _stable_factor(order, rate):
 def _stationary_covariance(characteristic, density):
     """Solve F P + P F' + D = 0 for the companion form.
 
-    ``E[u^(i) u^(j)] = (-1)^((i - j)/2) m_((i + j)/2)`` for i + j even and zero otherwise, so that
-    the Lyapunov equation has only the n spectral moments as unknowns, which keeps P exact to
-    rounding: row j is ``sum_k a_k E[u^(j) u^(k)] = density/2 [j = n - 1]``.
+    P consists of the n spectral moments (`covariance_of_derivatives`), so that the Lyapunov equation has these alone
+    as unknowns, which keeps P exact to rounding: row j is
+    ``sum_k a_k E[u^(j) u^(k)] = density/2 [j = n - 1]``.
     """
     n = len(characteristic) - 1
     system = np.zeros((n, n))
@@ -209,8 +183,4 @@ def _stationary_covariance(characteristic, density):
         for k in range(j % 2, n + 1, 2):
             system[j, (j + k) // 2] += (-1) ** ((j - k) // 2) * characteristic[k]
     moment = np.linalg.solve(system, np.append(np.zeros(n - 1), density / 2))
-    covariance = np.zeros((n, n))
-    for i in range(n):
-        for j in range(i % 2, n, 2):
-            covariance[i, j] = (-1) ** ((i - j) // 2) * moment[(i + j) // 2]
-    return covariance
+    return covariance_of_derivatives(moment)
