@@ -50,8 +50,17 @@ def linearise_observation(ssm: StateSpaceModel, rule: Rule, slope: jax.Array, t:
     """Linearise the observation about the predicted moments, or about those of ``about``."""
     centre = moments if about is None else about
 
+    angular = ssm.model.observation.angular
+    if angular:
+        matrix, offset = ssm.input_map(t)
+        middle = jax.lax.stop_gradient(ssm.observe(matmul(matrix, centre.mean[:, None])[:, 0] + offset, t))
+
     def function(w: jax.Array) -> tuple[jax.Array, Any]:
-        return ssm.observe(w, t), ssm.noise_covariance(w, t, row)
+        value = ssm.observe(w, t)
+        for index in angular:
+            # Averages are taken on the branch of the angle that is centred on the mean.
+            value = value.at[index].set(middle[index] + _wrapped(value[index] - middle[index]))
+        return value, ssm.noise_covariance(w, t, row)
 
     affine = linearise_state(ssm, rule, function, ssm.observation_structure, slope, t, centre.mean,
                              covariance_of(centre), _spread(ssm, rule, t, centre))
@@ -59,6 +68,11 @@ def linearise_observation(ssm: StateSpaceModel, rule: Rule, slope: jax.Array, t:
     if about is not None:
         value = value + matmul(affine.slope, (moments.mean - about.mean)[:, None])[:, 0]
     return Linearised(value, affine.slope, affine.residual + affine.extra)
+
+
+def _wrapped(angle: jax.Array) -> jax.Array:
+    """Return the angle in [-pi, pi]."""
+    return jnp.arctan2(jnp.sin(angle), jnp.cos(angle))
 
 
 def _spread(ssm: StateSpaceModel, rule: Rule, t: jax.Array, moments: Moments) -> jax.Array:
@@ -83,8 +97,7 @@ def update(ssm: StateSpaceModel, observation: Linearised, y: jax.Array, present:
     slope = jnp.where(present[:, None], observation.slope, 0.0)
     residual = jnp.where(present, y, 0.0) - observation.value
     for index in ssm.model.observation.angular:
-        wrapped = jnp.arctan2(jnp.sin(residual[index]), jnp.cos(residual[index]))
-        residual = residual.at[index].set(wrapped)
+        residual = residual.at[index].set(_wrapped(residual[index]))
     innovation = jnp.where(present, residual, 0.0)
     both = present[:, None] & present[None, :]
     noise = jnp.where(both, observation.noise, jnp.eye(y.shape[0]))

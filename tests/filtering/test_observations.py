@@ -74,6 +74,28 @@ def test_angles_are_compared_on_the_circle(turns):
     assert np.allclose(plain.filtered_mean, turned.filtered_mean, atol=1e-12)
 
 
+def bearing(x, u, t):
+    return jnp.arctan2(x[1:], x[:1])
+
+
+@pytest.mark.parametrize("rule", [lfm.Taylor(), lfm.Cubature(), lfm.Cubature(full_state=True), lfm.Unscented(),
+                                  lfm.GaussHermite(5), lfm.CentralDifference(), lfm.MonteCarlo(20)],
+                         ids=lambda rule: rule.name)
+def test_angles_are_averaged_on_the_circle(rule):
+    """A bearing next to the branch cut at pi, and the same picture turned by half a circle."""
+
+    def one(sign, angle):
+        model = lfm.LatentForceModel(
+            lambda x, u, t: -x, {}, lfm.GaussianObservation(bearing, jnp.array([0.01]), angular=(0,)),
+            lfm.Gaussian(sign * jnp.array([-1.0, 0.01]), 0.01 * jnp.eye(2)))
+        return lfm.filter(model, [0.0], [[angle]], rule=rule)
+
+    cut, away = one(1.0, np.pi - 0.05), one(-1.0, -0.05)
+    assert np.allclose(cut.log_likelihood, away.log_likelihood, rtol=1e-9)
+    assert np.allclose(cut.filtered_mean, -away.filtered_mean, rtol=1e-9)
+    assert np.allclose(cut.filtered_covariance, away.filtered_covariance, rtol=1e-9)
+
+
 def square_observed(x, u, t):
     return x**2 + 0.5 * u
 
