@@ -21,7 +21,7 @@ from lfm_ppl.filtering.transition import Exact, Factor, LinearPart
 from lfm_ppl.linalg import congruence, matmul, outer_square, safe_sqrt
 from lfm_ppl.linearisation.rule import Inputs, Rule, selection
 from lfm_ppl.linearisation.sigma_points import SigmaPointRule
-from lfm_ppl.model.augment import InputStructure, StateSpaceModel
+from lfm_ppl.model.augment import InputStructure, StateSpaceModel, just_before
 
 
 class Moments(NamedTuple):
@@ -69,7 +69,8 @@ def _integrated_offset(ssm: StateSpaceModel, transition: Exact, steps: int, star
     def step(offset: jax.Array, index: jax.Array) -> tuple[jax.Array, None]:
         t = start + index * h
         first = matmul(transition.full, offset + h / 6 * constant(t))
-        return first + h / 6 * (4 * matmul(transition.half, constant(t + 0.5 * h)) + constant(t + h)), None
+        last = constant(just_before(t + h, h))
+        return first + h / 6 * (4 * matmul(transition.half, constant(t + 0.5 * h)) + last), None
 
     offset, _ = jax.lax.scan(step, jnp.zeros((ssm.state_dim, 1)), jnp.arange(steps))
     return offset[:, 0]
@@ -210,7 +211,7 @@ def _step(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Factor, 
     flow4, m4 = node(at_full, h * matmul(half[:size, :size], k3))
     transport4 = half_x + matmul(_less(flow4[:size] - full_x, flow4, z3, size), back_half)
     q4 = lambda: _noise(factor, 2, [transport4], [three.diffusion], [h], size)  # noqa: E731
-    four = stage(3, t + h, m4, _propagated(p, flow4, q4, factor.noise_full, size))
+    four = stage(3, just_before(t + h, h), m4, _propagated(p, flow4, q4, factor.noise_full, size))
     k4 = increment(four, flow4)
     z4 = _inverse_flow(h, z3, back_half, three.slope, half, size)
 

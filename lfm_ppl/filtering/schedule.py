@@ -92,8 +92,9 @@ def schedule(ssm: StateSpaceModel, times: Any, steps: int, max_step: float | Non
 def _traced(ssm: StateSpaceModel, times: Any, steps: int, max_step: Any, at: Any, initial_time: Any,
             row_per_step: bool) -> Schedule:
     if max_step is not None or at is not None or ssm.stack.jump_times:
-        raise ValueError("max_step, requested times and forces with jumps need times (and initial_time) that are known "
-                         "before compilation; pass NumPy arrays rather than traced values.")
+        raise ValueError("max_step, requested times and forces with jumps need times (and initial_time) that are "
+                         "known before compilation; pass NumPy arrays rather than traced values, and do not convert "
+                         "them with jnp inside the model.")
     times = jnp.asarray(times, float)
     origin = times[:1] if initial_time is None else jnp.reshape(jnp.asarray(initial_time, float), (1,))
     start = jnp.concatenate([origin, times[:-1]])
@@ -122,7 +123,8 @@ def _concrete(times: np.ndarray, origin: float, jumps: tuple[float, ...], steps:
     jump = np.concatenate([jump_index, np.full(len(times) + len(extra), -1)]).astype(int)
     order = np.lexsort((observation, rank, time))
     time, observation, jump = time[order], observation[order], jump[order]
-    gap = np.diff(time, prepend=origin)
+    begin = np.append(origin, time[:-1])
+    gap = time - begin
     pieces = np.ones(len(time), int)
     if max_step is not None:
         pieces = np.maximum(1, np.ceil(gap / (max_step * steps) * (1 - 1e-12)).astype(int))
@@ -134,7 +136,7 @@ def _concrete(times: np.ndarray, origin: float, jumps: tuple[float, ...], steps:
     width = (gap / pieces)[event]
     last = piece == pieces[event] - 1
     lengths, kind = _distinct(width, max(abs(time[-1]), abs(origin)))
-    rows = Rows((time - gap)[event] + piece * width, width, np.where(last, observation[event], -1),
+    rows = Rows(begin[event] + piece * width, width, np.where(last, observation[event], -1),
                 np.where(last, jump[event], -1), kind)
     row_of_event = np.flatnonzero(last)
     observed = np.empty(len(times), int)

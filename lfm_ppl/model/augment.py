@@ -219,6 +219,11 @@ def _check_declared(function: Callable[[jax.Array], jax.Array], declared: tuple[
                          "nonlinear_inputs at None: the structure is then found automatically.")
 
 
+def just_before(t: jax.Array, step: jax.Array) -> jax.Array:
+    """Return the end ``t`` of a step as its own last node: a known input that jumps there has not jumped yet."""
+    return t - 8 * jnp.finfo(jnp.result_type(float)).eps * (jnp.abs(t) + jnp.abs(step))
+
+
 def check_times(times: Any, initial_time: Any) -> np.ndarray | None:
     """Check observation times; return them as NumPy, or None where they are traced.
 

@@ -30,7 +30,8 @@ class Input(eqx.Module):
         (5.0, 2.5)
 
     A jump inside an interval lowers the order of the integration there; put the times of jumps among the observation
-    times (with missing observations) or in ``at`` where that matters.
+    times (with missing observations) where that matters. At such a time the interval before it sees the value before
+    the jump, the interval after it the value after.
     """
 
     times: jax.Array
@@ -44,8 +45,8 @@ class Input(eqx.Module):
         self.times = jnp.atleast_1d(jnp.asarray(times, float))
         self.values = jnp.asarray(values, float)
         self.interpolation = interpolation
-        if self.values.ndim == 0 or self.times.ndim != 1 or self.values.shape[0] != self.times.shape[0]:
-            raise ValueError(f"input values must have one row a time: {self.times.shape} times, "
+        if self.times.ndim != 1 or self.times.size == 0 or self.values.shape[:1] != self.times.shape:
+            raise ValueError(f"input values must have one row a time, and at least one: {self.times.shape} times, "
                              f"values of shape {self.values.shape}.")
         known = checks.concrete(times)
         if known is not None and np.any(np.diff(known) <= 0):
