@@ -168,7 +168,7 @@ def fit(
     flat = {label: value.reshape(-1, *value.shape[2:]) for label, value in draws.items()}
     latent = _latent(model, arguments, keywords, keys[0], flat)
     rated = _kept("scores of the observations", lambda: scores(
-        model, arguments, keywords, latent, y, site.example.ssm.state_dim), None)
+        model, arguments, keywords, latent, y, site), None)
     chosen, paths, grid = _kept("trajectories", lambda: _paths(
         model, arguments, keywords, latent, site, y, at, trajectory_draws, chains, samples, keys[3]),
         (None, None, None))
@@ -192,8 +192,9 @@ def _kept(what: str, compute: Callable[[], Any], otherwise: Any) -> Any:
     """Compute something from the draws; a failure must not lose the draws, which took the time."""
     try:
         return compute()
-    except (RuntimeError, FloatingPointError, MemoryError) as error:
-        warnings.warn(f"the {what} could not be computed and are left out of the result: {error}", stacklevel=3)
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error}"
+        warnings.warn(f"the {what} could not be computed and are left out of the result: {reason}", stacklevel=3)
         return otherwise
 
 
@@ -315,7 +316,7 @@ def _paths(model: Callable, arguments: tuple, keywords: dict, latent: dict, site
         grid = (np.union1d(np.linspace(min(origin, times[0]), times[-1], _GRID), times) if at is None
                 else np.atleast_1d(np.asarray(at, float)))
     subset = {label: value[rows] for label, value in latent.items()}
-    paths = trajectories(model, arguments, keywords, subset, y, grid, key, site.example.ssm.state_dim)
+    paths = trajectories(model, arguments, keywords, subset, y, grid, key, site)
     return chosen, {k: v.reshape(chains, len(chosen), *v.shape[1:]) for k, v in paths.items()}, grid
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -82,7 +83,7 @@ class MarginalLikelihood(dist.Distribution):
         self.model, self.times = model, times
         self.rule, self.steps, self.max_step = as_rule(rule), steps, max_step
         self.iterations, self.damping = iterations, damping
-        model.check_at(self.plan.initial_time)
+        model.check_at(self.plan.initial_time, np.shape(times)[0])
         warn_single_precision()
         super().__init__((), (np.shape(times)[0], self.ssm.output_dim), validate_args=False)
 
@@ -96,6 +97,13 @@ class MarginalLikelihood(dist.Distribution):
     def plan(self) -> Schedule:
         """The rows of the scan."""
         return schedule(self.ssm, self.times, self.steps, self.max_step, row_per_step=self.iterations > 0)
+
+    def with_times(self, times: Any) -> MarginalLikelihood:
+        """Return the same distribution for times that are known, where its own were traced."""
+        other = copy.copy(self)
+        other.__dict__.pop("plan", None)
+        other.times = times
+        return other
 
     def log_prob_per_observation(self, value: Any) -> jax.Array:
         """Return (T,): log p(y_k | y_1:k-1) of the present entries of each observation."""
@@ -157,6 +165,9 @@ class Panel(dist.Distribution):
             raise ValueError(f"times has {np.shape(times)[0]} rows for {count} series; give one row a series, or one "
                              "vector for all.")
         known = checks.concrete(times)
+        if self._series_times and settings.get("max_step") is not None:
+            raise ValueError("max_step cannot be had in a panel whose series have times of their own: all series share "
+                             "one number of rows. Raise steps, or give all series one vector of times.")
         for series, row in enumerate(known) if self._series_times and known is not None else ():
             try:
                 check_times(row, None)
@@ -181,6 +192,12 @@ class Panel(dist.Distribution):
         """The distribution of the first series."""
         times = jnp.asarray(self.times, float)[0] if self._series_times else self.times
         return self._one(jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf)[0], self.parameters), times)
+
+    def with_times(self, times: Any) -> Panel:
+        """Return the same distribution for times that are known, where its own were traced."""
+        other = copy.copy(self)
+        other.times = times
+        return other
 
     def mapped(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Return ``function(distribution of a series, *its arguments)``, with the series as leading axis."""

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpyro import handlers
 
+from lfm_ppl import checks
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
 from lfm_ppl.linalg import matmul, semidefinite_root
 
@@ -61,8 +62,8 @@ def likelihood_site(model: Callable, arguments: tuple, keywords: Mapping[str, An
 
 
 def scores(model: Callable, arguments: tuple, keywords: Mapping[str, Any], draws: Mapping[str, Any],
-           y: Any, state_dim: int) -> dict[str, np.ndarray]:
-    """Score the observations under each draw; ``state_dim`` bounds the memory.
+           y: Any, known: LikelihoodSite) -> dict[str, np.ndarray]:
+    """Score the observations under each draw; ``known`` is the site outside of compiled code.
 
     Returns:
         ``leave_one_out`` (S, ..., T), ``one_step_ahead`` (S, ..., T), ``residual`` (S, ..., T, D); the series of a
@@ -75,14 +76,14 @@ def scores(model: Callable, arguments: tuple, keywords: Mapping[str, Any], draws
                 "residual": result.residual}
 
     def per_draw(parameters: Any, key: jax.Array) -> dict[str, jax.Array]:
-        site = likelihood_site(model, arguments, keywords, key, parameters)
-        return _each(site.distribution, one, jnp.asarray(y, float))
+        distribution = _drawn(model, arguments, keywords, key, parameters, known)
+        return _each(distribution, one, jnp.asarray(y, float))
 
-    return _over_draws(per_draw, draws, jax.random.key(0), len(np.ravel(arguments[0])), state_dim)
+    return _over_draws(per_draw, draws, jax.random.key(0), len(np.ravel(arguments[0])), known)
 
 
 def trajectories(model: Callable, arguments: tuple, keywords: Mapping[str, Any], draws: Mapping[str, Any], y: Any,
-                 at: Any, key: jax.Array, state_dim: int) -> dict[str, np.ndarray]:
+                 at: Any, key: jax.Array, known: LikelihoodSite) -> dict[str, np.ndarray]:
     """Draw one trajectory for each draw of the parameters, given the data, and replicate the data along it.
 
     Args:
@@ -93,7 +94,7 @@ def trajectories(model: Callable, arguments: tuple, keywords: Mapping[str, Any],
         y: (T, D), or (B, T, D) for a panel.
         at: (K,) times of the trajectories, or None for the observation times.
         key: a JAX random key.
-        state_dim: of the joint state; bounds the memory.
+        known: the site outside of compiled code, where its times are numbers.
 
     Returns:
         ``state`` (S, ..., K, M), ``force`` (S, ..., K, R), ``output`` (S, ..., K, D) free of noise, and ``y``
@@ -121,13 +122,20 @@ def trajectories(model: Callable, arguments: tuple, keywords: Mapping[str, Any],
 
     def per_draw(parameters: Any, key: jax.Array) -> dict[str, jax.Array]:
         site_key, key = jax.random.split(key)
-        site = likelihood_site(model, arguments, keywords, site_key, parameters)
+        distribution = _drawn(model, arguments, keywords, site_key, parameters, known)
         observed = jnp.asarray(y, float)
-        keys = jax.random.split(key, observed.shape[0]) if isinstance(site.distribution, Panel) else key
-        return _each(site.distribution, one, observed, keys)
+        keys = jax.random.split(key, observed.shape[0]) if isinstance(distribution, Panel) else key
+        return _each(distribution, one, observed, keys)
 
     rows = count + len(np.ravel(arguments[0]))
-    return _over_draws(per_draw, draws, key, rows, state_dim)
+    return _over_draws(per_draw, draws, key, rows, known)
+
+
+def _drawn(model: Callable, arguments: tuple, keywords: Mapping[str, Any], key: jax.Array, parameters: Any,
+           known: LikelihoodSite) -> MarginalLikelihood | Panel:
+    """The likelihood under one draw. Times that the model converted to traced values are those that are known."""
+    distribution = likelihood_site(model, arguments, keywords, key, parameters).distribution
+    return distribution.with_times(known.distribution.times) if checks.traced(distribution.times) else distribution
 
 
 def _each(distribution: MarginalLikelihood | Panel, function: Callable, *arguments: Any) -> Any:
@@ -137,11 +145,12 @@ def _each(distribution: MarginalLikelihood | Panel, function: Callable, *argumen
 
 
 def _over_draws(per_draw: Callable, draws: Mapping[str, Any], key: jax.Array, rows: int,
-                state_dim: int) -> dict[str, np.ndarray]:
+                known: LikelihoodSite) -> dict[str, np.ndarray]:
     """Map over draws, in batches that bound the memory."""
     draws = {name: jnp.asarray(value) for name, value in draws.items()}
     count = next(iter(draws.values())).shape[0]
-    batch = int(np.clip(_BATCH_NUMBERS // max(rows * state_dim**2 * 6, 1), 1, count))
+    numbers = rows * known.example.ssm.state_dim**2 * 6
+    batch = int(np.clip(_BATCH_NUMBERS // max(numbers, 1), 1, count))
     batches = -(-count // batch)
     # Repeat the last draws so that all batches are full: one shape, one compilation.
     index = np.minimum(np.arange(batches * batch), count - 1).reshape(batches, batch)

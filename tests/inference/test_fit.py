@@ -357,6 +357,42 @@ def test_the_same_seed_gives_the_same_result(y):
     assert attrs["seed"] == 0
 
 
+def converted(times, y=None, start=None, max_step=None):
+    """One decay; the model turns its times into a JAX array, and may say when the prior holds."""
+    decay = numpyro.sample("decay", dist.LogNormal(np.log(0.5), 0.5))
+    system = lfm.LatentForceModel(
+        lambda x, u, t: u - decay * x, {"u": lfm.Matern(1.0, 1.5)},
+        lfm.GaussianObservation(lambda x, u, t: x, 0.04 * jnp.ones(1)), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)),
+        initial_time=start)
+    times = times if max_step else jnp.asarray(times)
+    numpyro.sample("y", lfm.MarginalLikelihood(system, times, max_step=max_step), obs=y)
+
+
+@pytest.mark.parametrize("keywords", [{}, {"start": -1.0, "max_step": 0.1}], ids=["times as JAX array", "initial time"])
+def test_times_are_known_to_everything_after_sampling(y, keywords):
+    result = quiet_fit(converted, TIMES, y[:, :1], sampler="nuts", chains=1, warmup=5, samples=4, trajectory_draws=2,
+                       at=[0.5, 9.0], model_kwargs=keywords)
+    assert set(arviz_data.groups(result)) >= {"trajectories", "log_likelihood", "posterior_predictive"}
+    assert group(result, "trajectories")["forces"].sizes["at"] == 2
+    decay = float(group(result, "posterior")["decay"][0, 3])
+    values = {"decay": jnp.asarray(decay)}
+    with numpyro.handlers.seed(rng_seed=0), numpyro.handlers.substitute(data=values):
+        trace = numpyro.handlers.trace(converted).get_trace(TIMES, y[:, :1], **keywords)
+    whole = trace["y"]["fn"].log_prob(y[:, :1])
+    np.testing.assert_allclose(group(result, "one_step_ahead")["log_density"][0, 3].sum(), whole, rtol=1e-9)
+
+
+def test_what_fails_after_sampling_does_not_cost_the_draws(y, monkeypatch):
+    def broken(*arguments):
+        raise TypeError("no such thing")
+
+    monkeypatch.setattr("lfm_ppl.inference.fit.scores", broken)
+    with pytest.warns(UserWarning, match="scores of the observations could not be computed.*TypeError: no such thing"):
+        result = lfm.fit(one_parameter, TIMES, y, sampler="map", samples=5, trajectory_draws=0)
+    assert group(result, "posterior")["decay"].shape == (1, 5)
+    assert "log_likelihood" not in arviz_data.groups(result)
+
+
 # Errors
 
 
