@@ -228,6 +228,10 @@ def _find_outputs(
         if not names:
             raise ValueError(f"{path} has no column beside the time {time_name!r}.")
         return names
+    if isinstance(outputs, str):
+        raise TypeError(f"outputs must be a sequence of column names, such as [{outputs!r}], got the text {outputs!r}.")
+    if not len(outputs) or len(set(outputs)) < len(outputs):
+        raise ValueError(f"outputs must name at least one column, and each of them once; got {list(outputs)}.")
     for name in outputs:
         if name not in others:
             raise ValueError(f"{path}: {checks.unknown('output column', name, others)}")

@@ -87,6 +87,8 @@ def test_missing_cells(read, cell):
         (b"time,replicate\n0,1\n", {}, r"no column beside the time 'time'"),
         (b"time,DDB2\n0,1\n", {"outputs": ["DDB3"]}, r"unknown output column 'DDB3'.*'DDB2'"),
         (b"PK\x03\x04\xff\xfe\x00", {}, r"is not a comma-separated text file"),
+        (b"time,x\n0,1\n", {"outputs": []}, r"outputs must name at least one column, and each of them once; got \[\]"),
+        (b"time,x\n0,1\n", {"outputs": ["x", "x"]}, r"each of them once; got \['x', 'x'\]"),
     ],
 )
 def test_complaints_name_the_place_and_the_remedy(read, text, options, message):
@@ -141,3 +143,8 @@ def test_truth_that_is_not_there(tmp_path):
 def test_data_checks_its_parts(times, y, message):
     with pytest.raises(ValueError, match=message):
         Data(times, y, ("x",))
+
+
+def test_outputs_are_a_sequence_of_names(read):
+    with pytest.raises(TypeError, match=r"sequence of column names, such as \['decay'\]"):
+        read("time,decay\n0,1\n", outputs="decay")

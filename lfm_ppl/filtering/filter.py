@@ -199,7 +199,8 @@ def filter(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
         rule: linearisation rule; `Cubature()` by default.
         steps: integration steps between two consecutive times.
         max_step: longest step, in units of time; longer intervals get more steps.
-        start: the ``state`` of an earlier result, to go on with new observations; times continue from there.
+        start: the ``state`` of an earlier result, to go on with new observations; times continue from there. (An
+            observation covariance for each time holds those of the new times.)
 
     Returns:
         Log likelihoods, moments and residuals, by observation.
@@ -219,12 +220,25 @@ def filter(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
     """
     rule = as_rule(rule)
     ssm = state_space(model)
+    if start is not None:
+        _check_start(start, times, ssm.state_dim)
     plan = schedule(ssm, times, steps, max_step, initial_time=None if start is None else start.time)
-    model.check_at(plan.initial_time)
+    model.check_at(plan.initial_time, len(plan.observed))
     y = check_observations(y, len(plan.observed), ssm.output_dim)
     warn_single_precision()
     begin = None if start is None else Moments(start.mean, start.covariance)
     return _run_filter(ssm, rule, plan, y, jnp.asarray(times, float), begin)
+
+
+def _check_start(start: Any, times: Any, size: int) -> None:
+    if not isinstance(start, FilterState):
+        hint = " Pass result.state." if isinstance(start, FilterResult) else ""
+        raise TypeError(f"start must be the state of an earlier filter result, got {type(start).__name__}.{hint}")
+    if np.shape(start.mean) != (size,):
+        raise ValueError(f"start has {np.shape(start.mean)[0]} entries, but the joint state of this model has {size}.")
+    begin, known = checks.concrete(start.time), checks.concrete(times)
+    if begin is not None and known is not None and known.size and known.flat[0] < begin:
+        raise ValueError(f"times[0] = {known.flat[0]:g} lies before {float(begin):g}, where `start` stands.")
 
 
 @eqx.filter_jit

@@ -159,6 +159,10 @@ class Force(eqx.Module):
 
         return Sum((self, other)) if isinstance(other, Force) else NotImplemented
 
+    def __radd__(self, other: Any) -> "Force":
+        """Return the force itself for 0 + force, with which ``sum(forces)`` begins."""
+        return self if isinstance(other, int) and other == 0 else NotImplemented
+
 
 @eqx.filter_jit
 def _covariance(force, t, s):

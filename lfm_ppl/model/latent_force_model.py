@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import inspect
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -82,7 +83,9 @@ class LatentForceModel(eqx.Module):
         self.dynamics, self.observation, self.initial_state = dynamics, observation, initial_state
         if initial_time is not None:
             checks.finite("initial_time", initial_time)
-        self.initial_time = None if initial_time is None else jnp.asarray(initial_time, float)
+        # Kept as NumPy where it is known: inside jit jnp.asarray would make a tracer of it, too late to plan rows by.
+        known = None if initial_time is None else checks.concrete(initial_time)
+        self.initial_time = initial_time if known is None else known.astype(float)
         size = initial_state.mean.shape[0]
         self.state_names = _names("state_names", state_names, size, "x")
         if overlap := set(self.state_names) & set(self.force_names):
@@ -108,23 +111,24 @@ class LatentForceModel(eqx.Module):
     def _check_dynamics(self, size: int) -> None:
         u = jax.ShapeDtypeStruct((len(self.force_names),), jnp.result_type(float))
         x, t = self.initial_state.mean, jnp.zeros(())
-        found = jax.eval_shape(self.dynamics, x, u, t)
+        found = _traced_shape("dynamics", "f(x, u, t)", self.dynamics, x, u, t)
         if getattr(found, "shape", None) != (size,):
             raise ValueError(f"dynamics must return one derivative for each of the {size} entries of "
                              f"initial_state.mean, shape ({size},); it returned {getattr(found, 'shape', found)}.")
         if not callable(self.process_noise) and self.process_noise is not None:
             return
         if callable(self.process_noise):
-            found = jax.eval_shape(self.process_noise, x, u, t)
+            found = _traced_shape("process_noise", "(x, u, t)", self.process_noise, x, u, t)
             if len(found.shape) != 2 or found.shape[0] != size:
                 raise ValueError(f"process_noise must return a dispersion matrix ({size}, S), got {found.shape}.")
 
     def _outputs(self, size: int) -> int:
         u = jax.ShapeDtypeStruct((len(self.force_names),), jnp.result_type(float))
         arguments = (self.initial_state.mean, u, jnp.zeros(()))
-        found = jax.eval_shape(self.observation.function, *arguments)
-        if len(found.shape) != 1:
-            raise ValueError(f"the observation function must return a vector (D,), got shape {found.shape}. "
+        found = _traced_shape("the observation function", "h(x, u, t)", self.observation.function, *arguments)
+        if len(getattr(found, "shape", ())) != 1:
+            raise ValueError("the observation function must return a vector (D,), got "
+                             f"{f'shape {found.shape}' if hasattr(found, 'shape') else type(found).__name__}. "
                              "For one output, return x[:1] or jnp.array([...]).")
         outputs = found.shape[0]
         covariance = jax.eval_shape(self.observation.covariance_at, *arguments, 0)
@@ -135,20 +139,52 @@ class LatentForceModel(eqx.Module):
             raise ValueError(f"angular indices must lie in 0..{outputs - 1}, got {self.observation.angular}.")
         return outputs
 
-    def check_at(self, time: Any) -> None:
-        """Raise ValueError where the dynamics or the observation is not finite at the prior mean at ``time``."""
+    def check_at(self, time: Any, rows: int) -> None:
+        """Check what depends on where and how often the model is observed.
+
+        Args:
+            time: at which the functions are tried, at the prior mean.
+            rows: number of observations.
+
+        Raises:
+            ValueError: a function is not finite there, the observation covariance is no covariance, or there is not
+                one matrix for each observation.
+        """
+        covariance = self.observation.covariance
+        if np.ndim(covariance) == 3 and np.shape(covariance)[0] != rows:
+            raise ValueError(f"the observation covariance holds {np.shape(covariance)[0]} matrices, one for each time, "
+                             f"but there are {rows} times.")
         x = self.initial_state.mean
-        if checks.traced((self, time)):
-            return
         u = jnp.asarray([force.mean_at(time) for force in self.force_list], float)
+        if checks.traced((self, time, u)):
+            return
+        where = f"at the prior mean x = {np.asarray(x)}, u = {np.asarray(u)}, t = {float(time):g}"
         for label, function, names in (("dynamics", self.dynamics, self.state_names),
                                        ("observation function", self.observation.function, self.output_names)):
             value = checks.concrete(function(x, u, jnp.asarray(time, float)))
             if value is not None and not np.all(np.isfinite(value)):
                 name = names[int(np.argmin(np.isfinite(value)))]
-                raise ValueError(f"the {label} returned {value} at the prior mean x = {np.asarray(x)}, "
-                                 f"u = {np.asarray(u)}, t = {float(time):g}: the entry for {name!r} is not finite. "
+                raise ValueError(f"the {label} returned {value} {where}: the entry for {name!r} is not finite. "
                                  "Change initial_state.mean, or guard the expression (for example jnp.maximum).")
+        if callable(self.process_noise):
+            dispersion = checks.concrete(self.process_noise(x, u, jnp.asarray(time, float)))
+            if dispersion is not None and not np.all(np.isfinite(dispersion)):
+                raise ValueError(f"process_noise is not finite {where}: {dispersion.tolist()}.")
+        if callable(covariance):
+            noise = checks.concrete(self.observation.covariance_at(x, u, jnp.asarray(time, float), jnp.asarray(0)))
+            if noise is not None:
+                checks.covariance_matrix(f"the observation covariance {where}", noise)
+
+
+def _traced_shape(what: str, form: str, function: Callable, *arguments: Any) -> Any:
+    """Return the shape of a function's value; a wrong number of arguments gets a message of its own."""
+    try:
+        inspect.signature(function).bind(*arguments)
+    except TypeError as error:
+        raise TypeError(f"{what} must take three arguments, {form}: {error}.") from None
+    except ValueError:  # no signature to be had
+        pass
+    return jax.eval_shape(function, *arguments)
 
 
 def _check_types(dynamics: Any, observation: Any, initial_state: Any) -> None:
@@ -162,6 +198,9 @@ def _check_types(dynamics: Any, observation: Any, initial_state: Any) -> None:
 
 
 def _named_forces(forces: Any) -> tuple[tuple[str, ...], dict[str, Force]]:
+    if isinstance(forces, Force) or not isinstance(forces, Iterable):
+        raise TypeError('forces must map names to forces, for example {"p53": lfm.Matern(1.0, 2.0)}, or {} for none; '
+                        f"got {type(forces).__name__}.")
     items = list(forces.items()) if isinstance(forces, Mapping) else list(forces)
     for item in items:
         if not (isinstance(item, tuple) and len(item) == 2 and isinstance(item[0], str)):

@@ -76,7 +76,11 @@ class GaussianObservation(eqx.Module):
         if not callable(function):
             raise TypeError(f"observation function must be callable as h(x, u, t), got {type(function).__name__}.")
         self.function = function
-        self.angular = tuple(int(index) for index in np.atleast_1d(np.asarray(angular, int)))
+        indices = np.atleast_1d(np.asarray(angular))
+        if indices.size and indices.dtype.kind not in "iu":
+            raise TypeError(f"angular must hold the indices of the components that are angles, for example (0,), got "
+                            f"{angular!r}.")
+        self.angular = tuple(int(index) for index in indices)
         if callable(covariance):
             self.covariance = covariance
             return

@@ -6,10 +6,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from numpyro.util import is_prng_key
 
 from lfm_ppl import checks
 from lfm_ppl.linalg import matmul, semidefinite_root
-from lfm_ppl.model.augment import StateSpaceModel, check_times, state_space
+from lfm_ppl.model.augment import StateSpaceModel, check_times, just_before, state_space
 from lfm_ppl.model.latent_force_model import LatentForceModel
 
 
@@ -61,6 +63,9 @@ def simulate(key: jax.Array, model: LatentForceModel, times: Any, steps: int = 5
     checks.positive_integer("steps", steps)
     ssm = state_space(model)
     check_times(times, model.initial_time)
+    model.check_at(times[0] if model.initial_time is None else model.initial_time, np.shape(times)[0])
+    if not is_prng_key(key):
+        raise TypeError(f"key must be a JAX random key, such as jax.random.key(0), got {key!r}.")
     times = jnp.asarray(times, float)
     start = times[0] if model.initial_time is None else jnp.asarray(model.initial_time, float)
     run = lambda key, times, start: simulate_on(ssm, key, times, start, steps)  # noqa: E731
@@ -118,7 +123,8 @@ def _simulation_step(ssm: StateSpaceModel, state: jax.Array, t: jax.Array, h: ja
     kick = jnp.zeros(size)
     if dispersion is not None:
         kick = jnp.sqrt(h) * matmul(dispersion, jax.random.normal(state_key, (dispersion.shape[1], 1)))[:, 0]
-    after = ssm.drift(inputs(x + h * slope + kick, forces, t + h), t + h)
+    end = just_before(t + h, h)
+    after = ssm.drift(inputs(x + h * slope + kick, forces, end), end)
     return jnp.concatenate([x + 0.5 * h * (slope + after) + kick, forces])
 
 

@@ -255,8 +255,14 @@ def _dot(equation: Any, operands: list[_Value]) -> _Value:
     return _Value(first.reshape(-1, inputs), second.reshape(-1, inputs, inputs))
 
 
+def _converted(equation: Any, operands: list[_Value]) -> _Value | list[_Value] | None:
+    """Between floating types nothing happens; to whole numbers or truth values is a step function."""
+    floating = jnp.issubdtype(equation.params["new_dtype"], jnp.floating)
+    return (_union if floating else _nonlinear)(equation, operands)
+
+
 _RULES: dict[str, Callable[[Any, list[_Value]], _Value | list[_Value] | None]] = {
-    **dict.fromkeys(["add", "sub", "add_any", "neg", "copy", "copy_p", "convert_element_type", "real",
+    **dict.fromkeys(["add", "sub", "add_any", "neg", "copy", "copy_p", "real",
                      "reduce_precision"], _union),
     **dict.fromkeys(["reshape", "squeeze", "broadcast_in_dim", "transpose", "rev", "slice", "concatenate", "pad",
                      "stack", "unstack", "split", "tile", "expand_dims", "gather", "dynamic_slice",
@@ -265,6 +271,7 @@ _RULES: dict[str, Callable[[Any, list[_Value]], _Value | list[_Value] | None]] =
                      "acos", "atan", "atan2", "logistic", "sqrt", "rsqrt", "cbrt", "abs", "sign", "erf", "erfc",
                      "pow", "max", "min", "square", "clamp", "lgamma", "digamma", "rem", "floor", "ceil", "round",
                      "is_finite", "gt", "lt", "ge", "le", "eq", "ne", "and", "or", "not"], _nonlinear),
+    "convert_element_type": _converted,
     "mul": _product, "div": _quotient, "integer_pow": _power, "select_n": _select, "reduce_sum": _summed,
     "dot_general": _dot, "scatter-add": _scatter_add, "scatter_add": _scatter_add,
 }

@@ -58,6 +58,31 @@ def test_smoother(options, message):
         lfm.smooth(MODEL, TIMES, Y, **options)
 
 
+def per_row(x, u, t):
+    return x[:1]
+
+
+def test_a_covariance_for_each_time_needs_one_for_each():
+    model = lfm.LatentForceModel(MODEL.dynamics, MODEL.forces,
+                                 lfm.GaussianObservation(per_row, 0.1 * jnp.ones((4, 1, 1))), MODEL.initial_state)
+    message = "covariance holds 4 matrices, one for each time, but there are 3 times"
+    for call in (lambda: lfm.filter(model, TIMES, Y), lambda: lfm.smooth(model, TIMES, Y),
+                 lambda: lfm.MarginalLikelihood(model, TIMES), lambda: lfm.simulate(jax.random.key(0), model, TIMES)):
+        with pytest.raises(ValueError, match=message):
+            call()
+
+
+def test_where_a_filter_may_start():
+    first = lfm.filter(MODEL, TIMES, Y)
+    with pytest.raises(TypeError, match="start must be the state of an earlier.*got FilterResult. Pass result.state"):
+        lfm.filter(MODEL, TIMES + 9.0, Y, start=first)
+    with pytest.raises(ValueError, match=r"times\[0\] = 0 lies before 3, where `start` stands"):
+        lfm.filter(MODEL, TIMES - TIMES[0], Y, start=first.state)
+    other = lfm.filter(motif(genes=2), TIMES, np.ones((3, 2)))
+    with pytest.raises(ValueError, match="start has 4 entries, but the joint state of this model has 1"):
+        lfm.filter(MODEL, TIMES + 9.0, Y, start=other.state)
+
+
 def test_names_of_a_result():
     found = lfm.smooth(motif(genes=1), TIMES, Y)
     with pytest.raises(ValueError, match="unknown force 'v'.*Known: u"):

@@ -24,6 +24,7 @@ def test_a_sum_is_block_diagonal_and_adds():
     assert_array_equal(total.measurement(0.0), [1, 0, 1, 0, 0])
     assert_allclose(total.mean_at(0.5), 3.5)
     assert_allclose(total.mean(0.5), 3.5)
+    assert_array_equal(sum([a, b]).initial_covariance(), total.initial_covariance())
     lag = np.array([0.0, 0.2, 3.0])
     assert_allclose(total.covariance(lag), a.covariance(lag) + b.covariance(lag), rtol=1e-14)
     density = a.spectral_density(lag) + b.spectral_density(lag)

@@ -35,6 +35,8 @@ def make(dynamics=lambda x, u, t: -x, forces=FORCE, observation=OBSERVATION, ini
     ({"nonlinear_inputs": ("y",)}, "unknown name in nonlinear_inputs 'y'"),
     ({"observation": lfm.GaussianObservation(lambda x, u, t: x[0], jnp.ones(1))},
      r"must return a vector \(D,\), got shape \(\)"),
+    ({"observation": lfm.GaussianObservation(lambda x, u, t: [x[0]], jnp.ones(1))},
+     r"must return a vector \(D,\), got list"),
     ({"observation": lfm.GaussianObservation(whole_state, jnp.ones(3))},
      r"2 components.*must be \(2,\) or \(2, 2\); it is \(3, 3\)"),
     ({"observation": lfm.GaussianObservation(whole_state, jnp.ones(2), angular=(2,))},
@@ -51,6 +53,10 @@ def test_model_values(options, message):
     ({"initial_state": jnp.zeros(2)}, "initial_state must be an lfm.Gaussian"),
     ({"forces": {"u": 1.0}}, "force 'u' must be a force such as lfm.Matern, got float"),
     ({"forces": [lfm.Matern(1.0, 1.0)]}, "forces must map names to forces"),
+    ({"forces": lfm.Matern(1.0, 1.0)}, "forces must map names to forces.*or {} for none; got Matern"),
+    ({"forces": None}, "forces must map names to forces.*got NoneType"),
+    ({"dynamics": lambda x, u: -x}, r"dynamics must take three arguments, f\(x, u, t\): too many positional"),
+    ({"observation": lfm.GaussianObservation(lambda x: x, jnp.ones(2))}, r"must take three arguments, h\(x, u, t\)"),
 ])
 def test_model_types(options, message):
     with pytest.raises(TypeError, match=message):
@@ -71,6 +77,7 @@ def test_model_types(options, message):
      "observation covariance of row 1 is not positive semi-definite"),
     (lambda: lfm.Input([0.0, 1.0, 1.0], [1.0, 2.0, 3.0]), r"input times must increase; row 2 \(1\) does not"),
     (lambda: lfm.Input([0.0, 1.0], [1.0, 2.0, 3.0]), "one row a time"),
+    (lambda: lfm.Input([], []), "one row a time, and at least one"),
     (lambda: lfm.Input([0.0, np.nan], [1.0, 2.0]), "input times must be finite"),
     (lambda: lfm.Input([0.0, 1.0], [1.0, np.inf]), "input values must be finite"),
     (lambda: lfm.Input([0.0, 1.0], [1.0, 2.0], "linaer"), "unknown interpolation 'linaer'. Did you mean 'linear'"),
@@ -85,6 +92,22 @@ def test_model_types(options, message):
 def test_parts(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+def test_functions_are_tried_at_the_prior_mean():
+    variance = lfm.GaussianObservation(whole_state, lambda x, u, t: -jnp.ones(2))
+    with pytest.raises(ValueError, match="observation covariance at the prior mean x = .* t = 1 .*semi-definite"):
+        lfm.filter(make(observation=variance), [1.0], [[0.1, 0.2]])
+    with pytest.raises(ValueError, match="process_noise is not finite at the prior mean"):
+        lfm.filter(make(process_noise=lambda x, u, t: jnp.full((2, 1), jnp.nan)), [1.0], [[0.1, 0.2]])
+
+
+def test_keys_and_indices():
+    with pytest.raises(TypeError, match=r"key must be a JAX random key, such as jax.random.key\(0\), got 0"):
+        lfm.simulate(0, make(), [1.0])
+    for angular in ((True, False), (0.0,)):
+        with pytest.raises(TypeError, match="angular must hold the indices"):
+            lfm.GaussianObservation(whole_state, jnp.ones(2), angular=angular)
 
 
 def test_observation_function_must_be_callable():

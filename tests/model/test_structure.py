@@ -200,3 +200,13 @@ def test_a_wrong_declaration_names_the_coordinate():
         structure(Motif(jnp.ones(1), jnp.ones(1), 0.1, softplus), 1, ("p53",), nonlinear_inputs=("p5",))
     # What is linear after all, though its pattern cannot be seen, is accepted.
     assert structure(lambda x, u, t: jnp.cumsum(jnp.concatenate([x, u]))[1:], 1, nonlinear_inputs=())[0] == set()
+
+
+@pytest.mark.parametrize("step", [lambda v: v.astype(int).astype(float), lambda v: v.astype(bool) * 1.0])
+def test_steps_are_not_linear(step):
+    points, averaged, constant = structure(lambda x, u, t: u[0] - step(x), 1)
+    assert points == {"x0"} and constant == {"u"} and not averaged
+
+
+def test_precision_does_not_matter():
+    assert structure(lambda x, u, t: u - x.astype(jnp.float32).astype(float), 1)[2] == {"x0", "u"}
