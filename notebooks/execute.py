@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import sys
 import tempfile
 import time
@@ -54,11 +55,15 @@ def tidy(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:
     for number, cell in enumerate(notebook.cells):
         cell.id = f"cell-{number}"
         cell.metadata = nbformat.from_dict({})
+        for output in cell.get("outputs", []):
+            if output.output_type == "stream":  # a warning starts with the path of a file
+                output.text = re.sub(r"(?m)^/\S*/site-packages/", "", output.text)
     return notebook
 
 
 def main() -> int:
     """Run the notebooks that the command line names."""
+    os.environ["PYTHONWARNINGS"] = "ignore:IProgress not found"  # in the kernel: there is no widget to draw a bar
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("names", nargs="*", help="such as 01_quickstart; default: all")
     parser.add_argument("--check", action="store_true", help="write nothing")
