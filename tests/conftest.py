@@ -8,11 +8,6 @@ import jax
 import jaxlib.version
 import pytest
 
-# Set before a backend exists. XLA's older emitters compile these small loops in half the time. Newer versions lack the
-# switch, and XLA ends the process at a switch that it does not know.
-if jaxlib.version.__version_info__ < (0, 11):
-    os.environ["XLA_FLAGS"] = "--xla_cpu_use_fusion_emitters=false " + os.environ.get("XLA_FLAGS", "")
-
 jax.config.update("jax_enable_x64", True)
 
 # Most of the time of a test is compilation. JAX_COMPILATION_CACHE_DIR moves the cache.
@@ -22,11 +17,23 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 
+def _measures_speed(config: pytest.Config) -> bool:
+    return "performance" in config.option.markexpr and "not performance" not in config.option.markexpr
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Compile faster, before a backend exists, except where speed is measured.
+
+    XLA's older emitters compile these small loops in half the time. Newer versions lack the switch, and XLA ends the
+    process at a switch that it does not know.
+    """
+    if jaxlib.version.__version_info__ < (0, 11) and not _measures_speed(config):
+        os.environ["XLA_FLAGS"] = "--xla_cpu_use_fusion_emitters=false " + os.environ.get("XLA_FLAGS", "")
+
+
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     """A worker per core up to four, each needs 2 GiB; one process where speed is measured."""
-    if "performance" in config.option.markexpr and "not performance" not in config.option.markexpr:
-        return 0
-    return min(os.cpu_count() or 1, 4)
+    return 0 if _measures_speed(config) else min(os.cpu_count() or 1, 4)
 
 
 @pytest.fixture(autouse=True, scope="module")
