@@ -81,7 +81,7 @@ def _print_task(
     source = arguments.data or "simulated by the model"
     missing = int(np.isnan(observed.y).sum())
     size = f"{len(observed.times)} rows of {', '.join(observed.outputs)}"
-    print(f"model    {model.name}: {model.summary}")
+    print(f"model    {model.name}: {model.summary}" if model.summary else f"model    {model.name}")
     print(f"data     {source}: {size}" + (f"; {missing} values missing" if missing else ""))
     if options:
         print("options  " + ", ".join(f"{name} = {value}" for name, value in options.items()))
