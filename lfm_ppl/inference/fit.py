@@ -154,13 +154,17 @@ def fit(
     outputs = site.example.ssm.model.output_names
     model = fix(numpyro_model, fixed, labels=outputs) if fixed else numpyro_model
     arguments = (times, y)
+    space = UnconstrainedModel(model, arguments, keywords, keys[2])
+    size = space.draw(keys[2], init_to_median).size
+    if size == 0:
+        raise ValueError("the model has no parameters to sample; use lfm.smooth for the forces of a known model.")
     if sampler == "map":
-        draws, stats, remarks = _mode(model, arguments, keywords, keys[1], samples, seed, init)
+        draws, stats, remarks = _mode(model, arguments, keywords, keys[1], samples, seed, init, size)
         chains, warmup = 1, 0
     else:
         strategy = _strategy(init, model, arguments, keywords, seed)
-        kernel, first, size = _kernel(sampler, model, arguments, keywords, strategy, sampler_options, keys[2], seed,
-                                      chains, init is not None)
+        kernel, first = _kernel(sampler, model, arguments, keywords, strategy, sampler_options, keys[2], seed, chains,
+                                init is not None, space, size)
         thin = thin or (_RAM_STEPS * size if sampler == "ram" else 1)
         draws, stats = _sample(kernel, sampler, arguments, keywords, keys[1], chains, warmup, samples, thin,
                                chain_method, progress, first)
@@ -232,20 +236,16 @@ def _strategy(init: Any, model: Callable, arguments: tuple, keywords: dict, seed
 
 def _kernel(sampler: str, model: Callable, arguments: tuple, keywords: dict, strategy: Any,
             options: Mapping[str, Any] | None, key: jax.Array, seed: int, chains: int,
-            chosen_start: bool) -> tuple[Any, Any, int]:
-    """Return the kernel, for RAM unless the user chose where to start starting points, and the number of parameters."""
+            chosen_start: bool, space: UnconstrainedModel, size: int) -> tuple[Any, Any]:
+    """Return the kernel and, for RAM unless the user chose where to start, starting points."""
     options = dict(options or {})
-    space = UnconstrainedModel(model, arguments, keywords, key)
-    size = space.draw(key, init_to_median).size
-    if size == 0:
-        raise ValueError("the model has no parameters to sample; use lfm.smooth for the forces of a known model.")
     few = size <= _FORWARD_MODE_LIMIT
     if sampler == "nuts":
         options.setdefault("forward_mode_differentiation", few)
         options.setdefault("dense_mass", few)  # a full mass matrix is cheap to learn for a handful of parameters
-        return NUTS(model, init_strategy=strategy, **options), None, size
+        return NUTS(model, init_strategy=strategy, **options), None
     if "initial_covariance" in options:
-        return RAM(model, init_strategy=strategy, **options), None, size
+        return RAM(model, init_strategy=strategy, **options), None
     # A random walk that starts with the shape of the posterior needs no gradient afterwards, but learning that shape
     # by rejection takes thousands of steps. The mode gives it; chains start at draws from its Laplace approximation.
     with warnings.catch_warnings():
@@ -253,15 +253,15 @@ def _kernel(sampler: str, model: Callable, arguments: tuple, keywords: dict, str
         mode = map_estimate(model, *arguments, seed=seed, model_kwargs=keywords, restarts=2,
                             hessian="finite-differences", forward_mode=few)
     if mode.unidentified or not np.all(np.isfinite(mode.covariance)):
-        return RAM(model, init_strategy=strategy, **options), None, size
+        return RAM(model, init_strategy=strategy, **options), None
     kernel = RAM(model, init_strategy=strategy, initial_covariance=mode.covariance, **options)
     if chosen_start:
-        return kernel, None, size
+        return kernel, None
     root = np.linalg.cholesky(mode.covariance)
     points = mode.mode + np.asarray(jax.random.normal(key, (chains, size))) @ root.T
     possible = np.isfinite(np.asarray(jax.jit(jax.vmap(space.potential))(jnp.asarray(points))))
     points = jnp.asarray(np.where(possible[:, None], points, mode.mode))
-    return kernel, jax.vmap(space.unravel)(points) if chains > 1 else space.unravel(points[0]), size
+    return kernel, jax.vmap(space.unravel)(points) if chains > 1 else space.unravel(points[0])
 
 
 def _sample(kernel: Any, sampler: str, arguments: tuple, keywords: dict, key: jax.Array, chains: int, warmup: int,
@@ -282,11 +282,13 @@ def _sample(kernel: Any, sampler: str, arguments: tuple, keywords: dict, key: ja
 
 
 def _mode(model: Callable, arguments: tuple, keywords: dict, key: jax.Array, samples: int, seed: int,
-          init: Any) -> tuple[dict, dict, dict]:
+          init: Any, size: int) -> tuple[dict, dict, dict]:
     if isinstance(init, str):
         checks.one_of("init", init, ("map", "median"))
         init = None
-    mode = map_estimate(model, *arguments, seed=seed, model_kwargs=keywords, init=init)
+    # Second derivatives take longer to compile than everything else here takes to run.
+    mode = map_estimate(model, *arguments, seed=seed, model_kwargs=keywords, init=init, hessian="finite-differences",
+                        forward_mode=size <= _FORWARD_MODE_LIMIT)
     draws = {label: np.asarray(value)[None] for label, value in mode.sample(key, samples).items()}
     remarks = {"map_converged": int(mode.converged), "map_message": mode.message,
                "map_log_density": float(mode.log_density), "log_evidence": float(mode.log_evidence)}

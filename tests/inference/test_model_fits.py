@@ -28,6 +28,7 @@ def assert_complete(result, name):
     assert arviz_data.attributes(result)["model"] == name
 
 
+@pytest.mark.slow
 def test_double_well_in_a_few_draws():
     result = fitted("ginzburg-landau", sampler="nuts", chains=2, warmup=30, samples=20, trajectory_draws=10)
     assert_complete(result, "ginzburg-landau")
