@@ -67,6 +67,24 @@ class Outputs(eqx.Module):
         return self.matrix @ jnp.concatenate([x, u])
 
 
+class Kicked(lfm.Matern):
+    """At each time in ``kicks`` the force keeps ``share`` of itself and draws the rest anew."""
+
+    share: Any = 0.3
+    kicks: tuple = eqx.field(static=True, default=())
+
+    def __init__(self, share, kicks, *args):
+        super().__init__(*args)
+        self.share, self.kicks = share, kicks
+
+    @property
+    def jump_times(self):
+        return self.kicks
+
+    def jump(self, index):
+        return self.share * jnp.eye(self.state_dim), (1 - self.share**2) * self.initial_covariance()
+
+
 def whole_state(x, u, t):
     return x
 

@@ -18,10 +18,12 @@ LAYERS = (
     ("model",),
     ("linearisation",),
     ("filtering",),
+    ("comparators",),
     ("inference",),
     ("analysis",),
     ("inference.fit",),
     ("loading",),
+    ("experiments",),
     ("cli", "__main__"),
 )
 RANK = {name: rank for rank, layer in enumerate(LAYERS) for name in layer}

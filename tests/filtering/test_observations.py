@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from references import LinearLFM, Regression, gauss_hermite, matern
-from systems import Linear, Outputs, double_well, first_state, identity, motif, softplus
+from systems import Kicked, Linear, Outputs, double_well, first_state, identity, motif, softplus
 
 import lfm_ppl as lfm
 
@@ -109,24 +107,6 @@ def test_non_linear_observation_by_points():
     assert np.isclose(found.log_likelihood[0], -0.5 * ((0.7 - mean) ** 2 / variance + np.log(2 * np.pi * variance)),
                       rtol=1e-10)
     assert np.isclose(found.filtered_mean[0, 0], m + 2 * m * v / variance * (0.7 - mean), rtol=1e-10)
-
-
-class Kicked(lfm.Matern):
-    """At each time in ``kicks`` the force keeps ``share`` of itself and draws the rest anew."""
-
-    share: Any = 0.3
-    kicks: tuple = eqx.field(static=True, default=())
-
-    def __init__(self, share, kicks, *args):
-        super().__init__(*args)
-        self.share, self.kicks = share, kicks
-
-    @property
-    def jump_times(self):
-        return self.kicks
-
-    def jump(self, index):
-        return self.share * jnp.eye(self.state_dim), (1 - self.share**2) * self.initial_covariance()
 
 
 @pytest.mark.parametrize("link", [identity, softplus])

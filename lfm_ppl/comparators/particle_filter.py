@@ -1,0 +1,322 @@
+"""Bootstrap particle filter: an unbiased estimate of the likelihood of any state-space model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import logsumexp
+from numpyro.util import is_prng_key
+
+from lfm_ppl import checks
+from lfm_ppl.comparators.normals import normals
+from lfm_ppl.comparators.resampling import RESAMPLING, effective_sample_size, resample
+from lfm_ppl.comparators.stochastic_steps import Prepared, advance, choose_scheme, prepare
+from lfm_ppl.filtering.filter import check_observations, warn_single_precision
+from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays, schedule
+from lfm_ppl.linalg import cholesky, matmul, semidefinite_root, solve_lower
+from lfm_ppl.model.augment import StateSpaceModel, state_space
+from lfm_ppl.model.latent_force_model import LatentForceModel
+
+_LOG_2PI = float(np.log(2.0 * np.pi))
+
+
+class ParticleSettings(NamedTuple):
+    """How the filter runs; hashable, so that compiled code can take it as static.
+
+    Attributes:
+        particles: N.
+        resampling: one of `lfm_ppl.comparators.resampling.RESAMPLING`.
+        threshold: resample where the effective sample size is below this share of N; 1 for always.
+        scheme: of the steps, see `lfm_ppl.comparators.stochastic_steps.choose_scheme`.
+        batch: particles that are moved and weighted at a time; None: all.
+    """
+
+    particles: int = 1000
+    resampling: str = "systematic"
+    threshold: float = 0.5
+    scheme: str = "auto"
+    batch: int | None = None
+
+
+class ParticleFilterResult(eqx.Module):
+    """The outcome of `particle_filter`.
+
+    Attributes:
+        times: (T,).
+        log_likelihood: (T,), logarithms of the estimates of p(y_k | y_1:k-1). The exponential of their SUM is an
+            unbiased estimate of the likelihood.
+        mean, covariance: (T, n), (T, n, n), filtering moments of the joint state.
+        ess: (T,), effective sample size of the weights after each observation, before resampling.
+        resampled: (T,), whether the particles were resampled after it.
+        particles: N.
+        scheme: of the steps.
+    """
+
+    times: jax.Array
+    log_likelihood: jax.Array
+    mean: jax.Array
+    covariance: jax.Array
+    ess: jax.Array
+    resampled: jax.Array
+    particles: int = eqx.field(static=True)
+    scheme: str = eqx.field(static=True)
+
+    @property
+    def minimum_ess(self) -> tuple[float, float]:
+        """The smallest effective sample size, and the time at which it occurs."""
+        worst = int(np.argmin(np.asarray(self.ess)))
+        return float(self.ess[worst]), float(self.times[worst])
+
+
+class Step(NamedTuple):
+    """What a row leaves.
+
+    Attributes:
+        log_likelihood: of the row's observation, zero without one.
+        state: (n, N), the particles before resampling.
+        log_weights: (N,), normalised, after the observation.
+        ess: of these weights.
+        resampled: whether they were resampled.
+        ancestors: (N,), which particles go on.
+    """
+
+    log_likelihood: jax.Array
+    state: Any = None
+    log_weights: Any = None
+    ess: Any = None
+    resampled: Any = None
+    ancestors: Any = None
+
+
+def particle_filter(model: LatentForceModel, times: Any, y: Any, key: jax.Array, *, particles: int = 10_000,
+                    steps: int = 20, max_step: float | None = None, resampling: str = "systematic",
+                    threshold: float = 0.5, scheme: str = "auto", batch: int | None = None) -> ParticleFilterResult:
+    """Run the bootstrap particle filter.
+
+    Particles follow the model itself, forces exactly and the physical state by a stochastic Runge-Kutta scheme; at an
+    observation particle i gets the weight p(y_k | s_i), and
+
+        p(y_k | y_1:k-1) ~ sum_i W_i p(y_k | s_i),
+
+    with W the normalised weights of before. The product over k is an unbiased estimate of the likelihood (of the model
+    as the steps discretise it), whatever the number of particles.
+
+    Args:
+        model: the latent force model.
+        times: (T,), non-decreasing; equal times are replicates.
+        y: (T, D), NaN where missing.
+        key: a JAX random key.
+        particles: N.
+        steps: integration steps between two consecutive times.
+        max_step: longest step; longer intervals get more.
+        resampling: "systematic", "stratified" or "multinomial".
+        threshold: resample where the effective sample size is below this share of N; 1 for after every observation.
+        scheme: of the steps: "exact" (linear time-invariant models), "srk" (additive noise, strong order 1.5),
+            "milstein" (strong order 1; with several noise sources they must commute), "euler", or "auto" for the first
+            of these that the model allows, Milstein with one noise source only.
+        batch: particles that are moved and weighted at a time, one batch after another, where memory is short: what is
+            held besides the particles is proportional to it. None: all at once, which is faster.
+
+    Returns:
+        Log likelihoods, filtering moments and effective sample sizes, by observation.
+
+    Raises:
+        ValueError, TypeError: as `lfm_ppl.filter`; zero particles; an unknown name; observation noise whose covariance
+            is singular, so that the weights have no density.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, lfm_ppl as lfm
+        >>> model = lfm.LatentForceModel(
+        ...     lambda x, u, t: x - x**3, {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        ...     lfm.Gaussian(jnp.zeros(1), jnp.eye(1)), process_noise=jnp.eye(1))
+        >>> result = lfm.particle_filter(model, jnp.arange(3.0), jnp.ones((3, 1)), jax.random.key(0), particles=100)
+        >>> result.scheme
+        'srk'
+
+    Source: Gordon, Salmond and Smith (1993), IEE Proceedings F 140(2); Rössler (2010), SIAM J. Numer. Anal. 48(3).
+    """
+    ssm, plan, y = checked(model, times, y, key, steps, max_step)
+    settings = check_settings(ssm, ParticleSettings(particles, resampling, threshold, scheme, batch))
+    return _run(ssm, plan, y, jnp.asarray(times, float), key, settings)
+
+
+@eqx.filter_jit
+def _run(ssm: StateSpaceModel, plan: Schedule, y: jax.Array, times: jax.Array, key: jax.Array,
+         settings: ParticleSettings) -> ParticleFilterResult:
+    def summary(step: Step) -> tuple:
+        return step.log_likelihood, *_moments(step.state, step.log_weights), step.ess, step.resampled
+
+    kept = forward(ssm, plan, y, key, settings, summary)
+    total, mean, covariance, ess, resampled = (part[jnp.asarray(plan.observed)] for part in kept)
+    return ParticleFilterResult(times, total, mean, covariance, ess, resampled, settings.particles, settings.scheme)
+
+
+def log_likelihood(ssm: StateSpaceModel, plan: Schedule, y: jax.Array, key: jax.Array,
+                   settings: ParticleSettings) -> jax.Array:
+    """Return the log of an unbiased estimate of the likelihood, for compiled code; a failure is -inf.
+
+    Args:
+        ssm: the model; it may hold traced parameters.
+        plan: the rows.
+        y: (T, D), NaN where missing.
+        key: a JAX random key.
+        settings: checked ones, see `check_settings`.
+    """
+    total = forward(ssm, plan, y, key, settings, lambda step: step.log_likelihood).sum()
+    return jnp.where(jnp.isnan(total), -jnp.inf, total)
+
+
+def checked(model: LatentForceModel, times: Any, y: Any, key: jax.Array, steps: int, max_step: float | None,
+            at: Any = None, row_per_step: bool = False) -> tuple[StateSpaceModel, Schedule, jax.Array]:
+    """Check what a particle method is given, and return state-space model, rows and observations."""
+    if not is_prng_key(key):
+        raise TypeError(f"key must be a JAX random key, such as jax.random.key(0), got {key!r}.")
+    ssm = state_space(model)
+    plan = schedule(ssm, times, steps, max_step, at, row_per_step=row_per_step)
+    model.check_at(plan.initial_time, len(plan.observed))
+    check_noise(ssm, plan.initial_time)
+    warn_single_precision()
+    return ssm, plan, check_observations(y, len(plan.observed), ssm.output_dim)
+
+
+def check_settings(ssm: StateSpaceModel, settings: ParticleSettings) -> ParticleSettings:
+    """Check the settings, and return them with the scheme that "auto" stands for."""
+    checks.positive_integer("particles", settings.particles)
+    checks.one_of("resampling", settings.resampling, RESAMPLING)
+    if not 0.0 <= settings.threshold <= 1.0:
+        raise ValueError(f"threshold must lie in [0, 1], a share of the particles, got {settings.threshold}.")
+    if settings.batch is not None:
+        checks.positive_integer("batch", settings.batch)
+    return settings._replace(scheme=choose_scheme(ssm, settings.scheme))
+
+
+def check_noise(ssm: StateSpaceModel, time: Any) -> None:
+    """Raise ValueError where the observation noise has no density at the prior mean (where that is known)."""
+    w = jnp.concatenate([ssm.model.initial_state.mean, ssm.stack.mean_at(time)])
+    covariance = checks.concrete(ssm.noise_covariance(w, jnp.asarray(time, float), jnp.asarray(0)))
+    if covariance is None:
+        return
+    scale = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    for name, sd in zip(ssm.model.output_names, scale, strict=True):
+        if sd == 0.0:
+            raise ValueError(f"the observation noise of {name!r} is zero, so that an observation has no density given "
+                             "a particle. Give it a positive variance.")
+    if np.linalg.eigvalsh(covariance / np.outer(scale, scale)).min() < 1e-13:
+        raise ValueError("the covariance of the observation noise is singular, so that an observation has no density "
+                         f"given a particle: {covariance.tolist()}. Leave out the redundant outputs.")
+
+
+def forward(ssm: StateSpaceModel, plan: Schedule, y: jax.Array, key: jax.Array, settings: ParticleSettings,
+            keep: Callable[[Step], Any]) -> Any:
+    """Run over the rows and return ``keep`` of each, stacked."""
+    first_key, rows_key = jax.random.split(key)
+    mean, covariance = ssm.initial()
+    size = settings.particles
+    state = mean[:, None] + matmul(semidefinite_root(covariance), normals(first_key, ssm.state_dim, size))
+    table = None if plan.lengths is None else jax.vmap(
+        lambda length: prepare(ssm, settings.scheme, length, plan.steps))(jnp.asarray(plan.lengths))
+    padded = jnp.concatenate([jnp.asarray(y, float), jnp.full((1, ssm.output_dim), jnp.nan)])
+
+    def row(carry: tuple[jax.Array, jax.Array], inputs: tuple[Rows, jax.Array, jax.Array]) -> tuple[tuple, Any]:
+        state, log_weights = carry
+        one, observed, row_key = inputs
+        keys = jax.random.split(row_key, 3)
+        ready = (prepare(ssm, settings.scheme, one.length, plan.steps) if table is None
+                 else jax.tree_util.tree_map(lambda a: a[one.kind], table))
+        state, log_density = _in_batches(
+            lambda k, s: _move(ssm, settings, plan, ready, one, observed, k, s), keys[0], state, settings.batch)
+        state, log_weights, step = _weigh(settings, keys[1], state, log_weights, log_density, one.observation >= 0)
+        return (state, log_weights), keep(step)
+
+    start = (state, jnp.full(size, -np.log(size)))
+    rows = as_arrays(plan.rows)
+    keys = jax.random.split(rows_key, rows.start.shape[0])
+    return jax.lax.scan(row, start, (rows, padded[rows.observation], keys))[1]
+
+
+def _move(ssm: StateSpaceModel, settings: ParticleSettings, plan: Schedule, ready: Prepared, row: Rows,
+          observed: jax.Array, key: jax.Array, state: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Move particles over a row, let the forces jump at its end, and score the observation there."""
+    move_key, jump_key = jax.random.split(key)
+    move = lambda s: advance(  # noqa: E731
+        ssm, settings.scheme, ready, normals, move_key, s, row.start, row.length, plan.steps)
+    if plan.replicated:
+        state = jax.lax.cond(row.length > 0, move, lambda s: s, state)
+    else:
+        state = move(state)
+    for index in range(len(ssm.stack.jump_times)):
+        state = jnp.where(row.jump == index, _jumped(ssm, index, jump_key, state), state)
+    end = row.start + row.length
+    density = jax.vmap(lambda s: log_observation(ssm, s, end, jnp.maximum(row.observation, 0), observed),
+                       in_axes=-1)(state)
+    possible = jnp.isfinite(state).all(axis=0) & ~jnp.isnan(density)
+    return state, jnp.where(possible, density, -jnp.inf)
+
+
+def _jumped(ssm: StateSpaceModel, index: int, key: jax.Array, state: jax.Array) -> jax.Array:
+    transition, covariance = ssm.stack.jump(index)
+    noise = normals(jax.random.fold_in(key, index), ssm.force_dim, state.shape[1])
+    forces = matmul(transition, state[ssm.physical_dim:]) + matmul(semidefinite_root(covariance), noise)
+    return jnp.concatenate([state[:ssm.physical_dim], forces])
+
+
+def log_observation(ssm: StateSpaceModel, s: jax.Array, t: jax.Array, row: jax.Array, y: jax.Array) -> jax.Array:
+    """Return log p(y | s) of the present entries of ``y`` (D,), zero where all are missing."""
+    w = s
+    if ssm.force_dim:
+        matrix, offset = ssm.input_map(t)
+        w = matmul(matrix, s[:, None])[:, 0] + offset
+    present = jnp.isfinite(y)
+    residual = jnp.where(present, y, 0.0) - ssm.observe(w, t)
+    for index in ssm.model.observation.angular:
+        residual = residual.at[index].set(jnp.arctan2(jnp.sin(residual[index]), jnp.cos(residual[index])))
+    residual = jnp.where(present, residual, 0.0)
+    both = present[:, None] & present[None, :]
+    factor = cholesky(jnp.where(both, ssm.noise_covariance(w, t, row), jnp.eye(y.shape[0])))
+    white = solve_lower(factor.chol, residual)
+    value = -0.5 * ((white**2).sum() + present.sum() * _LOG_2PI) - jnp.log(jnp.diagonal(factor.chol)).sum()
+    return jnp.where(factor.degenerate.any(), -jnp.inf, value)
+
+
+def _weigh(settings: ParticleSettings, key: jax.Array, state: jax.Array, log_weights: jax.Array,
+           log_density: jax.Array, observed: jax.Array) -> tuple[jax.Array, jax.Array, Step]:
+    size = settings.particles
+    equal = jnp.full(size, -np.log(size))
+    joint = log_weights + log_density
+    total = logsumexp(joint)
+    # Where no particle explains the observation the estimate is zero for good; the particles go on as they are.
+    alive = jnp.isfinite(total)
+    log_weights = jnp.where(alive, joint - jnp.where(alive, total, 0.0), equal)
+    weights = jnp.exp(log_weights)
+    ess = effective_sample_size(weights)
+    needed = observed & (ess < settings.threshold * size) if settings.threshold < 1.0 else observed
+    stay = jnp.arange(size)
+    ancestors = jax.lax.cond(needed, lambda: resample(key, weights, settings.resampling), lambda: stay)
+    step = Step(jnp.where(observed, total, 0.0), state, log_weights, ess, needed, ancestors)
+    return state[:, ancestors], jnp.where(needed, equal, log_weights), step
+
+
+def _in_batches(move: Callable, key: jax.Array, state: jax.Array, batch: int | None) -> tuple[jax.Array, jax.Array]:
+    size = state.shape[1]
+    if batch is None or batch >= size:
+        return move(key, state)
+    count = -(-size // batch)
+    # Full batches only: the last one is filled up with copies, which are dropped again.
+    index = jnp.minimum(jnp.arange(count * batch), size - 1)
+    parts = jnp.moveaxis(state[:, index].reshape(-1, count, batch), 1, 0)
+    moved, density = jax.lax.map(lambda pair: move(*pair), (jax.random.split(key, count), parts))
+    return jnp.moveaxis(moved, 0, 1).reshape(state.shape[0], -1)[:, :size], density.reshape(-1)[:size]
+
+
+def _moments(state: jax.Array, log_weights: jax.Array) -> tuple[jax.Array, jax.Array]:
+    weights = jnp.exp(log_weights)
+    # A particle that has left the finite numbers has weight zero, and zero times infinity is NaN.
+    state = jnp.where(weights > 0, state, 0.0)
+    mean = state @ weights
+    centred = state - mean[:, None]
+    return mean, (centred * weights) @ centred.T
