@@ -114,15 +114,16 @@ def advance(ssm: StateSpaceModel, scheme: str, prepared: Prepared, draw: Callabl
     step = {"srk": srk, "milstein": milstein, "euler": euler}[scheme]
     sources, wide = _sources(ssm), prepared.root.shape[0]
     h = length / steps
+    used = 2 * sources if scheme == "srk" else sources  # the others have no use for the average of the path
 
     def body(state: jax.Array, index: jax.Array) -> tuple[jax.Array, None]:
-        noise = draw(jax.random.fold_in(key, index), 2 * sources + wide, count)
+        noise = draw(jax.random.fold_in(key, index), used + wide, count)
         # The forces' state at the end, and their average over the step, before the drift is asked for anything.
-        kicked = _columns(prepared.root, noise[2 * sources:])
+        kicked = _columns(prepared.root, noise[used:])
         one = lambda s, first, second, kick: step(  # noqa: E731
             ssm, prepared, h, start + index * h, s, (first, second), kick)
         return jax.vmap(one, in_axes=-1, out_axes=-1)(
-            state, noise[:sources], noise[sources:2 * sources], kicked), None
+            state, noise[:sources], noise[used - sources:used], kicked), None
 
     return jax.lax.scan(body, state, jnp.arange(steps))[0]
 

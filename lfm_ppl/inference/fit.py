@@ -26,17 +26,19 @@ from lfm_ppl.filtering.schedule import schedule
 from lfm_ppl.inference.fixing import fix
 from lfm_ppl.inference.map import map_estimate
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
+from lfm_ppl.inference.particle_marginal import ParticleMarginalRAM
 from lfm_ppl.inference.posterior import LikelihoodSite, likelihood_site, scores, trajectories
 from lfm_ppl.inference.ram import RAM
 from lfm_ppl.inference.unconstrained import UnconstrainedModel
 
-SAMPLERS = ("nuts", "ram", "map")
+SAMPLERS = ("nuts", "ram", "pmmh", "map")
 
 _FORWARD_MODE_LIMIT = 10
 """Most unconstrained parameters for which forward-mode gradients are the faster ones."""
 
-_RAM_STEPS = 5
-"""Steps of RAM for each parameter that make one draw: a random walk in d dimensions forgets in some multiple of d."""
+_STEPS_A_DRAW = {"ram": 5, "pmmh": 1}
+"""Steps for each parameter that make one draw: a random walk in d dimensions forgets in some multiple of d. A step of
+particle-marginal RAM takes some hundred times as long as one of RAM, so that it makes fewer."""
 
 _GRID = 200
 """Number of grid points of trajectories where no times are asked for."""
@@ -45,6 +47,8 @@ _EXTRA_FIELDS = {
     "nuts": {"diverging": "diverging", "accept_prob": "acceptance_rate", "num_steps": "n_steps", "energy": "energy",
              "adapt_state.step_size": "step_size", "potential_energy": "lp"},
     "ram": {"accept_prob": "acceptance_rate", "accepted": "accepted", "potential_energy": "lp"},
+    "pmmh": {"accept_prob": "acceptance_rate", "accepted": "accepted", "potential_energy": "lp",
+             "estimated": "estimated"},
 }
 
 
@@ -81,21 +85,23 @@ def fit(
             ``numpyro.sample(name, lfm.MarginalLikelihood(...), obs=y)``, or a `lfm.panel` in a plate.
         times: (T,), non-decreasing.
         y: (T, D), NaN where missing; (B, T, D) for a panel.
-        sampler: "nuts", "ram" (robust adaptive Metropolis), or "map" (posterior mode; the draws come from its
-            Laplace approximation).
+        sampler: "nuts", "ram" (robust adaptive Metropolis), "pmmh" (particle-marginal RAM: a particle filter estimates
+            the likelihood, and the posterior is exact up to its integration steps), or "map" (posterior mode; the draws
+            come from its Laplace approximation).
         chains: number of chains.
         warmup: number of warm-up steps in each.
         samples: number of draws in each; for "map", in all.
-        thin: steps of the chain that make one draw, in the warm-up too. By default 1 for NUTS, and 5 for each
-            parameter for RAM, whose steps are cheap and short.
+        thin: steps of the chain that make one draw, in the warm-up too. By default 1 for NUTS, 5 for each parameter
+            for RAM, whose steps are cheap and short, and 1 for each parameter for particle-marginal RAM.
         seed: of everything random.
         at: times of the trajectories; by default a grid over the data. Times after the last are forecasts.
         trajectory_draws: number of posterior draws, spread over the chains, for which trajectories are drawn; 0: none.
         model_kwargs: keyword arguments of the model.
         fixed: parameters that are not learnt: name -> value, ``{"decay": 0.8}`` or ``{"decay[CDKN1A]": 0.8}``.
         init: starting points: "map" for the posterior mode, "median" for the prior median, or a NumPyro strategy; by
-            default the prior median for NUTS, and draws from the Laplace approximation at the mode for RAM.
-        sampler_options: further arguments of NUTS or RAM, for example ``{"target_accept_prob": 0.95}``.
+            default the prior median for NUTS, and draws from the Laplace approximation at the mode for the others.
+        sampler_options: further arguments of NUTS, `RAM` or `ParticleMarginalRAM`, for example
+            ``{"target_accept_prob": 0.95}`` or ``{"particles": 500, "delayed": True}``.
         chain_method: "parallel", "vectorized" or "sequential"; by default parallel where there are as many devices as
             chains (``numpyro.set_host_device_count(chains)`` before JAX starts), sequential otherwise.
         progress: show a progress bar.
@@ -107,10 +113,11 @@ def fit(
 
         - ``posterior``: parameters, with coordinates;
         - ``sample_stats``;
-        - ``log_likelihood``: leave-one-out conditionals log p(y_k | y_-k, theta), which make ``az.loo`` right for
-          dependent data;
+        - ``log_likelihood``: the Gaussian filter's leave-one-out conditionals log p(y_k | y_-k, theta), which make
+          ``az.loo`` right for dependent data;
         - ``one_step_ahead``: log p(y_k | y_1:k-1, theta) and standardised residuals;
-        - ``trajectories``: forces, states and noise-free outputs at ``at``, given the data;
+        - ``trajectories``: forces, states and noise-free outputs at ``at``, given the data; from the Gaussian smoother,
+          and for "pmmh" from the particle smoother;
         - ``posterior_predictive``: replicated data along these trajectories. (``numpyro.infer.Predictive`` with the
           same draws simulates NEW forces instead.)
         - ``observed_data``, and ``truth`` where known.
@@ -158,6 +165,7 @@ def fit(
     size = space.draw(keys[2], init_to_median).size
     if size == 0:
         raise ValueError("the model has no parameters to sample; use lfm.smooth for the forces of a known model.")
+    particles = None
     if sampler == "map":
         draws, stats, remarks = _mode(model, arguments, keywords, keys[1], samples, seed, init, size)
         chains, warmup = 1, 0
@@ -165,16 +173,20 @@ def fit(
         strategy = _strategy(init, model, arguments, keywords, seed)
         kernel, first = _kernel(sampler, model, arguments, keywords, strategy, sampler_options, keys[2], seed, chains,
                                 init is not None, space, size)
-        thin = thin or (_RAM_STEPS * size if sampler == "ram" else 1)
+        thin = thin or _STEPS_A_DRAW.get(sampler, 0) * size or 1
         draws, stats = _sample(kernel, sampler, arguments, keywords, keys[1], chains, warmup, samples, thin,
                                chain_method, progress, first)
         remarks = {"thin": thin}
+        if isinstance(kernel, ParticleMarginalRAM) and kernel.tuned is not None:
+            particles = kernel.settings
+            remarks |= {"particles": kernel.tuned.particles, "log_likelihood_sd": kernel.tuned.sd,
+                        "delayed": int(kernel.delayed)}
     flat = {label: value.reshape(-1, *value.shape[2:]) for label, value in draws.items()}
     latent = _latent(model, arguments, keywords, keys[0], flat)
     rated = _kept("scores of the observations", lambda: scores(
         model, arguments, keywords, latent, y, site), None)
     chosen, paths, grid = _kept("trajectories", lambda: _paths(
-        model, arguments, keywords, latent, site, y, at, trajectory_draws, chains, samples, keys[3]),
+        model, arguments, keywords, latent, site, y, at, trajectory_draws, chains, samples, keys[3], particles),
         (None, None, None))
     groups = _groups(site, draws, stats, rated, paths, chosen, grid, times, y, truth, chains, samples)
     attrs = {
@@ -237,15 +249,16 @@ def _strategy(init: Any, model: Callable, arguments: tuple, keywords: dict, seed
 def _kernel(sampler: str, model: Callable, arguments: tuple, keywords: dict, strategy: Any,
             options: Mapping[str, Any] | None, key: jax.Array, seed: int, chains: int,
             chosen_start: bool, space: UnconstrainedModel, size: int) -> tuple[Any, Any]:
-    """Return the kernel and, for RAM unless the user chose where to start, starting points."""
+    """Return the kernel and, for a random walk unless the user chose where to start, starting points."""
     options = dict(options or {})
     few = size <= _FORWARD_MODE_LIMIT
     if sampler == "nuts":
         options.setdefault("forward_mode_differentiation", few)
         options.setdefault("dense_mass", few)  # a full mass matrix is cheap to learn for a handful of parameters
         return NUTS(model, init_strategy=strategy, **options), None
+    walk = RAM if sampler == "ram" else ParticleMarginalRAM
     if "initial_covariance" in options:
-        return RAM(model, init_strategy=strategy, **options), None
+        return walk(model, init_strategy=strategy, **options), None
     # A random walk that starts with the shape of the posterior needs no gradient afterwards, but learning that shape
     # by rejection takes thousands of steps. The mode gives it; chains start at draws from its Laplace approximation.
     with warnings.catch_warnings():
@@ -253,8 +266,11 @@ def _kernel(sampler: str, model: Callable, arguments: tuple, keywords: dict, str
         mode = map_estimate(model, *arguments, seed=seed, model_kwargs=keywords, restarts=2,
                             hessian="finite-differences", forward_mode=few)
     if mode.unidentified or not np.all(np.isfinite(mode.covariance)):
-        return RAM(model, init_strategy=strategy, **options), None
-    kernel = RAM(model, init_strategy=strategy, initial_covariance=mode.covariance, **options)
+        return walk(model, init_strategy=strategy, **options), None
+    if sampler == "pmmh" and options.get("particles") is None:
+        # At the mode, because a chain's own start may be a poor place to judge the estimate by.
+        options |= {"tune_at": space.unravel(jnp.asarray(mode.mode))}
+    kernel = walk(model, init_strategy=strategy, initial_covariance=mode.covariance, **options)
     if chosen_start:
         return kernel, None
     root = np.linalg.cholesky(mode.covariance)
@@ -304,7 +320,8 @@ def _latent(model: Callable, arguments: tuple, keywords: dict, key: jax.Array, f
 
 
 def _paths(model: Callable, arguments: tuple, keywords: dict, latent: dict, site: LikelihoodSite, y: Any, at: Any,
-           count: int, chains: int, samples: int, key: jax.Array) -> tuple[np.ndarray, dict | None, np.ndarray | None]:
+           count: int, chains: int, samples: int, key: jax.Array,
+           particles: Any) -> tuple[np.ndarray, dict | None, np.ndarray | None]:
     """Draw trajectories for draws that are spread evenly over each chain."""
     per_chain = min(samples, -(-count // chains))
     if per_chain == 0:
@@ -318,7 +335,7 @@ def _paths(model: Callable, arguments: tuple, keywords: dict, latent: dict, site
         grid = (np.union1d(np.linspace(min(origin, times[0]), times[-1], _GRID), times) if at is None
                 else np.atleast_1d(np.asarray(at, float)))
     subset = {label: value[rows] for label, value in latent.items()}
-    paths = trajectories(model, arguments, keywords, subset, y, grid, key, site)
+    paths = trajectories(model, arguments, keywords, subset, y, grid, key, site, particles)
     return chosen, {k: v.reshape(chains, len(chosen), *v.shape[1:]) for k, v in paths.items()}, grid
 
 

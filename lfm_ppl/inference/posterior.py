@@ -11,6 +11,9 @@ import numpy as np
 from numpyro import handlers
 
 from lfm_ppl import checks
+from lfm_ppl.comparators.particle_filter import ParticleSettings
+from lfm_ppl.comparators.particle_smoother import TRACING, draw_trajectories
+from lfm_ppl.filtering.schedule import schedule
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
 from lfm_ppl.linalg import matmul, semidefinite_root
 
@@ -76,14 +79,15 @@ def scores(model: Callable, arguments: tuple, keywords: Mapping[str, Any], draws
                 "residual": result.residual}
 
     def per_draw(parameters: Any, key: jax.Array) -> dict[str, jax.Array]:
-        distribution = _drawn(model, arguments, keywords, key, parameters, known)
-        return _each(distribution, one, jnp.asarray(y, float))
+        distribution = drawn(model, arguments, keywords, key, parameters, known)
+        return each(distribution, one, jnp.asarray(y, float))
 
-    return _over_draws(per_draw, draws, jax.random.key(0), len(np.ravel(arguments[0])), known)
+    return over_draws(per_draw, draws, jax.random.key(0), len(np.ravel(arguments[0])), known)
 
 
 def trajectories(model: Callable, arguments: tuple, keywords: Mapping[str, Any], draws: Mapping[str, Any], y: Any,
-                 at: Any, key: jax.Array, known: LikelihoodSite) -> dict[str, np.ndarray]:
+                 at: Any, key: jax.Array, known: LikelihoodSite,
+                 particles: ParticleSettings | None = None) -> dict[str, np.ndarray]:
     """Draw one trajectory for each draw of the parameters, given the data, and replicate the data along it.
 
     Args:
@@ -95,6 +99,7 @@ def trajectories(model: Callable, arguments: tuple, keywords: Mapping[str, Any],
         at: (K,) times of the trajectories, or None for the observation times.
         key: a JAX random key.
         known: the site outside of compiled code, where its times are numbers.
+        particles: draw the trajectories with the particle smoother; None: with the Gaussian one.
 
     Returns:
         ``state`` (S, ..., K, M), ``force`` (S, ..., K, R), ``output`` (S, ..., K, D) free of noise, and ``y``
@@ -107,11 +112,11 @@ def trajectories(model: Callable, arguments: tuple, keywords: Mapping[str, Any],
         times = jnp.asarray(distribution.times, float)
         both = None if at is None else np.concatenate([at, np.asarray(distribution.times, float)])
         path_key, noise_key = jax.random.split(key)
-        result = distribution.smooth(y, both)
-        path = result.sample(path_key, 1)
-        forces = [path.forces[name][0] for name in ssm.model.force_names]
-        w = jnp.concatenate([path.state[0], *(force[:, None] for force in forces)], axis=1)
-        output = jax.vmap(ssm.observe)(w, result.times)
+        if particles is None:
+            w, when = _smoothed_path(distribution, y, both, path_key)
+        else:
+            w, when = _particle_path(distribution, y, both, path_key, particles)
+        output = jax.vmap(ssm.observe)(w, when)
         row = jnp.arange(times.shape[0])
         covariance = jax.vmap(ssm.noise_covariance)(w[count:], times, row)
         noise = jax.random.normal(noise_key, (*output[count:].shape, 1))
@@ -122,31 +127,59 @@ def trajectories(model: Callable, arguments: tuple, keywords: Mapping[str, Any],
 
     def per_draw(parameters: Any, key: jax.Array) -> dict[str, jax.Array]:
         site_key, key = jax.random.split(key)
-        distribution = _drawn(model, arguments, keywords, site_key, parameters, known)
+        distribution = drawn(model, arguments, keywords, site_key, parameters, known)
         observed = jnp.asarray(y, float)
         keys = jax.random.split(key, observed.shape[0]) if isinstance(distribution, Panel) else key
-        return _each(distribution, one, observed, keys)
+        return each(distribution, one, observed, keys)
 
     rows = count + len(np.ravel(arguments[0]))
-    return _over_draws(per_draw, draws, key, rows, known)
+    width = 1 if particles is None else particles.particles
+    return over_draws(per_draw, draws, key, rows * width, known)
 
 
-def _drawn(model: Callable, arguments: tuple, keywords: Mapping[str, Any], key: jax.Array, parameters: Any,
-           known: LikelihoodSite) -> MarginalLikelihood | Panel:
-    """The likelihood under one draw. Times that the model converted to traced values are those that are known."""
+def _smoothed_path(distribution: MarginalLikelihood, y: jax.Array, at: Any,
+                   key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Draw the inputs (x, u) at times ``at`` (K,) from the Gaussian smoother: (K, M + R), and the times."""
+    result = distribution.smooth(y, at)
+    path = result.sample(key, 1)
+    forces = [path.forces[name][0][:, None] for name in distribution.ssm.model.force_names]
+    return jnp.concatenate([path.state[0], *forces], axis=1), result.times
+
+
+def _particle_path(distribution: MarginalLikelihood, y: jax.Array, at: Any, key: jax.Array,
+                   particles: ParticleSettings) -> tuple[jax.Array, jax.Array]:
+    """The same from a particle filter, by ancestor tracing."""
+    ssm = distribution.ssm
+    rows = distribution.event_shape[0] if at is None else len(at)
+    # As many steps over all rows as there are between the observations.
+    steps = -(-distribution.steps * distribution.event_shape[0] // rows)
+    plan = schedule(ssm, distribution.times, steps, distribution.max_step, at)
+    states, _ = draw_trajectories(ssm, plan, y, key, particles, 1, TRACING)
+    times = jnp.asarray(plan.requested_times, float)
+    matrix, offset = jax.vmap(ssm.input_map)(times)
+    return matmul(matrix, states[:, 0, :, None])[..., 0] + offset, times
+
+
+def drawn(model: Callable, arguments: tuple, keywords: Mapping[str, Any], key: jax.Array, parameters: Any,
+          known: LikelihoodSite) -> MarginalLikelihood | Panel:
+    """Return the likelihood under one draw, in compiled code too.
+
+    Times that the model converted to traced values are those of ``known``, the site outside of compiled code.
+    """
     distribution = likelihood_site(model, arguments, keywords, key, parameters).distribution
     return distribution.with_times(known.distribution.times) if checks.traced(distribution.times) else distribution
 
 
-def _each(distribution: MarginalLikelihood | Panel, function: Callable, *arguments: Any) -> Any:
+def each(distribution: MarginalLikelihood | Panel, function: Callable, *arguments: Any) -> Any:
+    """Return ``function(distribution, *arguments)``; of a panel, for each series, with the series as leading axis."""
     if isinstance(distribution, Panel):
         return distribution.mapped(function, *arguments)
     return function(distribution, *arguments)
 
 
-def _over_draws(per_draw: Callable, draws: Mapping[str, Any], key: jax.Array, rows: int,
-                known: LikelihoodSite) -> dict[str, np.ndarray]:
-    """Map over draws, in batches that bound the memory."""
+def over_draws(per_draw: Callable, draws: Mapping[str, Any], key: jax.Array, rows: int,
+               known: LikelihoodSite) -> dict[str, np.ndarray]:
+    """Return ``per_draw(parameters, key)`` for all draws (S, ...), in batches that bound the memory."""
     draws = {name: jnp.asarray(value) for name, value in draws.items()}
     count = next(iter(draws.values())).shape[0]
     numbers = rows * known.example.ssm.state_dim**2 * 6

@@ -80,34 +80,74 @@ def step(
         The state ``n``.
     """
     rng_key, key_noise, key_accept = jax.random.split(state.rng_key, 3)
-    flat, unravel = ravel_pytree(state.z)
-    noise = jax.random.normal(key_noise, flat.shape, flat.dtype)
-    proposal = unravel(flat + state.chol_proposal @ noise)
-    energy = potential(proposal)
-    energy = jnp.where(jnp.isfinite(energy), energy, jnp.inf)
-    # inf - inf, where both points are impossible, is NaN and counts as a rejection
-    ratio = jnp.exp(jnp.minimum(state.potential_energy - energy, 0.0))
-    accept_prob = jnp.where(jnp.isnan(ratio), 0.0, ratio).astype(flat.dtype)
-    accepted = jax.random.uniform(key_accept, (), flat.dtype) < accept_prob
+    proposal, noise = propose(state, key_noise)
+    energy = finite_or_infinity(potential(proposal))
+    accept_prob = acceptance(state.potential_energy - energy)
+    accepted = jax.random.uniform(key_accept, (), noise.dtype) < accept_prob
+    moved = state._replace(
+        z=choose(accepted, proposal, state.z),
+        potential_energy=jnp.where(accepted, energy, state.potential_energy),
+        accepted=accepted,
+        rng_key=rng_key,
+    )
+    return adapted(moved, noise, accept_prob, target_accept_prob, exponent, throughout)
 
+
+def propose(state: RAMState, key: jax.Array) -> tuple[Any, jax.Array]:
+    """Return a proposal ``x + S U``, shaped like ``state.z``, and the draw ``U`` (d,)."""
+    flat, unravel = ravel_pytree(state.z)
+    noise = jax.random.normal(key, flat.shape, flat.dtype)
+    return unravel(flat + state.chol_proposal @ noise), noise
+
+
+def finite_or_infinity(energy: jax.Array) -> jax.Array:
+    """Return the potential energy; a NaN or minus infinity, which no chain may accept, as infinity."""
+    return jnp.where(jnp.isfinite(energy), energy, jnp.inf)
+
+
+def acceptance(log_ratio: jax.Array) -> jax.Array:
+    """Return ``min(1, exp(log_ratio))``; inf - inf, where both points are impossible, counts as a rejection."""
+    ratio = jnp.exp(jnp.minimum(log_ratio, 0.0))
+    return jnp.where(jnp.isnan(ratio), 0.0, ratio)
+
+
+def choose(accepted: jax.Array, proposal: Any, present: Any) -> Any:
+    """Return the proposal where it is accepted, leaf by leaf."""
+    return jax.tree_util.tree_map(partial(jnp.where, accepted), proposal, present)
+
+
+def adapted(
+    state: RAMState,
+    noise: jax.Array,
+    accept_prob: jax.Array,
+    target_accept_prob: float | None,
+    exponent: float,
+    throughout: bool,
+) -> RAMState:
+    """Count the step that led to ``state``, and adapt its proposal.
+
+    Args:
+        state: position and energy after the step, everything else as before it.
+        noise: the draw ``U`` (d,) of the proposal.
+        accept_prob: ``alpha_n``.
+        target_accept_prob: as in ``step``, and so are the next two.
+        exponent: ``gamma``.
+        throughout: adapt after the warm-up as well.
+    """
+    accept_prob = accept_prob.astype(noise.dtype)
     i = state.i + 1
     warming_up = i <= state.num_warmup
-    eta = jnp.minimum(1.0, flat.size * i.astype(flat.dtype) ** -exponent)
+    eta = jnp.minimum(1.0, noise.size * i.astype(noise.dtype) ** -exponent)
     eta = jnp.where(warming_up | throughout, eta, 0.0)
-    target = target_accept_prob or (0.44 if flat.size == 1 else 0.234)
+    target = target_accept_prob or (0.44 if noise.size == 1 else 0.234)
     chol = adapt(state.chol_proposal, noise, eta * (accept_prob - target))
     in_phase = jnp.where(warming_up, i, i - state.num_warmup)
-    return RAMState(
+    return state._replace(
         i=i,
-        z=jax.tree_util.tree_map(partial(jnp.where, accepted), proposal, state.z),
-        potential_energy=jnp.where(accepted, energy, state.potential_energy),
         accept_prob=accept_prob,
-        accepted=accepted,
         mean_accept_prob=state.mean_accept_prob + (accept_prob - state.mean_accept_prob) / in_phase,
         step_size=_geometric_mean_scale(chol),
         chol_proposal=chol,
-        num_warmup=state.num_warmup,
-        rng_key=rng_key,
     )
 
 

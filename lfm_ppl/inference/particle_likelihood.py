@@ -1,0 +1,181 @@
+"""The likelihood of a NumPyro model, estimated by a particle filter in place of the Gaussian one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro.distributions as dist
+from numpyro import handlers
+from numpyro.distributions import constraints
+from numpyro.infer.util import potential_energy
+from numpyro.primitives import Messenger
+
+from lfm_ppl import checks
+from lfm_ppl.comparators.particle_filter import ParticleSettings, check_noise, check_settings, log_likelihood
+from lfm_ppl.filtering.schedule import schedule
+from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
+from lfm_ppl.inference.posterior import likelihood_site
+
+_REPLICATES = 64
+"""Filters whose log likelihoods give the standard deviation of one; that is known to a tenth of itself then."""
+
+_FEWEST, _MOST = 50, 200_000
+"""Least and largest number of particles that is chosen automatically."""
+
+
+class ParticleLikelihood(dist.Distribution):
+    """A likelihood whose log density is the log of an unbiased estimate, from one run of a particle filter.
+
+    Args:
+        base: the likelihood of the model; its times are used, its rule is not.
+        key: a JAX random key. The log density is a deterministic function of it.
+        settings: checked settings of the filter.
+        steps: integration steps between two times; None: those of ``base``.
+    """
+
+    support = constraints.real_matrix
+    pytree_data_fields = ("base", "key")
+    pytree_aux_fields = ("settings", "steps")
+
+    def __init__(self, base: MarginalLikelihood | Panel, key: jax.Array, settings: ParticleSettings,
+                 steps: int | None = None) -> None:
+        self.base, self.key, self.settings, self.steps = base, key, settings, steps
+        super().__init__(base.batch_shape, base.event_shape, validate_args=False)
+
+    def log_prob(self, value: Any) -> jax.Array:
+        """Return the log of the estimate; for a panel one for each series."""
+        value = jnp.asarray(value, float)
+        if isinstance(self.base, Panel):
+            keys = jax.random.split(self.key, self.base.batch_shape[0])
+            return self.base.mapped(lambda one, y, key: self._one(one, y, key), value, keys)
+        return self._one(self.base, value, self.key)
+
+    def _one(self, base: MarginalLikelihood, y: jax.Array, key: jax.Array) -> jax.Array:
+        plan = schedule(base.ssm, base.times, self.steps or base.steps, base.max_step)
+        return log_likelihood(base.ssm, plan, y, key, self.settings)
+
+    def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
+        """Simulate the model, as ``base`` does."""
+        return self.base.sample(key, sample_shape)
+
+
+class with_particles(Messenger):  # noqa: N801 (an effect handler, named as NumPyro names its handlers)
+    """Effect handler that replaces the likelihood of a model by a particle filter's estimate of it.
+
+    Args:
+        fn: a NumPyro model with a site ``MarginalLikelihood`` or ``panel``.
+        key: a JAX random key; another one gives another estimate.
+        settings: checked settings of the filter.
+        steps: integration steps between two times; None: those of the model.
+        times: of the site where the model's own are traced.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, numpyro, lfm_ppl as lfm
+        >>> def model(times, y=None):
+        ...     system = lfm.LatentForceModel(
+        ...         lambda x, u, t: x - x**3, {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        ...         lfm.Gaussian(jnp.zeros(1), jnp.eye(1)), process_noise=jnp.eye(1))
+        ...     numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
+        >>> estimated = with_particles(model, jax.random.key(0), ParticleSettings(100, scheme="srk"))
+        >>> trace = numpyro.handlers.trace(estimated).get_trace(jnp.arange(3.0), jnp.ones((3, 1)))
+        >>> type(trace["y"]["fn"]).__name__
+        'ParticleLikelihood'
+    """
+
+    def __init__(self, fn: Callable[..., Any] | None, key: jax.Array, settings: ParticleSettings,
+                 steps: int | None = None, times: Any = None) -> None:
+        self.key, self.settings, self.steps, self.times = key, settings, steps, times
+        super().__init__(fn)
+
+    def process_message(self, msg: dict[str, Any]) -> None:
+        """Put the estimate in the place of the likelihood."""
+        fn = msg.get("fn")
+        if msg["type"] == "sample" and isinstance(fn, (MarginalLikelihood, Panel)):
+            if self.times is not None and checks.traced(fn.times):
+                fn = fn.with_times(self.times)
+            msg["fn"] = ParticleLikelihood(fn, self.key, self.settings, self.steps)
+
+
+class Tuned(NamedTuple):
+    """A number of particles, and the standard deviation of the log likelihood estimate that it gives."""
+
+    particles: int
+    sd: float
+
+
+class ParticlePotential:
+    """Potential energy of a model's unconstrained parameters, with the likelihood estimated by particles.
+
+    Args:
+        model: a NumPyro model with one likelihood site.
+        args: its positional arguments, times first.
+        kwargs: its keyword arguments.
+        key: for what the model draws besides its sites.
+        settings: of the filter; the scheme is chosen, and everything checked, here.
+        steps: integration steps between two times; None: those of the model.
+
+    Raises:
+        ValueError: there is no likelihood site, or several; what the particle filter raises.
+    """
+
+    def __init__(self, model: Callable, args: tuple, kwargs: Mapping[str, Any], key: jax.Array,
+                 settings: ParticleSettings, steps: int | None = None) -> None:
+        if steps is not None:
+            checks.positive_integer("steps", steps)
+        site = likelihood_site(model, args, kwargs, key)
+        check_noise(site.example.ssm, site.example.plan.initial_time)
+        self.settings = check_settings(site.example.ssm, settings)
+        self._call = (model, args, dict(kwargs), key, steps, site.distribution.times)
+
+    def __call__(self, z: Any, key: jax.Array, particles: int | None = None) -> jax.Array:
+        """Return minus the log density at ``z``; ``key`` is that of the particle filter."""
+        model, args, kwargs, own, steps, times = self._call
+        settings = self.settings if particles is None else self.settings._replace(particles=particles)
+        seeded = handlers.seed(model, own)
+        return potential_energy(with_particles(seeded, key, settings, steps, times), args, kwargs, z)
+
+    def tune(self, z: Any, key: jax.Array, target_sd: float = 1.0) -> Tuned:
+        """Choose the number of particles for which the log likelihood at ``z`` has a standard deviation near 1.
+
+        The variance is inversely proportional to the number. Fewer particles make the chain stick to lucky
+        estimates, more cost more than they gain.
+
+        Args:
+            z: unconstrained parameters, as central in the posterior as they are known to be.
+            key: a JAX random key.
+            target_sd: the standard deviation wanted.
+
+        Raises:
+            ValueError: at ``z`` the estimates are not finite, or no number up to 200,000 is enough.
+
+        Source: Doucet, Pitt, Deligiannidis and Kohn (2015), Biometrika 102(2).
+        """
+        checks.positive("target_sd", target_sd)
+        particles = max(_FEWEST, min(200, _MOST))
+        for attempt in range(8):
+            keys = jax.random.split(jax.random.fold_in(key, attempt), _REPLICATES)
+            run = jax.jit(lambda z, keys, count=particles: jax.lax.map(lambda k: self(z, k, count), keys))
+            energies = np.asarray(run(z, keys))
+            if np.isfinite(energies).mean() < 0.5:
+                wanted = 8 * particles
+                sd = np.inf
+            else:
+                # Infinite energies are estimates of zero: as far down as the worst of the others, at least.
+                worst = np.where(np.isfinite(energies), energies, energies[np.isfinite(energies)].max())
+                sd = float(worst.std(ddof=1))
+                wanted = int(np.ceil(particles * np.clip((sd / target_sd) ** 2, 1 / 64, 8.0)))
+            close = particles / 1.4 < wanted < particles * 1.4
+            if close or (particles == _FEWEST and wanted <= _FEWEST):
+                return Tuned(particles, sd)
+            if particles == _MOST and wanted > _MOST:
+                break
+            particles = int(np.clip(wanted, _FEWEST, _MOST))
+        if np.isfinite(sd) and particles < _MOST:
+            return Tuned(particles, sd)
+        raise ValueError(f"the log likelihood estimate has a standard deviation of {sd:.3g} with {_MOST} particles; "
+                         f"{target_sd:g} is out of reach. The observations may be too precise, or too many, for a "
+                         "bootstrap filter, or the starting point is far from the posterior; give particles yourself.")

@@ -1,0 +1,237 @@
+"""Particle-marginal robust adaptive Metropolis: an exact chain from an unbiased likelihood estimate."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpyro.infer import init_to_median
+from numpyro.util import is_prng_key
+
+from lfm_ppl import checks
+from lfm_ppl.comparators.particle_filter import ParticleSettings
+from lfm_ppl.inference.particle_likelihood import ParticlePotential, Tuned
+from lfm_ppl.inference.ram import RAM
+from lfm_ppl.inference.robust_metropolis import (
+    RAMState,
+    acceptance,
+    adapted,
+    choose,
+    finite_or_infinity,
+    propose,
+)
+from lfm_ppl.inference.unconstrained import UnconstrainedModel
+
+_TARGET, _TARGET_ONE = 0.12, 0.21
+"""Half of what RAM aims at: noise of sd one in the log likelihood halves the acceptance at any scale."""
+
+
+class ParticleMarginalState(NamedTuple):
+    """What the chain carries: the fields of `RAMState`, and two of its own.
+
+    Attributes:
+        i, z, accept_prob, accepted, mean_accept_prob, step_size, chol_proposal, num_warmup, rng_key: as in `RAMState`.
+        potential_energy: minus the log of the ESTIMATED density at ``z``, from when ``z`` was proposed.
+        surrogate_energy: minus the log density at ``z`` with the Gaussian filter's likelihood; zero if not used.
+        estimated: whether the last proposal reached the particle filter.
+    """
+
+    i: jax.Array
+    z: Any
+    potential_energy: jax.Array
+    accept_prob: jax.Array
+    accepted: jax.Array
+    mean_accept_prob: jax.Array
+    step_size: jax.Array
+    chol_proposal: jax.Array
+    num_warmup: jax.Array
+    rng_key: jax.Array
+    surrogate_energy: jax.Array
+    estimated: jax.Array
+
+
+class ParticleMarginalRAM(RAM):
+    r"""Robust adaptive Metropolis on an estimated likelihood, with the exact posterior as its limit.
+
+    The likelihood is estimated, without bias, by a bootstrap particle filter on the model itself. A proposal x' with
+    estimate Z' is accepted with probability
+
+        min(1, p(x') Z' / (p(x) Z)),
+
+    where Z is the estimate with which x was accepted: it is carried along and never drawn again, which makes the
+    posterior of the parameters the chain's invariant distribution whatever the number of particles. With ``delayed``
+    acceptance a proposal first has to pass the test with the Gaussian filter's likelihood L; the particle filter runs
+    only then, and the second test, with ``min(1, Z' L / (Z L'))``, makes up for the first.
+
+    Args:
+        model: a NumPyro model with one likelihood site, ``lfm.MarginalLikelihood`` or ``lfm.panel``.
+        particles: N; None: chosen so that the log likelihood has a standard deviation near 1.
+        tune_at: unconstrained parameters at which N is chosen; None: where the first chain starts.
+        delayed: two-stage acceptance.
+        particle_steps: integration steps of the particles between two times; None: the model's ``steps``.
+        resampling: as in `lfm_ppl.particle_filter`, and so are the next two.
+        threshold: of the effective sample size.
+        scheme: of the steps.
+        target_accept_prob: by default 0.12, and 0.21 in one dimension.
+        initial_scale: as in `RAM`, and so are all that follow.
+        initial_covariance: of the proposal.
+        adapt: "warmup" or "throughout".
+        exponent: of the adaptation.
+        init_strategy: a NumPyro strategy for the first point of each chain.
+
+    Attributes:
+        delayed: whether acceptance is delayed.
+        tuned: after the start, the number of particles and the standard deviation of the log likelihood estimate.
+
+    Raises:
+        ValueError: what `RAM` and `lfm_ppl.particle_filter` raise; no number of particles is enough.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, numpyro, numpyro.distributions as dist, lfm_ppl as lfm
+        >>> from numpyro.infer import MCMC
+        >>> def model(times, y=None):
+        ...     noise = numpyro.sample("noise", dist.LogNormal(0.0, 0.5))
+        ...     system = lfm.LatentForceModel(
+        ...         lambda x, u, t: x - x**3, {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        ...         lfm.Gaussian(jnp.zeros(1), jnp.eye(1)), process_noise=noise * jnp.eye(1))
+        ...     numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
+        >>> mcmc = MCMC(ParticleMarginalRAM(model, particles=20), num_warmup=20, num_samples=20, progress_bar=False)
+        >>> mcmc.run(jax.random.key(0), jnp.arange(3.0), jnp.ones((3, 1)))
+        >>> mcmc.get_samples()["noise"].shape
+        (20,)
+
+    Source: Andrieu, Doucet and Holenstein (2010), JRSS B 72(3); Vihola (2012), Statistics and Computing 22; Golightly,
+    Henderson and Sherlock (2015), Statistics and Computing 25, for delayed acceptance.
+    """
+
+    def __init__(
+        self,
+        model: Callable,
+        particles: int | None = None,
+        tune_at: Any = None,
+        delayed: bool = False,
+        particle_steps: int | None = None,
+        resampling: str = "systematic",
+        threshold: float = 0.5,
+        scheme: str = "auto",
+        target_accept_prob: float | None = None,
+        initial_scale: float | None = None,
+        initial_covariance: Any = None,
+        adapt: str = "warmup",
+        exponent: float = 2 / 3,
+        init_strategy: Callable = init_to_median,
+    ) -> None:
+        super().__init__(model, None, target_accept_prob, initial_scale, initial_covariance, adapt, exponent,
+                         init_strategy)
+        if particles is not None:
+            checks.positive_integer("particles", particles)
+        self._settings = ParticleSettings(particles or 1, resampling, threshold, scheme)
+        self.delayed = delayed
+        self._tune_at = tune_at
+        self._particle_steps = particle_steps
+        self._estimate: ParticlePotential | None = None
+        self.tuned: Tuned | None = None if particles is None else Tuned(particles, float("nan"))
+
+    def init(  # type: ignore[override]
+        self,
+        rng_key: jax.Array,
+        num_warmup: int,
+        init_params: Any = None,
+        model_args: tuple = (),
+        model_kwargs: dict | None = None,
+    ) -> ParticleMarginalState:
+        """Return the state before the first step; arguments as in `RAM`."""
+        start: RAMState = super().init(rng_key, num_warmup, init_params, model_args, model_kwargs)
+        single = is_prng_key(rng_key)
+        first_key = rng_key if single else rng_key[0]
+        self._prepare(start.z if single else jax.tree_util.tree_map(lambda leaf: leaf[0], start.z), model_args,
+                      model_kwargs or {})
+        estimate_key = jax.random.fold_in(first_key, 1)
+        estimate = jax.jit(self._energy)
+        if single:
+            energy = estimate(start.z, estimate_key)
+        else:
+            energy = jax.lax.map(lambda pair: estimate(*pair), (start.z, jax.random.split(estimate_key, len(rng_key))))
+        energy = finite_or_infinity(energy)
+        surrogate = start.potential_energy if self.delayed else jnp.zeros_like(energy)
+        return ParticleMarginalState(*start._replace(potential_energy=energy), surrogate,
+                                     jnp.zeros(np.shape(energy), bool))
+
+    @property
+    def settings(self) -> ParticleSettings:
+        """Settings of the particle filter, with the number of particles that was chosen."""
+        assert self._estimate is not None and self.tuned is not None, "init must be called first."
+        return self._estimate.settings._replace(particles=self.tuned.particles)
+
+    def _prepare(self, start: Any, args: tuple, kwargs: dict) -> None:
+        """Check the filter and choose the number of particles: with numbers, since it decides what is compiled."""
+        assert self.model is not None
+        with jax.ensure_compile_time_eval():  # chains that run in parallel are initialised within a trace
+            key = jax.random.key(0)
+            self._estimate = ParticlePotential(self.model, args, kwargs, key, self._settings, self._particle_steps)
+            if self.tuned is None:
+                z = start if self._tune_at is None else self._tune_at
+                if checks.traced(z):
+                    space = UnconstrainedModel(self.model, args, kwargs, key)
+                    z = space.unravel(space.draw(key, self._init_strategy))
+                self.tuned = self._estimate.tune(z, key)
+
+    def sample(self, state: ParticleMarginalState, model_args: tuple,  # type: ignore[override]
+               model_kwargs: dict | None) -> ParticleMarginalState:
+        """Return the state after one step of every chain in ``state``."""
+        surrogate = self._potential(model_args, model_kwargs or {}) if self.delayed else None
+        one_chain = partial(particle_marginal_step, self._energy, surrogate, self._target_accept_prob, self._exponent,
+                            self._adapt_throughout)
+        return (one_chain if is_prng_key(state.rng_key) else jax.vmap(one_chain))(state)
+
+    def _energy(self, z: Any, key: jax.Array) -> jax.Array:
+        assert self._estimate is not None and self.tuned is not None, "init must be called before sample."
+        return self._estimate(z, key, self.tuned.particles)
+
+
+def particle_marginal_step(
+    estimate: Callable[[Any, jax.Array], jax.Array],
+    surrogate: Callable[[Any], jax.Array] | None,
+    target_accept_prob: float | None,
+    exponent: float,
+    throughout: bool,
+    state: ParticleMarginalState,
+) -> ParticleMarginalState:
+    """Propose, estimate, accept or reject, and adapt.
+
+    Args:
+        estimate: ``(z, key)`` -> minus the log of an unbiased estimate of the density. NaN or an infinity rejects.
+        surrogate: minus the log of a cheap density that has to accept first; None: there is none.
+        target_accept_prob: of the RAM adaptation; None for the default.
+        exponent: of the adaptation steps.
+        throughout: adapt after the warm-up as well.
+        state: the state ``n - 1``.
+
+    Returns:
+        The state ``n``.
+    """
+    rng_key, key_noise, key_accept, key_particles, key_second = jax.random.split(state.rng_key, 5)
+    ram = RAMState(*state[: len(RAMState._fields)])
+    proposal, noise = propose(ram, key_noise)
+    first, passed, reached = jnp.zeros_like(state.surrogate_energy), jnp.array(True), jnp.ones(())
+    if surrogate is not None:
+        first = finite_or_infinity(surrogate(proposal))
+        passed = jax.random.uniform(key_second) < acceptance(state.surrogate_energy - first)
+        reached = passed.astype(noise.dtype)
+    energy = jax.lax.cond(passed, lambda: finite_or_infinity(estimate(proposal, key_particles)),
+                          lambda: jnp.full_like(state.potential_energy, jnp.inf))
+    accept_prob = reached * acceptance((state.potential_energy - energy) - (state.surrogate_energy - first))
+    accepted = jax.random.uniform(key_accept) < accept_prob
+    moved = ram._replace(
+        z=choose(accepted, proposal, state.z),
+        potential_energy=jnp.where(accepted, energy, state.potential_energy),
+        accepted=accepted,
+        rng_key=rng_key,
+    )
+    target = target_accept_prob or (_TARGET_ONE if noise.size == 1 else _TARGET)
+    moved = adapted(moved, noise, accept_prob, target, exponent, throughout)
+    return ParticleMarginalState(*moved, jnp.where(accepted, first, state.surrogate_energy), passed)

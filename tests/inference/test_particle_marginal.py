@@ -1,0 +1,182 @@
+"""Particle-marginal RAM: exact whatever the noise of the estimate, and whatever the surrogate."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
+from numpyro.infer import MCMC
+
+import lfm_ppl as lfm
+from lfm_ppl.analysis.arviz_data import ess, group
+from lfm_ppl.comparators.particle_filter import ParticleSettings
+from lfm_ppl.inference import particle_likelihood
+from lfm_ppl.inference.particle_likelihood import ParticlePotential
+from lfm_ppl.inference.particle_marginal import ParticleMarginalState, particle_marginal_step
+
+TIMES = np.array([0.0, 0.6, 1.5, 1.5, 2.7, 4.0])
+Y = np.array([[1.2], [0.7], [np.nan], [0.5], [-0.2], [0.4]])
+
+
+def build(rate, noise=0.1):
+    return lfm.LatentForceModel(
+        lambda x, u, t: -rate * x, {}, lfm.GaussianObservation(lambda x, u, t: x, noise * jnp.ones(1)),
+        lfm.Gaussian(jnp.array([1.0]), jnp.array([0.2])), process_noise=jnp.array([[0.5]]))
+
+
+def relaxing(times, y=None):
+    """Linear, so that the Kalman filter is exact."""
+    rate = numpyro.sample("rate", dist.LogNormal(-0.5, 0.7))
+    numpyro.sample("y", lfm.MarginalLikelihood(build(rate), times), obs=y)
+
+
+def exact_posterior(y=Y):
+    """Mean and standard deviation of log rate, by quadrature over the Kalman filter's likelihood."""
+    grid = np.linspace(-4.0, 3.0, 400)
+    density = jax.jit(jax.vmap(lambda v: lfm.MarginalLikelihood(build(jnp.exp(v)), TIMES).log_prob(y)))
+    log_weights = np.asarray(density(jnp.asarray(grid))) - 0.5 * ((grid + 0.5) / 0.7) ** 2
+    weights = np.exp(log_weights - log_weights.max())
+    weights /= weights.sum()
+    mean = (weights * grid).sum()
+    return mean, np.sqrt((weights * (grid - mean) ** 2).sum())
+
+
+def effective(draws):
+    """Effective sample size of draws (chains, n)."""
+    import arviz
+
+    return float(arviz.ess(np.asarray(draws)))
+
+
+def assert_posterior(log_rate, mean, sd):
+    """Mean and spread within four Monte Carlo standard errors, which must be small for the test to have power."""
+    error = sd / np.sqrt(effective(log_rate))
+    assert error < 0.1 * sd
+    assert abs(log_rate.mean() - mean) < 4.0 * error
+    spread_error = 1.5 * sd / np.sqrt(2.0 * effective((log_rate - mean) ** 2))
+    assert abs(log_rate.std() - sd) < 4.0 * spread_error
+
+
+@pytest.mark.parametrize("delayed", [False, True], ids=["plain", "delayed"])
+def test_it_reproduces_the_exact_posterior_of_a_linear_model(delayed):
+    """Twenty particles give a noisy likelihood; the posterior is the Kalman filter's all the same."""
+    kernel = lfm.ParticleMarginalRAM(relaxing, particles=20, delayed=delayed)
+    mcmc = MCMC(kernel, num_warmup=500, num_samples=4000, num_chains=8, chain_method="vectorized", progress_bar=False)
+    mcmc.run(jax.random.key(0), TIMES, Y, extra_fields=("potential_energy", "accepted", "estimated"))
+    log_rate = np.log(mcmc.get_samples(group_by_chain=True)["rate"])
+    assert_posterior(log_rate, *exact_posterior())
+    extra = mcmc.get_extra_fields(group_by_chain=True)
+    # The estimate is carried along: it changes exactly where a proposal is accepted.
+    changed = np.diff(extra["potential_energy"], axis=1) != 0
+    assert np.array_equal(changed, np.asarray(extra["accepted"])[:, 1:])
+    reached = np.asarray(extra["estimated"])
+    assert reached.all() if not delayed else 0.2 < reached.mean() < 0.8
+
+
+@pytest.mark.parametrize("surrogate", [None, lambda z: 0.5 * ((z - 0.8) / 1.5) ** 2], ids=["plain", "delayed"])
+def test_noise_and_a_wrong_surrogate_leave_the_target_alone(surrogate):
+    """Standard normal target, log-normal noise of sd 1.2 without bias on the density's scale."""
+    sd = 1.2
+
+    def estimate(z, key):
+        return 0.5 * z**2 - sd * jax.random.normal(key) + 0.5 * sd**2
+
+    def chain(key):
+        zero = jnp.zeros(())
+        start = ParticleMarginalState(
+            jnp.array(0), zero, zero, zero, jnp.array(False), zero, jnp.ones(()), 2.4 * jnp.eye(1), jnp.array(0), key,
+            zero if surrogate is None else surrogate(zero), jnp.array(False))
+        step = partial(particle_marginal_step, estimate, surrogate, None, 2 / 3, False)
+        return jax.lax.scan(lambda s, _: ((new := step(s)), new.z), start, length=20_000)[1]
+
+    draws = np.asarray(jax.jit(jax.vmap(chain))(jax.random.split(jax.random.key(1), 16)))[:, 500:]
+    for power, moment in ((1, 0.0), (2, 1.0), (4, 3.0)):
+        values = draws**power
+        assert abs(values.mean() - moment) < 4.5 * values.std() / np.sqrt(effective(values))
+
+
+def test_the_number_of_particles_is_chosen_for_an_sd_of_one():
+    y = np.tile(Y, (4, 1))
+    times = np.arange(24.0) / 4
+    potential = ParticlePotential(relaxing, (times, y), {}, jax.random.key(0), ParticleSettings(1))
+    z = {"rate": jnp.array(-0.5)}
+    tuned = potential.tune(z, jax.random.key(1))
+    run = jax.jit(jax.vmap(lambda key: potential(z, key, tuned.particles)))
+    sd = float(run(jax.random.split(jax.random.key(2), 1000)).std())
+    assert 0.6 < sd < 1.5 and abs(tuned.sd - sd) < 0.4
+    more = potential.tune(z, jax.random.key(1), target_sd=0.3)
+    assert more.particles > 5 * tuned.particles
+
+
+def test_precise_observations_that_no_particle_meets_are_an_error(monkeypatch):
+    monkeypatch.setattr(particle_likelihood, "_MOST", 2000)
+
+    def impossible(times, y=None):
+        rate = numpyro.sample("rate", dist.LogNormal(-0.5, 0.7))
+        numpyro.sample("y", lfm.MarginalLikelihood(build(rate, noise=1e-20), times), obs=y)
+
+    potential = ParticlePotential(impossible, (TIMES, Y), {}, jax.random.key(0), ParticleSettings(1))
+    with pytest.raises(ValueError, match="out of reach"):
+        potential.tune({"rate": jnp.array(-0.5)}, jax.random.key(1))
+
+
+def test_a_panel():
+    """Two series share a rate: the estimate is the product of theirs, with independent particles."""
+
+    def panel(times, y=None):
+        rate = numpyro.sample("rate", dist.LogNormal(-0.5, 0.7))
+        with numpyro.plate("series", 2):
+            numpyro.sample("y", lfm.panel(build, rate * jnp.ones(2), times), obs=y)
+
+    y = np.stack([Y, np.full_like(Y, np.nan)])
+    settings = ParticleSettings(500)
+    z = {"rate": jnp.array(-0.3)}
+    both = ParticlePotential(panel, (TIMES, y), {}, jax.random.key(0), settings)
+    one = ParticlePotential(relaxing, (TIMES, Y), {}, jax.random.key(0), settings)
+    run = lambda potential: jax.jit(jax.vmap(lambda key: potential(z, key)))(  # noqa: E731
+        jax.random.split(jax.random.key(3), 200))
+    mine, single = np.asarray(run(both)), np.asarray(run(one))  # a series that is all missing adds nothing
+    assert abs(mine.mean() - single.mean()) < 5.0 * np.hypot(mine.std(), single.std()) / np.sqrt(200)
+
+
+def test_fit_samples_and_reports_the_particles():
+    result = lfm.fit(relaxing, TIMES, Y, sampler="pmmh", chains=2, warmup=100, samples=200, thin=5, progress=False,
+                     trajectory_draws=20, chain_method="vectorized")
+    log_rate = np.log(group(result, "posterior")["rate"].values)
+    mean, sd = exact_posterior()
+    assert abs(log_rate.mean() - mean) < 5.0 * sd / np.sqrt(float(ess(result).iloc[0]))
+    assert result.attrs["sampler"] == "pmmh" and result.attrs["particles"] >= 50
+    assert 0.0 < result.attrs["log_likelihood_sd"] < 1.6
+    assert set(group(result, "sample_stats")) == {"acceptance_rate", "accepted", "lp", "estimated"}
+
+
+@pytest.mark.parametrize("options, error, message", [
+    ({"particles": 0}, ValueError, "particles must be at least 1"),
+    ({"particle_steps": 0}, ValueError, "steps must be at least 1"),
+    ({"particles": 5, "scheme": "milstien"}, ValueError, "'milstein'"),
+    ({"particles": 5, "target_accept_prob": 1.5}, ValueError, "between 0 and 1"),
+])
+def test_errors(options, error, message):
+    with pytest.raises(error, match=message):
+        kernel = lfm.ParticleMarginalRAM(relaxing, **options)
+        kernel.init(jax.random.key(0), 10, None, (TIMES, Y), {})
+
+
+def test_a_model_without_the_likelihood_is_named():
+    def plain(times, y=None):
+        numpyro.sample("y", dist.Normal(numpyro.sample("level", dist.Normal()), 1.0), obs=y)
+
+    with pytest.raises(ValueError, match="exactly one site"):
+        lfm.ParticleMarginalRAM(plain, particles=5).init(jax.random.key(0), 10, None, (TIMES, np.zeros(6)), {})
+
+
+def test_noise_without_a_density_is_named():
+    def exactly(times, y=None):
+        rate = numpyro.sample("rate", dist.LogNormal(-0.5, 0.7))
+        numpyro.sample("y", lfm.MarginalLikelihood(build(rate, noise=0.0), times), obs=y)
+
+    with pytest.raises(ValueError, match="'y0' is zero"):
+        lfm.ParticleMarginalRAM(exactly, particles=5).init(jax.random.key(0), 10, None, (TIMES, Y), {})
