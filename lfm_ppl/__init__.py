@@ -1,5 +1,8 @@
 """Bayesian inference in latent force models, on NumPyro."""
 
+from lfm_ppl.comparators.fokker_planck import FokkerPlanckResult, fokker_planck
+from lfm_ppl.comparators.particle_filter import ParticleFilterResult, particle_filter
+from lfm_ppl.comparators.particle_smoother import ParticleSmootherResult, particle_smoother
 from lfm_ppl.data import Data, read_csv
 from lfm_ppl.filtering.filter import FilterResult, FilterState, filter
 from lfm_ppl.filtering.smoother import SmootherResult, smooth
@@ -8,6 +11,7 @@ from lfm_ppl.inference.fit import ConvergenceWarning, fit
 from lfm_ppl.inference.fixing import fix
 from lfm_ppl.inference.map import MAPResult, map_estimate
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, panel
+from lfm_ppl.inference.particle_marginal import ParticleMarginalRAM
 from lfm_ppl.inference.ram import RAM
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.linearisation.sigma_points import (
@@ -34,6 +38,7 @@ __all__ = [
     "Data",
     "FilterResult",
     "FilterState",
+    "FokkerPlanckResult",
     "Force",
     "GaussHermite",
     "Gaussian",
@@ -44,6 +49,9 @@ __all__ = [
     "MarginalLikelihood",
     "Matern",
     "MonteCarlo",
+    "ParticleFilterResult",
+    "ParticleMarginalRAM",
+    "ParticleSmootherResult",
     "RAM",
     "Rule",
     "Simulation",
@@ -56,8 +64,11 @@ __all__ = [
     "filter",
     "fit",
     "fix",
+    "fokker_planck",
     "map_estimate",
     "panel",
+    "particle_filter",
+    "particle_smoother",
     "read_csv",
     "simulate",
     "smooth",

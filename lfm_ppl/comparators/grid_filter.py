@@ -1,0 +1,208 @@
+"""Filter and smoother for the masses of a one-dimensional state on a grid: a hidden Markov model on its cells."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lfm_ppl.comparators.finite_volume import Chain, Grid, propagate, transition
+from lfm_ppl.comparators.grid_model import WEIGHTS, Cells, on_grid
+from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays
+from lfm_ppl.linalg import cholesky, solve_lower
+from lfm_ppl.model.augment import StateSpaceModel
+
+_LARGEST_TABLE = 2**25
+"""Most entries of the tabulated transition matrices, 256 MiB; beyond it the masses are propagated row by row."""
+
+_MATRIX_COST = 6.0
+"""A transition matrix takes about as long as this many propagations of one vector of masses."""
+
+_LOG_2PI = float(np.log(2.0 * np.pi))
+
+
+class Densities(NamedTuple):
+    """What a forward pass leaves; one entry a row, None where it was not asked for.
+
+    Attributes:
+        log_likelihood: (rows, B), zero where nothing is observed.
+        predicted, filtered: (rows, B, N) masses before and after the observation.
+        reach: (N,) the largest mass of each cell that was propagated, predicted or filtered.
+    """
+
+    log_likelihood: jax.Array
+    predicted: Any
+    filtered: Any
+    reach: jax.Array
+
+
+def _log_likelihood_of_cells(cells: Cells, index: jax.Array, y: jax.Array) -> jax.Array:
+    """Return (B, N): the log of the likelihood of y (B, D), averaged over each cell; zero where all is missing."""
+    index = jnp.maximum(index, 0)
+    value, noise = (a[jnp.where(a.shape[0] > 1, index, 0)] for a in (cells.value, cells.noise))
+    present = jnp.isfinite(y)[:, None, None, :]
+    residual = jnp.where(present, y[:, None, None, :], 0.0) - value
+    residual = jnp.where(cells.angular, jnp.arctan2(jnp.sin(residual), jnp.cos(residual)), residual)
+    residual = jnp.where(present, residual, 0.0)
+    if y.shape[-1] == 1:
+        variance = noise[..., 0]
+        log = -0.5 * (residual**2 / variance + jnp.log(variance) + _LOG_2PI)
+        log = jnp.where(present, log, 0.0)[..., 0]
+    else:
+        log = _log_normal(residual, noise, present)
+    return jax.scipy.special.logsumexp(log + np.log(0.5 * WEIGHTS), axis=-1)
+
+
+def _log_normal(residual: jax.Array, noise: jax.Array, present: jax.Array) -> jax.Array:
+    """Log density (B, N, G) of the present entries of ``residual`` (B, N, G, D), zero in the others."""
+    both = present[..., :, None] & present[..., None, :]
+    matrix = jnp.where(both, noise, jnp.eye(noise.shape[-1]))
+    flat = matrix.reshape(-1, *matrix.shape[-2:])
+    factor = jax.vmap(cholesky)(flat)
+    chol = jnp.where(factor.degenerate.any(-1)[:, None, None], jnp.nan, factor.chol).reshape(matrix.shape)
+    white = jnp.vectorize(solve_lower, signature="(d,d),(d)->(d)")(chol, residual)
+    diagonal = jnp.diagonal(chol, axis1=-2, axis2=-1)
+    return -0.5 * ((white**2).sum(-1) + present.sum(-1) * _LOG_2PI) - jnp.log(diagonal).sum(-1)
+
+
+class Moves(NamedTuple):
+    """How masses cross a row: a table of transition matrices, or the chain itself where that is None."""
+
+    cells: Cells
+    table: Any
+
+    def across(self, masses: jax.Array, row: Rows, walk: Chain | None, adjoint: bool = False) -> jax.Array:
+        """Move masses (B, N) over a row and its jump, or a function of the cell back over them."""
+        if adjoint:
+            masses = self._jump(masses, row.jump, True)
+        if self.table is not None:
+            matrix = self.table[row.kind]
+            masses = masses @ (matrix if adjoint else matrix.T)
+        elif walk is None:
+            masses = propagate(self.cells.chain, row.length, masses, adjoint)
+        else:
+            part = row.length / walk.up.shape[0]
+            step = lambda m, one: (propagate(one, part, m, adjoint), None)  # noqa: E731
+            masses, _ = jax.lax.scan(step, masses, walk, reverse=adjoint)
+        return masses if adjoint else self._jump(masses, row.jump, False)
+
+    def _jump(self, masses: jax.Array, index: jax.Array, adjoint: bool) -> jax.Array:
+        if self.cells.jumps is None:
+            return masses
+        matrix = self.cells.jumps[jnp.maximum(index, 0)]
+        return jnp.where(index >= 0, masses @ (matrix if adjoint else matrix.T), masses)
+
+
+def moves(cells: Cells, plan: Schedule, batch: int) -> Moves:
+    """Tabulate the transition matrices where that pays."""
+    size = cells.initial.shape[0]
+    if plan.lengths is None or cells.chain.up.ndim > 1:
+        return Moves(cells, None)
+    count, rows = np.shape(plan.lengths)[0], np.shape(plan.rows.length)[0]
+    if count * size**2 > _LARGEST_TABLE or count * _MATRIX_COST > rows * (1.0 + batch / 4.0):
+        return Moves(cells, None)
+    return Moves(cells, jax.lax.map(lambda length: transition(cells.chain, length), jnp.asarray(plan.lengths)))
+
+
+def forward(moving: Moves, plan: Schedule, y: jax.Array, keep: bool = False) -> Densities:
+    """Run the filter.
+
+    Args:
+        moving: the model on the grid.
+        plan: the rows.
+        y: (B, T, D), NaN where missing; all B data sets have the same times.
+        keep: whether to keep the masses.
+    """
+    cells, rows = moving.cells, as_arrays(plan.rows)
+    padded = jnp.concatenate([jnp.asarray(y, float), jnp.full((y.shape[0], 1, y.shape[2]), jnp.nan)], axis=1)
+    walks = cells.chain if cells.chain.up.ndim > 1 else None
+    start = jnp.broadcast_to(cells.initial, (y.shape[0], cells.initial.shape[0]))
+
+    def step(carry: tuple, inputs: tuple) -> tuple[tuple, tuple]:
+        masses, reach = carry
+        row, walk, observed = inputs
+        predicted = moving.across(masses, row, walk)
+        with_observation = jnp.log(predicted) + _log_likelihood_of_cells(cells, row.observation, observed)
+        total = jax.scipy.special.logsumexp(with_observation, axis=-1)
+        # An observation that no cell can explain leaves nothing to normalise.
+        possible = jnp.where(jnp.isneginf(total), jnp.nan, total)
+        any_present = jnp.isfinite(observed).any(-1)
+        filtered = jnp.where(any_present[:, None], jnp.exp(with_observation - possible[:, None]), predicted)
+        moved = (row.length > 0) | (row.jump >= 0)
+        reach = jnp.maximum(reach, jnp.where(moved, jnp.maximum(masses, predicted).max(0), 0.0))
+        out = (jnp.where(any_present, total, 0.0), *((predicted, filtered) if keep else (None, None)))
+        return (filtered, jnp.maximum(reach, filtered.max(0))), out
+
+    inputs = (rows, walks, jnp.moveaxis(padded, 1, 0)[rows.observation])
+    (_, reach), (log, predicted, filtered) = jax.lax.scan(step, (start, jnp.zeros(start.shape[1])), inputs)
+    return Densities(log, predicted, filtered, reach)
+
+
+def backward(moving: Moves, plan: Schedule, passed: Densities) -> jax.Array:
+    """Run the smoother; return masses (rows, B, N) at the rows' ends.
+
+        s_k-1(i) = f_k-1(i) sum_j P(i -> j) s_k(j) / p_k(j)
+
+    with the filtered masses f and the predicted ones p.
+    """
+    cells, rows = moving.cells, as_arrays(plan.rows)
+    walks = cells.chain if cells.chain.up.ndim > 1 else None
+    start = jnp.broadcast_to(cells.initial, passed.filtered.shape[1:])[None]
+    before = jnp.concatenate([start, passed.filtered[:-1]])
+
+    def step(later: jax.Array, inputs: tuple) -> tuple[jax.Array, jax.Array]:
+        row, walk, predicted, at_start = inputs
+        live = predicted > 1e-290
+        ratio = jnp.where(live, later / jnp.where(live, predicted, 1.0), 0.0)
+        smoothed = at_start * moving.across(ratio, row, walk, adjoint=True)
+        smoothed = smoothed / smoothed.sum(-1, keepdims=True)
+        return smoothed, later
+
+    _, ends = jax.lax.scan(step, passed.filtered[-1], (rows, walks, passed.predicted, before), reverse=True)
+    return ends
+
+
+def log_likelihood(ssm: StateSpaceModel, plan: Schedule, y: jax.Array, grid: Grid) -> jax.Array:
+    """Return the log likelihood on the grid; for compiled code.
+
+    The transition matrices are computed once for all data sets. A failure is minus infinity. Derivatives are to be
+    had in forward mode (`jax.jacfwd`), not in reverse mode.
+
+    Args:
+        ssm: the state-space model, of state dimension one; it may hold traced parameters, also under `jax.vmap`.
+        plan: from `lfm_ppl.filtering.schedule.schedule(ssm, times, steps)`; its ``steps`` matter only where drift or
+            dispersion depend on time: the generator is frozen at the middle of each of them.
+        y: (T, D), or (B, T, D) for B data sets with the same times; NaN where missing.
+        grid: the cells, from `choose_grid`.
+
+    Returns:
+        log p(y), a scalar or (B,).
+
+    Example:
+        >>> import jax.numpy as jnp, lfm_ppl as lfm
+        >>> from lfm_ppl.filtering.schedule import schedule
+        >>> ssm = lfm.state_space(lfm.LatentForceModel(
+        ...     lambda x, u, t: x - x**3, {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        ...     lfm.Gaussian(jnp.zeros(1), jnp.eye(1)), process_noise=jnp.eye(1)))
+        >>> plan = schedule(ssm, [0.0, 1.0, 2.0], 1)
+        >>> log_likelihood(ssm, plan, jnp.ones((5, 3, 1)), Grid(-6.0, 6.0, 100)).shape
+        (5,)
+    """
+    y = jnp.asarray(y, float)
+    sets = y if y.ndim == 3 else y[None]
+    total = total_log_likelihood(on_grid(ssm, plan, grid), plan, sets)
+    return total if y.ndim == 3 else total[0]
+
+
+def total_log_likelihood(cells: Cells, plan: Schedule, y: jax.Array) -> jax.Array:
+    """Return log p(y) (B,) of data sets y (B, T, D) for a model that is on the grid already."""
+    return total_and_reach(cells, plan, y)[0]
+
+
+def total_and_reach(cells: Cells, plan: Schedule, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return besides the largest mass (N,) that any cell had; see `Densities`."""
+    passed = forward(moves(cells, plan, y.shape[0]), plan, y)
+    total = passed.log_likelihood.sum(0)
+    return jnp.where(jnp.isfinite(total), total, -jnp.inf), passed.reach
