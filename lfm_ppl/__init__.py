@@ -1,5 +1,8 @@
 """Bayesian inference in latent force models, on NumPyro."""
 
+from lfm_ppl.analysis.accuracy import check_accuracy
+from lfm_ppl.analysis.correction import correct as correct_posterior
+from lfm_ppl.analysis.report import AccuracyReport
 from lfm_ppl.comparators.fokker_planck import FokkerPlanckResult, fokker_planck
 from lfm_ppl.comparators.particle_filter import ParticleFilterResult, particle_filter
 from lfm_ppl.comparators.particle_smoother import ParticleSmootherResult, particle_smoother
@@ -31,6 +34,7 @@ from lfm_ppl.model.simulate import Simulation, simulate
 __version__ = "0.1.0"
 
 __all__ = [
+    "AccuracyReport",
     "CentralDifference",
     "Constant",
     "ConvergenceWarning",
@@ -61,6 +65,8 @@ __all__ = [
     "Taylor",
     "Unscented",
     "WienerVelocity",
+    "check_accuracy",
+    "correct_posterior",
     "filter",
     "fit",
     "fix",

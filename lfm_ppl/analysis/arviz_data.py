@@ -22,6 +22,9 @@ from lfm_ppl.analysis.scalars import scalar_draws
 
 LIBRARY = "lfm_ppl"
 
+_SMALLEST_TAIL = 5
+"""Fewest importance ratios that a Pareto distribution can be fitted to."""
+
 _HOW_TO_GET = {
     "posterior": "lfm.fit",
     "sample_stats": "lfm.fit",
@@ -30,6 +33,7 @@ _HOW_TO_GET = {
     "posterior_predictive": "lfm.fit with trajectory_draws above zero",
     "trajectories": "lfm.fit with trajectory_draws above zero",
     "observed_data": "lfm.fit",
+    "accuracy": "lfm.check_accuracy, or `lfm-ppl check`",
     "truth": "lfm.fit on data that were simulated and carry their truth (lfm.Data.truth)",
 }
 
@@ -243,6 +247,47 @@ def convergence_warnings(result: Any) -> list[str]:
     stats = group(result, "sample_stats") if has_group(result, "sample_stats") else {}
     divergences = int(stats["diverging"].sum()) if "diverging" in stats else 0
     return convergence.messages(summary(result), sizes["chain"], sizes["draw"], divergences)
+
+
+def mcse_mean(values: np.ndarray) -> float:
+    """Return the Monte Carlo standard error of the mean of (chain, draw) values.
+
+    It is the sd over the root of the effective sample size, which counts as at most the number of values; zero where
+    all are equal, NaN where one is not finite. With fewer than four draws a chain, they count as independent.
+    """
+    if not np.isfinite(values).all() or values.size < 2:
+        return np.nan
+    if np.ptp(values) == 0.0:
+        return 0.0
+    size = float(values.size)
+    if values.shape[1] >= 4:
+        size = min(float(_arviz().ess(values, method="mean")), size)
+    return float(values.std(ddof=1) / np.sqrt(size))
+
+
+def psis(log_ratio: np.ndarray, relative_efficiency: float = 1.0) -> tuple[np.ndarray, float]:
+    """Return Pareto-smoothed, normalised log weights (S,) and the Pareto shape k of log ratios (S,).
+
+    k is -inf where the largest ratios are all equal, and +inf where there are too few to tell.
+    Source: Vehtari et al. (2024), Pareto smoothed importance sampling, JMLR 25(72).
+    """
+    raw = log_ratio - log_ratio.max()
+    raw = raw - np.log(np.exp(raw).sum())
+    tail = int(np.ceil(min(0.2 * raw.size, 3.0 * np.sqrt(raw.size / relative_efficiency))))
+    if tail < _SMALLEST_TAIL:
+        return raw, np.inf
+    if np.ptp(np.sort(raw)[-tail - 1 :]) == 0.0:
+        return raw, -np.inf
+    if _uses_datatree():
+        from arviz_stats.base import array_stats
+
+        # ArviZ 1.x takes the log of what is divided by.
+        smoothed, k = array_stats.psislw(-raw, r_eff=relative_efficiency)
+    else:
+        smoothed, k = _arviz().psislw(raw.copy(), relative_efficiency)
+    if not np.isfinite(k):  # ties leave too few distinct ratios
+        return raw, np.inf
+    return np.asarray(smoothed), float(k)
 
 
 def _diagnostic(

@@ -19,7 +19,8 @@ RULES = {
     "central-difference": "CentralDifference",
     "monte-carlo": "MonteCarlo",
 }
-SAMPLERS = ("nuts", "ram", "map")
+SAMPLERS = ("nuts", "ram", "pmmh", "map")
+REFERENCES = ("auto", "grid", "particles")
 FREE = "free"
 
 

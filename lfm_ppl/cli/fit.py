@@ -16,6 +16,9 @@ import numpy as np
 from lfm_ppl import data, loading
 from lfm_ppl.cli import choices, results, session
 
+SETTINGS = ("rule", "steps", "max_step", "iterations")
+"""Flags of the approximation; None where the user leaves one to the model."""
+
 _GRID = 241
 """Times of the trajectories with --until, besides those of the data: enough for a smooth line."""
 
@@ -29,13 +32,15 @@ def run(arguments: argparse.Namespace) -> int:
     fixed = choices.fixed(arguments.set, model.anchors(observed))
     at = _requested(observed.times, arguments.until)
     if arguments.target_accept is not None and arguments.sampler == "map":
-        raise ValueError("--target-accept is for the samplers nuts and ram; map accepts and rejects nothing.")
+        raise ValueError("--target-accept is for the samplers nuts, ram and pmmh; map accepts and rejects nothing.")
+    if arguments.particles is not None and arguments.sampler != "pmmh":
+        raise ValueError(f"--particles is for the sampler pmmh; {arguments.sampler} uses none.")
     with results.folder(model.name, arguments.out, arguments.overwrite) as folder:
         _print_task(arguments, model, observed, options, fixed)
         started = time.perf_counter()
         posterior = sample(arguments, model, observed, options, fixed, at)
         seconds = time.perf_counter() - started
-        return _report(posterior, folder, seconds, arguments.overwrite)
+        return report(posterior, folder, seconds, arguments.overwrite)
 
 
 def _observed(arguments: argparse.Namespace, model: loading.ModelFile, options: dict[str, Any]) -> data.Data:
@@ -137,13 +142,20 @@ def sample(
         thin=arguments.thin,
         seed=arguments.seed,
         at=at,
-        sampler_options=None if arguments.target_accept is None else {"target_accept_prob": arguments.target_accept},
+        sampler_options={
+            name: value
+            for name, value in (("target_accept_prob", arguments.target_accept), ("particles", arguments.particles))
+            if value is not None
+        },
         model_kwargs=model.keywords(observed, options),
         fixed=fixed,
         truth=observed.truth,
         progress=not arguments.quiet and sys.stderr.isatty(),  # in a log file a bar is noise
         name=model.name,
     )
+    # What `lfm-ppl check` rebuilds the model from, in the words of the command line.
+    posterior.attrs["model_file"] = model.name if loading.available().get(model.name) == model.path else str(model.path)
+    posterior.attrs["settings"] = json.dumps({name: getattr(arguments, name) for name in SETTINGS})
     posterior.attrs["options"] = json.dumps(options)
     posterior.attrs["data"] = arguments.data or "simulated"
     if observed.note:
@@ -151,7 +163,7 @@ def sample(
     return posterior
 
 
-def _report(posterior: Any, folder: Path, seconds: float, overwrite: bool) -> int:
+def report(posterior: Any, folder: Path, seconds: float, overwrite: bool) -> int:
     """Write and print everything; return 1 where a figure could not be drawn."""
     from lfm_ppl.analysis import arviz_data, tables
     from lfm_ppl.analysis.plots import save_figures

@@ -1,5 +1,6 @@
 """Figures of a result, at the sizes of a paper. Nothing here touches pyplot or the global style."""
 
+from lfm_ppl.analysis.plots.accuracy import plot_accuracy
 from lfm_ppl.analysis.plots.calibration import plot_calibration
 from lfm_ppl.analysis.plots.chains import plot_trace
 from lfm_ppl.analysis.plots.pairs import plot_pairs
@@ -8,6 +9,7 @@ from lfm_ppl.analysis.plots.saving import save_figures
 from lfm_ppl.analysis.plots.trajectories import plot_fit, plot_forces, plot_states
 
 __all__ = [
+    "plot_accuracy",
     "plot_calibration",
     "plot_fit",
     "plot_forces",

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from lfm_ppl.analysis.arviz_data import group, has_group
 from lfm_ppl.analysis.files import refuse_existing, writing
-from lfm_ppl.analysis.plots import chains, pairs, residuals, style, trajectories
+from lfm_ppl.analysis.plots import accuracy, chains, pairs, residuals, style, trajectories
 from lfm_ppl.analysis.scalars import choose, scalar_draws
 
 MAX_PAGES = 5
@@ -30,7 +30,7 @@ def save_figures(
 ) -> list[Path]:
     """Draw every figure that ``result`` has the groups for, and write it to ``folder``.
 
-    The figures are fit, forces, states, trace, pairs and residuals. What does not fit on one page
+    The figures are fit, forces, states, trace, pairs, residuals and accuracy. What does not fit on one page
     goes to numbered ones, such as ``trace-1.png`` and ``trace-2.png``, five at most. Every file is
     written under a temporary name and renamed.
 
@@ -100,6 +100,8 @@ def _pages(result: Any, width: str | float) -> Iterator[tuple[str, Draw, list[st
     if has_group(result, "one_step_ahead"):
         names = [str(name) for name in group(result, "one_step_ahead")["output"].values]
         yield from _numbered("residuals", residuals.plot_residuals, names, residuals.MAX_OUTPUTS)
+    if has_group(result, "accuracy"):
+        yield "accuracy", accuracy.plot_accuracy, None
 
 
 def _numbered(

@@ -1,0 +1,239 @@
+"""Log likelihoods at draws of the parameters: of the Gaussian filter, and of what it is measured against."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lfm_ppl.comparators import fokker_planck, particle_filter
+from lfm_ppl.comparators.particle_filter import ParticleSettings
+from lfm_ppl.filtering.schedule import schedule
+from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
+from lfm_ppl.inference.posterior import LikelihoodSite, drawn, each, likelihood_site, over_draws
+from lfm_ppl.inference.settings import approximate
+from lfm_ppl.model.augment import StateSpaceModel
+
+_CHUNK = 8
+"""Draws between two signs of life; also how many the pilot run takes."""
+
+GRID_ERROR = 1e-2
+"""Discretisation error of a log likelihood that does not matter: most of it is common to all draws, and cancels."""
+
+_SCOUTS = 10
+"""Draws whose models the grid is laid out for: those with the smallest and largest parameters, and others between."""
+
+
+class Problem(NamedTuple):
+    """A NumPyro model, its data, and draws of its parameters.
+
+    Attributes:
+        model: the NumPyro model.
+        times: as `lfm_ppl.fit` takes them.
+        y: (T, D), or (B, T, D) for a panel.
+        keywords: keyword arguments of the model.
+        known: its likelihood site outside of compiled code.
+        draws: site name -> (S, ...).
+    """
+
+    model: Callable
+    times: Any
+    y: np.ndarray
+    keywords: Mapping[str, Any]
+    known: LikelihoodSite
+    draws: Mapping[str, np.ndarray]
+
+    @property
+    def size(self) -> int:
+        """S, the number of draws."""
+        return len(next(iter(self.draws.values())))
+
+    @property
+    def series(self) -> int:
+        """Number of series."""
+        return self.y.shape[0] if isinstance(self.known.distribution, Panel) else 1
+
+    def likelihood(self, parameters: Any, key: jax.Array) -> MarginalLikelihood | Panel:
+        """Return the likelihood under one draw, in compiled code too."""
+        return drawn(self.model, (self.times, self.y), self.keywords, key, parameters, self.known)
+
+    def at(self, rows: Any) -> Problem:
+        """Return the same problem with some of the draws."""
+        return self._replace(draws={name: value[rows] for name, value in self.draws.items()})
+
+
+class Reference(NamedTuple):
+    """Log likelihoods of a reference.
+
+    Attributes:
+        estimates: (S, R) log likelihoods, R replicates of an unbiased estimate, or R = 1 where they are exact.
+        description: of the method, in words.
+        particles: in each replicate; zero where there are none.
+        limited: whether more particles were wanted than the limit on work allows.
+    """
+
+    estimates: np.ndarray
+    description: str
+    particles: int = 0
+    limited: bool = False
+
+
+def is_exact(ssm: StateSpaceModel) -> bool:
+    """Whether the Gaussian filter computes the exact likelihood: linear dynamics and observation, Gaussian noise."""
+    observation = ssm.model.observation
+    return (ssm.time_invariant and ssm.observation_structure.linear and not observation.varies_with_state
+            and not observation.angular)
+
+
+def gaussian(problem: Problem) -> np.ndarray:
+    """Return (S,): the log likelihoods of the Gaussian filter, summed over the series of a panel."""
+
+    def one(distribution: MarginalLikelihood, y: jax.Array) -> jax.Array:
+        return distribution.log_prob(y)
+
+    def per_draw(parameters: Any, key: jax.Array) -> dict[str, jax.Array]:
+        found = each(problem.likelihood(parameters, key), one, jnp.asarray(problem.y, float))
+        return {"total": found.sum()}
+
+    rows = len(np.ravel(problem.times))
+    return over_draws(per_draw, problem.draws, jax.random.key(0), rows, problem.known)["total"]
+
+
+def gaussian_with_doubled_steps(problem: Problem) -> np.ndarray:
+    """Return (S,): the log likelihoods of the Gaussian filter with twice as many integration steps."""
+    example = problem.known.example
+    finer = approximate(problem.model, steps=2 * example.steps,
+                        max_step=None if example.max_step is None else example.max_step / 2)
+    known = likelihood_site(finer, (problem.times, problem.y), problem.keywords, jax.random.key(0))
+    return gaussian(problem._replace(model=finer, known=known))
+
+
+def on_grid(problem: Problem, steps: int | None, progress: bool) -> Reference:
+    """Return the log likelihoods by the Fokker-Planck equation on one grid for all draws.
+
+    Raises:
+        ValueError: what the grid raises, for states of more than one dimension, no noise, and so on.
+    """
+    layout = fokker_planck.choose_grid(_scouted(problem), problem.known.example.times, problem.y, tolerance=GRID_ERROR)
+
+    def one(distribution: MarginalLikelihood, y: jax.Array) -> jax.Array:
+        plan = schedule(distribution.ssm, distribution.times, steps or distribution.steps, distribution.max_step)
+        return fokker_planck.log_likelihood(distribution.ssm, plan, y, layout)
+
+    def per_draw(parameters: Any, key: jax.Array) -> jax.Array:
+        return each(problem.likelihood(parameters, key), one, jnp.asarray(problem.y, float)).sum()
+
+    found = _in_chunks(per_draw, "Fokker-Planck grid", progress)(problem, jax.random.key(0))
+    return Reference(found[:, None], f"Fokker-Planck equation on a grid of {layout.cells} cells")
+
+
+def by_particles(problem: Problem, particles: int | None, replicates: int, steps: int | None, key: jax.Array,
+                 progress: bool, noise: Callable[[np.ndarray], float], target: float, most_work: float) -> Reference:
+    """Return replicates of the particle filter's estimates.
+
+    Without a number of particles, a pilot run at a few draws, spread over all, finds the number at which the noise of
+    a draw's averaged estimate is below ``target``, for the variance falls in proportion to it.
+
+    Args:
+        problem: the draws.
+        particles: N, or None.
+        replicates: R.
+        steps: integration steps between two times; None: those of the Gaussian filter.
+        key: a JAX random key.
+        progress: whether to show how far it is.
+        noise: maps estimates (S, R) to the sd of their averages.
+        target: of that sd.
+        most_work: limit on the number of particle steps, from which that on N follows.
+    """
+    example = problem.known.example
+    pilot_key, key = jax.random.split(key)
+    limited = False
+    chosen = particles or _FIRST_PARTICLES
+    run = _particle_run(problem, chosen, replicates, steps, progress)
+    if particles is None:
+        rows = np.unique(np.linspace(0, problem.size - 1, _CHUNK).round().astype(int))
+        sd = noise(run(problem.at(rows), pilot_key))
+        wanted = chosen * (sd / target) ** 2 * _SAFETY if np.isfinite(sd) else np.inf
+        plan = schedule(example.ssm, example.times, steps or example.steps, example.max_step)
+        each_particle = problem.size * replicates * problem.series * np.shape(plan.rows.length)[0] * plan.steps
+        most = max(chosen, most_work / each_particle)
+        limited = wanted > most
+        if wanted > chosen and most > chosen:
+            chosen = int(np.ceil(min(wanted, most) / 500) * 500)
+            run = _particle_run(problem, chosen, replicates, steps, progress)
+    return Reference(run(problem, key), f"particle filter, {replicates} runs of {chosen:,} particles a draw", chosen,
+                     limited)
+
+
+_FIRST_PARTICLES = 1000
+_SAFETY = 1.2
+"""Margin of the number of particles over what the pilot run asks for, which is itself an estimate."""
+
+
+def _particle_run(problem: Problem, particles: int, replicates: int, steps: int | None, progress: bool) -> Callable:
+    known = problem.known.example
+    particle_filter.check_noise(known.ssm, known.plan.initial_time)
+    settings = particle_filter.check_settings(known.ssm, ParticleSettings(particles))
+
+    def one(distribution: MarginalLikelihood, y: jax.Array, key: jax.Array) -> jax.Array:
+        plan = schedule(distribution.ssm, distribution.times, steps or distribution.steps, distribution.max_step)
+        return particle_filter.log_likelihood(distribution.ssm, plan, y, key, settings)
+
+    def per_draw(parameters: Any, key: jax.Array) -> jax.Array:
+        distribution = problem.likelihood(parameters, key)
+        y = jnp.asarray(problem.y, float)
+
+        def replicate(key: jax.Array) -> jax.Array:
+            keys = jax.random.split(key, problem.series) if isinstance(distribution, Panel) else key
+            return each(distribution, one, y, keys).sum()
+
+        return jax.lax.map(replicate, jax.random.split(key, replicates))
+
+    return _in_chunks(per_draw, f"particle filter, {particles:,} particles", progress)
+
+
+def _in_chunks(per_draw: Callable, label: str, progress: bool) -> Callable[[Problem, jax.Array], np.ndarray]:
+    """Return a function that maps over draws, a few at a time, with one compilation for any number of draws."""
+    run = jax.jit(lambda draws, keys: jax.lax.map(lambda pair: per_draw(*pair), (draws, keys)))
+
+    def call(problem: Problem, key: jax.Array) -> np.ndarray:
+        count = problem.size
+        keys = jax.random.split(key, count)
+        found = []
+        for start in range(0, count, _CHUNK):
+            _show(f"{label}: {start} of {count} draws", progress)
+            index = np.minimum(np.arange(start, start + _CHUNK), count - 1)  # full chunks: one shape
+            found.append(np.asarray(run({name: jnp.asarray(value[index]) for name, value in problem.draws.items()},
+                                        keys[index])))
+        _show("", progress)
+        return np.concatenate(found)[:count]
+
+    return call
+
+
+def _show(text: str, progress: bool) -> None:
+    if progress:
+        print(f"\r{text:<70}\r", end="", file=sys.stderr, flush=True)
+
+
+def _scouted(problem: Problem) -> list[Any]:
+    """Return latent force models at draws that span the posterior, to lay out one grid for all."""
+    flat = np.column_stack([np.reshape(value, (problem.size, -1)) for value in problem.draws.values()])
+    extreme = np.concatenate([flat.argmin(axis=0), flat.argmax(axis=0)])
+    even = np.linspace(0, problem.size - 1, min(_SCOUTS, problem.size)).round().astype(int)
+    rows = list(dict.fromkeys([*extreme, *even]))[: max(_SCOUTS, len(extreme))]
+    found = []
+    for row in rows:
+        parameters = {name: jnp.asarray(value[row]) for name, value in problem.draws.items()}
+        distribution = problem.likelihood(parameters, jax.random.key(0))
+        if isinstance(distribution, Panel):
+            leaves = [jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf)[b], distribution.parameters)  # noqa: B023
+                      for b in range(problem.series)]
+            found += [distribution.build(one) for one in leaves]
+        else:
+            found.append(distribution.model)
+    return found

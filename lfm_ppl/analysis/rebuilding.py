@@ -1,0 +1,116 @@
+"""From a stored result and its NumPyro model back to what the model says of the data at each draw."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import numpy as np
+import xarray as xr
+from numpyro import handlers
+
+from lfm_ppl.analysis import arviz_data
+from lfm_ppl.analysis.likelihoods import Problem
+from lfm_ppl.filtering.filter import check_observations
+from lfm_ppl.inference.fixing import fix
+from lfm_ppl.inference.marginal_likelihood import Panel
+from lfm_ppl.inference.posterior import LikelihoodSite, likelihood_site
+
+_SETTINGS = ("rule", "steps", "max_step", "iterations")
+_TOLERANCE = 1e-6
+"""Relative difference of log likelihoods between machines and versions that is rounding."""
+
+
+def observations(result: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return the times and the observations that ``result`` was made from.
+
+    Returns:
+        times (T,) or (B, T), and y (T, D) or (B, T, D).
+
+    Raises:
+        ValueError: the result holds no data.
+    """
+    data = arviz_data.group(result, "observed_data")
+    names = [name for name in data.data_vars if name != "times"]
+    if len(names) != 1 or ("times" not in data and "time" not in data.coords):
+        raise ValueError(f"the group observed_data holds {', '.join(map(str, data.variables)) or 'nothing'}; expected "
+                         "one variable of observations and their times. Pass times and y.")
+    times = data["times"] if "times" in data else data["time"]
+    return np.asarray(times.values, float), np.asarray(data[names[0]].values, float)
+
+
+def problem(result: Any, numpyro_model: Callable, times: Any = None, y: Any = None,
+            model_kwargs: Mapping[str, Any] | None = None) -> Problem:
+    """Return model, data and all draws (C * N, ...) of the sample sites, with the result's fixed parameters.
+
+    Raises:
+        ValueError: the result holds no posterior or no data; or the model is not the one that it was made with: other
+            settings, other parameters.
+    """
+    posterior = arviz_data.group(result, "posterior")
+    attrs = arviz_data.attributes(result)
+    if times is None or y is None:
+        stored = observations(result)
+        times, y = stored[0] if times is None else times, stored[1] if y is None else y
+    keywords = dict(model_kwargs or {})
+    site = likelihood_site(numpyro_model, (times, y), keywords, jax.random.key(0))
+    _check_settings(site, attrs)
+    if isinstance(site.distribution, Panel):
+        y = np.asarray(site.distribution.checked(y))
+    else:
+        y = np.asarray(check_observations(y, *site.distribution.event_shape))
+    fixed = json.loads(attrs.get("fixed") or "{}")
+    model = fix(numpyro_model, fixed, labels=site.example.ssm.model.output_names) if fixed else numpyro_model
+    draws = _latent(model, (times, y), keywords, posterior)
+    return Problem(model, times, y, keywords, site, draws)
+
+
+def check_likelihood(result: Any, log_likelihood: np.ndarray, chosen: np.ndarray) -> None:
+    """Compare log likelihoods (C, S) at draws ``chosen`` (S,) of each chain with those that the result records.
+
+    Raises:
+        ValueError: they differ: the model, its options or the data are others than those of the result.
+    """
+    if not arviz_data.has_group(result, "one_step_ahead"):
+        return
+    recorded = arviz_data.group(result, "one_step_ahead")["log_density"].transpose("chain", "draw", ...)
+    recorded = recorded.isel(draw=chosen).values.reshape(*log_likelihood.shape, -1).sum(axis=-1)
+    difference = np.abs(recorded - log_likelihood)
+    if np.any(difference > _TOLERANCE * (1.0 + np.abs(recorded))):
+        raise ValueError(f"the model gives other log likelihoods than the result records, by up to {difference.max():g}"
+                         " at its draws: the model, its options or the data are not those that the result was made "
+                         "with. Fit again, or give what was used then.")
+
+
+def _check_settings(site: LikelihoodSite, attrs: Mapping[str, Any]) -> None:
+    example = site.example
+    own = {"rule": example.rule.name, "steps": example.steps, "max_step": example.max_step,
+           "iterations": example.iterations}
+    for name in _SETTINGS:
+        if name in attrs and attrs[name] != own[name]:
+            raise ValueError(f"the result was made with {name} = {attrs[name]}, but the model has {name} = "
+                             f"{own[name]}; give the model as it was fitted.")
+
+
+def _latent(model: Callable, arguments: tuple, keywords: Mapping[str, Any], posterior: xr.Dataset) -> dict:
+    """Return the draws of the sample sites; deterministic ones the model computes itself."""
+    trace = handlers.trace(handlers.seed(model, jax.random.key(0))).get_trace(*arguments, **keywords)
+    draws = {}
+    for name, site in trace.items():
+        if site["type"] != "sample" or site["is_observed"]:
+            continue
+        stored = name.replace("/", ".")
+        if stored not in posterior:
+            known = ", ".join(map(str, posterior.data_vars))
+            raise ValueError(f"the model samples {name!r}, of which the result has no draws (it has {known}); it is "
+                             "not the model that the result was made with.")
+        values = posterior[stored].transpose("chain", "draw", ...).values
+        if values.shape[2:] != np.shape(site["value"]):
+            raise ValueError(f"{name!r} has shape {np.shape(site['value'])} in the model and {values.shape[2:]} in the "
+                             "result; it is not the model that the result was made with.")
+        draws[name] = values.reshape(-1, *values.shape[2:])
+    if not draws:
+        raise ValueError("the model has no parameters that are sampled, so there is nothing to check.")
+    return draws

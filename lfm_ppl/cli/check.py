@@ -1,0 +1,181 @@
+"""``lfm-ppl check``: how wrong is a saved posterior, and the corrected one."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import shlex
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from lfm_ppl import data, loading
+from lfm_ppl.cli import choices, fit, results, session
+
+TABLE = "accuracy.csv"
+FIGURE = "accuracy.png"
+CORRECTED = "corrected"
+_DRAWS, _DRAWS_TO_CORRECT = 200, 1000
+_CHAINS, _WARMUP, _SAMPLES = 4, 500, 500
+"""Of delayed acceptance where the result comes from the posterior mode, which has no chains."""
+
+_RECORD = ("model_file", "settings", "options", "data", "note")
+
+
+class Task(NamedTuple):
+    """What is checked: the result, its model and the keyword arguments of that."""
+
+    posterior: Any
+    name: str
+    model: Callable
+    keywords: dict[str, Any]
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print the accuracy report, store it beside and in the result, and write the corrected result if asked."""
+    from lfm_ppl.analysis import arviz_data, files
+
+    if arguments.out is not None and not arguments.correct:
+        raise ValueError("--out names the folder of the corrected result; add --correct.")
+    path = results.locate(arguments.result)
+    for name in (TABLE, FIGURE):
+        files.refuse_existing(path.parent / name, arguments.overwrite)
+    posterior = arviz_data.load(path)
+    session.start(int(arviz_data.attributes(posterior).get("chains", 1)))
+    task = _task(posterior, arguments.model)
+    with contextlib.ExitStack() as stack:
+        folder = None
+        if arguments.correct:
+            out = arguments.out or str(path.parent / CORRECTED)
+            folder = stack.enter_context(results.folder(task.name, out, arguments.overwrite))
+        report = _checked(task, arguments)
+        print(f"\n{report.text(result=shlex.quote(arguments.result))}\n")
+        status = _write(report, task.posterior, path)
+        if folder is None:
+            return status
+        if report.exact:
+            print("the filter is exact: there is nothing to correct")
+            return status
+        return max(status, _correct(task, report, arguments, folder))
+
+
+def _task(posterior: Any, model_file: str | None) -> Task:
+    """Rebuild the model from what the result remembers of it."""
+    from lfm_ppl.analysis import arviz_data, rebuilding
+    from lfm_ppl.analysis.scalars import unit_of
+    from lfm_ppl.inference.settings import approximate
+
+    attrs = arviz_data.attributes(posterior)
+    chosen = model_file or attrs.get("model_file")
+    if not chosen:
+        raise ValueError(f"the result does not say which file its model {attrs.get('model', '')!r} comes from, as of "
+                         "one that lfm.fit made. Name the file with --model FILE, or call lfm.check_accuracy(result, "
+                         "model) in Python.")
+    try:
+        model = loading.load(chosen)
+    except ValueError as error:
+        remedy = "" if model_file else " The result was made with this file; if it has moved, name it with --model."
+        raise ValueError(f"{error}{remedy}") from error
+    times, y = rebuilding.observations(posterior)
+    if y.ndim != 2 or times.ndim != 1:
+        raise ValueError("the result is of a panel of series; check it with lfm.check_accuracy in Python.")
+    group = arviz_data.group(posterior, "observed_data")
+    outputs = tuple(str(name) for name in group["output"].values)
+    if model.outputs is not None and model.outputs != outputs:
+        raise ValueError(f"the result is of the outputs {', '.join(outputs)}; {model.path} has "
+                         f"{', '.join(model.outputs)}. Give the file that it was made with.")
+    (variable,) = (group[name] for name in group.data_vars)
+    units = {name: unit for name in outputs if (unit := unit_of(variable, name))}
+    observed = data.Data(times, y, outputs, units={**model.units, **units})
+    options = json.loads(attrs.get("options") or "{}")
+    unknown = sorted(set(options) - set(model.options))
+    if unknown:
+        raise ValueError(f"the result was made with the option {unknown[0]!r}, which {model.path} no longer has.")
+    settings = json.loads(attrs.get("settings") or "{}")
+    settings["rule"] = choices.rule(settings.get("rule"))
+    numpyro_model = approximate(model.model, **settings)
+    return Task(posterior, model.name, numpyro_model, model.keywords(observed, options))
+
+
+def _checked(task: Task, arguments: argparse.Namespace) -> Any:
+    from lfm_ppl.analysis.accuracy import check_accuracy
+
+    return check_accuracy(
+        task.posterior,
+        task.model,
+        reference=arguments.reference,
+        draws=arguments.draws or (_DRAWS_TO_CORRECT if arguments.correct else _DRAWS),
+        particles=arguments.particles,
+        model_kwargs=task.keywords,
+        seed=arguments.seed,
+        progress=_progress(arguments),
+    )
+
+
+def _write(report: Any, posterior: Any, path: Path) -> int:
+    """Store the report in the result and beside it; return 1 where the figure could not be drawn."""
+    from lfm_ppl.analysis import arviz_data, files, tables
+    from lfm_ppl.analysis.plots import plot_accuracy
+    from lfm_ppl.analysis.report import GROUP
+
+    # The file again, not what was read before the computation: somebody may have added to it.
+    stored = arviz_data.add_group(arviz_data.load(path), GROUP, report.to_dataset())
+    print(f"wrote    {arviz_data.save(stored, path, overwrite=True)} (group {GROUP})")
+    print(f"wrote    {tables.write_csv(report.table, path.parent / TABLE, overwrite=True)}")
+    try:
+        figure = plot_accuracy(posterior, width="full")
+        with files.writing(path.parent / FIGURE, overwrite=True) as temporary:
+            figure.savefig(temporary, format="png")
+    except Exception as error:  # the numbers are safe
+        print(f"lfm-ppl: the figure could not be drawn: {error}", file=sys.stderr)
+        return 1
+    print(f"wrote    {path.parent / FIGURE}")
+    return 0
+
+
+def _correct(task: Task, report: Any, arguments: argparse.Namespace, folder: Path) -> int:
+    """Write the corrected result: by resampling where the weights are reliable, else by delayed acceptance."""
+    from lfm_ppl.analysis.correction import correct
+
+    started = time.perf_counter()
+    if report.reliable:
+        print(f"correct  resampling {report.log_weight.size} draws, worth {report.ess:.0f} after weighting")
+        corrected = correct(task.posterior, task.model, model_kwargs=task.keywords, seed=arguments.seed)
+    else:
+        corrected = _delayed_acceptance(task, arguments)
+    return fit.report(corrected, folder, time.perf_counter() - started, arguments.overwrite)
+
+
+def _delayed_acceptance(task: Task, arguments: argparse.Namespace) -> Any:
+    """Sample the exact posterior: proposals that the Gaussian filter accepts are put to the particle filter."""
+    import lfm_ppl
+    from lfm_ppl.analysis import arviz_data, rebuilding
+
+    attrs = arviz_data.attributes(task.posterior)
+    times, y = rebuilding.observations(task.posterior)
+    mode = attrs.get("sampler") == "map"
+    chains, warmup, samples = ((_CHAINS, _WARMUP, _SAMPLES) if mode else
+                               (int(attrs[name]) for name in ("chains", "warmup", "samples")))
+    at = None
+    if arviz_data.has_group(task.posterior, "trajectories"):
+        at = arviz_data.group(task.posterior, "trajectories")["at"].values
+    print(f"correct  delayed acceptance, {chains} chains of {warmup} warm-up and {samples} kept draws", flush=True)
+    options: dict[str, Any] = {"delayed": True}
+    if arguments.particles is not None:
+        options["particles"] = arguments.particles
+    corrected = lfm_ppl.fit(
+        task.model, times, y, sampler="pmmh", sampler_options=options, chains=chains, warmup=warmup, samples=samples,
+        seed=arguments.seed, at=at, trajectory_draws=0 if at is None else 400, model_kwargs=task.keywords,
+        fixed=json.loads(attrs.get("fixed") or "{}"), name=task.name, progress=_progress(arguments),
+    )  # fmt: skip
+    corrected.attrs.update({name: attrs[name] for name in _RECORD if name in attrs})
+    if arviz_data.has_group(task.posterior, "truth"):
+        arviz_data.add_group(corrected, "truth", arviz_data.group(task.posterior, "truth"))
+    return corrected
+
+
+def _progress(arguments: argparse.Namespace) -> bool:
+    return not arguments.quiet and sys.stderr.isatty()
