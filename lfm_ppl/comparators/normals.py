@@ -38,7 +38,9 @@ def normals(key: jax.Array, count: int, size: int) -> jax.Array:
     """
     if count == 0 or size == 0:
         return jnp.zeros((count, size))
-    bits = jax.random.bits(key, (2, (count + 1) // 2, size), jnp.uint32)
+    # Pairs fill two rows where the rows are even in number, else two halves of each row.
+    shape = (count // 2, size) if count % 2 == 0 else (count, (size + 1) // 2)
+    bits = jax.random.bits(key, (2, *shape), jnp.uint32)
     uniform = (bits[0].astype(float) + 0.5) * 2.0**-32
     radius = jnp.sqrt(-2.0 * jnp.log(uniform))
     quadrant = bits[1] >> 30
@@ -48,7 +50,7 @@ def normals(key: jax.Array, count: int, size: int) -> jax.Array:
     swap = (quadrant & 1) == 1
     signed = radius * jnp.where((quadrant & 2) == 2, -1.0, 1.0)
     pairs = [signed * jnp.where(swap, -sine, cosine), signed * jnp.where(swap, cosine, sine)]
-    return jnp.concatenate(pairs)[:count] if count > 1 else pairs[0]
+    return jnp.concatenate(pairs) if count % 2 == 0 else jnp.concatenate(pairs, axis=1)[:, :size]
 
 
 def _polynomial(coefficients: tuple[float, ...], x: jax.Array) -> jax.Array:

@@ -206,11 +206,14 @@ def test_normal_numbers():
     for values in (drawn, drawn**2):
         assert np.abs(np.corrcoef(values) - np.eye(5)).max() < 4.5 / np.sqrt(200_001)
     assert np.isclose(stats.norm.sf(4.0), (drawn > 4.0).mean(), rtol=0.5)
-    # The polynomials against the functions that they stand for, at every bit pattern that occurs above.
-    bits = np.asarray(jax.random.bits(jax.random.key(5), (2, 3, 200_001), jnp.uint32)).astype(float)
-    radius = np.sqrt(-2 * np.log((bits[0] + 0.5) * 2.0**-32))
-    first = np.sort(np.hypot(drawn[0], drawn[3]))  # rows 0 and 3 are the two halves of one pair
-    assert np.allclose(first, np.sort(radius[0]), rtol=1e-10)
+    # The polynomials against the functions that they stand for: the two numbers of a pair lie on a circle.
+    bits = np.asarray(jax.random.bits(jax.random.key(5), (2, 5, 100_001), jnp.uint32)).astype(float)
+    radius, turn = np.sqrt(-2 * np.log((bits[0] + 0.5) * 2.0**-32)), 2 * np.pi * (bits[1] + 0.5) * 2.0**-32
+    quarter = np.pi / 4  # angles are counted from the middle of a quadrant
+    assert np.allclose(drawn[:, :100_001], radius * np.cos(turn - quarter), atol=1e-9)
+    assert np.allclose(drawn[:, 100_001:], (radius * np.sin(turn - quarter))[:, :-1], atol=1e-9)
+    even = np.asarray(normals(jax.random.key(5), 4, 100_001))
+    assert even.shape == (4, 100_001) and np.abs(np.corrcoef(even) - np.eye(4)).max() < 4.5 / np.sqrt(100_001)
 
 
 @pytest.mark.parametrize("scheme", RESAMPLING)
