@@ -29,8 +29,8 @@ _BLOCK = 4_000_000
 """Transition densities that are computed at a time."""
 
 
-class ForceDraws(NamedTuple):
-    """Trajectories of one force: draws (S, K), and their mean and standard deviation (K,)."""
+class Paths(NamedTuple):
+    """Trajectories of one force or state: draws (S, K), and their mean and standard deviation (K,)."""
 
     draws: jax.Array
     mean: jax.Array
@@ -66,17 +66,28 @@ class ParticleSmootherResult(eqx.Module):
         centred = self.draws - self.mean
         return jnp.einsum("ski,skj->kij", centred, centred) / (self.draws.shape[0] - 1)
 
-    def force(self, name: str) -> ForceDraws:
+    def force(self, name: str) -> Paths:
         """Return the trajectories of a force.
 
         Raises:
             ValueError: there is no force of that name.
         """
         checks.one_of("force", name, self.ssm.model.force_names)
-        index = self.ssm.physical_dim + self.ssm.model.force_names.index(name)
+        return self._paths(self.ssm.physical_dim + self.ssm.model.force_names.index(name))
+
+    def state(self, name: str) -> Paths:
+        """Return the trajectories of a physical state.
+
+        Raises:
+            ValueError: there is no state of that name.
+        """
+        checks.one_of("state", name, self.ssm.model.state_names)
+        return self._paths(self.ssm.model.state_names.index(name))
+
+    def _paths(self, index: int) -> Paths:
         matrix, offset = jax.vmap(self.ssm.input_map)(self.times)
         draws = jnp.einsum("kn,skn->sk", matrix[:, index], self.draws) + offset[:, index]
-        return ForceDraws(draws, draws.mean(axis=0), draws.std(axis=0, ddof=1))
+        return Paths(draws, draws.mean(axis=0), draws.std(axis=0, ddof=1))
 
 
 def particle_smoother(model: LatentForceModel, times: Any, y: Any, key: jax.Array, *, particles: int = 2_000,

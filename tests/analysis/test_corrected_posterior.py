@@ -34,8 +34,8 @@ def exact(wells):
     """Seed -> means and standard deviations by quadrature, the likelihood from the Fokker-Planck equation."""
     model, data = wells
     times, y = data[WIDER].times, jnp.stack([jnp.asarray(one.y) for one in data.values()])
-    axes = (np.linspace(np.log(0.8), np.log(7.0), 26), np.linspace(-1.1, 0.15, 26),
-            np.linspace(np.log(0.006), np.log(0.16), 26))
+    axes = (np.linspace(np.log(0.85), np.log(6.5), 22), np.linspace(-0.9, 0.25, 22),
+            np.linspace(np.log(0.0015), np.log(0.1), 26))
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
     def one(node):
@@ -53,7 +53,7 @@ def exact(wells):
         log_weight = found[:, index] + prior
         weight = np.exp(log_weight - log_weight.max())
         weight /= weight.sum()
-        cube = weight.reshape(26, 26, 26)
+        cube = weight.reshape(22, 22, 26)
         faces = [cube.take(end, axis=axis).sum() for axis in range(3) for end in (0, -1)]
         assert max(faces) < 2e-3, "the nodes hold the posterior"
         mean = {name: (weight * value).sum() for name, value in values.items()}

@@ -109,3 +109,6 @@ def test_an_unknown_force_is_named():
     found = lfm.particle_smoother(linear(), TIMES, Y, jax.random.key(0), particles=20, draws=5)
     with pytest.raises(ValueError, match="unknown force 'v'"):
         found.force("v")
+    with pytest.raises(ValueError, match="unknown state 'y'"):
+        found.state("y")
+    assert np.array_equal(found.state("x0").draws, found.draws[:, :, 0])
