@@ -25,6 +25,9 @@ Journal of Computational and Graphical Statistics 11 (2002).
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -42,6 +45,7 @@ PARAMETERS = {
     "cubic": "beta / sigma^2, above zero (1/x^4)",
 }
 TRUTH = {"alpha": -1.0, "beta": 0.1, "sigma": 2.0}
+GRID = np.linspace(0.0, 50.0, 501)
 STEPS = 60  # between observations: after one that lies outside the wells, the mean moves fast
 
 
@@ -94,17 +98,22 @@ def simulate(seed: int = 2, noise_sd: float = 0.1) -> lfm.Data:
         seed: of the path and the noise; with the default one it visits both wells several times.
         noise_sd: standard deviation of the observation noise.
     """
-    grid = np.linspace(0.0, 50.0, 501)
+    drawn = _simulator(float(noise_sd))(jax.random.key(seed))
     observed = np.arange(0, 501, 20)
-    system = build(**TRUTH, noise_sd=noise_sd, start=np.sqrt(10.0))
-    drawn = lfm.simulate(jax.random.key(seed), system, grid, steps=10)
     return lfm.Data(
-        times=grid[observed],
+        times=GRID[observed],
         y=np.asarray(drawn.y)[observed],
         outputs=OUTPUTS,
         units=UNITS,
-        truth={"times": grid, "forces": {}, "state": drawn.state, "parameters": _true_parameters()},
+        truth={"times": GRID, "forces": {}, "state": drawn.state, "parameters": _true_parameters()},
     )
+
+
+@functools.cache
+def _simulator(noise_sd: float) -> Callable[[jax.Array], lfm.Simulation]:
+    """Return the simulator, compiled once for all seeds."""
+    system = build(**TRUTH, noise_sd=noise_sd, start=np.sqrt(10.0))
+    return jax.jit(lambda key: lfm.simulate(key, system, GRID, steps=10))
 
 
 def _true_parameters() -> dict[str, float]:

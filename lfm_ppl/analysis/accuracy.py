@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shlex
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -18,6 +20,9 @@ from lfm_ppl.analysis.verdict import NOISE_SD, Findings, judge
 from lfm_ppl.model.augment import StateSpaceModel
 
 REFERENCES = ("auto", "grid", "particles")
+
+_LARGEST_VARIANCE = 100.0
+"""Of the noise of a log ratio, where all replicates but one find the data impossible."""
 
 _MOST_WORK = 2e10
 """Limit on particle steps of a check: some ten minutes on two cores for a small model."""
@@ -126,7 +131,8 @@ def assess(result: Any, chosen: np.ndarray, filtered: np.ndarray, doubled: np.nd
     posterior = arviz_data.group(result, "posterior")
     averaged = importance.average(reference.estimates.reshape(*filtered.shape, -1))
     ratio = averaged.log_mean - filtered
-    weights = importance.smooth(ratio, _relative_efficiency(filtered))
+    efficiency = _relative_efficiency(filtered)
+    weights = importance.smooth(ratio, efficiency)
     all_draws = scalar_draws(posterior)
     varying = {label: all_draws[label] for label in choose(all_draws, None)}
     table = importance.corrected_moments(varying, chosen, weights.log_weight)
@@ -139,8 +145,7 @@ def assess(result: Any, chosen: np.ndarray, filtered: np.ndarray, doubled: np.nd
         step_change_sd=float(change.std()), noise_sd=noise_sd, noise_share=_share(noise_sd, ratio),
         particles=reference.particles, checked=ratio.size,
         available=posterior.sizes["chain"] * posterior.sizes["draw"], impossible=int(np.isneginf(ratio).sum()),
-        sampler=str(attrs.get("sampler", "")), model=str(attrs.get("model", "MODEL")), steps=example.steps,
-        max_step=example.max_step)
+        sampler=str(attrs.get("sampler", "")), refit=_refit(attrs), steps=example.steps, max_step=example.max_step)
     verdict = judge(findings)
     sample = ("chain", "draw")
     variables = {
@@ -153,7 +158,8 @@ def assess(result: Any, chosen: np.ndarray, filtered: np.ndarray, doubled: np.nd
               "draw": posterior["draw"].values[chosen] if "draw" in posterior.coords else chosen,
               "parameter": list(table.index)}
     return AccuracyReport(xr.Dataset(variables, coords, {
-        "reference": reference.description, "pareto_k": weights.k, "threshold": weights.threshold, "ess": weights.ess,
+        "reference": reference.description, "pareto_k": weights.k, "threshold": weights.threshold,
+        "ess": efficiency * weights.ess,
         "particles": reference.particles, "particles_limited": int(reference.limited), "noise_sd": noise_sd,
         "noise_share": findings.noise_share, "step_change_mean": float(change.mean()),
         "step_change_sd": findings.step_change_sd, "steps": example.steps, "available_draws": findings.available,
@@ -162,13 +168,31 @@ def assess(result: Any, chosen: np.ndarray, filtered: np.ndarray, doubled: np.nd
 
 def noise(averaged: importance.Averaged) -> float:
     """Return the root mean square, over draws, of the noise sd of averaged log likelihoods."""
-    known = averaged.variance[np.isfinite(averaged.variance)]
-    return float(np.sqrt(known.mean())) if known.size else np.inf
+    known = averaged.variance[~np.isnan(averaged.variance)]
+    return float(np.sqrt(np.minimum(known, _LARGEST_VARIANCE).mean())) if known.size else np.inf
 
 
 def _share(noise_sd: float, ratio: np.ndarray) -> float:
     variance = float(np.var(ratio[np.isfinite(ratio)]))
     return min(noise_sd**2 / variance, 1.0) if variance > 0.0 else 0.0
+
+
+def _refit(attrs: Mapping[str, Any]) -> str:
+    """Return the command that made a result, in the words that it remembers; empty for results of `lfm_ppl.fit`."""
+    if not attrs.get("model_file"):
+        return ""
+    words = ["lfm-ppl", "fit", str(attrs["model_file"])]
+    if attrs.get("data", "simulated") != "simulated":
+        words += ["--data", str(attrs["data"])]
+    if attrs.get("sampler", "nuts") != "nuts":
+        words += ["--sampler", str(attrs["sampler"])]
+    rule = json.loads(attrs.get("settings") or "{}").get("rule")
+    words += ["--rule", rule] if rule else []
+    for flag, stored in (("--option", "options"), ("--set", "fixed")):
+        for name, value in json.loads(attrs.get(stored) or "{}").items():
+            text = ",".join(f"{one:.12g}" for one in value) if isinstance(value, list) else str(value)
+            words += [flag, f"{name}={text}"]
+    return shlex.join(words)
 
 
 def _relative_efficiency(log_likelihood: np.ndarray) -> float:

@@ -200,7 +200,8 @@ def summary(result: Any) -> pd.DataFrame:
 
     Returns:
         Columns mean, sd, q2.5, q97.5 (quantiles in percent), mcse_mean, ess_bulk, ess_tail, r_hat;
-        rows labelled ``noise_sd`` or ``decay[CDKN1A]``.
+        rows labelled ``noise_sd`` or ``decay[CDKN1A]``. Resampled draws are no chains: the effective size is that of
+        the importance weights, and there is no R-hat.
 
     Raises:
         ValueError: the result has no posterior.
@@ -213,7 +214,8 @@ def summary(result: Any) -> pd.DataFrame:
     """
     draws = scalar_draws(group(result, "posterior"))
     quantiles = {label: np.quantile(values, (0.025, 0.975)) for label, values in draws.items()}
-    return pd.DataFrame(
+    resampled = attributes(result).get("effective_draws")
+    table = pd.DataFrame(
         {
             "mean": {label: values.mean() for label, values in draws.items()},
             "sd": {label: _sd(values) for label, values in draws.items()},
@@ -227,6 +229,11 @@ def summary(result: Any) -> pd.DataFrame:
         index=list(draws),
         dtype=float,
     )
+    if resampled is not None:
+        table["mcse_mean"] = table["sd"] / np.sqrt(resampled)
+        table["ess_bulk"] = float(resampled)
+        table[["ess_tail", "r_hat"]] = np.nan
+    return table
 
 
 def convergence_warnings(result: Any) -> list[str]:
@@ -241,7 +248,7 @@ def convergence_warnings(result: Any) -> list[str]:
     Returns:
         Messages that name the parameters, their values, and what to do; empty if all is well.
     """
-    if attributes(result).get("sampler") == "map":
+    if attributes(result).get("sampler") == "map" or "effective_draws" in attributes(result):
         return []
     sizes = group(result, "posterior").sizes
     stats = group(result, "sample_stats") if has_group(result, "sample_stats") else {}
@@ -273,7 +280,7 @@ def psis(log_ratio: np.ndarray, relative_efficiency: float = 1.0) -> tuple[np.nd
     """
     raw = log_ratio - log_ratio.max()
     raw = raw - np.log(np.exp(raw).sum())
-    tail = int(np.ceil(min(0.2 * raw.size, 3.0 * np.sqrt(raw.size / relative_efficiency))))
+    tail = int(min(0.2 * raw.size, 3.0 * np.sqrt(raw.size / relative_efficiency)))
     if tail < _SMALLEST_TAIL:
         return raw, np.inf
     if np.ptp(np.sort(raw)[-tail - 1 :]) == 0.0:

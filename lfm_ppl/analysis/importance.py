@@ -44,7 +44,8 @@ class Averaged(NamedTuple):
 
     Attributes:
         log_mean: (...), log of the mean of the likelihoods, whose expectation is the likelihood.
-        variance: (...), of log_mean over repetitions; NaN of a single replicate.
+        variance: (...), of log_mean over repetitions; NaN of a single replicate, and where all replicates find the data
+            impossible; infinite where all but one do.
     """
 
     log_mean: np.ndarray
@@ -107,7 +108,8 @@ def average(estimates: np.ndarray) -> Averaged:
         return Averaged(log_mean, np.full(log_mean.shape, np.nan))
     left_out = np.stack([_log_mean(np.delete(estimates, r, axis=-1)) for r in range(replicates)], axis=-1)
     with np.errstate(invalid="ignore"):  # of a draw that some or all replicates find impossible
-        return Averaged(log_mean, (replicates - 1) * left_out.var(axis=-1))
+        variance = (replicates - 1) * left_out.var(axis=-1)
+    return Averaged(log_mean, np.where(np.isfinite(estimates).sum(axis=-1) == 1, np.inf, variance))
 
 
 def _log_mean(logs: np.ndarray) -> np.ndarray:

@@ -82,7 +82,7 @@ class AccuracyReport:
 
     @property
     def ess(self) -> float:
-        """Effective number of draws after weighting."""
+        """Effective number of draws after weighting, autocorrelation counted."""
         return float(self.dataset.attrs["ess"])
 
     @property
@@ -145,7 +145,9 @@ class AccuracyReport:
                           f"(mean, sd over {count} draws); {self.ess:.0f} effective draws"))
             lines.append(("Pareto k", f"{self.k:.2f} (reliable below {self.threshold:.2f})"))
         if int(attrs["particles"]):
-            lines.append(("noise", f"sd {self.noise_sd:.2g} of a log ratio, {self.noise_share:.0%} of their variance"))
+            limited = "; as many particles as the limit on work allows" if int(attrs["particles_limited"]) else ""
+            lines.append(("noise", f"sd {self.noise_sd:.2g} of a log ratio, {self.noise_share:.0%} of their variance"
+                          f"{limited}"))
         lines.append(("steps", f"{int(attrs['steps'])} between observations; doubled, the log likelihood changes by "
                       f"{number(mean, 2)} +- {number(sd, 2)} (mean, sd over the draws)"))
         return lines

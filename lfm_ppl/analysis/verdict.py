@@ -22,6 +22,9 @@ STEP_CHANGE = 0.1
 NOISE_SD = 0.3
 """Noise of a log ratio that does not matter."""
 
+LEAST_DRAWS = 40
+"""Fewer draws have no tail to fit a Pareto distribution to."""
+
 _SIGMAS = 2.0
 _NAMED = 4
 
@@ -40,7 +43,7 @@ class Findings(NamedTuple):
         available: number of draws of the posterior.
         impossible: number of draws that the reference gives a likelihood of zero.
         sampler: that made the draws.
-        model: its name.
+        refit: the command that made the result; empty where it is not known.
         steps, max_step: of the Gaussian filter.
     """
 
@@ -56,7 +59,7 @@ class Findings(NamedTuple):
     available: int
     impossible: int
     sampler: str
-    model: str
+    refit: str
     steps: int
     max_step: float | None
 
@@ -89,7 +92,9 @@ def _judged(found: Findings) -> tuple[str, str, str]:
             finer += f" --max-step {found.max_step / 2:g}"
         reason = (f"the integration steps are too long: doubling them changes the log likelihood by amounts that vary "
                   f"by {found.step_change_sd:.2g} (sd) over the posterior, more than {STEP_CHANGE}.")
-        return "re-run", reason, f"lfm-ppl fit {found.model} {finer}"
+        if not found.refit:
+            return "re-run", f"{reason} Fit again with {2 * found.steps} steps.", ""
+        return "re-run", reason, f"{found.refit} {finer}"
     if found.exact:
         return "trust", "the model is linear with Gaussian noise, for which the filter is exact.", ""
     if not found.k < found.threshold:
@@ -98,7 +103,7 @@ def _judged(found: Findings) -> tuple[str, str, str]:
     if shifted:
         reason = (f"the Gaussian filter has moved {_listed(shifted)}; the importance weights can be relied on "
                   f"(k = {found.k:.2f}, below {found.threshold:.2f}), and so can the corrected mean and sd.")
-        return "corrected", reason, "lfm-ppl check RESULT --correct"
+        return "corrected", reason, "lfm-ppl check RESULT --correct --overwrite"
     reason = (f"no mean is off by more than {SHIFT} sd and no sd by more than {WIDTH:.0%}, beyond Monte Carlo error "
               f"(k = {found.k:.2f}, below {found.threshold:.2f}).")
     unseen = _SIGMAS * float(np.nanmax(found.table["shift_se"], initial=0.0))
@@ -106,25 +111,25 @@ def _judged(found: Findings) -> tuple[str, str, str]:
         return "trust", reason, ""
     more = min(math.ceil(found.checked * (unseen / (2.0 * SHIFT)) ** 2 / 100) * 100, found.available)
     reason += f" Shifts up to {unseen:.2f} sd cannot be told from Monte Carlo error with {found.checked} draws."
-    return "trust", reason, f"lfm-ppl check RESULT --draws {more}" if more > found.checked else ""
+    return "trust", reason, f"lfm-ppl check RESULT --draws {more} --overwrite" if more > found.checked else ""
 
 
 def _unreliable(found: Findings) -> tuple[str, str]:
+    if not math.isfinite(found.k) and found.checked < min(LEAST_DRAWS, found.available):
+        return (f"{found.checked} draws are too few for a Pareto k.",
+                f"lfm-ppl check RESULT --draws {min(200, found.available)} --overwrite")
     start = f"k = {found.k:.2f} is not below {found.threshold:.2f}, so that the importance weights cannot be relied on"
     if found.noise_share > 0.5:
         reason = (f"{start}; {found.noise_share:.0%} of the variance of the log ratios is noise of the particle "
                   "filter, which makes k larger.")
-        return reason, f"lfm-ppl check RESULT --particles {4 * found.particles}"
+        return reason, f"lfm-ppl check RESULT --particles {4 * found.particles} --overwrite"
     # The threshold rises with the number of draws.
     needed = math.ceil(10.0 ** (1.0 / (1.0 - found.k))) if 0.0 < found.k < LARGEST_K else math.inf
-    if not math.isfinite(found.k) and found.checked < found.available:
-        return (f"{found.checked} draws are too few for a Pareto k.",
-                f"lfm-ppl check RESULT --draws {min(200, found.available)}")
     if found.checked < needed <= found.available:
         more = min(2 * int(needed), found.available)  # a margin, because k itself is an estimate
-        return f"{start} with {found.checked} draws.", f"lfm-ppl check RESULT --draws {more}"
+        return f"{start} with {found.checked} draws.", f"lfm-ppl check RESULT --draws {more} --overwrite"
     return (f"{start}: the posterior of the Gaussian filter is too far from the exact one. Delayed acceptance, or "
-            "`lfm-ppl fit` with --sampler pmmh, samples the exact one.", "lfm-ppl check RESULT --correct")
+            "`lfm-ppl fit` with --sampler pmmh, samples the exact one.", "lfm-ppl check RESULT --correct --overwrite")
 
 
 def _changed(table: pd.DataFrame) -> list[str]:

@@ -8,8 +8,8 @@ from collections.abc import Callable
 from typing import Any, NoReturn
 
 from lfm_ppl import checks
-from lfm_ppl.cli import fit, models, plot, simulate, version
-from lfm_ppl.cli.choices import RULES, SAMPLERS
+from lfm_ppl.cli import check, compare, fit, models, plot, simulate, version
+from lfm_ppl.cli.choices import REFERENCES, RULES, SAMPLERS
 
 MODEL_HELP = "a shipped model (see `lfm-ppl models`) or the path of a Python file"
 OPTION_HELP = "a choice that the model offers, see `lfm-ppl models MODEL`; may be repeated"
@@ -33,7 +33,7 @@ def parser() -> argparse.ArgumentParser:
     )
     top.set_defaults(debug=False)
     commands = top.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    for add in (_add_models, _add_simulate, _add_fit, _add_plot, _add_version):
+    for add in (_add_models, _add_simulate, _add_fit, _add_check, _add_compare, _add_plot, _add_version):
         add(commands)
     return top
 
@@ -89,6 +89,65 @@ def _add_plot(commands: Any) -> None:
     command.add_argument("--overwrite", action="store_true", help="replace figures that exist")
 
 
+def _add_check(commands: Any) -> None:
+    examples = (
+        "  lfm-ppl check lfm-results/ginzburg-landau-001\n"
+        "  lfm-ppl check lfm-results/spring-001 --reference particles --particles 5000 --draws 100\n"
+        "  lfm-ppl check lfm-results/ginzburg-landau-001 --correct --overwrite"
+    )
+    help_ = "measure what the Gaussian filter's approximation does to a saved posterior, and correct it"
+    command = _command(commands, "check", check.run, help_, examples)
+    command.add_argument("result", metavar="RESULT", help="a results folder or a posterior.nc")
+    command.add_argument(
+        "--reference",
+        type=_one_of("reference", REFERENCES),
+        default="auto",
+        metavar="|".join(REFERENCES),
+        help="what gives the exact likelihood (default: auto, the grid for one state, else particles)",
+    )
+    command.add_argument(
+        "--draws", type=_whole(1), metavar="N", help="posterior draws to compare at (default: 200; to correct, 1000)"
+    )
+    command.add_argument("--particles", type=_whole(1), metavar="N", help="default: as many as keep the noise low")
+    command.add_argument("--seed", type=_whole(0), default=0, help="of the particle filter (default: 0)")
+    command.add_argument(
+        "--correct",
+        action="store_true",
+        help="write the corrected result: resampled draws, or delayed acceptance where their weights are too uneven",
+    )
+    command.add_argument("--model", metavar="FILE", help="the model file, where the result does not know it")
+    command.add_argument("--out", metavar="DIR", help="folder of the corrected result (default: RESULT/corrected)")
+    command.add_argument("--overwrite", action="store_true", help="replace an earlier report and corrected result")
+    command.add_argument("--quiet", action="store_true", help="no progress (there is none without a terminal)")
+
+
+def _add_compare(commands: Any) -> None:
+    examples = (
+        "  lfm-ppl compare\n"
+        "  lfm-ppl compare ginzburg-landau --quick\n"
+        "  lfm-ppl compare ginzburg-landau --realisations 50 --conditional 200 --out double-well"
+    )
+    help_ = "run a published experiment again, or go on with one that was stopped; without a name, list them"
+    command = _command(commands, "compare", compare.run, help_, examples)
+    command.add_argument("experiment", nargs="?", metavar="EXPERIMENT", help="see `lfm-ppl compare`")
+    command.add_argument("--realisations", type=_whole(1), metavar="N", help="data sets (default: the experiment's)")
+    command.add_argument(
+        "--conditional",
+        type=_whole(1),
+        metavar="N",
+        help="data sets for the conditional posteriors of single parameters (default: the experiment's own)",
+    )
+    command.add_argument("--seed", type=_whole(0), default=0, help="random seed of everything (default: 0)")
+    command.add_argument("--quick", action="store_true", help="few and small: it shows that it runs, and no more")
+    command.add_argument(
+        "--out",
+        metavar="DIR",
+        help="folder to write; what it holds already is kept and used (default: lfm-results/compare/EXPERIMENT)",
+    )
+    command.add_argument("--overwrite", action="store_true", help="replace results that were made with other settings")
+    command.add_argument("--quiet", action="store_true", help="no lines of progress")
+
+
 def _add_version(commands: Any) -> None:
     help_ = "print the versions of lfm_ppl and of what it stands on"
     _command(commands, "version", version.run, help_, "  lfm-ppl version")
@@ -133,20 +192,28 @@ def _add_inference(group: Any) -> None:
         type=_one_of("sampler", SAMPLERS),
         default="nuts",
         metavar="|".join(SAMPLERS),
-        help="default: nuts",
+        help="default: nuts; pmmh is ram on a particle filter's likelihood, exact and slow",
     )
     group.add_argument("--chains", type=_whole(1), default=4, help="default: 4")
     group.add_argument("--warmup", type=_whole(0), default=1000, help="per chain (default: 1000)")
     group.add_argument("--samples", type=_whole(1), default=1000, help="per chain (default: 1000)")
     group.add_argument(
-        "--thin", type=_whole(1), help="steps that make one draw (default: 1 for nuts, 5 per parameter for ram)"
+        "--thin",
+        type=_whole(1),
+        help="steps that make one draw (default: 1 for nuts, 5 per parameter for ram, 1 per parameter for pmmh)",
     )
     group.add_argument("--seed", type=_whole(0), default=0, help="random seed of the sampler (default: 0)")
     group.add_argument(
         "--target-accept",
         type=_fraction,
         metavar="P",
-        help="acceptance to aim at (default: 0.8 for nuts; for ram 0.234, or 0.44 for one parameter)",
+        help="acceptance to aim at (default: 0.8 for nuts; for ram 0.234, or 0.44 for one parameter; half for pmmh)",
+    )
+    group.add_argument(
+        "--particles",
+        type=_whole(1),
+        metavar="N",
+        help="of the particle filter of pmmh (default: as many as make the sd of the log likelihood about 1)",
     )
     group.add_argument(
         "--set",

@@ -8,6 +8,7 @@ import json
 import shlex
 import sys
 import time
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -52,6 +53,8 @@ def run(arguments: argparse.Namespace) -> int:
             out = arguments.out or str(path.parent / CORRECTED)
             folder = stack.enter_context(results.folder(task.name, out, arguments.overwrite))
         report = _checked(task, arguments)
+        for message in arviz_data.convergence_warnings(posterior):
+            warnings.warn(f"the draws that are checked: {message}", stacklevel=1)
         print(f"\n{report.text(result=shlex.quote(arguments.result))}\n")
         status = _write(report, task.posterior, path)
         if folder is None:

@@ -179,6 +179,10 @@ def report(posterior: Any, folder: Path, seconds: float, overwrite: bool) -> int
         print(f"lfm-ppl: the figures could not be drawn: {error}", file=sys.stderr)
         print(f"         try again with: lfm-ppl plot {folder} --overwrite", file=sys.stderr)
         status = 1
+    attrs = arviz_data.attributes(posterior)
+    if "log_likelihood_sd" in attrs:
+        print(f"particles {attrs['particles']}; the log likelihood estimate has a standard deviation of "
+              f"{attrs['log_likelihood_sd']:.2f} (near 1 is best)")
     print(f"time     {seconds:.0f} s")
     for path in written:
         print(f"wrote    {path}")

@@ -188,6 +188,9 @@ def _checked(model: Any) -> StateSpaceModel:
     """Convert a model after checking that its density exists on a grid."""
     if not isinstance(model, LatentForceModel):
         raise TypeError(f"model must be an lfm.LatentForceModel, got {type(model).__name__}.")
+    if jnp.result_type(float) != jnp.float64:
+        raise ValueError("the Fokker-Planck grid needs double precision. Call "
+                         'jax.config.update("jax_enable_x64", True) before anything else.')
     ssm = state_space(model)
     if ssm.state_dim != 1:
         states, forces = (", ".join(names) or "none" for names in (model.state_names, model.force_names))

@@ -77,7 +77,7 @@ class Step(NamedTuple):
     """What a row leaves.
 
     Attributes:
-        log_likelihood: of the row's observation, zero without one.
+        log_likelihood: of the row's observation; without one, of having stayed among the finite numbers, mostly zero.
         state: (n, N), the particles before resampling.
         log_weights: (N,), normalised, after the observation.
         ess: of these weights.
@@ -117,8 +117,8 @@ def particle_filter(model: LatentForceModel, times: Any, y: Any, key: jax.Array,
         resampling: "systematic", "stratified" or "multinomial".
         threshold: resample where the effective sample size is below this share of N; 1 for after every observation.
         scheme: of the steps: "exact" (linear time-invariant models), "srk" (additive noise, strong order 1.5),
-            "milstein" (strong order 1; with several noise sources they must commute), "euler", or "auto" for the first
-            of these that the model allows, Milstein with one noise source only.
+            "milstein" (strong order 1; several noise sources must commute, and a force in the dispersion be smooth),
+            "euler", or "auto" for the first of these that the model allows, Milstein with one noise source only.
         batch: particles that are moved and weighted at a time, one batch after another, where memory is short: what is
             held besides the particles is proportional to it. None: all at once, which is faster.
 
@@ -152,7 +152,11 @@ def _run(ssm: StateSpaceModel, plan: Schedule, y: jax.Array, times: jax.Array, k
         return step.log_likelihood, *_moments(step.state, step.log_weights), step.ess, step.resampled
 
     kept = forward(ssm, plan, y, key, settings, summary)
-    total, mean, covariance, ess, resampled = (part[jnp.asarray(plan.observed)] for part in kept)
+    observed = jnp.asarray(plan.observed)
+    # What happens in rows between two observations belongs to the second.
+    following = jnp.searchsorted(observed, jnp.arange(kept[0].shape[0]))
+    total = jax.ops.segment_sum(kept[0], following, observed.shape[0] + 1)[:-1]
+    mean, covariance, ess, resampled = (part[observed] for part in kept[1:])
     return ParticleFilterResult(times, total, mean, covariance, ess, resampled, settings.particles, settings.scheme)
 
 
@@ -297,7 +301,9 @@ def _weigh(settings: ParticleSettings, key: jax.Array, state: jax.Array, log_wei
     needed = observed & (ess < settings.threshold * size) if settings.threshold < 1.0 else observed
     stay = jnp.arange(size)
     ancestors = jax.lax.cond(needed, lambda: resample(key, weights, settings.resampling), lambda: stay)
-    step = Step(jnp.where(observed, total, 0.0), state, log_weights, ess, needed, ancestors)
+    # Particles that have left the finite numbers count as such wherever it happens, not only at an observation.
+    lost = jnp.isneginf(log_density).any()
+    step = Step(jnp.where(observed | lost, total, 0.0), state, log_weights, ess, needed, ancestors)
     return state[:, ancestors], jnp.where(needed, equal, log_weights), step
 
 

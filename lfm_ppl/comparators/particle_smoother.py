@@ -147,7 +147,7 @@ def particle_smoother(model: LatentForceModel, times: Any, y: Any, key: jax.Arra
     if (needed := 8 * rows * particles * (ssm.state_dim + 2)) > _LARGEST_HISTORY:
         raise ValueError(f"the particles of {rows} rows would take {needed / 2**30:.1f} GiB; smoothing keeps all of "
                          f"them. Take at most {particles * _LARGEST_HISTORY // needed} particles, or fewer steps.")
-    states, index = eqx.filter_jit(draw_trajectories)(ssm, plan, y, key, settings, draws, chosen)
+    states, index, _ = eqx.filter_jit(draw_trajectories)(ssm, plan, y, key, settings, draws, chosen)
     distinct = np.array([len(np.unique(row)) for row in np.asarray(index)])
     return ParticleSmootherResult(jnp.asarray(plan.requested_times, float), jnp.moveaxis(states, 0, 1),
                                   jnp.asarray(distinct), ssm, chosen, settings.scheme)
@@ -192,8 +192,11 @@ def _regular(covariance: jax.Array) -> bool:
 
 
 def draw_trajectories(ssm: StateSpaceModel, plan: Schedule, y: jax.Array, key: jax.Array, settings: ParticleSettings,
-                      draws: int, method: str) -> tuple[jax.Array, jax.Array]:
-    """Return trajectories (K, S, n), and the particles (K, S) that they pass through; for compiled code."""
+                      draws: int, method: str) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return trajectories (K, S, n), the particles (K, S) that they pass through, and the log likelihood estimate.
+
+    For compiled code.
+    """
     filter_key, last_key, back_key = jax.random.split(key, 3)
     steps: Step = forward(ssm, plan, y, filter_key, settings, lambda step: step)
     last = _choose(last_key, jnp.broadcast_to(steps.log_weights[-1], (draws, settings.particles)))
@@ -219,7 +222,7 @@ def draw_trajectories(ssm: StateSpaceModel, plan: Schedule, y: jax.Array, key: j
     states = jnp.concatenate([states, first[0][None]])
     indices = jnp.concatenate([indices, last[None]])
     requested = jnp.asarray(plan.requested)
-    return states[requested], indices[requested]
+    return states[requested], indices[requested], steps.log_likelihood.sum()
 
 
 def _drawn_back(ssm: StateSpaceModel, settings: ParticleSettings, plan: Schedule, row: Rows, state: jax.Array,

@@ -157,7 +157,10 @@ def srk(ssm: StateSpaceModel, prepared: Prepared, h: jax.Array, t: jax.Array, s:
 
 def milstein(ssm: StateSpaceModel, prepared: Prepared, h: jax.Array, t: jax.Array, s: jax.Array,
               noise: tuple[jax.Array, jax.Array], kick: jax.Array) -> jax.Array:
-    """Add half of (dG/dx G) (DeltaB DeltaB' - h I) to Euler's step: strong order 1 for commutative noise."""
+    """Add half of (dG/dx G) (DeltaB DeltaB' - h I) to Euler's step: strong order 1 for commutative noise.
+
+    A dispersion that depends on a force adds no term where the force is smooth (Matern of order 1 and more).
+    """
     size = ssm.physical_dim
     x, z = s[:size], s[size:]
     later, w, _ = force_inputs(ssm, prepared, h, t, x, z, kick)

@@ -165,7 +165,7 @@ def fit(
     size = space.draw(keys[2], init_to_median).size
     if size == 0:
         raise ValueError("the model has no parameters to sample; use lfm.smooth for the forces of a known model.")
-    particles = None
+    particles = particle_steps = None
     if sampler == "map":
         draws, stats, remarks = _mode(model, arguments, keywords, keys[1], samples, seed, init, size)
         chains, warmup = 1, 0
@@ -178,7 +178,7 @@ def fit(
                                chain_method, progress, first)
         remarks = {"thin": thin}
         if isinstance(kernel, ParticleMarginalRAM) and kernel.tuned is not None:
-            particles = kernel.settings
+            particles, particle_steps = kernel.settings, kernel.particle_steps
             remarks |= {"particles": kernel.tuned.particles, "log_likelihood_sd": kernel.tuned.sd,
                         "delayed": int(kernel.delayed)}
     flat = {label: value.reshape(-1, *value.shape[2:]) for label, value in draws.items()}
@@ -186,7 +186,8 @@ def fit(
     rated = _kept("scores of the observations", lambda: scores(
         model, arguments, keywords, latent, y, site), None)
     chosen, paths, grid = _kept("trajectories", lambda: _paths(
-        model, arguments, keywords, latent, site, y, at, trajectory_draws, chains, samples, keys[3], particles),
+        model, arguments, keywords, latent, site, y, at, trajectory_draws, chains, samples, keys[3], particles,
+        particle_steps),
         (None, None, None))
     groups = _groups(site, draws, stats, rated, paths, chosen, grid, times, y, truth, chains, samples)
     attrs = {
@@ -267,7 +268,7 @@ def _kernel(sampler: str, model: Callable, arguments: tuple, keywords: dict, str
                             hessian="finite-differences", forward_mode=few)
     if mode.unidentified or not np.all(np.isfinite(mode.covariance)):
         return walk(model, init_strategy=strategy, **options), None
-    if sampler == "pmmh" and options.get("particles") is None:
+    if sampler == "pmmh":
         # At the mode, because a chain's own start may be a poor place to judge the estimate by.
         options |= {"tune_at": space.unravel(jnp.asarray(mode.mode))}
     kernel = walk(model, init_strategy=strategy, initial_covariance=mode.covariance, **options)
@@ -321,7 +322,7 @@ def _latent(model: Callable, arguments: tuple, keywords: dict, key: jax.Array, f
 
 def _paths(model: Callable, arguments: tuple, keywords: dict, latent: dict, site: LikelihoodSite, y: Any, at: Any,
            count: int, chains: int, samples: int, key: jax.Array,
-           particles: Any) -> tuple[np.ndarray, dict | None, np.ndarray | None]:
+           particles: Any, particle_steps: int | None) -> tuple[np.ndarray, dict | None, np.ndarray | None]:
     """Draw trajectories for draws that are spread evenly over each chain."""
     per_chain = min(samples, -(-count // chains))
     if per_chain == 0:
@@ -335,7 +336,7 @@ def _paths(model: Callable, arguments: tuple, keywords: dict, latent: dict, site
         grid = (np.union1d(np.linspace(min(origin, times[0]), times[-1], _GRID), times) if at is None
                 else np.atleast_1d(np.asarray(at, float)))
     subset = {label: value[rows] for label, value in latent.items()}
-    paths = trajectories(model, arguments, keywords, subset, y, grid, key, site, particles)
+    paths = trajectories(model, arguments, keywords, subset, y, grid, key, site, particles, particle_steps)
     return chosen, {k: v.reshape(chains, len(chosen), *v.shape[1:]) for k, v in paths.items()}, grid
 
 

@@ -89,7 +89,22 @@ class with_particles(Messenger):  # noqa: N801 (an effect handler, named as NumP
     def __init__(self, fn: Callable[..., Any] | None, key: jax.Array, settings: ParticleSettings,
                  steps: int | None = None, times: Any = None) -> None:
         self.key, self.settings, self.steps, self.times = key, settings, steps, times
+        self.found = False
         super().__init__(fn)
+
+    def __enter__(self) -> with_particles:
+        """Start a run of the model."""
+        self.found = False
+        super().__enter__()
+        return self
+
+    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
+        """End the run; a likelihood that could not be replaced is an error."""
+        super().__exit__(kind, error, trace)
+        if kind is None and not self.found:
+            raise ValueError("the particle filter cannot stand in for the likelihood of this model: it needs a site "
+                             "numpyro.sample(name, lfm.MarginalLikelihood(...), obs=y) without mask, expand or plate "
+                             "around it (or an lfm.panel in its plate).")
 
     def process_message(self, msg: dict[str, Any]) -> None:
         """Put the estimate in the place of the likelihood."""
@@ -97,6 +112,7 @@ class with_particles(Messenger):  # noqa: N801 (an effect handler, named as NumP
         if msg["type"] == "sample" and isinstance(fn, (MarginalLikelihood, Panel)):
             if self.times is not None and checks.traced(fn.times):
                 fn = fn.with_times(self.times)
+            self.found = True
             msg["fn"] = ParticleLikelihood(fn, self.key, self.settings, self.steps)
 
 
@@ -125,15 +141,24 @@ class ParticlePotential:
     def __init__(self, model: Callable, args: tuple, kwargs: Mapping[str, Any], key: jax.Array,
                  settings: ParticleSettings, steps: int | None = None) -> None:
         if steps is not None:
-            checks.positive_integer("steps", steps)
+            checks.positive_integer("particle_steps", steps)
         site = likelihood_site(model, args, kwargs, key)
         check_noise(site.example.ssm, site.example.plan.initial_time)
         self.settings = check_settings(site.example.ssm, settings)
         self._call = (model, args, dict(kwargs), key, steps, site.distribution.times)
 
-    def __call__(self, z: Any, key: jax.Array, particles: int | None = None) -> jax.Array:
-        """Return minus the log density at ``z``; ``key`` is that of the particle filter."""
+    def __call__(self, z: Any, key: jax.Array, particles: int | None = None,
+                 call: tuple[tuple, dict] | None = None) -> jax.Array:
+        """Return minus the log density at ``z``.
+
+        Args:
+            z: unconstrained parameters.
+            key: of the particle filter.
+            particles: their number; None: that of the settings.
+            call: positional and keyword arguments of the model in place of its own, of the same shapes.
+        """
         model, args, kwargs, own, steps, times = self._call
+        args, kwargs = call or (args, kwargs)
         settings = self.settings if particles is None else self.settings._replace(particles=particles)
         seeded = handlers.seed(model, own)
         return potential_energy(with_particles(seeded, key, settings, steps, times), args, kwargs, z)
@@ -155,19 +180,10 @@ class ParticlePotential:
         Source: Doucet, Pitt, Deligiannidis and Kohn (2015), Biometrika 102(2).
         """
         checks.positive("target_sd", target_sd)
-        particles = max(_FEWEST, min(200, _MOST))
+        particles = 200
         for attempt in range(8):
-            keys = jax.random.split(jax.random.fold_in(key, attempt), _REPLICATES)
-            run = jax.jit(lambda z, keys, count=particles: jax.lax.map(lambda k: self(z, k, count), keys))
-            energies = np.asarray(run(z, keys))
-            if np.isfinite(energies).mean() < 0.5:
-                wanted = 8 * particles
-                sd = np.inf
-            else:
-                # Infinite energies are estimates of zero: as far down as the worst of the others, at least.
-                worst = np.where(np.isfinite(energies), energies, energies[np.isfinite(energies)].max())
-                sd = float(worst.std(ddof=1))
-                wanted = int(np.ceil(particles * np.clip((sd / target_sd) ** 2, 1 / 64, 8.0)))
+            sd = self.spread(z, jax.random.fold_in(key, attempt), particles)
+            wanted = int(np.ceil(particles * np.clip((sd / target_sd) ** 2, 1 / 64, 8.0)))
             close = particles / 1.4 < wanted < particles * 1.4
             if close or (particles == _FEWEST and wanted <= _FEWEST):
                 return Tuned(particles, sd)
@@ -179,3 +195,15 @@ class ParticlePotential:
         raise ValueError(f"the log likelihood estimate has a standard deviation of {sd:.3g} with {_MOST} particles; "
                          f"{target_sd:g} is out of reach. The observations may be too precise, or too many, for a "
                          "bootstrap filter, or the starting point is far from the posterior; give particles yourself.")
+
+    def spread(self, z: Any, key: jax.Array, particles: int) -> float:
+        """Return the standard deviation of the log likelihood estimate at ``z``, from 64 of them.
+
+        Estimates of zero count as the worst of the others; infinite where they are the majority.
+        """
+        run = jax.jit(lambda z, keys: jax.lax.map(lambda k: self(z, k, particles), keys))
+        energies = np.asarray(run(z, jax.random.split(key, _REPLICATES)))
+        finite = np.isfinite(energies)
+        if finite.mean() < 0.5:
+            return float("inf")
+        return float(np.where(finite, energies, energies[finite].max()).std(ddof=1))

@@ -85,7 +85,9 @@ class ParticleMarginalRAM(RAM):
 
     Attributes:
         delayed: whether acceptance is delayed.
-        tuned: after the start, the number of particles and the standard deviation of the log likelihood estimate.
+        particle_steps: as given.
+        tuned: after the start, the number of particles and the standard deviation of the log likelihood estimate
+            (NaN where the data were traced).
 
     Raises:
         ValueError: what `RAM` and `lfm_ppl.particle_filter` raise; no number of particles is enough.
@@ -129,12 +131,16 @@ class ParticleMarginalRAM(RAM):
                          init_strategy)
         if particles is not None:
             checks.positive_integer("particles", particles)
+        if not isinstance(delayed, bool):
+            raise TypeError(f"delayed must be True or False, got {delayed!r}.")
         self._settings = ParticleSettings(particles or 1, resampling, threshold, scheme)
         self.delayed = delayed
         self._tune_at = tune_at
-        self._particle_steps = particle_steps
+        self.particle_steps = particle_steps
+        self._particles = particles
         self._estimate: ParticlePotential | None = None
-        self.tuned: Tuned | None = None if particles is None else Tuned(particles, float("nan"))
+        self._tuned_for: Any = None
+        self.tuned: Tuned | None = None
 
     def init(  # type: ignore[override]
         self,
@@ -151,7 +157,7 @@ class ParticleMarginalRAM(RAM):
         self._prepare(start.z if single else jax.tree_util.tree_map(lambda leaf: leaf[0], start.z), model_args,
                       model_kwargs or {})
         estimate_key = jax.random.fold_in(first_key, 1)
-        estimate = jax.jit(self._energy)
+        estimate = jax.jit(partial(self._energy, (model_args, model_kwargs or {})))
         if single:
             energy = estimate(start.z, estimate_key)
         else:
@@ -172,25 +178,40 @@ class ParticleMarginalRAM(RAM):
         assert self.model is not None
         with jax.ensure_compile_time_eval():  # chains that run in parallel are initialised within a trace
             key = jax.random.key(0)
-            self._estimate = ParticlePotential(self.model, args, kwargs, key, self._settings, self._particle_steps)
-            if self.tuned is None:
-                z = start if self._tune_at is None else self._tune_at
-                if checks.traced(z):
-                    space = UnconstrainedModel(self.model, args, kwargs, key)
-                    z = space.unravel(space.draw(key, self._init_strategy))
+            self._estimate = ParticlePotential(self.model, args, kwargs, key, self._settings, self.particle_steps)
+            if checks.traced((args, kwargs)):
+                # Data that are arguments of a compiled program: there is nothing to choose the number by.
+                if self._particles is None:
+                    raise ValueError("the number of particles is chosen by the data, which are not known here; give "
+                                     "particles, or run with numbers (jit_model_args=False).")
+                self.tuned = Tuned(self._particles, float("nan"))
+                return
+            data = [np.asarray(leaf).tobytes() for leaf in jax.tree_util.tree_leaves((args, kwargs))
+                    if isinstance(leaf, (np.ndarray, jax.Array, float, int))]
+            if self.tuned is not None and data == self._tuned_for:
+                return
+            self._tuned_for = data
+            z = start if self._tune_at is None else self._tune_at
+            if checks.traced(z):
+                space = UnconstrainedModel(self.model, args, kwargs, key)
+                z = space.unravel(space.draw(key, self._init_strategy))
+            if self._particles is None:
                 self.tuned = self._estimate.tune(z, key)
+            else:
+                self.tuned = Tuned(self._particles, self._estimate.spread(z, key, self._particles))
 
     def sample(self, state: ParticleMarginalState, model_args: tuple,  # type: ignore[override]
                model_kwargs: dict | None) -> ParticleMarginalState:
         """Return the state after one step of every chain in ``state``."""
         surrogate = self._potential(model_args, model_kwargs or {}) if self.delayed else None
-        one_chain = partial(particle_marginal_step, self._energy, surrogate, self._target_accept_prob, self._exponent,
+        energy = partial(self._energy, (model_args, model_kwargs or {}))
+        one_chain = partial(particle_marginal_step, energy, surrogate, self._target_accept_prob, self._exponent,
                             self._adapt_throughout)
         return (one_chain if is_prng_key(state.rng_key) else jax.vmap(one_chain))(state)
 
-    def _energy(self, z: Any, key: jax.Array) -> jax.Array:
+    def _energy(self, call: tuple[tuple, dict], z: Any, key: jax.Array) -> jax.Array:
         assert self._estimate is not None and self.tuned is not None, "init must be called before sample."
-        return self._estimate(z, key, self.tuned.particles)
+        return self._estimate(z, key, self.tuned.particles, call)
 
 
 def particle_marginal_step(

@@ -16,6 +16,10 @@ from lfm_ppl.comparators.particle_smoother import TRACING, draw_trajectories
 from lfm_ppl.filtering.schedule import schedule
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
 from lfm_ppl.linalg import matmul, semidefinite_root
+from lfm_ppl.model.augment import StateSpaceModel
+
+_FILTERS = 4
+"""Particle filters from which the path of one draw is chosen."""
 
 _BATCH_NUMBERS = 2_000_000
 """Numbers that the smoother may hold for one batch of draws; more draws go one batch after another."""
@@ -87,7 +91,8 @@ def scores(model: Callable, arguments: tuple, keywords: Mapping[str, Any], draws
 
 def trajectories(model: Callable, arguments: tuple, keywords: Mapping[str, Any], draws: Mapping[str, Any], y: Any,
                  at: Any, key: jax.Array, known: LikelihoodSite,
-                 particles: ParticleSettings | None = None) -> dict[str, np.ndarray]:
+                 particles: ParticleSettings | None = None,
+                 particle_steps: int | None = None) -> dict[str, np.ndarray]:
     """Draw one trajectory for each draw of the parameters, given the data, and replicate the data along it.
 
     Args:
@@ -100,6 +105,7 @@ def trajectories(model: Callable, arguments: tuple, keywords: Mapping[str, Any],
         key: a JAX random key.
         known: the site outside of compiled code, where its times are numbers.
         particles: draw the trajectories with the particle smoother; None: with the Gaussian one.
+        particle_steps: integration steps of the particles between two observations; None: the model's.
 
     Returns:
         ``state`` (S, ..., K, M), ``force`` (S, ..., K, R), ``output`` (S, ..., K, D) free of noise, and ``y``
@@ -115,7 +121,7 @@ def trajectories(model: Callable, arguments: tuple, keywords: Mapping[str, Any],
         if particles is None:
             w, when = _smoothed_path(distribution, y, both, path_key)
         else:
-            w, when = _particle_path(distribution, y, both, path_key, particles)
+            w, when = _particle_path(distribution, y, both, path_key, particles, particle_steps or distribution.steps)
         output = jax.vmap(ssm.observe)(w, when)
         row = jnp.arange(times.shape[0])
         covariance = jax.vmap(ssm.noise_covariance)(w[count:], times, row)
@@ -147,17 +153,37 @@ def _smoothed_path(distribution: MarginalLikelihood, y: jax.Array, at: Any,
 
 
 def _particle_path(distribution: MarginalLikelihood, y: jax.Array, at: Any, key: jax.Array,
-                   particles: ParticleSettings) -> tuple[jax.Array, jax.Array]:
-    """The same from a particle filter, by ancestor tracing."""
-    ssm = distribution.ssm
-    rows = distribution.event_shape[0] if at is None else len(at)
-    # As many steps over all rows as there are between the observations.
-    steps = -(-distribution.steps * distribution.event_shape[0] // rows)
-    plan = schedule(ssm, distribution.times, steps, distribution.max_step, at)
-    states, _ = draw_trajectories(ssm, plan, y, key, particles, 1, TRACING)
-    times = jnp.asarray(plan.requested_times, float)
-    matrix, offset = jax.vmap(ssm.input_map)(times)
-    return matmul(matrix, states[:, 0, :, None])[..., 0] + offset, times
+                   particles: ParticleSettings, steps: int) -> tuple[jax.Array, jax.Array]:
+    """The same from particle filters: a path of one of several, by ancestor tracing.
+
+    The path of a single filter is from the right distribution only with many particles. A filter chosen in proportion
+    to its estimate of the likelihood gives a path of the right one as the number of filters grows, too.
+    """
+    ssm, times = distribution.ssm, distribution.times
+    plan = schedule(ssm, times, _steps_in_a_row(ssm, times, at, steps), distribution.max_step, at)
+    path_keys, choice = jax.random.split(key, _FILTERS + 1)[:-1], jax.random.fold_in(key, _FILTERS)
+    states, _, total = jax.lax.map(lambda k: draw_trajectories(ssm, plan, y, k, particles, 1, TRACING), path_keys)
+    best = jax.random.categorical(choice, jnp.where(jnp.isneginf(total).all(), 0.0, total))
+    when = jnp.asarray(plan.requested_times, float)
+    matrix, offset = jax.vmap(ssm.input_map)(when)
+    return matmul(matrix, states[best][:, 0, :, None])[..., 0] + offset, when
+
+
+def _steps_in_a_row(ssm: StateSpaceModel, times: Any, at: Any, steps: int) -> int:
+    """Return how many steps each row needs so that none is longer than those between two observations."""
+    known = checks.concrete(times)
+    if at is None or known is None:
+        return steps
+    rows = schedule(ssm, known, 1, None, at).rows
+    ends = np.asarray(rows.start + rows.length)
+    marks = np.unique(np.append(known, rows.start[0]))
+    if len(marks) == 1:
+        return steps
+    gaps = np.diff(marks)
+    # A row after the last observation is measured by the usual distance between two.
+    index = np.searchsorted(marks, ends - 1e-12 * np.abs(ends), side="left") - 1
+    own = np.where(index < len(gaps), gaps[np.clip(index, 0, len(gaps) - 1)], np.median(gaps))
+    return max(1, int(np.ceil(steps * min(float((rows.length / own).max()), 1.0) - 1e-9)))
 
 
 def drawn(model: Callable, arguments: tuple, keywords: Mapping[str, Any], key: jax.Array, parameters: Any,

@@ -116,7 +116,8 @@ def findings(**changes):
     table = table.assign(**rows)
     return Findings(**{"table": table, "k": 0.2, "threshold": 0.565, "exact": False, "step_change_sd": 0.0,
                        "noise_sd": 0.0, "noise_share": 0.0, "particles": 0, "checked": 200, "available": 4000,
-                       "impossible": 0, "sampler": "nuts", "model": "well", "steps": 10, "max_step": None, **changes})
+                       "impossible": 0, "sampler": "nuts", "refit": "lfm-ppl fit well", "steps": 10,
+                       "max_step": None, **changes})
 
 
 @pytest.mark.parametrize(

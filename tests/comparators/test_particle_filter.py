@@ -171,6 +171,18 @@ def test_some_exploding_particles_leave_the_others_alone():
     assert np.all(np.isfinite(result.log_likelihood)) and np.all(np.isfinite(result.mean))
 
 
+def test_lost_particles_count_wherever_they_are_lost():
+    """A drift that explodes from some starts: rows within an interval do not forgive what one row would not."""
+    model = lfm.LatentForceModel(lambda x, u, t: x**2, {}, lfm.GaussianObservation(first_state, jnp.array([1.0])),
+                                 lfm.Gaussian(jnp.array([0.0]), jnp.array([0.3])), process_noise=jnp.array([[0.01]]))
+    arguments = ([0.0, 4.0], [[np.nan], [0.0]], jax.random.key(0))
+    whole = lfm.particle_filter(model, *arguments, particles=20_000, steps=400, scheme="srk")
+    rows = lfm.particle_filter(model, *arguments, particles=20_000, steps=1, max_step=0.01, scheme="srk")
+    lost = 1.0 - np.exp(float(whole.log_likelihood.sum()) + 0.5 * np.log(2 * np.pi))
+    assert lost > 0.3  # the test has something to see
+    assert np.isclose(whole.log_likelihood.sum(), rows.log_likelihood.sum(), atol=0.03)
+
+
 def test_degeneracy_is_reported():
     """A precise observation after vague ones leaves few effective particles, and the report says where."""
     model = relaxing(noise=1e-4)

@@ -16,6 +16,7 @@ from lfm_ppl.comparators.particle_filter import ParticleSettings
 from lfm_ppl.inference import particle_likelihood
 from lfm_ppl.inference.particle_likelihood import ParticlePotential
 from lfm_ppl.inference.particle_marginal import ParticleMarginalState, particle_marginal_step
+from lfm_ppl.inference.posterior import likelihood_site, trajectories
 
 TIMES = np.array([0.0, 0.6, 1.5, 1.5, 2.7, 4.0])
 Y = np.array([[1.2], [0.7], [np.nan], [0.5], [-0.2], [0.4]])
@@ -153,9 +154,50 @@ def test_fit_samples_and_reports_the_particles():
     assert set(group(result, "sample_stats")) == {"acceptance_rate", "accepted", "lp", "estimated"}
 
 
+def test_data_may_be_arguments_of_a_compiled_program():
+    """One kernel, other data: with ``jit_model_args`` the chain follows the data of each run."""
+    mcmc = MCMC(lfm.ParticleMarginalRAM(relaxing, particles=50), num_warmup=200, num_samples=600, num_chains=4,
+                chain_method="vectorized", progress_bar=False, jit_model_args=True)
+    found = []
+    for y in (Y, np.sign(Y)):
+        mcmc.run(jax.random.key(0), TIMES, y)
+        found.append(np.log(mcmc.get_samples(group_by_chain=True)["rate"]))
+    mean, sd = exact_posterior()
+    assert abs(found[0].mean() - mean) < 5.0 * sd / np.sqrt(effective(found[0]))
+    assert abs(found[1].mean() - found[0].mean()) > 0.3 * sd
+
+
+@pytest.mark.parametrize("wrap", [lambda d: d.mask(jnp.array(True)), lambda d: d.expand((1,)).to_event(1)],
+                         ids=["mask", "expand"])
+def test_a_likelihood_that_cannot_be_replaced_is_an_error(wrap):
+    def wrapped(times, y=None):
+        rate = numpyro.sample("rate", dist.LogNormal(-0.5, 0.7))
+        shape = np.shape(y) if np.ndim(y) == 2 else None
+        numpyro.sample("y", wrap(lfm.MarginalLikelihood(build(rate), times)), obs=y[None] if shape is None else y)
+
+    y = Y if wrap(dist.Normal(0.0, 1.0)).event_shape == () else Y[None]
+    with pytest.raises(ValueError, match="cannot stand in"):
+        lfm.ParticleMarginalRAM(wrapped, particles=5).init(jax.random.key(0), 10, None, (TIMES, y), {})
+
+
+def test_trajectories_agree_with_the_exact_smoother_wherever_they_are_wanted():
+    """Paths at single parameter values; a crowd of forecast times changes nothing elsewhere."""
+    at = np.array([0.3, 1.0, 3.5])
+    site = likelihood_site(relaxing, (TIMES, Y), {}, jax.random.key(0))
+    draws = {"rate": np.full(600, 0.6)}
+    exact = lfm.smooth(build(0.6), TIMES, Y, at=at)
+    for times in (at, np.concatenate([at, np.linspace(4.0, 8.0, 9)])):
+        found = trajectories(relaxing, (TIMES, Y), {}, draws, Y, times, jax.random.key(1), site,
+                             ParticleSettings(200, scheme="srk"), 10)["state"][:, :3, 0]
+        sd = np.sqrt(np.asarray(exact.covariance)[:, 0, 0])
+        assert np.all(np.abs(found.mean(axis=0) - exact.mean[:, 0]) < 5.0 * sd / np.sqrt(600) + 0.02 * sd)
+        assert np.allclose(found.std(axis=0), sd, rtol=0.15)
+
+
 @pytest.mark.parametrize("options, error, message", [
+    ({"particles": 5, "delayed": "no"}, TypeError, "delayed must be True or False"),
     ({"particles": 0}, ValueError, "particles must be at least 1"),
-    ({"particle_steps": 0}, ValueError, "steps must be at least 1"),
+    ({"particle_steps": 0}, ValueError, "particle_steps must be at least 1"),
     ({"particles": 5, "scheme": "milstien"}, ValueError, "'milstein'"),
     ({"particles": 5, "target_accept_prob": 1.5}, ValueError, "between 0 and 1"),
 ])

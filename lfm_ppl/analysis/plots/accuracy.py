@@ -85,12 +85,13 @@ def _draw_ratios(axes: Axes, report: AccuracyReport) -> None:
     axes.axhline(0.0, color=style.GREY, lw=0.6)
     sd = report.dataset["noise_sd"].values.ravel()[seen]
     if np.nanmax(sd) > 0.0:
+        sd = np.where(np.isfinite(sd), sd, 0.0)
         axes.errorbar(x, y, yerr=sd, fmt="none", ecolor=style.SKY, elinewidth=0.4, zorder=1)
     axes.plot(x, y, color=style.BLUE, ls="", marker="o", ms=1.8, mew=0, alpha=0.6, zorder=2)
     if np.ptp(y) < 1e-6:
         axes.set_ylim(-1.0, 1.0)
     axes.set_xlabel("log likelihood, relative")
-    axes.set_ylabel("log ratio")
+    axes.set_ylabel("log ratio, relative")
     reliable = "reliable" if report.reliable else "not reliable"
     axes.set_title("the filter is exact" if report.exact else f"k = {report.k:.2f} ({reliable})")
 
@@ -116,7 +117,7 @@ def _range(values: np.ndarray, subset: np.ndarray, weight: np.ndarray) -> tuple[
     low, high = np.quantile(values, (0.005, 0.995))
     used = subset[weight > weight.max() * np.exp(_BELOW)]
     low, high = min(low, np.quantile(used, 0.005)), max(high, np.quantile(used, 0.995))
-    room = 0.05 * (high - low)
+    room = 0.12 * (high - low)
     return low - room, high + room
 
 

@@ -1,0 +1,54 @@
+"""``lfm-ppl compare``: a published experiment, run again, with tables and figures."""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import sys
+import time
+from pathlib import Path
+
+from lfm_ppl.cli import session
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """List the experiments, or run one: what its folder holds already is not computed again."""
+    session.start(chains=1)
+    from lfm_ppl.analysis import tables
+    from lfm_ppl.experiments import catalogue
+    from lfm_ppl.experiments.tasks import duration
+
+    if arguments.experiment is None:
+        _list()
+        return 0
+    chosen = catalogue.experiment(arguments.experiment)
+    folder = _folder(arguments, chosen.name)
+    started = time.perf_counter()
+    found = chosen.run(catalogue.Wanted(
+        folder, arguments.realisations, arguments.conditional, arguments.seed, arguments.quick, arguments.overwrite,
+        None if arguments.quiet else lambda line: print(line, file=sys.stderr, flush=True)))
+    for title, table in found.tables.items():
+        print(f"\n{title}\n{tables.text_table(table, width=shutil.get_terminal_size().columns)}")
+    print(f"\ntime     {duration(time.perf_counter() - started)}")
+    for path in found.written:
+        print(f"wrote    {path}")
+    return 0
+
+
+def _list() -> None:
+    from lfm_ppl.experiments import catalogue
+
+    shown = [catalogue.experiment(name) for name in catalogue.names()]
+    width = max(len(one.name) for one in shown)
+    for one in shown:
+        print(f"{one.name:<{width}}  {one.summary}")
+    print("\n`lfm-ppl compare NAME` runs one; `--quick` shows in a minute or two that it runs.")
+
+
+def _folder(arguments: argparse.Namespace, name: str) -> Path:
+    """Return the folder of the experiment: always the same one, so that the same command goes on where it stopped."""
+    kind = f"{name}-quick" if arguments.quick else name
+    folder = Path("lfm-results") / "compare" / kind if arguments.out is None else Path(arguments.out)
+    if folder.exists() and not folder.is_dir():
+        raise FileExistsError(f"{folder} is a file; expected the name of a folder for the results.")
+    return folder

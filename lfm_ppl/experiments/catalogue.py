@@ -1,0 +1,84 @@
+"""The experiments that can be run by name."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import pandas as pd
+
+from lfm_ppl import checks
+
+_MODULES = {"ginzburg-landau": "lfm_ppl.experiments.ginzburg_landau.report"}
+
+
+class Wanted(NamedTuple):
+    """What a user may ask of an experiment.
+
+    Attributes:
+        folder: for tasks, tables and figures.
+        realisations: number of data sets; None: the experiment's own.
+        conditional: number of data sets for the conditional posteriors; None: the experiment's own.
+        seed: of everything random.
+        quick: a small version that shows that everything runs.
+        overwrite: compute again what was stored with other settings.
+        report: what to do with a line of progress; None: nothing.
+    """
+
+    folder: Path
+    realisations: int | None = None
+    conditional: int | None = None
+    seed: int = 0
+    quick: bool = False
+    overwrite: bool = False
+    report: Callable[[str], None] | None = None
+
+
+class Report(NamedTuple):
+    """What an experiment found.
+
+    Attributes:
+        tables: title -> table, to be printed.
+        written: the files.
+    """
+
+    tables: dict[str, pd.DataFrame]
+    written: list[Path]
+
+
+class Experiment(NamedTuple):
+    """An experiment.
+
+    Attributes:
+        name: on the command line.
+        summary: one line.
+        run: from what is wanted to what was found.
+    """
+
+    name: str
+    summary: str
+    run: Callable[[Wanted], Report]
+
+
+def names() -> tuple[str, ...]:
+    """Return the names of the experiments."""
+    return tuple(_MODULES)
+
+
+def experiment(name: str) -> Experiment:
+    """Return an experiment by name, with dashes or underscores.
+
+    Raises:
+        ValueError: there is none of this name; the message has the nearest ones.
+
+    Example:
+        >>> experiment("ginzburg_landau").name
+        'ginzburg-landau'
+    """
+    wanted = name.replace("_", "-")
+    if wanted not in _MODULES:
+        raise ValueError(checks.unknown("experiment", name, _MODULES))
+    module = importlib.import_module(_MODULES[wanted])
+    return Experiment(wanted, module.SUMMARY, module.run)

@@ -1,0 +1,98 @@
+"""The problem: realisations of the double well, its true parameters, and the methods that are compared."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lfm_ppl import loading
+from lfm_ppl.inference.posterior import likelihood_site
+from lfm_ppl.linearisation.rule import Rule
+from lfm_ppl.linearisation.sigma_points import Cubature, GaussHermite
+from lfm_ppl.linearisation.taylor import Taylor
+from lfm_ppl.model.latent_force_model import LatentForceModel
+
+NAMES = ("alpha", "beta", "sigma")
+TRUTH = (-1.0, 0.1, 2.0)
+GAUSSIAN: dict[str, Rule] = {"EKF": Taylor(), "CKF": Cubature(), "GHKF(7)": GaussHermite(7)}
+PARTICLES, GRID = "particle filter", "grid"
+METHODS = (*GAUSSIAN, PARTICLES, GRID)
+STEPS = 60
+"""Integration steps of the Gaussian filters between two observations, those of the model."""
+
+DEFAULT = 2
+"""The realisation that the model simulates by default, for seed 0; the one of the figures."""
+
+MOST = 10_000
+"""Realisations for one seed of the experiment."""
+
+
+class Realisation(NamedTuple):
+    """One simulated path and its observations.
+
+    Attributes:
+        times: (T,) observation times.
+        y: (T, 1).
+        fine: (K,) times of the path, among them the observation times.
+        path: (K,) the state.
+        sparse: (K, 1) the observations on the fine times, NaN between them.
+    """
+
+    times: np.ndarray
+    y: np.ndarray
+    fine: np.ndarray
+    path: np.ndarray
+
+    @property
+    def sparse(self) -> np.ndarray:
+        """The observations among the fine times, NaN between them."""
+        values = np.full((len(self.fine), 1), np.nan)
+        values[np.searchsorted(self.fine, self.times - 1e-9)] = self.y
+        return values
+
+
+@functools.cache
+def model_file() -> loading.ModelFile:
+    """Return the shipped model."""
+    return loading.load("ginzburg-landau")
+
+
+def realisation(index: int, seed: int = 0) -> Realisation:
+    """Return realisation ``index`` of the experiment with this seed.
+
+    It is what ``lfm-ppl simulate ginzburg-landau --seed N`` writes for N = 10000 seed + index: the path starts in the
+    right well, at sqrt(10), while the filters' prior is N(0, 10). With seed 0, number 2 is the model's default data.
+    """
+    return from_model(MOST * seed + index)
+
+
+@functools.lru_cache(maxsize=256)
+def from_model(seed: int) -> Realisation:
+    """Return the data that the model file simulates with this seed."""
+    data = model_file().simulate(seed=seed)
+    truth: Any = data.truth
+    return Realisation(data.times, data.y, np.asarray(truth["times"]), np.asarray(truth["state"])[:, 0])
+
+
+def system(theta: Any) -> LatentForceModel:
+    """Return the double well with parameters (alpha, beta, sigma); they may be traced."""
+    alpha, beta, sigma = theta
+    sites = {"sigma": sigma, "linear": alpha / sigma**2, "cubic": beta / sigma**2}
+    times = np.arange(0.0, 51.0, 2.0)
+    return likelihood_site(model_file().model, (times,), {}, jax.random.key(0), sites).distribution.model
+
+
+@functools.cache
+def true_system() -> LatentForceModel:
+    """Return the double well at the truth: one object, so that what is compiled for it serves all realisations."""
+    with jax.ensure_compile_time_eval():
+        return system(jnp.asarray(TRUTH))
+
+
+def slug(method: str) -> str:
+    """Return the name of a method as part of the name of a task."""
+    return method.replace(" ", "-").replace("(", "").replace(")", "")

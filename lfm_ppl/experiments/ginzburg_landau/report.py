@@ -1,0 +1,28 @@
+"""The comparison as the command line runs it."""
+
+from __future__ import annotations
+
+from lfm_ppl.experiments.catalogue import Report, Wanted
+from lfm_ppl.experiments.ginzburg_landau import experiment, tables
+
+SUMMARY = "double well: EKF, CKF, GHKF, particle filter and exact grid, in states and parameters"
+
+
+def run(wanted: Wanted) -> Report:
+    """Run the comparison, or what is missing of it, and write tables and figures.
+
+    Raises:
+        ValueError: the folder holds results made with other settings.
+    """
+    make = experiment.quick if wanted.quick else experiment.Settings
+    counts = {name: value for name in ("realisations", "conditional")
+              if (value := getattr(wanted, name)) is not None}
+    settings = make(seed=wanted.seed, **counts)
+    found = experiment.run(settings, wanted.folder, overwrite=wanted.overwrite, report=wanted.report)
+    written = experiment.save(found, wanted.folder)
+    return Report({
+        f"Means over {settings.realisations} realisations (standard errors)": tables.readable(found.table),
+        f"Truth outside the 99% interval of a conditional posterior, {settings.conditional} realisations":
+            tables.readable(found.rates),
+        f"Posteriors of the parameters, {settings.realisations} realisations": tables.readable(found.parameters),
+    }, written)

@@ -1,0 +1,170 @@
+"""How good estimates are: errors, coverage, intervals of densities on a grid, and their standard errors."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from lfm_ppl import checks
+
+_FINER = 40
+"""Nodes of the fine grid for one of the given grid."""
+
+_FLOOR = -700.0
+"""Log densities below the largest one by more than this are zero in double precision."""
+
+
+class Estimate(NamedTuple):
+    """A number with its standard error.
+
+    Attributes:
+        value: the number; NaN where there is none.
+        error: its standard error; NaN where it cannot be told.
+    """
+
+    value: float
+    error: float
+
+    def __str__(self) -> str:
+        """Return ``value (error)`` with the digits that the error leaves."""
+        if not np.isfinite(self.value):
+            return "-"
+        if not (np.isfinite(self.error) and self.error > 0):
+            return f"{self.value:.3g}"
+        digits = int(np.clip(1 - np.floor(np.log10(self.error)), 0, 6))
+        return f"{self.value:.{digits}f} ({self.error:.{digits}f})"
+
+
+def mean_of(values: Any) -> Estimate:
+    """Return the mean of independent numbers with its standard error; NaN entries are left out.
+
+    Example:
+        >>> str(mean_of([1.0, 2.0, 3.0]))
+        '2.00 (0.58)'
+    """
+    known = np.asarray(values, float).ravel()
+    known = known[np.isfinite(known)]
+    if known.size == 0:
+        return Estimate(np.nan, np.nan)
+    error = known.std(ddof=1) / np.sqrt(known.size) if known.size > 1 else np.nan
+    return Estimate(float(known.mean()), float(error))
+
+
+def rate_of(hits: Any) -> Estimate:
+    """Return the share of True among independent outcomes with its binomial standard error sqrt(p (1 - p) / n).
+
+    Where all outcomes are the same, p in the error is (k + 1) / (n + 2), since none of n does not show that it never
+    happens.
+
+    Example:
+        >>> str(rate_of([True] * 20 + [False] * 80))
+        '0.200 (0.040)'
+    """
+    outcomes = np.asarray(hits, bool).ravel()
+    n, k = outcomes.size, int(outcomes.sum())
+    if n == 0:
+        return Estimate(np.nan, np.nan)
+    p = k / n if 0 < k < n else (k + 1) / (n + 2)
+    return Estimate(k / n, float(np.sqrt(p * (1 - p) / n)))
+
+
+def rmse(estimate: Any, truth: Any) -> float:
+    """Return the root of the mean squared difference."""
+    return float(np.sqrt(np.mean((np.asarray(estimate) - np.asarray(truth)) ** 2)))
+
+
+def covered(low: Any, high: Any, truth: Any) -> float:
+    """Return the share of entries of ``truth`` that lie between ``low`` and ``high``."""
+    truth = np.asarray(truth)
+    return float(np.mean((np.asarray(low) <= truth) & (truth <= np.asarray(high))))
+
+
+class GridPosterior:
+    r"""Posterior of one parameter under a flat prior, from its log likelihood at the nodes of a grid.
+
+        p(theta | y) = exp(L(theta)) / integral of exp(L)   on the interval that the nodes span.
+
+    Between the nodes L is a cubic spline, which is exact for a Gaussian likelihood; the integrals are trapezoidal
+    sums on nodes forty times as dense.
+
+    Args:
+        nodes: (G,), increasing; at least four.
+        log_likelihood: (G,); -inf where the likelihood is zero.
+
+    Raises:
+        ValueError: nodes that do not increase, shapes that do not fit, or no finite log likelihood.
+
+    Example:
+        >>> nodes = np.linspace(-8.0, 10.0, 41)
+        >>> posterior = GridPosterior(nodes, -0.5 * (nodes - 1.0) ** 2)
+        >>> f"{posterior.mean:.4f} {posterior.sd:.4f} {posterior.quantile(0.975):.3f}"
+        '1.0000 1.0000 2.960'
+    """
+
+    def __init__(self, nodes: Any, log_likelihood: Any) -> None:
+        nodes, values = np.asarray(nodes, float), np.asarray(log_likelihood, float)
+        checks.finite("nodes", nodes)
+        if nodes.ndim != 1 or nodes.size < 4 or np.any(np.diff(nodes) <= 0):
+            raise ValueError(f"nodes must be a vector of at least four increasing numbers, got shape {nodes.shape}.")
+        if values.shape != nodes.shape:
+            raise ValueError(f"log_likelihood must have the shape of nodes, {nodes.shape}, got {values.shape}.")
+        if not np.isfinite(values).any():
+            raise ValueError("log_likelihood is nowhere finite: there is no posterior on these nodes.")
+        relative = np.where(np.isnan(values), -np.inf, values) - np.max(values[np.isfinite(values)])
+        spline = CubicSpline(nodes, np.maximum(relative, _FLOOR))
+        self.x = np.unique(np.concatenate([np.linspace(a, b, _FINER + 1) for a, b in
+                                           zip(nodes[:-1], nodes[1:], strict=True)]))
+        log_density = spline(self.x)
+        density = np.exp(log_density - log_density.max())
+        steps = 0.5 * np.diff(self.x) * (density[1:] + density[:-1])
+        self.density = density / steps.sum()
+        self.distribution = np.concatenate([[0.0], np.cumsum(steps) / steps.sum()])
+
+    @property
+    def mean(self) -> float:
+        """Posterior mean."""
+        return float(np.trapezoid(self.density * self.x, self.x))
+
+    @property
+    def sd(self) -> float:
+        """Posterior standard deviation."""
+        return float(np.sqrt(np.trapezoid(self.density * (self.x - self.mean) ** 2, self.x)))
+
+    def quantile(self, p: Any) -> Any:
+        """Return the value below which a share ``p`` of the posterior lies."""
+        return np.interp(p, self.distribution, self.x)
+
+    def below(self, value: float) -> float:
+        """Return the posterior probability of a value below ``value``."""
+        return float(np.interp(value, self.x, self.distribution))
+
+    def cut(self, share: float = 0.01) -> bool:
+        """Return whether an end of the grid cuts the posterior off: its density there is over ``share`` of the peak."""
+        return bool(max(self.density[0], self.density[-1]) > share * self.density.max())
+
+
+def density_quantiles(x: Any, width: float, density: Any, p: Any) -> np.ndarray:
+    """Return quantiles of densities that are constant in the cells of a regular grid.
+
+    Args:
+        x: (N,) cell centres.
+        width: of a cell.
+        density: (..., N).
+        p: (Q,) probabilities.
+
+    Returns:
+        (Q, ...).
+
+    Example:
+        >>> density_quantiles([0.5, 1.5], 1.0, [[0.5, 0.5]], [0.25, 0.5]).ravel().tolist()
+        [0.5, 1.0]
+    """
+    x, density, p = np.asarray(x, float), np.asarray(density, float), np.atleast_1d(np.asarray(p, float))
+    edges = np.append(x - 0.5 * width, x[-1] + 0.5 * width)
+    mass = np.maximum(density, 0.0).reshape(-1, x.size)
+    below = np.concatenate([np.zeros((len(mass), 1)), np.cumsum(mass, axis=1)], axis=1)
+    below /= below[:, -1:]
+    found = np.array([np.interp(p, row, edges) for row in below])
+    return found.T.reshape(p.size, *density.shape[:-1])

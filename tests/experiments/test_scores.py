@@ -1,0 +1,79 @@
+"""Intervals and rates against closed forms."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from lfm_ppl.experiments import scores
+
+
+@pytest.mark.parametrize("nodes", [np.linspace(-4.0, 8.0, 31), np.geomspace(0.05, 40.0, 61)])
+def test_a_gaussian_posterior_has_its_closed_form(nodes):
+    mean, sd = (1.3, 0.7) if nodes[0] < 0 else (2.0, 0.3)
+    posterior = scores.GridPosterior(nodes, stats.norm.logpdf(nodes, mean, sd) + 123.0)
+    # Trapezoidal sums of a smooth density that vanishes at both ends; the spline of a parabola is the parabola.
+    p = np.array([0.005, 0.5, 0.995])
+    np.testing.assert_allclose(posterior.quantile(p), stats.norm.ppf(p, mean, sd), atol=2e-4 * sd + 1e-3 * sd)
+    np.testing.assert_allclose([posterior.mean, posterior.sd], [mean, sd], rtol=1e-4)
+    np.testing.assert_allclose(posterior.below(mean + sd), stats.norm.cdf(1.0), atol=2e-4)
+    assert not posterior.cut()
+
+
+def test_a_truncated_exponential_is_cut_and_right():
+    nodes = np.linspace(0.0, 3.0, 25)
+    posterior = scores.GridPosterior(nodes, -nodes)
+    truth = stats.truncexpon(3.0)
+    assert posterior.cut()
+    np.testing.assert_allclose(posterior.below(1.0), truth.cdf(1.0), atol=1e-5)
+    np.testing.assert_allclose(posterior.mean, truth.mean(), atol=1e-5)
+
+
+def test_impossible_values_have_no_posterior_mass():
+    nodes = np.linspace(-3.0, 3.0, 61)
+    values = np.where(nodes < -1.0, -np.inf, -0.5 * nodes**2)
+    posterior = scores.GridPosterior(nodes, values)
+    assert posterior.below(-1.2) < 1e-12
+    assert np.isfinite(posterior.density).all()
+
+
+def test_what_is_no_posterior_is_refused():
+    with pytest.raises(ValueError, match="increasing"):
+        scores.GridPosterior([0.0, 1.0, 1.0, 2.0], np.zeros(4))
+    with pytest.raises(ValueError, match="shape of nodes"):
+        scores.GridPosterior(np.arange(5.0), np.zeros(4))
+    with pytest.raises(ValueError, match="nowhere finite"):
+        scores.GridPosterior(np.arange(5.0), np.full(5, -np.inf))
+
+
+def test_quantiles_of_cell_densities_are_those_of_the_distribution():
+    edges = np.linspace(-8.0, 8.0, 321)
+    x, width = 0.5 * (edges[1:] + edges[:-1]), edges[1] - edges[0]
+    density = np.stack([np.diff(stats.norm.cdf(edges, m, s)) / width for m, s in ((0.0, 1.0), (1.0, 0.5))])
+    found = scores.density_quantiles(x, width, density, [0.025, 0.975])
+    assert found.shape == (2, 2)
+    # Linear interpolation within a cell: an error of order density' width^2 / density.
+    np.testing.assert_allclose(found[0], [stats.norm.ppf(0.025), stats.norm.ppf(0.025, 1.0, 0.5)], atol=2e-3)
+
+
+def test_rates_and_their_errors():
+    assert scores.rate_of([1, 0, 0, 0]) == scores.Estimate(0.25, np.sqrt(0.25 * 0.75 / 4))
+    none = scores.rate_of(np.zeros(98))
+    assert none.value == 0.0 and none.error == pytest.approx(np.sqrt(0.01 * 0.99 / 98))
+    assert np.isnan(scores.rate_of([]).value)
+
+
+def test_means_leave_out_what_is_missing():
+    found = scores.mean_of([1.0, np.nan, 3.0])
+    assert found == scores.Estimate(2.0, 1.0)
+    assert np.isnan(scores.mean_of([5.0]).error)
+
+
+def test_estimates_show_as_many_digits_as_the_error_leaves():
+    assert str(scores.Estimate(0.91234, 0.0312)) == "0.912 (0.031)"
+    assert str(scores.Estimate(12.3, 4.0)) == "12.3 (4.0)"
+    assert str(scores.Estimate(float("nan"), 1.0)) == "-"
+
+
+def test_errors_and_coverage():
+    assert scores.rmse([1.0, 3.0], [0.0, 0.0]) == pytest.approx(np.sqrt(5.0))
+    assert scores.covered([0.0, 0.0], [1.0, 1.0], [0.5, 2.0]) == 0.5

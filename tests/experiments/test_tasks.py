@@ -1,0 +1,117 @@
+"""Tasks that are stored one by one: resumed to the same numbers, never mixed with other settings."""
+
+import jax
+import numpy as np
+import pytest
+
+from lfm_ppl.experiments.tasks import Task, duration, read, run_tasks, write
+
+
+def tasks(count=4, **settings):
+    return [Task(f"noise/{index:02d}", 7, {"size": 3, **settings}) for index in range(count)]
+
+
+def noise(task):
+    draws = np.asarray(jax.random.normal(task.key, (task.settings["size"],)))
+    return {"mean": draws.mean(), "draws": draws, "label": "normal", "count": 3}
+
+
+def same(first, second):
+    assert first.keys() == second.keys()
+    for name in first:
+        for entry, value in first[name].items():
+            np.testing.assert_array_equal(value, second[name][entry])
+
+
+def test_a_killed_run_ends_with_the_same_numbers(tmp_path):
+    whole = run_tasks(tasks(), noise, tmp_path / "whole")
+    done = []
+
+    def killed(task):
+        if len(done) == 2:
+            raise KeyboardInterrupt
+        done.append(task.name)
+        return noise(task)
+
+    with pytest.raises(KeyboardInterrupt):
+        run_tasks(tasks(), killed, tmp_path / "half")
+    assert sorted(path.name for path in (tmp_path / "half").iterdir()) == ["noise-00.npz", "noise-01.npz"]
+    resumed = []
+    found = run_tasks(tasks(), lambda task: resumed.append(task.name) or noise(task), tmp_path / "half")
+    assert resumed == ["noise/02", "noise/03"]
+    same(whole, found)
+
+
+def test_a_result_does_not_depend_on_the_order_or_on_the_other_tasks(tmp_path):
+    forward = run_tasks(tasks(), noise, tmp_path / "a")
+    backward = run_tasks(tasks()[:0:-1], noise, tmp_path / "b")
+    for name, result in backward.items():
+        np.testing.assert_array_equal(result["draws"], forward[name]["draws"])
+    assert len({float(result["mean"]) for result in forward.values()}) == 4
+
+
+def test_more_tasks_go_on_from_fewer(tmp_path):
+    run_tasks(tasks(2), noise, tmp_path)
+    computed = []
+    run_tasks(tasks(4), lambda task: computed.append(task.name) or noise(task), tmp_path)
+    assert computed == ["noise/02", "noise/03"]
+
+
+def test_other_settings_are_refused_and_replaced_on_request(tmp_path):
+    run_tasks(tasks(2), noise, tmp_path)
+    with pytest.raises(ValueError, match=r"other settings: size is 3 there and 5 now.*--overwrite"):
+        run_tasks(tasks(2, size=5), noise, tmp_path)
+    found = run_tasks(tasks(2, size=5), noise, tmp_path, overwrite=True)
+    assert found["noise/00"]["draws"].shape == (5,)
+
+
+def test_another_seed_is_refused(tmp_path):
+    run_tasks([Task("a", 0)], lambda task: {"x": 1.0}, tmp_path)
+    with pytest.raises(ValueError, match="seed is 0 there and 1 now"):
+        run_tasks([Task("a", 1)], lambda task: {"x": 1.0}, tmp_path)
+
+
+@pytest.mark.parametrize("damage", [b"", b"no zip file", "cut", "other"])
+def test_a_damaged_file_is_computed_again_with_a_warning(tmp_path, damage):
+    whole = run_tasks(tasks(2), noise, tmp_path)
+    path = tmp_path / "noise-01.npz"
+    if damage == "cut":
+        path.write_bytes(path.read_bytes()[:-40])
+    elif damage == "other":
+        np.savez(path, x=1.0)
+    else:
+        path.write_bytes(damage)
+    with pytest.warns(UserWarning, match="noise-01.npz cannot be read"):
+        found = run_tasks(tasks(2), noise, tmp_path)
+    same(whole, found)
+
+
+def test_values_come_back_as_they_were(tmp_path):
+    task = Task("a", 0)
+    write(task, {"number": 0.1, "whole": 3, "flag": True, "text": "ok", "array": np.arange(3.0)}, tmp_path)
+    found = read(task, tmp_path)
+    assert (found["number"], found["whole"], found["flag"], found["text"]) == (0.1, 3, True, "ok")
+    np.testing.assert_array_equal(found["array"], np.arange(3.0))
+
+
+def test_what_cannot_be_stored_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="entry 'model' that is not a number"):
+        write(Task("a", 0), {"model": object()}, tmp_path)
+    with pytest.raises(TypeError, match="must be what JSON can store"):
+        Task("a", 0, {"model": object()})
+    with pytest.raises(ValueError, match="name of a task"):
+        Task("a b", 0)
+    with pytest.raises(ValueError, match="share the file a-b.npz"):
+        run_tasks([Task("a/b", 0), Task("a-b", 0)], lambda task: {"x": 1.0}, tmp_path)
+
+
+def test_progress_says_how_far_it_is(tmp_path):
+    lines = []
+    run_tasks(tasks(2), noise, tmp_path)
+    run_tasks(tasks(3), noise, tmp_path, report=lines.append)
+    assert lines[0] == "2 of 3 tasks are stored already"
+    assert lines[-1].startswith("3/3 noise/02")
+
+
+def test_durations():
+    assert [duration(s) for s in (0.0, 99.0, 120.0, 7200.0)] == ["0.0 s", "99 s", "2 min", "2.0 h"]
