@@ -248,7 +248,7 @@ def test_folders_are_numbered_and_not_left_empty(monkeypatch, tmp_path):
         ("fit MOTIF --chains 0", "expected a whole number of at least 1, got '0'"),
         ("fit MOTIF --max-step -1", "expected a number above zero, got '-1'"),
         ("fit MOTIF --target-accept 1.5", "expected a number between 0 and 1, got '1.5'"),
-        ("fit MOTIF --target-accept 0.9 --sampler map", "--target-accept is for the samplers nuts and ram"),
+        ("fit MOTIF --target-accept 0.9 --sampler map", "--target-accept is for the samplers nuts, ram and pmmh"),
         ("fit MOTIF --until 3", "--until takes a time after the last observation, at 7, got 3"),
         ("fit MOTIF --until nan", "--until takes a time after the last observation, at 7, got nan"),
         ("fit MOTIF --data absent.csv", "there is no file absent.csv"),

@@ -147,12 +147,12 @@ def test_the_tables_count_what_was_found():
     assert rates.loc["EKF", "differs"] == 1.0 and rates.loc["grid", "differs"] == 0.0
     assert rates.loc["grid", "alpha se"] == pytest.approx(np.sqrt(1 / 14 * 13 / 14 / 12))
     table = tables.comparison(results)
-    assert table.loc["RAM, CKF", "ESS/s"] == 50.0
+    assert table.loc["RAM, CKF", "ESS/CPU s"] == 50.0
     # alpha = -1 and beta = 0.1 lie in (-3, 1), sigma = 2 does not.
     assert table.loc["RAM, CKF", "coverage parameters"] == pytest.approx(2 / 3)
     assert table.loc["RAM, EKF", "RMSE published"] == 0.895
     assert tables.parameters(results).loc["RAM, CKF", "coverage sigma"] == 0.0
-    assert tables.readable(table).loc["RAM, CKF", "ESS/s"] == "50"
+    assert tables.readable(table).loc["RAM, CKF", "ESS/CPU s"] == "50"
 
 
 def test_the_figures_are_drawn_and_labelled():

@@ -82,14 +82,14 @@ def sample(settings: Any, data: problem.Realisation, key: jax.Array) -> tuple[np
         key: a JAX random key.
 
     Returns:
-        Draws (3, chains, draws) of alpha, beta and sigma, the number of divergent transitions, and the seconds of
+        Draws (3, chains, draws) of alpha, beta and sigma, the number of divergent transitions, and the CPU seconds of
         warm-up and draws, without compilation.
     """
     names = ("sampler", "warmup", "draws", "thin", "chains", "steps", "particles", "tree_depth")
     run = _program(*(settings.get(name) for name in names), tuple(data.times))
-    started = time.perf_counter()
+    started = time.process_time()
     draws, divergences = jax.block_until_ready(run(jax.random.key_data(key), jnp.asarray(data.y)))
-    return np.asarray(draws), int(divergences), time.perf_counter() - started
+    return np.asarray(draws), int(divergences), time.process_time() - started
 
 
 @functools.cache

@@ -48,7 +48,7 @@ def tasks(settings: Any) -> list[Task]:
 
 
 def compute(task: Task) -> Result:
-    """Return filtered and smoothed mean and 95% band on the fine times, their scores, and the seconds taken."""
+    """Return filtered and smoothed mean and 95% band on the fine times, their scores, and the CPU seconds taken."""
     method = task.settings["method"]
     data = problem.realisation(task.settings["index"], task.seed)
     found = estimate(method, data, task.settings, task.key)
@@ -66,7 +66,7 @@ def estimate(method: str, data: problem.Realisation, settings: Any, key: jax.Arr
 
     Returns:
         ``filter_mean``, ``filter_low``, ``filter_high`` and the same of the smoother, each (K,); ``log_likelihood``;
-        ``seconds`` of filter and smoother together, without compilation.
+        CPU ``seconds`` of filter and smoother together, without compilation.
     """
     if method in problem.GAUSSIAN:
         return _gaussian(method, data, settings["steps"])
@@ -176,8 +176,11 @@ def _warm(label: str, run: Callable[[], Any]) -> Callable[[], Any]:
 
 
 def timed(run: Callable, *arguments: Any) -> tuple[float, Any]:
-    """Return how many seconds a call takes, and its value."""
-    started = time.perf_counter()
+    """Return how many seconds of CPU time, of all threads, a call takes, and its value.
+
+    Other programs on the same machine do not change it, as they would the time on the wall.
+    """
+    started = time.process_time()
     found = run(*arguments)
     jax.block_until_ready(jax.tree_util.tree_leaves(found))
-    return time.perf_counter() - started, found
+    return time.process_time() - started, found

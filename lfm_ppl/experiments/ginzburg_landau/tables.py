@@ -28,7 +28,8 @@ def comparison(results: dict[str, Result]) -> pd.DataFrame:
         Columns ``name`` and ``name se``: root mean squared error of filter and smoother over the fine times; the share
         of these times at which the 95% band holds the path; for MCMC the share of realisations in which the 95%
         interval of a parameter (all three pooled) holds the truth, the smallest bulk effective sample size of the three
-        per second of warm-up and draws, and the largest R-hat; seconds for one realisation, without compilation.
+        per second of CPU time of warm-up and draws, and the largest R-hat; CPU seconds, of all threads, for one
+        realisation, without compilation.
     """
     rows: dict[str, dict[str, float]] = {}
     for method in problem.METHODS:
@@ -36,18 +37,18 @@ def comparison(results: dict[str, Result]) -> pd.DataFrame:
         if own:
             rows[f"{method}, true parameters"] = _row(own, {
                 "RMSE filter": "filter_rmse", "coverage filter": "filter_coverage", "RMSE smoother": "smoother_rmse",
-                "coverage smoother": "smoother_coverage", "seconds": "seconds"})
+                "coverage smoother": "smoother_coverage", "CPU s": "seconds"})
     for label in sampling.SAMPLERS:
         own = _of(results, f"mcmc/{sampling.slug(label)}/")
         if own:
             rows[label] = _row(own, {
                 "RMSE smoother": "smoother_rmse", "coverage smoother": "smoother_coverage",
-                "coverage parameters": _covers, "ESS/s": lambda one: one["ess"].min() / one["seconds"],
-                "seconds": "seconds", "R-hat": lambda one: one["r_hat"].max()})
+                "coverage parameters": _covers, "ESS/CPU s": lambda one: one["ess"].min() / one["seconds"],
+                "CPU s": "seconds", "R-hat": lambda one: one["r_hat"].max()})
             rows[label]["RMSE published"] = PUBLISHED.get(label, np.nan)
     order = [f"{name}{end}" for name in (
-        "RMSE filter", "coverage filter", "RMSE smoother", "coverage smoother", "coverage parameters", "ESS/s",
-        "seconds", "R-hat") for end in ("", _SE)] + ["RMSE published"]
+        "RMSE filter", "coverage filter", "RMSE smoother", "coverage smoother", "coverage parameters", "ESS/CPU s",
+        "CPU s", "R-hat") for end in ("", _SE)] + ["RMSE published"]
     frame = pd.DataFrame.from_dict(rows, orient="index", dtype=float)
     return frame.reindex(columns=[name for name in order if name in frame])
 
@@ -73,7 +74,7 @@ def rates(results: dict[str, Result]) -> pd.DataFrame:
         row["cut"] = one["cut"].mean()
         exact = found.get(problem.GRID)
         row["differs"] = np.nan if exact is None else float((outside != exact["outside"]).mean())
-        row["seconds"] = one["seconds"][0] / len(outside)
+        row["CPU s"] = one["seconds"][0] / len(outside)
         rows[method] = row
     return pd.DataFrame.from_dict(rows, orient="index", dtype=float)
 
