@@ -118,6 +118,7 @@ def test_correct_writes_a_result_of_its_own(run, fitted):
     assert (fitted / "corrected" / "mine.txt").read_text() == "keep"
 
 
+@pytest.mark.slow
 def test_delayed_acceptance_where_the_weights_are_not_reliable(run, fitted, monkeypatch):
     monkeypatch.setattr(AccuracyReport, "reliable", False)
     code, out, err = run(f"check {fitted} --draws 20 --correct --particles 100 --reference particles")

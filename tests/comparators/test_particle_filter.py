@@ -109,6 +109,7 @@ def test_the_double_well_agrees_with_the_grid():
     assert np.all(np.abs(result.mean[:, 0] - exact.mean) < 4.0 * error)
 
 
+@pytest.mark.slow
 def test_a_nonlinear_link_agrees_with_importance_sampling_from_the_prior():
     """Plain simulation of the model, weighted by all observations at once: no resampling, other integration."""
     model = motif(softplus, genes=1, noise_sd=0.3)
