@@ -140,7 +140,8 @@ def particle_filter(model: LatentForceModel, times: Any, y: Any, key: jax.Array,
 
     Source: Gordon, Salmond and Smith (1993), IEE Proceedings F 140(2); Rössler (2010), SIAM J. Numer. Anal. 48(3).
     """
-    ssm, plan, y = checked(model, times, y, key, steps, max_step)
+    ssm = state_space(model)
+    plan, y = checked(ssm, times, y, key, steps, max_step)
     settings = check_settings(ssm, ParticleSettings(particles, resampling, threshold, scheme, batch))
     return _run(ssm, plan, y, jnp.asarray(times, float), key, settings)
 
@@ -175,17 +176,16 @@ def log_likelihood(ssm: StateSpaceModel, plan: Schedule, y: jax.Array, key: jax.
     return jnp.where(jnp.isnan(total), -jnp.inf, total)
 
 
-def checked(model: LatentForceModel, times: Any, y: Any, key: jax.Array, steps: int, max_step: float | None,
-            at: Any = None, row_per_step: bool = False) -> tuple[StateSpaceModel, Schedule, jax.Array]:
-    """Check what a particle method is given, and return state-space model, rows and observations."""
+def checked(ssm: StateSpaceModel, times: Any, y: Any, key: jax.Array, steps: int, max_step: float | None,
+            at: Any = None, row_per_step: bool = False) -> tuple[Schedule, jax.Array]:
+    """Check what a particle method is given, and return rows and observations."""
     if not is_prng_key(key):
         raise TypeError(f"key must be a JAX random key, such as jax.random.key(0), got {key!r}.")
-    ssm = state_space(model)
     plan = schedule(ssm, times, steps, max_step, at, row_per_step=row_per_step)
-    model.check_at(plan.initial_time, len(plan.observed))
+    ssm.model.check_at(plan.initial_time, len(plan.observed))
     check_noise(ssm, plan.initial_time)
     warn_single_precision()
-    return ssm, plan, check_observations(y, len(plan.observed), ssm.output_dim)
+    return plan, check_observations(y, len(plan.observed), ssm.output_dim)
 
 
 def check_settings(ssm: StateSpaceModel, settings: ParticleSettings) -> ParticleSettings:

@@ -12,7 +12,7 @@ import numpy as np
 from lfm_ppl import checks
 from lfm_ppl.comparators.particle_filter import ParticleSettings, Step, check_settings, checked, forward
 from lfm_ppl.comparators.stochastic_steps import choose_scheme
-from lfm_ppl.filtering.predict import Moments, predict_exact
+from lfm_ppl.filtering.predict import exact_offset
 from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays
 from lfm_ppl.filtering.transition import Exact, exact, linear_part
 from lfm_ppl.linalg import cholesky, matmul, solve_lower
@@ -139,9 +139,10 @@ def particle_smoother(model: LatentForceModel, times: Any, y: Any, key: jax.Arra
     """
     checks.positive_integer("draws", draws)
     checks.one_of("method", method, ("auto", *METHODS))
-    ssm, chosen, scheme = _method(state_space(model), method, scheme)
+    ssm = state_space(model)
+    chosen, scheme = _method(ssm, method, scheme)
     per_step = chosen == BACKWARD and scheme == "euler"
-    _, plan, y = checked(model, times, y, key, steps, max_step, at, row_per_step=per_step)
+    plan, y = checked(ssm, times, y, key, steps, max_step, at, row_per_step=per_step)
     settings = check_settings(ssm, ParticleSettings(particles, resampling, threshold, scheme))
     rows = len(plan.rows.observation)
     if (needed := 8 * rows * particles * (ssm.state_dim + 2)) > _LARGEST_HISTORY:
@@ -153,17 +154,17 @@ def particle_smoother(model: LatentForceModel, times: Any, y: Any, key: jax.Arra
                                   jnp.asarray(distinct), ssm, chosen, settings.scheme)
 
 
-def _method(ssm: StateSpaceModel, method: str, scheme: str) -> tuple[StateSpaceModel, str, str]:
+def _method(ssm: StateSpaceModel, method: str, scheme: str) -> tuple[str, str]:
+    """Return the method and the scheme that are wanted, or that the model allows."""
     reason = _obstacle(ssm)
     if method == BACKWARD and reason:
         raise ValueError(f"backward simulation needs the transition density, but {reason}. Use "
                          f'method="{TRACING}" (or "auto").')
     if method == TRACING or reason:
-        return ssm, TRACING, choose_scheme(ssm, scheme)
+        return TRACING, choose_scheme(ssm, scheme)
     if scheme not in ("auto", "exact", "euler"):
         raise ValueError(f'backward simulation moves particles by the scheme "exact" or "euler", got {scheme!r}.')
-    return ssm, BACKWARD, choose_scheme(ssm, scheme if scheme != "auto" else
-                                        "exact" if ssm.time_invariant else "euler")
+    return BACKWARD, choose_scheme(ssm, scheme if scheme != "auto" else "exact" if ssm.time_invariant else "euler")
 
 
 def _obstacle(ssm: StateSpaceModel) -> str:
@@ -208,7 +209,7 @@ def draw_trajectories(ssm: StateSpaceModel, plan: Schedule, y: jax.Array, key: j
     def back(carry: tuple[jax.Array, jax.Array], inputs: tuple) -> tuple[tuple, tuple]:
         (state, log_weights, ancestors), row, row_key = inputs
         later, index = carry
-        traced = ancestors[index].astype(int)
+        traced = ancestors[index]
         if method == BACKWARD:
             drawn = lambda: _drawn_back(ssm, settings, plan, row, state, log_weights, later, row_key)  # noqa: E731
             index = jax.lax.cond(row.length > 0, drawn, lambda: traced)
@@ -244,8 +245,7 @@ def _transition(ssm: StateSpaceModel, scheme: str, row: Rows, steps: int,
     """Return the means (n, N) of the next state, and the factor of its covariance, (n, n) or (n, n, N)."""
     if scheme == "exact":
         whole: Exact = exact(ssm, linear_part(ssm, jnp.zeros(())), row.length, steps)
-        zero = Moments(jnp.zeros(ssm.state_dim), jnp.zeros((ssm.state_dim, ssm.state_dim)))
-        offset = predict_exact(ssm, whole, steps, row.start, row.length, zero).moments.mean
+        offset = exact_offset(ssm, whole, steps, row.start, row.length)
         return matmul(whole.phi, state) + offset[:, None], cholesky(whole.noise).chol
     size = ssm.physical_dim
     forces, noise = ssm.stack.discretise(row.length)

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import checks
-from lfm_ppl.filtering.predict import Moments, predict_exact
+from lfm_ppl.filtering.predict import exact_offset
 from lfm_ppl.filtering.transition import Exact, exact, linear_part
 from lfm_ppl.forces.discretise import discretise
 from lfm_ppl.linalg import matmul, semidefinite_root
@@ -107,8 +107,7 @@ def advance(ssm: StateSpaceModel, scheme: str, prepared: Prepared, draw: Callabl
     """
     count = state.shape[1]
     if prepared.whole is not None:
-        zero = Moments(jnp.zeros(ssm.state_dim), jnp.zeros((ssm.state_dim, ssm.state_dim)))
-        offset = predict_exact(ssm, prepared.whole, steps, start, length, zero).moments.mean
+        offset = exact_offset(ssm, prepared.whole, steps, start, length)
         noise = draw(key, ssm.state_dim, count)
         return _columns(prepared.whole.phi, state) + _columns(prepared.root, noise) + offset[:, None]
     step = {"srk": srk, "milstein": milstein, "euler": euler}[scheme]

@@ -50,12 +50,17 @@ class _Stage(NamedTuple):
 def predict_exact(ssm: StateSpaceModel, transition: Exact, steps: int, start: jax.Array, length: jax.Array,
                   moments: Moments) -> Prediction:
     """Predict through the exact transition of a linear time-invariant model."""
-    offset = transition.offset
-    if not ssm.mean_invariant and ssm.physical_dim:
-        offset = _integrated_offset(ssm, transition, steps, start, length / steps)
     phi, noise = transition.phi, transition.noise
-    mean = matmul(phi, moments.mean[:, None])[:, 0] + offset
+    mean = matmul(phi, moments.mean[:, None])[:, 0] + exact_offset(ssm, transition, steps, start, length)
     return Prediction(Moments(mean, congruence(phi, moments.covariance) + noise), phi, noise)
+
+
+def exact_offset(ssm: StateSpaceModel, transition: Exact, steps: int, start: jax.Array,
+                 length: jax.Array) -> jax.Array:
+    """Return (n,), what an exact transition adds to phi s over a row that begins at ``start``."""
+    if ssm.mean_invariant or not ssm.physical_dim:
+        return transition.offset
+    return _integrated_offset(ssm, transition, steps, start, length / steps)
 
 
 def _integrated_offset(ssm: StateSpaceModel, transition: Exact, steps: int, start: jax.Array,
