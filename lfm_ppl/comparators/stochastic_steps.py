@@ -114,17 +114,25 @@ def advance(ssm: StateSpaceModel, scheme: str, prepared: Prepared, draw: Callabl
     sources, wide = _sources(ssm), prepared.root.shape[0]
     h = length / steps
     used = 2 * sources if scheme == "srk" else sources  # the others have no use for the average of the path
+    rows = used + wide
+    # Normal numbers come in pairs: an odd number of rows is drawn for two steps at once.
+    together = 2 if rows % 2 and steps % 2 == 0 else 1
 
-    def body(state: jax.Array, index: jax.Array) -> tuple[jax.Array, None]:
-        noise = draw(jax.random.fold_in(key, index), used + wide, count)
+    def one_step(state: jax.Array, t: jax.Array, noise: jax.Array) -> jax.Array:
         # The forces' state at the end, and their average over the step, before the drift is asked for anything.
         kicked = _columns(prepared.root, noise[used:])
-        one = lambda s, first, second, kick: step(  # noqa: E731
-            ssm, prepared, h, start + index * h, s, (first, second), kick)
-        return jax.vmap(one, in_axes=-1, out_axes=-1)(
-            state, noise[:sources], noise[used - sources:used], kicked), None
+        one = lambda s, first, second, kick: step(ssm, prepared, h, t, s, (first, second), kick)  # noqa: E731
+        return jax.vmap(one, in_axes=-1, out_axes=-1)(state, noise[:sources], noise[used - sources:used], kicked)
 
-    return jax.lax.scan(body, state, jnp.arange(steps))[0]
+    def body(state: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
+        first, step_key = inputs
+        noise = draw(step_key, together * rows, count)
+        for index in range(together):
+            state = one_step(state, start + (first + index) * h, noise[index * rows:(index + 1) * rows])
+        return state, None
+
+    firsts = jnp.arange(0, steps, together)
+    return jax.lax.scan(body, state, (firsts, jax.random.split(key, len(firsts))))[0]
 
 
 def srk(ssm: StateSpaceModel, prepared: Prepared, h: jax.Array, t: jax.Array, s: jax.Array,

@@ -222,8 +222,9 @@ def test_normal_numbers():
         assert np.abs(np.corrcoef(values) - np.eye(5)).max() < 4.5 / np.sqrt(200_001)
     assert np.isclose(stats.norm.sf(4.0), (drawn > 4.0).mean(), rtol=0.5)
     # The polynomials against the functions that they stand for: the two numbers of a pair lie on a circle.
-    bits = np.asarray(jax.random.bits(jax.random.key(5), (2, 5, 100_001), jnp.uint32)).astype(float)
-    radius, turn = np.sqrt(-2 * np.log((bits[0] + 0.5) * 2.0**-32)), 2 * np.pi * (bits[1] + 0.5) * 2.0**-32
+    bits = np.asarray(jax.random.bits(jax.random.key(5), (5, 100_001), jnp.uint64))
+    radius = np.sqrt(-2 * np.log(((bits >> 32) | 1).astype(float) * 2.0**-32))
+    turn = 2 * np.pi * ((bits & 0xFFFFFFFF).astype(float) + 0.5) * 2.0**-32
     quarter = np.pi / 4  # angles are counted from the middle of a quadrant
     assert np.allclose(drawn[:, :100_001], radius * np.cos(turn - quarter), atol=1e-9)
     assert np.allclose(drawn[:, 100_001:], (radius * np.sin(turn - quarter))[:, :-1], atol=1e-9)
