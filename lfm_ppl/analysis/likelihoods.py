@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.comparators import fokker_planck, particle_filter
+from lfm_ppl.comparators.observation_noise import check_noise
 from lfm_ppl.comparators.particle_filter import ParticleSettings
 from lfm_ppl.filtering.schedule import schedule
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
@@ -176,7 +177,7 @@ _SAFETY = 1.2
 
 def _particle_run(problem: Problem, particles: int, replicates: int, steps: int | None, progress: bool) -> Callable:
     known = problem.known.example
-    particle_filter.check_noise(known.ssm, known.plan.initial_time)
+    check_noise(known.ssm, known.plan.initial_time)
     settings = particle_filter.check_settings(known.ssm, ParticleSettings(particles))
 
     def one(distribution: MarginalLikelihood, y: jax.Array, key: jax.Array) -> jax.Array:

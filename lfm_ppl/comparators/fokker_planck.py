@@ -16,6 +16,7 @@ from lfm_ppl.comparators.finite_volume import Grid
 from lfm_ppl.comparators.grid_choice import ROOM, Problem, choose, half_grid, second_order_error
 from lfm_ppl.comparators.grid_filter import backward, forward, log_likelihood, moves
 from lfm_ppl.comparators.grid_model import Cells, on_grid, varies_with_time
+from lfm_ppl.comparators.observation_noise import check_noise
 from lfm_ppl.filtering.filter import check_observations, warn_single_precision
 from lfm_ppl.filtering.schedule import Schedule, schedule
 from lfm_ppl.linalg import safe_sqrt
@@ -206,21 +207,8 @@ def _checked(model: Any) -> StateSpaceModel:
         what = "process_noise is zero" if ssm.physical_dim else f"the force {model.force_names[0]!r} has no noise"
         raise ValueError(f"{what}: without noise the state has no density that could spread over a grid. Give the "
                          "state process_noise, or use lfm.filter.")
-    _check_observation_noise(model)
+    check_noise(ssm, 0.0)
     return ssm
-
-
-def _check_observation_noise(model: LatentForceModel) -> None:
-    covariance = model.observation.covariance
-    if callable(covariance):
-        u = jnp.asarray([force.mean_at(0.0) for force in model.force_list], float)
-        covariance = model.observation.covariance_at(model.initial_state.mean, u, jnp.zeros(()), jnp.asarray(0))
-    values = np.asarray(covariance)
-    smallest = values.min() if values.ndim == 1 else np.linalg.eigvalsh(values).min()
-    if smallest <= 0:
-        raise ValueError(f"the observation covariance is singular (its smallest eigenvalue is {smallest:g}): without "
-                         "noise the observation has no density given the state. Give every output a variance above "
-                         "zero.")
 
 
 def _checked_bounds(bounds: Any) -> tuple[float, float]:

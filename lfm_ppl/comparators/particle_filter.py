@@ -14,11 +14,12 @@ from numpyro.util import is_prng_key
 
 from lfm_ppl import checks
 from lfm_ppl.comparators.normals import normals
+from lfm_ppl.comparators.observation_noise import check_noise
 from lfm_ppl.comparators.resampling import RESAMPLING, effective_sample_size, resample
 from lfm_ppl.comparators.stochastic_steps import Prepared, advance, choose_scheme, prepare
 from lfm_ppl.filtering.filter import check_observations, warn_single_precision
 from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays, schedule
-from lfm_ppl.linalg import cholesky, matmul, semidefinite_root, solve_lower
+from lfm_ppl.linalg import cholesky, matmul, semidefinite_root, solve_lower, wrapped
 from lfm_ppl.model.augment import StateSpaceModel, state_space
 from lfm_ppl.model.latent_force_model import LatentForceModel
 
@@ -199,22 +200,6 @@ def check_settings(ssm: StateSpaceModel, settings: ParticleSettings) -> Particle
     return settings._replace(scheme=choose_scheme(ssm, settings.scheme))
 
 
-def check_noise(ssm: StateSpaceModel, time: Any) -> None:
-    """Raise ValueError where the observation noise has no density at the prior mean (where that is known)."""
-    w = jnp.concatenate([ssm.model.initial_state.mean, ssm.stack.mean_at(time)])
-    covariance = checks.concrete(ssm.noise_covariance(w, jnp.asarray(time, float), jnp.asarray(0)))
-    if covariance is None:
-        return
-    scale = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    for name, sd in zip(ssm.model.output_names, scale, strict=True):
-        if sd == 0.0:
-            raise ValueError(f"the observation noise of {name!r} is zero, so that an observation has no density given "
-                             "a particle. Give it a positive variance.")
-    if np.linalg.eigvalsh(covariance / np.outer(scale, scale)).min() < 1e-13:
-        raise ValueError("the covariance of the observation noise is singular, so that an observation has no density "
-                         f"given a particle: {covariance.tolist()}. Leave out the redundant outputs.")
-
-
 def forward(ssm: StateSpaceModel, plan: Schedule, y: jax.Array, key: jax.Array, settings: ParticleSettings,
             keep: Callable[[Step], Any]) -> Any:
     """Run over the rows and return ``keep`` of each, stacked."""
@@ -271,14 +256,11 @@ def _jumped(ssm: StateSpaceModel, index: int, key: jax.Array, state: jax.Array) 
 
 def log_observation(ssm: StateSpaceModel, s: jax.Array, t: jax.Array, row: jax.Array, y: jax.Array) -> jax.Array:
     """Return log p(y | s) of the present entries of ``y`` (D,), zero where all are missing."""
-    w = s
-    if ssm.force_dim:
-        matrix, offset = ssm.input_map(t)
-        w = matmul(matrix, s[:, None])[:, 0] + offset
+    w = ssm.inputs(s, t) if ssm.force_dim else s
     present = jnp.isfinite(y)
     residual = jnp.where(present, y, 0.0) - ssm.observe(w, t)
     for index in ssm.model.observation.angular:
-        residual = residual.at[index].set(jnp.arctan2(jnp.sin(residual[index]), jnp.cos(residual[index])))
+        residual = residual.at[index].set(wrapped(residual[index]))
     residual = jnp.where(present, residual, 0.0)
     both = present[:, None] & present[None, :]
     factor = cholesky(jnp.where(both, ssm.noise_covariance(w, t, row), jnp.eye(y.shape[0])))

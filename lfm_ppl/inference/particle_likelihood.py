@@ -15,7 +15,8 @@ from numpyro.infer.util import potential_energy
 from numpyro.primitives import Messenger
 
 from lfm_ppl import checks
-from lfm_ppl.comparators.particle_filter import ParticleSettings, check_noise, check_settings, log_likelihood
+from lfm_ppl.comparators.observation_noise import check_noise
+from lfm_ppl.comparators.particle_filter import ParticleSettings, check_settings, log_likelihood
 from lfm_ppl.filtering.schedule import schedule
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
 from lfm_ppl.inference.posterior import likelihood_site

@@ -353,8 +353,8 @@ def simple(drift=linear, start=1.0, variance=0.1, process_noise=None, noise=0.1,
     (simple(process_noise=jnp.zeros((1, 1)), noise=jnp.array([0.1])), "process_noise is zero"),
     (simple(process_noise=lambda x, u, t: jnp.zeros((1, 1)), noise=jnp.array([0.1])), "noise is zero everywhere"),
     (only(lfm.Constant(1.0)), "the force 'u' has no noise"),
-    (simple(process_noise=jnp.eye(1), noise=jnp.array([0.0])), "observation covariance is singular"),
-    (simple(process_noise=jnp.eye(1), noise=lambda x, u, t: jnp.zeros(1)), "observation covariance is singular"),
+    (simple(process_noise=jnp.eye(1), noise=jnp.array([0.0])), "noise of 'y0' is zero"),
+    (simple(process_noise=jnp.eye(1), noise=lambda x, u, t: jnp.zeros(1)), "noise of 'y0' is zero"),
     (simple(process_noise=root, noise=jnp.array([0.1])), r"not finite near x = -.*Give bounds"),
 ])
 def test_models_without_a_density(model, message):

@@ -1,0 +1,31 @@
+"""What particles and grids ask of the observation noise."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lfm_ppl import checks
+from lfm_ppl.model.augment import StateSpaceModel
+
+
+def check_noise(ssm: StateSpaceModel, time: Any) -> None:
+    """Raise ValueError where the observation noise has no density at the prior mean (where that is known)."""
+    w = jnp.concatenate([ssm.model.initial_state.mean, ssm.stack.mean_at(time)])
+    own = ssm.model.observation.covariance
+    rows = jnp.arange(1 if callable(own) or jnp.ndim(own) < 3 else own.shape[0])
+    covariance = checks.concrete(jax.vmap(lambda row: ssm.noise_covariance(w, jnp.asarray(time, float), row))(rows))
+    if covariance is None:
+        return
+    scale = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0))
+    for name, sd in zip(ssm.model.output_names, scale.min(axis=0), strict=True):
+        if sd == 0.0:
+            raise ValueError(f"the observation noise of {name!r} is zero, so that an observation has no density given "
+                             "the state. Give it a positive variance.")
+    smallest = np.linalg.eigvalsh(covariance / (scale[:, :, None] * scale[:, None, :])).min(axis=1)
+    if smallest.min() < 1e-13:
+        raise ValueError("the covariance of the observation noise is singular, so that an observation has no density "
+                         f"given the state: {covariance[smallest.argmin()].tolist()}. Leave out the redundant outputs.")
