@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -15,6 +14,7 @@ from lfm_ppl.comparators import particle_filter
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.ginzburg_landau import grid, problem
 from lfm_ppl.experiments.tasks import Result, Task
+from lfm_ppl.experiments.timing import timed
 from lfm_ppl.filtering.schedule import schedule
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.model.augment import state_space
@@ -100,9 +100,8 @@ def compute(task: Task) -> Result:
         run = _particle_program(settings["particles"], settings["steps"], times, y.shape, count)
         arguments = (jnp.asarray(y), jax.vmap(lambda k: jax.random.fold_in(jax.random.key(task.seed), k))(
             jnp.asarray(indices)))
-    started = time.process_time()
-    values = np.asarray(run(*arguments))
-    return {"log_likelihood": values.reshape(len(y), 3, count), "seconds": time.process_time() - started}
+    seconds, values = timed(run, *arguments)
+    return {"log_likelihood": np.asarray(values).reshape(len(y), 3, count), "seconds": seconds}
 
 
 @functools.cache

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -17,6 +16,7 @@ from lfm_ppl.analysis import arviz_data
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.ginzburg_landau import grid, problem, state
 from lfm_ppl.experiments.tasks import Result, Task
+from lfm_ppl.experiments.timing import timed
 from lfm_ppl.filtering.smoother import smooth
 from lfm_ppl.inference.particle_marginal import ParticleMarginalRAM
 from lfm_ppl.inference.ram import RAM
@@ -87,9 +87,8 @@ def sample(settings: Any, data: problem.Realisation, key: jax.Array) -> tuple[np
     """
     names = ("sampler", "warmup", "draws", "thin", "chains", "steps", "particles", "tree_depth")
     run = _program(*(settings.get(name) for name in names), tuple(data.times))
-    started = time.process_time()
-    draws, divergences = jax.block_until_ready(run(jax.random.key_data(key), jnp.asarray(data.y)))
-    return np.asarray(draws), int(divergences), time.process_time() - started
+    seconds, (draws, divergences) = timed(run, jax.random.key_data(key), jnp.asarray(data.y))
+    return np.asarray(draws), int(divergences), seconds
 
 
 @functools.cache
@@ -118,8 +117,9 @@ def _program(label: str, warmup: int, draws: int, thin: int, chains: int, steps:
 
     def run(key: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
         keys = jax.random.split(jax.random.wrap_key_data(key), chains)
-        # A Gaussian filter costs hardly more for four chains than for one; the particles of one fill the cache.
-        size = 1 if rule is None else chains
+        # A Gaussian filter costs hardly more for four chains than for one; the particles of one fill the cache, and
+        # chains of NUTS that run together all wait for the longest trajectory among them.
+        size = chains if kernel_name == "RAM" else 1
         found, diverging = jax.lax.map(lambda k: chain(k, y), keys, batch_size=size)
         return jnp.moveaxis(found, 0, 1), diverging.sum()
 

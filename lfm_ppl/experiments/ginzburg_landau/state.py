@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -16,6 +15,7 @@ from lfm_ppl.comparators.particle_smoother import particle_smoother
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.ginzburg_landau import grid, problem
 from lfm_ppl.experiments.tasks import Result, Task
+from lfm_ppl.experiments.timing import timed
 from lfm_ppl.filtering.filter import filter as gaussian_filter
 from lfm_ppl.filtering.smoother import smooth
 
@@ -173,14 +173,3 @@ def _warm(label: str, run: Callable[[], Any]) -> Callable[[], Any]:
         jax.block_until_ready(jax.tree_util.tree_leaves(run()))
         _warmed.add(label)
     return run
-
-
-def timed(run: Callable, *arguments: Any) -> tuple[float, Any]:
-    """Return how many seconds of CPU time, of all threads, a call takes, and its value.
-
-    Other programs on the same machine do not change it, as they would the time on the wall.
-    """
-    started = time.process_time()
-    found = run(*arguments)
-    jax.block_until_ready(jax.tree_util.tree_leaves(found))
-    return time.process_time() - started, found
