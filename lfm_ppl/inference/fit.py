@@ -270,7 +270,7 @@ def _kernel(sampler: str, model: Callable, arguments: tuple, keywords: dict, str
         return walk(model, init_strategy=strategy, **options), None
     if sampler == "pmmh":
         # At the mode, because a chain's own start may be a poor place to judge the estimate by.
-        options |= {"tune_at": space.unravel(jnp.asarray(mode.mode))}
+        options.setdefault("tune_at", space.unravel(jnp.asarray(mode.mode)))
     kernel = walk(model, init_strategy=strategy, initial_covariance=mode.covariance, **options)
     if chosen_start:
         return kernel, None
