@@ -159,5 +159,10 @@ def semidefinite_root(p: jax.Array, tolerance: float = 1e-14) -> jax.Array:
     return sd[:, None] * cholesky(p * inverse[:, None] * inverse[None, :], floor=tolerance, keep=False).chol
 
 
+def wrapped(angle: jax.Array) -> jax.Array:
+    """Return the angle in [-pi, pi] radians."""
+    return jnp.arctan2(jnp.sin(angle), jnp.cos(angle))
+
+
 def _divide(a: jax.Array, b: jax.Array) -> jax.Array:
     return jnp.where(b != 0, a / jnp.where(b != 0, b, 1.0), 0.0)

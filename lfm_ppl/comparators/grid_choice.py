@@ -15,6 +15,7 @@ from lfm_ppl.comparators.finite_volume import Grid
 from lfm_ppl.comparators.grid_filter import total_and_reach
 from lfm_ppl.comparators.grid_model import Cells, drift_and_diffusion, on_grid
 from lfm_ppl.filtering.schedule import Schedule
+from lfm_ppl.linalg import wrapped
 from lfm_ppl.model.augment import StateSpaceModel
 
 _SCOUT = 256
@@ -163,7 +164,7 @@ def _first_cells(problems: Sequence[Problem], y: jax.Array, grid: Grid) -> float
     for problem in problems:
         cells = problem.cells(grid)
         slope = np.asarray(cells.value[..., -1, :] - cells.value[..., 0, :])
-        slope = np.arctan2(np.sin(slope), np.cos(slope)) if np.any(cells.angular) else slope
+        slope = np.asarray(wrapped(jnp.asarray(slope))) if np.any(cells.angular) else slope
         noise = np.broadcast_to(np.asarray(cells.noise)[:, :, 0], (*np.shape(cells.noise)[:2], *cells.noise.shape[-2:]))
         held = problem.reach(y, grid) > 1e-6
         noise = noise[:, held] if noise.shape[1] > 1 else noise

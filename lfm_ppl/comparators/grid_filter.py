@@ -11,7 +11,7 @@ import numpy as np
 from lfm_ppl.comparators.finite_volume import Chain, Grid, propagate, transition
 from lfm_ppl.comparators.grid_model import WEIGHTS, Cells, on_grid
 from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays
-from lfm_ppl.linalg import cholesky, solve_lower
+from lfm_ppl.linalg import cholesky, solve_lower, wrapped
 from lfm_ppl.model.augment import StateSpaceModel
 
 _LARGEST_TABLE = 2**25
@@ -44,7 +44,7 @@ def _log_likelihood_of_cells(cells: Cells, index: jax.Array, y: jax.Array) -> ja
     value, noise = (a[jnp.where(a.shape[0] > 1, index, 0)] for a in (cells.value, cells.noise))
     present = jnp.isfinite(y)[:, None, None, :]
     residual = jnp.where(present, y[:, None, None, :], 0.0) - value
-    residual = jnp.where(cells.angular, jnp.arctan2(jnp.sin(residual), jnp.cos(residual)), residual)
+    residual = jnp.where(cells.angular, wrapped(residual), residual)
     residual = jnp.where(present, residual, 0.0)
     if y.shape[-1] == 1:
         variance = noise[..., 0]

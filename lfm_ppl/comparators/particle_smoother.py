@@ -251,8 +251,7 @@ def _transition(ssm: StateSpaceModel, scheme: str, row: Rows, steps: int,
     forces, noise = ssm.stack.discretise(row.length)
 
     def one(s: jax.Array) -> tuple[jax.Array, jax.Array]:
-        matrix, offset = ssm.input_map(row.start)
-        w = matmul(matrix, s[:, None])[:, 0] + offset
+        w = ssm.inputs(s, row.start)
         moved = s[:size] + row.length * ssm.drift(w, row.start)
         dispersion = ssm.dispersion(w, row.start)
         own = jnp.zeros((0, 0)) if dispersion is None else row.length * matmul(dispersion, dispersion.T)

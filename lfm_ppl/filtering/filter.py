@@ -136,8 +136,7 @@ def forward(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, *, s
 def _observation_slope(ssm: StateSpaceModel, plan: Schedule) -> jax.Array:
     """The constant part of the observation's Jacobian; the same at every point and time."""
     t = jnp.asarray(plan.initial_time, float)
-    matrix, offset = ssm.input_map(t)
-    w = matmul(matrix, ssm.initial()[0][:, None])[:, 0] + offset
+    w = ssm.inputs(ssm.initial()[0], t)
     return constant_slope(lambda v: (ssm.observe(v, t), ()), w, ssm.observation_structure, ssm.output_dim)
 
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.filtering.predict import Moments, covariance_of, linearise_state
-from lfm_ppl.linalg import cholesky, congruence, matmul, solve_lower, solve_upper
+from lfm_ppl.linalg import cholesky, congruence, matmul, solve_lower, solve_upper, wrapped
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.linearisation.sigma_points import SigmaPointRule
 from lfm_ppl.model.augment import StateSpaceModel
@@ -52,14 +52,13 @@ def linearise_observation(ssm: StateSpaceModel, rule: Rule, slope: jax.Array, t:
 
     angular = ssm.model.observation.angular
     if angular:
-        matrix, offset = ssm.input_map(t)
-        middle = jax.lax.stop_gradient(ssm.observe(matmul(matrix, centre.mean[:, None])[:, 0] + offset, t))
+        middle = jax.lax.stop_gradient(ssm.observe(ssm.inputs(centre.mean, t), t))
 
     def function(w: jax.Array) -> tuple[jax.Array, Any]:
         value = ssm.observe(w, t)
         for index in angular:
             # Averages are taken on the branch of the angle that is centred on the mean.
-            value = value.at[index].set(middle[index] + _wrapped(value[index] - middle[index]))
+            value = value.at[index].set(middle[index] + wrapped(value[index] - middle[index]))
         return value, ssm.noise_covariance(w, t, row)
 
     affine = linearise_state(ssm, rule, function, ssm.observation_structure, slope, t, centre.mean,
@@ -70,19 +69,12 @@ def linearise_observation(ssm: StateSpaceModel, rule: Rule, slope: jax.Array, t:
     return Linearised(value, affine.slope, affine.residual + affine.extra)
 
 
-def _wrapped(angle: jax.Array) -> jax.Array:
-    """Return the angle in [-pi, pi]."""
-    return jnp.arctan2(jnp.sin(angle), jnp.cos(angle))
-
-
 def _spread(ssm: StateSpaceModel, rule: Rule, t: jax.Array, moments: Moments) -> jax.Array:
     """As in the prediction: the standard deviation below which a coordinate counts as known."""
     if isinstance(rule, SigmaPointRule) and rule.full_state:
         scale = moments.mean
     else:
-        matrix, offset = ssm.input_map(t)
-        w = matmul(matrix, moments.mean[:, None])[:, 0] + offset
-        scale = w[jnp.asarray(ssm.observation_structure.points, int)]
+        scale = ssm.inputs(moments.mean, t)[jnp.asarray(ssm.observation_structure.points, int)]
     # Next to a state that is exactly zero and known, one unit is as good a scale as any.
     return jax.lax.stop_gradient(1e-6 * jnp.where(scale == 0, 1e-3, jnp.abs(scale)))
 
@@ -97,7 +89,7 @@ def update(ssm: StateSpaceModel, observation: Linearised, y: jax.Array, present:
     slope = jnp.where(present[:, None], observation.slope, 0.0)
     residual = jnp.where(present, y, 0.0) - observation.value
     for index in ssm.model.observation.angular:
-        residual = residual.at[index].set(_wrapped(residual[index]))
+        residual = residual.at[index].set(wrapped(residual[index]))
     innovation = jnp.where(present, residual, 0.0)
     both = present[:, None] & present[None, :]
     noise = jnp.where(both, observation.noise, jnp.eye(y.shape[0]))

@@ -165,8 +165,7 @@ def _particle_path(distribution: MarginalLikelihood, y: jax.Array, at: Any, key:
     states, _, total = jax.lax.map(lambda k: draw_trajectories(ssm, plan, y, k, particles, 1, TRACING), path_keys)
     best = jax.random.categorical(choice, jnp.where(jnp.isneginf(total).all(), 0.0, total))
     when = jnp.asarray(plan.requested_times, float)
-    matrix, offset = jax.vmap(ssm.input_map)(when)
-    return matmul(matrix, states[best][:, 0, :, None])[..., 0] + offset, when
+    return jax.vmap(ssm.inputs)(states[best][:, 0], when), when
 
 
 def _steps_in_a_row(ssm: StateSpaceModel, times: Any, at: Any, steps: int) -> int:

@@ -12,6 +12,7 @@ import numpy as np
 
 from lfm_ppl import checks
 from lfm_ppl.forces.sum import Stack
+from lfm_ppl.linalg import matmul
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.structure import Pattern, pattern
 
@@ -97,6 +98,11 @@ class StateSpaceModel(eqx.Module):
         size = self.physical_dim
         matrix = jax.scipy.linalg.block_diag(jnp.eye(size), self.stack.measurement(t))
         return matrix, jnp.concatenate([jnp.zeros(size), self.stack.mean_at(t)])
+
+    def inputs(self, s: jax.Array, t: Any) -> jax.Array:
+        """Return w = (x, u) (M + R,) at the joint state s (n,) and time t."""
+        matrix, offset = self.input_map(t)
+        return matmul(matrix, s[:, None])[:, 0] + offset
 
     def split(self, w: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return x (M,) and u (R,) of w."""

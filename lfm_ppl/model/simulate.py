@@ -96,8 +96,7 @@ def simulate_on(ssm: StateSpaceModel, key: jax.Array, times: jax.Array, start: j
         return state, state
 
     _, states = jax.lax.scan(row, first, (starts, times, jax.random.split(path, times.shape[0])))
-    matrix, offset = jax.vmap(ssm.input_map)(times)
-    inputs = matmul(matrix, states[..., None])[..., 0] + offset
+    inputs = jax.vmap(ssm.inputs)(states, times)
     y = jax.vmap(lambda w, t, k, index: _observe(ssm, w, t, k, index))(
         inputs, times, jax.random.split(noise, times.shape[0]), jnp.arange(times.shape[0]))
     size = ssm.physical_dim
@@ -112,19 +111,15 @@ def _simulation_step(ssm: StateSpaceModel, state: jax.Array, t: jax.Array, h: ja
     draw = jax.random.normal(force_key, (ssm.force_dim, 1))
     forces = (matmul(transition, state[size:, None]) + matmul(root, draw))[:, 0]
 
-    def inputs(x: jax.Array, z: jax.Array, time: jax.Array) -> jax.Array:
-        matrix, offset = ssm.input_map(time)
-        return matmul(matrix, jnp.concatenate([x, z])[:, None])[:, 0] + offset
-
     x = state[:size]
-    now = inputs(x, state[size:], t)
+    now = ssm.inputs(state, t)
     slope = ssm.drift(now, t)
     dispersion = ssm.dispersion(now, t)
     kick = jnp.zeros(size)
     if dispersion is not None:
         kick = jnp.sqrt(h) * matmul(dispersion, jax.random.normal(state_key, (dispersion.shape[1], 1)))[:, 0]
     end = just_before(t + h, h)
-    after = ssm.drift(inputs(x + h * slope + kick, forces, end), end)
+    after = ssm.drift(ssm.inputs(jnp.concatenate([x + h * slope + kick, forces]), end), end)
     return jnp.concatenate([x + 0.5 * h * (slope + after) + kick, forces])
 
 
