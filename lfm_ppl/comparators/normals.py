@@ -54,7 +54,7 @@ def normals(key: jax.Array, count: int, size: int) -> jax.Array:
 
 def _words(key: jax.Array, shape: tuple[int, ...]) -> tuple[jax.Array, jax.Array]:
     """Return two arrays of 32 random bits."""
-    if not jax.config.jax_enable_x64:
+    if jnp.result_type(float) != jnp.float64:
         both = jax.random.bits(key, (2, *shape), jnp.uint32)
         return both[0], both[1]
     # Words of 64 bits use all that the generator makes; of each pair of words of 32 bits it throws one away.
