@@ -119,14 +119,16 @@ def test_correct_writes_a_result_of_its_own(run, fitted):
 
 
 @pytest.mark.slow
-def test_delayed_acceptance_where_the_weights_are_not_reliable(run, fitted, monkeypatch):
+@pytest.mark.parametrize("flag, name", [("", ""), (" --delayed", ", delayed acceptance")], ids=["plain", "delayed"])
+def test_exact_chains_where_the_weights_are_not_reliable(run, fitted, monkeypatch, flag, name):
     monkeypatch.setattr(AccuracyReport, "reliable", False)
-    code, out, err = run(f"check {fitted} --draws 20 --correct --particles 100 --reference particles")
+    code, out, err = run(f"check {fitted} --draws 20 --correct --particles 100 --reference particles{flag}")
     assert code == 0, err
-    assert "delayed acceptance, 2 chains of 100 warm-up and 100 kept draws" in out
+    assert f"particle-marginal RAM{name}, 2 chains of 100 warm-up and 100 kept draws" in out
     corrected = arviz_data.load(fitted / "corrected" / "posterior.nc")
     attributes = arviz_data.attributes(corrected)
-    assert attributes["sampler"] == "pmmh" and attributes["particles"] == 100 and attributes["delayed"] == 1
+    assert attributes["sampler"] == "pmmh" and attributes["particles"] == 100
+    assert attributes["delayed"] == bool(flag)
     assert attributes["steps"] == 12 and attributes["options"] == '{"noise": 0.25}'
     assert arviz_data.group(corrected, "posterior")["depth"].shape == (2, 100)
 
@@ -139,6 +141,7 @@ def test_delayed_acceptance_where_the_weights_are_not_reliable(run, fitted, monk
         ("check RESULT --draws 0", "expected a whole number of at least 1, got '0'"),
         ("check RESULT --particles 0", "expected a whole number of at least 1, got '0'"),
         ("check RESULT --out there", "--out names the folder of the corrected result; add --correct"),
+        ("check RESULT --delayed", "--delayed says how the corrected result is sampled; add --correct"),
         ("check RESULT --model nothing.py", "there is no model file nothing.py"),
         ("check RESULT --model ginzburg-landau", "made with the option 'noise', which"),
     ],

@@ -113,7 +113,13 @@ def _add_check(commands: Any) -> None:
     command.add_argument(
         "--correct",
         action="store_true",
-        help="write the corrected result: resampled draws, or delayed acceptance where their weights are too uneven",
+        help="write the corrected result: resampled draws, or exact chains where their weights are too uneven",
+    )
+    command.add_argument(
+        "--delayed",
+        action="store_true",
+        help="let the Gaussian filter screen half of the proposals of such chains: worth it where it is nearly right "
+        "and the particle filter slow",
     )
     command.add_argument("--model", metavar="FILE", help="the model file, where the result does not know it")
     command.add_argument("--out", metavar="DIR", help="folder of the corrected result (default: RESULT/corrected)")

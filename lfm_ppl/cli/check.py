@@ -21,7 +21,7 @@ FIGURE = "accuracy.png"
 CORRECTED = "corrected"
 _DRAWS, _DRAWS_TO_CORRECT = 200, 1000
 _CHAINS, _WARMUP, _SAMPLES = 4, 500, 500
-"""Of delayed acceptance where the result comes from the posterior mode, which has no chains."""
+"""Of the chains that correct a result from the posterior mode, which has none itself."""
 
 _RECORD = ("model_file", "settings", "options", "data", "note")
 
@@ -39,8 +39,11 @@ def run(arguments: argparse.Namespace) -> int:
     """Print the accuracy report, store it beside and in the result, and write the corrected result if asked."""
     from lfm_ppl.analysis import arviz_data, files
 
-    if arguments.out is not None and not arguments.correct:
-        raise ValueError("--out names the folder of the corrected result; add --correct.")
+    if not arguments.correct:
+        if arguments.out is not None:
+            raise ValueError("--out names the folder of the corrected result; add --correct.")
+        if arguments.delayed:
+            raise ValueError("--delayed says how the corrected result is sampled; add --correct.")
     path = results.locate(arguments.result)
     for name in (TABLE, FIGURE):
         files.refuse_existing(path.parent / name, arguments.overwrite)
@@ -140,7 +143,7 @@ def _write(report: Any, posterior: Any, path: Path) -> int:
 
 
 def _correct(task: Task, report: Any, arguments: argparse.Namespace, folder: Path) -> int:
-    """Write the corrected result: by resampling where the weights are reliable, else by delayed acceptance."""
+    """Write the corrected result: by resampling where the weights are reliable, else by new chains."""
     from lfm_ppl.analysis.correction import correct
 
     started = time.perf_counter()
@@ -148,12 +151,16 @@ def _correct(task: Task, report: Any, arguments: argparse.Namespace, folder: Pat
         print(f"correct  resampling {report.log_weight.size} draws, worth {report.ess:.0f} after weighting")
         corrected = correct(task.posterior, task.model, model_kwargs=task.keywords, seed=arguments.seed)
     else:
-        corrected = _delayed_acceptance(task, arguments)
+        corrected = _exact_chains(task, arguments)
     return fit.report(corrected, folder, time.perf_counter() - started, arguments.overwrite)
 
 
-def _delayed_acceptance(task: Task, arguments: argparse.Namespace) -> Any:
-    """Sample the exact posterior: proposals that the Gaussian filter accepts are put to the particle filter."""
+def _exact_chains(task: Task, arguments: argparse.Namespace) -> Any:
+    """Sample the exact posterior by particle-marginal RAM.
+
+    Where the weights fail, the filter's likelihood is too small in a part of the posterior, and delayed acceptance,
+    which screens proposals with it, mixes worse than it saves; so it is left to the user.
+    """
     import lfm_ppl
     from lfm_ppl.analysis import arviz_data, rebuilding
 
@@ -165,8 +172,10 @@ def _delayed_acceptance(task: Task, arguments: argparse.Namespace) -> Any:
     at = None
     if arviz_data.has_group(task.posterior, "trajectories"):
         at = arviz_data.group(task.posterior, "trajectories")["at"].values
-    print(f"correct  delayed acceptance, {chains} chains of {warmup} warm-up and {samples} kept draws", flush=True)
-    options: dict[str, Any] = {"delayed": True}
+    kind = ", delayed acceptance" if arguments.delayed else ""
+    print(f"correct  particle-marginal RAM{kind}, {chains} chains of {warmup} warm-up and {samples} kept draws",
+          flush=True)
+    options: dict[str, Any] = {"delayed": arguments.delayed}
     if arguments.particles is not None:
         options["particles"] = arguments.particles
     corrected = lfm_ppl.fit(

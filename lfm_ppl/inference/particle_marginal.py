@@ -29,6 +29,9 @@ from lfm_ppl.inference.unconstrained import UnconstrainedModel
 _TARGET, _TARGET_ONE = 0.12, 0.21
 """Half of what RAM aims at: noise of sd one in the log likelihood halves the acceptance at any scale."""
 
+_DELAYED = 0.5
+"""Share of the steps with delayed acceptance, where it is asked for; the others ask the particle filter at once."""
+
 
 class ParticleMarginalState(NamedTuple):
     """What the chain carries: the fields of `RAMState`, and two of its own.
@@ -64,14 +67,16 @@ class ParticleMarginalRAM(RAM):
 
     where Z is the estimate with which x was accepted: it is carried along and never drawn again, which makes the
     posterior of the parameters the chain's invariant distribution whatever the number of particles. With ``delayed``
-    acceptance a proposal first has to pass the test with the Gaussian filter's likelihood L; the particle filter runs
-    only then, and the second test, with ``min(1, Z' L / (Z L'))``, makes up for the first.
+    acceptance, in every other step at random, a proposal first has to pass the test with the Gaussian filter's
+    likelihood L; the particle filter runs only then, and the second test, with ``min(1, Z' L / (Z L'))``, makes up for
+    the first. It saves estimates where the filter is nearly right. Where L is far too small in a part of the posterior,
+    such steps hardly ever reach it or leave it again; the steps between, which do without L, keep the chain moving.
 
     Args:
         model: a NumPyro model with one likelihood site, ``lfm.MarginalLikelihood`` or ``lfm.panel``.
         particles: N; None: chosen so that the log likelihood has a standard deviation near 1.
         tune_at: unconstrained parameters at which N is chosen; None: where the first chain starts.
-        delayed: two-stage acceptance.
+        delayed: two-stage acceptance in half of the steps.
         particle_steps: integration steps of the particles between two times; None: the model's ``steps``.
         resampling: as in `lfm_ppl.particle_filter`, and so are the next two.
         threshold: of the effective sample size.
@@ -235,17 +240,19 @@ def particle_marginal_step(
     Returns:
         The state ``n``.
     """
-    rng_key, key_noise, key_accept, key_particles, key_second = jax.random.split(state.rng_key, 5)
+    rng_key, key_noise, key_accept, key_particles, key_first = jax.random.split(state.rng_key, 5)
     ram = RAMState(*state[: len(RAMState._fields)])
     proposal, noise = propose(ram, key_noise)
-    first, passed, reached = jnp.zeros_like(state.surrogate_energy), jnp.array(True), jnp.ones(())
+    first = gain = jnp.zeros_like(state.surrogate_energy)
+    passed = jnp.array(True)
     if surrogate is not None:
         first = finite_or_infinity(surrogate(proposal))
-        passed = jax.random.uniform(key_second) < acceptance(state.surrogate_energy - first)
-        reached = passed.astype(noise.dtype)
+        mixed, uniform = jax.random.uniform(key_first, (2,))
+        gain = jnp.where(mixed < _DELAYED, state.surrogate_energy - first, 0.0)
+        passed = uniform < acceptance(gain)
     energy = jax.lax.cond(passed, lambda: finite_or_infinity(estimate(proposal, key_particles)),
                           lambda: jnp.full_like(state.potential_energy, jnp.inf))
-    accept_prob = reached * acceptance((state.potential_energy - energy) - (state.surrogate_energy - first))
+    accept_prob = passed * acceptance(state.potential_energy - energy - gain)
     accepted = jax.random.uniform(key_accept) < accept_prob
     moved = ram._replace(
         z=choose(accepted, proposal, state.z),
