@@ -3,7 +3,10 @@
 from lfm_ppl.analysis.accuracy import check_accuracy
 from lfm_ppl.analysis.correction import correct as correct_posterior
 from lfm_ppl.analysis.report import AccuracyReport
+from lfm_ppl.comparators.elliptical_slice import EllipticalSlice
 from lfm_ppl.comparators.fokker_planck import FokkerPlanckResult, fokker_planck
+from lfm_ppl.comparators.laplace import LaplaceResult, laplace
+from lfm_ppl.comparators.latent_grid import LatentGrid
 from lfm_ppl.comparators.particle_filter import ParticleFilterResult, particle_filter
 from lfm_ppl.comparators.particle_smoother import ParticleSmootherResult, particle_smoother
 from lfm_ppl.data import Data, read_csv
@@ -14,6 +17,7 @@ from lfm_ppl.inference.fit import ConvergenceWarning, fit
 from lfm_ppl.inference.fixing import fix
 from lfm_ppl.inference.map import MAPResult, map_estimate
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, panel
+from lfm_ppl.inference.on_latent_grid import on_latent_grid
 from lfm_ppl.inference.particle_marginal import ParticleMarginalRAM
 from lfm_ppl.inference.ram import RAM
 from lfm_ppl.linearisation.rule import Rule
@@ -40,6 +44,7 @@ __all__ = [
     "ConvergenceWarning",
     "Cubature",
     "Data",
+    "EllipticalSlice",
     "FilterResult",
     "FilterState",
     "FokkerPlanckResult",
@@ -48,7 +53,9 @@ __all__ = [
     "Gaussian",
     "GaussianObservation",
     "Input",
+    "LaplaceResult",
     "LatentForceModel",
+    "LatentGrid",
     "MAPResult",
     "MarginalLikelihood",
     "Matern",
@@ -71,7 +78,9 @@ __all__ = [
     "fit",
     "fix",
     "fokker_planck",
+    "laplace",
     "map_estimate",
+    "on_latent_grid",
     "panel",
     "particle_filter",
     "particle_smoother",

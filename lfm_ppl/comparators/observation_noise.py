@@ -1,4 +1,4 @@
-"""What particles and grids ask of the observation noise."""
+"""The density of an observation given the state, and what it asks of the noise."""
 
 from __future__ import annotations
 
@@ -9,7 +9,36 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import checks
+from lfm_ppl.linalg import cholesky, solve_lower, wrapped
 from lfm_ppl.model.augment import StateSpaceModel
+
+_LOG_2PI = float(np.log(2.0 * np.pi))
+
+
+def log_density(ssm: StateSpaceModel, w: jax.Array, t: jax.Array, row: jax.Array,
+                y: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Score the present entries of an observation.
+
+    Args:
+        ssm: the model.
+        w: (M + R,), state and forces.
+        t: the time.
+        row: of the observation, where each has a noise covariance of its own.
+        y: (D,), NaN where missing.
+
+    Returns:
+        log p(y | w), zero where all entries are missing; the residual (D,) in units of the noise.
+    """
+    present = jnp.isfinite(y)
+    residual = jnp.where(present, y, 0.0) - ssm.observe(w, t)
+    for index in ssm.model.observation.angular:
+        residual = residual.at[index].set(wrapped(residual[index]))
+    residual = jnp.where(present, residual, 0.0)
+    both = present[:, None] & present[None, :]
+    factor = cholesky(jnp.where(both, ssm.noise_covariance(w, t, row), jnp.eye(y.shape[0])))
+    white = solve_lower(factor.chol, residual)
+    value = -0.5 * ((white**2).sum() + present.sum() * _LOG_2PI) - jnp.log(jnp.diagonal(factor.chol)).sum()
+    return jnp.where(factor.degenerate.any(), -jnp.inf, value), white
 
 
 def check_noise(ssm: StateSpaceModel, time: Any) -> None:

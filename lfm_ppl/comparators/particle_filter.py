@@ -14,16 +14,14 @@ from numpyro.util import is_prng_key
 
 from lfm_ppl import checks
 from lfm_ppl.comparators.normals import normals
-from lfm_ppl.comparators.observation_noise import check_noise
+from lfm_ppl.comparators.observation_noise import check_noise, log_density
 from lfm_ppl.comparators.resampling import RESAMPLING, effective_sample_size, resample
 from lfm_ppl.comparators.stochastic_steps import Prepared, advance, choose_scheme, prepare
 from lfm_ppl.filtering.filter import check_observations, warn_single_precision
 from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays, schedule
-from lfm_ppl.linalg import cholesky, matmul, semidefinite_root, solve_lower, wrapped
+from lfm_ppl.linalg import matmul, semidefinite_root
 from lfm_ppl.model.augment import StateSpaceModel, state_space
 from lfm_ppl.model.latent_force_model import LatentForceModel
-
-_LOG_2PI = float(np.log(2.0 * np.pi))
 
 
 class ParticleSettings(NamedTuple):
@@ -256,17 +254,7 @@ def _jumped(ssm: StateSpaceModel, index: int, key: jax.Array, state: jax.Array) 
 
 def log_observation(ssm: StateSpaceModel, s: jax.Array, t: jax.Array, row: jax.Array, y: jax.Array) -> jax.Array:
     """Return log p(y | s) of the present entries of ``y`` (D,), zero where all are missing."""
-    w = ssm.inputs(s, t) if ssm.force_dim else s
-    present = jnp.isfinite(y)
-    residual = jnp.where(present, y, 0.0) - ssm.observe(w, t)
-    for index in ssm.model.observation.angular:
-        residual = residual.at[index].set(wrapped(residual[index]))
-    residual = jnp.where(present, residual, 0.0)
-    both = present[:, None] & present[None, :]
-    factor = cholesky(jnp.where(both, ssm.noise_covariance(w, t, row), jnp.eye(y.shape[0])))
-    white = solve_lower(factor.chol, residual)
-    value = -0.5 * ((white**2).sum() + present.sum() * _LOG_2PI) - jnp.log(jnp.diagonal(factor.chol)).sum()
-    return jnp.where(factor.degenerate.any(), -jnp.inf, value)
+    return log_density(ssm, ssm.inputs(s, t) if ssm.force_dim else s, t, row, y)[0]
 
 
 def _weigh(settings: ParticleSettings, key: jax.Array, state: jax.Array, log_weights: jax.Array,

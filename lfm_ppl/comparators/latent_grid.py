@@ -1,0 +1,318 @@
+"""The forces on a grid of times: the physical state as an explicit function of them, and the exact posterior's density.
+
+Where the dynamics are linear in the state with constant coefficients, dx/dt = A x + p(u, t), the state follows from
+the forces by an integral, and the integral from their values on a grid by a rule. That is the model on which Laplace's
+approximation, elliptical slice sampling and Hamiltonian Monte Carlo over the force itself work.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lfm_ppl import checks
+from lfm_ppl.comparators.observation_noise import check_noise, log_density
+from lfm_ppl.filtering.filter import check_observations, warn_single_precision
+from lfm_ppl.forces.sde import Force
+from lfm_ppl.linalg import semidefinite_root
+from lfm_ppl.model.augment import StateSpaceModel, check_times, state_space
+from lfm_ppl.model.latent_force_model import LatentForceModel
+
+RULES = ("riemann", "trapezoid", "linear")
+
+JITTER = 1e-10
+"""Share of a force's variance that is added to the diagonal of its covariance on the grid, so that it has a factor."""
+
+
+class LatentGrid(eqx.Module):
+    r"""A latent force model whose forces are their values on a grid.
+
+    With s_0 < ... < s_G-1 the grid and c_i the end of cell i, cut off at t_k,
+
+        x(t_k) = e^(A (t_k - t_0)) x(t_0) + sum_i int_(s_i)^(c_i) e^(A (t_k - s)) p(u(s), s) ds,
+
+    where the integral over a cell is one of
+
+        riemann:    (c_i - s_i) times the integrand at s_i, as in the source,
+        trapezoid:  (c_i - s_i) times the mean of the integrand at both ends,
+        linear:     exact for p linear in time within the cell.
+
+    The first has an error of the order of the cells' width, the others of its square; the last stays accurate where a
+    decay is fast compared with the cells.
+
+    Args:
+        model: the latent force model: dynamics linear in the state with constant coefficients, any use of the forces,
+            no process noise. A Gaussian initial state is legal.
+        times: (T,) of the observations, non-decreasing.
+        points: number of equally spaced points from the initial time to the last observation, or the grid itself (G,),
+            increasing, which starts at the initial time.
+        rule: "riemann", "trapezoid" or "linear".
+
+    Attributes:
+        ssm: the model in state-space form.
+        times: (T,).
+        grid: (G,).
+        nearby: (T, G), the forces at the observation times as combinations of those on the grid.
+        flow: (T, M, M), e^(A (t_k - t_0)).
+        weights: (T, G, M) of p(u(s_i), s_i) where A is diagonal, else (T, G, M, M).
+        mean: (R, G), the forces' prior mean.
+        root: (R, G, G), lower triangular factor of their prior covariance.
+        rule: as given.
+
+    Raises:
+        ValueError: the dynamics are not linear in the state with constant coefficients; there is process noise; there
+            are no forces; a force jumps; the grid does not cover the data; observation noise without a density.
+
+    Example:
+        >>> import jax.numpy as jnp, lfm_ppl as lfm
+        >>> model = lfm.LatentForceModel(
+        ...     lambda x, u, t: jnp.exp(u) - x, {"u": lfm.Matern(1.0, 2.0, order=1)},
+        ...     lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.01])), lfm.Gaussian(jnp.zeros(1), jnp.zeros(1)))
+        >>> grid = LatentGrid(model, jnp.arange(4.0), points=61)
+        >>> grid.state(jnp.zeros((1, 61))).shape
+        (4, 1)
+
+    Source: Lawrence, Sanguinetti and Rattray (2006), NIPS 19; Hartikainen, Seppanen and Sarkka (2012), ICML,
+    section 5.1.
+    """
+
+    ssm: StateSpaceModel
+    times: np.ndarray
+    grid: np.ndarray
+    nearby: np.ndarray
+    flow: jax.Array
+    weights: jax.Array
+    mean: jax.Array
+    root: jax.Array
+    rule: str = eqx.field(static=True)
+
+    def __init__(self, model: LatentForceModel, times: Any, points: Any = 363, rule: str = "linear"):
+        ssm = state_space(model)
+        checks.one_of("rule", rule, RULES)
+        _check_model(ssm)
+        known = check_times(times, model.initial_time)
+        if known is None:
+            raise ValueError("times must be known when the grid is built, but they are traced.")
+        initial = float(known[0] if model.initial_time is None else model.initial_time)
+        check_noise(ssm, initial)
+        self.ssm, self.times, self.rule = ssm, known, rule
+        self.grid = _grid(points, initial, known)
+        self.nearby = np.stack([np.interp(known, self.grid, one) for one in np.eye(len(self.grid))], axis=1)
+        slope = _decay(ssm)
+        self.flow, self.weights = _weights(slope, _diagonal(ssm), self.grid, known, rule)
+        self.mean = jax.vmap(ssm.stack.mean_at)(jnp.asarray(self.grid)).T
+        self.root = jnp.stack([_root(force, self.grid) for force in ssm.stack.forces])
+        _check_production(self)
+
+    @property
+    def force_names(self) -> tuple[str, ...]:
+        """Names of the R forces."""
+        return self.ssm.model.force_names
+
+    def force(self, white: jax.Array) -> jax.Array:
+        """Return forces (R, G) from independent standard normal numbers (R, G)."""
+        return self.mean + jnp.einsum("rij,rj->ri", self.root, white)
+
+    def start(self, white: jax.Array) -> jax.Array:
+        """Return the physical state (M,) at the initial time from independent standard normal numbers (M,)."""
+        prior = self.ssm.model.initial_state
+        return prior.mean + semidefinite_root(prior.covariance) @ white
+
+    @property
+    def start_is_known(self) -> bool:
+        """Whether the initial state has no variance, as far as that is known."""
+        covariance = checks.concrete(self.ssm.model.initial_state.covariance)
+        return covariance is not None and not covariance.any()
+
+    def state(self, u: jax.Array, start: jax.Array | None = None) -> jax.Array:
+        """Return the physical state (T, M) at the observation times.
+
+        Args:
+            u: (R, G), the forces on the grid.
+            start: (M,), the state at the initial time; None: its prior mean.
+        """
+        first = self.ssm.model.initial_state.mean if start is None else start
+        made = jax.vmap(self._production)(u.T, jnp.asarray(self.grid))
+        kind = "kgj,gj->kj" if self.weights.ndim == 3 else "kgij,gj->ki"
+        return jnp.einsum("kij,j->ki", self.flow, first) + jnp.einsum(kind, self.weights, made)
+
+    def log_likelihood(self, u: jax.Array, y: jax.Array, start: jax.Array | None = None) -> jax.Array:
+        """Return log p(y | u, start); missing entries are left out, and what is not finite counts as impossible.
+
+        Args:
+            u: (R, G).
+            y: (T, D), NaN where missing.
+            start: as in `state`.
+        """
+        return self.scored(u, y, start)[0]
+
+    def scored(self, u: jax.Array, y: jax.Array, start: jax.Array | None = None) -> tuple[jax.Array, jax.Array]:
+        """Return log p(y | u, start) and the residuals (T, D) in units of the noise, zero where y is missing."""
+        state = self.state(u, start)
+        uses_forces = self.ssm.model.observation.varies_with_state or any(
+            any(row[self.ssm.physical_dim:]) for row in self.ssm.observation_structure.jacobian)
+        forces = jnp.asarray(self.nearby) @ u.T if uses_forces else jnp.zeros((len(state), len(u)))
+        w = jnp.concatenate([state, forces], axis=1)
+        rows = jnp.arange(len(self.times))
+        value, white = jax.vmap(lambda w, t, row, y: log_density(self.ssm, w, t, row, y))(
+            w, jnp.asarray(self.times), rows, y)
+        total = value.sum()
+        return jnp.where(jnp.isnan(total), -jnp.inf, total), white
+
+    def checked(self, y: Any) -> jax.Array:
+        """Check observations (T, D), and return them as an array."""
+        warn_single_precision()
+        return check_observations(y, len(self.times), self.ssm.output_dim)
+
+    def _production(self, u: jax.Array, t: jax.Array) -> jax.Array:
+        """Return p (M,): the dynamics without the state."""
+        return self.ssm.drift(jnp.concatenate([jnp.zeros(self.ssm.physical_dim), u]), t)
+
+
+def _check_model(ssm: StateSpaceModel) -> None:
+    model = ssm.model
+    if not model.force_names:
+        raise ValueError("the model has no forces: there is nothing to put on a grid.")
+    noise = model.process_noise
+    known = None if callable(noise) or noise is None else checks.concrete(noise)
+    if noise is not None and (known is None or known.any()):
+        raise ValueError("the state is a function of the forces only without process_noise; use the particle "
+                         "smoother, lfm.particle_smoother, instead.")
+    varying = [name for index, name in enumerate(model.state_names)
+               if index in ssm.drift_structure.points or index in ssm.drift_structure.averaged]
+    if varying:
+        raise ValueError(f"the dynamics must be linear in the state with constant coefficients, but their derivative "
+                         f"in {', '.join(varying)} varies; use the particle smoother, lfm.particle_smoother, instead.")
+    if ssm.stack.jump_times:
+        raise ValueError("a force with jumps has no covariance between arbitrary times; use the particle smoother, "
+                         "lfm.particle_smoother, instead.")
+
+
+def _grid(points: Any, initial: float, times: np.ndarray) -> np.ndarray:
+    last = float(times[-1])
+    if np.ndim(points) == 0:
+        checks.positive_integer("points", points)
+        if points < 2 or last <= initial:
+            raise ValueError(f"a grid needs at least 2 points and observations after the initial time; got "
+                             f"{points} points from {initial:g} to {last:g}.")
+        return np.linspace(initial, last, int(points))
+    grid = np.asarray(points, float)
+    if grid.ndim != 1 or grid.size < 2 or not np.isfinite(grid).all() or (np.diff(grid) <= 0).any():
+        raise ValueError("points must be a number of points, or at least two finite times that increase; got shape "
+                         f"{grid.shape}.")
+    slack = 1e-9 * (last - initial)
+    if abs(grid[0] - initial) > slack:
+        raise ValueError(f"the grid must start at the initial time {initial:g}, but starts at {grid[0]:g}.")
+    if grid[-1] < last - slack:
+        raise ValueError(f"the grid ends at {grid[-1]:g}, before the last observation at {last:g}; it has to cover "
+                         "the data.")
+    return grid
+
+
+def _decay(ssm: StateSpaceModel) -> jax.Array:
+    """Return A (M, M), the constant Jacobian of the dynamics in the state."""
+    size = ssm.physical_dim
+    at = jnp.zeros(ssm.input_dim)
+    return jax.jacfwd(lambda x: ssm.drift(at.at[:size].set(x), 0.0))(jnp.zeros(size))
+
+
+def _diagonal(ssm: StateSpaceModel) -> bool:
+    size = ssm.physical_dim
+    pattern = np.asarray(ssm.drift_structure.jacobian, bool)[:, :size]
+    return not (pattern & ~np.eye(size, dtype=bool)).any()
+
+
+def _weights(slope: jax.Array, diagonal: bool, grid: np.ndarray, times: np.ndarray,
+             rule: str) -> tuple[jax.Array, jax.Array]:
+    """Return the flow from the initial time (T, M, M), and the weights of the points."""
+    starts, wide = grid[:-1], np.diff(grid)
+    ends = np.clip(times[:, None], starts, grid[1:])
+    length = ends - starts
+    # How far along its cell a cell is used: all of it, none, or up to the observation.
+    share = length / wide
+    if diagonal:
+        rates = jnp.diagonal(slope)
+        flows = lambda lengths: jnp.exp(rates * jnp.asarray(lengths)[..., None])  # noqa: E731
+        first, second = _integrals(rates * jnp.asarray(length)[..., None])
+        scale = jnp.asarray(length)[..., None]
+        first, second = scale * first, scale * second
+        of = lambda a: jnp.asarray(a)[..., None]  # noqa: E731
+        after: Any = jnp.multiply
+    else:
+        flows = lambda lengths: _distinct(lambda h: _flow(slope, h)[0], lengths)  # noqa: E731
+        first, second = (_distinct(lambda h, i=index: _flow(slope, h)[i], length) for index in (1, 2))
+        of = lambda a: jnp.asarray(a)[..., None, None]  # noqa: E731
+        after = jnp.matmul
+    # A cell after the observation has no length, and starts at a time at which no flow is wanted.
+    back = flows(np.maximum(times[:, None] - ends, 0.0))
+    if rule == "riemann":
+        left, right = of(length) * flows(np.maximum(times[:, None] - starts, 0.0)), 0.0 * back
+    elif rule == "trapezoid":
+        whole = flows(np.maximum(times[:, None] - starts, 0.0))
+        left = of(0.5 * length) * (whole + of(1.0 - share) * back)
+        right = of(0.5 * length * share) * back
+    else:
+        # int e^(A (c - s)) (s - s_i) ds = length second, where `first` is the integral without the factor.
+        left, right = after(back, first - of(share) * second), of(share) * after(back, second)
+    nothing = jnp.zeros((len(times), 1, *left.shape[2:]))
+    weights = jnp.concatenate([left, nothing], axis=1) + jnp.concatenate([nothing, right], axis=1)
+    start = flows(times - grid[0])
+    return jax.vmap(jnp.diag)(start) if diagonal else start, weights
+
+
+def _integrals(z: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return (e^z - 1)/z and (e^z - 1 - z)/z^2, by their series near zero."""
+    near = jnp.abs(z) < 0.5
+    safe = jnp.where(near, 1.0, z)
+    small = jnp.where(near, z, 0.0)
+    second = jnp.ones_like(z)
+    for order in range(15, 2, -1):
+        second = 1.0 + small * second / order
+    second = 0.5 * second
+    far = (jnp.expm1(safe) - safe) / safe**2
+    second = jnp.where(near, second, far)
+    return 1.0 + z * second, second
+
+
+def _flow(slope: jax.Array, length: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return e^(A h), int_0^h e^(A (h - s)) ds and int_0^h e^(A (h - s)) s/h ds, from one exponential."""
+    size = slope.shape[0]
+    eye, zero = jnp.eye(size), jnp.zeros((size, size))
+    block = jnp.block([[slope * length, eye * length, zero], [zero, zero, eye], [zero, zero, zero]])
+    found = jax.scipy.linalg.expm(block)
+    return found[:size, :size], found[:size, size:2 * size], found[:size, 2 * size:]
+
+
+def _distinct(function: Any, lengths: np.ndarray) -> jax.Array:
+    """Return ``function`` of every length, computed once for lengths that are equal up to rounding."""
+    scale = max(float(np.max(lengths, initial=0.0)), np.finfo(float).tiny)
+    _, first, inverse = np.unique(np.round(lengths / scale, 12), return_index=True, return_inverse=True)
+    return jax.vmap(function)(jnp.asarray(np.ravel(lengths)[first]))[inverse.reshape(np.shape(lengths))]
+
+
+def _root(force: Force, grid: np.ndarray) -> jax.Array:
+    t, s = jnp.asarray(grid)[:, None], jnp.asarray(grid)[None, :]
+    try:
+        covariance = force.covariance(t - grid[0], s - grid[0])
+    except NotImplementedError:
+        covariance = force.sde_covariance(t - grid[0], s - grid[0])
+    jitter = JITTER * jnp.max(jnp.diagonal(covariance))
+    return jnp.linalg.cholesky(covariance + jitter * jnp.eye(len(grid)))
+
+
+def _check_production(latent: LatentGrid) -> None:
+    """Raise where the dynamics are not finite at forces that the prior deems ordinary."""
+    if checks.traced(latent):
+        return
+    spread = np.sqrt((np.asarray(latent.root) ** 2).sum(axis=2))
+    for sign in (0.0, -3.0, 3.0):
+        made = np.asarray(jax.vmap(latent._production)(latent.mean.T + sign * spread.T, jnp.asarray(latent.grid)))
+        if not np.isfinite(made).all():
+            where = int(np.flatnonzero(~np.isfinite(made).all(axis=1))[0])
+            what = "the forces' prior mean" if sign == 0 else f"{abs(sign):g} prior standard deviations from their mean"
+            raise ValueError(f"the dynamics are not finite at {what} (at t = {latent.grid[where]:g}): check the "
+                             "function of the forces.")

@@ -1,0 +1,117 @@
+"""The forces of a NumPyro model as latent sites: what samplers without a filter work on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpyro
+import numpyro.distributions as dist
+from numpyro.distributions import constraints
+from numpyro.primitives import Messenger
+
+from lfm_ppl import checks
+from lfm_ppl.comparators.latent_grid import LatentGrid
+from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
+
+
+class GridLikelihood(dist.Distribution):
+    """Distribution of the observations given the forces on a grid.
+
+    Args:
+        base: the marginal likelihood that it stands in for.
+        latent: the grid.
+        u: (R, G), forces.
+        start: (M,), state at the initial time.
+    """
+
+    support = constraints.real_matrix
+    pytree_data_fields = ("base", "latent", "u", "start")
+
+    def __init__(self, base: MarginalLikelihood, latent: LatentGrid, u: jax.Array, start: jax.Array) -> None:
+        self.base, self.latent, self.u, self.start = base, latent, u, start
+        super().__init__((), base.event_shape, validate_args=False)
+
+    def log_prob(self, value: Any) -> jax.Array:
+        """Return log p(value | u, start)."""
+        return self.latent.log_likelihood(self.u, jnp.asarray(value, float), self.start)
+
+    def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
+        """Simulate the model with forces of its own, as ``base`` does."""
+        return self.base.sample(key, sample_shape)
+
+
+class on_latent_grid(Messenger):  # noqa: N801 (an effect handler, named as NumPyro names its handlers)
+    """Effect handler that keeps the forces of a model as latent sites on a grid, in place of filtering them out.
+
+    A site ``y`` with ``lfm.MarginalLikelihood`` becomes: ``y_white`` (R, G), independent standard normal; ``y_start``
+    (M,) likewise, where the initial state is uncertain; ``y_forces`` (R, G), deterministic; and ``y`` given these. The
+    posterior of all other sites is that of the model itself, without a Gaussian filter's approximation and up to the
+    integration rule's error, but in hundreds of dimensions. Use it with `numpyro.infer.MCMC`; `lfm_ppl.EllipticalSlice`
+    works on it where all other sites are fixed.
+
+    Args:
+        fn: a NumPyro model with a site ``lfm.MarginalLikelihood``.
+        points: number of points, or the grid; as in `lfm_ppl.LatentGrid`.
+        rule: "riemann", "trapezoid" or "linear".
+
+    Raises:
+        ValueError: what `lfm_ppl.LatentGrid` raises; no such site; a panel.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, numpyro, lfm_ppl as lfm
+        >>> def model(times, y=None):
+        ...     system = lfm.LatentForceModel(
+        ...         lambda x, u, t: jnp.exp(u) - x, {"u": lfm.Matern(1.0, 2.0, order=1)},
+        ...         lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.01])),
+        ...         lfm.Gaussian(jnp.zeros(1), jnp.zeros(1)))
+        ...     numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
+        >>> latent = lfm.on_latent_grid(model, points=21)
+        >>> seeded = numpyro.handlers.seed(latent, 0)
+        >>> trace = numpyro.handlers.trace(seeded).get_trace(jnp.arange(3.0), jnp.ones((3, 1)))
+        >>> trace["y_forces"]["value"].shape
+        (1, 21)
+    """
+
+    def __init__(self, fn: Callable[..., Any] | None = None, points: Any = 363, rule: str = "linear") -> None:
+        self.points, self.rule = points, rule
+        self.found = False
+        super().__init__(fn)
+
+    def __enter__(self) -> on_latent_grid:
+        """Start a run of the model."""
+        self.found = False
+        super().__enter__()
+        return self
+
+    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
+        """End the run; a model without the site is an error."""
+        super().__exit__(kind, error, trace)
+        if kind is None and not self.found:
+            raise ValueError("the model has no site numpyro.sample(name, lfm.MarginalLikelihood(...), obs=y) without "
+                             "mask, expand or plate around it, whose forces could be put on a grid.")
+
+    def process_message(self, msg: dict[str, Any]) -> None:
+        """Sample the forces, and condition the site on them."""
+        fn = msg.get("fn")
+        if msg["type"] != "sample" or not isinstance(fn, (MarginalLikelihood, Panel)):
+            return
+        if isinstance(fn, Panel):
+            raise ValueError(f"the site {msg['name']!r} is a panel; put one series at a time on a grid.")
+        if checks.traced(fn.times):
+            raise ValueError("times must be known when the grid is built, but they are traced; run with "
+                             "jit_model_args=False.")
+        self.found = True
+        name = msg["name"]
+        latent = LatentGrid(fn.model, fn.times, self.points, self.rule)
+        shape = latent.mean.shape
+        u = latent.force(numpyro.sample(f"{name}_white", dist.Normal().expand(shape).to_event(2)))
+        numpyro.deterministic(f"{name}_forces", u)
+        if latent.start_is_known:
+            start = fn.model.initial_state.mean
+        else:
+            size = latent.ssm.physical_dim
+            start = latent.start(numpyro.sample(f"{name}_start", dist.Normal().expand([size]).to_event(1)))
+        msg["fn"] = GridLikelihood(fn, latent, u, start)

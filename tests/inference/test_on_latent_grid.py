@@ -1,0 +1,89 @@
+"""Forces as latent sites: the posterior that the marginal likelihood has, in many dimensions."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
+from numpyro import handlers
+from numpyro.infer import MCMC, NUTS
+
+import lfm_ppl as lfm
+
+TIMES = np.linspace(0.0, 5.0, 6)
+Y = np.array([[0.1], [0.6], [np.nan], [1.3], [0.7], [0.2]])
+
+
+def linear(times, y=None, variance=0.1):
+    """A linear model, whose marginal likelihood is exact."""
+    decay = numpyro.sample("decay", dist.LogNormal(0.0, 0.5))
+    system = lfm.LatentForceModel(
+        lambda x, u, t: u - decay * x, {"u": lfm.Matern(1.0, 2.0, order=1)},
+        lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.04])),
+        lfm.Gaussian(jnp.zeros(1), variance * jnp.eye(1)))
+    numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
+
+
+def test_nuts_over_the_force_has_the_posterior_of_the_marginal_model():
+    """The parameter against quadrature of the exact marginal posterior; the force against the smoother's mixture."""
+    latent = lfm.on_latent_grid(linear, points=61)
+    mcmc = MCMC(NUTS(latent, max_tree_depth=7), num_warmup=300, num_samples=700, num_chains=2,
+                chain_method="vectorized", progress_bar=False)
+    mcmc.run(jax.random.key(0), TIMES, Y)
+    draws = mcmc.get_samples(group_by_chain=True)
+    assert draws["y_forces"].shape == (2, 700, 1, 61) and draws["y_start"].shape == (2, 700, 1)
+    decay = np.linspace(0.05, 8.0, 400)
+
+    @jax.jit
+    def marginal(value):
+        seeded = handlers.substitute(handlers.seed(linear, 0), {"decay": value})
+        site = handlers.trace(seeded).get_trace(TIMES, Y)["y"]["fn"]
+        return site.log_prob(Y)
+
+    log_density = np.array([marginal(v) for v in decay]) + np.asarray(dist.LogNormal(0.0, 0.5).log_prob(decay))
+    weight = np.exp(log_density - log_density.max())
+    weight /= weight.sum()
+    mean = weight @ decay
+    sd = np.sqrt(weight @ (decay - mean) ** 2)
+    found = numpyro.diagnostics.summary({"decay": np.asarray(draws["decay"])})["decay"]
+    assert found["n_eff"] > 200
+    assert abs(found["mean"] - mean) < 4 * sd / np.sqrt(found["n_eff"])
+    assert abs(found["std"] / sd - 1) < 4 / np.sqrt(2 * found["n_eff"]) + 0.05
+
+
+def test_a_known_start_is_no_site_and_the_prior_predictive_is_the_models():
+    latent = lfm.on_latent_grid(linear, points=11)
+    trace = handlers.trace(handlers.seed(latent, 0)).get_trace(TIMES, Y, variance=0.0)
+    assert set(trace) == {"decay", "y_white", "y_forces", "y"}
+    drawn = handlers.trace(handlers.seed(latent, 0)).get_trace(TIMES)["y"]["value"]
+    assert drawn.shape == (6, 1) and np.isfinite(drawn).all()
+
+
+def test_elliptical_slice_sampling_where_the_parameters_are_fixed():
+    """Against the exact smoother, force by force."""
+    fixed = handlers.substitute(linear, {"decay": 0.8})
+    latent = lfm.on_latent_grid(handlers.block(fixed, hide=["decay"]), points=61)
+    mcmc = MCMC(lfm.EllipticalSlice(latent), num_warmup=500, num_samples=4000, num_chains=4,
+                chain_method="vectorized", progress_bar=False)
+    mcmc.run(jax.random.key(1), TIMES, Y)
+    forces = np.asarray(mcmc.get_samples(group_by_chain=True)["y_forces"])[:, :, 0, ::12]
+    found = numpyro.diagnostics.summary({"u": forces})["u"]
+    model = handlers.trace(handlers.seed(fixed, 0)).get_trace(TIMES, Y)["y"]["fn"].model
+    exact = lfm.smooth(model, TIMES, Y, at=np.linspace(0.0, 5.0, 6))
+    assert found["n_eff"].min() > 100
+    mean, sd = (np.asarray(part)[:6] for part in (exact.force("u").mean, exact.force("u").sd))
+    assert np.all(np.abs(found["mean"] - mean) < 4.5 * sd / np.sqrt(found["n_eff"]) + 5e-3)
+    assert np.all(np.abs(found["std"] / sd - 1) < 4.5 / np.sqrt(2 * found["n_eff"]) + 0.02)
+
+
+def test_errors():
+    def without(times, y=None):
+        numpyro.sample("y", dist.Normal(0.0, 1.0), obs=y)
+
+    with pytest.raises(ValueError, match="no site"):
+        handlers.seed(lfm.on_latent_grid(without), 0)(TIMES, 0.3)
+    with pytest.raises(ValueError, match="unknown rule"):
+        handlers.seed(lfm.on_latent_grid(linear, rule="exact"), 0)(TIMES, Y)
+    with pytest.raises(ValueError, match="traced"):
+        jax.jit(lambda t: handlers.seed(lfm.on_latent_grid(linear), 0)(t, Y))(TIMES)
