@@ -131,17 +131,20 @@ def _add_compare(commands: Any) -> None:
     examples = (
         "  lfm-ppl compare\n"
         "  lfm-ppl compare ginzburg-landau --quick\n"
+        "  lfm-ppl compare transcription --datasets 10\n"
         "  lfm-ppl compare ginzburg-landau --realisations 50 --conditional 200 --out double-well"
     )
     help_ = "run a published experiment again, or go on with one that was stopped; without a name, list them"
     command = _command(commands, "compare", compare.run, help_, examples)
     command.add_argument("experiment", nargs="?", metavar="EXPERIMENT", help="see `lfm-ppl compare`")
-    command.add_argument("--realisations", type=_whole(1), metavar="N", help="data sets (default: the experiment's)")
+    command.add_argument(
+        "--realisations", "--datasets", type=_whole(1), metavar="N", help="data sets (default: the experiment's)"
+    )
     command.add_argument(
         "--conditional",
         type=_whole(1),
         metavar="N",
-        help="data sets for the conditional posteriors of single parameters (default: the experiment's own)",
+        help="ginzburg-landau: data sets for the conditional posteriors of single parameters (default: 100)",
     )
     command.add_argument("--seed", type=_whole(0), default=0, help="random seed of everything (default: 0)")
     command.add_argument("--quick", action="store_true", help="few and small: it shows that it runs, and no more")

@@ -11,7 +11,8 @@ import pandas as pd
 
 from lfm_ppl import checks
 
-_MODULES = {"ginzburg-landau": "lfm_ppl.experiments.ginzburg_landau.report"}
+_MODULES = {"ginzburg-landau": "lfm_ppl.experiments.ginzburg_landau.report",
+            "transcription": "lfm_ppl.experiments.transcription.report"}
 
 
 class Wanted(NamedTuple):
@@ -20,7 +21,7 @@ class Wanted(NamedTuple):
     Attributes:
         folder: for tasks, tables and figures.
         realisations: number of data sets; None: the experiment's own.
-        conditional: number of data sets for the conditional posteriors; None: the experiment's own.
+        conditional: number of data sets for the conditional posteriors, where the experiment has them; None: its own.
         seed: of everything random.
         quick: a small version that shows that everything runs.
         overwrite: compute again what was stored with other settings.

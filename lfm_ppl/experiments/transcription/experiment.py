@@ -1,0 +1,163 @@
+"""The whole comparison: its settings, its run, and what it leaves in a folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from lfm_ppl import checks
+from lfm_ppl.analysis.files import writing
+from lfm_ppl.analysis.plots import style
+from lfm_ppl.analysis.tables import write_csv, write_markdown
+from lfm_ppl.experiments import scores
+from lfm_ppl.experiments.tasks import Result, Task, run_tasks
+from lfm_ppl.experiments.transcription import figures, laplace_modes, problem, slices, smoothers, tables
+
+TASKS = "tasks"
+METHODS = ("LA", "ESLS", "GFS", "GHS(7)", "iterated GHS(7)", "LA, trust region")
+BLOCK = 10
+"""Data sets that are computed in one go, and stored in one file."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How much is computed.
+
+    Attributes:
+        datasets: for each configuration.
+        seed: of everything random.
+        draws: of elliptical slice sampling for one data set, all chains together; the source's.
+        burn_in: the first of them, which are left out.
+    """
+
+    datasets: int = 100
+    seed: int = 0
+    draws: int = 100_000
+    burn_in: int = 5_000
+
+    def __post_init__(self) -> None:
+        """Check the numbers that a user gives."""
+        checks.positive_integer("datasets", self.datasets)
+
+
+def quick(datasets: int = 2, seed: int = 0) -> Settings:
+    """Return settings that show in a few minutes that everything runs, and no more."""
+    return Settings(datasets, seed, draws=4_000, burn_in=400)
+
+
+class Comparison(NamedTuple):
+    """What the experiment found.
+
+    Attributes:
+        settings: that it ran with.
+        results: of every task, by name.
+        table: a row for each configuration and method.
+        published: RMSE and divergences beside the published ones.
+        paired: every method against elliptical slice sampling.
+    """
+
+    settings: Settings
+    results: dict[str, Result]
+    table: pd.DataFrame
+    published: pd.DataFrame
+    paired: pd.DataFrame
+
+
+def all_tasks(settings: Settings) -> list[Task]:
+    """Return every task: all methods on the first data sets, then on the next, so that the time left can be told."""
+    found = []
+    for first in range(0, settings.datasets, BLOCK):
+        last = min(first + BLOCK, settings.datasets) - 1
+        for configuration in problem.CONFIGURATIONS:
+            for method in METHODS:
+                own: dict = {"draws": settings.draws, "burn_in": settings.burn_in} if method == "ESLS" else {}
+                found.append(Task(
+                    f"{slug(configuration.label)}/{slug(method)}/{first:03d}-{last:03d}", settings.seed,
+                    {"experiment": "transcription", "method": method, "link": configuration.link,
+                     "gamma": configuration.gamma, "first": first, "last": last, **own}))
+    return found
+
+
+def compute(task: Task) -> Result:
+    """Return what the method says of the force of each data set of the task, and how good it is."""
+    settings = task.settings
+    configuration = problem.Configuration(settings["link"], settings["gamma"])
+    data = [problem.data_set(configuration, index, task.seed)
+            for index in range(settings["first"], settings["last"] + 1)]
+    method = settings["method"]
+    if method in smoothers.SMOOTHERS:
+        found = smoothers.compute(settings, data)
+    elif method in laplace_modes.SEARCHES:
+        found = laplace_modes.compute(settings, data)
+    else:
+        found = slices.compute(settings, data, task.key)
+    return found | judged(found, np.stack([one.u for one in data]))
+
+
+def judged(found: Result, truth: np.ndarray) -> Result:
+    """Return ``rmse``, ``coverage``, ``nlpd`` and ``diverged`` (N,) of means and standard deviations (N, 363).
+
+    The predictive density of the force at a point of the grid is the normal one with the method's mean and standard
+    deviation, for all methods; the band is the mean +- 1.96 standard deviations.
+    """
+    mean, sd = found["mean"], np.maximum(found["sd"], 1e-12)
+    error = np.array([scores.rmse(one, u) if np.isfinite(one).all() else np.inf
+                      for one, u in zip(mean, truth, strict=True)])
+    z = (truth - mean) / sd
+    diverged = ~(error <= problem.DIVERGED)
+    if "stopped" in found:
+        diverged |= ~np.asarray(found["stopped"], bool)
+    return {"rmse": error, "coverage": (np.abs(z) <= figures.Z).mean(axis=1),
+            "nlpd": (0.5 * z**2 + np.log(sd) + 0.5 * np.log(2.0 * np.pi)).mean(axis=1), "diverged": diverged}
+
+
+def slug(label: str) -> str:
+    """Return a label as part of the name of a task."""
+    return label.replace(", ", "-").replace(" ", "-")
+
+
+def run(settings: Settings, folder: str | Path, *, overwrite: bool = False,
+        report: Callable[[str], None] | None = None) -> Comparison:
+    """Compute what is not stored yet in ``folder``, and tabulate everything.
+
+    Args:
+        settings: how much.
+        folder: of the experiment; its subfolder ``tasks`` holds a file for each task.
+        overwrite: compute again what was stored with other settings.
+        report: what to do with a line of progress; None: nothing.
+
+    Raises:
+        ValueError: the folder holds results made with other settings.
+    """
+    results = run_tasks(all_tasks(settings), compute, Path(folder) / TASKS, overwrite=overwrite, report=report)
+    grouped = by_cell(settings, results)
+    return Comparison(settings, results, tables.comparison(grouped), tables.beside_published(grouped),
+                      tables.against_slices(grouped))
+
+
+def by_cell(settings: Settings, results: dict[str, Result]) -> dict[tuple[str, str], Result]:
+    """Return (configuration, method) -> the results of all its data sets, one after another."""
+    cells: dict[tuple[str, str], list[Result]] = {}
+    for task in all_tasks(settings):
+        label = problem.Configuration(task.settings["link"], task.settings["gamma"]).label
+        cells.setdefault((label, task.settings["method"]), []).append(results[task.name])
+    return {cell: {name: np.concatenate([np.atleast_1d(part[name]) for part in parts]) for name in parts[0]}
+            for cell, parts in cells.items()}
+
+
+def save(found: Comparison, folder: str | Path) -> list[Path]:
+    """Write tables and figures of a comparison, replacing older ones, and return their paths."""
+    folder, written = Path(folder), []
+    for name, table in (("comparison", found.table), ("published", found.published), ("paired", found.paired)):
+        written.append(write_csv(table, folder / f"{name}.csv", True, index_label="case"))
+        written.append(write_markdown(tables.readable(table), folder / f"{name}.md", True))
+    for name, figure in figures.draw(found.settings, by_cell(found.settings, found.results)).items():
+        with writing(folder / f"{name}.png", True) as temporary, style.in_style():
+            figure.savefig(temporary, format="png")
+        written.append(folder / f"{name}.png")
+    return written

@@ -1,0 +1,111 @@
+"""The force of one data set by every method, and the errors of all data sets."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from lfm_ppl.analysis.plots import style
+from lfm_ppl.experiments.tasks import Result
+from lfm_ppl.experiments.transcription import problem
+
+Z = 1.959963984540054
+COLOURS = {"LA": style.VERMILLION, "LA, trust region": style.ORANGE, "ESLS": style.GREY, "GFS": style.BLUE,
+           "GHS(7)": style.SKY, "iterated GHS(7)": style.GREEN}
+_SHOWN = ("LA", "ESLS", "GFS", "iterated GHS(7)")
+
+
+def draw(settings: Any, cells: Mapping[tuple[str, str], Result]) -> dict[str, Figure]:
+    """Return every figure of the comparison by name."""
+    found = {}
+    for configuration in problem.CONFIGURATIONS:
+        if configuration.label in ("repression 0.1", "exponential"):
+            own = {method: cells[configuration.label, method] for method in _SHOWN}
+            data = problem.data_set(configuration, 0, settings.seed)
+            found[f"force-{configuration.label.replace(' ', '-')}"] = plot_force(data, own)
+    return found | {"errors": plot_errors(cells)}
+
+
+@style.styled
+def plot_force(data: problem.DataSet, methods: Mapping[str, Result], *, width: str | float = "full") -> Figure:
+    """Draw the force of a data set, its mean and 95% band by each method, and the data.
+
+    Args:
+        data: the data set, the first of those in ``methods``.
+        methods: method -> its results.
+        width: "column" (3.4 in), "full" (7 in), or inches.
+    """
+    figure = style.new_figure(width, 4.2)
+    grid = figure.subplots(2, 3)
+    panels = list(grid.ravel())
+    axes = panels[0]
+    for gene, colour in zip(range(problem.GENES), (style.BLUE, style.VERMILLION, style.GREEN), strict=True):
+        axes.plot(data.fine, data.state[:, gene], color=colour, lw=0.9)
+        axes.plot(problem.TIMES, data.y[:, gene], ls="", marker="x", ms=3.2, mew=0.9, color=colour)
+    axes.set_title("expression of the genes, and data")
+    axes.set_ylabel("expression")
+    style.tidy(axes)
+    top = 1.3 * np.abs(data.u).max() + 1.0
+    for axes, (method, found) in zip(panels[1:], methods.items(), strict=False):
+        mean, sd = found["mean"][0], found["sd"][0]
+        colour = COLOURS[method]
+        axes.fill_between(problem.GRID, mean - Z * sd, mean + Z * sd, color=colour, alpha=0.25, lw=0, zorder=1)
+        axes.plot(problem.GRID, mean, color=colour, zorder=3)
+        axes.plot(problem.GRID, data.u, color=style.BLACK, lw=0.7, zorder=2)
+        axes.set_ylim(-top, top)
+        axes.set_title(f"{method}, RMSE {found['rmse'][0]:.2f}")
+        axes.set_ylabel("force u")
+        style.tidy(axes)
+    for axes in panels[1 + len(methods):]:
+        axes.set_axis_off()
+    for axes in panels[: 1 + len(methods)]:
+        axes.set_xlabel("time")
+        axes.set_xlim(0.0, problem.END)
+    style.legend_above(figure, [Line2D([], [], color=style.BLACK, lw=0.7, label="truth"),
+                                Patch(color=style.GREY, alpha=0.5, label="mean and 95% band")])
+    return figure
+
+
+@style.styled
+def plot_errors(cells: Mapping[tuple[str, str], Result], *, width: str | float = "full") -> Figure:
+    """Draw the RMSE of the force of every data set, by configuration and method; diverged ones as crosses at the top.
+
+    Args:
+        cells: (configuration, method) -> results.
+        width: "column" (3.4 in), "full" (7 in), or inches.
+    """
+    labels = [one.label for one in problem.CONFIGURATIONS]
+    methods = [method for method in COLOURS if any((label, method) in cells for label in labels)]
+    figure = style.new_figure(width, 3.2)
+    axes = figure.subplots()
+    random = np.random.default_rng(0)
+    top = 2.0
+    for number, method in enumerate(methods):
+        for place, label in enumerate(labels):
+            found = cells.get((label, method))
+            if found is None:
+                continue
+            centre = place + 0.13 * (number - (len(methods) - 1) / 2)
+            sound = ~np.asarray(found["diverged"], bool)
+            values = np.minimum(found["rmse"][sound], top)
+            spread = 0.035 * random.uniform(-1, 1, len(values))
+            axes.plot(centre + spread, values, ls="", marker=".", ms=2.0, color=COLOURS[method], alpha=0.5, zorder=2)
+            if len(values):
+                axes.plot([centre - 0.055, centre + 0.055], [values.mean()] * 2, color=style.BLACK, lw=1.0, zorder=3)
+            if (~sound).any():
+                axes.annotate(f"{(~sound).sum()}", (centre, top + 0.03), ha="center", va="bottom",
+                              color=COLOURS[method], annotation_clip=False)
+    style.tidy(axes)
+    axes.set_ylim(0.0, top)
+    axes.set_xticks(range(len(labels)), [label.replace(" ", "\n") for label in labels])
+    axes.set_ylabel("RMSE of the force")
+    axes.set_xlabel("how the factor acts")
+    style.note_below(figure, "Bars: means without divergences, whose numbers stand above the frame. Points above 2 are "
+                             "drawn at 2.")
+    style.legend_above(figure, [Patch(color=COLOURS[method], label=method) for method in methods])
+    return figure

@@ -1,0 +1,29 @@
+"""The comparison as the command line runs it."""
+
+from __future__ import annotations
+
+from lfm_ppl.experiments.catalogue import Report, Wanted
+from lfm_ppl.experiments.transcription import experiment, tables
+
+SUMMARY = "transcription factors: Laplace, elliptical slice sampling and Gaussian smoothers, eight links, table 1"
+
+
+def run(wanted: Wanted) -> Report:
+    """Run the comparison, or what is missing of it, and write tables and figures.
+
+    Raises:
+        ValueError: the folder holds results made with other settings; something is asked that it does not have.
+    """
+    if wanted.conditional is not None:
+        raise ValueError("the experiment transcription has no conditional posteriors; leave out --conditional.")
+    make = experiment.quick if wanted.quick else experiment.Settings
+    counts = {} if wanted.realisations is None else {"datasets": wanted.realisations}
+    settings = make(seed=wanted.seed, **counts)
+    found = experiment.run(settings, wanted.folder, overwrite=wanted.overwrite, report=wanted.report)
+    written = experiment.save(found, wanted.folder)
+    return Report({
+        f"RMSE of the force and divergences, {settings.datasets} data sets, beside the published table":
+            tables.readable(found.published),
+        f"Means over {settings.datasets} data sets (standard errors)": tables.readable(found.table),
+        "Against elliptical slice sampling on the same data sets": tables.readable(found.paired),
+    }, written)

@@ -1,0 +1,100 @@
+"""Everything that was measured, in three tables."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pandas as pd
+
+from lfm_ppl.experiments.scores import Estimate, mean_of
+from lfm_ppl.experiments.tasks import Result
+from lfm_ppl.experiments.transcription import problem
+
+Cells = Mapping[tuple[str, str], Result]
+"""(configuration, method) -> results of all data sets."""
+
+_SE = " se"
+
+
+def comparison(cells: Cells) -> pd.DataFrame:
+    """Return one row for each configuration and method.
+
+    Returns:
+        ``RMSE`` of the force over the grid, without diverged data sets, and ``divergences``, their number; ``coverage``
+        of the 95% band, pooled over data sets and points; ``NLPD``, the negative log predictive density of the force at
+        a point; ``CPU s`` for one data set, compilation apart; of elliptical slice sampling ``R-hat`` (the share of
+        data sets with at most 1.01) and ``ESS``, the smallest among the points of the grid. ``name se`` are standard
+        errors over data sets.
+    """
+    rows = {}
+    for (label, method), found in cells.items():
+        sound = ~np.asarray(found["diverged"], bool)
+        row = _pair("RMSE", mean_of(found["rmse"][sound]))
+        row["divergences"] = float((~sound).sum())
+        for name, key in (("coverage", "coverage"), ("NLPD", "nlpd")):
+            row |= _pair(name, mean_of(found[key][sound]))
+        row |= _pair("CPU s", mean_of(found["seconds"]))
+        if "r_hat" in found:
+            row["R-hat"] = float((found["r_hat"] <= 1.01).mean())
+            row |= _pair("ESS", mean_of(found["ess"]))
+        rows[f"{label}: {method}"] = row
+    return pd.DataFrame.from_dict(rows, orient="index", dtype=float)
+
+
+def beside_published(cells: Cells) -> pd.DataFrame:
+    """Return one row for each configuration: RMSE and divergences of the source's methods beside the published ones.
+
+    ``z`` is the difference of the RMSE in standard errors of ours; the published mean over 100 data sets has an error
+    as large again.
+    """
+    rows = {}
+    for label, methods in problem.PUBLISHED.items():
+        row: dict[str, float] = {}
+        for method, (error, diverged) in methods.items():
+            found = cells.get((label, method))
+            if found is None:
+                continue
+            sound = ~np.asarray(found["diverged"], bool)
+            ours = mean_of(found["rmse"][sound])
+            row |= _pair(method, ours)
+            row |= {f"{method} published": error, f"{method} z": (ours.value - error) / ours.error,
+                    f"{method} div.": float((~sound).sum()), f"{method} div. published": float(diverged)}
+        rows[label] = row
+    return pd.DataFrame.from_dict(rows, orient="index", dtype=float)
+
+
+def against_slices(cells: Cells) -> pd.DataFrame:
+    """Return one row for each configuration and method: the RMSE relative to elliptical slice sampling's, by pairs.
+
+    Returns:
+        ``RMSE ratio`` of the means over data sets on which neither diverged; ``difference`` of the RMSE, with its
+        paired standard error; ``times as fast`` in CPU time for one data set.
+    """
+    rows = {}
+    for (label, method), found in cells.items():
+        reference = cells.get((label, "ESLS"))
+        if reference is None or method == "ESLS":
+            continue
+        sound = ~(np.asarray(found["diverged"], bool) | np.asarray(reference["diverged"], bool))
+        difference = mean_of((found["rmse"] - reference["rmse"])[sound])
+        ratio = found["rmse"][sound].mean() / reference["rmse"][sound].mean() if sound.any() else np.nan
+        rows[f"{label}: {method}"] = {
+            "RMSE ratio": ratio, **_pair("difference", difference),
+            "times as fast": reference["seconds"].mean() / found["seconds"].mean()}
+    return pd.DataFrame.from_dict(rows, orient="index", dtype=float)
+
+
+def readable(frame: pd.DataFrame) -> pd.DataFrame:
+    """Return the table with each estimate and its standard error in one cell, ``0.91 (0.03)``."""
+    columns: dict[str, list[str]] = {}
+    for name in frame.columns:
+        if name.endswith(_SE):
+            continue
+        errors = frame.get(f"{name}{_SE}", pd.Series(np.nan, frame.index))
+        columns[name] = [str(Estimate(value, error)) for value, error in zip(frame[name], errors, strict=True)]
+    return pd.DataFrame(columns, index=frame.index)
+
+
+def _pair(name: str, estimate: Estimate) -> dict[str, float]:
+    return {name: estimate.value, f"{name}{_SE}": estimate.error}
