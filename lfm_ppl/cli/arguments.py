@@ -154,6 +154,9 @@ def _add_compare(commands: Any) -> None:
         help="folder to write; what it holds already is kept and used (default: lfm-results/compare/EXPERIMENT)",
     )
     command.add_argument("--overwrite", action="store_true", help="replace results that were made with other settings")
+    command.add_argument(
+        "--jobs", type=_whole(1), metavar="N", help="processes that compute (default: one for each core, at most 4)"
+    )
     command.add_argument("--quiet", action="store_true", help="no lines of progress")
 
 

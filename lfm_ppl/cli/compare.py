@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import os
 import shutil
 import sys
 import time
 from pathlib import Path
 
 from lfm_ppl.cli import session
+
+_MOST_JOBS = 4
+"""Processes that compute where nothing else is asked for; each takes one or two GiB."""
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -26,7 +30,8 @@ def run(arguments: argparse.Namespace) -> int:
     started = time.perf_counter()
     found = chosen.run(catalogue.Wanted(
         folder, arguments.realisations, arguments.conditional, arguments.seed, arguments.quick, arguments.overwrite,
-        None if arguments.quiet else lambda line: print(line, file=sys.stderr, flush=True)))
+        None if arguments.quiet else lambda line: print(line, file=sys.stderr, flush=True),
+        arguments.jobs or min(os.cpu_count() or 1, _MOST_JOBS)))
     for title, table in found.tables.items():
         print(f"\n{title}\n{tables.text_table(table, width=shutil.get_terminal_size().columns)}")
     print(f"\ntime     {duration(time.perf_counter() - started)}")

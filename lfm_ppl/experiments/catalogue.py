@@ -26,6 +26,7 @@ class Wanted(NamedTuple):
         quick: a small version that shows that everything runs.
         overwrite: compute again what was stored with other settings.
         report: what to do with a line of progress; None: nothing.
+        workers: processes that compute.
     """
 
     folder: Path
@@ -35,6 +36,7 @@ class Wanted(NamedTuple):
     quick: bool = False
     overwrite: bool = False
     report: Callable[[str], None] | None = None
+    workers: int = 1
 
 
 class Report(NamedTuple):

@@ -5,10 +5,12 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import multiprocessing
 import time
 import warnings
 import zipfile
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +76,8 @@ _ALLOWED = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789/-_.()
 
 
 def run_tasks(tasks: Iterable[Task], compute: Callable[[Task], Mapping[str, Any]], folder: str | Path, *,
-              overwrite: bool = False, report: Callable[[str], None] | None = None) -> dict[str, Result]:
+              overwrite: bool = False, report: Callable[[str], None] | None = None,
+              workers: int = 1) -> dict[str, Result]:
     """Compute every task that ``folder`` does not hold yet, each into a file of its own, and return all results.
 
     A file is there whole or not at all, and a random key depends on its task alone. A run that is killed and started
@@ -82,10 +85,12 @@ def run_tasks(tasks: Iterable[Task], compute: Callable[[Task], Mapping[str, Any]
 
     Args:
         tasks: the tasks, in the order in which they are computed.
-        compute: from a task to its result: numbers, arrays and text by name.
+        compute: from a task to its result: numbers, arrays and text by name. With several workers a function at the
+            top of a module.
         folder: of the files; made where it does not exist.
         overwrite: compute again what was stored with other settings, which is an error otherwise.
         report: what to do with a line of progress, such as ``print``; None: nothing.
+        workers: processes that compute; each compiles for itself.
 
     Returns:
         Name of a task -> its result, read from its file, in the order of the tasks.
@@ -109,11 +114,39 @@ def run_tasks(tasks: Iterable[Task], compute: Callable[[Task], Mapping[str, Any]
     stored = {task.name: _stored(task, folder, overwrite) for task in tasks}
     missing = [task for task in tasks if stored[task.name] is None]
     progress = _Progress(len(tasks), len(missing), report)
-    for task in missing:
-        write(task, compute(task), folder, overwrite=True)
+    checks.positive_integer("workers", workers)
+    for task in _computed(missing, compute, folder, min(workers, len(missing))):
         stored[task.name] = read(task, folder)
         progress.done(task)
     return {task.name: result for task in tasks if (result := stored[task.name]) is not None}
+
+
+def _computed(tasks: list[Task], compute: Callable[[Task], Mapping[str, Any]], folder: Path,
+              workers: int) -> Iterator[Task]:
+    """Compute and store the tasks; yield each when its file is there."""
+    if workers <= 1:
+        for task in tasks:
+            write(task, compute(task), folder, overwrite=True)
+            yield task
+        return
+    double = bool(jax.config.read("jax_enable_x64"))
+    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _start_worker, (double,))
+    try:
+        running = {pool.submit(_compute_and_write, compute, task, folder): task for task in tasks}
+        for future in as_completed(running):
+            future.result()
+            yield running[future]
+    finally:
+        # An error, or Ctrl-C: what has begun is let finish and kept, nothing else begins.
+        pool.shutdown(cancel_futures=True)
+
+
+def _start_worker(double: bool) -> None:
+    jax.config.update("jax_enable_x64", double)
+
+
+def _compute_and_write(compute: Callable[[Task], Mapping[str, Any]], task: Task, folder: Path) -> None:
+    write(task, compute(task), folder, overwrite=True)
 
 
 def write(task: Task, result: Mapping[str, Any], folder: str | Path, overwrite: bool = False) -> Path:

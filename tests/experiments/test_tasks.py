@@ -42,6 +42,25 @@ def test_a_killed_run_ends_with_the_same_numbers(tmp_path):
     same(whole, found)
 
 
+def broken(task):
+    if task.name.endswith("01"):
+        raise ValueError("number one is broken")
+    return noise(task)
+
+
+def test_several_processes_find_the_same_numbers(tmp_path):
+    """Also in double precision, as this process has it; an error in one of them arrives, what is done stays."""
+    alone = run_tasks(tasks(), noise, tmp_path / "alone")
+    lines = []
+    same(alone, run_tasks(tasks(), noise, tmp_path / "together", workers=2, report=lines.append))
+    assert lines[-1].startswith("4/4")
+    with pytest.raises(ValueError, match="number one is broken"):
+        run_tasks(tasks(), broken, tmp_path / "broken", workers=2)
+    assert (tmp_path / "broken" / "noise-00.npz").is_file() and not (tmp_path / "broken" / "noise-01.npz").exists()
+    with pytest.raises(ValueError, match="workers"):
+        run_tasks(tasks(), noise, tmp_path, workers=0)
+
+
 def test_a_result_does_not_depend_on_the_order_or_on_the_other_tasks(tmp_path):
     forward = run_tasks(tasks(), noise, tmp_path / "a")
     backward = run_tasks(tasks()[:0:-1], noise, tmp_path / "b")

@@ -118,7 +118,7 @@ def compute(task: Task) -> Result:
 
 
 def run(settings: Settings, folder: str | Path, *, overwrite: bool = False,
-        report: Callable[[str], None] | None = None) -> Comparison:
+        report: Callable[[str], None] | None = None, workers: int = 1) -> Comparison:
     """Compute what is not stored yet in ``folder``, and tabulate everything.
 
     Args:
@@ -126,6 +126,7 @@ def run(settings: Settings, folder: str | Path, *, overwrite: bool = False,
         folder: of the experiment; its subfolder ``tasks`` holds a file for each task.
         overwrite: compute again what was stored with other settings.
         report: what to do with a line of progress; None: nothing.
+        workers: processes that compute.
 
     Returns:
         Results and tables.
@@ -138,7 +139,8 @@ def run(settings: Settings, folder: str | Path, *, overwrite: bool = False,
         >>> with tempfile.TemporaryDirectory() as folder:  # doctest: +SKIP
         ...     print(run(quick(), folder).rates)
     """
-    results = run_tasks(all_tasks(settings), compute, Path(folder) / TASKS, overwrite=overwrite, report=report)
+    results = run_tasks(all_tasks(settings), compute, Path(folder) / TASKS, overwrite=overwrite, report=report,
+                        workers=workers)
     return Comparison(settings, results, tables.comparison(results), tables.rates(results), tables.parameters(results))
 
 

@@ -18,7 +18,8 @@ def run(wanted: Wanted) -> Report:
     counts = {name: value for name in ("realisations", "conditional")
               if (value := getattr(wanted, name)) is not None}
     settings = make(seed=wanted.seed, **counts)
-    found = experiment.run(settings, wanted.folder, overwrite=wanted.overwrite, report=wanted.report)
+    found = experiment.run(settings, wanted.folder, overwrite=wanted.overwrite, report=wanted.report,
+                           workers=wanted.workers)
     written = experiment.save(found, wanted.folder)
     return Report({
         f"Means over {settings.realisations} realisations (standard errors)": tables.readable(found.table),

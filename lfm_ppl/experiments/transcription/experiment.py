@@ -122,7 +122,7 @@ def slug(label: str) -> str:
 
 
 def run(settings: Settings, folder: str | Path, *, overwrite: bool = False,
-        report: Callable[[str], None] | None = None) -> Comparison:
+        report: Callable[[str], None] | None = None, workers: int = 1) -> Comparison:
     """Compute what is not stored yet in ``folder``, and tabulate everything.
 
     Args:
@@ -130,11 +130,13 @@ def run(settings: Settings, folder: str | Path, *, overwrite: bool = False,
         folder: of the experiment; its subfolder ``tasks`` holds a file for each task.
         overwrite: compute again what was stored with other settings.
         report: what to do with a line of progress; None: nothing.
+        workers: processes that compute.
 
     Raises:
         ValueError: the folder holds results made with other settings.
     """
-    results = run_tasks(all_tasks(settings), compute, Path(folder) / TASKS, overwrite=overwrite, report=report)
+    results = run_tasks(all_tasks(settings), compute, Path(folder) / TASKS, overwrite=overwrite, report=report,
+                        workers=workers)
     grouped = by_cell(settings, results)
     return Comparison(settings, results, tables.comparison(grouped), tables.beside_published(grouped),
                       tables.against_slices(grouped))

@@ -19,7 +19,8 @@ def run(wanted: Wanted) -> Report:
     make = experiment.quick if wanted.quick else experiment.Settings
     counts = {} if wanted.realisations is None else {"datasets": wanted.realisations}
     settings = make(seed=wanted.seed, **counts)
-    found = experiment.run(settings, wanted.folder, overwrite=wanted.overwrite, report=wanted.report)
+    found = experiment.run(settings, wanted.folder, overwrite=wanted.overwrite, report=wanted.report,
+                           workers=wanted.workers)
     written = experiment.save(found, wanted.folder)
     return Report({
         f"RMSE of the force and divergences, {settings.datasets} data sets, beside the published table":
