@@ -63,7 +63,13 @@ STEPS = 6  # log likelihood within 0.02 of its limit over the posterior of the p
 
 
 def activity(u: jax.Array, link: str, gamma: float) -> jax.Array:
-    """Return g(u), the activity of the factor."""
+    """Return g(u), the activity of the factor.
+
+    Raises:
+        ValueError: an unknown link, or a saturation constant that is not positive.
+    """
+    if link in ("saturation", "repression") and isinstance(gamma, (int, float)) and not gamma > 0:
+        raise ValueError(f"gamma, the saturation constant, must be positive, got {gamma}.")
     if link == "linear":
         return u
     if link == "softplus":

@@ -53,6 +53,8 @@ def test_links_are_those_of_the_papers(activity, gamma):
         assert np.all(np.isfinite(activity(far, link, gamma))) and np.all(np.isfinite(slope))
     with pytest.raises(ValueError, match="link must be one of softplus, linear"):
         activity(u, "sigmoid", gamma)
+    with pytest.raises(ValueError, match="must be positive, got -0.1"):
+        activity(u, "saturation", -0.1)
 
 
 def test_files_are_scaled_gene_by_gene_and_the_truth_with_them(file, genes):
