@@ -50,7 +50,8 @@ def test_force_and_rates_are_shared_by_the_configurations_and_have_their_distrib
         assert abs(values.mean() - mean) < 4 * values.std() / np.sqrt(len(values))
 
 
-@pytest.mark.parametrize("method", experiment.METHODS)
+@pytest.mark.parametrize("method", [
+    pytest.param(method, marks=() if method in ("ESLS", "GFS") else pytest.mark.slow) for method in experiment.METHODS])
 def test_every_method_finds_the_force(method):
     settings = {"experiment": "transcription", "method": method, "link": "saturation", "gamma": 0.5, "first": 0,
                 "last": 1}
@@ -66,8 +67,9 @@ def test_every_method_finds_the_force(method):
         assert (found["length"] >= 3600).all() and (found["low"] < found["mean"]).all()
 
 
+@pytest.mark.slow
 def test_chains_that_have_not_mixed_go_on():
-    """From the same draws: a run that asks for more agreement is longer, and begins like the other."""
+    """Up to eight times as long as what was asked for."""
     data = [problem.data_set(EXPONENTIAL, index) for index in range(2)]
     given = {"link": "exponential", "gamma": None, "draws": 200, "burn_in": 40}
     found = slices.compute(given, data, jax.random.key(0))
