@@ -68,7 +68,8 @@ def activity(u: jax.Array, link: str, gamma: float) -> jax.Array:
     Raises:
         ValueError: an unknown link, or a saturation constant that is not positive.
     """
-    if link in ("saturation", "repression") and isinstance(gamma, (int, float)) and not gamma > 0:
+    known = not isinstance(gamma, jax.core.Tracer)
+    if link in ("saturation", "repression") and known and not np.all(np.asarray(gamma) > 0):
         raise ValueError(f"gamma, the saturation constant, must be positive, got {gamma}.")
     if link == "linear":
         return u

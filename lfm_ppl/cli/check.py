@@ -148,7 +148,8 @@ def _correct(task: Task, report: Any, arguments: argparse.Namespace, folder: Pat
 
     started = time.perf_counter()
     if report.reliable:
-        print(f"correct  resampling {report.log_weight.size} draws, worth {report.ess:.0f} after weighting")
+        print(f"correct  resampling {report.log_weight.size} draws, worth {report.ess:.0f} after weighting"
+              + (" (no chains are needed, and none are delayed)" if arguments.delayed else ""))
         corrected = correct(task.posterior, task.model, model_kwargs=task.keywords, seed=arguments.seed)
     else:
         corrected = _exact_chains(task, arguments)

@@ -47,7 +47,7 @@ def _list() -> None:
     width = max(len(one.name) for one in shown)
     for one in shown:
         print(f"{one.name:<{width}}  {one.summary}")
-    print("\n`lfm-ppl compare NAME` runs one; `--quick` shows in a minute or two that it runs.")
+    print("\n`lfm-ppl compare NAME` runs one; `--quick` shows in a few minutes that it runs.")
 
 
 def _folder(arguments: argparse.Namespace, name: str) -> Path:

@@ -23,14 +23,16 @@ class LaplaceResult(eqx.Module):
     Attributes:
         mode: (R, G), the forces at the mode, or where the search ended.
         sd: (R, G), standard deviations of the forces.
-        root: (R G, n), a factor of their posterior covariance, whose rows are those of ``mode`` one after another.
+        root: (R G, R G + M), a factor of their posterior covariance, with rows in the order of ``mode``.
         start: (M,), the initial state at the mode.
         log_marginal: approximate log marginal likelihood.
-        log_joint: log p(y | u) + log p(white u) at the mode.
+        log_joint: psi at the mode, log p(y | v) - v'v/2.
         gradient: largest entry of the gradient there, in coordinates with a standard normal prior.
         iterations: steps taken.
-        stopped: whether the objective changed by less than the tolerance before the last iteration.
-        converged: whether the point is a mode: the gradient vanishes and the curvature is that of a maximum.
+        stopped: whether the search ended by itself: a step changed psi, or in a trust region promised to change it, by
+            less than the tolerance; with Newton's method also where no step length was any better.
+        converged: whether the point is a mode: the gradient is below 1e-3 and the curvature that of a maximum. A
+            generous tolerance may stop the search before that.
     """
 
     mode: jax.Array
@@ -109,11 +111,9 @@ def laplace(latent: LatentGrid, y: Any, method: str = "trust-region", *, iterati
 def run(latent: LatentGrid, y: jax.Array, method: str, iterations: int, tolerance: float) -> LaplaceResult:
     """Search and approximate, in compiled code; arguments as in `laplace`."""
     count, size = latent.mean.shape
-    starts = 0 if latent.start_is_known else latent.ssm.physical_dim
 
     def places(white: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return latent.force(white[: count * size].reshape(count, size)), latent.start(
-            white[count * size:] if starts else jnp.zeros(latent.ssm.physical_dim))
+        return latent.force(white[: count * size].reshape(count, size)), latent.start(white[count * size:])
 
     def objective(white: jax.Array) -> jax.Array:
         u, start = places(white)
@@ -129,7 +129,8 @@ def run(latent: LatentGrid, y: jax.Array, method: str, iterations: int, toleranc
     def going(search: _Search) -> jax.Array:
         return ~search.stopped & (search.taken < iterations)
 
-    white = jnp.zeros(count * size + starts)
+    # A known initial state leaves its coordinates idle.
+    white = jnp.zeros(count * size + latent.ssm.physical_dim)
     first = _Search(white, objective(white), jnp.zeros(()), jnp.array(0), jnp.array(False))
     search = jax.lax.while_loop(going, lambda now: step(now, tolerance), first)
     return _gaussian(latent, search, objective, residual, places)

@@ -21,6 +21,7 @@ from lfm_ppl.forces.sde import Force
 from lfm_ppl.linalg import semidefinite_root
 from lfm_ppl.model.augment import StateSpaceModel, check_times, state_space
 from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.simulate import noisy_observation
 
 RULES = ("riemann", "trapezoid", "linear")
 
@@ -52,20 +53,25 @@ class LatentGrid(eqx.Module):
             increasing, which starts at the initial time.
         rule: "riemann", "trapezoid" or "linear".
 
+    Where the states are coupled the weights take a matrix exponential for each distinct distance between an observation
+    and a point: few if the observations lie on the grid or regularly beside it.
+
     Attributes:
         ssm: the model in state-space form.
         times: (T,).
         grid: (G,).
         nearby: (T, G), the forces at the observation times as combinations of those on the grid.
         flow: (T, M, M), e^(A (t_k - t_0)).
-        weights: (T, G, M) of p(u(s_i), s_i) where A is diagonal, else (T, G, M, M).
+        weights: (M, T, G) of p_j(u(s_i), s_i) where A is diagonal, else (M, M, T, G), the first index for the state.
         mean: (R, G), the forces' prior mean.
         root: (R, G, G), lower triangular factor of their prior covariance.
         rule: as given.
 
     Raises:
+        TypeError: ``model`` is something else.
         ValueError: the dynamics are not linear in the state with constant coefficients; there is process noise; there
-            are no forces; a force jumps; the grid does not cover the data; observation noise without a density.
+            are no forces, or no states; a force jumps; the grid does not cover the data; the dynamics are not finite
+            at ordinary forces; observation noise without a density; traced times.
 
     Example:
         >>> import jax.numpy as jnp, lfm_ppl as lfm
@@ -91,6 +97,9 @@ class LatentGrid(eqx.Module):
     rule: str = eqx.field(static=True)
 
     def __init__(self, model: LatentForceModel, times: Any, points: Any = 363, rule: str = "linear"):
+        if not isinstance(model, LatentForceModel):
+            raise TypeError(f"model must be an lfm.LatentForceModel, got {type(model).__name__}.")
+        warn_single_precision()
         ssm = state_space(model)
         checks.one_of("rule", rule, RULES)
         _check_model(ssm)
@@ -106,6 +115,7 @@ class LatentGrid(eqx.Module):
         self.flow, self.weights = _weights(slope, _diagonal(ssm), self.grid, known, rule)
         self.mean = jax.vmap(ssm.stack.mean_at)(jnp.asarray(self.grid)).T
         self.root = jnp.stack([_root(force, self.grid) for force in ssm.stack.forces])
+        _check_factor(self)
         _check_production(self)
 
     @property
@@ -115,18 +125,14 @@ class LatentGrid(eqx.Module):
 
     def force(self, white: jax.Array) -> jax.Array:
         """Return forces (R, G) from independent standard normal numbers (R, G)."""
+        _check_shape("white", "(R, G)", white, self.mean.shape)
         return self.mean + jnp.einsum("rij,rj->ri", self.root, white)
 
     def start(self, white: jax.Array) -> jax.Array:
         """Return the physical state (M,) at the initial time from independent standard normal numbers (M,)."""
         prior = self.ssm.model.initial_state
+        _check_shape("white", "(M,)", white, prior.mean.shape)
         return prior.mean + semidefinite_root(prior.covariance) @ white
-
-    @property
-    def start_is_known(self) -> bool:
-        """Whether the initial state has no variance, as far as that is known."""
-        covariance = checks.concrete(self.ssm.model.initial_state.covariance)
-        return covariance is not None and not covariance.any()
 
     def state(self, u: jax.Array, start: jax.Array | None = None) -> jax.Array:
         """Return the physical state (T, M) at the observation times.
@@ -136,8 +142,10 @@ class LatentGrid(eqx.Module):
             start: (M,), the state at the initial time; None: its prior mean.
         """
         first = self.ssm.model.initial_state.mean if start is None else start
-        made = jax.vmap(self._production)(u.T, jnp.asarray(self.grid))
-        kind = "kgj,gj->kj" if self.weights.ndim == 3 else "kgij,gj->ki"
+        _check_shape("u", "(R, G)", u, self.mean.shape)
+        _check_shape("start", "(M,)", first, self.ssm.model.initial_state.mean.shape)
+        made = jax.vmap(self._production, in_axes=(1, 0), out_axes=1)(u, jnp.asarray(self.grid))
+        kind = "jkg,jg->kj" if self.weights.ndim == 3 else "ijkg,jg->ki"
         return jnp.einsum("kij,j->ki", self.flow, first) + jnp.einsum(kind, self.weights, made)
 
     def log_likelihood(self, u: jax.Array, y: jax.Array, start: jax.Array | None = None) -> jax.Array:
@@ -152,20 +160,30 @@ class LatentGrid(eqx.Module):
 
     def scored(self, u: jax.Array, y: jax.Array, start: jax.Array | None = None) -> tuple[jax.Array, jax.Array]:
         """Return log p(y | u, start) and the residuals (T, D) in units of the noise, zero where y is missing."""
+        _check_shape("y", "(T, D)", y, (len(self.times), self.ssm.output_dim))
+        rows = jnp.arange(len(self.times))
+        value, white = jax.vmap(lambda w, t, row, y: log_density(self.ssm, w, t, row, y))(
+            self._inputs(u, start), jnp.asarray(self.times), rows, y)
+        total = value.sum()
+        return jnp.where(jnp.isnan(total), -jnp.inf, total), white
+
+    def observe(self, key: jax.Array, u: jax.Array, start: jax.Array | None = None) -> jax.Array:
+        """Draw observations (T, D) given the forces; arguments as in `state`."""
+        rows = jnp.arange(len(self.times))
+        keys = jax.random.split(key, len(self.times))
+        return jax.vmap(lambda w, t, k, row: noisy_observation(self.ssm, w, t, k, row))(
+            self._inputs(u, start), jnp.asarray(self.times), keys, rows)
+
+    def _inputs(self, u: jax.Array, start: jax.Array | None) -> jax.Array:
+        """Return w (T, M + R) at the observation times; the forces are zero where no observation asks for them."""
         state = self.state(u, start)
         uses_forces = self.ssm.model.observation.varies_with_state or any(
             any(row[self.ssm.physical_dim:]) for row in self.ssm.observation_structure.jacobian)
         forces = jnp.asarray(self.nearby) @ u.T if uses_forces else jnp.zeros((len(state), len(u)))
-        w = jnp.concatenate([state, forces], axis=1)
-        rows = jnp.arange(len(self.times))
-        value, white = jax.vmap(lambda w, t, row, y: log_density(self.ssm, w, t, row, y))(
-            w, jnp.asarray(self.times), rows, y)
-        total = value.sum()
-        return jnp.where(jnp.isnan(total), -jnp.inf, total), white
+        return jnp.concatenate([state, forces], axis=1)
 
     def checked(self, y: Any) -> jax.Array:
         """Check observations (T, D), and return them as an array."""
-        warn_single_precision()
         return check_observations(y, len(self.times), self.ssm.output_dim)
 
     def _production(self, u: jax.Array, t: jax.Array) -> jax.Array:
@@ -173,8 +191,24 @@ class LatentGrid(eqx.Module):
         return self.ssm.drift(jnp.concatenate([jnp.zeros(self.ssm.physical_dim), u]), t)
 
 
+def _check_shape(name: str, what: str, value: Any, expected: tuple[int, ...]) -> None:
+    if np.shape(value) != expected:
+        raise ValueError(f"{name} must have shape {what} = {expected}, got {np.shape(value)}.")
+
+
+def _check_factor(latent: LatentGrid) -> None:
+    for name, root in zip(latent.force_names, latent.root, strict=True):
+        known = checks.concrete(root)
+        if known is not None and not np.isfinite(known).all():
+            raise ValueError(f"the covariance of the force {name!r} on the grid has no Cholesky factor. Use double "
+                             'precision, jax.config.update("jax_enable_x64", True), or fewer points.')
+
+
 def _check_model(ssm: StateSpaceModel) -> None:
     model = ssm.model
+    if not model.state_names:
+        raise ValueError("the model has no physical state; its forces are what is observed, so that lfm.filter and "
+                         "lfm.smooth serve it.")
     if not model.force_names:
         raise ValueError("the model has no forces: there is nothing to put on a grid.")
     noise = model.process_noise
@@ -260,6 +294,7 @@ def _weights(slope: jax.Array, diagonal: bool, grid: np.ndarray, times: np.ndarr
         left, right = after(back, first - of(share) * second), of(share) * after(back, second)
     nothing = jnp.zeros((len(times), 1, *left.shape[2:]))
     weights = jnp.concatenate([left, nothing], axis=1) + jnp.concatenate([nothing, right], axis=1)
+    weights = jnp.moveaxis(weights, (0, 1), (-2, -1))
     start = flows(times - grid[0])
     return jax.vmap(jnp.diag)(start) if diagonal else start, weights
 

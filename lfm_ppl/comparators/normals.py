@@ -18,8 +18,8 @@ def normals(key: jax.Array, count: int, size: int) -> jax.Array:
         z_1 = sqrt(-2 log u) cos(2 pi v),    z_2 = sqrt(-2 log u) sin(2 pi v),
 
     with u uniform on 2^31 points and v on 2^32, so that numbers up to 6.7 occur. One block of JAX's counter-based
-    generator gives both. Sine, cosine and logarithm are polynomials, exact to 1e-12, so that XLA fuses all of it into
-    one loop over the particles, which takes a tenth of the time of ``jax.random.normal`` in double precision.
+    generator gives both. Sine, cosine and logarithm are polynomials, exact to 1e-12 in double precision, so that XLA
+    fuses all of it into one loop over the particles, which takes a tenth of the time of ``jax.random.normal``.
 
     Args:
         key: a JAX random key.
@@ -41,7 +41,8 @@ def normals(key: jax.Array, count: int, size: int) -> jax.Array:
     # Pairs fill two rows where the rows are even in number, else two halves of each row.
     shape = (count // 2, size) if count % 2 == 0 else (count, (size + 1) // 2)
     first, second = _words(key, shape)
-    radius = jnp.sqrt(2.0 * _minus_log(first))
+    # In single precision rounding makes the smallest of them negative.
+    radius = jnp.sqrt(jnp.maximum(2.0 * _minus_log(first), 0.0))
     quadrant = second >> 30
     # Turns from the middle of the quadrant, within an eighth on either side.
     turn = (second & 0x3FFFFFFF).astype(float) * 2.0**-32 + (2.0**-33 - 0.125)

@@ -49,6 +49,8 @@ def check_noise(ssm: StateSpaceModel, time: Any) -> None:
     covariance = checks.concrete(jax.vmap(lambda row: ssm.noise_covariance(w, jnp.asarray(time, float), row))(rows))
     if covariance is None:
         return
+    if not np.isfinite(covariance).all():
+        raise ValueError("the covariance of the observation noise is not finite at the prior mean.")
     scale = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0))
     for name, sd in zip(ssm.model.output_names, scale.min(axis=0), strict=True):
         if sd == 0.0:

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import itertools
 import json
 import multiprocessing
+import os
+import signal
+import threading
 import time
 import warnings
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
@@ -97,6 +102,7 @@ def run_tasks(tasks: Iterable[Task], compute: Callable[[Task], Mapping[str, Any]
 
     Raises:
         ValueError: two tasks share a file, or a stored result was made with other settings.
+        RuntimeError: a process ended by itself.
 
     Warns:
         UserWarning: a file cannot be read; its task is computed again.
@@ -130,19 +136,37 @@ def _computed(tasks: list[Task], compute: Callable[[Task], Mapping[str, Any]], f
             yield task
         return
     double = bool(jax.config.read("jax_enable_x64"))
-    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _start_worker, (double,))
-    try:
-        running = {pool.submit(_compute_and_write, compute, task, folder): task for task in tasks}
-        for future in as_completed(running):
-            future.result()
-            yield running[future]
-    finally:
-        # An error, or Ctrl-C: what has begun is let finish and kept, nothing else begins.
-        pool.shutdown(cancel_futures=True)
+    waiting = iter(tasks)
+    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _start_worker, (double,)) as pool:
+        # As many at a time as there are processes. After an error, or Ctrl-C, what has begun is let finish and kept.
+        running = {pool.submit(_compute_and_write, compute, task, folder): task
+                   for task in itertools.islice(waiting, workers)}
+        while running:
+            done, _ = wait(running, return_when=FIRST_COMPLETED)
+            for future in done:
+                task = running.pop(future)
+                try:
+                    future.result()
+                except BrokenProcessPool:
+                    raise RuntimeError("a computing process ended by itself, most likely for want of memory; what is "
+                                       "stored stays. Start again with fewer workers (--jobs).") from None
+                for following in itertools.islice(waiting, 1):
+                    running[pool.submit(_compute_and_write, compute, following, folder)] = following
+                yield task
 
 
 def _start_worker(double: bool) -> None:
+    # Ctrl-C reaches every process of a terminal; the parent decides. If that is killed, there is nobody to work for.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     jax.config.update("jax_enable_x64", double)
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _compute_and_write(compute: Callable[[Task], Mapping[str, Any]], task: Task, folder: Path) -> None:

@@ -7,13 +7,14 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import numpyro
 import numpyro.distributions as dist
 from numpyro.distributions import constraints
 from numpyro.primitives import Messenger
 
 from lfm_ppl import checks
-from lfm_ppl.comparators.latent_grid import LatentGrid
+from lfm_ppl.comparators.latent_grid import RULES, LatentGrid
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
 
 
@@ -21,36 +22,39 @@ class GridLikelihood(dist.Distribution):
     """Distribution of the observations given the forces on a grid.
 
     Args:
-        base: the marginal likelihood that it stands in for.
         latent: the grid.
         u: (R, G), forces.
         start: (M,), state at the initial time.
     """
 
     support = constraints.real_matrix
-    pytree_data_fields = ("base", "latent", "u", "start")
+    pytree_data_fields = ("latent", "u", "start")
 
-    def __init__(self, base: MarginalLikelihood, latent: LatentGrid, u: jax.Array, start: jax.Array) -> None:
-        self.base, self.latent, self.u, self.start = base, latent, u, start
-        super().__init__((), base.event_shape, validate_args=False)
+    def __init__(self, latent: LatentGrid, u: jax.Array, start: jax.Array) -> None:
+        self.latent, self.u, self.start = latent, u, start
+        super().__init__((), (len(latent.times), latent.ssm.output_dim), validate_args=False)
 
     def log_prob(self, value: Any) -> jax.Array:
         """Return log p(value | u, start)."""
         return self.latent.log_likelihood(self.u, jnp.asarray(value, float), self.start)
 
     def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
-        """Simulate the model with forces of its own, as ``base`` does."""
-        return self.base.sample(key, sample_shape)
+        """Draw observations given the forces: (*sample_shape, T, D)."""
+        run = lambda k: self.latent.observe(k, self.u, self.start)  # noqa: E731
+        if not sample_shape:
+            return run(key)
+        keys = jax.random.split(key, int(np.prod(sample_shape)))
+        return jax.vmap(run)(keys).reshape(*sample_shape, *self.event_shape)
 
 
 class on_latent_grid(Messenger):  # noqa: N801 (an effect handler, named as NumPyro names its handlers)
     """Effect handler that keeps the forces of a model as latent sites on a grid, in place of filtering them out.
 
     A site ``y`` with ``lfm.MarginalLikelihood`` becomes: ``y_white`` (R, G), independent standard normal; ``y_start``
-    (M,) likewise, where the initial state is uncertain; ``y_forces`` (R, G), deterministic; and ``y`` given these. The
-    posterior of all other sites is that of the model itself, without a Gaussian filter's approximation and up to the
-    integration rule's error, but in hundreds of dimensions. Use it with `numpyro.infer.MCMC`; `lfm_ppl.EllipticalSlice`
-    works on it where all other sites are fixed.
+    (M,) likewise, for the initial state, on which nothing depends where that is known; ``y_forces`` (R, G),
+    deterministic; and ``y`` given these. The posterior of all other sites is that of the model itself, without a
+    Gaussian filter's approximation and up to the integration rule's error, but in hundreds of dimensions. Use it with
+    `numpyro.infer.MCMC`; `lfm_ppl.EllipticalSlice` works on it where all other sites are conditioned on.
 
     Args:
         fn: a NumPyro model with a site ``lfm.MarginalLikelihood``.
@@ -76,6 +80,7 @@ class on_latent_grid(Messenger):  # noqa: N801 (an effect handler, named as NumP
     """
 
     def __init__(self, fn: Callable[..., Any] | None = None, points: Any = 363, rule: str = "linear") -> None:
+        checks.one_of("rule", rule, RULES)
         self.points, self.rule = points, rule
         self.found = False
         super().__init__(fn)
@@ -105,13 +110,13 @@ class on_latent_grid(Messenger):  # noqa: N801 (an effect handler, named as NumP
                              "jit_model_args=False.")
         self.found = True
         name = msg["name"]
+        if msg["is_observed"] and np.shape(msg["value"]) != fn.event_shape:
+            raise ValueError(f"the observations of {name!r} must have shape (T, D) = {fn.event_shape}, got "
+                             f"{np.shape(msg['value'])}.")
         latent = LatentGrid(fn.model, fn.times, self.points, self.rule)
         shape = latent.mean.shape
         u = latent.force(numpyro.sample(f"{name}_white", dist.Normal().expand(shape).to_event(2)))
         numpyro.deterministic(f"{name}_forces", u)
-        if latent.start_is_known:
-            start = fn.model.initial_state.mean
-        else:
-            size = latent.ssm.physical_dim
-            start = latent.start(numpyro.sample(f"{name}_start", dist.Normal().expand([size]).to_event(1)))
-        msg["fn"] = GridLikelihood(fn, latent, u, start)
+        # Also where the initial state is known: in compiled code nobody can tell, and the sites must be the same ones.
+        white = numpyro.sample(f"{name}_start", dist.Normal().expand([latent.ssm.physical_dim]).to_event(1))
+        msg["fn"] = GridLikelihood(latent, u, latent.start(white))

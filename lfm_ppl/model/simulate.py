@@ -97,7 +97,7 @@ def simulate_on(ssm: StateSpaceModel, key: jax.Array, times: jax.Array, start: j
 
     _, states = jax.lax.scan(row, first, (starts, times, jax.random.split(path, times.shape[0])))
     inputs = jax.vmap(ssm.inputs)(states, times)
-    y = jax.vmap(lambda w, t, k, index: _observe(ssm, w, t, k, index))(
+    y = jax.vmap(lambda w, t, k, index: noisy_observation(ssm, w, t, k, index))(
         inputs, times, jax.random.split(noise, times.shape[0]), jnp.arange(times.shape[0]))
     size = ssm.physical_dim
     forces = {name: inputs[:, size + index] for index, name in enumerate(ssm.model.force_names)}
@@ -136,7 +136,9 @@ def _cross_jumps(ssm: StateSpaceModel, jumps: jax.Array, state: jax.Array, begin
     return state
 
 
-def _observe(ssm: StateSpaceModel, w: jax.Array, t: jax.Array, key: jax.Array, index: jax.Array) -> jax.Array:
+def noisy_observation(ssm: StateSpaceModel, w: jax.Array, t: jax.Array, key: jax.Array,
+                      index: jax.Array) -> jax.Array:
+    """Draw the observation (D,) of row ``index`` at the inputs w (M + R,) and time t."""
     covariance = ssm.noise_covariance(w, t, index)
     draw = jax.random.normal(key, (covariance.shape[0], 1))
     return ssm.observe(w, t) + matmul(semidefinite_root(covariance), draw)[:, 0]

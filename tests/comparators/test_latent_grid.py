@@ -177,8 +177,27 @@ def test_gradients_in_the_parameters_are_those_of_finite_differences():
     ({"model": genes(noise=0.0)}, "noise of 'y0' is zero"),
     ({"model": genes(function=lambda u: jnp.log(u + 1.0))}, "not finite at 3 prior standard deviations"),
     ({"times": [0.0, 2.0, 1.0]}, "must not go back"),
+    ({"model": lfm.LatentForceModel(
+        lambda x, u, t: x, {"u": lfm.Matern(1.0, 1.5, order=1)},
+        lfm.GaussianObservation(lambda x, u, t: u, jnp.ones(1)), lfm.Gaussian(jnp.zeros(0), jnp.zeros((0, 0))))},
+     "no physical state"),
 ])
 def test_errors(change, message):
     given = {"model": genes(), "times": TIMES, "points": 31} | change
     with pytest.raises(ValueError, match=message):
         LatentGrid(given.pop("model"), given.pop("times"), given.pop("points"), **given)
+
+
+def test_wrong_shapes_are_named():
+    latent = LatentGrid(genes(), TIMES, 31)
+    u, y = jnp.zeros((1, 31)), jnp.zeros((6, 3))
+    with pytest.raises(ValueError, match=r"u must have shape \(R, G\) = \(1, 31\), got \(2, 31\)"):
+        latent.state(jnp.zeros((2, 31)))
+    with pytest.raises(ValueError, match=r"start must have shape \(M,\) = \(3,\)"):
+        latent.state(u, jnp.zeros(2))
+    with pytest.raises(ValueError, match=r"y must have shape \(T, D\) = \(6, 3\), got \(6, 2\)"):
+        latent.log_likelihood(u, y[:, :2])
+    with pytest.raises(ValueError, match=r"white must have shape \(R, G\)"):
+        latent.force(jnp.zeros(31))
+    with pytest.raises(TypeError, match="lfm.LatentForceModel, got str"):
+        LatentGrid("model", TIMES)

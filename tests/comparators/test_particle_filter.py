@@ -228,6 +228,9 @@ def test_normal_numbers():
     quarter = np.pi / 4  # angles are counted from the middle of a quadrant
     assert np.allclose(drawn[:, :100_001], radius * np.cos(turn - quarter), atol=1e-9)
     assert np.allclose(drawn[:, 100_001:], (radius * np.sin(turn - quarter))[:, :-1], atol=1e-9)
+    # In single precision the logarithm of the largest words is rounded below zero.
+    with jax.enable_x64(False):
+        assert not np.isnan(np.asarray(normals(jax.random.key(3), 2, 20_000_000))).any()
     even = np.asarray(normals(jax.random.key(5), 4, 100_001))
     assert even.shape == (4, 100_001) and np.abs(np.corrcoef(even) - np.eye(4)).max() < 4.5 / np.sqrt(100_001)
 

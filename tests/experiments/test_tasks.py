@@ -1,5 +1,11 @@
 """Tasks that are stored one by one: resumed to the same numbers, never mixed with other settings."""
 
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
 import jax
 import numpy as np
 import pytest
@@ -59,6 +65,46 @@ def test_several_processes_find_the_same_numbers(tmp_path):
     assert (tmp_path / "broken" / "noise-00.npz").is_file() and not (tmp_path / "broken" / "noise-01.npz").exists()
     with pytest.raises(ValueError, match="workers"):
         run_tasks(tasks(), noise, tmp_path, workers=0)
+
+
+def kept(task):
+    time.sleep(task.settings["seconds"])
+    return {"process": os.getpid()}
+
+
+@pytest.mark.slow
+def test_processes_end_with_the_one_that_started_them(tmp_path):
+    """Killed by force, too: nobody is left behind, and what was stored stays."""
+    script = f"""
+import sys
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+import test_tasks
+from lfm_ppl.experiments.tasks import run_tasks
+if __name__ == "__main__":
+    run_tasks(test_tasks.tasks(3, seconds=0.1) + test_tasks.tasks(9, seconds=30.0)[3:], test_tasks.kept,
+              {str(tmp_path)!r}, workers=2)
+"""
+    (tmp_path / "script.py").write_text(script)
+    parent = subprocess.Popen([sys.executable, str(tmp_path / "script.py")])
+    until = time.monotonic() + 120
+    while len(list(tmp_path.glob("*.npz"))) < 3 and time.monotonic() < until:
+        time.sleep(0.2)
+    workers = {int(read(task, tmp_path)["process"]) for task in tasks(3, seconds=0.1)}
+    parent.kill()
+    parent.wait()
+    while any(Path(f"/proc/{pid}").exists() for pid in workers) and time.monotonic() < until:
+        time.sleep(0.2)
+    assert not any(Path(f"/proc/{pid}").exists() for pid in workers)
+    assert len(list(tmp_path.glob("*.npz"))) == 3
+
+
+def fatal(task):
+    os._exit(9)
+
+
+def test_a_process_that_dies_is_explained(tmp_path):
+    with pytest.raises(RuntimeError, match="fewer workers"):
+        run_tasks(tasks(), fatal, tmp_path, workers=2)
 
 
 def test_a_result_does_not_depend_on_the_order_or_on_the_other_tasks(tmp_path):

@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.integrate import solve_ivp
 
@@ -60,7 +61,8 @@ def test_every_method_finds_the_force(method):
     found = experiment.compute(Task(f"saturation/{experiment.slug(method)}", 0, settings))
     assert found["mean"].shape == found["sd"].shape == (2, problem.POINTS)
     assert (found["sd"] > 0).all() and (found["seconds"] > 0).all()
-    if method == "LA":  # Newton's method is known to fail
+    if method == "LA":  # Newton's method is known to fail, and then to say so
+        assert (found["diverged"] | found["stopped"]).all() and np.isfinite(found["rmse"]).all()
         return
     assert not found["diverged"].any() and (found["rmse"] < 0.9).all()
     if method == "ESLS":
@@ -72,7 +74,7 @@ def test_chains_that_have_not_mixed_go_on():
     """Up to eight times as long as what was asked for."""
     data = [problem.data_set(EXPONENTIAL, index) for index in range(2)]
     given = {"link": "exponential", "gamma": None, "draws": 200, "burn_in": 40}
-    found = slices.compute(given, data, jax.random.key(0))
+    found = slices.compute(given, data, jax.random.split(jax.random.key(0), 2))
     assert (found["length"] == 8 * 160).all() and (found["r_hat"] > 1.01).all()
 
 
@@ -82,10 +84,10 @@ def test_slices_of_a_linear_link_have_the_exact_posterior(monkeypatch):
     from lfm_ppl.comparators.latent_grid import LatentGrid
 
     monkeypatch.setattr(problem, "activity", lambda u, link, gamma: u)
-    data = problem.data_set(problem.Configuration("softplus"), 1)
+    data = problem.data_set.__wrapped__(problem.Configuration("softplus"), 1)
     slices._program.cache_clear()
     found = slices.compute({"link": "softplus", "gamma": None, "draws": 40_000, "burn_in": 2_000}, [data],
-                           jax.random.key(1))
+                           jax.random.split(jax.random.key(1), 1))
     latent = LatentGrid(problem.system("softplus", 1.0, data.rates), problem.TIMES, problem.GRID, slices.RULE)
     exact = laplace(latent, data.y)
     slices._program.cache_clear()
@@ -126,6 +128,31 @@ def test_the_tables_count_what_was_found():
     assert paired.loc["softplus: GFS", "RMSE ratio"] == pytest.approx(2.0)
     assert paired.loc["softplus: GFS", "times as fast"] == 200.0
     assert not any(name.endswith("ESLS") for name in paired.index)
+
+
+@pytest.mark.slow
+def test_a_killed_run_ends_with_the_same_table(tmp_path, monkeypatch):
+    """The experiment itself, stopped after three tasks and started again: the same tables but for the times."""
+    monkeypatch.setattr(experiment, "METHODS", ("ESLS", "GFS"))
+    monkeypatch.setattr(problem, "CONFIGURATIONS", (SATURATION, EXPONENTIAL))
+    settings = experiment.Settings(datasets=2, draws=400, burn_in=40)
+    whole = experiment.run(settings, tmp_path / "whole")
+    compute, done = experiment.compute, []
+
+    def killed(task):
+        if len(done) == 3:
+            raise KeyboardInterrupt
+        done.append(task.name)
+        return compute(task)
+
+    monkeypatch.setattr(experiment, "compute", killed)
+    with pytest.raises(KeyboardInterrupt):
+        experiment.run(settings, tmp_path / "half")
+    monkeypatch.setattr(experiment, "compute", compute)
+    again = experiment.run(settings, tmp_path / "half")
+    for first, second in ((whole.table, again.table), (whole.published, again.published)):
+        timeless = [name for name in first if "CPU" not in name]
+        pd.testing.assert_frame_equal(first[timeless], second[timeless], check_exact=True)
 
 
 def test_what_is_not_finite_has_diverged():

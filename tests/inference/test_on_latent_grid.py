@@ -7,7 +7,7 @@ import numpyro
 import numpyro.distributions as dist
 import pytest
 from numpyro import handlers
-from numpyro.infer import MCMC, NUTS
+from numpyro.infer import MCMC, NUTS, Predictive
 
 import lfm_ppl as lfm
 
@@ -52,12 +52,27 @@ def test_nuts_over_the_force_has_the_posterior_of_the_marginal_model():
     assert abs(found["std"] / sd - 1) < 4 / np.sqrt(2 * found["n_eff"]) + 0.05
 
 
-def test_a_known_start_is_no_site_and_the_prior_predictive_is_the_models():
+@pytest.mark.parametrize("kernel", [NUTS, lfm.RAM])
+def test_a_known_start_is_known_in_compiled_code_too(kernel):
+    """Numbers that the model makes are tracers there, so that no site may depend on their values."""
     latent = lfm.on_latent_grid(linear, points=11)
-    trace = handlers.trace(handlers.seed(latent, 0)).get_trace(TIMES, Y, variance=0.0)
-    assert set(trace) == {"decay", "y_white", "y_forces", "y"}
-    drawn = handlers.trace(handlers.seed(latent, 0)).get_trace(TIMES)["y"]["value"]
-    assert drawn.shape == (6, 1) and np.isfinite(drawn).all()
+    for chains, method in ((1, "sequential"), (2, "vectorized")):
+        mcmc = MCMC(kernel(latent), num_warmup=5, num_samples=5, num_chains=chains, chain_method=method,
+                    progress_bar=False)
+        mcmc.run(jax.random.key(0), TIMES, Y, variance=0.0)
+        assert np.isfinite(mcmc.get_samples()["y_forces"]).all()
+
+
+def test_predictions_follow_the_forces():
+    """Given forces and start the observations scatter about their state with the noise, and nothing else."""
+    given = {"decay": jnp.array(0.8), "y_white": 0.3 * jnp.ones((1, 41)), "y_start": jnp.array([0.5])}
+    latent = handlers.condition(lfm.on_latent_grid(linear, points=41), given)
+    drawn = np.asarray(Predictive(latent, num_samples=4000)(jax.random.key(0), TIMES)["y"])
+    site = handlers.trace(handlers.seed(latent, 0)).get_trace(TIMES)["y"]["fn"]
+    state = np.asarray(site.latent.state(site.u, site.start))
+    assert np.all(np.abs(drawn.mean(axis=0) - state) < 4.5 * 0.2 / np.sqrt(4000))
+    assert np.all(np.abs(drawn.std(axis=0) / 0.2 - 1) < 4.5 / np.sqrt(8000))
+    assert site.sample(jax.random.key(1), (2, 3)).shape == (2, 3, 6, 1)
 
 
 def test_elliptical_slice_sampling_where_the_parameters_are_fixed():
@@ -84,6 +99,8 @@ def test_errors():
     with pytest.raises(ValueError, match="no site"):
         handlers.seed(lfm.on_latent_grid(without), 0)(TIMES, 0.3)
     with pytest.raises(ValueError, match="unknown rule"):
-        handlers.seed(lfm.on_latent_grid(linear, rule="exact"), 0)(TIMES, Y)
+        lfm.on_latent_grid(linear, rule="exact")
+    with pytest.raises(ValueError, match=r"must have shape \(T, D\) = \(6, 1\), got \(5, 1\)"):
+        handlers.seed(lfm.on_latent_grid(linear, points=11), 0)(TIMES, Y[1:])
     with pytest.raises(ValueError, match="traced"):
         jax.jit(lambda t: handlers.seed(lfm.on_latent_grid(linear), 0)(t, Y))(TIMES)

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
@@ -21,7 +23,7 @@ from lfm_ppl.experiments.transcription import figures, laplace_modes, problem, s
 TASKS = "tasks"
 METHODS = ("LA", "ESLS", "GFS", "GHS(7)", "iterated GHS(7)", "LA, trust region")
 BLOCK = 10
-"""Data sets that are computed in one go, and stored in one file."""
+"""Data sets that are computed in one go, and stored in one file; a run with more of them uses whole blocks again."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,10 @@ def compute(task: Task) -> Result:
     elif method in laplace_modes.SEARCHES:
         found = laplace_modes.compute(settings, data)
     else:
-        found = slices.compute(settings, data, task.key)
+        cell = Task(f"{slug(configuration.label)}/{slug(method)}", task.seed)
+        keys = jax.vmap(lambda index: jax.random.fold_in(cell.key, index))(
+            jnp.arange(settings["first"], settings["last"] + 1))
+        found = slices.compute(settings, data, keys)
     return found | judged(found, np.stack([one.u for one in data]))
 
 

@@ -14,7 +14,7 @@ from lfm_ppl.comparators import laplace
 from lfm_ppl.comparators.latent_grid import LatentGrid
 from lfm_ppl.experiments.timing import timed
 from lfm_ppl.experiments.transcription import problem
-from lfm_ppl.experiments.transcription.smoothers import rates
+from lfm_ppl.experiments.transcription.smoothers import rates, saturation
 
 ITERATIONS, TOLERANCE = 300, 1e-6
 
@@ -35,7 +35,7 @@ def compute(settings: Any, data: list[problem.DataSet]) -> dict[str, np.ndarray]
     known, found = rates(data), []
     for index, one in enumerate(data):
         own = jax.tree_util.tree_map(lambda a, index=index: a[index], known)
-        found.append(timed(run, jnp.asarray(settings["gamma"] or 1.0), own, jnp.asarray(one.y)))
+        found.append(timed(run, saturation(settings), own, jnp.asarray(one.y)))
     columns = zip(*(result for _, result in found), strict=True)
     names = ("mean", "sd", "stopped", "converged", "iterations")
     return {name: np.stack([np.asarray(value) for value in column]) for name, column in zip(names, columns, strict=True)

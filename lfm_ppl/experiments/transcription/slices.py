@@ -18,44 +18,46 @@ from lfm_ppl.comparators.latent_grid import LatentGrid
 from lfm_ppl.comparators.normals import normals
 from lfm_ppl.experiments.timing import timed
 from lfm_ppl.experiments.transcription import problem
-from lfm_ppl.experiments.transcription.smoothers import rates
+from lfm_ppl.experiments.transcription.smoothers import rates, saturation
 
 CHAINS = 4
 RULE = "riemann"
 """Integration rule, the source's."""
 
 KEPT = 500
-"""Draws that are kept of each chain, evenly spaced; means and standard deviations are of all draws."""
+"""Draws that are kept of each chain, evenly spaced, more if it goes on. Means and standard deviations are of all."""
 
 MONITORED = np.arange(6, problem.POINTS, 13)
-"""Points of the grid for which R-hat and effective sample sizes are computed."""
+"""The 28 points of the grid for which R-hat and effective sample sizes are computed."""
 
 R_HAT = 1.01
 _LONGEST = 8
 """A data set whose chains have not mixed goes on until they are this many times as long."""
 
 
-def compute(settings: Any, data: list[problem.DataSet], key: jax.Array) -> dict[str, np.ndarray]:
+def compute(settings: Any, data: list[problem.DataSet], keys: jax.Array) -> dict[str, np.ndarray]:
     """Return ``mean``, ``sd``, ``low``, ``high`` (N, 363), and ``r_hat``, ``ess``, ``length`` and ``seconds`` (N,).
 
-    The draws of all chains together number ``settings["draws"]``, of which ``settings["burn_in"]`` are left out. Where
-    R-hat of a data set is above 1.01 its chains go on, as long as everything before once more each time; all draws
-    after the burn-in count.
+    ``keys`` (N,) are those of the data sets. The draws of all chains together number ``settings["draws"]``, of which
+    ``settings["burn_in"]`` are left out. Where R-hat of a data set is above 1.01 its chains go on, as long as
+    everything before once more each time; all draws after the burn-in count.
     """
     length = settings["draws"] // CHAINS
     count = len(data)
     known, y = rates(data), jnp.stack([jnp.asarray(one.y) for one in data])
-    gamma = jnp.asarray(settings["gamma"] or 1.0)
+    gamma = saturation(settings)
     outcome: dict[str, np.ndarray] = {}
     seconds, lengths = np.zeros(count), np.zeros(count, int)
     burn_in = settings["burn_in"] // CHAINS
-    states, _ = _go(settings["link"], burn_in, 0, gamma, known, y, _unstarted(key, count), seconds, np.arange(count))
+    states, _ = _go(settings["link"], burn_in, 0, gamma, known, y, _unstarted(keys), seconds, np.arange(count))
     kept: list[list[np.ndarray]] = [[] for _ in range(count)]
     sums = np.zeros((count, 2, problem.POINTS))
     open_, ahead = np.arange(count), length - burn_in
     while True:
         rates_left, y_left = jax.tree_util.tree_map(lambda a, o=open_: a[o], (known, y))
-        states, (paths, moments) = _go(settings["link"], ahead, KEPT, gamma, rates_left, y_left, states, seconds, open_)
+        share = KEPT * ahead // (length - burn_in)
+        states, (paths, moments) = _go(
+            settings["link"], ahead, share, gamma, rates_left, y_left, states, seconds, open_)
         lengths[open_] += ahead
         sums[open_] += moments
         for place, index in enumerate(open_):
@@ -78,14 +80,18 @@ def compute(settings: Any, data: list[problem.DataSet], key: jax.Array) -> dict[
                       "length": CHAINS * lengths, "seconds": seconds}
 
 
-def _unstarted(key: jax.Array, count: int) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _unstarted(keys: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return keys (N, chains), and positions (N, chains, 363) and log likelihoods that the first segment replaces."""
-    keys = jax.random.split(key, (count, CHAINS))
-    return keys, jnp.zeros((count, CHAINS, problem.POINTS)), jnp.full((count, CHAINS), jnp.nan)
+    count = len(keys)
+    own = jax.vmap(lambda key: jax.random.split(key, CHAINS))(keys)
+    return own, jnp.zeros((count, CHAINS, problem.POINTS)), jnp.full((count, CHAINS), jnp.nan)
 
 
 def diagnose(draws: np.ndarray) -> tuple[float, float]:
-    """Return the largest R-hat and the smallest bulk effective sample size of draws (chains, K, 363)."""
+    """Return the largest R-hat and the smallest bulk effective sample size of kept draws (chains, K, 363).
+
+    At `MONITORED` points. The effective size cannot exceed the number of kept draws by much; that of all is larger.
+    """
     dataset = xr.Dataset({"u": (("chain", "draw", "point"), draws[..., MONITORED])})
     summary = arviz_data.summary(arviz_data.build({"posterior": dataset}))
     return float(summary["r_hat"].max()), float(summary["ess_bulk"].min())

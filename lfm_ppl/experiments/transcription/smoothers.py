@@ -44,7 +44,7 @@ SMOOTHERS = {
 def compute(settings: Any, data: list[problem.DataSet]) -> dict[str, np.ndarray]:
     """Return ``mean`` and ``sd`` (N, 363) of the force, ``change`` (N,) of the last iteration, and ``seconds``."""
     run = _program(settings["method"], settings["link"], len(data))
-    arguments = (jnp.asarray(settings["gamma"] or 1.0), rates(data), jnp.stack([jnp.asarray(one.y) for one in data]))
+    arguments = (saturation(settings), rates(data), jnp.stack([jnp.asarray(one.y) for one in data]))
     seconds, (mean, sd, change) = timed(run, *arguments)
     return {"mean": np.asarray(mean), "sd": np.asarray(sd), "change": np.asarray(change),
             "seconds": np.full(len(data), seconds / len(data))}
@@ -54,6 +54,11 @@ def rates(data: list[problem.DataSet]) -> problem.Rates:
     """Return the rates of data sets, stacked."""
     return problem.Rates(*(jnp.stack([jnp.asarray(value) for value in values])
                            for values in zip(*(one.rates for one in data), strict=True)))
+
+
+def saturation(settings: Any) -> jax.Array:
+    """Return gamma; any number where the link has none."""
+    return jnp.asarray(1.0 if settings["gamma"] is None else settings["gamma"])
 
 
 @functools.cache

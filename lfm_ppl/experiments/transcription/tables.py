@@ -24,8 +24,8 @@ def comparison(cells: Cells) -> pd.DataFrame:
         ``RMSE`` of the force over the grid, without diverged data sets, and ``divergences``, their number; ``coverage``
         of the 95% band, pooled over data sets and points; ``NLPD``, the negative log predictive density of the force at
         a point; ``CPU s`` for one data set, compilation apart; of elliptical slice sampling ``R-hat`` (the share of
-        data sets with at most 1.01) and ``ESS``, the smallest among the points of the grid. ``name se`` are standard
-        errors over data sets.
+        data sets with at most 1.01 at every monitored point of the grid) and ``ESS``, the smallest among these points,
+        of the draws that are kept. ``name se`` are standard errors over data sets.
     """
     rows = {}
     for (label, method), found in cells.items():
