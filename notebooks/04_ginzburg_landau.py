@@ -39,7 +39,8 @@ numpyro.enable_x64()
 
 import pandas as pd
 
-from lfm_ppl.experiments.ginzburg_landau import experiment, figures, problem, sampling, tables
+from lfm_ppl.experiments import scores
+from lfm_ppl.experiments.ginzburg_landau import experiment, figures, problem, sampling
 
 quick = bool(os.environ.get("LFM_QUICK"))
 settings = experiment.quick(realisations=1, conditional=2) if quick else experiment.Settings()
@@ -87,7 +88,7 @@ figures.plot_conditional(figures.conditional_rows(settings, found.results))
 figures.plot_rates(found.results)
 
 # %%
-tables.readable(found.rates)
+scores.readable(found.rates)
 
 # %% [markdown]
 # `cut` is the share of posteriors that reach an end of the interval on which the prior is flat, `differs` the share of
@@ -104,7 +105,7 @@ paths = {label: found.results[f"mcmc/{sampling.slug(label)}/{settings.figure:03d
 figures.plot_integrated(data, paths)
 
 # %%
-tables.readable(found.parameters)
+scores.readable(found.parameters)
 
 # %% [markdown]
 # ## Everything in one table
@@ -115,4 +116,4 @@ tables.readable(found.parameters)
 # gives 0.895 (EKF) and 0.935 (CKF) as root mean squared errors of its one path with the parameters integrated out.
 
 # %%
-tables.readable(found.table)
+scores.readable(found.table)

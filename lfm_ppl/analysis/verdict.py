@@ -118,7 +118,9 @@ def _unreliable(found: Findings) -> tuple[str, str]:
     if not math.isfinite(found.k) and found.checked < min(LEAST_DRAWS, found.available):
         return (f"{found.checked} draws are too few for a Pareto k.",
                 f"lfm-ppl check RESULT --draws {min(200, found.available)} --overwrite")
-    start = f"k = {found.k:.2f} is not below {found.threshold:.2f}, so that the importance weights cannot be relied on"
+    digits = 2 if f"{found.k:.2f}" != f"{found.threshold:.2f}" else 4
+    start = (f"k = {found.k:.{digits}f} is not below {found.threshold:.{digits}f}, so that the importance weights "
+             "cannot be relied on")
     if found.noise_share > 0.5:
         reason = (f"{start}; {found.noise_share:.0%} of the variance of the log ratios is noise of the particle "
                   "filter, which makes k larger.")

@@ -5,9 +5,13 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 from scipy.interpolate import CubicSpline
 
 from lfm_ppl import checks
+
+SE = " se"
+"""What the column of a standard error ends with."""
 
 _FINER = 40
 """Nodes of the fine grid for one of the given grid."""
@@ -35,6 +39,22 @@ class Estimate(NamedTuple):
             return f"{self.value:.3g}"
         digits = int(np.clip(1 - np.floor(np.log10(self.error)), 0, 6))
         return f"{self.value:.{digits}f} ({self.error:.{digits}f})"
+
+
+def pair(name: str, estimate: Estimate) -> dict[str, float]:
+    """Return the entries ``name`` and ``name se`` of a row of a table."""
+    return {name: estimate.value, f"{name}{SE}": estimate.error}
+
+
+def readable(frame: pd.DataFrame) -> pd.DataFrame:
+    """Return a table with each estimate and its standard error in one cell, ``0.91 (0.03)``."""
+    columns: dict[str, list[str]] = {}
+    for name in frame.columns:
+        if name.endswith(SE):
+            continue
+        errors = frame.get(f"{name}{SE}", pd.Series(np.nan, frame.index))
+        columns[name] = [str(Estimate(value, error)) for value, error in zip(frame[name], errors, strict=True)]
+    return pd.DataFrame(columns, index=frame.index)
 
 
 def mean_of(values: Any) -> Estimate:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.ginzburg_landau import conditional, experiment, figures, grid, problem, sampling, state, tables
 from lfm_ppl.experiments.tasks import write
 
@@ -152,7 +153,7 @@ def test_the_tables_count_what_was_found():
     assert table.loc["RAM, CKF", "coverage parameters"] == pytest.approx(2 / 3)
     assert table.loc["RAM, EKF", "RMSE published"] == 0.895
     assert tables.parameters(results).loc["RAM, CKF", "coverage sigma"] == 0.0
-    assert tables.readable(table).loc["RAM, CKF", "ESS/CPU s"] == "50"
+    assert scores.readable(table).loc["RAM, CKF", "ESS/CPU s"] == "50"
 
 
 def test_the_figures_are_drawn_and_labelled():

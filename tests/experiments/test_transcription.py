@@ -52,7 +52,8 @@ def test_force_and_rates_are_shared_by_the_configurations_and_have_their_distrib
 
 
 @pytest.mark.parametrize("method", [
-    pytest.param(method, marks=() if method in ("ESLS", "GFS") else pytest.mark.slow) for method in experiment.METHODS])
+    pytest.param(method, marks=() if method == "LA, trust region" else pytest.mark.slow)
+    for method in experiment.METHODS])
 def test_every_method_finds_the_force(method):
     settings = {"experiment": "transcription", "method": method, "link": "saturation", "gamma": 0.5, "first": 0,
                 "last": 1}

@@ -13,6 +13,7 @@ from lfm_ppl import checks
 from lfm_ppl.analysis.files import writing
 from lfm_ppl.analysis.plots import style
 from lfm_ppl.analysis.tables import write_csv, write_markdown
+from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.ginzburg_landau import conditional, figures, problem, sampling, state, tables
 from lfm_ppl.experiments.tasks import Result, Task, run_tasks
 
@@ -149,7 +150,7 @@ def save(found: Comparison, folder: str | Path) -> list[Path]:
     folder, written = Path(folder), []
     for name, table in (("comparison", found.table), ("rates", found.rates), ("parameters", found.parameters)):
         written.append(write_csv(table, folder / f"{name}.csv", True, index_label="method"))
-        written.append(write_markdown(tables.readable(table), folder / f"{name}.md", True))
+        written.append(write_markdown(scores.readable(table), folder / f"{name}.md", True))
     for name, figure in figures.draw(found.settings, found.results).items():
         with writing(folder / f"{name}.png", True) as temporary, style.in_style():
             figure.savefig(temporary, format="png")

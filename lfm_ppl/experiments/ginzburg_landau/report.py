@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.catalogue import Report, Wanted
-from lfm_ppl.experiments.ginzburg_landau import experiment, tables
+from lfm_ppl.experiments.ginzburg_landau import experiment
 
 SUMMARY = "double well: EKF, CKF, GHKF, particle filter and exact grid, in states and parameters"
 
@@ -22,8 +23,8 @@ def run(wanted: Wanted) -> Report:
                            workers=wanted.workers)
     written = experiment.save(found, wanted.folder)
     return Report({
-        f"Means over {settings.realisations} realisations (standard errors)": tables.readable(found.table),
+        f"Means over {settings.realisations} realisations (standard errors)": scores.readable(found.table),
         f"Truth outside the 99% interval of a conditional posterior, {settings.conditional} realisations":
-            tables.readable(found.rates),
-        f"Posteriors of the parameters, {settings.realisations} realisations": tables.readable(found.parameters),
+            scores.readable(found.rates),
+        f"Posteriors of the parameters, {settings.realisations} realisations": scores.readable(found.parameters),
     }, written)

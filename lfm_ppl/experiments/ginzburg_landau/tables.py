@@ -9,13 +9,11 @@ import numpy as np
 import pandas as pd
 
 from lfm_ppl.experiments.ginzburg_landau import conditional, problem, sampling
-from lfm_ppl.experiments.scores import Estimate, mean_of, rate_of
+from lfm_ppl.experiments.scores import SE, Estimate, mean_of, pair, rate_of
 from lfm_ppl.experiments.tasks import Result
 
 PUBLISHED = {"RAM, EKF": 0.895, "RAM, CKF": 0.935}
 """RMSE of the smoothed state in the source's figure 2.5, for its one realisation."""
-
-_SE = " se"
 
 
 def comparison(results: dict[str, Result]) -> pd.DataFrame:
@@ -48,7 +46,7 @@ def comparison(results: dict[str, Result]) -> pd.DataFrame:
             rows[label]["RMSE published"] = PUBLISHED.get(label, np.nan)
     order = [f"{name}{end}" for name in (
         "RMSE filter", "coverage filter", "RMSE smoother", "coverage smoother", "coverage parameters", "ESS/CPU s",
-        "CPU s", "R-hat") for end in ("", _SE)] + ["RMSE published"]
+        "CPU s", "R-hat") for end in ("", SE)] + ["RMSE published"]
     frame = pd.DataFrame.from_dict(rows, orient="index", dtype=float)
     return frame.reindex(columns=[name for name in order if name in frame])
 
@@ -66,11 +64,11 @@ def rates(results: dict[str, Result]) -> pd.DataFrame:
         outside = one["outside"]
         row: dict[str, float] = {}
         for index, name in enumerate(problem.NAMES):
-            row |= _pair(name, rate_of(outside[:, index]))
+            row |= pair(name, rate_of(outside[:, index]))
         # Realisations are independent of each other, and the three parameters of one are not.
         pooled = mean_of(outside.mean(axis=1))
         error = pooled.error if outside.any() and len(outside) > 1 else rate_of(outside).error
-        row |= _pair("pooled", Estimate(pooled.value, error))
+        row |= pair("pooled", Estimate(pooled.value, error))
         row["cut"] = one["cut"].mean()
         exact = found.get(problem.GRID)
         row["differs"] = np.nan if exact is None else float((outside != exact["outside"]).mean())
@@ -88,24 +86,13 @@ def parameters(results: dict[str, Result]) -> pd.DataFrame:
         for index, name in enumerate(problem.NAMES if own else ()):
             truth = problem.TRUTH[index]
             inside = [one["low"][index] <= truth <= one["high"][index] for one in own]
-            row |= _pair(f"mean {name}", mean_of([one["mean"][index] for one in own]))
-            row |= _pair(f"sd {name}", mean_of([one["sd"][index] for one in own]))
-            row |= _pair(f"coverage {name}", rate_of(inside))
+            row |= pair(f"mean {name}", mean_of([one["mean"][index] for one in own]))
+            row |= pair(f"sd {name}", mean_of([one["sd"][index] for one in own]))
+            row |= pair(f"coverage {name}", rate_of(inside))
         if own:
             row["divergences"] = float(np.mean([one["divergences"] for one in own]))
             rows[label] = row
     return pd.DataFrame.from_dict(rows, orient="index", dtype=float)
-
-
-def readable(frame: pd.DataFrame) -> pd.DataFrame:
-    """Return the table with each estimate and its standard error in one cell, ``0.91 (0.03)``."""
-    columns: dict[str, list[str]] = {}
-    for name in frame.columns:
-        if name.endswith(_SE):
-            continue
-        errors = frame.get(f"{name}{_SE}", pd.Series(np.nan, frame.index))
-        columns[name] = [str(Estimate(value, error)) for value, error in zip(frame[name], errors, strict=True)]
-    return pd.DataFrame(columns, index=frame.index)
 
 
 def _of(results: dict[str, Result], prefix: str) -> list[Result]:
@@ -116,12 +103,8 @@ def _row(results: list[Result], columns: dict[str, str | Callable[[Result], Any]
     row: dict[str, float] = {}
     for name, of in columns.items():
         values = [of(one) if callable(of) else one[of] for one in results]
-        row |= _pair(name, mean_of(values))
+        row |= pair(name, mean_of(values))
     return row
-
-
-def _pair(name: str, estimate: Estimate) -> dict[str, float]:
-    return {name: estimate.value, f"{name}{_SE}": estimate.error}
 
 
 def _covers(one: Result) -> float:

@@ -162,7 +162,7 @@ def save(found: Comparison, folder: str | Path) -> list[Path]:
     folder, written = Path(folder), []
     for name, table in (("comparison", found.table), ("published", found.published), ("paired", found.paired)):
         written.append(write_csv(table, folder / f"{name}.csv", True, index_label="case"))
-        written.append(write_markdown(tables.readable(table), folder / f"{name}.md", True))
+        written.append(write_markdown(scores.readable(table), folder / f"{name}.md", True))
     for name, figure in figures.draw(found.settings, by_cell(found.settings, found.results)).items():
         with writing(folder / f"{name}.png", True) as temporary, style.in_style():
             figure.savefig(temporary, format="png")

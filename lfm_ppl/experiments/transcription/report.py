@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.catalogue import Report, Wanted
-from lfm_ppl.experiments.transcription import experiment, tables
+from lfm_ppl.experiments.transcription import experiment
 
 SUMMARY = "transcription factors: Laplace, elliptical slice sampling and Gaussian smoothers, eight links, table 1"
 
@@ -24,7 +25,7 @@ def run(wanted: Wanted) -> Report:
     written = experiment.save(found, wanted.folder)
     return Report({
         f"RMSE of the force and divergences, {settings.datasets} data sets, beside the published table":
-            tables.readable(found.published),
-        f"Means over {settings.datasets} data sets (standard errors)": tables.readable(found.table),
-        "Against elliptical slice sampling on the same data sets": tables.readable(found.paired),
+            scores.readable(found.published),
+        f"Means over {settings.datasets} data sets (standard errors)": scores.readable(found.table),
+        "Against elliptical slice sampling on the same data sets": scores.readable(found.paired),
     }, written)

@@ -7,14 +7,12 @@ from collections.abc import Mapping
 import numpy as np
 import pandas as pd
 
-from lfm_ppl.experiments.scores import Estimate, mean_of
+from lfm_ppl.experiments.scores import mean_of, pair
 from lfm_ppl.experiments.tasks import Result
 from lfm_ppl.experiments.transcription import problem
 
 Cells = Mapping[tuple[str, str], Result]
 """(configuration, method) -> results of all data sets."""
-
-_SE = " se"
 
 
 def comparison(cells: Cells) -> pd.DataFrame:
@@ -30,14 +28,14 @@ def comparison(cells: Cells) -> pd.DataFrame:
     rows = {}
     for (label, method), found in cells.items():
         sound = ~np.asarray(found["diverged"], bool)
-        row = _pair("RMSE", mean_of(found["rmse"][sound]))
+        row = pair("RMSE", mean_of(found["rmse"][sound]))
         row["divergences"] = float((~sound).sum())
         for name, key in (("coverage", "coverage"), ("NLPD", "nlpd")):
-            row |= _pair(name, mean_of(found[key][sound]))
-        row |= _pair("CPU s", mean_of(found["seconds"]))
+            row |= pair(name, mean_of(found[key][sound]))
+        row |= pair("CPU s", mean_of(found["seconds"]))
         if "r_hat" in found:
             row["R-hat"] = float((found["r_hat"] <= 1.01).mean())
-            row |= _pair("ESS", mean_of(found["ess"]))
+            row |= pair("ESS", mean_of(found["ess"]))
         rows[f"{label}: {method}"] = row
     return pd.DataFrame.from_dict(rows, orient="index", dtype=float)
 
@@ -57,7 +55,7 @@ def beside_published(cells: Cells) -> pd.DataFrame:
                 continue
             sound = ~np.asarray(found["diverged"], bool)
             ours = mean_of(found["rmse"][sound])
-            row |= _pair(method, ours)
+            row |= pair(method, ours)
             row |= {f"{method} published": error, f"{method} z": (ours.value - error) / ours.error,
                     f"{method} div.": float((~sound).sum()), f"{method} div. published": float(diverged)}
         rows[label] = row
@@ -80,21 +78,6 @@ def against_slices(cells: Cells) -> pd.DataFrame:
         difference = mean_of((found["rmse"] - reference["rmse"])[sound])
         ratio = found["rmse"][sound].mean() / reference["rmse"][sound].mean() if sound.any() else np.nan
         rows[f"{label}: {method}"] = {
-            "RMSE ratio": ratio, **_pair("difference", difference),
+            "RMSE ratio": ratio, **pair("difference", difference),
             "times as fast": reference["seconds"].mean() / found["seconds"].mean()}
     return pd.DataFrame.from_dict(rows, orient="index", dtype=float)
-
-
-def readable(frame: pd.DataFrame) -> pd.DataFrame:
-    """Return the table with each estimate and its standard error in one cell, ``0.91 (0.03)``."""
-    columns: dict[str, list[str]] = {}
-    for name in frame.columns:
-        if name.endswith(_SE):
-            continue
-        errors = frame.get(f"{name}{_SE}", pd.Series(np.nan, frame.index))
-        columns[name] = [str(Estimate(value, error)) for value, error in zip(frame[name], errors, strict=True)]
-    return pd.DataFrame(columns, index=frame.index)
-
-
-def _pair(name: str, estimate: Estimate) -> dict[str, float]:
-    return {name: estimate.value, f"{name}{_SE}": estimate.error}
