@@ -76,7 +76,7 @@ class ParticleMarginalRAM(RAM):
         model: a NumPyro model with one likelihood site, ``lfm.MarginalLikelihood`` or ``lfm.panel``.
         particles: N; None: chosen so that the log likelihood has a standard deviation near 1.
         tune_at: unconstrained parameters at which N is chosen; None: where the first chain starts.
-        delayed: two-stage acceptance in half of the steps.
+        delayed: two-stage acceptance in half of the steps. Vectorised chains compute every estimate all the same.
         particle_steps: integration steps of the particles between two times; None: the model's ``steps``.
         resampling: as in `lfm_ppl.particle_filter`, and so are the next two.
         threshold: of the effective sample size.

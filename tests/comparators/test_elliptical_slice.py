@@ -416,6 +416,7 @@ print("same")
 """
 
 
+@pytest.mark.slow
 def test_chain_methods_give_the_same_draws():
     # two CPU devices, for chains that really run in parallel, exist in a fresh process only
     environment = os.environ | {

@@ -79,6 +79,7 @@ def test_chains_that_have_not_mixed_go_on():
     assert (found["length"] == 8 * 160).all() and (found["r_hat"] > 1.01).all()
 
 
+@pytest.mark.slow
 def test_slices_of_a_linear_link_have_the_exact_posterior(monkeypatch):
     """The experiment's own sampler on u itself as activity, against dense algebra on the grid."""
     from lfm_ppl.comparators.laplace import laplace

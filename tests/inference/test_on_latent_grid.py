@@ -25,6 +25,7 @@ def linear(times, y=None, variance=0.1):
     numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
 
 
+@pytest.mark.slow
 def test_nuts_over_the_force_has_the_posterior_of_the_marginal_model():
     """The parameter against quadrature of the exact marginal posterior; the force against the smoother's mixture."""
     latent = lfm.on_latent_grid(linear, points=61)

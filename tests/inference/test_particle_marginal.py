@@ -143,6 +143,7 @@ def test_a_panel():
     assert abs(mine.mean() - single.mean()) < 5.0 * np.hypot(mine.std(), single.std()) / np.sqrt(200)
 
 
+@pytest.mark.slow
 def test_fit_samples_and_reports_the_particles():
     result = lfm.fit(relaxing, TIMES, Y, sampler="pmmh", chains=2, warmup=100, samples=200, thin=5, progress=False,
                      trajectory_draws=20, chain_method="vectorized")
