@@ -17,6 +17,7 @@ import numpy as np
 from lfm_ppl import checks
 from lfm_ppl.comparators.observation_noise import check_noise, log_density
 from lfm_ppl.filtering.filter import check_observations, warn_single_precision
+from lfm_ppl.filtering.transition import linear_part
 from lfm_ppl.forces.sde import Force
 from lfm_ppl.linalg import semidefinite_root
 from lfm_ppl.model.augment import StateSpaceModel, check_times, state_space
@@ -111,8 +112,8 @@ class LatentGrid(eqx.Module):
         self.ssm, self.times, self.rule = ssm, known, rule
         self.grid = _grid(points, initial, known)
         self.nearby = np.stack([np.interp(known, self.grid, one) for one in np.eye(len(self.grid))], axis=1)
-        slope = _decay(ssm)
-        self.flow, self.weights = _weights(slope, _diagonal(ssm), self.grid, known, rule)
+        decay = linear_part(ssm, jnp.zeros(())).slope[:, : ssm.physical_dim]
+        self.flow, self.weights = _weights(decay, _diagonal(ssm), self.grid, known, rule)
         self.mean = jax.vmap(ssm.stack.mean_at)(jnp.asarray(self.grid)).T
         self.root = jnp.stack([_root(force, self.grid) for force in ssm.stack.forces])
         _check_factor(self)
@@ -247,13 +248,6 @@ def _grid(points: Any, initial: float, times: np.ndarray) -> np.ndarray:
     return grid
 
 
-def _decay(ssm: StateSpaceModel) -> jax.Array:
-    """Return A (M, M), the constant Jacobian of the dynamics in the state."""
-    size = ssm.physical_dim
-    at = jnp.zeros(ssm.input_dim)
-    return jax.jacfwd(lambda x: ssm.drift(at.at[:size].set(x), 0.0))(jnp.zeros(size))
-
-
 def _diagonal(ssm: StateSpaceModel) -> bool:
     size = ssm.physical_dim
     pattern = np.asarray(ssm.drift_structure.jacobian, bool)[:, :size]
@@ -278,7 +272,7 @@ def _weights(slope: jax.Array, diagonal: bool, grid: np.ndarray, times: np.ndarr
         after: Any = jnp.multiply
     else:
         flows = lambda lengths: _distinct(lambda h: _flow(slope, h)[0], lengths)  # noqa: E731
-        first, second = (_distinct(lambda h, i=index: _flow(slope, h)[i], length) for index in (1, 2))
+        _, first, second = _distinct(lambda h: _flow(slope, h), length)
         of = lambda a: jnp.asarray(a)[..., None, None]  # noqa: E731
         after = jnp.matmul
     # A cell after the observation has no length, and starts at a time at which no flow is wanted.
@@ -322,11 +316,12 @@ def _flow(slope: jax.Array, length: jax.Array) -> tuple[jax.Array, jax.Array, ja
     return found[:size, :size], found[:size, size:2 * size], found[:size, 2 * size:]
 
 
-def _distinct(function: Any, lengths: np.ndarray) -> jax.Array:
+def _distinct(function: Any, lengths: np.ndarray) -> Any:
     """Return ``function`` of every length, computed once for lengths that are equal up to rounding."""
     scale = max(float(np.max(lengths, initial=0.0)), np.finfo(float).tiny)
     _, first, inverse = np.unique(np.round(lengths / scale, 12), return_index=True, return_inverse=True)
-    return jax.vmap(function)(jnp.asarray(np.ravel(lengths)[first]))[inverse.reshape(np.shape(lengths))]
+    found = jax.vmap(function)(jnp.asarray(np.ravel(lengths)[first]))
+    return jax.tree_util.tree_map(lambda a: a[inverse.reshape(np.shape(lengths))], found)
 
 
 def _root(force: Force, grid: np.ndarray) -> jax.Array:

@@ -9,7 +9,7 @@ import pandas as pd
 
 from lfm_ppl.experiments.scores import mean_of, pair
 from lfm_ppl.experiments.tasks import Result
-from lfm_ppl.experiments.transcription import problem
+from lfm_ppl.experiments.transcription import problem, slices
 
 Cells = Mapping[tuple[str, str], Result]
 """(configuration, method) -> results of all data sets."""
@@ -34,7 +34,7 @@ def comparison(cells: Cells) -> pd.DataFrame:
             row |= pair(name, mean_of(found[key][sound]))
         row |= pair("CPU s", mean_of(found["seconds"]))
         if "r_hat" in found:
-            row["R-hat"] = float((found["r_hat"] <= 1.01).mean())
+            row["R-hat"] = float((found["r_hat"] <= slices.R_HAT).mean())
             row |= pair("ESS", mean_of(found["ess"]))
         rows[f"{label}: {method}"] = row
     return pd.DataFrame.from_dict(rows, orient="index", dtype=float)
