@@ -7,7 +7,8 @@ approximation, elliptical slice sampling and Hamiltonian Monte Carlo over the fo
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -30,17 +31,21 @@ JITTER = 1e-10
 """Share of a force's variance that is added to the diagonal of its covariance on the grid, so that it has a factor."""
 
 
+MOST_SLICES = 64
+"""Observations up to which the points that each needs are cut out one by one."""
+
+
 class LatentGrid(eqx.Module):
     r"""A latent force model whose forces are their values on a grid.
 
-    With s_0 < ... < s_G-1 the grid and c_i the end of cell i, cut off at t_k,
+    With s_0 < ... < s_G-1 the grid, and cell i cut to [a_i, b_i] by the observations at t_(k-1) and t_k,
 
-        x(t_k) = e^(A (t_k - t_0)) x(t_0) + sum_i int_(s_i)^(c_i) e^(A (t_k - s)) p(u(s), s) ds,
+        x(t_k) = e^(A (t_k - t_(k-1))) x(t_(k-1)) + sum_i int_(a_i)^(b_i) e^(A (t_k - s)) p(u(s), s) ds,
 
     where the integral over a cell is one of
 
-        riemann:    (c_i - s_i) times the integrand at s_i, as in the source,
-        trapezoid:  (c_i - s_i) times the mean of the integrand at both ends,
+        riemann:    (b_i - a_i) times the integrand at s_i, as in the source,
+        trapezoid:  (b_i - a_i) times the mean of the integrand at a_i and b_i, where p is interpolated,
         linear:     exact for p linear in time within the cell.
 
     The first has an error of the order of the cells' width, the others of its square; the last stays accurate where a
@@ -54,19 +59,22 @@ class LatentGrid(eqx.Module):
             increasing, which starts at the initial time.
         rule: "riemann", "trapezoid" or "linear".
 
-    Where the states are coupled the weights take a matrix exponential for each distinct distance between an observation
-    and a point: few if the observations lie on the grid or regularly beside it.
+    Each observation needs the points since the one before it only. Where the states are coupled their weights take a
+    matrix exponential for each distinct distance: few if the observations lie on the grid or regularly beside it.
 
     Attributes:
         ssm: the model in state-space form.
         times: (T,).
         grid: (G,).
         nearby: (T, G), the forces at the observation times as combinations of those on the grid.
-        flow: (T, M, M), e^(A (t_k - t_0)).
-        weights: (M, T, G) of p_j(u(s_i), s_i) where A is diagonal, else (M, M, T, G), the first index for the state.
+        weights: (M, T, K) of p_j at the K points that an observation needs, where A is diagonal; else (M, M, T, K), the
+            first index for the state.
+        from_start: (T, M), e^(A (t_k - t_0)), where A is diagonal; else (T, M, M), e^(A (t_k - t_(k-1))).
+        between: (M, T, T), e^(A_j (t_k - t_l)) for l <= k, else 0, where A is diagonal; else None.
         mean: (R, G), the forces' prior mean.
         root: (R, G, G), lower triangular factor of their prior covariance.
         rule: as given.
+        first: T numbers, each the first of the points that an observation needs.
 
     Raises:
         TypeError: ``model`` is something else.
@@ -91,11 +99,13 @@ class LatentGrid(eqx.Module):
     times: np.ndarray
     grid: np.ndarray
     nearby: np.ndarray
-    flow: jax.Array
     weights: jax.Array
+    from_start: jax.Array
+    between: jax.Array | None
     mean: jax.Array
     root: jax.Array
     rule: str = eqx.field(static=True)
+    first: tuple[int, ...] = eqx.field(static=True)
 
     def __init__(self, model: LatentForceModel, times: Any, points: Any = 363, rule: str = "linear"):
         if not isinstance(model, LatentForceModel):
@@ -113,7 +123,19 @@ class LatentGrid(eqx.Module):
         self.grid = _grid(points, initial, known)
         self.nearby = np.stack([np.interp(known, self.grid, one) for one in np.eye(len(self.grid))], axis=1)
         decay = linear_part(ssm, jnp.zeros(())).slope[:, : ssm.physical_dim]
-        self.flow, self.weights = _weights(decay, _diagonal(ssm), self.grid, known, rule)
+        first, pieces = _pieces(self.grid, known)
+        self.first = tuple(first.tolist())
+        if _diagonal(ssm):
+            rates, elapsed = jnp.diagonal(decay), known[:, None] - known
+            flow = lambda lengths: jnp.exp(rates * jnp.asarray(lengths)[..., None])  # noqa: E731
+            self.weights = _weights(pieces, flow, lambda h: _integrals(rates * h[..., None]), jnp.multiply, rule)
+            self.from_start = flow(known - self.grid[0])
+            self.between = jnp.moveaxis(flow(np.maximum(elapsed, 0.0)), -1, 0) * np.tri(len(known))
+        else:
+            flow = lambda lengths: _distinct(lambda h: _flow(decay, h)[0], lengths)  # noqa: E731
+            integrals = lambda lengths: _distinct(lambda h: _flow(decay, h)[1:], lengths)  # noqa: E731
+            self.weights = _weights(pieces, flow, integrals, jnp.matmul, rule)
+            self.from_start, self.between = flow(np.diff(known, prepend=self.grid[0])), None
         self.mean = jax.vmap(ssm.stack.mean_at)(jnp.asarray(self.grid)).T
         self.root = jnp.stack([_root(force, self.grid) for force in ssm.stack.forces])
         _check_factor(self)
@@ -145,9 +167,21 @@ class LatentGrid(eqx.Module):
         first = self.ssm.model.initial_state.mean if start is None else start
         _check_shape("u", "(R, G)", u, self.mean.shape)
         _check_shape("start", "(M,)", first, self.ssm.model.initial_state.mean.shape)
-        made = jax.vmap(self._production, in_axes=(1, 0), out_axes=1)(u, jnp.asarray(self.grid))
-        kind = "jkg,jg->kj" if self.weights.ndim == 3 else "ijkg,jg->ki"
-        return jnp.einsum("kij,j->ki", self.flow, first) + jnp.einsum(kind, self.weights, made)
+        at_times = jax.vmap(self._production, in_axes=(1, 0))
+        made = jax.vmap(at_times, in_axes=(1, 0))(self._window(u), self._window(jnp.asarray(self.grid)[None])[0])
+        if self.between is not None:
+            gained = jnp.einsum("jkg,kgj->jk", self.weights, made)
+            return self.from_start * first + jnp.einsum("jkl,jl->kj", self.between, gained)
+        gained = jnp.einsum("ijkg,kgj->ki", self.weights, made)
+        return jax.lax.scan(lambda x, row: (row[0] @ x + row[1],) * 2, first, (self.from_start, gained))[1]
+
+    def _window(self, values: jax.Array) -> jax.Array:
+        """Return values (R, G) at the points that each observation needs, (R, T, K)."""
+        size = self.weights.shape[-1]
+        if len(self.first) > MOST_SLICES:
+            return values[:, np.asarray(self.first)[:, None] + np.arange(size)]
+        # Slices are copied twice as fast as elements that are gathered, but each takes its time to compile.
+        return jnp.stack([values[:, start:start + size] for start in self.first], axis=1)
 
     def log_likelihood(self, u: jax.Array, y: jax.Array, start: jax.Array | None = None) -> jax.Array:
         """Return log p(y | u, start); missing entries are left out, and what is not finite counts as impossible.
@@ -254,43 +288,69 @@ def _diagonal(ssm: StateSpaceModel) -> bool:
     return not (pattern & ~np.eye(size, dtype=bool)).any()
 
 
-def _weights(slope: jax.Array, diagonal: bool, grid: np.ndarray, times: np.ndarray,
-             rule: str) -> tuple[jax.Array, jax.Array]:
-    """Return the flow from the initial time (T, M, M), and the weights of the points."""
-    starts, wide = grid[:-1], np.diff(grid)
-    ends = np.clip(times[:, None], starts, grid[1:])
-    length = ends - starts
-    # How far along its cell a cell is used: all of it, none, or up to the observation.
-    share = length / wide
-    if diagonal:
-        rates = jnp.diagonal(slope)
-        flows = lambda lengths: jnp.exp(rates * jnp.asarray(lengths)[..., None])  # noqa: E731
-        first, second = _integrals(rates * jnp.asarray(length)[..., None])
-        scale = jnp.asarray(length)[..., None]
-        first, second = scale * first, scale * second
-        of = lambda a: jnp.asarray(a)[..., None]  # noqa: E731
-        after: Any = jnp.multiply
-    else:
-        flows = lambda lengths: _distinct(lambda h: _flow(slope, h)[0], lengths)  # noqa: E731
-        _, first, second = _distinct(lambda h: _flow(slope, h), length)
-        of = lambda a: jnp.asarray(a)[..., None, None]  # noqa: E731
-        after = jnp.matmul
-    # A cell after the observation has no length, and starts at a time at which no flow is wanted.
-    back = flows(np.maximum(times[:, None] - ends, 0.0))
+class _Pieces(NamedTuple):
+    """Cells as the observations cut them, (T, C): those that observation k needs, with [a, b] in (t_(k-1), t_k].
+
+    Attributes:
+        length: b - a, zero for a cell that has no part in it.
+        left, right: a and b as shares of the cell, from its first point on.
+        since_point: t_k - s_i, at least 0.
+        since_left, since_right: t_k - a and t_k - b.
+    """
+
+    length: np.ndarray
+    left: np.ndarray
+    right: np.ndarray
+    since_point: np.ndarray
+    since_left: np.ndarray
+    since_right: np.ndarray
+
+
+def _pieces(grid: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, _Pieces]:
+    """Return the first point that each observation needs (T,), and the cells from there on."""
+    before = np.concatenate([grid[:1], times[:-1]])
+    cells = len(grid) - 1
+    first = np.clip(np.searchsorted(grid, before, side="right") - 1, 0, cells - 1)
+    last = np.clip(np.searchsorted(grid, times, side="left") - 1, first, cells - 1)
+    count = int((last - first).max()) + 1
+    first = np.minimum(first, cells - count)
+    cell = first[:, None] + np.arange(count)
+    start, end, t = grid[cell], grid[cell + 1], times[:, None]
+    a, b = np.clip(start, before[:, None], t), np.clip(end, before[:, None], t)
+    wide = end - start
+    since = np.maximum(t - start, 0.0)
+    return first, _Pieces(b - a, (a - start) / wide, (b - start) / wide, since, t - a, t - b)
+
+
+def _weights(pieces: _Pieces, flow: Callable, integrals: Callable, after: Callable, rule: str) -> jax.Array:
+    """Return the weights of the points, (M, T, C + 1) or (M, M, T, C + 1), from functions of arrays of lengths.
+
+    Args:
+        pieces: the cells.
+        flow: e^(A h).
+        integrals: 1/h int_0^h e^(A (h - s)) ds and 1/h int_0^h e^(A (h - s)) s/h ds.
+        after: product of two flows.
+        rule: of integration.
+    """
+    def of(a: np.ndarray) -> jax.Array:
+        return jnp.asarray(a).reshape(*a.shape, *[1] * (2 if after is jnp.matmul else 1))
+
+    length = of(pieces.length)
     if rule == "riemann":
-        left, right = of(length) * flows(np.maximum(times[:, None] - starts, 0.0)), 0.0 * back
-    elif rule == "trapezoid":
-        whole = flows(np.maximum(times[:, None] - starts, 0.0))
-        left = of(0.5 * length) * (whole + of(1.0 - share) * back)
-        right = of(0.5 * length * share) * back
+        at_point, at_next = length * flow(pieces.since_point), jnp.zeros(())
     else:
-        # int e^(A (c - s)) (s - s_i) ds = length second, where `first` is the integral without the factor.
-        left, right = after(back, first - of(share) * second), of(share) * after(back, second)
-    nothing = jnp.zeros((len(times), 1, *left.shape[2:]))
-    weights = jnp.concatenate([left, nothing], axis=1) + jnp.concatenate([nothing, right], axis=1)
-    weights = jnp.moveaxis(weights, (0, 1), (-2, -1))
-    start = flows(times - grid[0])
-    return jax.vmap(jnp.diag)(start) if diagonal else start, weights
+        if rule == "trapezoid":
+            at_left, at_right = 0.5 * length * flow(pieces.since_left), 0.5 * length * flow(pieces.since_right)
+        else:
+            whole, rising = integrals(pieces.length)
+            back = flow(pieces.since_right)
+            at_left, at_right = length * after(back, whole - rising), length * after(back, rising)
+        at_next = of(pieces.left) * at_left + of(pieces.right) * at_right
+        at_point = at_left + at_right - at_next
+    width = [(0, 0)] * at_point.ndim
+    width[1] = (0, 1)
+    weights = jnp.pad(at_point, width)
+    return jnp.moveaxis(weights.at[:, 1:].add(at_next), (0, 1), (-2, -1))
 
 
 def _integrals(z: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -308,10 +368,10 @@ def _integrals(z: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def _flow(slope: jax.Array, length: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return e^(A h), int_0^h e^(A (h - s)) ds and int_0^h e^(A (h - s)) s/h ds, from one exponential."""
+    """Return e^(A h), 1/h int_0^h e^(A (h - s)) ds and 1/h int_0^h e^(A (h - s)) s/h ds, from one exponential."""
     size = slope.shape[0]
     eye, zero = jnp.eye(size), jnp.zeros((size, size))
-    block = jnp.block([[slope * length, eye * length, zero], [zero, zero, eye], [zero, zero, zero]])
+    block = jnp.block([[slope * length, eye, zero], [zero, zero, eye], [zero, zero, zero]])
     found = jax.scipy.linalg.expm(block)
     return found[:size, :size], found[:size, size:2 * size], found[:size, 2 * size:]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -17,74 +18,65 @@ from lfm_ppl.comparators.elliptical_slice import SliceState, elliptical_slice_st
 from lfm_ppl.comparators.latent_grid import LatentGrid
 from lfm_ppl.comparators.normals import normals
 from lfm_ppl.experiments.timing import timed
-from lfm_ppl.experiments.transcription import problem
+from lfm_ppl.experiments.transcription import ellipses, problem
 from lfm_ppl.experiments.transcription.smoothers import rates, saturation
 
 CHAINS = 4
-RULE = "riemann"
-"""Integration rule, the source's."""
-
-KEPT = 500
-"""Draws that are kept of each chain, evenly spaced, more if it goes on. Means and standard deviations are of all."""
+KEPT = 625
+"""Draws that are kept of each chain, evenly spaced. Means and standard deviations are of all."""
 
 MONITORED = np.arange(6, problem.POINTS, 13)
 """The 28 points of the grid for which R-hat and effective sample sizes are computed."""
 
 R_HAT = 1.01
-_LONGEST = 8
-"""A data set whose chains have not mixed goes on until they are this many times as long."""
+_STAGES = 5
+"""Times that the chains of a data set are run at most, the first time on ellipses of the prior."""
 
 
 def compute(settings: Any, data: list[problem.DataSet], keys: jax.Array) -> dict[str, np.ndarray]:
-    """Return ``mean``, ``sd``, ``low``, ``high`` (N, 363), and ``r_hat``, ``ess``, ``length`` and ``seconds`` (N,).
+    """Return ``mean``, ``sd``, ``low``, ``high`` (N, 363), and ``r_hat``, ``ess``, ``draws`` and ``seconds`` (N,).
 
     ``keys`` (N,) are those of the data sets. The draws of all chains together number ``settings["draws"]``, of which
-    ``settings["burn_in"]`` are left out. Where R-hat of a data set is above 1.01 its chains go on, as long as
-    everything before once more each time; all draws after the burn-in count.
+    ``settings["burn_in"]`` are left out; each rounded up to a whole number for each draw that is kept. The chains of a
+    data set whose R-hat is above 1.01 then run as long once more, on ellipses of a Gaussian that resembles the
+    posterior (see `ellipses.resembling`), and what was before becomes burn-in. ``draws`` counts all of them,
+    ``seconds`` is the time of the first ``settings["draws"]`` and ``r_hat_first`` their R-hat, ``seconds_more`` the
+    time of the others.
     """
-    length = settings["draws"] // CHAINS
-    count = len(data)
+    burn_in, ahead = (math.ceil(number / CHAINS / KEPT)
+                      for number in (settings["burn_in"], settings["draws"] - settings["burn_in"]))
+    count, link, gamma = len(data), settings["link"], saturation(settings)
     known, y = rates(data), jnp.stack([jnp.asarray(one.y) for one in data])
-    gamma = saturation(settings)
-    outcome: dict[str, np.ndarray] = {}
-    seconds, lengths = np.zeros(count), np.zeros(count, int)
-    burn_in = settings["burn_in"] // CHAINS
-    states, _ = _go(settings["link"], burn_in, 0, gamma, known, y, _unstarted(keys), seconds, np.arange(count))
-    kept: list[list[np.ndarray]] = [[] for _ in range(count)]
-    sums = np.zeros((count, 2, problem.POINTS))
-    open_, ahead = np.arange(count), length - burn_in
-    while True:
-        rates_left, y_left = jax.tree_util.tree_map(lambda a, o=open_: a[o], (known, y))
-        share = KEPT * ahead // (length - burn_in)
-        states, (paths, moments) = _go(
-            settings["link"], ahead, share, gamma, rates_left, y_left, states, seconds, open_)
-        lengths[open_] += ahead
-        sums[open_] += moments
-        for place, index in enumerate(open_):
-            kept[index].append(paths[place])
-        diagnosed = {index: diagnose(np.concatenate(kept[index], axis=1)) for index in open_}
-        for index, (r_hat, ess) in diagnosed.items():
-            outcome.setdefault("r_hat", np.zeros(count))[index] = r_hat
-            outcome.setdefault("ess", np.zeros(count))[index] = ess
-        going = np.array([diagnosed[index][0] > R_HAT and lengths[index] < _LONGEST * (length - burn_in)
-                          for index in open_], bool)
-        if not going.any():
+    found = {name: np.zeros(count) for name in ("r_hat", "ess", "seconds", "seconds_more", "draws")}
+    found |= {name: np.zeros((count, problem.POINTS)) for name in ("mean", "sd", "low", "high")}
+    left, states, around = np.arange(count), _unstarted(keys), None
+    for stage in range(_STAGES):
+        own = (gamma, *jax.tree_util.tree_map(lambda a, i=left: a[i], (known, y)), around)
+        taken_first, (states, _, _) = timed(_program(link, len(left), stage > 0), jnp.asarray(burn_in), *own, *states)
+        taken, (states, kept, sums) = timed(_program(link, len(left), stage > 0), jnp.asarray(ahead), *own, *states)
+        found["seconds_more" if stage else "seconds"][left] += (taken_first + taken) / len(left)
+        found["draws"][left] += CHAINS * KEPT * (burn_in + ahead)
+        kept, (mean, square) = np.asarray(kept), np.moveaxis(np.asarray(sums), 1, 0) / (CHAINS * KEPT * ahead)
+        found["mean"][left], found["sd"][left] = mean, np.sqrt(np.maximum(square - mean**2, 0.0))
+        flat = kept.reshape(len(left), -1, problem.POINTS)
+        found["low"][left], found["high"][left] = np.quantile(flat, [0.025, 0.975], axis=1)
+        found["r_hat"][left], found["ess"][left] = np.transpose([diagnose(one) for one in kept])
+        if stage == 0:
+            found["r_hat_first"] = found["r_hat"].copy()
+        open_ = np.flatnonzero(found["r_hat"][left] > R_HAT)
+        left, states = left[open_], jax.tree_util.tree_map(lambda a, i=open_: a[i], states)
+        if not left.size:
             break
-        states = jax.tree_util.tree_map(lambda a, g=going: a[np.flatnonzero(g)], states)
-        open_, ahead = open_[going], int(lengths[open_[going][0]])
-    mean = sums[:, 0] / (CHAINS * lengths[:, None])
-    sd = np.sqrt(np.maximum(sums[:, 1] / (CHAINS * lengths[:, None]) - mean**2, 0.0))
-    quantiles = np.stack([np.quantile(np.concatenate(one, axis=1).reshape(-1, problem.POINTS), [0.025, 0.975], axis=0)
-                          for one in kept])
-    return outcome | {"mean": mean, "sd": sd, "low": quantiles[:, 0], "high": quantiles[:, 1],
-                      "length": CHAINS * lengths, "seconds": seconds}
+        around = ellipses.program(link, len(left))(
+            gamma, *jax.tree_util.tree_map(lambda a, i=left: a[i], (known, y)), jnp.asarray(flat[open_]))
+    return found
 
 
 def _unstarted(keys: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return keys (N, chains), and positions (N, chains, 363) and log likelihoods that the first segment replaces."""
+    """Return key data (N, chains, 2), and positions (N, chains, 363) and likelihoods that the first steps replace."""
     count = len(keys)
     own = jax.vmap(lambda key: jax.random.split(key, CHAINS))(keys)
-    return own, jnp.zeros((count, CHAINS, problem.POINTS)), jnp.full((count, CHAINS), jnp.nan)
+    return jax.random.key_data(own), jnp.zeros((count, CHAINS, problem.POINTS)), jnp.full((count, CHAINS), jnp.nan)
 
 
 def diagnose(draws: np.ndarray) -> tuple[float, float]:
@@ -97,70 +89,52 @@ def diagnose(draws: np.ndarray) -> tuple[float, float]:
     return float(summary["r_hat"].max()), float(summary["ess_bulk"].min())
 
 
-def _go(link: str, steps: int, kept: int, gamma: jax.Array, known: problem.Rates, y: jax.Array, states: Any,
-        seconds: np.ndarray, index: np.ndarray) -> tuple[Any, Any]:
-    """Take steps from ``states``; return the new ones, and what `_program` gives of the draws.
-
-    The CPU time, shared equally, is added to ``seconds`` at ``index``.
-    """
-    count = len(index)
-    run = _program(link, count, steps, kept)
-    keys, position, value = states
-    taken, (after, paths, moments) = timed(run, gamma, known, y, jax.random.key_data(keys), position, value)
-    seconds[index] += taken / count
-    data, position, value = after
-    return (jax.random.wrap_key_data(data), position, value), (np.asarray(paths), np.asarray(moments))
-
-
 @functools.cache
-def _program(link: str, count: int, steps: int, kept: int) -> Callable:
-    """Compile ``steps`` steps of every chain; the first of all draws its start from the prior."""
-    outer = max(kept, 1)
-    inner = [steps // outer + (place < steps % outer) for place in range(outer)]
-    most = max(inner)
+def _program(link: str, count: int, informed: bool) -> Callable:
+    """Compile steps of every chain, any number of them to a draw that is kept. Fresh chains start from the prior.
 
-    def chain(latent: LatentGrid, y: jax.Array, key: jax.Array, position: jax.Array, value: jax.Array) -> tuple:
-        log_likelihood = lambda u: latent.log_likelihood(u[None], y)  # noqa: E731
+    ``informed``: the ellipses are those of a Gaussian that is given.
+    """
+    def chain(latent: LatentGrid, y: jax.Array, around: ellipses.Gaussian | None, apart: jax.Array, key: jax.Array,
+              position: jax.Array, value: jax.Array) -> tuple:
         key, first = jax.random.split(key)
-        fresh = jnp.isnan(value)
-        position = jnp.where(fresh, latent.root[0] @ normals(first, problem.POINTS, 2)[:, 0], position)
-        state = SliceState(position, log_likelihood(position), jnp.zeros((), int))
+        position = jnp.where(jnp.isnan(value), latent.root[0] @ normals(first, problem.POINTS, 2)[:, 0], position)
+        start, log_likelihood, drawn, centre = ellipses.around(latent, y, around)
+        begun = start(position)
+        state = SliceState(begun, log_likelihood(begun), jnp.zeros((), int))
 
-        def step(index: jax.Array, carry: tuple) -> tuple:
+        def step(_: jax.Array, carry: tuple) -> tuple:
             key, state, sums = carry
             key, draw, move = jax.random.split(key, 3)
-            white = normals(draw, 2, (problem.POINTS + 1) // 2).ravel()[: problem.POINTS]
-            state = elliptical_slice_step(move, state, latent.root[0] @ white, log_likelihood)
-            return key, state, sums + jnp.stack([state.position, state.position**2])
+            state = elliptical_slice_step(move, state, drawn(draw), log_likelihood, centre)
+            u = state.position.force
+            return key, state, sums + jnp.stack([u, u**2])
 
-        def segment(carry: tuple, length: jax.Array) -> tuple[tuple, jax.Array]:
-            carry = jax.lax.fori_loop(0, most, lambda i, c: jax.lax.cond(i < length, lambda: step(i, c), lambda: c),
-                                      carry)
-            return carry, carry[1].position
+        def segment(carry: tuple, _: None) -> tuple[tuple, jax.Array]:
+            carry = jax.lax.fori_loop(0, apart, step, carry)
+            return carry, carry[1].position.force
 
         (key, state, sums), paths = jax.lax.scan(
-            segment, (key, state, jnp.zeros((2, problem.POINTS))), jnp.asarray(inner))
-        return (key, state.position, state.log_likelihood), paths, sums
+            segment, (key, state, jnp.zeros((2, problem.POINTS))), None, length=KEPT)
+        return (key, state.position.force, state.log_likelihood), paths, sums
 
-    def run(gamma: jax.Array, known: problem.Rates, y: jax.Array, data: jax.Array, position: jax.Array,
-            value: jax.Array) -> tuple:
+    def run(apart: jax.Array, gamma: jax.Array, known: problem.Rates, y: jax.Array, around: ellipses.Gaussian | None,
+            data: jax.Array, position: jax.Array, value: jax.Array) -> tuple:
         keys = jax.random.wrap_key_data(data)
         # One factor of the prior for all data sets, so that prior draws are one product of matrices.
-        shared = LatentGrid(problem.system(link, gamma, jax.tree_util.tree_map(lambda a: a[0], known)),
-                            problem.TIMES, problem.GRID, RULE).root
+        shared = ellipses.on_grid(link, gamma, jax.tree_util.tree_map(lambda a: a[0], known)).root
 
-        def one(own: problem.Rates, y: jax.Array, keys: jax.Array, position: jax.Array, value: jax.Array) -> tuple:
-            latent = LatentGrid(problem.system(link, gamma, own), problem.TIMES, problem.GRID, RULE)
-            latent = eqx.tree_at(lambda grid: grid.root, latent, shared)
-            return jax.vmap(lambda k, p, v: chain(latent, y, k, p, v))(keys, position, value)
+        def one(own: problem.Rates, y: jax.Array, around: ellipses.Gaussian | None, keys: jax.Array,
+                position: jax.Array, value: jax.Array) -> tuple:
+            latent = eqx.tree_at(lambda grid: grid.root, ellipses.on_grid(link, gamma, own), shared)
+            return jax.vmap(lambda k, p, v: chain(latent, y, around, apart, k, p, v))(keys, position, value)
 
-        (keys, position, value), paths, sums = jax.vmap(one)(known, y, keys, position, value)
+        (keys, position, value), paths, sums = jax.vmap(one)(known, y, around, keys, position, value)
         return (jax.random.key_data(keys), position, value), paths, sums.sum(axis=1)
 
-    shape = jax.ShapeDtypeStruct((count, problem.GENES), float)
-    y = jax.ShapeDtypeStruct((count, problem.OBSERVED, problem.GENES), float)
-    keys = jax.eval_shape(lambda: jax.random.key_data(jax.random.split(jax.random.key(0), (count, CHAINS))))
-    position = jax.ShapeDtypeStruct((count, CHAINS, problem.POINTS), float)
-    value = jax.ShapeDtypeStruct((count, CHAINS), float)
-    return jax.jit(run).lower(jax.ShapeDtypeStruct((), float), problem.Rates(*[shape] * 4), y, keys, position,
-                              value).compile()
+    shapes = ellipses.shapes(count)
+    chains = (jax.eval_shape(lambda: jax.random.key_data(jax.random.split(jax.random.key(0), (count, CHAINS)))),
+              jax.ShapeDtypeStruct((count, CHAINS, problem.POINTS), float),
+              jax.ShapeDtypeStruct((count, CHAINS), float))
+    return jax.jit(run).lower(jax.ShapeDtypeStruct((), int), *shapes[:3], shapes[3] if informed else None,
+                              *chains).compile()

@@ -21,9 +21,10 @@ def comparison(cells: Cells) -> pd.DataFrame:
     Returns:
         ``RMSE`` of the force over the grid, without diverged data sets, and ``divergences``, their number; ``coverage``
         of the 95% band, pooled over data sets and points; ``NLPD``, the negative log predictive density of the force at
-        a point; ``CPU s`` for one data set, compilation apart; of elliptical slice sampling ``R-hat`` (the share of
-        data sets with at most 1.01 at every monitored point of the grid) and ``ESS``, the smallest among these points,
-        of the draws that are kept. ``name se`` are standard errors over data sets.
+        a point; ``CPU s`` for one data set, compilation apart; of elliptical slice sampling ``mixed`` (the share of
+        data sets whose R-hat is at most 1.01 at every monitored point of the grid), ``mixed at first`` (the same after
+        the draws that ``CPU s`` is of), ``all CPU s`` (with those that followed where it was not) and ``ESS``, the
+        smallest among these points, of the draws that are kept. ``name se`` are standard errors over data sets.
     """
     rows = {}
     for (label, method), found in cells.items():
@@ -34,7 +35,9 @@ def comparison(cells: Cells) -> pd.DataFrame:
             row |= pair(name, mean_of(found[key][sound]))
         row |= pair("CPU s", mean_of(found["seconds"]))
         if "r_hat" in found:
-            row["R-hat"] = float((found["r_hat"] <= slices.R_HAT).mean())
+            row["mixed"] = float((found["r_hat"] <= slices.R_HAT).mean())
+            row["mixed at first"] = float((found["r_hat_first"] <= slices.R_HAT).mean())
+            row |= pair("all CPU s", mean_of(found["seconds"] + found["seconds_more"]))
             row |= pair("ESS", mean_of(found["ess"]))
         rows[f"{label}: {method}"] = row
     return pd.DataFrame.from_dict(rows, orient="index", dtype=float)
