@@ -44,7 +44,7 @@ def wanted(monkeypatch):
 def test_without_a_name_it_lists_the_experiments(run):
     code, out, err = run("compare")
     assert code == 0 and err == ""
-    assert "ginzburg-landau  double well" in out
+    assert "ginzburg-landau           double well" in out and "transcription-parameters  " in out
 
 
 def test_an_unknown_name_gets_the_nearest(run):

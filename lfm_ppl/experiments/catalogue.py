@@ -12,7 +12,8 @@ import pandas as pd
 from lfm_ppl import checks
 
 _MODULES = {"ginzburg-landau": "lfm_ppl.experiments.ginzburg_landau.report",
-            "transcription": "lfm_ppl.experiments.transcription.report"}
+            "transcription": "lfm_ppl.experiments.transcription.report",
+            "transcription-parameters": "lfm_ppl.experiments.transcription.parameters_report"}
 
 
 class Wanted(NamedTuple):

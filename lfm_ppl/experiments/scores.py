@@ -101,6 +101,17 @@ def covered(low: Any, high: Any, truth: Any) -> float:
     return float(np.mean((np.asarray(low) <= truth) & (truth <= np.asarray(high))))
 
 
+def spread(draws: np.ndarray, count: int) -> np.ndarray:
+    """Return ``count`` draws (count, P), spread evenly over draws (P, chains, draws)."""
+    flat = draws.reshape(len(draws), -1)
+    return flat[:, np.linspace(0, flat.shape[1] - 1, count).round().astype(int)].T
+
+
+def total_moments(mean: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and standard deviation (K,) of a mixture of components with mean and variance (S, K)."""
+    return mean.mean(axis=0), np.sqrt(variance.mean(axis=0) + mean.var(axis=0))
+
+
 class GridPosterior:
     r"""Posterior of one parameter under a flat prior, from its log likelihood at the nodes of a grid.
 

@@ -74,7 +74,7 @@ def test_every_sampler_draws_parameters_and_states(label):
 def test_the_law_of_total_variance():
     generator = np.random.default_rng(0)
     mean, variance = generator.normal(size=(3, 2)), generator.uniform(1.0, 2.0, (3, 2))
-    total, sd = sampling.total_moments(mean, variance)
+    total, sd = scores.total_moments(mean, variance)
     second = (variance + mean**2).mean(axis=0)
     np.testing.assert_allclose(total, mean.mean(axis=0))
     np.testing.assert_allclose(sd**2, second - total**2, rtol=1e-12)
@@ -82,7 +82,7 @@ def test_the_law_of_total_variance():
 
 def test_draws_are_spread_over_all_chains():
     draws = np.arange(24.0).reshape(3, 2, 4)
-    chosen = sampling.spread(draws, 2)
+    chosen = scores.spread(draws, 2)
     np.testing.assert_array_equal(chosen, [[0.0, 8.0, 16.0], [7.0, 15.0, 23.0]])
 
 

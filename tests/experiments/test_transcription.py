@@ -61,7 +61,7 @@ def test_every_method_finds_the_force(method):
                 "last": 1}
     if method == "ESLS":
         settings |= {"draws": 4000, "burn_in": 400}
-    found = experiment.compute(Task(f"saturation/{experiment.slug(method)}", 0, settings))
+    found = experiment.compute(Task(f"saturation/{problem.slug(method)}", 0, settings))
     assert found["mean"].shape == found["sd"].shape == (2, problem.POINTS)
     assert (found["sd"] > 0).all() and (found["seconds"] > 0).all()
     if method == "LA":  # Newton's method is known to fail, and then to say so

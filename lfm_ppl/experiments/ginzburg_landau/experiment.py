@@ -10,10 +10,7 @@ from typing import NamedTuple
 import pandas as pd
 
 from lfm_ppl import checks
-from lfm_ppl.analysis.files import writing
-from lfm_ppl.analysis.plots import style
-from lfm_ppl.analysis.tables import write_csv, write_markdown
-from lfm_ppl.experiments import scores
+from lfm_ppl.experiments import output
 from lfm_ppl.experiments.ginzburg_landau import conditional, figures, problem, sampling, state, tables
 from lfm_ppl.experiments.tasks import Result, Task, run_tasks
 
@@ -147,12 +144,5 @@ def run(settings: Settings, folder: str | Path, *, overwrite: bool = False,
 
 def save(found: Comparison, folder: str | Path) -> list[Path]:
     """Write tables and figures of a comparison, replacing older ones, and return their paths."""
-    folder, written = Path(folder), []
-    for name, table in (("comparison", found.table), ("rates", found.rates), ("parameters", found.parameters)):
-        written.append(write_csv(table, folder / f"{name}.csv", True, index_label="method"))
-        written.append(write_markdown(scores.readable(table), folder / f"{name}.md", True))
-    for name, figure in figures.draw(found.settings, found.results).items():
-        with writing(folder / f"{name}.png", True) as temporary, style.in_style():
-            figure.savefig(temporary, format="png")
-        written.append(folder / f"{name}.png")
-    return written
+    tables = {"comparison": found.table, "rates": found.rates, "parameters": found.parameters}
+    return output.save(folder, tables, figures.draw(found.settings, found.results), "method")

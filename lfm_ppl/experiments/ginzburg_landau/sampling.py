@@ -150,25 +150,14 @@ def integrated(settings: Any, data: problem.Realisation, draws: np.ndarray) -> R
     standard deviations, as in the source. The smoother is the sampler's own Gaussian one; for particle-marginal RAM,
     whose draws are from the exact posterior, it is the exact one on the grid.
     """
-    chosen = spread(draws, settings["paths"])
+    chosen = scores.spread(draws, settings["paths"])
     rule = SAMPLERS[settings["sampler"]].rule
     if rule is not None:
         run = _smoother_program(rule, state.steps_between(data, settings["steps"]), len(chosen), tuple(data.fine))
     else:
         run = grid.moments_program(settings["cells"], len(chosen), tuple(data.fine))
     mean, variance = map(np.asarray, run(jnp.asarray(chosen), jnp.asarray(data.sparse)))
-    return state.band("smoother", *total_moments(mean, variance))
-
-
-def spread(draws: np.ndarray, count: int) -> np.ndarray:
-    """Return ``count`` draws (count, 3) spread evenly over draws (3, chains, draws)."""
-    flat = draws.reshape(3, -1)
-    return flat[:, np.linspace(0, flat.shape[1] - 1, count).round().astype(int)].T
-
-
-def total_moments(mean: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and standard deviation (K,) of a mixture of components with mean and variance (S, K)."""
-    return mean.mean(axis=0), np.sqrt(variance.mean(axis=0) + mean.var(axis=0))
+    return state.band("smoother", *scores.total_moments(mean, variance))
 
 
 @functools.cache

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,10 +13,7 @@ import numpy as np
 import pandas as pd
 
 from lfm_ppl import checks
-from lfm_ppl.analysis.files import writing
-from lfm_ppl.analysis.plots import style
-from lfm_ppl.analysis.tables import write_csv, write_markdown
-from lfm_ppl.experiments import scores
+from lfm_ppl.experiments import output, scores
 from lfm_ppl.experiments.tasks import Result, Task, run_tasks
 from lfm_ppl.experiments.transcription import figures, laplace_modes, problem, slices, smoothers, tables
 
@@ -35,21 +32,25 @@ class Settings:
         seed: of everything random.
         draws: of elliptical slice sampling for one data set, all chains together; the source's.
         burn_in: the first of them, which are left out.
+        configurations: their labels; all by default.
     """
 
     datasets: int = 100
     seed: int = 0
     draws: int = 100_000
     burn_in: int = 5_000
+    configurations: tuple[str, ...] = tuple(one.label for one in problem.CONFIGURATIONS)
 
     def __post_init__(self) -> None:
-        """Check the numbers that a user gives."""
+        """Check what a user gives."""
         checks.positive_integer("datasets", self.datasets)
+        for label in self.configurations:
+            checks.one_of("configurations", label, [one.label for one in problem.CONFIGURATIONS])
 
 
-def quick(datasets: int = 2, seed: int = 0) -> Settings:
+def quick(datasets: int = 2, seed: int = 0, **changes: Any) -> Settings:
     """Return settings that show in a few minutes that everything runs, and no more."""
-    return Settings(datasets, seed, draws=4_000, burn_in=400)
+    return Settings(datasets, seed, draws=4_000, burn_in=400, **changes)
 
 
 class Comparison(NamedTuple):
@@ -57,14 +58,14 @@ class Comparison(NamedTuple):
 
     Attributes:
         settings: that it ran with.
-        results: of every task, by name.
+        cells: (configuration, method) -> the results of all its data sets.
         table: a row for each configuration and method.
         published: RMSE and divergences beside the published ones.
         paired: every method against elliptical slice sampling.
     """
 
     settings: Settings
-    results: dict[str, Result]
+    cells: dict[tuple[str, str], Result]
     table: pd.DataFrame
     published: pd.DataFrame
     paired: pd.DataFrame
@@ -76,10 +77,10 @@ def all_tasks(settings: Settings) -> list[Task]:
     for first in range(0, settings.datasets, BLOCK):
         last = min(first + BLOCK, settings.datasets) - 1
         for configuration in problem.CONFIGURATIONS:
-            for method in METHODS:
+            for method in METHODS if configuration.label in settings.configurations else ():
                 own: dict = {"draws": settings.draws, "burn_in": settings.burn_in} if method == "ESLS" else {}
                 found.append(Task(
-                    f"{slug(configuration.label)}/{slug(method)}/{first:03d}-{last:03d}", settings.seed,
+                    f"{problem.slug(configuration.label)}/{problem.slug(method)}/{first:03d}-{last:03d}", settings.seed,
                     {"experiment": "transcription", "method": method, "link": configuration.link,
                      "gamma": configuration.gamma, "first": first, "last": last, **own}))
     return found
@@ -97,7 +98,7 @@ def compute(task: Task) -> Result:
     elif method in laplace_modes.SEARCHES:
         found = laplace_modes.compute(settings, data)
     else:
-        cell = Task(f"{slug(configuration.label)}/{slug(method)}", task.seed)
+        cell = Task(f"{problem.slug(configuration.label)}/{problem.slug(method)}", task.seed)
         keys = jax.vmap(lambda index: jax.random.fold_in(cell.key, index))(
             jnp.arange(settings["first"], settings["last"] + 1))
         found = slices.compute(settings, data, keys)
@@ -121,11 +122,6 @@ def judged(found: Result, truth: np.ndarray) -> Result:
             "nlpd": (0.5 * z**2 + np.log(sd) + 0.5 * np.log(2.0 * np.pi)).mean(axis=1), "diverged": diverged}
 
 
-def slug(label: str) -> str:
-    """Return a label as part of the name of a task."""
-    return label.replace(", ", "-").replace(" ", "-")
-
-
 def run(settings: Settings, folder: str | Path, *, overwrite: bool = False,
         report: Callable[[str], None] | None = None, workers: int = 1) -> Comparison:
     """Compute what is not stored yet in ``folder``, and tabulate everything.
@@ -142,9 +138,9 @@ def run(settings: Settings, folder: str | Path, *, overwrite: bool = False,
     """
     results = run_tasks(all_tasks(settings), compute, Path(folder) / TASKS, overwrite=overwrite, report=report,
                         workers=workers)
-    grouped = by_cell(settings, results)
-    return Comparison(settings, results, tables.comparison(grouped), tables.beside_published(grouped),
-                      tables.against_slices(grouped))
+    cells = by_cell(settings, results)
+    return Comparison(settings, cells, tables.comparison(cells), tables.beside_published(cells),
+                      tables.against_slices(cells))
 
 
 def by_cell(settings: Settings, results: dict[str, Result]) -> dict[tuple[str, str], Result]:
@@ -159,12 +155,5 @@ def by_cell(settings: Settings, results: dict[str, Result]) -> dict[tuple[str, s
 
 def save(found: Comparison, folder: str | Path) -> list[Path]:
     """Write tables and figures of a comparison, replacing older ones, and return their paths."""
-    folder, written = Path(folder), []
-    for name, table in (("comparison", found.table), ("published", found.published), ("paired", found.paired)):
-        written.append(write_csv(table, folder / f"{name}.csv", True, index_label="case"))
-        written.append(write_markdown(scores.readable(table), folder / f"{name}.md", True))
-    for name, figure in figures.draw(found.settings, by_cell(found.settings, found.results)).items():
-        with writing(folder / f"{name}.png", True) as temporary, style.in_style():
-            figure.savefig(temporary, format="png")
-        written.append(folder / f"{name}.png")
-    return written
+    shown = {"comparison": found.table, "published": found.published, "paired": found.paired}
+    return output.save(folder, shown, figures.draw(found.settings, found.cells), "case")

@@ -24,10 +24,10 @@ def draw(settings: Any, cells: Mapping[tuple[str, str], Result]) -> dict[str, Fi
     """Return every figure of the comparison by name."""
     found = {}
     for configuration in problem.CONFIGURATIONS:
-        if configuration.label in ("repression 0.1", "exponential"):
+        if configuration.label in ("repression 0.1", "exponential") and configuration.label in settings.configurations:
             own = {method: cells[configuration.label, method] for method in _SHOWN}
             data = problem.data_set(configuration, 0, settings.seed)
-            found[f"force-{configuration.label.replace(' ', '-')}"] = plot_force(data, own)
+            found[f"force-{problem.slug(configuration.label)}"] = plot_force(data, own)
     return found | {"errors": plot_errors(cells)}
 
 
@@ -44,20 +44,27 @@ def plot_force(data: problem.DataSet, methods: Mapping[str, Result], *, width: s
     grid = figure.subplots(2, 3)
     panels = list(grid.ravel())
     axes = panels[0]
-    for gene, colour in zip(range(problem.GENES), (style.BLUE, style.VERMILLION, style.GREEN), strict=True):
-        axes.plot(data.fine, data.state[:, gene], color=colour, lw=0.9)
-        axes.plot(problem.TIMES, data.y[:, gene], ls="", marker="x", ms=3.2, mew=0.9, color=colour)
-    axes.set_title("expression of the genes, and data")
+    kinds = zip((style.BLUE, style.VERMILLION, style.GREEN), "os^", ("-", "--", ":"), strict=True)
+    for gene, (colour, marker, line) in enumerate(kinds):
+        axes.plot(data.fine, data.state[:, gene], color=colour, lw=0.9, ls=line)
+        axes.plot(problem.TIMES, data.y[:, gene], ls="", marker=marker, ms=2.6, color=colour, label=f"gene {gene + 1}")
+    axes.set_title("data, and the true expression")
+    axes.set_ylim(top=data.y.max() + 0.35 * np.ptp(data.y))
+    axes.legend(loc="upper center", ncols=problem.GENES, handletextpad=0.0, columnspacing=0.6, frameon=False)
     axes.set_ylabel("expression")
     style.tidy(axes)
-    top = 1.3 * np.abs(data.u).max() + 1.0
+    # A divergent band is cut; all others and the truth are seen whole.
+    means, sds = (np.stack([found[name][0] for found in methods.values()]) for name in ("mean", "sd"))
+    reach = [np.where(np.isfinite(bands), bands, 0.0) for bands in (means - Z * sds, means + Z * sds)]
+    low = max(min(reach[0].min(), data.u.min()), data.u.min() - 3.0) - 0.2
+    high = min(max(reach[1].max(), data.u.max()), data.u.max() + 3.0) + 0.2
     for axes, (method, found) in zip(panels[1:], methods.items(), strict=False):
         mean, sd = found["mean"][0], found["sd"][0]
         colour = COLOURS[method]
         axes.fill_between(problem.GRID, mean - Z * sd, mean + Z * sd, color=colour, alpha=0.25, lw=0, zorder=1)
         axes.plot(problem.GRID, mean, color=colour, zorder=3)
         axes.plot(problem.GRID, data.u, color=style.BLACK, lw=0.7, zorder=2)
-        axes.set_ylim(-top, top)
+        axes.set_ylim(low, high)
         axes.set_title(f"{method}, RMSE {found['rmse'][0]:.2f}")
         axes.set_ylabel("force u")
         style.tidy(axes)
@@ -79,7 +86,7 @@ def plot_errors(cells: Mapping[tuple[str, str], Result], *, width: str | float =
         cells: (configuration, method) -> results.
         width: "column" (3.4 in), "full" (7 in), or inches.
     """
-    labels = [one.label for one in problem.CONFIGURATIONS]
+    labels = [one.label for one in problem.CONFIGURATIONS if any(label == one.label for label, _ in cells)]
     methods = [method for method in COLOURS if any((label, method) in cells for label in labels)]
     figure = style.new_figure(width, 3.2)
     axes = figure.subplots()

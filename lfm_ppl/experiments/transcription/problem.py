@@ -60,6 +60,11 @@ PUBLISHED = {
 """Configuration -> method -> RMSE of the force and number of divergences among 100 data sets, table 1 of the source."""
 
 
+def slug(label: str) -> str:
+    """Return a label as part of the name of a task or a file."""
+    return label.replace(", ", "-").replace(" ", "-")
+
+
 def activity(u: jax.Array, link: str, gamma: Any) -> jax.Array:
     """Return g(u), the activity of the factor.
 

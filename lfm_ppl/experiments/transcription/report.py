@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.catalogue import Report, Wanted
 from lfm_ppl.experiments.transcription import experiment
@@ -18,7 +20,7 @@ def run(wanted: Wanted) -> Report:
     if wanted.conditional is not None:
         raise ValueError("the experiment transcription has no conditional posteriors; leave out --conditional.")
     make = experiment.quick if wanted.quick else experiment.Settings
-    counts = {} if wanted.realisations is None else {"datasets": wanted.realisations}
+    counts: dict[str, Any] = {} if wanted.realisations is None else {"datasets": wanted.realisations}
     settings = make(seed=wanted.seed, **counts)
     found = experiment.run(settings, wanted.folder, overwrite=wanted.overwrite, report=wanted.report,
                            workers=wanted.workers)

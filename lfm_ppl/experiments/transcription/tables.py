@@ -61,7 +61,8 @@ def beside_published(cells: Cells) -> pd.DataFrame:
             row |= pair(method, ours)
             row |= {f"{method} published": error, f"{method} z": (ours.value - error) / ours.error,
                     f"{method} div.": float((~sound).sum()), f"{method} div. published": float(diverged)}
-        rows[label] = row
+        if row:
+            rows[label] = row
     return pd.DataFrame.from_dict(rows, orient="index", dtype=float)
 
 

@@ -1,0 +1,169 @@
+"""Full posteriors with all rates unknown: the marginal likelihood against the force as latent sites."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import xarray as xr
+from numpyro.infer import MCMC, NUTS, init_to_value
+
+from lfm_ppl.analysis import arviz_data
+from lfm_ppl.experiments import scores
+from lfm_ppl.experiments.tasks import Result, Task
+from lfm_ppl.experiments.timing import timed
+from lfm_ppl.experiments.transcription import figures, problem
+from lfm_ppl.filtering.smoother import smooth
+from lfm_ppl.forces import Matern
+from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
+from lfm_ppl.inference.on_latent_grid import on_latent_grid
+from lfm_ppl.inference.ram import RAM
+from lfm_ppl.linearisation.sigma_points import GaussHermite
+from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.observation import Gaussian, GaussianObservation
+
+RULE, STEPS = GaussHermite(7), 6
+AT = np.linspace(0.0, problem.END, 61)
+"""The latent grid, with the exact weights for a production that is linear between its points; the force is reported
+there."""
+
+PATHS = 100
+"""Draws over which the smoothed force is averaged."""
+
+LINKS = {one.label: one for one in (problem.Configuration("softplus"), problem.Configuration("saturation", 0.5))}
+VECTORS = ("basal", "decay", "sensitivity", "away")
+NAMES = (*(f"{name}[{gene + 1}]" for name in VECTORS for gene in range(problem.GENES)), "noise_sd", "lengthscale")
+
+
+class Sampler(NamedTuple):
+    """A kernel and the model that it samples.
+
+    Attributes:
+        kernel: "NUTS" or "RAM".
+        latent: whether the force is a latent site on a grid; otherwise it is filtered out.
+        iterations: of posterior linearisation in the marginal likelihood.
+    """
+
+    kernel: str
+    latent: bool = False
+    iterations: int = 0
+
+
+SAMPLERS = {"NUTS, latent grid": Sampler("NUTS", latent=True), "NUTS, marginal": Sampler("NUTS"),
+            "RAM, marginal": Sampler("RAM"), "RAM, iterated marginal": Sampler("RAM", iterations=5)}
+REFERENCE = "NUTS, latent grid"
+
+
+def model(times: Any, y: Any = None, link: str = "softplus", gamma: float | None = None, iterations: int = 0) -> None:
+    """Sample rates, start, noise and lengthscale from the distributions that made the data, and score expression.
+
+    B ~ U(0, 0.1), D ~ U(0, 2), S ~ U(0, 1) and A ~ U(-0.1, 0.1) with x(0) = A + B/D, as in the source, which knew them;
+    the standard deviation of the noise and the lengthscale, which it fixed, are log-normal about their true values.
+    """
+    def each(name: str, low: float, high: float) -> jax.Array:
+        return numpyro.sample(name, dist.Uniform(low, high).expand([problem.GENES]).to_event(1))
+
+    basal, decay = each("basal", 0.0, 0.1), each("decay", 0.0, 2.0)
+    sensitivity, away = each("sensitivity", 0.0, 1.0), each("away", -0.1, 0.1)
+    noise_sd = numpyro.sample("noise_sd", dist.LogNormal(jnp.log(problem.NOISE), 0.5))
+    lengthscale = numpyro.sample("lengthscale", dist.LogNormal(jnp.log(problem.LENGTHSCALE), 0.5))
+    rates = problem.Rates(basal, sensitivity, decay, away + basal / decay)
+    system = unknown_system(link, gamma, rates, noise_sd, lengthscale)
+    numpyro.sample("y", MarginalLikelihood(system, times, rule=RULE, steps=STEPS, iterations=iterations), obs=y)
+
+
+def unknown_system(link: str, gamma: Any, rates: problem.Rates, noise_sd: Any, lengthscale: Any) -> LatentForceModel:
+    """Return the model with noise and lengthscale of its own."""
+    return LatentForceModel(
+        problem.Genes(rates.basal, rates.sensitivity, rates.decay, gamma, link),
+        {problem.FACTOR: Matern(problem.SCALE, lengthscale, 1)},
+        GaussianObservation(problem.expression, noise_sd**2 * jnp.ones(problem.GENES)),
+        Gaussian(rates.start, jnp.zeros((problem.GENES, problem.GENES))), initial_time=0.0)
+
+
+def tasks(settings: Any) -> list[Task]:
+    """Return one task for each link, data set and sampler."""
+    found = []
+    for index in range(settings.datasets):
+        for configuration in (LINKS[label] for label in settings.links):
+            for label, sampler in SAMPLERS.items():
+                warmup, draws, thin = settings.ram if sampler.kernel == "RAM" else settings.nuts
+                name = problem.slug(f"{configuration.label} {label}")
+                found.append(Task(f"parameters/{name}/{index:03d}", settings.seed, {
+                    "experiment": "transcription-parameters", "sampler": label, "link": configuration.link,
+                    "gamma": configuration.gamma, "index": index, "chains": settings.chains, "warmup": warmup,
+                    "draws": draws, "thin": thin, "tree_depth": settings.tree_depth}))
+    return found
+
+
+def compute(task: Task) -> Result:
+    """Return draws (parameters, chains, draws), their diagnostics, and the force at `AT`."""
+    settings = task.settings
+    sampler = SAMPLERS[settings["sampler"]]
+    data = problem.data_set(problem.Configuration(settings["link"], settings["gamma"]), settings["index"], task.seed)
+    kwargs = {"link": settings["link"], "gamma": settings["gamma"], "iterations": sampler.iterations}
+    kernel = _kernel(sampler, settings["tree_depth"])
+    mcmc = MCMC(kernel, num_warmup=settings["warmup"] * settings["thin"],
+                num_samples=settings["draws"] * settings["thin"], thinning=settings["thin"],
+                num_chains=settings["chains"], chain_method="vectorized" if sampler.kernel == "RAM" else "sequential",
+                progress_bar=False)
+    seconds, _ = timed(lambda: mcmc.run(task.key, problem.TIMES, data.y, **kwargs))
+    samples = {name: np.asarray(value) for name, value in mcmc.get_samples(group_by_chain=True).items()}
+    draws = np.stack([*(samples[name][..., gene] for name in VECTORS for gene in range(problem.GENES)),
+                      samples["noise_sd"], samples["lengthscale"]])
+    divergences = 0 if sampler.kernel == "RAM" else int(np.sum(mcmc.get_extra_fields()["diverging"]))
+    if sampler.latent:
+        forces = samples["y_forces"].reshape(-1, len(AT))
+        mean, sd = forces.mean(axis=0), forces.std(axis=0)
+    else:
+        mean, sd = _integrated(settings, sampler.iterations, data, draws)
+    truth = np.interp(AT, problem.GRID, data.u)
+    return {"draws": draws, "divergences": divergences, "seconds": seconds, **diagnose(draws), "force_mean": mean,
+            "force_sd": sd, "rmse": scores.rmse(mean, truth),
+            "coverage": scores.covered(mean - figures.Z * sd, mean + figures.Z * sd, truth), "truth": true_values(data)}
+
+
+def true_values(data: problem.DataSet) -> np.ndarray:
+    """Return the true value of every parameter, in the order of `NAMES`."""
+    rates = data.rates
+    return np.concatenate([rates.basal, rates.decay, rates.sensitivity, rates.start - rates.basal / rates.decay,
+                           [problem.NOISE, problem.LENGTHSCALE]])
+
+
+def diagnose(draws: np.ndarray) -> Result:
+    """Return mean, sd, 95% interval, bulk effective sample size and R-hat of each parameter."""
+    dataset = xr.Dataset({name: (("chain", "draw"), row) for name, row in zip(NAMES, draws, strict=True)})
+    summary = arviz_data.summary(arviz_data.build({"posterior": dataset}))
+    columns = {"mean": "mean", "sd": "sd", "low": "q2.5", "high": "q97.5", "ess": "ess_bulk", "r_hat": "r_hat"}
+    return {name: summary[column].to_numpy() for name, column in columns.items()}
+
+
+def _kernel(sampler: Sampler, tree_depth: int) -> Any:
+    start = {name: jnp.full(problem.GENES, value) for name, value in zip(VECTORS, (0.05, 1.0, 0.5, 0.0), strict=True)}
+    strategy = init_to_value(values=start | {"noise_sd": problem.NOISE, "lengthscale": problem.LENGTHSCALE})
+    if sampler.kernel == "RAM":
+        return RAM(model, init_strategy=strategy)
+    chosen: Callable = on_latent_grid(model, AT) if sampler.latent else model
+    return NUTS(chosen, init_strategy=strategy, dense_mass=not sampler.latent, max_tree_depth=tree_depth)
+
+
+def _integrated(settings: Any, iterations: int, data: problem.DataSet, draws: np.ndarray
+                ) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and standard deviation of the force at `AT`, the parameters integrated out."""
+    chosen = scores.spread(draws, min(PATHS, draws[0].size))
+
+    def one(theta: jax.Array) -> tuple[jax.Array, jax.Array]:
+        basal, decay, sensitivity, away = theta[:12].reshape(4, problem.GENES)
+        rates = problem.Rates(basal, sensitivity, decay, away + basal / decay)
+        system = unknown_system(settings["link"], settings["gamma"], rates, theta[12], theta[13])
+        found = smooth(system, problem.TIMES, data.y, RULE, STEPS, at=AT, iterations=iterations)
+        force = found.force(problem.FACTOR)
+        return force.mean, force.sd**2
+
+    mean, variance = map(np.asarray, jax.jit(jax.vmap(one))(jnp.asarray(chosen)))
+    return scores.total_moments(mean, variance)

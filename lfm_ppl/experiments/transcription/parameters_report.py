@@ -1,0 +1,182 @@
+"""The comparison of full posteriors as the command line runs it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from lfm_ppl import checks
+from lfm_ppl.analysis.plots import style
+from lfm_ppl.experiments import output
+from lfm_ppl.experiments.catalogue import Report, Wanted
+from lfm_ppl.experiments.scores import mean_of, pair, readable
+from lfm_ppl.experiments.tasks import Result, run_tasks
+from lfm_ppl.experiments.transcription import parameters, problem
+from lfm_ppl.experiments.transcription.figures import Z
+
+SUMMARY = "transcription factors with unknown rates: the marginal posterior against that of the force as latent sites"
+COLOURS = {parameters.REFERENCE: style.GREY, "NUTS, marginal": style.BLUE, "RAM, marginal": style.ORANGE,
+           "RAM, iterated marginal": style.GREEN}
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How much is computed.
+
+    Attributes:
+        datasets: for each link.
+        seed: of everything random.
+        chains: of every sampler.
+        nuts: warm-up, draws and thinning of a chain of NUTS.
+        ram: of RAM.
+        tree_depth: largest of NUTS.
+        links: labels of `parameters.LINKS`.
+    """
+
+    datasets: int = 5
+    seed: int = 0
+    chains: int = 4
+    nuts: tuple[int, int, int] = (500, 1000, 1)
+    ram: tuple[int, int, int] = (500, 1000, 50)
+    tree_depth: int = 10
+    links: tuple[str, ...] = tuple(parameters.LINKS)
+
+    def __post_init__(self) -> None:
+        """Check what a user gives."""
+        checks.positive_integer("datasets", self.datasets)
+        for label in self.links:
+            checks.one_of("links", label, parameters.LINKS)
+
+
+class Comparison(NamedTuple):
+    """What the experiment found.
+
+    Attributes:
+        settings: that it ran with.
+        cells: (link, sampler) -> the results of all data sets.
+        table: a row for each link and sampler.
+    """
+
+    settings: Settings
+    cells: dict[tuple[str, str], list[Result]]
+    table: pd.DataFrame
+
+
+def quick(datasets: int = 1, seed: int = 0) -> Settings:
+    """Return settings that show in a few minutes that everything runs, and no more."""
+    return Settings(datasets, seed, chains=2, nuts=(20, 20, 1), ram=(50, 50, 5), tree_depth=4, links=("softplus",))
+
+
+def run(wanted: Wanted) -> Report:
+    """Run the comparison, or what is missing of it, and write tables and figures.
+
+    Raises:
+        ValueError: the folder holds results made with other settings; something is asked that it does not have.
+    """
+    if wanted.conditional is not None:
+        raise ValueError("the experiment transcription-parameters has no conditional posteriors; leave out "
+                         "--conditional.")
+    make = quick if wanted.quick else Settings
+    settings = make(seed=wanted.seed, **({} if wanted.realisations is None else {"datasets": wanted.realisations}))
+    found = compute(settings, wanted.folder, overwrite=wanted.overwrite, report=wanted.report, workers=wanted.workers)
+    written = output.save(wanted.folder, {"agreement": found.table}, draw(found), "case")
+    title = f"Against {parameters.REFERENCE}, {settings.datasets} data set{'s' if settings.datasets > 1 else ''}"
+    return Report({title: readable(found.table)}, written)
+
+
+def compute(settings: Settings, folder: str | Path, *, overwrite: bool = False,
+            report: Callable[[str], None] | None = None, workers: int = 1) -> Comparison:
+    """Compute what is not stored yet in ``folder``, and tabulate everything; as `experiment.run`."""
+    results = run_tasks(parameters.tasks(settings), parameters.compute, Path(folder) / "tasks", overwrite=overwrite,
+                        report=report, workers=workers)
+    cells = by_cell(settings, results)
+    return Comparison(settings, cells, agreement(cells))
+
+
+def by_cell(settings: Settings, results: Mapping[str, Result]) -> dict[tuple[str, str], list[Result]]:
+    """Return (link, sampler) -> results of all data sets."""
+    cells: dict[tuple[str, str], list[Result]] = {}
+    for task in parameters.tasks(settings):
+        label = problem.Configuration(task.settings["link"], task.settings["gamma"]).label
+        cells.setdefault((label, task.settings["sampler"]), []).append(results[task.name])
+    return cells
+
+
+def agreement(cells: Mapping[tuple[str, str], list[Result]]) -> pd.DataFrame:
+    """Return one row for each link and sampler.
+
+    Returns:
+        ``shift``, the largest distance of a posterior mean from the reference's in its standard deviations, and ``sd
+        ratio``, the ratio of standard deviations that is furthest from one, over all parameters and data sets;
+        ``coverage`` of the true parameters by 95% intervals; ``RMSE`` of the force and ``coverage force``; ``ESS/CPU
+        s``, the smallest bulk effective sample size of a parameter for a second of CPU time of warm-up and draws,
+        compilation included; the largest ``R-hat``; ``divergences`` of one run.
+    """
+    rows = {}
+    for (label, sampler), found in cells.items():
+        reference = cells[label, parameters.REFERENCE]
+        shift = [(one["mean"] - exact["mean"]) / exact["sd"] for one, exact in zip(found, reference, strict=True)]
+        ratio = np.concatenate([one["sd"] / exact["sd"] for one, exact in zip(found, reference, strict=True)])
+        row = {"shift": float(np.abs(shift).max()), "sd ratio": float(ratio[np.abs(np.log(ratio)).argmax()])}
+        covered = [np.mean((one["low"] <= one["truth"]) & (one["truth"] <= one["high"])) for one in found]
+        for name, values in (("coverage", covered), ("RMSE", [one["rmse"] for one in found]),
+                             ("coverage force", [one["coverage"] for one in found]),
+                             ("ESS/CPU s", [one["ess"].min() / one["seconds"] for one in found])):
+            row |= pair(name, mean_of(values))
+        row |= {"R-hat": max(float(one["r_hat"].max()) for one in found),
+                "divergences": float(np.mean([one["divergences"] for one in found]))}
+        rows[f"{label}: {sampler}"] = row
+    return pd.DataFrame.from_dict(rows, orient="index", dtype=float)
+
+
+def draw(found: Comparison) -> dict[str, Figure]:
+    """Return a figure of the first data set of each link."""
+    return {f"posteriors-{problem.slug(link)}": plot_posteriors(
+        {sampler: found.cells[link, sampler][0] for sampler in parameters.SAMPLERS},
+        problem.data_set(parameters.LINKS[link], 0, found.settings.seed)) for link in found.settings.links}
+
+
+@style.styled
+def plot_posteriors(samplers: Mapping[str, Result], data: problem.DataSet, *, width: str | float = "full") -> Figure:
+    """Draw the 95% intervals of all parameters and the force by each sampler, with the truth.
+
+    Args:
+        samplers: sampler -> its result on the data set.
+        data: the data set.
+        width: "column" (3.4 in), "full" (7 in), or inches.
+    """
+    figure = style.new_figure(width, 4.6)
+    upper, lower = figure.subplots(2, 1)
+    for number, (sampler, found) in enumerate(samplers.items()):
+        # Each parameter in standard deviations of the reference about its mean, so that all fit one axis.
+        reference = samplers[parameters.REFERENCE]
+        centre, scale = reference["mean"], reference["sd"]
+        place = np.arange(len(parameters.NAMES)) + 0.16 * (number - (len(samplers) - 1) / 2)
+        upper.vlines(place, (found["low"] - centre) / scale, (found["high"] - centre) / scale, color=COLOURS[sampler])
+        upper.plot(place, (found["mean"] - centre) / scale, ls="", marker="o", ms=2.5, color=COLOURS[sampler])
+        mean, sd = found["force_mean"], found["force_sd"]
+        lower.plot(parameters.AT, mean, color=COLOURS[sampler])
+        for end in (-Z, Z):
+            lower.plot(parameters.AT, mean + end * sd, color=COLOURS[sampler], lw=0.6)
+    reference = samplers[parameters.REFERENCE]
+    upper.plot(np.arange(len(parameters.NAMES)), (reference["truth"] - reference["mean"]) / reference["sd"], ls="",
+               marker="_", ms=12, color=style.BLACK)
+    upper.set_xticks(range(len(parameters.NAMES)), parameters.NAMES, rotation=40, ha="right")
+    upper.set_ylabel("mean and 95%\n(sd of the reference)")
+    lower.plot(problem.GRID, data.u, color=style.BLACK, lw=0.7)
+    lower.set_ylabel("force u, mean\nand 95% band")
+    lower.set_xlabel("time")
+    lower.set_xlim(0.0, problem.END)
+    for axes in (upper, lower):
+        style.tidy(axes)
+    style.legend_above(figure, [
+        *(Line2D([], [], color=COLOURS[sampler], label=sampler) for sampler in samplers),
+        Line2D([], [], color=style.BLACK, label="truth")])
+    return figure
