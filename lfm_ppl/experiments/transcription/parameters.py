@@ -92,11 +92,11 @@ def tasks(settings: Any) -> list[Task]:
     for index in range(settings.datasets):
         for configuration in (LINKS[label] for label in settings.links):
             for label, sampler in SAMPLERS.items():
-                warmup, draws, thin = settings.ram if sampler.kernel == "RAM" else settings.nuts
+                chains, warmup, draws, thin = settings.ram if sampler.kernel == "RAM" else settings.nuts
                 name = problem.slug(f"{configuration.label} {label}")
                 found.append(Task(f"parameters/{name}/{index:03d}", settings.seed, {
                     "experiment": "transcription-parameters", "sampler": label, "link": configuration.link,
-                    "gamma": configuration.gamma, "index": index, "chains": settings.chains, "warmup": warmup,
+                    "gamma": configuration.gamma, "index": index, "chains": chains, "warmup": warmup,
                     "draws": draws, "thin": thin, "tree_depth": settings.tree_depth}))
     return found
 

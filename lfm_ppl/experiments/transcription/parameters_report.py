@@ -33,18 +33,16 @@ class Settings:
     Attributes:
         datasets: for each link.
         seed: of everything random.
-        chains: of every sampler.
-        nuts: warm-up, draws and thinning of a chain of NUTS.
+        nuts: chains, and warm-up, draws and thinning of each, of NUTS.
         ram: of RAM.
         tree_depth: largest of NUTS.
         links: labels of `parameters.LINKS`.
     """
 
-    datasets: int = 5
+    datasets: int = 2
     seed: int = 0
-    chains: int = 4
-    nuts: tuple[int, int, int] = (500, 1000, 1)
-    ram: tuple[int, int, int] = (500, 1000, 50)
+    nuts: tuple[int, int, int, int] = (2, 400, 600, 1)
+    ram: tuple[int, int, int, int] = (4, 500, 1000, 50)
     tree_depth: int = 10
     links: tuple[str, ...] = tuple(parameters.LINKS)
 
@@ -71,7 +69,7 @@ class Comparison(NamedTuple):
 
 def quick(datasets: int = 1, seed: int = 0) -> Settings:
     """Return settings that show in a few minutes that everything runs, and no more."""
-    return Settings(datasets, seed, chains=2, nuts=(20, 20, 1), ram=(50, 50, 5), tree_depth=4, links=("softplus",))
+    return Settings(datasets, seed, nuts=(2, 20, 20, 1), ram=(2, 50, 50, 5), tree_depth=4, links=("softplus",))
 
 
 def run(wanted: Wanted) -> Report:
