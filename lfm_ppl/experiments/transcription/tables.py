@@ -24,7 +24,10 @@ def comparison(cells: Cells) -> pd.DataFrame:
         a point; ``CPU s`` for one data set, compilation apart; of elliptical slice sampling ``mixed`` (the share of
         data sets whose R-hat is at most 1.01 at every monitored point of the grid), ``mixed at first`` (the same after
         the draws that ``CPU s`` is of), ``all CPU s`` (with those that followed where it was not) and ``ESS``, the
-        smallest among these points, of the draws that are kept. ``name se`` are standard errors over data sets.
+        smallest among these points, of the draws that are kept; of Laplace ``at a mode``, the share of data sets on
+        which the search ended at one, which it may not and yet stop; of the iterated smoother ``last change``, the
+        largest by which the last iteration moved a mean, in standard deviations. ``name se`` are standard errors over
+        data sets.
     """
     rows = {}
     for (label, method), found in cells.items():
@@ -39,6 +42,10 @@ def comparison(cells: Cells) -> pd.DataFrame:
             row["mixed at first"] = float((found["r_hat_first"] <= slices.R_HAT).mean())
             row |= pair("all CPU s", mean_of(found["seconds"] + found["seconds_more"]))
             row |= pair("ESS", mean_of(found["ess"]))
+        if "converged" in found:
+            row["at a mode"] = float(np.mean(found["converged"]))
+        if np.isfinite(found.get("change", np.nan)).any():
+            row["last change"] = float(np.max(found["change"]))
         rows[f"{label}: {method}"] = row
     return pd.DataFrame.from_dict(rows, orient="index", dtype=float)
 
