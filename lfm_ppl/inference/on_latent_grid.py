@@ -11,10 +11,10 @@ import numpy as np
 import numpyro
 import numpyro.distributions as dist
 from numpyro.distributions import constraints
-from numpyro.primitives import Messenger
 
 from lfm_ppl import checks
 from lfm_ppl.comparators.latent_grid import RULES, LatentGrid
+from lfm_ppl.inference.likelihood_handler import LikelihoodHandler
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
 
 
@@ -47,7 +47,7 @@ class GridLikelihood(dist.Distribution):
         return jax.vmap(run)(keys).reshape(*sample_shape, *self.event_shape)
 
 
-class on_latent_grid(Messenger):  # noqa: N801 (an effect handler, named as NumPyro names its handlers)
+class on_latent_grid(LikelihoodHandler):  # noqa: N801 (an effect handler, named as NumPyro names its handlers)
     """Effect handler that keeps the forces of a model as latent sites on a grid, in place of filtering them out.
 
     A site ``y`` with ``lfm.MarginalLikelihood`` becomes: ``y_white`` (R, G), independent standard normal; ``y_start``
@@ -82,41 +82,28 @@ class on_latent_grid(Messenger):  # noqa: N801 (an effect handler, named as NumP
     def __init__(self, fn: Callable[..., Any] | None = None, points: Any = 363, rule: str = "linear") -> None:
         checks.one_of("rule", rule, RULES)
         self.points, self.rule = points, rule
-        self.found = False
         super().__init__(fn)
 
-    def __enter__(self) -> on_latent_grid:
-        """Start a run of the model."""
-        self.found = False
-        super().__enter__()
-        return self
+    def complaint(self) -> str:
+        """Return what to say of a model without forces that could be put on a grid."""
+        return ("the model has no site numpyro.sample(name, lfm.MarginalLikelihood(...), obs=y) without mask, expand "
+                "or plate around it, whose forces could be put on a grid.")
 
-    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
-        """End the run; a model without the site is an error."""
-        super().__exit__(kind, error, trace)
-        if kind is None and not self.found:
-            raise ValueError("the model has no site numpyro.sample(name, lfm.MarginalLikelihood(...), obs=y) without "
-                             "mask, expand or plate around it, whose forces could be put on a grid.")
-
-    def process_message(self, msg: dict[str, Any]) -> None:
-        """Sample the forces, and condition the site on them."""
-        fn = msg.get("fn")
-        if msg["type"] != "sample" or not isinstance(fn, (MarginalLikelihood, Panel)):
-            return
-        if isinstance(fn, Panel):
-            raise ValueError(f"the site {msg['name']!r} is a panel; put one series at a time on a grid.")
-        if checks.traced(fn.times):
+    def replacement(self, likelihood: MarginalLikelihood | Panel, site: dict[str, Any]) -> GridLikelihood:
+        """Sample the forces, and return the distribution of the observations given them."""
+        if isinstance(likelihood, Panel):
+            raise ValueError(f"the site {site['name']!r} is a panel; put one series at a time on a grid.")
+        if checks.traced(likelihood.times):
             raise ValueError("times must be known when the grid is built, but they are traced; run with "
                              "jit_model_args=False.")
-        self.found = True
-        name = msg["name"]
-        if msg["is_observed"] and np.shape(msg["value"]) != fn.event_shape:
-            raise ValueError(f"the observations of {name!r} must have shape (T, D) = {fn.event_shape}, got "
-                             f"{np.shape(msg['value'])}.")
-        latent = LatentGrid(fn.model, fn.times, self.points, self.rule)
+        name = site["name"]
+        if site["is_observed"] and np.shape(site["value"]) != likelihood.event_shape:
+            raise ValueError(f"the observations of {name!r} must have shape (T, D) = {likelihood.event_shape}, "
+                             f"got {np.shape(site['value'])}.")
+        latent = LatentGrid(likelihood.model, likelihood.times, self.points, self.rule)
         shape = latent.mean.shape
         u = latent.force(numpyro.sample(f"{name}_white", dist.Normal().expand(shape).to_event(2)))
         numpyro.deterministic(f"{name}_forces", u)
         # Also where the initial state is known: in compiled code nobody can tell, and the sites must be the same ones.
         white = numpyro.sample(f"{name}_start", dist.Normal().expand([latent.ssm.physical_dim]).to_event(1))
-        msg["fn"] = GridLikelihood(latent, u, latent.start(white))
+        return GridLikelihood(latent, u, latent.start(white))

@@ -12,12 +12,12 @@ import numpyro.distributions as dist
 from numpyro import handlers
 from numpyro.distributions import constraints
 from numpyro.infer.util import potential_energy
-from numpyro.primitives import Messenger
 
 from lfm_ppl import checks
 from lfm_ppl.comparators.observation_noise import check_noise
 from lfm_ppl.comparators.particle_filter import ParticleSettings, check_settings, log_likelihood
 from lfm_ppl.filtering.schedule import schedule
+from lfm_ppl.inference.likelihood_handler import LikelihoodHandler
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
 from lfm_ppl.inference.posterior import likelihood_site
 
@@ -64,7 +64,7 @@ class ParticleLikelihood(dist.Distribution):
         return self.base.sample(key, sample_shape)
 
 
-class with_particles(Messenger):  # noqa: N801 (an effect handler, named as NumPyro names its handlers)
+class with_particles(LikelihoodHandler):  # noqa: N801 (an effect handler, named as NumPyro names its handlers)
     """Effect handler that replaces the likelihood of a model by a particle filter's estimate of it.
 
     Args:
@@ -90,31 +90,19 @@ class with_particles(Messenger):  # noqa: N801 (an effect handler, named as NumP
     def __init__(self, fn: Callable[..., Any] | None, key: jax.Array, settings: ParticleSettings,
                  steps: int | None = None, times: Any = None) -> None:
         self.key, self.settings, self.steps, self.times = key, settings, steps, times
-        self.found = False
         super().__init__(fn)
 
-    def __enter__(self) -> with_particles:
-        """Start a run of the model."""
-        self.found = False
-        super().__enter__()
-        return self
+    def complaint(self) -> str:
+        """Return what to say of a model without a likelihood that could be replaced."""
+        return ("the particle filter cannot stand in for the likelihood of this model: it needs a site "
+                "numpyro.sample(name, lfm.MarginalLikelihood(...), obs=y) without mask, expand or plate around it (or "
+                "an lfm.panel in its plate).")
 
-    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
-        """End the run; a likelihood that could not be replaced is an error."""
-        super().__exit__(kind, error, trace)
-        if kind is None and not self.found:
-            raise ValueError("the particle filter cannot stand in for the likelihood of this model: it needs a site "
-                             "numpyro.sample(name, lfm.MarginalLikelihood(...), obs=y) without mask, expand or plate "
-                             "around it (or an lfm.panel in its plate).")
-
-    def process_message(self, msg: dict[str, Any]) -> None:
-        """Put the estimate in the place of the likelihood."""
-        fn = msg.get("fn")
-        if msg["type"] == "sample" and isinstance(fn, (MarginalLikelihood, Panel)):
-            if self.times is not None and checks.traced(fn.times):
-                fn = fn.with_times(self.times)
-            self.found = True
-            msg["fn"] = ParticleLikelihood(fn, self.key, self.settings, self.steps)
+    def replacement(self, likelihood: MarginalLikelihood | Panel, site: dict[str, Any]) -> Any:
+        """Return the estimate."""
+        if self.times is not None and checks.traced(likelihood.times):
+            likelihood = likelihood.with_times(self.times)
+        return ParticleLikelihood(likelihood, self.key, self.settings, self.steps)
 
 
 class Tuned(NamedTuple):

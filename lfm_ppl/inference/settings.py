@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from numpyro.primitives import Messenger
-
+from lfm_ppl.inference.likelihood_handler import LikelihoodHandler
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
 
 NAMES = ("rule", "steps", "max_step", "iterations", "damping")
 
 
-class approximate(Messenger):  # noqa: N801 (an effect handler, named as NumPyro names its handlers)
+class approximate(LikelihoodHandler):  # noqa: N801 (an effect handler, named as NumPyro names its handlers)
     """Effect handler that replaces settings of the likelihood, such as the linearisation rule.
 
     Args:
@@ -44,34 +43,22 @@ class approximate(Messenger):  # noqa: N801 (an effect handler, named as NumPyro
         if unknown:
             raise TypeError(f"unknown setting {unknown[0]!r}; known: {', '.join(NAMES)}.")
         self.settings = {name: value for name, value in settings.items() if value is not None}
-        self.found = False
         super().__init__(fn)
 
-    def __enter__(self) -> approximate:
-        """Start a run of the model."""
-        self.found = False
-        super().__enter__()
-        return self
+    def complaint(self) -> str:
+        """Return what to say of a model without a likelihood whose settings could be changed."""
+        if not self.settings:
+            return ""
+        return (
+            f"the model has no likelihood whose {', '.join(self.settings)} could be set: "
+            "expected a site numpyro.sample(name, lfm.MarginalLikelihood(...), obs=y) or a "
+            "panel."
+        )
 
-    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
-        """End the run; a model without the site that was to be changed is an error."""
-        super().__exit__(kind, error, trace)
-        if kind is None and self.settings and not self.found:
-            raise ValueError(
-                f"the model has no likelihood whose {', '.join(self.settings)} could be set: "
-                "expected a site numpyro.sample(name, lfm.MarginalLikelihood(...), obs=y) or a "
-                "panel."
-            )
-
-    def process_message(self, msg: dict[str, Any]) -> None:
-        """Build the likelihood again with the new settings."""
-        fn = msg.get("fn")
-        if msg["type"] != "sample" or not isinstance(fn, (MarginalLikelihood, Panel)):
-            return
-        self.found = True
-        if isinstance(fn, Panel):
-            settings = {**fn.settings, **self.settings}
-            msg["fn"] = Panel(fn.build, fn.parameters, fn.times, settings)
-        else:
-            settings = {name: getattr(fn, name) for name in NAMES} | self.settings
-            msg["fn"] = MarginalLikelihood(fn.model, fn.times, **settings)
+    def replacement(self, likelihood: MarginalLikelihood | Panel, site: dict[str, Any]) -> Any:
+        """Return the likelihood with the new settings."""
+        if isinstance(likelihood, Panel):
+            settings = {**likelihood.settings, **self.settings}
+            return Panel(likelihood.build, likelihood.parameters, likelihood.times, settings)
+        settings = {name: getattr(likelihood, name) for name in NAMES} | self.settings
+        return MarginalLikelihood(likelihood.model, likelihood.times, **settings)
