@@ -166,7 +166,6 @@ def plot_posteriors(samplers: Mapping[str, Result], data: problem.DataSet, *, wi
     reference = samplers[parameters.REFERENCE]
     upper.plot(np.arange(len(parameters.NAMES)), (reference["truth"] - reference["mean"]) / reference["sd"], ls="",
                marker="_", ms=12, color=style.BLACK)
-    upper.set_xticks(range(len(parameters.NAMES)), parameters.NAMES, rotation=40, ha="right")
     upper.set_ylabel("mean and 95%\n(sd of the reference)")
     lower.plot(problem.GRID, data.u, color=style.BLACK, lw=0.7)
     lower.set_ylabel("force u, mean\nand 95% band")
@@ -174,6 +173,7 @@ def plot_posteriors(samplers: Mapping[str, Result], data: problem.DataSet, *, wi
     lower.set_xlim(0.0, problem.END)
     for axes in (upper, lower):
         style.tidy(axes)
+    upper.set_xticks(range(len(parameters.NAMES)), parameters.NAMES, rotation=40, ha="right")
     style.legend_above(figure, [
         *(Line2D([], [], color=COLOURS[sampler], label=sampler) for sampler in samplers),
         Line2D([], [], color=style.BLACK, label="truth")])

@@ -1,0 +1,120 @@
+"""The experiment with unknown rates: its model, its samplers on a little of it, its table and figure."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import pytest
+
+from lfm_ppl.experiments.tasks import Task
+from lfm_ppl.experiments.transcription import parameters, parameters_report, problem
+from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
+
+FEW = dataclasses.replace(parameters_report.quick(), links=tuple(parameters.LINKS))
+SOFTPLUS = parameters.LINKS["softplus"]
+
+
+def sites(data):
+    """True values of all sites of a data set."""
+    rates = data.rates
+    return {"basal": rates.basal, "decay": rates.decay, "sensitivity": rates.sensitivity,
+            "away": rates.start - rates.basal / rates.decay, "noise_sd": problem.NOISE,
+            "lengthscale": problem.LENGTHSCALE}
+
+
+def test_the_likelihood_at_the_truth_is_that_of_the_known_system():
+    data = problem.data_set(SOFTPLUS, 4)
+    with numpyro.handlers.substitute(data=sites(data)), numpyro.handlers.trace() as trace:
+        parameters.model(problem.TIMES, data.y)
+    known = problem.system("softplus", 1.0, data.rates)
+    expected = MarginalLikelihood(known, problem.TIMES, rule=parameters.RULE, steps=parameters.STEPS).log_prob(data.y)
+    assert np.isclose(trace["y"]["fn"].log_prob(data.y), expected, rtol=1e-10)
+    assert all(np.isfinite(trace[name]["fn"].log_prob(jnp.asarray(value))) for name, value in sites(data).items())
+
+
+def test_true_values_stand_in_the_order_of_the_names():
+    data = problem.data_set(SOFTPLUS, 4)
+    named = dict(zip(parameters.NAMES, parameters.true_values(data), strict=True))
+    for site, value in sites(data).items():
+        for gene in range(problem.GENES):
+            name = site if np.ndim(value) == 0 else f"{site}[{gene + 1}]"
+            assert named[name] == np.broadcast_to(value, problem.GENES)[gene]
+
+
+def made_up(settings):
+    """Results of every task: the marginal samplers half a standard deviation off, and 10% too wide."""
+    results = {}
+    for task in parameters.tasks(settings):
+        label = task.settings["sampler"]
+        truth = np.linspace(0.1, 1.0, len(parameters.NAMES))
+        off = label != parameters.REFERENCE
+        mean, sd = truth + 0.05 * off, np.full(truth.shape, 0.11 if off else 0.1)
+        results[task.name] = {
+            "mean": mean, "sd": sd, "low": mean - 2 * sd, "high": mean + 2 * sd, "truth": truth,
+            "ess": np.full(truth.shape, 200.0), "r_hat": np.full(truth.shape, 1.004), "seconds": 100.0,
+            "divergences": 1, "rmse": 0.4, "coverage": 0.95, "force_mean": np.zeros(parameters.AT.shape),
+            "force_sd": np.ones(parameters.AT.shape)}
+    return results
+
+
+def found_in(results, settings):
+    """The comparison of made-up results."""
+    cells = parameters_report.by_cell(settings, results)
+    return parameters_report.Comparison(settings, cells, parameters_report.agreement(cells))
+
+
+def test_the_table_measures_in_standard_deviations_of_the_reference():
+    table = found_in(made_up(FEW), FEW).table
+    assert len(table) == len(parameters.LINKS) * len(parameters.SAMPLERS)
+    row = table.loc["softplus: RAM, marginal"]
+    assert row["shift"] == pytest.approx(0.5) and row["sd ratio"] == pytest.approx(1.1)
+    assert row["ESS/CPU s"] == pytest.approx(2.0) and row["coverage"] == 1.0 and row["R-hat"] == pytest.approx(1.004)
+    assert table.loc[f"softplus: {parameters.REFERENCE}", "shift"] == 0.0
+
+
+def test_the_figures_are_labelled():
+    figures = parameters_report.draw(found_in(made_up(FEW), FEW))
+    assert set(figures) == {"posteriors-softplus", "posteriors-saturation-0.5"}
+    for figure in figures.values():
+        upper, lower = figure.axes
+        assert upper.get_ylabel() and lower.get_xlabel() and lower.get_ylabel() and figure.legends
+        assert [text.get_text() for text in upper.get_xticklabels()] == list(parameters.NAMES)
+
+
+def test_mistakes():
+    with pytest.raises(ValueError, match="datasets must be at least 1"):
+        parameters_report.Settings(datasets=0)
+    with pytest.raises(ValueError, match="unknown links 'cubic'"):
+        parameters_report.Settings(links=("cubic",))
+
+
+def settings_of(label, chains, warmup, draws, thin):
+    """Settings of one task."""
+    return {"sampler": label, "link": "softplus", "gamma": None, "index": 0, "chains": chains, "warmup": warmup,
+            "draws": draws, "thin": thin, "tree_depth": 10}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("label", parameters.SAMPLERS)
+def test_every_sampler_draws_parameters_and_force(label):
+    thin = 5 if "RAM" in label else 1
+    found = parameters.compute(Task("parameters", 0, settings_of(label, 2, 30, 30, thin) | {"tree_depth": 5}))
+    assert found["draws"].shape == (len(parameters.NAMES), 2, 30) and np.isfinite(found["draws"]).all()
+    assert found["force_mean"].shape == found["force_sd"].shape == parameters.AT.shape
+    assert (found["force_sd"] > 0).all() and found["rmse"] < 2 and found["seconds"] > 0
+
+
+@pytest.mark.slow
+def test_on_a_linear_link_marginal_and_latent_posteriors_are_the_same(monkeypatch):
+    """There the filter is exact, so that nothing but Monte Carlo error and the grid stands between them."""
+    monkeypatch.setattr(problem, "activity", lambda u, link, gamma: u)
+    problem.data_set.cache_clear()
+    marginal = parameters.compute(Task("marginal", 0, settings_of("RAM, marginal", 4, 500, 1000, 50)))
+    latent = parameters.compute(Task("latent", 0, settings_of("NUTS, latent grid", 2, 400, 600, 1)))
+    problem.data_set.cache_clear()
+    error = np.sqrt(1 / marginal["ess"] + 1 / latent["ess"])
+    assert max(marginal["r_hat"].max(), latent["r_hat"].max()) < 1.05
+    assert np.all(np.abs(marginal["mean"] - latent["mean"]) / latent["sd"] < 4.5 * error)
+    assert np.all(np.abs(np.log(marginal["sd"] / latent["sd"])) < 4.5 * error)
+    assert np.abs(marginal["force_mean"] - latent["force_mean"]).max() < 0.3
