@@ -150,6 +150,18 @@ def solve_semidefinite(p: jax.Array, b: jax.Array, tolerance: float = 1e-14) -> 
     return solution * (scale[:, None] if b.ndim > 1 else scale)
 
 
+def conditional_shares(p: jax.Array) -> jax.Array:
+    """Return the variance of each coordinate given those before it, as a share (n,) of its own; 1 where that is zero.
+
+    The least of them says by how much solving with ``P`` magnifies rounding errors.
+    """
+    variance = jnp.diagonal(p)
+    live = variance > 0
+    scale = jnp.where(live, 1.0 / jnp.sqrt(jnp.where(live, variance, 1.0)), 0.0)
+    pivots = jnp.diagonal(cholesky(p * scale[:, None] * scale[None, :], keep=False).chol) ** 2
+    return jnp.where(live, pivots, 1.0)
+
+
 def semidefinite_root(p: jax.Array, tolerance: float = 1e-14) -> jax.Array:
     """Return a lower triangular ``L`` with ``L L' = P`` for a semi-definite ``P``; null directions are zero."""
     variance = jnp.diagonal(p)

@@ -179,8 +179,8 @@ print(az.compare(results).to_string())
 
 # %%
 published = {
-    "sensitivity": {"DDB2": 3 / 1.8, "BIK": 0.8 / 1.8, "TNFRSF10b": 0.7 / 1.8, "SESN1": 0.7 / 1.8, "CDKN1A": 1.0},
-    "decay": {"DDB2": 0.3, "BIK": 0.4, "TNFRSF10b": 0.4375, "SESN1": 0.575, "CDKN1A": 0.8},
+    "sensitivity": {"DDB2": 3 / 1.8, "SESN1": 0.8 / 1.8, "TNFRSF10b": 0.7 / 1.8, "CDKN1A": 1.0, "BIK": 0.7 / 1.8},
+    "decay": {"DDB2": 0.3, "SESN1": 0.4, "TNFRSF10b": 0.4375, "CDKN1A": 0.8, "BIK": 0.575},
 }
 figure, panels = plt.subplots(1, 2, figsize=(7.0, 2.8), layout="constrained")
 colours, shapes = ("#0072B2", "#D55E00", "#009E73", "#CC79A7"), "osD^"
@@ -203,17 +203,12 @@ plt.show()
 # The activity of p53 under each shape, median and 95% band: the peak in the first hours is common to all.
 
 # %%
-responses = {
-    "softplus": jax.nn.softplus,
-    "linear": lambda u: u,
-    "saturation": lambda u: jax.nn.sigmoid(u - np.log(0.5)),
-    "exponential": np.exp,
-}
+response, gamma = transcription.model.__globals__["activity"], transcription.options["gamma"][0]
 figure, panels = plt.subplots(1, 4, figsize=(7.0, 2.2), layout="constrained")
 for axes, colour, (link, one) in zip(panels, colours, results.items(), strict=True):
     trajectories = group(one, "trajectories")
     force = trajectories["forces"].isel(force=0).stack(sample=("chain", "draw"))
-    activity = np.asarray(responses[link](force.transpose("at", "sample").values))
+    activity = np.asarray(response(jax.numpy.asarray(force.transpose("at", "sample").values), link, gamma))
     low, middle, high = np.quantile(activity, [0.025, 0.5, 0.975], axis=1)
     axes.fill_between(trajectories["at"].values, low, high, color=colour, alpha=0.3, linewidth=0)
     axes.plot(trajectories["at"].values, middle, color=colour)

@@ -31,8 +31,8 @@ JITTER = 1e-10
 """Share of a force's variance that is added to the diagonal of its covariance on the grid, so that it has a factor."""
 
 
-MOST_SLICES = 64
-"""Observations up to which the points that each needs are cut out one by one."""
+FEW = 64
+"""Observations up to which each is treated by itself, without a loop over them."""
 
 
 class LatentGrid(eqx.Module):
@@ -69,8 +69,9 @@ class LatentGrid(eqx.Module):
         nearby: (T, G), the forces at the observation times as combinations of those on the grid.
         weights: (M, T, K) of p_j at the K points that an observation needs, where A is diagonal; else (M, M, T, K), the
             first index for the state.
-        from_start: (T, M), e^(A (t_k - t_0)), where A is diagonal; else (T, M, M), e^(A (t_k - t_(k-1))).
-        between: (M, T, T), e^(A_j (t_k - t_l)) for l <= k, else 0, where A is diagonal; else None.
+        flow: e^(A (t_k - t_(k-1))), its diagonal (T, M) where A is diagonal, else (T, M, M).
+        between: (M, T, T), e^(A_j (t_k - t_l)) for l <= k, else 0, where A is diagonal and the observations are few;
+            else None.
         mean: (R, G), the forces' prior mean.
         root: (R, G, G), lower triangular factor of their prior covariance.
         rule: as given.
@@ -100,7 +101,7 @@ class LatentGrid(eqx.Module):
     grid: np.ndarray
     nearby: np.ndarray
     weights: jax.Array
-    from_start: jax.Array
+    flow: jax.Array
     between: jax.Array | None
     mean: jax.Array
     root: jax.Array
@@ -125,17 +126,20 @@ class LatentGrid(eqx.Module):
         decay = linear_part(ssm, jnp.zeros(())).slope[:, : ssm.physical_dim]
         first, pieces = _pieces(self.grid, known)
         self.first = tuple(first.tolist())
+        gaps = np.diff(known, prepend=self.grid[0])
         if _diagonal(ssm):
-            rates, elapsed = jnp.diagonal(decay), known[:, None] - known
+            rates = jnp.diagonal(decay)
             flow = lambda lengths: jnp.exp(rates * jnp.asarray(lengths)[..., None])  # noqa: E731
             self.weights = _weights(pieces, flow, lambda h: _integrals(rates * h[..., None]), jnp.multiply, rule)
-            self.from_start = flow(known - self.grid[0])
-            self.between = jnp.moveaxis(flow(np.maximum(elapsed, 0.0)), -1, 0) * np.tri(len(known))
+            self.flow, self.between = flow(gaps), None
+            if len(known) <= FEW:
+                elapsed = np.maximum(known[:, None] - known, 0.0)
+                self.between = jnp.moveaxis(flow(elapsed), -1, 0) * np.tri(len(known))
         else:
             flow = lambda lengths: _distinct(lambda h: _flow(decay, h)[0], lengths)  # noqa: E731
             integrals = lambda lengths: _distinct(lambda h: _flow(decay, h)[1:], lengths)  # noqa: E731
             self.weights = _weights(pieces, flow, integrals, jnp.matmul, rule)
-            self.from_start, self.between = flow(np.diff(known, prepend=self.grid[0])), None
+            self.flow, self.between = flow(gaps), None
         self.mean = jax.vmap(ssm.stack.mean_at)(jnp.asarray(self.grid)).T
         self.root = jnp.stack([_root(force, self.grid) for force in ssm.stack.forces])
         _check_factor(self)
@@ -167,18 +171,28 @@ class LatentGrid(eqx.Module):
         first = self.ssm.model.initial_state.mean if start is None else start
         _check_shape("u", "(R, G)", u, self.mean.shape)
         _check_shape("start", "(M,)", first, self.ssm.model.initial_state.mean.shape)
-        at_times = jax.vmap(self._production, in_axes=(1, 0))
-        made = jax.vmap(at_times, in_axes=(1, 0))(self._window(u), self._window(jnp.asarray(self.grid)[None])[0])
+        gained = self._gained(u)
         if self.between is not None:
-            gained = jnp.einsum("jkg,kgj->jk", self.weights, made)
-            return self.from_start * first + jnp.einsum("jkl,jl->kj", self.between, gained)
-        gained = jnp.einsum("ijkg,kgj->ki", self.weights, made)
-        return jax.lax.scan(lambda x, row: (row[0] @ x + row[1],) * 2, first, (self.from_start, gained))[1]
+            return jnp.einsum("jkl,lj->kj", self.between, gained.at[0].add(self.flow[0] * first))
+        after = jnp.multiply if self.flow.ndim == 2 else jnp.matmul
+        return jax.lax.scan(lambda x, row: (after(row[0], x) + row[1],) * 2, first, (self.flow, gained))[1]
+
+    def _gained(self, u: jax.Array) -> jax.Array:
+        """Return what the production since the observation before adds to the state (T, M)."""
+        count, size = len(self.first), self.weights.shape[-1]
+        at_times = jax.vmap(self._production, in_axes=(1, 0))
+        grid = jnp.asarray(self.grid)
+        if count * size > 2 * len(self.grid):
+            made = jnp.moveaxis(self._window(at_times(u, grid).T), 0, -1)
+        else:  # a few forces cost less to cut out than as many states
+            made = jax.vmap(at_times, in_axes=(1, 0))(self._window(u), self._window(grid[None])[0])
+        kind = "jkg,kgj->kj" if self.weights.ndim == 3 else "ijkg,kgj->ki"
+        return jnp.einsum(kind, self.weights, made)
 
     def _window(self, values: jax.Array) -> jax.Array:
         """Return values (R, G) at the points that each observation needs, (R, T, K)."""
         size = self.weights.shape[-1]
-        if len(self.first) > MOST_SLICES:
+        if len(self.first) > FEW:
             return values[:, np.asarray(self.first)[:, None] + np.arange(size)]
         # Slices are copied twice as fast as elements that are gathered, but each takes its time to compile.
         return jnp.stack([values[:, start:start + size] for start in self.first], axis=1)

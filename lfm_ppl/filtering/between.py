@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.filtering.predict import Moments, Prediction, predict_row
+from lfm_ppl.filtering.retrospect import combine
 from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays
 from lfm_ppl.filtering.transition import integrating_factor, linear_part
 from lfm_ppl.linalg import congruence, matmul, solve_semidefinite
@@ -43,12 +44,15 @@ def places(plan: Schedule, times: Any) -> Places:
 
 
 def marginals_between(ssm: StateSpaceModel, rule: Rule, plan: Schedule, start: Moments, filtered: Moments,
-                      smoothed: Moments, about: Moments | None, where: Places) -> Moments:
+                      smoothed: Moments, adjoint: tuple[jax.Array, jax.Array], about: Moments | None,
+                      where: Places) -> Moments:
     """Return smoothed moments at any times within the rows.
 
     Each time branches off on its own: the filter's moments at the start of its row are predicted up to it, and on to
-    the end of the row, whose smoothed moments come back through the gain of the second piece. The steps of the scan
-    itself are not cut, so that asking for times changes nothing, neither there nor at other requested times.
+    the end of the row, whence what the later observations say comes back through the second piece. The steps of the
+    scan itself are not cut, so that asking for times changes nothing, neither there nor at other requested times.
+
+    The pieces therefore differ from the row by an integration error, which `combine` keeps from being magnified.
 
     Args:
         ssm: the model.
@@ -57,6 +61,7 @@ def marginals_between(ssm: StateSpaceModel, rule: Rule, plan: Schedule, start: M
         start: moments at the initial time.
         filtered: (N, ...) at the rows' ends.
         smoothed: (N + 1, ...) at the nodes.
+        adjoint: r and Lambda at the rows' ends.
         about: (N + 1, ...) moments to linearise about, or None.
         where: the requested times.
     """
@@ -83,13 +88,14 @@ def marginals_between(ssm: StateSpaceModel, rule: Rule, plan: Schedule, start: M
         rest = piece(here.start + length, here.length - length, now, nearby[1], True)
         rest = _through_jump(ssm, jumps, here.jump, rest)
         gain = solve_semidefinite(rest.moments.covariance, matmul(rest.phi, now.covariance)).T
-        kept = jnp.eye(ssm.state_dim) - matmul(gain, rest.phi)
-        mean = now.mean + matmul(gain, (last.mean - rest.moments.mean)[:, None])[:, 0]
-        covariance = congruence(kept, now.covariance) + congruence(gain, rest.noise + last.covariance)
+        conditional = congruence(jnp.eye(ssm.state_dim) - matmul(gain, rest.phi), now.covariance) + congruence(
+            gain, rest.noise)
+        r, curvature = adjoint[0][index], adjoint[1][index]
+        back = matmul(rest.phi.T, r[:, None])[:, 0], congruence(rest.phi.T, curvature)
+        inside = combine(now, rest.moments, last, gain, conditional, *back)
         begins = length == 0
         return jax.tree_util.tree_map(
-            lambda inside, node, end: jnp.where(exactly, end, jnp.where(begins, node, inside)),
-            Moments(mean, covariance), first, last)
+            lambda inside, node, end: jnp.where(exactly, end, jnp.where(begins, node, inside)), inside, first, last)
 
     return jax.vmap(one)(*(jnp.asarray(a) for a in where))
 

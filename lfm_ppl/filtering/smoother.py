@@ -20,6 +20,7 @@ from lfm_ppl.filtering.filter import (
     warn_single_precision,
 )
 from lfm_ppl.filtering.predict import Moments
+from lfm_ppl.filtering.retrospect import combine
 from lfm_ppl.filtering.schedule import Schedule, schedule
 from lfm_ppl.linalg import (
     cholesky,
@@ -49,12 +50,15 @@ class Smoothed(NamedTuple):
         gain: (N, n, n), G of the row: s_start | s_end has mean m_f + G (s_end - m_p).
         conditional: (N, n, n), covariance of s_start given s_end and the past.
         leave_one_out: (N,), log p(y_k | all other observations), zero in rows without one.
+        adjoint: r (N, n) and Lambda (N, n, n) at the row's end, its observation and all later ones included: the
+            smoothed mean there is m_p + P_p r, the covariance P_p - P_p Lambda P_p.
     """
 
     moments: Moments
     gain: jax.Array
     conditional: jax.Array
     leave_one_out: jax.Array
+    adjoint: tuple[jax.Array, jax.Array]
 
 
 class Marginal(NamedTuple):
@@ -168,9 +172,10 @@ def _sample(result: SmootherResult, key: jax.Array, draws: int) -> Trajectories:
 def backward(passed: Pass, start: Moments, plan: Schedule) -> Smoothed:
     """Run the one backward scan.
 
-    Moments follow Rauch, Tung and Striebel with the gain from a semi-definite solve and the covariance as a sum of
-    squares. Alongside runs the adjoint of Bryson and Frazier, r and Lambda, which needs no inverse of a covariance:
-    with u = S^-1 v - K' r and C = S^-1 + K' Lambda K, an observation given all the others is N(y - C^-1 u, C^-1).
+    Moments follow Rauch, Tung and Striebel, with the gain from a semi-definite solve and the covariance as a sum of
+    squares, or the adjoint of Bryson and Frazier, r and Lambda, which needs no inverse of a covariance (`combine` says
+    when). With u = S^-1 v - K' r and C = S^-1 + K' Lambda K, an observation given all the others is
+    N(y - C^-1 u, C^-1).
     """
     length = jnp.asarray(plan.rows.length)
     still = (length == 0) & (jnp.asarray(plan.rows.jump) < 0)
@@ -186,21 +191,23 @@ def backward(passed: Pass, start: Moments, plan: Schedule) -> Smoothed:
         gain = jnp.where(at_rest, identity, gain)
         kept = identity - matmul(gain, one.phi)
         conditional = congruence(kept, at.covariance) + congruence(gain, one.noise)
-        mean = at.mean + matmul(gain, (later.mean - one.predicted.mean)[:, None])[:, 0]
-        smoothed = Moments(mean, conditional + congruence(gain, later.covariance))
         left_out, r, adjoint = _leave_one_out(one, r, adjoint)
-        return (smoothed, r, adjoint), (later, gain, conditional, left_out)
+        back = matmul(one.phi.T, r[:, None])[:, 0], congruence(one.phi.T, adjoint)
+        smoothed = combine(at, one.predicted, later, gain, conditional, *back)
+        # Nothing happens in a row without length but for the observation at its end.
+        smoothed = jax.tree_util.tree_map(lambda a, b: jnp.where(at_rest, a, b), later, smoothed)
+        return (smoothed, *back), (later, gain, conditional, left_out, (r, adjoint))
 
     last = Moments(passed.filtered.mean[-1], passed.filtered.covariance[-1])
     carry = (last, jnp.zeros(size), jnp.zeros((size, size)))
-    (first, _, _), (ends, gain, conditional, left_out) = jax.lax.scan(
+    (first, _, _), (ends, gain, conditional, left_out, adjoint) = jax.lax.scan(
         step, carry, (before, passed, still), reverse=True)
     moments = jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a[None], b]), first, ends)
-    return Smoothed(moments, gain, conditional, left_out)
+    return Smoothed(moments, gain, conditional, left_out, adjoint)
 
 
 def _leave_one_out(one: Pass, r: jax.Array, adjoint: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Log density of a row's observation given all others, and the adjoint before the row."""
+    """Log density of a row's observation given all others, and the adjoint at the row's end with it."""
     outputs = one.innovation.shape[0]
     inverse = solve_upper(one.chol, solve_lower(one.chol, jnp.eye(outputs)))
     white = matmul(inverse, one.innovation[:, None])[:, 0]
@@ -213,7 +220,7 @@ def _leave_one_out(one: Pass, r: jax.Array, adjoint: jax.Array) -> tuple[jax.Arr
     kept = jnp.eye(r.shape[0]) - matmul(one.gain, one.slope)
     r = matmul(one.slope.T, white[:, None])[:, 0] + matmul(kept.T, r[:, None])[:, 0]
     adjoint = congruence(one.slope.T, inverse) + congruence(kept.T, adjoint)
-    return (left_out, matmul(one.phi.T, r[:, None])[:, 0], congruence(one.phi.T, adjoint))
+    return left_out, r, adjoint
 
 
 def posterior_linearisation(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, start: Moments,
@@ -351,8 +358,8 @@ def smooth_on(ssm: StateSpaceModel, rule: Rule, plans: Plans, y: jax.Array, iter
     else:
         drawn, pieces, _, _ = _smooth_rows(ssm, rule, plans.joint, y, start, iterations, damping)
         requested = plans.joint.requested
-        mean, covariance = marginals_between(ssm, rule, plan, start, passed.filtered, smoothed.moments, about,
-                                             plans.where)
+        mean, covariance = marginals_between(ssm, rule, plan, start, passed.filtered, smoothed.moments,
+                                             smoothed.adjoint, about, plans.where)
     matrix, offset = jax.vmap(ssm.input_map)(times)
     observed = jnp.asarray(plan.observed)
     at_data = jax.tree_util.tree_map(lambda a: a[observed], passed)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any
 
@@ -12,7 +11,7 @@ from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
 
 
 class LikelihoodHandler(Messenger):
-    """Replaces the distribution of every site ``MarginalLikelihood`` or ``panel``; a model without one is an error.
+    """Replaces the distribution of every site ``MarginalLikelihood`` or ``panel``.
 
     Args:
         fn: a NumPyro model; None where the handler is used as a context.
@@ -22,13 +21,13 @@ class LikelihoodHandler(Messenger):
         self.found = False
         super().__init__(fn)
 
-    @abstractmethod
     def replacement(self, likelihood: MarginalLikelihood | Panel, site: dict[str, Any]) -> Any:
         """Return the distribution that takes the place of the likelihood of a site."""
+        raise NotImplementedError
 
-    @abstractmethod
     def complaint(self) -> str:
-        """Return what to say of a model without such a site; nothing where that is no mistake."""
+        """Return the error of a model without such a site; nothing where that is no mistake."""
+        raise NotImplementedError
 
     def __enter__(self) -> Any:
         """Start a run of the model."""
@@ -39,8 +38,8 @@ class LikelihoodHandler(Messenger):
     def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
         """End the run."""
         super().__exit__(kind, error, trace)
-        if kind is None and not self.found and self.complaint():
-            raise ValueError(self.complaint())
+        if kind is None and not self.found and (message := self.complaint()):
+            raise ValueError(message)
 
     def process_message(self, msg: dict[str, Any]) -> None:
         """Replace the distribution of the site."""

@@ -96,7 +96,7 @@ def test_the_gaussian_of_the_ellipses_is_the_posterior_of_a_linear_link(monkeypa
 
 @pytest.mark.slow
 def test_chains_that_have_not_mixed_go_on_and_mix():
-    """A data set on which ellipses of the prior hardly move, and one on which they do."""
+    """A data set on which ellipses of the prior hardly move."""
     data = [problem.data_set(EXPONENTIAL, 2)]
     given = {"link": "exponential", "gamma": None, "draws": 30_000, "burn_in": 2_500}
     found = slices.compute(given, data, jax.random.split(jax.random.key(0), 1))
@@ -138,7 +138,7 @@ def test_slices_of_a_linear_link_have_the_exact_posterior(monkeypatch):
 @pytest.mark.parametrize("configuration, index", [(problem.CONFIGURATIONS[number], index) for number, index in
                                                   ((0, 3), (1, 0), (4, 1), (5, 4), (7, 2))])
 def test_the_slices_agree_with_blackjax(configuration, index):
-    """Five data sets, five links: means and standard deviations at some points, in standard errors of both."""
+    """Five data sets, three links: means and standard deviations at some points, in standard errors of both."""
     blackjax = pytest.importorskip("blackjax")
     data = problem.data_set(configuration, index)
     found = slices.compute({"link": configuration.link, "gamma": configuration.gamma, "draws": 100_000,
@@ -270,6 +270,10 @@ def test_blocks_of_more_data_sets_hold_those_of_fewer():
 def test_mistakes():
     with pytest.raises(ValueError, match="datasets must be at least 1"):
         experiment.Settings(datasets=0)
+    with pytest.raises(ValueError, match="burn_in must lie in"):
+        experiment.Settings(draws=100, burn_in=200)
+    with pytest.raises(ValueError, match="must be a tuple of labels"):
+        experiment.Settings(configurations="exponential")
     with pytest.raises(ValueError, match="gamma must be"):
         problem.activity(jnp.zeros(3), "saturation", -0.1)
     with pytest.raises(ValueError, match="unknown link 'cubic'"):

@@ -108,8 +108,8 @@ def resembling(latent: LatentGrid, y: jax.Array, draws: jax.Array) -> Gaussian:
 
 
 @functools.cache
-def program(link: str, count: int) -> Callable:
-    """Compile `resembling` for data sets: gamma, rates, observations, draws (N, S, 363) -> Gaussians."""
+def program(link: str) -> Callable:
+    """Return `resembling` for many data sets, compiled: gamma, rates, observations, draws (N, S, 363) -> Gaussians."""
     def one(gamma: jax.Array, rates: problem.Rates, y: jax.Array, draws: jax.Array) -> Gaussian:
         return resembling(on_grid(link, gamma, rates), y, draws[::_USED])
 

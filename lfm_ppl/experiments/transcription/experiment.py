@@ -44,6 +44,11 @@ class Settings:
     def __post_init__(self) -> None:
         """Check what a user gives."""
         checks.positive_integer("datasets", self.datasets)
+        checks.positive_integer("draws", self.draws)
+        if not 0 <= self.burn_in < self.draws:
+            raise ValueError(f"burn_in must lie in [0, draws) = [0, {self.draws}), got {self.burn_in}.")
+        if not self.configurations or isinstance(self.configurations, str):
+            raise ValueError(f"configurations must be a tuple of labels, got {self.configurations!r}.")
         for label in self.configurations:
             checks.one_of("configurations", label, [one.label for one in problem.CONFIGURATIONS])
 

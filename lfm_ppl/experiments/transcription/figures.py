@@ -53,7 +53,7 @@ def plot_force(data: problem.DataSet, methods: Mapping[str, Result], *, width: s
     axes.legend(loc="upper center", ncols=problem.GENES, handletextpad=0.0, columnspacing=0.6, frameon=False)
     axes.set_ylabel("expression")
     style.tidy(axes)
-    # A divergent band is cut; all others and the truth are seen whole.
+    # The truth is seen whole, and a band unless it reaches far beyond.
     means, sds = (np.stack([found[name][0] for found in methods.values()]) for name in ("mean", "sd"))
     reach = [np.where(np.isfinite(bands), bands, 0.0) for bands in (means - Z * sds, means + Z * sds)]
     low = max(min(reach[0].min(), data.u.min()), data.u.min() - 3.0) - 0.2

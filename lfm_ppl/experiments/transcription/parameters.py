@@ -11,7 +11,7 @@ import numpy as np
 import numpyro
 import numpyro.distributions as dist
 import xarray as xr
-from numpyro.infer import MCMC, NUTS, init_to_value
+from numpyro.infer import MCMC, NUTS, init_to_uniform
 
 from lfm_ppl.analysis import arviz_data
 from lfm_ppl.experiments import scores
@@ -112,8 +112,13 @@ def compute(task: Task) -> Result:
                 num_samples=settings["draws"] * settings["thin"], thinning=settings["thin"],
                 num_chains=settings["chains"], chain_method="vectorized" if sampler.kernel == "RAM" else "sequential",
                 progress_bar=False)
-    seconds, _ = timed(lambda: mcmc.run(task.key, problem.TIMES, data.y, **kwargs))
-    samples = {name: np.asarray(value) for name, value in mcmc.get_samples(group_by_chain=True).items()}
+
+    def run() -> dict[str, jax.Array]:
+        mcmc.run(task.key, problem.TIMES, data.y, **kwargs)
+        return mcmc.get_samples(group_by_chain=True)
+
+    seconds, drawn = timed(run)
+    samples = {name: np.asarray(value) for name, value in drawn.items()}
     draws = np.stack([*(samples[name][..., gene] for name in VECTORS for gene in range(problem.GENES)),
                       samples["noise_sd"], samples["lengthscale"]])
     divergences = 0 if sampler.kernel == "RAM" else int(np.sum(mcmc.get_extra_fields()["diverging"]))
@@ -144,8 +149,7 @@ def diagnose(draws: np.ndarray) -> Result:
 
 
 def _kernel(sampler: Sampler, tree_depth: int) -> Any:
-    start = {name: jnp.full(problem.GENES, value) for name, value in zip(VECTORS, (0.05, 1.0, 0.5, 0.0), strict=True)}
-    strategy = init_to_value(values=start | {"noise_sd": problem.NOISE, "lengthscale": problem.LENGTHSCALE})
+    strategy = init_to_uniform(radius=1.0)  # chains start apart, or R-hat would say nothing
     if sampler.kernel == "RAM":
         return RAM(model, init_strategy=strategy)
     chosen: Callable = on_latent_grid(model, AT) if sampler.latent else model

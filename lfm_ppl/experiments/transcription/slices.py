@@ -37,11 +37,10 @@ def compute(settings: Any, data: list[problem.DataSet], keys: jax.Array) -> dict
     """Return ``mean``, ``sd``, ``low``, ``high`` (N, 363), and ``r_hat``, ``ess``, ``draws`` and ``seconds`` (N,).
 
     ``keys`` (N,) are those of the data sets. The draws of all chains together number ``settings["draws"]``, of which
-    ``settings["burn_in"]`` are left out; each rounded up to a whole number for each draw that is kept. The chains of a
-    data set whose R-hat is above 1.01 then run as long once more, on ellipses of a Gaussian that resembles the
-    posterior (see `ellipses.resembling`), and what was before becomes burn-in. ``draws`` counts all of them,
-    ``seconds`` is the time of the first ``settings["draws"]`` and ``r_hat_first`` their R-hat, ``seconds_more`` the
-    time of the others.
+    ``settings["burn_in"]`` are left out; both parts are rounded up to multiples of 2,500. The chains of a data set
+    whose R-hat is above 1.01 then run as long once more, on ellipses of a Gaussian that resembles the posterior (see
+    `ellipses.resembling`), and what was before becomes burn-in. ``draws`` counts all of them, ``seconds`` is the time
+    of the first run and ``r_hat_first`` its R-hat, ``seconds_more`` the time of the others.
     """
     burn_in, ahead = (math.ceil(number / CHAINS / KEPT)
                       for number in (settings["burn_in"], settings["draws"] - settings["burn_in"]))
@@ -63,11 +62,11 @@ def compute(settings: Any, data: list[problem.DataSet], keys: jax.Array) -> dict
         found["r_hat"][left], found["ess"][left] = np.transpose([diagnose(one) for one in kept])
         if stage == 0:
             found["r_hat_first"] = found["r_hat"].copy()
-        open_ = np.flatnonzero(found["r_hat"][left] > R_HAT)
+        open_ = np.flatnonzero(~(found["r_hat"][left] <= R_HAT))
         left, states = left[open_], jax.tree_util.tree_map(lambda a, i=open_: a[i], states)
-        if not left.size:
+        if not left.size or stage == _STAGES - 1:
             break
-        around = ellipses.program(link, len(left))(
+        around = ellipses.program(link)(
             gamma, *jax.tree_util.tree_map(lambda a, i=left: a[i], (known, y)), jnp.asarray(flat[open_]))
     return found
 
@@ -86,7 +85,7 @@ def diagnose(draws: np.ndarray) -> tuple[float, float]:
     """
     dataset = xr.Dataset({"u": (("chain", "draw", "point"), draws[..., MONITORED])})
     summary = arviz_data.summary(arviz_data.build({"posterior": dataset}))
-    return float(summary["r_hat"].max()), float(summary["ess_bulk"].min())
+    return float(summary["r_hat"].max(skipna=False)), float(summary["ess_bulk"].min(skipna=False))
 
 
 @functools.cache
