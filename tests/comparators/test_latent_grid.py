@@ -201,3 +201,20 @@ def test_wrong_shapes_are_named():
         latent.force(jnp.zeros(31))
     with pytest.raises(TypeError, match="lfm.LatentForceModel, got str"):
         LatentGrid("model", TIMES)
+
+
+@pytest.mark.parametrize("build", [genes, oscillator])
+def test_many_observations_are_those_of_few(build, monkeypatch):
+    """Above a number of observations the grid loops over them; with gaps, repeats, and one at the start."""
+    times = np.sort(np.concatenate([np.linspace(0.0, 1.0, 70), [1.0, 3.7, 3.7, 4.0]]))
+    model = build()
+    looped = LatentGrid(model, times, 31)
+    monkeypatch.setattr("lfm_ppl.comparators.latent_grid.FEW", 100)
+    single = LatentGrid(model, times, 31)
+    assert looped.between is None and (single.between is None) == (build is oscillator)
+    u = looped.force(jax.random.normal(jax.random.key(0), looped.mean.shape))
+    assert np.allclose(looped.state(u), single.state(u), rtol=1e-12, atol=1e-12)
+    longer = LatentGrid(model, times, 3001)  # many points: the forces are cut out, not what they produce
+    few = LatentGrid(build(initial_time=0.0), times[-4:], longer.grid)
+    u = longer.force(jax.random.normal(jax.random.key(1), longer.mean.shape))
+    assert np.allclose(longer.state(u)[-4:], few.state(u), rtol=1e-9, atol=1e-9)

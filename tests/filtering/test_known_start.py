@@ -1,0 +1,52 @@
+"""Smoothing soon after a known start, where all states are moved by one force and their covariance is singular."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lfm_ppl as lfm
+from lfm_ppl.model.augment import state_space
+
+TIMES = np.linspace(0.0, 15.0, 13)
+AT = np.linspace(0.0, 15.0, 91)
+# Two of the decays nearly equal, so that two of the states are nearly proportional to each other for all times.
+DECAY, SENSITIVITY = jnp.array([0.801797, 1.170477, 0.801614]), jnp.array([0.96, 0.2, 0.84])
+
+
+def genes(link, variance=0.0, integrated=False):
+    """Three decays pushed by one force; ``integrated``: with a term in t that is never there, so that it is stepped."""
+    def dynamics(x, u, t):
+        made = SENSITIVITY * link(u[0]) - DECAY * x
+        return made + jnp.where(t > 1e6, 1.0, 0.0) if integrated else made
+
+    return lfm.LatentForceModel(
+        dynamics, {"u": lfm.Matern(1.0, 2.0, order=1)},
+        lfm.GaussianObservation(lambda x, u, t: x, 0.01 * jnp.ones(3)),
+        lfm.Gaussian(jnp.array([0.1, 0.04, 0.07]), variance * jnp.eye(3)), initial_time=0.0)
+
+
+@pytest.mark.parametrize("variance", [0.0, 1e-12, 1e8])
+def test_between_nodes_it_is_the_exact_smoother(variance):
+    """A linear model by its exact transition and in Runge-Kutta steps, from a known start to an unknown one."""
+    y = np.asarray(lfm.simulate(jax.random.key(0), genes(lambda u: u), TIMES).y)
+    exact = lfm.smooth(genes(lambda u: u, variance), TIMES, y, at=AT)
+    found = lfm.smooth(genes(lambda u: u, variance, integrated=True), TIMES, y, at=AT)
+    scale = np.sqrt(np.diagonal(np.asarray(exact.covariance), axis1=1, axis2=2).max(axis=0))
+    assert np.all(np.abs(found.mean - exact.mean) < 2e-4 * scale)
+    assert np.all(np.abs(found.covariance - exact.covariance) < 2e-4 * scale * scale[:, None])
+
+
+@pytest.mark.parametrize("iterations", [0, 25])
+def test_variances_are_positive_and_below_the_prior(iterations):
+    """Also after iterations, which converge to the last digits."""
+    model = genes(lambda u: jax.nn.sigmoid(jnp.log(0.1) - u) / 0.1)
+    y = np.asarray(lfm.simulate(jax.random.key(1), model, TIMES).y)
+    found = lfm.smooth(model, TIMES, y, lfm.GaussHermite(7), 10, at=AT, iterations=iterations, damping=0.5)
+    force = found.covariance[:, 3:, 3:]
+    assert np.all(np.asarray(found.force("u").sd) > 0.02)
+    assert np.linalg.eigvalsh(np.asarray(force)).min() > 0
+    assert np.linalg.eigvalsh(np.asarray(found.covariance)).min() > -1e-12
+    prior = np.diagonal(np.asarray(state_space(model).initial()[1]))[3:]  # of a stationary force, at all times
+    assert np.all(np.diagonal(np.asarray(force), axis1=1, axis2=2) <= prior * (1 + 1e-6))
+    assert iterations == 0 or found.change < 1e-3
