@@ -190,6 +190,7 @@ def test_prior_and_posterior_predictive_shapes():
     assert np.all(np.isfinite(new["y"]))
 
 
+@pytest.mark.slow
 def test_variational_inference_raises_the_evidence_bound(y):
     svi = SVI(motif.model, AutoNormal(motif.model, init_scale=0.02), numpyro.optim.Adam(0.03), Trace_ELBO())
     state = jax.jit(svi.init)(jax.random.key(0), TIMES, y)
