@@ -159,7 +159,7 @@ def test_the_slices_agree_with_blackjax(configuration, index):
 
         first, rest = jax.random.split(key)
         state = algorithm.init(latent.root[0] @ jax.random.normal(first, (problem.POINTS,)))
-        return jax.lax.scan(kept, state, jax.random.split(rest, 750))[1][125:]
+        return jax.lax.scan(kept, state, jax.random.split(rest, 2500))[1][250:]
 
     draws = np.asarray(jax.jit(jax.vmap(chain))(jax.random.split(jax.random.key(1), 4)))
     theirs = {name: np.array([float(az.ess(draws[..., place], method=name)) for place in range(len(at))])
