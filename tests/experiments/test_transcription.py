@@ -100,7 +100,8 @@ def test_chains_that_have_not_mixed_go_on_and_mix():
     data = [problem.data_set(EXPONENTIAL, 2)]
     given = {"link": "exponential", "gamma": None, "draws": 30_000, "burn_in": 2_500}
     found = slices.compute(given, data, jax.random.split(jax.random.key(0), 1))
-    assert found["draws"][0] >= 60_000 and found["r_hat"][0] <= 1.01 and found["ess"][0] > 800
+    assert found["draws"][0] >= 60_000 and found["r_hat_first"][0] > 1.05
+    assert found["r_hat"][0] <= 1.01 and found["ess"][0] > 400  # 100 for each chain, as ArviZ asks
     assert (found["seconds"] > 0).all() and (found["seconds_more"] > 0).all()
 
 
