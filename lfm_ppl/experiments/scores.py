@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+import xarray as xr
 from scipy.interpolate import CubicSpline
 
 from lfm_ppl import checks
+from lfm_ppl.analysis import arviz_data
 
 SE = " se"
 """What the column of a standard error ends with."""
@@ -110,6 +113,22 @@ def spread(draws: np.ndarray, count: int) -> np.ndarray:
 def total_moments(mean: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return mean and standard deviation (K,) of a mixture of components with mean and variance (S, K)."""
     return mean.mean(axis=0), np.sqrt(variance.mean(axis=0) + mean.var(axis=0))
+
+
+def diagnose(names: Sequence[str], draws: np.ndarray) -> dict[str, np.ndarray]:
+    """Return ``mean``, ``sd``, 95% interval ``low`` and ``high``, bulk ``ess`` and ``r_hat`` of parameters.
+
+    Args:
+        names: of the P parameters.
+        draws: (P, chains, draws).
+
+    Returns:
+        Name -> array (P,).
+    """
+    dataset = xr.Dataset({name: (("chain", "draw"), row) for name, row in zip(names, draws, strict=True)})
+    summary = arviz_data.summary(arviz_data.build({"posterior": dataset}))
+    columns = {"mean": "mean", "sd": "sd", "low": "q2.5", "high": "q97.5", "ess": "ess_bulk", "r_hat": "r_hat"}
+    return {name: summary[column].to_numpy() for name, column in columns.items()}
 
 
 class GridPosterior:

@@ -9,10 +9,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import xarray as xr
 from numpyro.infer import NUTS
 
-from lfm_ppl.analysis import arviz_data
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.ginzburg_landau import grid, problem, state
 from lfm_ppl.experiments.tasks import Result, Task
@@ -66,7 +64,7 @@ def compute(task: Task) -> Result:
     """Return draws (3, chains, draws), their diagnostics, and the smoothed state on the fine times."""
     data = problem.realisation(task.settings["index"], task.seed)
     draws, divergences, seconds = sample(task.settings, data, task.key)
-    result = {"draws": draws, "divergences": divergences, "seconds": seconds, **_diagnose(draws)}
+    result = {"draws": draws, "divergences": divergences, "seconds": seconds, **scores.diagnose(problem.NAMES, draws)}
     paths = integrated(task.settings, data, draws)
     return {**result, **paths,
             "smoother_rmse": scores.rmse(paths["smoother_mean"], data.path),
@@ -133,13 +131,6 @@ def _kernel(name: str, model: Any, particles: int | None, steps: int, tree_depth
     if name == "RAM":
         return RAM(model, initial_covariance=TYPICAL)
     return ParticleMarginalRAM(model, particles=particles, particle_steps=steps, initial_covariance=TYPICAL)
-
-
-def _diagnose(draws: np.ndarray) -> Result:
-    dataset = xr.Dataset({name: (("chain", "draw"), row) for name, row in zip(problem.NAMES, draws, strict=True)})
-    summary = arviz_data.summary(arviz_data.build({"posterior": dataset}))
-    columns = {"mean": "mean", "sd": "sd", "low": "q2.5", "high": "q97.5", "ess": "ess_bulk", "r_hat": "r_hat"}
-    return {name: summary[column].to_numpy() for name, column in columns.items()}
 
 
 def integrated(settings: Any, data: problem.Realisation, draws: np.ndarray) -> Result:

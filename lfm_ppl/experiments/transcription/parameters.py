@@ -10,22 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
-import xarray as xr
 from numpyro.infer import MCMC, NUTS, init_to_uniform
 
-from lfm_ppl.analysis import arviz_data
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.tasks import Result, Task
 from lfm_ppl.experiments.timing import timed
 from lfm_ppl.experiments.transcription import figures, problem
 from lfm_ppl.filtering.smoother import smooth
-from lfm_ppl.forces import Matern
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.inference.on_latent_grid import on_latent_grid
 from lfm_ppl.inference.ram import RAM
 from lfm_ppl.linearisation.sigma_points import GaussHermite
-from lfm_ppl.model.latent_force_model import LatentForceModel
-from lfm_ppl.model.observation import Gaussian, GaussianObservation
 
 RULE, STEPS = GaussHermite(7), 6
 AT = np.linspace(0.0, problem.END, 61)
@@ -73,17 +68,8 @@ def model(times: Any, y: Any = None, link: str = "softplus", gamma: float | None
     noise_sd = numpyro.sample("noise_sd", dist.LogNormal(jnp.log(problem.NOISE), 0.5))
     lengthscale = numpyro.sample("lengthscale", dist.LogNormal(jnp.log(problem.LENGTHSCALE), 0.5))
     rates = problem.Rates(basal, sensitivity, decay, away + basal / decay)
-    system = unknown_system(link, gamma, rates, noise_sd, lengthscale)
+    system = problem.system(link, gamma, rates, noise_sd, lengthscale)
     numpyro.sample("y", MarginalLikelihood(system, times, rule=RULE, steps=STEPS, iterations=iterations), obs=y)
-
-
-def unknown_system(link: str, gamma: Any, rates: problem.Rates, noise_sd: Any, lengthscale: Any) -> LatentForceModel:
-    """Return the model with noise and lengthscale of its own."""
-    return LatentForceModel(
-        problem.Genes(rates.basal, rates.sensitivity, rates.decay, gamma, link),
-        {problem.FACTOR: Matern(problem.SCALE, lengthscale, 1)},
-        GaussianObservation(problem.expression, noise_sd**2 * jnp.ones(problem.GENES)),
-        Gaussian(rates.start, jnp.zeros((problem.GENES, problem.GENES))), initial_time=0.0)
 
 
 def tasks(settings: Any) -> list[Task]:
@@ -128,8 +114,8 @@ def compute(task: Task) -> Result:
     else:
         mean, sd = _integrated(settings, sampler.iterations, data, draws)
     truth = np.interp(AT, problem.GRID, data.u)
-    return {"draws": draws, "divergences": divergences, "seconds": seconds, **diagnose(draws), "force_mean": mean,
-            "force_sd": sd, "rmse": scores.rmse(mean, truth),
+    return {"draws": draws, "divergences": divergences, "seconds": seconds, **scores.diagnose(NAMES, draws),
+            "force_mean": mean, "force_sd": sd, "rmse": scores.rmse(mean, truth),
             "coverage": scores.covered(mean - figures.Z * sd, mean + figures.Z * sd, truth), "truth": true_values(data)}
 
 
@@ -138,14 +124,6 @@ def true_values(data: problem.DataSet) -> np.ndarray:
     rates = data.rates
     return np.concatenate([rates.basal, rates.decay, rates.sensitivity, rates.start - rates.basal / rates.decay,
                            [problem.NOISE, problem.LENGTHSCALE]])
-
-
-def diagnose(draws: np.ndarray) -> Result:
-    """Return mean, sd, 95% interval, bulk effective sample size and R-hat of each parameter."""
-    dataset = xr.Dataset({name: (("chain", "draw"), row) for name, row in zip(NAMES, draws, strict=True)})
-    summary = arviz_data.summary(arviz_data.build({"posterior": dataset}))
-    columns = {"mean": "mean", "sd": "sd", "low": "q2.5", "high": "q97.5", "ess": "ess_bulk", "r_hat": "r_hat"}
-    return {name: summary[column].to_numpy() for name, column in columns.items()}
 
 
 def _kernel(sampler: Sampler, tree_depth: int) -> Any:
@@ -164,7 +142,7 @@ def _integrated(settings: Any, iterations: int, data: problem.DataSet, draws: np
     def one(theta: jax.Array) -> tuple[jax.Array, jax.Array]:
         basal, decay, sensitivity, away = theta[:12].reshape(4, problem.GENES)
         rates = problem.Rates(basal, sensitivity, decay, away + basal / decay)
-        system = unknown_system(settings["link"], settings["gamma"], rates, theta[12], theta[13])
+        system = problem.system(settings["link"], settings["gamma"], rates, theta[12], theta[13])
         found = smooth(system, problem.TIMES, data.y, RULE, STEPS, at=AT, iterations=iterations)
         force = found.force(problem.FACTOR)
         return force.mean, force.sd**2

@@ -117,13 +117,14 @@ class Rates(NamedTuple):
     start: Any
 
 
-def system(link: str, gamma: Any, rates: Rates) -> LatentForceModel:
-    """Return the model; gamma and rates may be traced."""
+def system(link: str, gamma: Any, rates: Rates, noise_sd: Any = NOISE, lengthscale: Any = LENGTHSCALE
+           ) -> LatentForceModel:
+    """Return the model; all but the link may be traced."""
     names = tuple(f"gene {index + 1}" for index in range(GENES))
     return LatentForceModel(
-        Genes(rates.basal, rates.sensitivity, rates.decay, gamma, link), {FACTOR: Matern(SCALE, LENGTHSCALE, 1)},
-        GaussianObservation(expression, NOISE**2 * jnp.ones(GENES)), Gaussian(rates.start, jnp.zeros((GENES, GENES))),
-        state_names=names, output_names=names, initial_time=0.0)
+        Genes(rates.basal, rates.sensitivity, rates.decay, gamma, link), {FACTOR: Matern(SCALE, lengthscale, 1)},
+        GaussianObservation(expression, noise_sd**2 * jnp.ones(GENES)),
+        Gaussian(rates.start, jnp.zeros((GENES, GENES))), state_names=names, output_names=names, initial_time=0.0)
 
 
 class DataSet(NamedTuple):
