@@ -130,7 +130,7 @@ class LatentGrid(eqx.Module):
         if _diagonal(ssm):
             rates = jnp.diagonal(decay)
             flow = lambda lengths: jnp.exp(rates * jnp.asarray(lengths)[..., None])  # noqa: E731
-            self.weights = _weights(pieces, flow, lambda h: _integrals(rates * h[..., None]), jnp.multiply, rule)
+            self.weights = _weights(pieces, flow, lambda h: _integrals(rates * h[..., None]), 1, rule)
             self.flow, self.between = flow(gaps), None
             if len(known) <= FEW:
                 elapsed = np.maximum(known[:, None] - known, 0.0)
@@ -138,7 +138,7 @@ class LatentGrid(eqx.Module):
         else:
             flow = lambda lengths: _distinct(lambda h: _flow(decay, h)[0], lengths)  # noqa: E731
             integrals = lambda lengths: _distinct(lambda h: _flow(decay, h)[1:], lengths)  # noqa: E731
-            self.weights = _weights(pieces, flow, integrals, jnp.matmul, rule)
+            self.weights = _weights(pieces, flow, integrals, 2, rule)
             self.flow, self.between = flow(gaps), None
         self.mean = jax.vmap(ssm.stack.mean_at)(jnp.asarray(self.grid)).T
         self.root = jnp.stack([_root(force, self.grid) for force in ssm.stack.forces])
@@ -336,19 +336,20 @@ def _pieces(grid: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, _Pieces]:
     return first, _Pieces(b - a, (a - start) / wide, (b - start) / wide, since, t - a, t - b)
 
 
-def _weights(pieces: _Pieces, flow: Callable, integrals: Callable, after: Callable, rule: str) -> jax.Array:
+def _weights(pieces: _Pieces, flow: Callable, integrals: Callable, rank: int, rule: str) -> jax.Array:
     """Return the weights of the points, (M, T, C + 1) or (M, M, T, C + 1), from functions of arrays of lengths.
 
     Args:
         pieces: the cells.
         flow: e^(A h).
         integrals: 1/h int_0^h e^(A (h - s)) ds and 1/h int_0^h e^(A (h - s)) s/h ds.
-        after: product of two flows.
+        rank: of a flow: 1 for the diagonal of one, 2 for a matrix.
         rule: of integration.
     """
     def of(a: np.ndarray) -> jax.Array:
-        return jnp.asarray(a).reshape(*a.shape, *[1] * (2 if after is jnp.matmul else 1))
+        return jnp.asarray(a).reshape(*a.shape, *[1] * rank)
 
+    after = jnp.multiply if rank == 1 else jnp.matmul
     length = of(pieces.length)
     if rule == "riemann":
         at_point, at_next = length * flow(pieces.since_point), jnp.zeros(())

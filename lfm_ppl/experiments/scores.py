@@ -13,6 +13,9 @@ from scipy.interpolate import CubicSpline
 from lfm_ppl import checks
 from lfm_ppl.analysis import arviz_data
 
+Z = 1.959963984540054
+"""Half the width of a 95% interval, in standard deviations."""
+
 SE = " se"
 """What the column of a standard error ends with."""
 

@@ -70,6 +70,7 @@ def test_the_table_measures_in_standard_deviations_of_the_reference():
     row = table.loc["softplus: RAM, marginal"]
     assert row["shift"] == pytest.approx(0.5) and row["sd ratio"] == pytest.approx(1.1)
     assert row["ESS/CPU s"] == pytest.approx(2.0) and row["coverage"] == 1.0 and row["R-hat"] == pytest.approx(1.004)
+    assert row["shift se"] == pytest.approx(0.1) and row["least ESS"] == 200.0
     assert table.loc[f"softplus: {parameters.REFERENCE}", "shift"] == 0.0
 
 
@@ -87,6 +88,8 @@ def test_mistakes():
         parameters_report.Settings(datasets=0)
     with pytest.raises(ValueError, match="unknown links 'cubic'"):
         parameters_report.Settings(links=("cubic",))
+    with pytest.raises(ValueError, match="a tuple of different labels"):
+        parameters_report.Settings(links=())
 
 
 def settings_of(label, chains, warmup, draws, thin):

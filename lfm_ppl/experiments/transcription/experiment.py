@@ -123,7 +123,7 @@ def judged(found: Result, truth: np.ndarray) -> Result:
     diverged = ~(error <= problem.DIVERGED)
     if "stopped" in found:
         diverged |= ~np.asarray(found["stopped"], bool)
-    return {"rmse": error, "coverage": (np.abs(z) <= figures.Z).mean(axis=1),
+    return {"rmse": error, "coverage": (np.abs(z) <= scores.Z).mean(axis=1),
             "nlpd": (0.5 * z**2 + np.log(sd) + 0.5 * np.log(2.0 * np.pi)).mean(axis=1), "diverged": diverged}
 
 

@@ -11,10 +11,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from lfm_ppl.analysis.plots import style
+from lfm_ppl.experiments.scores import Z
 from lfm_ppl.experiments.tasks import Result
 from lfm_ppl.experiments.transcription import problem
 
-Z = 1.959963984540054
 COLOURS = {"LA": style.VERMILLION, "LA, trust region": style.ORANGE, "ESLS": style.GREY, "GFS": style.BLUE,
            "GHS(7)": style.SKY, "iterated GHS(7)": style.GREEN}
 _SHOWN = ("LA", "ESLS", "GFS", "iterated GHS(7)")

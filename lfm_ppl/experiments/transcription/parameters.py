@@ -15,7 +15,7 @@ from numpyro.infer import MCMC, NUTS, init_to_uniform
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.tasks import Result, Task
 from lfm_ppl.experiments.timing import timed
-from lfm_ppl.experiments.transcription import figures, problem
+from lfm_ppl.experiments.transcription import problem
 from lfm_ppl.filtering.smoother import smooth
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.inference.on_latent_grid import on_latent_grid
@@ -116,7 +116,7 @@ def compute(task: Task) -> Result:
     truth = np.interp(AT, problem.GRID, data.u)
     return {"draws": draws, "divergences": divergences, "seconds": seconds, **scores.diagnose(NAMES, draws),
             "force_mean": mean, "force_sd": sd, "rmse": scores.rmse(mean, truth),
-            "coverage": scores.covered(mean - figures.Z * sd, mean + figures.Z * sd, truth), "truth": true_values(data)}
+            "coverage": scores.covered(mean - scores.Z * sd, mean + scores.Z * sd, truth), "truth": true_values(data)}
 
 
 def true_values(data: problem.DataSet) -> np.ndarray:

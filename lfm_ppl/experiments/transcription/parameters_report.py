@@ -16,11 +16,11 @@ from lfm_ppl import checks
 from lfm_ppl.analysis.plots import style
 from lfm_ppl.experiments import output
 from lfm_ppl.experiments.catalogue import Report, Wanted
-from lfm_ppl.experiments.scores import mean_of, pair, readable
+from lfm_ppl.experiments.scores import Estimate, Z, mean_of, pair, readable
 from lfm_ppl.experiments.tasks import Result, run_tasks
 from lfm_ppl.experiments.transcription import parameters, problem
-from lfm_ppl.experiments.transcription.figures import Z
 
+TASKS = "tasks"
 SUMMARY = "transcription factors with unknown rates: the marginal posterior against that of the force as latent sites"
 COLOURS = {parameters.REFERENCE: style.GREY, "NUTS, marginal": style.BLUE, "RAM, marginal": style.ORANGE,
            "RAM, iterated marginal": style.GREEN}
@@ -49,6 +49,8 @@ class Settings:
     def __post_init__(self) -> None:
         """Check what a user gives."""
         checks.positive_integer("datasets", self.datasets)
+        if not self.links or isinstance(self.links, str) or len(set(self.links)) < len(self.links):
+            raise ValueError(f"links must be a tuple of different labels, got {self.links!r}.")
         for label in self.links:
             checks.one_of("links", label, parameters.LINKS)
 
@@ -91,8 +93,8 @@ def run(wanted: Wanted) -> Report:
 
 def compute(settings: Settings, folder: str | Path, *, overwrite: bool = False,
             report: Callable[[str], None] | None = None, workers: int = 1) -> Comparison:
-    """Compute what is not stored yet in ``folder``, and tabulate everything; as `experiment.run`."""
-    results = run_tasks(parameters.tasks(settings), parameters.compute, Path(folder) / "tasks", overwrite=overwrite,
+    """Compute what is not stored yet in ``folder``, and tabulate everything; arguments as in `run_tasks`."""
+    results = run_tasks(parameters.tasks(settings), parameters.compute, Path(folder) / TASKS, overwrite=overwrite,
                         report=report, workers=workers)
     cells = by_cell(settings, results)
     return Comparison(settings, cells, agreement(cells))
@@ -112,23 +114,31 @@ def agreement(cells: Mapping[tuple[str, str], list[Result]]) -> pd.DataFrame:
 
     Returns:
         ``shift``, the largest distance of a posterior mean from the reference's in its standard deviations, and ``sd
-        ratio``, the ratio of standard deviations that is furthest from one, over all parameters and data sets;
-        ``coverage`` of the true parameters by 95% intervals; ``RMSE`` of the force and ``coverage force``; ``ESS/CPU
-        s``, the smallest bulk effective sample size of a parameter for a second of CPU time of warm-up and draws,
-        compilation included; the largest ``R-hat``; ``divergences`` of one run.
+        ratio``, the ratio of standard deviations that is furthest from one, over all parameters and data sets; ``shift
+        se`` and ``sd ratio se`` are the Monte Carlo errors of these two, to be held against them, as the largest of
+        many; ``coverage`` of the true parameters by 95% intervals; ``RMSE`` of the force and ``coverage force``;
+        ``least ESS``, the smallest bulk effective sample size of a parameter, and ``ESS/CPU s``, the same for a second
+        of CPU time of warm-up and draws, compilation included; the largest ``R-hat``; ``divergences`` of one run.
     """
     rows = {}
     for (label, sampler), found in cells.items():
         reference = cells[label, parameters.REFERENCE]
-        shift = [(one["mean"] - exact["mean"]) / exact["sd"] for one, exact in zip(found, reference, strict=True)]
-        ratio = np.concatenate([one["sd"] / exact["sd"] for one, exact in zip(found, reference, strict=True)])
-        row = {"shift": float(np.abs(shift).max()), "sd ratio": float(ratio[np.abs(np.log(ratio)).argmax()])}
+        pairs = list(zip(found, reference, strict=True))
+        shift = np.concatenate([(one["mean"] - exact["mean"]) / exact["sd"] for one, exact in pairs])
+        ratio = np.concatenate([one["sd"] / exact["sd"] for one, exact in pairs])
+        error = np.concatenate([np.sqrt(1 / one["ess"] + 1 / exact["ess"]) for one, exact in pairs])
+        worst, widest = np.abs(shift).argmax(), np.abs(np.log(ratio)).argmax()
+        own = sampler == parameters.REFERENCE
+        row = pair("shift", Estimate(float(abs(shift[worst])), np.nan if own else float(error[worst])))
+        row |= pair("sd ratio", Estimate(float(ratio[widest]), np.nan if own else float(
+            ratio[widest] * error[widest] / np.sqrt(2.0))))
         covered = [np.mean((one["low"] <= one["truth"]) & (one["truth"] <= one["high"])) for one in found]
         for name, values in (("coverage", covered), ("RMSE", [one["rmse"] for one in found]),
                              ("coverage force", [one["coverage"] for one in found]),
                              ("ESS/CPU s", [one["ess"].min() / one["seconds"] for one in found])):
             row |= pair(name, mean_of(values))
-        row |= {"R-hat": max(float(one["r_hat"].max()) for one in found),
+        row |= {"least ESS": min(float(one["ess"].min()) for one in found),
+                "R-hat": max(float(one["r_hat"].max()) for one in found),
                 "divergences": float(np.mean([one["divergences"] for one in found]))}
         rows[f"{label}: {sampler}"] = row
     return pd.DataFrame.from_dict(rows, orient="index", dtype=float)
