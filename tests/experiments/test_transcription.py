@@ -86,12 +86,12 @@ def test_the_gaussian_of_the_ellipses_is_the_posterior_of_a_linear_link(monkeypa
     draws = jax.vmap(latent.force)(jax.random.normal(jax.random.key(0), (50, 1, problem.POINTS)))[:, 0]
     found = ellipses.resembling(latent, data.y, draws)
     assert np.allclose(found.mean, exact.mode[0], atol=1e-7)
-    start, log_ratio, drawn, centre = ellipses.around(latent, data.y, found)
-    some = jax.vmap(drawn)(jax.random.split(jax.random.key(1), 4000))
+    own = ellipses.around(latent, data.y, found)
+    some = jax.vmap(own.draw)(jax.random.split(jax.random.key(1), 4000))
     assert np.all(np.abs(np.asarray(some.force).std(axis=0) / exact.sd[0] - 1) < 5 / np.sqrt(2 * 4000))
     assert np.abs(some.force.mean(axis=0) - exact.mode[0]).max() < 4.5 * float(jnp.max(exact.sd)) / np.sqrt(4000)
-    assert np.ptp(jax.vmap(log_ratio)(some)) < 1e-6
-    assert np.allclose(start(some.force[0]).linear, some.linear[0]) and np.allclose(centre.force, found.mean)
+    assert np.ptp(jax.vmap(own.log_ratio)(some)) < 1e-6
+    assert np.allclose(own.point(some.force[0]).linear, some.linear[0]) and np.allclose(own.mean.force, found.mean)
 
 
 @pytest.mark.slow

@@ -52,24 +52,37 @@ class Point(NamedTuple):
     linear: jax.Array
 
 
+class Ellipses(NamedTuple):
+    """How to slice.
+
+    Attributes:
+        point: from a force to its `Point`.
+        log_ratio: log L of a point, or log L/l.
+        draw: from a random key to a draw of the prior, or of the Gaussian.
+        mean: of the prior, or of the Gaussian.
+    """
+
+    point: Callable[[jax.Array], Point]
+    log_ratio: Callable[[Point], jax.Array]
+    draw: Callable[[jax.Array], Point]
+    mean: Point
+
+
 def on_grid(link: str, gamma: Any, rates: problem.Rates) -> LatentGrid:
     """Return the model of a data set with its force on the grid."""
     return LatentGrid(problem.system(link, gamma, rates), problem.TIMES, problem.GRID, RULE)
 
 
-def around(latent: LatentGrid, y: jax.Array, gaussian: Gaussian | None) -> tuple[Callable, Callable, Callable, Point]:
-    """Return how to slice: a force's `Point`, log L or log L/l of one, a draw from a key, and the mean.
-
-    Without a Gaussian the ellipses are those of the prior.
-    """
+def around(latent: LatentGrid, y: jax.Array, gaussian: Gaussian | None) -> Ellipses:
+    """Return the ellipses of a Gaussian; without one, those of the prior."""
     def prior_draw(key: jax.Array) -> jax.Array:
         white = normals(key, 2, (problem.POINTS + 1) // 2).ravel()[: problem.POINTS]
         return latent.root[0] @ white
 
     if gaussian is None:
         nothing = jnp.zeros(0)
-        return (lambda u: Point(u, nothing), lambda point: latent.log_likelihood(point.force[None], y),
-                lambda key: Point(prior_draw(key), nothing), Point(jnp.zeros(problem.POINTS), nothing))
+        return Ellipses(lambda u: Point(u, nothing), lambda point: latent.log_likelihood(point.force[None], y),
+                        lambda key: Point(prior_draw(key), nothing), Point(jnp.zeros(problem.POINTS), nothing))
 
     def log_ratio(point: Point) -> jax.Array:
         z = jax.scipy.linalg.solve_triangular(gaussian.noise_root, gaussian.residual - point.linear, lower=True)
@@ -83,8 +96,8 @@ def around(latent: LatentGrid, y: jax.Array, gaussian: Gaussian | None) -> tuple
         u = u + gaussian.gain @ (gaussian.residual - noisy)
         return Point(u, gaussian.slope @ u)
 
-    return (lambda u: Point(u, gaussian.slope @ u), log_ratio, draw,
-            Point(gaussian.mean, gaussian.slope @ gaussian.mean))
+    return Ellipses(lambda u: Point(u, gaussian.slope @ u), log_ratio, draw,
+                    Point(gaussian.mean, gaussian.slope @ gaussian.mean))
 
 
 def resembling(latent: LatentGrid, y: jax.Array, draws: jax.Array) -> Gaussian:

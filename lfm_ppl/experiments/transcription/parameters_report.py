@@ -22,6 +22,7 @@ from lfm_ppl.experiments.transcription import parameters, problem
 
 TASKS = "tasks"
 SUMMARY = "transcription factors with unknown rates: the marginal posterior against that of the force as latent sites"
+MARKERS, LINES = "osD^", ("-", "--", "-.", ":")
 COLOURS = {parameters.REFERENCE: style.GREY, "NUTS, marginal": style.BLUE, "RAM, marginal": style.ORANGE,
            "RAM, iterated marginal": style.GREEN}
 
@@ -168,11 +169,15 @@ def plot_posteriors(samplers: Mapping[str, Result], data: problem.DataSet, *, wi
         centre, scale = reference["mean"], reference["sd"]
         place = np.arange(len(parameters.NAMES)) + 0.16 * (number - (len(samplers) - 1) / 2)
         upper.vlines(place, (found["low"] - centre) / scale, (found["high"] - centre) / scale, color=COLOURS[sampler])
-        upper.plot(place, (found["mean"] - centre) / scale, ls="", marker="o", ms=2.5, color=COLOURS[sampler])
+        upper.plot(place, (found["mean"] - centre) / scale, ls="", marker=MARKERS[number], ms=2.5,
+                   color=COLOURS[sampler])
         mean, sd = found["force_mean"], found["force_sd"]
-        lower.plot(parameters.AT, mean, color=COLOURS[sampler])
-        for end in (-Z, Z):
-            lower.plot(parameters.AT, mean + end * sd, color=COLOURS[sampler], lw=0.6)
+        lower.plot(parameters.AT, mean, color=COLOURS[sampler], ls=LINES[number])
+        if sampler == parameters.REFERENCE:
+            lower.fill_between(parameters.AT, mean - Z * sd, mean + Z * sd, color=COLOURS[sampler], alpha=0.3, lw=0)
+        else:
+            for end in (-Z, Z):
+                lower.plot(parameters.AT, mean + end * sd, color=COLOURS[sampler], lw=0.6, ls=LINES[number])
     reference = samplers[parameters.REFERENCE]
     upper.plot(np.arange(len(parameters.NAMES)), (reference["truth"] - reference["mean"]) / reference["sd"], ls="",
                marker="_", ms=12, color=style.BLACK)
@@ -185,6 +190,7 @@ def plot_posteriors(samplers: Mapping[str, Result], data: problem.DataSet, *, wi
         style.tidy(axes)
     upper.set_xticks(range(len(parameters.NAMES)), parameters.NAMES, rotation=40, ha="right")
     style.legend_above(figure, [
-        *(Line2D([], [], color=COLOURS[sampler], label=sampler) for sampler in samplers),
+        *(Line2D([], [], color=COLOURS[sampler], marker=MARKERS[number], ms=2.5, ls=LINES[number], label=sampler)
+          for number, sampler in enumerate(samplers)),
         Line2D([], [], color=style.BLACK, label="truth")])
     return figure

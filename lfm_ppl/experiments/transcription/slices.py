@@ -98,14 +98,14 @@ def _program(link: str, count: int, informed: bool) -> Callable:
               position: jax.Array, value: jax.Array) -> tuple:
         key, first = jax.random.split(key)
         position = jnp.where(jnp.isnan(value), latent.root[0] @ normals(first, problem.POINTS, 2)[:, 0], position)
-        start, log_likelihood, drawn, centre = ellipses.around(latent, y, around)
-        begun = start(position)
-        state = SliceState(begun, log_likelihood(begun), jnp.zeros((), int))
+        own = ellipses.around(latent, y, around)
+        begun = own.point(position)
+        state = SliceState(begun, own.log_ratio(begun), jnp.zeros((), int))
 
         def step(_: jax.Array, carry: tuple) -> tuple:
             key, state, sums = carry
             key, draw, move = jax.random.split(key, 3)
-            state = elliptical_slice_step(move, state, drawn(draw), log_likelihood, centre)
+            state = elliptical_slice_step(move, state, own.draw(draw), own.log_ratio, own.mean)
             u = state.position.force
             return key, state, sums + jnp.stack([u, u**2])
 
