@@ -29,10 +29,18 @@ def pytest_configure(config: pytest.Config) -> None:
     """
     if _measures_speed(config):
         return
+    _keep_to_one_cpu(os.environ.get("PYTEST_XDIST_WORKER", ""))
     flags = ["--xla_backend_optimization_level=1"]
     if jaxlib.version.__version_info__ < (0, 11):
         flags.append("--xla_cpu_use_fusion_emitters=false")
     os.environ["XLA_FLAGS"] = " ".join([*flags, os.environ.get("XLA_FLAGS", "")])
+
+
+def _keep_to_one_cpu(worker: str) -> None:
+    """Run xdist's process gw0, gw1... on a CPU of its own: the threads of JAX in one get in the way of the others'."""
+    if worker and hasattr(os, "sched_setaffinity"):
+        cpus = sorted(os.sched_getaffinity(0))
+        os.sched_setaffinity(0, [cpus[int(worker.removeprefix("gw")) % len(cpus)]])
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:

@@ -42,7 +42,7 @@ class Settings:
 
     datasets: int = 2
     seed: int = 0
-    nuts: tuple[int, int, int, int] = (2, 400, 600, 1)
+    nuts: tuple[int, int, int, int] = (4, 500, 1000, 1)
     ram: tuple[int, int, int, int] = (4, 500, 1000, 50)
     tree_depth: int = 10
     links: tuple[str, ...] = tuple(parameters.LINKS)
