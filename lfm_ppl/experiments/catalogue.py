@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pandas as pd
 
@@ -38,6 +38,24 @@ class Wanted(NamedTuple):
     overwrite: bool = False
     report: Callable[[str], None] | None = None
     workers: int = 1
+
+    def counts(self, **names: str) -> dict[str, Any]:
+        """Return the seed, and the counts that a user gave, under the names that the experiment's settings have.
+
+        Args:
+            names: ``realisations`` and ``conditional``, where the experiment has them -> name in its settings.
+
+        Raises:
+            ValueError: conditional posteriors are asked of an experiment without them.
+
+        Example:
+            >>> Wanted(Path("out"), realisations=10).counts(realisations="datasets")
+            {'seed': 0, 'datasets': 10}
+        """
+        if self.conditional is not None and "conditional" not in names:
+            raise ValueError("the experiment has no conditional posteriors; leave out --conditional.")
+        given = {own: getattr(self, name) for name, own in names.items()}
+        return {"seed": self.seed} | {own: count for own, count in given.items() if count is not None}
 
 
 class Report(NamedTuple):

@@ -115,12 +115,12 @@ def run_tasks(tasks: Iterable[Task], compute: Callable[[Task], Mapping[str, Any]
         >>> float(found["square/2"]["value"])
         4.0
     """
+    checks.positive_integer("workers", workers)
     tasks, folder = list(tasks), Path(folder)
     _check_distinct(tasks)
     stored = {task.name: _stored(task, folder, overwrite) for task in tasks}
     missing = [task for task in tasks if stored[task.name] is None]
     progress = _Progress(len(tasks), len(missing), report)
-    checks.positive_integer("workers", workers)
     for task in _computed(missing, compute, folder, min(workers, len(missing))):
         stored[task.name] = read(task, folder)
         progress.done(task)

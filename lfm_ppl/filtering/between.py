@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.filtering.predict import Moments, Prediction, predict_row
-from lfm_ppl.filtering.retrospect import combine
+from lfm_ppl.filtering.retrospect import combine, given_later
 from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays
 from lfm_ppl.filtering.transition import integrating_factor, linear_part
-from lfm_ppl.linalg import congruence, matmul, solve_semidefinite
+from lfm_ppl.linalg import congruence, matmul
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.augment import StateSpaceModel
 
@@ -87,9 +87,7 @@ def marginals_between(ssm: StateSpaceModel, rule: Rule, plan: Schedule, start: M
         now = piece(here.start, length, _entry(before, index), nearby[0], False).moments
         rest = piece(here.start + length, here.length - length, now, nearby[1], True)
         rest = _through_jump(ssm, jumps, here.jump, rest)
-        gain = solve_semidefinite(rest.moments.covariance, matmul(rest.phi, now.covariance)).T
-        conditional = congruence(jnp.eye(ssm.state_dim) - matmul(gain, rest.phi), now.covariance) + congruence(
-            gain, rest.noise)
+        gain, conditional = given_later(now, rest.moments, rest.phi, rest.noise)
         r, curvature = adjoint[0][index], adjoint[1][index]
         back = matmul(rest.phi.T, r[:, None])[:, 0], congruence(rest.phi.T, curvature)
         inside = combine(now, rest.moments, last, gain, conditional, *back)

@@ -20,7 +20,7 @@ from lfm_ppl.filtering.filter import (
     warn_single_precision,
 )
 from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.filtering.retrospect import combine
+from lfm_ppl.filtering.retrospect import combine, given_later
 from lfm_ppl.filtering.schedule import Schedule, schedule
 from lfm_ppl.linalg import (
     cholesky,
@@ -29,7 +29,6 @@ from lfm_ppl.linalg import (
     safe_sqrt,
     semidefinite_root,
     solve_lower,
-    solve_semidefinite,
     solve_upper,
 )
 from lfm_ppl.linearisation.rule import Rule
@@ -187,14 +186,12 @@ def backward(passed: Pass, start: Moments, plan: Schedule) -> Smoothed:
     def step(carry: tuple, row: tuple) -> tuple[tuple, tuple]:
         later, r, adjoint = carry
         at, one, at_rest = row
-        gain = solve_semidefinite(one.predicted.covariance, matmul(one.phi, at.covariance)).T
-        gain = jnp.where(at_rest, identity, gain)
-        kept = identity - matmul(gain, one.phi)
-        conditional = congruence(kept, at.covariance) + congruence(gain, one.noise)
+        gain, conditional = given_later(at, one.predicted, one.phi, one.noise)
+        # Nothing happens in a row without length but for the observation at its end.
+        gain, conditional = jnp.where(at_rest, identity, gain), jnp.where(at_rest, 0.0, conditional)
         left_out, r, adjoint = _leave_one_out(one, r, adjoint)
         back = matmul(one.phi.T, r[:, None])[:, 0], congruence(one.phi.T, adjoint)
         smoothed = combine(at, one.predicted, later, gain, conditional, *back)
-        # Nothing happens in a row without length but for the observation at its end.
         smoothed = jax.tree_util.tree_map(lambda a, b: jnp.where(at_rest, a, b), later, smoothed)
         return (smoothed, *back), (later, gain, conditional, left_out, (r, adjoint))
 

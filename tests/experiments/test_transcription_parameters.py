@@ -2,11 +2,13 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro
 import pytest
 
+from lfm_ppl.analysis import arviz_data
 from lfm_ppl.experiments.tasks import Task
 from lfm_ppl.experiments.transcription import parameters, parameters_report, problem
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
@@ -54,7 +56,7 @@ def made_up(settings):
             "mean": mean, "sd": sd, "low": mean - 2 * sd, "high": mean + 2 * sd, "truth": truth,
             "ess": np.full(truth.shape, 200.0), "r_hat": np.full(truth.shape, 1.004), "seconds": 100.0,
             "divergences": 1, "rmse": 0.4, "coverage": 0.95, "force_mean": np.zeros(parameters.AT.shape),
-            "force_sd": np.ones(parameters.AT.shape)}
+            "force_sd": np.ones(parameters.AT.shape), **({"k": 0.2} if "iterated" in label else {})}
     return results
 
 
@@ -70,6 +72,7 @@ def test_the_table_measures_in_standard_deviations_of_the_reference():
     row = table.loc["softplus: RAM, marginal"]
     assert row["shift"] == pytest.approx(0.5) and row["sd ratio"] == pytest.approx(1.1)
     assert row["ESS/CPU s"] == pytest.approx(2.0) and row["coverage"] == 1.0 and row["R-hat"] == pytest.approx(1.004)
+    assert np.isnan(row["k"]) and table.loc["softplus: RAM, iterated marginal", "k"] == 0.2
     assert row["shift se"] == pytest.approx(0.1) and row["least ESS"] == 200.0
     assert table.loc[f"softplus: {parameters.REFERENCE}", "shift"] == 0.0
 
@@ -121,3 +124,28 @@ def test_on_a_linear_link_marginal_and_latent_posteriors_are_the_same(monkeypatc
     assert np.all(np.abs(marginal["mean"] - latent["mean"]) / latent["sd"] < 4.5 * error)
     assert np.all(np.abs(np.log(marginal["sd"] / latent["sd"])) < 4.5 * error)
     assert np.abs(marginal["force_mean"] - latent["force_mean"]).max() < 0.3
+
+
+@pytest.mark.slow
+def test_draws_are_taken_as_often_as_the_iterated_likelihood_says():
+    data = problem.data_set(SOFTPLUS, 4)
+    truth = parameters.true_values(data)
+    draws = truth[:, None, None] * np.random.default_rng(0).uniform(0.8, 1.2, (len(truth), 2, 20))
+
+    def log_likelihood(theta, iterations):
+        basal, decay, sensitivity, away = theta[:12].reshape(4, 3)
+        rates = problem.Rates(basal, sensitivity, decay, away + basal / decay)
+        system = problem.system("softplus", None, rates, theta[12], theta[13])
+        return MarginalLikelihood(system, problem.TIMES, rule=parameters.RULE, steps=parameters.STEPS,
+                                  iterations=iterations).log_prob(data.y)
+
+    flat = jnp.asarray(draws.reshape(len(truth), -1).T)
+    ratio = jax.vmap(lambda theta: log_likelihood(theta, 2) - log_likelihood(theta, 0))(flat)
+    smoothed, k = arviz_data.psis(np.asarray(ratio))
+    weight = np.exp(smoothed).reshape(2, 20)
+    found, found_k = parameters._weighted({"link": "softplus", "gamma": None}, 2, data, draws)
+    assert found.shape == draws.shape and found_k == pytest.approx(k)
+    for chain, own in enumerate(weight / weight.sum(axis=1, keepdims=True)):
+        counts = [(found[0, chain] == value).sum() for value in draws[0, chain]]
+        assert np.abs(counts - 20 * own).max() < 1
+        assert (found[:, chain, :, None] == draws[:, chain, None, :]).all(axis=0).any(axis=1).all()  # whole draws

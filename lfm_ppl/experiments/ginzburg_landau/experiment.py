@@ -77,7 +77,7 @@ class Settings:
 
 
 def quick(realisations: int = 2, conditional: int = 4, seed: int = 0) -> Settings:
-    """Return settings that show in a minute or two that everything runs, and no more."""
+    """Return settings that show in a few minutes that everything runs, and no more."""
     return Settings(
         realisations, conditional, seed, particles=500, smoother_particles=200, smoother_draws=50,
         conditional_particles=200, cells=160, draw_cells=120, nodes=31, paths=10, marginal_particles=50,

@@ -16,9 +16,7 @@ def run(wanted: Wanted) -> Report:
         ValueError: the folder holds results made with other settings.
     """
     make = experiment.quick if wanted.quick else experiment.Settings
-    counts = {name: value for name in ("realisations", "conditional")
-              if (value := getattr(wanted, name)) is not None}
-    settings = make(seed=wanted.seed, **counts)
+    settings = make(**wanted.counts(realisations="realisations", conditional="conditional"))
     found = experiment.run(settings, wanted.folder, overwrite=wanted.overwrite, report=wanted.report,
                            workers=wanted.workers)
     written = experiment.save(found, wanted.folder)

@@ -150,10 +150,7 @@ def run(settings: Settings, folder: str | Path, *, overwrite: bool = False,
 
 def by_cell(settings: Settings, results: dict[str, Result]) -> dict[tuple[str, str], Result]:
     """Return (configuration, method) -> the results of all its data sets, one after another."""
-    cells: dict[tuple[str, str], list[Result]] = {}
-    for task in all_tasks(settings):
-        label = problem.Configuration(task.settings["link"], task.settings["gamma"]).label
-        cells.setdefault((label, task.settings["method"]), []).append(results[task.name])
+    cells = problem.by_cell(all_tasks(settings), results, "method")
     return {cell: {name: np.concatenate([np.atleast_1d(part[name]) for part in parts]) for name in parts[0]}
             for cell, parts in cells.items()}
 

@@ -42,8 +42,8 @@ class Settings:
 
     datasets: int = 2
     seed: int = 0
-    nuts: tuple[int, int, int, int] = (4, 500, 1000, 1)
-    ram: tuple[int, int, int, int] = (4, 500, 1000, 50)
+    nuts: tuple[int, int, int, int] = (2, 500, 1000, 1)
+    ram: tuple[int, int, int, int] = (4, 250, 1000, 200)
     tree_depth: int = 10
     links: tuple[str, ...] = tuple(parameters.LINKS)
 
@@ -81,11 +81,8 @@ def run(wanted: Wanted) -> Report:
     Raises:
         ValueError: the folder holds results made with other settings; something is asked that it does not have.
     """
-    if wanted.conditional is not None:
-        raise ValueError("the experiment transcription-parameters has no conditional posteriors; leave out "
-                         "--conditional.")
     make = quick if wanted.quick else Settings
-    settings = make(seed=wanted.seed, **({} if wanted.realisations is None else {"datasets": wanted.realisations}))
+    settings = make(**wanted.counts(realisations="datasets"))
     found = compute(settings, wanted.folder, overwrite=wanted.overwrite, report=wanted.report, workers=wanted.workers)
     written = output.save(wanted.folder, {"agreement": found.table}, draw(found), "case")
     title = f"Against {parameters.REFERENCE}, {settings.datasets} data set{'s' if settings.datasets > 1 else ''}"
@@ -103,11 +100,7 @@ def compute(settings: Settings, folder: str | Path, *, overwrite: bool = False,
 
 def by_cell(settings: Settings, results: Mapping[str, Result]) -> dict[tuple[str, str], list[Result]]:
     """Return (link, sampler) -> results of all data sets."""
-    cells: dict[tuple[str, str], list[Result]] = {}
-    for task in parameters.tasks(settings):
-        label = problem.Configuration(task.settings["link"], task.settings["gamma"]).label
-        cells.setdefault((label, task.settings["sampler"]), []).append(results[task.name])
-    return cells
+    return problem.by_cell(parameters.tasks(settings), results, "sampler")
 
 
 def agreement(cells: Mapping[tuple[str, str], list[Result]]) -> pd.DataFrame:
@@ -119,7 +112,8 @@ def agreement(cells: Mapping[tuple[str, str], list[Result]]) -> pd.DataFrame:
         se`` and ``sd ratio se`` are the Monte Carlo errors of these two, to be held against them, as the largest of
         many; ``coverage`` of the true parameters by 95% intervals; ``RMSE`` of the force and ``coverage force``;
         ``least ESS``, the smallest bulk effective sample size of a parameter, and ``ESS/CPU s``, the same for a second
-        of CPU time of warm-up and draws, compilation included; the largest ``R-hat``; ``divergences`` of one run.
+        of CPU time of warm-up and draws, compilation included; the largest ``R-hat``, and Pareto index ``k`` where
+        draws are weighted; ``divergences`` of one run.
     """
     rows = {}
     for (label, sampler), found in cells.items():
@@ -140,6 +134,7 @@ def agreement(cells: Mapping[tuple[str, str], list[Result]]) -> pd.DataFrame:
             row |= pair(name, mean_of(values))
         row |= {"least ESS": min(float(one["ess"].min()) for one in found),
                 "R-hat": max(float(one["r_hat"].max()) for one in found),
+                "k": max(float(one.get("k", np.nan)) for one in found),
                 "divergences": float(np.mean([one["divergences"] for one in found]))}
         rows[f"{label}: {sampler}"] = row
     return pd.DataFrame.from_dict(rows, orient="index", dtype=float)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -11,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import checks
+from lfm_ppl.experiments.tasks import Result, Task
 from lfm_ppl.forces import Matern
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation import Gaussian, GaussianObservation
@@ -63,6 +65,15 @@ PUBLISHED = {
 def slug(label: str) -> str:
     """Return a label as part of the name of a task or a file."""
     return label.replace(", ", "-").replace(" ", "-")
+
+
+def by_cell(tasks: Iterable[Task], results: Mapping[str, Result], by: str) -> dict[tuple[str, str], list[Result]]:
+    """Return (label of the configuration, setting ``by``) -> results of all its tasks, in their order."""
+    cells: dict[tuple[str, str], list[Result]] = {}
+    for task in tasks:
+        label = Configuration(task.settings["link"], task.settings["gamma"]).label
+        cells.setdefault((label, task.settings[by]), []).append(results[task.name])
+    return cells
 
 
 def activity(u: jax.Array, link: str, gamma: Any) -> jax.Array:

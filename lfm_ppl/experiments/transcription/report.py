@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.catalogue import Report, Wanted
 from lfm_ppl.experiments.transcription import experiment
@@ -17,11 +15,8 @@ def run(wanted: Wanted) -> Report:
     Raises:
         ValueError: the folder holds results made with other settings; something is asked that it does not have.
     """
-    if wanted.conditional is not None:
-        raise ValueError("the experiment transcription has no conditional posteriors; leave out --conditional.")
     make = experiment.quick if wanted.quick else experiment.Settings
-    counts: dict[str, Any] = {} if wanted.realisations is None else {"datasets": wanted.realisations}
-    settings = make(seed=wanted.seed, **counts)
+    settings = make(**wanted.counts(realisations="datasets"))
     found = experiment.run(settings, wanted.folder, overwrite=wanted.overwrite, report=wanted.report,
                            workers=wanted.workers)
     written = experiment.save(found, wanted.folder)
