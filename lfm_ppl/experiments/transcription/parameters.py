@@ -100,6 +100,8 @@ def compute(task: Task) -> Result:
     ``k`` is the Pareto index of the weights, where draws are weighted; the diagnostics are then those of as many draws,
     taken from each chain by weight.
     """
+    # The programs of one task serve no other, and would stay: half a gigabyte each.
+    jax.clear_caches()
     settings = task.settings
     sampler = SAMPLERS[settings["sampler"]]
     data = problem.data_set(problem.Configuration(settings["link"], settings["gamma"]), settings["index"], task.seed)
