@@ -1,0 +1,151 @@
+"""Ballistic target on reentry, decelerated by drag and pushed by an unseen force.
+
+A target falls towards the ground. Its altitude r (m) and its speed downwards v (m/s) follow
+
+    dr = -v dt + q_r dB_1,
+    dv = (-alpha exp(-gamma r) v^2 + g + u(t)) dt + q_v dB_2,
+    y_k = sqrt(s_x^2 + (s_y - r(t_k))^2) + e_k,    e_k ~ N(0, noise_sd^2),
+
+where the drag grows with the density of the air, gamma = 1.49e-4 per metre, g = 9.8 m/s^2, and u is an
+unknown acceleration, a Gaussian process with a Matern-5/2 covariance. A radar at (s_x, s_y), 30 km aside
+and 30 m above the ground, measures the distance alone. Dynamics and measurement are both non-linear.
+
+Unknown are the drag alpha and the force's scale and lengthscale. The levels of the noise, q_r, q_v and
+noise_sd, are known in the source and fixed at its values unless they are freed, as in
+
+    lfm-ppl fit ballistic --set noise_sd=free
+
+The target is at about 65 km at the first time and falls at about 3 km/s: r ~ N(65000, 500^2),
+v ~ N(3000, 100^2). The default data start at the means, and have 120 distances in 30 s.
+
+Sources: J. Hartikainen, M. Seppanen and S. Sarkka, State-space inference for non-linear latent force
+models (ICML 2012), section 5.2; X. R. Li and V. P. Jilkov, Survey of maneuvering target tracking: II.
+Ballistic target models, Proc. SPIE 4473 (2001).
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+
+import lfm_ppl as lfm
+
+OUTPUTS = ("distance",)
+UNITS = {
+    "time": "s",
+    "distance": "m",
+    "altitude": "m",
+    "speed": "m/s",
+    "u": "m/s^2",
+}
+OPTIONS = {
+    "aside": (30_000.0, float, "horizontal distance of the radar from the target's path (m)"),
+    "height": (30.0, float, "height of the radar above the ground (m)"),
+}
+PARAMETERS = {
+    "alpha": "drag where the density of the air is that of the ground (1/m)",
+    "scale": "standard deviation of the unknown acceleration (m/s^2)",
+    "lengthscale": "lengthscale of the unknown acceleration (s)",
+    "q_r": "dispersion of the altitude (m/sqrt(s))",
+    "q_v": "dispersion of the speed (m/s/sqrt(s))",
+    "noise_sd": "standard deviation of the radar's noise (m)",
+}
+KNOWN = {"q_r": 50.0, "q_v": 10.0, "noise_sd": 30.0}
+TRUTH = {"alpha": 4.49e-4, "scale": 50.0, "lengthscale": 5.0, **KNOWN}
+AIR, GRAVITY = 1.49e-4, 9.8
+START = (65_000.0, 3_000.0)
+START_SD = (500.0, 100.0)
+GRID = np.linspace(0.0, 30.0, 1191)  # ten cells between two of 120 measurements
+STEPS = 4
+
+
+def build(
+    alpha, scale, lengthscale, q_r, q_v, noise_sd, aside=30_000.0, height=30.0, units=None, start_sd=START_SD
+) -> lfm.LatentForceModel:
+    """Return the target with these parameters.
+
+    Args:
+        alpha: see PARAMETERS; so are all before `aside`.
+        scale: see PARAMETERS.
+        lengthscale: see PARAMETERS.
+        q_r: see PARAMETERS.
+        q_v: see PARAMETERS.
+        noise_sd: see PARAMETERS.
+        aside: horizontal distance of the radar (m).
+        height: of the radar (m).
+        units: name -> unit.
+        start_sd: standard deviations of altitude and speed at the first time.
+    """
+
+    def dynamics(x, u, t):
+        altitude, speed = x
+        return jnp.stack([-speed, -alpha * jnp.exp(-AIR * altitude) * speed**2 + GRAVITY + u[0]])
+
+    def distance(x, u, t):
+        return jnp.sqrt(aside**2 + (height - x[:1]) ** 2)
+
+    return lfm.LatentForceModel(
+        dynamics=dynamics,
+        forces={"u": lfm.Matern(scale=scale, lengthscale=lengthscale, order=2)},
+        process_noise=jnp.diag(jnp.array([q_r, q_v], dtype=float)),
+        observation=lfm.GaussianObservation(distance, noise_sd**2 * jnp.ones(1)),
+        initial_state=lfm.Gaussian(jnp.array(START), jnp.diag(jnp.array(start_sd) ** 2)),
+        state_names=("altitude", "speed"),
+        output_names=OUTPUTS,
+        units=units,
+    )
+
+
+def model(times, y=None, aside: float = 30_000.0, height: float = 30.0, units=None) -> None:
+    """Sample the drag, the force's parameters and the noise, and score the distances.
+
+    Args:
+        times: of the measurements (s), shape (T,).
+        y: distances (m), shape (T, 1); NaN is missing, None draws from the prior predictive.
+        aside: horizontal distance of the radar from the target's path (m).
+        height: of the radar (m).
+        units: name -> unit, for plots.
+    """
+    alpha = numpyro.sample("alpha", dist.LogNormal(jnp.log(5e-4), 1.0))
+    scale = numpyro.sample("scale", dist.LogNormal(jnp.log(30.0), 1.0))
+    lengthscale = numpyro.sample("lengthscale", dist.LogNormal(jnp.log(5.0), 0.7))
+    q_r, q_v, noise_sd = (numpyro.sample(name, dist.LogNormal(jnp.log(value), 0.7)) for name, value in KNOWN.items())
+    system = build(alpha, scale, lengthscale, q_r, q_v, noise_sd, aside, height, units)
+    numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=STEPS), obs=y)
+
+
+def anchors(data: lfm.Data) -> dict[str, float]:
+    """Return what is known unless it is freed: the levels of the noise."""
+    return dict(KNOWN)
+
+
+def simulate(seed: int = 0, aside: float = 30_000.0, height: float = 30.0) -> lfm.Data:
+    """Simulate 30 s of the source's target, measured 120 times.
+
+    Args:
+        seed: of force, path and noise.
+        aside: horizontal distance of the radar (m).
+        height: of the radar (m).
+    """
+    drawn = _simulator(float(aside), float(height))(jax.random.key(seed))
+    observed = np.arange(0, len(GRID), 10)
+    return lfm.Data(
+        times=GRID[observed],
+        y=np.asarray(drawn.y)[observed],
+        outputs=OUTPUTS,
+        units=UNITS,
+        truth={"times": GRID, "forces": drawn.forces, "state": drawn.state, "parameters": TRUTH},
+    )
+
+
+@functools.cache
+def _simulator(aside: float, height: float) -> Callable[[jax.Array], lfm.Simulation]:
+    """Return the simulator, compiled once for all seeds."""
+    system = build(**TRUTH, aside=aside, height=height, start_sd=(0.0, 0.0))
+    return jax.jit(lambda key: lfm.simulate(key, system, GRID, steps=5))
