@@ -1,7 +1,9 @@
 """Settings that every test needs: double precision, compiled programs kept between runs, and processes to run in."""
 
+import contextlib
 import gc
 import os
+import re
 from pathlib import Path
 
 import jax
@@ -38,9 +40,11 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def _keep_to_one_cpu(worker: str) -> None:
     """Run xdist's process gw0, gw1... on a CPU of its own: the threads of JAX in one get in the way of the others'."""
-    if worker and hasattr(os, "sched_setaffinity"):
+    several = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")) > 1
+    if several and re.fullmatch(r"gw\d+", worker) and hasattr(os, "sched_setaffinity"):
         cpus = sorted(os.sched_getaffinity(0))
-        os.sched_setaffinity(0, [cpus[int(worker.removeprefix("gw")) % len(cpus)]])
+        with contextlib.suppress(OSError):
+            os.sched_setaffinity(0, [cpus[int(worker[2:]) % len(cpus)]])
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import shutil
 import sys
 import time
@@ -20,7 +19,7 @@ def run(arguments: argparse.Namespace) -> int:
     session.start(chains=1)
     from lfm_ppl.analysis import tables
     from lfm_ppl.experiments import catalogue
-    from lfm_ppl.experiments.tasks import duration
+    from lfm_ppl.experiments.tasks import available_cpus, duration
 
     if arguments.experiment is None:
         _list()
@@ -31,7 +30,7 @@ def run(arguments: argparse.Namespace) -> int:
     found = chosen.run(catalogue.Wanted(
         folder, arguments.realisations, arguments.conditional, arguments.seed, arguments.quick, arguments.overwrite,
         None if arguments.quiet else lambda line: print(line, file=sys.stderr, flush=True),
-        arguments.jobs or min(os.cpu_count() or 1, _MOST_JOBS)))
+        arguments.jobs or min(available_cpus(), _MOST_JOBS)))
     for title, table in found.tables.items():
         print(f"\n{title}\n{tables.text_table(table, width=shutil.get_terminal_size().columns)}")
     print(f"\ntime     {duration(time.perf_counter() - started)}")

@@ -46,16 +46,16 @@ class Wanted(NamedTuple):
             names: ``realisations`` and ``conditional``, where the experiment has them -> name in its settings.
 
         Raises:
-            ValueError: conditional posteriors are asked of an experiment without them.
+            ValueError: a count is given that the experiment does not have.
 
         Example:
             >>> Wanted(Path("out"), realisations=10).counts(realisations="datasets")
             {'seed': 0, 'datasets': 10}
         """
-        if self.conditional is not None and "conditional" not in names:
-            raise ValueError("the experiment has no conditional posteriors; leave out --conditional.")
-        given = {own: getattr(self, name) for name, own in names.items()}
-        return {"seed": self.seed} | {own: count for own, count in given.items() if count is not None}
+        given = {name: count for name in ("realisations", "conditional") if (count := getattr(self, name)) is not None}
+        for name in set(given) - set(names):
+            raise ValueError(f"this experiment does not take --{name}; leave it out.")
+        return {"seed": self.seed} | {names[name]: count for name, count in given.items()}
 
 
 class Report(NamedTuple):

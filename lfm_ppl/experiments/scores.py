@@ -134,6 +134,19 @@ def diagnose(names: Sequence[str], draws: np.ndarray) -> dict[str, np.ndarray]:
     return {name: summary[column].to_numpy() for name, column in columns.items()}
 
 
+def relative_errors_of_sd(draws: np.ndarray) -> np.ndarray:
+    """Return the Monte Carlo errors of standard deviations, as shares of them, (P,) of draws (P, chains, draws).
+
+    The standard deviation s follows the mean of (x - m)^2, so that its error is s times that of the mean of
+    ((x - m)^2 / s^2 - 1) / 2: larger for heavy tails than for a normal distribution, and with the autocorrelation of
+    the squares. NaN where all draws of a parameter are equal.
+    """
+    mean, variance = draws.mean(axis=(1, 2), keepdims=True), draws.var(axis=(1, 2), keepdims=True)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        squares = 0.5 * ((draws - mean) ** 2 / variance - 1.0)
+    return np.array([arviz_data.mcse_mean(one) for one in squares])
+
+
 class GridPosterior:
     r"""Posterior of one parameter under a flat prior, from its log likelihood at the nodes of a grid.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import itertools
@@ -167,15 +168,30 @@ def _start_worker(double: bool, begun: Any, workers: int) -> None:
 
 
 def _keep_to_share(number: int, workers: int) -> None:
-    """Run on this worker's share of the CPUs alone, before JAX counts them for its threads.
+    """Run on this worker's share of the CPUs alone, where the system lets it, before JAX counts them for its threads.
 
     Each process would otherwise have as many threads as there are CPUs, which hand small operations to one another: two
     Hamiltonian chains side by side on two CPUs took over four times as long as one by itself.
     """
-    if not hasattr(os, "sched_setaffinity"):  # macOS
-        return
-    cpus = sorted(os.sched_getaffinity(0))
-    os.sched_setaffinity(0, cpus[number % workers::workers] or [cpus[number % len(cpus)]])
+    if hasattr(os, "sched_setaffinity"):  # not on macOS and Windows
+        with contextlib.suppress(OSError):  # a sandbox may forbid it
+            os.sched_setaffinity(0, share(os.sched_getaffinity(0), number, workers))
+
+
+def share(cpus: Iterable[int], number: int, workers: int) -> list[int]:
+    """Return the CPUs of worker ``number``: disjoint and all of them together, or one each where they are too few.
+
+    Example:
+        >>> share([0, 1, 2], 0, 2), share([0, 1, 2], 1, 2), share([0, 1], 2, 3)
+        ([0, 2], [1], [0])
+    """
+    ordered = sorted(cpus)
+    return ordered[number % workers::workers] or [ordered[number % len(ordered)]]
+
+
+def available_cpus() -> int:
+    """Return the number of CPUs that this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _end_with_parent() -> None:

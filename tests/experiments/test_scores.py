@@ -77,3 +77,13 @@ def test_estimates_show_as_many_digits_as_the_error_leaves():
 def test_errors_and_coverage():
     assert scores.rmse([1.0, 3.0], [0.0, 0.0]) == pytest.approx(np.sqrt(5.0))
     assert scores.covered([0.0, 0.0], [1.0, 1.0], [0.5, 2.0]) == 0.5
+
+
+def test_the_error_of_a_standard_deviation_follows_from_the_fourth_moment():
+    """sd of s is s sqrt((kurtosis - 1) / (4 n)) for independent draws; squares that repeat count once."""
+    generator = np.random.default_rng(3)
+    heavy, normal = generator.laplace(size=(4, 5000)), generator.normal(size=(4, 5000))
+    found = scores.relative_errors_of_sd(np.stack([heavy, normal, np.repeat(normal[:, :1250], 4, axis=1)]))
+    expected = np.sqrt(np.array([6.0, 3.0, 3.0]) - 1) / np.sqrt(4 * np.array([20_000, 20_000, 5_000]))
+    np.testing.assert_allclose(found, expected, rtol=0.12)
+    assert np.isnan(scores.relative_errors_of_sd(np.ones((1, 2, 50)))).all()

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 import pytest
 
-from lfm_ppl.experiments.tasks import Task, duration, read, run_tasks, write
+from lfm_ppl.experiments.tasks import Task, available_cpus, duration, read, run_tasks, share, write
 
 
 def tasks(count=4, **settings):
@@ -65,6 +65,31 @@ def test_several_processes_find_the_same_numbers(tmp_path):
     assert (tmp_path / "broken" / "noise-00.npz").is_file() and not (tmp_path / "broken" / "noise-01.npz").exists()
     with pytest.raises(ValueError, match="workers"):
         run_tasks(tasks(), noise, tmp_path, workers=0)
+
+
+def cpus(task):
+    time.sleep(1.0)  # so that every process gets one of the tasks
+    return {"process": os.getpid(), "cpus": np.array(sorted(os.sched_getaffinity(0)))}
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="the system does not tell or take CPUs")
+def test_each_process_keeps_to_its_share_of_the_cpus(tmp_path):
+    own = os.sched_getaffinity(0)
+    found = run_tasks(tasks(2), cpus, tmp_path, workers=2)
+    shares = {int(one["process"]): one["cpus"].tolist() for one in found.values()}
+    assert sorted(shares.values()) == sorted(share(own, number, 2) for number in range(2))
+    assert os.sched_getaffinity(0) == own and available_cpus() == len(own)
+
+
+@pytest.mark.parametrize("count, workers", [(5, 3), (4, 4), (16, 2), (7, 1)])
+def test_shares_are_disjoint_and_leave_no_cpu_out(count, workers):
+    shares = [share(range(10, 10 + count), number, workers) for number in range(workers)]
+    assert sorted(sum(shares, [])) == list(range(10, 10 + count))
+    assert max(map(len, shares)) - min(map(len, shares)) <= 1
+
+
+def test_more_processes_than_cpus_have_one_each():
+    assert [share([4, 8], number, 5) for number in range(5)] == [[4], [8], [4], [8], [4]]
 
 
 def kept(task):

@@ -1,6 +1,7 @@
 """The experiment with unknown rates: its model, its samplers on a little of it, its table and figure."""
 
 import dataclasses
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ import numpyro
 import pytest
 
 from lfm_ppl.analysis import arviz_data
+from lfm_ppl.experiments import catalogue
 from lfm_ppl.experiments.tasks import Task
 from lfm_ppl.experiments.transcription import parameters, parameters_report, problem
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
@@ -46,7 +48,7 @@ def test_true_values_stand_in_the_order_of_the_names():
 
 def made_up(settings):
     """Results of every task: the marginal samplers half a standard deviation off, and 10% too wide."""
-    results = {}
+    results, draws = {}, np.random.default_rng(0).normal(size=(len(parameters.NAMES), 2, 500))
     for task in parameters.tasks(settings):
         label = task.settings["sampler"]
         truth = np.linspace(0.1, 1.0, len(parameters.NAMES))
@@ -56,7 +58,7 @@ def made_up(settings):
             "mean": mean, "sd": sd, "low": mean - 2 * sd, "high": mean + 2 * sd, "truth": truth,
             "ess": np.full(truth.shape, 200.0), "r_hat": np.full(truth.shape, 1.004), "seconds": 100.0,
             "divergences": 1, "rmse": 0.4, "coverage": 0.95, "force_mean": np.zeros(parameters.AT.shape),
-            "force_sd": np.ones(parameters.AT.shape), **({"k": 0.2} if "iterated" in label else {})}
+            "force_sd": np.ones(parameters.AT.shape), "draws": draws, **({"k": 0.2} if "iterated" in label else {})}
     return results
 
 
@@ -74,7 +76,21 @@ def test_the_table_measures_in_standard_deviations_of_the_reference():
     assert row["ESS/CPU s"] == pytest.approx(2.0) and row["coverage"] == 1.0 and row["R-hat"] == pytest.approx(1.004)
     assert np.isnan(row["k"]) and table.loc["softplus: RAM, iterated marginal", "k"] == 0.2
     assert row["shift se"] == pytest.approx(0.1) and row["least ESS"] == 200.0
-    assert table.loc[f"softplus: {parameters.REFERENCE}", "shift"] == 0.0
+    assert row["sd ratio se"] == pytest.approx(1.1 * np.sqrt(2 / (2 * 1000)), rel=0.3)  # normal, independent draws
+    own = table.loc[f"softplus: {parameters.REFERENCE}"]
+    assert own["shift"] == 0.0 and own["sd ratio"] == 1.0 and own[["shift se", "sd ratio se"]].isna().all()
+
+
+def test_a_chain_that_stands_still_shows():
+    two = dataclasses.replace(FEW, datasets=2)
+    results = made_up(two)
+    still = next(task.name for task in parameters.tasks(two) if task.settings["index"] == 1
+                 and task.settings["sampler"] == "RAM, marginal" and task.settings["link"] == "softplus")
+    for name, value in (("ess", np.nan), ("r_hat", np.nan), ("sd", 0.0)):
+        results[still][name][3] = value
+    row = found_in(results, two).table.loc["softplus: RAM, marginal"]
+    assert row["least ESS"] == 0 and row["R-hat"] == np.inf and row["sd ratio"] == 0
+    assert row["ESS/CPU s"] == pytest.approx(1.0)
 
 
 def test_the_figures_are_labelled():
@@ -93,6 +109,15 @@ def test_mistakes():
         parameters_report.Settings(links=("cubic",))
     with pytest.raises(ValueError, match="a tuple of different labels"):
         parameters_report.Settings(links=())
+    with pytest.raises(ValueError, match="chains, warm-up, draws and thinning"):
+        parameters_report.Settings(nuts=(2, 10, 10))
+    with pytest.raises(ValueError, match="ram: chains must be at least 1"):
+        parameters_report.Settings(ram=(0, 1, 1, 1))
+    with pytest.raises(ValueError, match="tree_depth must be at least 1"):
+        parameters_report.Settings(tree_depth=0)
+    wanted = catalogue.Wanted(Path("out"), conditional=3)
+    with pytest.raises(ValueError, match="does not take --conditional"):
+        parameters_report.run(wanted)
 
 
 def settings_of(label, chains, warmup, draws, thin):

@@ -12,7 +12,7 @@ import numpyro
 import numpyro.distributions as dist
 from numpyro.infer import MCMC, NUTS, init_to_uniform
 
-from lfm_ppl.analysis import arviz_data, importance
+from lfm_ppl.analysis import importance
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.tasks import Result, Task
 from lfm_ppl.experiments.timing import timed
@@ -47,7 +47,7 @@ class Sampler(NamedTuple):
         kernel: "NUTS" or "RAM".
         latent: whether the force is a latent site on a grid; otherwise it is filtered out.
         iterations: of posterior linearisation in the likelihood that the draws are weighted to. They come from the
-            likelihood without, which is some ten times as fast and close enough for the weights to be even.
+            likelihood without, which is some ten times as fast and close enough for importance weights.
     """
 
     kernel: str
@@ -61,10 +61,11 @@ REFERENCE = "NUTS, latent grid"
 
 
 def model(times: Any, y: Any = None, link: str = "softplus", gamma: float | None = None) -> None:
-    """Sample rates, start, noise and lengthscale from the distributions that made the data, and score expression.
+    """Sample rates, start, noise and lengthscale, and score expression.
 
-    B ~ U(0, 0.1), D ~ U(0, 2), S ~ U(0, 1) and A ~ U(-0.1, 0.1) with x(0) = A + B/D, as in the source, which knew them;
-    the standard deviation of the noise and the lengthscale, which it fixed, are log-normal about their true values.
+    B ~ U(0, 0.1), D ~ U(0, 2), S ~ U(0, 1) and A ~ U(-0.1, 0.1) with x(0) = A + B/D, the distributions that made the
+    data, whose draws the source knew. The standard deviation of the noise and the lengthscale are the same in all data,
+    and log-normal here about these values.
     """
     def each(name: str, low: float, high: float) -> jax.Array:
         return numpyro.sample(name, dist.Uniform(low, high).expand([problem.GENES]).to_event(1))
@@ -98,7 +99,8 @@ def compute(task: Task) -> Result:
     """Return draws (parameters, chains, draws), their diagnostics, and the force at `AT`.
 
     ``k`` is the Pareto index of the weights, where draws are weighted; the diagnostics are then those of as many draws,
-    taken from each chain by weight.
+    taken from each chain by weight. Every chain keeps its share of the draws: where the weights of one are lower than
+    those of others, R-hat shows it.
     """
     # The programs of one task serve no other, and would stay: half a gigabyte each.
     jax.clear_caches()
@@ -168,11 +170,14 @@ def _weighted(settings: Any, iterations: int, data: problem.DataSet, draws: np.n
 
     flat = jnp.asarray(draws.reshape(len(draws), -1).T)
     ratios = jax.jit(lambda all_: jax.lax.map(log_ratio, all_, batch_size=min(BATCH, len(all_))))(flat)
-    log_weight, k = arviz_data.psis(np.asarray(ratios))
-    chains = log_weight.reshape(draws.shape[1:])
+    found = importance.smooth(np.asarray(ratios).reshape(draws.shape[1:]))
+    if not np.isfinite(found.log_weight).any(axis=1).all():
+        raise ValueError("the iterated likelihood is zero at all draws of a chain; no weights make it a chain of that "
+                         "posterior.")
     # In the order of the chain, whose effective sample size would seem larger otherwise.
-    taken = [np.sort(importance.resample(weights, len(weights), chain)) for chain, weights in enumerate(chains)]
-    return np.stack([draws[:, chain, index] for chain, index in enumerate(taken)], axis=1), k
+    taken = [np.sort(importance.resample(weights, len(weights), chain))
+             for chain, weights in enumerate(found.log_weight)]
+    return np.stack([draws[:, chain, index] for chain, index in enumerate(taken)], axis=1), found.k
 
 
 def _integrated(settings: Any, iterations: int, data: problem.DataSet, draws: np.ndarray

@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 
 from lfm_ppl import checks
 from lfm_ppl.analysis.plots import style
-from lfm_ppl.experiments import output
+from lfm_ppl.experiments import output, scores
 from lfm_ppl.experiments.catalogue import Report, Wanted
 from lfm_ppl.experiments.scores import Estimate, Z, mean_of, pair, readable
 from lfm_ppl.experiments.tasks import Result, run_tasks
@@ -50,8 +50,15 @@ class Settings:
     def __post_init__(self) -> None:
         """Check what a user gives."""
         checks.positive_integer("datasets", self.datasets)
-        if not self.links or isinstance(self.links, str) or len(set(self.links)) < len(self.links):
+        if not isinstance(self.links, tuple) or not self.links or len(set(self.links)) < len(self.links):
             raise ValueError(f"links must be a tuple of different labels, got {self.links!r}.")
+        for name in ("nuts", "ram"):
+            size = getattr(self, name)
+            if not isinstance(size, tuple) or len(size) != 4:
+                raise ValueError(f"{name} must be chains, warm-up, draws and thinning, got {size!r}.")
+            for what, count in zip(("chains", "warm-up", "draws", "thinning"), size, strict=True):
+                checks.positive_integer(f"{name}: {what}", count)
+        checks.positive_integer("tree_depth", self.tree_depth)
         for label in self.links:
             checks.one_of("links", label, parameters.LINKS)
 
@@ -110,31 +117,37 @@ def agreement(cells: Mapping[tuple[str, str], list[Result]]) -> pd.DataFrame:
         ``shift``, the largest distance of a posterior mean from the reference's in its standard deviations, and ``sd
         ratio``, the ratio of standard deviations that is furthest from one, over all parameters and data sets; ``shift
         se`` and ``sd ratio se`` are the Monte Carlo errors of these two, to be held against them, as the largest of
-        many; ``coverage`` of the true parameters by 95% intervals; ``RMSE`` of the force and ``coverage force``;
-        ``least ESS``, the smallest bulk effective sample size of a parameter, and ``ESS/CPU s``, the same for a second
-        of CPU time of warm-up and draws, compilation included; the largest ``R-hat``, and Pareto index ``k`` where
-        draws are weighted; ``divergences`` of one run.
+        many; ``coverage`` of the true parameters by 95% intervals, of which noise and lengthscale lie at the centre of
+        their priors; ``RMSE`` of the force and ``coverage force``; ``least ESS``, the smallest bulk effective sample
+        size of a parameter, and ``ESS/CPU s``, the same for a second of CPU time of warm-up and draws, compilation
+        included, which takes more of it where several CPUs share the work of one process; the largest ``R-hat``, and
+        Pareto index ``k`` where draws are weighted; ``divergences`` of one run.
     """
     rows = {}
     for (label, sampler), found in cells.items():
         reference = cells[label, parameters.REFERENCE]
         pairs = list(zip(found, reference, strict=True))
-        shift = np.concatenate([(one["mean"] - exact["mean"]) / exact["sd"] for one, exact in pairs])
-        ratio = np.concatenate([one["sd"] / exact["sd"] for one, exact in pairs])
-        error = np.concatenate([np.sqrt(1 / one["ess"] + 1 / exact["ess"]) for one, exact in pairs])
-        worst, widest = np.abs(shift).argmax(), np.abs(np.log(ratio)).argmax()
+        shift = np.stack([(one["mean"] - exact["mean"]) / exact["sd"] for one, exact in pairs])
+        ratio = np.stack([one["sd"] / exact["sd"] for one, exact in pairs])
+        error = np.stack([np.sqrt(1 / one["ess"] + 1 / exact["ess"]) for one, exact in pairs])
+        spread = ratio * np.stack([np.hypot(*(scores.relative_errors_of_sd(which["draws"]) for which in both))
+                                   for both in pairs])
+        worst = np.unravel_index(np.abs(shift).argmax(), shift.shape)
+        with np.errstate(divide="ignore"):
+            widest = np.unravel_index(np.abs(np.log(ratio)).argmax(), ratio.shape)
         own = sampler == parameters.REFERENCE
         row = pair("shift", Estimate(float(abs(shift[worst])), np.nan if own else float(error[worst])))
-        row |= pair("sd ratio", Estimate(float(ratio[widest]), np.nan if own else float(
-            ratio[widest] * error[widest] / np.sqrt(2.0))))
+        row |= pair("sd ratio", Estimate(float(ratio[widest]), np.nan if own else float(spread[widest])))
+        # A chain that does not move has neither; it must not look as if it did.
+        least = [float(np.nan_to_num(one["ess"]).min()) for one in found]
+        r_hat = [float(np.nan_to_num(one["r_hat"], nan=np.inf).max()) for one in found]
         covered = [np.mean((one["low"] <= one["truth"]) & (one["truth"] <= one["high"])) for one in found]
         for name, values in (("coverage", covered), ("RMSE", [one["rmse"] for one in found]),
                              ("coverage force", [one["coverage"] for one in found]),
-                             ("ESS/CPU s", [one["ess"].min() / one["seconds"] for one in found])):
+                             ("ESS/CPU s", [ess / one["seconds"] for ess, one in zip(least, found, strict=True)])):
             row |= pair(name, mean_of(values))
-        row |= {"least ESS": min(float(one["ess"].min()) for one in found),
-                "R-hat": max(float(one["r_hat"].max()) for one in found),
-                "k": max(float(one.get("k", np.nan)) for one in found),
+        row |= {"least ESS": min(least), "R-hat": max(r_hat),
+                "k": float(np.max([one.get("k", np.nan) for one in found])),
                 "divergences": float(np.mean([one["divergences"] for one in found]))}
         rows[f"{label}: {sampler}"] = row
     return pd.DataFrame.from_dict(rows, orient="index", dtype=float)
