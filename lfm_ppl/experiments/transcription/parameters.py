@@ -85,7 +85,8 @@ def tasks(settings: Any) -> list[Task]:
     for index in range(settings.datasets):
         for configuration in (LINKS[label] for label in settings.links):
             for label, sampler in SAMPLERS.items():
-                chains, warmup, draws, thin = settings.ram if sampler.kernel == "RAM" else settings.nuts
+                size = "latent" if sampler.latent else sampler.kernel.lower()
+                chains, warmup, draws, thin = getattr(settings, size)
                 name = problem.slug(f"{configuration.label} {label}")
                 own = {"iterations": sampler.iterations} if sampler.iterations else {}
                 found.append(Task(f"parameters/{name}/{index:03d}", settings.seed, {

@@ -34,7 +34,8 @@ class Settings:
     Attributes:
         datasets: for each link.
         seed: of everything random.
-        nuts: chains, and warm-up, draws and thinning of each, of NUTS.
+        latent: chains, and warm-up, draws and thinning of each, of NUTS on the latent grid.
+        nuts: of NUTS on the marginal likelihood.
         ram: of RAM.
         tree_depth: largest of NUTS.
         links: labels of `parameters.LINKS`.
@@ -42,6 +43,7 @@ class Settings:
 
     datasets: int = 2
     seed: int = 0
+    latent: tuple[int, int, int, int] = (2, 500, 5000, 1)
     nuts: tuple[int, int, int, int] = (2, 500, 1000, 1)
     ram: tuple[int, int, int, int] = (4, 250, 1000, 200)
     tree_depth: int = 10
@@ -52,7 +54,7 @@ class Settings:
         checks.positive_integer("datasets", self.datasets)
         if not isinstance(self.links, tuple) or not self.links or len(set(self.links)) < len(self.links):
             raise ValueError(f"links must be a tuple of different labels, got {self.links!r}.")
-        for name in ("nuts", "ram"):
+        for name in ("latent", "nuts", "ram"):
             size = getattr(self, name)
             if not isinstance(size, tuple) or len(size) != 4:
                 raise ValueError(f"{name} must be chains, warm-up, draws and thinning, got {size!r}.")
@@ -79,7 +81,8 @@ class Comparison(NamedTuple):
 
 def quick(datasets: int = 1, seed: int = 0) -> Settings:
     """Return settings that show in a few minutes that everything runs, and no more."""
-    return Settings(datasets, seed, nuts=(2, 20, 20, 1), ram=(2, 50, 50, 5), tree_depth=4, links=("softplus",))
+    return Settings(datasets, seed, latent=(2, 20, 20, 1), nuts=(2, 20, 20, 1), ram=(2, 50, 50, 5), tree_depth=4,
+                    links=("softplus",))
 
 
 def run(wanted: Wanted) -> Report:
