@@ -87,7 +87,8 @@ def run_tasks(tasks: Iterable[Task], compute: Callable[[Task], Mapping[str, Any]
     """Compute every task that ``folder`` does not hold yet, each into a file of its own, and return all results.
 
     A file is there whole or not at all, and a random key depends on its task alone. A run that is killed and started
-    again therefore ends with the same numbers as one that is not (measured times apart).
+    again therefore ends with the same numbers as one that is not (measured times apart), if it has as many processes:
+    sums that are split among other numbers of CPUs are rounded otherwise.
 
     Args:
         tasks: the tasks, in the order in which they are computed.
