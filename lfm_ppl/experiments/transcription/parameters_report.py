@@ -43,7 +43,7 @@ class Settings:
 
     datasets: int = 2
     seed: int = 0
-    latent: tuple[int, int, int, int] = (2, 500, 5000, 1)
+    latent: tuple[int, int, int, int] = (2, 500, 1000, 1)
     nuts: tuple[int, int, int, int] = (2, 500, 1000, 1)
     ram: tuple[int, int, int, int] = (4, 250, 1000, 200)
     tree_depth: int = 10
