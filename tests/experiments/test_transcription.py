@@ -211,8 +211,8 @@ def test_the_tables_count_what_was_found():
 def test_a_killed_run_ends_with_the_same_table(tmp_path, monkeypatch):
     """The experiment itself, stopped after three tasks and started again: the same tables but for the times."""
     monkeypatch.setattr(experiment, "METHODS", ("ESLS", "GFS"))
-    monkeypatch.setattr(problem, "CONFIGURATIONS", (SATURATION, EXPONENTIAL))
-    settings = experiment.Settings(datasets=2, draws=400, burn_in=40)
+    settings = experiment.Settings(datasets=2, draws=400, burn_in=40,
+                                   configurations=(SATURATION.label, EXPONENTIAL.label))
     whole = experiment.run(settings, tmp_path / "whole")
     compute, done = experiment.compute, []
 
