@@ -130,7 +130,7 @@ drawn.get("posteriors-saturation-0.5")
 # one at draws of the posterior, and says how far the moments would move.
 
 # %%
-size = dict(chains=2, warmup=20, samples=20) if quick else dict(chains=2, warmup=500, samples=500)
+size = dict(chains=2, warmup=20, samples=20) if quick else dict(chains=2, warmup=500, samples=1500)
 for label in chosen.links:
     data = problem.data_set(parameters.LINKS[label], 0, chosen.seed)
     keywords = {"link": parameters.LINKS[label].link, "gamma": parameters.LINKS[label].gamma}
