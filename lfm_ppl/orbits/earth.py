@@ -1,0 +1,140 @@
+"""How the Earth turns: from the celestial frame (GCRS) to the terrestrial one (ITRS)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lfm_ppl.orbits import times
+from lfm_ppl.orbits.table import Table
+
+_SPACING = 3.0  # hours; the cubic through it is within 1e-12 rad for the nutation's fastest term
+_MARGIN = 4
+
+
+class Orientation(NamedTuple):
+    """Earth orientation parameters at some epochs, each (K,).
+
+    Attributes:
+        ut1_minus_utc: s.
+        x: of the pole (rad).
+        y: of the pole (rad).
+        dx: offset of the celestial pole (rad).
+        dy: offset of the celestial pole (rad).
+    """
+
+    ut1_minus_utc: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    dx: np.ndarray
+    dy: np.ndarray
+
+
+def orientation(seconds: np.ndarray) -> Orientation:
+    """Return what the International Earth Rotation Service measured, from the tables that come with Astropy.
+
+    Args:
+        seconds: epochs, in GPS seconds, (K,).
+
+    Raises:
+        ImportError: Astropy is not installed.
+        ValueError: an epoch that the tables do not cover.
+    """
+    iers, data = times.library("astropy.utils.iers"), times.library("astropy_iers_data")
+    first, second = times.utc(seconds)
+    table = iers.IERS_A.open(data.IERS_A_FILE)
+    mjd = np.asarray(first - 2_400_000.5 + second)
+    known = np.asarray(table["MJD"], float)
+    if mjd.min() < known[1] or mjd.max() > known[-2]:
+        raise ValueError(f"Earth orientation is known from MJD {known[1]:.0f} to {known[-2]:.0f} only; asked for "
+                         f"{mjd.min():.1f} to {mjd.max():.1f}. A newer astropy-iers-data knows more.")
+    # Beyond a day or two the tables end in other columns; a plain array of the rows around is all that is needed.
+    near = (known >= mjd.min() - 4) & (known <= mjd.max() + 4)
+    offset = np.asarray(table["UT1_UTC"][near], float)
+    leap = np.round(np.concatenate([[0.0], np.cumsum(np.diff(offset))]))  # UT1 - UTC jumps with a leap second
+    arcseconds = np.pi / 180 / 3600
+    columns = [offset - leap, *(arcseconds * np.asarray(table[name][near], float)
+                                for name in ("PM_x", "PM_y", "dX_2000A", "dY_2000A"))]
+    units = [1.0, 1.0, 1.0, 1e-3, 1e-3]  # the offsets of the pole stand in milliarcseconds
+    smooth = [_cubic(known[near], unit * column, mjd) for unit, column in zip(units, columns, strict=True)]
+    smooth[0] = smooth[0] + leap[np.searchsorted(known[near], mjd, side="right") - 1]
+    return Orientation(*smooth)
+
+
+def _cubic(x: np.ndarray, y: np.ndarray, at: np.ndarray) -> np.ndarray:
+    from scipy.interpolate import CubicSpline
+
+    return CubicSpline(x, y)(at)
+
+
+class EarthRotation(eqx.Module):
+    """The rotation from GCRS to ITRS as a function of time, for compiled code.
+
+        r_itrs = W R3(ERA) Q r_gcrs,
+
+    with the celestial pole in Q, the Earth rotation angle ERA and the terrestrial pole in W (IAU 2006/2000A).
+
+    Attributes:
+        table: of X, Y and s of the celestial pole (rad), x and y of the terrestrial one and s' (rad), and what the
+            Earth rotation angle is ahead of one that grows at a constant rate (rad).
+        angle: Earth rotation angle at the epoch, UT1 taken as GPS time (rad).
+        rate: its growth (rad/h).
+    """
+
+    table: Table
+    angle: jax.Array
+    rate: jax.Array
+
+    @classmethod
+    def over(cls, epoch: float, hours: float) -> EarthRotation:
+        """Tabulate the rotation from ``epoch`` (GPS seconds) for ``hours``.
+
+        Raises:
+            ImportError: pyerfa or Astropy is not installed.
+            ValueError: Earth orientation is not known there.
+        """
+        erfa = times.library("erfa")
+        nodes = _SPACING * np.arange(-_MARGIN, int(np.ceil(hours / _SPACING)) + _MARGIN + 1)
+        seconds = epoch + 3600.0 * nodes
+        found = orientation(seconds)
+        tt = times.terrestrial(seconds)
+        x, y, s = erfa.xys06a(*tt)
+        first, second = times.utc(seconds)
+        ut1 = erfa.utcut1(first, second, found.ut1_minus_utc)
+        rate = 2 * np.pi * 1.00273781191135448 / 24.0
+        start = float(erfa.era00(times.GPS_START, epoch / times.DAY))
+        ahead = erfa.era00(*ut1) - start - rate * nodes
+        values = np.stack([x + found.dx, y + found.dy, s, found.x, found.y, erfa.sp00(*tt),
+                           np.unwrap(np.remainder(ahead, 2 * np.pi))], axis=1)
+        return cls(Table(nodes[0], _SPACING, values), jnp.asarray(start), jnp.asarray(rate))
+
+    def __call__(self, t: jax.Array) -> jax.Array:
+        """Return the matrix (3, 3) at ``t`` hours after the epoch; its transpose leads back."""
+        x, y, s, px, py, sp, ahead = self.table(t)
+        era = self.angle + self.rate * t + ahead
+        # The celestial pole: Q' = [[1 - a x^2, -a x y, x], ...] R3(s), a = 1 / (1 + cos d).
+        a = 1.0 / (1.0 + jnp.sqrt(1.0 - x * x - y * y))
+        to_gcrs = jnp.stack([jnp.stack([1 - a * x * x, -a * x * y, x]), jnp.stack([-a * x * y, 1 - a * y * y, y]),
+                             jnp.stack([-x, -y, 1 - a * (x * x + y * y)])])
+        # The locators s and s' turn about the same axes as the angle.
+        turned = _about_z(era - s) @ to_gcrs.T
+        return _about_x(-py) @ (_about_y(-px) @ (_about_z(sp) @ turned))
+
+
+def _about_x(angle: jax.Array) -> jax.Array:
+    c, s, zero, one = jnp.cos(angle), jnp.sin(angle), jnp.zeros(()), jnp.ones(())
+    return jnp.stack([jnp.stack([one, zero, zero]), jnp.stack([zero, c, s]), jnp.stack([zero, -s, c])])
+
+
+def _about_y(angle: jax.Array) -> jax.Array:
+    c, s, zero, one = jnp.cos(angle), jnp.sin(angle), jnp.zeros(()), jnp.ones(())
+    return jnp.stack([jnp.stack([c, zero, -s]), jnp.stack([zero, one, zero]), jnp.stack([s, zero, c])])
+
+
+def _about_z(angle: jax.Array) -> jax.Array:
+    c, s, zero, one = jnp.cos(angle), jnp.sin(angle), jnp.zeros(()), jnp.ones(())
+    return jnp.stack([jnp.stack([c, s, zero]), jnp.stack([-s, c, zero]), jnp.stack([zero, zero, one])])
