@@ -1,5 +1,6 @@
 """Bayesian inference in latent force models, on NumPyro."""
 
+from lfm_ppl import orbits
 from lfm_ppl.analysis.accuracy import check_accuracy
 from lfm_ppl.analysis.correction import correct as correct_posterior
 from lfm_ppl.analysis.report import AccuracyReport
@@ -12,7 +13,7 @@ from lfm_ppl.comparators.particle_smoother import ParticleSmootherResult, partic
 from lfm_ppl.data import Data, read_csv
 from lfm_ppl.filtering.filter import FilterResult, FilterState, filter
 from lfm_ppl.filtering.smoother import SmootherResult, smooth
-from lfm_ppl.forces import Constant, Force, Matern, SquaredExponential, WienerVelocity
+from lfm_ppl.forces import Constant, Force, Matern, RandomWalk, Resonator, SquaredExponential, WienerVelocity
 from lfm_ppl.inference.fit import ConvergenceWarning, fit
 from lfm_ppl.inference.fixing import fix
 from lfm_ppl.inference.map import MAPResult, map_estimate
@@ -64,6 +65,8 @@ __all__ = [
     "ParticleMarginalRAM",
     "ParticleSmootherResult",
     "RAM",
+    "RandomWalk",
+    "Resonator",
     "Rule",
     "Simulation",
     "SmootherResult",
@@ -81,6 +84,7 @@ __all__ = [
     "laplace",
     "map_estimate",
     "on_latent_grid",
+    "orbits",
     "panel",
     "particle_filter",
     "particle_smoother",

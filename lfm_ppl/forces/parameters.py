@@ -31,6 +31,15 @@ def scalar_parameter(name: str, value: Any) -> jax.Array:
     return array
 
 
+def standard_deviation_parameter(name: str, value: Any) -> jax.Array:
+    """Return ``value`` as a scalar array after checking that it is one number, zero or above."""
+    deviation = scalar_parameter(name, value)
+    concrete = checks.concrete(deviation)
+    if concrete is not None and concrete < 0:
+        raise ValueError(f"{name} must be >= 0, got {concrete:g}.")
+    return deviation
+
+
 def static_order(order: Any, allowed: Sequence[int]) -> int:
     """Return ``order`` after checking that it is a Python int among those allowed."""
     choices = ", ".join(str(value) for value in allowed)

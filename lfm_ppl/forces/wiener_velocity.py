@@ -9,8 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from lfm_ppl import checks
-from lfm_ppl.forces.parameters import mean_parameter, positive_parameter, scalar_parameter
+from lfm_ppl.forces.parameters import mean_parameter, positive_parameter, standard_deviation_parameter
 from lfm_ppl.forces.sde import Force
 
 
@@ -56,8 +55,8 @@ class WienerVelocity(Force):
         mean: Any = 0.0,
     ):
         self.scale = positive_parameter("scale", scale)
-        self.initial_value_sd = _standard_deviation("initial_value_sd", initial_value_sd)
-        self.initial_velocity_sd = _standard_deviation("initial_velocity_sd", initial_velocity_sd)
+        self.initial_value_sd = standard_deviation_parameter("initial_value_sd", initial_value_sd)
+        self.initial_velocity_sd = standard_deviation_parameter("initial_velocity_sd", initial_velocity_sd)
         self.mean = mean_parameter(mean)
 
     @property
@@ -102,11 +101,3 @@ class WienerVelocity(Force):
             "WienerVelocity is not stationary, so it has no spectral density; use `covariance(t, "
             "s)`, or a Matern force with a long lengthscale."
         )
-
-
-def _standard_deviation(name, value):
-    deviation = scalar_parameter(name, value)
-    concrete = checks.concrete(deviation)
-    if concrete is not None and concrete < 0:
-        raise ValueError(f"{name} is a standard deviation and must be >= 0, got {concrete:g}.")
-    return deviation

@@ -87,24 +87,9 @@ def acceleration(r: jax.Array, degree: int = DEGREE) -> jax.Array:
     """
     if not 0 <= degree <= DEGREE:
         raise ValueError(f"degree must lie in 0..{DEGREE}, got {degree}.")
-    c, s = coefficients()
     v, w = _solid_harmonics(r, degree + 1)
-    x = y = z = jnp.zeros(())
-    for n in range(degree + 1):
-        for m in range(n + 1):
-            cnm, snm = float(c[n, m]), float(s[n, m])
-            if n == 1:
-                continue  # the origin is the centre of mass
-            if m == 0:
-                x, y = x - cnm * v[n + 1, 1], y - cnm * w[n + 1, 1]
-            else:
-                fall = (n - m + 1) * (n - m + 2) / 2
-                x = x + (-cnm * v[n + 1, m + 1] - snm * w[n + 1, m + 1]) / 2
-                x = x + fall * (cnm * v[n + 1, m - 1] + snm * w[n + 1, m - 1])
-                y = y + (-cnm * w[n + 1, m + 1] + snm * v[n + 1, m + 1]) / 2
-                y = y + fall * (-cnm * w[n + 1, m - 1] + snm * v[n + 1, m - 1])
-            z = z + (n - m + 1) * (-cnm * v[n + 1, m] - snm * w[n + 1, m])
-    return GM / RADIUS**2 * jnp.stack([x, y, z])
+    of_v, of_w = _weights(degree)
+    return GM / RADIUS**2 * ((of_v * v).sum((1, 2)) + (of_w * w).sum((1, 2)))
 
 
 @functools.cache
@@ -120,19 +105,48 @@ def coefficients() -> tuple[np.ndarray, np.ndarray]:
     return c, s
 
 
-def _solid_harmonics(r: jax.Array, degree: int) -> tuple[dict, dict]:
-    """Return V_nm and W_nm by (n, m), from one degree to the next."""
+@functools.cache
+def _weights(degree: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return what V and W (degree + 2, degree + 2) contribute to x, y and z, each (3, degree + 2, degree + 2)."""
+    c, s = coefficients()
+    of_v, of_w = np.zeros((2, 3, degree + 2, degree + 2))
+    for n in range(degree + 1):
+        for m in range(n + 1):
+            cnm, snm = c[n, m], s[n, m]
+            of_v[2, n + 1, m] -= (n - m + 1) * cnm
+            of_w[2, n + 1, m] -= (n - m + 1) * snm
+            half = 1.0 if m == 0 else 0.5
+            of_v[0, n + 1, m + 1] -= half * cnm
+            of_w[1, n + 1, m + 1] -= half * cnm
+            if m > 0:
+                of_w[0, n + 1, m + 1] -= half * snm
+                of_v[1, n + 1, m + 1] += half * snm
+                fall = half * (n - m + 1) * (n - m + 2)
+                of_v[0, n + 1, m - 1] += fall * cnm
+                of_w[0, n + 1, m - 1] += fall * snm
+                of_w[1, n + 1, m - 1] -= fall * cnm
+                of_v[1, n + 1, m - 1] += fall * snm
+    return of_v, of_w
+
+
+def _solid_harmonics(r: jax.Array, degree: int) -> tuple[jax.Array, jax.Array]:
+    """Return V and W (degree + 1, degree + 1), rows n and columns m; all orders of a degree at a time."""
     square = (r * r).sum()
     x, y, z = r * RADIUS / square
     rho = RADIUS**2 / square
-    v, w = {(0, 0): RADIUS / jnp.sqrt(square)}, {(0, 0): jnp.zeros(())}
-    for m in range(degree + 1):
-        if m > 0:
-            v[m, m] = (2 * m - 1) * (x * v[m - 1, m - 1] - y * w[m - 1, m - 1])
-            w[m, m] = (2 * m - 1) * (x * w[m - 1, m - 1] + y * v[m - 1, m - 1])
-        for n in range(m + 1, degree + 1):
-            for harmonics in (v, w):
-                harmonics[n, m] = (2 * n - 1) / (n - m) * z * harmonics[n - 1, m]
-                if n > m + 1:
-                    harmonics[n, m] = harmonics[n, m] - (n + m - 1) / (n - m) * rho * harmonics[n - 2, m]
+    one_v, one_w = RADIUS / jnp.sqrt(square), jnp.zeros(())
+    sectoral = [(one_v, one_w)]
+    for m in range(1, degree + 1):
+        one_v, one_w = (2 * m - 1) * (x * one_v - y * one_w), (2 * m - 1) * (x * one_w + y * one_v)
+        sectoral.append((one_v, one_w))
+    start = jnp.stack([jnp.stack(column) for column in zip(*sectoral, strict=True)])
+    orders = np.arange(degree + 1)
+    before, now = jnp.zeros_like(start), start * (orders == 0)
+    rows = [now]
+    for n in range(1, degree + 1):
+        gap = np.maximum(n - orders, 1)
+        climb, drop = (2 * n - 1) / gap * (orders < n), (n + orders - 1) / gap * (orders < n)
+        before, now = now, climb * z * now - drop * rho * before + start * (orders == n)
+        rows.append(now)
+    v, w = jnp.stack(rows, axis=1)
     return v, w

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lfm_ppl.forces import Constant, Force, Matern, SquaredExponential, WienerVelocity
+from lfm_ppl.forces import Constant, Force, Matern, RandomWalk, Resonator, SquaredExponential, WienerVelocity
 
 # Functions of (scale, lengthscale). A new force is covered by a line here.
 FORCES = {
@@ -21,6 +21,9 @@ FORCES = {
         for n in (2, 4, 6, 8)
     },
     "wiener_velocity": lambda s, ell: WienerVelocity(s, 0.5 * s, 2.0 * s / ell, mean=0.5),
+    "random_walk": lambda s, ell: RandomWalk(s / jnp.sqrt(ell), 0.5 * s),
+    "resonator": lambda s, ell: Resonator(10.0 * ell, s, s / jnp.sqrt(ell)),
+    "damped_resonator": lambda s, ell: Resonator(12.0 * ell, s, s / jnp.sqrt(ell), 0.7 / ell),
     "constant": lambda s, ell: Constant(s),
     "sum": lambda s, ell: Matern(s, ell, order=1, mean=1.0) + Constant(2.0 * s),
     "nested_sum": lambda s, ell: Matern(s, ell, order=2) + (Matern(s, ell, 0) + Matern(s, ell, 0)),
