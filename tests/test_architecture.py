@@ -14,6 +14,7 @@ PACKAGE = ROOT / "lfm_ppl"
 # import from its own layer and from the layers below.
 LAYERS = (
     ("checks", "linalg", "gradients", "data"),
+    ("orbits",),
     ("forces",),
     ("model",),
     ("linearisation",),
