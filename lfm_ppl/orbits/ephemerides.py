@@ -198,6 +198,8 @@ def check_satellites(names: Sequence[str], known: Sequence[str], files: Sequence
         raise ValueError(f"satellites must name at least one satellite, and each of them once; got {list(names)}.")
     for name in names:
         if name not in known:
-            where = f" Read from {', '.join(files)}." if files else ""
-            raise ValueError(checks.unknown("satellite", name, known) + where)
+            system = [other for other in known if other[:1] == str(name)[:1].upper()]
+            where = f" Read from {files[0]}" if files else ""
+            where += f" to {files[-1]}, {len(files)} files" if len(files) > 1 else ""
+            raise ValueError(checks.unknown("satellite", name, system or known) + where + ("." if files else ""))
     return tuple(names)

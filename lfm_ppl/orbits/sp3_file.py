@@ -8,6 +8,7 @@ keeps to.
 from __future__ import annotations
 
 import gzip
+import re
 import zlib
 from collections.abc import Container
 from pathlib import Path
@@ -22,6 +23,9 @@ TIME_SYSTEMS = {"GPS": 0.0, "GAL": 0.0, "QZS": 0.0, "IRN": 0.0, "TAI": -19.0, "B
 ABSENT = 999999.0  # km; and three zeros
 _SKIPPED = ("V", "EP", "EV")  # velocities, and correlations of positions and of velocities
 _MJD_OF_GPS_ORIGIN = 44244
+# Columns 5 to 46 are three numbers, F14.6; then to column 60 the clock, and to column 80 accuracies and flags. Strict,
+# because a line that lost a character, or its end, still has numbers in these columns.
+_POSITION = re.compile(r"P...(?:[ \d-]{7}\.\d{6}){3}(?:(?: {14}|[ \d-]{7}\.[ \d]{0,6})[ \dEPM]{0,20})?")
 
 
 class Header(NamedTuple):
@@ -233,8 +237,8 @@ def _read_positions(text: _Text, header: Header, satellites: tuple[str, ...]) ->
             column = columns[name] if name in columns else _listed(text, number, columns)
             if column is None:
                 continue
-            if len(line) < 46:
-                raise text.error(number, f"the line is cut after column {len(line)}; a position ends in column 46.")
+            if not _POSITION.fullmatch(line):
+                raise _bad_position(text, number)
             try:
                 values.append((float(line[4:18]), float(line[18:32]), float(line[32:46])))
             except ValueError:
@@ -257,8 +261,6 @@ def _positions(
 ) -> np.ndarray:
     """Return the values (epochs, satellites, 3) that were read at the lines ``places``, NaN where there is none."""
     found = np.array(values).reshape(-1, 3)
-    if not np.isfinite(found).all():
-        raise _bad_position(text, places[int(np.argmin(np.isfinite(found).all(axis=1)))])
     _, first = np.unique(cells, return_index=True)
     if len(first) < len(cells):
         line = places[min(set(range(len(cells))) - set(first.tolist()))]
@@ -278,19 +280,28 @@ def _listed(text: _Text, line: int, columns: dict[str, int | None]) -> int | Non
 
 
 def _bad_position(text: _Text, line: int) -> ValueError:
-    """Return the complaint about a line without three numbers in the columns 5 to 46."""
+    """Return the complaint about a line that is not a position."""
+    length = len(text.lines[line - 1])
+    if length < 46:
+        return text.error(line, f"the line is cut after column {length}; a position ends in column 46.")
     try:
         for first, axis in ((5, "x"), (19, "y"), (33, "z")):
             text.number(line, first, first + 13, f"the coordinate {axis} in kilometres")
     except ValueError as error:
         return error
-    raise AssertionError(f"line {line} is a position")
+    return text.error(
+        line,
+        "expected three numbers with six decimals in columns 5 to 46, the clock and its flags after them, and at most "
+        f"80 columns, got {text.lines[line - 1][:100]!r}.",
+    )
 
 
 def _check_epoch(text: _Text, header: Header, epochs: list[int]) -> None:
     """Raise unless the last of ``epochs`` is where line 1 and the interval put it."""
     if len(epochs) > header.epochs:
         raise text.error(epochs[-1], f"an epoch more than the {header.epochs} of line 1.")
+    if extra := text.lines[epochs[-1] - 1][31:]:
+        raise text.error(epochs[-1], f"expected nothing after the date, which ends in column 31, got {extra[:20]!r}.")
     epoch = text.epoch(epochs[-1])
     expected = header.start + (len(epochs) - 1) * header.interval
     if abs(epoch - expected) > 1e-3:

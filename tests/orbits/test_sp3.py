@@ -150,6 +150,15 @@ def test_a_satellite_without_a_line_at_some_epochs(write):
     assert np.isnan(orbits.positions[2, 1]).all() and np.isnan(orbits.positions).sum() == 3
 
 
+@pytest.mark.parametrize(
+    "rest", ["", "     -4.812044 19 18 17 219 EP  MP", f"{'':14} 19 18 17{'':9}MP", f"{'':32}MP", " 999999.9999"]
+)
+def test_what_follows_the_position_is_not_read(write, rest):
+    lines = [line[:46] + rest if line.startswith("P") else line for line in sp3()]
+    orbits = read_sp3(write(lines))
+    np.testing.assert_array_equal(orbits.positions, circle(orbits.epochs, orbits.satellites))
+
+
 def test_names_with_a_blank(write):
     lines = [line.replace("G05", "G 5") for line in sp3()]
     assert read_sp3(write(lines)).satellites == ("E01", "G05", "G32")
@@ -251,6 +260,11 @@ def cut(line, at, *columns):
          r"line 24: expected the coordinate y in kilometres in columns 19 to 32, got '-84x6\.234828'"),
         (replace("PG05", f"PG05{1:14.6f}{1:14.6f}{'nan':>14}{1:14.6f}", 3), r"line 36: .* coordinate z .* got 'nan'"),
         (replace("PG05", f"PG05{'':14}{1:14.6f}{1:14.6f}"), r"line 24: .* coordinate x .* got ''"),
+        (lambda lines: [*lines[:23], lines[23] + lines[24], *lines[25:]], r"line 24: .* at most 80 columns, got 'PG05"),
+        (lambda lines: [*lines[:22], lines[22] + lines[23], *lines[24:]], r"line 23: expected nothing after the date"),
+        (replace("PG05", f"PG05{1:15.6f}{1:14.6f}{1:14.6f}{1:14.6f}"), r"line 24: expected the coordinate y .* got '0"),
+        (replace("PG05", f"PG05{1:14.6f}{1:14.6f}{1:15.6f}{1:14.6f}"), r"line 24: expected three numbers with six dec"),
+        (replace("PG05", f"PG05{1:14.6f}{1:14.6f}{1:13.6f}{1:14.6f}"), r"line 24: expected three numbers with six dec"),
         (replace("PG05", f"PG07{1:14.6f}{1:14.6f}{1:14.6f}"), r"line 24: the satellite 'G07' is not among the 3 that"),
         (replace("PG32", f"PG05{1:14.6f}{1:14.6f}{1:14.6f}"), r"line 25: a second position of G05 at the same epoch"),
         (replace("PG32", "QG32"), r"line 25: expected a line that begins with \*, P, .* got 'QG32'"),
@@ -311,8 +325,12 @@ def test_files_and_folders_that_are_not_there(tmp_path):
 
 def test_satellites_that_are_not_there(write):
     path = write(sp3())
-    with pytest.raises(ValueError, match=r"unknown satellite 'G06'\. Did you mean .*'G05'.*E01, G05, G32.*a\.sp3"):
+    with pytest.raises(ValueError, match=r"unknown satellite 'G06'\. .*Known: G05, G32\. Read from .*a\.sp3\."):
         read_sp3(path, ["G06"])
+    with pytest.raises(ValueError, match=r"'g05'\. Did you mean 'G05'.* Read from .*a\.sp3 to .*b\.sp3, 2 files\."):
+        read_sp3([path, write(sp3(1), "b.sp3")], ["g05"])
+    with pytest.raises(ValueError, match=r"unknown satellite 'R01'.* Known: E01, G05, G32\."):
+        read_sp3(path, ["R01"])
     orbits = read_sp3(path)
     for ask in (lambda: orbits.select(["G06"]), lambda: orbits.gaps("G06")):
         with pytest.raises(ValueError, match=r"unknown satellite 'G06'\. Did you mean .*a\.sp3"):
