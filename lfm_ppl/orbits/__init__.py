@@ -1,7 +1,14 @@
-"""Satellites: their precise orbits as files, and what is known of the forces on them."""
+"""Satellites: their orbits as the analysis centres publish them, and what is known of the forces on them.
+
+>>> from lfm_ppl.orbits import Environment, read_sp3      # doctest: +SKIP
+>>> orbits = read_sp3("data/gps", satellites=["G05"])     # doctest: +SKIP
+>>> around = Environment.over(orbits.epochs[0], hours=24 * orbits.days)  # doctest: +SKIP
+>>> around.celestial(orbits)  # the positions, in axes that do not turn  # doctest: +SKIP
+"""
 
 from lfm_ppl.orbits.environment import NANO, Environment
+from lfm_ppl.orbits.ephemerides import Ephemerides, Gap, calendar, gps_seconds
 from lfm_ppl.orbits.frames import AXES, dyb, rtn
-from lfm_ppl.orbits.times import gps_date, gps_seconds
+from lfm_ppl.orbits.sp3 import read_sp3
 
-__all__ = ["AXES", "NANO", "Environment", "dyb", "gps_date", "gps_seconds", "rtn"]
+__all__ = ["AXES", "NANO", "Environment", "Ephemerides", "Gap", "calendar", "dyb", "gps_seconds", "read_sp3", "rtn"]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from lfm_ppl.orbits import times
 from lfm_ppl.orbits.table import Table
@@ -35,40 +37,39 @@ class Orientation(NamedTuple):
 
 
 def orientation(seconds: np.ndarray) -> Orientation:
-    """Return what the International Earth Rotation Service measured, from the tables that come with Astropy.
+    """Return what the International Earth Rotation Service measured, its series EOP 20 C04 or the one before it.
+
+    The daily values are interpolated by a cubic spline. What the ocean's tides do within a day is left out, at most
+    0.4 milliarcseconds, 5 cm at a GPS satellite.
 
     Args:
         seconds: epochs, in GPS seconds, (K,).
 
     Raises:
-        ImportError: Astropy is not installed.
-        ValueError: an epoch that the tables do not cover.
+        ImportError: the library astropy-iers-data, which has the series, is not installed.
+        ValueError: an epoch that the series does not cover.
     """
-    iers, data = times.library("astropy.utils.iers"), times.library("astropy_iers_data")
     first, second = times.utc(seconds)
-    table = iers.IERS_A.open(data.IERS_A_FILE)
     mjd = np.asarray(first - 2_400_000.5 + second)
-    known = np.asarray(table["MJD"], float)
-    if mjd.min() < known[1] or mjd.max() > known[-2]:
-        raise ValueError(f"Earth orientation is known from MJD {known[1]:.0f} to {known[-2]:.0f} only; asked for "
-                         f"{mjd.min():.1f} to {mjd.max():.1f}. A newer astropy-iers-data knows more.")
-    # Beyond a day or two the tables end in other columns; a plain array of the rows around is all that is needed.
+    known, values = _daily_values()
+    if mjd.min() < known[4] or mjd.max() > known[-5]:
+        raise ValueError(f"Earth orientation is known from MJD {known[4]:.0f} to {known[-5]:.0f}; asked for "
+                         f"{mjd.min():.1f} to {mjd.max():.1f}. A newer release of astropy-iers-data knows more.")
     near = (known >= mjd.min() - 4) & (known <= mjd.max() + 4)
-    offset = np.asarray(table["UT1_UTC"][near], float)
-    leap = np.round(np.concatenate([[0.0], np.cumsum(np.diff(offset))]))  # UT1 - UTC jumps with a leap second
-    arcseconds = np.pi / 180 / 3600
-    columns = [offset - leap, *(arcseconds * np.asarray(table[name][near], float)
-                                for name in ("PM_x", "PM_y", "dX_2000A", "dY_2000A"))]
-    units = [1.0, 1.0, 1.0, 1e-3, 1e-3]  # the offsets of the pole stand in milliarcseconds
-    smooth = [_cubic(known[near], unit * column, mjd) for unit, column in zip(units, columns, strict=True)]
-    smooth[0] = smooth[0] + leap[np.searchsorted(known[near], mjd, side="right") - 1]
+    known, values = known[near], values[near].copy()
+    leap = np.round(np.concatenate([[0.0], np.cumsum(np.diff(values[:, 0]))]))  # UT1 - UTC jumps with a leap second
+    values[:, 0] -= leap
+    smooth = CubicSpline(known, values)(mjd).T
+    smooth[0] += leap[np.searchsorted(known, mjd, side="right") - 1]
     return Orientation(*smooth)
 
 
-def _cubic(x: np.ndarray, y: np.ndarray, at: np.ndarray) -> np.ndarray:
-    from scipy.interpolate import CubicSpline
-
-    return CubicSpline(x, y)(at)
+@functools.cache
+def _daily_values() -> tuple[np.ndarray, np.ndarray]:
+    """Return the days (MJD) and the columns of `Orientation`, (K, 5)."""
+    rows = np.loadtxt(times.library("astropy_iers_data").IERS_B_FILE, comments="#")
+    arcseconds = np.pi / 180 / 3600
+    return rows[:, 4], rows[:, [7, 5, 6, 8, 9]] * np.array([1.0, *(4 * [arcseconds])])
 
 
 class EarthRotation(eqx.Module):
@@ -94,7 +95,7 @@ class EarthRotation(eqx.Module):
         """Tabulate the rotation from ``epoch`` (GPS seconds) for ``hours``.
 
         Raises:
-            ImportError: pyerfa or Astropy is not installed.
+                ImportError: a library of the extra ``gps`` is not installed.
             ValueError: Earth orientation is not known there.
         """
         erfa = times.library("erfa")

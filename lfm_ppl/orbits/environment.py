@@ -7,9 +7,11 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from lfm_ppl.orbits import bodies, frames, geopotential
 from lfm_ppl.orbits.earth import EarthRotation
+from lfm_ppl.orbits.ephemerides import Ephemerides
 from lfm_ppl.orbits.table import Table
 
 PER_HOUR2 = 3600.0**2
@@ -54,6 +56,16 @@ class Environment(eqx.Module):
         """
         return cls(jnp.asarray(float(epoch)), EarthRotation.over(epoch, hours), bodies.positions(epoch, hours))
 
+    def celestial(self, orbits: Ephemerides) -> np.ndarray:
+        """Return the positions (T, S, 3) in axes that do not turn, GCRS, in km.
+
+        Args:
+            orbits: in the frame that turns with the Earth; its epochs are counted in GPS time.
+        """
+        hours = (orbits.epochs - float(self.epoch)) / 3600.0
+        turns = np.asarray(_turns(self.rotation, jnp.asarray(hours)))
+        return np.einsum("tji,tsj->tsi", turns, orbits.positions)
+
     def sun(self, t: Any) -> jax.Array:
         """Return the Sun's position (3,) in km."""
         return self.table(t)[:3]
@@ -84,3 +96,8 @@ class Environment(eqx.Module):
         """Return the axes D, Y and B (3, 3) as columns, times the visible part of the Sun's disc."""
         sun = self.sun(t)
         return bodies.sunlight(r, sun) * frames.dyb(r, sun)
+
+
+@jax.jit
+def _turns(rotation: EarthRotation, hours: jax.Array) -> jax.Array:
+    return jax.vmap(lambda t: rotation(t))(hours)
