@@ -9,7 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 
 _FUSED_SIZE = 8
-"""Largest dimension that is multiplied by broadcasting; XLA's CPU dot wins above it."""
+"""Largest dimension that is multiplied by broadcasting; XLA's CPU dot wins above it.
+
+Also the largest that is factorised and solved in unrolled operations. Their number grows with the cube of the
+dimension, and with it the time of compilation; a larger matrix is worked through in a loop over its columns.
+"""
 
 
 def matmul(a: jax.Array, b: jax.Array) -> jax.Array:
@@ -88,6 +92,8 @@ def cholesky(p: jax.Array, floor: jax.Array | float = 0.0, keep: bool = True) ->
     if size == 0:
         return Factor(p, jnp.zeros(0, bool))
     floor = jnp.broadcast_to(jnp.asarray(floor, p.dtype), (size,))
+    if size > _FUSED_SIZE:
+        return _cholesky_in_a_loop(p, floor, keep)
     rows = np.arange(size)
     columns: list[jax.Array] = []
     degenerate = []
@@ -105,6 +111,25 @@ def cholesky(p: jax.Array, floor: jax.Array | float = 0.0, keep: bool = True) ->
     return Factor(jnp.stack(columns, axis=-1), jnp.stack(degenerate))
 
 
+def _cholesky_in_a_loop(p: jax.Array, floor: jax.Array, keep: bool) -> Factor:
+    """Factorise as `cholesky` does; each column is taken off what is left of the matrix."""
+    rows = np.arange(p.shape[-1])
+
+    def take(left: jax.Array, at: tuple) -> tuple[jax.Array, tuple]:
+        j, least = at
+        column = left[:, j]
+        pivot = column[j]
+        positive = pivot > least
+        root = jnp.sqrt(jnp.where(positive, pivot, jnp.where(least > 0, least, 1.0)))
+        diagonal = root if keep else jnp.where(positive, root, 0.0)
+        below = jnp.where(positive, column / root, 0.0)
+        column = jnp.where(rows > j, below, jnp.where(rows == j, diagonal, 0.0))
+        return left - column[:, None] * column[None, :], (column, ~positive)
+
+    _, (columns, degenerate) = jax.lax.scan(take, p, (jnp.arange(p.shape[-1]), floor))
+    return Factor(columns.T, degenerate)
+
+
 def solve_lower(chol: jax.Array, b: jax.Array) -> jax.Array:
     """Solve ``L X = B`` for a lower triangular ``L`` (n, n) and ``B`` (n,) or (n, m), in plain operations.
 
@@ -112,6 +137,8 @@ def solve_lower(chol: jax.Array, b: jax.Array) -> jax.Array:
     """
     if chol.shape[-1] == 0:
         return b
+    if chol.shape[-1] > _FUSED_SIZE:
+        return _substitute(chol, b, reverse=False)
     rows: list[jax.Array] = []
     for j in range(chol.shape[-1]):
         value = b[j]
@@ -126,6 +153,8 @@ def solve_upper(chol: jax.Array, b: jax.Array) -> jax.Array:
     size = chol.shape[-1]
     if size == 0:
         return b
+    if size > _FUSED_SIZE:
+        return _substitute(chol.T, b, reverse=True)
     rows: dict[int, jax.Array] = {}
     for j in reversed(range(size)):
         value = b[j]
@@ -133,6 +162,17 @@ def solve_upper(chol: jax.Array, b: jax.Array) -> jax.Array:
             value = value - chol[k, j] * rows[k]
         rows[j] = _divide(value, chol[j, j])
     return jnp.stack([rows[j] for j in range(size)])
+
+
+def _substitute(triangle: jax.Array, b: jax.Array, reverse: bool) -> jax.Array:
+    """Solve a triangular system row by row, the last row first in ``reverse``."""
+
+    def solve(found: jax.Array, at: tuple) -> tuple[jax.Array, None]:
+        j, row, value = at
+        return found.at[j].set(_divide(value - row @ found, row[j])), None
+
+    rows = (jnp.arange(triangle.shape[-1]), triangle, b)
+    return jax.lax.scan(solve, jnp.zeros(b.shape, jnp.result_type(triangle, b)), rows, reverse=reverse)[0]
 
 
 def solve_semidefinite(p: jax.Array, b: jax.Array, tolerance: float = 1e-14) -> jax.Array:

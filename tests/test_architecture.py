@@ -14,9 +14,9 @@ PACKAGE = ROOT / "lfm_ppl"
 # import from its own layer and from the layers below.
 LAYERS = (
     ("checks", "linalg", "gradients", "data"),
-    ("orbits",),
     ("forces",),
     ("model",),
+    ("orbits",),
     ("linearisation",),
     ("filtering",),
     ("comparators",),

@@ -9,6 +9,8 @@
 from lfm_ppl.orbits.environment import NANO, Environment
 from lfm_ppl.orbits.ephemerides import Ephemerides, Gap, calendar, gps_seconds
 from lfm_ppl.orbits.frames import AXES, dyb, rtn
+from lfm_ppl.orbits.satellite import START_SD, satellite, small_forces, start_near
 from lfm_ppl.orbits.sp3 import read_sp3
 
-__all__ = ["AXES", "NANO", "Environment", "Ephemerides", "Gap", "calendar", "dyb", "gps_seconds", "read_sp3", "rtn"]
+__all__ = ["AXES", "NANO", "START_SD", "Environment", "Ephemerides", "Gap", "calendar", "dyb", "gps_seconds", "read_sp3", "rtn",
+           "satellite", "small_forces", "start_near"]

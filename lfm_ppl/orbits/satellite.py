@@ -1,0 +1,149 @@
+"""A satellite as a latent force model: known gravity, and small forces that nobody measured."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lfm_ppl import checks
+from lfm_ppl.forces import Constant, Force, RandomWalk, Resonator
+from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.observation import Gaussian, GaussianObservation
+from lfm_ppl.orbits import frames
+from lfm_ppl.orbits.environment import NANO, Environment
+
+SOLAR_PRESSURE = 100.0
+"""Acceleration of a GPS satellite by sunlight, in nm/s^2, before anything is known of the satellite."""
+SIDEREAL_DAY = 23.9344696
+"""Hours in which the Earth turns once, and a GPS satellite twice around it."""
+HARMONICS = {"DYB": {"solar": (1, 2, 3, 4), "panel": (1, 2, 3, 4), "remaining": (1, 2, 3, 4)},
+             "RTN": {"radial": range(1, 8), "tangential": range(1, 8), "normal": range(1, 11)}}
+"""Axes -> force -> multiples of the base frequency: of the orbit for DYB, of the day for RTN (as in the source)."""
+STATES = ("x", "y", "z", "vx", "vy", "vz")
+START_SD = (0.1, 0.1)
+"""Of the start (km, km/h): far wider than what a few positions tell."""
+_NEAR = 9
+
+
+class Motion(eqx.Module):
+    """The dynamics of `satellite`: d(r, v) = (v, a(r, t) + u_solar a_solar(r, t) + R u)."""
+
+    environment: Environment
+    axes: str = eqx.field(static=True)
+
+    def __call__(self, x: jax.Array, u: jax.Array, t: Any) -> jax.Array:
+        """Return the derivatives (6,) in km/h and km/h^2; the first force is that of the sunlight."""
+        r, v = x[:3], x[3:]
+        total = self.environment.acceleration(r, t) + u[0] * self.environment.solar_pressure(r, t)
+        if self.axes == "DYB":
+            return jnp.concatenate([v, total + NANO * self.environment.sunlit_axes(r, t)[:, 1:] @ u[1:]])
+        return jnp.concatenate([v, total + NANO * frames.rtn(r, v) @ u[1:]])
+
+
+def satellite(environment: Environment, start: Gaussian, forces: Mapping[str, Force], axes: str = "DYB",
+              white: Any = 0.0, noise_sd: Any = 5e-5, units: Mapping[str, str] | None = None) -> LatentForceModel:
+    """Return a satellite pushed by unknown small forces, observed in its position.
+
+        dr = v dt,    dv = (a(r, t) + u_1(t) a_solar(r, t) + R (u_2, ...)) dt + white dB,    y_k = r(t_k) + e_k,
+
+    with a(r, t) the pull of Earth, Moon and Sun, a_solar the pressure of sunlight of one nm/s^2, zero in the Earth's
+    shadow, and R the other axes: Y and B of `dyb`, lit by the Sun, or all three of `rtn`. The small forces are in
+    nm/s^2, distances in km, times in hours. Position and velocity alone enter non-linearly, so that a sigma-point rule
+    needs twelve points, however many states the forces have.
+
+    Args:
+        environment: what is known of the surroundings.
+        start: position (km) and velocity (km/h) at the first time, (6,).
+        forces: name -> force, in nm/s^2: that of the sunlight first, then one for each other axis. `small_forces`
+            gives some.
+        axes: "DYB" or "RTN".
+        white: dispersion of white noise on the acceleration, in nm/s^2 sqrt(h).
+        noise_sd: standard deviation of a coordinate's error (km).
+        units: name -> unit, for results and plots.
+
+    Raises:
+        ValueError: unknown axes, or a wrong number of forces.
+
+    Source: Hartikainen, Seppanen and Sarkka (2012), section 6.
+    """
+    checks.one_of("axes", axes, tuple(frames.AXES))
+    wanted = 3 if axes == "DYB" else 4
+    if len(forces) != wanted:
+        raise ValueError(f"a satellite with axes {axes} has {wanted} forces, that of the sunlight first; got "
+                         f"{list(forces)}.")
+    push = jnp.concatenate([jnp.zeros((3, 3)), NANO * jnp.asarray(white) * jnp.eye(3)])
+    return LatentForceModel(
+        Motion(environment, axes), dict(forces),
+        GaussianObservation(_position, jnp.asarray(noise_sd) ** 2 * jnp.ones(3)), start, process_noise=push,
+        state_names=STATES, output_names=STATES[:3], units=units)
+
+
+def _position(x: jax.Array, u: jax.Array, t: Any) -> jax.Array:
+    return x[:3]
+
+
+def small_forces(axes: str = "DYB", amplitude: Any = 1.0, wander: Any = 0.01, drift: Any = 0.003,
+                 level: tuple[float, float] = (10.0, 2.0), harmonics: Mapping[str, Any] | None = None
+                 ) -> dict[str, Force]:
+    """Return quasi-periodic forces for `satellite`, in nm/s^2: on each axis a level and resonators.
+
+        u(t) = b(t) + sum_n c_n(t),    db = drift dbeta,    c_n'' = -(2 pi n f)^2 c_n + white noise,
+
+    c_n with standard deviation amplitude / n at the start, and wander / n gained per square root of an hour.
+
+    Args:
+        axes: "DYB", with the orbit's frequency, or "RTN", with that of the sidereal day.
+        amplitude: nm/s^2.
+        wander: nm/s^2 / sqrt(h).
+        drift: nm/s^2 / sqrt(h).
+        level: standard deviation of the sunlight's acceleration, and of the levels b on the other axes (nm/s^2).
+        harmonics: force -> multiples of the base frequency; None: `HARMONICS`.
+
+    Example:
+        >>> {name: force.state_dim for name, force in small_forces().items()}
+        {'solar': 9, 'panel': 9, 'remaining': 9}
+    """
+    checks.one_of("axes", axes, tuple(HARMONICS))
+    period = SIDEREAL_DAY / 2 if axes == "DYB" else SIDEREAL_DAY
+    found: dict[str, Force] = {} if axes == "DYB" else {"solar": Constant(level[0], SOLAR_PRESSURE)}
+    for name, multiples in (harmonics or HARMONICS[axes]).items():
+        sunward = name == "solar"
+        force: Force = RandomWalk(drift, level[0 if sunward else 1], mean=SOLAR_PRESSURE if sunward else 0.0)
+        for n in multiples:
+            force = force + Resonator(period / n, amplitude / n, wander / n)
+        found[name] = force
+    return found
+
+
+def start_near(times: Any, positions: Any) -> Gaussian:
+    """Return a wide prior of the state at the first time, around what the first nine positions say.
+
+    A polynomial of degree eight goes through them; over two hours of a GPS orbit its velocity is good to 1e-4 km/h.
+
+    Args:
+        times: (T,) hours.
+        positions: (T, 3) km; rows with NaN are passed over.
+
+    Raises:
+        ValueError: fewer than nine positions, or the first of them is not at the first time's orbit arc (6 h).
+    """
+    times = np.asarray(times, float)
+    known = checks.concrete(positions)
+    rows = np.arange(len(times)) if known is None else np.flatnonzero(np.isfinite(known).all(axis=1))
+    rows = rows[np.concatenate([[True], np.diff(times[rows]) > 0])][:_NEAR] if len(rows) else rows
+    if len(rows) < _NEAR:
+        raise ValueError(f"the start of an orbit is taken from its first {_NEAR} positions; there are {len(rows)}.")
+    at, first = times[rows], times[0]
+    if at[-1] - first > 6.0:
+        raise ValueError(f"the start of an orbit is taken from its first {_NEAR} positions, which must lie within six "
+                         f"hours of the first time; here they end after {at[-1] - first:g} h. Begin the data where "
+                         "the positions begin.")
+    vandermonde = np.vander((at - first) / (at[-1] - first), _NEAR, increasing=True)
+    weights = np.linalg.inv(vandermonde)[:2] / np.array([[1.0], [at[-1] - first]])
+    mean = (jnp.asarray(weights) @ jnp.asarray(positions)[rows]).ravel()
+    return Gaussian(mean, jnp.diag(jnp.repeat(jnp.asarray(START_SD) ** 2, 3)))
