@@ -12,6 +12,7 @@ import pandas as pd
 from lfm_ppl import checks
 
 _MODULES = {"ginzburg-landau": "lfm_ppl.experiments.ginzburg_landau.report",
+            "gps": "lfm_ppl.experiments.gps.report",
             "transcription": "lfm_ppl.experiments.transcription.report",
             "transcription-parameters": "lfm_ppl.experiments.transcription.parameters_report"}
 
@@ -28,6 +29,9 @@ class Wanted(NamedTuple):
         overwrite: compute again what was stored with other settings.
         report: what to do with a line of progress; None: nothing.
         workers: processes that compute.
+        data: a folder of files, where the experiment reads some; None: it makes its own data.
+        satellites: names, where the experiment has satellites; None: all.
+        train_days: days to learn from, where the experiment predicts those after them; None: its own.
     """
 
     folder: Path
@@ -38,24 +42,30 @@ class Wanted(NamedTuple):
     overwrite: bool = False
     report: Callable[[str], None] | None = None
     workers: int = 1
+    data: str | None = None
+    satellites: tuple[str, ...] | None = None
+    train_days: float | None = None
 
     def counts(self, **names: str) -> dict[str, Any]:
-        """Return the seed, and the counts that a user gave, under the names that the experiment's settings have.
+        """Return the seed, and what a user gave, under the names that the experiment's settings have.
 
         Args:
-            names: ``realisations`` and ``conditional``, where the experiment has them -> name in its settings.
+            names: ``realisations``, ``conditional``, ``data``, ``satellites`` and ``train_days``, where the experiment
+                has them -> name in its settings.
 
         Raises:
-            ValueError: a count is given that the experiment does not have.
+            ValueError: something is given that the experiment does not have.
 
         Example:
             >>> Wanted(Path("out"), realisations=10).counts(realisations="datasets")
             {'seed': 0, 'datasets': 10}
         """
-        given = {name: count for name in ("realisations", "conditional") if (count := getattr(self, name)) is not None}
-        for name in set(given) - set(names):
-            raise ValueError(f"this experiment does not take --{name}; leave it out.")
-        return {"seed": self.seed} | {names[name]: count for name, count in given.items()}
+        choices = ("realisations", "conditional", "data", "satellites", "train_days")
+        given = {name: value for name in choices if (value := getattr(self, name)) is not None}
+        for name in given:
+            if name not in names:
+                raise ValueError(f"this experiment does not take --{name.replace('_', '-')}; leave it out.")
+        return {"seed": self.seed} | {names[name]: value for name, value in given.items()}
 
 
 class Report(NamedTuple):

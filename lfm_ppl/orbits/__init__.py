@@ -6,11 +6,34 @@
 >>> around.celestial(orbits)  # the positions, in axes that do not turn  # doctest: +SKIP
 """
 
+from lfm_ppl.orbits.bodies import sunlight
+from lfm_ppl.orbits.deterministic import Orbit, fit_orbit, propagate
 from lfm_ppl.orbits.environment import NANO, Environment
 from lfm_ppl.orbits.ephemerides import Ephemerides, Gap, calendar, gps_seconds
 from lfm_ppl.orbits.frames import AXES, dyb, rtn
-from lfm_ppl.orbits.satellite import START_SD, satellite, small_forces, start_near
+from lfm_ppl.orbits.geopotential import GM
+from lfm_ppl.orbits.satellite import SOLAR_PRESSURE, START_SD, satellite, small_forces, start_near
 from lfm_ppl.orbits.sp3 import read_sp3
 
-__all__ = ["AXES", "NANO", "START_SD", "Environment", "Ephemerides", "Gap", "calendar", "dyb", "gps_seconds", "read_sp3", "rtn",
-           "satellite", "small_forces", "start_near"]
+__all__ = [
+    "AXES",
+    "GM",
+    "NANO",
+    "SOLAR_PRESSURE",
+    "START_SD",
+    "Environment",
+    "Ephemerides",
+    "Gap",
+    "Orbit",
+    "calendar",
+    "dyb",
+    "fit_orbit",
+    "gps_seconds",
+    "propagate",
+    "read_sp3",
+    "rtn",
+    "satellite",
+    "small_forces",
+    "start_near",
+    "sunlight",
+]

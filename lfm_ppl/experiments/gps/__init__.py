@@ -1,0 +1,1 @@
+"""GPS orbits: predicted with and without forces that nobody measured."""

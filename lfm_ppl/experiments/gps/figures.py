@@ -1,0 +1,138 @@
+"""Forces and errors of satellites, as in figures 2 and 3 of the source, and the errors of all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from lfm_ppl.analysis.plots import style
+from lfm_ppl.experiments.scores import Z
+from lfm_ppl.experiments.tasks import Result
+
+DETERMINISTIC, LATEST, LFM, SEEN = style.VERMILLION, style.ORANGE, style.BLUE, style.GREY
+_METRE = 1e-3
+
+
+def draw(results: Mapping[str, Result], online: Mapping[str, Result]) -> dict[str, Figure]:
+    """Return every figure of the comparison by name."""
+    name = next(iter(online), next(iter(results)))
+    found = {"all": plot_all(results), f"errors-{name}": plot_errors(name, results[name]),
+             f"forces-{name}": plot_forces(name, results[name])}
+    if name in online:
+        found[f"online-{name}"] = plot_online(name, online[name])
+    return found
+
+
+@style.styled
+def plot_forces(name: str, result: Result, *, width: str | float = "full") -> Figure:
+    """Draw the small forces of a satellite: learnt in training, predicted after it, and what all positions show.
+
+    Args:
+        name: of the satellite.
+        result: of its task.
+        width: "column" (3.4 in), "full" (7 in), or inches.
+    """
+    names = [str(one) for one in np.atleast_1d(result["force_names"])]
+    figure, panels = style.small_multiples(width, len(names), 1.7)
+    days, train = result["times"] / 24.0, result["times"][int(result["train"])] / 24.0
+    for index, (axes, force) in enumerate(zip(panels, names, strict=True)):
+        mean, sd = result["forces"][:, index], result["forces_sd"][:, index]
+        axes.plot(days, result["seen"][:, index], color=DETERMINISTIC, lw=0.8)
+        axes.fill_between(days, mean - Z * sd, mean + Z * sd, color=LFM, alpha=0.2, lw=0)
+        axes.plot(days, mean, color=LFM, lw=0.9)
+        axes.axvline(train, color=SEEN, lw=0.7, ls=":")
+        middle = np.median(result["seen"][:, index])
+        reach = 1.5 * max(np.abs(result["seen"][:, index] - middle).max(), np.abs(mean - middle).max(), 0.05)
+        axes.set_ylim(middle - reach, middle + reach)
+        axes.set_title(f"{name}: {force}")
+        style.label_values(axes, force, "nm/s²")
+    style.label_time(panels, "days")
+    style.legend_above(figure, [Line2D([], [], color=LFM, label="learnt in training, then predicted"),
+                                Patch(color=LFM, alpha=0.2, label="95%"),
+                                Line2D([], [], color=DETERMINISTIC, label="smoothed from all positions"),
+                                Line2D([], [], color=SEEN, ls=":", label="end of training")])
+    return figure
+
+
+@style.styled
+def plot_errors(name: str, result: Result, *, width: str | float = "full") -> Figure:
+    """Draw the errors of a satellite's position along the radial, tangential and normal directions."""
+    figure, panels = style.small_multiples(width, 3, 1.7)
+    days, train = result["times"] / 24.0, int(result["train"])
+    for index, (axes, direction) in enumerate(zip(panels, ("radial", "tangential", "normal"), strict=True)):
+        lfm, sd = result["lfm"][:, index] / _METRE, result["sd"][:, index] / _METRE
+        axes.plot(days, result["fitted"][:, index] / _METRE, color=DETERMINISTIC, lw=0.9)
+        axes.plot(days, result["latest"][:, index] / _METRE, color=LATEST, lw=0.9, ls="--")
+        axes.fill_between(days, -Z * sd, Z * sd, color=LFM, alpha=0.2, lw=0)
+        axes.plot(days, lfm, color=LFM, lw=0.9)
+        axes.axvline(days[train], color=SEEN, lw=0.7, ls=":")
+        largest = max(np.nanmax(np.abs(result[key][:, index])) for key in ("fitted", "latest", "lfm")) / _METRE
+        axes.set_ylim(-1.1 * largest, 1.1 * largest)
+        axes.set_title(f"{name}: {direction}")
+        style.label_values(axes, "error", "m")
+    style.label_time(panels, "days")
+    style.legend_above(figure, [
+        Line2D([], [], color=DETERMINISTIC, label="deterministic, fitted to training"),
+        Line2D([], [], color=LATEST, ls="--", label="deterministic, from the latest state"),
+        Line2D([], [], color=LFM, label="latent force model"),
+        Patch(color=LFM, alpha=0.2, label="its 95% about zero"),
+        Line2D([], [], color=SEEN, ls=":", label="end of training")])
+    return figure
+
+
+@style.styled
+def plot_online(name: str, result: Result, *, width: str | float = "full") -> Figure:
+    """Draw the errors of both models as positions come in, in windows with predictions between them."""
+    figure, panels = style.small_multiples(width, 3, 1.7)
+    days, observed = result["times"] / 24.0, result["observed"].astype(bool)
+    for index, (axes, direction) in enumerate(zip(panels, ("x", "y", "z"), strict=True)):
+        sd = result["sd"][:, index] / _METRE
+        axes.fill_between(days, 0, 1, where=observed, color=SEEN, alpha=0.2, lw=0,
+                          transform=axes.get_xaxis_transform())
+        axes.plot(days, result["restarted"][:, index] / _METRE, color=LATEST, lw=0.9, ls="--")
+        axes.fill_between(days, -Z * sd, Z * sd, color=LFM, alpha=0.2, lw=0)
+        axes.plot(days, result["lfm"][:, index] / _METRE, color=LFM, lw=0.9)
+        largest = max(np.nanmax(np.abs(result[key][observed.argmin():, index])) for key in ("restarted", "lfm"))
+        axes.set_ylim(-1.1 * largest / _METRE, 1.1 * largest / _METRE)
+        axes.set_title(f"{name}: {direction}")
+        style.label_values(axes, "error", "m")
+    style.label_time(panels, "days")
+    style.legend_above(figure, [Line2D([], [], color=LATEST, ls="--", label="deterministic, from the latest state"),
+                                Line2D([], [], color=LFM, label="latent force model"),
+                                Patch(color=LFM, alpha=0.2, label="its 95% about zero"),
+                                Patch(color=SEEN, alpha=0.2, label="positions observed")])
+    return figure
+
+
+@style.styled
+def plot_all(results: Mapping[str, Result], *, width: str | float = "full") -> Figure:
+    """Draw the errors after training of all satellites, those in the Earth's shadow set apart."""
+    figure = style.new_figure(width, 2.6)
+    axes = figure.subplots()
+    names = sorted(results, key=lambda name: (bool(results[name]["eclipsed"]), name))
+    place = np.arange(len(names))
+    for key, colour, marker, label in (("fitted", DETERMINISTIC, "o", "deterministic, fitted to training"),
+                                       ("latest", LATEST, "^", "deterministic, from the latest state"),
+                                       ("lfm", LFM, "s", "latent force model")):
+        errors = [rms(results[name][key][int(results[name]["train"]):]) for name in names]
+        axes.semilogy(place, errors, ls="", marker=marker, ms=3.5, color=colour, label=label)
+    shadow = sum(not results[name]["eclipsed"] for name in names)
+    if 0 < shadow < len(names):
+        axes.axvline(shadow - 0.5, color=SEEN, lw=0.7, ls=":")
+        axes.text(shadow - 0.4, 0.98, "in the Earth's shadow", va="top", transform=axes.get_xaxis_transform(),
+                  fontsize=style.SMALL, color=SEEN)
+    axes.set_xticks(place, names, rotation=90, fontsize=style.SMALL)
+    axes.tick_params(labelsize=style.SMALL, length=2.5, width=0.6)
+    axes.set_ylabel("error after training (m)")
+    style.legend_above(figure, axes.get_legend_handles_labels()[0])
+    return figure
+
+
+def rms(errors: Any) -> float:
+    """Return the root mean square distance in metres, of errors (T, 3) in km; NaN rows do not count."""
+    return float(np.sqrt(np.nanmean((np.asarray(errors) ** 2).sum(axis=1)))) / _METRE

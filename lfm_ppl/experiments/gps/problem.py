@@ -1,0 +1,134 @@
+"""The problem: positions of satellites, from files or simulated, and the model that predicts them."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lfm_ppl import orbits
+from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.observation import Gaussian
+from lfm_ppl.model.simulate import simulate
+
+NOISE = 5e-5
+"""Standard deviation of a coordinate's error, in km: published positions are smoothed, their scatter says nothing."""
+STEPS_AN_HOUR = 120
+SIMULATED = tuple(f"S{number:02d}" for number in range(1, 13))
+_HIDDEN = {"amplitude": 0.5, "wander": 0.02, "drift": 0.005, "white": 0.03}
+_DAYS, _INTERVAL = 10, 900.0
+
+
+class Magnitudes(NamedTuple):
+    """How large the small forces are; see `lfm_ppl.orbits.small_forces`."""
+
+    amplitude: Any
+    wander: Any
+    drift: Any
+    white: Any
+
+
+CANDIDATES = tuple(Magnitudes(amplitude, wander, 0.3 * wander, white) for amplitude, wander, white in
+                   itertools.product((0.1, 0.3, 1.0), (0.001, 0.003, 0.01, 0.03), (0.01, 0.1)))
+"""Magnitudes to choose from, in steps of a factor three."""
+
+
+class Arcs(NamedTuple):
+    """Positions in axes that do not turn.
+
+    Attributes:
+        environment: Earth, Moon and Sun over these days.
+        times: (T,) hours after the first epoch.
+        positions: satellite -> (T, 3) km, NaN where missing.
+        published: what was read; None for simulated satellites.
+    """
+
+    environment: orbits.Environment
+    times: np.ndarray
+    positions: dict[str, np.ndarray]
+    published: orbits.Ephemerides | None
+
+
+@functools.lru_cache(maxsize=2)
+def arcs(folder: str | None, seed: int = 0) -> Arcs:
+    """Return the positions of all GPS satellites in a folder of SP3 files, or of twelve simulated ones.
+
+    Args:
+        folder: of SP3 files; None: simulate ten days.
+        seed: of the simulation.
+
+    Raises:
+        FileNotFoundError, ValueError: no files, or files that cannot be read; the message has file and line.
+    """
+    if folder is None:
+        return _simulated(seed)
+    published = orbits.read_sp3(Path(folder))
+    gps = [name for name in published.satellites if name.startswith("G")]
+    if not gps:
+        raise ValueError(f"{folder}: there is no GPS satellite (G01, G02, ...) in these files, only "
+                         f"{', '.join(published.satellites[:5])}.")
+    published = published.select(gps)
+    environment = orbits.Environment.over(published.epochs[0], 24.0 * published.days)
+    positions = environment.celestial(published)
+    times = (published.epochs - published.epochs[0]) / 3600.0
+    return Arcs(environment, times, {name: positions[:, index] for index, name in enumerate(gps)}, published)
+
+
+def _simulated(seed: int) -> Arcs:
+    epoch = orbits.gps_seconds(2019, 4, 7)
+    environment = orbits.Environment.over(epoch, 24.0 * _DAYS)
+    times = _INTERVAL / 3600.0 * np.arange(int(_DAYS * 86_400 / _INTERVAL))
+    random = np.random.default_rng(seed)
+    turns = 2 * np.pi * np.stack([np.arange(len(SIMULATED)) % 6 / 6, random.uniform(size=len(SIMULATED))], axis=1)
+
+    @jax.jit
+    def draw(key: jax.Array, start: jax.Array) -> jax.Array:
+        system = model(environment, Gaussian(start, jnp.zeros((6, 6))), Magnitudes(**_HIDDEN))
+        return simulate(key, system, times, steps=STEPS_AN_HOUR // 4).y
+
+    keys = jax.random.split(jax.random.key(seed), len(SIMULATED))
+    found = {name: np.asarray(draw(key, jnp.asarray(_circular(*turn))))
+             for name, key, turn in zip(SIMULATED, keys, turns, strict=True)}
+    return Arcs(environment, times, found, None)
+
+
+def _circular(node: float, along: float) -> np.ndarray:
+    """Return a state on a circular orbit of half a sidereal day, inclined by 55 degrees."""
+    radius, inclination = 26_560.0, np.radians(55.0)
+    speed = 3600.0 * np.sqrt(orbits.GM / radius)
+    first = np.array([np.cos(node), np.sin(node), 0.0])
+    second = np.array([-np.sin(node) * np.cos(inclination), np.cos(node) * np.cos(inclination), np.sin(inclination)])
+    place = np.cos(along) * first + np.sin(along) * second
+    return np.concatenate([radius * place, speed * (np.cos(along) * second - np.sin(along) * first)])
+
+
+def model(environment: orbits.Environment, start: Gaussian, magnitudes: Magnitudes, axes: str = "DYB"
+          ) -> LatentForceModel:
+    """Return the satellite; all but the axes may be traced."""
+    forces = orbits.small_forces(axes, magnitudes.amplitude, magnitudes.wander, magnitudes.drift)
+    return orbits.satellite(environment, start, forces, axes, magnitudes.white, NOISE)
+
+
+def axes_of(state: np.ndarray) -> np.ndarray:
+    """Return the radial, tangential and normal directions (T, 3, 3), as columns, along states (T, 6)."""
+    return np.asarray(_rtn(jnp.asarray(state)))
+
+
+@jax.jit
+def _rtn(state: jax.Array) -> jax.Array:
+    return jax.vmap(lambda x: orbits.rtn(x[:3], x[3:]))(state)
+
+
+def eclipsed(environment: orbits.Environment, times: np.ndarray, state: np.ndarray) -> bool:
+    """Return whether the Earth's shadow falls on an orbit (T, 6) at any of the times."""
+    return bool((np.asarray(_light(environment, jnp.asarray(times), jnp.asarray(state))) < 1.0).any())
+
+
+@jax.jit
+def _light(environment: orbits.Environment, times: jax.Array, state: jax.Array) -> jax.Array:
+    return jax.vmap(lambda t, x: orbits.sunlight(x[:3], environment.sun(t)))(times, state)
