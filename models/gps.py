@@ -65,7 +65,9 @@ GRID = 0.25 * np.arange(193)
 STEPS = 30
 
 
-def build(amplitude, wander, drift, white, noise_sd, environment, start, axes="DYB", units=None) -> lfm.LatentForceModel:
+def build(
+    amplitude, wander, drift, white, noise_sd, environment, start, axes="DYB", units=None
+) -> lfm.LatentForceModel:
     """Return the satellite with these parameters.
 
     Args:

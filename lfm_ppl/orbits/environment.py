@@ -9,7 +9,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.orbits import bodies, frames, geopotential
+from lfm_ppl.orbits import frames, geopotential
+from lfm_ppl.orbits.bodies import (
+    ASTRONOMICAL_UNIT,
+    GM_MOON,
+    GM_SUN,
+    attraction,
+    positions,
+    solid_tide,
+    sunlight,
+)
 from lfm_ppl.orbits.earth import EarthRotation
 from lfm_ppl.orbits.ephemerides import Ephemerides
 from lfm_ppl.orbits.table import Table
@@ -30,6 +39,8 @@ class Environment(eqx.Module):
         epoch: GPS seconds at time zero.
         rotation: of the Earth.
         table: of Sun and Moon.
+        degree: and order of the Earth's field, from 0 (a point mass) to 8.
+        bodies: whether Sun and Moon pull.
 
     Example:
         >>> import jax.numpy as jnp
@@ -41,20 +52,24 @@ class Environment(eqx.Module):
     epoch: Any
     rotation: EarthRotation
     table: Table
+    degree: int = eqx.field(static=True, default=geopotential.DEGREE)
+    bodies: bool = eqx.field(static=True, default=True)
 
     @classmethod
-    def over(cls, epoch: float, hours: float) -> Environment:
+    def over(cls, epoch: float, hours: float, degree: int = geopotential.DEGREE, bodies: bool = True) -> Environment:
         """Tabulate what does not depend on the satellite.
 
         Args:
             epoch: GPS seconds.
             hours: how long it is needed.
+            degree: see the class.
+            bodies: see the class.
 
         Raises:
             ImportError: a library of the extra ``gps`` is not installed.
             ValueError: Earth orientation is not known there.
         """
-        return cls(jnp.asarray(float(epoch)), EarthRotation.over(epoch, hours), bodies.positions(epoch, hours))
+        return cls(jnp.asarray(float(epoch)), EarthRotation.over(epoch, hours), positions(epoch, hours), degree, bodies)
 
     def celestial(self, orbits: Ephemerides) -> np.ndarray:
         """Return the positions (T, S, 3) in axes that do not turn, GCRS, in km.
@@ -74,9 +89,9 @@ class Environment(eqx.Module):
         """Return what gravity does to a satellite (3,), km/h^2: Earth to degree 8, Sun, Moon, and the solid tide."""
         turn = self.rotation(t)
         sun, moon = jnp.split(self.table(t), 2)
-        total = turn.T @ geopotential.acceleration(turn @ r)
-        for body, gm in ((sun, bodies.GM_SUN), (moon, bodies.GM_MOON)):
-            total = total + bodies.attraction(r, body, gm) + bodies.solid_tide(r, body, gm)
+        total = turn.T @ geopotential.acceleration(turn @ r, self.degree)
+        for body, gm in ((sun, GM_SUN), (moon, GM_MOON)) if self.bodies else ():
+            total = total + attraction(r, body, gm) + solid_tide(r, body, gm)
         return PER_HOUR2 * total
 
     def solar_pressure(self, r: jax.Array, t: Any) -> jax.Array:
@@ -89,13 +104,13 @@ class Environment(eqx.Module):
         sun = self.sun(t)
         away = r - sun
         square = (away * away).sum()
-        light = bodies.sunlight(r, sun) * bodies.ASTRONOMICAL_UNIT**2 / square
+        light = sunlight(r, sun) * ASTRONOMICAL_UNIT**2 / square
         return NANO * light * away / jnp.sqrt(square)
 
     def sunlit_axes(self, r: jax.Array, t: Any) -> jax.Array:
         """Return the axes D, Y and B (3, 3) as columns, times the visible part of the Sun's disc."""
         sun = self.sun(t)
-        return bodies.sunlight(r, sun) * frames.dyb(r, sun)
+        return sunlight(r, sun) * frames.dyb(r, sun)
 
 
 @jax.jit

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -21,8 +21,10 @@ SOLAR_PRESSURE = 100.0
 """Acceleration of a GPS satellite by sunlight, in nm/s^2, before anything is known of the satellite."""
 SIDEREAL_DAY = 23.9344696
 """Hours in which the Earth turns once, and a GPS satellite twice around it."""
-HARMONICS = {"DYB": {"solar": (1, 2, 3, 4), "panel": (1, 2, 3, 4), "remaining": (1, 2, 3, 4)},
-             "RTN": {"radial": range(1, 8), "tangential": range(1, 8), "normal": range(1, 11)}}
+HARMONICS: dict[str, Mapping[str, Sequence[int]]] = {
+    "DYB": {"solar": (1, 2, 3, 4), "panel": (1, 2, 3, 4), "remaining": (1, 2, 3, 4)},
+    "RTN": {"radial": range(1, 8), "tangential": range(1, 8), "normal": range(1, 11)},
+}
 """Axes -> force -> multiples of the base frequency: of the orbit for DYB, of the day for RTN (as in the source)."""
 STATES = ("x", "y", "z", "vx", "vy", "vz")
 START_SD = (0.1, 0.1)
@@ -88,7 +90,7 @@ def _position(x: jax.Array, u: jax.Array, t: Any) -> jax.Array:
 
 
 def small_forces(axes: str = "DYB", amplitude: Any = 1.0, wander: Any = 0.01, drift: Any = 0.003,
-                 level: tuple[float, float] = (10.0, 2.0), harmonics: Mapping[str, Any] | None = None
+                 level: tuple[float, float] = (10.0, 2.0), harmonics: Mapping[str, Sequence[int]] | None = None
                  ) -> dict[str, Force]:
     """Return quasi-periodic forces for `satellite`, in nm/s^2: on each axis a level and resonators.
 

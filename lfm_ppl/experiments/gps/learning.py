@@ -31,7 +31,8 @@ from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation import Gaussian, GaussianObservation
 
 WAYS = ("held out", "marginal likelihood", "posterior average", "smoothed forces")
-_SMOOTH = {"scale": 2.0, "lengthscale": 3.0, "order": 1}
+_SCALE, _LENGTHSCALE = 2.0, 3.0
+"""Of the Matern model that smooths the forces: nm/s^2, hours."""
 _KEPT = 1e-3
 _THINNED = 4
 
@@ -83,7 +84,8 @@ def _smooth_forces(environment: orbits.Environment, start: Gaussian, y: jax.Arra
                    ) -> tuple[jax.Array, jax.Array]:
     times, axes, steps = fixed
     names = orbits.small_forces(axes)
-    forces = {name: Matern(**_SMOOTH, mean=orbits.SOLAR_PRESSURE if name == "solar" else 0.0) for name in names}
+    forces = {name: Matern(_SCALE, _LENGTHSCALE, mean=orbits.SOLAR_PRESSURE if name == "solar" else 0.0)
+              for name in names}
     system = orbits.satellite(environment, start, forces, axes, noise_sd=NOISE)
     found = smooth(system, np.array(times), y, rule=Taylor(), steps=steps)
     return found.input_mean[:, 6:], jnp.sqrt(jnp.diagonal(found.input_covariance, axis1=1, axis2=2)[:, 6:])

@@ -1,0 +1,131 @@
+"""Orbits without unknown forces, and the satellite as a latent force model."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lfm_ppl as lfm
+from lfm_ppl import orbits
+from lfm_ppl.model.augment import state_space
+from lfm_ppl.orbits import geopotential
+from lfm_ppl.orbits.environment import PER_HOUR2
+
+pytest.importorskip("erfa", reason="needs the extra gps")
+
+EPOCH = orbits.gps_seconds(2019, 4, 7)
+START = np.array([26_560.0, 0.0, 0.0, 0.0, 8_000.0, 11_425.0])
+TIMES = 0.25 * np.arange(97)
+
+
+@pytest.fixture(scope="session")
+def around():
+    return orbits.Environment.over(EPOCH, 48.0)
+
+
+def kepler(state, hours, gm):
+    """The two-body orbit after some hours, by Kepler's equation."""
+    r, v = state[:3], state[3:]
+    energy = v @ v / 2 - gm / np.linalg.norm(r)
+    a = -gm / (2 * energy)
+    n = np.sqrt(gm / a**3)
+    e_cos, e_sin = 1 - np.linalg.norm(r) / a, r @ v / np.sqrt(gm * a)
+    change = n * hours
+    for _ in range(50):
+        left = change - e_cos * np.sin(change) + e_sin * (1 - np.cos(change)) - n * hours
+        change -= left / (1 - e_cos * np.cos(change) + e_sin * np.sin(change))
+    f = 1 - a / np.linalg.norm(r) * (1 - np.cos(change))
+    g = hours - (change - np.sin(change)) / n
+    return f * r + g * v
+
+
+def test_the_two_body_limit_is_an_ellipse():
+    alone = orbits.Environment.over(EPOCH, 24.0, degree=0, bodies=False)
+    path = orbits.propagate(alone, orbits.Orbit(0.0, START, 0.0, 0.0), TIMES)
+    gm = geopotential.GM * PER_HOUR2
+    for index in (40, 96):
+        assert np.linalg.norm(path[index, :3] - kepler(START, TIMES[index], gm)) < 5e-6  # km
+    energy = (path[:, 3:] ** 2).sum(1) / 2 - gm / np.linalg.norm(path[:, :3], axis=1)
+    assert np.abs(energy / energy[0] - 1).max() < 1e-12
+
+
+def test_energy_in_the_turning_field_is_conserved():
+    """Jacobi's integral v^2/2 - U - omega . (r x v), for a field that turns evenly about a fixed axis."""
+    field = orbits.Environment.over(EPOCH, 24.0, bodies=False)
+    path = orbits.propagate(field, orbits.Orbit(0.0, START, 0.0, 0.0), TIMES)
+    turns = np.asarray(jax.vmap(lambda t: field.rotation(t))(TIMES))
+
+    def work(r, degree):
+        """U by integrating the pull from far away along the radius."""
+        nodes, weights = np.polynomial.legendre.leggauss(40)
+        s = 0.5 * (nodes + 1)  # r' = r / s, s from 0 to 1
+        pull = jax.vmap(lambda q: geopotential.acceleration(q, degree))(jnp.asarray(r[None] / s[:, None]))
+        return -(0.5 * weights * (np.asarray(pull) @ r) / s**2).sum()
+
+    potential = PER_HOUR2 * np.array([work(turn @ r, 8) for turn, r in zip(turns, path[:, :3], strict=True)])
+    axis = turns[48].T @ np.array([0.0, 0.0, 1.0])
+    rate = 2 * np.pi * 1.00273781191135448 / 24.0
+    jacobi = (path[:, 3:] ** 2).sum(1) / 2 - potential - rate * np.cross(path[:, :3], path[:, 3:]) @ axis
+    point = (path[:, 3:] ** 2).sum(1) / 2 - PER_HOUR2 * geopotential.GM / np.linalg.norm(path[:, :3], axis=1)
+    assert np.ptp(jacobi) < 1e-3 * np.ptp(point)
+
+
+@pytest.mark.slow
+def test_halved_steps_change_nothing(around, monkeypatch):
+    orbit = orbits.Orbit(0.0, START, 100.0, 0.0)
+    path = orbits.propagate(around, orbit, TIMES)
+    monkeypatch.setattr("lfm_ppl.orbits.deterministic.STEP", 1 / 240)
+    finer = orbits.propagate(around, orbit, TIMES)
+    assert np.linalg.norm((path - finer)[-1, :3]) < 1e-5  # km, after a day
+
+
+def test_an_orbit_is_found_again(around):
+    """Noise of 1 cm, gaps, and an unknown amplitude of the sunlight."""
+    orbit = orbits.Orbit(0.0, START, 93.0, 0.0)
+    truth = orbits.propagate(around, orbit, TIMES)
+    y = truth[:, :3] + 1e-5 * np.random.default_rng(0).normal(size=(97, 3))
+    y[[12, 40, 41]] = np.nan
+    found = orbits.fit_orbit(around, TIMES, y)
+    assert abs(found.solar - 93.0) < 0.2 and np.abs(found.state - START)[:3].max() < 3e-5
+    assert found.residual == pytest.approx(1e-5 * np.sqrt(3), rel=0.2)
+    for bad, message in ((TIMES**2, "equally spaced"), (TIMES[:1], "equally spaced")):
+        with pytest.raises(ValueError, match=message):
+            orbits.fit_orbit(around, bad, y[:len(bad)])
+    with pytest.raises(ValueError, match="nine|9 positions"):
+        orbits.fit_orbit(around, TIMES, np.where(np.arange(97)[:, None] < 5, y, np.nan))
+    with pytest.raises(ValueError, match="within six hours"):
+        orbits.fit_orbit(around, TIMES, np.where(np.arange(97)[:, None] > 60, y, np.nan))
+    with pytest.raises(ValueError, match="must begin with"):
+        orbits.propagate(around, orbit, TIMES + 1.0)
+
+
+@pytest.mark.parametrize(("axes", "states"), [("DYB", 33), ("RTN", 58)])
+def test_points_are_placed_in_position_and_velocity_alone(around, axes, states):
+    """At most twelve points, whatever the number of states."""
+    start = lfm.Gaussian(jnp.asarray(START), 1e-2 * jnp.eye(6))
+    ssm = state_space(orbits.satellite(around, start, orbits.small_forces(axes), axes, white=0.1))
+    assert ssm.state_dim == states
+    wanted = (0, 1, 2) if axes == "DYB" else (0, 1, 2, 3, 4, 5)
+    assert tuple(ssm.drift_structure.points) == wanted
+
+
+def test_small_forces_and_satellite_say_what_is_wrong(around):
+    start = lfm.Gaussian(jnp.asarray(START), jnp.eye(6))
+    with pytest.raises(ValueError, match="axes"):
+        orbits.small_forces("XYZ")
+    with pytest.raises(ValueError, match="has 3 forces"):
+        orbits.satellite(around, start, {"solar": lfm.Constant(1.0)})
+    # Any force of the library can stand there.
+    forces = dict.fromkeys(("solar", "panel", "remaining"), lfm.Matern(1.0, 3.0))
+    assert orbits.satellite(around, start, forces).force_names == ("solar", "panel", "remaining")
+
+
+def test_start_of_an_orbit_from_positions(around):
+    truth = orbits.propagate(around, orbits.Orbit(0.0, START, 100.0, 0.0), TIMES)
+    found = orbits.start_near(TIMES, truth[:, :3])
+    assert np.abs(found.mean - START)[:3].max() < 1e-9 and np.abs(found.mean - START)[3:].max() < 1e-3
+    holes = truth[:, :3].copy()
+    holes[[0, 3]] = np.nan
+    assert np.abs(orbits.start_near(TIMES, holes).mean - START)[:3].max() < 1e-3
