@@ -160,8 +160,8 @@ def _jump(ssm: StateSpaceModel, jumps: tuple[jax.Array, jax.Array], index: jax.A
     return moments, *((matmul(transition, phi), congruence(transition, noise) + added) if flow else (phi, noise))
 
 
-def check_observations(y: Any, count: int, outputs: int) -> jax.Array:
-    """Return y as an array (T, D) after checking it.
+def check_observations(y: Any, count: int, outputs: int, empty: bool = False) -> jax.Array:
+    """Return y as an array (T, D) after checking it; that nothing is observed is fine if ``empty``.
 
     Raises:
         ValueError: a wrong shape, infinite entries, or nothing observed at all.
@@ -179,7 +179,7 @@ def check_observations(y: Any, count: int, outputs: int) -> jax.Array:
         if np.isinf(known).any():
             row, column = np.argwhere(np.isinf(known))[0]
             raise ValueError(f"y[{row}, {column}] is infinite; use NaN for a missing entry.")
-        if np.isnan(known).all():
+        if np.isnan(known).all() and not empty:
             raise ValueError("every entry of y is missing (NaN); there is nothing to learn from.")
     return jnp.asarray(y, float)
 
@@ -198,8 +198,10 @@ def filter(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
         rule: linearisation rule; `Cubature()` by default.
         steps: integration steps between two consecutive times.
         max_step: longest step, in units of time; longer intervals get more steps.
-        start: the ``state`` of an earlier result, to go on with new observations; times continue from there. (An
-            observation covariance for each time holds those of the new times.)
+        start: the ``state`` of an earlier result, to go on with new observations; times continue from there, and
+            nothing need be observed at them (a prediction). The numbers are those of one pass, and as many new times
+            as in an earlier call take no new compilation. (An observation covariance for each time holds those of the
+            new times.)
 
     Returns:
         Log likelihoods, moments and residuals, by observation.
@@ -223,7 +225,7 @@ def filter(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
         _check_start(start, times, ssm.state_dim)
     plan = schedule(ssm, times, steps, max_step, initial_time=None if start is None else start.time)
     model.check_at(plan.initial_time, len(plan.observed))
-    y = check_observations(y, len(plan.observed), ssm.output_dim)
+    y = check_observations(y, len(plan.observed), ssm.output_dim, empty=start is not None)
     warn_single_precision()
     begin = None if start is None else Moments(start.mean, start.covariance)
     return _run_filter(ssm, rule, plan, y, jnp.asarray(times, float), begin)

@@ -146,7 +146,7 @@ def compute(task: Task) -> Result:
     return {
         "times": one.times, "train": one.train, "residual": paths.orbit.residual, "solar": paths.orbit.solar,
         "eclipsed": problem.eclipsed(one.environment, one.times[:one.train], paths.fitted[:one.train]),
-        "fitted": error(paths.fitted), "latest": error(paths.latest), "lfm": lfm, "sd": np.sqrt(variance),
+        "complete": np.isfinite(one.positions).all(), "fitted": error(paths.fitted), "latest": error(paths.latest), "lfm": lfm, "sd": np.sqrt(variance),
         "coverage": inside[known].mean(), "forces": found.forces, "forces_sd": found.forces_sd,
         "seen": everything.forces, "force_names": np.array(list(orbits.small_forces(asked["axes"]))),
         "scores": chosen.score, "held_out": chosen.rmse, "candidate": best, "log_likelihood": found.log_likelihood,
@@ -209,8 +209,10 @@ def satellites(results: dict[str, Result]) -> pd.DataFrame:
 
 def pooled(results: dict[str, Result]) -> pd.DataFrame:
     """Return one row a group of satellites: pooled errors in metres, ratios and coverage."""
-    groups = {"all": list(results), "never in shadow": [name for name, one in results.items() if not one["eclipsed"]],
-              "in shadow": [name for name, one in results.items() if one["eclipsed"]]}
+    complete = [name for name, one in results.items() if one["complete"]]
+    groups = {"all": list(results), "without gaps": complete,
+              "without gaps, never in shadow": [name for name in complete if not results[name]["eclipsed"]],
+              "without gaps, in shadow": [name for name in complete if results[name]["eclipsed"]]}
     rows = {}
     for group, names in groups.items():
         if not names:
