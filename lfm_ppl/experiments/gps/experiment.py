@@ -146,10 +146,11 @@ def compute(task: Task) -> Result:
     return {
         "times": one.times, "train": one.train, "residual": paths.orbit.residual, "solar": paths.orbit.solar,
         "eclipsed": problem.eclipsed(one.environment, one.times[:one.train], paths.fitted[:one.train]),
-        "complete": np.isfinite(one.positions).all(), "fitted": error(paths.fitted), "latest": error(paths.latest), "lfm": lfm, "sd": np.sqrt(variance),
-        "coverage": inside[known].mean(), "forces": found.forces, "forces_sd": found.forces_sd,
-        "seen": everything.forces, "force_names": np.array(list(orbits.small_forces(asked["axes"]))),
-        "scores": chosen.score, "held_out": chosen.rmse, "candidate": best, "log_likelihood": found.log_likelihood,
+        "complete": np.isfinite(one.positions).all(), "fitted": error(paths.fitted), "latest": error(paths.latest),
+        "lfm": lfm, "sd": np.sqrt(variance), "coverage": inside[known].mean(),
+        "forces": found.forces, "forces_sd": found.forces_sd, "seen": everything.forces,
+        "force_names": np.array(list(orbits.small_forces(asked["axes"]))), "scores": chosen.score,
+        "held_out": chosen.rmse, "candidate": best, "log_likelihood": found.log_likelihood,
         "cpu_s": time.process_time() - started}
 
 

@@ -1,0 +1,117 @@
+# ---
+# jupyter:
+#   jupytext:
+#     formats: ipynb,py:percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # Orbits of GPS satellites: small forces that nobody measured
+#
+# $$\dot r = v, \qquad \dot v = a(r, t) + u_\mathrm{solar}(t)\, a_\mathrm{solar}(r, t) + R(r, t)\, u(t),$$
+#
+# where $a$ is the pull of the Earth (to degree and order 8), the Moon, the Sun and the solid tide, and
+# $a_\mathrm{solar}$ the pressure of sunlight, nothing in the Earth's shadow. What is left, some nanometres per second
+# squared, moves a satellite by hundreds of metres in a week. It repeats with the orbit, nearly. So each small force is
+# a level that wanders and resonators at the orbit's frequency and three multiples of it,
+#
+# $$u(t) = b(t) + \sum_{n=1}^4 c_n(t), \qquad \ddot c_n = -(2\pi n f)^2 c_n + \mathrm{noise},$$
+#
+# along the direction to the Sun (together with the sunlight), the axis of the solar panels, and the third axis, in
+# sunlight only. That is a latent force model of 33 states, of which position and velocity alone are not linear.
+#
+# The source is J. Hartikainen, M. Seppanen and S. Sarkka, *State-space inference for non-linear latent force models*
+# (ICML 2012), section 6. The same comparison runs from the command line, on a folder of SP3 files:
+#
+#     lfm-ppl compare gps --data FOLDER
+
+# %%
+import os
+from pathlib import Path
+
+import numpyro
+
+numpyro.set_host_device_count(2)
+numpyro.enable_x64()
+
+import pandas as pd
+
+import lfm_ppl as lfm
+from lfm_ppl.experiments import scores
+from lfm_ppl.experiments.gps import experiment, figures, problem
+
+quick = bool(os.environ.get("LFM_QUICK"))
+pd.set_option("display.width", 170, "display.max_columns", 30)
+
+shared = Path(os.environ.get("LFM_DATA", "../../shared/data")) / "gps"
+real = shared.is_dir() and not quick
+if real:
+    orbits = lfm.orbits.read_sp3(shared, satellites=["G05", "G18", "G20"])
+    print(f"{orbits.days:g} days of {orbits.agency.strip()} from {lfm.orbits.calendar(orbits.epochs[0])} GPS time")
+else:
+    print("simulated satellites, with forces of the same kind")
+
+# %% [markdown]
+# Learning takes the first three days; the other seven are predicted, and nothing of them is looked at before. The
+# magnitudes of the forces are chosen among a few, for each satellite, by what the first day says of the second and
+# third.
+
+# %%
+if quick:
+    settings = experiment.Settings(satellites=problem.SIMULATED[:1], alternatives=0)
+else:
+    settings = experiment.Settings(data=str(shared) if real else None)
+# The folder of an earlier run of `lfm-ppl compare gps`; without one everything is computed here.
+folder = Path(os.environ.get("LFM_COMPARE_GPS", "lfm-results/compare/gps"))
+found = experiment.run(settings, folder)
+for name, reason in found.refused.items():
+    print(f"left out, {reason}")
+scores.readable(found.pooled).T
+
+# %% [markdown]
+# Errors are root mean squares of the distance in metres over the days that were predicted. *Deterministic* has an
+# initial state and a constant amplitude of the sunlight, fitted to the three days; *latest state* starts from the last
+# six hours of them, as in the source.
+
+# %%
+figures.plot_all(found.results)
+
+# %%
+found.satellites[["eclipsed", "fit", "deterministic", "latest state", "LFM", "ratio", "coverage"]].round(3)
+
+# %% [markdown]
+# ## One satellite
+#
+# The forces, as they are learnt from three days and predicted for seven, and as all ten days show them. The bands of
+# the levels are wide where a constant push along one axis cannot be told from a slightly different start.
+
+# %%
+one = next(iter(found.online), next(iter(found.results)))
+figures.plot_forces(one, found.results[one])
+
+# %%
+figures.plot_errors(one, found.results[one])
+
+# %% [markdown]
+# ## As positions come in
+#
+# A receiver sees the satellite now and then. The filter goes on from where it stands; the deterministic model is
+# started again from the latest state.
+
+# %%
+figures.plot_online(one, found.online[one]) if found.online else None
+
+# %% [markdown]
+# ## Ways to learn the magnitudes
+#
+# Published positions come out of somebody's dynamic model. They are smooth, and wrong by centimetres all the same, so
+# their scatter is no measure of their error: with a free noise level, the marginal likelihood makes it millimetres and
+# has the forces explain the rest. Here the noise is 5 cm, and the magnitudes are chosen by held-out positions, by the
+# marginal likelihood, by the average of its posterior over the candidates, and by the likelihood of forces that a
+# Matern model has smoothed first, which is what the source does.
+
+# %%
+scores.readable(found.learning) if len(found.learning) else None
