@@ -46,7 +46,7 @@ from lfm_ppl.experiments.gps import experiment, figures, problem
 quick = bool(os.environ.get("LFM_QUICK"))
 pd.set_option("display.width", 170, "display.max_columns", 30)
 
-shared = Path(os.environ.get("LFM_DATA", "../../shared/data")) / "gps"
+shared = Path(os.environ.get("LFM_DATA", "../shared/data")) / "gps"
 real = shared.is_dir() and not quick
 if real:
     orbits = lfm.orbits.read_sp3(shared, satellites=["G05", "G18", "G20"])
@@ -67,9 +67,9 @@ else:
 # The folder of an earlier run of `lfm-ppl compare gps`; without one everything is computed here.
 folder = Path(os.environ.get("LFM_COMPARE_GPS", "lfm-results/compare/gps"))
 found = experiment.run(settings, folder)
-for name, reason in found.refused.items():
-    print(f"left out, {reason}")
-scores.readable(found.pooled).T
+for reason in found.refused.values():
+    print(f"left out, {reason}\n")
+scores.readable(found.pooled)
 
 # %% [markdown]
 # Errors are root mean squares of the distance in metres over the days that were predicted. *Deterministic* has an
