@@ -127,7 +127,8 @@ def plot_drag(settings: Any, results: dict[str, Result], *, width: str | float =
     first, several, ranks = figure.subplots(1, 3)
     draws = results[parameters.tasks(settings)[0].name]["draws"][0]
     chain = results[next(task for task in chains.tasks(settings) if task.settings["sampler"] == tables.NUTS).name]
-    places = np.linspace(*np.quantile(np.concatenate([draws, chain["draws"][0].ravel()]), [0.0005, 0.9995]), 200)
+    low, high = np.quantile(np.concatenate([draws, chain["draws"][0].ravel()]), [0.0005, 0.9995])
+    places = np.linspace(low, high, 200)
     first.fill_between(places, stats.gaussian_kde(draws)(places), color=_SHADE, lw=0)
     first.plot(places, stats.gaussian_kde(chain["draws"][0].ravel())(places), color=style.VERMILLION, ls="--")
     first.axvline(truth, color=style.BLACK, lw=0.9)

@@ -1,8 +1,9 @@
 """Drag, scale and lengthscale from the distances alone: the most likely values, and the posterior of each target.
 
 The posterior is that of the model with its priors and the Gaussian filter's likelihood, in the logarithms z of the
-parameters. Its mode and curvature give a multivariate t distribution, whose draws are weighted by the posterior; the
-Pareto index of the weights says whether that is good enough. `chains` compares it with NUTS and RAM.
+parameters. Draws of a multivariate t distribution at its mode are weighted by it; their weighted moments give a second
+one, whose draws, weighted, stand for the posterior. The Pareto index of the weights says whether that is good enough.
+`chains` compares it with NUTS and RAM.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,8 +29,11 @@ from lfm_ppl.inference.optimise import Minimum, Objective, newton, quasi_newton
 START = np.log([5e-4, 30.0, 5.0])
 """Where every search starts: the prior medians."""
 
-FREEDOM, WIDER = 7, 1.2
-"""Degrees of freedom of the t distribution, and how much wider it is than the curvature says."""
+FREEDOM = (3, 5)
+"""Degrees of freedom of the first and the second t distribution."""
+
+WIDER = (1.2, 1.05)
+"""How much wider they are than the curvature and the weighted moments say."""
 
 LEVELS = (0.5, 0.8, 0.95)
 FURTHEST = 3.0
@@ -62,7 +66,7 @@ def compute(task: Task) -> Result:
         (``likely_``) and with the parameters integrated out (``posterior_``); CPU ``seconds`` of searches and weights.
         ``draws`` (3, D) of the first target, for a figure.
     """
-    _programs(task.settings["draws"], task.settings["paths"])
+    _warm(task.settings["draws"], task.settings["paths"])
     rows: dict[str, list] = {}
     first: Result = {}
     for index in range(task.settings["first"], task.settings["last"] + 1):
@@ -85,20 +89,18 @@ def estimate(target: problem.Target, count: int, paths: int, seed: int) -> Resul
         paths: draws over which the smoothed paths are averaged.
         seed: of the draws.
     """
-    densities, one_path, smoothing = _programs(count, paths)
+    densities, one_path, smoothing = _programs()
     y = jnp.asarray(target.y)
 
-    def search() -> tuple[Minimum, Minimum, np.ndarray, np.ndarray]:
+    def search() -> tuple[Minimum, Weighted]:
         mode, likely = (_minimum(target.y, weight) for weight in (1.0, 0.0))
-        draws, log_proposed = proposals(mode, count, seed)
-        return mode, likely, draws, np.asarray(densities(jnp.asarray(draws), y)) - log_proposed
+        return likely, weighted(lambda draws: np.asarray(densities(jnp.asarray(draws), y)), mode, count, seed)
 
-    seconds, (mode, likely, draws, log_ratio) = timed(search)
-    weights = importance.smooth(np.where(np.isfinite(log_ratio), log_ratio, -np.inf)[None])
+    seconds, (likely, (draws, weights)) = timed(search)
     weight = np.exp(weights.log_weight[0])
-    mean = weight @ draws
-    sd = np.sqrt(weight @ (draws - mean) ** 2)
+    mean, sd = moments(draws, weight)[0], np.sqrt(np.diag(moments(draws, weight)[1]))
     chosen = draws[importance.resample(weights.log_weight, paths, seed)]
+    plain = one_path(jnp.asarray(likely.point), y)
     means, sds = map(np.asarray, smoothing(jnp.asarray(chosen), y))
     total = [scores.total_moments(means[:, row], sds[:, row] ** 2) for row in range(len(problem.PATHS))]
     exists = likely.curvature is not None and bool(
@@ -107,12 +109,25 @@ def estimate(target: problem.Target, count: int, paths: int, seed: int) -> Resul
         "likely": likely.point, "exists": exists, "posterior_mean": mean, "posterior_sd": sd,
         "below": weight @ (draws < problem.true_z()), "k": weights.k, "ess": weights.ess, "seconds": seconds,
         "draws": draws[importance.resample(weights.log_weight, count, seed)].T,
-        **judged("likely", *one_path(jnp.asarray(likely.point), y), target),
+        **judged("likely", plain[0], plain[1], target),
         **judged("posterior", np.stack([one[0] for one in total]), np.stack([one[1] for one in total]), target)}
 
 
-def proposals(mode: Minimum, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return draws (count, 3) of the multivariate t distribution at a mode, and their log densities up to a constant.
+class Weighted(NamedTuple):
+    """Draws (D, 3) with their importance weights."""
+
+    draws: np.ndarray
+    weights: importance.Importance
+
+
+def weighted(log_density: Callable[[np.ndarray], np.ndarray], mode: Minimum, count: int, seed: int) -> Weighted:
+    """Return weighted draws of a density.
+
+    Args:
+        log_density: of draws (count, 3).
+        mode: of the density.
+        count: draws that are returned; a third as many go before them.
+        seed: of the draws.
 
     Raises:
         ValueError: there is no curvature at the mode.
@@ -120,12 +135,20 @@ def proposals(mode: Minimum, count: int, seed: int) -> tuple[np.ndarray, np.ndar
     if mode.curvature is None:
         raise ValueError("the posterior has no curvature at its mode; its derivatives there are not finite.")
     generator = np.random.default_rng(seed)
-    root = WIDER * mode.curvature.factor
-    dimension = len(root)
-    white = generator.normal(size=(count, dimension))
-    white *= np.sqrt(FREEDOM / generator.chisquare(FREEDOM, size=(count, 1)))
-    log_density = stats.multivariate_t(np.zeros(dimension), np.eye(dimension), df=FREEDOM).logpdf(white)
-    return mode.point + white @ root.T, log_density
+    centre, covariance = mode.point, mode.curvature.factor @ mode.curvature.factor.T
+    for freedom, wider, size in zip(FREEDOM, WIDER, (max(count // 3, 30), count), strict=True):
+        proposal = stats.multivariate_t(centre, wider**2 * covariance, df=freedom)
+        draws = proposal.rvs(size, random_state=generator)
+        log_ratio = log_density(draws) - proposal.logpdf(draws)
+        weights = importance.smooth(np.where(np.isfinite(log_ratio), log_ratio, -np.inf)[None])
+        centre, covariance = moments(draws, np.exp(weights.log_weight[0]))
+    return Weighted(draws, weights)
+
+
+def moments(draws: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean (3,) and covariance (3, 3) of draws (D, 3) with weights (D,) that sum to one."""
+    mean = weight @ draws
+    return mean, (draws - mean).T @ ((draws - mean) * weight[:, None])
 
 
 @dataclass
@@ -144,7 +167,8 @@ class _Energy(Objective):
 
 def _minimum(y: np.ndarray, prior: float) -> Minimum:
     """Return the mode of the posterior (``prior`` 1) or of the likelihood (0)."""
-    energy = _Energy(_energy, exact_hessian=False, y=jnp.asarray(y), prior=prior)
+    given = jnp.asarray(y)
+    energy = _Energy(lambda z: _energy(z, given, prior), exact_hessian=False, y=given, prior=prior)
     return newton(energy, quasi_newton(energy, START, 200))
 
 
@@ -164,19 +188,18 @@ def _energy_program() -> Callable:
 
 
 @functools.cache
-def _programs(count: int, paths: int) -> tuple[Callable, Callable, Callable]:
-    """Compile the densities of draws, and the smoothed paths of one and of several, once for all targets."""
+def _programs() -> tuple[Callable, Callable, Callable]:
+    """Return densities of draws, and smoothed paths for one and for several, compiled once for all targets."""
     def one(z: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
         return problem.paths_of(problem.likelihood(z).smooth(y))
-
-    y = jax.ShapeDtypeStruct((len(problem.target(0).times), 1), float)
-    z = [jax.ShapeDtypeStruct((*shape, len(problem.NAMES)), float) for shape in ((count,), (), (paths,))]
 
     def each(function: Callable) -> Callable:
         return lambda all_, y: jax.lax.map(lambda z: function(z, y), all_, batch_size=_TOGETHER)
 
-    functions = each(lambda z, y: -_energy(z, y, 1.0)), one, each(one)
-    energy = _energy_program()
-    energy(jnp.asarray(START), jnp.asarray(problem.target(0).y), 1.0)
-    return tuple(jax.jit(function).lower(shape, y).compile()  # type: ignore[return-value]
-                 for function, shape in zip(functions, z, strict=True))
+    return jax.jit(each(lambda z, y: -_energy(z, y, 1.0))), jax.jit(one), jax.jit(each(one))
+
+
+@functools.cache
+def _warm(count: int, paths: int) -> None:
+    """Compile everything before it is timed."""
+    estimate(problem.target(0), count, paths, 0)

@@ -86,7 +86,7 @@ def _programs(name: str) -> tuple[Callable, Callable]:
     """Compile filter and smoother once for all targets."""
     rule = RULES[name]
     given = problem.true_likelihood()
-    options = {"rule": rule, "steps": given.steps, "max_step": given.max_step}
+    options: dict[str, Any] = {"rule": rule, "steps": given.steps, "max_step": given.max_step}
     times = problem.target(0).times
 
     def filtering(y: jax.Array) -> tuple[jax.Array, jax.Array]:
