@@ -1,5 +1,6 @@
 """The target on reentry as an experiment: a little of every part, tables and figures, and what they must satisfy."""
 
+import dataclasses
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -24,7 +25,7 @@ from lfm_ppl.experiments.ballistic import (
 from lfm_ppl.experiments.tasks import write
 
 SMALL = experiment.Settings(
-    runs=2, particle_runs=1, particles=(2_000,), chain_runs=1, draws=200, paths=5, nuts=(2, 10, 10, 1),
+    runs=2, particle_runs=1, particles=(2_000,), chain_runs=1, drawn_runs=1, draws=200, paths=5, nuts=(2, 10, 10, 1),
     ram=(2, 10, 10, 2))
 
 
@@ -144,7 +145,8 @@ def made_up(settings):
                      "filter_seconds": np.full(count, 1e-3), "smoother_seconds": np.full(count, 2e-3),
                      "mean": problem.target(0).paths, "sd": np.ones((3, 120))}
         else:
-            below = (np.arange(given["first"], given["last"] + 1)[:, None] + 0.5) / settings.runs * np.ones(3)
+            total = settings.drawn_runs if given["what"] == "drawn" else settings.runs
+            below = (np.arange(given["first"], given["last"] + 1)[:, None] + 0.5) / total * np.ones(3)
             found = {"likely": problem.true_z() + np.zeros((count, 3)), "exists": np.arange(count) > 0,
                      "posterior_mean": problem.true_z() + np.zeros((count, 3)),
                      "posterior_sd": np.full((count, 3), 0.1), "below": below, "k": np.full(count, 0.2),
@@ -156,13 +158,15 @@ def made_up(settings):
     return results
 
 
-MADE = experiment.Settings(runs=100, particle_runs=3, particles=(500, 1_000), chain_runs=2)
+MADE = experiment.Settings(runs=100, particle_runs=3, particles=(500, 1_000), chain_runs=2, drawn_runs=20)
 
 
 def test_the_tables_hold_what_was_found():
     results = made_up(MADE)
     tracked = tables.tracked(MADE, results)
-    assert list(tracked.index) == [*tracking.RULES, *(f"cubature, {label}" for label in tables.UNKNOWN)]
+    assert list(tracked.index) == [
+        *tracking.RULES, *(f"cubature, {label}{end}" for end in ("", "; parameters drawn from the prior")
+                           for label in tables.UNKNOWN)]
     assert tracked.loc["Taylor", "RMSE speed (m/s)"] == 30.0 and tracked.loc["cubature", "coverage u"] == 0.95
     against = tables.against_particles(MADE, results)
     row = against.loc["smoother, 1,000 particles"]
@@ -174,6 +178,7 @@ def test_the_tables_hold_what_was_found():
     row = found.loc["log alpha"]
     assert row["maximum"] == 0.9 and row["truth"] == pytest.approx(-7.708, abs=1e-3)
     assert [row[f"coverage {level}%"] for level in (50, 80, 95)] == pytest.approx([0.5, 0.8, 0.96], abs=0.011)
+    assert found.loc["log scale, drawn from the prior", "coverage 80%"] == pytest.approx(0.8, abs=0.051)
     assert row["coverage 50% se"] == pytest.approx(0.05, abs=1e-3) and row["rank p"] > 0.99
     agreement = tables.agreement(MADE, results)
     assert agreement.loc["RAM", "shift"] == pytest.approx(0.5)
@@ -215,13 +220,12 @@ def test_what_is_stored_is_tabulated_and_drawn_without_computing(tmp_path):
         "paths.png", "particles.png", "drag.png", "coverage.png"}
     assert scores.readable(found.tracking).loc["cubature", "coverage u"].startswith("0.95")
     with pytest.raises(ValueError, match="seed is 0 there and 1 now"):
-        experiment.run(experiment.Settings(runs=100, particle_runs=3, particles=(500, 1_000), chain_runs=2, seed=1),
-                       tmp_path)
+        experiment.run(dataclasses.replace(MADE, seed=1), tmp_path)
 
 
 def test_tasks_have_files_of_their_own():
     found = experiment.all_tasks(experiment.Settings())
-    assert len({task.file for task in found}) == len(found) == 4 * 10 + 50 + 4 * 20 + 2 * 3
+    assert len({task.file for task in found}) == len(found) == 4 * 10 + 50 + 20 + 4 * 20 + 2 * 3
 
 
 def test_mistakes():

@@ -27,6 +27,7 @@ class Settings:
         particle_runs: of them, the first so many, by particles, too.
         particles: numbers of particles; the source has 50,000.
         chain_runs: of them, the first so many, with NUTS and RAM, too.
+        drawn_runs: further targets, whose parameters are drawn from the prior.
         draws: of the parameters, that are weighted.
         paths: draws over which the smoothed paths are averaged.
         nuts: chains, and warm-up, draws and thinning of each, of NUTS.
@@ -38,6 +39,7 @@ class Settings:
     particle_runs: int = 20
     particles: tuple[int, ...] = (500, 2_000, 10_000, 50_000)
     chain_runs: int = 3
+    drawn_runs: int = 200
     draws: int = 1_000
     paths: int = 50
     nuts: tuple[int, int, int, int] = (2, 300, 700, 1)
@@ -45,7 +47,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         """Check what a user gives."""
-        for name in ("runs", "particle_runs", "chain_runs", "draws", "paths"):
+        for name in ("runs", "particle_runs", "drawn_runs", "chain_runs", "draws", "paths"):
             checks.positive_integer(name, getattr(self, name))
         if self.runs > problem.MOST:
             raise ValueError(f"one seed has {problem.MOST} targets; use several seeds for more.")
@@ -64,8 +66,8 @@ class Settings:
 
 def quick(runs: int = 4, seed: int = 0) -> Settings:
     """Return settings that show in a minute that everything runs, and no more."""
-    return Settings(runs, seed, particle_runs=2, particles=(500, 2_000), chain_runs=1, draws=300, paths=20,
-                    nuts=(2, 30, 30, 1), ram=(2, 50, 100, 5))
+    return Settings(runs, seed, particle_runs=2, particles=(500, 2_000), chain_runs=1, drawn_runs=2, draws=300,
+                    paths=20, nuts=(2, 30, 30, 1), ram=(2, 50, 100, 5))
 
 
 class Comparison(NamedTuple):
@@ -91,14 +93,14 @@ class Comparison(NamedTuple):
 def all_tasks(settings: Settings) -> list[Task]:
     """Return every task: those of the first targets first, so that the time left can be told."""
     found = [*tracking.tasks(settings), *parameters.tasks(settings), *particles.tasks(settings),
-             *chains.tasks(settings)]
+             *chains.tasks(settings), *parameters.drawn_tasks(settings)]
     return sorted(found, key=lambda task: task.settings.get("index", task.settings.get("first")))
 
 
 def compute(task: Task) -> Result:
     """Compute one task."""
     return {"tracking": tracking.compute, "particles": particles.compute, "parameters": parameters.compute,
-            "chains": chains.compute}[task.settings["what"]](task)
+            "drawn": parameters.compute, "chains": chains.compute}[task.settings["what"]](task)
 
 
 def run(settings: Settings, folder: str | Path, *, overwrite: bool = False,

@@ -50,10 +50,19 @@ BLOCK = 10
 
 def tasks(settings: Any) -> list[Task]:
     """Return one task for each block of targets."""
-    return [Task(f"parameters/{first:04d}-{last:04d}", settings.seed,
-                 {"experiment": "ballistic", "what": "parameters", "first": first, "last": last,
+    return _tasks("parameters", settings.runs, settings)
+
+
+def drawn_tasks(settings: Any) -> list[Task]:
+    """Return one task for each block of targets whose parameters are drawn from the prior."""
+    return _tasks("drawn", settings.drawn_runs, settings)
+
+
+def _tasks(what: str, count: int, settings: Any) -> list[Task]:
+    return [Task(f"{what}/{first:04d}-{last:04d}", settings.seed,
+                 {"experiment": "ballistic", "what": what, "first": first, "last": last,
                   "draws": settings.draws, "paths": settings.paths})
-            for first, last in blocks(settings.runs, BLOCK)]
+            for first, last in blocks(count, BLOCK)]
 
 
 def compute(task: Task) -> Result:
@@ -67,10 +76,11 @@ def compute(task: Task) -> Result:
         ``draws`` (3, D) of the first target, for a figure.
     """
     _warm(task.settings["draws"], task.settings["paths"])
+    given = problem.drawn_target if task.settings["what"] == "drawn" else problem.target
     rows: dict[str, list] = {}
     first: Result = {}
     for index in range(task.settings["first"], task.settings["last"] + 1):
-        target = problem.target(index, task.seed)
+        target = given(index, task.seed)
         seed = int(jax.random.bits(jax.random.fold_in(task.key, index)))
         found = estimate(target, task.settings["draws"], task.settings["paths"], seed)
         drawn = found.pop("draws")
@@ -107,7 +117,7 @@ def estimate(target: problem.Target, count: int, paths: int, seed: int) -> Resul
         (likely.curvature.values > likely.curvature.floor).all() and np.all(np.abs(likely.point - START) < FURTHEST))
     return {
         "likely": likely.point, "exists": exists, "posterior_mean": mean, "posterior_sd": sd,
-        "below": weight @ (draws < problem.true_z()), "k": weights.k, "ess": weights.ess, "seconds": seconds,
+        "below": weight @ (draws < target.z), "k": weights.k, "ess": weights.ess, "seconds": seconds,
         "draws": draws[importance.resample(weights.log_weight, count, seed)].T,
         **judged("likely", plain[0], plain[1], target),
         **judged("posterior", np.stack([one[0] for one in total]), np.stack([one[1] for one in total]), target)}

@@ -14,12 +14,16 @@ from lfm_ppl import loading
 from lfm_ppl.inference.fixing import fix
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.inference.posterior import likelihood_site
+from lfm_ppl.model.simulate import simulate
 
 NAMES = ("alpha", "scale", "lengthscale")
 """The unknown parameters; everything here is in their logarithms z."""
 
 PATHS = ("altitude", "speed", "u")
 """What is estimated, in the order of the rows of every array of paths."""
+
+_FINER = 10
+"""Cells of the simulation between two measurements, those of the model file."""
 
 MOST = 10_000
 """Targets for one seed of the experiment."""
@@ -32,11 +36,13 @@ class Target(NamedTuple):
         times: (T,) of the measurements (s).
         y: (T, 1) distances (m).
         paths: (3, T) true altitude (m), speed (m/s) and acceleration u (m/s^2) at these times.
+        z: (3,) logarithms of the true parameters.
     """
 
     times: np.ndarray
     y: np.ndarray
     paths: np.ndarray
+    z: np.ndarray
 
 
 @functools.cache
@@ -56,7 +62,32 @@ def target(index: int, seed: int = 0) -> Target:
     truth: Any = data.truth
     at = np.searchsorted(np.asarray(truth["times"]), data.times - 1e-9)
     state = np.asarray(truth["state"])[at]
-    return Target(data.times, data.y, np.stack([state[:, 0], state[:, 1], np.asarray(truth["forces"]["u"])[at]]))
+    paths = np.stack([state[:, 0], state[:, 1], np.asarray(truth["forces"]["u"])[at]])
+    return Target(data.times, data.y, paths, true_z())
+
+
+@functools.lru_cache(maxsize=1024)
+def drawn_target(index: int, seed: int = 0) -> Target:
+    """Return a target whose parameters and start are drawn from their priors, too."""
+    with jax.ensure_compile_time_eval():
+        z, found = _drawing()(jax.random.fold_in(jax.random.key(seed), index))
+    at = np.searchsorted(np.asarray(found.times), target(0).times - 1e-9)
+    paths = np.stack([found.state[:, 0], found.state[:, 1], found.forces["u"]])[:, at]
+    return Target(target(0).times, np.asarray(found.y)[at], paths, np.asarray(z))
+
+
+@functools.cache
+def _drawing() -> Any:
+    """Return what draws parameters and simulates, compiled once."""
+    fine = np.linspace(0.0, target(0).times[-1], _FINER * (len(target(0).times) - 1) + 1)
+
+    def draw(key: jax.Array) -> tuple[jax.Array, Any]:
+        keys = jax.random.split(key)
+        trace = handlers.trace(handlers.seed(model(), keys[0])).get_trace(target(0).times)
+        z = jnp.log(jnp.stack([trace[name]["value"] for name in NAMES]))
+        return z, simulate(keys[1], likelihood(z).model, fine, steps=5)
+
+    return jax.jit(draw)
 
 
 @functools.cache

@@ -32,9 +32,9 @@ def of_rule(settings: Any, results: dict[str, Result], rule: str) -> dict[str, n
                                  "filter_seconds", "smoother_seconds"))
 
 
-def of_parameters(settings: Any, results: dict[str, Result]) -> dict[str, np.ndarray]:
-    """Return what is known of the parameters of all targets."""
-    return joined(estimates.tasks(settings), results, (
+def of_parameters(settings: Any, results: dict[str, Result], drawn: bool = False) -> dict[str, np.ndarray]:
+    """Return what is known of the parameters of all targets, or of all those whose parameters are ``drawn``."""
+    return joined(estimates.drawn_tasks(settings) if drawn else estimates.tasks(settings), results, (
         "likely", "exists", "posterior_mean", "posterior_sd", "below", "k", "ess", "seconds", "likely_rmse",
         "likely_coverage", "posterior_rmse", "posterior_coverage"))
 
@@ -58,9 +58,11 @@ def tracked(settings: Any, results: dict[str, Result]) -> pd.DataFrame:
     for rule in tracking.RULES:
         found = of_rule(settings, results, rule)
         rows[rule] = _scored(found, "smoother") | pair("CPU s", mean_of(found["smoother_seconds"]))
-    found = of_parameters(settings, results)
-    for label, what in UNKNOWN.items():
-        rows[f"{tracking.REPORTED}, {label}"] = _scored(found, what) | pair("CPU s", mean_of(found["seconds"]))
+    for drawn, ending in ((False, ""), (True, "; parameters drawn from the prior")):
+        found = of_parameters(settings, results, drawn)
+        for label, what in UNKNOWN.items():
+            rows[f"{tracking.REPORTED}, {label}{ending}"] = _scored(found, what) | pair(
+                "CPU s", mean_of(found["seconds"]))
     return pd.DataFrame.from_dict(rows, orient="index", dtype=float)
 
 
@@ -119,31 +121,38 @@ def paired_ratio(first: np.ndarray, second: np.ndarray) -> Estimate:
 
 
 def parameters(settings: Any, results: dict[str, Result]) -> pd.DataFrame:
-    """Return one row for each parameter, in its logarithm.
+    """Return one row for each parameter, in its logarithm, and one for where it is drawn from the prior.
 
     Returns:
         The truth; mean and standard deviation over targets of the most likely value, where the likelihood has a
         maximum (``maximum``, the share of targets); posterior mean and standard deviation; the share of targets whose
         central posterior intervals of 50%, 80% and 95% hold the truth, with binomial standard errors; ``rank p``, the
         p-value of Kolmogorov and Smirnov's test that the posterior probability of less than the truth is uniform over
-        targets. The truth is the same for all targets: at the centre of an interval oftener than a draw from the prior
-        where the prior has a say, as with scale and lengthscale.
+        targets. For one and the same truth the shares are nominal only as far as the data outweigh the prior; for
+        parameters that are drawn from the prior they are nominal if the posterior is right.
     """
-    found = of_parameters(settings, results)
     rows = {}
-    exists = found["exists"].astype(bool)
-    for index, name in enumerate(problem.NAMES):
-        likely, below = found["likely"][exists, index], found["below"][:, index]
-        row = {"truth": float(problem.true_z()[index]), **pair("maximum", rate_of(exists)),
-               **pair("most likely", mean_of(likely)),
-               "its sd": float(likely.std(ddof=1)) if len(likely) > 1 else np.nan,
-               **pair("posterior mean", mean_of(found["posterior_mean"][:, index])),
-               **pair("posterior sd", mean_of(found["posterior_sd"][:, index]))}
-        for level in estimates.LEVELS:
-            row |= pair(f"coverage {level:.0%}", rate_of(np.abs(below - 0.5) <= level / 2))
-        row["rank p"] = float(stats.kstest(below, "uniform").pvalue)
-        rows[f"log {name}"] = row
+    for drawn in (False, True):
+        for index, name in enumerate(problem.NAMES):
+            found = of_parameters(settings, results, drawn)
+            rows[f"log {name}{', drawn from the prior' if drawn else ''}"] = _parameter(found, index, drawn)
     return pd.DataFrame.from_dict(rows, orient="index", dtype=float)
+
+
+def _parameter(found: dict[str, np.ndarray], index: int, drawn: bool) -> dict[str, float]:
+    exists, below = found["exists"].astype(bool), found["below"][:, index]
+    row: dict[str, float] = {}
+    if not drawn:
+        likely = found["likely"][exists, index]
+        row |= {"truth": float(problem.true_z()[index]), **pair("maximum", rate_of(exists)),
+                **pair("most likely", mean_of(likely)),
+                "its sd": float(likely.std(ddof=1)) if len(likely) > 1 else np.nan,
+                **pair("posterior mean", mean_of(found["posterior_mean"][:, index]))}
+    row |= pair("posterior sd", mean_of(found["posterior_sd"][:, index]))
+    for level in estimates.LEVELS:
+        row |= pair(f"coverage {level:.0%}", rate_of(np.abs(below - 0.5) <= level / 2))
+    row["rank p"] = float(stats.kstest(below, "uniform").pvalue)
+    return row
 
 
 def agreement(settings: Any, results: dict[str, Result]) -> pd.DataFrame:
