@@ -225,12 +225,13 @@ def test_what_is_stored_is_tabulated_and_drawn_without_computing(tmp_path):
 
 def test_tasks_have_files_of_their_own():
     found = experiment.all_tasks(experiment.Settings())
-    assert len({task.file for task in found}) == len(found) == 4 * 10 + 50 + 20 + 4 * 20 + 2 * 3
+    assert len({task.file for task in found}) == len(found) == 4 * 10 + 50 + 10 + 4 * 20 + 2 * 3
 
 
 def test_mistakes():
     for wrong, message in (
             ({"runs": 0}, "runs must be at least 1"), ({"runs": 20_000}, "use several seeds"),
+            ({"rules": ("Taylor",)}, "rules must hold 'cubature'"), ({"rules": ("cubic",)}, "cubic"),
             ({"particles": ()}, "a tuple of different numbers"), ({"particles": (5, 5)}, "a tuple of different"),
             ({"particles": (0,)}, "particles must be at least 1"), ({"nuts": (2, 10, 10)}, "chains, warm-up, draws"),
             ({"ram": (0, 1, 1, 1)}, "ram: chains must be at least 1")):

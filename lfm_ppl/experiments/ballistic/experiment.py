@@ -24,6 +24,7 @@ class Settings:
     Attributes:
         runs: simulated targets.
         seed: of everything random.
+        rules: of linearisation, names of `tracking.RULES`; the first one, the model's own, is always among them.
         particle_runs: of them, the first so many, by particles, too.
         particles: numbers of particles; the source has 50,000.
         chain_runs: of them, the first so many, with NUTS and RAM, too.
@@ -36,10 +37,11 @@ class Settings:
 
     runs: int = 500
     seed: int = 0
+    rules: tuple[str, ...] = tuple(tracking.RULES)
     particle_runs: int = 20
     particles: tuple[int, ...] = (500, 2_000, 10_000, 50_000)
     chain_runs: int = 3
-    drawn_runs: int = 200
+    drawn_runs: int = 100
     draws: int = 1_000
     paths: int = 50
     nuts: tuple[int, int, int, int] = (2, 300, 700, 1)
@@ -54,6 +56,10 @@ class Settings:
         if not isinstance(self.particles, tuple) or not self.particles or len(set(self.particles)) < len(
                 self.particles):
             raise ValueError(f"particles must be a tuple of different numbers, got {self.particles!r}.")
+        for rule in self.rules:
+            checks.one_of("rules", rule, tracking.RULES)
+        if tracking.REPORTED not in self.rules:
+            raise ValueError(f"rules must hold {tracking.REPORTED!r}, got {self.rules!r}.")
         for count in self.particles:
             checks.positive_integer("particles", count)
         for name in ("nuts", "ram"):
@@ -66,8 +72,8 @@ class Settings:
 
 def quick(runs: int = 4, seed: int = 0) -> Settings:
     """Return settings that show in a minute that everything runs, and no more."""
-    return Settings(runs, seed, particle_runs=2, particles=(500, 2_000), chain_runs=1, drawn_runs=2, draws=300,
-                    paths=20, nuts=(2, 30, 30, 1), ram=(2, 50, 100, 5))
+    return Settings(runs, seed, rules=(tracking.REPORTED,), particle_runs=2, particles=(500,), chain_runs=1,
+                    drawn_runs=2, draws=300, paths=20, nuts=(2, 30, 30, 1), ram=(2, 50, 100, 5))
 
 
 class Comparison(NamedTuple):

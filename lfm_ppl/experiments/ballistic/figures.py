@@ -40,7 +40,7 @@ def plot_paths(settings: Any, results: dict[str, Result], *, width: str | float 
         width: "column" (3.4 in), "full" (7 in), or inches.
     """
     target = problem.target(0, settings.seed)
-    own = results[tracking.tasks(settings)[0].name]
+    own = results[next(one for one in tracking.tasks(settings) if one.settings["method"] == tracking.REPORTED).name]
     most = max(settings.particles)
     by = next(task for task in particles.tasks(settings) if task.settings["particles"] == most)
     figure = style.new_figure(width, 3.8)

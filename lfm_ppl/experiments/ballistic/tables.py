@@ -55,7 +55,7 @@ def tracked(settings: Any, results: dict[str, Result]) -> pd.DataFrame:
         parameters and their posterior.
     """
     rows = {}
-    for rule in tracking.RULES:
+    for rule in settings.rules:
         found = of_rule(settings, results, rule)
         rows[rule] = _scored(found, "smoother") | pair("CPU s", mean_of(found["smoother_seconds"]))
     for drawn, ending in ((False, ""), (True, "; parameters drawn from the prior")):

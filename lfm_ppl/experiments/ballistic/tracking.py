@@ -32,7 +32,7 @@ def tasks(settings: Any) -> list[Task]:
     """Return one task for each rule and block of targets."""
     return [Task(f"tracking/{slug(rule)}/{first:04d}-{last:04d}", settings.seed,
                  {"experiment": "ballistic", "what": "tracking", "method": rule, "first": first, "last": last})
-            for rule in RULES for first, last in blocks(settings.runs, BLOCK)]
+            for rule in settings.rules for first, last in blocks(settings.runs, BLOCK)]
 
 
 def blocks(count: int, size: int) -> list[tuple[int, int]]:
