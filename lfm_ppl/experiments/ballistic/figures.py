@@ -153,7 +153,7 @@ def plot_drag(settings: Any, results: dict[str, Result], *, width: str | float =
     ranks.hist(found["below"][:, 0], np.linspace(0.0, 1.0, cells + 1), histtype="step", color=style.BLUE)
     ranks.axhline(expected, color=style.BLACK, lw=0.9)
     ranks.set_ylim(0.0, 1.8 * expected)
-    ranks.set_xlabel("posterior probability of less than the truth")
+    ranks.set_xlabel("posterior probability\nof less than the truth")
     ranks.set_ylabel("targets")
     ranks.set_title(f"{settings.runs} targets")
     for axes in (first, several, ranks):

@@ -11,7 +11,7 @@ from scipy import stats
 from lfm_ppl.experiments.ballistic import chains, problem, tracking
 from lfm_ppl.experiments.ballistic import parameters as estimates
 from lfm_ppl.experiments.ballistic import particles as by_particles
-from lfm_ppl.experiments.scores import Estimate, mean_of, pair, rate_of
+from lfm_ppl.experiments.scores import Estimate, mean_of, pair, rate_of, relative_errors_of_sd
 from lfm_ppl.experiments.tasks import Result, Task
 
 UNITS = {"altitude": "m", "speed": "m/s", "u": "m/s^2"}
@@ -184,8 +184,8 @@ def agreement(settings: Any, results: dict[str, Result]) -> pd.DataFrame:
             with np.errstate(divide="ignore"):
                 widest = np.unravel_index(np.abs(np.log(ratio)).argmax(), ratio.shape)
             row |= pair("shift", Estimate(float(abs(shift[worst])), float(error[worst])))
-            # That of a normal distribution; scale and lengthscale are near to it in their logarithms.
-            row |= pair("sd ratio", Estimate(float(ratio[widest]), float(ratio[widest] * error[widest] / np.sqrt(2))))
+            spread = ratio * np.stack([np.hypot(*map(_relative_error_of_sd, both)) for both in pairs])
+            row |= pair("sd ratio", Estimate(float(ratio[widest]), float(spread[widest])))
         # A chain that does not move has neither; it must not look as if it did.
         row["least ESS"] = min(float(np.nan_to_num(one["ess"]).min()) for one in own)
         row |= pair("CPU s", mean_of([one["seconds"] for one in own]))
@@ -196,3 +196,8 @@ def agreement(settings: Any, results: dict[str, Result]) -> pd.DataFrame:
             row["divergences"] = float(np.mean([one["divergences"] for one in own]))
         rows[label] = row
     return pd.DataFrame.from_dict(rows, orient="index", dtype=float)
+
+
+def _relative_error_of_sd(found: Result) -> np.ndarray:
+    """Return Monte Carlo errors of standard deviations; of weighted draws those of a normal distribution."""
+    return relative_errors_of_sd(found["draws"]) if "draws" in found else np.sqrt(0.5 / found["ess"])
