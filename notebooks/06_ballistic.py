@@ -33,13 +33,14 @@ import numpyro
 numpyro.set_host_device_count(2)
 numpyro.enable_x64()
 
+import jax
 import numpy as np
 import pandas as pd
 
-import lfm_ppl as lfm
 from lfm_ppl import loading
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.ballistic import experiment, figures
+from lfm_ppl.inference.posterior import likelihood_site
 
 quick = bool(os.environ.get("LFM_QUICK"))
 pd.set_option("display.width", 160, "display.max_columns", 30)
@@ -112,13 +113,10 @@ data = file.simulate()
 azimuth = data.y[:, 1]
 jump = int(np.abs(np.diff(azimuth)).argmax())
 print("azimuth about the jump (rad):", azimuth[jump - 2 : jump + 4].round(3))
-# The drag alone is learnt here; every parameter takes `lfm-ppl fit ballistic-3d` some minutes.
-known = {**file.anchors(data), "scale": 50.0, "lengthscale": 5.0}
-result = lfm.fit(file.model, data.times, data.y, sampler="ram", fixed=known, chains=2, warmup=20 if quick else 200,
-                 samples=20 if quick else 300, trajectory_draws=20 if quick else 100, at=data.times, truth=data.truth,
-                 progress=False)
-drag = np.log(np.asarray(result["posterior"]["alpha"]))
-print(f"log alpha: {drag.mean():.3f}, standard deviation {drag.std():.3f}, the truth {np.log(4.49e-4):.3f}")
-state = np.asarray(result["trajectories"]["states"].mean(["chain", "draw"]))
+given = likelihood_site(file.model, (data.times,), {}, jax.random.key(0), data.truth["parameters"]).example
+smoothed = given.smooth(data.y)
 truth = np.asarray(data.truth["state"])[np.isin(data.truth["times"], data.times)]
-print("RMSE of the position (m), east, north, up:", np.sqrt(np.mean((state - truth)[:, :3] ** 2, axis=0)).round(1))
+error = np.asarray(smoothed.mean)[:, :3] - truth[:, :3]
+sd = np.sqrt(np.diagonal(smoothed.covariance, axis1=1, axis2=2))[:, :3]
+summary = {"RMSE (m)": np.sqrt(np.mean(error**2, axis=0)), "coverage": np.mean(np.abs(error) < scores.Z * sd, axis=0)}
+pd.DataFrame(summary, ["east", "north", "up"]).round(3)
