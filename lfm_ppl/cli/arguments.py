@@ -133,13 +133,19 @@ def _add_compare(commands: Any) -> None:
         "  lfm-ppl compare ginzburg-landau --quick\n"
         "  lfm-ppl compare transcription --datasets 10\n"
         "  lfm-ppl compare gps --data shared/data/gps --satellites G05 G20 --train-days 3\n"
+        "  lfm-ppl compare ballistic --runs 20 --jobs 2\n"
         "  lfm-ppl compare ginzburg-landau --realisations 50 --conditional 200 --out double-well"
     )
     help_ = "run a published experiment again, or go on with one that was stopped; without a name, list them"
     command = _command(commands, "compare", compare.run, help_, examples)
     command.add_argument("experiment", nargs="?", metavar="EXPERIMENT", help="see `lfm-ppl compare`")
     command.add_argument(
-        "--realisations", "--datasets", type=_whole(1), metavar="N", help="data sets (default: the experiment's)"
+        "--realisations",
+        "--datasets",
+        "--runs",
+        type=_whole(1),
+        metavar="N",
+        help="data sets (default: the experiment's)",
     )
     command.add_argument(
         "--conditional",

@@ -1,0 +1,215 @@
+"""Drag, scale and lengthscale from the distances alone: the most likely values, and the posterior of each target.
+
+The posterior is that of the model with its priors and the Gaussian filter's likelihood, in the logarithms z of the
+parameters. Draws of a multivariate t distribution at its mode are weighted by it; their weighted moments give a second
+one, whose draws, weighted, stand for the posterior. The Pareto index of the weights says whether that is good enough.
+`chains` compares it with NUTS and RAM.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import stats
+
+from lfm_ppl.analysis import importance
+from lfm_ppl.experiments import scores
+from lfm_ppl.experiments.ballistic import problem
+from lfm_ppl.experiments.ballistic.tracking import blocks, judged
+from lfm_ppl.experiments.tasks import Result, Task
+from lfm_ppl.experiments.timing import timed
+from lfm_ppl.inference.optimise import Minimum, Objective, newton, quasi_newton
+
+START = np.log([5e-4, 30.0, 5.0])
+"""Where every search starts: the prior medians."""
+
+FREEDOM = (3, 5)
+"""Degrees of freedom of the first and the second t distribution."""
+
+WIDER = (1.2, 1.05)
+"""How much wider they are than the curvature and the weighted moments say."""
+
+LEVELS = (0.5, 0.8, 0.95)
+FURTHEST = 3.0
+"""A most likely value further than this from `START`, in logarithms, lies at the edge: the likelihood has no maximum
+among plausible values."""
+
+_TOGETHER = 10
+"""Parameter values that are computed at a time: a thousand no longer fit the CPU's cache, and take seven times as long
+each."""
+
+BLOCK = 10
+"""Targets that are computed in one go, and stored in one file."""
+
+
+def tasks(settings: Any) -> list[Task]:
+    """Return one task for each block of targets."""
+    return _tasks("parameters", settings.runs, settings)
+
+
+def drawn_tasks(settings: Any) -> list[Task]:
+    """Return one task for each block of targets whose parameters are drawn from the prior."""
+    return _tasks("drawn", settings.drawn_runs, settings)
+
+
+def _tasks(what: str, count: int, settings: Any) -> list[Task]:
+    return [Task(f"{what}/{first:04d}-{last:04d}", settings.seed,
+                 {"experiment": "ballistic", "what": what, "first": first, "last": last,
+                  "draws": settings.draws, "paths": settings.paths})
+            for first, last in blocks(count, BLOCK)]
+
+
+def compute(task: Task) -> Result:
+    """Return what is found of every target of the task, (N, ...).
+
+    Returns:
+        ``likely`` (3,), the most likely z, and whether it ``exists``; of the posterior of z ``posterior_mean``,
+        ``posterior_sd`` and ``below`` (3,), the probability of less than the true value; ``k``, the Pareto index, and
+        ``ess`` of the weights; RMSE and coverage (3,) of the smoothed paths with the most likely parameters
+        (``likely_``) and with the parameters integrated out (``posterior_``); CPU ``seconds`` of searches and weights.
+        ``draws`` (3, D) of the first target, for a figure.
+    """
+    _warm(task.settings["draws"], task.settings["paths"])
+    given = problem.drawn_target if task.settings["what"] == "drawn" else problem.target
+    rows: dict[str, list] = {}
+    first: Result = {}
+    for index in range(task.settings["first"], task.settings["last"] + 1):
+        target = given(index, task.seed)
+        seed = int(jax.random.bits(jax.random.fold_in(task.key, index)))
+        found = estimate(target, task.settings["draws"], task.settings["paths"], seed)
+        drawn = found.pop("draws")
+        first = first or {"draws": drawn}
+        for name, value in found.items():
+            rows.setdefault(name, []).append(value)
+    return {**{name: np.stack(values) for name, values in rows.items()}, **first}
+
+
+def estimate(target: problem.Target, count: int, paths: int, seed: int) -> Result:
+    """Return what is found of a target, see `compute`.
+
+    Args:
+        target: the target.
+        count: draws that are weighted.
+        paths: draws over which the smoothed paths are averaged.
+        seed: of the draws.
+    """
+    densities, one_path, smoothing = _programs()
+    y = jnp.asarray(target.y)
+
+    def search() -> tuple[Minimum, Weighted]:
+        mode, likely = (_minimum(target.y, weight) for weight in (1.0, 0.0))
+        return likely, weighted(lambda draws: np.asarray(densities(jnp.asarray(draws), y)), mode, count, seed)
+
+    seconds, (likely, (draws, weights)) = timed(search)
+    weight = np.exp(weights.log_weight[0])
+    mean, sd = moments(draws, weight)[0], np.sqrt(np.diag(moments(draws, weight)[1]))
+    chosen = draws[importance.resample(weights.log_weight, paths, seed)]
+    plain = one_path(jnp.asarray(likely.point), y)
+    means, sds = map(np.asarray, smoothing(jnp.asarray(chosen), y))
+    total = [scores.total_moments(means[:, row], sds[:, row] ** 2) for row in range(len(problem.PATHS))]
+    exists = likely.curvature is not None and bool(
+        (likely.curvature.values > likely.curvature.floor).all() and np.all(np.abs(likely.point - START) < FURTHEST))
+    return {
+        "likely": likely.point, "exists": exists, "posterior_mean": mean, "posterior_sd": sd,
+        "below": weight @ (draws < target.z), "k": weights.k, "ess": weights.ess, "seconds": seconds,
+        "draws": draws[importance.resample(weights.log_weight, count, seed)].T,
+        **judged("likely", plain[0], plain[1], target),
+        **judged("posterior", np.stack([one[0] for one in total]), np.stack([one[1] for one in total]), target)}
+
+
+class Weighted(NamedTuple):
+    """Draws (D, 3) with their importance weights."""
+
+    draws: np.ndarray
+    weights: importance.Importance
+
+
+def weighted(log_density: Callable[[np.ndarray], np.ndarray], mode: Minimum, count: int, seed: int) -> Weighted:
+    """Return weighted draws of a density.
+
+    Args:
+        log_density: of draws (count, 3).
+        mode: of the density.
+        count: draws that are returned; a third as many go before them.
+        seed: of the draws.
+
+    Raises:
+        ValueError: there is no curvature at the mode.
+    """
+    if mode.curvature is None:
+        raise ValueError("the posterior has no curvature at its mode; its derivatives there are not finite.")
+    generator = np.random.default_rng(seed)
+    centre, covariance = mode.point, mode.curvature.factor @ mode.curvature.factor.T
+    for freedom, wider, size in zip(FREEDOM, WIDER, (max(count // 3, 30), count), strict=True):
+        proposal = stats.multivariate_t(centre, wider**2 * covariance, df=freedom)
+        draws = proposal.rvs(size, random_state=generator)
+        log_ratio = log_density(draws) - proposal.logpdf(draws)
+        weights = importance.smooth(np.where(np.isfinite(log_ratio), log_ratio, -np.inf)[None])
+        centre, covariance = moments(draws, np.exp(weights.log_weight[0]))
+    return Weighted(draws, weights)
+
+
+def moments(draws: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean (3,) and covariance (3, 3) of draws (D, 3) with weights (D,) that sum to one."""
+    mean = weight @ draws
+    return mean, (draws - mean).T @ ((draws - mean) * weight[:, None])
+
+
+@dataclass
+class _Energy(Objective):
+    """Minus the log posterior density of a target, or minus its log likelihood, from the one compiled program."""
+
+    y: Any = None
+    prior: float = 1.0
+
+    def value_and_gradient(self, point: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return the value and the gradient (3,)."""
+        self.evaluations += 1
+        value, gradient = _energy_program()(jnp.asarray(point), self.y, self.prior)
+        return float(value), np.asarray(gradient)
+
+
+def _minimum(y: np.ndarray, prior: float) -> Minimum:
+    """Return the mode of the posterior (``prior`` 1) or of the likelihood (0)."""
+    given = jnp.asarray(y)
+    energy = _Energy(lambda z: _energy(z, given, prior), exact_hessian=False, y=given, prior=prior)
+    return newton(energy, quasi_newton(energy, START, 200))
+
+
+def _energy(z: jax.Array, y: jax.Array, prior: Any) -> jax.Array:
+    log_likelihood, log_prior = problem.log_densities(z, y)
+    return -log_likelihood - prior * log_prior
+
+
+@functools.cache
+def _energy_program() -> Callable:
+    """Return value and gradient, by forward mode, compiled once for all targets."""
+    def twice(*arguments: Any) -> tuple[jax.Array, jax.Array]:
+        value = _energy(*arguments)
+        return value, value
+
+    return jax.jit(lambda *arguments: jax.jacfwd(twice, has_aux=True)(*arguments)[::-1])
+
+
+@functools.cache
+def _programs() -> tuple[Callable, Callable, Callable]:
+    """Return densities of draws, and smoothed paths for one and for several, compiled once for all targets."""
+    def one(z: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return problem.paths_of(problem.likelihood(z).smooth(y))
+
+    def each(function: Callable) -> Callable:
+        return lambda all_, y: jax.lax.map(lambda z: function(z, y), all_, batch_size=_TOGETHER)
+
+    return jax.jit(each(lambda z, y: -_energy(z, y, 1.0))), jax.jit(one), jax.jit(each(one))
+
+
+@functools.cache
+def _warm(count: int, paths: int) -> None:
+    """Compile everything before it is timed."""
+    estimate(problem.target(0), count, paths, 0)

@@ -1,0 +1,122 @@
+# ---
+# jupyter:
+#   jupytext:
+#     formats: ipynb,py:percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # A target on reentry: its drag and the force on it, from distances alone
+#
+# $$dr = -v\,dt + q_r\,d\beta_r, \qquad dv = \left(-\alpha e^{-\gamma r} v^2 + g + u(t)\right) dt + q_v\,d\beta_v,
+# \qquad y_k = \sqrt{s_x^2 + (s_y - r(t_k))^2} + e_k.$$
+#
+# A target falls from 65 km at 3 km/s. A radar 30 km aside measures its distance 120 times in 30 s, with an error of
+# 30 m. The drag $\alpha$ is unknown, and so is a force $u$, a Gaussian process (Matern-5/2) with unknown scale and
+# lengthscale. Drift and measurement are both non-linear.
+#
+# The source is J. Hartikainen, M. Seppanen and S. Sarkka, *State-space inference for non-linear latent force models*
+# (ICML 2012), section 5.2 and figure 1. It shows one target; here are many, simulated at its parameters. The same
+# experiment runs from the command line, where it can be stopped and resumed:
+#
+#     lfm-ppl compare ballistic
+
+# %%
+import os
+from pathlib import Path
+
+import numpyro
+
+numpyro.set_host_device_count(2)
+numpyro.enable_x64()
+
+import jax
+import numpy as np
+import pandas as pd
+
+from lfm_ppl import loading
+from lfm_ppl.experiments import scores
+from lfm_ppl.experiments.ballistic import experiment, figures
+from lfm_ppl.inference.posterior import likelihood_site
+
+quick = bool(os.environ.get("LFM_QUICK"))
+pd.set_option("display.width", 160, "display.max_columns", 30)
+settings = experiment.quick(2) if quick else experiment.Settings()
+# The folder of an earlier run of `lfm-ppl compare ballistic`; without one everything is computed here.
+folder = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/ballistic"))
+found = experiment.run(settings, folder)
+
+# %% [markdown]
+# ## One target
+#
+# The smoother at the true parameters. In the upper row the bands are hardly wider than the line; below are the errors,
+# and those of the smoother with the most particles.
+
+# %%
+figures.plot_paths(settings, found.results)
+
+# %% [markdown]
+# ## All targets
+#
+# Root mean squared error over the 120 times, and the share of them at which the 95% band holds the truth, by the
+# linearisation of the smoother; then with the most likely parameters instead of the true ones, as in the source, and
+# with the parameters integrated out. Bands with the most likely parameters are too narrow for the force, since they
+# know nothing of the parameters' uncertainty.
+
+# %%
+scores.readable(found.tracking)
+
+# %%
+figures.plot_coverage(settings, found.results)
+
+# %% [markdown]
+# ## Particles
+#
+# A bootstrap particle filter whose particles follow the model by a stochastic Runge-Kutta scheme of strong order 1.5,
+# and the paths of its last particles, traced back. `ratio` is the Gaussian's error over theirs, `times as long` their
+# time over its.
+
+# %%
+scores.readable(found.particles)
+
+# %%
+figures.plot_particles(settings, found.results)
+
+# %% [markdown]
+# ## The drag
+#
+# The posterior of $\log\alpha$, whose true value is -7.71: of one target, by weighted draws and by NUTS; of several;
+# and the ranks of the truth over all targets, which are uniform where a posterior means what it says.
+
+# %%
+figures.plot_drag(settings, found.results)
+
+# %%
+scores.readable(found.parameters)
+
+# %%
+scores.readable(found.agreement)
+
+# %% [markdown]
+# ## In three dimensions
+#
+# The model `ballistic-3d` has a force in each direction, and a radar that measures range, azimuth and elevation. Its
+# default target crosses the direction in which the azimuth jumps from $\pi$ to $-\pi$, which the observation declares
+# as an angle: `lfm.GaussianObservation(radar, covariance, angular=(1,))`.
+
+# %%
+file = loading.load("ballistic-3d")
+data = file.simulate()
+azimuth = data.y[:, 1]
+jump = int(np.abs(np.diff(azimuth)).argmax())
+print("azimuth about the jump (rad):", azimuth[jump - 2 : jump + 4].round(3))
+given = likelihood_site(file.model, (data.times,), {}, jax.random.key(0), data.truth["parameters"]).example
+smoothed = given.smooth(data.y)
+truth = np.asarray(data.truth["state"])[np.isin(data.truth["times"], data.times)]
+error = np.asarray(smoothed.mean)[:, :3] - truth[:, :3]
+sd = np.sqrt(np.diagonal(smoothed.covariance, axis1=1, axis2=2))[:, :3]
+summary = {"RMSE (m)": np.sqrt(np.mean(error**2, axis=0)), "coverage": np.mean(np.abs(error) < scores.Z * sd, axis=0)}
+pd.DataFrame(summary, ["east", "north", "up"]).round(3)

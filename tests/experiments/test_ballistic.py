@@ -1,0 +1,248 @@
+"""The target on reentry as an experiment: a little of every part, tables and figures, and what they must satisfy."""
+
+import dataclasses
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from lfm_ppl.experiments import catalogue, scores
+from lfm_ppl.experiments.ballistic import (
+    chains,
+    experiment,
+    figures,
+    parameters,
+    particles,
+    problem,
+    report,
+    tables,
+    tracking,
+)
+from lfm_ppl.experiments.tasks import write
+
+SMALL = experiment.Settings(
+    runs=2, particle_runs=1, particles=(2_000,), chain_runs=1, drawn_runs=1, draws=200, paths=5, nuts=(2, 10, 10, 1),
+    ram=(2, 10, 10, 2))
+
+
+def test_the_targets_are_those_of_the_model_file():
+    data = problem.model_file().simulate(seed=problem.MOST + 3)
+    target = problem.target(3, seed=1)
+    np.testing.assert_array_equal(target.y, data.y)
+    at = np.isin(data.truth["times"], target.times)
+    np.testing.assert_array_equal(target.paths[0], np.asarray(data.truth["state"])[at, 0])
+    np.testing.assert_array_equal(target.paths[2], np.asarray(data.truth["forces"]["u"])[at])
+    assert np.exp(problem.true_z()) == pytest.approx([4.49e-4, 50.0, 5.0])
+    assert problem.true_z()[0] == pytest.approx(-7.7, abs=0.01)  # as published
+
+
+def test_the_densities_are_those_of_the_model():
+    """The prior against scipy's, and the likelihood against that of the system built by hand."""
+    z = problem.true_z() + np.array([0.3, -0.2, 0.1])
+    target = problem.target(0)
+    log_likelihood, log_prior = jax.jit(problem.log_densities)(jnp.asarray(z), target.y)
+    expected = stats.norm([np.log(5e-4), np.log(30.0), np.log(5.0)], [1.0, 1.0, 0.7]).logpdf(z).sum()
+    assert log_prior == pytest.approx(expected, rel=1e-12)
+    assert log_likelihood == pytest.approx(float(problem.likelihood(z).log_prob(target.y)), rel=1e-10)
+
+
+def test_a_gaussian_smoother_tracks():
+    """Its errors are those of its own mean, and its band is honest about them."""
+    (task,) = [one for one in tracking.tasks(SMALL) if one.settings["method"] == "Taylor"]
+    found = tracking.compute(task)
+    target = problem.target(0)
+    assert found["smoother_rmse"].shape == found["smoother_coverage"].shape == (2, 3)
+    np.testing.assert_allclose(found["smoother_rmse"][0], np.sqrt(np.mean((found["mean"] - target.paths) ** 2, axis=1)))
+    assert (found["smoother_rmse"] < found["filter_rmse"]).all()
+    assert (found["smoother_coverage"] > 0.8).all()
+    assert (found["smoother_seconds"] > 0).all() and found["log_likelihood"].shape == (2,)
+
+
+def test_particles_agree_with_the_gaussian_smoother_where_it_is_nearly_exact():
+    (task,) = particles.tasks(SMALL)
+    found = particles.compute(task)
+    given = problem.true_likelihood()
+    target = problem.target(0)
+    mean, sd = map(np.asarray, problem.paths_of(given.smooth(target.y)))
+    # 2,000 particles leave an error of the log likelihood of about 1, and many different paths at the end alone.
+    assert abs(found["log_likelihood"] - float(given.log_prob(target.y))) < 4.0
+    assert found["distinct"][0] < found["distinct"][-1] <= 2_000
+    late = found["distinct"] > 200
+    assert late.sum() >= 5
+    off = ((found["mean"] - mean) / sd)[:, late]
+    assert np.sqrt(np.mean(off**2)) < 4.0 / np.sqrt(200)
+    np.testing.assert_allclose(found["sd"][:, late], sd[:, late], rtol=0.3)
+
+
+def test_weighted_draws_have_the_moments_of_their_density():
+    """A normal density found from a wrong mode and a wrong curvature."""
+    factor = np.array([[2.0, 0.0, 0.0], [0.5, 1.0, 0.0], [0.0, -0.3, 0.4]])
+    target = stats.multivariate_normal([1.0, -2.0, 3.0], factor @ factor.T)
+    mode = SimpleNamespace(point=target.mean + [1.0, 0.0, 0.2], curvature=SimpleNamespace(factor=0.8 * factor))
+    draws, found = parameters.weighted(target.logpdf, mode, 20_000, 0)
+    mean, covariance = parameters.moments(draws, np.exp(found.log_weight[0]))
+    assert found.k < 0.5 and found.ess > 10_000
+    variance = np.diag(target.cov)
+    np.testing.assert_array_less(np.abs(mean - target.mean), 4 * np.sqrt(variance / found.ess))
+    np.testing.assert_allclose(np.diag(covariance), variance, rtol=4 * np.sqrt(2 / found.ess))
+    with pytest.raises(ValueError, match="no curvature"):
+        parameters.weighted(target.logpdf, SimpleNamespace(point=mode.point, curvature=None), 10, 0)
+
+
+@pytest.mark.slow
+def test_the_posterior_is_that_of_a_grid():
+    """Mean and standard deviation of each parameter against a sum over a grid of all three."""
+    target = problem.target(0)
+    found = parameters.estimate(target, 1_000, 5, 0)
+    assert found["k"] < 0.7 and found["exists"]
+    axes = [np.linspace(m - 5 * s, m + 5 * s, 25)
+            for m, s in zip(found["posterior_mean"], found["posterior_sd"], strict=True)]
+    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    density = jax.jit(lambda all_: jax.lax.map(lambda z: sum(problem.log_densities(z, target.y)), all_, batch_size=25))
+    log_density = np.asarray(density(jnp.asarray(nodes)))
+    weight = np.exp(log_density - log_density.max())
+    weight /= weight.sum()
+    mean = weight @ nodes
+    sd = np.sqrt(weight @ (nodes - mean) ** 2)
+    error = sd / np.sqrt(found["ess"])
+    np.testing.assert_array_less(np.abs(found["posterior_mean"] - mean), 4 * error)
+    np.testing.assert_allclose(found["posterior_sd"], sd, rtol=4 / np.sqrt(found["ess"]))
+    np.testing.assert_allclose(found["below"], weight @ (nodes < problem.true_z()), atol=0.1)
+    # No point of the grid is more likely than the most likely one.
+    best = sum(problem.log_densities(jnp.asarray(found["likely"]), target.y)[:1])
+    assert float(best) >= max(float(problem.log_densities(jnp.asarray(nodes[i]), target.y)[0])
+                              for i in np.argsort(log_density)[-5:]) - 1e-6
+
+
+def made_up(settings):
+    """Results of every task: particles with RMSE and time that follow from their number, parameters as expected."""
+    generator, results = np.random.default_rng(0), {}
+    for task in experiment.all_tasks(settings):
+        given = task.settings
+        if given["what"] == "chains":
+            draws = problem.true_z()[:, None, None] + 0.1 * generator.normal(size=(3, 2, 300))
+            off = given["sampler"] == "RAM"
+            results[task.name] = {"draws": draws, "seconds": 10.0, "divergences": 1, "r_hat": np.full(3, 1.002),
+                                  "mean": problem.true_z() + 0.05 * off, "sd": np.full(3, 0.11 if off else 0.1),
+                                  "ess": np.full(3, 200.0)}
+            continue
+        if given["what"] == "particles":
+            worse = 1.0 + 100.0 / given["particles"]
+            results[task.name] = {
+                "filter_rmse": 2 * worse * np.ones(3), "smoother_rmse": worse * np.array([50.0, 30.0, 20.0]),
+                "smoother_coverage": np.full(3, 0.9), "log_likelihood": -600.0 + given["index"], "filter_seconds": 0.1,
+                "smoother_seconds": given["particles"] * 1e-3, "distinct": np.full(120, 7.0),
+                "mean": np.zeros((3, 120)), "sd": np.ones((3, 120))}
+            continue
+        count = given["last"] - given["first"] + 1
+        if given["what"] == "tracking":
+            found = {"filter_rmse": np.full((count, 3), 2.0), "smoother_rmse": np.tile([50.0, 30.0, 20.0], (count, 1)),
+                     "smoother_coverage": np.full((count, 3), 0.95), "log_likelihood": np.full(count, -601.0),
+                     "filter_seconds": np.full(count, 1e-3), "smoother_seconds": np.full(count, 2e-3),
+                     "mean": problem.target(0).paths, "sd": np.ones((3, 120))}
+        else:
+            total = settings.drawn_runs if given["what"] == "drawn" else settings.runs
+            below = (np.arange(given["first"], given["last"] + 1)[:, None] + 0.5) / total * np.ones(3)
+            found = {"likely": problem.true_z() + np.zeros((count, 3)), "exists": np.arange(count) > 0,
+                     "posterior_mean": problem.true_z() + np.zeros((count, 3)),
+                     "posterior_sd": np.full((count, 3), 0.1), "below": below, "k": np.full(count, 0.2),
+                     "ess": np.full(count, 300.0), "seconds": np.full(count, 0.5),
+                     "draws": problem.true_z()[:, None] + 0.1 * generator.normal(size=(3, 200)),
+                     **{f"{what}_{name}": np.full((count, 3), 0.9) for what in ("likely", "posterior")
+                        for name in ("rmse", "coverage")}}
+        results[task.name] = found
+    return results
+
+
+MADE = experiment.Settings(runs=100, particle_runs=3, particles=(500, 1_000), chain_runs=2, drawn_runs=20)
+
+
+def test_the_tables_hold_what_was_found():
+    results = made_up(MADE)
+    tracked = tables.tracked(MADE, results)
+    assert list(tracked.index) == [
+        *tracking.RULES, *(f"cubature, {label}{end}" for end in ("", "; parameters drawn from the prior")
+                           for label in tables.UNKNOWN)]
+    assert tracked.loc["Taylor", "RMSE speed (m/s)"] == 30.0 and tracked.loc["cubature", "coverage u"] == 0.95
+    against = tables.against_particles(MADE, results)
+    row = against.loc["smoother, 1,000 particles"]
+    assert row["ratio u"] == pytest.approx(1 / 1.1) and row["ratio u se"] == pytest.approx(0.0, abs=1e-12)
+    assert row["times as long"] == pytest.approx(500.0) and row["distinct"] == 7.0
+    assert row["log likelihood - Gaussian"] == pytest.approx(2.0) and row["its sd"] == pytest.approx(1.0)
+    assert against.loc["smoother, Gaussian", "CPU s"] == 2e-3
+    found = tables.parameters(MADE, results)
+    row = found.loc["log alpha"]
+    assert row["maximum"] == 0.9 and row["truth"] == pytest.approx(-7.708, abs=1e-3)
+    assert [row[f"coverage {level}%"] for level in (50, 80, 95)] == pytest.approx([0.5, 0.8, 0.96], abs=0.011)
+    assert found.loc["log scale, drawn from the prior", "coverage 80%"] == pytest.approx(0.8, abs=0.051)
+    assert row["coverage 50% se"] == pytest.approx(0.05, abs=1e-3) and row["rank p"] > 0.99
+    agreement = tables.agreement(MADE, results)
+    assert agreement.loc["RAM", "shift"] == pytest.approx(0.5)
+    assert agreement.loc["RAM", "sd ratio"] == pytest.approx(1.1)
+    assert agreement.loc["RAM", "shift se"] == pytest.approx(0.1)
+    assert agreement.loc["weighted draws", "k"] == 0.2 and agreement.loc["NUTS", "R-hat"] == 1.002
+
+
+def test_a_chain_that_stands_still_shows():
+    results = made_up(MADE)
+    still = next(task.name for task in chains.tasks(MADE) if task.settings["sampler"] == "RAM")
+    for name, value in (("ess", np.nan), ("r_hat", np.nan), ("sd", 0.0)):
+        results[still][name][1] = value
+    row = tables.agreement(MADE, results).loc["RAM"]
+    assert row["least ESS"] == 0 and row["R-hat"] == np.inf and row["sd ratio"] == 0
+
+
+def test_the_figures_are_drawn_and_labelled():
+    drawn = figures.draw(MADE, made_up(MADE))
+    assert list(drawn) == ["paths", "particles", "drag", "coverage"]
+    for figure in drawn.values():
+        assert figure.get_figwidth() == 7.0 and figure.legends
+        for axes in figure.axes:
+            assert axes.get_ylabel()
+            assert axes.get_xlabel() or not axes.get_subplotspec().is_last_row()
+
+
+def test_what_is_stored_is_tabulated_and_drawn_without_computing(tmp_path):
+    results = made_up(MADE)
+    for task in experiment.all_tasks(MADE):
+        write(task, results[task.name], tmp_path / experiment.TASKS)
+    lines = []
+    found = experiment.run(MADE, tmp_path, report=lines.append)
+    count = len(results)
+    assert lines == [f"{count} of {count} tasks are stored already"]
+    written = experiment.save(found, tmp_path)
+    stems = ("tracking", "particles", "parameters", "agreement")
+    assert {path.name for path in written} == {f"{stem}.{end}" for stem in stems for end in ("csv", "md")} | {
+        "paths.png", "particles.png", "drag.png", "coverage.png"}
+    assert scores.readable(found.tracking).loc["cubature", "coverage u"].startswith("0.95")
+    with pytest.raises(ValueError, match="seed is 0 there and 1 now"):
+        experiment.run(dataclasses.replace(MADE, seed=1), tmp_path)
+
+
+def test_tasks_have_files_of_their_own():
+    found = experiment.all_tasks(experiment.Settings())
+    assert len({task.file for task in found}) == len(found) == 4 * 10 + 50 + 10 + 4 * 20 + 2 * 3
+
+
+def test_mistakes():
+    for wrong, message in (
+            ({"runs": 0}, "runs must be at least 1"), ({"runs": 20_000}, "use several seeds"),
+            ({"rules": ("Taylor",)}, "rules must hold 'cubature'"), ({"rules": ("cubic",)}, "cubic"),
+            ({"particles": ()}, "a tuple of different numbers"), ({"particles": (5, 5)}, "a tuple of different"),
+            ({"particles": (0,)}, "particles must be at least 1"), ({"nuts": (2, 10, 10)}, "chains, warm-up, draws"),
+            ({"ram": (0, 1, 1, 1)}, "ram: chains must be at least 1")):
+        with pytest.raises(ValueError, match=message):
+            experiment.Settings(**wrong)
+    with pytest.raises(ValueError, match="does not take --conditional"):
+        report.run(catalogue.Wanted(Path("out"), conditional=3))
+
+
+@pytest.mark.slow
+def test_the_quick_version_runs_from_end_to_end(tmp_path):
+    found = report.run(catalogue.Wanted(tmp_path, realisations=2, quick=True))
+    assert len(found.written) == 12 and all(path.stat().st_size > 0 for path in found.written)
+    assert len(found.tables) == 4
