@@ -83,7 +83,7 @@ def test_tables():
     assert each.loc["G02", "LFM radial"] == pytest.approx(2.0) and each.loc["G02", "ratio"] == pytest.approx(0.1)
     assert each.loc["G01", "amplitude"] == problem.CANDIDATES[3].amplitude
     together = experiment.pooled(results)
-    assert list(together.index) == ["all", "without gaps", "without gaps, never in shadow", "without gaps, in shadow"]
+    assert list(together.index) == ["without gaps", "without gaps, never in shadow", "without gaps, in shadow", "with gaps"]
     row = together.loc["without gaps"]
     assert row["satellites"] == 2 and row["improved"] == 2
     assert row["deterministic"] == pytest.approx(np.sqrt(3 * (10.0**2 + 20.0**2) / 2))

@@ -209,11 +209,15 @@ def satellites(results: dict[str, Result]) -> pd.DataFrame:
 
 
 def pooled(results: dict[str, Result]) -> pd.DataFrame:
-    """Return one row a group of satellites: pooled errors in metres, ratios and coverage."""
+    """Return one row a group of satellites: pooled errors in metres, ratios and coverage.
+
+    Satellites with gaps stand apart: a gap is often a manoeuvre, which no model of small forces predicts.
+    """
     complete = [name for name, one in results.items() if one["complete"]]
-    groups = {"all": list(results), "without gaps": complete,
+    groups = {"without gaps": complete,
               "without gaps, never in shadow": [name for name in complete if not results[name]["eclipsed"]],
-              "without gaps, in shadow": [name for name in complete if results[name]["eclipsed"]]}
+              "without gaps, in shadow": [name for name in complete if results[name]["eclipsed"]],
+              "with gaps": [name for name in results if name not in complete]}
     rows = {}
     for group, names in groups.items():
         if not names:
