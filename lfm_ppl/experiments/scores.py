@@ -53,10 +53,13 @@ def pair(name: str, estimate: Estimate) -> dict[str, float]:
 
 
 def readable(frame: pd.DataFrame) -> pd.DataFrame:
-    """Return a table with each estimate and its standard error in one cell, ``0.91 (0.03)``."""
+    """Return a table with each estimate and its standard error in one cell, ``0.91 (0.03)``; text stays as it is."""
     columns: dict[str, list[str]] = {}
     for name in frame.columns:
         if name.endswith(SE):
+            continue
+        if not pd.api.types.is_numeric_dtype(frame[name]):
+            columns[name] = frame[name].map(str).tolist()
             continue
         errors = frame.get(f"{name}{SE}", pd.Series(np.nan, frame.index))
         columns[name] = [str(Estimate(value, error)) for value, error in zip(frame[name], errors, strict=True)]

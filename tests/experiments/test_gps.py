@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from lfm_ppl import orbits
+from lfm_ppl.experiments import output
 from lfm_ppl.experiments.catalogue import Wanted
 from lfm_ppl.experiments.gps import experiment, figures, learning, prediction, problem, report
 
@@ -88,6 +89,12 @@ def test_tables():
     assert row["satellites"] == 2 and row["improved"] == 2
     assert row["deterministic"] == pytest.approx(np.sqrt(3 * (10.0**2 + 20.0**2) / 2))
     assert row["ratio"] == pytest.approx(0.1) and row["ratio, latest"] == pytest.approx(0.2)
+
+
+def test_tables_are_written_with_their_text(tmp_path):
+    each = experiment.satellites({"G01": result(10.0), "G02": result(20.0, eclipsed=True)})
+    output.save(tmp_path, {"satellites": each}, {}, "")
+    assert "| yes " in (tmp_path / "satellites.md").read_text() and ",no," in (tmp_path / "satellites.csv").read_text()
 
 
 def test_missing_positions_after_training_do_not_count():
