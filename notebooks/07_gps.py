@@ -55,9 +55,8 @@ else:
     print("simulated satellites, with forces of the same kind")
 
 # %% [markdown]
-# Learning takes the first three days; the other seven are predicted, and nothing of them is looked at before. The
-# magnitudes of the forces are chosen among a few, for each satellite, by what the first day says of the second and
-# third.
+# Learning takes the first three days; the other seven are predicted. The magnitudes of the forces are chosen among a
+# few, for each satellite, by what the first day says of the second and third.
 
 # %%
 if quick:
@@ -65,7 +64,7 @@ if quick:
 else:
     settings = experiment.Settings(data=str(shared) if real else None)
 # The folder of an earlier run of `lfm-ppl compare gps`; without one everything is computed here.
-folder = Path(os.environ.get("LFM_COMPARE_GPS", "lfm-results/compare/gps"))
+folder = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/gps"))
 found = experiment.run(settings, folder)
 for reason in found.refused.values():
     print(f"left out, {reason}\n")

@@ -9,7 +9,7 @@
 from lfm_ppl.orbits.bodies import sunlight
 from lfm_ppl.orbits.deterministic import Orbit, fit_orbit, propagate
 from lfm_ppl.orbits.environment import NANO, Environment
-from lfm_ppl.orbits.ephemerides import Ephemerides, Gap, calendar, gps_seconds
+from lfm_ppl.orbits.ephemerides import Ephemerides, Gap, calendar, check_satellites, gps_seconds
 from lfm_ppl.orbits.frames import AXES, dyb, rtn
 from lfm_ppl.orbits.geopotential import GM
 from lfm_ppl.orbits.satellite import SOLAR_PRESSURE, START_SD, satellite, small_forces, start_near
@@ -26,6 +26,7 @@ __all__ = [
     "Gap",
     "Orbit",
     "calendar",
+    "check_satellites",
     "dyb",
     "fit_orbit",
     "gps_seconds",

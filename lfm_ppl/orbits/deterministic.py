@@ -11,11 +11,13 @@ import numpy as np
 
 from lfm_ppl import checks
 from lfm_ppl.orbits.environment import Environment
-from lfm_ppl.orbits.satellite import SOLAR_PRESSURE, start_near
+from lfm_ppl.orbits.satellite import SOLAR_PRESSURE, polynomial_state
 
 STEP = 1.0 / 120.0
 """Longest step of the Runge-Kutta method, in hours; its error is 5 cm after ten days of a GPS orbit."""
-_ITERATIONS = 8
+_ITERATIONS = 12
+_REACH = 6.0
+"""Hours in which the first nine positions must lie for the search to start near enough."""
 
 
 class Orbit(NamedTuple):
@@ -66,20 +68,29 @@ def fit_orbit(environment: Environment, times: Any, positions: Any, solar: float
         The orbit, its state at the first time.
 
     Raises:
-        ValueError: too few positions; times that are not equally spaced.
+        ValueError: too few positions, or none in the first hours; times that are not equally spaced; no convergence.
+
+    Example:
+        >>> orbit = fit_orbit(environment, times, positions)  # doctest: +SKIP
+        >>> path = propagate(environment, orbit, times)  # doctest: +SKIP
     """
     times, positions = np.asarray(times, float), np.asarray(positions, float)
     interval = _interval(times)
-    start = np.asarray(start_near(times, positions).mean)
+    start, _, reach = polynomial_state(times, positions)
+    if reach > _REACH:
+        raise ValueError(f"the search for an orbit begins with nine positions in its first {_REACH:g} hours; here they "
+                         f"take {reach:g} h. Begin where the positions begin.")
     parameters = jnp.asarray(np.append(start, SOLAR_PRESSURE if solar is None else solar))
     free = 7 if solar is None else 6
-    residual = jnp.inf
     for _ in range(_ITERATIONS):
         change, residual = _gauss_newton(environment, parameters, jnp.asarray(positions), times[0], interval,
                                          _steps(interval), free)
         parameters = parameters.at[:free].add(change)
         if float(jnp.abs(change[:3]).max()) < 1e-7:
             break
+    else:
+        raise ValueError(f"no orbit fits these positions: after {_ITERATIONS} steps of the search the distance is "
+                         f"{float(residual):.3g} km and still changing. Is there a manoeuvre among them?")
     found = np.asarray(parameters)
     return Orbit(float(times[0]), found[:6], float(found[6]), float(residual))
 

@@ -95,7 +95,7 @@ class EarthRotation(eqx.Module):
         """Tabulate the rotation from ``epoch`` (GPS seconds) for ``hours``.
 
         Raises:
-                ImportError: a library of the extra ``gps`` is not installed.
+            ImportError: a library of the extra ``gps`` is not installed.
             ValueError: Earth orientation is not known there.
         """
         erfa = times.library("erfa")

@@ -125,14 +125,41 @@ def small_forces(axes: str = "DYB", amplitude: Any = 1.0, wander: Any = 0.01, dr
 def start_near(times: Any, positions: Any) -> Gaussian:
     """Return a wide prior of the state at the first time, around what the first nine positions say.
 
-    A polynomial of degree eight goes through them; over two hours of a GPS orbit its velocity is good to 1e-4 km/h.
+    A polynomial of degree eight goes through them. Over two hours of a GPS orbit its velocity is good to 1e-4 km/h,
+    over three to 0.01 km/h, and the standard deviations of the prior are 0.1 km and 0.1 km/h.
 
     Args:
         times: (T,) hours.
         positions: (T, 3) km; rows with NaN are passed over.
 
     Raises:
-        ValueError: fewer than nine positions, or the first of them is not at the first time's orbit arc (6 h).
+        ValueError: fewer than nine positions, none at the first time, or nine of them that take more than three hours.
+
+    Example:
+        >>> times = 0.25 * np.arange(9)
+        >>> start_near(times, 8000.0 * times[:, None] * np.ones(3)).mean[3:].round(6).tolist()
+        [8000.0, 8000.0, 8000.0]
+    """
+    mean, missing, reach = polynomial_state(times, positions)
+    if missing or reach > 3.0:
+        raise ValueError("the start of an orbit is taken from nine positions within three hours, the first of them at "
+                         f"the first time; here {'the first one is missing' if missing else f'nine take {reach:g} h'}. "
+                         "Begin the data where the positions begin.")
+    return Gaussian(mean, jnp.diag(jnp.repeat(jnp.asarray(START_SD) ** 2, 3)))
+
+
+def polynomial_state(times: Any, positions: Any) -> tuple[jax.Array, bool, float]:
+    """Return the state (6,) at the first time by a polynomial through nine positions, and how far it can be trusted.
+
+    Args:
+        times: (T,) hours.
+        positions: (T, 3) km; rows with NaN are passed over.
+
+    Returns:
+        The state; whether the first position is missing; how many hours after the first time the ninth one is.
+
+    Raises:
+        ValueError: fewer than nine positions.
     """
     times = np.asarray(times, float)
     known = checks.concrete(positions)
@@ -141,11 +168,6 @@ def start_near(times: Any, positions: Any) -> Gaussian:
     if len(rows) < _NEAR:
         raise ValueError(f"the start of an orbit is taken from its first {_NEAR} positions; there are {len(rows)}.")
     at, first = times[rows], times[0]
-    if at[-1] - first > 6.0:
-        raise ValueError(f"the start of an orbit is taken from its first {_NEAR} positions, which must lie within six "
-                         f"hours of the first time; here they end after {at[-1] - first:g} h. Begin the data where "
-                         "the positions begin.")
     vandermonde = np.vander((at - first) / (at[-1] - first), _NEAR, increasing=True)
     weights = np.linalg.inv(vandermonde)[:2] / np.array([[1.0], [at[-1] - first]])
-    mean = (jnp.asarray(weights) @ jnp.asarray(positions)[rows]).ravel()
-    return Gaussian(mean, jnp.diag(jnp.repeat(jnp.asarray(START_SD) ** 2, 3)))
+    return (jnp.asarray(weights) @ jnp.asarray(positions)[rows]).ravel(), bool(at[0] > first), float(at[-1] - first)

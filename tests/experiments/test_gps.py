@@ -38,10 +38,18 @@ def test_one_task_a_satellite_and_the_alternatives_of_the_first(data):
 
 
 def test_what_is_asked_must_be_there(data):
-    with pytest.raises(ValueError, match="unknown satellite 'G99'.*Read from folder"):
+    with pytest.raises(ValueError, match="unknown satellite 'G99'"):
         experiment.plan(experiment.Settings(data="folder", satellites=("G99",)))
-    with pytest.raises(ValueError, match=r"training takes 12 days, but the data have 10; take fewer \(--train-days\)"):
+    with pytest.raises(ValueError, match=r"training takes 12 days, but the data have 10,.*take fewer \(--train-days\)"):
         experiment.plan(experiment.Settings(data="folder", train_days=12.0))
+    with pytest.raises(ValueError, match="half a day is the least"):
+        experiment.plan(experiment.Settings(data="folder", train_days=0.2))
+    with pytest.raises(ValueError, match="each of them once"):
+        experiment.plan(experiment.Settings(data="folder", satellites=("G01", "G01")))
+    with pytest.raises(ValueError, match="axes"):
+        experiment.Settings(axes="XYZ")
+    few = experiment.plan(experiment.quick(data="folder"))
+    assert [task.name for task in few] == ["predict/G01", "predict/G02", "learn/G01", "online/G01"]
     with pytest.raises(ValueError, match="train_days"):
         experiment.Settings(train_days=-1.0)
     with pytest.raises(ValueError, match="does not take --realisations"):
@@ -84,7 +92,8 @@ def test_tables():
     assert each.loc["G02", "LFM radial"] == pytest.approx(2.0) and each.loc["G02", "ratio"] == pytest.approx(0.1)
     assert each.loc["G01", "amplitude"] == problem.CANDIDATES[3].amplitude
     together = experiment.pooled(results)
-    assert list(together.index) == ["without gaps", "without gaps, never in shadow", "without gaps, in shadow", "with gaps"]
+    assert list(together.index) == ["without gaps", "without gaps, never in shadow", "without gaps, in shadow",
+                                    "with gaps"]
     row = together.loc["without gaps"]
     assert row["satellites"] == 2 and row["improved"] == 2
     assert row["deterministic"] == pytest.approx(np.sqrt(3 * (10.0**2 + 20.0**2) / 2))

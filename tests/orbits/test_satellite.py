@@ -95,7 +95,7 @@ def test_an_orbit_is_found_again(around):
             orbits.fit_orbit(around, bad, y[:len(bad)])
     with pytest.raises(ValueError, match="nine|9 positions"):
         orbits.fit_orbit(around, TIMES, np.where(np.arange(97)[:, None] < 5, y, np.nan))
-    with pytest.raises(ValueError, match="within six hours"):
+    with pytest.raises(ValueError, match="in its first 6 hours"):
         orbits.fit_orbit(around, TIMES, np.where(np.arange(97)[:, None] > 60, y, np.nan))
     with pytest.raises(ValueError, match="must begin with"):
         orbits.propagate(around, orbit, TIMES + 1.0)
@@ -127,5 +127,11 @@ def test_start_of_an_orbit_from_positions(around):
     found = orbits.start_near(TIMES, truth[:, :3])
     assert np.abs(found.mean - START)[:3].max() < 1e-9 and np.abs(found.mean - START)[3:].max() < 1e-3
     holes = truth[:, :3].copy()
-    holes[[0, 3]] = np.nan
-    assert np.abs(orbits.start_near(TIMES, holes).mean - START)[:3].max() < 1e-3
+    holes[[2, 5]] = np.nan
+    near = np.abs(orbits.start_near(TIMES, holes).mean - START)
+    assert near[:3].max() < 1e-9 and near[3:].max() < 0.1 * orbits.START_SD[1]
+    for missing, message in (([0], "the first one is missing"), ([2, 3, 4, 5, 6], "nine take 3.25 h")):
+        holes = truth[:, :3].copy()
+        holes[missing] = np.nan
+        with pytest.raises(ValueError, match=message):
+            orbits.start_near(TIMES, holes)

@@ -128,7 +128,8 @@ def parameters(settings: Any, results: dict[str, Result]) -> pd.DataFrame:
         maximum (``maximum``, the share of targets); posterior mean and standard deviation; the share of targets whose
         central posterior intervals of 50%, 80% and 95% hold the truth, with binomial standard errors; ``rank p``, the
         p-value of Kolmogorov and Smirnov's test that the posterior probability of less than the truth is uniform over
-        targets. For one and the same truth the shares are nominal only as far as the data outweigh the prior; for
+        targets; ``k > 0.7``, the share of targets whose weights have a Pareto index above 0.7, and are not to be relied
+        on. For one and the same truth the shares are nominal only as far as the data outweigh the prior; for
         parameters that are drawn from the prior they are nominal if the posterior is right.
     """
     rows = {}
@@ -152,6 +153,7 @@ def _parameter(found: dict[str, np.ndarray], index: int, drawn: bool) -> dict[st
     for level in estimates.LEVELS:
         row |= pair(f"coverage {level:.0%}", rate_of(np.abs(below - 0.5) <= level / 2))
     row["rank p"] = float(stats.kstest(below, "uniform").pvalue)
+    row["k > 0.7"] = float((found["k"] > 0.7).mean())
     return row
 
 
@@ -162,8 +164,7 @@ def agreement(settings: Any, results: dict[str, Result]) -> pd.DataFrame:
         ``shift``, the largest distance of a posterior mean from that of NUTS in its standard deviations, and ``sd
         ratio``, the ratio of standard deviations furthest from one, over parameters and targets, with their Monte Carlo
         errors, to be held against them as the largest of many; ``least ESS`` of a parameter; the largest ``R-hat``, and
-        Pareto index ``k`` of weights over all targets; ``divergences`` of a target; CPU seconds, compilation included
-        for chains.
+        Pareto index ``k`` of weights; ``divergences`` of a target; CPU seconds, compilation included for chains.
     """
     few = min(settings.runs, settings.chain_runs)
     everything = of_parameters(settings, results)
@@ -190,7 +191,7 @@ def agreement(settings: Any, results: dict[str, Result]) -> pd.DataFrame:
         row["least ESS"] = min(float(np.nan_to_num(one["ess"]).min()) for one in own)
         row |= pair("CPU s", mean_of([one["seconds"] for one in own]))
         if label == WEIGHTED:
-            row["k"] = float(everything["k"].max())
+            row["k"] = float(everything["k"][:few].max())
         else:
             row["R-hat"] = max(float(np.nan_to_num(one["r_hat"], nan=np.inf).max()) for one in own)
             row["divergences"] = float(np.mean([one["divergences"] for one in own]))

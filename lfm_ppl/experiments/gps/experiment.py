@@ -15,7 +15,7 @@ from lfm_ppl import checks, orbits
 from lfm_ppl.experiments import output, tasks
 from lfm_ppl.experiments.gps import figures, learning, prediction, problem
 from lfm_ppl.experiments.gps.figures import rms
-from lfm_ppl.experiments.scores import SE, Z
+from lfm_ppl.experiments.scores import SE
 from lfm_ppl.experiments.tasks import Result, Task
 
 METRE = 1e-3
@@ -33,6 +33,7 @@ class Settings:
         train_days: days to learn from; the others are predicted.
         axes: of the small forces, "DYB" or "RTN".
         alternatives: number of satellites whose magnitudes are learnt in every way.
+        most: number of satellites where none are named; None: all.
         seed: of the simulation.
     """
 
@@ -41,11 +42,13 @@ class Settings:
     train_days: float = 3.0
     axes: str = "DYB"
     alternatives: int = 4
+    most: int | None = None
     seed: int = 0
 
     def __post_init__(self) -> None:
         """Check the numbers."""
         checks.positive("train_days", self.train_days, "Give the days to learn from (--train-days).")
+        checks.one_of("axes", self.axes, tuple(orbits.AXES))
 
 
 class Found(NamedTuple):
@@ -72,9 +75,7 @@ class Found(NamedTuple):
 
 def quick(**given: Any) -> Settings:
     """Return settings that show in a few minutes that everything runs: two satellites."""
-    settings = Settings(**given)
-    few = settings.satellites or (("G01", "G05") if settings.data else problem.SIMULATED[:2])
-    return dataclasses.replace(settings, satellites=tuple(few)[:2], alternatives=1)
+    return Settings(**{"most": 2, "alternatives": 1} | given)
 
 
 def plan(settings: Settings) -> list[Task]:
@@ -84,11 +85,10 @@ def plan(settings: Settings) -> list[Task]:
         ValueError, FileNotFoundError: as `problem.arcs` and `prediction.arc`; a satellite that there is not.
     """
     data = problem.arcs(settings.data, settings.seed)
-    for name in settings.satellites or ():
-        if name not in data.positions:
-            where = settings.data or "the simulation"
-            raise ValueError(f"{checks.unknown('satellite', name, data.positions)} Read from {where}.")
-    names = settings.satellites or tuple(data.positions)
+    names = tuple(data.positions)[:settings.most]
+    if settings.satellites is not None:
+        files = () if data.published is None else data.published.files
+        names = orbits.check_satellites(settings.satellites, tuple(data.positions), files)
     # Where training is longer than the data, it is so for all satellites; the rest is each one's own.
     for name in names:
         _refusal(data, name, settings.train_days)
@@ -123,31 +123,33 @@ def compute(task: Task) -> Result:
     except prediction.Unusable as reason:
         return {_REFUSED: str(reason)}
     started = time.process_time()
-    paths = prediction.deterministic(one)
+    try:
+        paths = prediction.deterministic(one)
+    except ValueError as reason:
+        return {_REFUSED: f"{asked['satellite']}: {reason}"}
     if task.name.startswith("learn/"):
-        return learning.compare(one, paths.orbit, asked["axes"])
+        return learning.compare(one, paths, asked["axes"])
     chosen = prediction.validate(one, paths.orbit, asked["axes"])
     best = int(np.argmax(chosen.score))
     magnitudes = problem.CANDIDATES[best]
     if task.name.startswith("online/"):
-        return _online(one, paths.orbit, magnitudes, asked)
+        try:
+            return _online(one, paths.orbit, magnitudes, asked)
+        except ValueError as reason:  # a window without positions
+            return {_REFUSED: f"{asked['satellite']}: {reason}"}
     found = prediction.predict(one, paths.orbit, magnitudes, asked["axes"])
     everything = prediction.predict(one, paths.orbit, magnitudes, asked["axes"], one.positions)
     axes = problem.axes_of(paths.fitted)
-    after = slice(one.train, None)
-    variance = np.einsum("tji,tjk,tki->ti", axes, found.covariance, axes) + problem.NOISE**2
+    lfm, sd, coverage = prediction.judge(one, found.state[:, :3], found.covariance, axes)
 
     def error(path: np.ndarray) -> np.ndarray:
         return np.einsum("tji,tj->ti", axes, path[:, :3] - one.positions)
 
-    lfm = error(found.state)
-    inside = np.abs(lfm[after]) < Z * np.sqrt(variance[after])
-    known = np.isfinite(one.positions[after]).all(axis=1)
     return {
         "times": one.times, "train": one.train, "residual": paths.orbit.residual, "solar": paths.orbit.solar,
         "eclipsed": problem.eclipsed(one.environment, one.times[:one.train], paths.fitted[:one.train]),
         "complete": np.isfinite(one.positions).all(), "fitted": error(paths.fitted), "latest": error(paths.latest),
-        "lfm": lfm, "sd": np.sqrt(variance), "coverage": inside[known].mean(),
+        "lfm": lfm, "sd": sd, "coverage": coverage.mean(),
         "forces": found.forces, "forces_sd": found.forces_sd, "seen": everything.forces,
         "force_names": np.array(list(orbits.small_forces(asked["axes"]))), "scores": chosen.score,
         "held_out": chosen.rmse, "candidate": best, "log_likelihood": found.log_likelihood,
@@ -185,8 +187,9 @@ def run(settings: Settings, folder: str | Path, *, overwrite: bool = False,
     kept = {name: result for name, result in predicted.items() if name not in refused}
     if not kept:
         raise ValueError("no satellite can be predicted. " + " ".join(refused.values()))
-    learnt = {task.settings["satellite"]: results[task.name] for task in planned if task.name[:6] == "learn/"}
-    online = {task.settings["satellite"]: results[task.name] for task in planned if task.name[:7] == "online/"}
+    learnt, online = ({task.settings["satellite"]: results[task.name] for task in planned
+                       if task.name.startswith(kind) and _REFUSED not in results[task.name]}
+                      for kind in ("learn/", "online/"))
     return Found(settings, kept, refused, satellites(kept), pooled(kept), learning.table(learnt), online)
 
 

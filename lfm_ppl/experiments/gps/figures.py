@@ -111,20 +111,29 @@ def plot_online(name: str, result: Result, *, width: str | float = "full") -> Fi
 
 @style.styled
 def plot_all(results: Mapping[str, Result], *, width: str | float = "full") -> Figure:
-    """Draw the errors after training of all satellites, those in the Earth's shadow set apart."""
+    """Draw the errors after training of all satellites; those in the Earth's shadow and with gaps stand apart."""
     figure = style.new_figure(width, 2.6)
     axes = figure.subplots()
-    names = sorted(results, key=lambda name: (bool(results[name]["eclipsed"]), name))
+    groups: dict[str, list[str]] = {"in the Earth's shadow": [], "with gaps": []}
+    names: list[str] = []
+    for name in sorted(results):
+        one = results[name]
+        group = "" if one["complete"] and not one["eclipsed"] else list(groups)[not one["complete"]]
+        groups.get(group, names).append(name)
+    starts = {}
+    for group, own in groups.items():
+        if own:
+            starts[group] = len(names)
+            names += own
     place = np.arange(len(names))
     for key, colour, marker, label in (("fitted", DETERMINISTIC, "o", "deterministic, fitted to training"),
                                        ("latest", LATEST, "^", "deterministic, from the latest state"),
                                        ("lfm", LFM, "s", "latent force model")):
         errors = [rms(results[name][key][int(results[name]["train"]):]) for name in names]
         axes.semilogy(place, errors, ls="", marker=marker, ms=3.5, color=colour, label=label)
-    shadow = sum(not results[name]["eclipsed"] for name in names)
-    if 0 < shadow < len(names):
-        axes.axvline(shadow - 0.5, color=SEEN, lw=0.7, ls=":")
-        axes.text(shadow - 0.4, 0.98, "in the Earth's shadow", va="top", transform=axes.get_xaxis_transform(),
+    for group, first in starts.items():
+        axes.axvline(first - 0.5, color=SEEN, lw=0.7, ls=":")
+        axes.text(first - 0.4, 1.0, group, va="bottom", transform=axes.get_xaxis_transform(),
                   fontsize=style.SMALL, color=SEEN)
     axes.set_xticks(place, names, rotation=90, fontsize=style.SMALL)
     axes.tick_params(labelsize=style.SMALL, length=2.5, width=0.6)

@@ -18,10 +18,10 @@ import pandas as pd
 from scipy.special import logsumexp
 
 from lfm_ppl import orbits
-from lfm_ppl.experiments.gps import prediction
-from lfm_ppl.experiments.gps.prediction import Arc
+from lfm_ppl.experiments.gps import prediction, problem
+from lfm_ppl.experiments.gps.prediction import Arc, Deterministic
 from lfm_ppl.experiments.gps.problem import CANDIDATES, NOISE, Magnitudes
-from lfm_ppl.experiments.scores import Z, mean_of, pair
+from lfm_ppl.experiments.scores import mean_of, pair
 from lfm_ppl.experiments.tasks import Result
 from lfm_ppl.filtering.filter import filter
 from lfm_ppl.filtering.smoother import smooth
@@ -37,8 +37,9 @@ _KEPT = 1e-3
 _THINNED = 4
 
 
-def compare(one: Arc, orbit: orbits.Orbit, axes: str) -> Result:
+def compare(one: Arc, paths: Deterministic, axes: str) -> Result:
     """Return error (km) after training and coverage of every way, each (W,), and the candidates that were chosen."""
+    orbit, frame = paths.orbit, problem.axes_of(paths.fitted)
     validation = prediction.validate(one, orbit, axes)
     likelihood = prediction.likelihoods(one, orbit, axes)
     smoothed = _on_smoothed_forces(one, orbit, axes)
@@ -50,14 +51,14 @@ def compare(one: Arc, orbit: orbits.Orbit, axes: str) -> Result:
     errors, coverage = [], []
     for mixture in mixtures:
         total = sum(mixture.values())
-        mean = sum(w / total * found[k].state[:, :3] for k, w in mixture.items())
-        variance = sum(w / total * (np.diagonal(found[k].covariance, axis1=1, axis2=2)
-                                    + (found[k].state[:, :3] - mean) ** 2) for k, w in mixture.items())
-        left = (mean - one.positions)[one.train:]
-        left, sd = left[np.isfinite(left).all(axis=1)], np.sqrt(variance + NOISE**2)[one.train:]
-        sd = sd[np.isfinite(one.positions[one.train:]).all(axis=1)]
-        errors.append(np.sqrt((left**2).sum(axis=1).mean()))
-        coverage.append((np.abs(left) < Z * sd).mean())
+        mean = np.sum([w / total * found[k].state[:, :3] for k, w in mixture.items()], axis=0)
+        covariance = np.zeros((len(one.times), 3, 3))
+        for k, w in mixture.items():
+            away = found[k].state[:, :3] - mean
+            covariance += w / total * (found[k].covariance + away[:, :, None] * away[:, None, :])
+        left, _, covered = prediction.judge(one, mean, covariance, frame)
+        errors.append(np.sqrt(np.nanmean((left[one.train:] ** 2).sum(axis=1))))
+        coverage.append(covered.mean())
     return {"error": np.array(errors), "coverage": np.array(coverage), "score": validation.score,
             "likelihood": likelihood, "smoothed": smoothed,
             "candidates": np.array([max(mixture, key=mixture.__getitem__) for mixture in mixtures])}

@@ -12,6 +12,7 @@ import numpy as np
 from lfm_ppl import orbits
 from lfm_ppl.experiments.gps import problem
 from lfm_ppl.experiments.gps.problem import CANDIDATES, NOISE, Arcs, Magnitudes
+from lfm_ppl.experiments.scores import Z
 from lfm_ppl.filtering.filter import filter
 from lfm_ppl.filtering.smoother import smooth
 from lfm_ppl.linearisation.taylor import Taylor
@@ -19,8 +20,6 @@ from lfm_ppl.model.observation import Gaussian
 
 _LATEST = 6.0
 """Hours before the end of training that determine the latest state."""
-_START_SD = 0.1
-"""Of the prior of the start, in km and km/h: so wide that it says nothing beside the positions."""
 
 
 class Arc(NamedTuple):
@@ -49,16 +48,19 @@ class Unusable(ValueError):
 
 
 def arc(data: Arcs, satellite: str, train_days: float) -> Arc:
-    """Return the arc of a satellite, from its first position on.
+    """Return the arc of a satellite, all epochs of the data.
 
     Raises:
         Unusable: too few positions to learn from, or none to judge by.
         ValueError: the training is longer than the data.
     """
     train = int(np.searchsorted(data.times, 24.0 * train_days - 1e-9))
-    if not 0 < train < len(data.times):
-        raise ValueError(f"training takes {train_days:g} days, but the data have {_days(data.times):g}; take fewer "
-                         "(--train-days), so that days are left to judge by.")
+    if 24.0 * train_days < 2 * _LATEST:
+        raise ValueError(f"training takes {train_days:g} days; half a day is the least (--train-days).")
+    if train >= len(data.times):
+        raise ValueError(f"training takes {train_days:g} days, but the data have {_days(data.times):g}, the last "
+                         f"position {data.times[-1] / 24.0:.6g} days after the first; take fewer (--train-days), so "
+                         "that days are left to judge by.")
     positions = data.positions[satellite]
     known = np.isfinite(positions).all(axis=1)
     gaps = "" if data.published is None else "; ".join(map(str, data.published.gaps(satellite)))
@@ -101,7 +103,7 @@ def deterministic(one: Arc) -> Deterministic:
 
 def start(orbit: orbits.Orbit) -> Gaussian:
     """Return a wide prior about the state of a fitted orbit."""
-    return Gaussian(jnp.asarray(orbit.state), _START_SD**2 * jnp.eye(6))
+    return Gaussian(jnp.asarray(orbit.state), jnp.diag(jnp.repeat(jnp.asarray(orbits.START_SD) ** 2, 3)))
 
 
 class Validation(NamedTuple):
@@ -131,7 +133,13 @@ def validate(one: Arc, orbit: orbits.Orbit, axes: str, candidates: tuple[Magnitu
     steps = steps_of(one)
     found = _validate(one.environment, start(orbit), jnp.asarray(y), jnp.asarray(held), magnitudes,
                       (tuple(one.times[:one.train]), axes, steps, seen))
-    return Validation(*map(np.asarray, found))
+    score, rmse, likelihood = map(np.asarray, found)
+    return Validation(_or_never(score), rmse, _or_never(likelihood))
+
+
+def _or_never(score: np.ndarray) -> np.ndarray:
+    """Return scores, minus infinity where the filter broke down, so that such a candidate is not chosen."""
+    return np.where(np.isfinite(score), score, -np.inf)
 
 
 @functools.partial(jax.jit, static_argnums=(5,))
@@ -160,9 +168,9 @@ def _validate(environment: orbits.Environment, start: Gaussian, y: jax.Array, he
 def likelihoods(one: Arc, orbit: orbits.Orbit, axes: str, candidates: tuple[Magnitudes, ...] = CANDIDATES
                 ) -> np.ndarray:
     """Return the log marginal likelihood (C,) of all positions of training, for every candidate."""
-    return np.asarray(_likelihoods(one.environment, start(orbit), jnp.asarray(one.positions[:one.train]),
-                                   Magnitudes(*jnp.asarray(candidates, float).T),
-                                   (tuple(one.times[:one.train]), axes, steps_of(one))))
+    return _or_never(np.asarray(_likelihoods(
+        one.environment, start(orbit), jnp.asarray(one.positions[:one.train]),
+        Magnitudes(*jnp.asarray(candidates, float).T), (tuple(one.times[:one.train]), axes, steps_of(one)))))
 
 
 @functools.partial(jax.jit, static_argnums=(4,))
@@ -175,6 +183,26 @@ def _likelihoods(environment: orbits.Environment, start: Gaussian, y: jax.Array,
         return filter(system, np.array(times), y, rule=Taylor(), steps=steps).log_likelihood.sum()
 
     return jax.lax.map(score, magnitudes)
+
+
+def judge(one: Arc, mean: np.ndarray, covariance: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return errors and their standard deviations along some axes, and how many lie within the 95% bands.
+
+    Args:
+        one: the satellite.
+        mean: (T, 3) predicted positions.
+        covariance: (T, 3, 3) of these.
+        axes: (T, 3, 3), as columns.
+
+    Returns:
+        Errors (T, 3) and standard deviations (T, 3) in km, those of the published positions included, and the share of
+        errors after training that are covered, (3,) by axis.
+    """
+    error = np.einsum("tji,tj->ti", axes, mean - one.positions)
+    sd = np.sqrt(np.einsum("tji,tjk,tki->ti", axes, covariance, axes) + NOISE**2)
+    known = np.isfinite(one.positions[one.train:]).all(axis=1)
+    inside = np.abs(error[one.train:]) < Z * sd[one.train:]
+    return error, sd, inside[known].mean(axis=0)
 
 
 class Prediction(NamedTuple):
