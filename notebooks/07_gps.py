@@ -60,7 +60,7 @@ else:
 
 # %%
 if quick:
-    settings = experiment.Settings(satellites=problem.SIMULATED[:1], alternatives=0)
+    settings = experiment.Settings(satellites=problem.SIMULATED[:1], alternatives=0, train_days=1.0)
 else:
     settings = experiment.Settings(data=str(shared) if real else None)
 # The folder of an earlier run of `lfm-ppl compare gps`; without one everything is computed here.

@@ -28,6 +28,11 @@ class Orbit(NamedTuple):
         state: (6,) position (km) and velocity (km/h).
         solar: amplitude of the pressure of sunlight (nm/s^2).
         residual: root mean square distance from the positions that it was fitted to (km).
+
+    Example:
+        >>> orbit = Orbit(0.0, np.array([26_560.0, 0.0, 0.0, 0.0, 8_000.0, 11_425.0]), solar=100.0, residual=0.0)
+        >>> round(float(np.linalg.norm(orbit.state[3:])), 1)  # km/h
+        13947.3
     """
 
     time: float

@@ -80,7 +80,7 @@ def acceleration(r: jax.Array, degree: int = DEGREE) -> jax.Array:
         >>> import jax.numpy as jnp
         >>> a = acceleration(jnp.array([26_560.0, 0.0, 0.0]), degree=0)
         >>> round(float(a[0]) * 1e6, 3)
-        -565.053
+        -565.043
 
     Source: O. Montenbruck and E. Gill, Satellite Orbits (2005), section 3.2; N. K. Pavlis and others, The development
     and evaluation of the Earth Gravitational Model 2008, J. Geophys. Res. 117 (2012).

@@ -114,7 +114,7 @@ def paired_ratio(first: np.ndarray, second: np.ndarray) -> Estimate:
 
     Example:
         >>> str(paired_ratio(np.array([1.0, 2.1]), np.array([2.0, 4.0])))
-        '0.517 (0.0083)'
+        '0.517 (0.011)'
     """
     ratio = first.mean() / second.mean()
     return Estimate(float(ratio), mean_of(first - ratio * second).error / float(second.mean()))
