@@ -32,7 +32,7 @@ class Orbit(NamedTuple):
     Example:
         >>> orbit = Orbit(0.0, np.array([26_560.0, 0.0, 0.0, 0.0, 8_000.0, 11_425.0]), solar=100.0, residual=0.0)
         >>> round(float(np.linalg.norm(orbit.state[3:])), 1)  # km/h
-        13947.3
+        13947.4
     """
 
     time: float
