@@ -14,11 +14,10 @@ import pandas as pd
 from lfm_ppl import checks, orbits
 from lfm_ppl.experiments import output, tasks
 from lfm_ppl.experiments.gps import figures, learning, prediction, problem
-from lfm_ppl.experiments.gps.figures import rms
-from lfm_ppl.experiments.scores import SE
+from lfm_ppl.experiments.gps.figures import METRE, rms
+from lfm_ppl.experiments.scores import mean_of, pair
 from lfm_ppl.experiments.tasks import Result, Task
 
-METRE = 1e-3
 _REFUSED = "refused"
 _WINDOW = 0.25
 
@@ -89,9 +88,6 @@ def plan(settings: Settings) -> list[Task]:
     if settings.satellites is not None:
         files = () if data.published is None else data.published.files
         names = orbits.check_satellites(settings.satellites, tuple(data.positions), files)
-    # Where training is longer than the data, it is so for all satellites; the rest is each one's own.
-    for name in names:
-        _refusal(data, name, settings.train_days)
     shared = {"data": settings.data and str(Path(settings.data).resolve()), "train_days": settings.train_days,
               "axes": settings.axes, "candidates": [list(one) for one in problem.CANDIDATES]}
     found = [Task(f"predict/{name}", settings.seed, {**shared, "satellite": name}) for name in names]
@@ -228,13 +224,11 @@ def pooled(results: dict[str, Result]) -> pd.DataFrame:
         own = satellites({name: results[name] for name in names})
         together = {column: float(np.sqrt((own[column] ** 2).mean())) for column in
                     ("deterministic", "latest state", "LFM", "LFM radial", "LFM tangential", "LFM normal")}
-        error = own["coverage"].std(ddof=1) / np.sqrt(len(own)) if len(own) > 1 else np.nan
         rows[group] = {
             "satellites": len(own), "fit, median": own["fit"].median(), **together,
             "median": own["LFM"].median(), "ratio": together["LFM"] / together["deterministic"],
             "ratio, latest": together["LFM"] / together["latest state"],
-            "improved": int((own["LFM"] < own["deterministic"]).sum()), "coverage": own["coverage"].mean(),
-            f"coverage{SE}": error}
+            "improved": int((own["LFM"] < own["deterministic"]).sum()), **pair("coverage", mean_of(own["coverage"]))}
     return pd.DataFrame.from_dict(rows, orient="index")
 
 

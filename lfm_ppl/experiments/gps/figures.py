@@ -15,7 +15,7 @@ from lfm_ppl.experiments.scores import Z
 from lfm_ppl.experiments.tasks import Result
 
 DETERMINISTIC, LATEST, LFM, SEEN = style.VERMILLION, style.ORANGE, style.BLUE, style.GREY
-_METRE = 1e-3
+METRE = 1e-3
 
 
 def draw(results: Mapping[str, Result], online: Mapping[str, Result]) -> dict[str, Figure]:
@@ -65,13 +65,13 @@ def plot_errors(name: str, result: Result, *, width: str | float = "full") -> Fi
     figure, panels = style.small_multiples(width, 3, 1.7)
     days, train = result["times"] / 24.0, int(result["train"])
     for index, (axes, direction) in enumerate(zip(panels, ("radial", "tangential", "normal"), strict=True)):
-        lfm, sd = result["lfm"][:, index] / _METRE, result["sd"][:, index] / _METRE
-        axes.plot(days, result["fitted"][:, index] / _METRE, color=DETERMINISTIC, lw=0.9)
-        axes.plot(days, result["latest"][:, index] / _METRE, color=LATEST, lw=0.9, ls="--")
+        lfm, sd = result["lfm"][:, index] / METRE, result["sd"][:, index] / METRE
+        axes.plot(days, result["fitted"][:, index] / METRE, color=DETERMINISTIC, lw=0.9)
+        axes.plot(days, result["latest"][:, index] / METRE, color=LATEST, lw=0.9, ls="--")
         axes.fill_between(days, -Z * sd, Z * sd, color=LFM, alpha=0.2, lw=0)
         axes.plot(days, lfm, color=LFM, lw=0.9)
         axes.axvline(days[train], color=SEEN, lw=0.7, ls=":")
-        largest = max(np.nanmax(np.abs(result[key][:, index])) for key in ("fitted", "latest", "lfm")) / _METRE
+        largest = max(np.nanmax(np.abs(result[key][:, index])) for key in ("fitted", "latest", "lfm")) / METRE
         axes.set_ylim(-1.1 * largest, 1.1 * largest)
         axes.set_title(f"{name}: {direction}")
         style.label_values(axes, "error", "m")
@@ -91,14 +91,14 @@ def plot_online(name: str, result: Result, *, width: str | float = "full") -> Fi
     figure, panels = style.small_multiples(width, 3, 1.7)
     days, observed = result["times"] / 24.0, result["observed"].astype(bool)
     for index, (axes, direction) in enumerate(zip(panels, ("x", "y", "z"), strict=True)):
-        sd = result["sd"][:, index] / _METRE
+        sd = result["sd"][:, index] / METRE
         axes.fill_between(days, 0, 1, where=observed, color=SEEN, alpha=0.2, lw=0,
                           transform=axes.get_xaxis_transform())
-        axes.plot(days, result["restarted"][:, index] / _METRE, color=LATEST, lw=0.9, ls="--")
+        axes.plot(days, result["restarted"][:, index] / METRE, color=LATEST, lw=0.9, ls="--")
         axes.fill_between(days, -Z * sd, Z * sd, color=LFM, alpha=0.2, lw=0)
-        axes.plot(days, result["lfm"][:, index] / _METRE, color=LFM, lw=0.9)
+        axes.plot(days, result["lfm"][:, index] / METRE, color=LFM, lw=0.9)
         largest = max(np.nanmax(np.abs(result[key][observed.argmin():, index])) for key in ("restarted", "lfm"))
-        axes.set_ylim(-1.1 * largest / _METRE, 1.1 * largest / _METRE)
+        axes.set_ylim(-1.1 * largest / METRE, 1.1 * largest / METRE)
         axes.set_title(f"{name}: {direction}")
         style.label_values(axes, "error", "m")
     style.label_time(panels, "days")
@@ -144,4 +144,4 @@ def plot_all(results: Mapping[str, Result], *, width: str | float = "full") -> F
 
 def rms(errors: Any) -> float:
     """Return the root mean square distance in metres, of errors (T, 3) in km; NaN rows do not count."""
-    return float(np.sqrt(np.nanmean((np.asarray(errors) ** 2).sum(axis=1)))) / _METRE
+    return float(np.sqrt(np.nanmean((np.asarray(errors) ** 2).sum(axis=1)))) / METRE

@@ -19,6 +19,7 @@ from scipy.special import logsumexp
 
 from lfm_ppl import orbits
 from lfm_ppl.experiments.gps import prediction, problem
+from lfm_ppl.experiments.gps.figures import METRE
 from lfm_ppl.experiments.gps.prediction import Arc, Deterministic
 from lfm_ppl.experiments.gps.problem import CANDIDATES, NOISE, Magnitudes
 from lfm_ppl.experiments.scores import mean_of, pair
@@ -114,7 +115,7 @@ def table(results: dict[str, Result]) -> pd.DataFrame:
         return pd.DataFrame()
     rows = {}
     for index, way in enumerate(WAYS):
-        errors = [result["error"][index] / 1e-3 for result in results.values()]
+        errors = [result["error"][index] / METRE for result in results.values()]
         rows[way] = {"satellites": len(errors), **pair("error", mean_of(errors)), "median": float(np.median(errors)),
                      **pair("coverage", mean_of([result["coverage"][index] for result in results.values()]))}
     return pd.DataFrame.from_dict(rows, orient="index")

@@ -94,11 +94,17 @@ def deterministic(one: Arc) -> Deterministic:
     """Fit an orbit to the training, and another to its last six hours with the same amplitude of the sunlight."""
     orbit = orbits.fit_orbit(one.environment, one.times[:one.train], one.positions[:one.train])
     fitted = orbits.propagate(one.environment, orbit, one.times)
-    first = one.train - int(round(_LATEST / (one.times[1] - one.times[0])))
-    last = orbits.fit_orbit(one.environment, one.times[first:one.train], one.positions[first:one.train], orbit.solar)
+    first, path = _from_latest(one, one.train, orbit.solar)
     latest = np.full_like(fitted, np.nan)
-    latest[first:] = orbits.propagate(one.environment, last, one.times[first:])
+    latest[first:] = path
     return Deterministic(orbit, fitted, latest)
+
+
+def _from_latest(one: Arc, end: int, solar: float) -> tuple[int, np.ndarray]:
+    """Fit the last six hours before the epoch ``end``; return their first epoch and the path from it on."""
+    first = end - int(round(_LATEST / (one.times[1] - one.times[0])))
+    last = orbits.fit_orbit(one.environment, one.times[first:end], one.positions[first:end], solar)
+    return first, orbits.propagate(one.environment, last, one.times[first:])
 
 
 def start(orbit: orbits.Orbit) -> Gaussian:
@@ -275,11 +281,9 @@ def online(one: Arc, orbit: orbits.Orbit, magnitudes: Magnitudes, axes: str, win
     mean, covariance = _online(one.environment, start(orbit), jnp.asarray(y), Magnitudes(*map(jnp.asarray, magnitudes)),
                                (tuple(one.times), axes, steps_of(one)))
     restarted = np.full((len(days), 6), np.nan)
-    hours = int(round(_LATEST / (one.times[1] - one.times[0])))
     for end in ends:
-        last = orbits.fit_orbit(one.environment, one.times[end - hours:end], one.positions[end - hours:end],
-                                orbit.solar)
-        restarted[end - hours:] = orbits.propagate(one.environment, last, one.times[end - hours:])
+        first, path = _from_latest(one, end, orbit.solar)
+        restarted[first:] = path
     variances = np.diagonal(np.asarray(covariance), axis1=1, axis2=2)
     return np.asarray(mean), variances, observed, restarted
 
