@@ -100,7 +100,7 @@ def model(times, y=None, axes: str = "DYB", epoch: float = EPOCH, units=None) ->
     drift = numpyro.sample("drift", dist.LogNormal(jnp.log(0.005), 1.0))
     white = numpyro.sample("white", dist.LogNormal(jnp.log(0.03), 1.0))
     noise_sd = numpyro.sample("noise_sd", dist.LogNormal(jnp.log(KNOWN["noise_sd"]), 0.5))
-    start = _default_start() if y is None else lfm.orbits.start_near(times, y)
+    start = lfm.orbits.wide_start(jnp.array(START)) if y is None else lfm.orbits.start_near(times, y)
     system = build(amplitude, wander, drift, white, noise_sd, _environment(epoch, times), start, axes, units)
     numpyro.sample("y", lfm.MarginalLikelihood(system, times, rule=lfm.Taylor(), steps=STEPS), obs=y)
 
@@ -145,8 +145,3 @@ def _environment(epoch: float, times) -> lfm.orbits.Environment:
 def _tabulated(epoch: float, hours: float) -> lfm.orbits.Environment:
     with jax.ensure_compile_time_eval():
         return lfm.orbits.Environment.over(epoch, hours)
-
-
-def _default_start() -> lfm.Gaussian:
-    variances = jnp.repeat(jnp.asarray(lfm.orbits.START_SD) ** 2, 3)
-    return lfm.Gaussian(jnp.array(START), jnp.diag(variances))

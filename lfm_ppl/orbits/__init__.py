@@ -12,7 +12,7 @@ from lfm_ppl.orbits.environment import NANO, Environment
 from lfm_ppl.orbits.ephemerides import Ephemerides, Gap, calendar, check_satellites, gps_seconds
 from lfm_ppl.orbits.frames import AXES, dyb, rtn
 from lfm_ppl.orbits.geopotential import GM
-from lfm_ppl.orbits.satellite import SOLAR_PRESSURE, START_SD, satellite, small_forces, start_near
+from lfm_ppl.orbits.satellite import SOLAR_PRESSURE, START_SD, satellite, small_forces, start_near, wide_start
 from lfm_ppl.orbits.sp3 import read_sp3
 
 __all__ = [
@@ -37,4 +37,5 @@ __all__ = [
     "small_forces",
     "start_near",
     "sunlight",
+    "wide_start",
 ]

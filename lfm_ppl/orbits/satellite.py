@@ -145,7 +145,17 @@ def start_near(times: Any, positions: Any) -> Gaussian:
         raise ValueError("the start of an orbit is taken from nine positions within three hours, the first of them at "
                          f"the first time; here {'the first one is missing' if missing else f'nine take {reach:g} h'}. "
                          "Begin the data where the positions begin.")
-    return Gaussian(mean, jnp.diag(jnp.repeat(jnp.asarray(START_SD) ** 2, 3)))
+    return wide_start(mean)
+
+
+def wide_start(state: Any) -> Gaussian:
+    """Return a prior about a state (6,), in km and km/h, that says little beside positions: with START_SD.
+
+    Example:
+        >>> wide_start(jnp.zeros(6)).covariance.diagonal().round(6).tolist()
+        [0.01, 0.01, 0.01, 0.01, 0.01, 0.01]
+    """
+    return Gaussian(jnp.asarray(state), jnp.diag(jnp.repeat(jnp.asarray(START_SD) ** 2, 3)))
 
 
 def polynomial_state(times: Any, positions: Any) -> tuple[jax.Array, bool, float]:

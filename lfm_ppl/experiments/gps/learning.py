@@ -73,7 +73,7 @@ def _on_smoothed_forces(one: Arc, orbit: orbits.Orbit, axes: str) -> np.ndarray:
     """Return the log likelihood of each candidate (C,) where the smoothed forces are its data, as in the source."""
     steps = prediction.steps_of(one)
     times = tuple(one.times[:one.train])
-    mean, sd = map(np.asarray, _smooth_forces(one.environment, prediction.start(orbit),
+    mean, sd = map(np.asarray, _smooth_forces(one.environment, orbits.wide_start(orbit.state),
                                               jnp.asarray(one.positions[:one.train]), (times, axes, steps)))
     # Neighbouring values of a smoothed force say much the same; one an hour stands for them.
     magnitudes = Magnitudes(*jnp.asarray(CANDIDATES, float).T)

@@ -107,11 +107,6 @@ def _from_latest(one: Arc, end: int, solar: float) -> tuple[int, np.ndarray]:
     return first, orbits.propagate(one.environment, last, one.times[first:])
 
 
-def start(orbit: orbits.Orbit) -> Gaussian:
-    """Return a wide prior about the state of a fitted orbit."""
-    return Gaussian(jnp.asarray(orbit.state), jnp.diag(jnp.repeat(jnp.asarray(orbits.START_SD) ** 2, 3)))
-
-
 class Validation(NamedTuple):
     """What each candidate says of positions that it has not seen; each (C,).
 
@@ -137,7 +132,7 @@ def validate(one: Arc, orbit: orbits.Orbit, axes: str, candidates: tuple[Magnitu
     y = np.where((np.arange(one.train) < seen)[:, None], held, np.nan)
     magnitudes = Magnitudes(*jnp.asarray(candidates, float).T)
     steps = steps_of(one)
-    found = _validate(one.environment, start(orbit), jnp.asarray(y), jnp.asarray(held), magnitudes,
+    found = _validate(one.environment, orbits.wide_start(orbit.state), jnp.asarray(y), jnp.asarray(held), magnitudes,
                       (tuple(one.times[:one.train]), axes, steps, seen))
     score, rmse, likelihood = map(np.asarray, found)
     return Validation(_or_never(score), rmse, _or_never(likelihood))
@@ -175,7 +170,7 @@ def likelihoods(one: Arc, orbit: orbits.Orbit, axes: str, candidates: tuple[Magn
                 ) -> np.ndarray:
     """Return the log marginal likelihood (C,) of all positions of training, for every candidate."""
     return _or_never(np.asarray(_likelihoods(
-        one.environment, start(orbit), jnp.asarray(one.positions[:one.train]),
+        one.environment, orbits.wide_start(orbit.state), jnp.asarray(one.positions[:one.train]),
         Magnitudes(*jnp.asarray(candidates, float).T), (tuple(one.times[:one.train]), axes, steps_of(one)))))
 
 
@@ -241,8 +236,8 @@ def predict(one: Arc, orbit: orbits.Orbit, magnitudes: Magnitudes, axes: str, y:
         y: (T, 3) positions to learn from; None: those of training.
     """
     y = one.learnt() if y is None else y
-    found = _predict(one.environment, start(orbit), jnp.asarray(y), Magnitudes(*map(jnp.asarray, magnitudes)),
-                     (tuple(one.times), axes, steps_of(one)))
+    found = _predict(one.environment, orbits.wide_start(orbit.state), jnp.asarray(y),
+                     Magnitudes(*map(jnp.asarray, magnitudes)), (tuple(one.times), axes, steps_of(one)))
     mean, covariance, likelihood = map(np.asarray, found)
     sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     return Prediction(mean[:, :6], covariance[:, :3, :3], mean[:, 6:], sd[:, 6:], float(likelihood))
@@ -278,8 +273,8 @@ def online(one: Arc, orbit: orbits.Orbit, magnitudes: Magnitudes, axes: str, win
         observed |= inside
         ends.append(int(np.flatnonzero(inside)[-1]) + 1)
     y = np.where(observed[:, None], one.positions, np.nan)
-    mean, covariance = _online(one.environment, start(orbit), jnp.asarray(y), Magnitudes(*map(jnp.asarray, magnitudes)),
-                               (tuple(one.times), axes, steps_of(one)))
+    mean, covariance = _online(one.environment, orbits.wide_start(orbit.state), jnp.asarray(y),
+                               Magnitudes(*map(jnp.asarray, magnitudes)), (tuple(one.times), axes, steps_of(one)))
     restarted = np.full((len(days), 6), np.nan)
     for end in ends:
         first, path = _from_latest(one, end, orbit.solar)
