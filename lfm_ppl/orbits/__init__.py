@@ -7,26 +7,39 @@
 """
 
 from lfm_ppl.orbits.bodies import sunlight
-from lfm_ppl.orbits.deterministic import Orbit, fit_orbit, propagate
+from lfm_ppl.orbits.deterministic import STEP, Orbit, fit_orbit, propagate
+from lfm_ppl.orbits.deviations import Neighbourhood, departure
 from lfm_ppl.orbits.environment import NANO, Environment
 from lfm_ppl.orbits.ephemerides import Ephemerides, Gap, calendar, check_satellites, gps_seconds
 from lfm_ppl.orbits.frames import AXES, dyb, rtn
 from lfm_ppl.orbits.geopotential import GM
-from lfm_ppl.orbits.satellite import SOLAR_PRESSURE, START_SD, satellite, small_forces, start_near, wide_start
+from lfm_ppl.orbits.satellite import (
+    HARMONICS,
+    SOLAR_PRESSURE,
+    START_SD,
+    satellite,
+    small_forces,
+    start_near,
+    wide_start,
+)
 from lfm_ppl.orbits.sp3 import read_sp3
 
 __all__ = [
     "AXES",
     "GM",
+    "HARMONICS",
     "NANO",
     "SOLAR_PRESSURE",
     "START_SD",
+    "STEP",
     "Environment",
     "Ephemerides",
     "Gap",
+    "Neighbourhood",
     "Orbit",
     "calendar",
     "check_satellites",
+    "departure",
     "dyb",
     "fit_orbit",
     "gps_seconds",

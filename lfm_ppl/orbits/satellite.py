@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -40,11 +40,14 @@ class Motion(eqx.Module):
 
     def __call__(self, x: jax.Array, u: jax.Array, t: Any) -> jax.Array:
         """Return the derivatives (6,) in km/h and km/h^2; the first force is that of the sunlight."""
+        return jnp.concatenate([x[3:], self.acceleration(x, u, t)])
+
+    def acceleration(self, x: jax.Array, u: jax.Array, t: Any) -> jax.Array:
+        """Return the acceleration (3,) in km/h^2."""
         r, v = x[:3], x[3:]
         total = self.environment.acceleration(r, t) + u[0] * self.environment.solar_pressure(r, t)
-        if self.axes == "DYB":
-            return jnp.concatenate([v, total + NANO * self.environment.sunlit_axes(r, t)[:, 1:] @ u[1:]])
-        return jnp.concatenate([v, total + NANO * frames.rtn(r, v) @ u[1:]])
+        others = self.environment.sunlit_axes(r, t)[:, 1:] if self.axes == "DYB" else frames.rtn(r, v)
+        return total + NANO * others @ u[1:]
 
 
 def satellite(environment: Environment, start: Gaussian, forces: Mapping[str, Force], axes: str = "DYB",
@@ -74,15 +77,20 @@ def satellite(environment: Environment, start: Gaussian, forces: Mapping[str, Fo
     Source: Hartikainen, Seppanen and Sarkka (2012), section 6.
     """
     checks.one_of("axes", axes, tuple(frames.AXES))
+    return pushed(Motion(environment, axes), start, forces, axes, white, noise_sd, units)
+
+
+def pushed(dynamics: Callable, start: Gaussian, forces: Mapping[str, Force], axes: str, white: Any, noise_sd: Any,
+           units: Mapping[str, str] | None) -> LatentForceModel:
+    """Return the model of a position and a velocity with these dynamics; arguments as for `satellite`."""
     wanted = 3 if axes == "DYB" else 4
     if len(forces) != wanted:
         raise ValueError(f"a satellite with axes {axes} has {wanted} forces, that of the sunlight first; got "
                          f"{list(forces)}.")
     push = jnp.concatenate([jnp.zeros((3, 3)), NANO * jnp.asarray(white) * jnp.eye(3)])
     return LatentForceModel(
-        Motion(environment, axes), dict(forces),
-        GaussianObservation(_position, jnp.asarray(noise_sd) ** 2 * jnp.ones(3)), start, process_noise=push,
-        state_names=STATES, output_names=STATES[:3], units=units)
+        dynamics, dict(forces), GaussianObservation(_position, jnp.asarray(noise_sd) ** 2 * jnp.ones(3)), start,
+        process_noise=push, state_names=STATES, output_names=STATES[:3], units=units)
 
 
 def _position(x: jax.Array, u: jax.Array, t: Any) -> jax.Array:
@@ -90,8 +98,7 @@ def _position(x: jax.Array, u: jax.Array, t: Any) -> jax.Array:
 
 
 def small_forces(axes: str = "DYB", amplitude: Any = 1.0, wander: Any = 0.01, drift: Any = 0.003,
-                 level: tuple[float, float] = (10.0, 2.0), harmonics: Mapping[str, Sequence[int]] | None = None
-                 ) -> dict[str, Force]:
+                 level: Any = (10.0, 2.0), harmonics: Mapping[str, Sequence[int]] | None = None) -> dict[str, Force]:
     """Return quasi-periodic forces for `satellite`, in nm/s^2: on each axis a level and resonators.
 
         u(t) = b(t) + sum_n c_n(t),    db = drift dbeta,    c_n'' = -(2 pi n f)^2 c_n + white noise,
@@ -100,11 +107,15 @@ def small_forces(axes: str = "DYB", amplitude: Any = 1.0, wander: Any = 0.01, dr
 
     Args:
         axes: "DYB", with the orbit's frequency, or "RTN", with that of the sidereal day.
-        amplitude: nm/s^2.
-        wander: nm/s^2 / sqrt(h).
-        drift: nm/s^2 / sqrt(h).
-        level: standard deviation of the sunlight's acceleration, and of the levels b on the other axes (nm/s^2).
+        amplitude: nm/s^2; or force -> one number for each of its multiples n, not divided by n.
+        wander: nm/s^2 / sqrt(h); or force -> numbers, as amplitude.
+        drift: nm/s^2 / sqrt(h); or force -> number.
+        level: standard deviation of the sunlight's acceleration, and of the levels b on the other axes (nm/s^2); or
+            force -> number.
         harmonics: force -> multiples of the base frequency; None: `HARMONICS`.
+
+    Raises:
+        ValueError: unknown axes.
 
     Example:
         >>> {name: force.state_dim for name, force in small_forces().items()}
@@ -112,14 +123,26 @@ def small_forces(axes: str = "DYB", amplitude: Any = 1.0, wander: Any = 0.01, dr
     """
     checks.one_of("axes", axes, tuple(HARMONICS))
     period = SIDEREAL_DAY / 2 if axes == "DYB" else SIDEREAL_DAY
-    found: dict[str, Force] = {} if axes == "DYB" else {"solar": Constant(level[0], SOLAR_PRESSURE)}
+    own = level if isinstance(level, Mapping) else {}
+    sunlight, others = (0.0, 0.0) if own else level
+    found: dict[str, Force] = {}
+    if axes == "RTN":
+        found["solar"] = Constant(own.get("solar", sunlight), SOLAR_PRESSURE)
     for name, multiples in (harmonics or HARMONICS[axes]).items():
         sunward = name == "solar"
-        force: Force = RandomWalk(drift, level[0 if sunward else 1], mean=SOLAR_PRESSURE if sunward else 0.0)
-        for n in multiples:
-            force = force + Resonator(period / n, amplitude / n, wander / n)
+        walk = drift[name] if isinstance(drift, Mapping) else drift
+        force: Force = RandomWalk(walk, own.get(name, sunlight if sunward else others),
+                                  mean=SOLAR_PRESSURE if sunward else 0.0)
+        sizes = zip(multiples, _each(amplitude, name, multiples), _each(wander, name, multiples), strict=True)
+        for n, size, gain in sizes:
+            force = force + Resonator(period / n, size, gain)
         found[name] = force
     return found
+
+
+def _each(given: Any, name: str, multiples: Sequence[int]) -> Sequence[Any]:
+    """Return one magnitude for each multiple of a force."""
+    return given[name] if isinstance(given, Mapping) else [given / n for n in multiples]
 
 
 def start_near(times: Any, positions: Any) -> Gaussian:

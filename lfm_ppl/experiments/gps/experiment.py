@@ -13,7 +13,7 @@ import pandas as pd
 
 from lfm_ppl import checks, orbits
 from lfm_ppl.experiments import output, tasks
-from lfm_ppl.experiments.gps import figures, learning, prediction, problem
+from lfm_ppl.experiments.gps import figures, learning, magnitudes, prediction, problem, ways
 from lfm_ppl.experiments.gps.figures import METRE, rms
 from lfm_ppl.experiments.scores import mean_of, pair
 from lfm_ppl.experiments.tasks import Result, Task
@@ -59,7 +59,8 @@ class Found(NamedTuple):
         refused: satellite -> why it was left out.
         satellites: one row a satellite.
         pooled: one row a group of satellites.
-        learning: one row a way to choose the magnitudes; empty where there are none.
+        magnitudes: one row a magnitude of the small forces: what satellites have in common, and each of them.
+        learning: one row a way to learn the magnitudes; empty where there are none.
         online: satellite -> result of its prediction as positions come in.
     """
 
@@ -68,6 +69,7 @@ class Found(NamedTuple):
     refused: dict[str, str]
     satellites: pd.DataFrame
     pooled: pd.DataFrame
+    magnitudes: pd.DataFrame
     learning: pd.DataFrame
     online: dict[str, Result]
 
@@ -78,7 +80,7 @@ def quick(**given: Any) -> Settings:
 
 
 def plan(settings: Settings) -> list[Task]:
-    """Return the tasks: the prediction of each satellite, and the alternatives of the first ones.
+    """Return the first tasks: each satellite is learnt by itself.
 
     Raises:
         ValueError, FileNotFoundError: as `problem.arcs` and `prediction.arc`; a satellite that there is not.
@@ -89,57 +91,83 @@ def plan(settings: Settings) -> list[Task]:
         files = () if data.published is None else data.published.files
         names = orbits.check_satellites(settings.satellites, tuple(data.positions), files)
     shared = {"data": settings.data and str(Path(settings.data).resolve()), "train_days": settings.train_days,
-              "axes": settings.axes, "candidates": [list(one) for one in problem.CANDIDATES]}
-    found = [Task(f"predict/{name}", settings.seed, {**shared, "satellite": name}) for name in names]
-    usable = [name for name in names if _refusal(data, name, settings.train_days) is None]
-    found += [Task(f"learn/{name}", settings.seed, {**shared, "satellite": name})
-              for name in usable[:settings.alternatives]]
-    days = data.times[-1] / 24.0
+              "axes": settings.axes}
+    found = []
+    for name in names:
+        try:
+            digest = prediction.arc(data, name, settings.train_days).digest
+        except prediction.Unusable:
+            digest = None
+        found.append(Task(f"learn/{name}", settings.seed, {**shared, "satellite": name, "positions": digest}))
+    return found
+
+
+def plan_predictions(settings: Settings, learnt: Mapping[str, Result], tasks: list[Task]) -> list[Task]:
+    """Return the tasks that follow: the predictions, and the ways to learn on the first satellites.
+
+    Args:
+        settings: what is asked.
+        learnt: satellite -> result of its first task; those that can be predicted.
+        tasks: the first ones.
+    """
+    data = problem.arcs(settings.data, settings.seed)
+    prior = magnitudes.common([one["logarithms"] for one in learnt.values()], settings.axes)
+    usable = [{**task.settings, "orbit": [float(value) for value in learnt[name]["orbit"]],
+               "prior": [values.tolist() for values in prior]}
+              for task in tasks if (name := task.settings["satellite"]) in learnt]
+    found = [Task(f"predict/{one['satellite']}", settings.seed, one) for one in usable]
+    found += [Task(f"ways/{one['satellite']}", settings.seed, one) for one in usable[:settings.alternatives]]
     # Two windows of a quarter of a day, at two and at four sevenths of what is left.
-    left = days - settings.train_days
+    left = data.times[-1] / 24.0 - settings.train_days
     windows = [[begin, begin + _WINDOW] for begin in (settings.train_days + share * left for share in (2 / 7, 4 / 7))]
-    return found + [Task(f"online/{name}", settings.seed, {**shared, "satellite": name, "windows": windows})
-                    for name in usable[:settings.alternatives and 1] if left > 10 * _WINDOW]
-
-
-def _refusal(data: problem.Arcs, name: str, train_days: float) -> str | None:
-    try:
-        prediction.arc(data, name, train_days)
-    except prediction.Unusable as reason:
-        return str(reason)
-    return None
+    return found + [Task(f"online/{one['satellite']}", settings.seed, {**one, "windows": windows})
+                    for one in usable[:settings.alternatives and 1] if left > 10 * _WINDOW]
 
 
 def compute(task: Task) -> Result:
     """Compute one task."""
-    asked = task.settings
+    asked, started = task.settings, time.process_time()
     data = problem.arcs(asked["data"], task.seed)
     try:
         one = prediction.arc(data, asked["satellite"], asked["train_days"])
     except prediction.Unusable as reason:
         return {_REFUSED: str(reason)}
-    started = time.process_time()
-    try:
-        paths = prediction.deterministic(one)
-    except ValueError as reason:
-        return {_REFUSED: f"{asked['satellite']}: {reason}"}
     if task.name.startswith("learn/"):
-        return learning.compare(one, paths, asked["axes"])
-    chosen = prediction.validate(one, paths.orbit, asked["axes"])
-    best = int(np.argmax(chosen.score))
-    magnitudes = problem.CANDIDATES[best]
+        try:
+            return {**_learn(one, asked["axes"]), "cpu_s": time.process_time() - started}
+        except ValueError as reason:  # no orbit fits, most likely for a manoeuvre
+            return {_REFUSED: f"{asked['satellite']}: {reason}"}
+    orbit = orbits.Orbit(float(one.times[0]), np.array(asked["orbit"][:6]), *asked["orbit"][6:])
+    paths, prior = prediction.deterministic(one, orbit), magnitudes.Prior(*map(np.array, asked["prior"]))
+    if task.name.startswith("ways/"):
+        return ways.compare(one, paths, asked["axes"], prior, task.key)
+    target = learning.held_out(learning.training(one, orbit, asked["axes"]), prior)
+    mode = target.mode()
     if task.name.startswith("online/"):
         try:
-            return _online(one, paths.orbit, magnitudes, asked)
+            return _online(one, orbit, mode, asked)
         except ValueError as reason:  # a window without positions
             return {_REFUSED: f"{asked['satellite']}: {reason}"}
-    found = prediction.predict(one, paths.orbit, magnitudes, asked["axes"])
-    everything = prediction.predict(one, paths.orbit, magnitudes, asked["axes"], one.positions)
-    axes = problem.axes_of(paths.fitted)
-    lfm, sd, coverage = prediction.judge(one, found.state[:, :3], found.covariance, axes)
+    return {**_predict(one, paths, mode, target.draws(mode, learning.DRAWS), asked["axes"]),
+            "cpu_s": time.process_time() - started}
+
+
+def _learn(one: problem.Arc, axes: str) -> Result:
+    orbit = orbits.fit_orbit(one.environment, one.times[:one.train], one.positions[:one.train])
+    target = learning.held_out(learning.training(one, orbit, axes), magnitudes.wide(axes))
+    return {"orbit": np.array([*orbit.state, orbit.solar, orbit.residual]), "logarithms": target.mode()}
+
+
+def _predict(one: problem.Arc, paths: prediction.Deterministic, mode: np.ndarray, draws: np.ndarray, axes: str
+             ) -> Result:
+    near = prediction.surroundings(one, paths.orbit, axes)
+    found = prediction.predict(one, near, draws)
+    everything = prediction.predict(one, near, mode[None], one.positions)
+    frame = problem.axes_of(paths.fitted)
+    lfm, sd, coverage = prediction.judge(one, found.state[:, :3], found.covariance, frame)
 
     def error(path: np.ndarray) -> np.ndarray:
-        return np.einsum("tji,tj->ti", axes, path[:, :3] - one.positions)
+        return np.einsum("tji,tj->ti", frame, path[:, :3] - one.positions)
 
     return {
         "times": one.times, "train": one.train, "residual": paths.orbit.residual, "solar": paths.orbit.solar,
@@ -147,14 +175,12 @@ def compute(task: Task) -> Result:
         "complete": np.isfinite(one.positions).all(), "fitted": error(paths.fitted), "latest": error(paths.latest),
         "lfm": lfm, "sd": sd, "coverage": coverage.mean(),
         "forces": found.forces, "forces_sd": found.forces_sd, "seen": everything.forces,
-        "force_names": np.array(list(orbits.small_forces(asked["axes"]))), "scores": chosen.score,
-        "held_out": chosen.rmse, "candidate": best, "log_likelihood": found.log_likelihood,
-        "cpu_s": time.process_time() - started}
+        "force_names": np.array(list(orbits.small_forces(axes))), "logarithms": mode}
 
 
-def _online(one: prediction.Arc, orbit: orbits.Orbit, magnitudes: problem.Magnitudes, asked: Mapping[str, Any]
+def _online(one: prediction.Arc, orbit: orbits.Orbit, logarithms: np.ndarray, asked: Mapping[str, Any]
             ) -> Result:
-    mean, variance, observed, restarted = prediction.online(one, orbit, magnitudes, asked["axes"], asked["windows"])
+    mean, variance, observed, restarted = prediction.online(one, orbit, logarithms, asked["axes"], asked["windows"])
     return {"times": one.times, "observed": observed, "lfm": mean - one.positions,
             "sd": np.sqrt(variance + problem.NOISE**2), "restarted": restarted[:, :3] - one.positions}
 
@@ -175,18 +201,43 @@ def run(settings: Settings, folder: str | Path, *, overwrite: bool = False,
             results of other settings.
         FileNotFoundError: there are no files.
     """
-    planned = plan(settings)
-    results = tasks.run_tasks(planned, compute, Path(folder) / "tasks", overwrite=overwrite, report=report,
-                              workers=workers)
-    predicted = {task.settings["satellite"]: results[task.name] for task in planned if task.name[:8] == "predict/"}
-    refused = {name: str(result[_REFUSED]) for name, result in predicted.items() if _REFUSED in result}
-    kept = {name: result for name, result in predicted.items() if name not in refused}
-    if not kept:
+    def done(planned: list[Task]) -> dict[str, Result]:
+        return tasks.run_tasks(planned, compute, Path(folder) / "tasks", overwrite=overwrite, report=report,
+                               workers=workers)
+
+    first = plan(settings)
+    refused: dict[str, str] = {}
+    learnt = _kept(first, done(first), "learn/", refused)
+    if not learnt:
         raise ValueError("no satellite can be predicted. " + " ".join(refused.values()))
-    learnt, online = ({task.settings["satellite"]: results[task.name] for task in planned
-                       if task.name.startswith(kind) and _REFUSED not in results[task.name]}
-                      for kind in ("learn/", "online/"))
-    return Found(settings, kept, refused, satellites(kept), pooled(kept), learning.table(learnt), online)
+    second = plan_predictions(settings, learnt, first)
+    results = done(second)
+    predicted, compared, online = (_kept(second, results, kind, {}) for kind in ("predict/", "ways/", "online/"))
+    for name, result in predicted.items():
+        result["cpu_s"] = result["cpu_s"] + learnt[name]["cpu_s"]
+    prior = magnitudes.common([one["logarithms"] for one in learnt.values()], settings.axes)
+    return Found(settings, predicted, refused, satellites(predicted), pooled(predicted),
+                 magnitudes_of(predicted, prior, settings.axes), ways.table(compared), online)
+
+
+def _kept(planned: list[Task], results: dict[str, Result], kind: str, refused: dict[str, str]) -> dict[str, Result]:
+    """Return satellite -> result of one kind of task; why others were refused is added to ``refused``."""
+    found = {}
+    for task in planned:
+        if task.name.startswith(kind):
+            name, result = task.settings["satellite"], results[task.name]
+            if _REFUSED in result:
+                refused[name] = str(result[_REFUSED])
+            else:
+                found[name] = result
+    return found
+
+
+def magnitudes_of(results: dict[str, Result], prior: magnitudes.Prior, axes: str) -> pd.DataFrame:
+    """Return one row a magnitude of the small forces, in nm/s^2 and hours: what is common, and each satellite's."""
+    columns = {"common": np.exp(prior.mean), "factor": np.exp(prior.sd)}
+    columns |= {name: np.exp(one["logarithms"]) for name, one in results.items()}
+    return pd.DataFrame(columns, index=list(magnitudes.names(axes)))
 
 
 def satellites(results: dict[str, Result]) -> pd.DataFrame:
@@ -195,14 +246,12 @@ def satellites(results: dict[str, Result]) -> pd.DataFrame:
     for name, one in results.items():
         after = slice(int(one["train"]), None)
         lfm = one["lfm"][after]
-        magnitudes = problem.CANDIDATES[int(one["candidate"])]
         rows[name] = {
             "eclipsed": "yes" if one["eclipsed"] else "no", "fit": float(one["residual"]) / METRE,
             "deterministic": rms(one["fitted"][after]), "latest state": rms(one["latest"][after]),
             "LFM": rms(lfm), "LFM radial": rms(lfm[:, :1]), "LFM tangential": rms(lfm[:, 1:2]),
             "LFM normal": rms(lfm[:, 2:]), "LFM at the end": float(np.linalg.norm(lfm[-1])) / METRE,
             "ratio": rms(lfm) / rms(one["fitted"][after]), "coverage": float(one["coverage"]),
-            **magnitudes._asdict(), "held out": float(one["held_out"][int(one["candidate"])]) / METRE,
             "CPU s": float(one["cpu_s"])}
     return pd.DataFrame.from_dict(rows, orient="index")
 
@@ -234,7 +283,7 @@ def pooled(results: dict[str, Result]) -> pd.DataFrame:
 
 def save(found: Found, folder: str | Path) -> list[Path]:
     """Write tables and figures, and return their paths."""
-    named = {"satellites": found.satellites, "pooled": found.pooled}
+    named = {"satellites": found.satellites, "pooled": found.pooled, "magnitudes": found.magnitudes}
     if len(found.learning):
         named["learning"] = found.learning
     return output.save(folder, named, figures.draw(found.results, found.online), "")

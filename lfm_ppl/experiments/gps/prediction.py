@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import orbits
-from lfm_ppl.experiments.gps import problem
-from lfm_ppl.experiments.gps.problem import CANDIDATES, NOISE, Arcs, Magnitudes
+from lfm_ppl.experiments.gps import learning, magnitudes
+from lfm_ppl.experiments.gps.problem import NOISE, Arc, Arcs
 from lfm_ppl.experiments.scores import Z
 from lfm_ppl.filtering.filter import filter
 from lfm_ppl.filtering.smoother import smooth
@@ -20,27 +20,8 @@ from lfm_ppl.model.observation import Gaussian
 
 _LATEST = 6.0
 """Hours before the end of training that determine the latest state."""
-
-
-class Arc(NamedTuple):
-    """A satellite and the part of its positions that may be learnt from.
-
-    Attributes:
-        environment: Earth, Moon and Sun.
-        times: (T,) hours, equally spaced.
-        positions: (T, 3) km; NaN where missing.
-        train: number of epochs to learn from.
-    """
-
-    environment: orbits.Environment
-    times: np.ndarray
-    positions: np.ndarray
-    train: int
-
-    def learnt(self, count: int | None = None) -> np.ndarray:
-        """Return the positions (T, 3), NaN after the first ``count`` epochs, by default those of training."""
-        return np.where((np.arange(len(self.times)) < (self.train if count is None else count))[:, None],
-                        self.positions, np.nan)
+_STEP = 0.125
+"""Longest integration step of a departure in predictions (h); its error is 2e-4 of the departure after two days."""
 
 
 class Unusable(ValueError):
@@ -90,9 +71,8 @@ class Deterministic(NamedTuple):
     latest: np.ndarray
 
 
-def deterministic(one: Arc) -> Deterministic:
-    """Fit an orbit to the training, and another to its last six hours with the same amplitude of the sunlight."""
-    orbit = orbits.fit_orbit(one.environment, one.times[:one.train], one.positions[:one.train])
+def deterministic(one: Arc, orbit: orbits.Orbit) -> Deterministic:
+    """Follow the orbit that was fitted to training, and another one that is fitted to its last six hours."""
     fitted = orbits.propagate(one.environment, orbit, one.times)
     first, path = _from_latest(one, one.train, orbit.solar)
     latest = np.full_like(fitted, np.nan)
@@ -105,85 +85,6 @@ def _from_latest(one: Arc, end: int, solar: float) -> tuple[int, np.ndarray]:
     first = end - int(round(_LATEST / (one.times[1] - one.times[0])))
     last = orbits.fit_orbit(one.environment, one.times[first:end], one.positions[first:end], solar)
     return first, orbits.propagate(one.environment, last, one.times[first:])
-
-
-class Validation(NamedTuple):
-    """What each candidate says of positions that it has not seen; each (C,).
-
-    Attributes:
-        score: mean log predictive density of a held-out position.
-        rmse: root mean square distance from these (km).
-        likelihood: log marginal likelihood of the positions that were seen.
-    """
-
-    score: np.ndarray
-    rmse: np.ndarray
-    likelihood: np.ndarray
-
-
-def validate(one: Arc, orbit: orbits.Orbit, axes: str, candidates: tuple[Magnitudes, ...] = CANDIDATES) -> Validation:
-    """Learn from the first third of the training, and judge every candidate by the other two.
-
-    What is held out is longer than what is learnt from, as it is in the prediction that follows. A shorter time
-    would not tell forces that stay from forces that wander.
-    """
-    seen = one.train // 3
-    held = one.positions[:one.train]
-    y = np.where((np.arange(one.train) < seen)[:, None], held, np.nan)
-    magnitudes = Magnitudes(*jnp.asarray(candidates, float).T)
-    steps = steps_of(one)
-    found = _validate(one.environment, orbits.wide_start(orbit.state), jnp.asarray(y), jnp.asarray(held), magnitudes,
-                      (tuple(one.times[:one.train]), axes, steps, seen))
-    score, rmse, likelihood = map(np.asarray, found)
-    return Validation(_or_never(score), rmse, _or_never(likelihood))
-
-
-def _or_never(score: np.ndarray) -> np.ndarray:
-    """Return scores, minus infinity where the filter broke down, so that such a candidate is not chosen."""
-    return np.where(np.isfinite(score), score, -np.inf)
-
-
-@functools.partial(jax.jit, static_argnums=(5,))
-def _validate(environment: orbits.Environment, start: Gaussian, y: jax.Array, held: jax.Array,
-              magnitudes: Magnitudes, fixed: tuple) -> tuple[jax.Array, jax.Array, jax.Array]:
-    known_times, axes, steps, seen = fixed
-
-    def judge(one: Magnitudes) -> tuple[jax.Array, jax.Array, jax.Array]:
-        system = problem.model(environment, start, one, axes)
-        passed = filter(system, np.array(known_times), y, rule=Taylor(), steps=steps)
-        error = held[seen:] - passed.predicted_mean[seen:, :3]
-        there = jnp.isfinite(error).all(axis=1)
-        error = jnp.where(there[:, None], error, 0.0)
-        covariance = passed.predicted_covariance[seen:, :3, :3] + NOISE**2 * jnp.eye(3)
-        chol = jnp.linalg.cholesky(covariance)
-        white = jax.vmap(lambda a, b: jax.scipy.linalg.solve_triangular(a, b, lower=True))(chol, error)
-        density = (-0.5 * (white**2).sum(1) - jnp.log(jnp.diagonal(chol, axis1=1, axis2=2)).sum(1)
-                   - 1.5 * jnp.log(2 * jnp.pi))
-        count = jnp.maximum(there.sum(), 1)
-        return (jnp.where(there, density, 0.0).sum() / count, jnp.sqrt((error**2).sum() / count),
-                passed.log_likelihood.sum())
-
-    return jax.lax.map(judge, magnitudes)
-
-
-def likelihoods(one: Arc, orbit: orbits.Orbit, axes: str, candidates: tuple[Magnitudes, ...] = CANDIDATES
-                ) -> np.ndarray:
-    """Return the log marginal likelihood (C,) of all positions of training, for every candidate."""
-    return _or_never(np.asarray(_likelihoods(
-        one.environment, orbits.wide_start(orbit.state), jnp.asarray(one.positions[:one.train]),
-        Magnitudes(*jnp.asarray(candidates, float).T), (tuple(one.times[:one.train]), axes, steps_of(one)))))
-
-
-@functools.partial(jax.jit, static_argnums=(4,))
-def _likelihoods(environment: orbits.Environment, start: Gaussian, y: jax.Array, magnitudes: Magnitudes,
-                 fixed: tuple) -> jax.Array:
-    times, axes, steps = fixed
-
-    def score(one: Magnitudes) -> jax.Array:
-        system = problem.model(environment, start, one, axes)
-        return filter(system, np.array(times), y, rule=Taylor(), steps=steps).log_likelihood.sum()
-
-    return jax.lax.map(score, magnitudes)
 
 
 def judge(one: Arc, mean: np.ndarray, covariance: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -207,58 +108,67 @@ def judge(one: Arc, mean: np.ndarray, covariance: np.ndarray, axes: np.ndarray) 
 
 
 class Prediction(NamedTuple):
-    """What the latent force model says at all times, given the positions of training.
+    """What the latent force model says at all times, given some positions, averaged over magnitudes.
 
     Attributes:
-        state: (T, 6) mean, smoothed in training and predicted after it.
+        state: (T, 6) mean, smoothed where there are positions and predicted elsewhere.
         covariance: (T, 3, 3) of the position.
         forces: (T, R) mean, in nm/s^2.
         forces_sd: (T, R).
-        log_likelihood: of the training.
     """
 
     state: np.ndarray
     covariance: np.ndarray
     forces: np.ndarray
     forces_sd: np.ndarray
-    log_likelihood: float
 
 
-def predict(one: Arc, orbit: orbits.Orbit, magnitudes: Magnitudes, axes: str, y: np.ndarray | None = None
-            ) -> Prediction:
+def predict(one: Arc, near: orbits.Neighbourhood, logarithms: np.ndarray, y: np.ndarray | None = None) -> Prediction:
     """Smooth the positions of training, and predict all others.
 
     Args:
         one: the satellite.
-        orbit: that was fitted to it.
-        magnitudes: of its small forces.
-        axes: of these.
+        near: the orbit that was fitted to it, at all times; see `surroundings`.
+        logarithms: (K, d) of the magnitudes, over which the moments are averaged.
         y: (T, 3) positions to learn from; None: those of training.
     """
-    y = one.learnt() if y is None else y
-    found = _predict(one.environment, orbits.wide_start(orbit.state), jnp.asarray(y),
-                     Magnitudes(*map(jnp.asarray, magnitudes)), (tuple(one.times), axes, steps_of(one)))
-    mean, covariance, likelihood = map(np.asarray, found)
+    y = (one.learnt() if y is None else y) - np.asarray(near.path[:, :3])
+    found = _predict(near, jnp.asarray(y), jnp.asarray(logarithms), (tuple(one.times), near.axes))
+    mean, covariance = map(np.asarray, found)
     sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-    return Prediction(mean[:, :6], covariance[:, :3, :3], mean[:, 6:], sd[:, 6:], float(likelihood))
+    return Prediction(np.asarray(near.path) + mean[:, :6], covariance[:, :3, :3], mean[:, 6:], sd[:, 6:])
 
 
-@functools.partial(jax.jit, static_argnums=(4,))
-def _predict(environment: orbits.Environment, start: Gaussian, y: jax.Array, magnitudes: Magnitudes,
-             fixed: tuple) -> tuple[jax.Array, jax.Array, jax.Array]:
-    times, axes, steps = fixed
-    found = smooth(problem.model(environment, start, magnitudes, axes), np.array(times), y, rule=Taylor(), steps=steps)
-    return found.input_mean, found.input_covariance, found.log_likelihood.sum()
+@functools.partial(jax.jit, static_argnums=(3,))
+def _predict(near: orbits.Neighbourhood, y: jax.Array, logarithms: jax.Array, fixed: tuple
+             ) -> tuple[jax.Array, jax.Array]:
+    times, axes = np.array(fixed[0]), fixed[1]
+
+    def one(vector: jax.Array) -> tuple[jax.Array, jax.Array]:
+        system = learning.departing(vector, near, axes)
+        found = smooth(system, times, y, rule=Taylor(), steps=learning.steps_of(times, _STEP))
+        return found.input_mean, found.input_covariance
+
+    means, covariances = jax.lax.map(one, logarithms)
+    mean = means.mean(axis=0)
+    away = means - mean
+    return mean, covariances.mean(axis=0) + jnp.einsum("kti,ktj->tij", away, away) / len(away)
 
 
-def online(one: Arc, orbit: orbits.Orbit, magnitudes: Magnitudes, axes: str, windows: Any) -> tuple[np.ndarray, ...]:
+def surroundings(one: Arc, orbit: orbits.Orbit, axes: str) -> orbits.Neighbourhood:
+    """Return the orbit and what is around it, at all times."""
+    return orbits.Neighbourhood.of(one.environment, orbit, one.times, axes,
+                                   nodes=2 * learning.steps_of(one.times, _STEP))
+
+
+def online(one: Arc, orbit: orbits.Orbit, logarithms: np.ndarray, axes: str, windows: Any) -> tuple[np.ndarray, ...]:
     """Predict as positions come in: in training, and in windows after it.
 
     Args:
         one: the satellite.
         orbit: that was fitted to it.
-        magnitudes: of its small forces.
-        axes: of these.
+        logarithms: (d,) of the magnitudes.
+        axes: of the small forces.
         windows: (begin, end) in days, in which positions are observed.
 
     Returns:
@@ -273,24 +183,30 @@ def online(one: Arc, orbit: orbits.Orbit, magnitudes: Magnitudes, axes: str, win
         observed |= inside
         ends.append(int(np.flatnonzero(inside)[-1]) + 1)
     y = np.where(observed[:, None], one.positions, np.nan)
-    mean, covariance = _online(one.environment, orbits.wide_start(orbit.state), jnp.asarray(y),
-                               Magnitudes(*map(jnp.asarray, magnitudes)), (tuple(one.times), axes, steps_of(one)))
+    mean, covariance = filter_positions(one, orbit, logarithms, axes, y)
     restarted = np.full((len(days), 6), np.nan)
     for end in ends:
         first, path = _from_latest(one, end, orbit.solar)
         restarted[first:] = path
-    variances = np.diagonal(np.asarray(covariance), axis1=1, axis2=2)
-    return np.asarray(mean), variances, observed, restarted
+    return mean, np.diagonal(covariance, axis1=1, axis2=2), observed, restarted
+
+
+def filter_positions(one: Arc, orbit: orbits.Orbit, logarithms: np.ndarray, axes: str, y: np.ndarray
+                     ) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean (T, 3) and covariance (T, 3, 3) of each position before it is seen, of the satellite itself.
+
+    Nothing is taken to be small here: the filter follows the satellite in steps of 30 s.
+    """
+    found = _filter(one.environment, orbits.wide_start(orbit.state), jnp.asarray(y), jnp.asarray(logarithms),
+                    (tuple(one.times), axes))
+    return np.asarray(found[0]), np.asarray(found[1])
 
 
 @functools.partial(jax.jit, static_argnums=(4,))
-def _online(environment: orbits.Environment, start: Gaussian, y: jax.Array, magnitudes: Magnitudes,
-            fixed: tuple) -> tuple[jax.Array, jax.Array]:
-    times, axes, steps = fixed
-    found = filter(problem.model(environment, start, magnitudes, axes), np.array(times), y, rule=Taylor(), steps=steps)
+def _filter(environment: orbits.Environment, start: Gaussian, y: jax.Array, logarithms: jax.Array, fixed: tuple
+            ) -> tuple[jax.Array, jax.Array]:
+    times, axes = np.array(fixed[0]), fixed[1]
+    forces, white = magnitudes.forces(logarithms, axes)
+    system = orbits.satellite(environment, start, forces, axes, white, NOISE)
+    found = filter(system, times, y, rule=Taylor(), steps=learning.steps_of(times, orbits.STEP))
     return found.predicted_mean[:, :3], found.predicted_covariance[:, :3, :3]
-
-
-def steps_of(one: Arc) -> int:
-    """Return integration steps per interval: of 30 s at most."""
-    return int(np.ceil((one.times[1] - one.times[0]) * problem.STEPS_AN_HOUR - 1e-9))

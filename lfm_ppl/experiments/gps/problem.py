@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-import itertools
+import hashlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,30 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import orbits
-from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation import Gaussian
 from lfm_ppl.model.simulate import simulate
 
 NOISE = 5e-5
 """Standard deviation of a coordinate's error, in km: published positions are smoothed, their scatter says nothing."""
-STEPS_AN_HOUR = 120
 SIMULATED = tuple(f"S{number:02d}" for number in range(1, 13))
-_HIDDEN = {"amplitude": 0.5, "wander": 0.02, "drift": 0.005, "white": 0.03}
+_HIDDEN: dict[str, Any] = {"amplitude": 0.5, "wander": 0.02, "drift": 0.005}
+_HIDDEN_WHITE = 0.03
 _DAYS, _INTERVAL = 10, 900.0
-
-
-class Magnitudes(NamedTuple):
-    """How large the small forces are; see `lfm_ppl.orbits.small_forces`."""
-
-    amplitude: Any
-    wander: Any
-    drift: Any
-    white: Any
-
-
-CANDIDATES = tuple(Magnitudes(amplitude, wander, 0.3 * wander, white) for amplitude, wander, white in
-                   itertools.product((0.1, 0.3, 1.0), (0.001, 0.003, 0.01, 0.03), (0.01, 0.1)))
-"""Magnitudes to choose from, in steps of a factor three."""
 
 
 class Arcs(NamedTuple):
@@ -52,6 +37,32 @@ class Arcs(NamedTuple):
     times: np.ndarray
     positions: dict[str, np.ndarray]
     published: orbits.Ephemerides | None
+
+
+class Arc(NamedTuple):
+    """A satellite and the part of its positions that may be learnt from.
+
+    Attributes:
+        environment: Earth, Moon and Sun.
+        times: (T,) hours, equally spaced.
+        positions: (T, 3) km; NaN where missing.
+        train: number of epochs to learn from.
+    """
+
+    environment: orbits.Environment
+    times: np.ndarray
+    positions: np.ndarray
+    train: int
+
+    def learnt(self, count: int | None = None) -> np.ndarray:
+        """Return the positions (T, 3), NaN after the first ``count`` epochs, by default those of training."""
+        return np.where((np.arange(len(self.times)) < (self.train if count is None else count))[:, None],
+                        self.positions, np.nan)
+
+    @property
+    def digest(self) -> str:
+        """What tells these positions from others."""
+        return hashlib.sha256(np.ascontiguousarray(self.positions).tobytes()).hexdigest()[:16]
 
 
 @functools.lru_cache(maxsize=2)
@@ -88,8 +99,9 @@ def _simulated(seed: int) -> Arcs:
 
     @jax.jit
     def draw(key: jax.Array, start: jax.Array) -> jax.Array:
-        system = model(environment, Gaussian(start, jnp.zeros((6, 6))), Magnitudes(**_HIDDEN))
-        return simulate(key, system, times, steps=STEPS_AN_HOUR // 4).y
+        system = orbits.satellite(environment, Gaussian(start, jnp.zeros((6, 6))), orbits.small_forces(**_HIDDEN),
+                                  white=_HIDDEN_WHITE, noise_sd=NOISE)
+        return simulate(key, system, times, steps=int(_INTERVAL / 30)).y
 
     keys = jax.random.split(jax.random.key(seed), len(SIMULATED))
     found = {name: np.asarray(draw(key, jnp.asarray(_circular(*turn))))
@@ -105,13 +117,6 @@ def _circular(node: float, along: float) -> np.ndarray:
     second = np.array([-np.sin(node) * np.cos(inclination), np.cos(node) * np.cos(inclination), np.sin(inclination)])
     place = np.cos(along) * first + np.sin(along) * second
     return np.concatenate([radius * place, speed * (np.cos(along) * second - np.sin(along) * first)])
-
-
-def model(environment: orbits.Environment, start: Gaussian, magnitudes: Magnitudes, axes: str = "DYB"
-          ) -> LatentForceModel:
-    """Return the satellite; all but the axes may be traced."""
-    forces = orbits.small_forces(axes, magnitudes.amplitude, magnitudes.wander, magnitudes.drift)
-    return orbits.satellite(environment, start, forces, axes, magnitudes.white, NOISE)
 
 
 def axes_of(state: np.ndarray) -> np.ndarray:

@@ -1,0 +1,85 @@
+"""How large the small forces are: a vector of logarithms, its prior, and the forces that follow."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lfm_ppl import orbits
+from lfm_ppl.forces import Force
+
+_SUNLIGHT = 10.0
+"""Standard deviation of the sunlight's acceleration (nm/s^2); the positions tell it far better."""
+_LEAST_SD = 0.5
+"""Of the logarithms, where it is taken from a few satellites."""
+FEW = 5
+"""Fewer satellites than these do not say what is common to all of them."""
+# What is sampled: median, and standard deviation of its logarithm. In nm/s^2 and hours; the amplitude is over n.
+_LEVEL, _DRIFT, _AMPLITUDE, _SHARE, _WHITE = (1.0, 2.0), (1e-3, 2.0), (0.1, 1.5), (0.01, 2.0), (0.01, 2.0)
+
+
+class Prior(NamedTuple):
+    """A normal prior of the logarithms, independent: mean (d,) and standard deviation (d,)."""
+
+    mean: np.ndarray
+    sd: np.ndarray
+
+
+def names(axes: str) -> tuple[str, ...]:
+    """Return what the entries of the vector are.
+
+    Example:
+        >>> names("DYB")[:3], len(names("DYB"))
+        (('level of panel', 'level of remaining', 'drift of solar'), 21)
+    """
+    return tuple(name for name, _ in _entries(axes))
+
+
+def wide(axes: str) -> Prior:
+    """Return the prior before any satellite is seen."""
+    given = [given for _, given in _entries(axes)]
+    return Prior(np.log([median for median, _ in given]), np.array([sd for _, sd in given]))
+
+
+def common(learnt: list[np.ndarray], axes: str) -> Prior:
+    """Return the prior that other satellites make: their mean, and how they scatter.
+
+    Args:
+        learnt: vectors (d,), one a satellite; too few of them leave the wide prior.
+        axes: of the small forces.
+    """
+    if len(learnt) < FEW:
+        return wide(axes)
+    return Prior(np.mean(learnt, axis=0), np.maximum(np.std(learnt, axis=0), _LEAST_SD))
+
+
+def _entries(axes: str) -> Iterator[tuple[str, tuple[float, float]]]:
+    harmonics = orbits.HARMONICS[axes]
+    for name in harmonics:
+        if name != "solar":
+            yield f"level of {name}", _LEVEL
+    for name in harmonics:
+        yield f"drift of {name}", _DRIFT
+    for name, multiples in harmonics.items():
+        for n in multiples:
+            yield f"amplitude of {name} {n}", (_AMPLITUDE[0] / n, _AMPLITUDE[1])
+    for name in harmonics:
+        yield f"wander of {name} over amplitude", _SHARE
+    yield "white", _WHITE
+
+
+def forces(logarithms: jax.Array, axes: str) -> tuple[dict[str, Force], jax.Array]:
+    """Return the small forces, and the dispersion of white noise; the logarithms (d,) may be traced."""
+    value = dict(zip(names(axes), jnp.exp(logarithms), strict=True))
+    harmonics = orbits.HARMONICS[axes]
+    amplitude = {name: [value[f"amplitude of {name} {n}"] for n in multiples] for name, multiples in harmonics.items()}
+    wander = {name: [value[f"wander of {name} over amplitude"] * one for one in own]
+              for name, own in amplitude.items()}
+    level: dict[str, Any] = {"solar": _SUNLIGHT} | {
+        name: value[f"level of {name}"] for name in harmonics if name != "solar"}
+    drift = {name: value[f"drift of {name}"] for name in harmonics}
+    return orbits.small_forces(axes, amplitude, wander, drift, level), value["white"]

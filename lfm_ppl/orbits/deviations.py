@@ -1,0 +1,108 @@
+"""Small departures from a known orbit: a linear latent force model, far cheaper than the satellite itself."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lfm_ppl import checks
+from lfm_ppl.forces import Force
+from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.observation import Gaussian
+from lfm_ppl.orbits import frames
+from lfm_ppl.orbits.deterministic import Orbit, propagate
+from lfm_ppl.orbits.environment import Environment
+from lfm_ppl.orbits.satellite import Motion, pushed, wide_start
+from lfm_ppl.orbits.table import Table
+
+
+class Neighbourhood(eqx.Module):
+    """How the acceleration changes near an orbit, with place, velocity and small forces: the dynamics of `departure`.
+
+    Attributes:
+        path: (T, 6) position (km) and velocity (km/h) on the orbit, at the times it was made for.
+        slopes: table of the derivatives (3, 6 + R) of the acceleration by position, velocity and small forces.
+        on_orbit: (R,) the small forces on the orbit itself: sunlight of constant amplitude, and nothing else.
+        axes: of the small forces.
+    """
+
+    path: jax.Array
+    slopes: Table
+    on_orbit: jax.Array
+    axes: str = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, environment: Environment, orbit: Orbit, times: Any, axes: str = "DYB", nodes: int = 2
+           ) -> Neighbourhood:
+        """Tabulate along an orbit.
+
+        Args:
+            environment: what surrounds the satellite.
+            orbit: where it is at the first of the times, and the sunlight's amplitude.
+            times: (T,) hours, equally spaced.
+            axes: of the small forces, "DYB" or "RTN".
+            nodes: of the table from one time to the next. It is cubic between them, so that the edges of the Earth's
+                shadow are about half a node wide.
+
+        Raises:
+            ValueError: unknown axes; times as for `propagate`.
+        """
+        checks.one_of("axes", axes, tuple(frames.AXES))
+        checks.positive_integer("nodes", nodes)
+        times = np.asarray(times, float)
+        fine = np.interp(np.arange(nodes * (len(times) - 1) + 1) / nodes, np.arange(len(times)), times)
+        path = propagate(environment, orbit, fine)
+        on_orbit = jnp.zeros(3 if axes == "DYB" else 4).at[0].set(orbit.solar)
+        slopes = _slopes(Motion(environment, axes), jnp.asarray(path), on_orbit, jnp.asarray(fine))
+        return cls(jnp.asarray(path[::nodes]), Table(fine[0], fine[1] - fine[0], slopes), on_orbit, axes)
+
+    def __call__(self, x: jax.Array, u: jax.Array, t: Any) -> jax.Array:
+        """Return the derivatives (6,) of a departure x (6,) under the small forces u (R,)."""
+        slopes = self.slopes(t).reshape(3, -1)
+        return jnp.concatenate([x[3:], slopes[:, :6] @ x + slopes[:, 6:] @ (u - self.on_orbit)])
+
+
+@jax.jit
+def _slopes(motion: Motion, path: jax.Array, u: jax.Array, times: jax.Array) -> jax.Array:
+    def one(inputs: tuple[jax.Array, jax.Array]) -> jax.Array:
+        x, t = inputs
+        by_state, by_force = jax.jacfwd(motion.acceleration, argnums=(0, 1))(x, u, t)
+        return jnp.concatenate([by_state, by_force], axis=1).ravel()
+
+    return jax.lax.map(one, (path, times))
+
+
+def departure(near: Neighbourhood, forces: Mapping[str, Force], white: Any = 0.0, noise_sd: Any = 5e-5,
+              start: Gaussian | None = None, units: Mapping[str, str] | None = None) -> LatentForceModel:
+    """Return the departure from an orbit as a latent force model, linear and with coefficients that depend on time.
+
+        d(dr) = dv dt,    d(dv) = (A(t) dr + B(t) dv + C(t) (u - u_0)) dt + white dB,    y_k = dr(t_k) + e_k,
+
+    with A, B and C the derivatives of the acceleration on the orbit and u_0 the forces there. It is what `satellite`
+    is for small departures, with steps thirty times as long: a departure changes as slowly as the orbit turns, and
+    one step of a quarter of an hour is good to 1e-6 of it. What it leaves out is of the order of the departure
+    squared over the radius, 0.4 mm for 100 m. Observations are positions less `near.path`.
+
+    Args:
+        near: an orbit and what is around it.
+        forces: as for `satellite`.
+        white: as for `satellite`.
+        noise_sd: standard deviation of a coordinate's error (km).
+        start: departure at the first time; None: wide about none.
+        units: name -> unit.
+
+    Raises:
+        ValueError: a wrong number of forces.
+
+    Example:
+        >>> near = Neighbourhood.of(environment, orbit, times)  # doctest: +SKIP
+        >>> model = departure(near, small_forces("DYB"))  # doctest: +SKIP
+        >>> lfm.smooth(model, times, positions - near.path[:, :3], lfm.Taylor(), steps=1)  # doctest: +SKIP
+    """
+    start = wide_start(jnp.zeros(6)) if start is None else start
+    return pushed(near, start, forces, near.axes, white, noise_sd, units)
