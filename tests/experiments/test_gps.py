@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from lfm_ppl import orbits
 from lfm_ppl.experiments import output
 from lfm_ppl.experiments.catalogue import Wanted
-from lfm_ppl.experiments.gps import experiment, figures, learning, prediction, problem, report
+from lfm_ppl.experiments.gps import experiment, figures, learning, magnitudes, prediction, problem, report, ways
 
 TIMES = 0.25 * np.arange(960)
 
@@ -29,12 +30,99 @@ def data(monkeypatch):
     return found
 
 
-def test_one_task_a_satellite_and_the_alternatives_of_the_first(data):
-    names = [task.name for task in experiment.plan(experiment.Settings(data="folder", alternatives=2))]
-    assert names == ["predict/G01", "predict/G02", "predict/G04", "learn/G01", "learn/G02", "online/G01"]
+def learnt(value=0.0):
+    """Result of a first task, all logarithms alike."""
+    return {"orbit": np.arange(8.0), "logarithms": np.full(len(magnitudes.names("DYB")), value), "cpu_s": 1.0}
+
+
+def test_each_satellite_is_learnt_then_predicted_with_what_all_have_in_common(data):
+    settings = experiment.Settings(data="folder", alternatives=2)
+    first = experiment.plan(settings)
+    assert [task.name for task in first] == ["learn/G01", "learn/G02", "learn/G04"]
+    assert first[0].settings["train_days"] == 3.0 and first[0].settings["positions"] == first[1].settings["positions"]
+    assert first[2].settings["positions"] is None  # it will be refused
+    second = experiment.plan_predictions(settings, {"G01": learnt(), "G02": learnt()}, first)
+    assert [task.name for task in second] == ["predict/G01", "predict/G02", "ways/G01", "ways/G02", "online/G01"]
+    mean, sd = second[0].settings["prior"]
+    assert (mean, sd) == tuple(values.tolist() for values in magnitudes.wide("DYB"))  # two do not say what is common
+    assert np.allclose(second[-1].settings["windows"], [[5.0, 5.25], [7.0, 7.25]], atol=0.01)
     few = experiment.plan(experiment.Settings(data="folder", satellites=("G02",), alternatives=0))
-    assert [task.name for task in few] == ["predict/G02"]
-    assert few[0].settings["train_days"] == 3.0 and len(few[0].settings["candidates"]) == len(problem.CANDIDATES)
+    assert [task.name for task in few] == ["learn/G02"]
+
+
+def test_other_positions_are_another_task(data):
+    before = experiment.plan(experiment.Settings(data="folder"))[0].settings["positions"]
+    data.positions["G01"][7, 1] += 1e-6
+    assert experiment.plan(experiment.Settings(data="folder"))[0].settings["positions"] != before
+
+
+def test_common_magnitudes_are_the_mean_and_the_scatter_of_the_satellites():
+    several = [np.full(21, value) for value in (-2.0, -1.0, 0.0, 1.0, 2.0)]
+    mean, sd = magnitudes.common(several, "DYB")
+    assert np.allclose(mean, 0.0) and np.allclose(sd, np.sqrt(2.0))
+    assert np.allclose(magnitudes.common([np.zeros(21)] * 5, "DYB").sd, 0.5)
+    assert magnitudes.common(several[:4], "DYB").mean is not mean and np.allclose(
+        magnitudes.common(several[:4], "DYB").mean, magnitudes.wide("DYB").mean)
+
+
+@pytest.mark.parametrize(("axes", "size", "states"), [("DYB", 21, 27), ("RTN", 34, 1 + 15 + 15 + 21)])
+def test_magnitudes_become_forces(axes, size, states):
+    names = magnitudes.names(axes)
+    assert len(names) == size == len(set(names))
+    vector = np.log(np.arange(1.0, size + 1))
+    forces, white = magnitudes.forces(vector, axes)
+    assert sum(force.state_dim for force in forces.values()) == states and float(white) == pytest.approx(size)
+    force = forces["panel" if axes == "DYB" else "radial"]
+    value = dict(zip(names, np.exp(vector), strict=True))
+    name = "panel" if axes == "DYB" else "radial"
+    level, first = force.forces[0], force.forces[1]
+    assert float(level.initial_sd) == pytest.approx(value[f"level of {name}"])
+    assert float(level.scale) == pytest.approx(value[f"drift of {name}"])
+    assert float(first.scale) == pytest.approx(value[f"amplitude of {name} 1"])
+    assert float(first.noise) == pytest.approx(value[f"amplitude of {name} 1"]
+                                               * value[f"wander of {name} over amplitude"])
+
+
+def test_target_of_a_normal_evidence_has_its_mode_and_its_covariance():
+    centre, precision = np.array([1.0, -2.0]), np.array([[4.0, 1.0], [1.0, 3.0]])
+    prior = magnitudes.Prior(np.array([0.5, 0.5]), np.array([2.0, 0.5]))
+
+    def evidence(z):
+        return -0.5 * (z - centre) @ precision @ (z - centre), -precision @ (z - centre)
+
+    target = learning.Target(evidence, prior)
+    total = precision + np.diag(prior.sd**-2)
+    mode = np.linalg.solve(total, precision @ centre + prior.mean / prior.sd**2)
+    assert target.mode() == pytest.approx(mode, abs=1e-5)
+    draws = target.draws(mode, 20_000)
+    covariance = np.linalg.inv(total)
+    # The standard error of a variance is sqrt(2/N) of it.
+    assert np.abs(np.cov(draws.T) - covariance).max() < 4 * np.sqrt(2 / 20_000) * covariance.max()
+    assert np.abs(draws.mean(axis=0) - mode).max() < 4 * np.sqrt(covariance.max() / 20_000)
+
+
+def test_where_positions_say_nothing_the_prior_is_left():
+    prior = magnitudes.Prior(np.array([0.5, -1.0]), np.array([2.0, 0.5]))
+    target = learning.Target(lambda z: (0.0, np.zeros(2)), prior)
+    assert target.mode() == pytest.approx(prior.mean)
+    assert np.cov(target.draws(prior.mean, 20_000).T) == pytest.approx(np.diag(prior.sd**2), abs=0.16)
+
+
+def test_a_breakdown_turns_the_search_back():
+    def evidence(z):
+        value = -0.5 * float(z @ z) if z[0] > -1.0 else np.nan
+        return value, -z
+    target = learning.Target(evidence, magnitudes.Prior(np.array([4.0]), np.array([100.0])))
+    assert target.mode() == pytest.approx([0.0], abs=1e-2)
+
+
+def test_log_density_of_errors():
+    random = np.random.default_rng(0)
+    root = random.normal(size=(5, 3, 3))
+    error, covariance = random.normal(size=(5, 3)), root @ root.transpose(0, 2, 1)
+    expected = [stats.multivariate_normal.logpdf(e, cov=c + problem.NOISE**2 * np.eye(3))
+                for e, c in zip(error, covariance, strict=True)]
+    assert np.asarray(learning.log_density(error, covariance)) == pytest.approx(np.array(expected), rel=1e-10)
 
 
 def test_what_is_asked_must_be_there(data):
@@ -49,7 +137,7 @@ def test_what_is_asked_must_be_there(data):
     with pytest.raises(ValueError, match="axes"):
         experiment.Settings(axes="XYZ")
     few = experiment.plan(experiment.quick(data="folder"))
-    assert [task.name for task in few] == ["predict/G01", "predict/G02", "learn/G01", "online/G01"]
+    assert [task.name for task in few] == ["learn/G01", "learn/G02"]
     with pytest.raises(ValueError, match="train_days"):
         experiment.Settings(train_days=-1.0)
     with pytest.raises(ValueError, match="does not take --realisations"):
@@ -81,8 +169,7 @@ def result(scale, eclipsed=False, complete=True):
     return {"times": TIMES, "train": 288, "residual": 1e-3, "solar": 100.0, "eclipsed": eclipsed, "complete": complete,
             "fitted": error, "latest": 0.5 * error, "lfm": 0.1 * error, "sd": error, "coverage": 0.9,
             "forces": np.zeros((960, 3)), "forces_sd": np.ones((960, 3)), "seen": np.zeros((960, 3)),
-            "force_names": np.array(["solar", "panel", "remaining"]), "scores": np.zeros(24),
-            "held_out": np.full(24, 1e-3), "candidate": 3, "log_likelihood": 0.0, "cpu_s": 1.0}
+            "force_names": np.array(["solar", "panel", "remaining"]), "logarithms": np.zeros(21), "cpu_s": 1.0}
 
 
 def test_tables():
@@ -90,7 +177,8 @@ def test_tables():
     each = experiment.satellites(results)
     assert each.loc["G02", "deterministic"] == pytest.approx(20.0 * np.sqrt(3))
     assert each.loc["G02", "LFM radial"] == pytest.approx(2.0) and each.loc["G02", "ratio"] == pytest.approx(0.1)
-    assert each.loc["G01", "amplitude"] == problem.CANDIDATES[3].amplitude
+    sizes = experiment.magnitudes_of(results, magnitudes.wide("DYB"), "DYB")
+    assert sizes.loc["amplitude of panel 2", "common"] == pytest.approx(0.05) and (sizes["G01"] == 1.0).all()
     together = experiment.pooled(results)
     assert list(together.index) == ["without gaps", "without gaps, never in shadow", "without gaps, in shadow",
                                     "with gaps"]
@@ -123,10 +211,11 @@ def test_figures():
 
 
 def test_table_of_the_ways_to_learn():
-    ways = {"error": 1e-3 * np.array([1.0, 4.0, 3.0, 2.0]), "coverage": np.full(4, 0.9)}
-    table = learning.table({"G01": ways, "G02": ways})
-    assert table.loc["marginal likelihood", "error"] == pytest.approx(4.0) and list(table.index) == list(learning.WAYS)
-    assert learning.table({}).empty
+    one = {"error": 1e-3 * np.arange(1.0, 6.0), "coverage": np.full(5, 0.9)}
+    table = ways.table({"G01": one, "G02": one})
+    assert table.loc["marginal likelihood, mode", "error"] == pytest.approx(3.0)
+    assert list(table.index) == list(ways.WAYS)
+    assert ways.table({}).empty
 
 
 @pytest.mark.slow
@@ -137,7 +226,44 @@ def test_a_simulated_satellite_is_predicted_better_with_its_forces(tmp_path):
     found = experiment.run(settings, tmp_path)
     row = found.satellites.loc[problem.SIMULATED[0]]
     assert row["LFM"] < 0.3 * row["deterministic"] and 0.6 < row["coverage"] <= 1.0
-    assert len(found.learning) == 4
+    assert len(found.learning) == len(ways.WAYS)
     again = experiment.run(settings, tmp_path)
     assert again.satellites.drop(columns="CPU s").equals(found.satellites.drop(columns="CPU s"))
     assert {path.name for path in experiment.save(found, tmp_path)} >= {"satellites.csv", "pooled.md", "all.png"}
+
+
+@pytest.fixture(scope="module")
+def satellite():
+    """A day of a simulated satellite, learnt from its first eighteen hours."""
+    pytest.importorskip("erfa", reason="needs the extra gps")
+    data = problem.arcs(None)
+    return problem.Arc(data.environment, data.times[:96], data.positions[problem.SIMULATED[0]][:96], 72)
+
+
+@pytest.mark.slow
+def test_departures_are_predicted_as_the_satellite_itself(satellite):
+    """The linear model of departures, in steps thirty times as long, against the filter of the satellite."""
+    one, axes = satellite, "DYB"
+    orbit = orbits.fit_orbit(one.environment, one.times[:one.train], one.positions[:one.train])
+    near = prediction.surroundings(one, orbit, axes)
+    vector = magnitudes.wide(axes).mean
+    mean, covariance = prediction.filter_positions(one, orbit, vector, axes, one.learnt())
+    found = prediction.predict(one, near, vector[None])
+    after = slice(one.train, None)
+    sd = np.sqrt(np.diagonal(covariance[after], axis1=1, axis2=2))
+    assert np.abs(found.state[after, :3] - mean[after]).max() < 2e-2 * sd.min()
+    assert np.abs(found.covariance[after] / covariance[after] - 1)[:, [0, 1, 2], [0, 1, 2]].max() < 1e-2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("axes", ["DYB", "RTN"])
+def test_the_slope_of_what_is_held_out_is_that_of_differences(satellite, axes):
+    one = satellite
+    orbit = orbits.fit_orbit(one.environment, one.times[:one.train], one.positions[:one.train])
+    target = learning.held_out(learning.training(one, orbit, axes), magnitudes.wide(axes))
+    point = target.prior.mean + 0.1
+    _, slope = target.evidence(point)
+    for index in (0, 3, len(point) // 2, len(point) - 1):
+        step = 1e-4 * np.eye(len(point))[index]
+        difference = (target.evidence(point + step)[0] - target.evidence(point - step)[0]) / 2e-4
+        assert slope[index] == pytest.approx(difference, rel=1e-4, abs=1e-5)

@@ -135,3 +135,39 @@ def test_start_of_an_orbit_from_positions(around):
         holes[missing] = np.nan
         with pytest.raises(ValueError, match=message):
             orbits.start_near(TIMES, holes)
+
+
+def test_departures_follow_two_orbits_that_differ_a_little(around):
+    """The linear model against the difference of two paths, whose start and sunlight differ."""
+    first = orbits.Orbit(0.0, START, 100.0, 0.0)
+    change = np.array([2e-3, -1e-3, 3e-3, 1e-3, -2e-3, 1e-3])
+    other = orbits.propagate(around, orbits.Orbit(0.0, START + change, 102.0, 0.0), TIMES)
+    near = orbits.Neighbourhood.of(around, first, TIMES, nodes=8)
+    forces = {"solar": lfm.Constant(1e-9, mean=102.0), "panel": lfm.Constant(1e-9), "remaining": lfm.Constant(1e-9)}
+    model = orbits.departure(near, forces, start=lfm.Gaussian(jnp.asarray(change), jnp.zeros((6, 6))))
+    nothing = np.full((len(TIMES), 3), np.nan)
+    nothing[0] = change[:3]
+    for steps, error in ((2, 1e-3), (4, 1e-4)):
+        found = lfm.filter(model, TIMES, nothing, rule=lfm.Taylor(), steps=steps).filtered_mean[:, :6]
+        apart = other - np.asarray(near.path)
+        assert np.abs(found - apart).max() < error * np.abs(apart).max()
+
+
+def test_neighbourhood_says_what_is_wrong(around):
+    orbit = orbits.Orbit(0.0, START, 100.0, 0.0)
+    with pytest.raises(ValueError, match="axes"):
+        orbits.Neighbourhood.of(around, orbit, TIMES, axes="XYZ")
+    with pytest.raises(ValueError, match="equally spaced"):
+        orbits.Neighbourhood.of(around, orbit, TIMES[[0, 1, 3]])
+    near = orbits.Neighbourhood.of(around, orbit, TIMES, axes="RTN", nodes=8)
+    with pytest.raises(ValueError, match="axes RTN has 4 forces"):
+        orbits.departure(near, orbits.small_forces("DYB"))
+
+
+def test_small_forces_take_one_magnitude_for_each_oscillation():
+    forces = orbits.small_forces("DYB", {name: [1.0, 2.0, 3.0, 4.0] for name in ("solar", "panel", "remaining")},
+                                 {name: [0.1] * 4 for name in ("solar", "panel", "remaining")},
+                                 {"solar": 0.1, "panel": 0.2, "remaining": 0.3},
+                                 {"solar": 10.0, "panel": 1.0, "remaining": 2.0})
+    assert [float(force.scale) for force in forces["panel"].forces] == pytest.approx([0.2, 1.0, 2.0, 3.0, 4.0])
+    assert float(forces["remaining"].forces[0].initial_sd) == 2.0
