@@ -27,8 +27,12 @@ def choices(name):
     return [dict(zip(listed, values, strict=True)) for values in itertools.product(*listed.values())]
 
 
+COSTLY = ("gps",)
+"""Models whose other variants take long to compile; these are run with -m slow."""
+
 CASES = [
-    pytest.param(name, options, id="-".join([name, *map(str, options.values())]))
+    pytest.param(name, options, id="-".join([name, *map(str, options.values())]),
+                 marks=[pytest.mark.slow] if name in COSTLY and options != choices(name)[0] else [])
     for name in MODELS
     for options in choices(name)
 ]
