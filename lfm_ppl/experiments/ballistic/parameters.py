@@ -26,7 +26,7 @@ from lfm_ppl.experiments.tasks import Result, Task
 from lfm_ppl.experiments.timing import timed
 from lfm_ppl.inference.optimise import Minimum, Objective, newton, quasi_newton
 
-START = np.log([5e-4, 30.0, 5.0])
+START = np.log([5e-4, 50.0, 5.0])
 """Where every search starts: the prior medians."""
 
 FREEDOM = (3, 5)

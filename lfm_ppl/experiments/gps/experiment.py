@@ -112,7 +112,7 @@ def plan_predictions(settings: Settings, learnt: Mapping[str, Result], tasks: li
     """
     data = problem.arcs(settings.data, settings.seed)
     prior = magnitudes.common([one["logarithms"] for one in learnt.values()], settings.axes)
-    usable = [{**task.settings, "orbit": [float(value) for value in learnt[name]["orbit"]],
+    usable = [{**task.settings, "orbit": learnt[name]["orbit"].tolist(), "alone": learnt[name]["logarithms"].tolist(),
                "prior": [values.tolist() for values in prior]}
               for task in tasks if (name := task.settings["satellite"]) in learnt]
     found = [Task(f"predict/{one['satellite']}", settings.seed, one) for one in usable]
@@ -142,7 +142,7 @@ def compute(task: Task) -> Result:
     if task.name.startswith("ways/"):
         return ways.compare(one, paths, asked["axes"], prior, task.key)
     target = learning.held_out(learning.training(one, orbit, asked["axes"]), prior)
-    mode = target.mode()
+    mode = target.mode(np.array(asked["alone"]))
     if task.name.startswith("online/"):
         try:
             return _online(one, orbit, mode, asked)
