@@ -156,6 +156,7 @@ def _add_compare(commands: Any) -> None:
     command.add_argument("--data", metavar="FOLDER", help="gps: SP3 files to read (default: simulated satellites)")
     command.add_argument("--satellites", nargs="+", metavar="NAME", help="gps: as in G05 G20 (default: all)")
     command.add_argument("--train-days", type=_positive, metavar="D", help="gps: days to learn from (default: 3)")
+    command.add_argument("--axes", metavar="AXES", help="gps: of the small forces, DYB (Sun-oriented, default) or RTN")
     command.add_argument("--seed", type=_whole(0), default=0, help="random seed of everything (default: 0)")
     command.add_argument("--quick", action="store_true", help="few and small: it shows that it runs, and no more")
     command.add_argument(

@@ -31,7 +31,7 @@ def run(arguments: argparse.Namespace) -> int:
         folder, arguments.realisations, arguments.conditional, arguments.seed, arguments.quick, arguments.overwrite,
         None if arguments.quiet else lambda line: print(line, file=sys.stderr, flush=True),
         arguments.jobs or min(available_cpus(), _MOST_JOBS), arguments.data,
-        tuple(arguments.satellites) if arguments.satellites else None, arguments.train_days))
+        tuple(arguments.satellites) if arguments.satellites else None, arguments.train_days, arguments.axes))
     for title, table in found.tables.items():
         print(f"\n{title}\n{tables.text_table(table, width=shutil.get_terminal_size().columns)}")
     print(f"\ntime     {duration(time.perf_counter() - started)}")

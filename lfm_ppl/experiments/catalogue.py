@@ -33,6 +33,7 @@ class Wanted(NamedTuple):
         data: a folder of files, where the experiment reads some; None: it makes its own data.
         satellites: names, where the experiment has satellites; None: all.
         train_days: days to learn from, where the experiment predicts those after them; None: its own.
+        axes: of small forces, where the experiment has them; None: its own.
     """
 
     folder: Path
@@ -46,13 +47,14 @@ class Wanted(NamedTuple):
     data: str | None = None
     satellites: tuple[str, ...] | None = None
     train_days: float | None = None
+    axes: str | None = None
 
     def counts(self, **names: str) -> dict[str, Any]:
         """Return the seed, and what a user gave, under the names that the experiment's settings have.
 
         Args:
-            names: ``realisations``, ``conditional``, ``data``, ``satellites`` and ``train_days``, where the experiment
-                has them -> name in its settings.
+            names: ``realisations``, ``conditional``, ``data``, ``satellites``, ``train_days`` and ``axes``, where the
+                experiment has them -> name in its settings.
 
         Raises:
             ValueError: something is given that the experiment does not have.
@@ -61,7 +63,7 @@ class Wanted(NamedTuple):
             >>> Wanted(Path("out"), realisations=10).counts(realisations="datasets")
             {'seed': 0, 'datasets': 10}
         """
-        choices = ("realisations", "conditional", "data", "satellites", "train_days")
+        choices = ("realisations", "conditional", "data", "satellites", "train_days", "axes")
         given = {name: value for name in choices if (value := getattr(self, name)) is not None}
         for name in given:
             if name not in names:

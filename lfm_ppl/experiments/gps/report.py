@@ -20,14 +20,14 @@ def run(wanted: Wanted) -> Report:
         FileNotFoundError: there are no files.
     """
     make = experiment.quick if wanted.quick else experiment.Settings
-    settings = make(**wanted.counts(data="data", satellites="satellites", train_days="train_days"))
+    settings = make(**wanted.counts(data="data", satellites="satellites", train_days="train_days", axes="axes"))
     found = experiment.run(settings, wanted.folder, overwrite=wanted.overwrite, report=wanted.report,
                            workers=wanted.workers)
     written = experiment.save(found, wanted.folder)
     shown = {"Errors after training (m), pooled over satellites, and 95% coverage": scores.readable(found.pooled),
              "Each satellite: root mean square errors after training (m)": _few(found.satellites)}
     if len(found.learning):
-        shown["Ways to choose the magnitudes of the forces: error after training (m)"] = scores.readable(found.learning)
+        shown["Ways to learn the magnitudes of the forces: error after training (m)"] = scores.readable(found.learning)
     if found.refused:
         shown["Left out"] = pd.DataFrame({"reason": found.refused})
     return Report(shown, written)
