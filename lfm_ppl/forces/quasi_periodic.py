@@ -10,7 +10,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from lfm_ppl import checks
-from lfm_ppl.forces.basis import Basis, Eigenfunctions, spectrum, waves
+from lfm_ppl.forces.basis import Basis, Eigenfunctions, Waves, spectrum, waves
 from lfm_ppl.forces.constant import Constant
 from lfm_ppl.forces.parameters import mean_parameter
 from lfm_ppl.forces.periodic_kernels import Kernel
@@ -71,9 +71,7 @@ class QuasiPeriodic(Force):
 
     def __init__(self, kernel: Kernel, evolution: Force, functions: int | None = None, gamma: float = 0.01,
                  mean: Any = 0.0, points: int = _POINTS):
-        if not isinstance(kernel, Kernel):
-            raise TypeError(f"kernel must be a periodic kernel such as lfm.PeriodicMatern, got {kernel!r}. Wrap a "
-                            "function k(t, s) in lfm.PeriodicKernel.")
+        _check_kernel(kernel)
         if not isinstance(evolution, Force):
             raise TypeError("evolution must be lfm.CQM, lfm.SQM, lfm.WQM or a force of scale 1, got "
                             f"{type(evolution).__name__}.")
@@ -155,6 +153,10 @@ class QuasiPeriodic(Force):
         """Raise NotImplementedError."""
         raise NotImplementedError(f"a {type(self).__name__} force has no spectral density in closed form; use "
                                   "`covariance`.")
+
+    def covariance_in_model(self, t: ArrayLike, s: ArrayLike, initial_time: ArrayLike) -> jax.Array:
+        """Return the product of the two kernels in a model that starts at ``initial_time``."""
+        return self.kernel(t, s) * self.evolution.covariance_in_model(t, s, initial_time)
 
     @property
     def jump_times(self) -> tuple[float, ...]:
@@ -241,17 +243,39 @@ def significant_functions(kernel: Kernel, gamma: float = 0.01, points: int = _PO
                      "larger gamma or a longer lengthscale, or give functions.")
 
 
+def stationary_basis(kernel: Kernel, functions: int | None, gamma: float) -> Waves:
+    """Return the level and the pairs of a stationary kernel, as many as were asked for or are significant.
+
+    Raises:
+        TypeError, ValueError: as `QuasiPeriodic`; a kernel that is not stationary.
+    """
+    _check_kernel(kernel)
+    if not kernel.stationary:
+        raise ValueError(f"the kernel {kernel.name!r} is not stationary, so its eigenfunctions are not oscillations of "
+                         "one frequency each; use lfm.Periodic or lfm.QuasiPeriodic.")
+    if functions is None:
+        functions = significant_functions(kernel, gamma)
+    checks.positive_integer("functions", functions, "It is the number of eigenfunctions.")
+    if functions % 2 == 0:
+        raise ValueError("functions must be odd for a stationary kernel, one constant and pairs of cosine and "
+                         f"sine; got {functions}. Take {functions - 1} or {functions + 1}.")
+    return waves(kernel, functions // 2)
+
+
 def _basis(kernel: Kernel, functions: int | None, gamma: float, points: int) -> Basis:
+    if kernel.stationary:
+        return stationary_basis(kernel, functions, gamma)
     if functions is None:
         functions = significant_functions(kernel, gamma, points)
     checks.positive_integer("functions", functions, "It is the number of eigenfunctions.")
-    if kernel.stationary:
-        if functions % 2 == 0:
-            raise ValueError("functions must be odd for a stationary kernel, one constant and pairs of cosine and "
-                             f"sine; got {functions}. Take {functions - 1} or {functions + 1}.")
-        return waves(kernel, functions // 2)
     if functions > points:
         raise ValueError(f"functions must be at most points = {points}, got {functions}; take more points.")
     if not checks.traced(kernel):
         spectrum(kernel, points)
     return Eigenfunctions(kernel, functions, points)
+
+
+def _check_kernel(kernel: Kernel) -> None:
+    if not isinstance(kernel, Kernel):
+        raise TypeError(f"kernel must be a periodic kernel such as lfm.PeriodicMatern, got {kernel!r}. Wrap a "
+                        "function k(t, s) in lfm.PeriodicKernel.")
