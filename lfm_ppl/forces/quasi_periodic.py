@@ -158,6 +158,14 @@ class QuasiPeriodic(Force):
         """Return the product of the two kernels in a model that starts at ``initial_time``."""
         return self.kernel(t, s) * self.evolution.covariance_in_model(t, s, initial_time)
 
+    def check_span(self, name: str, first: float, last: float) -> None:
+        """Check that a cycle is not longer than the data, where the period is known."""
+        period = checks.concrete(self.period)
+        if period is not None and period > (last - first) * (1 + 1e-9):
+            raise ValueError(f"the force {name!r} has a period of {float(period):g}, longer than the data, which span "
+                             f"{last - first:g} from {first:g} to {last:g}: nothing repeats in them. Check the unit of "
+                             "the period, or take lfm.Matern.")
+
     @property
     def jump_times(self) -> tuple[float, ...]:
         """The change points of the evolution."""

@@ -169,6 +169,13 @@ class Force(eqx.Module):
         count = len(self.jump_times)
         raise IndexError(f"{type(self).__name__} has {count} jumps, so none at index {index}.")
 
+    def check_span(self, name: str, first: float, last: float) -> None:
+        """Check the force against data from ``first`` to ``last``; all is well by default.
+
+        Raises:
+            ValueError: nothing can be learned from such data, for example about a period longer than they are.
+        """
+
     def __add__(self, other: "Force") -> "Force":
         """Return the force that is the sum of two independent forces."""
         # The sum is itself a force, so its module imports this one.

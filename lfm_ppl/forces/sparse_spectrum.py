@@ -17,7 +17,7 @@ from lfm_ppl.forces.periodic_kernels import Kernel
 from lfm_ppl.forces.sde import Force
 from lfm_ppl.forces.squared_exponential import SquaredExponential
 
-_HARMONICS = 1024
+_HARMONICS = 512
 
 
 class SparseSpectrum(Force):

@@ -176,6 +176,11 @@ class Sum(Force):
         """Return the sum of the closed-form spectral densities."""
         return functools.reduce(jnp.add, [f.spectral_density(omega) for f in self.forces])
 
+    def check_span(self, name: str, first: float, last: float) -> None:
+        """Check every term."""
+        for force in self.forces:
+            force.check_span(name, first, last)
+
     @property
     def jump_times(self) -> tuple[float, ...]:
         """All times at which a term jumps."""
