@@ -30,8 +30,9 @@ class QuasiPeriodic(Force):
     with the leading eigenfunctions phi_j of the periodic kernel, their eigenvalues mu_j, and any process for the
     weights: `CQM`, `SQM`, `WQM`, or another force of scale 1, such as a Matern force of any order. At no lag does the
     covariance miss more than the eigenvalues left out. Where those above 1/100 of the largest are kept, as by default,
-    that is less than 0.01 of the variance for the periodic squared exponential and the periodic Matern of order 2 or
-    more, but up to 0.02 for order 1 and 0.07 for order 0: these need more functions, that is a smaller gamma.
+    that is less than 0.01 of the variance for the periodic squared exponential and for order 2 of the periodic Matern,
+    or 0.02 at lengthscales where a pair is only just left out; 0.022 for order 1 and 0.07 for order 0. Rough kernels
+    need more functions, that is a smaller gamma.
 
     A stationary kernel has the Fourier series ``sum_j q_j cos(2 pi j t / D)``, whose coefficients are integrals of
     the kernel, so that no eigen-decomposition is needed; each pair turns in its state and the force has constant
@@ -185,7 +186,7 @@ class Periodic(QuasiPeriodic):
 
     The phi_j are the leading eigenfunctions of a periodic kernel, the mu_j their eigenvalues; `QuasiPeriodic` says how
     they are found and how many are needed. At the default gamma the covariance of a periodic Matern force of order 0 is
-    0.07 of the variance off, that of order 2 and that of a periodic squared exponential less than 0.01.
+    0.07 of the variance off, that of order 2 and that of a periodic squared exponential mostly less than 0.01.
 
     Args:
         kernel: a periodic kernel, such as `PeriodicMatern`.
