@@ -5,7 +5,12 @@ The mean number L of customers in the queue follows the fluid approximation of a
     dL/dt = -Omega(t) L / (1 + L) + zeta(t),    y_k = L(t_k) + e_k,    e_k ~ N(0, noise_sd^2),
 
 where Omega is the known service rate, a number or an `lfm.Input`, and zeta the unknown rate of arrivals. At
-zeta = rho Omega < Omega it settles at L = rho / (1 - rho). The option `link` says what the force u does:
+zeta = rho Omega < Omega it settles at L = rho / (1 - rho): a few more arrivals make a much longer queue. The state is
+therefore x = log(1 + L), in which Gaussians do far better,
+
+    dx/dt = (zeta - Omega (1 - exp(-x))) exp(-x),    log(1 + y_k) ~ N(x(t_k), noise_sd^2 exp(-2 x(t_k))),
+
+with readings below zero as zero. The option `link` says what the force u does:
 
     linear       zeta = u, which may be negative: customers who hang up
     softplus     zeta = log(1 + exp(u)) customers per minute, never negative
@@ -22,9 +27,10 @@ and the option `force` what u is: its mean, plus
 `memory` is the number of cycles over which cycles stay alike: correlations fall by e, or variances double.
 
 Times are minutes of opening hours, joined day to day from the first opening on, so that cycles begin at the multiples
-of the period. A short queue settles within seconds, which no observation shows and explicit integration has to follow;
-the rate at which it settles, r = Omega / (1 + L)^2, is therefore bounded: to r / (1 + FASTEST r). Below zero, where
-only the tails of the filter's Gaussians lie, L / (1 + L) goes on as L.
+of the period. A data file has a column `queue` of customers, or a column `log queue` of log(1 + customers). A short
+queue settles within seconds, which no reading shows and explicit integration has to follow; the rate
+r = Omega exp(-2 x) at which it settles is therefore bounded, to r / (1 + FASTEST r). Below zero, where only the tails
+of the filter's Gaussians lie, exp(-x) goes on as exp(-|x|), and L / (1 + L) = 1 - exp(-x) as an odd function.
 
 The default data are three days of 14 hours at Omega = 10 per minute, the queue read every 40 minutes.
 
@@ -35,6 +41,7 @@ nonstationary queues, IEEE INFOCOM (1996).
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import warnings
 from collections.abc import Callable
@@ -50,8 +57,9 @@ import lfm_ppl as lfm
 
 LINKS = ("linear", "softplus")
 FORCES = ("sqm", "cqm", "wqm", "periodic", "matern", "resonator")
-OUTPUTS = ("queue",)
-UNITS = {"time": "min", "queue": "customers", "arrivals": "customers/min"}
+OUTPUTS = None
+LOG_QUEUE, QUEUE = "log queue", "queue"
+UNITS = {"time": "min", "arrivals": "customers/min"}
 OPTIONS = {
     "link": ("linear", LINKS, "the rate of arrivals as a function of the force"),
     "force": ("sqm", str, f"what the force is: {', '.join(FORCES)}"),
@@ -145,18 +153,21 @@ def build(mean, scale, noise_sd, lengthscale=None, memory=None, force="sqm", lin
     _check_service(omega)
 
     def dynamics(x, u, t):
-        length = jnp.maximum(x, 0.0)
-        busy = jnp.where(x > 0, length / (1.0 + length), x)
+        free = jnp.exp(-jnp.abs(x))  # the share of time in which nobody waits
         rate = jax.nn.softplus(u) if link == "softplus" else u
-        return (rate - omega(t) * busy) / (1.0 + fastest * omega(t) / (1.0 + length) ** 2)
+        settling = omega(t) * free**2
+        return (rate - omega(t) * jnp.sign(x) * (1.0 - free)) * free / (1.0 + fastest * settling)
+
+    def variance(x, u, t):
+        return (noise_sd * jnp.exp(-x)) ** 2
 
     return lfm.LatentForceModel(
         dynamics=dynamics,
         forces={"arrivals": arrivals(force, mean, scale, lengthscale, memory, period, functions, cycles)},
-        observation=lfm.GaussianObservation(lambda x, u, t: x, noise_sd**2 * jnp.ones(1)),
-        initial_state=lfm.Gaussian(jnp.ones(1), jnp.ones(1)),
-        state_names=OUTPUTS,
-        output_names=OUTPUTS,
+        observation=lfm.GaussianObservation(lambda x, u, t: x, variance),
+        initial_state=lfm.Gaussian(0.5 * jnp.ones(1), 0.25 * jnp.ones(1)),
+        state_names=(LOG_QUEUE,),
+        output_names=(LOG_QUEUE,),
         units=units,
     )
 
@@ -166,7 +177,7 @@ def model(times, y=None, link="linear", force="sqm", service=10.0, period=840.0,
 
     Args:
         times: of the readings, minutes of opening hours from the first opening on, shape (T,).
-        y: number of customers, shape (T, 1); NaN is missing, None draws from the prior predictive.
+        y: log(1 + customers), shape (T, 1); NaN is missing, None draws from the prior predictive.
         link: one of LINKS.
         force: one of FORCES.
         service: the rate Omega, a number or an `lfm.Input` (customers/min).
@@ -215,10 +226,25 @@ def simulate(seed: int = 0, link: str = "linear", force: str = "sqm", service: f
     return lfm.Data(
         times=grid[::10],
         y=np.asarray(drawn.y)[::10],
-        outputs=OUTPUTS,
+        outputs=(LOG_QUEUE,),
         units=UNITS,
         truth={"times": grid, "forces": drawn.forces, "state": drawn.state, "parameters": truth},
     )
+
+
+def prepare(data: lfm.Data) -> lfm.Data:
+    """Take the logarithm log(1 + customers) of readings, readings below zero as zero.
+
+    Raises:
+        ValueError: there is neither a column `queue` nor a column `log queue`, or there are others.
+    """
+    if data.outputs == (LOG_QUEUE,):
+        return data
+    if data.outputs != (QUEUE,):
+        raise ValueError(f"the call centre takes one column, `{QUEUE}` (customers) or `{LOG_QUEUE}` (log(1 + "
+                         f"customers)); got {', '.join(data.outputs)}. Name it with --outputs.")
+    note = f"The readings are taken as log(1 + {QUEUE}), those below zero as zero."
+    return dataclasses.replace(data, y=np.log1p(np.maximum(data.y, 0.0)), outputs=(LOG_QUEUE,), note=note)
 
 
 @functools.cache

@@ -43,9 +43,6 @@ TRAINING = np.arange(0.0, TRAIN * DAY - 1e-9, EVERY)
 READ = np.concatenate([TRAINING, np.arange(TRAIN * DAY, (TRAIN + 1) * DAY - 1e-9, RARELY)])
 """Times of readings: of training, and of all four days."""
 
-_FINE_STEPS = 3
-"""Integration steps between two times of `GRID`: as long as those of the model."""
-
 
 class Window(NamedTuple):
     """Three days to learn from and one to track, at both service rates of it.
@@ -54,7 +51,7 @@ class Window(NamedTuple):
         date: of the test day.
         arrivals: (672,) true rate in each five minutes (customers/min).
         queues: name in `TESTED` -> (673,) true number of customers on `GRID`.
-        y: name in `TESTED` -> (673, 1) readings, NaN where there is none.
+        y: name in `TESTED` -> (673, 1) readings as log(1 + customers), NaN where there is none; those below zero as zero.
     """
 
     date: np.datetime64
@@ -64,7 +61,7 @@ class Window(NamedTuple):
 
     @property
     def training(self) -> np.ndarray:
-        """Readings (63, 1) at the times `TRAINING`, alike for both service rates."""
+        """Readings (63, 1) as log(1 + customers) at the times `TRAINING`, alike for both service rates."""
         return self.y["constant"][np.isin(GRID, TRAINING)]
 
 
@@ -111,7 +108,8 @@ def window(data: str | None, weekday: str, index: int, seed: int = 0) -> Window:
     arrivals = rate * own.calls[index:index + TRAIN + 1].ravel()
     errors = NOISE * np.random.default_rng([seed, index]).normal(size=len(GRID))
     queues = {name: counts.queue(arrivals, service(rates)) for name, rates in TESTED.items()}
-    y = {name: np.where(np.isin(GRID, READ), path + errors, np.nan)[:, None] for name, path in queues.items()}
+    y = {name: np.log1p(np.maximum(np.where(np.isin(GRID, READ), path + errors, np.nan), 0.0))[:, None]
+         for name, path in queues.items()}
     return Window(own.dates[index + TRAIN], arrivals, queues, y)
 
 
@@ -154,7 +152,7 @@ def log_densities(method: Method, z: jax.Array, y: jax.Array) -> tuple[jax.Array
     Args:
         method: the model of the arrivals.
         z: logarithms (P,) of its parameters.
-        y: (63, 1) readings.
+        y: (63, 1) logarithms of the readings.
     """
     values = dict(zip(method.names, jnp.exp(z), strict=True))
     seeded = handlers.seed(handlers.substitute(model_file().model, data=values), jax.random.key(0))

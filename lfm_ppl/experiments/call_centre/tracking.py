@@ -2,7 +2,8 @@
 
 Tracking is filtering: at every five minutes of the test day the queue and the rate of arrivals are estimated from the
 readings up to then, so that the longest prediction is one of three hours. The parameters are those most likely given
-the training, and stay.
+the training, and stay. The model's state is x = log(1 + L) with the queue L, so that L has a shifted log-normal
+distribution: its median is the estimate, its quantiles are the bands.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ METHODS = {"SQM": "sqm", "CQM": "cqm", "WQM": "wqm", "periodic": "periodic", "Ma
 QUASI = ("SQM", "CQM", "WQM")
 
 LIMITS = {"mean": (1.0, 6.0, 30.0), "scale": (0.1, 2.0, 30.0), "lengthscale": (10.0, 150.0, 10_000.0),
-          "memory": (0.2, 10.0, 10_000.0), "noise_sd": (0.05, 0.5, 5.0)}
+          "memory": (0.2, 10.0, 10_000.0), "noise_sd": (0.01, 0.5, 5.0)}
 """Parameter -> least value, where the search starts, and largest value."""
 
 STEPS = 3
@@ -60,7 +61,7 @@ def learn(method: Method, y: np.ndarray) -> Learnt:
 
     Args:
         method: the model of the arrivals.
-        y: (63, 1) readings of the training.
+        y: (63, 1) logarithms of the readings of the training.
     """
     low, start, high = np.log([LIMITS[name] for name in method.names]).T
     energy = _energy(method)
@@ -86,16 +87,20 @@ class Tracked(NamedTuple):
     """What a filter says on `GRID`.
 
     Attributes:
-        queue: (T,) mean number of customers.
-        queue_sd: (T,).
+        log_queue: (T,) mean of log(1 + customers).
+        log_queue_sd: (T,).
         arrivals: (T,) mean rate of arrivals (customers/min).
         arrivals_sd: (T,).
     """
 
-    queue: np.ndarray
-    queue_sd: np.ndarray
+    log_queue: np.ndarray
+    log_queue_sd: np.ndarray
     arrivals: np.ndarray
     arrivals_sd: np.ndarray
+
+    def queue(self, deviations: float = 0.0) -> np.ndarray:
+        """Return customers (T,), so many standard deviations above the median."""
+        return np.expm1(np.maximum(self.log_queue + deviations * self.log_queue_sd, 0.0))
 
 
 def track(method: Method, z: np.ndarray, y: np.ndarray, tested: tuple[float, float]) -> Tracked:
@@ -104,7 +109,7 @@ def track(method: Method, z: np.ndarray, y: np.ndarray, tested: tuple[float, flo
     Args:
         method: the model of the arrivals.
         z: logarithms of its parameters.
-        y: (673, 1) readings on `GRID`, NaN where there is none.
+        y: (673, 1) logarithms of readings on `GRID`, NaN where there is none.
         tested: service rates in the halves of the test day.
     """
     found = _tracker(method)(jnp.asarray(z), jnp.asarray(y), jnp.asarray(tested))
@@ -162,12 +167,14 @@ def judge(found: Tracked, one: Window, name: str) -> dict[str, float]:
         ``rmse`` and ``coverage`` of the 95% bands, of the queue and (``rate_``) of the arrivals; ``ell``, the log
         density of the true queue, summed over these times; and ``largest``, the longest true queue.
     """
-    test = slice(FIRST + 1, None)
+    test, z = slice(FIRST + 1, None), scores.Z
     queue, arrivals = one.queues[name][test], one.arrivals[FIRST:]
-    mean, sd, rate, rate_sd = (np.asarray(part)[test] for part in found)
-    z = scores.Z
-    return {"rmse": scores.rmse(mean, queue), "coverage": scores.covered(mean - z * sd, mean + z * sd, queue),
-            "ell": float(stats.norm(mean, sd).logpdf(queue).sum()), "rate_rmse": scores.rmse(rate, arrivals),
+    # The density of L is that of x = log(1 + L) times dx/dL = exp(-x).
+    x, rate, rate_sd = np.log1p(queue), found.arrivals[test], found.arrivals_sd[test]
+    density = stats.norm(found.log_queue[test], found.log_queue_sd[test]).logpdf(x) - x
+    return {"rmse": scores.rmse(found.queue()[test], queue),
+            "coverage": scores.covered(found.queue(-z)[test], found.queue(z)[test], queue),
+            "ell": float(density.sum()), "rate_rmse": scores.rmse(rate, arrivals),
             "rate_coverage": scores.covered(rate - z * rate_sd, rate + z * rate_sd, arrivals),
             "largest": float(queue.max())}
 
