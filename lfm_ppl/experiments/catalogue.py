@@ -15,7 +15,8 @@ _MODULES = {"ginzburg-landau": "lfm_ppl.experiments.ginzburg_landau.report",
             "gps": "lfm_ppl.experiments.gps.report",
             "transcription": "lfm_ppl.experiments.transcription.report",
             "transcription-parameters": "lfm_ppl.experiments.transcription.parameters_report",
-            "ballistic": "lfm_ppl.experiments.ballistic.report"}
+            "ballistic": "lfm_ppl.experiments.ballistic.report",
+            "call-centre": "lfm_ppl.experiments.call_centre.report"}
 
 
 class Wanted(NamedTuple):

@@ -25,8 +25,12 @@ DAY = BIN * OPEN
 _STEPS = 100
 """Runge-Kutta steps for one count: the queue is right to 1e-6 customers at a service rate of 15 per minute."""
 
-_WARNED = 2.0
+WARNED = 2.0
 """Hours for which more customers may come than are served before a warning says so."""
+
+
+class OverloadWarning(UserWarning):
+    """More customers come than are served, for hours."""
 
 
 class Counts(NamedTuple):
@@ -86,7 +90,8 @@ def read(path: str | Path) -> Counts:
     short = counts != OPEN
     if short.any() or not (whole == kept).all() or not len(dates):
         what = f"{dates[short][0]} has {counts[short][0]}" if short.any() else "some are at other times or missing"
-        raise ValueError(f"{path}: every day needs {OPEN} counts, one for each five minutes from 7:00 to 21:00; {what}.")
+        raise ValueError(f"{path}: every day needs {OPEN} counts, one for each five minutes from 7:00 to 21:00; "
+                         f"{what}.")
     return Counts(dates, calls[kept].reshape(len(dates), OPEN))
 
 
@@ -118,6 +123,11 @@ def simulated(days: int, seed: int = 0) -> Counts:
     return Counts(dates, calls.astype(float))
 
 
+def overload(arrivals: np.ndarray, service: np.ndarray) -> float:
+    """Return the hours in which more customers come than are served."""
+    return BIN / 60.0 * float((arrivals > service).sum())
+
+
 def queue(arrivals: Any, service: Any, start: float = 0.0) -> np.ndarray:
     """Return the mean number of customers at the ends of all counts, with the given rates as the truth.
 
@@ -135,7 +145,7 @@ def queue(arrivals: Any, service: Any, start: float = 0.0) -> np.ndarray:
         ValueError: rates or a start that are negative or not finite.
 
     Warns:
-        UserWarning: more customers come than are served for over two hours, all in all.
+        OverloadWarning: more customers come than are served for over two hours, all in all.
 
     Example:
         >>> f"{queue(np.full(60, 5.0), 10.0)[-1]:.4f}"
@@ -147,9 +157,10 @@ def queue(arrivals: Any, service: Any, start: float = 0.0) -> np.ndarray:
         checks.finite(name, values)
         if np.min(values, initial=0.0) < 0:
             raise ValueError(f"{name} must not be negative, got {np.min(values):g}.")
-    over = BIN / 60.0 * float((zeta > omega).sum())
-    if over > _WARNED:
-        warnings.warn(f"more customers come than are served for {over:.1f} h; the queue grows meanwhile.", stacklevel=2)
+    over = overload(zeta, omega)
+    if over > WARNED:
+        warnings.warn(f"more customers come than are served for {over:.1f} h; the queue grows meanwhile.",
+                      OverloadWarning, stacklevel=2)
     h, path = BIN / _STEPS, [float(start)]
     length = path[0]
     for a, b in zip(zeta.tolist(), omega.tolist(), strict=True):

@@ -51,7 +51,8 @@ class Window(NamedTuple):
         date: of the test day.
         arrivals: (672,) true rate in each five minutes (customers/min).
         queues: name in `TESTED` -> (673,) true number of customers on `GRID`.
-        y: name in `TESTED` -> (673, 1) readings as log(1 + customers), NaN where there is none; those below zero as zero.
+        y: name in `TESTED` -> (673, 1) readings as log(1 + customers), NaN where there is none; those below zero as
+            zero.
     """
 
     date: np.datetime64
