@@ -106,15 +106,14 @@ def arrivals(force, mean, scale, lengthscale, memory, period, functions, cycles)
     """
     if force not in FORCES:
         raise ValueError(f"force must be one of {', '.join(FORCES)}, got {force!r}.")
-    if not period > 0:
-        raise ValueError(f"period must be positive, got {period:g} min. Give the length of a cycle.")
+    _check_period(period)
     if force == "matern":
         return lfm.Matern(scale, lengthscale, order=0, mean=mean)
     if force == "resonator":
-        spread = [scale / k for k in range(1, functions // 2 + 1)]
-        noises = [sd / jnp.sqrt(memory * period) for sd in spread]
-        waves = [lfm.Resonator(period / (k + 1), sd, noises[k]) for k, sd in enumerate(spread)]
-        return functools.reduce(lambda a, b: a + b, waves, lfm.Constant(scale, mean=mean))
+        waves: lfm.Force = lfm.Constant(scale, mean=mean)
+        for k in range(1, functions // 2 + 1):
+            waves = waves + lfm.Resonator(period / k, scale / k, scale / k / jnp.sqrt(memory * period))
+        return waves
     # A short distance in time is pi / period times as long on the circle.
     kernel = lfm.PeriodicMatern(scale, lengthscale * np.pi / period, period, order=0)
     if force == "periodic":
@@ -188,6 +187,7 @@ def model(times, y=None, link="linear", force="sqm", service=10.0, period=840.0,
     Raises:
         ValueError: as `build`; a period that is longer than the data.
     """
+    _check_period(period)
     last = float(np.max(times))
     if force != "matern" and period > last:
         raise ValueError(f"period is {period:g} min, but the data end after {last:g}: nothing repeats in them. Give "
@@ -254,6 +254,12 @@ def _simulator(link: str, force: str, service: float, period: float, functions: 
     system = build(**parameters, force=force, link=link, service=service, period=period, functions=functions)
     grid = np.arange(0.0, DAYS * period + 1e-9, INTERVAL / 10)
     return jax.jit(lambda key: lfm.simulate(key, system, grid, steps=4))
+
+
+def _check_period(period: float) -> None:
+    """Raise for a period that is not positive."""
+    if not period > 0:
+        raise ValueError(f"period must be positive, got {period:g} min. Give the length of a cycle.")
 
 
 def _check_service(omega: Any) -> None:

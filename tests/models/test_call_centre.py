@@ -31,7 +31,7 @@ def test_the_drift_is_that_of_the_fluid_equation(link):
 
 
 def test_a_known_rate_gives_a_known_queue():
-    """A force without variance: the filter's mean is the solution, through overload and a change of the service rate."""
+    """A force without variance: the mean is the solution, through overload and a change of the service rate."""
     m = own()
     service = lfm.Input([0.0, 300.0], [10.0, 5.0])
     system = m.build(7.0, 1e-6, 0.5, 200.0, force="matern", service=service, fastest=0.0)
@@ -48,22 +48,27 @@ def test_a_known_rate_gives_a_known_queue():
     np.testing.assert_allclose(np.expm1(found.predicted_mean[:, 0]), path, rtol=1e-4)
 
 
-@pytest.mark.parametrize("force", ["cqm", "wqm", "periodic", "matern", "resonator"])
-def test_every_force_gives_a_density_of_its_parameters(force):
-    m, file = own(), loading.load("call-centre")
-    data = file.simulate()
-    values = {name: value for name, value in m.TRUTH.items() if name in m.names(force)}
-    site = likelihood_site(file.model, (data.times,), {"force": force, "functions": 3}, jax.random.key(0), values)
-    system = site.example.model
-    moved = {"cqm": 1 + 3, "wqm": 1 + 3, "periodic": 1 + 3, "matern": 2, "resonator": 1 + 3}
-    assert site.example.ssm.state_dim == moved[force]
-    assert len(system.force_list[0].jump_times) == (2 if force == "wqm" else 0)
-    assert np.isfinite(site.example.log_prob(data.y))
+@pytest.mark.parametrize(("force", "variance"), [("cqm", 1.0), ("wqm", 1.2), ("periodic", 1.0), ("matern", 1.0),
+                                                 ("resonator", 2.1)])
+def test_every_force_has_the_covariance_that_is_said(force, variance):
+    """At a distance of two cycles, and at one time: as shares of scale^2; eigenfunctions left out may miss a little."""
+    m = own()
+    values = {"mean": 6.0, "scale": 2.0, "lengthscale": 400.0, "memory": 10.0}
+    values |= dict.fromkeys(set(values) - set(m.names(force)))
+    found = m.arrivals(force, **values, period=840.0, functions=41 if force != "resonator" else 3, cycles=4)
+    assert found.mean_at(0.0) == 6.0
+    late, early = 1800.0, 120.0
+    expected = {"cqm": np.exp(-0.2), "wqm": 1.0, "periodic": 1.0, "matern": np.exp(-4.2), "resonator": 2.0}[force]
+    spread = {"resonator": 2.0 + late / 8400.0 / 2.0}.get(force, variance)
+    assert found.covariance(late, late) / 4.0 == pytest.approx(spread, abs=0.05)
+    assert found.covariance(late, early) / 4.0 == pytest.approx(expected, abs=0.05)
+    assert len(found.jump_times) == (3 if force == "wqm" else 0)
 
 
 def test_steps_of_two_minutes_are_short_enough():
     m, data = own(), loading.load("call-centre").simulate()
-    system = m.build(**m.TRUTH, functions=5)
+    values = {name: m.TRUTH[name] for name in m.names("matern")}
+    system = m.build(**values, force="matern")
     coarse, fine = (float(lfm.MarginalLikelihood(system, data.times, steps=steps).log_prob(data.y))
                     for steps in (m.STEPS, 5 * m.STEPS))
     assert coarse == pytest.approx(fine, abs=0.02)

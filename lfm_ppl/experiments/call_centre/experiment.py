@@ -65,7 +65,8 @@ class Settings:
 
 def quick(**given: Any) -> Settings:
     """Return settings that show in a few minutes that everything runs, and no more."""
-    return Settings(**{"days": 2, "methods": ("SQM", "Matern"), "functions": 7, "draws": 60, "mixed": 5} | given)
+    small: dict[str, Any] = {"days": 2, "methods": ("SQM", "Matern"), "functions": 7, "draws": 60, "mixed": 5}
+    return Settings(**small | given)
 
 
 class Comparison(NamedTuple):
@@ -90,7 +91,7 @@ class Comparison(NamedTuple):
 
 def all_tasks(settings: Settings) -> list[Task]:
     """Return every task."""
-    return [*posterior.tasks(settings), *tracking.tasks(settings)]
+    return [*tracking.tasks(settings), *posterior.tasks(settings)]
 
 
 def compute(task: Task) -> Result:

@@ -45,7 +45,9 @@ def compute(task: Task) -> Result:
         for both tests, with its name before it, the entries of `judge` (N,); for the first window the smoothed
         arrivals ``shapes`` and ``shapes_sd`` (673,), given all readings, at the most likely parameters.
     """
-    method, rows, first = tracking.method_of(task), [], {}
+    method = tracking.method_of(task)
+    rows: list[dict[str, Any]] = []
+    first: Result = {}
     for index, one in enumerate(tracking.windows_of(task)):
         (draws, weights) = posterior(method, one.training, task.settings["draws"], task.seed + index)
         weight = np.exp(weights.log_weight[0])
