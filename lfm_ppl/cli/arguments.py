@@ -134,6 +134,7 @@ def _add_compare(commands: Any) -> None:
         "  lfm-ppl compare transcription --datasets 10\n"
         "  lfm-ppl compare gps --data shared/data/gps --satellites G05 G20 --train-days 3\n"
         "  lfm-ppl compare ballistic --runs 20 --jobs 2\n"
+        "  lfm-ppl compare call-centre --data shared/data/calls\n"
         "  lfm-ppl compare ginzburg-landau --realisations 50 --conditional 200 --out double-well"
     )
     help_ = "run a published experiment again, or go on with one that was stopped; without a name, list them"
@@ -153,7 +154,7 @@ def _add_compare(commands: Any) -> None:
         metavar="N",
         help="ginzburg-landau: data sets for the conditional posteriors of single parameters (default: 100)",
     )
-    command.add_argument("--data", metavar="FOLDER", help="gps: SP3 files to read (default: simulated satellites)")
+    command.add_argument("--data", metavar="FOLDER", help="gps: SP3 files, call-centre: counts (default: simulated)")
     command.add_argument("--satellites", nargs="+", metavar="NAME", help="gps: as in G05 G20 (default: all)")
     command.add_argument("--train-days", type=_positive, metavar="D", help="gps: days to learn from (default: 3)")
     command.add_argument("--axes", metavar="AXES", help="gps: of the small forces, DYB (Sun-oriented, default) or RTN")

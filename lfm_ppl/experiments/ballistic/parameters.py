@@ -11,12 +11,11 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import stats
 
 from lfm_ppl.analysis import importance
 from lfm_ppl.experiments import scores
@@ -24,16 +23,11 @@ from lfm_ppl.experiments.ballistic import problem
 from lfm_ppl.experiments.ballistic.tracking import blocks, judged
 from lfm_ppl.experiments.tasks import Result, Task
 from lfm_ppl.experiments.timing import timed
+from lfm_ppl.experiments.weighting import Weighted, moments, weighted
 from lfm_ppl.inference.optimise import Minimum, Objective, newton, quasi_newton
 
 START = np.log([5e-4, 50.0, 5.0])
 """Where every search starts: the prior medians."""
-
-FREEDOM = (3, 5)
-"""Degrees of freedom of the first and the second t distribution."""
-
-WIDER = (1.2, 1.05)
-"""How much wider they are than the curvature and the weighted moments say."""
 
 LEVELS = (0.5, 0.8, 0.95)
 FURTHEST = 3.0
@@ -121,44 +115,6 @@ def estimate(target: problem.Target, count: int, paths: int, seed: int) -> Resul
         "draws": draws[importance.resample(weights.log_weight, count, seed)].T,
         **judged("likely", plain[0], plain[1], target),
         **judged("posterior", np.stack([one[0] for one in total]), np.stack([one[1] for one in total]), target)}
-
-
-class Weighted(NamedTuple):
-    """Draws (D, 3) with their importance weights."""
-
-    draws: np.ndarray
-    weights: importance.Importance
-
-
-def weighted(log_density: Callable[[np.ndarray], np.ndarray], mode: Minimum, count: int, seed: int) -> Weighted:
-    """Return weighted draws of a density.
-
-    Args:
-        log_density: of draws (count, 3).
-        mode: of the density.
-        count: draws that are returned; a third as many go before them.
-        seed: of the draws.
-
-    Raises:
-        ValueError: there is no curvature at the mode.
-    """
-    if mode.curvature is None:
-        raise ValueError("the posterior has no curvature at its mode; its derivatives there are not finite.")
-    generator = np.random.default_rng(seed)
-    centre, covariance = mode.point, mode.curvature.factor @ mode.curvature.factor.T
-    for freedom, wider, size in zip(FREEDOM, WIDER, (max(count // 3, 30), count), strict=True):
-        proposal = stats.multivariate_t(centre, wider**2 * covariance, df=freedom)
-        draws = proposal.rvs(size, random_state=generator)
-        log_ratio = log_density(draws) - proposal.logpdf(draws)
-        weights = importance.smooth(np.where(np.isfinite(log_ratio), log_ratio, -np.inf)[None])
-        centre, covariance = moments(draws, np.exp(weights.log_weight[0]))
-    return Weighted(draws, weights)
-
-
-def moments(draws: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean (3,) and covariance (3, 3) of draws (D, 3) with weights (D,) that sum to one."""
-    mean = weight @ draws
-    return mean, (draws - mean).T @ ((draws - mean) * weight[:, None])
 
 
 @dataclass

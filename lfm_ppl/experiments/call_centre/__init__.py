@@ -1,0 +1,4 @@
+"""Queues of a call centre, tracked through days whose arrivals nearly repeat.
+
+S. Reece and others, Efficient state-space inference of periodic latent force models, JMLR 15 (2014), section 8.
+"""

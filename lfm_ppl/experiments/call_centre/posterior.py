@@ -1,0 +1,126 @@
+"""The parameters integrated out: the posterior given the training, and what it adds to the most likely parameters.
+
+Draws of the posterior of the logarithms z under the model's priors are weighted draws, see
+`lfm_ppl.experiments.weighting`. Each tracks the test day; the estimates of all, mixed, stand for the prediction.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import special, stats
+
+from lfm_ppl.analysis import importance
+from lfm_ppl.experiments import scores
+from lfm_ppl.experiments.call_centre import problem, tracking
+from lfm_ppl.experiments.call_centre.problem import FIRST, TESTED, Method, Window
+from lfm_ppl.experiments.call_centre.tracking import Tracked
+from lfm_ppl.experiments.tasks import Result, Task
+from lfm_ppl.experiments.weighting import Weighted, weighted
+from lfm_ppl.inference.curvature import decompose, finite_difference_hessian
+from lfm_ppl.inference.optimise import Minimum
+
+_TOGETHER = 10
+_NOISE = 1e-7
+"""Relative error of a Hessian by differences."""
+
+
+def tasks(settings: Any) -> list[Task]:
+    """Return the task of the method whose parameters are integrated out."""
+    return [Task(f"posterior/{settings.integrated}", settings.seed, {
+        "experiment": "call-centre", "what": "posterior", "method": settings.integrated, "link": settings.link,
+        "functions": settings.functions, "draws": settings.draws, "mixed": settings.mixed, **settings.windows()})]
+
+
+def compute(task: Task) -> Result:
+    """Return what the posterior says of all windows.
+
+    Returns:
+        ``k``, the Pareto index, and ``ess`` of the weights (N,), ``posterior_mean`` and ``posterior_sd`` of z (N, P);
+        for both tests, with its name before it, the entries of `judge` (N,); for the first window the smoothed
+        arrivals ``shapes`` and ``shapes_sd`` (673,), given all readings, at the most likely parameters.
+    """
+    method = tracking.method_of(task)
+    rows: list[dict[str, Any]] = []
+    first: Result = {}
+    for index, one in enumerate(tracking.windows_of(task)):
+        (draws, weights) = posterior(method, one.training, task.settings["draws"], task.seed + index)
+        weight = np.exp(weights.log_weight[0])
+        mean = weight @ draws
+        row: dict[str, Any] = {"k": float(np.ravel(weights.k)[0]), "ess": float(np.ravel(weights.ess)[0]),
+                               "posterior_mean": mean, "posterior_sd": np.sqrt(weight @ (draws - mean) ** 2)}
+        chosen = draws[importance.resample(weights.log_weight, task.settings["mixed"], task.seed + index)]
+        for name, tested in TESTED.items():
+            found = [tracking.track(method, z, one.y[name], tested) for z in chosen]
+            row |= {f"{name}_{key}": value for key, value in judge(found, one, name).items()}
+        if not rows:
+            best = tracking.learn(method, one.training)
+            shape = tracking.shapes(method, best.z, one.y["constant"], TESTED["constant"])
+            first = {"shapes": shape.arrivals, "shapes_sd": shape.arrivals_sd}
+        rows.append(row)
+    return {**{key: np.array([row[key] for row in rows]) for key in rows[0]}, **first}
+
+
+def posterior(method: Method, y: np.ndarray, count: int, seed: int) -> Weighted:
+    """Return weighted draws (count, P) of z.
+
+    Args:
+        method: the model of the arrivals.
+        y: (63, 1) logarithms of the readings of the training.
+        count: draws that are weighted.
+        seed: of them.
+    """
+    learnt = tracking.learn(method, y, prior=1.0)
+    value_and_gradient = tracking.energy(method, y, 1.0)
+    hessian = finite_difference_hessian(lambda z: value_and_gradient(z)[1], learnt.z)
+    value, gradient = value_and_gradient(learnt.z)
+    mode = Minimum(learnt.z, value, decompose(hessian, _NOISE), 0.0, np.zeros_like(learnt.z), gradient)
+    density = _densities(method)
+    return weighted(lambda draws: np.asarray(density(jnp.asarray(draws), jnp.asarray(y))), mode, count, seed)
+
+
+@functools.cache
+def _densities(method: Method) -> Callable:
+    """Return log posterior densities of draws, compiled once for all windows."""
+    def one(z: jax.Array, y: jax.Array) -> jax.Array:
+        log_likelihood, log_prior = problem.log_densities(method, z, y)
+        return log_likelihood + log_prior
+
+    return jax.jit(lambda draws, y: jax.lax.map(lambda z: one(z, y), draws, batch_size=_TOGETHER))
+
+
+def judge(found: list[Tracked], one: Window, name: str) -> dict[str, float]:
+    """Return how good a mixture of estimates is, the same as `tracking.judge` of one."""
+    test = slice(FIRST + 1, None)
+    queue, arrivals = one.queues[name][test], one.arrivals[FIRST:]
+    mean, sd = (np.array([getattr(part, key)[test] for part in found]) for key in ("log_queue", "log_queue_sd"))
+    rate, rate_sd = (np.array([getattr(part, key)[test] for part in found]) for key in ("arrivals", "arrivals_sd"))
+    low, middle, high = np.expm1(np.maximum(quantiles(mean, sd, np.array([0.025, 0.5, 0.975])), 0.0))
+    rate_low, rate_high = quantiles(rate, rate_sd, np.array([0.025, 0.975]))
+    x = np.log1p(queue)
+    density = special.logsumexp(stats.norm(mean, sd).logpdf(x), axis=0) - np.log(len(found)) - x
+    return {"rmse": scores.rmse(middle, queue), "coverage": scores.covered(low, high, queue),
+            "ell": float(density.sum()), "rate_rmse": scores.rmse(rate.mean(axis=0), arrivals),
+            "rate_coverage": scores.covered(rate_low, rate_high, arrivals)}
+
+
+def quantiles(mean: np.ndarray, sd: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """Return quantiles (Q, K) of equal mixtures of normal distributions with mean and sd (S, K), by bisection.
+
+    Example:
+        >>> quantiles(np.array([[-1.0], [1.0]]), np.ones((2, 1)), np.array([0.5])).round(6).tolist()
+        [[0.0]]
+    """
+    shape = (len(p), mean.shape[1])
+    low = np.broadcast_to((mean - 10 * sd).min(axis=0), shape)
+    high = np.broadcast_to((mean + 10 * sd).max(axis=0), shape)
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        below = special.ndtr((middle[:, None] - mean) / sd).mean(axis=1) < p[:, None]
+        low, high = np.where(below, middle, low), np.where(below, high, middle)
+    return 0.5 * (low + high)

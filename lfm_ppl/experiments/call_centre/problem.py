@@ -1,0 +1,170 @@
+"""The problem: windows of four same weekdays, their queues and readings, and the model that tracks them."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpyro import handlers
+
+from lfm_ppl import loading
+from lfm_ppl.experiments.call_centre import counts
+from lfm_ppl.experiments.call_centre.counts import BIN, DAY, OPEN, Counts
+from lfm_ppl.inference.posterior import likelihood_site
+from lfm_ppl.model.known_input import Input
+
+UTILISATION = 0.7
+"""Mean rate of arrivals over all days, as a share of `SERVICE`: the queue of a middling Thursday then reaches some 25
+customers at that rate, as in the source's figure."""
+
+SERVICE = 10.0
+"""Service rate of training (customers/min)."""
+
+TESTED = {"constant": (10.0, 10.0), "changed": (15.0, 5.0)}
+"""Service rates in the two halves of the test day (customers/min)."""
+
+NOISE = 0.5
+"""Standard deviation of the error of a reading (customers); the source does not give its own."""
+
+TRAIN = 3
+EVERY, RARELY = 40.0, 180.0
+"""Minutes between readings, in training and on the test day."""
+
+GRID = BIN * np.arange((TRAIN + 1) * OPEN + 1)
+"""(673,) ends of all counts, in minutes."""
+
+FIRST = TRAIN * OPEN
+"""Index in `GRID` of the beginning of the test day."""
+
+TRAINING = np.arange(0.0, TRAIN * DAY - 1e-9, EVERY)
+READ = np.concatenate([TRAINING, np.arange(TRAIN * DAY, (TRAIN + 1) * DAY - 1e-9, RARELY)])
+"""Times of readings: of training, and of all four days."""
+
+
+class Window(NamedTuple):
+    """Three days to learn from and one to track, at both service rates of it.
+
+    Attributes:
+        date: of the test day.
+        arrivals: (672,) true rate in each five minutes (customers/min).
+        queues: name in `TESTED` -> (673,) true number of customers on `GRID`.
+        y: name in `TESTED` -> (673, 1) readings as log(1 + customers), NaN where there is none; those below zero as
+            zero.
+    """
+
+    date: np.datetime64
+    arrivals: np.ndarray
+    queues: dict[str, np.ndarray]
+    y: dict[str, np.ndarray]
+
+    @property
+    def training(self) -> np.ndarray:
+        """Readings (63, 1) as log(1 + customers) at the times `TRAINING`, alike for both service rates."""
+        return self.y["constant"][np.isin(GRID, TRAINING)]
+
+
+@functools.lru_cache(maxsize=4)
+def days(data: str | None, weekday: str, seed: int) -> tuple[Counts, float]:
+    """Return the days of one weekday, and the rate that one call of their counts stands for (customers/min).
+
+    Args:
+        data: folder or file of counts; None: simulated ones.
+        weekday: name of it.
+        seed: of the simulation.
+
+    Raises:
+        FileNotFoundError, ValueError: as `counts.read`; too few days.
+    """
+    everything = counts.simulated(34, seed) if data is None else counts.read(data)
+    own = everything if data is None else everything.on(weekday)
+    if len(own.dates) <= TRAIN:
+        raise ValueError(f"there are {len(own.dates)} days that are {weekday}; {TRAIN} to learn from and one to track "
+                         "are needed.")
+    return own, UTILISATION * SERVICE / float(everything.calls.mean())
+
+
+def windows(data: str | None, weekday: str, seed: int) -> int:
+    """Return the number of test days."""
+    return len(days(data, weekday, seed)[0].dates) - TRAIN
+
+
+def service(tested: tuple[float, float]) -> np.ndarray:
+    """Return the service rate (672,) in each five minutes of a window."""
+    return np.repeat([SERVICE, *tested], [FIRST, OPEN // 2, OPEN // 2])
+
+
+def window(data: str | None, weekday: str, index: int, seed: int = 0) -> Window:
+    """Return window ``index``: the days ``index`` to ``index + 3`` of a weekday.
+
+    Args:
+        data: folder or file of counts; None: simulated ones.
+        weekday: name of it.
+        index: from zero.
+        seed: of the errors of readings, and of the simulation.
+    """
+    own, rate = days(data, weekday, seed)
+    arrivals = rate * own.calls[index:index + TRAIN + 1].ravel()
+    errors = NOISE * np.random.default_rng([seed, index]).normal(size=len(GRID))
+    queues = {name: counts.queue(arrivals, service(rates)) for name, rates in TESTED.items()}
+    y = {name: np.log1p(np.maximum(np.where(np.isin(GRID, READ), path + errors, np.nan), 0.0))[:, None]
+         for name, path in queues.items()}
+    return Window(own.dates[index + TRAIN], arrivals, queues, y)
+
+
+class Method(NamedTuple):
+    """A model of the arrivals; options of the model file.
+
+    Attributes:
+        force: name there.
+        link: name there.
+        functions: of which a cycle is made.
+    """
+
+    force: str
+    link: str = "linear"
+    functions: int = 15
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The parameters; everything here is in their logarithms z."""
+        return _names(self)
+
+
+@functools.cache
+def model_file() -> loading.ModelFile:
+    """Return the shipped model."""
+    return loading.load("call-centre")
+
+
+@functools.cache
+def _names(method: Method) -> tuple[str, ...]:
+    with jax.ensure_compile_time_eval():
+        seeded = handlers.seed(model_file().model, jax.random.key(0))
+        trace = handlers.trace(seeded).get_trace(TRAINING, **method._asdict())
+    return tuple(name for name, site in trace.items() if site["type"] == "sample" and name != "y")
+
+
+def log_densities(method: Method, z: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return the log likelihood of the training and the log prior density of z.
+
+    Args:
+        method: the model of the arrivals.
+        z: logarithms (P,) of its parameters.
+        y: (63, 1) logarithms of the readings.
+    """
+    values = dict(zip(method.names, jnp.exp(z), strict=True))
+    seeded = handlers.seed(handlers.substitute(model_file().model, data=values), jax.random.key(0))
+    trace = handlers.trace(seeded).get_trace(TRAINING, **method._asdict())
+    prior = sum(trace[name]["fn"].log_prob(value) for name, value in values.items())
+    return trace["y"]["fn"].log_prob(y), prior + z.sum()
+
+
+def system(method: Method, z: jax.Array, tested: jax.Array) -> Any:
+    """Return the latent force model of a whole window, with service rates ``tested`` (2,) on the test day."""
+    values = dict(zip(method.names, jnp.exp(z), strict=True))
+    omega = Input([0.0, TRAIN * DAY, (TRAIN + 0.5) * DAY], jnp.concatenate([jnp.array([SERVICE]), tested]))
+    keywords = {**method._asdict(), "service": omega}
+    return likelihood_site(model_file().model, (GRID,), keywords, jax.random.key(0), values).example.model

@@ -1,0 +1,94 @@
+"""What was measured, in the form of the published tables and beside their numbers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from lfm_ppl.experiments.call_centre import posterior, tracking
+from lfm_ppl.experiments.scores import mean_of, pair
+from lfm_ppl.experiments.tasks import Result
+
+PUBLISHED = {
+    "constant": {"SQM": (4.6, 2.2, -146, 22), "CQM": (4.4, 1.3, -142, 15), "WQM": (1.8, 0.2, -139, 20),
+                 "periodic": (2.2, 0.4, -276, 60), "Matern": (10.6, 5.9, -209, 29)},
+    "changed": {"SQM": (7.2, 1.8, -183, 21), "CQM": (15.2, 4.0, -205, 24), "WQM": (3.3, 0.6, -152, 15),
+                "periodic": (5.7, 1.2, -725, 301), "Matern": (11.6, 1.1, -305, 49)},
+}
+"""Test -> method -> RMSE, its error, expected log likelihood, its error: tables 2 and 3 of the source."""
+
+INTEGRATED = "{}, parameters integrated out"
+
+
+def by_method(settings: Any, results: dict[str, Result]) -> dict[str, Result]:
+    """Return the results of tracking by method, and those with the parameters integrated out."""
+    found = {task.settings["method"]: results[task.name] for task in tracking.tasks(settings)}
+    for task in posterior.tasks(settings):
+        found[INTEGRATED.format(task.settings["method"])] = results[task.name]
+    return found
+
+
+def tracked(settings: Any, results: dict[str, Result], test: str) -> pd.DataFrame:
+    """Return one row for each method.
+
+    Args:
+        settings: of the experiment.
+        results: of its tasks.
+        test: "constant" or "changed".
+
+    Returns:
+        Means over test days, ``name se`` their standard errors, and what the source has: root mean squared error of
+        the queue over the ends of the day's 168 counts; the sum of the log densities of the true queue at these times
+        (ELL; the source does not give its number of times, so that only the order can be compared); coverage of 95%
+        bands; the same error and coverage of the arrivals; and the error relative to that of Matern, mean over mean.
+    """
+    rows = {}
+    found = by_method(settings, results)
+    reference = found.get("Matern")
+    for method, one in found.items():
+        row = pair("RMSE", mean_of(one[f"{test}_rmse"])) | pair("ELL", mean_of(one[f"{test}_ell"]))
+        row |= pair("coverage", mean_of(one[f"{test}_coverage"]))
+        row |= pair("RMSE arrivals", mean_of(one[f"{test}_rate_rmse"]))
+        row |= pair("coverage arrivals", mean_of(one[f"{test}_rate_coverage"]))
+        row["of Matern"] = np.nan if reference is None else float(
+            np.mean(one[f"{test}_rmse"]) / np.mean(reference[f"{test}_rmse"]))
+        values = PUBLISHED[test].get(method, (np.nan,) * 4)
+        rows[method] = row | dict(zip(("published RMSE", "published RMSE se", "published ELL", "published ELL se"),
+                                      map(float, values), strict=True))
+    return pd.DataFrame.from_dict(rows, orient="index")
+
+
+def gain(settings: Any, results: dict[str, Result]) -> pd.DataFrame:
+    """Return what integrating the parameters out adds to the most likely ones, day by day, one row a test.
+
+    Returns:
+        The gain in log density of a day's queue, ``days`` the share of days on which there is one, the RMSE as a share
+        of that of the most likely parameters, both coverages; the largest Pareto index and the least effective number
+        of the weighted draws.
+    """
+    found, rows = by_method(settings, results), {}
+    plain, whole = found[settings.integrated], found[INTEGRATED.format(settings.integrated)]
+    for test in ("constant", "changed"):
+        difference = whole[f"{test}_ell"] - plain[f"{test}_ell"]
+        rows[test] = pair("gain", mean_of(difference)) | {
+            "days": float(np.mean(difference > 0)),
+            "RMSE ratio": float(whole[f"{test}_rmse"].mean() / plain[f"{test}_rmse"].mean()),
+            "coverage, most likely": float(plain[f"{test}_coverage"].mean()),
+            "coverage, integrated": float(whole[f"{test}_coverage"].mean()),
+            "k": float(np.max(whole["k"])), "least ESS": float(np.min(whole["ess"]))}
+    return pd.DataFrame.from_dict(rows, orient="index")
+
+
+def learnt(settings: Any, results: dict[str, Result]) -> pd.DataFrame:
+    """Return the most likely parameters: medians over windows, the log likelihood, and CPU seconds of a window."""
+    rows = {}
+    for task in tracking.tasks(settings):
+        one = results[task.name]
+        names = tracking.method_of(task).names
+        rows[task.settings["method"]] = {
+            **dict(zip(names, np.exp(np.median(one["z"], axis=0)), strict=True)),
+            "log likelihood": float(np.mean(one["log_likelihood"])),
+            "evaluations": float(np.mean(one["evaluations"])), "CPU s": float(np.median(one["seconds"]))}
+    return pd.DataFrame.from_dict(rows, orient="index")

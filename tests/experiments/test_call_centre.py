@@ -1,0 +1,302 @@
+"""Queues of a call centre as an experiment: counts, the queue that they make, scores, tables and figures."""
+
+import dataclasses
+import os
+import warnings
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import integrate, special, stats
+
+from lfm_ppl.experiments import catalogue, scores
+from lfm_ppl.experiments.call_centre import counts, experiment, figures, posterior, problem, report, tables, tracking
+from lfm_ppl.experiments.tasks import write
+
+DATA = Path(os.environ.get("LFM_DATA", "../shared/data")) / "calls"
+real = pytest.mark.skipif(not DATA.is_dir(), reason="the counts of real calls are not there (LFM_DATA)")
+SMALL = experiment.Settings(days=2, methods=("SQM", "Matern"), functions=5, draws=40, mixed=3)
+
+
+def window(index=0, data=None):
+    """Return a window; that its queues grow is no news here."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", counts.OverloadWarning)
+        return problem.window(data, "Thursday", index)
+
+
+def written(path, change=lambda table: table):
+    """Write two days of counts as a file."""
+    times = [pd.Timestamp(day) + pd.Timedelta(minutes=5 * k + 420)
+             for day in ("2003-03-06", "2003-03-13") for k in range(169)]
+    table = pd.DataFrame({"DateTime": [t.strftime("%Y-%m-%dT%H:%M:%SZ") for t in times],
+                          "Calls": [str(k) for k in range(338)]})
+    change(table).to_csv(path)
+    return path
+
+
+def test_counts_are_read_day_by_day(tmp_path):
+    found = counts.read(written(tmp_path / counts.FILE))
+    assert found.dates.astype(str).tolist() == ["2003-03-06", "2003-03-13"]
+    np.testing.assert_array_equal(found.calls, [np.arange(168), 169 + np.arange(168)])
+    assert len(counts.read(tmp_path).on("Thursday").dates) == 2 and len(found.on("Friday").dates) == 0
+
+
+def set_cell(row, column, value):
+    def change(table):
+        table.loc[row, column] = value
+        return table
+
+    return change
+
+
+@pytest.mark.parametrize(("change", "message"), [
+    (lambda table: table.rename(columns={"Calls": "n"}), "no column 'Calls'; its columns are"),
+    (set_cell(3, "Calls", "-2"), "row 5, column 'Calls': expected a number of calls, zero or more, got '-2'"),
+    (set_cell(3, "Calls", "many"), "row 5, column 'Calls'.*'many'"),
+    (set_cell(7, "DateTime", "noon"), "row 9, column 'DateTime': expected a time.*'noon'"),
+    (set_cell(7, "DateTime", "2003-03-05T07:00:00Z"), "row 9.*a later time than before"),
+    (lambda table: table.drop(index=20), "2003-03-06 has 167"),
+])
+def test_counts_that_cannot_be_used(tmp_path, change, message):
+    with pytest.raises(ValueError, match=message):
+        counts.read(written(tmp_path / "calls.csv", change))
+    with pytest.raises(FileNotFoundError, match="there is no file"):
+        counts.read(tmp_path / "none")
+
+
+def test_the_queue_solves_its_equation():
+    """Against an adaptive method of order eight, five minutes at a time, through an overload."""
+    arrivals = np.random.default_rng(0).uniform(2.0, 14.0, 60)
+    service = np.repeat([15.0, 5.0, 10.0], 20)
+    with pytest.warns(counts.OverloadWarning, match="more customers come than are served for"):
+        found = counts.queue(arrivals, service)
+    expected = [0.0]
+    for zeta, omega in zip(arrivals, service, strict=True):
+        one = integrate.solve_ivp(lambda t, x: zeta - omega * x / (1 + x), (0, 5), expected[-1:],  # noqa: B023
+                                  method="DOP853", rtol=1e-11, atol=1e-12)
+        expected.append(one.y[0, -1])
+    np.testing.assert_allclose(found, expected, rtol=1e-7, atol=2e-6)
+
+
+def test_rates_must_not_be_negative():
+    with pytest.raises(ValueError, match="the service rate must not be negative, got -1"):
+        counts.queue(np.ones(3), -1.0)
+    with pytest.raises(ValueError, match="arrivals must not be negative"):
+        counts.queue(-np.ones(3), 1.0)
+
+
+@real
+def test_real_days_have_the_stated_utilisation():
+    everything = counts.read(DATA)
+    own, rate = problem.days(str(DATA), "Thursday", 0)
+    assert everything.calls.shape == (164, 168) and len(own.dates) == 34
+    assert rate * everything.calls.mean() == pytest.approx(7.0)
+    assert problem.windows(str(DATA), "Thursday", 0) == 31
+
+
+def test_a_window_has_its_readings_where_they_belong():
+    one = window(1)
+    assert one.arrivals.shape == (672,) and one.training.shape == (63, 1)
+    test = one.y["changed"][problem.FIRST:, 0]
+    np.testing.assert_array_equal(problem.GRID[problem.FIRST:][np.isfinite(test)], 2520.0 + 180.0 * np.arange(5))
+    np.testing.assert_array_equal(one.y["constant"][:problem.FIRST], one.y["changed"][:problem.FIRST])
+    read = np.isfinite(one.y["constant"][:, 0])
+    error = np.expm1(one.y["constant"][read, 0]) - one.queues["constant"][read]
+    assert 0.3 < np.std(error) < 0.7
+    np.testing.assert_array_equal(window(0).arrivals[168:], one.arrivals[:504])  # a window later is a week later
+
+
+@real
+def test_the_bound_on_settling_does_not_matter():
+    """Real queues with the bounded rate of the model, against the equation itself, in customers."""
+    fastest = 1.0
+    for index in (0, 10):
+        one = window(index, str(DATA))
+        for name, tested in problem.TESTED.items():
+            x, path, h = 0.0, [0.0], 0.25
+            for zeta, omega in zip(one.arrivals, problem.service(tested), strict=True):
+                for _ in range(20):
+                    def slope(x, zeta=zeta, omega=omega):
+                        free = np.exp(-x)
+                        return (zeta - omega * (1 - free)) * free / (1 + fastest * omega * free**2)
+                    k1 = slope(x)
+                    k2 = slope(x + 0.5 * h * k1)
+                    x += h * slope(x + 0.5 * h * (2 * k2 - k1) * 0.5 + 0.25 * h * k1)
+                path.append(x)
+            off = np.abs(np.expm1(path) - one.queues[name])[2:]
+            # Most of all where the queue is long and arrivals jump from one count to the next.
+            assert np.median(off) < 0.05 and np.max(off / (1.0 + one.queues[name][2:])) < 0.1
+
+
+def test_the_densities_are_those_of_the_model():
+    """The prior against scipy's; without any memory of the past a Matern force of known level gives a known queue."""
+    method, one = problem.Method("matern"), window()
+    assert method.names == ("mean", "scale", "lengthscale", "noise_sd")
+    z = np.log([6.5, 2.0, 100.0, 0.6])
+    log_likelihood, log_prior = problem.log_densities(method, jnp.asarray(z), jnp.asarray(one.training))
+    medians, spread = np.log([6.0, 2.0, 168.0, 0.5]), np.array([0.5, 0.7, 0.7, 0.7])
+    assert log_prior == pytest.approx(stats.norm(medians, spread).logpdf(z).sum(), rel=1e-12)
+    assert np.isfinite(log_likelihood)
+
+
+def test_the_gradient_is_that_of_finite_differences():
+    method, one = problem.Method("sqm", functions=3), window()
+    value_and_gradient = tracking.energy(method, one.training, 1.0)
+    z = np.log([6.5, 2.0, 150.0, 8.0, 0.8])
+    _, gradient = value_and_gradient(z)
+    steps = 1e-5 * np.eye(5)
+    expected = [(value_and_gradient(z + step)[0] - value_and_gradient(z - step)[0]) / 2e-5 for step in steps]
+    np.testing.assert_allclose(gradient, expected, rtol=1e-5, atol=1e-5)
+    learnt = tracking.learn(method, one.training)
+    assert -learnt.log_likelihood < tracking.energy(method, one.training, 0.0)(z)[0]
+
+
+def made_up(settings):
+    """Results of every task: bands that hold all, and errors that follow from the method."""
+    one, results = window(), {}
+    test = slice(problem.FIRST + 1, None)
+    for task in experiment.all_tasks(settings):
+        method = task.settings["method"]
+        names = tracking.method_of(task).names
+        worse = {"SQM": 1.0, "Matern": 3.0}.get(method, 2.0) * (0.9 if task.settings["what"] == "posterior" else 1.0)
+        found = {}
+        for name in problem.TESTED:
+            rmse = worse * (1.0 + 0.1 * np.arange(settings.days))
+            found |= {f"{name}_rmse": rmse, f"{name}_ell": -100.0 * rmse, f"{name}_rate_rmse": 0.1 * rmse,
+                      f"{name}_coverage": np.full(settings.days, 0.94),
+                      f"{name}_rate_coverage": np.full(settings.days, 0.9)}
+            if task.settings["what"] == "track":
+                x = np.log1p(one.queues[name])
+                found |= {f"{name}_log_queue": x, f"{name}_log_queue_sd": np.full(x.shape, 0.2),
+                          f"{name}_arrivals": np.append(0, one.arrivals), f"{name}_arrivals_sd": np.ones(x.shape)}
+        if task.settings["what"] == "track":
+            found |= {"z": np.zeros((settings.days, len(names))), "log_likelihood": np.full(settings.days, -50.0),
+                      "evaluations": np.full(settings.days, 40), "seconds": np.full(settings.days, 2.0)}
+        else:
+            found |= {"k": np.full(settings.days, 0.3), "ess": np.full(settings.days, 90.0),
+                      "posterior_mean": np.zeros((settings.days, len(names))),
+                      "posterior_sd": np.ones((settings.days, len(names))),
+                      "shapes": np.append(0, one.arrivals), "shapes_sd": np.ones(one.queues["constant"].shape)}
+        results[task.name] = found
+    assert test.start == 505
+    return results
+
+
+MADE = experiment.Settings(days=3, methods=("SQM", "periodic", "Matern"))
+
+
+def test_scores_are_those_of_the_log_normal_distribution():
+    one = window()
+    x = np.log1p(one.queues["constant"])
+    found = tracking.Tracked(x + 0.1, np.full(x.shape, 0.1), np.append(0, one.arrivals) + 0.2, np.full(x.shape, 0.05))
+    judged = tracking.judge(found, one, "constant")
+    queue = one.queues["constant"][505:]
+    assert judged["rmse"] == pytest.approx(np.sqrt(np.mean(((1 + queue) * (np.exp(0.1) - 1)) ** 2)))
+    expected = stats.lognorm(0.1, scale=(1 + queue) * np.exp(0.1)).logpdf(1 + queue).sum()
+    assert judged["ell"] == pytest.approx(expected)
+    assert judged["coverage"] == 1.0 and judged["rate_coverage"] == 0.0
+    assert judged["rate_rmse"] == pytest.approx(0.2)
+    mixed = posterior.judge([found, found], one, "constant")
+    for key, value in mixed.items():
+        assert value == pytest.approx(judged[key], rel=1e-9), key
+
+
+def test_quantiles_of_a_mixture():
+    mean, sd = np.array([[0.0, 1.0], [3.0, 1.0]]), np.array([[1.0, 2.0], [0.5, 2.0]])
+    p = np.array([0.1, 0.5, 0.9])
+    found = posterior.quantiles(mean, sd, p)
+    np.testing.assert_allclose(special.ndtr((found[:, None] - mean) / sd).mean(axis=1), np.repeat(p, 2).reshape(3, 2),
+                               rtol=1e-9)
+    np.testing.assert_allclose(found[:, 1], stats.norm(1.0, 2.0).ppf(p))
+
+
+def test_the_tables_hold_what_was_found():
+    results = made_up(MADE)
+    table = tables.tracked(MADE, results, "constant")
+    assert list(table.index) == ["SQM", "periodic", "Matern", "SQM, parameters integrated out"]
+    assert table.loc["SQM", "RMSE"] == pytest.approx(1.1) and table.loc["SQM", "of Matern"] == pytest.approx(1 / 3)
+    assert table.loc["Matern", "published RMSE"] == 10.6 and table.loc["SQM", "published ELL"] == -146
+    assert tables.tracked(MADE, results, "changed").loc["periodic", "published RMSE"] == 5.7
+    gain = tables.gain(MADE, results)
+    assert gain.loc["changed", "gain"] == pytest.approx(11.0) and gain.loc["constant", "days"] == 1.0
+    assert gain.loc["constant", "RMSE ratio"] == pytest.approx(0.9)
+    learnt = tables.learnt(MADE, results)
+    assert learnt.loc["SQM", "memory"] == 1.0 and np.isnan(learnt.loc["Matern", "memory"])
+
+
+def test_the_figures_are_drawn_and_labelled():
+    drawn = figures.draw(MADE, made_up(MADE))
+    assert list(drawn) == ["queue-constant", "queue-changed", "arrivals", "cycles", "errors"]
+    for figure in drawn.values():
+        assert figure.get_figwidth() == 7.0 and figure.legends
+        for axes in figure.axes:
+            assert axes.get_ylabel()
+
+
+def test_what_is_stored_is_tabulated_and_drawn_without_computing(tmp_path):
+    results = made_up(MADE)
+    for task in experiment.all_tasks(MADE):
+        write(task, results[task.name], tmp_path / experiment.TASKS)
+    lines = []
+    with pytest.warns(counts.OverloadWarning, match="changed service rate: on 3 of 3 test days"):
+        found = experiment.run(MADE, tmp_path, report=lines.append)
+    assert lines[0].startswith("the counts are simulated") and lines[1] == "4 of 4 tasks are stored already"
+    kept = experiment.save(found, tmp_path)
+    assert {path.name for path in kept} == {
+        f"{stem}.{end}" for stem in ("constant", "changed", "gain", "learnt") for end in ("csv", "md")} | {
+        "queue-constant.png", "queue-changed.png", "arrivals.png", "cycles.png", "errors.png"}
+    assert scores.readable(found.constant).loc["SQM", "published RMSE"] == "4.6 (2.2)"
+    with pytest.raises(ValueError, match="seed is 0 there and 1 now"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        experiment.run(dataclasses.replace(MADE, seed=1), tmp_path)
+
+
+def test_mistakes(tmp_path):
+    for wrong, message in (({"days": 0}, "days must be at least 1"), ({"methods": ("SQN",)}, "SQM"),
+                           ({"integrated": "CQM", "methods": ("SQM",)}, "integrated"),
+                           ({"weekday": "Thrusday"}, "Did you mean 'Thursday'"), ({"link": "log"}, "link")):
+        with pytest.raises(ValueError, match=message):
+            experiment.Settings(**wrong)
+    with pytest.raises(ValueError, match="there are 31 test days that are Thursday, 40 are asked for"):
+        experiment.run(experiment.Settings(days=40), tmp_path)
+    with pytest.raises(ValueError, match="does not take --conditional"):
+        report.run(catalogue.Wanted(Path("out"), conditional=3))
+    with pytest.raises(FileNotFoundError, match="there is no file"):
+        report.run(catalogue.Wanted(tmp_path, data=str(tmp_path)))
+
+
+@pytest.mark.slow
+def test_weighted_draws_are_those_of_a_long_chain():
+    """The posterior of one window against random-walk Metropolis with the same density."""
+    method, one = problem.Method("sqm", functions=5), window()
+    draws, weights = posterior.posterior(method, one.training, 1_000, 0)
+    weight = np.exp(weights.log_weight[0])
+    mean = weight @ draws
+    sd = np.sqrt(weight @ (draws - mean) ** 2)
+    density = jax.jit(jax.vmap(lambda z: sum(problem.log_densities(method, z, jnp.asarray(one.training)))))
+    factor = np.linalg.cholesky((draws - mean).T @ ((draws - mean) * weight[:, None]))
+    generator = np.random.default_rng(0)
+    at = mean + generator.normal(size=(20, 5)) @ factor.T
+    value, kept = np.asarray(density(jnp.asarray(at))), []
+    for _ in range(600):
+        proposed = at + 2.4 / np.sqrt(5) * generator.normal(size=at.shape) @ factor.T
+        new = np.asarray(density(jnp.asarray(proposed)))
+        accept = np.log(generator.uniform(size=20)) < new - value
+        at, value = np.where(accept[:, None], proposed, at), np.where(accept, new, value)
+        kept.append(at)
+    chain = np.array(kept[100:])
+    error = chain.mean(axis=0).std(axis=0) / np.sqrt(20) + sd / np.sqrt(float(np.ravel(weights.ess)[0]))
+    np.testing.assert_array_less(np.abs(chain.mean(axis=(0, 1)) - mean), 4 * error)
+
+
+@pytest.mark.slow
+def test_the_quick_version_runs_from_end_to_end(tmp_path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", counts.OverloadWarning)
+        found = report.run(catalogue.Wanted(tmp_path, realisations=1, quick=True))
+    assert len(found.written) == 13 and all(path.stat().st_size > 0 for path in found.written)
+    assert len(found.tables) == 4
