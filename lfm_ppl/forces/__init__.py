@@ -2,21 +2,42 @@
 
 from lfm_ppl.forces.constant import Constant
 from lfm_ppl.forces.matern import Matern
+from lfm_ppl.forces.periodic_kernels import (
+    Kernel,
+    ModeratedPeriodicMatern,
+    PeriodicKernel,
+    PeriodicMatern,
+    PeriodicSquaredExponential,
+)
+from lfm_ppl.forces.quasi_periodic import Periodic, QuasiPeriodic, significant_functions
 from lfm_ppl.forces.random_walk import RandomWalk
 from lfm_ppl.forces.resonator import Resonator
 from lfm_ppl.forces.sde import Force
 from lfm_ppl.forces.squared_exponential import SquaredExponential
 from lfm_ppl.forces.sum import Stack, Sum
+from lfm_ppl.forces.weights import CQM, SQM, WQM, change_points
 from lfm_ppl.forces.wiener_velocity import WienerVelocity
 
 __all__ = [
+    "CQM",
     "Constant",
     "Force",
+    "Kernel",
     "Matern",
+    "ModeratedPeriodicMatern",
+    "Periodic",
+    "PeriodicKernel",
+    "PeriodicMatern",
+    "PeriodicSquaredExponential",
+    "QuasiPeriodic",
     "RandomWalk",
     "Resonator",
+    "SQM",
     "SquaredExponential",
     "Stack",
     "Sum",
+    "WQM",
     "WienerVelocity",
+    "change_points",
+    "significant_functions",
 ]

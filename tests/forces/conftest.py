@@ -11,7 +11,23 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lfm_ppl.forces import Constant, Force, Matern, RandomWalk, Resonator, SquaredExponential, WienerVelocity
+from lfm_ppl.forces import (
+    CQM,
+    SQM,
+    WQM,
+    Constant,
+    Force,
+    Matern,
+    ModeratedPeriodicMatern,
+    Periodic,
+    PeriodicMatern,
+    PeriodicSquaredExponential,
+    QuasiPeriodic,
+    RandomWalk,
+    Resonator,
+    SquaredExponential,
+    WienerVelocity,
+)
 
 # Functions of (scale, lengthscale). A new force is covered by a line here.
 FORCES = {
@@ -27,11 +43,22 @@ FORCES = {
     "constant": lambda s, ell: Constant(s),
     "sum": lambda s, ell: Matern(s, ell, order=1, mean=1.0) + Constant(2.0 * s),
     "nested_sum": lambda s, ell: Matern(s, ell, order=2) + (Matern(s, ell, 0) + Matern(s, ell, 0)),
+    "cqm": lambda s, ell: CQM(ell),
+    "sqm": lambda s, ell: SQM(ell, (1.0, 3.0)),
+    "wqm": lambda s, ell: WQM(s, (1.0, 3.0)),
+    "periodic": lambda s, ell: Periodic(PeriodicMatern(s, 1.2, 9.0 * ell, 2), functions=5),
+    "periodic_exact": lambda s, ell: Periodic(PeriodicSquaredExponential(s, 4.0, 9.0 * ell), functions=11),
+    "periodic_moderated": lambda s, ell: Periodic(ModeratedPeriodicMatern(s, 1.2, 9.0 * ell, 0.1 / ell), functions=3),
+    "quasi_periodic": lambda s, ell: QuasiPeriodic(
+        PeriodicMatern(s, 1.2, 9.0 * ell), Matern(1.0, 5.0 * ell), functions=3),
+    "quasi_periodic_steps": lambda s, ell: QuasiPeriodic(
+        PeriodicSquaredExponential(s, 1.2, 9.0 * ell), SQM(2.0, (1.0, 3.0)), functions=3),
     "oscillator": lambda s, ell: Oscillator(s, ell),
     "jumping_sum": lambda s, ell: Oscillator(s, ell, (1.0, 3.0)) + Matern(s, ell),
 }
 # Forces whose state-space form has exactly the covariance that they state in closed form.
-EXACT = [name for name in FORCES if not name.startswith(("squared", "oscillator", "jumping"))]
+EXACT = [name for name in FORCES if not name.startswith(
+    ("squared", "oscillator", "jumping", "quasi")) and name not in ("periodic", "periodic_moderated")]
 
 
 class Oscillator(Force):

@@ -1,0 +1,266 @@
+"""Covariance functions that repeat after a period, to be made into forces."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from lfm_ppl import checks
+from lfm_ppl.forces.matern import Matern
+from lfm_ppl.forces.parameters import positive_parameter, scalar_parameter, standard_deviation_parameter, static_order
+
+
+class Kernel(eqx.Module):
+    """A covariance function k(t, s) with ``k(t + D, s) = k(t, s)``, D the period.
+
+    It is a pytree whose parameters are its leaves. A subclass says ``__call__``, elementwise in both times.
+
+    Attributes:
+        period: D, in units of time.
+        stationary: whether k depends on t - s alone.
+    """
+
+    period: eqx.AbstractVar[jax.Array]
+
+    @property
+    def stationary(self) -> bool:
+        """Whether k depends on t - s alone."""
+        return True
+
+    @property
+    def start(self) -> jax.Array:
+        """Where the cycle begins that its eigenfunctions are computed on."""
+        return jnp.zeros(())
+
+    @property
+    def name(self) -> str:
+        """How messages call it."""
+        return type(self).__name__
+
+    def __call__(self, t: ArrayLike, s: ArrayLike = 0.0) -> jax.Array:
+        """Return k(t, s), elementwise."""
+        raise NotImplementedError
+
+    def chord(self, t: ArrayLike, s: ArrayLike) -> jax.Array:
+        """Return ``|sin(pi (t - s) / D)|``, elementwise: from 0 to 1 and back within a period."""
+        return jnp.abs(jnp.sin(np.pi * (jnp.asarray(t) - s) / self.period))
+
+
+class PeriodicMatern(Kernel):
+    """The Matern kernel of the chord: ``k(t, s) = Matern(|sin(pi (t - s) / D)|)``, nu = order + 1/2.
+
+    Args:
+        scale: standard deviation, in the units of the force; > 0.
+        lengthscale: as a share of the chord, without unit: at about 1 neighbouring halves of a cycle are alike, a
+            small one makes many wiggles a cycle; > 0.
+        period: D, in units of time; > 0.
+        order: a Python int from 0 to 5. The number of functions that are needed grows as it falls.
+
+    Raises:
+        ValueError: for a parameter that is not positive, or an order out of range.
+
+    Example:
+        >>> kernel = PeriodicMatern(scale=2.0, lengthscale=0.5, period=24.0)
+        >>> round(float(kernel(30.0, 6.0)), 6)
+        4.0
+
+    Source: Reece et al. (2014), equation 31.
+    """
+
+    scale: jax.Array
+    lengthscale: jax.Array
+    period: jax.Array
+    order: int = eqx.field(static=True)
+
+    def __init__(self, scale: Any, lengthscale: Any, period: Any, order: int = 1):
+        self.scale = positive_parameter("scale", scale)
+        self.lengthscale = positive_parameter("lengthscale", lengthscale)
+        self.period = positive_parameter("period", period)
+        self.order = static_order(order, Matern.orders)
+
+    def __call__(self, t: ArrayLike, s: ArrayLike = 0.0) -> jax.Array:
+        """Return k(t, s), elementwise."""
+        return Matern(self.scale, self.lengthscale, self.order).covariance(self.chord(t, s))
+
+
+class PeriodicSquaredExponential(Kernel):
+    """The squared exponential of the chord: ``k(t, s) = scale^2 exp(-sin^2(pi (t - s) / D) / lengthscale^2)``.
+
+    Args:
+        scale: standard deviation, in the units of the force; > 0.
+        lengthscale: as a share of the chord, without unit; > 0.
+        period: D, in units of time; > 0.
+
+    Raises:
+        ValueError: for a parameter that is not positive.
+
+    Example:
+        >>> kernel = PeriodicSquaredExponential(scale=1.0, lengthscale=1.0, period=10.0)
+        >>> round(float(kernel(5.0)), 6)
+        0.367879
+
+    Source: Reece et al. (2014), equation 16.
+    """
+
+    scale: jax.Array
+    lengthscale: jax.Array
+    period: jax.Array
+
+    def __init__(self, scale: Any, lengthscale: Any, period: Any):
+        self.scale = positive_parameter("scale", scale)
+        self.lengthscale = positive_parameter("lengthscale", lengthscale)
+        self.period = positive_parameter("period", period)
+
+    def __call__(self, t: ArrayLike, s: ArrayLike = 0.0) -> jax.Array:
+        """Return k(t, s), elementwise."""
+        return self.scale**2 * jnp.exp(-((self.chord(t, s) / self.lengthscale) ** 2))
+
+
+class ModeratedPeriodicMatern(Kernel):
+    """A periodic Matern kernel that fades away from the beginnings of cycles, and so is not stationary.
+
+        k(t, s) = Matern(|sin(pi (t - s) / D)|) exp(-decay (|t| + |s|)),
+
+    where |t| is the distance from t to the nearest multiple of D.
+
+    Args:
+        scale: standard deviation at t = 0, in the units of the force; > 0.
+        lengthscale: as a share of the chord, without unit; > 0.
+        period: D, in units of time; > 0.
+        decay: per unit of time; >= 0.
+        order: as in `PeriodicMatern`.
+
+    Raises:
+        ValueError: for a parameter that is not positive, or a negative decay.
+
+    Example:
+        >>> kernel = ModeratedPeriodicMatern(scale=1.0, lengthscale=1.0, period=10.0, decay=0.5)
+        >>> round(float(kernel(12.0, 12.0)), 6), kernel.stationary
+        (0.135335, False)
+
+    Source: Reece et al. (2014), equation 32, with a decay of one.
+    """
+
+    scale: jax.Array
+    lengthscale: jax.Array
+    period: jax.Array
+    decay: jax.Array
+    order: int = eqx.field(static=True)
+
+    def __init__(self, scale: Any, lengthscale: Any, period: Any, decay: Any = 1.0, order: int = 1):
+        self.scale = positive_parameter("scale", scale)
+        self.lengthscale = positive_parameter("lengthscale", lengthscale)
+        self.period = positive_parameter("period", period)
+        self.decay = standard_deviation_parameter("decay", decay)
+        self.order = static_order(order, Matern.orders)
+
+    @property
+    def stationary(self) -> bool:
+        """False."""
+        return False
+
+    def __call__(self, t: ArrayLike, s: ArrayLike = 0.0) -> jax.Array:
+        """Return k(t, s), elementwise."""
+        matern = Matern(self.scale, self.lengthscale, self.order).covariance(self.chord(t, s))
+        return matern * jnp.exp(-self.decay * (self._distance(t) + self._distance(s)))
+
+    def _distance(self, t: ArrayLike) -> jax.Array:
+        t = jnp.asarray(t)
+        return jnp.abs(t - self.period * jax.lax.stop_gradient(jnp.round(t / self.period)))
+
+
+class PeriodicKernel(Kernel):
+    """Any covariance function, taken on one cycle and repeated.
+
+        k(t, s) = function(t', s'),    t' = t less as many periods as brings it into [start, start + D), s' likewise.
+
+    Args:
+        function: k(t, s), elementwise, made of JAX operations. An Equinox module keeps its parameters as leaves.
+        period: D, in units of time; > 0.
+        stationary: whether the function depends on t - s alone, and repeats by itself. Its eigenfunctions are then
+            sines and cosines, in closed form.
+        start: the beginning of a cycle.
+
+    Raises:
+        ValueError: for a period that is not positive; for a function that is not symmetric or not finite, or said to be
+            stationary and not so.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> kernel = PeriodicKernel(lambda t, s: jnp.exp(-jnp.abs(t - s) / 3.0), period=10.0)
+        >>> round(float(kernel(21.0, 4.0)), 6)
+        0.367879
+    """
+
+    function: Callable[..., Any]
+    period: jax.Array
+    first: jax.Array
+    repeats: bool = eqx.field(static=True)
+    label: str = eqx.field(static=True)
+
+    def __init__(self, function: Callable[..., Any], period: Any, stationary: bool = False, start: Any = 0.0):
+        if not callable(function):
+            raise TypeError(f"function must be callable as k(t, s), got {type(function).__name__}.")
+        self.function = function if isinstance(function, eqx.Module) else jax.tree_util.Partial(function)
+        self.period = positive_parameter("period", period)
+        self.first = scalar_parameter("start", start)
+        self.repeats = bool(stationary)
+        self.label = getattr(function, "__name__", type(function).__name__)
+        _check_function(self)
+
+    @property
+    def stationary(self) -> bool:
+        """What was said of the function."""
+        return self.repeats
+
+    @property
+    def start(self) -> jax.Array:
+        """The beginning of a cycle."""
+        return self.first
+
+    @property
+    def name(self) -> str:
+        """The function's name."""
+        return self.label
+
+    def __call__(self, t: ArrayLike, s: ArrayLike = 0.0) -> jax.Array:
+        """Return k(t, s), elementwise."""
+        return jnp.asarray(self.function(self._in_cycle(t), self._in_cycle(s)), float)
+
+    def _in_cycle(self, t: ArrayLike) -> jax.Array:
+        t = jnp.asarray(t, float)
+        cycle = jax.lax.stop_gradient(jnp.floor((t - self.first) / self.period))
+        return t - cycle * self.period
+
+
+def _check_function(kernel: PeriodicKernel) -> None:
+    """Try the function at a few times of a cycle."""
+    # Shares of a cycle without any pattern.
+    share = np.array([0.0, 0.113, 0.331, 0.502, 0.743, 0.958])
+    at = kernel.first + kernel.period * share
+    value = kernel(at[:, None], at[None, :])
+    if value.shape != (6, 6):
+        raise ValueError(f"the kernel {kernel.name!r} must work elementwise: for times of shape (6, 1) and (1, 6) it "
+                         f"must return (6, 6), it returned {value.shape}.")
+    known = checks.concrete(value)
+    if known is None:
+        return
+    if not np.isfinite(known).all():
+        raise ValueError(f"the kernel {kernel.name!r} is not finite on the cycle from {float(kernel.first):g}.")
+    tolerance = 1e-8 * np.abs(known).max()
+    if np.abs(known - known.T).max() > tolerance:
+        raise ValueError(f"the kernel {kernel.name!r} is not symmetric: k(t, s) differs from k(s, t) by "
+                         f"{np.abs(known - known.T).max():g}.")
+    if kernel.repeats:
+        moved = np.asarray(kernel(at[:, None] + 0.271 * kernel.period, at[None, :] + 0.271 * kernel.period))
+        if np.abs(moved - known).max() > tolerance:
+            raise ValueError(f"the kernel {kernel.name!r} was said to be stationary with period "
+                             f"{float(kernel.period):g}, but is not: moved by part of a period it differs by "
+                             f"{np.abs(moved - known).max():g}. Leave stationary=False, or write it with a function of "
+                             "jnp.sin(pi * (t - s) / period).")

@@ -1,0 +1,257 @@
+"""Periodic and quasi-periodic forces: eigenfunctions of a periodic kernel, with weights that stay or evolve."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from lfm_ppl import checks
+from lfm_ppl.forces.basis import Basis, Eigenfunctions, spectrum, waves
+from lfm_ppl.forces.constant import Constant
+from lfm_ppl.forces.parameters import mean_parameter
+from lfm_ppl.forces.periodic_kernels import Kernel
+from lfm_ppl.forces.sde import Force
+from lfm_ppl.linalg import safe_sqrt
+
+_POINTS = 100
+_MOST = 1024
+
+
+class QuasiPeriodic(Force):
+    r"""A force that nearly repeats: the product of a periodic kernel and that of how its weights evolve.
+
+        u(t) = mean(t) + sum_j a_j(t) phi_j(t),    a_j ~ GP(0, mu_j k_evolution) independent,
+        k(t, s) = k_periodic(t, s) k_evolution(t, s),
+
+    with the leading eigenfunctions phi_j of the periodic kernel, their eigenvalues mu_j, and any process for the
+    weights: `CQM`, `SQM`, `WQM`, or another force of scale 1, such as a Matern force of any order. At no lag does the
+    covariance miss more than the eigenvalues left out. Where those above 1/100 of the largest are kept, as by default,
+    that is less than 0.01 of the variance for the periodic squared exponential and the periodic Matern of order 2 or
+    more, but up to 0.02 for order 1 and 0.07 for order 0: these need more functions, that is a smaller gamma.
+
+    A stationary kernel has the Fourier series ``sum_j q_j cos(2 pi j t / D)``, whose coefficients are integrals of
+    the kernel, so that no eigen-decomposition is needed; each pair turns in its state and the force has constant
+    matrices. The eigenfunctions of another kernel are found by Nystrom's method, see `lfm_ppl.forces.basis`. Both can
+    be differentiated by all parameters, the period included.
+
+    Args:
+        kernel: a periodic kernel, such as `PeriodicMatern`.
+        evolution: a force of mean zero and, as a rule, of scale 1.
+        functions: J, how many eigenfunctions; a Python int, since it sets the number of states. None: those that
+            `significant_functions` counts, for which the kernel's parameters must be known before compilation. A
+            stationary kernel has one constant function and pairs, so that J is odd.
+        gamma: share of the largest eigenvalue above which one is significant.
+        mean: a number, or a function of time.
+        points: of Nystrom's method in a cycle, for kernels that are not stationary.
+
+    Raises:
+        ValueError: a kernel that is not positive definite, a number of functions that does not fit, or one that is not
+            given although the kernel's parameters are traced.
+        TypeError: a kernel or an evolution that is none.
+
+    Example:
+        >>> from lfm_ppl.forces import CQM, PeriodicMatern
+        >>> kernel = PeriodicMatern(scale=2.0, lengthscale=1.0, period=24.0, order=2)
+        >>> force = QuasiPeriodic(kernel, CQM(lengthscale=48.0))
+        >>> force.state_dim, round(float(force.covariance(48.0, 0.0)), 4)
+        (5, 1.4715)
+
+    Source: Reece, Ghosh, Rogers, Roberts and Jennings (2014), Efficient state-space inference of periodic latent force
+    models, Journal of Machine Learning Research 15, sections 5 and 6.
+    """
+
+    kernel: Kernel
+    evolution: Force
+    basis: Basis
+    mean: Any
+
+    def __init__(self, kernel: Kernel, evolution: Force, functions: int | None = None, gamma: float = 0.01,
+                 mean: Any = 0.0, points: int = _POINTS):
+        if not isinstance(kernel, Kernel):
+            raise TypeError(f"kernel must be a periodic kernel such as lfm.PeriodicMatern, got {kernel!r}. Wrap a "
+                            "function k(t, s) in lfm.PeriodicKernel.")
+        if not isinstance(evolution, Force):
+            raise TypeError("evolution must be lfm.CQM, lfm.SQM, lfm.WQM or a force of scale 1, got "
+                            f"{type(evolution).__name__}.")
+        level = checks.concrete(evolution.mean_at(0.0))
+        if level is not None and level != 0.0:
+            raise ValueError(f"evolution must have mean zero, got {float(level):g}; the force itself takes a mean.")
+        checks.positive_integer("points", points)
+        self.kernel, self.evolution, self.mean = kernel, evolution, mean_parameter(mean)
+        self.basis = _basis(kernel, functions, gamma, points)
+
+    @property
+    def period(self) -> jax.Array:
+        """The period D of the kernel, in units of time."""
+        return self.kernel.period
+
+    @property
+    def functions(self) -> int:
+        """Number J of eigenfunctions."""
+        return self.basis.count
+
+    def eigenfunctions(self, t: ArrayLike) -> jax.Array:
+        """Return phi_j at times t, in a new last axis (..., J), of mean square one over a cycle."""
+        return self.basis.eigenfunctions(t)
+
+    def eigenvalues(self) -> jax.Array:
+        """Return mu_j (J,), the prior variances of the weights."""
+        return self.basis.eigenvalues()
+
+    @property
+    def state_dim(self) -> int:
+        """J times the states of the evolution."""
+        return self.basis.count * self.evolution.state_dim
+
+    @property
+    def noise_dim(self) -> int:
+        """J times the Brownian motions of the evolution."""
+        return self.basis.count * self.evolution.noise_dim
+
+    @property
+    def stationary(self) -> bool:
+        """Whether both kernels are stationary."""
+        return self.basis.stationary and self.evolution.stationary
+
+    def initial_covariance(self) -> jax.Array:
+        """Return P0 (n, n)."""
+        return self._weighted(self.evolution.initial_covariance())
+
+    def feedback(self) -> jax.Array:
+        """Return F (n, n), the sum of turning and evolution."""
+        turning = jnp.kron(self.basis.feedback(), np.eye(self.evolution.state_dim))
+        return turning + jnp.kron(np.eye(self.basis.count), self.evolution.feedback())
+
+    def dispersion(self) -> jax.Array:
+        """Return L (n, S)."""
+        return jnp.kron(jnp.diag(safe_sqrt(self.basis.variances())), self.evolution.dispersion())
+
+    def discretise(self, dt: ArrayLike) -> tuple[jax.Array, jax.Array]:
+        """Return transition (n, n) and process noise (n, n) over a step of length dt >= 0."""
+        transition, noise = self.evolution.discretise(dt)
+        # Turning leaves the covariance of a pair, a multiple of the identity, as it is.
+        return jnp.kron(self.basis.transition(dt), transition), self._weighted(noise)
+
+    def measurement(self, t: ArrayLike) -> jax.Array:
+        """Return H(t) (n,)."""
+        return jnp.kron(self.basis.row(t), self.evolution.measurement(t))
+
+    def covariance(self, t: ArrayLike, s: ArrayLike = 0.0) -> jax.Array:
+        """Return the product of the two kernels, of which the force keeps the leading eigenfunctions.
+
+        Where the kernel or the evolution is not stationary, the times are the model's.
+        """
+        return self.kernel(t, s) * self.evolution.covariance(t, s)
+
+    def sde_covariance(self, t: ArrayLike, s: ArrayLike = 0.0) -> jax.Array:
+        """Return the covariance that the force has with its J eigenfunctions, jumps included; times as above."""
+        return self.basis.covariance(t, s) * self.evolution.sde_covariance(t, s)
+
+    def spectral_density(self, omega: ArrayLike) -> jax.Array:
+        """Raise NotImplementedError."""
+        raise NotImplementedError(f"a {type(self).__name__} force has no spectral density in closed form; use "
+                                  "`covariance`.")
+
+    @property
+    def jump_times(self) -> tuple[float, ...]:
+        """The change points of the evolution."""
+        return self.evolution.jump_times
+
+    def jump(self, index: int) -> tuple[jax.Array, jax.Array]:
+        """Return G (n, n) and Q (n, n), those of the evolution for every weight."""
+        transition, noise = self.evolution.jump(index)
+        return jnp.kron(np.eye(self.basis.count), transition), self._weighted(noise)
+
+    def _weighted(self, covariance: jax.Array) -> jax.Array:
+        return jnp.kron(jnp.diag(self.basis.variances()), covariance)
+
+
+class Periodic(QuasiPeriodic):
+    """A force that repeats exactly: ``u(t) = mean(t) + sum_j w_j phi_j(t)`` with constant weights w_j ~ N(0, mu_j).
+
+    The phi_j are the leading eigenfunctions of a periodic kernel, the mu_j their eigenvalues; `QuasiPeriodic` says how
+    they are found and how many are needed. At the default gamma the covariance of a periodic Matern force of order 0 is
+    0.07 of the variance off, that of order 2 and that of a periodic squared exponential less than 0.01.
+
+    Args:
+        kernel: a periodic kernel, such as `PeriodicMatern`.
+        functions: J, how many eigenfunctions; see `QuasiPeriodic`.
+        gamma: share of the largest eigenvalue above which one is significant.
+        mean: a number, or a function of time.
+        points: of Nystrom's method in a cycle, for kernels that are not stationary.
+
+    Raises:
+        ValueError, TypeError: as `QuasiPeriodic`.
+
+    Example:
+        >>> from lfm_ppl.forces import PeriodicSquaredExponential
+        >>> force = Periodic(PeriodicSquaredExponential(scale=1.0, lengthscale=1.0, period=24.0), functions=5)
+        >>> force.state_dim, round(float(force.sde_covariance(24.0)), 3)
+        (5, 0.997)
+
+    Source: Reece et al. (2014), section 5.
+    """
+
+    def __init__(self, kernel: Kernel, functions: int | None = None, gamma: float = 0.01, mean: Any = 0.0,
+                 points: int = _POINTS):
+        super().__init__(kernel, Constant(1.0), functions, gamma, mean, points)
+
+
+def significant_functions(kernel: Kernel, gamma: float = 0.01, points: int = _POINTS) -> int:
+    """Return how many eigenfunctions have an eigenvalue above ``gamma`` times the largest.
+
+    For a stationary kernel they are a constant and pairs of cosine and sine, up to the last significant pair.
+
+    Args:
+        kernel: a periodic kernel whose parameters are known.
+        gamma: the share; > 0 and < 1.
+        points: of Nystrom's method in a cycle, for kernels that are not stationary.
+
+    Raises:
+        ValueError: a kernel with traced parameters or one that is not positive definite, or a gamma out of range.
+
+    Example:
+        >>> from lfm_ppl.forces import PeriodicMatern
+        >>> significant_functions(PeriodicMatern(scale=1.0, lengthscale=1.0, period=24.0, order=2))
+        5
+
+    Source: Reece et al. (2014), definition 1.
+    """
+    checks.positive("gamma", gamma)
+    if not gamma < 1:
+        raise ValueError(f"gamma must be below 1, got {gamma:g}. It is a share of the largest eigenvalue.")
+    if checks.traced(kernel):
+        raise ValueError("the number of functions sets the number of states, and cannot follow from traced parameters. "
+                         "Give functions=J; lfm.significant_functions(kernel) says how many for typical values.")
+    if not kernel.stationary:
+        values = spectrum(kernel, points)
+        return int((values > gamma * values[0]).sum())
+    harmonics = 32
+    while harmonics <= _MOST:
+        values = spectrum(kernel, harmonics)
+        last = int(np.flatnonzero(values > gamma * values.max()).max())
+        if last < harmonics // 2:
+            return 1 + 2 * last
+        harmonics *= 2
+    raise ValueError(f"the kernel {kernel.name!r} has more than {_MOST} significant functions in a cycle; take a "
+                     "larger gamma or a longer lengthscale, or give functions.")
+
+
+def _basis(kernel: Kernel, functions: int | None, gamma: float, points: int) -> Basis:
+    if functions is None:
+        functions = significant_functions(kernel, gamma, points)
+    checks.positive_integer("functions", functions, "It is the number of eigenfunctions.")
+    if kernel.stationary:
+        if functions % 2 == 0:
+            raise ValueError("functions must be odd for a stationary kernel, one constant and pairs of cosine and "
+                             f"sine; got {functions}. Take {functions - 1} or {functions + 1}.")
+        return waves(kernel, functions // 2)
+    if functions > points:
+        raise ValueError(f"functions must be at most points = {points}, got {functions}; take more points.")
+    if not checks.traced(kernel):
+        spectrum(kernel, points)
+    return Eigenfunctions(kernel, functions, points)

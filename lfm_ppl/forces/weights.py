@@ -1,0 +1,211 @@
+"""How the weights of a periodic force change from cycle to cycle, as processes of unit variance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from lfm_ppl import checks
+from lfm_ppl.forces.matern import Matern
+from lfm_ppl.forces.parameters import positive_parameter, scalar_parameter, standard_deviation_parameter
+from lfm_ppl.forces.sde import Force
+
+
+class CQM(Matern):
+    """Weights that change continuously (continuous quasi model): ``exp(-|t - s| / lengthscale)``.
+
+    It is the Matern process of order 0 and scale 1.
+
+    Args:
+        lengthscale: in units of time; > 0.
+
+    Raises:
+        ValueError: for a lengthscale that is not positive.
+
+    Example:
+        >>> round(float(CQM(lengthscale=10.0).covariance(10.0)), 6)
+        0.367879
+
+    Source: Reece et al. (2014), equation 38.
+    """
+
+    def __init__(self, lengthscale: Any):
+        super().__init__(1.0, lengthscale, order=0)
+
+
+class _Steps(Force):
+    """A weight that stands still but for jumps ``a <- G a + N(0, Q)`` at change points; at first a ~ N(0, 1)."""
+
+    change_points: tuple[float, ...] = eqx.field(static=True)
+    mean: Any
+
+    @property
+    def state_dim(self) -> int:
+        """One state."""
+        return 1
+
+    @property
+    def noise_dim(self) -> int:
+        """No noise between change points."""
+        return 0
+
+    @property
+    def jump_times(self) -> tuple[float, ...]:
+        """The change points."""
+        return self.change_points
+
+    def initial_covariance(self) -> jax.Array:
+        """Return the unit variance (1, 1)."""
+        return jnp.ones((1, 1))
+
+    def feedback(self) -> jax.Array:
+        """Return F (1, 1), zero."""
+        return jnp.zeros((1, 1))
+
+    def dispersion(self) -> jax.Array:
+        """Return L (1, 0)."""
+        return jnp.zeros((1, 0))
+
+    def discretise(self, dt: ArrayLike) -> tuple[jax.Array, jax.Array]:
+        """Return transition (1, 1), one, and process noise (1, 1), zero."""
+        return jnp.ones((1, 1)), jnp.zeros((1, 1))
+
+    def sde_covariance(self, t: ArrayLike, s: ArrayLike = 0.0) -> jax.Array:
+        """Return the same as `covariance`, which is exact."""
+        return self.covariance(t, s)
+
+    def cycle(self, t: ArrayLike) -> jax.Array:
+        """Return the number of change points up to t, elementwise; one at t itself counts."""
+        points = np.asarray(self.change_points, float)
+        return (jnp.asarray(t, float)[..., None] >= points).sum(-1)
+
+
+class SQM(_Steps):
+    """Weights that step at change points and keep their variance (step quasi model).
+
+        k(t, s) = exp(-|C(t) - C(s)| / lengthscale),    C(t) the number of change points up to t.
+
+    At a change point ``a <- exp(-1/lengthscale) a + N(0, 1 - exp(-2/lengthscale))``.
+
+    Args:
+        lengthscale: in cycles, without unit; > 0.
+        change_points: increasing times, known before compilation. Those up to a model's initial time do nothing.
+
+    Raises:
+        ValueError: for a lengthscale that is not positive, or change points that do not increase.
+
+    Example:
+        >>> steps = SQM(lengthscale=2.0, change_points=(24.0, 48.0))
+        >>> round(float(steps.covariance(50.0, 3.0)), 6)
+        0.367879
+
+    Source: Reece et al. (2014), equations 39, 42 and 43.
+    """
+
+    lengthscale: jax.Array
+
+    def __init__(self, lengthscale: Any, change_points: Sequence[float]):
+        self.lengthscale = positive_parameter("lengthscale", lengthscale)
+        self.change_points = _increasing(change_points)
+        self.mean = scalar_parameter("mean", 0.0)
+
+    def jump(self, index: int) -> tuple[jax.Array, jax.Array]:
+        """Return G (1, 1) and Q (1, 1)."""
+        if not 0 <= index < len(self.change_points):
+            return super().jump(index)
+        return jnp.exp(-jnp.ones((1, 1)) / self.lengthscale), -jnp.expm1(-2.0 * jnp.ones((1, 1)) / self.lengthscale)
+
+    def covariance(self, t: ArrayLike, s: ArrayLike = 0.0) -> jax.Array:
+        """Return k(t, s), elementwise; the times are the model's."""
+        return jnp.exp(-jnp.abs(self.cycle(t) - self.cycle(s)) / self.lengthscale)
+
+
+class WQM(_Steps):
+    """Weights that step at change points and spread (Wiener-step quasi model).
+
+        k(t, s) = 1 + growth min(C(t), C(s)),    C(t) the number of change points up to t.
+
+    At a change point ``a <- a + N(0, growth)``.
+
+    Args:
+        growth: variance gained at a change point, as a share of the first cycle's; >= 0.
+        change_points: increasing times, known before compilation. Those up to a model's initial time do nothing, but
+            count in `covariance`.
+
+    Raises:
+        ValueError: for a negative growth, or change points that do not increase.
+
+    Example:
+        >>> steps = WQM(growth=0.25, change_points=(24.0, 48.0))
+        >>> float(steps.covariance(50.0, 60.0)), float(steps.covariance(50.0, 3.0))
+        (1.5, 1.0)
+
+    Source: Reece et al. (2014), equations 40, 44 and 45.
+    """
+
+    growth: jax.Array
+
+    def __init__(self, growth: Any, change_points: Sequence[float]):
+        self.growth = standard_deviation_parameter("growth", growth)
+        self.change_points = _increasing(change_points)
+        self.mean = scalar_parameter("mean", 0.0)
+
+    def jump(self, index: int) -> tuple[jax.Array, jax.Array]:
+        """Return G (1, 1), one, and Q (1, 1)."""
+        if not 0 <= index < len(self.change_points):
+            return super().jump(index)
+        return jnp.ones((1, 1)), jnp.reshape(self.growth, (1, 1))
+
+    def covariance(self, t: ArrayLike, s: ArrayLike = 0.0) -> jax.Array:
+        """Return k(t, s), elementwise; the times are the model's."""
+        return 1.0 + self.growth * jnp.minimum(self.cycle(t), self.cycle(s))
+
+
+def change_points(period: float, start: float, stop: float) -> tuple[float, ...]:
+    """Return the ends of the cycles that begin at ``start``, up to ``stop``: start + D, start + 2 D, ...
+
+    Args:
+        period: D, in units of time; a number that is known before compilation, since the times of jumps are static.
+        start: where the first cycle begins.
+        stop: the last time of interest.
+
+    Raises:
+        ValueError: a period that is not positive, or longer than the time between start and stop.
+        TypeError: a traced period.
+
+    Example:
+        >>> change_points(24.0, start=0.0, stop=72.0)
+        (24.0, 48.0, 72.0)
+    """
+    if checks.traced((period, start, stop)):
+        raise TypeError("period, start and stop must be known before compilation, since change points are static; "
+                        "pass numbers, and keep the change points fixed where the period is a parameter.")
+    period, start, stop = (float(scalar_parameter(name, value)) for name, value in
+                           (("period", period), ("start", start), ("stop", stop)))
+    checks.positive("period", period)
+    count = int(np.floor((stop - start) / period * (1 + 1e-12)))
+    if count < 1:
+        raise ValueError(f"period must not be longer than the time from start to stop, {stop - start:g}; got "
+                         f"{period:g}. There is no whole cycle, so no change point between cycles.")
+    return tuple(start + period * index for index in range(1, count + 1))
+
+
+def _increasing(points: Sequence[float]) -> tuple[float, ...]:
+    if checks.traced(points):
+        raise TypeError("change_points must be known before compilation; pass numbers, not traced values.")
+    known = np.asarray(points)
+    if known.dtype.kind not in "biuf" or known.ndim != 1:
+        raise TypeError(f"change_points must be a sequence of times, got {points!r}.")
+    checks.finite("change_points", known)
+    back = np.flatnonzero(np.diff(known) <= 0)
+    if back.size:
+        index = int(back[0]) + 1
+        raise ValueError(f"change_points must increase: entry {index} is {known[index]:g} after {known[index - 1]:g}. "
+                         "Sort them, each once.")
+    return tuple(float(point) for point in known)
