@@ -153,7 +153,12 @@ def _add_compare(commands: Any) -> None:
         metavar="N",
         help="ginzburg-landau: data sets for the conditional posteriors of single parameters (default: 100)",
     )
-    command.add_argument("--data", metavar="FOLDER", help="gps: SP3 files to read (default: simulated satellites)")
+    command.add_argument(
+        "--data",
+        metavar="FOLDER",
+        help="gps: SP3 files to read (default: simulated satellites); home-heating: where house_hourly.csv is "
+        "(default: $LFM_DATA/house)",
+    )
     command.add_argument("--satellites", nargs="+", metavar="NAME", help="gps: as in G05 G20 (default: all)")
     command.add_argument("--train-days", type=_positive, metavar="D", help="gps: days to learn from (default: 3)")
     command.add_argument("--seed", type=_whole(0), default=0, help="random seed of everything (default: 0)")

@@ -22,7 +22,8 @@ EVERY = 3
 """Hours between two measurements where a day is tracked; the source has 100 minutes."""
 
 _LAST = problem.TRAIN - 1
-_SCORED = problem.FINE >= problem.TRAIN
+SCORED = problem.FINE >= problem.TRAIN
+"""Which of the times `problem.FINE` are of the fifth day."""
 
 
 class Filtered(NamedTuple):
@@ -75,6 +76,13 @@ def filtered(method: str, store: str, functions: int) -> Callable[..., Filtered]
 
 
 @functools.cache
+def filtered_under_draws(method: str, store: str, functions: int) -> Callable[..., Filtered]:
+    """Return the same for several z (S, P)."""
+    one = filtered(method, store, functions)
+    return jax.jit(lambda zs, y, outdoor: jax.lax.map(lambda z: one(z, y, outdoor), zs))
+
+
+@functools.cache
 def smoothed(method: str, store: str, functions: int) -> Callable[..., tuple[jax.Array, jax.Array]]:
     """Return the compiled smoother of the residual: mean and standard deviation (120,) in K/h."""
 
@@ -109,7 +117,8 @@ def known_heater(method: str, store: str, functions: int, window: problem.Window
         ``{what}_rmse``, ``{what}_ell`` and ``{what}_inside`` for ``ahead``, ``track`` and ``blind``; ``mean`` and
         ``sd`` (24,) of the day ahead.
     """
-    run, found = filtered(method, store, functions), {}
+    run = filtered(method, store, functions)
+    found: Result = {}
     test = problem.TIMES >= problem.TRAIN
     between = test & ~tracked()
     for what, y, rows in (("ahead", masked(window.y), test), ("track", masked(window.y, "some"), between),
@@ -144,10 +153,10 @@ def thermostat_ahead(method: str, store: str, functions: int, window: problem.Wi
     found = under_thermostat(method, store, functions, particles)(
         key, jnp.asarray(z), window.outdoor, start, jnp.asarray(weather), jnp.asarray(window.set_points), window.on)
     truth = window.fine[:, :1]
-    mean, density, below = (np.asarray(part)[_SCORED, 0] for part in _judge(found.observed, jnp.asarray(truth)))
-    return {"rmse": float(np.sqrt(np.mean((truth[_SCORED, 0] - mean) ** 2))), "ell": float(density.sum()),
+    mean, density, below = (np.asarray(part)[SCORED, 0] for part in _judge(found.observed, jnp.asarray(truth)))
+    return {"rmse": float(np.sqrt(np.mean((truth[SCORED, 0] - mean) ** 2))), "ell": float(density.sum()),
             "inside": float(np.mean(np.abs(below - 0.5) <= 0.475)), "mean": mean,
-            "on": np.asarray(found.input_mean)[_SCORED]}, found
+            "on": np.asarray(found.input_mean)[SCORED]}, found
 
 
 @jax.jit
