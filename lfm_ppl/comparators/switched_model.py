@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import checks
-from lfm_ppl.filtering.filter import FilterState
+from lfm_ppl.filtering.filter import FilterState, jump_table
 from lfm_ppl.filtering.predict import Moments, predict_exact, predict_row
 from lfm_ppl.filtering.schedule import Rows, Schedule, schedule
 from lfm_ppl.filtering.transition import exact, integrating_factor, linear_part
@@ -131,7 +131,7 @@ def row_maps(ssm: StateSpaceModel, rule: SwitchingRule, plan: Schedule) -> Calla
     size, total = ssm.physical_dim, ssm.state_dim
     linear = linear_part(ssm, jnp.asarray(plan.initial_time, float))
     nothing = Moments(jnp.zeros(total), jnp.zeros((total, total)))
-    jumps = [ssm.stack.jump(index) for index in range(len(ssm.stack.jump_times))]
+    jumps = jump_table(ssm)
 
     def prepare(length: jax.Array) -> Any:
         if ssm.time_invariant:
@@ -148,12 +148,10 @@ def row_maps(ssm: StateSpaceModel, rule: SwitchingRule, plan: Schedule) -> Calla
         else:
             one = predict_row(ssm, Taylor(), linear, ready, plan.steps, row.start, row.length, nothing, flow=True)
         phi, noise, offset = one.phi, one.noise, one.moments.mean
-        for number, (transition, covariance) in enumerate(jumps):
-            jump = jax.scipy.linalg.block_diag(jnp.eye(size), transition)
-            added = jax.scipy.linalg.block_diag(jnp.zeros((size, size)), covariance)
-            here = row.jump == number
-            noise = jnp.where(here, congruence(jump, noise) + added, noise)
-            phi, offset = jnp.where(here, matmul(jump, phi), phi), jnp.where(here, jump @ offset, offset)
+        if jumps is not None:
+            jump = jax.scipy.linalg.block_diag(jnp.eye(size), jumps[0][row.jump])
+            added = jax.scipy.linalg.block_diag(jnp.zeros((size, size)), jumps[1][row.jump])
+            phi, offset, noise = matmul(jump, phi), jump @ offset, congruence(jump, noise) + added
         end = row.start + row.length
         observe = lambda s: ssm.observe(ssm.inputs(s, end), end)  # noqa: E731
         read = lambda s: rule.reading(*ssm.split(ssm.inputs(s, end)), end)  # noqa: E731

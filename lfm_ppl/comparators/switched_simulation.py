@@ -13,7 +13,7 @@ from lfm_ppl import checks
 from lfm_ppl.comparators.normals import normals
 from lfm_ppl.comparators.stochastic_steps import advance, choose_scheme, prepare
 from lfm_ppl.comparators.switched_model import Build, check_initial, first_moments, plan_rows, switched
-from lfm_ppl.filtering.filter import FilterState
+from lfm_ppl.filtering.filter import FilterState, jump_table
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays
 from lfm_ppl.linalg import matmul, semidefinite_root
@@ -96,6 +96,11 @@ def _run(ssms: tuple[StateSpaceModel, ...], schemes: tuple[str, ...], rule: Swit
     first_key, rows_key, noise_key = jax.random.split(key, 3)
     first = begin.mean[:, None] + matmul(semidefinite_root(begin.covariance), normals(first_key, ssm.state_dim, paths))
     error = semidefinite_root(jnp.diag(rule.variance()))
+    tables = [None if plan.lengths is None else jax.vmap(
+        lambda length, own=own, scheme=scheme: prepare(own, scheme, length, plan.steps))(jnp.asarray(plan.lengths))
+        for own, scheme in zip(ssms, schemes, strict=True)]
+    jumps = [None if (table := jump_table(own)) is None else (table[0], jax.vmap(semidefinite_root)(table[1]))
+             for own in ssms]
 
     def row(carry: tuple[jax.Array, jax.Array], inputs: tuple[Rows, jax.Array, jax.Array]) -> tuple[tuple, tuple]:
         state, index = carry
@@ -103,16 +108,14 @@ def _run(ssms: tuple[StateSpaceModel, ...], schemes: tuple[str, ...], rule: Swit
         move_key, jump_key, read_key = jax.random.split(row_key, 3)
         end = one.start + one.length
         moved = []
-        for own, scheme in zip(ssms, schemes, strict=True):
-            ready = prepare(own, scheme, one.length, plan.steps)
-            state_then = advance(own, scheme, ready, normals, move_key, state, one.start, one.length, plan.steps)
-            for number in range(len(own.stack.jump_times)):
-                transition, covariance = own.stack.jump(number)
-                kick = matmul(semidefinite_root(covariance), normals(jump_key, own.force_dim, paths))
-                forces = matmul(transition, state_then[size:]) + kick
-                jumped = jnp.concatenate([state_then[:size], forces])
-                state_then = jnp.where(one.jump == number, jumped, state_then)
-            moved.append(state_then)
+        for own, scheme, table, jump in zip(ssms, schemes, tables, jumps, strict=True):
+            ready = (prepare(own, scheme, one.length, plan.steps) if table is None
+                     else jax.tree_util.tree_map(lambda a: a[one.kind], table))
+            then = advance(own, scheme, ready, normals, move_key, state, one.start, one.length, plan.steps)
+            if jump is not None:
+                kick = matmul(jump[1][one.jump], normals(jump_key, own.force_dim, paths))
+                then = jnp.concatenate([then[:size], matmul(jump[0][one.jump], then[size:]) + kick])
+            moved.append(then)
         state = jnp.take_along_axis(jnp.stack(moved), index[None, None, :], axis=0)[0]
         read = jax.vmap(lambda s: rule.reading(*ssm.split(ssm.inputs(s, end)), end), in_axes=1)(state)
         read = read + normals(read_key, read.shape[1], paths).T @ error.T

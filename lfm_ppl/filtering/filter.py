@@ -98,7 +98,7 @@ def forward(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, *, s
         return integrating_factor(ssm, linear, length / plan.steps)
 
     table = None if plan.lengths is None else jax.vmap(prepare)(jnp.asarray(plan.lengths))
-    jumps = _jump_table(ssm)
+    jumps = jump_table(ssm)
     padded = jnp.concatenate([jnp.asarray(y, float), jnp.full((1, ssm.output_dim), jnp.nan)])
 
     def step(moments: Moments, inputs: tuple[Rows, jax.Array, Any]) -> tuple[Moments, Pass]:
@@ -140,7 +140,8 @@ def _observation_slope(ssm: StateSpaceModel, plan: Schedule) -> jax.Array:
     return constant_slope(lambda v: (ssm.observe(v, t), ()), w, ssm.observation_structure, ssm.output_dim)
 
 
-def _jump_table(ssm: StateSpaceModel) -> tuple[jax.Array, jax.Array] | None:
+def jump_table(ssm: StateSpaceModel) -> tuple[jax.Array, jax.Array] | None:
+    """Return transitions and covariances (J + 1, nz, nz) of the forces' jumps, the last one none; None without any."""
     count = len(ssm.stack.jump_times)
     if count == 0:
         return None

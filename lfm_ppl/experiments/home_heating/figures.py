@@ -156,6 +156,7 @@ def plot_scores(settings: Any, results: dict[str, Result], *, width: str | float
                               2 * np.array([one.error for one in values]), color=colour, marker=marker, ls="", ms=3.0,
                               elinewidth=0.8, capsize=1.5)
             style.tidy(axes)
+            axes.set_xlim(-0.5, len(places) - 0.5)
             axes.set_xticks(places, [LABELS[method] for method in settings.methods], rotation=30, ha="right")
             axes.set_ylabel(axis)
             axes.set_title(label)
@@ -198,10 +199,11 @@ def _finish(figure: Figure, panels: dict[str, tuple[Axes, Axes]], label: str) ->
             lower.set_ylabel(label)
         if index + columns >= len(panels):
             lower.set_xlabel("hour of the day")
+    style.note_below(figure, "In brackets: root mean squared error and log likelihood of the day.")
 
 
 def _score(axes: Axes, method: str, rmse: float, ell: float) -> None:
-    axes.set_title(f"{LABELS[method]}: RMSE {rmse:.2f} K, log likelihood {ell:.0f}")
+    axes.set_title(f"{LABELS[method]} ({rmse:.2f} K, {ell:.0f})")
 
 
 def _fan_handles(truth: str) -> list[Any]:

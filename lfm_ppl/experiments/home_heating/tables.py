@@ -106,7 +106,7 @@ def _published(table: str, method: str, what: str) -> dict[str, float]:
 
 def _gains(found: Result, all_: dict[str, Result], prefix: str = "") -> dict[str, float]:
     """Return paired differences from the references: positive where this residual is better."""
-    gains = {}
+    gains: dict[str, float] = {}
     for reference in (one for one in REFERENCES if one in all_):
         other = all_[reference]
         gains |= pair(f"RMSE below {reference} (K)", mean_of(other[f"{prefix}rmse"] - found[f"{prefix}rmse"]))
