@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import checks
-from lfm_ppl.filtering.filter import FilterState, jump_table
+from lfm_ppl.filtering.filter import FilterState
+from lfm_ppl.filtering.jumps import after_jump
 from lfm_ppl.filtering.predict import Moments, predict_exact, predict_row
 from lfm_ppl.filtering.schedule import Rows, Schedule, schedule
 from lfm_ppl.filtering.transition import exact, integrating_factor, linear_part
-from lfm_ppl.linalg import congruence, matmul
 from lfm_ppl.linearisation.taylor import Taylor
 from lfm_ppl.model.augment import StateSpaceModel, state_space
 from lfm_ppl.model.latent_force_model import LatentForceModel
@@ -128,10 +128,10 @@ def only_adds(build: Build) -> bool:
 
 def row_maps(ssm: StateSpaceModel, rule: SwitchingRule, plan: Schedule) -> Callable[[Rows], Affine]:
     """Return what makes the affine maps of a row, for a model that is linear; traceable."""
-    size, total = ssm.physical_dim, ssm.state_dim
+    total = ssm.state_dim
     linear = linear_part(ssm, jnp.asarray(plan.initial_time, float))
     nothing = Moments(jnp.zeros(total), jnp.zeros((total, total)))
-    jumps = jump_table(ssm)
+    jumps = ssm.stack.jump_table()
 
     def prepare(length: jax.Array) -> Any:
         if ssm.time_invariant:
@@ -147,17 +147,14 @@ def row_maps(ssm: StateSpaceModel, rule: SwitchingRule, plan: Schedule) -> Calla
             one = predict_exact(ssm, ready, plan.steps, row.start, row.length, nothing)
         else:
             one = predict_row(ssm, Taylor(), linear, ready, plan.steps, row.start, row.length, nothing, flow=True)
-        phi, noise, offset = one.phi, one.noise, one.moments.mean
         if jumps is not None:
-            jump = jax.scipy.linalg.block_diag(jnp.eye(size), jumps[0][row.jump])
-            added = jax.scipy.linalg.block_diag(jnp.zeros((size, size)), jumps[1][row.jump])
-            phi, offset, noise = matmul(jump, phi), jump @ offset, congruence(jump, noise) + added
+            one = after_jump(ssm, jumps, row.jump, one, flow=True)
         end = row.start + row.length
         observe = lambda s: ssm.observe(ssm.inputs(s, end), end)  # noqa: E731
         read = lambda s: rule.reading(*ssm.split(ssm.inputs(s, end)), end)  # noqa: E731
         zero = nothing.mean
         variance = ssm.noise_covariance(ssm.inputs(zero, end), end, jnp.maximum(row.observation, 0))
-        return Affine(phi, offset, noise, jax.jacfwd(observe)(zero), observe(zero), variance,
+        return Affine(one.phi, one.moments.mean, one.noise, jax.jacfwd(observe)(zero), observe(zero), variance,
                       jax.jacfwd(read)(zero), read(zero))
 
     return make

@@ -13,7 +13,7 @@ from lfm_ppl import checks
 from lfm_ppl.comparators.normals import normals
 from lfm_ppl.comparators.stochastic_steps import advance, choose_scheme, prepare
 from lfm_ppl.comparators.switched_model import Build, check_initial, first_moments, plan_rows, switched
-from lfm_ppl.filtering.filter import FilterState, jump_table
+from lfm_ppl.filtering.filter import FilterState
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays
 from lfm_ppl.linalg import matmul, semidefinite_root
@@ -99,7 +99,7 @@ def _run(ssms: tuple[StateSpaceModel, ...], schemes: tuple[str, ...], rule: Swit
     tables = [None if plan.lengths is None else jax.vmap(
         lambda length, own=own, scheme=scheme: prepare(own, scheme, length, plan.steps))(jnp.asarray(plan.lengths))
         for own, scheme in zip(ssms, schemes, strict=True)]
-    jumps = [None if (table := jump_table(own)) is None else (table[0], jax.vmap(semidefinite_root)(table[1]))
+    jumps = [None if (table := own.stack.jump_table()) is None else (table[0], jax.vmap(semidefinite_root)(table[1]))
              for own in ssms]
 
     def row(carry: tuple[jax.Array, jax.Array], inputs: tuple[Rows, jax.Array, jax.Array]) -> tuple[tuple, tuple]:

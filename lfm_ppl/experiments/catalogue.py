@@ -16,7 +16,8 @@ _MODULES = {"ginzburg-landau": "lfm_ppl.experiments.ginzburg_landau.report",
             "home-heating": "lfm_ppl.experiments.home_heating.report",
             "transcription": "lfm_ppl.experiments.transcription.report",
             "transcription-parameters": "lfm_ppl.experiments.transcription.parameters_report",
-            "ballistic": "lfm_ppl.experiments.ballistic.report"}
+            "ballistic": "lfm_ppl.experiments.ballistic.report",
+            "periodic-kernels": "lfm_ppl.experiments.periodic_kernels.report"}
 
 
 class Wanted(NamedTuple):

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
+from scipy.special import roots_legendre
 
 from lfm_ppl import checks
-from lfm_ppl.forces.discretise import gauss_legendre
 from lfm_ppl.forces.eigenspace import leading_eigenvectors
 from lfm_ppl.forces.periodic_kernels import Kernel
 from lfm_ppl.linalg import matmul
@@ -231,7 +231,8 @@ def fourier_coefficients(kernel: Kernel, harmonics: int) -> jax.Array:
     ``q_j = (2 - [j = 0]) 2/D int_0^(D/2) k(lag) cos(2 pi j lag / D) dlag`` by Gauss-Legendre quadrature, which
     converges exponentially for kernels that are smooth between lag 0, where they may have a kink, and half a period.
     """
-    nodes, weights = gauss_legendre(64 + 2 * harmonics)
+    nodes, weights = roots_legendre(64 + 2 * harmonics)
+    nodes, weights = 0.5 * (nodes + 1.0), 0.5 * weights
     order = np.arange(harmonics + 1)
     wave = np.cos(np.pi * order[:, None] * nodes) * weights * np.where(order == 0, 1.0, 2.0)[:, None]
     # At times that lie in one cycle of the kernel, whatever its start.
