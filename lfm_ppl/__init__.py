@@ -10,6 +10,8 @@ from lfm_ppl.comparators.laplace import LaplaceResult, laplace
 from lfm_ppl.comparators.latent_grid import LatentGrid
 from lfm_ppl.comparators.particle_filter import ParticleFilterResult, particle_filter
 from lfm_ppl.comparators.particle_smoother import ParticleSmootherResult, particle_smoother
+from lfm_ppl.comparators.rao_blackwellised import RaoBlackwellisedResult, rao_blackwellised
+from lfm_ppl.comparators.switched_simulation import SwitchedSimulation, simulate_switched
 from lfm_ppl.data import Data, read_csv
 from lfm_ppl.filtering.filter import FilterResult, FilterState, filter
 from lfm_ppl.filtering.smoother import SmootherResult, smooth
@@ -58,6 +60,7 @@ from lfm_ppl.model.known_input import Input
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation import Gaussian, GaussianObservation
 from lfm_ppl.model.simulate import Simulation, simulate
+from lfm_ppl.model.switching import SwitchingRule, Thermostat
 
 __version__ = "0.1.0"
 
@@ -97,6 +100,7 @@ __all__ = [
     "QuasiPeriodic",
     "RAM",
     "RandomWalk",
+    "RaoBlackwellisedResult",
     "Resonator",
     "Rule",
     "SQM",
@@ -105,7 +109,10 @@ __all__ = [
     "SparseSpectrum",
     "SquaredExponential",
     "StateSpaceModel",
+    "SwitchedSimulation",
+    "SwitchingRule",
     "Taylor",
+    "Thermostat",
     "Unscented",
     "WQM",
     "WienerVelocity",
@@ -124,10 +131,12 @@ __all__ = [
     "particle_filter",
     "particle_smoother",
     "random_frequencies",
+    "rao_blackwellised",
     "read_csv",
     "resonators",
     "significant_functions",
     "simulate",
+    "simulate_switched",
     "smooth",
     "state_space",
 ]

@@ -154,7 +154,12 @@ def _add_compare(commands: Any) -> None:
         metavar="N",
         help="ginzburg-landau: data sets for the conditional posteriors of single parameters (default: 100)",
     )
-    command.add_argument("--data", metavar="FOLDER", help="gps: SP3 files, call-centre: counts (default: simulated)")
+    command.add_argument(
+        "--data",
+        metavar="FOLDER",
+        help="gps: SP3 files, call-centre: counts (default of both: simulated); home-heating: where house_hourly.csv is "
+        "(default: $LFM_DATA/house)",
+    )
     command.add_argument("--satellites", nargs="+", metavar="NAME", help="gps: as in G05 G20 (default: all)")
     command.add_argument("--train-days", type=_positive, metavar="D", help="gps: days to learn from (default: 3)")
     command.add_argument("--axes", metavar="AXES", help="gps: of the small forces, DYB (Sun-oriented, default) or RTN")

@@ -13,6 +13,7 @@ from lfm_ppl import checks
 
 _MODULES = {"ginzburg-landau": "lfm_ppl.experiments.ginzburg_landau.report",
             "gps": "lfm_ppl.experiments.gps.report",
+            "home-heating": "lfm_ppl.experiments.home_heating.report",
             "transcription": "lfm_ppl.experiments.transcription.report",
             "transcription-parameters": "lfm_ppl.experiments.transcription.parameters_report",
             "ballistic": "lfm_ppl.experiments.ballistic.report",

@@ -1,0 +1,295 @@
+"""Temperature of a heated home, with a residual heat that nearly repeats every day.
+
+The temperature T inside (degC) follows, with one store of heat or with the walls T_w as a second one,
+
+    dT/dt = alpha (T_out - T) + beta E + R(t)                                            (one store)
+    dT/dt = alpha (T_w - T) + beta E + R(t),   dT_w/dt = gamma (T - T_w) + psi (T_out - T_w)     (envelope=true)
+    y_k = (T(t_k), T_out(t_k)) + e_k,    e_k ~ N(0, diag(noise_sd^2, 0.1^2)),
+
+where E is the heater, a known input, T_out the temperature outside, a Gaussian process with a Matern-3/2
+covariance that is measured too, and R the heat of sun and people and whatever the equation leaves out. The
+option `residual` says what R is, a day being 24 h:
+
+    SQM, CQM, WQM   quasi-periodic: a periodic Matern-1/2 force whose weights change with each midnight (SQM,
+                    WQM) or all the time (CQM)
+    periodic        the same day after day         matern   a Matern-1/2 force that knows nothing of days
+    resonator       oscillations of a day and its harmonics, with damping and noise         none   no residual
+
+`memory` is the number of days after which R has changed by itself: of SQM and CQM the lengthscale, of WQM the
+variance gained in a day is 1/memory of the first day's. `lengthscale` is that of the periodic kernel as a share
+of its chord, at 1 about a third of a day; of `matern` it is in hours. With the envelope there are two more sites,
+`gamma` and `psi`; some residuals have fewer sites or, the resonator, others.
+
+A data file has the columns time_h (hours, midnight a multiple of 24), indoor, outdoor and heater. The heater is
+its power from that time to the next, in any unit, as a share of full power, say: it is no output but the known
+input, and must not be missing. Outdoor mean, scale and lengthscale are taken from the outdoor column unless they
+are freed.
+
+The default data are four days of hourly measurements under a thermostat that decides every ten minutes; the heater
+is the share of each hour that it was on.
+
+Sources: S. Reece and others, Efficient state-space inference of periodic latent force models, Journal of Machine
+Learning Research 15 (2014), section 9; P. Bacher and H. Madsen, Identifying suitable models for the heat dynamics of
+buildings, Energy and Buildings 43 (2011).
+"""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+
+import lfm_ppl as lfm
+
+OUTPUTS = ("indoor", "outdoor", "heater")
+UNITS = {"time": "h", "indoor": "degC", "outdoor": "degC", "heater": "1", "walls": "degC", "air": "degC",
+         "weather": "degC", "residual": "K/h"}
+RESIDUALS = ("SQM", "CQM", "WQM", "periodic", "matern", "resonator", "none")
+OPTIONS = {
+    "residual": ("SQM", str, f"the force R: {', '.join(RESIDUALS)}"),
+    "envelope": (False, bool, "whether the walls are a second store of heat"),
+    "functions": (9, int, "eigenfunctions of the periodic kernel, an odd number"),
+}
+PARAMETERS = {
+    "alpha": "rate at which the air takes the temperature outside, or that of the walls (1/h)",
+    "beta": "warming by the heater at full power (K/h)",
+    "scale": "standard deviation of the residual (K/h)",
+    "lengthscale": "lengthscale of the residual within a day, as a share of the chord (1)",
+    "memory": "days after which the residual has changed (1)",
+    "noise_sd": "standard deviation of a measurement inside (degC)",
+    "outdoor_mean": "mean of the temperature outside (degC)",
+    "outdoor_scale": "its standard deviation (degC)",
+    "outdoor_lengthscale": "its lengthscale (h)",
+}
+DAY, OUTDOOR_NOISE = 24.0, 0.1
+READ_ERROR = 1e-3  # of the heater's column, which the model reproduces
+START = (18.0, 3.0, 15.0, 5.0)  # mean and standard deviation of the first temperatures of air and walls (degC)
+HARMONICS = 4  # of the resonator
+TRUTH = {
+    "alpha": 0.1, "beta": 2.5, "scale": 0.3, "lengthscale": 0.5, "memory": 5.0, "noise_sd": 0.05,
+    "outdoor_mean": 6.0, "outdoor_scale": 3.0, "outdoor_lengthscale": 10.0,
+}
+DAYS, DECISIONS = 4, 6  # of the default data; decisions of the thermostat in an hour
+
+
+def residual_force(kind, scale, lengthscale, memory, functions, midnights, period=DAY, noise=0.0, damping=0.0):
+    """Return the residual R.
+
+    Args:
+        kind: one of RESIDUALS but none.
+        scale: see PARAMETERS; so are the next two.
+        lengthscale: of the kernel; of `matern` in hours.
+        memory: days.
+        functions: number of eigenfunctions.
+        midnights: times at which the weights of SQM and WQM change.
+        period: of the resonator (h).
+        noise: of the resonator (K/h/sqrt(h)).
+        damping: of the resonator (1/h).
+
+    Raises:
+        ValueError: an unknown kind.
+    """
+    if kind == "matern":
+        return lfm.Matern(scale, lengthscale, order=0)
+    if kind == "resonator":
+        # Higher harmonics are weaker, as those of a force with kinks.
+        waves = [lfm.Resonator(period / k, scale / k, noise / k, damping) for k in range(1, HARMONICS + 1)]
+        return sum(waves, lfm.Constant(scale))
+    if kind not in RESIDUALS:
+        raise ValueError(f"residual must be one of {', '.join(RESIDUALS)}, got {kind!r}.")
+    kernel = lfm.PeriodicMatern(scale, lengthscale, DAY, order=0)
+    if kind == "periodic":
+        return lfm.Periodic(kernel, functions)
+    evolution = {
+        "SQM": lambda: lfm.SQM(memory, midnights),
+        "CQM": lambda: lfm.CQM(DAY * memory),
+        "WQM": lambda: lfm.WQM(1.0 / memory, midnights),
+    }[kind]()
+    return lfm.QuasiPeriodic(kernel, evolution, functions)
+
+
+def build(heater, residual, alpha, beta, noise_sd, outdoor, gamma=None, psi=None, units=None) -> lfm.LatentForceModel:
+    """Return the home.
+
+    Args:
+        heater: the known input, a function of time.
+        residual: the force R, or None.
+        alpha: see PARAMETERS; so are the next two.
+        beta: see PARAMETERS.
+        noise_sd: see PARAMETERS.
+        outdoor: mean, scale and lengthscale of the temperature outside.
+        gamma: rate at which the walls take the temperature of the air (1/h); None: no walls.
+        psi: rate at which they take that outside (1/h).
+        units: name -> unit.
+    """
+    walls = gamma is not None
+
+    def dynamics(x, u, t):
+        rest = u[1] if residual is not None else 0.0
+        if not walls:
+            return jnp.stack([alpha * (u[0] - x[0]) + beta * heater(t) + rest])
+        return jnp.stack([
+            alpha * (x[1] - x[0]) + beta * heater(t) + rest,
+            gamma * (x[0] - x[1]) + psi * (u[0] - x[1]),
+        ])
+
+    mean, scale, lengthscale = outdoor
+    size = 2 if walls else 1
+    return lfm.LatentForceModel(
+        dynamics=dynamics,
+        forces={"weather": lfm.Matern(scale, lengthscale, order=1, mean=mean),
+                **({} if residual is None else {"residual": residual})},
+        observation=lfm.GaussianObservation(
+            lambda x, u, t: jnp.stack([x[0], u[0], jnp.asarray(heater(t), float)]),
+            jnp.stack([jnp.asarray(noise_sd, float) ** 2, jnp.asarray(OUTDOOR_NOISE**2), jnp.asarray(READ_ERROR**2)])),
+        initial_state=lfm.Gaussian(jnp.array(START[::2][:size]), jnp.diag(jnp.array(START[1::2][:size]) ** 2)),
+        state_names=("air", "walls")[:size],
+        output_names=OUTPUTS,
+        units=units,
+    )
+
+
+def model(times, y=None, residual: str = "SQM", envelope: bool = False, functions: int = 9, units=None) -> None:
+    """Sample the parameters of home and residual, and score the temperatures.
+
+    Args:
+        times: hours, shape (T,), midnight a multiple of 24.
+        y: indoor, outdoor and heater, shape (T, 3); temperatures may be missing (NaN). None draws temperatures from the
+            prior, with the heater on in the morning and in the evening.
+        residual: the force R, one of RESIDUALS.
+        envelope: whether the walls are a second store of heat.
+        functions: eigenfunctions of the periodic kernel, an odd number.
+        units: name -> unit, for plots.
+    """
+    if residual not in RESIDUALS:
+        raise ValueError(f"residual must be one of {', '.join(RESIDUALS)}, got {residual!r}.")
+
+    def positive(name, median, spread):
+        return numpyro.sample(name, dist.LogNormal(jnp.log(median), spread))
+
+    repeats = residual in ("SQM", "CQM", "WQM", "periodic")
+    rates = {"alpha": positive("alpha", 0.1, 1.0), "beta": positive("beta", 1.0, 1.0)}
+    if envelope:
+        rates |= {"gamma": positive("gamma", 0.05, 1.0), "psi": positive("psi", 0.03, 1.0)}
+    hyper = {"scale": 0.0, "lengthscale": 0.0, "memory": 0.0}
+    if residual != "none":
+        hyper["scale"] = positive("scale", 0.3, 1.0)
+    if repeats:
+        hyper["lengthscale"] = positive("lengthscale", 0.5, 0.7)
+    if residual in ("SQM", "CQM", "WQM"):
+        hyper["memory"] = positive("memory", 5.0, 1.0)
+    if residual == "matern":
+        hyper["lengthscale"] = positive("lengthscale", 5.0, 1.0)
+    if residual == "resonator":
+        hyper |= {"period": positive("period", DAY, 0.05), "noise": positive("noise", 0.03, 1.0),
+                  "damping": positive("damping", 0.01, 1.0)}
+    noise_sd = positive("noise_sd", 0.1, 0.7)
+    outdoor = (numpyro.sample("outdoor_mean", dist.Normal(8.0, 8.0)), positive("outdoor_scale", 4.0, 0.5),
+               positive("outdoor_lengthscale", 10.0, 0.5))
+    force = None
+    if residual != "none":
+        force = residual_force(residual, functions=functions, midnights=_midnights(times, residual), **hyper)
+    system = build(_heater(times, y), force, noise_sd=noise_sd, outdoor=outdoor, units=units, **rates)
+    numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=1), obs=y)
+
+
+def anchors(data: lfm.Data) -> dict[str, float]:
+    """Return what is taken from the temperature outside: mean, standard deviation and lengthscale.
+
+    The slope of a Matern-3/2 process has the variance 3 scale^2 / lengthscale^2.
+    """
+    known = np.isfinite(data.y[:, 1])
+    if known.sum() < 3:
+        return {}
+    times, outside = data.times[known], data.y[known, 1]
+    scale = max(float(outside.std()), 0.1)
+    gap = np.diff(times)
+    slope = np.diff(outside)[gap > 0] / gap[gap > 0]
+    return {"outdoor_mean": float(outside.mean()), "outdoor_scale": scale,
+            "outdoor_lengthscale": float(np.sqrt(3.0) * scale / max(np.sqrt(np.mean(slope**2)), 1e-2 * scale))}
+
+
+def prepare(data: lfm.Data) -> lfm.Data:
+    """Check the heater's column of a data file.
+
+    Raises:
+        ValueError: a missing value, or no heating at all.
+    """
+    heater = data.y[:, 2]
+    if np.isnan(heater).any():
+        row = int(np.argmax(np.isnan(heater)))
+        raise ValueError(f"the heater is missing at time {data.times[row]:g}; it is a known input, so fill the gap.")
+    if not np.any(heater != heater[0]):
+        raise ValueError(f"the heater is {heater[0]:g} all the time, so that nothing can be said of it; expected the "
+                         "power of a heater that is switched.")
+    return data
+
+
+def thermostat(hysteresis: float = 0.0) -> lfm.Thermostat:
+    """Return the thermostat of the default data: 20 degC from 6 to 22 o'clock, 16 degC at night."""
+
+    def set_point(t):
+        hour = jnp.mod(t, DAY)
+        return jnp.where((hour >= 6.0) & (hour < 22.0), 20.0, 16.0)
+
+    return lfm.Thermostat(set_point, hysteresis)
+
+
+def simulate(seed: int = 0, residual: str = "SQM", envelope: bool = False, functions: int = 9) -> lfm.Data:
+    """Simulate four days of a home under its thermostat.
+
+    Args:
+        seed: of forces, paths and errors.
+        residual: the force R, one of RESIDUALS.
+        envelope: whether the walls are a second store of heat.
+        functions: eigenfunctions of the periodic kernel.
+    """
+    fine = np.arange(DAYS * 24 * DECISIONS + 1) / DECISIONS
+    drawn = _simulator(residual, envelope, functions)(jax.random.key(seed))
+    hourly = slice(None, None, DECISIONS)
+    on = np.asarray(drawn.inputs[:, 0])
+    # From each hour to the next; nothing follows the last one.
+    share = np.append(on[:-1].reshape(-1, DECISIONS).mean(axis=1), on[-1])
+    y = np.column_stack([np.asarray(drawn.y)[hourly, 0, :2], share])
+    extra = {"gamma": 0.05, "psi": 0.05} if envelope else {}
+    return lfm.Data(
+        times=fine[hourly], y=y, outputs=OUTPUTS, units=UNITS,
+        truth={"times": fine, "state": drawn.state[:, 0],
+               "forces": {name: path[:, 0] for name, path in drawn.forces.items()}, "parameters": TRUTH | extra})
+
+
+@functools.cache
+def _simulator(residual: str, envelope: bool, functions: int):
+    """Return the simulator, compiled once for all seeds."""
+    fine = np.arange(DAYS * 24 * DECISIONS + 1) / DECISIONS
+    values = TRUTH | {"lengthscale": 5.0} if residual == "matern" else TRUTH
+    force = None if residual == "none" else residual_force(
+        residual, values["scale"], values["lengthscale"], values["memory"], functions, _midnights(fine, residual),
+        noise=0.02, damping=0.005)
+    walls = {"gamma": 0.05, "psi": 0.05} if envelope else {}
+    outdoor = (TRUTH["outdoor_mean"], TRUTH["outdoor_scale"], TRUTH["outdoor_lengthscale"])
+
+    def home(heater):
+        return build(lambda t: heater, force, TRUTH["alpha"], TRUTH["beta"], TRUTH["noise_sd"], outdoor, **walls)
+
+    return jax.jit(lambda key: lfm.simulate_switched(key, home, thermostat(), fine, steps=1))
+
+
+def _midnights(times, residual: str) -> tuple[float, ...]:
+    """Return the midnights after the first of the times, and up to the last."""
+    if residual not in ("SQM", "WQM"):
+        return ()
+    times = np.asarray(times)
+    return tuple(DAY * np.arange(np.floor(times[0] / DAY) + 1, np.floor(times[-1] / DAY) + 1))
+
+
+def _heater(times, y):
+    """Return the heater as a function of time."""
+    if y is None:
+        return lambda t: jnp.where((jnp.mod(t, DAY) >= 6.0) & (jnp.mod(t, DAY) < 9.0)
+                                   | (jnp.mod(t, DAY) >= 16.0) & (jnp.mod(t, DAY) < 22.0), 1.0, 0.0)
+    return lfm.Input(times, jnp.asarray(y)[:, 2])

@@ -1,0 +1,191 @@
+"""Home heating as an experiment: its data, a little of every part, its tables and figures."""
+
+import os
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from scipy import stats
+
+from lfm_ppl.experiments import scores
+from lfm_ppl.experiments.home_heating import experiment, figures, learning, prediction, problem, report, tables
+
+REAL = problem.data_folder()
+SMALL = experiment.Settings(homes=2, methods=("SQM", "none", "matern"), stores=("one store",), functions=3,
+                            particles=50)
+
+
+@pytest.fixture(scope="module")
+def window():
+    """A simulated home."""
+    return problem.home(0, "one store")
+
+
+def test_a_simulated_home_is_under_its_thermostat(window):
+    assert window.y.shape == (120, 3) and window.fine.shape == (149, 3) and problem.FINE.shape == (149,)
+    points = window.set_points[problem.FINE.astype(int)]
+    away = window.fine[:, 0] - points
+    # Measurements have an error of 0.05 K.
+    assert (window.fine[away < -0.3, 2] == 1.0).all() and (window.fine[away > 0.3, 2] == 0.0).all()
+    assert (window.set_points[:24] != window.set_points[96:]).any(), "the last day has other set points"
+    np.testing.assert_array_equal(window.set_points[:24], window.set_points[72:96])
+    shares = window.fine[5:, 2].reshape(-1, 6).mean(axis=1)
+    np.testing.assert_allclose(shares, window.y[96:, 2])
+    assert set(window.outdoor) == set(problem.OUTDOOR)
+
+
+@pytest.mark.skipif(REAL is None, reason="needs ../shared/data/house")
+def test_the_real_house_has_29_windows():
+    windows = problem.house(str(REAL))
+    assert len(windows) == 29
+    np.testing.assert_array_equal(windows[0].y[24:], windows[1].y[:96])
+    assert all(np.isfinite(one.y).all() and one.set_points is None for one in windows)
+    assert 0.5 < max(one.y[:, 2].max() for one in windows) < 2.0
+
+
+@pytest.mark.parametrize(("text", "message"), [
+    (",Ti,Ta\n2020-01-01 00:00,1,1\n", "no column 'Ph'"),
+    (",Ti,Ta,Ph\n2020-01-01 00:00,1,1,1\n2020-01-01 02:00,1,1,1\n", "a row an hour"),
+    (",Ti,Ta,Ph\n2020-01-01 00:00,1,1,1\n2020-01-01 01:00,1,1,1\n", "five whole days")])
+def test_files_that_cannot_be_used(tmp_path, text, message):
+    (tmp_path / problem.FILE).write_text(text)
+    with pytest.raises(ValueError, match=message):
+        problem.house(str(tmp_path))
+
+
+def test_without_data_there_are_simulated_homes_only(tmp_path, monkeypatch):
+    monkeypatch.setenv("LFM_DATA", str(tmp_path))
+    assert problem.data_folder() is None
+    assert all(task.name.startswith("homes/") for task in experiment.tasks(SMALL))
+    with pytest.raises(FileNotFoundError, match="leave --data out"):
+        problem.data_folder(str(tmp_path))
+
+
+def test_a_window_without_set_points_cannot_be_predicted_under_a_thermostat():
+    window = problem.Window(np.zeros((120, 3)), {})
+    with pytest.raises(ValueError, match="needs a set point"):
+        prediction.thermostat_ahead("SQM", "one store", 3, window, np.zeros(6), 10, jax.random.key(0))
+
+
+def test_what_is_hidden():
+    y = np.ones((120, 3))
+    hidden = np.isnan(prediction.masked(y))
+    assert hidden[96:, 0].all() and hidden.sum() == 24
+    some = np.isnan(prediction.masked(y, "some"))[:, 0]
+    assert (np.flatnonzero(~some[96:]) == [3, 6, 9, 12, 15, 18, 21]).all() and not some[:96].any()
+    assert np.isnan(prediction.masked(y, outdoor=False))[96:, :2].all()
+
+
+def test_gaussian_scores_against_scipy():
+    generator = np.random.default_rng(0)
+    mean, sd, truth = generator.normal(size=24), generator.uniform(0.5, 2.0, 24), generator.normal(size=24)
+    found = prediction.gaussian_scores(mean, sd**2, truth)
+    low, high = stats.norm(mean, sd).interval(0.95)
+    assert found["ell"] == pytest.approx(stats.norm(mean, sd).logpdf(truth).sum())
+    assert found["rmse"] == pytest.approx(np.sqrt(np.mean((mean - truth) ** 2)))
+    assert found["inside"] == np.mean((low <= truth) & (truth <= high))
+
+
+def test_the_most_likely_parameters(window):
+    """No residual: the search ends where nothing near is better."""
+    model = ("none", "one store", 3)
+    z, density = learning.most_likely(*model, window)
+    energy = learning._program(*model)
+    y, outdoor = window.y[:96], window.outdoor
+    value, gradient = energy(z, y, outdoor)
+    assert density == pytest.approx(-float(value))
+    np.testing.assert_allclose(gradient, 0.0, atol=1e-2)
+    assert problem.names(*model[:2]) == ("alpha", "beta", "noise_sd")
+    for index in range(3):
+        step = 0.05 * np.eye(3)[index]
+        assert min(float(energy(z + step, y, outdoor)[0]), float(energy(z - step, y, outdoor)[0])) > float(value)
+
+
+@pytest.mark.slow
+def test_both_predictions(window):
+    model = ("none", "one store", 3)
+    z, _ = learning.most_likely(*model, window)
+    known = prediction.known_heater(*model, window, z)
+    assert known["ahead_rmse"] < 1.5 and known["mean"].shape == (24,)
+    found, whole = prediction.thermostat_ahead(*model, window, z, 200, jax.random.key(0))
+    assert found["rmse"] < 1.5 and found["mean"].shape == found["on"].shape == (144,)
+    truth = window.fine[prediction.SCORED, 0]
+    density = whole.observed.log_density(window.fine)[prediction.SCORED, 0]
+    assert found["ell"] == pytest.approx(float(density.sum()))
+    assert found["rmse"] == pytest.approx(scores.rmse(found["mean"], truth))
+    assert ((found["on"] >= 0) & (found["on"] <= 1 + 1e-12)).all()
+
+
+def made_up(settings):
+    """Results of every task."""
+    generator, results = np.random.default_rng(0), {}
+    for index, task in enumerate(experiment.tasks(settings)):
+        what = task.name.split("/")[0]
+        if what == "homes":
+            rmse = 0.5 + 0.1 * index + 0.01 * np.arange(settings.homes)
+            found = {"rmse": rmse, "ell": -100 * rmse, "inside": np.full(settings.homes, 0.9),
+                     "mean": np.full((settings.homes, 144), 18.0), "on": generator.uniform(size=(settings.homes, 144)),
+                     "quantiles": 18.0 + np.linspace(-1, 1, 5)[:, None] * np.ones(144)}
+        elif what == "house":
+            count = task.settings["windows"]
+            rmse = 0.3 + 0.1 * index + 0.01 * np.arange(count)
+            found = {f"{kind}_{name}": value for kind in ("ahead", "track", "blind")
+                     for name, value in (("rmse", rmse), ("ell", -20 * rmse), ("inside", np.full(count, 0.95)))}
+            found |= {"mean": np.full((count, 24), 19.0), "sd": np.ones((count, 24)),
+                      "residual": generator.normal(size=120), "residual_sd": np.ones(120)}
+        else:
+            found = {"ell": np.array([-4.0, -8.0]), "point_ell": np.array([-5.0, -11.0]), "rmse": np.ones(2),
+                     "point_rmse": np.ones(2), "r_hat": np.full(2, 1.01), "ess": np.full(2, 300.0)}
+        results[task.name] = {**found, "cpu_s": 2.0}
+    return results
+
+
+def test_tables_of_simulated_homes(window):
+    found = tables.every(SMALL, made_up(SMALL))
+    assert list(found) == ["homes-one-store"]
+    table = found["homes-one-store"]
+    assert list(table.index) == ["SQM", "none", "matern"]
+    assert table.loc["SQM", "RMSE ahead (K)"] == pytest.approx(0.505)
+    assert table.loc["SQM", "published RMSE ahead (K)"] == 1.0
+    assert table.loc["SQM", "RMSE below none (K)"] == pytest.approx(0.1)
+    assert table.loc["SQM", "ELL above matern"] == pytest.approx(20.0)
+    drawn = figures.draw(SMALL, made_up(SMALL))
+    assert set(drawn) == {"homes-ahead", "scores"}
+    assert "means over 2 homes" in report.title(SMALL, "homes-one-store")
+
+
+@pytest.mark.skipif(REAL is None, reason="needs ../shared/data/house")
+def test_tables_and_figures_with_the_real_house(window, tmp_path):
+    settings = experiment.Settings(data=str(REAL), homes=2, windows=3, methods=SMALL.methods, every=2)
+    found = experiment.Comparison(settings, made_up(settings), tables.every(settings, made_up(settings)))
+    assert list(found.tables) == ["house-one-store", "homes-one-store", "posterior", "house-envelope",
+                                  "homes-envelope"]
+    assert found.tables["posterior"].loc["parameters integrated out", "gain in ELL"] == pytest.approx(2.0)
+    one, envelope = found.tables["house-one-store"], found.tables["house-envelope"]
+    assert one.loc["none", "published ELL tracked"] == 31 and envelope.loc["SQM", "published RMSE ahead (K)"] == 0.22
+    assert np.isnan(envelope.loc["matern", "published RMSE ahead (K)"])
+    assert scores.readable(one).loc["none", "RMSE below none (K)"] == "0"
+    written = {path.name for path in experiment.save(found, tmp_path)}
+    assert {"house-ahead.png", "homes-ahead.png", "residual.png", "scores.png", "house-envelope.md"} <= written
+    assert "2 windows" in report.title(settings, "posterior")
+    assert "3 windows" in report.title(settings, "house-envelope")
+
+
+@pytest.mark.parametrize("given", [{"homes": 0}, {"windows": 0}, {"methods": ("ARX",)}, {"stores": ("two",)},
+                                   {"integrated": "WQM", "methods": ("SQM",)}])
+def test_bad_settings(given):
+    with pytest.raises(ValueError):
+        experiment.Settings(**given)
+
+
+@pytest.mark.slow
+def test_the_quick_version_runs_and_goes_on(tmp_path):
+    settings = experiment.quick(data=None if REAL is None else str(REAL), methods=("SQM", "none"), homes=1)
+    first = experiment.run(settings, tmp_path)
+    lines: list[str] = []
+    again = experiment.run(settings, tmp_path, report=lines.append)
+    assert "stored already" in lines[0]
+    for name, table in first.tables.items():
+        assert table.equals(again.tables[name])
+    assert os.listdir(tmp_path / "tasks") and Path(tmp_path).is_dir()
