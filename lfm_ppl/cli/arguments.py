@@ -157,7 +157,7 @@ def _add_compare(commands: Any) -> None:
     command.add_argument(
         "--data",
         metavar="FOLDER",
-        help="gps: SP3 files, call-centre: counts (default of both: simulated); home-heating: where house_hourly.csv is "
+        help="gps: SP3 files, call-centre: counts (default of both: simulated); home-heating: house_hourly.csv "
         "(default: $LFM_DATA/house)",
     )
     command.add_argument("--satellites", nargs="+", metavar="NAME", help="gps: as in G05 G20 (default: all)")
