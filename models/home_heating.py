@@ -52,7 +52,7 @@ RESIDUALS = ("SQM", "CQM", "WQM", "periodic", "matern", "resonator", "none")
 OPTIONS = {
     "residual": ("SQM", str, f"the force R: {', '.join(RESIDUALS)}"),
     "envelope": (False, bool, "whether the walls are a second store of heat"),
-    "functions": (9, int, "eigenfunctions of the periodic kernel, an odd number"),
+    "functions": (5, int, "eigenfunctions of the periodic kernel, an odd number"),
 }
 PARAMETERS = {
     "alpha": "rate at which the air takes the temperature outside, or that of the walls (1/h)",
@@ -153,7 +153,7 @@ def build(heater, residual, alpha, beta, noise_sd, outdoor, gamma=None, psi=None
     )
 
 
-def model(times, y=None, residual: str = "SQM", envelope: bool = False, functions: int = 9, units=None) -> None:
+def model(times, y=None, residual: str = "SQM", envelope: bool = False, functions: int = 5, units=None) -> None:
     """Sample the parameters of home and residual, and score the temperatures.
 
     Args:
@@ -239,7 +239,7 @@ def thermostat(hysteresis: float = 0.0) -> lfm.Thermostat:
     return lfm.Thermostat(set_point, hysteresis)
 
 
-def simulate(seed: int = 0, residual: str = "SQM", envelope: bool = False, functions: int = 9) -> lfm.Data:
+def simulate(seed: int = 0, residual: str = "SQM", envelope: bool = False, functions: int = 5) -> lfm.Data:
     """Simulate four days of a home under its thermostat.
 
     Args:

@@ -15,6 +15,7 @@ from numpyro import handlers
 
 from lfm_ppl import loading
 from lfm_ppl.comparators.switched_simulation import simulate_switched
+from lfm_ppl.data import Data
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.inference.posterior import likelihood_site
 from lfm_ppl.model.known_input import Input
@@ -39,7 +40,12 @@ OUTDOOR = ("outdoor_mean", "outdoor_scale", "outdoor_lengthscale")
 _POWER = 100.0
 """Unit of the recorded heating power, so that full power is about one."""
 
-_WALLS = {"gamma": 0.05, "psi": 0.05}
+_HOME = {"alpha": 0.1, "beta": 2.5, "scale": 0.3, "lengthscale": 0.5, "memory": 5.0, "noise_sd": 0.05,
+         "outdoor_mean": 6.0, "outdoor_scale": 3.0, "outdoor_lengthscale": 10.0, "gamma": 0.05, "psi": 0.05}
+"""The simulated home, that of the model file's default data and its walls."""
+
+_VARIED = ("alpha", "beta", "scale", "gamma", "psi")
+_FUNCTIONS = 15
 
 
 class Window(NamedTuple):
@@ -109,8 +115,6 @@ def house(folder: str) -> tuple[Window, ...]:
 
 
 def _window(y: np.ndarray, **more: Any) -> Window:
-    from lfm_ppl.data import Data
-
     learnt = Data(TIMES[:TRAIN], y[:TRAIN], model_file().outputs or ())
     return Window(y, model_file().anchors(learnt), **more)
 
@@ -156,10 +160,8 @@ def home(index: int, store: str, seed: int = 0) -> Window:
     """
     generator = np.random.default_rng([seed, index, STORES.index(store)])
     points = _set_points(generator)
-    truth: Any = model_file().simulate().truth
-    vary = ("alpha", "beta", "scale", "gamma", "psi")
-    values = {name: value * np.exp(0.2 * generator.normal()) if name in vary else value
-              for name, value in (truth["parameters"] | (_WALLS if store == STORES[1] else {})).items()}
+    values = {name: _HOME[name] * np.exp(0.2 * generator.normal()) if name in _VARIED else _HOME[name]
+              for name in _HOME if store == STORES[1] or name not in ("gamma", "psi")}
     key = jax.random.fold_in(jax.random.key(seed), index)
     y, inputs = (np.asarray(part) for part in _simulator(store)(key, values, points))
     share = inputs[:-1].reshape(-1, PER_HOUR).mean(axis=1)
@@ -184,7 +186,7 @@ def _simulator(store: str) -> Any:
     times = np.arange(len(TIMES) * PER_HOUR + 1) / PER_HOUR
 
     def draw(key: jax.Array, values: dict[str, Any], points: jax.Array) -> tuple[jax.Array, jax.Array]:
-        build = lambda heater: under("SQM", store, 15, values, heater)  # noqa: E731
+        build = lambda heater: under("SQM", store, _FUNCTIONS, values, heater)  # noqa: E731
         found = simulate_switched(key, build, thermostat(points), times, steps=1)
         return found.y[:, 0], found.inputs[:, 0]
 
