@@ -17,6 +17,9 @@ FREEDOM = (3, 5)
 WIDER = (1.2, 1.05)
 """How much wider they are than the curvature and the weighted moments say."""
 
+_LEAST = 0.01
+"""Share of the first covariance that is added to the weighted one: a few draws with all the weight make it singular."""
+
 
 class Weighted(NamedTuple):
     """Draws (D, P) with their importance weights."""
@@ -46,7 +49,8 @@ def weighted(log_density: Callable[[np.ndarray], np.ndarray], mode: Minimum, cou
         draws = proposal.rvs(size, random_state=generator)
         log_ratio = log_density(draws) - proposal.logpdf(draws)
         weights = importance.smooth(np.where(np.isfinite(log_ratio), log_ratio, -np.inf)[None])
-        centre, covariance = moments(draws, np.exp(weights.log_weight[0]))
+        centre, spread = moments(draws, np.exp(weights.log_weight[0]))
+        covariance = spread + _LEAST * covariance
     return Weighted(draws, weights)
 
 

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from lfm_ppl.experiments import catalogue, scores
+from lfm_ppl.experiments import catalogue, scores, weighting
 from lfm_ppl.experiments.ballistic import (
     chains,
     experiment,
     figures,
+    known,
     parameters,
     particles,
     problem,
@@ -83,14 +84,21 @@ def test_weighted_draws_have_the_moments_of_their_density():
     factor = np.array([[2.0, 0.0, 0.0], [0.5, 1.0, 0.0], [0.0, -0.3, 0.4]])
     target = stats.multivariate_normal([1.0, -2.0, 3.0], factor @ factor.T)
     mode = SimpleNamespace(point=target.mean + [1.0, 0.0, 0.2], curvature=SimpleNamespace(factor=0.8 * factor))
-    draws, found = parameters.weighted(target.logpdf, mode, 20_000, 0)
+    draws, found = weighting.weighted(target.logpdf, mode, 20_000, 0)
     mean, covariance = parameters.moments(draws, np.exp(found.log_weight[0]))
     assert found.k < 0.5 and found.ess > 10_000
     variance = np.diag(target.cov)
     np.testing.assert_array_less(np.abs(mean - target.mean), 4 * np.sqrt(variance / found.ess))
     np.testing.assert_allclose(np.diag(covariance), variance, rtol=4 * np.sqrt(2 / found.ess))
     with pytest.raises(ValueError, match="no curvature"):
-        parameters.weighted(target.logpdf, SimpleNamespace(point=mode.point, curvature=None), 10, 0)
+        weighting.weighted(target.logpdf, SimpleNamespace(point=mode.point, curvature=None), 10, 0)
+
+
+def test_weights_that_one_draw_has_do_not_end_the_search():
+    """A density far narrower than its curvature says: the second proposal must not be singular."""
+    mode = SimpleNamespace(point=np.zeros(3), curvature=SimpleNamespace(factor=np.eye(3)))
+    draws, found = weighting.weighted(lambda z: -0.5 * ((z - 3.0) ** 2).sum(axis=1) / 1e-8, mode, 50, 0)
+    assert np.isfinite(draws).all() and found.k > 0.7
 
 
 @pytest.mark.slow
@@ -147,6 +155,9 @@ def made_up(settings):
         else:
             total = settings.drawn_runs if given["what"] == "drawn" else settings.runs
             below = (np.arange(given["first"], given["last"] + 1)[:, None] + 0.5) / total * np.ones(3)
+            if given["what"] == "known":
+                results[task.name] = {"below": below[:, 0]}
+                continue
             found = {"likely": problem.true_z() + np.zeros((count, 3)), "exists": np.arange(count) > 0,
                      "posterior_mean": problem.true_z() + np.zeros((count, 3)),
                      "posterior_sd": np.full((count, 3), 0.1), "below": below, "k": np.full(count, 0.2),
@@ -179,6 +190,8 @@ def test_the_tables_hold_what_was_found():
     assert row["maximum"] == 0.9 and row["truth"] == pytest.approx(-7.708, abs=1e-3)
     assert [row[f"coverage {level}%"] for level in (50, 80, 95)] == pytest.approx([0.5, 0.8, 0.96], abs=0.011)
     assert found.loc["log scale, drawn from the prior", "coverage 80%"] == pytest.approx(0.8, abs=0.051)
+    alone = found.loc["log alpha, the force's parameters known"]
+    assert alone["coverage 80%"] == pytest.approx(0.8, abs=0.011) and np.isnan(alone["posterior sd"])
     assert row["coverage 50% se"] == pytest.approx(0.05, abs=1e-3) and row["rank p"] > 0.99
     agreement = tables.agreement(MADE, results)
     assert agreement.loc["RAM", "shift"] == pytest.approx(0.5)
@@ -225,7 +238,7 @@ def test_what_is_stored_is_tabulated_and_drawn_without_computing(tmp_path):
 
 def test_tasks_have_files_of_their_own():
     found = experiment.all_tasks(experiment.Settings())
-    assert len({task.file for task in found}) == len(found) == 4 * 10 + 50 + 10 + 4 * 20 + 2 * 3
+    assert len({task.file for task in found}) == len(found) == 4 * 10 + 50 + 20 + 4 * 20 + 2 * 3 + 10
 
 
 def test_mistakes():
@@ -246,3 +259,14 @@ def test_the_quick_version_runs_from_end_to_end(tmp_path):
     found = report.run(catalogue.Wanted(tmp_path, realisations=2, quick=True))
     assert len(found.written) == 12 and all(path.stat().st_size > 0 for path in found.written)
     assert len(found.tables) == 4
+
+
+def test_the_drag_alone_is_covered_as_often_as_it_should():
+    """With the force's parameters known, by another quadrature."""
+    target = problem.target(0)
+    z = np.log(np.linspace(*np.exp(target.z[0] + np.array([-1.0, 1.0])), 400))  # equally spaced in alpha
+    points = jnp.asarray(np.stack([z, np.full(400, target.z[1]), np.full(400, target.z[2])], axis=1))
+    log_likelihood = np.asarray(jax.lax.map(lambda one: problem.log_densities(one, target.y)[0], points, batch_size=20))
+    density = np.exp(log_likelihood - log_likelihood.max())
+    cells = 0.5 * (density[1:] + density[:-1]) * np.diff(z)
+    assert known.below(target) == pytest.approx(cells[z[1:] <= target.z[0]].sum() / cells.sum(), abs=0.02)

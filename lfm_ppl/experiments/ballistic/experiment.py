@@ -11,7 +11,7 @@ import pandas as pd
 
 from lfm_ppl import checks
 from lfm_ppl.experiments import output
-from lfm_ppl.experiments.ballistic import chains, figures, parameters, particles, problem, tables, tracking
+from lfm_ppl.experiments.ballistic import chains, figures, known, parameters, particles, problem, tables, tracking
 from lfm_ppl.experiments.tasks import Result, Task, run_tasks
 
 TASKS = "tasks"
@@ -99,14 +99,14 @@ class Comparison(NamedTuple):
 def all_tasks(settings: Settings) -> list[Task]:
     """Return every task: those of the first targets first, so that the time left can be told."""
     found = [*tracking.tasks(settings), *parameters.tasks(settings), *particles.tasks(settings),
-             *chains.tasks(settings), *parameters.drawn_tasks(settings)]
+             *chains.tasks(settings), *parameters.drawn_tasks(settings), *known.tasks(settings)]
     return sorted(found, key=lambda task: task.settings.get("index", task.settings.get("first")))
 
 
 def compute(task: Task) -> Result:
     """Compute one task."""
     return {"tracking": tracking.compute, "particles": particles.compute, "parameters": parameters.compute,
-            "drawn": parameters.compute, "chains": chains.compute}[task.settings["what"]](task)
+            "drawn": parameters.compute, "known": known.compute, "chains": chains.compute}[task.settings["what"]](task)
 
 
 def run(settings: Settings, folder: str | Path, *, overwrite: bool = False,

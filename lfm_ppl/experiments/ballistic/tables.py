@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from lfm_ppl.experiments.ballistic import chains, problem, tracking
+from lfm_ppl.experiments.ballistic import chains, known, problem, tracking
 from lfm_ppl.experiments.ballistic import parameters as estimates
 from lfm_ppl.experiments.ballistic import particles as by_particles
 from lfm_ppl.experiments.scores import Estimate, mean_of, pair, rate_of, relative_errors_of_sd
@@ -123,6 +123,8 @@ def paired_ratio(first: np.ndarray, second: np.ndarray) -> Estimate:
 def parameters(settings: Any, results: dict[str, Result]) -> pd.DataFrame:
     """Return one row for each parameter, in its logarithm, and one for where it is drawn from the prior.
 
+    The last row is of the drag where the force's scale and lengthscale are known.
+
     Returns:
         The truth; mean and standard deviation over targets of the most likely value, where the likelihood has a
         maximum (``maximum``, the share of targets); posterior mean and standard deviation; the share of targets whose
@@ -137,6 +139,8 @@ def parameters(settings: Any, results: dict[str, Result]) -> pd.DataFrame:
         for index, name in enumerate(problem.NAMES):
             found = of_parameters(settings, results, drawn)
             rows[f"log {name}{', drawn from the prior' if drawn else ''}"] = _parameter(found, index, drawn)
+    below = np.concatenate([results[task.name]["below"] for task in known.tasks(settings)])
+    rows["log alpha, the force's parameters known"] = _covered(below)
     return pd.DataFrame.from_dict(rows, orient="index", dtype=float)
 
 
@@ -150,10 +154,15 @@ def _parameter(found: dict[str, np.ndarray], index: int, drawn: bool) -> dict[st
                 "its sd": float(likely.std(ddof=1)) if len(likely) > 1 else np.nan,
                 **pair("posterior mean", mean_of(found["posterior_mean"][:, index]))}
     row |= pair("posterior sd", mean_of(found["posterior_sd"][:, index]))
+    return row | _covered(below) | {"k > 0.7": float((found["k"] > 0.7).mean())}
+
+
+def _covered(below: np.ndarray) -> dict[str, float]:
+    """Return how often central intervals hold the truth, of posterior probabilities (N,) of less than it."""
+    row: dict[str, float] = {}
     for level in estimates.LEVELS:
         row |= pair(f"coverage {level:.0%}", rate_of(np.abs(below - 0.5) <= level / 2))
     row["rank p"] = float(stats.kstest(below, "uniform").pvalue)
-    row["k > 0.7"] = float((found["k"] > 0.7).mean())
     return row
 
 

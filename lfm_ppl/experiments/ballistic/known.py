@@ -1,0 +1,58 @@
+"""Posterior of the drag alone, where the force's scale and lengthscale are known: by quadrature.
+
+With the force's parameters unknown too, the shares of one truth that posteriors cover depend on how far their prior
+pulls. Here nothing else is unknown, so that they are nominal if the filter's likelihood is right.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lfm_ppl.experiments.ballistic import problem
+from lfm_ppl.experiments.ballistic.tracking import blocks
+from lfm_ppl.experiments.tasks import Result, Task
+
+REACH, POINTS = 1.5, 121
+"""Of the grid about the true log alpha: a dozen posterior standard deviations wide, of a tenth of one a cell."""
+BLOCK = 50
+"""Targets that are computed in one go, and stored in one file."""
+_TOGETHER = 11
+"""Points that are computed at a time."""
+
+
+def tasks(settings: Any) -> list[Task]:
+    """Return one task for each block of targets."""
+    return [Task(f"known/{first:04d}-{last:04d}", settings.seed,
+                 {"experiment": "ballistic", "what": "known", "first": first, "last": last})
+            for first, last in blocks(settings.runs, BLOCK)]
+
+
+def compute(task: Task) -> Result:
+    """Return ``below`` (N,), the posterior probability of less than the true log alpha, for a flat prior of it."""
+    targets = range(task.settings["first"], task.settings["last"] + 1)
+    return {"below": np.array([below(problem.target(index, task.seed)) for index in targets])}
+
+
+def below(target: problem.Target) -> float:
+    """Return the posterior probability that log alpha is less than it is; by the trapezoidal rule."""
+    alphas = target.z[0] + REACH * np.linspace(-1.0, 1.0, POINTS)
+    points = np.stack([alphas, np.full(POINTS, target.z[1]), np.full(POINTS, target.z[2])], axis=1)
+    log_likelihood = np.asarray(_log_likelihoods()(jnp.asarray(points), jnp.asarray(target.y)))
+    density = np.where(np.isfinite(log_likelihood), np.exp(log_likelihood - np.nanmax(log_likelihood)), 0.0)
+    total = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]))])
+    return float(np.interp(target.z[0], alphas, total / total[-1]))
+
+
+@functools.cache
+def _log_likelihoods() -> Callable:
+    """Return log likelihoods (K,) at points (K, 3), compiled once for all targets."""
+    def all_(points: jax.Array, y: jax.Array) -> jax.Array:
+        return jax.lax.map(lambda z: problem.log_densities(z, y)[0], points, batch_size=_TOGETHER)
+
+    return jax.jit(all_)
