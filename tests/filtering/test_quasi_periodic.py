@@ -91,6 +91,7 @@ def link(x, u, t):
     return softplus(u) - 0.7 * x
 
 
+@pytest.mark.slow
 def test_iterations_across_jumps_converge_with_the_steps():
     """The state just before a jump is a node of its own, so that finer steps change little."""
     one = model(lfm.QuasiPeriodic(kernel(), lfm.SQM(0.5, POINTS), functions=1), link)
@@ -99,6 +100,7 @@ def test_iterations_across_jumps_converge_with_the_steps():
     np.testing.assert_allclose(coarse.mean, fine.mean, atol=1e-2)
 
 
+@pytest.mark.slow
 def test_asking_for_times_changes_nothing():
     one = model(lfm.QuasiPeriodic(kernel(), lfm.SQM(0.5, POINTS), functions=1), link)
     plain, asked = lfm.smooth(one, TIMES, Y, steps=4), lfm.smooth(one, TIMES, Y, steps=4, at=np.append(AT, TIMES))
