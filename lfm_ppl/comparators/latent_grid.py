@@ -270,9 +270,6 @@ def _check_model(ssm: StateSpaceModel) -> None:
     if varying:
         raise ValueError(f"the dynamics must be linear in the state with constant coefficients, but their derivative "
                          f"in {', '.join(varying)} varies; use the particle smoother, lfm.particle_smoother, instead.")
-    if ssm.stack.jump_times:
-        raise ValueError("a force with jumps has no covariance between arbitrary times; use the particle smoother, "
-                         "lfm.particle_smoother, instead.")
 
 
 def _grid(points: Any, initial: float, times: np.ndarray) -> np.ndarray:
@@ -402,9 +399,10 @@ def _distinct(function: Any, lengths: np.ndarray) -> Any:
 def _root(force: Force, grid: np.ndarray) -> jax.Array:
     t, s = jnp.asarray(grid)[:, None], jnp.asarray(grid)[None, :]
     try:
-        covariance = force.covariance(t - grid[0], s - grid[0])
+        covariance = force.covariance_in_model(t, s, grid[0])
     except NotImplementedError:
-        covariance = force.sde_covariance(t - grid[0], s - grid[0])
+        raise ValueError("a force with jumps has no covariance between arbitrary times; use the particle smoother, "
+                         "lfm.particle_smoother, instead.") from None
     jitter = JITTER * jnp.max(jnp.diagonal(covariance))
     return jnp.linalg.cholesky(covariance + jitter * jnp.eye(len(grid)))
 

@@ -236,8 +236,9 @@ def _move(ssm: StateSpaceModel, settings: ParticleSettings, plan: Schedule, read
         state = jax.lax.cond(row.length > 0, move, lambda s: s, state)
     else:
         state = move(state)
-    for index in range(len(ssm.stack.jump_times)):
-        state = jnp.where(row.jump == index, _jumped(ssm, index, jump_key, state), state)
+    jumps = ssm.stack.jump_table()
+    if jumps is not None:
+        state = jax.lax.cond(row.jump >= 0, lambda s: _jumped(ssm, jumps, row.jump, jump_key, s), lambda s: s, state)
     end = row.start + row.length
     density = jax.vmap(lambda s: log_observation(ssm, s, end, jnp.maximum(row.observation, 0), observed),
                        in_axes=-1)(state)
@@ -245,10 +246,10 @@ def _move(ssm: StateSpaceModel, settings: ParticleSettings, plan: Schedule, read
     return state, jnp.where(possible, density, -jnp.inf)
 
 
-def _jumped(ssm: StateSpaceModel, index: int, key: jax.Array, state: jax.Array) -> jax.Array:
-    transition, covariance = ssm.stack.jump(index)
-    noise = normals(jax.random.fold_in(key, index), ssm.force_dim, state.shape[1])
-    forces = matmul(transition, state[ssm.physical_dim:]) + matmul(semidefinite_root(covariance), noise)
+def _jumped(ssm: StateSpaceModel, jumps: tuple[jax.Array, jax.Array], index: jax.Array, key: jax.Array,
+            state: jax.Array) -> jax.Array:
+    noise = normals(key, ssm.force_dim, state.shape[1])
+    forces = matmul(jumps[0][index], state[ssm.physical_dim:]) + matmul(semidefinite_root(jumps[1][index]), noise)
     return jnp.concatenate([state[:ssm.physical_dim], forces])
 
 

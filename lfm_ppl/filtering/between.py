@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lfm_ppl.filtering.jumps import after_jump
 from lfm_ppl.filtering.predict import Moments, Prediction, predict_row
 from lfm_ppl.filtering.retrospect import combine, given_later
 from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays
@@ -68,7 +69,7 @@ def marginals_between(ssm: StateSpaceModel, rule: Rule, plan: Schedule, start: M
     linear = linear_part(ssm, jnp.asarray(plan.initial_time, float))
     before = jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a[None], b[:-1]]), start, filtered)
     rows = as_arrays(plan.rows)
-    jumps = [ssm.stack.jump(index) for index in range(len(ssm.stack.jump_times))]
+    jumps = ssm.stack.jump_table()
 
     def piece(begin: jax.Array, length: jax.Array, moments: Moments, nearby: Any, flow: bool) -> Prediction:
         factor = integrating_factor(ssm, linear, length / plan.steps)
@@ -86,7 +87,8 @@ def marginals_between(ssm: StateSpaceModel, rule: Rule, plan: Schedule, start: M
             nearby = ((left, middle), (middle, right))
         now = piece(here.start, length, _entry(before, index), nearby[0], False).moments
         rest = piece(here.start + length, here.length - length, now, nearby[1], True)
-        rest = _through_jump(ssm, jumps, here.jump, rest)
+        if jumps is not None:
+            rest = after_jump(ssm, jumps, here.jump, rest, flow=True)
         gain, conditional = given_later(now, rest.moments, rest.phi, rest.noise)
         r, curvature = adjoint[0][index], adjoint[1][index]
         back = matmul(rest.phi.T, r[:, None])[:, 0], congruence(rest.phi.T, curvature)
@@ -100,15 +102,3 @@ def marginals_between(ssm: StateSpaceModel, rule: Rule, plan: Schedule, start: M
 
 def _entry(tree: Any, index: jax.Array) -> Any:
     return jax.tree_util.tree_map(lambda a: a[index], tree)
-
-
-def _through_jump(ssm: StateSpaceModel, jumps: list, index: jax.Array, one: Prediction) -> Prediction:
-    size = ssm.physical_dim
-    for number, (transition, covariance) in enumerate(jumps):
-        whole = jax.scipy.linalg.block_diag(jnp.eye(size), transition)
-        added = jax.scipy.linalg.block_diag(jnp.zeros((size, size)), covariance)
-        jumped = Prediction(
-            Moments(matmul(whole, one.moments.mean[:, None])[:, 0], congruence(whole, one.moments.covariance) + added),
-            matmul(whole, one.phi), congruence(whole, one.noise) + added)
-        one = jax.tree_util.tree_map(lambda a, b: jnp.where(index == number, a, b), jumped, one)  # noqa: B023
-    return one

@@ -10,11 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import checks
+from lfm_ppl.filtering.jumps import after_jump
 from lfm_ppl.filtering.predict import Moments, predict_exact, predict_row, unmoved
 from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays, schedule
 from lfm_ppl.filtering.transition import constant_slope, exact, integrating_factor, linear_part
 from lfm_ppl.filtering.update import linearise_observation, update
-from lfm_ppl.linalg import congruence, matmul, solve_lower
+from lfm_ppl.linalg import solve_lower
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.linearisation.sigma_points import Cubature
 from lfm_ppl.model.augment import StateSpaceModel, state_space
@@ -98,7 +99,7 @@ def forward(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, *, s
         return integrating_factor(ssm, linear, length / plan.steps)
 
     table = None if plan.lengths is None else jax.vmap(prepare)(jnp.asarray(plan.lengths))
-    jumps = _jump_table(ssm)
+    jumps = ssm.stack.jump_table()
     padded = jnp.concatenate([jnp.asarray(y, float), jnp.full((1, ssm.output_dim), jnp.nan)])
 
     def step(moments: Moments, inputs: tuple[Rows, jax.Array, Any]) -> tuple[Moments, Pass]:
@@ -113,7 +114,7 @@ def forward(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, *, s
             one = jax.lax.cond(row.length > 0, move, stay) if plan.replicated else move()
         predicted, phi, noise = one
         if jumps is not None:
-            predicted, phi, noise = _jump(ssm, jumps, row.jump, predicted, phi, noise, keep == "all" or invariant)
+            predicted, phi, noise = after_jump(ssm, jumps, row.jump, one, flow=keep == "all" or invariant)
         affine = linearise_observation(ssm, rule, slope, row.start + row.length, jnp.maximum(row.observation, 0),
                                        predicted, None if nearby is None else nearby[1])
         new = update(ssm, affine, observed, jnp.isfinite(observed), predicted)
@@ -138,26 +139,6 @@ def _observation_slope(ssm: StateSpaceModel, plan: Schedule) -> jax.Array:
     t = jnp.asarray(plan.initial_time, float)
     w = ssm.inputs(ssm.initial()[0], t)
     return constant_slope(lambda v: (ssm.observe(v, t), ()), w, ssm.observation_structure, ssm.output_dim)
-
-
-def _jump_table(ssm: StateSpaceModel) -> tuple[jax.Array, jax.Array] | None:
-    count = len(ssm.stack.jump_times)
-    if count == 0:
-        return None
-    pairs = [ssm.stack.jump(index) for index in range(count)]
-    nothing = (jnp.eye(ssm.force_dim), jnp.zeros((ssm.force_dim, ssm.force_dim)))
-    # The last entry, which index -1 selects, is no jump.
-    return tuple(jnp.stack([pair[part] for pair in (*pairs, nothing)]) for part in (0, 1))  # type: ignore[return-value]
-
-
-def _jump(ssm: StateSpaceModel, jumps: tuple[jax.Array, jax.Array], index: jax.Array, moments: Moments, phi: Any,
-          noise: Any, flow: bool) -> tuple[Moments, Any, Any]:
-    size = ssm.physical_dim
-    transition = jax.scipy.linalg.block_diag(jnp.eye(size), jumps[0][index])
-    added = jax.scipy.linalg.block_diag(jnp.zeros((size, size)), jumps[1][index])
-    moments = Moments(matmul(transition, moments.mean[:, None])[:, 0],
-                      congruence(transition, moments.covariance) + added)
-    return moments, *((matmul(transition, phi), congruence(transition, noise) + added) if flow else (phi, noise))
 
 
 def check_observations(y: Any, count: int, outputs: int, empty: bool = False) -> jax.Array:

@@ -116,11 +116,16 @@ def _concrete(times: np.ndarray, origin: float, jumps: tuple[float, ...], steps:
     end = max(times[-1], requested.max(initial=-np.inf))
     jump_index = [index for index, jump in enumerate(jumps) if origin < jump <= end]
     extra = np.setdiff1d(extra, [jumps[index] for index in jump_index])
-    time = np.concatenate([np.asarray(jumps, float)[jump_index], times, extra])
+    jump_time = np.asarray(jumps, float)[jump_index]
+    # Where the smoother looks at each step, a jump has a row of its own, so that the state just before it is a node.
+    before = jump_time if row_per_step else jump_time[:0]
+    time = np.concatenate([before, jump_time, times, extra])
     # At equal times a jump comes before an observation.
-    rank = np.repeat([0, 1, 2], [len(jump_index), len(times), len(extra)])
-    observation = np.concatenate([np.full(len(jump_index), -1), np.arange(len(times)), np.full(len(extra), -1)])
-    jump = np.concatenate([jump_index, np.full(len(times) + len(extra), -1)]).astype(int)
+    rank = np.repeat([0, 1, 2, 3], [len(before), len(jump_time), len(times), len(extra)])
+    observation = np.full(len(time), -1)
+    observation[rank == 2] = np.arange(len(times))
+    jump = np.full(len(time), -1)
+    jump[rank == 1] = jump_index
     order = np.lexsort((observation, rank, time))
     time, observation, jump = time[order], observation[order], jump[order]
     begin = np.append(origin, time[:-1])

@@ -12,7 +12,9 @@ from lfm_ppl.forces.periodic_kernels import (
 from lfm_ppl.forces.quasi_periodic import Periodic, QuasiPeriodic, significant_functions
 from lfm_ppl.forces.random_walk import RandomWalk
 from lfm_ppl.forces.resonator import Resonator
+from lfm_ppl.forces.resonators import resonators
 from lfm_ppl.forces.sde import Force
+from lfm_ppl.forces.sparse_spectrum import SparseSpectrum, random_frequencies
 from lfm_ppl.forces.squared_exponential import SquaredExponential
 from lfm_ppl.forces.sum import Stack, Sum
 from lfm_ppl.forces.weights import CQM, SQM, WQM, change_points
@@ -33,11 +35,14 @@ __all__ = [
     "RandomWalk",
     "Resonator",
     "SQM",
+    "SparseSpectrum",
     "SquaredExponential",
     "Stack",
     "Sum",
     "WQM",
     "WienerVelocity",
     "change_points",
+    "random_frequencies",
+    "resonators",
     "significant_functions",
 ]

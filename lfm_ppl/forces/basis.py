@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
+from scipy.special import roots_legendre
 
 from lfm_ppl import checks
-from lfm_ppl.forces.discretise import gauss_legendre
 from lfm_ppl.forces.eigenspace import leading_eigenvectors
 from lfm_ppl.forces.periodic_kernels import Kernel
-from lfm_ppl.linalg import matmul
+from lfm_ppl.linalg import matmul, semidefinite_root, solve_lower
 
 _NEGATIVE = 1e-8
 """Share of the largest eigenvalue below zero at which a kernel is not taken for positive definite."""
@@ -165,8 +165,9 @@ class Eigenfunctions(Basis):
         gram = kernel(self.points[:, None], self.points[None, :])
         self.vectors = leading_eigenvectors(0.5 * (gram + gram.T), count)
         inner = self.vectors.T @ gram @ self.vectors
-        factor = jnp.linalg.cholesky(0.5 * (inner + inner.T))
-        self.white = jax.scipy.linalg.solve_triangular(factor, self.vectors.T, lower=True).T
+        # Eigenvalues at rounding level have no direction of their own; theirs is left out.
+        factor = semidefinite_root(0.5 * (inner + inner.T))
+        self.white = solve_lower(factor, self.vectors.T).T
         self.spectrum = jnp.diagonal(inner) / points
 
     @property
@@ -231,7 +232,8 @@ def fourier_coefficients(kernel: Kernel, harmonics: int) -> jax.Array:
     ``q_j = (2 - [j = 0]) 2/D int_0^(D/2) k(lag) cos(2 pi j lag / D) dlag`` by Gauss-Legendre quadrature, which
     converges exponentially for kernels that are smooth between lag 0, where they may have a kink, and half a period.
     """
-    nodes, weights = gauss_legendre(64 + 2 * harmonics)
+    nodes, weights = roots_legendre(64 + 2 * harmonics)
+    nodes, weights = 0.5 * (nodes + 1.0), 0.5 * weights
     order = np.arange(harmonics + 1)
     wave = np.cos(np.pi * order[:, None] * nodes) * weights * np.where(order == 0, 1.0, 2.0)[:, None]
     # At times that lie in one cycle of the kernel, whatever its start.

@@ -10,7 +10,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from lfm_ppl import checks
-from lfm_ppl.forces.basis import Basis, Eigenfunctions, spectrum, waves
+from lfm_ppl.forces.basis import Basis, Eigenfunctions, Waves, spectrum, waves
 from lfm_ppl.forces.constant import Constant
 from lfm_ppl.forces.parameters import mean_parameter
 from lfm_ppl.forces.periodic_kernels import Kernel
@@ -30,8 +30,9 @@ class QuasiPeriodic(Force):
     with the leading eigenfunctions phi_j of the periodic kernel, their eigenvalues mu_j, and any process for the
     weights: `CQM`, `SQM`, `WQM`, or another force of scale 1, such as a Matern force of any order. At no lag does the
     covariance miss more than the eigenvalues left out. Where those above 1/100 of the largest are kept, as by default,
-    that is less than 0.01 of the variance for the periodic squared exponential and the periodic Matern of order 2 or
-    more, but up to 0.02 for order 1 and 0.07 for order 0: these need more functions, that is a smaller gamma.
+    that is less than 0.01 of the variance for the periodic squared exponential and for order 2 of the periodic Matern,
+    or 0.02 at lengthscales where a pair is only just left out; 0.022 for order 1 and 0.07 for order 0. Rough kernels
+    need more functions, that is a smaller gamma.
 
     A stationary kernel has the Fourier series ``sum_j q_j cos(2 pi j t / D)``, whose coefficients are integrals of
     the kernel, so that no eigen-decomposition is needed; each pair turns in its state and the force has constant
@@ -71,9 +72,7 @@ class QuasiPeriodic(Force):
 
     def __init__(self, kernel: Kernel, evolution: Force, functions: int | None = None, gamma: float = 0.01,
                  mean: Any = 0.0, points: int = _POINTS):
-        if not isinstance(kernel, Kernel):
-            raise TypeError(f"kernel must be a periodic kernel such as lfm.PeriodicMatern, got {kernel!r}. Wrap a "
-                            "function k(t, s) in lfm.PeriodicKernel.")
+        _check_kernel(kernel)
         if not isinstance(evolution, Force):
             raise TypeError("evolution must be lfm.CQM, lfm.SQM, lfm.WQM or a force of scale 1, got "
                             f"{type(evolution).__name__}.")
@@ -156,6 +155,18 @@ class QuasiPeriodic(Force):
         raise NotImplementedError(f"a {type(self).__name__} force has no spectral density in closed form; use "
                                   "`covariance`.")
 
+    def covariance_in_model(self, t: ArrayLike, s: ArrayLike, initial_time: ArrayLike) -> jax.Array:
+        """Return the product of the two kernels in a model that starts at ``initial_time``."""
+        return self.kernel(t, s) * self.evolution.covariance_in_model(t, s, initial_time)
+
+    def check_span(self, name: str, first: float, last: float) -> None:
+        """Check that a cycle is not longer than the data, where the period is known."""
+        period = checks.concrete(self.period)
+        if period is not None and period > (last - first) * (1 + 1e-9):
+            raise ValueError(f"the force {name!r} has a period of {float(period):g}, longer than the data, which span "
+                             f"{last - first:g} from {first:g} to {last:g}: nothing repeats in them. Check the unit of "
+                             "the period, or take lfm.Matern.")
+
     @property
     def jump_times(self) -> tuple[float, ...]:
         """The change points of the evolution."""
@@ -175,7 +186,7 @@ class Periodic(QuasiPeriodic):
 
     The phi_j are the leading eigenfunctions of a periodic kernel, the mu_j their eigenvalues; `QuasiPeriodic` says how
     they are found and how many are needed. At the default gamma the covariance of a periodic Matern force of order 0 is
-    0.07 of the variance off, that of order 2 and that of a periodic squared exponential less than 0.01.
+    0.07 of the variance off, that of order 2 and that of a periodic squared exponential mostly less than 0.01.
 
     Args:
         kernel: a periodic kernel, such as `PeriodicMatern`.
@@ -241,17 +252,39 @@ def significant_functions(kernel: Kernel, gamma: float = 0.01, points: int = _PO
                      "larger gamma or a longer lengthscale, or give functions.")
 
 
+def stationary_basis(kernel: Kernel, functions: int | None, gamma: float) -> Waves:
+    """Return the level and the pairs of a stationary kernel, as many as were asked for or are significant.
+
+    Raises:
+        TypeError, ValueError: as `QuasiPeriodic`; a kernel that is not stationary.
+    """
+    _check_kernel(kernel)
+    if not kernel.stationary:
+        raise ValueError(f"the kernel {kernel.name!r} is not stationary, so its eigenfunctions are not oscillations of "
+                         "one frequency each; use lfm.Periodic or lfm.QuasiPeriodic.")
+    if functions is None:
+        functions = significant_functions(kernel, gamma)
+    checks.positive_integer("functions", functions, "It is the number of eigenfunctions.")
+    if functions % 2 == 0:
+        raise ValueError("functions must be odd for a stationary kernel, one constant and pairs of cosine and "
+                         f"sine; got {functions}. Take {functions - 1} or {functions + 1}.")
+    return waves(kernel, functions // 2)
+
+
 def _basis(kernel: Kernel, functions: int | None, gamma: float, points: int) -> Basis:
+    if kernel.stationary:
+        return stationary_basis(kernel, functions, gamma)
     if functions is None:
         functions = significant_functions(kernel, gamma, points)
     checks.positive_integer("functions", functions, "It is the number of eigenfunctions.")
-    if kernel.stationary:
-        if functions % 2 == 0:
-            raise ValueError("functions must be odd for a stationary kernel, one constant and pairs of cosine and "
-                             f"sine; got {functions}. Take {functions - 1} or {functions + 1}.")
-        return waves(kernel, functions // 2)
     if functions > points:
         raise ValueError(f"functions must be at most points = {points}, got {functions}; take more points.")
     if not checks.traced(kernel):
         spectrum(kernel, points)
     return Eigenfunctions(kernel, functions, points)
+
+
+def _check_kernel(kernel: Kernel) -> None:
+    if not isinstance(kernel, Kernel):
+        raise TypeError(f"kernel must be a periodic kernel such as lfm.PeriodicMatern, got {kernel!r}. Wrap a "
+                        "function k(t, s) in lfm.PeriodicKernel.")

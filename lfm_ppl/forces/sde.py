@@ -122,6 +122,23 @@ class Force(eqx.Module):
             )
         return _covariance(self, t, s)
 
+    def covariance_in_model(self, t: ArrayLike, s: ArrayLike, initial_time: ArrayLike) -> jax.Array:
+        """Return the covariance of u(t) and u(s) in a model that starts at ``initial_time``, elementwise.
+
+        It is the closed form, or that of the state-space form where there is none, with both times counted from
+        ``initial_time``. A force whose covariance depends on the time itself replaces it.
+
+        Raises:
+            NotImplementedError: for a force with jumps that does not replace it.
+        """
+        if self.jump_times:
+            raise NotImplementedError(f"{type(self).__name__} jumps, and has no covariance between arbitrary times.")
+        t, s = jnp.asarray(t) - initial_time, jnp.asarray(s) - initial_time
+        try:
+            return self.covariance(t, s)
+        except NotImplementedError:
+            return self.sde_covariance(t, s)
+
     def sde_spectral_density(self, omega: ArrayLike) -> jax.Array:
         """Return the spectral density ``|H (i omega - F)^-1 L|^2`` of the state-space form.
 
@@ -151,6 +168,13 @@ class Force(eqx.Module):
         """
         count = len(self.jump_times)
         raise IndexError(f"{type(self).__name__} has {count} jumps, so none at index {index}.")
+
+    def check_span(self, name: str, first: float, last: float) -> None:
+        """Check the force against data from ``first`` to ``last``; all is well by default.
+
+        Raises:
+            ValueError: nothing can be learned from such data, for example about a period longer than they are.
+        """
 
     def __add__(self, other: "Force") -> "Force":
         """Return the force that is the sum of two independent forces."""

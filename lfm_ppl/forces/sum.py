@@ -74,6 +74,14 @@ class Stack(eqx.Module):
         pairs = [_jump_at(force, time) for force in self.forces]
         return block_diagonal([p[0] for p in pairs]), block_diagonal([p[1] for p in pairs])
 
+    def jump_table(self) -> tuple[jax.Array, jax.Array] | None:
+        """Return G and Q (K + 1, n, n) of all K jumps, the last entry (index -1) for no jump; None without any."""
+        if not self.jump_times:
+            return None
+        nothing = (jnp.eye(self.state_dim), jnp.zeros((self.state_dim, self.state_dim)))
+        pairs = [*(self.jump(index) for index in range(len(self.jump_times))), nothing]
+        return jnp.stack([pair[0] for pair in pairs]), jnp.stack([pair[1] for pair in pairs])
+
 
 class Sum(Force):
     """The sum of independent forces, itself a force: ``u(t) = sum_r u_r(t)``.
@@ -160,9 +168,18 @@ class Sum(Force):
         """Return the sum of the closed-form covariances."""
         return functools.reduce(jnp.add, [force.covariance(t, s) for force in self.forces])
 
+    def covariance_in_model(self, t: ArrayLike, s: ArrayLike, initial_time: ArrayLike) -> jax.Array:
+        """Return the sum of the terms' covariances in a model that starts at ``initial_time``."""
+        return functools.reduce(jnp.add, [f.covariance_in_model(t, s, initial_time) for f in self.forces])
+
     def spectral_density(self, omega: ArrayLike) -> jax.Array:
         """Return the sum of the closed-form spectral densities."""
         return functools.reduce(jnp.add, [f.spectral_density(omega) for f in self.forces])
+
+    def check_span(self, name: str, first: float, last: float) -> None:
+        """Check every term."""
+        for force in self.forces:
+            force.check_span(name, first, last)
 
     @property
     def jump_times(self) -> tuple[float, ...]:

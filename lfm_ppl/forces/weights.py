@@ -80,6 +80,19 @@ class _Steps(Force):
         """Return the same as `covariance`, which is exact."""
         return self.covariance(t, s)
 
+    def covariance(self, t: ArrayLike, s: ArrayLike = 0.0) -> jax.Array:
+        """Return k(t, s), elementwise; the times are the model's."""
+        return self.between_cycles(self.cycle(t), self.cycle(s))
+
+    def covariance_in_model(self, t: ArrayLike, s: ArrayLike, initial_time: ArrayLike) -> jax.Array:
+        """Return k(t, s) in a model that starts at ``initial_time``: no change point before it counts."""
+        before = self.cycle(initial_time)
+        return self.between_cycles(self.cycle(t) - before, self.cycle(s) - before)
+
+    def between_cycles(self, one: jax.Array, other: jax.Array) -> jax.Array:
+        """Return the covariance of the weights in two cycles, elementwise; the first cycle is number 0."""
+        raise NotImplementedError
+
     def cycle(self, t: ArrayLike) -> jax.Array:
         """Return the number of change points up to t, elementwise; one at t itself counts."""
         points = np.asarray(self.change_points, float)
@@ -121,9 +134,9 @@ class SQM(_Steps):
             return super().jump(index)
         return jnp.exp(-jnp.ones((1, 1)) / self.lengthscale), -jnp.expm1(-2.0 * jnp.ones((1, 1)) / self.lengthscale)
 
-    def covariance(self, t: ArrayLike, s: ArrayLike = 0.0) -> jax.Array:
-        """Return k(t, s), elementwise; the times are the model's."""
-        return jnp.exp(-jnp.abs(self.cycle(t) - self.cycle(s)) / self.lengthscale)
+    def between_cycles(self, one: jax.Array, other: jax.Array) -> jax.Array:
+        """Return ``exp(-|one - other| / lengthscale)``."""
+        return jnp.exp(-jnp.abs(one - other) / self.lengthscale)
 
 
 class WQM(_Steps):
@@ -162,9 +175,9 @@ class WQM(_Steps):
             return super().jump(index)
         return jnp.ones((1, 1)), jnp.reshape(self.growth, (1, 1))
 
-    def covariance(self, t: ArrayLike, s: ArrayLike = 0.0) -> jax.Array:
-        """Return k(t, s), elementwise; the times are the model's."""
-        return 1.0 + self.growth * jnp.minimum(self.cycle(t), self.cycle(s))
+    def between_cycles(self, one: jax.Array, other: jax.Array) -> jax.Array:
+        """Return ``1 + growth min(one, other)``."""
+        return 1.0 + self.growth * jnp.minimum(one, other)
 
 
 def change_points(period: float, start: float, stop: float) -> tuple[float, ...]:

@@ -84,6 +84,9 @@ class MarginalLikelihood(dist.Distribution):
         self.rule, self.steps, self.max_step = as_rule(rule), steps, max_step
         self.iterations, self.damping = iterations, damping
         model.check_at(self.plan.initial_time, np.shape(times)[0])
+        known = checks.concrete(times)
+        if known is not None:
+            model.check_span(float(known[0]), float(known[-1]))
         warn_single_precision()
         super().__init__((), (np.shape(times)[0], self.ssm.output_dim), validate_args=False)
 
@@ -173,7 +176,8 @@ class Panel(dist.Distribution):
                 check_times(row, None)
             except ValueError as error:
                 raise ValueError(f"series {series}: {error}") from None
-        one = jax.eval_shape(lambda p, t: jnp.zeros(self._one(p, t).event_shape),
+        # Times that all series share stay known, since jumps of a force and longest steps are planned by them.
+        one = jax.eval_shape(lambda p, t: jnp.zeros(self._one(p, t if self._series_times else times).event_shape),
                              jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf)[0], parameters),
                              jnp.zeros(np.shape(times)[-1]))
         if not self._series_times:

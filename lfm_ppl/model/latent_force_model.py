@@ -139,6 +139,11 @@ class LatentForceModel(eqx.Module):
             raise ValueError(f"angular indices must lie in 0..{outputs - 1}, got {self.observation.angular}.")
         return outputs
 
+    def check_span(self, first: float, last: float) -> None:
+        """Check the forces against data from ``first`` to ``last``; raise ValueError where one does not suit them."""
+        for name, force in self.forces.items():
+            force.check_span(name, first, last)
+
     def check_at(self, time: Any, rows: int) -> None:
         """Check what depends on where and how often the model is observed.
 

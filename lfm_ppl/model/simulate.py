@@ -80,7 +80,8 @@ def simulate_on(ssm: StateSpaceModel, key: jax.Array, times: jax.Array, start: j
     mean, covariance = ssm.initial()
     first = mean + matmul(semidefinite_root(covariance), jax.random.normal(initial, (ssm.state_dim, 1)))[:, 0]
     starts = jnp.concatenate([jnp.reshape(start, (1,)), times[:-1]])
-    jumps = jnp.asarray(ssm.stack.jump_times, float)
+    table = ssm.stack.jump_table()
+    jumps = None if table is None else (table[0][:-1], jax.vmap(semidefinite_root)(table[1][:-1]))
 
     def row(state: jax.Array, inputs: tuple) -> tuple[jax.Array, jax.Array]:
         begin, end, row_key = inputs
@@ -91,7 +92,9 @@ def simulate_on(ssm: StateSpaceModel, key: jax.Array, times: jax.Array, start: j
         def step(state: jax.Array, index: jax.Array) -> tuple[jax.Array, None]:
             keys = jax.random.fold_in(row_key, index)
             state = _simulation_step(ssm, state, begin + index * h, h, transition, root, keys)
-            return _cross_jumps(ssm, jumps, state, begin + index * h, begin + (index + 1) * h, keys), None
+            # The last step ends at the row's end to the last bit: a jump there is crossed, and once only.
+            until = jnp.where(index == steps - 1, end, begin + (index + 1) * h)
+            return _cross_jumps(ssm, jumps, state, begin + index * h, until, keys), None
 
         state, _ = jax.lax.scan(step, state, jnp.arange(steps))
         return state, state
@@ -131,17 +134,26 @@ def _simulation_step(ssm: StateSpaceModel, state: jax.Array, t: jax.Array, h: ja
     return jnp.concatenate([x + h / 6 * (slope + 2 * second + 2 * third + last) + kick, forces])
 
 
-def _cross_jumps(ssm: StateSpaceModel, jumps: jax.Array, state: jax.Array, begin: jax.Array, end: jax.Array,
+def _cross_jumps(ssm: StateSpaceModel, jumps: Any, state: jax.Array, begin: jax.Array, end: jax.Array,
                  key: jax.Array) -> jax.Array:
     """Apply the forces' jumps that fall into (begin, end], at the step's end."""
+    if jumps is None:
+        return state
     size = ssm.physical_dim
-    for index in range(len(ssm.stack.jump_times)):
-        transition, covariance = ssm.stack.jump(index)
+    times = jnp.asarray(ssm.stack.jump_times, float)
+    crossed = (times > begin) & (times <= end)
+
+    def one(forces: jax.Array, jump: tuple) -> tuple[jax.Array, None]:
+        here, index, transition, root = jump
         draw = jax.random.normal(jax.random.fold_in(key, index + 1), (ssm.force_dim, 1))
-        jumped = (matmul(transition, state[size:, None]) + matmul(semidefinite_root(covariance), draw))[:, 0]
-        crossed = (jumps[index] > begin) & (jumps[index] <= end)
-        state = state.at[size:].set(jnp.where(crossed, jumped, state[size:]))
-    return state
+        jumped = (matmul(transition, forces[:, None]) + matmul(root, draw))[:, 0]
+        return jnp.where(here, jumped, forces), None
+
+    def all_crossed(forces: jax.Array) -> jax.Array:
+        return jax.lax.scan(one, forces, (crossed, jnp.arange(len(times)), *jumps))[0]
+
+    forces = jax.lax.cond(crossed.any(), all_crossed, lambda forces: forces, state[size:])
+    return jnp.concatenate([state[:size], forces])
 
 
 def noisy_observation(ssm: StateSpaceModel, w: jax.Array, t: jax.Array, key: jax.Array,

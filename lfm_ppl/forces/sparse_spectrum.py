@@ -1,0 +1,151 @@
+"""The sparse spectrum approximation: oscillations of random frequencies, to compare other forces with."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from lfm_ppl import checks
+from lfm_ppl.forces.basis import Waves, fourier_coefficients
+from lfm_ppl.forces.matern import Matern
+from lfm_ppl.forces.parameters import mean_parameter, positive_parameter
+from lfm_ppl.forces.periodic_kernels import Kernel
+from lfm_ppl.forces.sde import Force
+from lfm_ppl.forces.squared_exponential import SquaredExponential
+
+_HARMONICS = 512
+
+
+class SparseSpectrum(Force):
+    r"""A force made of S oscillations: what random frequencies leave of a stationary Gaussian process.
+
+        u(t) = sum_i a_i cos(w_i t) + b_i sin(w_i t),    a_i, b_i ~ N(0, scale^2 / S),
+        k(t, s) = scale^2 / S sum_i cos(w_i (t - s)).
+
+    With frequencies drawn from the spectral density of a kernel this is its unbiased estimate, off by about
+    ``scale^2 / sqrt(2 S)`` at long lags. It is meant for comparisons; `Matern` and `SquaredExponential` forces are
+    better and cheaper, and `Periodic` ones where the kernel is periodic.
+
+    Args:
+        scale: standard deviation of u, in the units of the force; > 0.
+        frequencies: (S,) w_i, in radians per unit of time.
+        mean: a number, or a function of time.
+
+    Raises:
+        ValueError: for a scale that is not positive, or frequencies that are not a vector of finite numbers.
+
+    Example:
+        >>> import numpy as np
+        >>> force = SparseSpectrum(scale=2.0, frequencies=np.array([1.0, 3.0]))
+        >>> force.state_dim, float(force.covariance(0.0))
+        (4, 4.0)
+
+    Source: Lazaro-Gredilla et al. (2010), Journal of Machine Learning Research 11; Reece et al. (2014), section 5.
+    """
+
+    scale: jax.Array
+    frequencies: jax.Array
+    mean: Any
+
+    def __init__(self, scale: Any, frequencies: Any, mean: Any = 0.0):
+        self.scale = positive_parameter("scale", scale)
+        checks.finite("frequencies", frequencies)
+        self.frequencies = jnp.asarray(frequencies, float)
+        if self.frequencies.ndim != 1 or self.frequencies.shape[0] == 0:
+            raise ValueError(f"frequencies must be a vector of at least one, got shape {self.frequencies.shape}.")
+        self.mean = mean_parameter(mean)
+
+    @property
+    def _waves(self) -> Waves:
+        count = self.frequencies.shape[0]
+        return Waves(None, self.frequencies, self.scale**2 / count * jnp.ones(count))
+
+    @property
+    def state_dim(self) -> int:
+        """Two states for each frequency."""
+        return 2 * self.frequencies.shape[0]
+
+    @property
+    def noise_dim(self) -> int:
+        """No noise."""
+        return 0
+
+    @property
+    def stationary(self) -> bool:
+        """True."""
+        return True
+
+    def initial_covariance(self) -> jax.Array:
+        """Return P0 (n, n)."""
+        return jnp.diag(self._waves.variances())
+
+    def feedback(self) -> jax.Array:
+        """Return F (n, n)."""
+        return self._waves.feedback()
+
+    def dispersion(self) -> jax.Array:
+        """Return L (n, 0)."""
+        return jnp.zeros((self.state_dim, 0))
+
+    def discretise(self, dt: ArrayLike) -> tuple[jax.Array, jax.Array]:
+        """Return transition (n, n) and process noise (n, n), zero, over a step of length dt >= 0."""
+        return self._waves.transition(dt), jnp.zeros((self.state_dim, self.state_dim))
+
+    def measurement(self, t: ArrayLike) -> jax.Array:
+        """Return H (n,), the same at all times."""
+        return self._waves.row(t)
+
+    def covariance(self, t: ArrayLike, s: ArrayLike = 0.0) -> jax.Array:
+        """Return k(t - s), elementwise."""
+        lag = jnp.asarray(t, float) - s
+        return self.scale**2 * jnp.cos(lag[..., None] * self.frequencies).mean(-1)
+
+    def spectral_density(self, omega: ArrayLike) -> jax.Array:
+        """Raise NotImplementedError: all the power sits at single frequencies."""
+        raise NotImplementedError("a SparseSpectrum force has all its power at single frequencies, so its spectral "
+                                  "density is not a function; use `covariance`.")
+
+    def sde_spectral_density(self, omega: ArrayLike) -> jax.Array:
+        """Raise NotImplementedError, as `spectral_density` does."""
+        return self.spectral_density(omega)
+
+
+def random_frequencies(key: jax.Array, prior: Force | Kernel, count: int) -> jax.Array:
+    """Draw frequencies (count,) from the spectral density of a stationary kernel, in radians per unit of time.
+
+    Args:
+        key: JAX random key.
+        prior: a `Matern` or `SquaredExponential` force, or a stationary periodic kernel, whose power sits at multiples
+            of its frequency.
+        count: S.
+
+    Raises:
+        TypeError: another prior.
+        ValueError: a kernel that is not stationary.
+
+    Example:
+        >>> import jax
+        >>> from lfm_ppl.forces import SquaredExponential
+        >>> random_frequencies(jax.random.key(0), SquaredExponential(1.0, 10.0), 22).shape
+        (22,)
+
+    Source: Lazaro-Gredilla et al. (2010), section 3.
+    """
+    checks.positive_integer("count", count)
+    if isinstance(prior, Matern):
+        # (1 + (w / lam)^2)^-(p + 1) is the density of Student's t with 2 p + 1 degrees of freedom.
+        freedom = 2 * prior.order + 1
+        return prior.rate / np.sqrt(freedom) * jax.random.t(key, freedom, (count,))
+    if isinstance(prior, SquaredExponential):
+        return jax.random.normal(key, (count,)) / prior.lengthscale
+    if not isinstance(prior, Kernel):
+        raise TypeError("prior must be a lfm.Matern or lfm.SquaredExponential force or a stationary periodic kernel, "
+                        f"got {type(prior).__name__}.")
+    if not prior.stationary:
+        raise ValueError(f"the kernel {prior.name!r} is not stationary, so it has no spectrum to draw from.")
+    share = jnp.maximum(fourier_coefficients(prior, _HARMONICS), 0.0)
+    return 2 * np.pi / prior.period * jax.random.choice(key, _HARMONICS + 1, (count,), p=share / share.sum())

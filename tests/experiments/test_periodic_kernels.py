@@ -1,0 +1,77 @@
+"""Periodic kernels as an experiment: a little of every part, tables and figures, and what they must satisfy."""
+
+import numpy as np
+import pytest
+
+from lfm_ppl.experiments import catalogue
+from lfm_ppl.experiments.periodic_kernels import covariance, experiment, figures, problem, regression
+from lfm_ppl.experiments.tasks import Task
+
+SMALL = experiment.Settings(runs=20, functions=(5, 22), draws=20, points=(20, 200))
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory):
+    return experiment.run(SMALL, tmp_path_factory.mktemp("kernels"))
+
+
+def test_the_published_comparison(found):
+    """Below 1e-4 with 22 eigenfunctions, above 0.1 with random frequencies, and not with 20 points."""
+    error = found.published["error"]
+    assert error["22 eigenfunctions, 200 points"] < 1e-4 and error["20 eigenfunctions, 20 points"] > 5e-3
+    assert error[regression.SPARSE] > error[regression.SPARSE_4] > 0.1
+
+
+def test_the_order_of_the_published_table_holds(found):
+    rmse, density = found.regression["RMSE"], found.regression["log likelihood"]
+    assert rmse[regression.SPARSE] > rmse[regression.SPARSE_4] > rmse[regression.KPCA]
+    assert density[regression.SPARSE] < density[regression.SPARSE_4] < density[regression.KPCA]
+    assert rmse[regression.KPCA] == pytest.approx(rmse[regression.EXACT], rel=1e-2)
+    coverage = found.regression.loc[regression.EXACT]
+    assert abs(coverage["coverage"] - 0.95) < 4 * coverage["coverage se"]
+
+
+def test_errors_fall_with_the_number_of_functions(found):
+    table = found.covariance
+    for row in table.index[table.index.str.endswith("eigenfunctions")]:
+        assert table.loc[row, "22"] < table.loc[row, "5"]
+        name = row.removesuffix(", eigenfunctions")
+        resonators = f"{name}, resonators"
+        if resonators in table.index:
+            assert table.loc[resonators, "22"] == pytest.approx(table.loc[row, "22"], abs=1e-12)
+            # A stationary kernel misses the same variance at all times.
+            assert table.loc[row, "22"] == pytest.approx(table.loc[f"{name}, left out", "22"], abs=1e-12)
+
+
+def test_prediction_is_conditioning():
+    """Against the conditional of one joint normal, by its precision matrix."""
+    task = Task("x", 0, {})
+    prior = regression.covariances(task, regression.EXACT, 0)
+    data = np.cos(np.arange(len(problem.measured())))
+    one = regression.predict(prior, data)
+    times = np.append(problem.measured(), problem.predicted()[40])
+    joint = np.exp(-0.5 * ((times[:, None] - times) / 10.0) ** 2) + 1e-8 * np.eye(len(times))
+    precision = np.linalg.inv(joint)
+    assert one.variance[40] == pytest.approx(1.0 / precision[-1, -1], rel=1e-5)
+    assert one.mean[40] == pytest.approx(-precision[-1, :-1] @ data / precision[-1, -1], rel=1e-5)
+
+
+def test_settings_are_checked():
+    with pytest.raises(ValueError, match="increasing numbers"):
+        experiment.Settings(functions=(5, 3))
+    with pytest.raises(ValueError, match="at most 200"):
+        experiment.Settings(functions=(500,))
+    assert experiment.quick(3).runs == 3
+
+
+def test_files_and_figures(found, tmp_path):
+    written = {path.name for path in experiment.save(found, tmp_path)}
+    expected = {f"{name}.{kind}" for name in ("covariance", "published", "regression") for kind in ("csv", "md")}
+    assert written == expected | {f"{name}.png" for name in
+                                  ("errors", "covariances", "eigenfunctions", "draws", "prediction")}
+    assert len(figures.plot_errors(SMALL, found.results).axes) == len(problem.kernels())
+
+
+def test_it_is_in_the_catalogue():
+    assert catalogue.experiment("periodic_kernels").name == "periodic-kernels"
+    assert [task.settings["what"] for task in covariance.tasks(SMALL)].count("covariance") == 6

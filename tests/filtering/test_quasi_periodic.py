@@ -1,0 +1,155 @@
+"""Filter and smoother with forces that repeat and jump, against dense Gaussian process algebra."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from references import LinearLFM, Regression
+from systems import Linear, first_state, softplus
+
+import lfm_ppl as lfm
+
+PERIOD, POINTS = 3.0, (3.0, 6.0)
+TIMES = np.array([0.3, 1.0, 1.0, 2.5, 3.0, 4.4, 6.0, 7.7])
+Y = np.array([0.4, 0.6, 0.5, 0.1, np.nan, -0.3, 0.2, 0.9])[:, None]
+AT = np.array([0.0, 1.7, 3.0, 3.5, 6.0, 8.5])
+EVOLUTIONS = {"constant": lfm.Constant(1.0), "CQM": lfm.CQM(5.0), "SQM": lfm.SQM(1.5, POINTS),
+              "WQM": lfm.WQM(0.5, POINTS), "Matern-5/2": lfm.Matern(1.0, 4.0, order=2)}
+RULES = {"Taylor": lfm.Taylor(), "unscented": lfm.Unscented(), "cubature": lfm.Cubature(),
+         "Gauss-Hermite": lfm.GaussHermite(3), "central difference": lfm.CentralDifference()}
+
+
+def kernel(lengthscale=1.5, period=PERIOD):
+    return lfm.PeriodicSquaredExponential(1.0, lengthscale, period)
+
+
+def exact(evolution):
+    """The product of the published kernels, in NumPy."""
+
+    def product(t, s):
+        cycle = [(np.asarray(x)[..., None] >= np.asarray(POINTS)).sum(-1) for x in (t, s)]
+        lag = np.abs(t - s)
+        weight = {"constant": 1.0, "CQM": np.exp(-lag / 5.0), "SQM": np.exp(-np.abs(cycle[0] - cycle[1]) / 1.5),
+                  "WQM": 1.0 + 0.5 * np.minimum(*cycle),
+                  "Matern-5/2": (lambda x: (1 + x + x * x / 3) * np.exp(-x))(np.sqrt(5) * lag / 4.0)}[evolution]
+        return np.exp(-((np.sin(np.pi * (t - s) / PERIOD) / 1.5) ** 2)) * weight
+
+    return product
+
+
+def model(force, dynamics=None):
+    return lfm.LatentForceModel(
+        dynamics or Linear(-0.7 * jnp.eye(1), jnp.ones((1, 1))), {"u": force},
+        lfm.GaussianObservation(first_state, jnp.array([0.1])), lfm.Gaussian(jnp.array([0.2]), jnp.array([0.3])),
+        initial_time=0.0)
+
+
+def dense(evolution):
+    process = LinearLFM(-0.7 * np.eye(1), np.ones((1, 1)), [exact(evolution)], 0.0, np.array([0.2]),
+                        np.array([[0.3]]), longest=0.5, breaks=POINTS)
+    return Regression(process, np.eye(1, 2), np.array([0.1]))
+
+
+@pytest.mark.parametrize("evolution", EVOLUTIONS)
+def test_a_driven_state_is_that_of_dense_algebra(evolution):
+    """All eigenfunctions above 1e-12; times asked for, one of them a change point; replicates; a missing entry."""
+    force = lfm.QuasiPeriodic(kernel(), EVOLUTIONS[evolution], gamma=1e-12)
+    found = lfm.smooth(model(force), TIMES, Y, at=AT)
+    reference = dense(evolution)
+    assert abs(float(found.log_likelihood.sum()) - reference.log_likelihood(TIMES, Y)) < 1e-6
+    mean, covariance = reference.posterior(TIMES, Y, AT)
+    np.testing.assert_allclose(found.input_mean, mean, atol=1e-6)
+    np.testing.assert_allclose(found.input_covariance, covariance[np.arange(6), np.arange(6)], atol=1e-6)
+
+
+def test_a_kernel_that_is_not_stationary_drives_a_state():
+    """Its functions of time are integrated by Runge-Kutta steps; the reference has the same covariance."""
+    force = lfm.QuasiPeriodic(lfm.ModeratedPeriodicMatern(1.0, 1.0, PERIOD, 0.2, 2), lfm.SQM(1.5, POINTS), functions=5)
+    reference = dense("SQM")
+    reference.process.kernels = [lambda t, s: np.asarray(force.sde_covariance(t, s))]
+    reference.process.breaks = (1.5, 3.0, 4.5, 6.0, 7.5)
+    found = lfm.filter(model(force), TIMES, Y, steps=40)
+    assert abs(float(found.log_likelihood.sum()) - reference.log_likelihood(TIMES, Y)) < 1e-5
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_every_rule_is_exact_where_nothing_is_curved(rule):
+    """The rate depends on time, so that no rule may take the exact transition."""
+
+    def dynamics(x, u, t):
+        return u - 0.7 * x + 0.0 * jnp.sin(t) * x
+
+    force = lfm.QuasiPeriodic(kernel(), lfm.WQM(0.5, POINTS), functions=9)
+    expected = lfm.filter(model(force), TIMES, Y).log_likelihood
+    found = lfm.filter(model(force, dynamics), TIMES, Y, rule=RULES[rule], steps=20).log_likelihood
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+def link(x, u, t):
+    return softplus(u) - 0.7 * x
+
+
+def test_iterations_across_jumps_converge_with_the_steps():
+    """The state just before a jump is a node of its own, so that finer steps change little."""
+    one = model(lfm.QuasiPeriodic(kernel(), lfm.SQM(0.5, POINTS), functions=1), link)
+    coarse, fine = (lfm.smooth(one, TIMES, Y, steps=steps, iterations=2) for steps in (4, 8))
+    assert abs(float(coarse.log_likelihood.sum() - fine.log_likelihood.sum())) < 1e-3
+    np.testing.assert_allclose(coarse.mean, fine.mean, atol=1e-2)
+
+
+def test_asking_for_times_changes_nothing():
+    one = model(lfm.QuasiPeriodic(kernel(), lfm.SQM(0.5, POINTS), functions=1), link)
+    plain, asked = lfm.smooth(one, TIMES, Y, steps=4), lfm.smooth(one, TIMES, Y, steps=4, at=np.append(AT, TIMES))
+    np.testing.assert_allclose(asked.log_likelihood, plain.log_likelihood, atol=1e-9)
+    np.testing.assert_allclose(np.asarray(asked.mean)[len(AT):], plain.mean, atol=1e-8)
+
+
+def test_a_panel_is_a_loop():
+    def build(p):
+        return model(lfm.QuasiPeriodic(kernel(p["lengthscale"], p["period"]), lfm.SQM(2.0, POINTS), functions=3))
+
+    parameters = {"lengthscale": jnp.array([1.0, 2.0]), "period": jnp.array([3.0, 2.5])}
+    y = jnp.stack([jnp.asarray(Y), 2.0 * jnp.asarray(Y)])
+    found = lfm.panel(build, parameters, TIMES).log_prob(y)
+    each = [lfm.MarginalLikelihood(build({"lengthscale": a, "period": b}), TIMES).log_prob(one)
+            for a, b, one in zip((1.0, 2.0), (3.0, 2.5), y, strict=True)]
+    np.testing.assert_allclose(found, each, rtol=1e-10)
+
+
+def test_gradients_of_the_likelihood_are_finite_differences():
+    """By scale, lengthscale, period and the weights' lengthscale."""
+
+    def value(p):
+        force = lfm.QuasiPeriodic(lfm.PeriodicMatern(p[0], p[1], p[2], 1), lfm.SQM(p[3], POINTS), functions=5)
+        return lfm.MarginalLikelihood(model(force), TIMES).log_prob(Y)
+
+    point, h = jnp.array([1.2, 0.9, 2.8, 1.5]), 1e-5
+    run = jax.jit(value)
+    difference = [(run(point + step) - run(point - step)) / (2 * h) for step in h * np.eye(4)]
+    np.testing.assert_allclose(jax.jit(jax.grad(value))(point), difference, rtol=1e-6, atol=1e-8)
+
+
+def test_a_resonator_with_a_bias_is_that_of_dense_algebra():
+    """Noise, damping and a mean; and the same for the sum that carries a kernel."""
+    for force in (lfm.Resonator(3.0, 0.8, 0.3, 0.1, mean=1.5),
+                  lfm.resonators(kernel(), functions=5, noise=0.2, damping=0.1, mean=1.5)):
+        reference = dense("constant")
+        reference.process.kernels = [lambda t, s, force=force: np.asarray(force.covariance(t, s))]
+        reference.process.means = [lambda t: 1.5 + np.zeros_like(t)]
+        found = lfm.filter(model(force), TIMES, Y)
+        assert abs(float(found.log_likelihood.sum()) - reference.log_likelihood(TIMES, Y)) < 1e-8
+
+
+def test_forces_on_a_grid_may_jump():
+    """Their prior there is the product of the kernels."""
+    latent = lfm.LatentGrid(model(lfm.QuasiPeriodic(kernel(), lfm.SQM(1.5, POINTS), functions=5)), TIMES, 40)
+    prior = np.asarray(latent.root[0] @ latent.root[0].T)
+    np.testing.assert_allclose(prior, exact("SQM")(latent.grid[:, None], latent.grid), atol=1e-5)
+
+
+def test_a_period_longer_than_the_data_is_an_error():
+    late = model(lfm.Periodic(kernel(period=24.0), functions=3) + lfm.Constant(1.0))
+    with pytest.raises(ValueError, match="force 'u' has a period of 24, longer than the data, which span 7.4"):
+        lfm.MarginalLikelihood(late, TIMES)

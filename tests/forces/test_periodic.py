@@ -1,0 +1,293 @@
+"""Periodic and quasi-periodic forces against their kernels, quadrature and Monte Carlo."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.integrate import quad
+from scipy.special import ive
+
+import lfm_ppl as lfm
+from lfm_ppl.forces.basis import fourier_coefficients
+from lfm_ppl.forces.eigenspace import leading_eigenvectors
+
+LAG = np.linspace(0.0, 20.0, 401)
+POINTS = (10.0, 20.0, 30.0)
+
+
+def squared_exponential(lengthscale=1.0, period=10.0, scale=1.0):
+    return lfm.PeriodicSquaredExponential(scale, lengthscale, period)
+
+
+def test_kernels_are_the_published_ones():
+    chord = np.abs(np.sin(np.pi * LAG / 10.0))
+    assert_allclose(squared_exponential(0.7, scale=1.5)(LAG), 1.5**2 * np.exp(-(chord**2) / 0.7**2), rtol=1e-12)
+    for order, polynomial in enumerate((lambda x: 1 + 0 * x, lambda x: 1 + x, lambda x: 1 + x + x**2 / 3)):
+        x = np.sqrt(2 * order + 1) * chord / 0.7
+        expected = 1.5**2 * polynomial(x) * np.exp(-x)
+        assert_allclose(lfm.PeriodicMatern(1.5, 0.7, 10.0, order)(LAG + 3.0, 3.0), expected, rtol=1e-11)
+        moderated = lfm.ModeratedPeriodicMatern(1.5, 0.7, 10.0, 0.3, order)
+        near = np.abs(LAG - 10 * np.round(LAG / 10))
+        assert_allclose(moderated(LAG, 0.0), expected * np.exp(-0.3 * near), rtol=1e-11)
+        assert_allclose(moderated(LAG + 10.0, 3.0), moderated(LAG, -7.0), rtol=1e-11)
+
+
+@pytest.mark.parametrize("lengthscale", [0.15, 1.0, 5.0])
+def test_fourier_coefficients_are_bessel_functions(lengthscale):
+    """exp(-sin^2(x) / l^2) = exp(-b) sum_j (2 - [j = 0]) I_j(b) cos(2 j x), b = 1 / (2 l^2)."""
+    order = np.arange(30)
+    expected = ive(order, 0.5 / lengthscale**2) * np.where(order == 0, 1, 2)
+    assert_allclose(fourier_coefficients(squared_exponential(lengthscale), 29), expected, atol=1e-13)
+
+
+@pytest.mark.parametrize("order", range(3))
+def test_fourier_coefficients_of_rough_kernels_are_their_integrals(order):
+    kernel = lfm.PeriodicMatern(1.3, 0.4, 7.0, order)
+    found = fourier_coefficients(kernel, 12)
+    for j in (0, 1, 5, 12):
+        x = np.sqrt(2 * order + 1) / 0.4
+
+        def value(lag, x=x):
+            y = x * np.sin(np.pi * lag / 7.0)
+            return 1.3**2 * np.exp(-y) * (1, 1 + y, 1 + y + y * y / 3)[order]
+
+        integral = quad(value, 0.0, 3.5, weight="cos", wvar=2 * np.pi * j / 7.0, epsabs=1e-12)[0]
+        assert_allclose(found[j], integral * (2 if j else 1) / 3.5, atol=1e-10)
+
+
+@pytest.mark.parametrize("order", [0, 1, 2, "se"])
+@pytest.mark.parametrize("functions", [3, 9, 21])
+def test_the_error_is_the_spectral_mass_left_out(order, functions):
+    kernel = squared_exponential(0.5) if order == "se" else lfm.PeriodicMatern(1.0, 0.5, 10.0, order)
+    force = lfm.Periodic(kernel, functions=functions)
+    error = np.abs(force.sde_covariance(LAG) - force.covariance(LAG))
+    # By an independent transform, of which a kernel with a kink needs a fine grid.
+    spectrum = np.fft.rfft(np.asarray(kernel(np.linspace(0.0, 10.0, 2**17, endpoint=False)))).real / 2**17
+    left_out = 2.0 * spectrum[functions // 2 + 1:-1].sum()
+    assert error.max() == pytest.approx(error[0], abs=1e-13)
+    assert error[0] == pytest.approx(left_out, abs=1e-4 if order == 0 else 1e-8)
+    assert error[0] == pytest.approx(1.0 - float(force.eigenvalues().sum()), abs=1e-13)
+
+
+@pytest.mark.parametrize(("order", "usual", "largest"), [
+    ("se", (0.0, 0.01), 0.02), (2, (0.0, 0.01), 0.02), (1, (0.01, 0.02), 0.022), (0, (0.06, 0.07), 0.07)])
+def test_the_default_is_as_good_as_documented(order, usual, largest):
+    for lengthscale in (0.2, 0.5, 1.34, 5.0):
+        matern = None if order == "se" else lfm.PeriodicMatern(1.0, lengthscale, 10.0, order)
+        kernel = matern or squared_exponential(lengthscale)
+        force = lfm.Periodic(kernel)
+        assert force.functions == lfm.significant_functions(kernel)
+        error = 1.0 - float(force.eigenvalues().sum())
+        assert error < largest
+        if lengthscale < 1.0:
+            assert usual[0] < error < usual[1]
+
+
+def test_the_error_goes_to_zero():
+    for kernel, gammas, last in ((squared_exponential(0.3), (1e-2, 1e-6, 1e-13), 1e-11),
+                                 (lfm.PeriodicMatern(1.0, 1.0, 10.0, 0), (1e-2, 1e-3, 1e-5), 2.1e-3)):
+        errors = [1.0 - float(lfm.Periodic(kernel, gamma=gamma).eigenvalues().sum()) for gamma in gammas]
+        assert errors[0] > errors[1] > errors[2] and errors[2] < last
+
+
+def test_nystrom_is_the_paper_s_formula():
+    """Equation 30, orthonormal eigenfunctions, and a mean error of the eigenvalues left out."""
+    kernel, count = lfm.ModeratedPeriodicMatern(1.2, 0.8, 10.0, 0.2, 1), 7
+    force = lfm.Periodic(kernel, functions=count, points=100)
+    at = np.asarray(force.basis.points)
+    gram = np.asarray(kernel(at[:, None], at[None, :]))
+    values, vectors = np.linalg.eigh(gram)
+    values, vectors = values[::-1], vectors[:, ::-1]
+    t = np.array([0.3, 4.4, 9.9, 13.0])
+    phi = np.sqrt(100) / values[:count] * (np.asarray(kernel(t[:, None], at)) @ vectors[:, :count])
+    assert_allclose(force.sde_covariance(t[:, None], t), phi * values[:count] / 100 @ phi.T, atol=1e-12)
+    assert_allclose(force.eigenvalues(), values[:count] / 100, rtol=1e-10)
+    assert_allclose(np.abs(force.eigenfunctions(t)), np.abs(phi), atol=1e-9)
+    on_grid = np.asarray(force.eigenfunctions(at))
+    assert_allclose(on_grid.T @ on_grid / 100, np.eye(count), atol=1e-10)
+    error = np.diag(gram) - np.asarray(force.sde_covariance(at, at))
+    assert (error > -1e-12).all()
+    assert error.mean() == pytest.approx(values[count:].sum() / 100, rel=1e-9)
+    assert lfm.significant_functions(kernel) == (values > 0.01 * values[0]).sum()
+
+
+def test_both_treatments_agree_where_both_apply():
+    kernel = squared_exponential(0.8)
+    other = lfm.PeriodicKernel(lambda t, s: jnp.exp(-(jnp.sin(jnp.pi * (t - s) / 10.0) / 0.8) ** 2), 10.0)
+    said = lfm.PeriodicKernel(other.function, 10.0, stationary=True, start=2.0)
+    one, two, three = (lfm.Periodic(k, functions=9).sde_covariance(LAG, 1.7) for k in (kernel, other, said))
+    assert_allclose(two, one, atol=1e-9)
+    assert_allclose(three, one, atol=1e-12)
+
+
+def test_the_published_comparison():
+    """A squared exponential of scale 10 on a window of 130: 22 eigenfunctions against random frequencies."""
+    window = np.linspace(0.0, 130.0, 131)[:-1]
+    prior = lfm.SquaredExponential(1.0, 10.0)
+    exact = np.exp(-0.5 * ((window[:, None] - window) / 10.0) ** 2)
+
+    def error(functions, points):
+        kernel = lfm.PeriodicKernel(lambda t, s: jnp.exp(-0.5 * ((t - s) / 10.0) ** 2), 130.0)
+        force = lfm.Periodic(kernel, functions=functions, points=points)
+        return np.abs(np.asarray(force.sde_covariance(window[:, None], window)) - exact).max()
+
+    assert error(22, 200) < 1e-4
+    assert error(20, 20) > 5e-3  # with as few points as the source names, there are no 22 eigenfunctions
+    for count in (22, 88):
+        off = []
+        for seed in range(10):
+            frequencies = lfm.random_frequencies(jax.random.key(seed), prior, count)
+            random = lfm.SparseSpectrum(1.0, frequencies).covariance(window)
+            off.append(np.abs(np.asarray(random) - exact[0]).max())
+        assert np.mean(off) > 0.1
+
+
+def test_random_frequencies_have_the_kernel_as_their_mean():
+    lag, count = np.array([0.0, 0.7, 3.0, 11.0]), 100_000
+    periodic = lfm.PeriodicMatern(1.0, 0.7, 8.0, 1)
+    for prior in (lfm.Matern(1.0, 2.0, 0), lfm.Matern(1.0, 2.0, 2), lfm.SquaredExponential(1.0, 2.0), periodic):
+        w = np.asarray(lfm.random_frequencies(jax.random.key(1), prior, count))
+        exact = periodic(lag) if prior is periodic else prior.covariance(lag)
+        waves = np.cos(lag[:, None] * w)
+        error = waves.std(axis=1) / np.sqrt(count)
+        assert (np.abs(waves.mean(axis=1) - exact) <= 4 * error + 1e-7).all()
+        assert_allclose(lfm.SparseSpectrum(1.0, w[:50]).covariance(lag), waves[:, :50].mean(axis=1), atol=1e-12)
+
+
+def kernels(p):
+    return {"stationary": lfm.PeriodicMatern(p[0], p[1], p[2], 1),
+            "moderated": lfm.ModeratedPeriodicMatern(p[0], p[1], p[2], p[3], 1),
+            "function": lfm.PeriodicKernel(
+                lambda t, s: p[0] ** 2 * jnp.exp(-(((t - s) / p[1]) ** 2) / 20) * (1 + p[3] * jnp.cos(t) * jnp.cos(s)),
+                p[2])}
+
+
+@pytest.mark.parametrize("kind", ["stationary", "moderated", "function"])
+def test_derivatives_by_all_parameters_are_finite_differences(kind):
+    """First and second ones, the period among the parameters."""
+    t = np.array([0.4, 3.1, 8.8, 17.0, 31.0])
+
+    def total(p):
+        force = lfm.QuasiPeriodic(kernels(p)[kind], lfm.SQM(p[4], POINTS), functions=5, points=40)
+        return (force.sde_covariance(t[:, None], t) * jnp.cos(jnp.arange(25.0)).reshape(5, 5)).sum()
+
+    point, h = jnp.array([1.2, 0.8, 10.1, 0.3, 2.5]), 1e-5
+    value, gradient = jax.jit(total), jax.jit(jax.grad(total))
+    along = h * np.eye(5)
+    difference = [(value(point + step) - value(point - step)) / (2 * h) for step in along]
+    assert_allclose(gradient(point), difference, rtol=1e-7, atol=1e-8)
+    second = [(gradient(point + step) - gradient(point - step)) / (2 * h) for step in along]
+    assert_allclose(jax.jit(jax.hessian(total))(point), second, rtol=1e-6, atol=1e-6)
+
+
+def test_repeated_eigenvalues_have_finite_derivatives():
+    """All eigenvalues of a circulant matrix but the first come in pairs; the space of three does not split one."""
+    angle = 2 * np.pi * np.arange(12) / 12
+    weight = np.cos(np.arange(144.0)).reshape(12, 12)
+
+    def projector(p):
+        lag = angle[:, None] - angle
+        matrix = jnp.exp(p[0] * jnp.cos(lag)) + p[1] * jnp.cos(angle[:, None] + angle)
+        vectors = leading_eigenvectors(matrix, 3)
+        return (weight * (vectors @ vectors.T)).sum()
+
+    point, h = jnp.array([1.3, 0.0]), 1e-5
+    difference = [(projector(point + step) - projector(point - step)) / (2 * h) for step in h * np.eye(2)]
+    assert_allclose(jax.grad(projector)(point), difference, atol=1e-8)
+
+
+@pytest.mark.parametrize("evolution", [lfm.CQM(12.0), lfm.SQM(1.5, POINTS), lfm.WQM(0.4, POINTS)],
+                         ids=["CQM", "SQM", "WQM"])
+def test_simulated_weights_have_the_published_covariance(evolution):
+    t, draws = np.array([3.0, 8.0, 20.0, 22.0, 37.0]), 20_000
+    model = lfm.LatentForceModel(lambda x, u, t: x, {"a": evolution}, lfm.GaussianObservation(
+        lambda x, u, t: u, jnp.array([1e-12])), lfm.Gaussian(jnp.zeros(0), jnp.zeros((0, 0))), initial_time=0.0)
+    drawn = np.asarray(jax.jit(jax.vmap(lambda key: lfm.simulate(key, model, t, steps=2).forces["a"]))(
+        jax.random.split(jax.random.key(0), draws)))
+    cycle = np.array([0, 0, 2, 2, 3])  # a change point at an observation comes before it
+    later, earlier = np.maximum(*np.meshgrid(cycle, cycle)), np.minimum(*np.meshgrid(cycle, cycle))
+    exact = {"CQM": np.exp(-np.abs(t[:, None] - t) / 12.0), "SQM": np.exp(-(later - earlier) / 1.5),
+             "WQM": 1.0 + 0.4 * earlier}[type(evolution).__name__]
+    assert_allclose(evolution.covariance(t[:, None], t), exact, rtol=1e-12)
+    found = drawn.T @ drawn / draws
+    error = np.sqrt((np.outer(np.diag(exact), np.diag(exact)) + exact**2) / draws)
+    assert (np.abs(found - exact) < 4 * error).all()
+
+
+def test_change_points_before_the_initial_time_do_not_count():
+    steps = lfm.WQM(0.5, POINTS) + lfm.Constant(1.0)
+    assert float(steps.covariance_in_model(25.0, 35.0, 12.0)) == 1.0 + 0.5 + 1.0
+    assert float(lfm.SQM(2.0, POINTS).covariance_in_model(25.0, 35.0, 22.0)) == pytest.approx(np.exp(-0.5))
+
+
+def test_the_covariance_of_the_state_space_form_is_that_of_the_basis():
+    t = np.array([0.0, 1.2, 7.0, 13.0])
+    for kernel in (squared_exponential(), lfm.ModeratedPeriodicMatern(1.0, 1.0, 10.0, 0.1)):
+        force = lfm.QuasiPeriodic(kernel, lfm.Matern(1.0, 9.0, order=2), functions=5)
+        assert force.state_dim == 15
+        assert_allclose(lfm.Force.sde_covariance(force, t[:, None], t), force.sde_covariance(t[:, None], t), atol=1e-12)
+        assert_allclose(force.covariance(t, 2.0), kernel(t, 2.0) * lfm.Matern(1.0, 9.0, 2).covariance(t - 2.0))
+
+
+def test_resonators_carry_the_kernel():
+    kernel = lfm.PeriodicMatern(1.3, 0.7, 24.0, 1)
+    found = lfm.resonators(kernel, functions=9, mean=2.0)
+    exact = lfm.Periodic(kernel, functions=9).sde_covariance(LAG[:, None], LAG)
+    assert_allclose(found.covariance(LAG[:, None], LAG), exact, atol=1e-12)
+    assert [float(force.period) for force in found.forces[1:]] == [24.0, 12.0, 8.0, 6.0]
+    assert float(found.mean_at(5.0)) == 2.0
+    moving = lfm.resonators(kernel, functions=3, noise=0.1, damping=0.02)
+    scale = float(moving.forces[1].scale)
+    assert float(moving.forces[1].noise) == pytest.approx(0.1 * scale) and float(moving.forces[1].damping) == 0.02
+    gradient = jax.grad(lambda p: lfm.resonators(lfm.PeriodicMatern(1.0, 0.7, p), functions=5).covariance(7.0))(24.0)
+    expected = jax.grad(lambda p: lfm.Periodic(lfm.PeriodicMatern(1.0, 0.7, p), functions=5).sde_covariance(7.0))(24.0)
+    assert float(gradient) == pytest.approx(float(expected), rel=1e-10)
+
+
+@pytest.mark.parametrize(("make", "message"), [
+    (lambda: lfm.PeriodicMatern(1.0, 1.0, 0.0), "period must be finite and greater than zero"),
+    (lambda: lfm.PeriodicSquaredExponential(1.0, 1.0, -3.0), "period must be finite and greater than zero"),
+    (lambda: lfm.PeriodicSquaredExponential(1.0, 0.0, 3.0), "lengthscale must be finite and greater than zero"),
+    (lambda: lfm.SQM(1.0, (1.0, 3.0, 2.0)), "change_points must increase: entry 2 is 2 after 3"),
+    (lambda: lfm.WQM(0.1, (1.0, 1.0)), "change_points must increase: entry 1 is 1 after 1"),
+    (lambda: lfm.WQM(-0.1, ()), "growth .*must be >= 0"),
+    (lambda: lfm.CQM(0.0), "lengthscale must be"),
+    (lambda: lfm.change_points(24.0, 0.0, 20.0), "period must not be longer than .* 20; got 24"),
+    (lambda: lfm.change_points(0.0, 0.0, 20.0), "period must be finite and greater than zero"),
+    (lambda: lfm.Periodic(squared_exponential(), functions=4), "must be odd for a stationary kernel.*Take 3 or 5"),
+    (lambda: lfm.Periodic(squared_exponential(), gamma=2.0), "gamma must be below 1"),
+    (lambda: lfm.QuasiPeriodic(squared_exponential(), lfm.Matern(1.0, 1.0, mean=2.0)), "evolution must have mean zero"),
+    (lambda: lfm.resonators(lfm.ModeratedPeriodicMatern(1.0, 1.0, 5.0)), "'ModeratedPeriodicMatern' is not stationary"),
+    (lambda: lfm.PeriodicKernel(lambda t, s: t - s, 5.0), "not symmetric"),
+    (lambda: lfm.PeriodicKernel(lambda t, s: jnp.exp(-((t - s) ** 2)), 5.0, stationary=True), "said to be stationary"),
+    (lambda: lfm.PeriodicKernel(lambda t, s: 1.0, 5.0), "must work elementwise"),
+    (lambda: lfm.SparseSpectrum(1.0, np.ones((2, 2))), "frequencies must be a vector"),
+])
+def test_bad_arguments_are_named(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_a_kernel_that_is_not_positive_definite_is_named():
+    def box(t, s):
+        return jnp.where(jnp.abs(jnp.sin(jnp.pi * (t - s) / 5.0)) < 0.6, 1.0, 0.0)
+
+    for stationary, what in ((True, "Fourier coefficient"), (False, "least eigenvalue")):
+        with pytest.raises(ValueError, match=f"'box' is not positive definite.*{what}"):
+            lfm.Periodic(lfm.PeriodicKernel(box, 5.0, stationary=stationary))
+        with pytest.raises(ValueError, match="'box' is not positive definite"):
+            lfm.Periodic(lfm.PeriodicKernel(box, 5.0, stationary=stationary), functions=9)
+    negative = jax.jit(lambda p: lfm.Periodic(lfm.PeriodicKernel(box, p, stationary=True), functions=9).eigenvalues())
+    assert np.isnan(negative(5.0)).any()
+
+
+def test_traced_parameters_need_a_number_of_functions():
+    with pytest.raises(ValueError, match="traced parameters. Give functions=J; lfm.significant_functions"):
+        jax.jit(lambda p: lfm.Periodic(lfm.PeriodicMatern(1.0, 1.0, p)).eigenvalues())(24.0)
+    with pytest.raises(TypeError, match="kernel must be a periodic kernel"):
+        lfm.Periodic(lfm.Matern(1.0, 1.0))
+    with pytest.raises(TypeError, match="evolution must be lfm.CQM"):
+        lfm.QuasiPeriodic(squared_exponential(), 3.0)
+    with pytest.raises(TypeError, match="known before compilation"):
+        jax.jit(lambda p: lfm.change_points(p, 0.0, 50.0))(24.0)
