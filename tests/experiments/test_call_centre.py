@@ -20,7 +20,6 @@ from lfm_ppl.experiments.tasks import write
 
 DATA = Path(os.environ.get("LFM_DATA", "../shared/data")) / "calls"
 real = pytest.mark.skipif(not DATA.is_dir(), reason="the counts of real calls are not there (LFM_DATA)")
-SMALL = experiment.Settings(days=2, methods=("SQM", "Matern"), functions=5, draws=40, mixed=3)
 
 
 def window(index=0, data=None):
@@ -193,7 +192,7 @@ def made_up(settings):
     return results
 
 
-MADE = experiment.Settings(days=3, methods=("SQM", "periodic", "Matern"))
+MADE = experiment.Settings(days=3, methods=("SQM", "periodic", "Matern"), integrated=("SQM",))
 
 
 def test_scores_are_those_of_the_log_normal_distribution():
@@ -229,8 +228,8 @@ def test_the_tables_hold_what_was_found():
     assert table.loc["Matern", "published RMSE"] == 10.6 and table.loc["SQM", "published ELL"] == -146
     assert tables.tracked(MADE, results, "changed").loc["periodic", "published RMSE"] == 5.7
     gain = tables.gain(MADE, results)
-    assert gain.loc["changed", "gain"] == pytest.approx(11.0) and gain.loc["constant", "days"] == 1.0
-    assert gain.loc["constant", "RMSE ratio"] == pytest.approx(0.9)
+    assert gain.loc["SQM, changed", "gain"] == pytest.approx(11.0) and gain.loc["SQM, constant", "days"] == 1.0
+    assert gain.loc["SQM, constant", "RMSE ratio"] == pytest.approx(0.9)
     learnt = tables.learnt(MADE, results)
     assert learnt.loc["SQM", "memory"] == 1.0 and np.isnan(learnt.loc["Matern", "memory"])
 
@@ -264,7 +263,8 @@ def test_what_is_stored_is_tabulated_and_drawn_without_computing(tmp_path):
 
 def test_mistakes(tmp_path):
     for wrong, message in (({"days": 0}, "days must be at least 1"), ({"methods": ("SQN",)}, "SQM"),
-                           ({"integrated": "CQM", "methods": ("SQM",)}, "integrated"),
+                           ({"integrated": ("CQM",), "methods": ("SQM",)}, "integrated"),
+                           ({"integrated": "SQM"}, "a tuple of at least one method"),
                            ({"weekday": "Thrusday"}, "Did you mean 'Thursday'"), ({"link": "log"}, "link")):
         with pytest.raises(ValueError, match=message):
             experiment.Settings(**wrong)
