@@ -43,8 +43,8 @@ def tracked(settings: Any, results: dict[str, Result], test: str) -> pd.DataFram
         Means over test days, ``name se`` their standard errors, and what the source has: root mean squared error of
         the queue over the ends of the day's 168 counts; the sum of the log densities of the true queue at these times
         (ELL; the source does not give its number of times, so that only the order can be compared); coverage of 95%
-        bands; the same error and coverage of the arrivals; the median error of a day, since the mean is that of few days
-        with long queues; and both relative to those of Matern.
+        bands; the same error and coverage of the arrivals; the median error of a day, since the mean is that of few
+        days with long queues; and both relative to those of Matern.
     """
     rows = {}
     found = by_method(settings, results)
