@@ -31,8 +31,8 @@ class Settings:
         methods: names of `tracking.METHODS`.
         link: of the model file.
         functions: of which a cycle is made.
-        integrated: the method whose parameters are integrated out, one of ``methods``.
-        draws: of its parameters, that are weighted.
+        integrated: the methods whose parameters are integrated out, too; at least one, all of them among ``methods``.
+        draws: of their parameters, that are weighted.
         mixed: of them, so many are drawn to track with.
     """
 
@@ -43,7 +43,7 @@ class Settings:
     methods: tuple[str, ...] = tuple(tracking.METHODS)
     link: str = "linear"
     functions: int = 15
-    integrated: str = "SQM"
+    integrated: tuple[str, ...] = ("SQM", "CQM")
     draws: int = 200
     mixed: int = 20
 
@@ -53,7 +53,10 @@ class Settings:
             checks.positive_integer(name, getattr(self, name))
         for method in self.methods:
             checks.one_of("methods", method, tracking.METHODS)
-        checks.one_of("integrated", self.integrated, self.methods)
+        if not isinstance(self.integrated, tuple) or not self.integrated:
+            raise ValueError(f"integrated must be a tuple of at least one method, got {self.integrated!r}.")
+        for method in self.integrated:
+            checks.one_of("integrated", method, self.methods)
         checks.one_of("weekday", self.weekday, counts.WEEKDAYS)
         checks.one_of("link", self.link, ("linear", "softplus"))
 
@@ -65,7 +68,8 @@ class Settings:
 
 def quick(**given: Any) -> Settings:
     """Return settings that show in a few minutes that everything runs, and no more."""
-    small: dict[str, Any] = {"days": 2, "methods": ("SQM", "Matern"), "functions": 7, "draws": 60, "mixed": 5}
+    small: dict[str, Any] = {"days": 2, "methods": ("SQM", "Matern"), "integrated": ("SQM",), "functions": 7,
+                             "draws": 60, "mixed": 5}
     return Settings(**small | given)
 
 

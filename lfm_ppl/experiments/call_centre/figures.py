@@ -106,7 +106,7 @@ def plot_cycles(settings: Any, results: dict[str, Result], *, width: str | float
     The smoother has all readings of the window at the service rate of training.
     """
     one = _first(settings)
-    (task,) = posterior.tasks(settings)
+    task = posterior.tasks(settings)[0]
     mean, sd = results[task.name]["shapes"], results[task.name]["shapes_sd"]
     figure, panels = style.small_multiples(width, TRAIN + 1, 1.6)
     hours = 7.0 + BIN * np.arange(1, OPEN + 1) / 60.0
@@ -119,7 +119,7 @@ def plot_cycles(settings: Any, results: dict[str, Result], *, width: str | float
         axes.set_title("test day" if day == TRAIN else f"day {day + 1}")
         style.label_values(axes, "arrivals", "1/min")
     style.label_time(panels, "hours after midnight")
-    style.legend_above(figure, [Line2D([], [], color=_ESTIMATE, label=f"{settings.integrated}, smoothed"),
+    style.legend_above(figure, [Line2D([], [], color=_ESTIMATE, label=f"{settings.integrated[0]}, smoothed"),
                                 Patch(color=_ESTIMATE, alpha=0.2, label="95%"),
                                 Line2D([], [], color=_TRUTH, lw=0.8, label="counts")])
     return figure

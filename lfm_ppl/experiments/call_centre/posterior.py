@@ -31,10 +31,11 @@ _NOISE = 1e-7
 
 
 def tasks(settings: Any) -> list[Task]:
-    """Return the task of the method whose parameters are integrated out."""
-    return [Task(f"posterior/{settings.integrated}", settings.seed, {
-        "experiment": "call-centre", "what": "posterior", "method": settings.integrated, "link": settings.link,
-        "functions": settings.functions, "draws": settings.draws, "mixed": settings.mixed, **settings.windows()})]
+    """Return one task for each method whose parameters are integrated out."""
+    return [Task(f"posterior/{name}", settings.seed, {
+        "experiment": "call-centre", "what": "posterior", "method": name, "link": settings.link,
+        "functions": settings.functions, "draws": settings.draws, "mixed": settings.mixed, **settings.windows()})
+        for name in settings.integrated]
 
 
 def compute(task: Task) -> Result:

@@ -26,6 +26,6 @@ def run(wanted: Wanted) -> Report:
     return Report({
         f"Service rate 10 as in training, {settings.days} test days, {source}": scores.readable(found.constant),
         f"Service rate 15, then 5, {settings.days} test days, {source}": scores.readable(found.changed),
-        f"{settings.integrated}: gain in log density by integrating the parameters out": scores.readable(found.gain),
+        "Gain in the log density of a day by integrating the parameters out": scores.readable(found.gain),
         "Most likely parameters (medians)": scores.readable(found.learnt),
     }, written)

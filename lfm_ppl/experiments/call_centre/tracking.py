@@ -32,8 +32,6 @@ METHODS = {"SQM": "sqm", "CQM": "cqm", "WQM": "wqm", "periodic": "periodic", "Ma
            "resonator": "resonator"}
 """Method -> force of the model file."""
 
-QUASI = ("SQM", "CQM", "WQM")
-
 LIMITS = {"mean": (1.0, 30.0), "scale": (0.1, 30.0), "lengthscale": (10.0, 10_000.0), "memory": (0.2, 10_000.0),
           "noise_sd": (0.01, 5.0)}
 """Parameter -> least and largest value."""
