@@ -113,8 +113,8 @@ def model(times, y=None, aside: float = 30_000.0, height: float = 30.0, units=No
         units: name -> unit, for plots.
     """
     alpha = numpyro.sample("alpha", dist.LogNormal(jnp.log(5e-4), 1.0))
-    scale = numpyro.sample("scale", dist.LogNormal(jnp.log(50.0), 1.0))
-    lengthscale = numpyro.sample("lengthscale", dist.LogNormal(jnp.log(5.0), 1.0))
+    scale = numpyro.sample("scale", dist.LogNormal(jnp.log(30.0), 1.0))
+    lengthscale = numpyro.sample("lengthscale", dist.LogNormal(jnp.log(5.0), 0.7))
     q_r, q_v, noise_sd = (numpyro.sample(name, dist.LogNormal(jnp.log(value), 0.7)) for name, value in KNOWN.items())
     system = build(alpha, scale, lengthscale, q_r, q_v, noise_sd, aside, height, units)
     numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=1, max_step=LONGEST_STEP), obs=y)

@@ -124,8 +124,8 @@ def model(times, y=None, bearing: float = 0.0, units=None) -> None:
         units: name -> unit, for plots.
     """
     alpha = numpyro.sample("alpha", dist.LogNormal(jnp.log(5e-4), 1.0))
-    scale = numpyro.sample("scale", dist.LogNormal(jnp.log(50.0), 1.0))
-    lengthscale = numpyro.sample("lengthscale", dist.LogNormal(jnp.log(5.0), 1.0))
+    scale = numpyro.sample("scale", dist.LogNormal(jnp.log(30.0), 1.0))
+    lengthscale = numpyro.sample("lengthscale", dist.LogNormal(jnp.log(5.0), 0.7))
     noise = {name: numpyro.sample(name, dist.LogNormal(jnp.log(value), 0.7)) for name, value in KNOWN.items()}
     system = build(alpha, scale, lengthscale, **noise, bearing=bearing, units=units)
     numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=1, max_step=LONGEST_STEP), obs=y)

@@ -46,7 +46,7 @@ def test_the_densities_are_those_of_the_model():
     z = problem.true_z() + np.array([0.3, -0.2, 0.1])
     target = problem.target(0)
     log_likelihood, log_prior = jax.jit(problem.log_densities)(jnp.asarray(z), target.y)
-    expected = stats.norm([np.log(5e-4), np.log(50.0), np.log(5.0)], [1.0, 1.0, 1.0]).logpdf(z).sum()
+    expected = stats.norm([np.log(5e-4), np.log(30.0), np.log(5.0)], [1.0, 1.0, 0.7]).logpdf(z).sum()
     assert log_prior == pytest.approx(expected, rel=1e-12)
     assert log_likelihood == pytest.approx(float(problem.likelihood(z).log_prob(target.y)), rel=1e-10)
 
@@ -238,7 +238,7 @@ def test_what_is_stored_is_tabulated_and_drawn_without_computing(tmp_path):
 
 def test_tasks_have_files_of_their_own():
     found = experiment.all_tasks(experiment.Settings())
-    assert len({task.file for task in found}) == len(found) == 4 * 10 + 50 + 20 + 4 * 20 + 2 * 3 + 10
+    assert len({task.file for task in found}) == len(found) == 4 * 10 + 50 + 10 + 4 * 20 + 2 * 3 + 10
 
 
 def test_mistakes():

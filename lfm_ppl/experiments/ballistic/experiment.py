@@ -41,7 +41,7 @@ class Settings:
     particle_runs: int = 20
     particles: tuple[int, ...] = (500, 2_000, 10_000, 50_000)
     chain_runs: int = 3
-    drawn_runs: int = 200
+    drawn_runs: int = 100
     draws: int = 1_000
     paths: int = 50
     nuts: tuple[int, int, int, int] = (2, 300, 700, 1)

@@ -26,7 +26,7 @@ from lfm_ppl.experiments.timing import timed
 from lfm_ppl.experiments.weighting import Weighted, moments, weighted
 from lfm_ppl.inference.optimise import Minimum, Objective, newton, quasi_newton
 
-START = np.log([5e-4, 50.0, 5.0])
+START = np.log([5e-4, 30.0, 5.0])
 """Where every search starts: the prior medians."""
 
 LEVELS = (0.5, 0.8, 0.95)
