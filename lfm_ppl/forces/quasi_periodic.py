@@ -28,11 +28,12 @@ class QuasiPeriodic(Force):
         k(t, s) = k_periodic(t, s) k_evolution(t, s),
 
     with the leading eigenfunctions phi_j of the periodic kernel, their eigenvalues mu_j, and any process for the
-    weights: `CQM`, `SQM`, `WQM`, or another force of scale 1, such as a Matern force of any order. At no lag does the
-    covariance miss more than the eigenvalues left out. Where those above 1/100 of the largest are kept, as by default,
-    that is less than 0.01 of the variance for the periodic squared exponential and for order 2 of the periodic Matern,
-    or 0.02 at lengthscales where a pair is only just left out; 0.022 for order 1 and 0.07 for order 0. Rough kernels
-    need more functions, that is a smaller gamma.
+    weights: `CQM`, `SQM`, `WQM`, or another force of scale 1, such as a Matern force of any order. For a stationary
+    kernel the covariance misses at no lag more than the eigenvalues left out, for others it does so on average over a
+    cycle. Where those above 1/100 of the largest are kept, as by default, that is less than 0.01 of the variance for
+    the periodic squared exponential and for order 2 of the periodic Matern, or 0.02 at lengthscales where a pair is
+    only just left out; 0.022 for order 1 and 0.07 for order 0. Rough kernels need more functions, that is a smaller
+    gamma.
 
     A stationary kernel has the Fourier series ``sum_j q_j cos(2 pi j t / D)``, whose coefficients are integrals of
     the kernel, so that no eigen-decomposition is needed; each pair turns in its state and the force has constant

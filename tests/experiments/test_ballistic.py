@@ -261,8 +261,8 @@ def test_the_quick_version_runs_from_end_to_end(tmp_path):
     assert len(found.tables) == 4
 
 
-def test_the_drag_alone_is_covered_as_often_as_it_should():
-    """With the force's parameters known, by another quadrature."""
+def test_the_drag_alone_is_integrated_right():
+    """With the force's parameters known, on another grid and equally spaced in the drag."""
     target = problem.target(0)
     z = np.log(np.linspace(*np.exp(target.z[0] + np.array([-1.0, 1.0])), 400))  # equally spaced in alpha
     points = jnp.asarray(np.stack([z, np.full(400, target.z[1]), np.full(400, target.z[2])], axis=1))

@@ -153,6 +153,25 @@ def test_a_satellite_without_positions_in_training_is_refused_with_the_reason(da
     assert "G04" in experiment.compute(task)["refused"]
 
 
+def test_a_gap_at_the_end_of_training_refuses_one_satellite(data, monkeypatch):
+    """Enough positions to be learnt from, too few of the latest ones; the other satellites are not lost."""
+    data.positions["G01"][278:288] = np.nan
+    data.positions["G01"][264:272] = np.nan
+    monkeypatch.setattr(orbits, "fit_orbit", lambda around, times, positions, solar=None: orbits.Orbit(
+        0.0, orbits.deterministic.polynomial_state(times, positions)[0], 100.0, 0.0))
+    task = experiment.plan(experiment.Settings(data="folder", satellites=("G01",)))[0]
+    assert "G01: the start of an orbit is taken from its first 9 positions; there are 6" in str(
+        experiment.compute(task)["refused"])
+
+
+def test_a_search_that_starts_where_there_is_no_density_says_so():
+    target = learning.Target(lambda z: (np.nan, np.zeros(2)), magnitudes.Prior(np.zeros(2), np.ones(2)))
+    with pytest.raises(ValueError, match="no density at the first magnitudes"):
+        target.mode()
+    with pytest.raises(ValueError, match="no finite curvature"):
+        learning.Target(lambda z: (0.0, np.full(2, np.nan)), target.prior).draws(np.zeros(2), 3)
+
+
 def test_only_refused_satellites_are_an_error(data, tmp_path):
     with pytest.raises(ValueError, match="no satellite can be predicted. G04: 0%"):
         experiment.run(experiment.Settings(data="folder", satellites=("G04",)), tmp_path)

@@ -1,7 +1,8 @@
 """Posterior of the drag alone, where the force's scale and lengthscale are known: by quadrature.
 
-With the force's parameters unknown too, the shares of one truth that posteriors cover depend on how far their prior
-pulls. Here nothing else is unknown, so that they are nominal if the filter's likelihood is right.
+With the force's parameters unknown too, how often posteriors cover one and the same truth depends on how far their
+prior pulls. Here nothing else is unknown, and a flat prior hardly pulls beside 120 distances, so that they cover it
+about as often as they say if the filter's likelihood is right.
 """
 
 from __future__ import annotations
@@ -40,11 +41,17 @@ def compute(task: Task) -> Result:
 
 
 def below(target: problem.Target) -> float:
-    """Return the posterior probability that log alpha is less than it is; by the trapezoidal rule."""
+    """Return the posterior probability that log alpha is less than it is; by the trapezoidal rule.
+
+    Raises:
+        ValueError: no drag on the grid has a finite likelihood.
+    """
     alphas = target.z[0] + REACH * np.linspace(-1.0, 1.0, POINTS)
     points = np.stack([alphas, np.full(POINTS, target.z[1]), np.full(POINTS, target.z[2])], axis=1)
     log_likelihood = np.asarray(_log_likelihoods()(jnp.asarray(points), jnp.asarray(target.y)))
     density = np.where(np.isfinite(log_likelihood), np.exp(log_likelihood - np.nanmax(log_likelihood)), 0.0)
+    if not np.isfinite(log_likelihood).any():
+        raise ValueError("the filter breaks down at every drag on the grid.")
     total = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]))])
     return float(np.interp(target.z[0], alphas, total / total[-1]))
 

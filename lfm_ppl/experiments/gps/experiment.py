@@ -132,28 +132,32 @@ def compute(task: Task) -> Result:
         one = prediction.arc(data, asked["satellite"], asked["train_days"])
     except prediction.Unusable as reason:
         return {_REFUSED: str(reason)}
-    if task.name.startswith("learn/"):
-        try:
-            return {**_learn(one, asked["axes"]), "cpu_s": time.process_time() - started}
-        except ValueError as reason:  # no orbit fits, most likely for a manoeuvre
-            return {_REFUSED: f"{asked['satellite']}: {reason}"}
+    try:
+        found = _compute(task.name.split("/")[0], one, task)
+    except ValueError as reason:  # an orbit that does not fit: a gap, or a manoeuvre; a window without positions
+        return {_REFUSED: f"{asked['satellite']}: {reason}"}
+    return {**found, "cpu_s": time.process_time() - started}
+
+
+def _compute(kind: str, one: problem.Arc, task: Task) -> Result:
+    asked = task.settings
+    if kind == "learn":
+        return _learn(one, asked["axes"])
     orbit = orbits.Orbit(float(one.times[0]), np.array(asked["orbit"][:6]), *asked["orbit"][6:])
-    paths, prior = prediction.deterministic(one, orbit), magnitudes.Prior(*map(np.array, asked["prior"]))
-    if task.name.startswith("ways/"):
-        return ways.compare(one, paths, asked["axes"], prior, task.key)
+    prior = magnitudes.Prior(*map(np.array, asked["prior"]))
+    if kind == "ways":
+        return ways.compare(one, prediction.deterministic(one, orbit), asked["axes"], prior, task.key)
     target = learning.held_out(learning.training(one, orbit, asked["axes"]), prior)
     mode = target.mode(np.array(asked["alone"]))
-    if task.name.startswith("online/"):
-        try:
-            return _online(one, orbit, mode, asked)
-        except ValueError as reason:  # a window without positions
-            return {_REFUSED: f"{asked['satellite']}: {reason}"}
-    return {**_predict(one, paths, mode, target.draws(mode, learning.DRAWS), asked["axes"]),
-            "cpu_s": time.process_time() - started}
+    if kind == "online":
+        return _online(one, orbit, mode, asked)
+    draws = target.draws(mode, learning.DRAWS)
+    return _predict(one, prediction.deterministic(one, orbit), mode, draws, asked["axes"])
 
 
 def _learn(one: problem.Arc, axes: str) -> Result:
     orbit = orbits.fit_orbit(one.environment, one.times[:one.train], one.positions[:one.train])
+    prediction.latest_orbit(one, one.train, orbit.solar)
     target = learning.held_out(learning.training(one, orbit, axes), magnitudes.wide(axes))
     return {"orbit": np.array([*orbit.state, orbit.solar, orbit.residual]), "logarithms": target.mode()}
 
@@ -171,14 +175,14 @@ def _predict(one: problem.Arc, paths: prediction.Deterministic, mode: np.ndarray
 
     return {
         "times": one.times, "train": one.train, "residual": paths.orbit.residual, "solar": paths.orbit.solar,
-        "eclipsed": problem.eclipsed(one.environment, one.times[:one.train], paths.fitted[:one.train]),
+        "eclipsed": problem.eclipsed(one.environment, one.times, paths.fitted),
         "complete": np.isfinite(one.positions).all(), "fitted": error(paths.fitted), "latest": error(paths.latest),
         "lfm": lfm, "sd": sd, "coverage": coverage.mean(),
         "forces": found.forces, "forces_sd": found.forces_sd, "seen": everything.forces,
         "force_names": np.array(list(orbits.small_forces(axes))), "logarithms": mode}
 
 
-def _online(one: prediction.Arc, orbit: orbits.Orbit, logarithms: np.ndarray, asked: Mapping[str, Any]
+def _online(one: problem.Arc, orbit: orbits.Orbit, logarithms: np.ndarray, asked: Mapping[str, Any]
             ) -> Result:
     mean, variance, observed, restarted = prediction.online(one, orbit, logarithms, asked["axes"], asked["windows"])
     return {"times": one.times, "observed": observed, "lfm": mean - one.positions,
@@ -212,7 +216,10 @@ def run(settings: Settings, folder: str | Path, *, overwrite: bool = False,
         raise ValueError("no satellite can be predicted. " + " ".join(refused.values()))
     second = plan_predictions(settings, learnt, first)
     results = done(second)
-    predicted, compared, online = (_kept(second, results, kind, {}) for kind in ("predict/", "ways/", "online/"))
+    predicted = _kept(second, results, "predict/", refused)
+    compared, online = (_kept(second, results, kind, {}) for kind in ("ways/", "online/"))
+    if not predicted:
+        raise ValueError("no satellite can be predicted. " + " ".join(refused.values()))
     for name, result in predicted.items():
         result["cpu_s"] = result["cpu_s"] + learnt[name]["cpu_s"]
     prior = magnitudes.common([one["logarithms"] for one in learnt.values()], settings.axes)

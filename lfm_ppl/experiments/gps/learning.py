@@ -53,7 +53,11 @@ class Target(NamedTuple):
     prior: Prior
 
     def mode(self, start: np.ndarray | None = None) -> np.ndarray:
-        """Return its mode (d,), searched from ``start`` (d,) or from the prior's mean."""
+        """Return its mode (d,), searched from ``start`` (d,) or from the prior's mean.
+
+        Raises:
+            ValueError: the density there is not finite.
+        """
         highest = -np.inf
 
         def descent(point: np.ndarray) -> tuple[float, np.ndarray]:
@@ -65,6 +69,8 @@ class Target(NamedTuple):
             return value, gradient
 
         first = self.prior.mean if start is None else start
+        if not np.isfinite(self.negative(first)[0]):
+            raise ValueError(f"positions have no density at the first magnitudes of the search, {np.exp(first)}.")
         return scipy.optimize.minimize(descent, first, jac=True, method="L-BFGS-B",
                                        options={"maxfun": _EVALUATIONS}).x
 
@@ -75,7 +81,11 @@ class Target(NamedTuple):
         return 0.5 * float(away @ away) - value, away / self.prior.sd - gradient
 
     def draws(self, mode: np.ndarray, count: int) -> np.ndarray:
-        """Return vectors (count, d) about the mode, normal with the curvature there; the same at every call."""
+        """Return vectors (count, d) about the mode, normal with the curvature there; the same at every call.
+
+        Raises:
+            ValueError: the curvature is not finite.
+        """
         mean, sd = self.prior
         here = self.negative(mode)[1]
         # One-sided: the error of a second derivative is the step times a third, which is nothing beside a Laplace
@@ -83,6 +93,8 @@ class Target(NamedTuple):
         columns = np.stack([(self.negative(mode + _DIFFERENCE * unit)[1] - here) / _DIFFERENCE
                             for unit in np.eye(len(mode))])
         hessian = 0.5 * (columns + columns.T)
+        if not np.isfinite(hessian).all():
+            raise ValueError(f"positions have no finite curvature at the magnitudes {np.exp(mode)}.")
         # In units of the prior the curvature is at least one: positions may say nothing, but never less than that.
         values, vectors = np.linalg.eigh(hessian * np.outer(sd, sd))
         root = sd[:, None] * vectors / np.sqrt(np.maximum(values, 1.0))

@@ -46,7 +46,7 @@ def wide(axes: str) -> Prior:
 
 
 def common(learnt: list[np.ndarray], axes: str) -> Prior:
-    """Return the prior that other satellites make: their mean, and how they scatter.
+    """Return the prior that several satellites make, the one to be predicted among them: mean and scatter.
 
     Args:
         learnt: vectors (d,), one a satellite; too few of them leave the wide prior.

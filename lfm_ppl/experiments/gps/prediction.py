@@ -80,11 +80,20 @@ def deterministic(one: Arc, orbit: orbits.Orbit) -> Deterministic:
     return Deterministic(orbit, fitted, latest)
 
 
-def _from_latest(one: Arc, end: int, solar: float) -> tuple[int, np.ndarray]:
-    """Fit the last six hours before the epoch ``end``; return their first epoch and the path from it on."""
+def latest_orbit(one: Arc, end: int, solar: float) -> tuple[int, orbits.Orbit]:
+    """Fit the last six hours before the epoch ``end``; return their first epoch and the orbit.
+
+    Raises:
+        ValueError: too few positions in them, or no orbit that fits.
+    """
     first = end - int(round(_LATEST / (one.times[1] - one.times[0])))
-    last = orbits.fit_orbit(one.environment, one.times[first:end], one.positions[first:end], solar)
-    return first, orbits.propagate(one.environment, last, one.times[first:])
+    return first, orbits.fit_orbit(one.environment, one.times[first:end], one.positions[first:end], solar)
+
+
+def _from_latest(one: Arc, end: int, solar: float) -> tuple[int, np.ndarray]:
+    """Return the first epoch of the last six hours before ``end``, and the path from it on that they determine."""
+    first, orbit = latest_orbit(one, end, solar)
+    return first, orbits.propagate(one.environment, orbit, one.times[first:])
 
 
 def judge(one: Arc, mean: np.ndarray, covariance: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, ...]:
