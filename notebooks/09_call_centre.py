@@ -65,8 +65,9 @@ print("real calls" if data else "simulated calls")
 figures.plot_queues(settings, found.results, "constant")
 
 # %% [markdown]
-# RMSE over the day's 168 five minutes, and the log density of the true queue at these times, summed (ELL); the source
-# does not say at how many times its own is taken, so that only the order can be compared.
+# A model whose days are all alike (periodic) is far too sure of itself. RMSE over the day's 168 five minutes, and the
+# log density of the true queue at these times, summed (ELL); the source does not say at how many times its own is taken,
+# so that only the order can be compared.
 
 # %%
 scores.readable(found.constant)
@@ -100,9 +101,9 @@ figures.plot_errors(settings, found.results)
 # %% [markdown]
 # ## Parameters integrated out
 #
-# Three days say little about how alike days are, and the most likely value is taken for certain. Integrating the
-# parameters out, over their posterior given the training, widens the bands. The gain is in the log density of a day's
-# queue.
+# Three days say little about how alike days are, and the most likely value is taken for certain: the bands above are
+# too narrow. Integrating the parameters out, over their posterior given the training, makes them honest, and the
+# estimates a little better. The gain is in the log density of a day's queue.
 
 # %%
 scores.readable(found.gain)

@@ -112,9 +112,9 @@ def test_a_window_has_its_readings_where_they_belong():
 
 
 @real
-def test_the_bound_on_settling_does_not_matter():
-    """Real queues with the bounded rate of the model, against the equation itself, in customers."""
-    fastest = 1.0
+def test_the_bound_on_settling_matters_little():
+    """Real queues with the bounded rate of the model, against the equation itself: below the error of readings."""
+    fastest = sys.modules[problem.model_file().model.__module__].FASTEST
     for index in (0, 10):
         one = window(index, str(DATA))
         for name, tested in problem.TESTED.items():
@@ -124,13 +124,17 @@ def test_the_bound_on_settling_does_not_matter():
                     def slope(x, zeta=zeta, omega=omega):
                         free = np.exp(-x)
                         return (zeta - omega * (1 - free)) * free / (1 + fastest * omega * free**2)
+
                     k1 = slope(x)
                     k2 = slope(x + 0.5 * h * k1)
-                    x += h * slope(x + 0.5 * h * (2 * k2 - k1) * 0.5 + 0.25 * h * k1)
+                    k3 = slope(x + 0.5 * h * k2)
+                    x += h / 6 * (k1 + 2 * k2 + 2 * k3 + slope(x + h * k3))
                 path.append(x)
             off = np.abs(np.expm1(path) - one.queues[name])[2:]
-            # Most of all where the queue is long and arrivals jump from one count to the next.
-            assert np.median(off) < 0.05 and np.max(off / (1.0 + one.queues[name][2:])) < 0.1
+            # Most of all where arrivals jump from one count to the next.
+            share = off / (1.0 + one.queues[name][2:])
+            assert np.median(share) < 0.007 and np.max(share) < 0.14
+            assert name == "changed" or np.sqrt(np.mean(off**2)) < 0.4 * problem.NOISE
 
 
 def test_the_densities_are_those_of_the_model():

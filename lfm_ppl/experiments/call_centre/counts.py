@@ -22,7 +22,7 @@ OPEN = 168
 DAY = BIN * OPEN
 """Minutes of a day: opening hours, joined to those of the day before."""
 
-_STEPS = 100
+_STEPS = 200
 """Runge-Kutta steps for one count: the queue is right to 1e-6 customers at a service rate of 15 per minute."""
 
 WARNED = 2.0

@@ -43,7 +43,7 @@ class Settings:
     methods: tuple[str, ...] = tuple(tracking.METHODS)
     link: str = "linear"
     functions: int = 15
-    integrated: tuple[str, ...] = ("SQM", "CQM")
+    integrated: tuple[str, ...] = ("SQM",)
     draws: int = 200
     mixed: int = 20
 
@@ -68,8 +68,7 @@ class Settings:
 
 def quick(**given: Any) -> Settings:
     """Return settings that show in a few minutes that everything runs, and no more."""
-    small: dict[str, Any] = {"days": 2, "methods": ("SQM", "Matern"), "integrated": ("SQM",), "functions": 7,
-                             "draws": 60, "mixed": 5}
+    small: dict[str, Any] = {"days": 2, "methods": ("SQM", "Matern"), "functions": 7, "draws": 60, "mixed": 5}
     return Settings(**small | given)
 
 
