@@ -168,8 +168,8 @@ def plot_scores(settings: Any, results: dict[str, Result], *, width: str | float
                 axes.set_yscale("symlog", linthresh=20.0)
     style.legend_above(figure, [Line2D([], [], color=_MARKS[store][0], marker=_MARKS[store][1], ls="", ms=3.0,
                                        label=store) for store in settings.stores])
-    style.note_below(figure, "Left: means and two standard errors. Right: medians and quartiles; the axis is linear near "
-                             "zero and logarithmic beyond 20.")
+    style.note_below(figure, "Left: means and two standard errors. Right: medians and quartiles; the axis is linear "
+                             "near zero and logarithmic beyond 20.")
     return figure
 
 
