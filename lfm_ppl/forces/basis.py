@@ -14,7 +14,7 @@ from scipy.special import roots_legendre
 from lfm_ppl import checks
 from lfm_ppl.forces.eigenspace import leading_eigenvectors
 from lfm_ppl.forces.periodic_kernels import Kernel
-from lfm_ppl.linalg import matmul
+from lfm_ppl.linalg import matmul, semidefinite_root, solve_lower
 
 _NEGATIVE = 1e-8
 """Share of the largest eigenvalue below zero at which a kernel is not taken for positive definite."""
@@ -165,8 +165,9 @@ class Eigenfunctions(Basis):
         gram = kernel(self.points[:, None], self.points[None, :])
         self.vectors = leading_eigenvectors(0.5 * (gram + gram.T), count)
         inner = self.vectors.T @ gram @ self.vectors
-        factor = jnp.linalg.cholesky(0.5 * (inner + inner.T))
-        self.white = jax.scipy.linalg.solve_triangular(factor, self.vectors.T, lower=True).T
+        # Eigenvalues at rounding level have no direction of their own; theirs is left out.
+        factor = semidefinite_root(0.5 * (inner + inner.T))
+        self.white = solve_lower(factor, self.vectors.T).T
         self.spectrum = jnp.diagonal(inner) / points
 
     @property

@@ -237,7 +237,8 @@ def significant_functions(kernel: Kernel, gamma: float = 0.01, points: int = _PO
         raise ValueError(f"gamma must be below 1, got {gamma:g}. It is a share of the largest eigenvalue.")
     if checks.traced(kernel):
         raise ValueError("the number of functions sets the number of states, and cannot follow from traced parameters. "
-                         "Give functions=J; lfm.significant_functions(kernel) says how many for typical values.")
+                         "Give functions=J; lfm.significant_functions(kernel) says how many for typical values. "
+                         "(Inside compiled code, such as a NumPyro model, numbers become traced, too.)")
     if not kernel.stationary:
         values = spectrum(kernel, points)
         return int((values > gamma * values[0]).sum())

@@ -199,9 +199,11 @@ def change_points(period: float, start: float, stop: float) -> tuple[float, ...]
     if checks.traced((period, start, stop)):
         raise TypeError("period, start and stop must be known before compilation, since change points are static; "
                         "pass numbers, and keep the change points fixed where the period is a parameter.")
-    period, start, stop = (float(scalar_parameter(name, value)) for name, value in
-                           (("period", period), ("start", start), ("stop", stop)))
+    # As NumPy numbers: inside compiled code jnp would make tracers of them.
+    for name, value in (("period", period), ("start", start), ("stop", stop)):
+        checks.finite(name, value)
     checks.positive("period", period)
+    period, start, stop = float(period), float(start), float(stop)
     count = int(np.floor((stop - start) / period * (1 + 1e-12)))
     if count < 1:
         raise ValueError(f"period must not be longer than the time from start to stop, {stop - start:g}; got "

@@ -176,7 +176,8 @@ class Panel(dist.Distribution):
                 check_times(row, None)
             except ValueError as error:
                 raise ValueError(f"series {series}: {error}") from None
-        one = jax.eval_shape(lambda p, t: jnp.zeros(self._one(p, t).event_shape),
+        # Times that all series share stay known, since jumps of a force and longest steps are planned by them.
+        one = jax.eval_shape(lambda p, t: jnp.zeros(self._one(p, t if self._series_times else times).event_shape),
                              jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf)[0], parameters),
                              jnp.zeros(np.shape(times)[-1]))
         if not self._series_times:

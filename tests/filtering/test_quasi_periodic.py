@@ -91,16 +91,18 @@ def link(x, u, t):
     return softplus(u) - 0.7 * x
 
 
+@pytest.mark.slow
 def test_iterations_across_jumps_converge_with_the_steps():
     """The state just before a jump is a node of its own, so that finer steps change little."""
-    one = model(lfm.QuasiPeriodic(kernel(), lfm.SQM(0.5, POINTS), functions=3), link)
-    coarse, fine = (lfm.smooth(one, TIMES, Y, steps=steps, iterations=3) for steps in (4, 8))
+    one = model(lfm.QuasiPeriodic(kernel(), lfm.SQM(0.5, POINTS), functions=1), link)
+    coarse, fine = (lfm.smooth(one, TIMES, Y, steps=steps, iterations=2) for steps in (4, 8))
     assert abs(float(coarse.log_likelihood.sum() - fine.log_likelihood.sum())) < 1e-3
     np.testing.assert_allclose(coarse.mean, fine.mean, atol=1e-2)
 
 
+@pytest.mark.slow
 def test_asking_for_times_changes_nothing():
-    one = model(lfm.QuasiPeriodic(kernel(), lfm.SQM(0.5, POINTS), functions=3), link)
+    one = model(lfm.QuasiPeriodic(kernel(), lfm.SQM(0.5, POINTS), functions=1), link)
     plain, asked = lfm.smooth(one, TIMES, Y, steps=4), lfm.smooth(one, TIMES, Y, steps=4, at=np.append(AT, TIMES))
     np.testing.assert_allclose(asked.log_likelihood, plain.log_likelihood, atol=1e-9)
     np.testing.assert_allclose(np.asarray(asked.mean)[len(AT):], plain.mean, atol=1e-8)

@@ -291,3 +291,5 @@ def test_traced_parameters_need_a_number_of_functions():
         lfm.QuasiPeriodic(squared_exponential(), 3.0)
     with pytest.raises(TypeError, match="known before compilation"):
         jax.jit(lambda p: lfm.change_points(p, 0.0, 50.0))(24.0)
+    inside = jax.jit(lambda ell: lfm.SQM(ell, lfm.change_points(24.0, 0.0, 50.0)).covariance(0.0, 49.0))
+    assert float(inside(2.0)) == pytest.approx(np.exp(-1.0))

@@ -88,3 +88,13 @@ def test_starts_at_the_initial_time_and_covers_equal_times():
     found = lfm.simulate(jax.random.key(0), motif(softplus, variance=0.0), [0.0, 0.0, 1.0])
     assert np.allclose(found.state[0], 0.3 / (0.8 * np.array([1.0, 1.5]))) and np.array_equal(*found.state[:2])
     assert found.y.shape == (3, 2) and found.forces["u"].shape == (3,)
+
+
+def test_a_jump_at_a_row_is_never_lost():
+    """Rows whose end is not the sum of their steps to the last bit; each change point makes the force anew."""
+    times = np.arange(40) * 0.1
+    force = lfm.SQM(1e-2, tuple(times[1:]))
+    model = lfm.LatentForceModel(lambda x, u, t: x, {"u": force}, lfm.GaussianObservation(
+        lambda x, u, t: u, jnp.array([0.1])), lfm.Gaussian(jnp.zeros(0), jnp.zeros((0, 0))))
+    drawn = lfm.simulate(jax.random.key(0), model, times, steps=3).forces["u"]
+    assert len(np.unique(drawn)) == 40

@@ -34,33 +34,46 @@ def compute(task: Task) -> Result:
     kernel = problem.kernels()[task.settings["kernel"]]
     at = problem.grid(kernel)
     exact = np.asarray(kernel(at[:, None], at))
+    most = task.settings["functions"][-1]
+    own = leading_parts(eigenfunctions(kernel, most), at)
     found: dict[str, list] = {method: [] for method in (*METHODS, "left out")}
+    # The force of fewer functions is the sum of the first parts of the one with the most.
+    other = ([np.asarray(one.covariance(at, 0.0)) for one in resonators(kernel, own.shape[1]).forces]
+             if kernel.stationary else [])
     for count in task.settings["functions"]:
-        force = eigenfunctions(kernel, count)
-        found[EIGENFUNCTIONS].append(error(force, at, exact))
-        covariance = np.asarray(force.sde_covariance(at, at))
-        found["left out"].append(float((np.diag(exact) - covariance).mean()))
-        found[RESONATORS].append(_resonators(kernel, force.functions, at, exact) if kernel.stationary else np.nan)
+        count = fitting(kernel, count)
+        covariance = own[:, :count] @ own[:, :count].T
+        found[EIGENFUNCTIONS].append(np.abs(covariance - exact).max())
+        found["left out"].append((np.diag(exact) - np.diag(covariance)).mean())
+        # Without noise and damping a resonator's covariance depends on the distance in time alone.
+        found[RESONATORS].append(np.abs(sum(other[:1 + count // 2]) - exact[:, 0]).max() if other else np.nan)
         found[RANDOM].append(_random(task, kernel, count, at, exact))
     significant = significant_functions(kernel)
     return {name: np.asarray(values) for name, values in found.items()} | {
         "significant": significant, "at default": error(eigenfunctions(kernel, significant), at, exact)}
 
 
+def fitting(kernel: Kernel, count: int) -> int:
+    """Return the number of functions; of a stationary kernel, which has pairs, one less if even."""
+    return count - (count + 1) % 2 if kernel.stationary else count
+
+
+def leading_parts(force: Periodic, at: np.ndarray) -> np.ndarray:
+    """Return ``sqrt(mu_j) phi_j`` at times (K, J), the largest first and the two of a pair side by side."""
+    parts = np.asarray(force.eigenfunctions(at)) * np.sqrt(np.maximum(np.asarray(force.eigenvalues()), 0.0))
+    pairs = force.functions // 2
+    order = [0, *np.stack([np.arange(pairs), pairs + np.arange(pairs)], axis=1).ravel() + 1]
+    return parts[:, order] if force.kernel.stationary else parts
+
+
 def eigenfunctions(kernel: Kernel, count: int, points: int = 200) -> Periodic:
-    """Return the force of so many eigenfunctions; of a stationary kernel, which has pairs, of one less if even."""
-    return Periodic(kernel, functions=count - (count + 1) % 2 if kernel.stationary else count, points=points)
+    """Return the force of so many eigenfunctions, as far as the kernel has them."""
+    return Periodic(kernel, functions=fitting(kernel, count), points=points)
 
 
 def error(force: Force, at: np.ndarray, exact: np.ndarray) -> float:
     """Return the largest difference between the covariance of a force with eigenfunctions and the exact one."""
     return float(np.abs(np.asarray(force.sde_covariance(at[:, None], at)) - exact).max())
-
-
-def _resonators(kernel: Kernel, count: int, at: np.ndarray, exact: np.ndarray) -> float:
-    # Without noise and damping their covariance depends on the distance in time alone.
-    covariance = np.asarray(resonators(kernel, count).covariance(at, 0.0))
-    return float(np.abs(covariance - exact[:, 0]).max())
 
 
 def _random(task: Task, kernel: Kernel, count: int, at: np.ndarray, exact: np.ndarray) -> float:
