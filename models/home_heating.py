@@ -21,9 +21,9 @@ of its chord, at 1 about a third of a day; of `matern` it is in hours. With the 
 `gamma` and `psi`; some residuals have fewer sites or, the resonator, others.
 
 A data file has the columns time_h (hours, midnight a multiple of 24), indoor, outdoor and heater. The heater is
-its power from that time to the next, in any unit, as a share of full power, say: it is no output but the known
-input, and must not be missing. Outdoor mean, scale and lengthscale are taken from the outdoor column unless they
-are freed.
+its power from that time to the next, in any unit, as a share of full power, say: it is the known input, must not be
+missing, and is reproduced as it is, so that its own residuals are zero. Outdoor mean, scale and lengthscale are
+taken from the outdoor column unless they are freed.
 
 The default data are four days of hourly measurements under a thermostat that decides every ten minutes; the heater
 is the share of each hour that it was on.

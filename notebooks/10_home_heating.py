@@ -141,6 +141,14 @@ show("house-envelope", ("below", "above"))
 figures.plot_house(settings, found.results) if settings.data else None
 
 # %% [markdown]
+# In all 29 windows CQM has an RMSE of 0.45 K (0.39 K with the walls), the Matern force 0.66 K (0.52 K), no residual
+# 0.81 K (0.58 K), and a higher log likelihood than either, on average and on seven days in ten. The differences in
+# RMSE are three to four standard errors from the Matern force's. Those in log likelihood are not: a few days rule
+# the means, those after the house stood empty, when four days without heating say nothing of the heater. What the
+# published homes had as their best model, a residual that repeats exactly, is the worst one here: without anything
+# that changes from day to day its bands are far too narrow, and hold 44% of the measurements. Resonators with one
+# period, which drift in amplitude and phase, are as good as the quasi-periodic forces.
+#
 # The residual, day by day. What repeats is carried over to the fifth day; a Matern force forgets it within hours.
 
 # %%
@@ -156,10 +164,16 @@ figures.plot_residual(settings, found.results) if settings.data else None
 scores.readable(found.tables["posterior"]) if "posterior" in found.tables else "no data"
 
 # %% [markdown]
+# That is no gain here: on these days the bands at the most likely parameters hold nearly all measurements already, and
+# four days say little of how long the residual remembers, so that the posterior of its scales makes the bands wider
+# still.
+
+# %% [markdown]
 # ## Simulated homes under a thermostat
 #
 # The residual is drawn from SQM, so that model is right and the others are not. The set points of the fifth day differ
-# from those before.
+# from those before. The thermostat corrects much of what a model gets wrong, so that errors are smaller than in the
+# house, and the three quasi-periodic models alike.
 
 # %%
 show("homes-one-store", ("RMSE ahead", "ELL ahead", "coverage"))

@@ -18,7 +18,7 @@ from lfm_ppl.experiments.tasks import Result
 LABELS = {"none": "no residual", "matern": "Matern", **{name: name for name in ("SQM", "CQM", "WQM", "periodic",
                                                                               "resonator")}}
 _WIDE, _NARROW = "#D6E8F3", "#9CC9E3"
-_MARKS = {"one store": (style.BLUE, "o"), "envelope": (style.VERMILLION, "s"), "published": (style.GREY, "D")}
+_MARKS = {"one store": (style.BLUE, "o"), "envelope": (style.VERMILLION, "s")}
 _SHOWN = ("SQM", "periodic", "CQM", "none", "matern", "resonator")
 
 
@@ -134,7 +134,7 @@ def plot_residual(settings: Any, results: dict[str, Result], *, width: str | flo
 
 @style.styled
 def plot_scores(settings: Any, results: dict[str, Result], *, width: str | float = "full") -> Figure:
-    """Draw day-ahead RMSE and expected log likelihood of every residual, with two standard errors.
+    """Draw day-ahead RMSE of every residual with two standard errors, and the quartiles of its log likelihood.
 
     Args:
         settings: of the experiment.
@@ -146,14 +146,18 @@ def plot_scores(settings: Any, results: dict[str, Result], *, width: str | float
     grid = figure.subplots(len(kinds), 2, squeeze=False)
     places = np.arange(len(settings.methods))
     for (what, prefix, label), row in zip(kinds, grid, strict=True):
-        for axes, score, axis in zip(row, ("rmse", "ell"), ("RMSE a day ahead (K)", "expected log likelihood"),
+        for axes, score, axis in zip(row, ("rmse", "ell"), ("RMSE a day ahead (K)", "log likelihood of a day"),
                                      strict=True):
             for index, store in enumerate(settings.stores):
-                values = [mean_of(tables.of(results, what, store, method)[prefix + score])
-                          for method in settings.methods]
+                values = [tables.of(results, what, store, method)[prefix + score] for method in settings.methods]
                 colour, marker = _MARKS[store]
-                axes.errorbar(places + 0.16 * (index - 0.5), [one.value for one in values],
-                              2 * np.array([one.error for one in values]), color=colour, marker=marker, ls="", ms=3.0,
+                if score == "rmse":
+                    means = [mean_of(one) for one in values]
+                    middle, bars = [one.value for one in means], 2 * np.array([[one.error for one in means]] * 2)
+                else:
+                    low, middle, high = np.array([np.quantile(one, [0.25, 0.5, 0.75]) for one in values]).T
+                    bars = np.stack([middle - low, high - middle])
+                axes.errorbar(places + 0.16 * (index - 0.5), middle, bars, color=colour, marker=marker, ls="", ms=3.0,
                               elinewidth=0.8, capsize=1.5)
             style.tidy(axes)
             axes.set_xlim(-0.5, len(places) - 0.5)
@@ -164,8 +168,8 @@ def plot_scores(settings: Any, results: dict[str, Result], *, width: str | float
                 axes.set_yscale("symlog", linthresh=20.0)
     style.legend_above(figure, [Line2D([], [], color=_MARKS[store][0], marker=_MARKS[store][1], ls="", ms=3.0,
                                        label=store) for store in settings.stores])
-    style.note_below(figure, "Bars are two standard errors. The axis of the log likelihood is linear near zero and "
-                             "logarithmic beyond 20.")
+    style.note_below(figure, "Left: means and two standard errors. Right: medians and quartiles; the axis is linear "
+                             "near zero and logarithmic beyond 20.")
     return figure
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from lfm_ppl.experiments.scores import Estimate, mean_of, pair
+from lfm_ppl.experiments.scores import Estimate, mean_of, pair, rate_of
 from lfm_ppl.experiments.tasks import Result
 
 PUBLISHED: dict[str, dict[str, tuple[float, float, float, float]]] = {
@@ -105,10 +105,16 @@ def _published(table: str, method: str, what: str) -> dict[str, float]:
 
 
 def _gains(found: Result, all_: dict[str, Result], prefix: str = "") -> dict[str, float]:
-    """Return paired differences from the references: positive where this residual is better."""
+    """Return paired differences from the references, positive where this residual is better, and how often it is.
+
+    A few days with tiny log likelihoods rule the means, so the share of days with a higher one stands beside them.
+    """
     gains: dict[str, float] = {}
     for reference in (one for one in REFERENCES if one in all_):
         other = all_[reference]
         gains |= pair(f"RMSE below {reference} (K)", mean_of(other[f"{prefix}rmse"] - found[f"{prefix}rmse"]))
-        gains |= pair(f"ELL above {reference}", mean_of(found[f"{prefix}ell"] - other[f"{prefix}ell"]))
+        more = found[f"{prefix}ell"] - other[f"{prefix}ell"]
+        gains |= pair(f"ELL above {reference}", mean_of(more))
+        if other is not found:
+            gains |= pair(f"share of days above {reference}", rate_of(more > 0))
     return gains
