@@ -94,6 +94,7 @@ def test_check_prints_stores_and_draws(run, fitted):
     assert code == 0 and "accuracy.png" in out
 
 
+@pytest.mark.slow
 def test_correct_writes_a_result_of_its_own(run, fitted):
     (fitted / "corrected").mkdir()
     (fitted / "corrected" / "mine.txt").write_text("keep")

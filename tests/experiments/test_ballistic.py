@@ -63,6 +63,7 @@ def test_a_gaussian_smoother_tracks():
     assert (found["smoother_seconds"] > 0).all() and found["log_likelihood"].shape == (2,)
 
 
+@pytest.mark.slow
 def test_particles_agree_with_the_gaussian_smoother_where_it_is_nearly_exact():
     (task,) = particles.tasks(SMALL)
     found = particles.compute(task)

@@ -101,7 +101,7 @@ def test_an_interval_in_two_pieces(model):
     same((whole.mean, whole.covariance), (halves.mean[::2], halves.covariance[::2]), 1e-8)
 
 
-@pytest.mark.parametrize("link, steps", [(identity, 2), (softplus, 2)])
+@pytest.mark.parametrize("link, steps", [(identity, 2), pytest.param(softplus, 2, marks=pytest.mark.slow)])
 def test_requested_times_change_nothing_elsewhere(link, steps):
     model = motif(link, variance=0.1)
     plain = lfm.smooth(model, TIMES, Y, steps=steps, at=TIMES)

@@ -75,6 +75,7 @@ def test_predictions_follow_the_forces():
     assert site.sample(jax.random.key(1), (2, 3)).shape == (2, 3, 6, 1)
 
 
+@pytest.mark.slow
 def test_elliptical_slice_sampling_where_the_parameters_are_fixed():
     """Against the exact smoother, force by force."""
     fixed = handlers.substitute(linear, {"decay": 0.8})
