@@ -66,8 +66,8 @@ figures.plot_queues(settings, found.results, "constant")
 
 # %% [markdown]
 # A model whose days are all alike (periodic) is far too sure of itself. RMSE over the day's 168 five minutes, and the
-# log density of the true queue at these times, summed (ELL); the source does not say at how many times its own is taken,
-# so that only the order can be compared.
+# log density of the true queue at these times, summed (ELL); the source does not say at how many times its own is
+# taken, so that only the order can be compared.
 
 # %%
 scores.readable(found.constant)

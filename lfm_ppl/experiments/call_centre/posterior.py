@@ -114,8 +114,8 @@ def quantiles(mean: np.ndarray, sd: np.ndarray, p: np.ndarray) -> np.ndarray:
     """Return quantiles (Q, K) of equal mixtures of normal distributions with mean and sd (S, K), by bisection.
 
     Example:
-        >>> quantiles(np.array([[-1.0], [1.0]]), np.ones((2, 1)), np.array([0.5])).round(6).tolist()
-        [[0.0]]
+        >>> quantiles(np.array([[1.0], [3.0]]), np.ones((2, 1)), np.array([0.5])).round(6).tolist()
+        [[2.0]]
     """
     shape = (len(p), mean.shape[1])
     low = np.broadcast_to((mean - 10 * sd).min(axis=0), shape)
