@@ -101,7 +101,8 @@ def rao_blackwellised(build: Build, rule: SwitchingRule, times: Any, key: jax.Ar
     """Predict, or filter, a linear latent force model with a discrete input that follows a known rule.
 
     What a particle draws is what the rule reads, and nothing else; see the module. Within ``jax.jit`` the times must be
-    known, and one compilation serves all values of everything else.
+    known, and one compilation serves all values of everything else. Outside of it each call compiles anew, since
+    ``build`` makes new functions: compile what is called repeatedly.
 
     Args:
         build: from a value of the input to the `LatentForceModel` that holds while it has that value.

@@ -122,8 +122,9 @@ def only_adds(build: Build) -> bool:
 
     try:
         return not pattern(coefficients, 2).jacobian[:, 0].any()
-    except jax.errors.ConcretizationTypeError:  # build asks in Python for the value of the input: it may do anything
-        return False
+    except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError,
+            jax.errors.TracerIntegerConversionError, TypeError):
+        return False  # build asks in Python for the value of the input: it may do anything
 
 
 def row_maps(ssm: StateSpaceModel, rule: SwitchingRule, plan: Schedule) -> Callable[[Rows], Affine]:

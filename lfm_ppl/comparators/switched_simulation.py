@@ -30,7 +30,7 @@ class SwitchedSimulation(NamedTuple):
         state: (T, N, M), the physical state.
         forces: name -> (T, N).
         inputs: (T, N), values of the discrete input after each time.
-        y: (T, N, D), observations with their noise.
+        y: (T, N, D), observations with their noise, each before the decision at the same time.
     """
 
     times: jax.Array
@@ -46,7 +46,8 @@ def simulate_switched(key: jax.Array, build: Build, rule: SwitchingRule, times: 
     """Draw whole paths of a latent force model with a discrete input that follows a known rule.
 
     Averages over many paths are a plain particle prediction, of which `lfm_ppl.rao_blackwellised` is the version with
-    less variance for linear models. The model may be non-linear here.
+    less variance for linear models. The model may be non-linear here. Each call outside ``jax.jit`` compiles anew,
+    since ``build`` makes new functions: compile what is called repeatedly.
 
     Args:
         key: a JAX random key.
@@ -117,23 +118,28 @@ def _run(ssms: tuple[StateSpaceModel, ...], schemes: tuple[str, ...], rule: Swit
                 then = jnp.concatenate([then[:size], matmul(jump[0][one.jump], then[size:]) + kick])
             moved.append(then)
         state = jnp.take_along_axis(jnp.stack(moved), index[None, None, :], axis=0)[0]
-        read = jax.vmap(lambda s: rule.reading(*ssm.split(ssm.inputs(s, end)), end), in_axes=1)(state)
+        before = index
+
+        def reading(s: jax.Array, index: jax.Array) -> jax.Array:
+            return jnp.stack([rule.reading(*own.split(own.inputs(s, end)), end) for own in ssms])[index]
+
+        read = jax.vmap(reading, in_axes=(1, 0))(state, index)
         read = read + normals(read_key, read.shape[1], paths).T @ error.T
         chosen = jax.vmap(lambda d, r: rule.decide(d, r, end))(index, read).astype(index.dtype)
         index = jnp.where(decide, chosen, index)
-        return (state, index), (state, index)
+        return (state, index), (state, before, index)
 
     rows = as_arrays(plan.rows)
     keys = jax.random.split(rows_key, decides.shape[0])
-    _, (states, indices) = jax.lax.scan(row, (first, initial), (rows, decides, keys))
-    at = jnp.asarray(plan.observed)
-    states, indices = states[at], indices[at]
-    w = jax.vmap(lambda s, t: jax.vmap(lambda one: ssm.inputs(one, t), in_axes=1)(s))(states, times)
+    _, kept = jax.lax.scan(row, (first, initial), (rows, decides, keys))
+    states, before, indices = (part[jnp.asarray(plan.observed)] for part in kept)
 
-    def observe(w: jax.Array, t: jax.Array, index: jax.Array, key: jax.Array, row: jax.Array) -> jax.Array:
-        return jnp.stack([noisy_observation(own, w, t, key, row) for own in ssms])[index]
+    def observe(s: jax.Array, t: jax.Array, index: jax.Array, key: jax.Array, row: jax.Array) -> tuple:
+        inputs = [own.inputs(s, t) for own in ssms]
+        y = [noisy_observation(own, w, t, key, row) for own, w in zip(ssms, inputs, strict=True)]
+        return jnp.stack(inputs)[index], jnp.stack(y)[index]
 
     keys = jax.random.split(noise_key, (times.shape[0], paths))
-    y = jax.vmap(jax.vmap(observe, (0, None, 0, 0, None)))(w, times, indices, keys, jnp.arange(times.shape[0]))
+    w, y = jax.vmap(jax.vmap(observe, (1, None, 0, 0, None)))(states, times, before, keys, jnp.arange(times.shape[0]))
     forces = {name: w[:, :, size + number] for number, name in enumerate(ssm.model.force_names)}
     return SwitchedSimulation(times, w[:, :, :size], forces, jnp.asarray(rule.values)[indices], y)

@@ -244,3 +244,26 @@ def curved(heater):
 def two_rooms():
     return lfm.LatentForceModel(lambda x, u, t: -x, {}, lfm.GaussianObservation(lambda x, u, t: x[:1], [0.1]),
                                 lfm.Gaussian(jnp.zeros(2), jnp.eye(2)))
+
+
+def test_an_observation_comes_before_the_decision_at_its_time():
+    """Of the input itself, which is switched on at the first time: the first reading is still of the heater off."""
+
+    def lamp(heater):
+        return lfm.LatentForceModel(
+            lambda x, u, t: 0.0 * x, {}, lfm.GaussianObservation(lambda x, u, t: x + 100.0 * heater, jnp.array([1e-6])),
+            lfm.Gaussian(jnp.array([17.0]), 1e-4 * jnp.eye(1)))
+
+    times, key = np.arange(3.0), jax.random.key(0)
+    drawn = lfm.simulate_switched(key, lamp, lfm.Thermostat(1000.0), times, steps=1)
+    np.testing.assert_allclose(drawn.y[:, 0, 0], [17.0, 117.0, 117.0], atol=0.1)
+    np.testing.assert_array_equal(drawn.inputs[:, 0], [1.0, 1.0, 1.0])
+    found = lfm.rao_blackwellised(lamp, lfm.Thermostat(1000.0), times, key, y=drawn.y[:, 0], particles=10, steps=1)
+    np.testing.assert_allclose(found.outputs.moments()[0][:, 0], [17.0, 117.0, 117.0], atol=0.1)
+    assert np.isfinite(found.log_likelihood).all() and found.log_likelihood[0] > 0.0
+
+
+def test_a_model_that_asks_for_the_value_in_python_has_a_covariance_for_each_particle():
+    rates = {0.0: ALPHA, 1.0: ALPHA}
+    assert not only_adds(lambda heater: house(heater, rates[heater]))
+    assert not only_adds(lambda heater: house(heater, float(np.array([heater])[0])))
