@@ -100,9 +100,14 @@ def departure(near: Neighbourhood, forces: Mapping[str, Force], white: Any = 0.0
         ValueError: a wrong number of forces.
 
     Example:
+        >>> import lfm_ppl as lfm
         >>> near = Neighbourhood.of(environment, orbit, times)  # doctest: +SKIP
-        >>> model = departure(near, small_forces("DYB"))  # doctest: +SKIP
-        >>> lfm.smooth(model, times, positions - near.path[:, :3], lfm.Taylor(), steps=1)  # doctest: +SKIP
+        >>> nowhere = Table(0.0, 1.0, np.zeros((4, 27)))  # no gravity, no sunlight
+        >>> near = Neighbourhood(jnp.zeros((4, 6)), nowhere, jnp.zeros(3), "DYB")
+        >>> model = departure(near, lfm.orbits.small_forces("DYB"))
+        >>> found = lfm.filter(model, np.arange(2.0), np.zeros((2, 3)), lfm.Taylor(), steps=1)
+        >>> bool(abs(found.predicted_mean[1, :6]).max() < 1e-12)
+        True
     """
     start = wide_start(jnp.zeros(6)) if start is None else start
     return pushed(near, start, forces, near.axes, white, noise_sd, units)

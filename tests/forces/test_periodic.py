@@ -163,7 +163,7 @@ def kernels(p):
                 p[2])}
 
 
-@pytest.mark.parametrize("kind", ["stationary", "moderated", "function"])
+@pytest.mark.parametrize("kind", ["stationary", "moderated", pytest.param("function", marks=pytest.mark.slow)])
 def test_derivatives_by_all_parameters_are_finite_differences(kind):
     """First and second ones, the period among the parameters."""
     t = np.array([0.4, 3.1, 8.8, 17.0, 31.0])
@@ -230,6 +230,7 @@ def test_the_covariance_of_the_state_space_form_is_that_of_the_basis():
         assert_allclose(force.covariance(t, 2.0), kernel(t, 2.0) * lfm.Matern(1.0, 9.0, 2).covariance(t - 2.0))
 
 
+@pytest.mark.slow
 def test_resonators_carry_the_kernel():
     kernel = lfm.PeriodicMatern(1.3, 0.7, 24.0, 1)
     found = lfm.resonators(kernel, functions=9, mean=2.0)
