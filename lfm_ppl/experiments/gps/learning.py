@@ -26,6 +26,7 @@ from lfm_ppl.experiments.gps import magnitudes
 from lfm_ppl.experiments.gps.magnitudes import Prior
 from lfm_ppl.experiments.gps.problem import NOISE, Arc
 from lfm_ppl.filtering.filter import filter
+from lfm_ppl.linalg import solve_lower
 from lfm_ppl.linearisation.taylor import Taylor
 
 WEIGHT = 30.0
@@ -69,10 +70,11 @@ class Target(NamedTuple):
             return value, gradient
 
         first = self.prior.mean if start is None else start
-        if not np.isfinite(self.negative(first)[0]):
+        found = scipy.optimize.minimize(descent, first, jac=True, method="L-BFGS-B",
+                                        options={"maxfun": _EVALUATIONS}).x
+        if highest == -np.inf:  # not one value was finite: the search ends where it begins
             raise ValueError(f"positions have no density at the first magnitudes of the search, {np.exp(first)}.")
-        return scipy.optimize.minimize(descent, first, jac=True, method="L-BFGS-B",
-                                       options={"maxfun": _EVALUATIONS}).x
+        return found
 
     def negative(self, point: np.ndarray) -> tuple[float, np.ndarray]:
         """Return minus the log density, and its gradient (d,)."""
@@ -177,6 +179,6 @@ def departing(logarithms: jax.Array, near: orbits.Neighbourhood, axes: str) -> A
 def log_density(error: jax.Array, covariance: jax.Array) -> jax.Array:
     """Return the log density (T,) of errors (T, 3) whose covariance is (T, 3, 3) and that of the positions."""
     chol = jnp.linalg.cholesky(covariance + NOISE**2 * jnp.eye(3))
-    white = jax.vmap(lambda a, b: jax.scipy.linalg.solve_triangular(a, b, lower=True))(chol, error)
+    white = jax.vmap(solve_lower)(chol, error)
     return (-0.5 * (white**2).sum(1) - jnp.log(jnp.diagonal(chol, axis1=1, axis2=2)).sum(1)
             - 1.5 * jnp.log(2 * jnp.pi))
