@@ -21,6 +21,10 @@ from lfm_ppl.orbits.satellite import Motion, pushed, wide_start
 from lfm_ppl.orbits.table import Table
 
 
+_FINEST = 1 / 120
+"""Spacing of the points on the orbit over which means are taken (h): 30 s, half as long as a penumbra lasts."""
+
+
 class Neighbourhood(eqx.Module):
     """How the acceleration changes near an orbit, with place, velocity and small forces: the dynamics of `departure`.
 
@@ -46,8 +50,9 @@ class Neighbourhood(eqx.Module):
             orbit: where it is at the first of the times, and the sunlight's amplitude.
             times: (T,) hours, equally spaced.
             axes: of the small forces, "DYB" or "RTN".
-            nodes: of the table from one time to the next. It is cubic between them, so that the edges of the Earth's
-                shadow are about half a node wide.
+            nodes: of the table from one time to the next, two for each integration step. The table is cubic between
+                them; of the derivatives by forces it holds means over the steps around them, so that integrals over
+                the edges of the Earth's shadow are right.
 
         Raises:
             ValueError: unknown axes; times as for `propagate`.
@@ -55,11 +60,18 @@ class Neighbourhood(eqx.Module):
         checks.one_of("axes", axes, tuple(frames.AXES))
         checks.positive_integer("nodes", nodes)
         times = np.asarray(times, float)
-        fine = np.interp(np.arange(nodes * (len(times) - 1) + 1) / nodes, np.arange(len(times)), times)
+        spacing = float(times[1] - times[0]) / nodes if len(times) > 1 else 1.0
+        finer = 2 * max(1, int(np.ceil(spacing / (2 * _FINEST) - 1e-9)))
+        count = nodes * finer
+        fine = np.interp(np.arange(count * (len(times) - 1) + 1) / count, np.arange(len(times)), times)
         path = propagate(environment, orbit, fine)
         on_orbit = jnp.zeros(3 if axes == "DYB" else 4).at[0].set(orbit.solar)
         slopes = _slopes(Motion(environment, axes), jnp.asarray(path), on_orbit, jnp.asarray(fine))
-        return cls(jnp.asarray(path[::nodes]), Table(fine[0], fine[1] - fine[0], slopes), on_orbit, axes)
+        # Only forces switch with the shadow. The pull's own slope must stay as it is: an error of it adds up with time.
+        values = np.asarray(slopes).reshape(len(fine), 3, -1)
+        by_force = _means(values[:, :, 6:].reshape(len(fine), -1), finer).reshape(-1, 3, len(on_orbit))
+        table = np.concatenate([values[::finer, :, :6], by_force], axis=2)
+        return cls(jnp.asarray(path[::count]), Table(fine[0], spacing, table.reshape(len(table), -1)), on_orbit, axes)
 
     def __call__(self, x: jax.Array, u: jax.Array, t: Any) -> jax.Array:
         """Return the derivatives (6,) of a departure x (6,) under the small forces u (R,)."""
@@ -77,6 +89,29 @@ def _slopes(motion: Motion, path: jax.Array, u: jax.Array, times: jax.Array) -> 
     return jax.lax.map(one, (path, times))
 
 
+def _means(values: np.ndarray, finer: int) -> np.ndarray:
+    """Return local means of values (K finer + 1, C) around every ``finer``-th of them; there are none near both ends.
+
+    A step samples its beginning, its middle and its end. Where the function jumps in between, the sum of such samples
+    is wrong by a share of the jump times the step; that of means over one step is not, but flattens whatever is curved.
+    Means over one and over two steps are combined so that polynomials of degree three are left as they are.
+    """
+    nodes = values[::finer].copy()
+    one, two = (_mean_over(values, half) for half in (finer, 2 * finer))
+    inner = slice(2, len(nodes) - 2)
+    narrow, wide = (half**2 / 3 + 1 / 6 for half in (finer, 2 * finer))  # second moments of the trapezoidal rule
+    nodes[inner] = (wide * one[::finer][inner] - narrow * two[::finer][inner]) / (wide - narrow)
+    return nodes
+
+
+def _mean_over(values: np.ndarray, half: int) -> np.ndarray:
+    """Return means of what is linear between the values (K, C), over ``half`` intervals to each side; NaN at ends."""
+    below = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(0.5 * (values[1:] + values[:-1]), axis=0)])
+    found = np.full_like(values, np.nan)
+    found[half:len(values) - half] = (below[2 * half:] - below[:len(values) - 2 * half]) / (2 * half)
+    return found
+
+
 def departure(near: Neighbourhood, forces: Mapping[str, Force], white: Any = 0.0, noise_sd: Any = 5e-5,
               start: Gaussian | None = None, units: Mapping[str, str] | None = None) -> LatentForceModel:
     """Return the departure from an orbit as a latent force model, linear and with coefficients that depend on time.
@@ -85,8 +120,9 @@ def departure(near: Neighbourhood, forces: Mapping[str, Force], white: Any = 0.0
 
     with A, B and C the derivatives of the acceleration on the orbit and u_0 the forces there. It is what `satellite`
     is for small departures, with steps thirty times as long: a departure changes as slowly as the orbit turns, and
-    one step of a quarter of an hour is good to 1e-6 of it. What it leaves out is of the order of the departure
-    squared over the radius, 0.4 mm for 100 m. Observations are positions less `near.path`.
+    one step of a quarter of an hour is good to 1e-6 of it in sunlight, 1e-4 with the Earth's shadow. What is left out
+    is of the order of the departure squared over the radius, 0.4 mm for 100 m. Observations are positions less
+    `near.path`.
 
     Args:
         near: an orbit and what is around it.

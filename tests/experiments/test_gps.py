@@ -261,7 +261,7 @@ def satellite():
 
 @pytest.mark.slow
 def test_departures_are_predicted_as_the_satellite_itself(satellite):
-    """The linear model of departures, in steps thirty times as long, against the filter of the satellite."""
+    """The linear model of departures, in steps fifteen times as long, against the filter of the satellite."""
     one, axes = satellite, "DYB"
     orbit = orbits.fit_orbit(one.environment, one.times[:one.train], one.positions[:one.train])
     near = prediction.surroundings(one, orbit, axes)

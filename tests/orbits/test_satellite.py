@@ -10,7 +10,7 @@ import pytest
 import lfm_ppl as lfm
 from lfm_ppl import orbits
 from lfm_ppl.model.augment import state_space
-from lfm_ppl.orbits import geopotential
+from lfm_ppl.orbits import deviations, geopotential
 from lfm_ppl.orbits.environment import PER_HOUR2
 
 pytest.importorskip("erfa", reason="needs the extra gps")
@@ -151,6 +151,22 @@ def test_departures_follow_two_orbits_that_differ_a_little(around):
         found = lfm.filter(model, TIMES, nothing, rule=lfm.Taylor(), steps=steps).filtered_mean[:, :6]
         apart = other - np.asarray(near.path)
         assert np.abs(found - apart).max() < error * np.abs(apart).max()
+
+
+def test_the_table_of_a_neighbourhood_holds_means():
+    """Sums of samples through a jump are right, wherever it is, and polynomials of degree three are left alone."""
+    finer, nodes = 8, 30
+    t = np.arange(finer * nodes + 1) / finer
+    smooth = np.stack([t**k for k in range(4)], axis=1) / 30.0 ** np.arange(4)
+    np.testing.assert_allclose(deviations._means(smooth, finer), smooth[::finer], atol=1e-13)
+    weights = np.where(np.arange(nodes + 1) % 2, 4.0, 2.0) / 3.0  # Simpson's rule: Runge-Kutta's for a pure integral
+    weights[[0, -1]] = 1 / 3
+    for edge in np.linspace(10.0, 12.0, 17):
+        jump = (t[:, None] >= edge).astype(float)
+        whole = 0.5 * (jump[1:] + jump[:-1]).sum() / finer
+        assert weights @ deviations._means(jump, finer)[:, 0] == pytest.approx(whole, abs=1e-12)
+    plain = [weights @ (t[::finer] >= edge) - (30.0 - edge) for edge in np.linspace(10.0, 12.0, 17)]
+    assert np.abs(plain).max() > 0.6
 
 
 def test_neighbourhood_says_what_is_wrong(around):
