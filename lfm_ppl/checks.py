@@ -7,7 +7,7 @@ gives a log likelihood of minus infinity instead.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import jax
@@ -37,6 +37,15 @@ def positive_integer(name: str, value: Any, remedy: str = "") -> None:
         raise TypeError(f"{name} must be a whole number, got {value!r}. {remedy}".strip())
     if value < 1:
         raise ValueError(_message(name, "at least 1", value, remedy))
+
+
+def sizes(name: str, value: Any, meaning: Sequence[str]) -> None:
+    """Raise unless ``value`` is a tuple of whole numbers of at least one, one for each of ``meaning``."""
+    if not isinstance(value, tuple) or len(value) != len(meaning):
+        expected = f"{', '.join(meaning[:-1])} and {meaning[-1]}"
+        raise ValueError(f"{name} must be {expected}, got {value!r}.")
+    for what, count in zip(meaning, value, strict=True):
+        positive_integer(f"{name}: {what}", count)
 
 
 def finite(name: str, value: Any, remedy: str = "") -> None:

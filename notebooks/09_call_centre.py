@@ -108,5 +108,12 @@ figures.plot_errors(settings, found.results)
 # %%
 scores.readable(found.gain)
 
+# %% [markdown]
+# These are weighted draws. NUTS, which shares nothing with them but the density, finds the same posterior, here for the
+# first days: how far apart the means are at most, in posterior standard deviations, and both gains on these days.
+
+# %%
+scores.readable(found.agreement)
+
 # %%
 scores.readable(found.learnt)

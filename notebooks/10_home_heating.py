@@ -157,8 +157,8 @@ figures.plot_residual(settings, found.results) if settings.data else None
 # %% [markdown]
 # ## Parameters integrated out
 #
-# The tables above take the most likely parameters of the four days, as the source does. With draws of the posterior
-# (RAM) the prediction is a mixture over them:
+# The tables above take the most likely parameters of the four days, as the source does. With draws of the posterior,
+# by RAM and by NUTS, the prediction is a mixture over them:
 
 # %%
 scores.readable(found.tables["posterior"]) if "posterior" in found.tables else "no data"

@@ -262,6 +262,7 @@ def test_the_quick_version_runs_from_end_to_end(tmp_path):
     assert len(found.tables) == 4
 
 
+@pytest.mark.slow
 def test_the_drag_alone_is_integrated_right():
     """With the force's parameters known, on another grid and equally spaced in the drag."""
     target = problem.target(0)

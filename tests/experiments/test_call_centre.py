@@ -174,6 +174,11 @@ def made_up(settings):
         names = tracking.method_of(task).names
         worse = {"SQM": 1.0, "Matern": 3.0}.get(method, 2.0) * (0.9 if task.settings["what"] == "posterior" else 1.0)
         found = {}
+        if task.settings["what"] == "nuts":
+            results[task.name] = {f"{name}_ell": -70.0 for name in problem.TESTED} | {
+                "mean": np.full(len(names), 0.1), "sd": np.full(len(names), 0.8), "ess": np.full(len(names), 150.0),
+                "r_hat": np.full(len(names), 1.004), "divergences": 0, "seconds": 60.0}
+            continue
         for name in problem.TESTED:
             rmse = worse * (1.0 + 0.1 * np.arange(settings.days))
             found |= {f"{name}_rmse": rmse, f"{name}_ell": -100.0 * rmse, f"{name}_rate_rmse": 0.1 * rmse,
@@ -234,6 +239,11 @@ def test_the_tables_hold_what_was_found():
     gain = tables.gain(MADE, results)
     assert gain.loc["SQM, changed", "gain"] == pytest.approx(11.0) and gain.loc["SQM, constant", "days"] == 1.0
     assert gain.loc["SQM, constant", "RMSE ratio"] == pytest.approx(0.9)
+    agreement = tables.agreement(MADE, results).loc["SQM"]
+    assert agreement["windows"] == 2 and agreement["means apart (sd)"] == pytest.approx(0.125)
+    assert agreement["ratio of sds"] == pytest.approx(1.25)
+    assert agreement["gain constant, NUTS"] == pytest.approx(35.0)  # of -100 and -110
+    assert agreement["gain constant, weighted"] == pytest.approx(10.5)
     learnt = tables.learnt(MADE, results)
     assert learnt.loc["SQM", "memory"] == 1.0 and np.isnan(learnt.loc["Matern", "memory"])
 
@@ -254,10 +264,10 @@ def test_what_is_stored_is_tabulated_and_drawn_without_computing(tmp_path):
     lines = []
     with pytest.warns(counts.OverloadWarning, match="changed service rate: on 3 of 3 test days"):
         found = experiment.run(MADE, tmp_path, report=lines.append)
-    assert lines[0].startswith("the counts are simulated") and lines[1] == "4 of 4 tasks are stored already"
+    assert lines[0].startswith("the counts are simulated") and lines[1] == "6 of 6 tasks are stored already"
     kept = experiment.save(found, tmp_path)
     assert {path.name for path in kept} == {
-        f"{stem}.{end}" for stem in ("constant", "changed", "gain", "learnt") for end in ("csv", "md")} | {
+        f"{stem}.{end}" for stem in ("constant", "changed", "gain", "agreement", "learnt") for end in ("csv", "md")} | {
         "queue-constant.png", "queue-changed.png", "arrivals.png", "cycles.png", "errors.png"}
     assert scores.readable(found.constant).loc["SQM", "published RMSE"] == "4.6 (2.2)"
     with pytest.raises(ValueError, match="seed is 0 there and 1 now"), warnings.catch_warnings():
@@ -268,7 +278,8 @@ def test_what_is_stored_is_tabulated_and_drawn_without_computing(tmp_path):
 def test_mistakes(tmp_path):
     for wrong, message in (({"days": 0}, "days must be at least 1"), ({"methods": ("SQN",)}, "SQM"),
                            ({"integrated": ("CQM",), "methods": ("SQM",)}, "integrated"),
-                           ({"integrated": "SQM"}, "a tuple of at least one method"),
+                           ({"nuts": (2, 10)}, "nuts must be chains, warm-up and draws"),
+                           ({"nuts": (2, 0, 10)}, "nuts: warm-up must be at least 1"), ({"integrated": "SQM"}, "a tuple of at least one method"),
                            ({"weekday": "Thrusday"}, "Did you mean 'Thursday'"), ({"link": "log"}, "link")):
         with pytest.raises(ValueError, match=message):
             experiment.Settings(**wrong)
@@ -311,3 +322,16 @@ def test_the_quick_version_runs_from_end_to_end(tmp_path):
         found = report.run(catalogue.Wanted(tmp_path, realisations=1, quick=True))
     assert len(found.written) == 13 and all(path.stat().st_size > 0 for path in found.written)
     assert len(found.tables) == 4
+
+
+@pytest.mark.slow
+def test_nuts_and_weighted_draws_have_the_same_posterior():
+    """Two samplers that share nothing but the density, on one window."""
+    settings = experiment.Settings(days=1, methods=("SQM",), functions=5, draws=1_000, mixed=5, nuts_days=1,
+                                   nuts=(2, 300, 700))
+    found = posterior.compute_nuts(posterior.nuts_tasks(settings)[0])
+    weighted = posterior.compute(posterior.tasks(settings)[0])
+    assert found["divergences"] == 0 and found["r_hat"].max() < 1.02
+    error = np.sqrt(1 / found["ess"] + 1 / weighted["ess"])
+    assert (np.abs(found["mean"] - weighted["posterior_mean"][0]) < 4 * error * found["sd"]).all()
+    np.testing.assert_allclose(found["sd"], weighted["posterior_sd"][0], rtol=4 * error.max())

@@ -136,7 +136,9 @@ def made_up(settings):
                       "residual": generator.normal(size=120), "residual_sd": np.ones(120)}
         else:
             found = {"ell": np.array([-4.0, -8.0]), "point_ell": np.array([-5.0, -11.0]), "rmse": np.ones(2),
-                     "point_rmse": np.ones(2), "r_hat": np.full(2, 1.01), "ess": np.full(2, 300.0)}
+                     "point_rmse": np.ones(2), "r_hat": np.full(2, 1.01), "ess": np.full(2, 300.0),
+                     "mean": np.full((2, 6), 0.1 if task.settings["sampler"] == "NUTS" else 0.0),
+                     "sd": np.full((2, 6), 0.5), "divergences": np.ones(2), "seconds": np.full(2, 7.0)}
         results[task.name] = {**found, "cpu_s": 2.0}
     return results
 
@@ -161,7 +163,9 @@ def test_tables_and_figures_with_the_real_house(window, tmp_path):
     found = experiment.Comparison(settings, made_up(settings), tables.every(settings, made_up(settings)))
     assert list(found.tables) == ["house-one-store", "homes-one-store", "posterior", "house-envelope",
                                   "homes-envelope"]
-    assert found.tables["posterior"].loc["parameters integrated out", "gain in ELL"] == pytest.approx(2.0)
+    integrated = found.tables["posterior"].loc["integrated out by NUTS"]
+    assert integrated["gain in ELL"] == pytest.approx(2.0) and integrated["divergences"] == 2
+    assert integrated["means from RAM (sd)"] == pytest.approx(0.2)
     one, envelope = found.tables["house-one-store"], found.tables["house-envelope"]
     assert one.loc["none", "published ELL tracked"] == 31 and envelope.loc["SQM", "published RMSE ahead (K)"] == 0.22
     assert np.isnan(envelope.loc["matern", "published RMSE ahead (K)"])
@@ -189,3 +193,15 @@ def test_the_quick_version_runs_and_goes_on(tmp_path):
     for name, table in first.tables.items():
         assert table.equals(again.tables[name])
     assert os.listdir(tmp_path / "tasks") and Path(tmp_path).is_dir()
+
+
+@pytest.mark.slow
+def test_nuts_and_ram_have_the_same_posterior(window):
+    model = ("none", "one store", 3)
+    z, _ = learning.most_likely(*model, window)
+    nuts = learning.posterior("NUTS", *model, window, z, jax.random.key(0), (2, 300, 700))
+    ram = learning.posterior("RAM", *model, window, z, jax.random.key(1), (4, 1000, 4000))
+    assert nuts["divergences"] == 0 and max(nuts["r_hat"].max(), ram["r_hat"].max()) < 1.03
+    error = np.sqrt(1 / nuts["ess"] + 1 / ram["ess"])
+    assert (np.abs(nuts["mean"] - ram["mean"]) < 4 * error * nuts["sd"]).all()
+    np.testing.assert_allclose(nuts["sd"], ram["sd"], rtol=4 * error.max())

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import jax
-import numpy as np
-from numpyro.infer import MCMC, NUTS, init_to_uniform
+from numpyro.infer import MCMC, init_to_uniform
 
-from lfm_ppl.experiments import scores
+from lfm_ppl.experiments import chains
 from lfm_ppl.experiments.ballistic import problem
 from lfm_ppl.experiments.tasks import Result, Task
-from lfm_ppl.experiments.timing import timed
 from lfm_ppl.inference.ram import RAM
 
 SAMPLERS = ("NUTS", "RAM")
@@ -22,9 +19,9 @@ def tasks(settings: Any) -> list[Task]:
     found = []
     for index in range(min(settings.runs, settings.chain_runs)):
         for sampler in SAMPLERS:
-            chains, warmup, draws, thin = getattr(settings, sampler.lower())
+            count, warmup, draws, thin = getattr(settings, sampler.lower())
             found.append(Task(f"chains/{sampler}/{index:04d}", settings.seed, {
-                "experiment": "ballistic", "what": "chains", "sampler": sampler, "index": index, "chains": chains,
+                "experiment": "ballistic", "what": "chains", "sampler": sampler, "index": index, "chains": count,
                 "warmup": warmup, "draws": draws, "thin": thin}))
     return found
 
@@ -36,17 +33,9 @@ def compute(task: Task) -> Result:
     if settings["sampler"] == "RAM":
         kernel: Any = RAM(problem.model(), init_strategy=strategy)
     else:
-        kernel = NUTS(problem.model(), init_strategy=strategy, dense_mass=True, forward_mode_differentiation=True)
+        kernel = chains.nuts(problem.model(), init_strategy=strategy)
     thin = settings["thin"]
     mcmc = MCMC(kernel, num_warmup=settings["warmup"] * thin, num_samples=settings["draws"] * thin, thinning=thin,
                 num_chains=settings["chains"], progress_bar=False,
                 chain_method="vectorized" if settings["sampler"] == "RAM" else "sequential")
-
-    def run() -> dict[str, jax.Array]:
-        mcmc.run(task.key, target.times, target.y)
-        return mcmc.get_samples(group_by_chain=True)
-
-    seconds, drawn = timed(run)
-    draws = np.log(np.stack([np.asarray(drawn[name]) for name in problem.NAMES]))
-    divergences = 0 if settings["sampler"] == "RAM" else int(np.sum(mcmc.get_extra_fields()["diverging"]))
-    return {"draws": draws, "seconds": seconds, "divergences": divergences, **scores.diagnose(problem.NAMES, draws)}
+    return chains.sample(mcmc, problem.NAMES, task.key, target.times, target.y)

@@ -41,7 +41,7 @@ class Settings:
     particle_runs: int = 20
     particles: tuple[int, ...] = (500, 2_000, 10_000, 50_000)
     chain_runs: int = 3
-    drawn_runs: int = 100
+    drawn_runs: int = 500
     draws: int = 1_000
     paths: int = 50
     nuts: tuple[int, int, int, int] = (2, 300, 700, 1)
@@ -63,11 +63,7 @@ class Settings:
         for count in self.particles:
             checks.positive_integer("particles", count)
         for name in ("nuts", "ram"):
-            size = getattr(self, name)
-            if not isinstance(size, tuple) or len(size) != 4:
-                raise ValueError(f"{name} must be chains, warm-up, draws and thinning, got {size!r}.")
-            for what, count in zip(("chains", "warm-up", "draws", "thinning"), size, strict=True):
-                checks.positive_integer(f"{name}: {what}", count)
+            checks.sizes(name, getattr(self, name), ("chains", "warm-up", "draws", "thinning"))
 
 
 def quick(runs: int = 4, seed: int = 0) -> Settings:

@@ -34,6 +34,8 @@ class Settings:
         integrated: the methods whose parameters are integrated out, too; at least one, all of them among ``methods``.
         draws: of their parameters, that are weighted.
         mixed: of them, so many are drawn to track with.
+        nuts_days: of the test days, the first so many, by NUTS, too.
+        nuts: its chains, and warm-up and draws of each.
     """
 
     days: int = 11
@@ -46,11 +48,14 @@ class Settings:
     integrated: tuple[str, ...] = ("SQM",)
     draws: int = 200
     mixed: int = 20
+    nuts_days: int = 2
+    nuts: tuple[int, int, int] = (2, 150, 200)
 
     def __post_init__(self) -> None:
         """Check what a user gives."""
-        for name in ("days", "functions", "draws", "mixed"):
+        for name in ("days", "functions", "draws", "mixed", "nuts_days"):
             checks.positive_integer(name, getattr(self, name))
+        checks.sizes("nuts", self.nuts, ("chains", "warm-up", "draws"))
         for method in self.methods:
             checks.one_of("methods", method, tracking.METHODS)
         if not isinstance(self.integrated, tuple) or not self.integrated:
@@ -68,7 +73,8 @@ class Settings:
 
 def quick(**given: Any) -> Settings:
     """Return settings that show in a few minutes that everything runs, and no more."""
-    small: dict[str, Any] = {"days": 2, "methods": ("SQM", "Matern"), "functions": 7, "draws": 60, "mixed": 5}
+    small: dict[str, Any] = {"days": 2, "methods": ("SQM", "Matern"), "functions": 7, "draws": 60, "mixed": 5,
+                             "nuts_days": 1, "nuts": (2, 20, 20)}
     return Settings(**small | given)
 
 
@@ -81,6 +87,7 @@ class Comparison(NamedTuple):
         constant: one row a method, at the service rate of training.
         changed: the same with a changed service rate.
         gain: of integrating the parameters out.
+        agreement: of weighted draws with NUTS.
         learnt: most likely parameters.
     """
 
@@ -89,17 +96,18 @@ class Comparison(NamedTuple):
     constant: pd.DataFrame
     changed: pd.DataFrame
     gain: pd.DataFrame
+    agreement: pd.DataFrame
     learnt: pd.DataFrame
 
 
 def all_tasks(settings: Settings) -> list[Task]:
     """Return every task."""
-    return [*tracking.tasks(settings), *posterior.tasks(settings)]
+    return [*tracking.tasks(settings), *posterior.tasks(settings), *posterior.nuts_tasks(settings)]
 
 
 def compute(task: Task) -> Result:
     """Compute one task."""
-    return {"track": tracking.compute, "posterior": posterior.compute}[task.settings["what"]](task)
+    return {"track": tracking.compute, "posterior": posterior.compute, "nuts": posterior.compute_nuts}[task.settings["what"]](task)
 
 
 def run(settings: Settings, folder: str | Path, *, overwrite: bool = False,
@@ -131,7 +139,7 @@ def run(settings: Settings, folder: str | Path, *, overwrite: bool = False,
                         workers=workers)
     return Comparison(settings, results, tables.tracked(settings, results, "constant"),
                       tables.tracked(settings, results, "changed"), tables.gain(settings, results),
-                      tables.learnt(settings, results))
+                      tables.agreement(settings, results), tables.learnt(settings, results))
 
 
 def _warn_overload(settings: Settings) -> None:
@@ -150,5 +158,6 @@ def _warn_overload(settings: Settings) -> None:
 
 def save(found: Comparison, folder: str | Path) -> list[Path]:
     """Write tables and figures, replacing older ones, and return their paths."""
-    shown = {"constant": found.constant, "changed": found.changed, "gain": found.gain, "learnt": found.learnt}
+    shown = {"constant": found.constant, "changed": found.changed, "gain": found.gain,
+             "agreement": found.agreement, "learnt": found.learnt}
     return output.save(folder, shown, figures.draw(found.settings, found.results), "method")

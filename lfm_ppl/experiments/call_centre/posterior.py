@@ -1,7 +1,8 @@
 """The parameters integrated out: the posterior given the training, and what it adds to the most likely parameters.
 
 Draws of the posterior of the logarithms z under the model's priors are weighted draws, see
-`lfm_ppl.experiments.weighting`. Each tracks the test day; the estimates of all, mixed, stand for the prediction.
+`lfm_ppl.experiments.weighting`; of the first windows there are those of NUTS, too, which they must agree with. Each
+tracks the test day; the estimates of all, mixed, stand for the prediction.
 """
 
 from __future__ import annotations
@@ -13,10 +14,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpyro.infer import MCMC
 from scipy import special, stats
 
 from lfm_ppl.analysis import importance
-from lfm_ppl.experiments import scores
+from lfm_ppl.experiments import chains, scores
 from lfm_ppl.experiments.call_centre import problem, tracking
 from lfm_ppl.experiments.call_centre.problem import FIRST, TESTED, Method, Window
 from lfm_ppl.experiments.call_centre.tracking import Tracked
@@ -31,11 +33,21 @@ _NOISE = 1e-7
 
 
 def tasks(settings: Any) -> list[Task]:
-    """Return one task for each method whose parameters are integrated out."""
-    return [Task(f"posterior/{name}", settings.seed, {
-        "experiment": "call-centre", "what": "posterior", "method": name, "link": settings.link,
-        "functions": settings.functions, "draws": settings.draws, "mixed": settings.mixed, **settings.windows()})
-        for name in settings.integrated]
+    """Return one task for each method whose parameters are integrated out, by weighted draws in all windows."""
+    return [Task(f"posterior/{name}", settings.seed, {**_shared(settings, name), **settings.windows()})
+            for name in settings.integrated]
+
+
+def nuts_tasks(settings: Any) -> list[Task]:
+    """Return one task for each method and window whose parameters are integrated out by NUTS."""
+    return [Task(f"nuts/{name}/{index:02d}", settings.seed, {
+        **_shared(settings, name), "what": "nuts", "chains": list(settings.nuts), **settings.windows(), "first": index,
+        "count": 1}) for name in settings.integrated for index in range(min(settings.nuts_days, settings.days))]
+
+
+def _shared(settings: Any, name: str) -> dict[str, Any]:
+    return {"experiment": "call-centre", "what": "posterior", "method": name, "link": settings.link,
+            "functions": settings.functions, "draws": settings.draws, "mixed": settings.mixed}
 
 
 def compute(task: Task) -> Result:
@@ -56,15 +68,38 @@ def compute(task: Task) -> Result:
         row: dict[str, Any] = {"k": float(np.ravel(weights.k)[0]), "ess": float(np.ravel(weights.ess)[0]),
                                "posterior_mean": mean, "posterior_sd": np.sqrt(weight @ (draws - mean) ** 2)}
         chosen = draws[importance.resample(weights.log_weight, task.settings["mixed"], task.seed + index)]
-        for name, tested in TESTED.items():
-            found = [tracking.track(method, z, one.y[name], tested) for z in chosen]
-            row |= {f"{name}_{key}": value for key, value in judge(found, one, name).items()}
-        if not rows:
+        rows.append(row | _judged(method, chosen, one))
+        if index == 0:
             best = tracking.learn(method, one.training)
             shape = tracking.shapes(method, best.z, one.y["constant"], TESTED["constant"])
             first = {"shapes": shape.arrivals, "shapes_sd": shape.arrivals_sd}
-        rows.append(row)
     return {**{key: np.array([row[key] for row in rows]) for key in rows[0]}, **first}
+
+
+def compute_nuts(task: Task) -> Result:
+    """Return the entries of `judge` of one window for both tests, and those of `chains.sample`."""
+    method, (one,) = tracking.method_of(task), tracking.windows_of(task)
+    count, warmup, draws = task.settings["chains"]
+
+    def model(y: np.ndarray) -> None:
+        problem.model_file().model(problem.TRAINING, y, **method._asdict())
+
+    mcmc = MCMC(chains.nuts(model), num_warmup=warmup, num_samples=draws, num_chains=count, chain_method="sequential",
+                progress_bar=False)
+    start_key, run_key = jax.random.split(task.key)
+    near = tracking.learn(method, one.training, prior=1.0).z
+    found = chains.sample(mcmc, method.names, run_key, one.training,
+                          init_params=chains.starts(method.names, near, count, start_key))
+    return found | _judged(method, scores.spread(found["draws"], task.settings["mixed"]), one)
+
+
+def _judged(method: Method, several: np.ndarray, one: Window) -> dict[str, float]:
+    """Return the entries of `judge` for both tests, with its name before them."""
+    row: dict[str, float] = {}
+    for name, tested in TESTED.items():
+        found = [tracking.track(method, z, one.y[name], tested) for z in several]
+        row |= {f"{name}_{key}": value for key, value in judge(found, one, name).items()}
+    return row
 
 
 def posterior(method: Method, y: np.ndarray, count: int, seed: int) -> Weighted:

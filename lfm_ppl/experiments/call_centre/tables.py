@@ -85,6 +85,36 @@ def gain(settings: Any, results: dict[str, Result]) -> pd.DataFrame:
     return pd.DataFrame.from_dict(rows, orient="index")
 
 
+def agreement(settings: Any, results: dict[str, Result]) -> pd.DataFrame:
+    """Return how well weighted draws and NUTS agree, one row for each method, over the windows that have both.
+
+    Returns:
+        The largest distance of two means in standard deviations of NUTS, over parameters and windows, and the ratio of
+        two standard deviations furthest from one; the gains in log density of a day's queue over the most likely
+        parameters, both tests, by NUTS and by weighted draws of the same windows; the largest R-hat, the least
+        effective number of draws, divergences, and CPU seconds of a window.
+    """
+    found, rows = by_method(settings, results), {}
+    for method in settings.integrated:
+        chains = [results[task.name] for task in posterior.nuts_tasks(settings) if task.settings["method"] == method]
+        plain, whole, count = found[method], found[INTEGRATED.format(method)], len(chains)
+        mean, sd = (np.array([one[name] for one in chains]) for name in ("mean", "sd"))
+        ratio = (whole["posterior_sd"][:count] / sd).ravel()
+        rows[method] = {"windows": count,
+                        "means apart (sd)": float((np.abs(whole["posterior_mean"][:count] - mean) / sd).max()),
+                        "ratio of sds": float(ratio[np.argmax(np.abs(np.log(ratio)))])}
+        for test in ("constant", "changed"):
+            before = plain[f"{test}_ell"][:count]
+            by_nuts = np.array([one[f"{test}_ell"] for one in chains])
+            rows[method] |= pair(f"gain {test}, NUTS", mean_of(by_nuts - before))
+            rows[method] |= pair(f"gain {test}, weighted", mean_of(whole[f"{test}_ell"][:count] - before))
+        rows[method] |= {"R-hat": float(max(one["r_hat"].max() for one in chains)),
+                         "least ESS": float(min(one["ess"].min() for one in chains)),
+                         "divergences": int(sum(one["divergences"] for one in chains)),
+                         "CPU s": float(np.mean([one["seconds"] for one in chains]))}
+    return pd.DataFrame.from_dict(rows, orient="index")
+
+
 def learnt(settings: Any, results: dict[str, Result]) -> pd.DataFrame:
     """Return the most likely parameters: medians over windows, the log likelihood, and CPU seconds of a window."""
     rows = {}

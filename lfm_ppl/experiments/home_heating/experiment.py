@@ -39,7 +39,8 @@ class Settings:
         particles: of a prediction under a thermostat.
         integrated: residual whose parameters are integrated out, too.
         every: in every so many windows.
-        chains: chains, warm-up and draws of each.
+        ram: chains, warm-up and draws of each, of RAM.
+        nuts: of NUTS.
     """
 
     data: str | None = None
@@ -52,7 +53,8 @@ class Settings:
     particles: int = 1000
     integrated: str = "SQM"
     every: int = 7
-    chains: tuple[int, int, int] = (4, 700, 1300)
+    ram: tuple[int, int, int] = (4, 1000, 4000)
+    nuts: tuple[int, int, int] = (2, 150, 250)
 
     def __post_init__(self) -> None:
         """Check what a user gives."""
@@ -60,6 +62,8 @@ class Settings:
             checks.positive_integer(name, getattr(self, name))
         if self.windows is not None:
             checks.positive_integer("windows", self.windows)
+        for name in ("ram", "nuts"):
+            checks.sizes(name, getattr(self, name), ("chains", "warm-up", "draws"))
         for name, known in (("methods", problem.METHODS), ("stores", problem.STORES)):
             for one in getattr(self, name):
                 checks.one_of(name, one, known)
@@ -82,7 +86,8 @@ class Settings:
 def quick(**given: Any) -> Settings:
     """Return settings that show in a few minutes that everything runs, and no more."""
     small: dict[str, Any] = {"homes": 2, "windows": 2, "methods": ("SQM", "none", "matern"),
-                             "stores": problem.STORES[:1], "functions": 5, "particles": 200, "chains": (2, 50, 50)}
+                             "stores": problem.STORES[:1], "functions": 5, "particles": 200, "ram": (2, 50, 50),
+                             "nuts": (2, 20, 20)}
     return Settings(**small | given)
 
 
@@ -111,8 +116,9 @@ def tasks(settings: Settings) -> list[Task]:
                 house = {**own, "data": str(Path(settings.data).resolve()), "windows": settings.window_count}
                 found.append(Task(name("house", store, method), settings.seed, {**house, "shown": settings.shown}))
                 if method == settings.integrated and store == settings.stores[0]:
-                    found.append(Task(name("posterior", store, method), settings.seed,
-                                      {**house, "every": settings.every, "chains": list(settings.chains)}))
+                    found.extend(Task(name(f"posterior/{sampler}", store, method), settings.seed, {
+                        **house, "sampler": sampler, "every": settings.every,
+                        "chains": list(getattr(settings, sampler.lower()))}) for sampler in learning.SAMPLERS)
             found.append(Task(name("homes", store, method), settings.seed,
                               {**own, "homes": settings.homes, "particles": settings.particles}))
     return found
@@ -175,17 +181,18 @@ def _posterior(task: Task) -> Result:
         z, _ = learning.most_likely(*model, window, z)
         if index % task.settings["every"]:
             continue
-        draws = learning.posterior(*model, window, z, jax.random.fold_in(task.key, index),
-                                   tuple(task.settings["chains"]))
+        sampled = learning.posterior(task.settings["sampler"], *model, window, z, jax.random.fold_in(task.key, index),
+                                     tuple(task.settings["chains"]))
+        draws = sampled["draws"]
         truth, y = window.y[test, 0], jnp.asarray(prediction.masked(window.y))
         several = prediction.filtered_under_draws(*model)(jnp.asarray(scores.spread(draws, 100)), y, window.outdoor)
         mean, variance = several.mean[:, test], several.variance[:, test]
         terms = -0.5 * ((truth - mean) ** 2 / variance + jnp.log(2 * np.pi * variance))
         point = prediction.known_heater(*model, window, z)
-        found = scores.diagnose(problem.names(*model[:2]), draws)
         rows.append({"ell": float((logsumexp(terms, axis=0) - np.log(len(mean))).sum()),
                      "rmse": scores.rmse(mean.mean(axis=0), truth), "point_ell": point["ahead_ell"],
-                     "point_rmse": point["ahead_rmse"], "r_hat": np.max(found["r_hat"]), "ess": np.min(found["ess"])})
+                     "point_rmse": point["ahead_rmse"], "r_hat": np.max(sampled["r_hat"]), "ess": np.min(sampled["ess"]),
+                     **{name: sampled[name] for name in ("mean", "sd", "divergences", "seconds")}})
     return _stacked(rows)
 
 

@@ -12,11 +12,14 @@ import numpy as np
 from numpyro import handlers
 from numpyro.infer import MCMC
 
+from lfm_ppl.experiments import chains
 from lfm_ppl.experiments.home_heating import problem
+from lfm_ppl.experiments.tasks import Result
 from lfm_ppl.inference.fixing import fix
 from lfm_ppl.inference.optimise import Objective, quasi_newton
 from lfm_ppl.inference.ram import RAM
 
+SAMPLERS = ("RAM", "NUTS")
 _ITERATIONS = 60
 
 
@@ -84,23 +87,30 @@ def _program(method: str, store: str, functions: int) -> Callable[..., tuple[jax
     return jax.jit(both)
 
 
-def posterior(method: str, store: str, functions: int, window: problem.Window, near: np.ndarray, key: jax.Array,
-              size: tuple[int, int, int]) -> np.ndarray:
-    """Return draws (P, chains, draws) of z by RAM, its chains started around ``near``."""
-    chains, warmup, draws = size
-    mcmc = _sampler(method, store, functions, chains, warmup, draws)
+def posterior(sampler: str, method: str, store: str, functions: int, window: problem.Window, near: np.ndarray,
+              key: jax.Array, size: tuple[int, int, int]) -> Result:
+    """Return draws of z and what is known of them, see `chains.sample`; chains start around ``near``.
+
+    Args:
+        sampler: one of `SAMPLERS`.
+        method: the residual.
+        store: one of `problem.STORES`.
+        functions: eigenfunctions.
+        window: five days, of which the first four are used.
+        near: (P,) the mode.
+        key: JAX random key.
+        size: chains, warm-up and draws of each.
+    """
     names = problem.names(method, store)
     start_key, run_key = jax.random.split(key)
-    starts = near + 0.1 * np.asarray(jax.random.normal(start_key, (chains, len(names))))
     outdoor = [jnp.asarray(window.outdoor[name]) for name in problem.OUTDOOR]
-    mcmc.run(run_key, jnp.asarray(window.y[:problem.TRAIN]), *outdoor,
-             init_params={name: jnp.asarray(starts[:, index]) for index, name in enumerate(names)})
-    drawn = mcmc.get_samples(group_by_chain=True)
-    return np.log(np.stack([np.asarray(drawn[name]) for name in names]))
+    return chains.sample(_sampler(sampler, method, store, functions, *size), names, run_key,
+                         jnp.asarray(window.y[:problem.TRAIN]), *outdoor,
+                         init_params=chains.starts(names, near, size[0], start_key))
 
 
 @functools.cache
-def _sampler(method: str, store: str, functions: int, chains: int, warmup: int, draws: int) -> MCMC:
+def _sampler(sampler: str, method: str, store: str, functions: int, count: int, warmup: int, draws: int) -> MCMC:
     """Return the sampler of a model: one, so that its programs are compiled once for all windows."""
 
     def model(y: jax.Array, *outdoor: jax.Array) -> None:
@@ -108,6 +118,7 @@ def _sampler(method: str, store: str, functions: int, chains: int, warmup: int, 
         fixed(problem.TIMES[:problem.TRAIN], y, **problem.keywords(method, store, functions))
 
     size = len(problem.names(method, store))
-    kernel = RAM(model, initial_scale=0.3, initial_covariance=np.eye(size))
-    return MCMC(kernel, num_warmup=warmup, num_samples=draws, num_chains=chains, chain_method="vectorized",
-                progress_bar=False, jit_model_args=True)
+    ram = sampler == "RAM"
+    kernel = RAM(model, initial_scale=0.3, initial_covariance=np.eye(size)) if ram else chains.nuts(model)
+    return MCMC(kernel, num_warmup=warmup, num_samples=draws, num_chains=count,
+                chain_method="vectorized" if ram else "sequential", progress_bar=False, jit_model_args=True)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from lfm_ppl.experiments.home_heating import learning
 from lfm_ppl.experiments.scores import Estimate, mean_of, pair, rate_of
 from lfm_ppl.experiments.tasks import Result
 
@@ -84,17 +85,25 @@ def homes(settings: Any, results: dict[str, Result], store: str) -> pd.DataFrame
 
 
 def posterior(settings: Any, results: dict[str, Result]) -> pd.DataFrame:
-    """Return what is gained where the parameters are integrated out, over some windows of the real house."""
-    found = of(results, "posterior", settings.stores[0], settings.integrated)
-    rows = {
-        "most likely parameters": {**pair("RMSE ahead (K)", mean_of(found["point_rmse"])),
-                                   **pair("ELL ahead", mean_of(found["point_ell"]))},
-        "parameters integrated out": {**pair("RMSE ahead (K)", mean_of(found["rmse"])),
-                                      **pair("ELL ahead", mean_of(found["ell"])),
-                                      **pair("gain in ELL", mean_of(found["ell"] - found["point_ell"])),
-                                      "median gain": float(np.median(found["ell"] - found["point_ell"])),
-                                      "largest R-hat": float(found["r_hat"].max()),
-                                      "smallest ESS": float(found["ess"].min())}}
+    """Return what is gained where the parameters are integrated out, over some windows of the real house.
+
+    How far a sampler's posterior is from that of RAM: the largest distance of two means in standard deviations of RAM,
+    over parameters and windows.
+    """
+    several = {sampler: of(results, f"posterior/{sampler}", settings.stores[0], settings.integrated)
+               for sampler in learning.SAMPLERS}
+    first = several[learning.SAMPLERS[0]]
+    rows = {"most likely parameters": {**pair("RMSE ahead (K)", mean_of(first["point_rmse"])),
+                                       **pair("ELL ahead", mean_of(first["point_ell"]))}}
+    for sampler, found in several.items():
+        away = np.abs(found["mean"] - first["mean"]) / first["sd"]
+        rows[f"integrated out by {sampler}"] = {
+            **pair("RMSE ahead (K)", mean_of(found["rmse"])), **pair("ELL ahead", mean_of(found["ell"])),
+            **pair("gain in ELL", mean_of(found["ell"] - found["point_ell"])),
+            "median gain": float(np.median(found["ell"] - found["point_ell"])),
+            f"means from {learning.SAMPLERS[0]} (sd)": float(away.max()) if found is not first else np.nan,
+            "largest R-hat": float(found["r_hat"].max()), "smallest ESS": float(found["ess"].min()),
+            "divergences": float(found["divergences"].sum()), "CPU time (s)": float(found["seconds"].mean())}
     return pd.DataFrame.from_dict(rows, orient="index")
 
 

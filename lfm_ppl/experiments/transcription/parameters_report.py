@@ -55,11 +55,7 @@ class Settings:
         if not isinstance(self.links, tuple) or not self.links or len(set(self.links)) < len(self.links):
             raise ValueError(f"links must be a tuple of different labels, got {self.links!r}.")
         for name in ("latent", "nuts", "ram"):
-            size = getattr(self, name)
-            if not isinstance(size, tuple) or len(size) != 4:
-                raise ValueError(f"{name} must be chains, warm-up, draws and thinning, got {size!r}.")
-            for what, count in zip(("chains", "warm-up", "draws", "thinning"), size, strict=True):
-                checks.positive_integer(f"{name}: {what}", count)
+            checks.sizes(name, getattr(self, name), ("chains", "warm-up", "draws", "thinning"))
         checks.positive_integer("tree_depth", self.tree_depth)
         for label in self.links:
             checks.one_of("links", label, parameters.LINKS)
