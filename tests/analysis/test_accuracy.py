@@ -183,7 +183,7 @@ def bent():
 @pytest.fixture(scope="module")
 def checked(bent):
     """The double well against the grid."""
-    return bent, check_accuracy(bent, well, draws=400, progress=False)
+    return bent, check_accuracy(bent, well, draws=100, progress=False)
 
 
 def test_a_linear_model_needs_no_reference(linear):
@@ -195,6 +195,7 @@ def test_a_linear_model_needs_no_reference(linear):
     assert "Gaussian filter is exact" in report.text(width=100)
 
 
+@pytest.mark.slow
 def test_ratios_of_a_linear_model_are_zero_on_the_grid(linear):
     report = check_accuracy(linear, relaxation, reference="grid", draws=40, progress=False)
     assert np.abs(report.log_ratio).max() < 2 * likelihoods.GRID_ERROR
@@ -212,8 +213,9 @@ def test_ratios_of_a_linear_model_are_zero_up_to_the_noise_of_particles(linear):
     assert report.verdict.word != "corrected"
 
 
-def test_particles_and_grid_agree(checked):
-    result, exact = checked
+@pytest.mark.slow
+def test_particles_and_grid_agree(bent):
+    result, exact = bent, check_accuracy(bent, well, draws=400, progress=False)
     copy = arviz_data.build({"posterior": arviz_data.group(result, "posterior"),
                              "observed_data": arviz_data.group(result, "observed_data")},
                             arviz_data.attributes(result))
@@ -228,9 +230,10 @@ def test_particles_and_grid_agree(checked):
     assert abs(both[0]["shift"] - both[1]["shift"]) < 4 * both[0]["shift_se"]
 
 
-def test_the_corrected_posterior_is_the_exact_one_on_a_grid_of_parameters(checked):
+@pytest.mark.slow
+def test_the_corrected_posterior_is_the_exact_one_on_a_grid_of_parameters(bent):
     """Importance weights from draws of the wrong posterior against quadrature with the exact likelihood."""
-    result, _ = checked
+    result = bent
     problem = rebuilding.problem(result, well)
     nodes = np.linspace(0.15, 5.0, 60)
     posteriors = {}
@@ -373,6 +376,7 @@ def test_the_grid_takes_one_state(linear):
         check_accuracy(draws, two, TIMES, Y, reference="grid")
 
 
+@pytest.mark.slow
 def test_fixed_parameters_stay_fixed():
     def model(times, y=None):
         depth = numpyro.sample("depth", dist.LogNormal(0.0, 0.4))

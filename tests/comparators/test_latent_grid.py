@@ -203,7 +203,7 @@ def test_wrong_shapes_are_named():
         LatentGrid("model", TIMES)
 
 
-@pytest.mark.parametrize("build", [genes, oscillator])
+@pytest.mark.parametrize("build", [genes, pytest.param(oscillator, marks=pytest.mark.slow)])
 def test_many_observations_are_those_of_few(build, monkeypatch):
     """Above a number of observations the grid loops over them; with gaps, repeats, and one at the start."""
     times = np.sort(np.concatenate([np.linspace(0.0, 1.0, 70), [1.0, 3.7, 3.7, 4.0]]))

@@ -65,7 +65,7 @@ def test_smallest_eigenvalue(build, order, linear):
                 assert np.abs(covariance - np.swapaxes(covariance, 1, 2)).max() <= 1e-15 * np.abs(covariance).max()
 
 
-@pytest.mark.parametrize("steps", [1, 7])
+@pytest.mark.parametrize("steps", [pytest.param(1, marks=pytest.mark.slow), 7])
 @pytest.mark.parametrize("link", [identity, softplus])
 def test_the_force_keeps_its_stationary_distribution(link, steps):
     """Nothing is learnt from the observation of an output that the force does not reach."""

@@ -69,7 +69,8 @@ OSCILLATORS = {
     "cubic, known state, tiny noise": ([1.0, 0.5, 0.7, 1.3, 1e-8, 0.0], Y),
     "free mass": ([0.0, 0.0, 0.0, 1.3, 0.1, 0.1], Y),
 }
-ALL = [(name, edge) for name in ("linear", "softplus") for edge in EDGES] + [("oscillator", e) for e in OSCILLATORS]
+ALL = [(name, edge) for name in ("linear", "softplus") for edge in EDGES] + [
+    pytest.param("oscillator", edge, marks=pytest.mark.slow) for edge in OSCILLATORS]
 
 
 @pytest.mark.parametrize("name, edge", ALL)
@@ -93,6 +94,7 @@ def test_gradient_equals_central_differences(compiled, name, edge):
             index, reverse[index], difference)
 
 
+@pytest.mark.slow
 def test_one_observation():
     value = jax.jit(lambda theta: lfm.MarginalLikelihood(single(softplus)(theta), TIMES[1:2], steps=2).log_prob(
         jnp.array([[0.6]])))

@@ -183,6 +183,7 @@ def test_iterations_find_the_posterior_linearisation_of_dense_algebra():
     assert np.isclose(found.log_likelihood.sum(), log_likelihood, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_iterations_converge_on_a_non_linear_drift():
     model = motif(softplus, genes=1, noise_sd=0.05, scale=2.0, lengthscale=0.8)
     times = np.linspace(0.25, 3.0, 12)

@@ -108,7 +108,8 @@ def smoothed(units, known, iterations):
 
 
 @pytest.mark.parametrize("iterations", [0, pytest.param(2, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("known", [False, True], ids=["uncertain start", "known start"])
+@pytest.mark.parametrize("known", [False, pytest.param(True, marks=pytest.mark.slow)],
+                         ids=["uncertain start", "known start"])
 @pytest.mark.parametrize("units", OTHERS.values(), ids=OTHERS)
 def test_smoothed_moments_are_those_in_other_units(units, known, iterations):
     mean, covariance, left_out = smoothed(METRIC, known, iterations)

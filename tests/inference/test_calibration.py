@@ -43,6 +43,7 @@ def assert_uniform(name, found, bins):
     assert min(min(pair.values()) for pair in values.values()) > 0.001, values
 
 
+@pytest.mark.slow
 def test_ram_is_calibrated_on_the_linear_motif():
     found = calibration.calibrate(motif, TIMES, lfm.RAM, jax.random.key(11), data_sets=40, thin=40, warmup=1000)
     assert set(found.ranks) == {"decay", "sensitivity", "lengthscale", "noise_sd", "log likelihood"}

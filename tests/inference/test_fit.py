@@ -187,6 +187,7 @@ def density():
     return nodes, stats.norm.logpdf(nodes), log_likelihood
 
 
+@pytest.mark.slow
 def test_loo_equals_refitting_without_each_observation(line, y, density):
     # p(y_k | y_-k) = Z(y) / Z(y_-k), with evidences Z by quadrature: exact refits
     nodes, prior, log_likelihood = density
@@ -213,6 +214,7 @@ def test_loo_equals_refitting_without_each_observation(line, y, density):
     assert error.sum() < 0.2
 
 
+@pytest.mark.slow
 def test_ram_posterior_on_a_line(line, y, density):
     nodes, prior, log_likelihood = density
     # The density of the unconstrained parameter log(decay) = log(0.5) + z / 2
@@ -231,6 +233,7 @@ def test_ram_posterior_on_a_line(line, y, density):
     np.testing.assert_allclose(statistics["lp"].values[0, :20], at, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_no_trajectories_where_none_are_asked_for(line):
     assert "trajectories" not in arviz_data.groups(line)
     assert "posterior_predictive" not in arviz_data.groups(line)
@@ -368,7 +371,8 @@ def converted(times, y=None, start=None, max_step=None):
     numpyro.sample("y", lfm.MarginalLikelihood(system, times, max_step=max_step), obs=y)
 
 
-@pytest.mark.parametrize("keywords", [{}, {"start": -1.0, "max_step": 0.1}], ids=["times as JAX array", "initial time"])
+@pytest.mark.parametrize("keywords", [pytest.param({}, marks=pytest.mark.slow), {"start": -1.0, "max_step": 0.1}],
+                         ids=["times as JAX array", "initial time"])
 def test_times_are_known_to_everything_after_sampling(y, keywords):
     result = quiet_fit(converted, TIMES, y[:, :1], sampler="nuts", chains=1, warmup=5, samples=4, trajectory_draws=2,
                        at=[0.5, 9.0], model_kwargs=keywords)

@@ -27,6 +27,7 @@ def model():
 FIXED = {"x[b]": 1.0, "decay[2]": 0.8, "u[1]": 2.0, "u[3]": 4.0, "noise_sd": 0.5}
 
 
+@pytest.mark.slow
 def test_free_elements_follow_the_conditional_distribution():
     mcmc = MCMC(
         NUTS(fix(model, FIXED, LABELS)),

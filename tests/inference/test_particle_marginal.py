@@ -61,7 +61,7 @@ def assert_posterior(log_rate, mean, sd):
     assert abs(log_rate.std() - sd) < 4.0 * spread_error
 
 
-@pytest.mark.parametrize("delayed", [False, True], ids=["plain", "delayed"])
+@pytest.mark.parametrize("delayed", [pytest.param(False, marks=pytest.mark.slow), True], ids=["plain", "delayed"])
 def test_it_reproduces_the_exact_posterior_of_a_linear_model(delayed):
     """Twenty particles give a noisy likelihood; the posterior is the Kalman filter's all the same."""
     kernel = lfm.ParticleMarginalRAM(relaxing, particles=20, delayed=delayed)
@@ -155,6 +155,7 @@ def test_fit_samples_and_reports_the_particles():
     assert set(group(result, "sample_stats")) == {"acceptance_rate", "accepted", "lp", "estimated"}
 
 
+@pytest.mark.slow
 def test_data_may_be_arguments_of_a_compiled_program():
     """One kernel, other data: with ``jit_model_args`` the chain follows the data of each run."""
     mcmc = MCMC(lfm.ParticleMarginalRAM(relaxing, particles=50), num_warmup=200, num_samples=600, num_chains=4,

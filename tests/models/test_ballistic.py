@@ -17,6 +17,7 @@ def module(name):
     return sys.modules[loading.load(name).model.__module__]
 
 
+@pytest.mark.slow
 def test_one_step_between_measurements_is_exact():
     """Over the prior: to 0.005 everywhere, and to 0.001 within 50 nats of the best, where a posterior may be."""
     file, own = loading.load("ballistic"), module("ballistic")
