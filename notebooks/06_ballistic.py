@@ -91,8 +91,8 @@ figures.plot_particles(settings, found.results)
 # The posterior of $\log\alpha$, whose true value is -7.71: of one target, by weighted draws and by NUTS; of several;
 # and the ranks of the truth over all targets.
 #
-# Where the parameters are drawn from the prior, a posterior that means what it says covers them as often as it says, and
-# so it does. At one and the same truth it need not: the force here is twice as strong as the prior's median. The last
+# Where the parameters are drawn from the prior, a posterior that means what it says covers them as often as it says,
+# and so it does. At one and the same truth it need not: the force here is stronger than the prior's median. The last
 # row has the force's scale and lengthscale known, and a flat prior of the drag alone.
 
 # %%

@@ -20,7 +20,7 @@ would say nothing."""
 
 
 def nuts(model: Any, **settings: Any) -> NUTS:
-    """Return NUTS with a dense mass matrix and forward-mode gradients, the cheaper ones for up to some ten parameters."""
+    """Return NUTS with a dense mass matrix and forward-mode gradients, which are cheaper for up to ten parameters."""
     return NUTS(model, dense_mass=True, forward_mode_differentiation=True, **settings)
 
 

@@ -20,7 +20,6 @@ from lfm_ppl.orbits.environment import Environment
 from lfm_ppl.orbits.satellite import Motion, pushed, wide_start
 from lfm_ppl.orbits.table import Table
 
-
 _FINEST = 1 / 120
 """Spacing of the points on the orbit over which means are taken (h): 30 s, half as long as a penumbra lasts."""
 

@@ -279,7 +279,8 @@ def test_mistakes(tmp_path):
     for wrong, message in (({"days": 0}, "days must be at least 1"), ({"methods": ("SQN",)}, "SQM"),
                            ({"integrated": ("CQM",), "methods": ("SQM",)}, "integrated"),
                            ({"nuts": (2, 10)}, "nuts must be chains, warm-up and draws"),
-                           ({"nuts": (2, 0, 10)}, "nuts: warm-up must be at least 1"), ({"integrated": "SQM"}, "a tuple of at least one method"),
+                           ({"nuts": (2, 0, 10)}, "nuts: warm-up must be at least 1"),
+                           ({"integrated": "SQM"}, "a tuple of at least one method"),
                            ({"weekday": "Thrusday"}, "Did you mean 'Thursday'"), ({"link": "log"}, "link")):
         with pytest.raises(ValueError, match=message):
             experiment.Settings(**wrong)

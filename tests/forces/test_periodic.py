@@ -163,7 +163,8 @@ def kernels(p):
                 p[2])}
 
 
-@pytest.mark.parametrize("kind", ["stationary", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("moderated", "function"))])
+@pytest.mark.parametrize("kind", ["stationary", pytest.param("moderated", marks=pytest.mark.slow),
+                                  pytest.param("function", marks=pytest.mark.slow)])
 def test_derivatives_by_all_parameters_are_finite_differences(kind):
     """First and second ones, the period among the parameters."""
     t = np.array([0.4, 3.1, 8.8, 17.0, 31.0])

@@ -107,7 +107,8 @@ def all_tasks(settings: Settings) -> list[Task]:
 
 def compute(task: Task) -> Result:
     """Compute one task."""
-    return {"track": tracking.compute, "posterior": posterior.compute, "nuts": posterior.compute_nuts}[task.settings["what"]](task)
+    kinds = {"track": tracking.compute, "posterior": posterior.compute, "nuts": posterior.compute_nuts}
+    return kinds[task.settings["what"]](task)
 
 
 def run(settings: Settings, folder: str | Path, *, overwrite: bool = False,

@@ -191,7 +191,8 @@ def _posterior(task: Task) -> Result:
         point = prediction.known_heater(*model, window, z)
         rows.append({"ell": float((logsumexp(terms, axis=0) - np.log(len(mean))).sum()),
                      "rmse": scores.rmse(mean.mean(axis=0), truth), "point_ell": point["ahead_ell"],
-                     "point_rmse": point["ahead_rmse"], "r_hat": np.max(sampled["r_hat"]), "ess": np.min(sampled["ess"]),
+                     "point_rmse": point["ahead_rmse"], "r_hat": np.max(sampled["r_hat"]),
+                     "ess": np.min(sampled["ess"]),
                      **{name: sampled[name] for name in ("mean", "sd", "divergences", "seconds")}})
     return _stacked(rows)
 
