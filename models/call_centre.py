@@ -99,7 +99,7 @@ def arrivals(force, mean, scale, lengthscale, memory, period, functions, cycles)
         memory: see PARAMETERS.
         period: length of a cycle (min).
         functions: of which a cycle is made.
-        cycles: number of them, which have change points between them.
+        cycles: number of them, which have change points between them; those after the last time do nothing.
 
     Raises:
         ValueError: an unknown force, a period that is not positive.
@@ -148,7 +148,7 @@ def build(mean, scale, noise_sd, lengthscale=None, memory=None, force="sqm", lin
     """
     if link not in LINKS:
         raise ValueError(f"link must be one of {', '.join(LINKS)}, got {link!r}.")
-    omega = service if callable(service) else lfm.Input([0.0], [service])
+    omega = _service(service)
     _check_service(omega)
 
     def dynamics(x, u, t):
@@ -185,20 +185,25 @@ def model(times, y=None, link="linear", force="sqm", service=10.0, period=840.0,
         units: name -> unit, for plots.
 
     Raises:
-        ValueError: as `build`; a period that is longer than the data.
+        ValueError: as `build`; a period that is longer than the data; nobody ever serves.
     """
     _check_period(period)
     last = float(np.max(times))
     if force != "matern" and period > last:
         raise ValueError(f"period is {period:g} min, but the data end after {last:g}: nothing repeats in them. Give "
                          "the length of a cycle in the unit of the times, or force=matern.")
-    typical = jnp.mean(service.values) if callable(service) else service
+    omega = _service(service)
+    _check_service(omega)
+    typical = jnp.mean(omega.values)
+    if not isinstance(typical, jax.core.Tracer) and typical == 0:
+        raise ValueError("the service rate is zero all the time; what arrives is compared with it, so that it must be "
+                         "positive for some of the time.")
     priors = {"mean": dist.LogNormal(jnp.log(0.6 * typical), 0.5), "scale": dist.LogNormal(jnp.log(0.2 * typical), 0.7),
               "lengthscale": dist.LogNormal(jnp.log(period / 5), 0.7), "memory": dist.LogNormal(jnp.log(10.0), 1.0),
               "noise_sd": dist.LogNormal(jnp.log(0.5), 0.7)}
     parameters = {name: numpyro.sample(name, priors[name]) for name in names(force)}
-    cycles = int(np.ceil(last / period))
-    system = build(**parameters, force=force, link=link, service=service, period=period, functions=functions,
+    cycles = 2 * int(np.ceil(last / period))  # a forecast as long as the data has change points, too
+    system = build(**parameters, force=force, link=link, service=omega, period=period, functions=functions,
                    cycles=cycles, units=units)
     numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=STEPS, max_step=LONGEST_STEP), obs=y)
 
@@ -260,6 +265,11 @@ def _check_period(period: float) -> None:
     """Raise for a period that is not positive."""
     if not period > 0:
         raise ValueError(f"period must be positive, got {period:g} min. Give the length of a cycle.")
+
+
+def _service(service: Any) -> Any:
+    """Return a service rate as a function of time."""
+    return service if callable(service) else lfm.Input([0.0], [service])
 
 
 def _check_service(omega: Any) -> None:

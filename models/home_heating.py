@@ -280,11 +280,12 @@ def _simulator(residual: str, envelope: bool, functions: int):
 
 
 def _midnights(times, residual: str) -> tuple[float, ...]:
-    """Return the midnights after the first of the times, and up to the last."""
+    """Return the midnights after the first of the times, and so far beyond the last that a forecast has them, too."""
     if residual not in ("SQM", "WQM"):
         return ()
     times = np.asarray(times)
-    return tuple(DAY * np.arange(np.floor(times[0] / DAY) + 1, np.floor(times[-1] / DAY) + 1))
+    last = 2 * times[-1] - times[0]  # of a forecast as long as the data; what lies beyond the last time does nothing
+    return tuple(DAY * np.arange(np.floor(times[0] / DAY) + 1, np.floor(last / DAY) + 1))
 
 
 def _heater(times, y):

@@ -109,8 +109,9 @@ figures.plot_errors(settings, found.results)
 scores.readable(found.gain)
 
 # %% [markdown]
-# These are weighted draws. NUTS, which shares nothing with them but the density, finds the same posterior, here for the
-# first days: how far apart the means are at most, in posterior standard deviations, and both gains on these days.
+# These are weighted draws. NUTS, which shares the density with them and the mode about which it starts, finds the same
+# posterior, here for the first days: how far apart the means are at most, in posterior standard deviations, and both
+# gains on these days.
 
 # %%
 scores.readable(found.agreement)

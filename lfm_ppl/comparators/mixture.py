@@ -49,7 +49,10 @@ class Mixture(eqx.Module):
         return jnp.sqrt((weights**2 * (self.mean - mean) ** 2).sum(1))
 
     def log_density(self, value: Any) -> jax.Array:
-        """Return the log density (T, D) of each number of ``value`` (T, D); NaN where that is."""
+        """Return the log density (T, D) of each number of ``value`` (T, D).
+
+        NaN where that is, or where a component has no variance.
+        """
         away = jnp.asarray(value, float)[:, None, :] - self.mean
         terms = -0.5 * (away**2 / self.variance + jnp.log(2 * np.pi * self.variance))
         return logsumexp(self.log_weights[:, :, None] + terms, axis=1)

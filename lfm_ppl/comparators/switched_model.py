@@ -48,7 +48,7 @@ def switched(build: Build, rule: SwitchingRule) -> tuple[StateSpaceModel, ...]:
 
     Raises:
         TypeError: ``rule`` is no rule.
-        ValueError: the input changes what states, outputs or jumps there are.
+        ValueError: the input changes what states, outputs or jumps there are, or the initial state.
     """
     if not isinstance(rule, SwitchingRule):
         raise TypeError(f"rule must be an lfm.SwitchingRule such as lfm.Thermostat(20.0), got {type(rule).__name__}.")
@@ -59,6 +59,12 @@ def switched(build: Build, rule: SwitchingRule) -> tuple[StateSpaceModel, ...]:
         if kind != kinds[0]:
             raise ValueError(f"build({value:g}) has other states, outputs or jump times than build({rule.values[0]:g});"
                              " the discrete input may change coefficients only.")
+    starts = [[checks.concrete(part) for part in (*ssm.initial(), ssm.model.initial_time)] for ssm in ssms]
+    for value, start in zip(rule.values, starts, strict=True):
+        pairs = zip(start, starts[0], strict=True)
+        if any(a is not None and b is not None and not np.array_equal(a, b) for a, b in pairs):
+            raise ValueError(f"build({value:g}) has another initial state or time than build({rule.values[0]:g}); what "
+                             "the input does begins there, so both must be alike.")
     return ssms
 
 

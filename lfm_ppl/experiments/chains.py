@@ -25,9 +25,12 @@ def nuts(model: Any, **settings: Any) -> NUTS:
 
 
 def starts(names: Sequence[str], near: Any, chains: int, key: jax.Array, sd: float = APART) -> dict[str, jax.Array]:
-    """Return where the chains start, by name: unconstrained values (chains,) around the logarithms ``near`` (P,)."""
+    """Return where the chains start, by name: unconstrained values (chains,) around the logarithms ``near`` (P,).
+
+    NumPyro wants those of a single chain without an axis.
+    """
     drawn = jnp.asarray(near) + sd * jax.random.normal(key, (chains, len(names)))
-    return {name: drawn[:, index] for index, name in enumerate(names)}
+    return {name: drawn[:, index] if chains > 1 else drawn[0, index] for index, name in enumerate(names)}
 
 
 def sample(mcmc: MCMC, names: Sequence[str], key: jax.Array, *data: Any, **given: Any) -> Result:

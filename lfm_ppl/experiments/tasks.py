@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import itertools
 import json
 import multiprocessing
 import os
 import signal
+import tempfile
 import threading
 import time
 import warnings
@@ -97,7 +99,8 @@ def run_tasks(tasks: Iterable[Task], compute: Callable[[Task], Mapping[str, Any]
         folder: of the files; made where it does not exist.
         overwrite: compute again what was stored with other settings, which is an error otherwise.
         report: what to do with a line of progress, such as ``print``; None: nothing.
-        workers: processes that compute; each compiles for itself.
+        workers: processes that compute; each compiles what it finds compiled by no other one, also by those of an
+            earlier call.
 
     Returns:
         Name of a task -> its result, read from its file, in the order of the tasks.
@@ -140,7 +143,8 @@ def _computed(tasks: list[Task], compute: Callable[[Task], Mapping[str, Any]], f
     double = bool(jax.config.read("jax_enable_x64"))
     waiting, context = iter(tasks), multiprocessing.get_context("spawn")
     begun = context.Value("i", 0)
-    with ProcessPoolExecutor(workers, context, _start_worker, (double, begun, workers)) as pool:
+    programs = jax.config.jax_compilation_cache_dir or _programs().name  # type: ignore[attr-defined]
+    with ProcessPoolExecutor(workers, context, _start_worker, (double, begun, workers, programs)) as pool:
         # As many at a time as there are processes. After an error, or Ctrl-C, what has begun is let finish and kept.
         running = {pool.submit(_compute_and_write, compute, task, folder): task
                    for task in itertools.islice(waiting, workers)}
@@ -158,7 +162,13 @@ def _computed(tasks: list[Task], compute: Callable[[Task], Mapping[str, Any]], f
                 yield task
 
 
-def _start_worker(double: bool, begun: Any, workers: int) -> None:
+@functools.cache
+def _programs() -> tempfile.TemporaryDirectory[str]:
+    """Return a folder where processes find what others have compiled; it goes when this process ends."""
+    return tempfile.TemporaryDirectory(prefix="lfm-ppl-")
+
+
+def _start_worker(double: bool, begun: Any, workers: int, programs: str) -> None:
     # Ctrl-C reaches every process of a terminal; the parent decides. If that is killed, there is nobody to work for.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
@@ -166,6 +176,7 @@ def _start_worker(double: bool, begun: Any, workers: int) -> None:
         number, begun.value = begun.value, begun.value + 1
     _keep_to_share(number, workers)
     jax.config.update("jax_enable_x64", double)
+    jax.config.update("jax_compilation_cache_dir", programs)
 
 
 def _keep_to_share(number: int, workers: int) -> None:

@@ -24,9 +24,11 @@ class Kernel(eqx.Module):
     Attributes:
         period: D, in units of time.
         stationary: whether k depends on t - s alone.
+        given: whether the period was given as a number. One that is sampled comes as an array, and may be anything.
     """
 
     period: eqx.AbstractVar[jax.Array]
+    given: eqx.AbstractVar[bool]
 
     @property
     def stationary(self) -> bool:
@@ -50,6 +52,10 @@ class Kernel(eqx.Module):
     def chord(self, t: ArrayLike, s: ArrayLike) -> jax.Array:
         """Return ``|sin(pi (t - s) / D)|``, elementwise: from 0 to 1 and back within a period."""
         return jnp.abs(jnp.sin(np.pi * (jnp.asarray(t) - s) / self.period))
+
+
+def _is_number(value: Any) -> bool:
+    return not isinstance(value, jax.Array)
 
 
 class PeriodicMatern(Kernel):
@@ -77,11 +83,12 @@ class PeriodicMatern(Kernel):
     lengthscale: jax.Array
     period: jax.Array
     order: int = eqx.field(static=True)
+    given: bool = eqx.field(static=True)
 
     def __init__(self, scale: Any, lengthscale: Any, period: Any, order: int = 1):
         self.scale = positive_parameter("scale", scale)
         self.lengthscale = positive_parameter("lengthscale", lengthscale)
-        self.period = positive_parameter("period", period)
+        self.period, self.given = positive_parameter("period", period), _is_number(period)
         self.order = static_order(order, Matern.orders)
 
     def __call__(self, t: ArrayLike, s: ArrayLike = 0.0) -> jax.Array:
@@ -111,11 +118,12 @@ class PeriodicSquaredExponential(Kernel):
     scale: jax.Array
     lengthscale: jax.Array
     period: jax.Array
+    given: bool = eqx.field(static=True)
 
     def __init__(self, scale: Any, lengthscale: Any, period: Any):
         self.scale = positive_parameter("scale", scale)
         self.lengthscale = positive_parameter("lengthscale", lengthscale)
-        self.period = positive_parameter("period", period)
+        self.period, self.given = positive_parameter("period", period), _is_number(period)
 
     def __call__(self, t: ArrayLike, s: ArrayLike = 0.0) -> jax.Array:
         """Return k(t, s), elementwise."""
@@ -152,11 +160,12 @@ class ModeratedPeriodicMatern(Kernel):
     period: jax.Array
     decay: jax.Array
     order: int = eqx.field(static=True)
+    given: bool = eqx.field(static=True)
 
     def __init__(self, scale: Any, lengthscale: Any, period: Any, decay: Any = 1.0, order: int = 1):
         self.scale = positive_parameter("scale", scale)
         self.lengthscale = positive_parameter("lengthscale", lengthscale)
-        self.period = positive_parameter("period", period)
+        self.period, self.given = positive_parameter("period", period), _is_number(period)
         self.decay = standard_deviation_parameter("decay", decay)
         self.order = static_order(order, Matern.orders)
 
@@ -189,7 +198,9 @@ class PeriodicKernel(Kernel):
 
     Raises:
         ValueError: for a period that is not positive; for a function that is not symmetric or not finite, or said to be
-            stationary and not so.
+            stationary and not so. Whether it is positive definite is seen by the force that is made of it, where the
+            function's parameters are known; in compiled code a stationary one that is not gives NaN, and so a log
+            likelihood of -inf, and another one is taken for what is left of it.
 
     Example:
         >>> import jax.numpy as jnp
@@ -203,12 +214,13 @@ class PeriodicKernel(Kernel):
     first: jax.Array
     repeats: bool = eqx.field(static=True)
     label: str = eqx.field(static=True)
+    given: bool = eqx.field(static=True)
 
     def __init__(self, function: Callable[..., Any], period: Any, stationary: bool = False, start: Any = 0.0):
         if not callable(function):
             raise TypeError(f"function must be callable as k(t, s), got {type(function).__name__}.")
         self.function = function if isinstance(function, eqx.Module) else jax.tree_util.Partial(function)
-        self.period = positive_parameter("period", period)
+        self.period, self.given = positive_parameter("period", period), _is_number(period)
         self.first = scalar_parameter("start", start)
         self.repeats = bool(stationary)
         self.label = getattr(function, "__name__", type(function).__name__)

@@ -156,14 +156,25 @@ class QuasiPeriodic(Force):
         raise NotImplementedError(f"a {type(self).__name__} force has no spectral density in closed form; use "
                                   "`covariance`.")
 
+    def sde_spectral_density(self, omega: ArrayLike) -> jax.Array:
+        """Return the spectral density of the state-space form; as in `Force`.
+
+        Raises:
+            NotImplementedError: for weights that stay, whose spectrum is lines; or a force that is not stationary.
+        """
+        if self.noise_dim == 0:
+            raise NotImplementedError(f"a {type(self).__name__} force without noise has lines for a spectrum, and no "
+                                      "spectral density; `eigenvalues` says how strong they are.")
+        return super().sde_spectral_density(omega)
+
     def covariance_in_model(self, t: ArrayLike, s: ArrayLike, initial_time: ArrayLike) -> jax.Array:
         """Return the product of the two kernels in a model that starts at ``initial_time``."""
         return self.kernel(t, s) * self.evolution.covariance_in_model(t, s, initial_time)
 
     def check_span(self, name: str, first: float, last: float) -> None:
-        """Check that a cycle is not longer than the data, where the period is known."""
+        """Check that a cycle is not longer than the data, where the period was given as a number."""
         period = checks.concrete(self.period)
-        if period is not None and period > (last - first) * (1 + 1e-9):
+        if self.kernel.given and period is not None and period > (last - first) * (1 + 1e-9):
             raise ValueError(f"the force {name!r} has a period of {float(period):g}, longer than the data, which span "
                              f"{last - first:g} from {first:g} to {last:g}: nothing repeats in them. Check the unit of "
                              "the period, or take lfm.Matern.")

@@ -168,6 +168,10 @@ class Sum(Force):
         """Return the sum of the closed-form covariances."""
         return functools.reduce(jnp.add, [force.covariance(t, s) for force in self.forces])
 
+    def sde_covariance(self, t: ArrayLike, s: ArrayLike = 0.0) -> jax.Array:
+        """Return the sum of the covariances that the terms have in state space."""
+        return functools.reduce(jnp.add, [force.sde_covariance(t, s) for force in self.forces])
+
     def covariance_in_model(self, t: ArrayLike, s: ArrayLike, initial_time: ArrayLike) -> jax.Array:
         """Return the sum of the terms' covariances in a model that starts at ``initial_time``."""
         return functools.reduce(jnp.add, [f.covariance_in_model(t, s, initial_time) for f in self.forces])

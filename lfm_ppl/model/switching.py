@@ -55,7 +55,7 @@ class Thermostat(SwitchingRule):
 
     Raises:
         ValueError: there is no set point, or it is not finite; a negative hysteresis or sensor_sd.
-        TypeError: the set point is neither a number nor a function.
+        TypeError: the set point is neither a number nor a function; an array of widths or errors.
 
     Example:
         >>> import jax.numpy as jnp, lfm_ppl as lfm
@@ -89,6 +89,8 @@ class Thermostat(SwitchingRule):
         for name, value in (("hysteresis", hysteresis), ("sensor_sd", sensor_sd)):
             known = checks.concrete(value)
             checks.finite(name, value)
+            if np.ndim(value):
+                raise TypeError(f"{name} must be one number, got an array of shape {np.shape(value)}.")
             if known is not None and np.any(known < 0):
                 raise ValueError(f"{name} must not be negative, got {float(known):g}.")
         self.hysteresis, self.sensor_sd = jnp.asarray(hysteresis, float), jnp.asarray(sensor_sd, float)

@@ -96,6 +96,8 @@ def _means(values: np.ndarray, finer: int) -> np.ndarray:
     Means over one and over two steps are combined so that polynomials of degree three are left as they are.
     """
     nodes = values[::finer].copy()
+    if len(nodes) < 5:
+        return nodes
     one, two = (_mean_over(values, half) for half in (finer, 2 * finer))
     inner = slice(2, len(nodes) - 2)
     narrow, wide = (half**2 / 3 + 1 / 6 for half in (finer, 2 * finer))  # second moments of the trapezoidal rule

@@ -1,5 +1,6 @@
 """Discrete inputs under a rule: Rao-Blackwellised particles against plain ones, the filter and independent algebra."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -212,6 +213,7 @@ def test_mixtures_against_scipy():
     (lambda: run(build=curved), "not linear in 'x0'.*simulate_switched"),
     (lambda: run(rule=lfm.Thermostat(20.0, sensor=lambda x, u, t: x[0] ** 2)), "what the rule reads is not linear"),
     (lambda: run(build=lambda heater: house(heater) if heater else two_rooms()), "other states, outputs"),
+    (lambda: run(build=later), "build\\(1\\) has another initial state or time than build\\(0\\)"),
     (lambda: run(start=lfm.FilterState(0.0, jnp.zeros(5), jnp.eye(5))), "start has 5 entries"),
     (lambda: run(y=np.zeros((3, 2))), "y must have one row"),
     (lambda: Mixture(jnp.zeros((1, 1, 1)), jnp.ones((1, 1, 1)), jnp.zeros((1, 1))).quantiles(1.0), "between 0 and 1"),
@@ -226,6 +228,7 @@ def test_bad_input(make, message):
     (lambda: lfm.simulate_switched(0, house, THERMOSTAT, TIMES), "JAX random key"),
     (lambda: lfm.rao_blackwellised(house, THERMOSTAT, TIMES, 0), "JAX random key"),
     (lambda: lfm.Thermostat([18.0, 20.0]), "lfm.Input"),
+    (lambda: lfm.Thermostat(20.0, hysteresis=np.array([1.0, 2.0])), "hysteresis must be one number"),
 ])
 def test_wrong_types(make, message):
     with pytest.raises(TypeError, match=message):
@@ -239,6 +242,10 @@ def run(build=house, rule=THERMOSTAT, particles=10, **keywords):
 def curved(heater):
     return lfm.LatentForceModel(lambda x, u, t: heater - x**3, {}, lfm.GaussianObservation(lambda x, u, t: x, [0.1]),
                                 lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
+
+
+def later(heater):
+    return eqx.tree_at(lambda m: m.initial_state.mean, house(heater), jnp.array([17.0 + heater]))
 
 
 def two_rooms():

@@ -69,7 +69,8 @@ def test_several_processes_find_the_same_numbers(tmp_path):
 
 def cpus(task):
     time.sleep(1.0)  # so that every process gets one of the tasks
-    return {"process": os.getpid(), "cpus": np.array(sorted(os.sched_getaffinity(0)))}
+    return {"process": os.getpid(), "cpus": np.array(sorted(os.sched_getaffinity(0))),
+            "programs": jax.config.jax_compilation_cache_dir}
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="the system does not tell or take CPUs")
@@ -79,6 +80,19 @@ def test_each_process_keeps_to_its_share_of_the_cpus(tmp_path):
     shares = {int(one["process"]): one["cpus"].tolist() for one in found.values()}
     assert sorted(shares.values()) == sorted(share(own, number, 2) for number in range(2))
     assert os.sched_getaffinity(0) == own and available_cpus() == len(own)
+    # What one process compiles the others find, in this process's folder of programs.
+    assert {str(one["programs"]) for one in found.values()} == {jax.config.jax_compilation_cache_dir}
+
+
+def test_processes_share_a_folder_of_programs_where_there_is_none(tmp_path):
+    own = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", None)
+    try:
+        found = run_tasks(tasks(2), cpus, tmp_path, workers=2)
+    finally:
+        jax.config.update("jax_compilation_cache_dir", own)
+    (folder,) = {str(one["programs"]) for one in found.values()}
+    assert Path(folder).is_dir() and folder != own
 
 
 @pytest.mark.parametrize("count, workers", [(5, 3), (4, 4), (16, 2), (7, 1)])

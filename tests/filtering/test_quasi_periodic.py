@@ -155,3 +155,9 @@ def test_a_period_longer_than_the_data_is_an_error():
     late = model(lfm.Periodic(kernel(period=24.0), functions=3) + lfm.Constant(1.0))
     with pytest.raises(ValueError, match="force 'u' has a period of 24, longer than the data, which span 7.4"):
         lfm.MarginalLikelihood(late, TIMES)
+
+
+def test_a_sampled_period_may_be_longer_than_the_data():
+    """A draw from its prior must not end a fit."""
+    late = model(lfm.Periodic(kernel(period=jnp.asarray(24.0)), functions=3))
+    assert np.isfinite(float(lfm.MarginalLikelihood(late, TIMES).log_prob(Y)))

@@ -222,6 +222,23 @@ def test_change_points_before_the_initial_time_do_not_count():
     assert float(lfm.SQM(2.0, POINTS).covariance_in_model(25.0, 35.0, 22.0)) == pytest.approx(np.exp(-0.5))
 
 
+def test_a_sum_with_jumps_has_the_covariances_of_its_terms():
+    force = lfm.QuasiPeriodic(squared_exponential(), lfm.SQM(2.0, POINTS), functions=5)
+    t = np.array([3.0, 8.0, 20.0, 37.0])
+    found = (force + lfm.Matern(2.0, 3.0)).sde_covariance(t[:, None], t)
+    expected = force.sde_covariance(t[:, None], t) + lfm.Matern(2.0, 3.0).covariance(t[:, None], t)
+    assert_allclose(found, expected, atol=1e-12)
+
+
+def test_a_spectrum_of_lines_has_no_density():
+    for force in (lfm.Periodic(squared_exponential(), functions=5),
+                  lfm.QuasiPeriodic(squared_exponential(), lfm.SQM(2.0, POINTS), functions=5)):
+        with pytest.raises(NotImplementedError):
+            force.sde_spectral_density(1.0)
+    moving = lfm.QuasiPeriodic(squared_exponential(), lfm.CQM(12.0), functions=5)
+    assert float(moving.sde_spectral_density(0.3)) > 0
+
+
 def test_the_covariance_of_the_state_space_form_is_that_of_the_basis():
     t = np.array([0.0, 1.2, 7.0, 13.0])
     for kernel in (squared_exponential(), lfm.ModeratedPeriodicMatern(1.0, 1.0, 10.0, 0.1)):

@@ -91,6 +91,9 @@ def test_what_is_refused():
         m.build(**values, service=-5.0)
     with pytest.raises(ValueError, match="service rate must not be negative, got -1"):
         m.build(**values, service=lfm.Input([0.0, 1.0], [10.0, -1.0]))
+    for rate, message in ((-5.0, "service rate must not be negative, got -5"), (0.0, "zero all the time")):
+        with pytest.raises(ValueError, match=message):
+            likelihood_site(file.model, (np.arange(0.0, 2000.0, 40.0),), {"service": rate}, jax.random.key(0))
     with pytest.raises(ValueError, match="period must be positive, got 0"):
         m.build(**values, period=0.0)
     with pytest.raises(ValueError, match="force must be one of sqm"):

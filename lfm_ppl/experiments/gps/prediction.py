@@ -144,8 +144,10 @@ def predict(one: Arc, near: orbits.Neighbourhood, logarithms: np.ndarray, y: np.
         y: (T, 3) positions to learn from; None: those of training.
     """
     y = (one.learnt() if y is None else y) - np.asarray(near.path[:, :3])
-    last = int(np.flatnonzero(np.isfinite(y).any(axis=1))[-1])
-    found = _predict(near, jnp.asarray(y), jnp.asarray(logarithms), (tuple(one.times), near.axes, last + 1))
+    known = np.flatnonzero(np.isfinite(y).any(axis=1))
+    if not len(known):
+        raise ValueError("every position is missing (NaN); there is nothing to learn from.")
+    found = _predict(near, jnp.asarray(y), jnp.asarray(logarithms), (tuple(one.times), near.axes, int(known[-1]) + 1))
     mean, covariance = map(np.asarray, found)
     sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     return Prediction(np.asarray(near.path) + mean[:, :6], covariance[:, :3, :3], mean[:, 6:], sd[:, 6:])

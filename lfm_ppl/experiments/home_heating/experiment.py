@@ -53,8 +53,8 @@ class Settings:
     particles: int = 1000
     integrated: str = "SQM"
     every: int = 7
-    ram: tuple[int, int, int] = (4, 1000, 4000)
-    nuts: tuple[int, int, int] = (2, 150, 250)
+    ram: tuple[int, int, int] = (4, 1000, 3000)
+    nuts: tuple[int, int, int] = (2, 120, 180)
 
     def __post_init__(self) -> None:
         """Check what a user gives."""
