@@ -39,7 +39,6 @@
 
 # %%
 import os
-import tempfile
 from pathlib import Path
 
 import numpyro
@@ -94,7 +93,7 @@ folder = problem.data_folder()
 print("real house and simulated homes" if folder else f"no {problem.FILE}: simulated homes only")
 make = experiment.quick if quick else experiment.Settings
 settings = make(data=None if folder is None else str(folder))
-kept = Path(os.environ.get("LFM_RESULTS", tempfile.mkdtemp()))
+kept = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/home-heating"))
 found = experiment.run(settings, kept)
 
 # %% [markdown]

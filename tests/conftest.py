@@ -27,8 +27,8 @@ def pytest_configure(config: pytest.Config) -> None:
     """Compile faster, before a backend exists, except where speed is measured.
 
     Without optimisations tests take two thirds of the time, since they compile more than they compute, and XLA's older
-    emitters compile these small loops in half of what is left. Newer versions lack that switch, and XLA ends the process
-    at a switch that it does not know.
+    emitters compile these small loops in half of what is left. Newer versions lack that switch, and XLA ends the
+    process at a switch that it does not know.
     """
     if _measures_speed(config):
         return

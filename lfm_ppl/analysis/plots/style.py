@@ -177,6 +177,21 @@ def small_multiples(width: str | float, count: int, height: float) -> tuple[Figu
     return figure, panels[:count]
 
 
+def in_a_row(width: str | float, count: int, height: float, **shared: Any) -> tuple[Figure, list[Axes]]:
+    """Return a figure of ``count`` panels side by side, and its axes; in a narrow one they stand above one another.
+
+    Args:
+        width: of the figure.
+        count: number of panels.
+        height: of the figure where they stand side by side, in inches.
+        **shared: axes that the panels share, as for `Figure.subplots`.
+    """
+    narrow = is_narrow(width)
+    figure = new_figure(width, height * (0.3 + 0.7 * count if narrow else 1.0))
+    grid = figure.subplots(*((count, 1) if narrow else (1, count)), **shared, squeeze=False)
+    return figure, list(grid.flat)
+
+
 def label_time(panels: Sequence[Axes], unit: str) -> None:
     """Write "time" and its unit under the panels that show x tick labels."""
     for axes in panels:

@@ -82,8 +82,7 @@ def plot_particles(settings: Any, results: dict[str, Result], *, width: str | fl
     few = min(settings.runs, settings.particle_runs)
     gaussian = {name: values[:few] for name, values in tables.of_rule(settings, results, tracking.REPORTED).items()}
     found = {count: tables.of_particles(settings, results, count) for count in counts}
-    figure = style.new_figure(width, 2.5)
-    left, right = figure.subplots(1, 2)
+    figure, (left, right) = style.in_a_row(width, 2, 2.5)
     for index, path in enumerate(problem.PATHS):
         ratios = [tables.paired_ratio(found[count]["smoother_rmse"][:, index], gaussian["smoother_rmse"][:, index])
                   for count in counts]
@@ -123,8 +122,7 @@ def plot_drag(settings: Any, results: dict[str, Result], *, width: str | float =
     """
     truth = problem.true_z()[0]
     found = tables.of_parameters(settings, results)
-    figure = style.new_figure(width, 2.5)
-    first, several, ranks = figure.subplots(1, 3)
+    figure, (first, several, ranks) = style.in_a_row(width, 3, 2.5)
     draws = results[parameters.tasks(settings)[0].name]["draws"][0]
     chain = results[next(task for task in chains.tasks(settings) if task.settings["sampler"] == tables.NUTS).name]
     low, high = np.quantile(np.concatenate([draws, chain["draws"][0].ravel()]), [0.0005, 0.9995])
@@ -147,14 +145,17 @@ def plot_drag(settings: Any, results: dict[str, Result], *, width: str | float =
     several.set_ylabel("log alpha, mean and 1.96 sd")
     several.set_title(f"{count} targets")
     cells = 10 if settings.runs >= 100 else 5
-    expected = settings.runs / cells
-    low, high = stats.binom(settings.runs, 1 / cells).ppf([0.025, 0.975])
+    low, high = stats.binom(settings.runs, 1 / cells).ppf([0.025, 0.975]) / settings.runs
     ranks.axhspan(low, high, color="#DDDDDD", lw=0)
-    ranks.hist(found["below"][:, 0], np.linspace(0.0, 1.0, cells + 1), histtype="step", color=style.BLUE)
-    ranks.axhline(expected, color=style.BLACK, lw=0.9)
-    ranks.set_ylim(0.0, 1.8 * expected)
+    drawn = tables.of_parameters(settings, results, drawn=True)
+    for given, colour, line in ((found, style.BLUE, "-"), (drawn, style.GREEN, "--")):
+        below = given["below"][:, 0]
+        ranks.hist(below, np.linspace(0.0, 1.0, cells + 1), weights=np.full(len(below), 1 / len(below)),
+                   histtype="step", color=colour, ls=line)
+    ranks.axhline(1 / cells, color=style.BLACK, lw=0.9)
+    ranks.set_ylim(0.0, 1.8 / cells)
     ranks.set_xlabel("posterior probability\nof less than the truth")
-    ranks.set_ylabel("targets")
+    ranks.set_ylabel("share of targets")
     ranks.set_title(f"{settings.runs} targets")
     for axes in (first, several, ranks):
         style.tidy(axes)
@@ -162,7 +163,8 @@ def plot_drag(settings: Any, results: dict[str, Result], *, width: str | float =
         Line2D([], [], color=style.BLACK, lw=0.9, label="truth, and what is expected"),
         Patch(color=_SHADE, label="weighted draws"), Line2D([], [], color=style.VERMILLION, ls="--", label="NUTS"),
         Line2D([], [], color=style.ORANGE, marker="o", ms=2.0, label="95% interval without the truth"),
-        Patch(color="#DDDDDD", label="95% of counts")])
+        Line2D([], [], color=style.GREEN, ls="--", label="parameters drawn from the prior"),
+        Patch(color="#DDDDDD", label="95% of shares")])
     return figure
 
 
@@ -178,8 +180,7 @@ def plot_coverage(settings: Any, results: dict[str, Result], *, width: str | flo
     found = tables.of_parameters(settings, results)
     rows = {"truth": tables.of_rule(settings, results, tracking.REPORTED)["smoother_coverage"],
             "most\nlikely": found["likely_coverage"], "integrated\nout": found["posterior_coverage"]}
-    figure = style.new_figure(width, 2.5)
-    left, right = figure.subplots(1, 2)
+    figure, (left, right) = style.in_a_row(width, 2, 2.5)
     left.axhspan(0.93, 0.97, color="#DDDDDD", lw=0)
     left.axhline(0.95, color=style.BLACK, lw=0.8)
     for index, path in enumerate(problem.PATHS):

@@ -128,8 +128,7 @@ def plot_cycles(settings: Any, results: dict[str, Result], *, width: str | float
 @style.styled
 def plot_errors(settings: Any, results: dict[str, Result], *, width: str | float = "full") -> Figure:
     """Draw the error of the queue on each test day by method, at both service rates, and the coverage of the bands."""
-    figure = style.new_figure(width, 2.7)
-    panels = figure.subplots(1, 3)
+    figure, panels = style.in_a_row(width, 3, 2.7)
     names = [task.settings["method"] for task in tracking.tasks(settings)]
     for axes, test in zip(panels, TESTED, strict=False):
         for place, task in enumerate(tracking.tasks(settings)):

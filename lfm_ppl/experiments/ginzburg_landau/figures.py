@@ -134,8 +134,8 @@ def plot_conditional(rows: dict[str, np.ndarray], *, width: str | float = "full"
         rows: method -> log likelihood (3, nodes), see `conditional_rows`.
         width: "column" (3.4 in), "full" (7 in), or inches.
     """
-    figure = style.new_figure(width, 2.5)
-    for number, (axes, name) in enumerate(zip(figure.subplots(1, 3), problem.NAMES, strict=True)):
+    figure, panels = style.in_a_row(width, 3, 2.5)
+    for number, (axes, name) in enumerate(zip(panels, problem.NAMES, strict=True)):
         found = {method: conditional.posterior(row[number], name) for method, row in rows.items()}
         for method, one in found.items():
             if method == problem.GRID:

@@ -109,9 +109,8 @@ def plot_residual(settings: Any, results: dict[str, Result], *, width: str | flo
         results: of its tasks.
         width: "column" (3.4 in), "full" (7 in), or inches.
     """
-    figure = style.new_figure(width, 2.6)
+    figure, panels = style.in_a_row(width, 2, 2.6, sharey=True)
     colours = ("#BBBBBB", style.SKY, style.GREEN, style.PURPLE)
-    panels = figure.subplots(1, 2, sharey=True)
     hours = np.arange(problem.DAY)
     for axes, method in zip(panels, ("SQM", "matern"), strict=True):
         found = tables.of(results, "house", settings.stores[0], method)

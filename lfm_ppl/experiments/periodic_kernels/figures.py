@@ -65,8 +65,7 @@ def plot_errors(settings: Any, results: dict[str, Result], *, width: str | float
 def plot_covariances(settings: Any, *, width: str | float = "full") -> Figure:
     """Draw the squared exponential of scale 10 and what 22 functions, or 22 and 88 frequencies, make of it."""
     at = problem.grid(problem.window_kernel())
-    figure = style.new_figure(width, 2.4)
-    panels = figure.subplots(1, 3, sharey=True)
+    figure, panels = style.in_a_row(width, 3, 2.4, sharey=True)
     exact = np.asarray(problem.window_prior().covariance(at))
     chosen: dict[str, Force] = {regression.KPCA: covariance.eigenfunctions(problem.window_kernel(), 22)}
     for label, count in ((regression.SPARSE, 22), (regression.SPARSE_4, 88)):
@@ -87,8 +86,7 @@ def plot_covariances(settings: Any, *, width: str | float = "full") -> Figure:
 @style.styled
 def plot_eigenfunctions(*, width: str | float = "full") -> Figure:
     """Draw the first eigenfunctions of a stationary kernel and of one that is not (figure 2 of the source)."""
-    figure = style.new_figure(width, 2.4)
-    panels = figure.subplots(1, 2, sharey=True)
+    figure, panels = style.in_a_row(width, 2, 2.4, sharey=True)
     t = np.linspace(0.0, 2 * problem.PERIOD, 401)
     every = problem.kernels()
     for axes, name in zip(panels, ("periodic Matern-3_2", "moderated periodic Matern-3_2"), strict=True):
