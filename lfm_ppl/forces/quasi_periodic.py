@@ -31,9 +31,8 @@ class QuasiPeriodic(Force):
     weights: `CQM`, `SQM`, `WQM`, or another force of scale 1, such as a Matern force of any order. For a stationary
     kernel the covariance misses at no lag more than the eigenvalues left out, for others it does so on average over a
     cycle. Where those above 1/100 of the largest are kept, as by default, that is less than 0.01 of the variance for
-    the periodic squared exponential and for order 2 of the periodic Matern, or 0.02 at lengthscales where a pair is
-    only just left out; 0.022 for order 1 and 0.07 for order 0. Rough kernels need more functions, that is a smaller
-    gamma.
+    the periodic squared exponential and for order 2 of the periodic Matern, whatever the lengthscale; up to 0.015 for
+    order 1 and 0.064 for order 0. Rough kernels need more functions, that is a smaller gamma.
 
     A stationary kernel has the Fourier series ``sum_j q_j cos(2 pi j t / D)``, whose coefficients are integrals of
     the kernel, so that no eigen-decomposition is needed; each pair turns in its state and the force has constant
@@ -198,7 +197,7 @@ class Periodic(QuasiPeriodic):
 
     The phi_j are the leading eigenfunctions of a periodic kernel, the mu_j their eigenvalues; `QuasiPeriodic` says how
     they are found and how many are needed. At the default gamma the covariance of a periodic Matern force of order 0 is
-    0.07 of the variance off, that of order 2 and that of a periodic squared exponential mostly less than 0.01.
+    up to 0.064 of the variance off, that of order 2 and that of a periodic squared exponential less than 0.01.
 
     Args:
         kernel: a periodic kernel, such as `PeriodicMatern`.
@@ -227,7 +226,9 @@ class Periodic(QuasiPeriodic):
 def significant_functions(kernel: Kernel, gamma: float = 0.01, points: int = _POINTS) -> int:
     """Return how many eigenfunctions have an eigenvalue above ``gamma`` times the largest.
 
-    For a stationary kernel they are a constant and pairs of cosine and sine, up to the last significant pair.
+    For a stationary kernel they are a constant and pairs of cosine and sine, up to the last significant pair. The two
+    of a pair are one oscillation of any phase, whose eigenvalue counts twice: that is its share of the variance, and
+    what the covariance misses without it.
 
     Args:
         kernel: a periodic kernel whose parameters are known.
@@ -257,6 +258,7 @@ def significant_functions(kernel: Kernel, gamma: float = 0.01, points: int = _PO
     harmonics = 32
     while harmonics <= _MOST:
         values = spectrum(kernel, harmonics)
+        values[1:] *= 2.0
         last = int(np.flatnonzero(values > gamma * values.max()).max())
         if last < harmonics // 2:
             return 1 + 2 * last
