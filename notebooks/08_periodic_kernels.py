@@ -70,8 +70,8 @@ figures.plot_errors(settings, found.results)
 scores.readable(found.covariance)
 
 # %% [markdown]
-# `significant` counts eigenvalues above 1/100 of the largest, those of a pair together. That leaves out less than 0.01 of
-# the variance of smooth kernels, but 0.05 of that of the roughest here.
+# `significant` counts eigenvalues above 1/100 of the largest, those of a pair together. That leaves out less than 0.01
+# of the variance of smooth kernels, but 0.05 of that of the roughest here.
 #
 # ## A kernel that is not periodic
 #
