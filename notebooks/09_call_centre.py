@@ -110,8 +110,8 @@ scores.readable(found.gain)
 
 # %% [markdown]
 # These are weighted draws. NUTS, which shares the density with them and the mode about which it starts, finds the same
-# posterior, here for the first days: how far apart the means are at most, in posterior standard deviations, and both
-# gains on these days.
+# posterior, here for the first day: how far apart the means are at most, in posterior standard deviations, and both
+# gains on that day.
 
 # %%
 scores.readable(found.agreement)

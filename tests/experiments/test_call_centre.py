@@ -201,7 +201,7 @@ def made_up(settings):
     return results
 
 
-MADE = experiment.Settings(days=3, methods=("SQM", "periodic", "Matern"), integrated=("SQM",))
+MADE = experiment.Settings(days=3, methods=("SQM", "periodic", "Matern"), integrated=("SQM",), nuts_days=2)
 
 
 def test_scores_are_those_of_the_log_normal_distribution():

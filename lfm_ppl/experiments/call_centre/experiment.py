@@ -48,7 +48,7 @@ class Settings:
     integrated: tuple[str, ...] = ("SQM",)
     draws: int = 200
     mixed: int = 20
-    nuts_days: int = 2
+    nuts_days: int = 1
     nuts: tuple[int, int, int] = (2, 150, 200)
 
     def __post_init__(self) -> None:
@@ -74,7 +74,7 @@ class Settings:
 def quick(**given: Any) -> Settings:
     """Return settings that show in a few minutes that everything runs, and no more."""
     small: dict[str, Any] = {"days": 2, "methods": ("SQM", "Matern"), "functions": 7, "draws": 60, "mixed": 5,
-                             "nuts_days": 1, "nuts": (2, 20, 20)}
+                             "nuts": (2, 20, 20)}
     return Settings(**small | given)
 
 
