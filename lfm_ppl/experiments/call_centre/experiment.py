@@ -74,7 +74,7 @@ class Settings:
 def quick(**given: Any) -> Settings:
     """Return settings that show in a few minutes that everything runs, and no more."""
     small: dict[str, Any] = {"days": 2, "methods": ("SQM", "Matern"), "functions": 7, "draws": 60, "mixed": 5,
-                             "nuts": (2, 20, 20)}
+                             "nuts": (2, 8, 8)}
     return Settings(**small | given)
 
 

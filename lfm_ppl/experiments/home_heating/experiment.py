@@ -87,7 +87,7 @@ def quick(**given: Any) -> Settings:
     """Return settings that show in a few minutes that everything runs, and no more."""
     small: dict[str, Any] = {"homes": 2, "windows": 2, "methods": ("SQM", "none", "matern"),
                              "stores": problem.STORES[:1], "functions": 5, "particles": 200, "ram": (2, 50, 50),
-                             "nuts": (2, 20, 20)}
+                             "nuts": (2, 8, 8)}
     return Settings(**small | given)
 
 
