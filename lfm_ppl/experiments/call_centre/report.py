@@ -23,10 +23,11 @@ def run(wanted: Wanted) -> Report:
                            workers=wanted.workers)
     written = experiment.save(found, wanted.folder)
     source = "simulated counts" if settings.data is None else f"counts in {settings.data}"
+    both = min(settings.days, settings.nuts_days)
     return Report({
         f"Service rate 10 as in training, {settings.days} test days, {source}": scores.readable(found.constant),
         f"Service rate 15, then 5, {settings.days} test days, {source}": scores.readable(found.changed),
         "Gain in the log density of a day by integrating the parameters out": scores.readable(found.gain),
-        f"Weighted draws against NUTS, test days: {min(settings.days, settings.nuts_days)}": scores.readable(found.agreement),
+        f"Weighted draws against NUTS, test days: {both}": scores.readable(found.agreement),
         "Most likely parameters (medians)": scores.readable(found.learnt),
     }, written)
