@@ -150,7 +150,7 @@ def plot_drag(settings: Any, results: dict[str, Result], *, width: str | float =
     drawn = tables.of_parameters(settings, results, drawn=True)
     for given, colour, line in ((found, style.BLUE, "-"), (drawn, style.GREEN, "--")):
         below = given["below"][:, 0]
-        ranks.hist(below, cells, (0.0, 1.0), weights=np.full(len(below), 1 / len(below)),
+        ranks.hist(below, cells, range=(0.0, 1.0), weights=np.full(len(below), 1 / len(below)),
                    histtype="step", color=colour, ls=line)
     ranks.axhline(1 / cells, color=style.BLACK, lw=0.9)
     ranks.set_ylim(0.0, 1.8 / cells)
