@@ -239,7 +239,7 @@ def test_what_is_stored_is_tabulated_and_drawn_without_computing(tmp_path):
 
 def test_tasks_have_files_of_their_own():
     found = experiment.all_tasks(experiment.Settings())
-    assert len({task.file for task in found}) == len(found) == 4 * 10 + 50 + 10 + 4 * 20 + 2 * 3 + 10
+    assert len({task.file for task in found}) == len(found) == 4 * 10 + 50 + 50 + 4 * 20 + 2 * 3 + 10
 
 
 def test_mistakes():

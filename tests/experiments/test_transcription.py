@@ -79,6 +79,7 @@ def linear(monkeypatch):
     return data, ellipses.on_grid("softplus", 1.0, data.rates)
 
 
+@pytest.mark.slow
 def test_the_gaussian_of_the_ellipses_is_the_posterior_of_a_linear_link(monkeypatch):
     """Found from any draws; a draw of it is one of the posterior, and the ratio of likelihoods is flat."""
     data, latent = linear(monkeypatch)

@@ -157,6 +157,7 @@ def test_filter_goes_on_from_its_state(model, cut):
     same(whole.state, second.state, 1e-12)
 
 
+@pytest.mark.slow
 def test_requested_times_come_in_the_order_that_was_asked(model):
     shuffled = np.array([2.2, 4.0, 0.5, 1.7])
     order = np.argsort(shuffled)

@@ -182,6 +182,7 @@ def test_a_likelihood_that_cannot_be_replaced_is_an_error(wrap):
         lfm.ParticleMarginalRAM(wrapped, particles=5).init(jax.random.key(0), 10, None, (TIMES, y), {})
 
 
+@pytest.mark.slow
 def test_trajectories_agree_with_the_exact_smoother_wherever_they_are_wanted():
     """Paths at single parameter values; a crowd of forecast times changes nothing elsewhere."""
     at = np.array([0.3, 1.0, 3.5])
