@@ -6,7 +6,7 @@ result with its pictures beside the source.
 
     python notebooks/execute.py                    all of them
     python notebooks/execute.py 01_quickstart      one
-    LFM_QUICK=1 python notebooks/execute.py --check --jobs 2    run all in quick mode, two at a time, write nothing
+    LFM_QUICK=1 python notebooks/execute.py --check    run all in quick mode, write nothing
 
 With LFM_QUICK=1 the notebooks draw few samples: it shows that they run, and no more. An error in a
 cell ends the script.
@@ -15,14 +15,11 @@ cell ends the script.
 from __future__ import annotations
 
 import argparse
-import multiprocessing
 import os
 import re
 import sys
 import tempfile
 import time
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
 
 import jupytext
@@ -64,33 +61,12 @@ def tidy(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:
     return notebook
 
 
-def run(source: Path, keep: bool) -> str:
-    """Run a notebook, keep its result beside it where asked, and return how long it took."""
-    started = time.perf_counter()
-    with tempfile.TemporaryDirectory() as scratch:
-        notebook = execute(source, Path(scratch))
-    if keep:
-        nbformat.write(notebook, source.with_suffix(".ipynb"))
-    return f"{source.stem}: {time.perf_counter() - started:.0f} s"
-
-
-def take_cpus(number: Synchronized, jobs: int) -> None:
-    """Keep this process and its kernels to a share of the CPUs: the threads of one would get in the way of others."""
-    with number.get_lock():
-        mine = number.value
-        number.value += 1
-    if hasattr(os, "sched_setaffinity"):
-        cpus = sorted(os.sched_getaffinity(0))
-        os.sched_setaffinity(0, cpus[mine % len(cpus)::jobs] or cpus)
-
-
 def main() -> int:
     """Run the notebooks that the command line names."""
     os.environ["PYTHONWARNINGS"] = "ignore:IProgress not found"  # in the kernel: there is no widget to draw a bar
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("names", nargs="*", help="such as 01_quickstart; default: all")
     parser.add_argument("--check", action="store_true", help="write nothing")
-    parser.add_argument("--jobs", type=int, default=1, help="notebooks that run side by side; default: 1")
     arguments = parser.parse_args()
     wanted = [path for path in sources() if not arguments.names or path.stem in arguments.names]
     if not wanted:
@@ -100,17 +76,13 @@ def main() -> int:
     if not arguments.check and os.environ.get("LFM_QUICK"):
         print("LFM_QUICK is for --check: quick results are not to be kept", file=sys.stderr)
         return 2
-    if arguments.jobs < 1:
-        parser.error(f"--jobs must be at least 1, got {arguments.jobs}")
-    jobs = min(arguments.jobs, len(wanted))
-    if jobs == 1:
-        for source in wanted:
-            print(run(source, not arguments.check), flush=True)
-        return 0
-    number = multiprocessing.Value("i", 0)
-    with ProcessPoolExecutor(jobs, initializer=take_cpus, initargs=(number, jobs)) as pool:
-        for future in as_completed([pool.submit(run, source, not arguments.check) for source in wanted]):
-            print(future.result(), flush=True)
+    for source in wanted:
+        started = time.perf_counter()
+        with tempfile.TemporaryDirectory() as scratch:
+            notebook = execute(source, Path(scratch))
+        if not arguments.check:
+            nbformat.write(notebook, source.with_suffix(".ipynb"))
+        print(f"{source.stem}: {time.perf_counter() - started:.0f} s")
     return 0
 
 
