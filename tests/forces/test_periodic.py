@@ -77,12 +77,15 @@ def test_the_default_is_as_good_as_documented(order, largest):
     for lengthscale in (0.06, 0.11, 0.2, 0.5, 1.0, 1.34, 2.0, 3.5, 5.03, 6.46, 7.14, 15.0):
         matern = None if order == "se" else lfm.PeriodicMatern(1.0, lengthscale, 10.0, order)
         kernel = matern or squared_exponential(lengthscale)
-        harmonics = lfm.significant_functions(kernel) // 2
+        force = lfm.Periodic(kernel)
+        assert force.functions == lfm.significant_functions(kernel)
+        harmonics = force.functions // 2
         # By an independent transform: the variance of the level, and of each pair together.
         variance = np.fft.rfft(np.asarray(kernel(np.linspace(0.0, 10.0, 2**14, endpoint=False)))).real / 2**14
         variance[1:] *= 2.0
         assert variance[harmonics] > 0.01 * variance.max() > variance[harmonics + 1:].max()
-        errors.append(variance[harmonics + 1:].sum())
+        errors.append(1.0 - float(force.eigenvalues().sum()))
+        assert errors[-1] == pytest.approx(variance[harmonics + 1:].sum(), abs=1e-4)
     assert 0.6 * largest < max(errors) < largest
     kernel = squared_exponential(5.03)
     assert lfm.Periodic(kernel).functions == lfm.significant_functions(kernel) == 3
