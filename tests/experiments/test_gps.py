@@ -6,10 +6,22 @@ import numpy as np
 import pytest
 from scipy import stats
 
+import lfm_ppl as lfm
 from lfm_ppl import orbits
 from lfm_ppl.experiments import output
 from lfm_ppl.experiments.catalogue import Wanted
-from lfm_ppl.experiments.gps import experiment, figures, learning, magnitudes, prediction, problem, report, ways
+from lfm_ppl.experiments.gps import (
+    experiment,
+    figures,
+    learning,
+    magnitudes,
+    prediction,
+    problem,
+    report,
+    training,
+    ways,
+)
+from lfm_ppl.orbits.table import Table
 
 TIMES = 0.25 * np.arange(960)
 
@@ -122,7 +134,7 @@ def test_log_density_of_errors():
     error, covariance = random.normal(size=(5, 3)), root @ root.transpose(0, 2, 1)
     expected = [stats.multivariate_normal.logpdf(e, cov=c + problem.NOISE**2 * np.eye(3))
                 for e, c in zip(error, covariance, strict=True)]
-    assert np.asarray(learning.log_density(error, covariance)) == pytest.approx(np.array(expected), rel=1e-10)
+    assert np.asarray(training.log_density(error, covariance)) == pytest.approx(np.array(expected), rel=1e-10)
 
 
 def test_what_is_asked_must_be_there(data):
@@ -274,13 +286,112 @@ def test_departures_are_predicted_as_the_satellite_itself(satellite):
     assert np.abs(found.covariance[after] / covariance[after] - 1)[:, [0, 1, 2], [0, 1, 2]].max() < 1e-2
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("axes", ["DYB", "RTN"])
-def test_the_slope_of_what_is_held_out_is_that_of_differences(satellite, axes):
-    one = satellite
+@pytest.fixture(scope="module", params=["DYB", "RTN"])
+def freely(request):
+    """A regression far from everything: forces push straight along fixed axes. One position is missing."""
+    axes, times, random = request.param, 0.5 * np.arange(9), np.random.default_rng(2)
+    along = np.zeros((3, 9)) if axes == "DYB" else np.zeros((3, 10))
+    along[:, 6:9] = orbits.NANO * np.linalg.qr(random.normal(size=(3, 3)))[0]
+    if axes == "RTN":
+        along[:, 9] = orbits.NANO * random.normal(size=3)
+    table = Table(0.0, 1.0, np.tile(along.ravel(), (8, 1)))
+    near = orbits.Neighbourhood(np.zeros((9, 6)), table, np.zeros(along.shape[1] - 6), axes)
+    vector = magnitudes.wide(axes).mean + 0.3 * random.normal(size=len(magnitudes.names(axes)))
+    # Forces and noises that move a satellite by far more than its positions' noise within hours.
+    larger = {"level": 100.0, "amplitude": 100.0, "drift": 1e4, "wander": 30.0, "white": 1e3}
+    vector = vector + np.log([larger[name.split()[0]] for name in magnitudes.names(axes)])
+    mean, covariance = moments(times, axes, along[:, 6:], vector)
+    y = (mean + np.linalg.cholesky(covariance) @ random.normal(size=27)).reshape(9, 3)
+    y[4] = np.nan
+    return (training.Training(near, times, y, axes, *training._responses(near, times, axes)), vector, mean,
+            covariance)
+
+
+def moments(times, axes, along, vector):
+    """Mean (3 T,) and covariance (3 T, 3 T) of free positions, by the textbook's covariances of the forces."""
+    forces, white = magnitudes.forces(vector, axes)
+    late, early = np.maximum.outer(times, times), np.minimum.outer(times, times)
+    nodes, weights = np.polynomial.legendre.leggauss(12)
+
+    def pushed(force):
+        """Covariance of twice the integral of a force: its covariance function (a - v) (b - u) k(u, v), integrated."""
+        a, b = late[..., None, None, None], early[..., None, None]
+        u = 0.5 * b * (nodes[:, None] + 1)
+        weight = 0.5 * b * weights[:, None] * (b - u)
+        # It has a kink where both times are the same; the square is cut there.
+        bounds = np.stack([np.stack([0 * u, u], axis=-1), np.stack([u, a[..., 0] + 0 * u], axis=-1)])
+        low, high = bounds[..., :1], bounds[..., 1:]
+        v = low + 0.5 * (high - low) * (nodes + 1)
+        inner = 0.5 * (high - low) * weights * (a - v) * np.asarray(force.covariance(u[..., None] + 0 * v, v))
+        return (weight[..., None] * inner).sum(axis=(0, 3, 4, 5))
+
+    unit = np.multiply.outer
+    covariance = np.einsum("ts,ij->tisj", orbits.START_SD[0] ** 2 + orbits.START_SD[1] ** 2 * unit(times, times),
+                           np.eye(3))
+    integral = late * early**2 / 2 - early**3 / 6
+    covariance = covariance + np.einsum("ts,ij->tisj", (orbits.NANO * float(white)) ** 2 * integral, np.eye(3))
+    mean = np.zeros((len(times), 3))
+    for axis, force in zip(along.T, forces.values(), strict=True):
+        covariance = covariance + np.einsum("ts,i,j->tisj", pushed(force), axis, axis)
+        mean = mean + float(force.mean_at(0.0)) * 0.5 * times[:, None] ** 2 * axis
+    size = 3 * len(times)
+    return mean.ravel(), covariance.reshape(size, size) + problem.NOISE**2 * np.eye(size)
+
+
+def test_densities_of_positions_are_those_of_a_gaussian(freely):
+    """Covariances by quadrature of the forces' covariance functions, densities by SciPy."""
+    data, vector, mean, covariance = freely
+    y = data.y.ravel()
+    known = np.isfinite(y)
+    expected = stats.multivariate_normal.logpdf(y[known], mean[known], covariance[np.ix_(known, known)])
+    assert float(training.log_likelihood(vector, data.regression, data.axes)) == pytest.approx(expected, rel=1e-5)
+    total = 0.0
+    for seen in (3, 6):
+        some = np.flatnonzero(known & (np.arange(27) < 3 * seen))
+        rows = []
+        for row in (row for row in range(seen, 9) if row != 4):
+            at = np.arange(3 * row, 3 * row + 3)
+            gain = np.linalg.solve(covariance[np.ix_(some, some)], covariance[np.ix_(some, at)]).T
+            rows.append(stats.multivariate_normal.logpdf(
+                y[at], mean[at] + gain @ (y - mean)[some],
+                covariance[np.ix_(at, at)] - gain @ covariance[np.ix_(some, at)]))
+        total += np.mean(rows)
+    assert float(training.held_out(vector, data.regression, data.axes)) == pytest.approx(total, rel=1e-5)
+
+
+@pytest.fixture(scope="module", params=["DYB", "RTN"])
+def learning_from(request, satellite):
+    """The training of the simulated satellite, one position missing, and magnitudes."""
+    one, axes = satellite, request.param
+    positions = one.positions.copy()
+    positions[10] = np.nan
+    one = one._replace(positions=positions)
     orbit = orbits.fit_orbit(one.environment, one.times[:one.train], one.positions[:one.train])
-    target = learning.held_out(learning.training(one, orbit, axes), magnitudes.wide(axes))
-    point = target.prior.mean + 0.1
+    return training.training(one, orbit, axes), magnitudes.wide(axes).mean + 0.1
+
+
+@pytest.mark.slow
+def test_the_regression_has_the_densities_of_the_filter(learning_from):
+    data, vector = learning_from
+    assert np.isnan(data.y).any() and len(data.times) == 36
+    settings = {"rule": lfm.Taylor(), "steps": training.steps_of(data.times)}
+    system = training.departing(vector, data.near, data.axes)
+    found = lfm.filter(system, data.times, data.y, **settings)
+    assert float(training.log_likelihood(vector, data.regression, data.axes)) == pytest.approx(
+        float(found.log_likelihood.sum()), rel=1e-8)
+    total = 0.0
+    for seen in (12, 24):
+        passed = lfm.filter(system, data.times, np.where(np.arange(36)[:, None] < seen, data.y, np.nan), **settings)
+        density = training.log_density(data.y - passed.predicted_mean[:, :3], passed.predicted_covariance[:, :3, :3])
+        total += np.nanmean(density[seen:])
+    assert float(training.held_out(vector, data.regression, data.axes)) == pytest.approx(total, rel=1e-8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("target", [learning.held_out, learning.likelihood])
+def test_slopes_of_the_targets_are_those_of_differences(learning_from, target):
+    data, point = learning_from
+    target = target(data, magnitudes.wide(data.axes))
     _, slope = target.evidence(point)
     for index in (0, 3, len(point) // 2, len(point) - 1):
         step = 1e-4 * np.eye(len(point))[index]

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import orbits
-from lfm_ppl.experiments.gps import learning, magnitudes
+from lfm_ppl.experiments.gps import magnitudes, training
 from lfm_ppl.experiments.gps.problem import NOISE, Arc, Arcs
 from lfm_ppl.experiments.scores import Z
 from lfm_ppl.filtering.filter import FilterState, filter
@@ -157,10 +157,10 @@ def predict(one: Arc, near: orbits.Neighbourhood, logarithms: np.ndarray, y: np.
 def _predict(near: orbits.Neighbourhood, y: jax.Array, logarithms: jax.Array, fixed: tuple
              ) -> tuple[jax.Array, jax.Array]:
     times, (axes, seen) = np.array(fixed[0]), fixed[1:]
-    settings: dict[str, Any] = {"rule": Taylor(), "steps": learning.steps_of(times, _STEP)}
+    settings: dict[str, Any] = {"rule": Taylor(), "steps": training.steps_of(times, _STEP)}
 
     def one(vector: jax.Array) -> tuple[jax.Array, jax.Array]:
-        system = learning.departing(vector, near, axes)
+        system = training.departing(vector, near, axes)
         found = smooth(system, times[:seen], y[:seen], **settings)
         if seen == len(times):
             return found.input_mean, found.input_covariance
@@ -181,7 +181,7 @@ def _predict(near: orbits.Neighbourhood, y: jax.Array, logarithms: jax.Array, fi
 def surroundings(one: Arc, orbit: orbits.Orbit, axes: str) -> orbits.Neighbourhood:
     """Return the orbit and what is around it, at all times."""
     return orbits.Neighbourhood.of(one.environment, orbit, one.times, axes,
-                                   nodes=2 * learning.steps_of(one.times, _STEP))
+                                   nodes=2 * training.steps_of(one.times, _STEP))
 
 
 def online(one: Arc, orbit: orbits.Orbit, logarithms: np.ndarray, axes: str, windows: Any) -> tuple[np.ndarray, ...]:
@@ -231,5 +231,5 @@ def _filter(environment: orbits.Environment, start: Gaussian, y: jax.Array, loga
     times, axes = np.array(fixed[0]), fixed[1]
     forces, white = magnitudes.forces(logarithms, axes)
     system = orbits.satellite(environment, start, forces, axes, white, NOISE)
-    found = filter(system, times, y, rule=Taylor(), steps=learning.steps_of(times, orbits.STEP))
+    found = filter(system, times, y, rule=Taylor(), steps=training.steps_of(times, orbits.STEP))
     return found.predicted_mean[:, :3], found.predicted_covariance[:, :3, :3]

@@ -14,11 +14,12 @@ import pandas as pd
 from numpyro.infer import MCMC, init_to_value
 
 from lfm_ppl import orbits
-from lfm_ppl.experiments.gps import learning, magnitudes, prediction, problem
+from lfm_ppl.experiments.gps import learning, magnitudes, prediction, problem, training
 from lfm_ppl.experiments.gps.figures import METRE
-from lfm_ppl.experiments.gps.learning import DRAWS, Target, Training, departing
+from lfm_ppl.experiments.gps.learning import DRAWS, Target
 from lfm_ppl.experiments.gps.magnitudes import Prior
 from lfm_ppl.experiments.gps.problem import NOISE, Arc
+from lfm_ppl.experiments.gps.training import Regression, Training, steps_of
 from lfm_ppl.experiments.scores import mean_of, pair
 from lfm_ppl.experiments.tasks import Result
 from lfm_ppl.filtering.filter import filter
@@ -42,10 +43,10 @@ def compare(one: Arc, paths: prediction.Deterministic, axes: str, prior: Prior, 
     """Return error (km) after training and coverage of every way, each (W,)."""
     frame = problem.axes_of(paths.fitted)
     near = prediction.surroundings(one, paths.orbit, axes)
-    data = learning.training(one, paths.orbit, axes)
+    data = training.training(one, paths.orbit, axes)
     target = learning.held_out(data, prior)
     mode = target.mode()
-    likelihood = Target(_of_positions(data), prior).mode()
+    likelihood = learning.likelihood(data, prior).mode()
     smoothed = Target(_of_smoothed_forces(data), prior).mode()
     vectors = (target.draws(mode, DRAWS), mode[None], likelihood[None], _posterior(data, prior, likelihood, key),
                smoothed[None])
@@ -59,41 +60,23 @@ def compare(one: Arc, paths: prediction.Deterministic, axes: str, prior: Prior, 
             "logarithms": np.array([vector.mean(axis=0) for vector in vectors])}
 
 
-def _of_positions(data: Training) -> Callable[[np.ndarray], tuple[float, np.ndarray]]:
-    """Return the log marginal likelihood of all positions of training, as a function of the logarithms."""
-    def evidence(logarithms: np.ndarray) -> tuple[float, np.ndarray]:
-        value, gradient = _likelihood_and_slope(jnp.asarray(logarithms), data.near, jnp.asarray(data.y), data.fixed)
-        return float(value), np.asarray(gradient)
-
-    return evidence
-
-
-def _likelihood(logarithms: jax.Array, near: orbits.Neighbourhood, y: jax.Array, fixed: tuple) -> jax.Array:
-    times, axes = np.array(fixed[0]), fixed[1]
-    system = departing(logarithms, near, axes)
-    return filter(system, times, y, rule=Taylor(), steps=learning.steps_of(times)).log_likelihood.sum()
-
-
-_likelihood_and_slope = functools.partial(jax.jit, static_argnums=(3,))(jax.value_and_grad(_likelihood))
-
-
 def _posterior(data: Training, prior: Prior, start: np.ndarray, key: jax.Array) -> np.ndarray:
     """Return draws (DRAWS, d) of the posterior of the logarithms given all positions of training, by RAM."""
-    def model(near: orbits.Neighbourhood, y: jax.Array) -> None:
+    def model(known: Regression) -> None:
         logarithms = numpyro.sample("logarithms", dist.Normal(prior.mean, prior.sd).to_event(1))
-        numpyro.factor("positions", _likelihood(logarithms, near, y, data.fixed))
+        numpyro.factor("positions", training.log_likelihood(logarithms, known, data.axes))
 
     strategy = init_to_value(values={"logarithms": jnp.asarray(start)})
     kernel = RAM(model, initial_covariance=(0.1 * prior.sd) ** 2, init_strategy=strategy)
     chain = MCMC(kernel, num_warmup=_WARMUP, num_samples=_SAMPLES, progress_bar=False)
-    chain.run(key, data.near, jnp.asarray(data.y))
+    chain.run(key, data.regression)
     return np.asarray(chain.get_samples()["logarithms"])[::_SAMPLES // DRAWS][:DRAWS]
 
 
 def _of_smoothed_forces(data: Training) -> Callable[[np.ndarray], tuple[float, np.ndarray]]:
     """Return the log likelihood of the logarithms where forces that a Matern model smooths are the data."""
     thin = max(1, int(round(_APART / (data.times[1] - data.times[0]))))
-    mean, sd = _smooth_forces(data.near, jnp.asarray(data.y), data.fixed)
+    mean, sd = _smooth_forces(data.near, jnp.asarray(data.y), (tuple(data.times), data.axes))
     fixed = tuple(data.times[::thin]), data.axes
 
     def evidence(logarithms: np.ndarray) -> tuple[float, np.ndarray]:
@@ -109,7 +92,7 @@ def _smooth_forces(near: orbits.Neighbourhood, y: jax.Array, fixed: tuple) -> tu
     forces = {name: Matern(_SCALE, _LENGTHSCALE, mean=orbits.SOLAR_PRESSURE if name == "solar" else 0.0)
               for name in orbits.small_forces(axes)}
     found = smooth(orbits.departure(near, forces, noise_sd=NOISE), times, y, rule=Taylor(),
-                   steps=learning.steps_of(times))
+                   steps=steps_of(times))
     return found.input_mean[:, 6:], jnp.sqrt(jnp.diagonal(found.input_covariance, axis1=1, axis2=2)[:, 6:])
 
 
