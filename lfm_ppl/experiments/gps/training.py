@@ -123,7 +123,7 @@ def scales(logarithms: jax.Array, axes: str) -> tuple[jax.Array, jax.Array]:
 
 def _responses(near: orbits.Neighbourhood, times: np.ndarray, axes: str) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return m, O and K of `Training`: those of one force at a time, as forces do not see one another."""
-    members = list(_members(magnitudes.forces(magnitudes.wide(axes).mean, axes)[0]))
+    members = list(_members(magnitudes.forces(jnp.asarray(magnitudes.wide(axes).mean), axes)[0]))
     along = np.eye(len(near.on_orbit))
     levels = [(axis, force) for axis, force in members if not isinstance(force, Resonator)]
     resonators = [(axis, force) for axis, force in members if isinstance(force, Resonator)]
