@@ -19,21 +19,21 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 
-def _measures_speed(config: pytest.Config) -> bool:
-    return "performance" in config.option.markexpr and "not performance" not in config.option.markexpr
+def _asked_for(config: pytest.Config, mark: str) -> bool:
+    return mark in config.option.markexpr and f"not {mark}" not in config.option.markexpr
 
 
 def pytest_configure(config: pytest.Config) -> None:
     """Compile faster, before a backend exists, except where speed is measured.
 
-    Without optimisations tests take two thirds of the time, since they compile more than they compute, and XLA's older
-    emitters compile these small loops in half of what is left. Newer versions lack that switch, and XLA ends the
-    process at a switch that it does not know.
+    Without optimisations tests take two thirds of the time, since they compile more than they compute (but for slow
+    ones), and XLA's older emitters compile these small loops in half of what is left. Newer versions lack that switch,
+    and XLA ends the process at a switch that it does not know.
     """
-    if _measures_speed(config):
+    if _asked_for(config, "performance"):
         return
     _keep_to_one_cpu(os.environ.get("PYTEST_XDIST_WORKER", ""))
-    flags = ["--xla_backend_optimization_level=0"]
+    flags = [] if _asked_for(config, "slow") else ["--xla_backend_optimization_level=0"]
     if jaxlib.version.__version_info__ < (0, 11):
         flags.append("--xla_cpu_use_fusion_emitters=false")
     os.environ["XLA_FLAGS"] = " ".join([*flags, os.environ.get("XLA_FLAGS", "")])
@@ -50,7 +50,7 @@ def _keep_to_one_cpu(worker: str) -> None:
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     """A worker per core up to four, each needs 2 GiB; one process where speed is measured."""
-    return 0 if _measures_speed(config) else min(os.cpu_count() or 1, 4)
+    return 0 if _asked_for(config, "performance") else min(os.cpu_count() or 1, 4)
 
 
 @pytest.fixture(autouse=True, scope="module")
