@@ -286,28 +286,34 @@ def test_departures_are_predicted_as_the_satellite_itself(satellite):
     assert np.abs(found.covariance[after] / covariance[after] - 1)[:, [0, 1, 2], [0, 1, 2]].max() < 1e-2
 
 
-@pytest.fixture(scope="module", params=["DYB", "RTN"])
+BEGIN, COUNT, GROWTH = 10.25, 11, 0.1
+
+
+@pytest.fixture(scope="module", params=["DYB", pytest.param("RTN", marks=pytest.mark.slow)])
 def freely(request):
-    """A regression far from everything: forces push straight along fixed axes. One position is missing."""
-    axes, times, random = request.param, 0.5 * np.arange(9), np.random.default_rng(2)
+    """A training far from everything, its magnitudes and moments: forces push along axes that grow with time.
+
+    One position is missing, and one coordinate of another.
+    """
+    axes, times, random = request.param, BEGIN + 0.5 * np.arange(COUNT), np.random.default_rng(2)
     along = np.zeros((3, 9)) if axes == "DYB" else np.zeros((3, 10))
     along[:, 6:9] = orbits.NANO * np.linalg.qr(random.normal(size=(3, 3)))[0]
     if axes == "RTN":
         along[:, 9] = orbits.NANO * random.normal(size=3)
-    table = Table(0.0, 1.0, np.tile(along.ravel(), (8, 1)))
-    near = orbits.Neighbourhood(np.zeros((9, 6)), table, np.zeros(along.shape[1] - 6), axes)
-    vector = magnitudes.wide(axes).mean + 0.3 * random.normal(size=len(magnitudes.names(axes)))
+    table = Table(BEGIN, 1.0, (1 + GROWTH * np.arange(8.0)[:, None]) * along.ravel())
+    on_orbit = 90.0 * np.eye(along.shape[1] - 6)[0]
+    near = orbits.Neighbourhood(np.zeros((COUNT, 6)), table, on_orbit, axes)
     # Forces and noises that move a satellite by far more than its positions' noise within hours.
     larger = {"level": 100.0, "amplitude": 100.0, "drift": 1e4, "wander": 30.0, "white": 1e3}
-    vector = vector + np.log([larger[name.split()[0]] for name in magnitudes.names(axes)])
-    mean, covariance = moments(times, axes, along[:, 6:], vector)
-    y = (mean + np.linalg.cholesky(covariance) @ random.normal(size=27)).reshape(9, 3)
-    y[4] = np.nan
-    return (training.Training(near, times, y, axes, *training._responses(near, times, axes)), vector, mean,
-            covariance)
+    vector = (magnitudes.wide(axes).mean + 0.3 * random.normal(size=len(magnitudes.names(axes)))
+              + np.log([larger[name.split()[0]] for name in magnitudes.names(axes)]))
+    mean, covariance = moments(times - BEGIN, axes, along[:, 6:], on_orbit, vector)
+    y = (mean + np.linalg.cholesky(covariance) @ random.normal(size=3 * COUNT)).reshape(-1, 3)
+    y[4] = y[8, 1] = np.nan
+    return training.Training.along(near, times, y, axes), vector, mean, covariance
 
 
-def moments(times, axes, along, vector):
+def moments(times, axes, along, on_orbit, vector):
     """Mean (3 T,) and covariance (3 T, 3 T) of free positions, by the textbook's covariances of the forces."""
     forces, white = magnitudes.forces(vector, axes)
     late, early = np.maximum.outer(times, times), np.minimum.outer(times, times)
@@ -317,12 +323,13 @@ def moments(times, axes, along, vector):
         """Covariance of twice the integral of a force: its covariance function (a - v) (b - u) k(u, v), integrated."""
         a, b = late[..., None, None, None], early[..., None, None]
         u = 0.5 * b * (nodes[:, None] + 1)
-        weight = 0.5 * b * weights[:, None] * (b - u)
+        weight = 0.5 * b * weights[:, None] * (b - u) * (1 + GROWTH * u)
         # It has a kink where both times are the same; the square is cut there.
         bounds = np.stack([np.stack([0 * u, u], axis=-1), np.stack([u, a[..., 0] + 0 * u], axis=-1)])
         low, high = bounds[..., :1], bounds[..., 1:]
         v = low + 0.5 * (high - low) * (nodes + 1)
-        inner = 0.5 * (high - low) * weights * (a - v) * np.asarray(force.covariance(u[..., None] + 0 * v, v))
+        inner = (0.5 * (high - low) * weights * (a - v) * (1 + GROWTH * v)
+                 * np.asarray(force.covariance(u[..., None] + 0 * v, v)))
         return (weight[..., None] * inner).sum(axis=(0, 3, 4, 5))
 
     unit = np.multiply.outer
@@ -331,9 +338,10 @@ def moments(times, axes, along, vector):
     integral = late * early**2 / 2 - early**3 / 6
     covariance = covariance + np.einsum("ts,ij->tisj", (orbits.NANO * float(white)) ** 2 * integral, np.eye(3))
     mean = np.zeros((len(times), 3))
-    for axis, force in zip(along.T, forces.values(), strict=True):
+    for axis, force, already in zip(along.T, forces.values(), on_orbit, strict=True):
         covariance = covariance + np.einsum("ts,i,j->tisj", pushed(force), axis, axis)
-        mean = mean + float(force.mean_at(0.0)) * 0.5 * times[:, None] ** 2 * axis
+        response = 0.5 * times**2 + GROWTH * times**3 / 6
+        mean = mean + (float(force.mean_at(0.0)) - already) * response[:, None] * axis
     size = 3 * len(times)
     return mean.ravel(), covariance.reshape(size, size) + problem.NOISE**2 * np.eye(size)
 
@@ -346,10 +354,10 @@ def test_densities_of_positions_are_those_of_a_gaussian(freely):
     expected = stats.multivariate_normal.logpdf(y[known], mean[known], covariance[np.ix_(known, known)])
     assert float(training.log_likelihood(vector, data.regression, data.axes)) == pytest.approx(expected, rel=1e-5)
     total = 0.0
-    for seen in (3, 6):
-        some = np.flatnonzero(known & (np.arange(27) < 3 * seen))
+    for seen in (3, 7):
+        some = np.flatnonzero(known & (np.arange(len(y)) < 3 * seen))
         rows = []
-        for row in (row for row in range(seen, 9) if row != 4):
+        for row in (row for row in range(seen, COUNT) if np.isfinite(data.y[row]).all()):
             at = np.arange(3 * row, 3 * row + 3)
             gain = np.linalg.solve(covariance[np.ix_(some, some)], covariance[np.ix_(some, at)]).T
             rows.append(stats.multivariate_normal.logpdf(
@@ -357,6 +365,24 @@ def test_densities_of_positions_are_those_of_a_gaussian(freely):
                 covariance[np.ix_(at, at)] - gain @ covariance[np.ix_(some, at)]))
         total += np.mean(rows)
     assert float(training.held_out(vector, data.regression, data.axes)) == pytest.approx(total, rel=1e-5)
+
+
+@pytest.mark.parametrize("slope", [training.slope_of_held_out, training.slope_of_log_likelihood])
+@pytest.mark.parametrize("logarithm", [400.0, np.inf, np.nan])
+def test_magnitudes_beyond_numbers_have_minus_infinity_and_zero_slopes(freely, slope, logarithm):
+    data, vector, _, _ = freely
+    value, found = slope(np.full_like(vector, logarithm), data.regression, data.axes)
+    assert value == -np.inf and (np.asarray(found) == 0.0).all()
+    value, found = slope(np.full_like(vector, -400.0), data.regression, data.axes)
+    assert np.isfinite(value) and np.isfinite(found).all()
+
+
+def test_a_matrix_without_a_root_has_no_density_and_zero_slopes(freely):
+    data, vector, _, _ = freely
+    wrong = data.regression._replace(noise=-data.noise)
+    for slope in (training.slope_of_held_out, training.slope_of_log_likelihood):
+        value, found = slope(vector, wrong, data.axes)
+        assert value == -np.inf and (np.asarray(found) == 0.0).all()
 
 
 @pytest.fixture(scope="module", params=["DYB", "RTN"])
@@ -367,7 +393,7 @@ def learning_from(request, satellite):
     positions[10] = np.nan
     one = one._replace(positions=positions)
     orbit = orbits.fit_orbit(one.environment, one.times[:one.train], one.positions[:one.train])
-    return training.training(one, orbit, axes), magnitudes.wide(axes).mean + 0.1
+    return training.Training.of(one, orbit, axes), magnitudes.wide(axes).mean + 0.1
 
 
 @pytest.mark.slow

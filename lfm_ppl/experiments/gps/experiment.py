@@ -13,8 +13,9 @@ import pandas as pd
 
 from lfm_ppl import checks, orbits
 from lfm_ppl.experiments import output, tasks
-from lfm_ppl.experiments.gps import figures, learning, magnitudes, prediction, problem, training, ways
+from lfm_ppl.experiments.gps import figures, learning, magnitudes, prediction, problem, ways
 from lfm_ppl.experiments.gps.figures import METRE, rms
+from lfm_ppl.experiments.gps.training import Training
 from lfm_ppl.experiments.scores import mean_of, pair
 from lfm_ppl.experiments.tasks import Result, Task
 
@@ -147,7 +148,7 @@ def _compute(kind: str, one: problem.Arc, task: Task) -> Result:
     prior = magnitudes.Prior(*map(np.array, asked["prior"]))
     if kind == "ways":
         return ways.compare(one, prediction.deterministic(one, orbit), asked["axes"], prior, task.key)
-    target = learning.held_out(training.training(one, orbit, asked["axes"]), prior)
+    target = learning.held_out(Training.of(one, orbit, asked["axes"]), prior)
     mode = target.mode(np.array(asked["alone"]))
     if kind == "online":
         return _online(one, orbit, mode, asked)
@@ -158,7 +159,7 @@ def _compute(kind: str, one: problem.Arc, task: Task) -> Result:
 def _learn(one: problem.Arc, axes: str) -> Result:
     orbit = orbits.fit_orbit(one.environment, one.times[:one.train], one.positions[:one.train])
     prediction.latest_orbit(one, one.train, orbit.solar)
-    target = learning.held_out(training.training(one, orbit, axes), magnitudes.wide(axes))
+    target = learning.held_out(Training.of(one, orbit, axes), magnitudes.wide(axes))
     return {"orbit": np.array([*orbit.state, orbit.solar, orbit.residual]), "logarithms": target.mode()}
 
 

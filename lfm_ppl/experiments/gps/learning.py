@@ -92,21 +92,19 @@ class Target(NamedTuple):
 
 def held_out(data: Training, prior: Prior) -> Target:
     """Return how well held-out positions are predicted, as a target."""
-    known = data.regression
-
-    def evidence(logarithms: np.ndarray) -> tuple[float, np.ndarray]:
-        value, gradient = slope_of_held_out(jnp.asarray(logarithms), known, data.axes)
-        return WEIGHT * float(value), WEIGHT * np.asarray(gradient)
-
-    return Target(evidence, prior)
+    return _target(slope_of_held_out, WEIGHT, data, prior)
 
 
 def likelihood(data: Training, prior: Prior) -> Target:
     """Return the log marginal likelihood of all positions of training, as a target."""
+    return _target(slope_of_log_likelihood, 1.0, data, prior)
+
+
+def _target(value_and_slope: Callable, weight: float, data: Training, prior: Prior) -> Target:
     known = data.regression
 
     def evidence(logarithms: np.ndarray) -> tuple[float, np.ndarray]:
-        value, gradient = slope_of_log_likelihood(jnp.asarray(logarithms), known, data.axes)
-        return float(value), np.asarray(gradient)
+        value, slope = value_and_slope(jnp.asarray(logarithms), known, data.axes)
+        return weight * float(value), weight * np.asarray(slope)
 
     return Target(evidence, prior)

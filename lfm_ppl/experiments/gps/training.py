@@ -6,14 +6,14 @@ and neither response depends on the magnitudes. So the positions, all in one vec
     y = m + O S s_0 + e,    s_0 ~ N(0, I),    e ~ N(0, sum_j q_j^2 K_j + NOISE^2 I),
 
 with m what the forces' means make, S the standard deviations at the start and q the noises. m, O and K_j come from the
-affine maps of the filter, once for a satellite; what follows is algebra with matrices of a few hundred rows, ten times
-as fast as the filter itself.
+affine maps of the filter. What follows is algebra with matrices of 3 T rows: six to ten times as fast as the filter for
+three days, as fast for nine, since it is cubic in T, and K, quadratic in it, takes 24 MB for the first and 215 for the
+second.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -26,7 +26,7 @@ from lfm_ppl.experiments.gps import magnitudes
 from lfm_ppl.experiments.gps.problem import NOISE, Arc
 from lfm_ppl.filtering.filter import forward
 from lfm_ppl.filtering.schedule import schedule
-from lfm_ppl.forces import Constant, Force, RandomWalk, Resonator
+from lfm_ppl.forces import Force, RandomWalk, Resonator
 from lfm_ppl.forces.sum import Sum
 from lfm_ppl.linalg import congruence, matmul, solve_lower
 from lfm_ppl.linearisation.taylor import Taylor
@@ -36,6 +36,8 @@ from lfm_ppl.model.observation import Gaussian, GaussianObservation
 
 _LONGEST = 0.5
 """Hours from one position to the next in learning; closer ones say the same."""
+_LARGEST = 60.0
+"""Logarithm of a magnitude that counts as infinite: a force of 1e26 nm/s^2."""
 _STEP = 0.25
 """Longest integration step of a departure (h): its error is 3e-3 of the departure after two days, a quarter of the
 step one of 3e-6."""
@@ -49,9 +51,11 @@ class Training(NamedTuple):
         times: (T,) hours.
         y: (T, 3) km, NaN where missing.
         axes: of the small forces.
-        mean: (3 T,), m: all positions where nothing is but the means of the forces.
-        start: (3 T, n), the response O of all positions to the joint state at the first time.
-        noise: (J, 3 T, 3 T), their covariances K by noise.
+        mean: (3 T,), m, the expected departures.
+        start: (3 T, n), the response O of all positions to the joint state at the first time: position and velocity,
+            the levels of all axes, then two states for each resonator.
+        noise: (J, 3 T, 3 T), covariances K_j of all positions by noises of size one: the white noise of the
+            acceleration, the drifts of the levels that have one, then the noise of each resonator.
     """
 
     near: orbits.Neighbourhood
@@ -61,6 +65,21 @@ class Training(NamedTuple):
     mean: jax.Array
     start: jax.Array
     noise: jax.Array
+
+    @classmethod
+    def of(cls, one: Arc, orbit: orbits.Orbit, axes: str) -> Training:
+        """Return the training of a satellite, thinned to half an hour from one position to the next."""
+        interval = float(one.times[1] - one.times[0])
+        thin = max(1, int(_LONGEST / interval + 1e-9))
+        times = one.times[:one.train:thin]
+        near = orbits.Neighbourhood.of(one.environment, orbit, times, axes, nodes=2 * steps_of(times))
+        y = one.positions[:one.train:thin] - np.asarray(near.path[:, :3])
+        return cls.along(near, times, y, axes)
+
+    @classmethod
+    def along(cls, near: orbits.Neighbourhood, times: np.ndarray, y: np.ndarray, axes: str) -> Training:
+        """Return the training on these departures y (T, 3)."""
+        return cls(near, times, y, axes, *_responses(near, times, axes))
 
     @property
     def regression(self) -> Regression:
@@ -76,16 +95,6 @@ class Regression(NamedTuple):
     y: jax.Array
 
 
-def training(one: Arc, orbit: orbits.Orbit, axes: str) -> Training:
-    """Return the training of a satellite, thinned to half an hour from one position to the next."""
-    interval = float(one.times[1] - one.times[0])
-    thin = max(1, int(_LONGEST / interval + 1e-9))
-    times = one.times[:one.train:thin]
-    near = orbits.Neighbourhood.of(one.environment, orbit, times, axes, nodes=2 * steps_of(times))
-    y = one.positions[:one.train:thin] - np.asarray(near.path[:, :3])
-    return Training(near, times, y, axes, *_responses(near, times, axes))
-
-
 def steps_of(times: np.ndarray, step: float = _STEP) -> int:
     """Return integration steps between two times."""
     return max(1, int(np.ceil((times[1] - times[0]) / step - 1e-9)))
@@ -97,41 +106,41 @@ def departing(logarithms: jax.Array, near: orbits.Neighbourhood, axes: str) -> L
     return orbits.departure(near, forces, white, NOISE)
 
 
-def _members(forces: dict[str, Force]) -> Iterator[tuple[int, Force]]:
-    """Yield the index of an axis and a force along it, a level or a resonator: all levels first."""
-    every = [(axis, one) for axis, force in enumerate(forces.values())
-             for one in (force.forces if isinstance(force, Sum) else (force,))]
-    yield from (pair for pair in every if not isinstance(pair[1], Resonator))
-    yield from (pair for pair in every if isinstance(pair[1], Resonator))
+class _Members(NamedTuple):
+    """The forces of which the small ones are sums, each with the index of its axis."""
+
+    levels: list[tuple[int, Any]]
+    resonators: list[tuple[int, Any]]
+
+
+def _members(forces: dict[str, Force]) -> _Members:
+    found = _Members([], [])
+    for axis, force in enumerate(forces.values()):
+        for one in force.forces if isinstance(force, Sum) else (force,):
+            (found.resonators if isinstance(one, Resonator) else found.levels).append((axis, one))
+    return found
 
 
 def scales(logarithms: jax.Array, axes: str) -> tuple[jax.Array, jax.Array]:
     """Return the standard deviations S (n,) at the first time, and the noises q (J,), in the order of `Training`."""
     forces, white = magnitudes.forces(logarithms, axes)
-    start, noise = [*np.repeat(orbits.START_SD, 3)], [white]
-    for _, force in _members(forces):
-        if isinstance(force, Resonator):
-            start, noise = [*start, force.scale, force.scale], [*noise, force.noise]
-        elif isinstance(force, RandomWalk):
-            start, noise = [*start, force.initial_sd], [*noise, force.scale]
-        elif isinstance(force, Constant):
-            start = [*start, force.scale]
-        else:
-            raise TypeError(f"a small force is a level or a resonator, got {type(force).__name__}.")
-    return jnp.stack(start), jnp.stack(noise)
+    levels, resonators = _members(forces)
+    start = [*np.repeat(orbits.START_SD, 3)]
+    start += [force.initial_sd if isinstance(force, RandomWalk) else force.scale for _, force in levels]
+    start += [force.scale for _, force in resonators for _ in range(2)]
+    drifts = [force.scale for _, force in levels if isinstance(force, RandomWalk)]
+    return jnp.stack(start), jnp.stack([white, *drifts, *(force.noise for _, force in resonators)])
 
 
 def _responses(near: orbits.Neighbourhood, times: np.ndarray, axes: str) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return m, O and K of `Training`: those of one force at a time, as forces do not see one another."""
-    members = list(_members(magnitudes.forces(jnp.asarray(magnitudes.wide(axes).mean), axes)[0]))
+    levels, resonators = _members(magnitudes.forces(jnp.asarray(magnitudes.wide(axes).mean), axes)[0])
     along = np.eye(len(near.on_orbit))
-    levels = [(axis, force) for axis, force in members if not isinstance(force, Resonator)]
-    resonators = [(axis, force) for axis, force in members if isinstance(force, Resonator)]
     fixed = tuple(times)
-    # The white noise goes with a level that has none: the first one, whose noise is taken out.
-    axis_of = along[[0, *(axis for axis, _ in levels)]]
-    quiet = np.array([0.0, *(1.0 for _ in levels)])
-    by_level, level_noise = _response(near, axis_of, None, quiet, 1.0 - quiet, fixed)
+    # White noise goes first, with a level that does not drift.
+    noises = np.array([0.0, *(1.0 for _ in levels)])
+    by_level, level_noise = _response(near, along[[0, *(axis for axis, _ in levels)]], None, noises, 1.0 - noises,
+                                      fixed)
     periods = np.array([float(force.period) for _, force in resonators])
     by_resonator, resonator_noise = _response(near, along[[axis for axis, _ in resonators]], periods,
                                               np.ones(len(periods)), np.zeros(len(periods)), fixed)
@@ -179,86 +188,102 @@ def _spread(system: LatentForceModel, times: np.ndarray) -> tuple[jax.Array, jax
     size, count = ssm.state_dim, len(times)
 
     def step(carry: tuple, row: tuple) -> tuple[tuple, tuple]:
-        flow, spread, cross = carry
-        phi, noise, observed = row
+        flow, spread, cross = carry  # cross: covariances of the state with all positions up to now
+        phi, noise, index = row
         flow, spread = matmul(phi, flow), congruence(phi, spread) + noise
-        cross = matmul(phi, cross.reshape(size, -1)).reshape(size, count, 3)
-        cross = cross.at[:, observed].set(spread[:, :3], mode="drop")
+        cross = matmul(phi, cross.reshape(size, -1)).reshape(size, count, 3).at[:, index].set(spread[:, :3])
         return (flow, spread, cross), (flow[:3], cross[:3])
 
-    observed = np.full(len(passed.log_likelihood), count)
-    observed[np.asarray(plan.observed)] = np.arange(count)
     first = (jnp.eye(size), jnp.zeros((size, size)), jnp.zeros((size, count, 3)))
-    _, (response, lower) = jax.lax.scan(step, first, (passed.phi, passed.noise, jnp.asarray(observed)))
-    rows = np.asarray(plan.observed)
-    lower = lower[rows].reshape(3 * count, 3 * count)  # zero above the diagonal blocks, which are whole
+    _, (response, lower) = jax.lax.scan(step, first, (passed.phi, passed.noise, jnp.arange(count)))
+    lower = lower.reshape(3 * count, 3 * count)  # zero above the diagonal blocks, which are whole
     late = np.repeat(np.arange(count), 3)
-    covariance = jnp.where(late[:, None] >= late[None, :], lower, lower.T)
-    return response[rows].reshape(3 * count, size), covariance
+    return response.reshape(3 * count, size), jnp.where(late[:, None] >= late[None, :], lower, lower.T)
 
 
 class _Whitened(NamedTuple):
-    """Some positions with the noise's covariance divided out: its root, and O S and y in its units."""
+    """Some entries of the positions with the noise's covariance divided out.
+
+    Attributes:
+        chol: root of the covariance.
+        present: which entries there are.
+        start: O S in units of the root.
+        y: and the entries.
+        usable: whether all of this can be computed; if not, it is that of other numbers.
+    """
 
     chol: jax.Array
+    present: jax.Array
     start: jax.Array
     y: jax.Array
+    usable: jax.Array
 
 
-def _noise_covariance(data: Regression, noise: jax.Array) -> jax.Array:
-    return jnp.tensordot(noise**2, data.noise, axes=1)
+def _root(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return the Cholesky factor, and whether there is one; if not, that of the identity, for finite gradients."""
+    usable = jnp.isfinite(jnp.linalg.cholesky(jax.lax.stop_gradient(matrix))).all()
+    return jnp.linalg.cholesky(jnp.where(usable, matrix, jnp.eye(len(matrix)))), usable
 
 
-def _whitened(data: Regression, covariance: jax.Array, start: jax.Array, count: int) -> tuple[_Whitened, jax.Array]:
-    """Whiten the first ``count`` entries of the positions; return also which of them there are."""
+def _moments(logarithms: jax.Array, data: Regression, axes: str) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return O S (3 T, n), the covariance of the noise (3 T, 3 T), and whether the magnitudes are numbers."""
+    usable = (logarithms < _LARGEST).all()
+    start, noise = scales(jnp.where(usable, logarithms, 0.0), axes)
+    return data.start * start, jnp.tensordot(noise**2, data.noise, axes=1), usable
+
+
+def _whitened(data: Regression, start: jax.Array, covariance: jax.Array, count: int) -> _Whitened:
+    """Whiten the first ``count`` entries of the positions."""
     y = data.y.ravel()[:count]
     present = jnp.isfinite(y)
     both = present[:, None] & present[None, :]
-    chol = jnp.linalg.cholesky(jnp.where(both, covariance[:count, :count] + NOISE**2 * jnp.eye(count), jnp.eye(count)))
-    known = jnp.concatenate([data.start[:count] * start, jnp.where(present, y, 0.0)[:, None]], axis=1)
+    chol, usable = _root(jnp.where(both, covariance[:count, :count], 0.0)
+                         + jnp.diag(jnp.where(present, NOISE**2, 1.0)))
+    known = jnp.concatenate([start[:count], jnp.where(present, y, 0.0)[:, None]], axis=1)
     solved = solve_triangular(chol, jnp.where(present[:, None], known, 0.0), lower=True)
-    return _Whitened(chol, solved[:, :-1], solved[:, -1]), present
+    return _Whitened(chol, present, solved[:, :-1], solved[:, -1], usable)
 
 
 def log_likelihood(logarithms: jax.Array, data: Regression, axes: str) -> jax.Array:
-    """Return the log density of all positions, -inf where it cannot be computed."""
-    start, noise = scales(logarithms, axes)
-    white, present = _whitened(data, _noise_covariance(data, noise), start, data.y.size)
-    root = jnp.linalg.cholesky(jnp.eye(len(start)) + white.start.T @ white.start)
-    state = _solve_twice(root, white.start.T @ white.y)
+    """Return the log density of all positions; -inf, with gradient zero, where it cannot be computed."""
+    start, covariance, usable = _moments(logarithms, data, axes)
+    white = _whitened(data, start, covariance, data.y.size)
+    root, found = _root(jnp.eye(start.shape[1]) + white.start.T @ white.start)
+    state = solve_triangular(root, solve_triangular(root, white.start.T @ white.y, lower=True), lower=True, trans=1)
     left = white.y - white.start @ state
     value = (-0.5 * (left @ left + state @ state) - jnp.log(jnp.diagonal(white.chol)).sum()
-             - jnp.log(jnp.diagonal(root)).sum() - 0.5 * present.sum() * jnp.log(2 * jnp.pi))
-    return jnp.where(jnp.isfinite(value), value, -jnp.inf)
+             - jnp.log(jnp.diagonal(root)).sum() - 0.5 * white.present.sum() * jnp.log(2 * jnp.pi))
+    return jnp.where(usable & white.usable & found, value, -jnp.inf)
 
 
 def held_out(logarithms: jax.Array, data: Regression, axes: str) -> jax.Array:
-    """Return the mean log density of a position that is predicted: from the first third, plus from two thirds."""
-    start, noise = scales(logarithms, axes)
-    covariance = _noise_covariance(data, noise)
+    """Return the mean log density of a position that is predicted: from the first third, plus from two thirds.
+
+    Where it cannot be computed it is -inf, with gradient zero.
+    """
+    start, covariance, usable = _moments(logarithms, data, axes)
     count = len(data.y)
     folds = count // 3, 2 * count // 3
-    white, present = _whitened(data, covariance, start, 3 * folds[-1])
+    white = _whitened(data, start, covariance, 3 * folds[-1])
     known = jnp.isfinite(data.y).all(axis=1)
     early = 3 * folds[0]
-    across = solve_triangular(white.chol, jnp.where(present[:, None], covariance[:3 * folds[-1], early:], 0.0),
+    across = solve_triangular(white.chol, jnp.where(white.present[:, None], covariance[:3 * folds[-1], early:], 0.0),
                               lower=True)
-    own = jnp.diagonal(covariance.reshape(count, 3, count, 3), axis1=0, axis2=2)  # (3, 3, T)
-    total = jnp.zeros(())
+    own = jnp.moveaxis(jnp.diagonal(covariance.reshape(count, 3, count, 3), axis1=0, axis2=2), 2, 0)
+    total, usable = jnp.zeros(()), usable & white.usable
     for seen in folds:  # what is seen first is whitened alike in both
         some = slice(None, 3 * seen)
-        later = across[some, 3 * seen - early:]
-        root = jnp.linalg.cholesky(jnp.eye(len(start)) + white.start[some].T @ white.start[some])
-        left = solve_triangular(root, (data.start[3 * seen:] * start - later.T @ white.start[some]).T, lower=True)
-        mean = later.T @ white.y[some] + left.T @ solve_triangular(root, white.start[some].T @ white.y[some],
-                                                                  lower=True)
+        later, first, y = across[some, 3 * seen - early:], white.start[some], white.y[some]
+        root, found = _root(jnp.eye(start.shape[1]) + first.T @ first)
+        left = solve_triangular(root, (start[3 * seen:] - later.T @ first).T, lower=True)
+        mean = later.T @ y + left.T @ solve_triangular(root, first.T @ y, lower=True)
         reduced, added = (part.reshape(-1, count - seen, 3) for part in (later, left))
-        spread = (jnp.moveaxis(own[:, :, seen:], 2, 0) - jnp.einsum("mti,mtj->tij", reduced, reduced)
+        spread = (own[seen:] - jnp.einsum("mti,mtj->tij", reduced, reduced)
                   + jnp.einsum("mti,mtj->tij", added, added))
         error = jnp.where(known[seen:, None], data.y[seen:], 0.0) - mean.reshape(-1, 3)
         density = jnp.where(known[seen:], log_density(error, spread), 0.0)
-        total = total + density.sum() / jnp.maximum(known[seen:].sum(), 1)
-    return total
+        total, usable = total + density.sum() / jnp.maximum(known[seen:].sum(), 1), usable & found
+    return jnp.where(usable & jnp.isfinite(total), total, -jnp.inf)
 
 
 def log_density(error: jax.Array, covariance: jax.Array) -> jax.Array:
@@ -267,10 +292,6 @@ def log_density(error: jax.Array, covariance: jax.Array) -> jax.Array:
     white = jax.vmap(solve_lower)(chol, error)
     return (-0.5 * (white**2).sum(1) - jnp.log(jnp.diagonal(chol, axis1=1, axis2=2)).sum(1)
             - 1.5 * jnp.log(2 * jnp.pi))
-
-
-def _solve_twice(root: jax.Array, right: jax.Array) -> jax.Array:
-    return solve_triangular(root, solve_triangular(root, right, lower=True), lower=True, trans=1)
 
 
 slope_of_log_likelihood: Any = functools.partial(jax.jit, static_argnums=(2,))(jax.value_and_grad(log_likelihood))

@@ -43,7 +43,7 @@ def compare(one: Arc, paths: prediction.Deterministic, axes: str, prior: Prior, 
     """Return error (km) after training and coverage of every way, each (W,)."""
     frame = problem.axes_of(paths.fitted)
     near = prediction.surroundings(one, paths.orbit, axes)
-    data = training.training(one, paths.orbit, axes)
+    data = Training.of(one, paths.orbit, axes)
     target = learning.held_out(data, prior)
     mode = target.mode()
     likelihood = learning.likelihood(data, prior).mode()
