@@ -1,6 +1,8 @@
 """Tasks that are stored one by one: resumed to the same numbers, never mixed with other settings."""
 
+import ctypes
 import os
+import platform
 import subprocess
 import sys
 import time
@@ -10,7 +12,7 @@ import jax
 import numpy as np
 import pytest
 
-from lfm_ppl.experiments.tasks import Task, available_cpus, duration, read, run_tasks, share, write
+from lfm_ppl.experiments.tasks import Task, _return_memory, available_cpus, duration, read, run_tasks, share, write
 
 
 def tasks(count=4, **settings):
@@ -68,7 +70,12 @@ def test_several_processes_find_the_same_numbers(tmp_path):
 
 
 def cpus(task):
-    time.sleep(1.0)  # so that every process gets one of the tasks
+    meeting = Path(task.settings["meeting"])  # of both processes, so that each gets one of the tasks
+    meeting.mkdir(exist_ok=True)
+    (meeting / str(os.getpid())).touch()
+    deadline = time.monotonic() + 120
+    while len(list(meeting.iterdir())) < 2 and time.monotonic() < deadline:
+        time.sleep(0.05)
     return {"process": os.getpid(), "cpus": np.array(sorted(os.sched_getaffinity(0))),
             "programs": jax.config.jax_compilation_cache_dir}
 
@@ -76,7 +83,7 @@ def cpus(task):
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="the system does not tell or take CPUs")
 def test_each_process_keeps_to_its_share_of_the_cpus(tmp_path):
     own = os.sched_getaffinity(0)
-    found = run_tasks(tasks(2), cpus, tmp_path, workers=2)
+    found = run_tasks(tasks(2, meeting=str(tmp_path / "meeting")), cpus, tmp_path, workers=2)
     shares = {int(one["process"]): one["cpus"].tolist() for one in found.values()}
     assert sorted(shares.values()) == sorted(share(own, number, 2) for number in range(2))
     assert os.sched_getaffinity(0) == own and available_cpus() == len(own)
@@ -88,7 +95,7 @@ def test_processes_share_a_folder_of_programs_where_there_is_none(tmp_path):
     own = jax.config.jax_compilation_cache_dir
     jax.config.update("jax_compilation_cache_dir", None)
     try:
-        found = run_tasks(tasks(2), cpus, tmp_path, workers=2)
+        found = run_tasks(tasks(2, meeting=str(tmp_path / "meeting")), cpus, tmp_path, workers=2)
     finally:
         jax.config.update("jax_compilation_cache_dir", own)
     (folder,) = {str(one["programs"]) for one in found.values()}
@@ -219,3 +226,26 @@ def test_progress_says_how_far_it_is(tmp_path):
 
 def test_durations():
     assert [duration(s) for s in (0.0, 99.0, 120.0, 7200.0)] == ["0.0 s", "99 s", "2 min", "2.0 h"]
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries are left alone")
+def test_freed_memory_goes_back_to_the_system():
+    """Small blocks below one that stays: the C library keeps them when they are freed."""
+    library = ctypes.CDLL("libc.so.6")
+    library.malloc.restype, library.free.argtypes = ctypes.c_void_p, [ctypes.c_void_p]
+    blocks = [library.malloc(4000) for _ in range(25_000)]
+    for block in blocks:
+        ctypes.memset(block, 1, 4000)
+    last = library.malloc(4000)
+    for block in blocks:
+        library.free(block)
+    before = resident()
+    _return_memory()
+    freed = before - resident()
+    library.free(last)
+    assert freed > 80e6
+
+
+def resident():
+    """Memory of this process in bytes."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
