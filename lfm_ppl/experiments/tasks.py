@@ -138,7 +138,7 @@ def _computed(tasks: list[Task], compute: Callable[[Task], Mapping[str, Any]], f
     """Compute and store the tasks; yield each when its file is there."""
     if workers <= 1:
         for task in tasks:
-            write(task, compute(task), folder, overwrite=True)
+            _compute_and_write(compute, task, folder)
             yield task
         return
     double = bool(jax.config.read("jax_enable_x64"))
