@@ -2,7 +2,6 @@
 
 import dataclasses
 from pathlib import Path
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from lfm_ppl.experiments import catalogue, scores, weighting
+from lfm_ppl.experiments import catalogue, scores
 from lfm_ppl.experiments.ballistic import (
     chains,
     experiment,
@@ -78,28 +77,6 @@ def test_particles_agree_with_the_gaussian_smoother_where_it_is_nearly_exact():
     off = ((found["mean"] - mean) / sd)[:, late]
     assert np.sqrt(np.mean(off**2)) < 4.0 / np.sqrt(200)
     np.testing.assert_allclose(found["sd"][:, late], sd[:, late], rtol=0.3)
-
-
-def test_weighted_draws_have_the_moments_of_their_density():
-    """A normal density found from a wrong mode and a wrong curvature."""
-    factor = np.array([[2.0, 0.0, 0.0], [0.5, 1.0, 0.0], [0.0, -0.3, 0.4]])
-    target = stats.multivariate_normal([1.0, -2.0, 3.0], factor @ factor.T)
-    mode = SimpleNamespace(point=target.mean + [1.0, 0.0, 0.2], curvature=SimpleNamespace(factor=0.8 * factor))
-    draws, found = weighting.weighted(target.logpdf, mode, 20_000, 0)
-    mean, covariance = parameters.moments(draws, np.exp(found.log_weight[0]))
-    assert found.k < 0.5 and found.ess > 10_000
-    variance = np.diag(target.cov)
-    np.testing.assert_array_less(np.abs(mean - target.mean), 4 * np.sqrt(variance / found.ess))
-    np.testing.assert_allclose(np.diag(covariance), variance, rtol=4 * np.sqrt(2 / found.ess))
-    with pytest.raises(ValueError, match="no curvature"):
-        weighting.weighted(target.logpdf, SimpleNamespace(point=mode.point, curvature=None), 10, 0)
-
-
-def test_weights_that_one_draw_has_do_not_end_the_search():
-    """A density far narrower than its curvature says: the second proposal must not be singular."""
-    mode = SimpleNamespace(point=np.zeros(3), curvature=SimpleNamespace(factor=np.eye(3)))
-    draws, found = weighting.weighted(lambda z: -0.5 * ((z - 3.0) ** 2).sum(axis=1) / 1e-8, mode, 50, 0)
-    assert np.isfinite(draws).all() and found.k > 0.7
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ import pytest
 from scipy import integrate, special, stats
 
 import lfm_ppl as lfm
-from lfm_ppl.experiments import catalogue, scores
+from lfm_ppl.experiments import catalogue, scores, weighting
 from lfm_ppl.experiments.call_centre import counts, experiment, figures, posterior, problem, report, tables, tracking
 from lfm_ppl.experiments.tasks import write
 
@@ -165,6 +165,30 @@ def test_the_gradient_is_that_of_finite_differences():
     assert -learnt.log_likelihood < tracking.energy(method, one.training, 0.0)(z)[0]
 
 
+def test_searches_from_several_starts_find_several_modes(monkeypatch):
+    """Three wells, one of them far higher than the others."""
+    method = problem.Method("sqm")
+    starts = np.log([[start[name] for name in method.names] for start in tracking.STARTS])
+    wells, depth = starts + 0.05, np.array([3.0, -2.0, 30.0])
+
+    def energy(method, y, prior):
+        def value_and_gradient(z):
+            k = np.argmin(((z - wells) ** 2).sum(axis=1))
+            return 20 * ((z - wells[k]) ** 2).sum() + depth[k] + prior, 40 * (z - wells[k])
+
+        return value_and_gradient
+
+    monkeypatch.setattr(tracking, "energy", energy)
+    found = tracking.modes(method, np.zeros((63, 1)), prior=1.0)
+    np.testing.assert_allclose([one.z for one in found], wells[[1, 0]], atol=1e-4)
+    assert [one.log_likelihood for one in found] == pytest.approx([1.0, -4.0])
+    best = tracking.learn(method, np.zeros((63, 1)))
+    np.testing.assert_array_equal(best.z, found[0].z)
+    assert best.log_likelihood == pytest.approx(2.0) and best.evaluations > sum(one.evaluations for one in found)
+    depth[:], wells[:] = 0.0, wells[0]
+    assert len(tracking.modes(method, np.zeros((63, 1)))) == 1
+
+
 def made_up(settings):
     """Results of every task: bands that hold all, and errors that follow from the method."""
     one, results = window(), {}
@@ -193,6 +217,7 @@ def made_up(settings):
                       "evaluations": np.full(settings.days, 40), "seconds": np.full(settings.days, 2.0)}
         else:
             found |= {"k": np.full(settings.days, 0.3), "ess": np.full(settings.days, 90.0),
+                      "modes": np.arange(1, settings.days + 1), "beyond": 0.2 * np.arange(settings.days),
                       "posterior_mean": np.zeros((settings.days, len(names))),
                       "posterior_sd": np.ones((settings.days, len(names))),
                       "shapes": np.append(0, one.arrivals), "shapes_sd": np.ones(one.queues["constant"].shape)}
@@ -239,6 +264,7 @@ def test_the_tables_hold_what_was_found():
     gain = tables.gain(MADE, results)
     assert gain.loc["SQM, changed", "gain"] == pytest.approx(11.0) and gain.loc["SQM, constant", "days"] == 1.0
     assert gain.loc["SQM, constant", "RMSE ratio"] == pytest.approx(0.9)
+    assert gain.loc["SQM, changed", ["several modes", "beyond"]].tolist() == pytest.approx([2 / 3, 0.4])
     agreement = tables.agreement(MADE, results).loc["SQM"]
     assert agreement["windows"] == 2 and agreement["means apart (sd)"] == pytest.approx(0.125)
     assert agreement["ratio of sds"] == pytest.approx(1.25)
@@ -325,44 +351,72 @@ def test_the_quick_version_runs_from_end_to_end(tmp_path):
     assert len(found.tables) == 5
 
 
+BOTH = experiment.Settings(days=4, methods=("SQM",), functions=5, draws=2_000, mixed=5, nuts_days=4, nuts=(2, 300, 700))
+"""Weighted draws and NUTS, on simulated days."""
+
+
 @pytest.mark.slow
 def test_nuts_and_weighted_draws_have_the_same_posterior():
-    """Two samplers that share the density and the mode about which they start, on one window."""
-    settings = experiment.Settings(days=1, methods=("SQM",), functions=5, draws=1_000, mixed=5, nuts_days=1,
-                                   nuts=(2, 300, 700))
-    found = posterior.compute_nuts(posterior.nuts_tasks(settings)[0])
-    weighted = posterior.compute(posterior.tasks(settings)[0])
+    """Two samplers that share the density and the modes about which they start, on the fourth window, which has one."""
+    task = posterior.nuts_tasks(BOTH)[3]
+    method, (one,) = tracking.method_of(task), tracking.windows_of(task)
+    draws, weights, mass = posterior.posterior(method, one.training, BOTH.draws, BOTH.seed)
+    assert len(mass) == 1 and weights.reliable
+    mean, covariance = weighting.moments(draws, np.exp(weights.log_weight[0]))
+    found = posterior.compute_nuts(task)
     assert found["divergences"] == 0 and found["r_hat"].max() < 1.02
-    error = np.sqrt(1 / found["ess"] + 1 / weighted["ess"])
-    assert (np.abs(found["mean"] - weighted["posterior_mean"][0]) < 4 * error * found["sd"]).all()
-    np.testing.assert_allclose(found["sd"], weighted["posterior_sd"][0], rtol=4 * error.max())
+    error = np.sqrt(1 / found["ess"] + 1 / weights.ess)
+    assert error.max() < 0.1
+    assert (np.abs(found["mean"] - mean) < 4 * error * found["sd"]).all()
+    np.testing.assert_allclose(found["sd"], np.sqrt(np.diag(covariance)), rtol=4 * error.max())
+
+
+def with_two_modes(count):
+    """The method, the training and weighted draws of the first window, which of them lie about its second mode, and
+    where that begins: it is one of small noises and short memories."""
+    task = posterior.nuts_tasks(BOTH)[0]
+    method, (one,) = tracking.method_of(task), tracking.windows_of(task)
+    draws, weights, mass = posterior.posterior(method, one.training, count, BOTH.seed)
+    assert len(mass) == 2 and weights.reliable
+    noise = method.names.index("noise_sd")
+    edge = 0.5 * sum(mode.point[noise] for mode in posterior.modes(method, one.training))
+    return method, one.training, draws, np.exp(weights.log_weight[0]), noise, edge
+
+
+@pytest.mark.slow
+def test_weighted_draws_see_a_second_mode():
+    """Its share of the posterior, against draws of one wide proposal over both modes."""
+    method, y, draws, weight, noise, edge = with_two_modes(4_000)
+    below = draws[:, noise] < edge
+    share = weight[below].sum()
+    error = np.sqrt((weight**2 * (below - share) ** 2).sum())
+
+    first, second = posterior.modes(method, y)
+    scale = np.abs(first.point - second.point) / 2 + np.linalg.norm(first.curvature.factor, axis=1)
+    wide = stats.multivariate_t(0.5 * (first.point + second.point), np.diag(scale**2), df=5)
+    others = wide.rvs(12_000, random_state=1)
+    log_ratio = np.asarray(posterior._densities(method)(jnp.asarray(others), jnp.asarray(y))) - wide.logpdf(others)
+    log_ratio = np.where(np.isfinite(log_ratio), log_ratio, -np.inf)
+    plain, there = np.exp(log_ratio - special.logsumexp(log_ratio)), others[:, noise] < edge
+    expected = plain[there].sum()
+    apart = np.hypot(error, np.sqrt((plain**2 * (there - expected) ** 2).sum()))
+    assert abs(share - expected) < 4 * apart and apart < share / 2
 
 
 @pytest.mark.slow
 def test_nuts_and_weighted_draws_agree_about_the_first_mode():
-    """Two samplers that share the density and the mode about which they start, on one window.
-
-    The posterior has a second mode with about 1% of it (by importance sampling from both), of small noises and short
-    memories. Weighted draws do not see it; NUTS stays there for hundreds of draws, so that these chains cannot tell its
-    share. They agree about the first one.
-    """
-    settings = experiment.Settings(days=1, methods=("SQM",), functions=5, draws=2_000, mixed=5, nuts_days=1,
-                                   nuts=(2, 300, 700))
-    task = posterior.nuts_tasks(settings)[0]
-    found = posterior.compute_nuts(task)
-    method, (one,) = tracking.method_of(task), tracking.windows_of(task)
-    noise = method.names.index("noise_sd")
-    elsewhere = found["draws"][noise] < 0.75
-    assert elsewhere.mean() < 0.6
+    """NUTS comes to the second one by chance, and then stays for a hundred draws: it cannot tell how much is there."""
+    _, _, draws, weight, noise, edge = with_two_modes(4_000)
+    draws, own = draws[draws[:, noise] > edge], weight[draws[:, noise] > edge]
+    own = own / own.sum()
+    mean, covariance = weighting.moments(draws, own)
+    sd = np.sqrt(np.diag(covariance))
+    found = posterior.compute_nuts(posterior.nuts_tasks(BOTH)[0])
+    elsewhere = found["draws"][noise] < edge
+    assert elsewhere.mean() < 0.5
     chain = found["draws"][:, ~elsewhere]
-    draws, weights = posterior.posterior(method, one.training, settings.draws, settings.seed)
-    weight = np.exp(weights.log_weight[0]) * (draws[:, noise] > 0.75)
-    assert weight.sum() > 0.98
-    weight = weight / weight.sum()
-    mean = weight @ draws
-    sd = np.sqrt(weight @ (draws - mean) ** 2)
-    ess = scores.diagnose(method.names, chain[:, None])["ess"]
-    error = np.sqrt(1 / ess + (weight**2).sum())
+    ess = scores.diagnose(list("abcde"), chain[:, None])["ess"]
+    error = np.sqrt(1 / ess + (own**2).sum())
     assert error.max() < 0.1
     assert (np.abs(chain.mean(axis=1) - mean) < 4 * error * sd).all()
     np.testing.assert_allclose(chain.std(axis=1), sd, rtol=4 * error.max())

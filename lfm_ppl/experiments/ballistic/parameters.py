@@ -98,9 +98,9 @@ def estimate(target: problem.Target, count: int, paths: int, seed: int) -> Resul
 
     def search() -> tuple[Minimum, Weighted]:
         mode, likely = (_minimum(target.y, weight) for weight in (1.0, 0.0))
-        return likely, weighted(lambda draws: np.asarray(densities(jnp.asarray(draws), y)), mode, count, seed)
+        return likely, weighted(lambda draws: np.asarray(densities(jnp.asarray(draws), y)), [mode], count, seed)
 
-    seconds, (likely, (draws, weights)) = timed(search)
+    seconds, (likely, (draws, weights, _)) = timed(search)
     weight = np.exp(weights.log_weight[0])
     mean, sd = moments(draws, weight)[0], np.sqrt(np.diag(moments(draws, weight)[1]))
     chosen = draws[importance.resample(weights.log_weight, paths, seed)]

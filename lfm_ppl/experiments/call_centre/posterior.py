@@ -1,7 +1,8 @@
 """The parameters integrated out: the posterior given the training, and what it adds to the most likely parameters.
 
-Draws of the posterior of the logarithms z under the model's priors are weighted draws, see
-`lfm_ppl.experiments.weighting`; of the first windows there are those of NUTS, too, which they must agree with. Each
+Draws of the posterior of the logarithms z under the model's priors are weighted draws about all modes that are found,
+see `lfm_ppl.experiments.weighting`; of the first windows there are those of NUTS, too, which they must agree with where
+there is one mode (chains are far too short to tell how much of the posterior is about each of several). Each draw
 tracks the test day; the estimates of all, mixed, stand for the prediction.
 """
 
@@ -54,7 +55,8 @@ def compute(task: Task) -> Result:
     """Return what the posterior says of all windows.
 
     Returns:
-        ``k``, the Pareto index, and ``ess`` of the weights (N,), ``posterior_mean`` and ``posterior_sd`` of z (N, P);
+        ``k``, the Pareto index, and ``ess`` of the weights, the number of ``modes`` and the share of the posterior
+        ``beyond`` the highest of them (N,), ``posterior_mean`` and ``posterior_sd`` of z (N, P);
         for both tests, with its name before it, the entries of `judge` (N,); for the first window the smoothed
         arrivals ``shapes`` and ``shapes_sd`` (673,), given all readings, at the most likely parameters.
     """
@@ -62,10 +64,11 @@ def compute(task: Task) -> Result:
     rows: list[dict[str, Any]] = []
     first: Result = {}
     for index, one in enumerate(tracking.windows_of(task)):
-        (draws, weights) = posterior(method, one.training, task.settings["draws"], task.seed + index)
+        draws, weights, mass = posterior(method, one.training, task.settings["draws"], task.seed + index)
         weight = np.exp(weights.log_weight[0])
         mean = weight @ draws
         row: dict[str, Any] = {"k": float(np.ravel(weights.k)[0]), "ess": float(np.ravel(weights.ess)[0]),
+                               "modes": len(mass), "beyond": 1.0 - float(mass[0]),
                                "posterior_mean": mean, "posterior_sd": np.sqrt(weight @ (draws - mean) ** 2)}
         chosen = draws[importance.resample(weights.log_weight, task.settings["mixed"], task.seed + index)]
         rows.append(row | _judged(method, chosen, one))
@@ -103,7 +106,7 @@ def _judged(method: Method, several: np.ndarray, one: Window) -> dict[str, float
 
 
 def posterior(method: Method, y: np.ndarray, count: int, seed: int) -> Weighted:
-    """Return weighted draws (count, P) of z.
+    """Return weighted draws (count, P) of z, about all modes that are found.
 
     Args:
         method: the model of the arrivals.
@@ -111,13 +114,20 @@ def posterior(method: Method, y: np.ndarray, count: int, seed: int) -> Weighted:
         count: draws that are weighted.
         seed: of them.
     """
-    learnt = tracking.learn(method, y, prior=1.0)
+    density, given = _densities(method), jnp.asarray(y)
+    return weighted(lambda draws: np.asarray(density(jnp.asarray(draws), given)), modes(method, y), count, seed)
+
+
+def modes(method: Method, y: np.ndarray) -> list[Minimum]:
+    """Return the modes of the posterior with their curvature, the highest first; arguments as `posterior`."""
     value_and_gradient = tracking.energy(method, y, 1.0)
-    hessian = finite_difference_hessian(lambda z: value_and_gradient(z)[1], learnt.z)
-    value, gradient = value_and_gradient(learnt.z)
-    mode = Minimum(learnt.z, value, decompose(hessian, _NOISE), 0.0, np.zeros_like(learnt.z), gradient)
-    density = _densities(method)
-    return weighted(lambda draws: np.asarray(density(jnp.asarray(draws), jnp.asarray(y))), mode, count, seed)
+
+    def with_curvature(point: np.ndarray) -> Minimum:
+        hessian = finite_difference_hessian(lambda z: value_and_gradient(z)[1], point)
+        value, gradient = value_and_gradient(point)
+        return Minimum(point, value, decompose(hessian, _NOISE), 0.0, np.zeros_like(point), gradient)
+
+    return [with_curvature(one.z) for one in tracking.modes(method, y, prior=1.0)]
 
 
 @functools.cache

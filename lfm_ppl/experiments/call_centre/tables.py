@@ -70,7 +70,8 @@ def gain(settings: Any, results: dict[str, Result]) -> pd.DataFrame:
     Returns:
         The gain in log density of a day's queue, ``days`` the share of days on which there is one, the RMSE as a share
         of that of the most likely parameters, both coverages; the largest Pareto index and the least effective number
-        of the weighted draws.
+        of the weighted draws; the share of days whose posterior has ``several modes``, and the largest share of a
+        posterior ``beyond`` its highest mode.
     """
     found, rows = by_method(settings, results), {}
     for method, test in itertools.product(settings.integrated, ("constant", "changed")):
@@ -81,7 +82,8 @@ def gain(settings: Any, results: dict[str, Result]) -> pd.DataFrame:
             "RMSE ratio": float(whole[f"{test}_rmse"].mean() / plain[f"{test}_rmse"].mean()),
             "coverage, most likely": float(plain[f"{test}_coverage"].mean()),
             "coverage, integrated": float(whole[f"{test}_coverage"].mean()),
-            "k": float(np.max(whole["k"])), "least ESS": float(np.min(whole["ess"]))}
+            "k": float(np.max(whole["k"])), "least ESS": float(np.min(whole["ess"])),
+            "several modes": float(np.mean(whole["modes"] > 1)), "beyond": float(np.max(whole["beyond"]))}
     return pd.DataFrame.from_dict(rows, orient="index")
 
 

@@ -36,8 +36,19 @@ LIMITS = {"mean": (1.0, 30.0), "scale": (0.1, 30.0), "lengthscale": (10.0, 10_00
           "noise_sd": (0.01, 5.0)}
 """Parameter -> least and largest value."""
 
-START = {"mean": 6.0, "scale": 2.0, "lengthscale": 150.0, "memory": 10.0, "noise_sd": 2.0}
-"""Where the search starts. From a small noise it gets lost where cycles differ more than a model allows."""
+STARTS = (
+    {"mean": 6.0, "scale": 2.0, "lengthscale": 150.0, "memory": 10.0, "noise_sd": 2.0},
+    {"mean": 4.0, "scale": 3.5, "lengthscale": 220.0, "memory": 1.0, "noise_sd": 1.5},
+    {"mean": 7.0, "scale": 1.3, "lengthscale": 110.0, "memory": 60.0, "noise_sd": 1.0},
+)
+"""Where searches start: cycles somewhat alike, hardly alike, and nearly the same. From a small noise a search gets lost
+where cycles differ more than a model allows."""
+
+SAME = 0.1
+"""Ends of searches that differ by less than this in every logarithm are the same mode."""
+
+FAR = 7.0
+"""Modes that are so much lower in log density than the highest are left out: below a thousandth of it."""
 
 STEPS = 3
 """Integration steps in five minutes, about as long as those of the model file."""
@@ -46,7 +57,7 @@ _SEARCH = {"ftol": 1e-7, "gtol": 1e-3, "maxfun": 60}
 
 
 class Learnt(NamedTuple):
-    """The most likely parameters.
+    """A mode, the most likely parameters most of all.
 
     Attributes:
         z: (P,) their logarithms.
@@ -60,18 +71,37 @@ class Learnt(NamedTuple):
 
 
 def learn(method: Method, y: np.ndarray, prior: float = 0.0) -> Learnt:
-    """Return the most likely parameters within `LIMITS`.
+    """Return the most likely parameters within `LIMITS`, with the evaluations of all searches; arguments as `modes`."""
+    found = _searches(method, y, prior)
+    return found[0]._replace(evaluations=sum(one.evaluations for one in found))
+
+
+def modes(method: Method, y: np.ndarray, prior: float = 0.0) -> list[Learnt]:
+    """Return the different modes within `LIMITS` that searches from `STARTS` find, the highest first.
 
     Args:
         method: the model of the arrivals.
         y: (63, 1) logarithms of the readings of the training.
-        prior: 0 for the maximum of the likelihood, 1 for that of the posterior of z.
+        prior: 0 for maxima of the likelihood, 1 for those of the posterior density of z.
     """
+    found = _searches(method, y, prior)
+    kept: list[Learnt] = []
+    for one in found:
+        high = found[0].log_likelihood - one.log_likelihood < FAR
+        if high and all(np.abs(one.z - other.z).max() > SAME for other in kept):
+            kept.append(one)
+    return kept
+
+
+def _searches(method: Method, y: np.ndarray, prior: float) -> list[Learnt]:
+    """Return the ends of all searches, the highest first."""
     low, high = np.log([LIMITS[name] for name in method.names]).T
-    value_and_gradient = energy(method, y, prior)
-    found = optimize.minimize(value_and_gradient, np.log([START[name] for name in method.names]), jac=True,
-                              method="L-BFGS-B", bounds=list(zip(low, high, strict=True)), options=_SEARCH)
-    return Learnt(found.x, -float(found.fun), int(found.nfev))
+    value_and_gradient, found = energy(method, y, prior), []
+    for start in STARTS:
+        one = optimize.minimize(value_and_gradient, np.log([start[name] for name in method.names]), jac=True,
+                                method="L-BFGS-B", bounds=list(zip(low, high, strict=True)), options=_SEARCH)
+        found.append(Learnt(one.x, -float(one.fun), int(one.nfev)))
+    return sorted(found, key=lambda one: -one.log_likelihood)
 
 
 def energy(method: Method, y: np.ndarray, prior: float) -> Callable[[np.ndarray], tuple[float, np.ndarray]]:

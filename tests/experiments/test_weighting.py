@@ -1,0 +1,82 @@
+"""Weighted draws about one mode and about several."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy import special, stats
+
+from lfm_ppl.experiments import weighting
+
+
+def test_weighted_draws_have_the_moments_of_their_density():
+    """A normal density found from a wrong mode and a wrong curvature."""
+    factor = np.array([[2.0, 0.0, 0.0], [0.5, 1.0, 0.0], [0.0, -0.3, 0.4]])
+    target = stats.multivariate_normal([1.0, -2.0, 3.0], factor @ factor.T)
+    mode = SimpleNamespace(point=target.mean + [1.0, 0.0, 0.2], curvature=SimpleNamespace(factor=0.8 * factor))
+    draws, found, _ = weighting.weighted(target.logpdf, [mode], 20_000, 0)
+    mean, covariance = weighting.moments(draws, np.exp(found.log_weight[0]))
+    assert found.k < 0.5 and found.ess > 10_000
+    variance = np.diag(target.cov)
+    np.testing.assert_array_less(np.abs(mean - target.mean), 4 * np.sqrt(variance / found.ess))
+    np.testing.assert_allclose(np.diag(covariance), variance, rtol=4 * np.sqrt(2 / found.ess))
+    with pytest.raises(ValueError, match="no curvature"):
+        weighting.weighted(target.logpdf, [SimpleNamespace(point=mode.point, curvature=None)], 10, 0)
+
+
+def test_weights_that_one_draw_has_do_not_end_the_search():
+    """A density far narrower than its curvature says: the second proposal must not be singular."""
+    mode = SimpleNamespace(point=np.zeros(3), curvature=SimpleNamespace(factor=np.eye(3)))
+    draws, found, _ = weighting.weighted(lambda z: -0.5 * ((z - 3.0) ** 2).sum(axis=1) / 1e-8, [mode], 50, 0)
+    assert np.isfinite(draws).all() and found.k > 0.7
+
+
+SHARE = 0.03
+FIRST = stats.multivariate_normal([0.0, 0.0], np.diag([1.0, 0.04]))
+SECOND = stats.multivariate_normal([9.0, 2.0], [[0.3, -0.2], [-0.2, 0.5]])
+
+
+def two_modes(z):
+    """Logarithm of 7.5 times a density with a small second mode, far from the first."""
+    parts = [np.log(1 - SHARE) + FIRST.logpdf(z), np.log(SHARE) + SECOND.logpdf(z)]
+    return special.logsumexp(parts, axis=0) + np.log(7.5)
+
+
+def modes(*parts, wrong=1.3):
+    """Modes at the means of normal densities, their curvature off by a factor."""
+    return [SimpleNamespace(point=part.mean, curvature=SimpleNamespace(factor=wrong * np.linalg.cholesky(part.cov)))
+            for part in parts]
+
+
+def test_a_small_second_mode_has_its_share():
+    draws, found, mass = weighting.weighted(two_modes, modes(FIRST, SECOND), 6_000, 0)
+    weight = np.exp(found.log_weight[0])
+    second = draws[:, 0] > 5
+    # It gets some of the draws whatever its share, which is therefore known better than by draws of the density.
+    assert draws.shape == (6_000, 2) and second.mean() == pytest.approx(0.1 / 1.07, rel=0.1)
+    share = weight[second].sum()
+    error = np.sqrt((weight**2 * (second - share) ** 2).sum())
+    assert abs(share - SHARE) < 4 * error < SHARE / 4
+    np.testing.assert_allclose(mass, [1 - share, share], atol=1e-4)
+    mean, covariance = weighting.moments(draws[second], weight[second] / share)
+    ess = share**2 / (weight[second] ** 2).sum()
+    assert found.reliable and ess > 300
+    np.testing.assert_array_less(np.abs(mean - SECOND.mean), 4 * np.sqrt(np.diag(SECOND.cov) / ess))
+    np.testing.assert_allclose(np.diag(covariance), np.diag(SECOND.cov), rtol=4 * np.sqrt(2 / ess))
+
+
+def test_a_mode_that_is_not_given_is_not_seen():
+    """The limitation that is documented: not even the Pareto index tells."""
+    draws, found, _ = weighting.weighted(two_modes, modes(FIRST), 2_000, 0)
+    assert found.k < 0.5 and np.exp(found.log_weight[0])[draws[:, 0] > 5].sum() < SHARE / 10
+
+
+@pytest.mark.parametrize("where", [[40.0, 0.0], [0.1, 0.05]])
+def test_what_is_no_mode_does_no_harm(where):
+    """A second point without mass about it, where the density underflows; and the same mode given twice."""
+    other = stats.multivariate_normal(where, FIRST.cov)
+    draws, found, _ = weighting.weighted(FIRST.logpdf, modes(FIRST, other), 4_000, 0)
+    mean, covariance = weighting.moments(draws, np.exp(found.log_weight[0]))
+    assert found.reliable and found.ess > 1_000
+    np.testing.assert_array_less(np.abs(mean), 4 * np.sqrt(np.diag(FIRST.cov) / found.ess))
+    np.testing.assert_allclose(np.diag(covariance), np.diag(FIRST.cov), rtol=4 * np.sqrt(2 / found.ess))
