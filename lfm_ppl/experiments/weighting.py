@@ -4,7 +4,8 @@ With several modes the proposal is the mixture of one t distribution about each,
 
     q(z) = sum_k (n_k / n) t_k(z),    w_i proportional to p(z_i) / q(z_i),
 
-and n_k of the n draws come from the k-th. A mode that is not given and lies far from those that are is not seen,
+and n_k of the n draws come from the k-th. How much of the posterior is about each mode say the masses m_k with which
+sum_k m_k t_k fits the weighted draws best. A mode that is not given and lies far from those that are is not seen,
 neither in the draws nor in the Pareto index of their weights.
 """
 
@@ -29,6 +30,12 @@ LEAST_SHARE = 0.1
 """A mode gets at least this share of the draws, before shares are made to sum to one: how much of the posterior is
 there has to be learnt from them."""
 
+LEAST_MASS = 1e-3
+"""With less of the posterior about a mode its t distribution stays as it was: draws there say nothing of moments."""
+
+_ITERATIONS = 100
+"""In which masses are fitted. They settle in a few, unless t distributions overlap so much that masses mean little."""
+
 _LEAST = 0.01
 """Share of the first covariance that is added to the weighted one: a few draws with all the weight make it singular."""
 
@@ -39,7 +46,8 @@ class Weighted(NamedTuple):
     Attributes:
         draws: (D, P).
         weights: their importance weights.
-        mass: (K,) share of the posterior about each mode; sums to one.
+        mass: (K,) share of the posterior about each mode, as far as their t distributions can be told apart; sums to
+            one.
     """
 
     draws: np.ndarray
@@ -59,11 +67,11 @@ def weighted(log_density: Callable[[np.ndarray], np.ndarray], modes: Sequence[Mi
         seed: of the draws.
 
     Raises:
-        ValueError: there is no curvature at any mode.
+        ValueError: there is no curvature at any mode; no draw has a density.
     """
     used = [mode for mode in modes if mode.curvature is not None]
     if not used:
-        raise ValueError("the posterior has no curvature at its mode; its derivatives there are not finite.")
+        raise ValueError("the posterior has no curvature at a mode; its derivatives there are not finite.")
     generator = np.random.default_rng(seed)
     about = [(mode.point, mode.curvature.factor @ mode.curvature.factor.T) for mode in used]
     sizes = np.full(len(used), max(count // 3, 30))
@@ -75,27 +83,39 @@ def weighted(log_density: Callable[[np.ndarray], np.ndarray], modes: Sequence[Mi
         log_proposal = special.logsumexp(parts, axis=0)
         log_ratio = log_density(draws) - log_proposal
         weights = importance.smooth(np.where(np.isfinite(log_ratio), log_ratio, -np.inf)[None])
-        # Each draw counts for a mode as far as its proposal made it.
-        weight = np.exp(weights.log_weight[0] + parts - log_proposal)
-        mass = weight.sum(axis=1)
-        about = [_next(draws, own, *one) for own, one in zip(weight, about, strict=True)]
+        mass, belongs = _masses(np.exp(weights.log_weight[0]), parts - np.log(sizes / sizes.sum())[:, None])
+        about = [_next(draws, own, *one) for own, one in zip(belongs, about, strict=True)]
         share = np.maximum(mass, LEAST_SHARE)
         sizes = _shared_out(count, share / share.sum())
     return Weighted(draws, weights, mass)
 
 
+def _masses(weight: np.ndarray, log_t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return masses (K,) of the mixture that fits best, by expectation maximisation, and parts of the weights (K, D).
+
+    Args:
+        weight: (D,) of the draws.
+        log_t: (K, D) log densities of the parts of the mixture.
+    """
+    mass = np.full(len(log_t), 1.0 / len(log_t))
+    for _ in range(_ITERATIONS if len(log_t) > 1 else 1):
+        belongs = weight * special.softmax(log_t + np.log(np.maximum(mass, 1e-300))[:, None], axis=0)
+        mass = belongs.sum(axis=1)
+    return mass, belongs
+
+
 def _next(draws: np.ndarray, weight: np.ndarray, centre: np.ndarray,
           covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the weighted moments, with a little of the covariance of before; as before where nothing has weight."""
-    if not weight.sum() > 0:
+    """Return the weighted moments, with a little of the covariance of before; all as before where weights are tiny."""
+    if weight.sum() < LEAST_MASS:
         return centre, covariance
     mean, spread = moments(draws, weight / weight.sum())
     return mean, spread + _LEAST * covariance
 
 
 def _shared_out(count: int, share: np.ndarray) -> np.ndarray:
-    """Return positive integers (K,) that sum to ``count`` where it is large enough, by shares (K,) that sum to one."""
-    return np.maximum(np.diff(np.round(count * np.append(0.0, np.cumsum(share)))).astype(int), 1)
+    """Return positive integers (K,) that sum to ``count``, or K, by shares (K,) that sum to one."""
+    return 1 + np.diff(np.round(max(count - len(share), 0) * np.append(0.0, np.cumsum(share)))).astype(int)
 
 
 def moments(draws: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -187,6 +187,29 @@ def test_searches_from_several_starts_find_several_modes(monkeypatch):
     assert best.log_likelihood == pytest.approx(2.0) and best.evaluations > sum(one.evaluations for one in found)
     depth[:], wells[:] = 0.0, wells[0]
     assert len(tracking.modes(method, np.zeros((63, 1)))) == 1
+    wall = (tracking._WALL, np.zeros(len(method.names)))
+    monkeypatch.setattr(tracking, "energy", lambda *_: lambda z: wall)
+    with pytest.raises(ValueError, match="not finite wherever a search for the parameters of sqm starts"):
+        tracking.learn(method, np.zeros((63, 1)))
+
+
+def test_a_lower_mode_without_curvature_is_none(monkeypatch):
+    """The second of three lies on a saddle; where the gradient about the third is not a number, it is left out, too."""
+    method = problem.Method("matern")
+    points = [np.full(4, value) for value in (0.0, 3.0, 6.0)]
+
+    def value_and_gradient(z):
+        k = int(np.argmin([np.abs(z - point).max() for point in points]))
+        signs = np.array([1.0, 1.0, 1.0, -1.0 if k == 1 else 1.0]) * (np.nan if k == 2 else 1.0)
+        return 0.5 * signs @ (z - points[k]) ** 2, signs * (z - points[k])
+
+    monkeypatch.setattr(tracking, "energy", lambda *_: value_and_gradient)
+    for order, kept in (([0, 1, 2], [0]), ([1, 0, 2], [1, 0])):
+        monkeypatch.setattr(tracking, "modes", lambda *_, order=order, **__: [
+            tracking.Learnt(points[k], 0.0, 1) for k in order])
+        found = posterior.modes(method, np.zeros((63, 1)))
+        np.testing.assert_array_equal([mode.point for mode in found], [points[k] for k in kept])
+    np.testing.assert_allclose(found[1].curvature.factor @ found[1].curvature.factor.T, np.eye(4), atol=1e-6)
 
 
 def made_up(settings):
@@ -371,23 +394,25 @@ def test_nuts_and_weighted_draws_have_the_same_posterior():
     np.testing.assert_allclose(found["sd"], np.sqrt(np.diag(covariance)), rtol=4 * error.max())
 
 
+NOISE = 4
+"""Index of a parameter."""
+
+
 def with_two_modes(count):
-    """The method, the training and weighted draws of the first window, which of them lie about its second mode, and
-    where that begins: it is one of small noises and short memories."""
+    """Return method, training and weighted draws of the first window, and below which noise its second mode lies."""
     task = posterior.nuts_tasks(BOTH)[0]
     method, (one,) = tracking.method_of(task), tracking.windows_of(task)
     draws, weights, mass = posterior.posterior(method, one.training, count, BOTH.seed)
-    assert len(mass) == 2 and weights.reliable
-    noise = method.names.index("noise_sd")
-    edge = 0.5 * sum(mode.point[noise] for mode in posterior.modes(method, one.training))
-    return method, one.training, draws, np.exp(weights.log_weight[0]), noise, edge
+    assert len(mass) == 2 and weights.reliable and method.names[NOISE] == "noise_sd"
+    edge = 0.5 * sum(mode.point[NOISE] for mode in posterior.modes(method, one.training))
+    return method, one.training, draws, np.exp(weights.log_weight[0]), edge
 
 
 @pytest.mark.slow
 def test_weighted_draws_see_a_second_mode():
     """Its share of the posterior, against draws of one wide proposal over both modes."""
-    method, y, draws, weight, noise, edge = with_two_modes(4_000)
-    below = draws[:, noise] < edge
+    method, y, draws, weight, edge = with_two_modes(4_000)
+    below = draws[:, NOISE] < edge
     share = weight[below].sum()
     error = np.sqrt((weight**2 * (below - share) ** 2).sum())
 
@@ -397,7 +422,7 @@ def test_weighted_draws_see_a_second_mode():
     others = wide.rvs(12_000, random_state=1)
     log_ratio = np.asarray(posterior._densities(method)(jnp.asarray(others), jnp.asarray(y))) - wide.logpdf(others)
     log_ratio = np.where(np.isfinite(log_ratio), log_ratio, -np.inf)
-    plain, there = np.exp(log_ratio - special.logsumexp(log_ratio)), others[:, noise] < edge
+    plain, there = np.exp(log_ratio - special.logsumexp(log_ratio)), others[:, NOISE] < edge
     expected = plain[there].sum()
     apart = np.hypot(error, np.sqrt((plain**2 * (there - expected) ** 2).sum()))
     assert abs(share - expected) < 4 * apart and apart < share / 2
@@ -406,16 +431,16 @@ def test_weighted_draws_see_a_second_mode():
 @pytest.mark.slow
 def test_nuts_and_weighted_draws_agree_about_the_first_mode():
     """NUTS comes to the second one by chance, and then stays for a hundred draws: it cannot tell how much is there."""
-    _, _, draws, weight, noise, edge = with_two_modes(4_000)
-    draws, own = draws[draws[:, noise] > edge], weight[draws[:, noise] > edge]
-    own = own / own.sum()
-    mean, covariance = weighting.moments(draws, own)
+    method, _, draws, weight, edge = with_two_modes(4_000)
+    above = draws[:, NOISE] > edge
+    own = weight[above] / weight[above].sum()
+    mean, covariance = weighting.moments(draws[above], own)
     sd = np.sqrt(np.diag(covariance))
     found = posterior.compute_nuts(posterior.nuts_tasks(BOTH)[0])
-    elsewhere = found["draws"][noise] < edge
+    elsewhere = found["draws"][NOISE] < edge
     assert elsewhere.mean() < 0.5
     chain = found["draws"][:, ~elsewhere]
-    ess = scores.diagnose(list("abcde"), chain[:, None])["ess"]
+    ess = scores.diagnose(method.names, chain[:, None])["ess"]
     error = np.sqrt(1 / ess + (own**2).sum())
     assert error.max() < 0.1
     assert (np.abs(chain.mean(axis=1) - mean) < 4 * error * sd).all()

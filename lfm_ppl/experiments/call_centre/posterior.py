@@ -48,7 +48,8 @@ def nuts_tasks(settings: Any) -> list[Task]:
 
 def _shared(settings: Any, name: str) -> dict[str, Any]:
     return {"experiment": "call-centre", "what": "posterior", "method": name, "link": settings.link,
-            "functions": settings.functions, "draws": settings.draws, "mixed": settings.mixed}
+            "functions": settings.functions, "starts": len(tracking.STARTS), "draws": settings.draws,
+            "mixed": settings.mixed}
 
 
 def compute(task: Task) -> Result:
@@ -68,7 +69,7 @@ def compute(task: Task) -> Result:
         weight = np.exp(weights.log_weight[0])
         mean = weight @ draws
         row: dict[str, Any] = {"k": float(np.ravel(weights.k)[0]), "ess": float(np.ravel(weights.ess)[0]),
-                               "modes": len(mass), "beyond": 1.0 - float(mass[0]),
+                               "modes": len(mass), "beyond": float(mass[1:].sum()),
                                "posterior_mean": mean, "posterior_sd": np.sqrt(weight @ (draws - mean) ** 2)}
         chosen = draws[importance.resample(weights.log_weight, task.settings["mixed"], task.seed + index)]
         rows.append(row | _judged(method, chosen, one))
@@ -119,20 +120,26 @@ def posterior(method: Method, y: np.ndarray, count: int, seed: int) -> Weighted:
 
 
 def modes(method: Method, y: np.ndarray) -> list[Minimum]:
-    """Return the modes of the posterior with their curvature, the highest first; arguments as `posterior`."""
+    """Return the modes of the posterior with their curvature, the highest first; arguments as `posterior`.
+
+    A lower one without a positive definite curvature is none, but the edge of what is allowed or of a search.
+    """
     value_and_gradient = tracking.energy(method, y, 1.0)
 
     def with_curvature(point: np.ndarray) -> Minimum:
         hessian = finite_difference_hessian(lambda z: value_and_gradient(z)[1], point)
+        curvature = decompose(hessian, _NOISE) if np.isfinite(hessian).all() else None
         value, gradient = value_and_gradient(point)
-        return Minimum(point, value, decompose(hessian, _NOISE), 0.0, np.zeros_like(point), gradient)
+        return Minimum(point, value, curvature, 0.0, np.zeros_like(point), gradient)
 
-    return [with_curvature(one.z) for one in tracking.modes(method, y, prior=1.0)]
+    highest, *lower = [with_curvature(one.z) for one in tracking.modes(method, y, prior=1.0)]
+    return [highest, *(mode for mode in lower
+                       if mode.curvature is not None and (mode.curvature.values > mode.curvature.floor).all())]
 
 
 @functools.cache
 def _densities(method: Method) -> Callable:
-    """Return log posterior densities of draws, compiled once for all windows."""
+    """Return log posterior densities of draws, compiled once for all windows and each number of draws."""
     def one(z: jax.Array, y: jax.Array) -> jax.Array:
         log_likelihood, log_prior = problem.log_densities(method, z, y)
         return log_likelihood + log_prior

@@ -118,7 +118,10 @@ def agreement(settings: Any, results: dict[str, Result]) -> pd.DataFrame:
 
 
 def learnt(settings: Any, results: dict[str, Result]) -> pd.DataFrame:
-    """Return the most likely parameters: medians over windows, the log likelihood, and CPU seconds of a window."""
+    """Return the most likely parameters: medians over windows, the log likelihood, and what a window took.
+
+    Evaluations and CPU seconds are those of all its searches.
+    """
     rows = {}
     for task in tracking.tasks(settings):
         one = results[task.name]

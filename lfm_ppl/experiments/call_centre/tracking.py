@@ -48,16 +48,20 @@ SAME = 0.1
 """Ends of searches that differ by less than this in every logarithm are the same mode."""
 
 FAR = 7.0
-"""Modes that are so much lower in log density than the highest are left out: below a thousandth of it."""
+"""Modes that are so much lower in log density than the highest are left out: below a thousandth of it. Unless they are
+much wider, they hold next to nothing."""
 
 STEPS = 3
 """Integration steps in five minutes, about as long as those of the model file."""
+
+_WALL = 1e6
+"""Height of the wall where a density is not finite: a line search turns back from one that is not much higher."""
 
 _SEARCH = {"ftol": 1e-7, "gtol": 1e-3, "maxfun": 60}
 
 
 class Learnt(NamedTuple):
-    """A mode, the most likely parameters most of all.
+    """Where a search ended.
 
     Attributes:
         z: (P,) their logarithms.
@@ -71,7 +75,7 @@ class Learnt(NamedTuple):
 
 
 def learn(method: Method, y: np.ndarray, prior: float = 0.0) -> Learnt:
-    """Return the most likely parameters within `LIMITS`, with the evaluations of all searches; arguments as `modes`."""
+    """Return the most likely parameters within `LIMITS`, with the evaluations of all searches; otherwise as `modes`."""
     found = _searches(method, y, prior)
     return found[0]._replace(evaluations=sum(one.evaluations for one in found))
 
@@ -83,6 +87,9 @@ def modes(method: Method, y: np.ndarray, prior: float = 0.0) -> list[Learnt]:
         method: the model of the arrivals.
         y: (63, 1) logarithms of the readings of the training.
         prior: 0 for maxima of the likelihood, 1 for those of the posterior density of z.
+
+    Raises:
+        ValueError: the density is not finite wherever a search starts.
     """
     found = _searches(method, y, prior)
     kept: list[Learnt] = []
@@ -101,19 +108,23 @@ def _searches(method: Method, y: np.ndarray, prior: float) -> list[Learnt]:
         one = optimize.minimize(value_and_gradient, np.log([start[name] for name in method.names]), jac=True,
                                 method="L-BFGS-B", bounds=list(zip(low, high, strict=True)), options=_SEARCH)
         found.append(Learnt(one.x, -float(one.fun), int(one.nfev)))
-    return sorted(found, key=lambda one: -one.log_likelihood)
+    there = [one for one in found if one.log_likelihood != -_WALL]
+    if not there:
+        raise ValueError(f"the likelihood is not finite wherever a search for the parameters of {method.force} starts; "
+                         "are there readings that no queue can have?")
+    return sorted(there, key=lambda one: -one.log_likelihood)
 
 
 def energy(method: Method, y: np.ndarray, prior: float) -> Callable[[np.ndarray], tuple[float, np.ndarray]]:
     """Return the function of z that gives minus the log likelihood, less ``prior`` times the log prior, and gradient.
 
-    Where it is not finite it is a wall of moderate height, from which a line search turns back.
+    Where it is not finite it is `_WALL`.
     """
     program, given = _energy(method), jnp.asarray(y)
 
     def value_and_gradient(z: np.ndarray) -> tuple[float, np.ndarray]:
         value, gradient = program(jnp.asarray(z), given, prior)
-        return (float(value), np.asarray(gradient)) if np.isfinite(value) else (1e6, np.zeros_like(z))
+        return (float(value), np.asarray(gradient)) if np.isfinite(value) else (_WALL, np.zeros_like(z))
 
     return value_and_gradient
 
@@ -229,7 +240,7 @@ def tasks(settings: Any) -> list[Task]:
     """Return one task for each method: what is compiled for it serves all windows."""
     return [Task(f"track/{name}", settings.seed, {
         "experiment": "call-centre", "what": "track", "method": name, "link": settings.link,
-        "functions": settings.functions, **settings.windows()}) for name in settings.methods]
+        "functions": settings.functions, "starts": len(STARTS), **settings.windows()}) for name in settings.methods]
 
 
 def method_of(task: Task) -> Method:
