@@ -69,12 +69,12 @@ def weighted(log_density: Callable[[np.ndarray], np.ndarray], modes: Sequence[Mi
     Raises:
         ValueError: there is no curvature at any mode; no draw has a density.
     """
-    used = [mode for mode in modes if mode.curvature is not None]
-    if not used:
+    about = [(mode.point, mode.curvature.factor @ mode.curvature.factor.T)
+             for mode in modes if mode.curvature is not None]
+    if not about:
         raise ValueError("the posterior has no curvature at a mode; its derivatives there are not finite.")
     generator = np.random.default_rng(seed)
-    about = [(mode.point, mode.curvature.factor @ mode.curvature.factor.T) for mode in used]
-    sizes = np.full(len(used), max(count // 3, 30))
+    sizes = np.full(len(about), max(count // 3, 30))
     for freedom, wider in zip(FREEDOM, WIDER, strict=True):
         proposals = [stats.multivariate_t(centre, wider**2 * covariance, df=freedom) for centre, covariance in about]
         draws = np.concatenate([proposal.rvs(size, random_state=generator).reshape(size, -1)

@@ -419,7 +419,7 @@ def test_weighted_draws_see_a_second_mode():
     first, second = posterior.modes(method, y)
     scale = np.abs(first.point - second.point) / 2 + np.linalg.norm(first.curvature.factor, axis=1)
     wide = stats.multivariate_t(0.5 * (first.point + second.point), np.diag(scale**2), df=5)
-    others = wide.rvs(12_000, random_state=1)
+    others = wide.rvs(60_000, random_state=1)
     log_ratio = np.asarray(posterior._densities(method)(jnp.asarray(others), jnp.asarray(y))) - wide.logpdf(others)
     log_ratio = np.where(np.isfinite(log_ratio), log_ratio, -np.inf)
     plain, there = np.exp(log_ratio - special.logsumexp(log_ratio)), others[:, NOISE] < edge

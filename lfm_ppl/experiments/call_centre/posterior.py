@@ -28,6 +28,10 @@ from lfm_ppl.experiments.weighting import Weighted, weighted
 from lfm_ppl.inference.curvature import decompose, finite_difference_hessian
 from lfm_ppl.inference.optimise import Minimum
 
+ACCEPTED = 0.95
+"""Acceptance that NUTS aims at: steps fine enough for the walls of the posterior, where arrivals exceed what is served
+and the log density falls by hundreds within a few standard deviations."""
+
 _TOGETHER = 10
 _NOISE = 1e-7
 """Relative error of a Hessian by differences."""
@@ -41,9 +45,10 @@ def tasks(settings: Any) -> list[Task]:
 
 def nuts_tasks(settings: Any) -> list[Task]:
     """Return one task for each method and window whose parameters are integrated out by NUTS."""
+    first = range(min(settings.nuts_days, settings.days))
     return [Task(f"nuts/{name}/{index:02d}", settings.seed, {
-        **_shared(settings, name), "what": "nuts", "chains": list(settings.nuts), **settings.windows(), "first": index,
-        "count": 1}) for name in settings.integrated for index in range(min(settings.nuts_days, settings.days))]
+        **_shared(settings, name), "what": "nuts", "chains": list(settings.nuts), "accepted": ACCEPTED,
+        **settings.windows(), "first": index, "count": 1}) for name in settings.integrated for index in first]
 
 
 def _shared(settings: Any, name: str) -> dict[str, Any]:
@@ -88,8 +93,8 @@ def compute_nuts(task: Task) -> Result:
     def model(y: np.ndarray) -> None:
         problem.model_file().model(problem.TRAINING, y, **method._asdict())
 
-    mcmc = MCMC(chains.nuts(model), num_warmup=warmup, num_samples=draws, num_chains=count, chain_method="sequential",
-                progress_bar=False)
+    mcmc = MCMC(chains.nuts(model, target_accept_prob=task.settings["accepted"]), num_warmup=warmup, num_samples=draws,
+                num_chains=count, chain_method="sequential", progress_bar=False)
     start_key, run_key = jax.random.split(task.key)
     near = tracking.learn(method, one.training, prior=1.0).z
     found = chains.sample(mcmc, method.names, run_key, one.training,
