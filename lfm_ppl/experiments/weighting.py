@@ -79,11 +79,10 @@ def weighted(log_density: Callable[[np.ndarray], np.ndarray], modes: Sequence[Mi
         proposals = [stats.multivariate_t(centre, wider**2 * covariance, df=freedom) for centre, covariance in about]
         draws = np.concatenate([proposal.rvs(size, random_state=generator).reshape(size, -1)
                                 for proposal, size in zip(proposals, sizes, strict=True)])
-        parts = np.stack([proposal.logpdf(draws) for proposal in proposals]) + np.log(sizes / sizes.sum())[:, None]
-        log_proposal = special.logsumexp(parts, axis=0)
-        log_ratio = log_density(draws) - log_proposal
+        log_t = np.stack([proposal.logpdf(draws) for proposal in proposals])
+        log_ratio = log_density(draws) - special.logsumexp(log_t, axis=0, b=(sizes / sizes.sum())[:, None])
         weights = importance.smooth(np.where(np.isfinite(log_ratio), log_ratio, -np.inf)[None])
-        mass, belongs = _masses(np.exp(weights.log_weight[0]), parts - np.log(sizes / sizes.sum())[:, None])
+        mass, belongs = _masses(np.exp(weights.log_weight[0]), log_t)
         about = [_next(draws, own, *one) for own, one in zip(belongs, about, strict=True)]
         share = np.maximum(mass, LEAST_SHARE)
         sizes = _shared_out(count, share / share.sum())
