@@ -22,9 +22,9 @@
 # a cycle has 14 hours.
 #
 # The queue is computed from the counts. It is read every 40 minutes, with an error of 0.5 customers, on three
-# Thursdays, from which a method learns its parameters (maximum likelihood), and every three hours on the fourth, which
-# it tracks: at every five minutes the estimate is that of the filter, given the readings up to then. The test day has
-# the service rate of training, or 15 in its first half and 5 in its second.
+# Thursdays, from which a method learns its parameters (maximum likelihood, the best of three searches), and every three
+# hours on the fourth, which it tracks: at every five minutes the estimate is that of the filter, given the readings up
+# to then. The test day has the service rate of training, or 15 in its first half and 5 in its second.
 #
 # The same experiment runs from the command line, where it can be stopped and resumed:
 #
@@ -109,9 +109,11 @@ figures.plot_errors(settings, found.results)
 scores.readable(found.gain)
 
 # %% [markdown]
-# These are weighted draws. NUTS, which shares the density with them and the mode about which it starts, finds the same
-# posterior, here for the first day: how far apart the means are at most, in posterior standard deviations, and both
-# gains on that day.
+# These are weighted draws about every mode of the posterior that searches from three starts find: `several modes` is
+# the share of days on which there is more than one, `beyond` the largest share of a posterior that is not about its
+# highest mode. NUTS, which shares the density with them and the mode about which it starts, finds the same posterior,
+# here for the first day: how far apart the means are at most, in posterior standard deviations, and both gains on that
+# day.
 
 # %%
 scores.readable(found.agreement)
