@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from lfm_ppl.analysis.plots import style
-from lfm_ppl.experiments.call_centre import counts, posterior, problem, tracking
+from lfm_ppl.experiments.call_centre import counts, posterior, problem, tables, tracking
 from lfm_ppl.experiments.call_centre.problem import BIN, DAY, GRID, OPEN, TESTED, TRAIN
 from lfm_ppl.experiments.call_centre.tracking import Tracked
 from lfm_ppl.experiments.scores import Z, mean_of
@@ -127,21 +127,29 @@ def plot_cycles(settings: Any, results: dict[str, Result], *, width: str | float
 
 @style.styled
 def plot_errors(settings: Any, results: dict[str, Result], *, width: str | float = "full") -> Figure:
-    """Draw the error of the queue on each test day by method, at both service rates, and the coverage of the bands."""
+    """Draw the error of the queue on each test day by method, at both service rates, and the coverage of the bands.
+
+    Methods whose parameters are integrated out come last, in the colour of the method and with open markers.
+    """
     figure, panels = style.in_a_row(width, 3, 2.7)
-    names = [task.settings["method"] for task in tracking.tasks(settings)]
+    whole = {tables.INTEGRATED.format(method): method for method in settings.integrated}
+    drawn = []
+    for name, found in tables.by_method(settings, results).items():
+        colour = _COLOURS[settings.methods.index(whole.get(name, name)) % 6]
+        drawn.append((found, colour, "white" if name in whole else colour))
+    names = [*settings.methods, *(f"{method},\nintegrated" for method in settings.integrated)]
     for axes, test in zip(panels, TESTED, strict=False):
-        for place, task in enumerate(tracking.tasks(settings)):
-            values = results[task.name][f"{test}_rmse"]
-            axes.semilogy(np.full(len(values), place), values, ls="", marker=".", ms=3, color=_COLOURS[place % 6])
-            axes.semilogy([place - 0.3, place + 0.3], [values.mean()] * 2, color=_COLOURS[place % 6], lw=1.5)
+        for place, (found, colour, face) in enumerate(drawn):
+            values = found[f"{test}_rmse"]
+            axes.semilogy(np.full(len(values), place), values, ls="", marker=".", ms=4, color=colour, mfc=face, mew=0.6)
+            axes.semilogy([place - 0.3, place + 0.3], [values.mean()] * 2, color=colour, lw=1.5)
         axes.set_title(f"{test} service rate")
         axes.set_ylabel("RMSE of the queue (customers)")
-    for place, task in enumerate(tracking.tasks(settings)):
+    for place, (found, colour, face) in enumerate(drawn):
         for shift, marker, test in ((-0.12, "o", "constant"), (0.12, "s", "changed")):
-            share = mean_of(results[task.name][f"{test}_coverage"])
-            panels[2].errorbar(place + shift, share.value, share.error, marker=marker, ms=3.5, lw=0.8,
-                               color=_COLOURS[place % 6])
+            share = mean_of(found[f"{test}_coverage"])
+            panels[2].errorbar(place + shift, share.value, share.error, marker=marker, ms=3.5, lw=0.8, color=colour,
+                               mfc=face, mew=0.8)
     panels[2].axhspan(0.9, 0.98, color=style.GREY, alpha=0.15, lw=0)
     panels[2].axhline(0.95, color=style.GREY, lw=0.7, ls=":")
     panels[2].set_ylim(min(0.5, panels[2].get_ylim()[0]), 1.02)
