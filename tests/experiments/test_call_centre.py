@@ -345,7 +345,7 @@ def test_mistakes(tmp_path):
 def test_weighted_draws_are_those_of_a_long_chain():
     """The posterior of one window against random-walk Metropolis with the same density."""
     method, one = problem.Method("sqm", functions=5), window()
-    draws, weights = posterior.posterior(method, one.training, 1_000, 0)
+    draws, weights, _ = posterior.posterior(method, one.training, 1_000, 0)
     weight = np.exp(weights.log_weight[0])
     mean = weight @ draws
     sd = np.sqrt(weight @ (draws - mean) ** 2)
