@@ -64,7 +64,7 @@ class Learnt(NamedTuple):
     """Where a search ended.
 
     Attributes:
-        z: (P,) their logarithms.
+        z: (P,) logarithms of the parameters.
         log_likelihood: of the training; with the log prior density of z where that was asked for.
         evaluations: of it and its gradient.
     """
