@@ -30,6 +30,11 @@ class Curvature:
         return np.abs(self.values) <= self.floor
 
     @property
+    def definite(self) -> bool:
+        """Whether all directions have positive curvature beyond rounding."""
+        return bool((self.values > self.floor).all())
+
+    @property
     def factor(self) -> np.ndarray:
         """A square root ``R`` of the inverse, ``R R' = H^-1``, flat and negative ones floored."""
         return self.vectors / np.sqrt(np.maximum(self.values, self.floor)) / self.root[:, None]

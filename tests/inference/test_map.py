@@ -299,6 +299,12 @@ def test_curvature_does_not_depend_on_units():
     )
 
 
+@pytest.mark.parametrize("last, definite", [(3.0, True), (1e-9, False), (-3.0, False)])
+def test_only_positive_curvature_in_all_directions_is_definite(last, definite):
+    rotation = np.linalg.qr(np.random.default_rng(5).normal(size=(3, 3)))[0]
+    assert decompose(rotation @ np.diag([1.0, 2.0, last]) @ rotation.T, 1e-7).definite is definite
+
+
 # Errors
 
 

@@ -107,8 +107,8 @@ def estimate(target: problem.Target, count: int, paths: int, seed: int) -> Resul
     plain = one_path(jnp.asarray(likely.point), y)
     means, sds = map(np.asarray, smoothing(jnp.asarray(chosen), y))
     total = [scores.total_moments(means[:, row], sds[:, row] ** 2) for row in range(len(problem.PATHS))]
-    exists = likely.curvature is not None and bool(
-        (likely.curvature.values > likely.curvature.floor).all() and np.all(np.abs(likely.point - START) < FURTHEST))
+    inside = bool(np.all(np.abs(likely.point - START) < FURTHEST))
+    exists = likely.curvature is not None and likely.curvature.definite and inside
     return {
         "likely": likely.point, "exists": exists, "posterior_mean": mean, "posterior_sd": sd,
         "below": weight @ (draws < target.z), "k": weights.k, "ess": weights.ess, "seconds": seconds,

@@ -138,8 +138,7 @@ def modes(method: Method, y: np.ndarray) -> list[Minimum]:
         return Minimum(point, value, curvature, 0.0, np.zeros_like(point), gradient)
 
     highest, *lower = [with_curvature(one.z) for one in tracking.modes(method, y, prior=1.0)]
-    return [highest, *(mode for mode in lower
-                       if mode.curvature is not None and (mode.curvature.values > mode.curvature.floor).all())]
+    return [highest, *(mode for mode in lower if mode.curvature is not None and mode.curvature.definite)]
 
 
 @functools.cache
