@@ -29,7 +29,8 @@ class Pass(NamedTuple):
         log_likelihood: (N,) of each row's observation, zero without one.
         predicted, filtered: moments (N, n), (N, n, n) at the row's end, before and after the observation.
         phi, noise: (N, n, n), the affine map of the row.
-        innovation, present, chol, gain, slope: of the update, (N, D), (N, D), (N, D, D), (N, n, D), (N, D, n).
+        innovation, present, chol, gain, slope, obs_cov: of the update, (N, D), (N, D), (N, D, D), (N, n, D), (N, D, n),
+            (N, D, D).
     """
 
     log_likelihood: jax.Array
@@ -42,6 +43,7 @@ class Pass(NamedTuple):
     chol: Any = None
     gain: Any = None
     slope: Any = None
+    obs_cov: Any = None
 
 
 class FilterState(NamedTuple):
@@ -123,7 +125,7 @@ def forward(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, *, s
             out = out._replace(predicted=predicted, filtered=new.moments, innovation=new.innovation,
                                present=jnp.isfinite(observed), chol=new.chol)
         if keep == "all":
-            out = out._replace(phi=phi, noise=noise, gain=new.gain, slope=new.slope)
+            out = out._replace(phi=phi, noise=noise, gain=new.gain, slope=new.slope, obs_cov=new.obs_cov)
         return new.moments, out
 
     nearby = None

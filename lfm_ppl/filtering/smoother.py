@@ -22,12 +22,12 @@ from lfm_ppl.filtering.filter import (
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.retrospect import combine, given_later
 from lfm_ppl.filtering.schedule import Schedule, schedule
+from lfm_ppl.filtering.simulation_smoother import smoothing_errors
 from lfm_ppl.linalg import (
     cholesky,
     congruence,
     matmul,
     safe_sqrt,
-    semidefinite_root,
     solve_lower,
     solve_upper,
 )
@@ -127,7 +127,7 @@ class SmootherResult(eqx.Module):
         return Marginal(self.input_mean[:, index], safe_sqrt(self.input_covariance[:, index, index]))
 
     def sample(self, key: jax.Array, draws: int = 1) -> Trajectories:
-        """Draw whole trajectories from the joint smoothing distribution, by backward simulation.
+        """Draw whole trajectories from the joint smoothing distribution, by `smoothing_errors`.
 
         Args:
             key: a JAX random key.
@@ -146,23 +146,10 @@ class SmootherResult(eqx.Module):
 
 @eqx.filter_jit
 def _sample(result: SmootherResult, key: jax.Array, draws: int) -> Trajectories:
-    requested, filtered, predicted, smoothed = result._elements
-    last = Moments(filtered.mean[-1], filtered.covariance[-1])
-    count, size = filtered.mean.shape[0], last.mean.shape[0]
-    noise = jax.random.normal(key, (count, draws, size))
-    end = last.mean + matmul(noise[-1], semidefinite_root(last.covariance).T)
-
-    def step(later: jax.Array, row: tuple) -> tuple[jax.Array, jax.Array]:
-        before, after, gain, conditional, standard = row
-        mean = before + matmul(later - after, gain.T)
-        return mean + matmul(standard, semidefinite_root(conditional).T), later
-
-    # filtered[k] is the start of row k + 1; the start of the first row is not asked for.
-    rows = (filtered.mean[:-1], predicted.mean[1:], smoothed.gain[1:], smoothed.conditional[1:], noise[:-1])
-    first, ends = jax.lax.scan(step, end, rows, reverse=True)
-    states = jnp.concatenate([first[None], ends])[requested]
+    requested, start, passed, mean = result._elements
+    states = (mean[..., None] + smoothing_errors(key, passed, start, draws))[requested]
     matrix, offset = result._input_map
-    inputs = jnp.einsum("kwn,kdn->dkw", matrix, states) + offset
+    inputs = jnp.moveaxis(matmul(matrix, states) + offset[..., None], -1, 0)
     size = len(result.state_names)
     forces = {name: inputs[:, :, size + index] for index, name in enumerate(result.force_names)}
     return Trajectories(result.times, inputs[:, :, :size], forces)
@@ -363,7 +350,7 @@ def smooth_on(ssm: StateSpaceModel, rule: Rule, plans: Plans, y: jax.Array, iter
     return SmootherResult(
         times, mean, covariance, matmul(matrix, mean[..., None])[..., 0] + offset, congruence(matrix, covariance),
         at_data.log_likelihood, smoothed.leave_one_out[observed], standardised(at_data, y), change,
-        (jnp.asarray(requested), drawn.filtered, drawn.predicted, pieces), (matrix, offset),
+        (jnp.asarray(requested), start, drawn, pieces.moments.mean[1:]), (matrix, offset),
         ssm.model.state_names, ssm.model.force_names)
 
 

@@ -35,6 +35,7 @@ class Update(NamedTuple):
         chol: (D, D), Cholesky factor of the innovation covariance, the identity where missing.
         gain: (n, D).
         slope: (D, n), zero rows where missing.
+        obs_cov: (D, D), covariance of the observation given the state, the identity where missing.
     """
 
     moments: Moments
@@ -43,6 +44,7 @@ class Update(NamedTuple):
     chol: jax.Array
     gain: jax.Array
     slope: jax.Array
+    obs_cov: jax.Array
 
 
 def linearise_observation(ssm: StateSpaceModel, rule: Rule, slope: jax.Array, t: jax.Array, row: jax.Array,
@@ -103,4 +105,4 @@ def update(ssm: StateSpaceModel, observation: Linearised, y: jax.Array, present:
     kept = jnp.eye(mean.shape[0]) - matmul(gain, slope)
     return Update(
         Moments(mean + matmul(gain, innovation[:, None])[:, 0], congruence(kept, covariance) + congruence(gain, noise)),
-        jnp.where(factor.degenerate.any(), -jnp.inf, log_likelihood), innovation, chol, gain, slope)
+        jnp.where(factor.degenerate.any(), -jnp.inf, log_likelihood), innovation, chol, gain, slope, noise)
