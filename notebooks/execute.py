@@ -7,6 +7,7 @@ result with its pictures beside the source.
     python notebooks/execute.py                    all of them
     python notebooks/execute.py 01_quickstart      one
     LFM_QUICK=1 python notebooks/execute.py --check    run all in quick mode, write nothing
+    python notebooks/execute.py --jobs 2           two at a time
 
 With LFM_QUICK=1 the notebooks draw few samples: it shows that they run, and no more. An error in a
 cell ends the script.
@@ -20,6 +21,7 @@ import re
 import sys
 import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import jupytext
@@ -67,6 +69,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("names", nargs="*", help="such as 01_quickstart; default: all")
     parser.add_argument("--check", action="store_true", help="write nothing")
+    parser.add_argument("--jobs", type=int, default=1, help="how many at a time; default: 1")
     arguments = parser.parse_args()
     wanted = [path for path in sources() if not arguments.names or path.stem in arguments.names]
     if not wanted:
@@ -76,13 +79,26 @@ def main() -> int:
     if not arguments.check and os.environ.get("LFM_QUICK"):
         print("LFM_QUICK is for --check: quick results are not to be kept", file=sys.stderr)
         return 2
-    for source in wanted:
+    if arguments.jobs < 1:
+        print(f"--jobs must be at least 1, got {arguments.jobs}", file=sys.stderr)
+        return 2
+
+    def run(source: Path) -> None:
         started = time.perf_counter()
         with tempfile.TemporaryDirectory() as scratch:
             notebook = execute(source, Path(scratch))
         if not arguments.check:
             nbformat.write(notebook, source.with_suffix(".ipynb"))
-        print(f"{source.stem}: {time.perf_counter() - started:.0f} s")
+        print(f"{source.stem}: {time.perf_counter() - started:.0f} s", flush=True)
+
+    # Each notebook computes in a kernel, which is a process of its own; here a thread waits for it.
+    with ThreadPoolExecutor(arguments.jobs) as pool:
+        waiting = [pool.submit(run, source) for source in wanted]
+        try:
+            for one in waiting:
+                one.result()
+        finally:
+            pool.shutdown(cancel_futures=True)
     return 0
 
 

@@ -144,6 +144,7 @@ def test_fit_prints_summary_time_and_paths(short_run):
     assert "\ntime " in out
 
 
+@pytest.mark.slow
 def test_fit_with_everything_said(run, motif, tmp_path):
     """A file with missing cells and other columns, fixed values, an option, settings, a sampler."""
     (tmp_path / "d.csv").write_text(
@@ -174,6 +175,7 @@ def test_fit_with_everything_said(run, motif, tmp_path):
     np.testing.assert_array_equal(observed.sel(output="b"), [np.nan, 0.3, 0.5, 0.1])
 
 
+@pytest.mark.slow
 def test_simulated_files_can_be_fitted(run, motif, tmp_path):
     code, out, err = run(f"simulate {motif} --seed 5 --option order=1 --out d.csv")
     assert code == 0, err

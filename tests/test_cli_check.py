@@ -163,6 +163,7 @@ def rewritten(fitted, drop=(), **attributes):
     arviz_data.save(arviz_data.build(groups, attrs), fitted / "posterior.nc", overwrite=True)
 
 
+@pytest.mark.slow
 def test_a_result_without_its_model_or_its_data(run, fitted, original):
     rewritten(fitted, model_file=None)
     code, _, err = run(f"check {fitted}")

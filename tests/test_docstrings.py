@@ -14,7 +14,14 @@ MODULES = sorted(
 )
 
 
-@pytest.mark.parametrize("name", MODULES)
+COSTLY = tuple(f"lfm_ppl.{name}" for name in (
+    "analysis.accuracy", "analysis.calibration", "comparators.laplace", "inference.particle_marginal",
+    "inference.settings"))
+"""Modules whose examples take several seconds to compile; these are run with -m slow."""
+
+
+@pytest.mark.parametrize("name", [
+    pytest.param(name, marks=[pytest.mark.slow] if name in COSTLY else []) for name in MODULES])
 def test_examples(name):
     module = importlib.import_module(name)
     outcome = doctest.testmod(module, optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE)

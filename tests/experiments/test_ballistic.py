@@ -40,6 +40,7 @@ def test_the_targets_are_those_of_the_model_file():
     assert problem.true_z()[0] == pytest.approx(-7.7, abs=0.01)  # as published
 
 
+@pytest.mark.slow
 def test_the_densities_are_those_of_the_model():
     """The prior against scipy's, and the likelihood against that of the system built by hand."""
     z = problem.true_z() + np.array([0.3, -0.2, 0.1])

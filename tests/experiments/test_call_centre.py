@@ -137,6 +137,7 @@ def test_the_bound_on_settling_matters_little():
             assert name == "changed" or np.sqrt(np.mean(off**2)) < 0.4 * problem.NOISE
 
 
+@pytest.mark.slow
 def test_the_densities_are_those_of_the_model():
     """The prior against scipy's, the likelihood against that of the model built by hand."""
     method, one = problem.Method("matern"), window()

@@ -40,7 +40,8 @@ def test_every_method_filters_and_smooths(method):
     assert result["seconds"] > 0.0
 
 
-@pytest.mark.parametrize("method", problem.METHODS)
+@pytest.mark.parametrize("method", [
+    pytest.param(method, marks=() if method == "CKF" else pytest.mark.slow) for method in problem.METHODS])
 def test_every_method_has_conditional_posteriors(method):
     result = conditional.compute(task(conditional.tasks(SMALL), problem.slug(method)))
     values = result["log_likelihood"]
@@ -61,7 +62,7 @@ def test_the_grid_gives_the_same_likelihood_in_one_step_and_in_twenty():
 
 
 @pytest.mark.parametrize("label", [
-    pytest.param(label, marks=() if label == "RAM, CKF" else pytest.mark.slow) for label in sampling.SAMPLERS])
+    pytest.param(label, marks=pytest.mark.slow) for label in sampling.SAMPLERS])
 def test_every_sampler_draws_parameters_and_states(label):
     result = sampling.compute(task(sampling.tasks(SMALL), sampling.slug(label)))
     assert result["draws"].shape == (3, sampling.CHAINS, 6)

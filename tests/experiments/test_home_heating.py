@@ -87,6 +87,7 @@ def test_gaussian_scores_against_scipy():
     assert found["inside"] == np.mean((low <= truth) & (truth <= high))
 
 
+@pytest.mark.slow
 def test_the_most_likely_parameters(window):
     """No residual: the search ends where nothing near is better."""
     model = ("none", "one store", 3)

@@ -15,6 +15,7 @@ def found(tmp_path_factory):
     return experiment.run(SMALL, tmp_path_factory.mktemp("kernels"))
 
 
+@pytest.mark.slow
 def test_the_published_comparison(found):
     """Below 1e-4 with 22 eigenfunctions, above 0.1 with random frequencies, and not with 20 points."""
     error = found.published["error"]
@@ -22,6 +23,7 @@ def test_the_published_comparison(found):
     assert error[regression.SPARSE] > error[regression.SPARSE_4] > 0.1
 
 
+@pytest.mark.slow
 def test_the_order_of_the_published_table_holds(found):
     rmse, density = found.regression["RMSE"], found.regression["log likelihood"]
     assert rmse[regression.SPARSE] > rmse[regression.SPARSE_4] > rmse[regression.KPCA]
@@ -31,6 +33,7 @@ def test_the_order_of_the_published_table_holds(found):
     assert abs(coverage["coverage"] - 0.95) < 4 * coverage["coverage se"]
 
 
+@pytest.mark.slow
 def test_errors_fall_with_the_number_of_functions(found):
     table = found.covariance
     for row in table.index[table.index.str.endswith("eigenfunctions")]:
@@ -64,6 +67,7 @@ def test_settings_are_checked():
     assert experiment.quick(3).runs == 3
 
 
+@pytest.mark.slow
 def test_files_and_figures(found, tmp_path):
     written = {path.name for path in experiment.save(found, tmp_path)}
     expected = {f"{name}.{kind}" for name in ("covariance", "published", "regression") for kind in ("csv", "md")}

@@ -65,6 +65,7 @@ def test_projected_points_equal_points_in_the_whole_state_within_their_degree(dy
     same(moments_of(found[0]), moments_of(found[1]), 1e-10)
 
 
+@pytest.mark.slow
 def test_projected_and_full_points_converge_to_the_same_value():
     """Softplus is no polynomial: the rules differ, and converge to one value with the number of points."""
     model = motif(order=0, genes=1, variance=0.1, lengthscale=2.0)
@@ -110,6 +111,7 @@ def test_requested_times_change_nothing_elsewhere(link, steps):
     same((plain.mean, plain.covariance), (extra.mean[1:6], extra.covariance[1:6]), 1e-8)
 
 
+@pytest.mark.slow
 def test_replicates_are_one_observation_of_several_outputs():
     """Three values at each time, row by row or as three outputs: predictions of length zero are passed over."""
     times, y = np.array([0.5, 1.0, 2.2]), np.random.default_rng(3).normal(0.6, 0.3, size=(3, 3))

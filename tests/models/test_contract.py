@@ -27,12 +27,12 @@ def choices(name):
     return [dict(zip(listed, values, strict=True)) for values in itertools.product(*listed.values())]
 
 
-COSTLY = ("gps",)
+COSTLY = ("gps", "home-heating")
 """Models whose other variants take long to compile; these are run with -m slow."""
 
 CASES = [
     pytest.param(name, options, id="-".join([name, *map(str, options.values())]),
-                 marks=[pytest.mark.slow] if name in COSTLY and options != choices(name)[0] else [])
+                 marks=[pytest.mark.slow] if name in COSTLY and (name == "gps" or options != choices(name)[0]) else [])
     for name in MODELS
     for options in choices(name)
 ]
@@ -118,7 +118,8 @@ def test_the_density_at_the_truth_is_finite_and_near_its_best(name, options):
         assert best > float(density(others)) - 30.0
 
 
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", [
+    pytest.param(name, marks=[pytest.mark.slow] if name in COSTLY else []) for name in MODELS])
 def test_prior_predictive_has_the_shape_of_the_data(name):
     file = loading.load(name)
     data = simulated(name)

@@ -93,6 +93,7 @@ def test_anchors_need_the_gene_and_hours(file):
     assert file.anchors(replace(hours, outputs=("DDB2", "BIK"))) == {}
 
 
+@pytest.mark.slow
 def test_priors_follow_the_duration(file, genes):
     """The same expression on another clock has the same density, up to the change of units."""
     from numpyro.infer.util import log_density
