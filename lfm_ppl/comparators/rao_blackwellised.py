@@ -222,7 +222,7 @@ def _observe(ssm: StateSpaceModel, particles: _Particles, own: Affine, observed:
     def one(value: jax.Array, slope: jax.Array, noise: jax.Array, mean: jax.Array, covariance: jax.Array) -> Update:
         return update(ssm, Linearised(value, slope, noise), observed, jnp.isfinite(observed), Moments(mean, covariance))
 
-    new = jax.vmap(one, (0, at, at, 0, at), Update(Moments(0, at), 0, 0, at, at, at))(  # type: ignore[arg-type]
+    new = jax.vmap(one, (0, at, at, 0, at), Update(Moments(0, at), 0, 0, at, at, at, at))(  # type: ignore[arg-type]
         value, own.slope, own.variance, particles.mean, particles.covariance)
     joint = particles.log_weights + new.log_likelihood
     total = logsumexp(joint)

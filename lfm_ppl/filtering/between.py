@@ -11,6 +11,7 @@ import numpy as np
 from lfm_ppl.filtering.jumps import after_jump
 from lfm_ppl.filtering.predict import Moments, Prediction, predict_row
 from lfm_ppl.filtering.retrospect import combine, given_later
+from lfm_ppl.filtering.rts import at_start
 from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays
 from lfm_ppl.filtering.transition import integrating_factor, linear_part
 from lfm_ppl.linalg import congruence, matmul
@@ -44,9 +45,25 @@ def places(plan: Schedule, times: Any) -> Places:
     return Places(np.where(at_end, last, row), times, at_end)
 
 
-def marginals_between(ssm: StateSpaceModel, rule: Rule, plan: Schedule, start: Moments, filtered: Moments,
-                      smoothed: Moments, adjoint: tuple[jax.Array, jax.Array], about: Moments | None,
-                      where: Places) -> Moments:
+class Branches(NamedTuple):
+    """Rows from whose starts the marginals within them branch off.
+
+    Attributes:
+        plan: the rows.
+        filtered: (N, ...) at their ends.
+        smoothed: (N + 1, ...) at the nodes.
+        adjoint: r and Lambda at the rows' ends.
+        about: moments (N, ...) at the rows' starts and ends to linearise about; None: the filter's own.
+    """
+
+    plan: Schedule
+    filtered: Moments
+    smoothed: Moments
+    adjoint: tuple[jax.Array, jax.Array]
+    about: tuple[Moments, Moments] | None
+
+
+def marginals_between(ssm: StateSpaceModel, rule: Rule, given: Branches, start: Moments, where: Places) -> Moments:
     """Return smoothed moments at any times within the rows.
 
     Each time branches off on its own: the filter's moments at the start of its row are predicted up to it, and on to
@@ -58,16 +75,13 @@ def marginals_between(ssm: StateSpaceModel, rule: Rule, plan: Schedule, start: M
     Args:
         ssm: the model.
         rule: the linearisation rule.
-        plan: the rows.
+        given: the rows, and what is known of them.
         start: moments at the initial time.
-        filtered: (N, ...) at the rows' ends.
-        smoothed: (N + 1, ...) at the nodes.
-        adjoint: r and Lambda at the rows' ends.
-        about: (N + 1, ...) moments to linearise about, or None.
         where: the requested times.
     """
+    plan, filtered, smoothed, adjoint, about = given
     linear = linear_part(ssm, jnp.asarray(plan.initial_time, float))
-    before = jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a[None], b[:-1]]), start, filtered)
+    before = at_start(filtered, start)
     rows = as_arrays(plan.rows)
     jumps = ssm.stack.jump_table()
 
@@ -81,7 +95,7 @@ def marginals_between(ssm: StateSpaceModel, rule: Rule, plan: Schedule, start: M
         length = jnp.clip(t - here.start, 0.0, here.length)
         nearby: tuple[Any, Any] = (None, None)
         if about is not None:
-            left, right = _entry(about, index), _entry(about, index + 1)
+            left, right = _entry(about, index)
             share = jnp.where(here.length > 0, length / jnp.where(here.length > 0, here.length, 1.0), 0.0)
             middle = jax.tree_util.tree_map(lambda a, b: a + share * (b - a), left, right)
             nearby = ((left, middle), (middle, right))

@@ -11,11 +11,11 @@ import numpy as np
 
 from lfm_ppl import checks
 from lfm_ppl.filtering.jumps import after_jump
-from lfm_ppl.filtering.predict import Moments, predict_exact, predict_row, unmoved
+from lfm_ppl.filtering.predict import Moments, Prediction, predict_exact, predict_row, unmoved
 from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays, schedule
-from lfm_ppl.filtering.transition import constant_slope, exact, integrating_factor, linear_part
-from lfm_ppl.filtering.update import linearise_observation, update
-from lfm_ppl.linalg import solve_lower
+from lfm_ppl.filtering.transition import LinearPart, constant_slope, exact, integrating_factor, linear_part
+from lfm_ppl.filtering.update import Linearised, linearise_observation, update
+from lfm_ppl.linalg import congruence, matmul, solve_lower
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.linearisation.sigma_points import Cubature
 from lfm_ppl.model.augment import StateSpaceModel, state_space
@@ -31,6 +31,7 @@ class Pass(NamedTuple):
         phi, noise: (N, n, n), the affine map of the row.
         innovation, present, chol, gain, slope, obs_cov: of the update, (N, D), (N, D), (N, D, D), (N, n, D), (N, D, n),
             (N, D, D).
+        steps: predictions (N, J, ...) of the integration steps of each row.
     """
 
     log_likelihood: jax.Array
@@ -44,6 +45,62 @@ class Pass(NamedTuple):
     gain: Any = None
     slope: Any = None
     obs_cov: Any = None
+    steps: Any = None
+
+
+class GivenRows(NamedTuple):
+    """Rows as affine maps that are known before the scan: s(end) ~ value + phi (s(start) - point) + N(0, noise).
+
+    Attributes:
+        point, value: (N, n).
+        phi, noise: (N, n, n).
+        observation: (N, ...), of the observation at the row's end.
+        observation_point: (N, n), about which that is linearised.
+    """
+
+    point: jax.Array
+    value: jax.Array
+    phi: jax.Array
+    noise: jax.Array
+    observation: Linearised
+    observation_point: jax.Array
+
+
+class Preparation(NamedTuple):
+    """What the rows of a scan share.
+
+    Attributes:
+        linear: the constant linear part of the dynamics.
+        jacobian: (D, M + R), the constant part of the observation's.
+        table: transitions of the distinct lengths; None where they are computed row by row.
+        jumps: G and Q of the forces' jumps, None without any.
+    """
+
+    linear: LinearPart
+    jacobian: jax.Array
+    table: Any
+    jumps: tuple[jax.Array, jax.Array] | None
+
+
+def preparation(ssm: StateSpaceModel, plan: Schedule) -> Preparation:
+    """Compute what the rows of a scan share."""
+    linear = linear_part(ssm, jnp.asarray(plan.initial_time, float))
+    lengths = None if plan.lengths is None else jnp.asarray(plan.lengths)
+    table = None if lengths is None else jax.vmap(lambda length: _transition(ssm, linear, plan, length))(lengths)
+    return Preparation(linear, _observation_slope(ssm, plan), table, ssm.stack.jump_table())
+
+
+def row_transition(ssm: StateSpaceModel, plan: Schedule, prepared: Preparation, row: Rows) -> Any:
+    """Return the exact transition of a row, or the integrating factor of its steps."""
+    if prepared.table is None:
+        return _transition(ssm, prepared.linear, plan, row.length)
+    return jax.tree_util.tree_map(lambda a: a[row.kind], prepared.table)
+
+
+def _transition(ssm: StateSpaceModel, linear: LinearPart, plan: Schedule, length: jax.Array) -> Any:
+    if ssm.time_invariant:
+        return exact(ssm, linear, length, plan.steps)
+    return integrating_factor(ssm, linear, length / plan.steps)
 
 
 class FilterState(NamedTuple):
@@ -78,7 +135,7 @@ class FilterResult(eqx.Module):
 
 
 def forward(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, *, start: Moments | None = None,
-            about: Moments | None = None, keep: str = "likelihood") -> Pass:
+            given: GivenRows | None = None, keep: str = "likelihood") -> Pass:
     """Run the one forward scan.
 
     Args:
@@ -87,52 +144,54 @@ def forward(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, *, s
         plan: the rows.
         y: (T, D), NaN where missing.
         start: moments at the initial time; the model's by default.
-        about: linearise about these moments, (N + 1, ...) at the start and at each row's end.
-        keep: "likelihood" (log likelihoods only), "moments" (and the moments), "all" (what the smoother needs).
+        given: the rows' affine maps where these are known; by default each is found on the way, from the filter's own
+            moments.
+        keep: "likelihood" (log likelihoods only), "moments" (and the moments), "all" (what the smoother needs),
+            "steps" (and the steps within the rows).
     """
-    rows = as_arrays(plan.rows)
-    linear = linear_part(ssm, jnp.asarray(plan.initial_time, float))
-    invariant = ssm.time_invariant
-    slope = _observation_slope(ssm, plan)
+    prepared = preparation(ssm, plan)
+    flow, invariant = keep in ("all", "steps"), ssm.time_invariant
+    each = plan.steps if keep == "steps" and not invariant else 0
 
-    def prepare(length: jax.Array) -> Any:
+    def predict(row: Rows, moments: Moments) -> Prediction:
+        transition = row_transition(ssm, plan, prepared, row)
         if invariant:
-            return exact(ssm, linear, length, plan.steps)
-        return integrating_factor(ssm, linear, length / plan.steps)
-
-    table = None if plan.lengths is None else jax.vmap(prepare)(jnp.asarray(plan.lengths))
-    jumps = ssm.stack.jump_table()
-    padded = jnp.concatenate([jnp.asarray(y, float), jnp.full((1, ssm.output_dim), jnp.nan)])
-
-    def step(moments: Moments, inputs: tuple[Rows, jax.Array, Any]) -> tuple[Moments, Pass]:
-        row, observed, nearby = inputs
-        prepared = prepare(row.length) if table is None else jax.tree_util.tree_map(lambda a: a[row.kind], table)
-        if invariant:
-            one = predict_exact(ssm, prepared, plan.steps, row.start, row.length, moments)
+            one = predict_exact(ssm, transition, plan.steps, row.start, row.length, moments)
         else:
             move = lambda: predict_row(  # noqa: E731
-                ssm, rule, linear, prepared, plan.steps, row.start, row.length, moments, nearby, flow=keep == "all")
-            stay = lambda: unmoved(moments, flow=keep == "all")  # noqa: E731
+                ssm, rule, prepared.linear, transition, plan.steps, row.start, row.length, moments, flow=flow,
+                each=bool(each))
+            stay = lambda: unmoved(moments, flow, each)  # noqa: E731
             one = jax.lax.cond(row.length > 0, move, stay) if plan.replicated else move()
-        predicted, phi, noise = one
-        if jumps is not None:
-            predicted, phi, noise = after_jump(ssm, jumps, row.jump, one, flow=keep == "all" or invariant)
-        affine = linearise_observation(ssm, rule, slope, row.start + row.length, jnp.maximum(row.observation, 0),
-                                       predicted, None if nearby is None else nearby[1])
-        new = update(ssm, affine, observed, jnp.isfinite(observed), predicted)
+        if prepared.jumps is not None:
+            one = after_jump(ssm, prepared.jumps, row.jump, one, flow=flow or invariant)
+        return one
+
+    def step(moments: Moments, inputs: tuple[Rows, jax.Array, GivenRows | None]) -> tuple[Moments, Pass]:
+        row, observed, known = inputs
+        if known is None:
+            one = predict(row, moments)
+            affine = linearise_observation(ssm, rule, prepared.jacobian, row.start + row.length,
+                                           jnp.maximum(row.observation, 0), one.moments)
+        else:
+            mean = known.value + matmul(known.phi, (moments.mean - known.point)[:, None])[:, 0]
+            covariance = congruence(known.phi, moments.covariance) + known.noise
+            one = Prediction(Moments(mean, covariance), known.phi, known.noise)
+            affine = known.observation.shifted(mean - known.observation_point)
+        new = update(ssm, affine, observed, jnp.isfinite(observed), one.moments)
         out = Pass(new.log_likelihood)
         if keep != "likelihood":
-            out = out._replace(predicted=predicted, filtered=new.moments, innovation=new.innovation,
+            out = out._replace(predicted=one.moments, filtered=new.moments, innovation=new.innovation,
                                present=jnp.isfinite(observed), chol=new.chol)
-        if keep == "all":
-            out = out._replace(phi=phi, noise=noise, gain=new.gain, slope=new.slope, obs_cov=new.obs_cov)
+        if flow:
+            out = out._replace(phi=one.phi, noise=one.noise, gain=new.gain, slope=new.slope, obs_cov=new.obs_cov,
+                               steps=one.steps)
         return new.moments, out
 
-    nearby = None
-    if about is not None:
-        nearby = (jax.tree_util.tree_map(lambda a: a[:-1], about), jax.tree_util.tree_map(lambda a: a[1:], about))
+    padded = jnp.concatenate([jnp.asarray(y, float), jnp.full((1, ssm.output_dim), jnp.nan)])
+    rows = as_arrays(plan.rows)
     first = Moments(*ssm.initial()) if start is None else start
-    _, passed = jax.lax.scan(jax.checkpoint(step, prevent_cse=False), first, (rows, padded[rows.observation], nearby))
+    _, passed = jax.lax.scan(jax.checkpoint(step, prevent_cse=False), first, (rows, padded[rows.observation], given))
     return passed
 
 

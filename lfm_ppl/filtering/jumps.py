@@ -28,4 +28,5 @@ def after_jump(ssm: StateSpaceModel, jumps: tuple[jax.Array, jax.Array], index: 
                       congruence(transition, one.moments.covariance) + added)
     if not flow:
         return one._replace(moments=moments)
-    return Prediction(moments, matmul(transition, one.phi), congruence(transition, one.noise) + added)
+    return one._replace(moments=moments, phi=matmul(transition, one.phi),
+                        noise=congruence(transition, one.noise) + added)

@@ -32,11 +32,15 @@ class Moments(NamedTuple):
 
 
 class Prediction(NamedTuple):
-    """The moments at the end of a row, and its affine map s -> phi s + ... + N(0, noise) where that was asked for."""
+    """The moments at the end of a row, and its affine map s -> phi s + ... + N(0, noise) where that was asked for.
+
+    ``steps`` holds the same of each integration step (J, ...) where these were asked for.
+    """
 
     moments: Moments
     phi: Any
     noise: Any
+    steps: Any = None
 
 
 class _Stage(NamedTuple):
@@ -83,7 +87,7 @@ def _integrated_offset(ssm: StateSpaceModel, transition: Exact, steps: int, star
 
 def predict_row(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Factor, steps: int, start: jax.Array,
                 length: jax.Array, moments: Moments, about: tuple[Moments, Moments] | None = None,
-                flow: bool = False) -> Prediction:
+                flow: bool = False, each: bool = False) -> Prediction:
     """Predict over a row in ``steps`` Runge-Kutta steps.
 
     Args:
@@ -97,28 +101,32 @@ def predict_row(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Fa
         moments: at its start.
         about: linearise about these moments, at the row's start and end, and not about the filter's own.
         flow: whether phi and noise of the whole row are wanted (for the smoother).
+        each: whether those of each step are wanted, too.
     """
     h = length / steps
     spread = _smallest_spread(ssm, rule, factor, start, h, moments)
 
-    def step(carry: tuple, index: jax.Array) -> tuple[tuple, None]:
+    def step(carry: tuple, index: jax.Array) -> tuple[tuple, Prediction | None]:
         now, phi, noise = carry
         nodes = None if about is None else _between(about, index / steps, (index + 1) / steps)
         one = _step(ssm, rule, linear, factor, start + index * h, h, now, spread, nodes)
         if flow:
             phi, noise = matmul(one.phi, phi), congruence(one.phi, noise) + one.noise
-        return (one.moments, phi, noise), None
+        return (one.moments, phi, noise), one if each else None
 
-    carry = tuple(unmoved(moments, flow))
-    (moments, whole, added), _ = jax.lax.scan(jax.checkpoint(step, prevent_cse=False), carry, jnp.arange(steps))
-    return Prediction(moments, whole, added)
+    carry = tuple(unmoved(moments, flow))[:3]
+    (moments, whole, added), within = jax.lax.scan(jax.checkpoint(step, prevent_cse=False), carry, jnp.arange(steps))
+    return Prediction(moments, whole, added, within)
 
 
-def unmoved(moments: Moments, flow: bool) -> Prediction:
-    """Predict over a row of length zero; the same structure as what `predict_row` returns."""
+def unmoved(moments: Moments, flow: bool, each: int = 0) -> Prediction:
+    """Predict over a row of length zero, of ``each`` steps; the same structure as what `predict_row` returns."""
     size = moments.mean.shape[0]
-    return (Prediction(moments, jnp.eye(size), jnp.zeros((size, size))) if flow
-            else Prediction(moments, jnp.zeros(0), jnp.zeros(0)))
+    still = (Prediction(moments, jnp.eye(size), jnp.zeros((size, size))) if flow
+             else Prediction(moments, jnp.zeros(0), jnp.zeros(0)))
+    if each:
+        still = still._replace(steps=jax.tree_util.tree_map(lambda a: jnp.broadcast_to(a, (each, *a.shape)), still))
+    return still
 
 
 def _between(about: tuple[Moments, Moments], *fractions: jax.Array) -> list[Moments]:

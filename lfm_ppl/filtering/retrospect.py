@@ -7,12 +7,9 @@ import jax.numpy as jnp
 
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.linalg import (
-    cholesky,
     conditional_shares,
     congruence,
     matmul,
-    outer_square,
-    semidefinite_root,
     solve_semidefinite,
 )
 
@@ -44,10 +41,10 @@ def combine(now: Moments, predicted: Moments, later: Moments, gain: jax.Array, c
     and magnifies errors by the inverse of P_p. Soon after a known start, where all states are moved by the same force,
     P_p is singular but for rounding. Bryson and Frazier's goes through the adjoint,
 
-        m + P r,    P - P Lambda P = L (I - L' Lambda L) L',    P = L L',
+        m + P r,    P - P Lambda P,
 
-    and magnifies them by the reduction of the variance, without bound for a start of which nothing is known. The one
-    whose smallest pivot is larger is taken.
+    and magnifies them by the reduction of the variances, without bound for a start of which nothing is known. The
+    first is taken where the conditional shares of P_p are larger than those of the variances that the second leaves.
 
     Args:
         now: filtered, m and P.
@@ -60,10 +57,12 @@ def combine(now: Moments, predicted: Moments, later: Moments, gain: jax.Array, c
 
     Source: Rauch, Tung and Striebel (1965), AIAA Journal 3; Bryson and Frazier (1963), ASD-TDR-63-119.
     """
-    root = semidefinite_root(now.covariance)
-    left = cholesky(jnp.eye(root.shape[0]) - congruence(root.T, adjoint), keep=False).chol
-    trusted = jnp.min(conditional_shares(predicted.covariance)) > jnp.min(jnp.diagonal(left)) ** 2
+    # Not by a root of P: where P is singular but for rounding, a Cholesky factor is right to half the digits only.
+    reduced = now.covariance - congruence(now.covariance, adjoint)
+    before = jnp.diagonal(now.covariance)
+    shares = jnp.where(before > 0, jnp.diagonal(reduced) / jnp.where(before > 0, before, 1.0), 1.0)
+    trusted = jnp.min(conditional_shares(predicted.covariance)) > jnp.min(shares)
     mean = jnp.where(trusted, matmul(gain, (later.mean - predicted.mean)[:, None])[:, 0],
                      matmul(now.covariance, r[:, None])[:, 0])
-    covariance = jnp.where(trusted, conditional + congruence(gain, later.covariance), outer_square(matmul(root, left)))
+    covariance = jnp.where(trusted, conditional + congruence(gain, later.covariance), reduced)
     return Moments(now.mean + mean, covariance)

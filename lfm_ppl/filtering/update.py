@@ -18,11 +18,15 @@ _LOG_2PI = float(np.log(2.0 * np.pi))
 
 
 class Linearised(NamedTuple):
-    """An observation as an affine map of the state: y ~ value + slope (s - mean) + N(0, noise)."""
+    """An observation as an affine map of the state: y ~ value + slope (s - point) + N(0, noise)."""
 
     value: jax.Array
     slope: jax.Array
     noise: jax.Array
+
+    def shifted(self, change: jax.Array) -> Linearised:
+        """Return the same map with its point moved by ``change`` (n,)."""
+        return self._replace(value=self.value + matmul(self.slope, change[:, None])[:, 0])
 
 
 class Update(NamedTuple):
@@ -48,10 +52,8 @@ class Update(NamedTuple):
 
 
 def linearise_observation(ssm: StateSpaceModel, rule: Rule, slope: jax.Array, t: jax.Array, row: jax.Array,
-                          moments: Moments, about: Moments | None = None) -> Linearised:
-    """Linearise the observation about the predicted moments, or about those of ``about``."""
-    centre = moments if about is None else about
-
+                          centre: Moments) -> Linearised:
+    """Linearise the observation about given moments."""
     angular = ssm.model.observation.angular
     if angular:
         middle = jax.lax.stop_gradient(ssm.observe(ssm.inputs(centre.mean, t), t))
@@ -65,10 +67,7 @@ def linearise_observation(ssm: StateSpaceModel, rule: Rule, slope: jax.Array, t:
 
     affine = linearise_state(ssm, rule, function, ssm.observation_structure, slope, t, centre.mean,
                              covariance_of(centre), _spread(ssm, rule, t, centre))
-    value = affine.value
-    if about is not None:
-        value = value + matmul(affine.slope, (moments.mean - about.mean)[:, None])[:, 0]
-    return Linearised(value, affine.slope, affine.residual + affine.extra)
+    return Linearised(affine.value, affine.slope, affine.residual + affine.extra)
 
 
 def _spread(ssm: StateSpaceModel, rule: Rule, t: jax.Array, moments: Moments) -> jax.Array:

@@ -15,12 +15,12 @@ from numpyro.distributions import constraints
 
 from lfm_ppl import checks
 from lfm_ppl.filtering.filter import as_rule, check_observations, forward, warn_single_precision
+from lfm_ppl.filtering.iterated import posterior_linearisation
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.schedule import Schedule, schedule
 from lfm_ppl.filtering.smoother import (
     SmootherResult,
     check_iterations,
-    posterior_linearisation,
     smooth_on,
     smoothing_plans,
 )
@@ -99,7 +99,7 @@ class MarginalLikelihood(dist.Distribution):
     @functools.cached_property
     def plan(self) -> Schedule:
         """The rows of the scan."""
-        return schedule(self.ssm, self.times, self.steps, self.max_step, row_per_step=self.iterations > 0)
+        return schedule(self.ssm, self.times, self.steps, self.max_step)
 
     def with_times(self, times: Any) -> MarginalLikelihood:
         """Return the same distribution for times that are known, where its own were traced."""
@@ -123,10 +123,11 @@ class MarginalLikelihood(dist.Distribution):
 
     def _one_step_ahead(self, y: jax.Array) -> jax.Array:
         start = Moments(*self.ssm.initial())
-        about = None
+        given = None
         if self.iterations:
-            about, _ = posterior_linearisation(self.ssm, self.rule, self.plan, y, start, self.iterations, self.damping)
-        passed = forward(self.ssm, self.rule, self.plan, y, start=start, about=about)
+            given = posterior_linearisation(self.ssm, self.rule, self.plan, y, start, self.iterations,
+                                            self.damping).given
+        passed = forward(self.ssm, self.rule, self.plan, y, start=start, given=given)
         return passed.log_likelihood[jnp.asarray(self.plan.observed)]
 
     def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:

@@ -1,0 +1,86 @@
+"""THE smoother's scan: backward, once, over what the filter left, for any rule and any model."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lfm_ppl.filtering.filter import Pass
+from lfm_ppl.filtering.predict import Moments
+from lfm_ppl.filtering.retrospect import combine, given_later
+from lfm_ppl.filtering.schedule import Schedule
+from lfm_ppl.linalg import cholesky, congruence, matmul, solve_lower, solve_upper
+
+_LOG_2PI = float(np.log(2.0 * np.pi))
+
+
+class Smoothed(NamedTuple):
+    """What the backward scan leaves: nodes are the initial time and each row's end.
+
+    Attributes:
+        moments: smoothed, at the N + 1 nodes.
+        leave_one_out: (N,), log p(y_k | all other observations), zero in rows without one.
+        adjoint: r (N, n) and Lambda (N, n, n) at the row's end, its observation and all later ones included: the
+            smoothed mean there is m_p + P_p r, the covariance P_p - P_p Lambda P_p.
+    """
+
+    moments: Moments
+    leave_one_out: jax.Array
+    adjoint: tuple[jax.Array, jax.Array]
+
+
+def at_start(filtered: Moments, start: Moments) -> Moments:
+    """Return the filtered moments (N, ...) at the rows' starts."""
+    return jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a[None], b[:-1]]), start, filtered)
+
+
+def backward(passed: Pass, start: Moments, plan: Schedule) -> Smoothed:
+    """Run the one backward scan.
+
+    Moments follow Rauch, Tung and Striebel, with the gain from a semi-definite solve and the covariance as a sum of
+    squares, or the adjoint of Bryson and Frazier, r and Lambda, which needs no inverse of a covariance (`combine` says
+    when). With u = S^-1 v - K' r and C = S^-1 + K' Lambda K, an observation given all the others is
+    N(y - C^-1 u, C^-1).
+    """
+    length = jnp.asarray(plan.rows.length)
+    still = (length == 0) & (jnp.asarray(plan.rows.jump) < 0)
+    before = at_start(passed.filtered, start)
+    size = start.mean.shape[0]
+
+    def step(carry: tuple, row: tuple) -> tuple[tuple, tuple]:
+        later, r, adjoint = carry
+        at, one, at_rest = row
+        gain, conditional = given_later(at, one.predicted, one.phi, one.noise)
+        left_out, r, adjoint = _leave_one_out(one, r, adjoint)
+        back = matmul(one.phi.T, r[:, None])[:, 0], congruence(one.phi.T, adjoint)
+        smoothed = combine(at, one.predicted, later, gain, conditional, *back)
+        # Nothing happens in a row without length but for the observation at its end.
+        smoothed = jax.tree_util.tree_map(lambda a, b: jnp.where(at_rest, a, b), later, smoothed)
+        return (smoothed, *back), (later, left_out, (r, adjoint))
+
+    last = Moments(passed.filtered.mean[-1], passed.filtered.covariance[-1])
+    carry = (last, jnp.zeros(size), jnp.zeros((size, size)))
+    (first, _, _), (ends, left_out, adjoint) = jax.lax.scan(
+        step, carry, (before, passed._replace(steps=None), still), reverse=True)
+    moments = jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a[None], b]), first, ends)
+    return Smoothed(moments, left_out, adjoint)
+
+
+def _leave_one_out(one: Pass, r: jax.Array, adjoint: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Log density of a row's observation given all others, and the adjoint at the row's end with it."""
+    outputs = one.innovation.shape[0]
+    inverse = solve_upper(one.chol, solve_lower(one.chol, jnp.eye(outputs)))
+    white = matmul(inverse, one.innovation[:, None])[:, 0]
+    u = white - matmul(one.gain.T, r[:, None])[:, 0]
+    precision = inverse + congruence(one.gain.T, adjoint)
+    factor = cholesky(precision)
+    # A missing entry has unit precision and u = 0, and so contributes nothing.
+    left_out = (jnp.log(jnp.diagonal(factor.chol)).sum() - 0.5 * (solve_lower(factor.chol, u) ** 2).sum()
+                - 0.5 * _LOG_2PI * one.present.sum())
+    kept = jnp.eye(r.shape[0]) - matmul(one.gain, one.slope)
+    r = matmul(one.slope.T, white[:, None])[:, 0] + matmul(kept.T, r[:, None])[:, 0]
+    adjoint = congruence(one.slope.T, inverse) + congruence(kept.T, adjoint)
+    return left_out, r, adjoint
