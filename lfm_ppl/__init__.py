@@ -59,6 +59,7 @@ from lfm_ppl.model.augment import StateSpaceModel, state_space
 from lfm_ppl.model.known_input import Input
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation import Gaussian, GaussianObservation
+from lfm_ppl.model.resolution import ApproximationWarning
 from lfm_ppl.model.simulate import Simulation, simulate
 from lfm_ppl.model.switching import SwitchingRule, Thermostat
 
@@ -66,6 +67,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "AccuracyReport",
+    "ApproximationWarning",
     "CQM",
     "CentralDifference",
     "Constant",

@@ -267,6 +267,7 @@ def filter(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
         _check_start(start, times, ssm.state_dim)
     plan = schedule(ssm, times, steps, max_step, initial_time=None if start is None else start.time)
     model.check_at(plan.initial_time, len(plan.observed))
+    model.check_resolution(times)
     y = check_observations(y, len(plan.observed), ssm.output_dim, empty=start is not None)
     warn_single_precision()
     begin = None if start is None else Moments(start.mean, start.covariance)

@@ -199,6 +199,7 @@ def smooth(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
     ssm = state_space(model)
     plans = smoothing_plans(ssm, times, steps, max_step, at, iterations)
     model.check_at(plans.rows.initial_time, np.shape(times)[0])
+    model.check_resolution(times)
     y = check_observations(y, len(plans.rows.observed), ssm.output_dim)
     warn_single_precision()
     return _run_smoother(ssm, rule, plans, y, iterations, damping)

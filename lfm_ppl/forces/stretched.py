@@ -33,8 +33,9 @@ class UnitMatrices(Protocol):
 class Stretched(Force):
     """A stationary force with P0 = scale^2 P_1, F = lam F_1 and L = scale sqrt(lam) L_1.
 
-    The state is ``(u, u'/lam, u''/lam^2, ...)`` with a rate lam proportional to 1/lengthscale, so that the matrices of
-    the unit process depend on the order alone. A subclass says ``unit`` and ``rate``.
+    The state is ``(v, v'/lam, v''/lam^2, ...)`` with a rate lam proportional to 1/lengthscale, so that the matrices of
+    the unit process depend on the order alone. v is u itself, unless a subclass replaces ``measurement``. A subclass
+    says ``unit`` and ``rate``.
 
     Args:
         scale: standard deviation of u, in the units of the force; > 0.
@@ -90,9 +91,9 @@ class Stretched(Force):
 
 
 def covariance_of_derivatives(moments: Sequence[Any] | np.ndarray) -> np.ndarray:
-    """Return the stationary covariance (n, n) of u and its first n - 1 derivatives.
+    """Return the stationary covariance (n, n) of a process and its first n - 1 derivatives.
 
-    ``E[u^(i) u^(j)] = (-1)^((i - j)/2) m_((i + j)/2)`` where i + j is even, zero otherwise.
+    ``E[v^(i) v^(j)] = (-1)^((i - j)/2) m_((i + j)/2)`` where i + j is even, zero otherwise.
 
     Args:
         moments: the n spectral moments m_0, ..., m_(n-1).

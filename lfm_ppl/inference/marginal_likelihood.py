@@ -84,6 +84,7 @@ class MarginalLikelihood(dist.Distribution):
         self.rule, self.steps, self.max_step = as_rule(rule), steps, max_step
         self.iterations, self.damping = iterations, damping
         model.check_at(self.plan.initial_time, np.shape(times)[0])
+        model.check_resolution(times)
         known = checks.concrete(times)
         if known is not None:
             model.check_span(float(known[0]), float(known[-1]))

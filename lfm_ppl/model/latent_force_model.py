@@ -14,6 +14,7 @@ import numpy as np
 from lfm_ppl import checks
 from lfm_ppl.forces.sde import Force
 from lfm_ppl.model.observation import Gaussian, GaussianObservation
+from lfm_ppl.model.resolution import check_resolution
 
 
 class LatentForceModel(eqx.Module):
@@ -143,6 +144,10 @@ class LatentForceModel(eqx.Module):
         """Check the forces against data from ``first`` to ``last``; raise ValueError where one does not suit them."""
         for name, force in self.forces.items():
             force.check_span(name, first, last)
+
+    def check_resolution(self, times: Any) -> None:
+        """Warn (`lfm.ApproximationWarning`) of squared exponential forces of too low an order for data at ``times``."""
+        check_resolution(self, times)
 
     def check_at(self, time: Any, rows: int) -> None:
         """Check what depends on where and how often the model is observed.

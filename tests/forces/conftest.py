@@ -34,7 +34,7 @@ FORCES = {
     **{f"matern_{p}": lambda s, ell, p=p: Matern(s, ell, order=p) for p in range(6)},
     **{
         f"squared_exponential_{n}": lambda s, ell, n=n: SquaredExponential(s, ell, order=n)
-        for n in (2, 4, 6, 8)
+        for n in (2, 4, 6, 7, 8)
     },
     "wiener_velocity": lambda s, ell: WienerVelocity(s, 0.5 * s, 2.0 * s / ell, mean=0.5),
     "random_walk": lambda s, ell: RandomWalk(s / jnp.sqrt(ell), 0.5 * s),
