@@ -21,8 +21,8 @@ from lfm_ppl.forces.discretise import (
 )
 from lfm_ppl.forces.stretched import Stretched, covariance_of_derivatives
 
-_FAR = 100.0
-"""Dimensionless time lam dt after which nothing is left: every mode decays by exp(-64) or more."""
+_FAR = 150.0
+"""Dimensionless time lam dt after which nothing is left: every mode decays by exp(-65) or more."""
 
 
 class _Fit(NamedTuple):
