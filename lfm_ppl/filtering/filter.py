@@ -106,7 +106,7 @@ def _transition(ssm: StateSpaceModel, linear: LinearPart, plan: Schedule, length
 class FilterState(NamedTuple):
     """Where a filter stands: the time and the moments of the joint state, to pass on as ``start``."""
 
-    time: jax.Array
+    time: Any
     mean: jax.Array
     covariance: jax.Array
 
@@ -271,7 +271,13 @@ def filter(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
     y = check_observations(y, len(plan.observed), ssm.output_dim, empty=start is not None)
     warn_single_precision()
     begin = None if start is None else Moments(start.mean, start.covariance)
-    return _run_filter(ssm, rule, plan, y, jnp.asarray(times, float), begin)
+    result = _run_filter(ssm, rule, plan, y, jnp.asarray(times, float), begin)
+    known = checks.concrete(times)
+    if known is not None:
+        # A number also in a trace, so that another call there can go on from it with a plan of its own.
+        last = np.asarray(known[-1], float)
+        result = eqx.tree_at(lambda r: r.state.time, result, last)
+    return result
 
 
 def _check_start(start: Any, times: Any, size: int) -> None:

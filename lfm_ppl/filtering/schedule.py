@@ -84,6 +84,8 @@ def schedule(ssm: StateSpaceModel, times: Any, steps: int, max_step: float | Non
     known = check_times(times, initial_time)
     start = known[0] if initial_time is None and known is not None else initial_time
     origin = None if start is None else checks.concrete(start)
+    if known is not None and origin is None and ssm.stack.jump_times and max_step is None and at is None:
+        return _traced_origin(known, start, ssm.stack.jump_times, steps, row_per_step)
     if known is None or origin is None:
         return _traced(ssm, times, steps, max_step, at, initial_time, row_per_step)
     return _concrete(known, float(origin), ssm.stack.jump_times, steps, max_step, at, row_per_step)
@@ -92,9 +94,9 @@ def schedule(ssm: StateSpaceModel, times: Any, steps: int, max_step: float | Non
 def _traced(ssm: StateSpaceModel, times: Any, steps: int, max_step: Any, at: Any, initial_time: Any,
             row_per_step: bool) -> Schedule:
     if max_step is not None or at is not None or ssm.stack.jump_times:
-        raise ValueError("max_step, requested times and forces with jumps need times (and initial_time) that are "
-                         "known before compilation; pass NumPy arrays rather than traced values, and do not convert "
-                         "them with jnp inside the model.")
+        raise ValueError("max_step, requested times and forces with jumps need times (the first two also an "
+                         "initial_time or `start`) that are known before compilation; pass NumPy arrays rather than "
+                         "traced values, and do not convert them with jnp inside the model.")
     times = jnp.asarray(times, float)
     origin = times[:1] if initial_time is None else jnp.reshape(jnp.asarray(initial_time, float), (1,))
     start = jnp.concatenate([origin, times[:-1]])
@@ -106,6 +108,29 @@ def _traced(ssm: StateSpaceModel, times: Any, steps: int, max_step: Any, at: Any
     observation[ends] = np.arange(times.shape[0])
     rows = Rows(start, width, observation, np.full(observation.shape, -1), np.zeros_like(observation))
     return Schedule(rows, None, ends, ends, times, 1 if row_per_step else steps, origin[0])
+
+
+def _traced_origin(times: np.ndarray, origin: Any, jumps: tuple[float, ...], steps: int,
+                   row_per_step: bool) -> Schedule:
+    """Plan for times that are known and forces that jump, where the initial time is not known.
+
+    Every jump up to the last time has a row. Those at or before the initial time have length zero and do not jump.
+    """
+    if row_per_step:
+        raise ValueError("iterations with forces that jump need an initial_time that is known before compilation.")
+    origin = jnp.asarray(origin, float)
+    indices = [index for index, jump in enumerate(jumps) if jump <= times[-1]]
+    time = np.concatenate([np.asarray(jumps, float)[indices], times])
+    jump = np.concatenate([indices, np.full(len(times), -1)]).astype(int)
+    observation = np.concatenate([np.full(len(indices), -1), np.arange(len(times))])
+    # At equal times a jump comes before an observation.
+    order = np.lexsort((observation, time))
+    time, jump, observation = time[order], jump[order], observation[order]
+    end = jnp.where(jump >= 0, jnp.maximum(time, origin), time)
+    begin = jnp.concatenate([origin[None], jnp.maximum(end[:-1], origin)])
+    rows = Rows(begin, end - begin, observation, jnp.where(time > origin, jump, -1), np.zeros_like(jump))
+    observed = np.flatnonzero(observation >= 0)
+    return Schedule(rows, None, observed, observed, times, steps, origin)
 
 
 def _concrete(times: np.ndarray, origin: float, jumps: tuple[float, ...], steps: int, max_step: float | None,

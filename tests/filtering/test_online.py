@@ -76,3 +76,49 @@ def test_a_saved_state_goes_on(tmp_path):
 def test_the_first_call_needs_an_observation():
     with pytest.raises(ValueError, match="every entry of y is missing"):
         lfm.filter(MODEL, TIMES[:2], np.full((2, 1), np.nan), steps=3)
+
+
+def repeating(period_decay, lengthscale):
+    """A model whose force jumps at 1.1 and 2.6; its parameters may be traced."""
+    kernel = lfm.PeriodicSquaredExponential(1.0, lengthscale, 1.5)
+    force = lfm.QuasiPeriodic(kernel, lfm.SQM(period_decay, (1.1, 2.6)), functions=3)
+    return lfm.LatentForceModel(
+        lambda x, u, t: u - x**3, {"drive": force}, lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.04])),
+        lfm.Gaussian(jnp.zeros(1), jnp.eye(1)), initial_time=0.0)
+
+
+@pytest.mark.parametrize("cut", [3, 12])
+def test_forces_that_jump_go_on_in_compiled_code(cut):
+    """The times are known; the state comes from the same compiled function, or from outside of it as an argument."""
+    times = TIMES[:18]
+    decays = jnp.array([0.7, 2.0])
+
+    def first(decay):
+        return lfm.filter(repeating(decay, 1.2), times[:cut], Y[:cut], steps=3)
+
+    def second(decay, state):
+        return lfm.filter(repeating(decay, 1.2), times[cut:], Y[cut:18], steps=3, start=state).log_likelihood
+
+    expected = [lfm.filter(repeating(decay, 1.2), times, Y[:18], steps=3).log_likelihood[cut:] for decay in decays]
+    within = jax.vmap(lambda decay: second(decay, first(decay).state))(decays)
+    np.testing.assert_allclose(within, expected, rtol=1e-9)
+    states = jax.vmap(lambda decay: first(decay).state)(decays)
+    passed_in = jax.jit(jax.vmap(second))(decays, states)
+    np.testing.assert_allclose(passed_in, expected, rtol=1e-9)
+
+
+def test_a_jump_is_not_repeated_where_the_filter_stands_at_it():
+    """The first window ends exactly at the jump, which it has seen."""
+    times = np.array([0.4, 1.1, 1.9, 2.6, 3.0])
+    model, y = repeating(0.7, 1.2), np.array([0.1, 0.4, -0.3, 0.2, 0.0])[:, None]
+    joint = lfm.filter(model, times, y, steps=3)
+    first = lfm.filter(model, times[:2], y[:2], steps=3)
+    on = jax.jit(lambda state: lfm.filter(model, times[2:], y[2:], steps=3, start=state))(first.state)
+    np.testing.assert_allclose(on.log_likelihood, joint.log_likelihood[2:], rtol=1e-9)
+    np.testing.assert_allclose(on.filtered_covariance, joint.filtered_covariance[2:], rtol=1e-9, atol=1e-12)
+
+
+def test_longest_steps_need_a_known_start():
+    state = lfm.filter(MODEL, TIMES[:6], Y[:6], steps=3).state
+    with pytest.raises(ValueError, match="max_step.*`start`.*NumPy arrays"):
+        jax.jit(lambda state: lfm.filter(MODEL, TIMES[6:], Y[6:], max_step=0.1, start=state))(state)
