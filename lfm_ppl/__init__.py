@@ -13,6 +13,7 @@ from lfm_ppl.comparators.particle_smoother import ParticleSmootherResult, partic
 from lfm_ppl.comparators.rao_blackwellised import RaoBlackwellisedResult, rao_blackwellised
 from lfm_ppl.comparators.switched_simulation import SwitchedSimulation, simulate_switched
 from lfm_ppl.data import Data, read_csv
+from lfm_ppl.filtering.breakdown import FilterWarning
 from lfm_ppl.filtering.filter import FilterResult, FilterState, filter
 from lfm_ppl.filtering.smoother import SmootherResult, smooth
 from lfm_ppl.forces import (
@@ -77,6 +78,7 @@ __all__ = [
     "EllipticalSlice",
     "FilterResult",
     "FilterState",
+    "FilterWarning",
     "FokkerPlanckResult",
     "Force",
     "GaussHermite",

@@ -251,6 +251,10 @@ def filter(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
     Raises:
         ValueError, TypeError: unsorted times, a wrong shape of y, and so on; each says what to do.
 
+    Warns:
+        FilterWarning: outside of compiled code, where a log likelihood is -inf or not finite: which row and step breaks
+            down, and how.
+
     Example:
         >>> import jax.numpy as jnp, lfm_ppl as lfm
         >>> model = lfm.LatentForceModel(
@@ -277,6 +281,10 @@ def filter(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
         # A number also in a trace, so that another call there can go on from it with a plan of its own.
         last = np.asarray(known[-1], float)
         result = eqx.tree_at(lambda r: r.state.time, result, last)
+    # It runs the filter itself, so that its module imports this one.
+    from lfm_ppl.filtering.breakdown import warn_of_breakdown
+
+    warn_of_breakdown(ssm, rule, plan, y, begin, result.log_likelihood)
     return result
 
 

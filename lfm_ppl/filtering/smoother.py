@@ -11,6 +11,7 @@ import numpy as np
 
 from lfm_ppl import checks
 from lfm_ppl.filtering.between import Branches, Places, marginals_between, places
+from lfm_ppl.filtering.breakdown import warn_of_breakdown
 from lfm_ppl.filtering.filter import (
     Pass,
     as_rule,
@@ -183,6 +184,9 @@ def smooth(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
     Raises:
         ValueError, TypeError: as `lfm_ppl.filter`; also for a requested time before the initial time.
 
+    Warns:
+        FilterWarning: as `lfm_ppl.filter`.
+
     Example:
         >>> import jax.numpy as jnp, lfm_ppl as lfm
         >>> model = lfm.LatentForceModel(
@@ -202,7 +206,9 @@ def smooth(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
     model.check_resolution(times)
     y = check_observations(y, len(plans.rows.observed), ssm.output_dim)
     warn_single_precision()
-    return _run_smoother(ssm, rule, plans, y, iterations, damping)
+    result = _run_smoother(ssm, rule, plans, y, iterations, damping)
+    warn_of_breakdown(ssm, rule, plans.rows, y, None, result.log_likelihood)
+    return result
 
 
 class Plans(NamedTuple):

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import sys
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from importlib import metadata
 from typing import Any
@@ -21,6 +22,7 @@ from numpyro.infer import MCMC, NUTS, init_to_median
 from lfm_ppl import checks
 from lfm_ppl.analysis import arviz_data
 from lfm_ppl.analysis.scalars import units_attribute
+from lfm_ppl.filtering.breakdown import FilterWarning, breakdown
 from lfm_ppl.filtering.filter import check_observations
 from lfm_ppl.filtering.schedule import schedule
 from lfm_ppl.inference.fixing import fix
@@ -127,6 +129,8 @@ def fit(
 
     Warns:
         ConvergenceWarning: R-hat above 1.01, fewer than 100 effective draws a chain, divergences; each with a remedy.
+        FilterWarning: no point to start from was found (which is an error): where the filter breaks down at the prior
+            median, and how.
 
     Example:
         >>> import jax.numpy as jnp, numpyro, numpyro.distributions as dist, lfm_ppl as lfm
@@ -167,15 +171,17 @@ def fit(
         raise ValueError("the model has no parameters to sample; use lfm.smooth for the forces of a known model.")
     particles = particle_steps = None
     if sampler == "map":
-        draws, stats, remarks = _mode(model, arguments, keywords, keys[1], samples, seed, init, size)
+        with _start_explained(model, arguments, keywords, keys[2], space):
+            draws, stats, remarks = _mode(model, arguments, keywords, keys[1], samples, seed, init, size)
         chains, warmup = 1, 0
     else:
-        strategy = _strategy(init, model, arguments, keywords, seed)
-        kernel, first = _kernel(sampler, model, arguments, keywords, strategy, sampler_options, keys[2], seed, chains,
-                                init is not None, space, size)
-        thin = thin or _STEPS_A_DRAW.get(sampler, 0) * size or 1
-        draws, stats = _sample(kernel, sampler, arguments, keywords, keys[1], chains, warmup, samples, thin,
-                               chain_method, progress, first)
+        with _start_explained(model, arguments, keywords, keys[2], space):
+            strategy = _strategy(init, model, arguments, keywords, seed)
+            kernel, first = _kernel(sampler, model, arguments, keywords, strategy, sampler_options, keys[2], seed,
+                                    chains, init is not None, space, size)
+            thin = thin or _STEPS_A_DRAW.get(sampler, 0) * size or 1
+            draws, stats = _sample(kernel, sampler, arguments, keywords, keys[1], chains, warmup, samples, thin,
+                                   chain_method, progress, first)
         remarks = {"thin": thin}
         if isinstance(kernel, ParticleMarginalRAM) and kernel.tuned is not None:
             particles, particle_steps = kernel.settings, kernel.particle_steps
@@ -203,6 +209,34 @@ def fit(
         for message in arviz_data.convergence_warnings(result):
             warnings.warn(message, ConvergenceWarning, stacklevel=2)
     return result
+
+
+@contextlib.contextmanager
+def _start_explained(model: Callable, arguments: tuple, keywords: dict, key: jax.Array,
+                     space: UnconstrainedModel) -> Iterator[None]:
+    """Where no point to start from is found, say how the filter breaks down at the prior median."""
+    try:
+        yield
+    except (RuntimeError, ValueError) as error:
+        if "valid initial parameters" in str(error) or "finite density" in str(error):
+            _kept("reason why there is nowhere to start", lambda: _explain_start(
+                model, arguments, keywords, key, space), None)
+        raise
+
+
+def _explain_start(model: Callable, arguments: tuple, keywords: dict, key: jax.Array,
+                   space: UnconstrainedModel) -> None:
+    median = space.constrain(space.draw(key, init_to_median))
+    distribution = likelihood_site(model, arguments, keywords, key, median).distribution
+    y = jnp.asarray(arguments[1], float)
+    several = isinstance(distribution, Panel)
+    for index in range(distribution.batch_shape[0] if several else 1):
+        one = distribution.series(index) if several else distribution
+        said = breakdown(one.ssm, one.rule, one.plan, (y[index] if several else y).reshape(one.event_shape))
+        if said is not None:
+            series = f" of series {index}" if several else ""
+            warnings.warn(f"at the prior median{series}, {said}", FilterWarning, stacklevel=6)
+            return
 
 
 def _kept(what: str, compute: Callable[[], Any], otherwise: Any) -> Any:

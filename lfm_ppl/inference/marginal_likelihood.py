@@ -196,8 +196,12 @@ class Panel(dist.Distribution):
     @property
     def first(self) -> MarginalLikelihood:
         """The distribution of the first series."""
-        times = jnp.asarray(self.times, float)[0] if self._series_times else self.times
-        return self._one(jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf)[0], self.parameters), times)
+        return self.series(0)
+
+    def series(self, index: int) -> MarginalLikelihood:
+        """Return the distribution of one series."""
+        times = jnp.asarray(self.times, float)[index] if self._series_times else self.times
+        return self._one(jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf)[index], self.parameters), times)
 
     def with_times(self, times: Any) -> Panel:
         """Return the same distribution for times that are known, where its own were traced."""

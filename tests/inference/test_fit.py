@@ -449,3 +449,20 @@ def test_a_model_needs_exactly_one_likelihood_site(y):
         lfm.fit(without, TIMES, y)
     with pytest.raises(ValueError, match="exactly one site .*found y, z"):
         lfm.fit(twice, TIMES, y)
+
+
+def steep(times, y=None):
+    """A cubic force far too strong for ten steps between observations."""
+    strength = numpyro.sample("strength", dist.LogNormal(10.0, 0.1))
+    model = lfm.LatentForceModel(
+        lambda x, u, t: u - strength * x**3, {"u": lfm.Matern(1.0, 1.0)},
+        lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])), lfm.Gaussian(jnp.ones(1), jnp.eye(1)))
+    numpyro.sample("y", lfm.MarginalLikelihood(model, times), obs=y)
+
+
+@pytest.mark.parametrize("sampler", ["nuts", "map"])
+def test_nowhere_to_start_from_is_explained(sampler):
+    times = np.array([0.0, 1.0, 2.0])
+    with pytest.warns(lfm.FilterWarning, match=r"at the prior median, the filter breaks down at row 1 \(time 1\), step"):
+        with pytest.raises((RuntimeError, ValueError), match="initial parameters|finite density"):
+            lfm.fit(steep, times, np.ones((3, 1)), sampler=sampler, chains=1, warmup=2, samples=2, progress=False)

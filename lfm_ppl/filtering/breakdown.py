@@ -1,0 +1,118 @@
+"""Where and how a filter breaks down, found after the fact so that it costs nothing where none does."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lfm_ppl import checks
+from lfm_ppl.filtering.filter import Pass, forward
+from lfm_ppl.filtering.predict import Moments
+from lfm_ppl.filtering.schedule import Rows, Schedule
+from lfm_ppl.linearisation.rule import Rule
+from lfm_ppl.model.augment import StateSpaceModel
+
+_NEGATIVE = 1e-8
+"""Share of the largest variance so far by which one must be negative to be no rounding error."""
+
+_HUGE = 1e6
+"""Growth of a standard deviation within a row, or beyond one, from which the message tells it."""
+
+
+class FilterWarning(UserWarning):
+    """The filter breaks down: its log likelihood is -inf. The message says where, how, and what to try."""
+
+
+def warn_of_breakdown(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: Any, start: Moments | None,
+                      log_likelihood: Any, stacklevel: int = 3) -> None:
+    """Warn where a log likelihood is not finite; nothing happens in compiled code.
+
+    Args:
+        ssm: the model.
+        rule: the linearisation rule.
+        plan: the rows.
+        y: (T, D), NaN where missing.
+        start: moments at the initial time; the model's by default.
+        log_likelihood: what the filter found, of any shape.
+        stacklevel: as in `warnings.warn`.
+    """
+    if checks.traced((ssm, plan, y, start, log_likelihood)) or np.isfinite(np.asarray(log_likelihood)).all():
+        return
+    warnings.warn(breakdown(ssm, rule, plan, y, start) or "the log likelihood is -inf, but the filter does not break "
+                  "down without posterior linearisation: try iterations=0, or more damping (a smaller share).",
+                  FilterWarning, stacklevel=stacklevel)
+
+
+def breakdown(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: Any, start: Moments | None = None) -> str | None:
+    """Return where and how the filter breaks down and what to try, None where it does not. Arguments must be concrete.
+
+    The filter runs once more, and through the row that breaks down step by step.
+    """
+    y = jnp.asarray(y, float)
+    start = Moments(*ssm.initial()) if start is None else start
+    passed = _run(ssm, rule, plan, y, start)
+    row = _first_bad(passed)
+    if row is None:
+        return None
+    rows = jax.tree_util.tree_map(np.asarray, plan.rows)
+    before = start if row == 0 else Moments(passed.filtered.mean[row - 1], passed.filtered.covariance[row - 1])
+    count = 1 if ssm.time_invariant else plan.steps
+    one = Rows(*(np.asarray(column)[row] for column in rows))
+    width = one.length / count
+    last = np.arange(count) == count - 1
+    pieces = Rows(one.start + width * np.arange(count), np.full(count, width), np.where(last, one.observation, -1),
+                  np.where(last, one.jump, -1), np.zeros(count, int))
+    nodes = np.arange(count)
+    stepped = _run(ssm, rule, Schedule(pieces, None, nodes, nodes, pieces.start, 1, plan.initial_time), y, before)
+    step = _first_bad(stepped)
+    # Steps of their own differ by rounding, and need not break down.
+    found, at = (passed, row) if step is None else (stepped, step)
+    largest = float(np.sqrt(np.max(np.diagonal(before.covariance), initial=0.0)))
+    reason = _reason(found, at, largest)
+    index = int(np.argmax(np.asarray(plan.observed) >= row))
+    time = float(rows.start[plan.observed[index]] + rows.length[plan.observed[index]])
+    where = f"row {index} (time {time:.6g})"
+    if not ssm.time_invariant and step is not None:
+        where += f", step {step + 1} of {count} from time {float(one.start):.6g} to {float(one.start + one.length):.6g}"
+    remedy = ("Try a tighter prior, an observation noise that is not so small, or other units" if ssm.time_invariant
+              else "Try more steps (steps=...), a longest step (max_step=...), another rule, or a tighter prior")
+    return f"the filter breaks down at {where}: {reason}. The log likelihood is -inf. {remedy}."
+
+
+@eqx.filter_jit
+def _run(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, start: Moments) -> Pass:
+    return forward(ssm, rule, plan, y, start=start, keep="moments")
+
+
+def _first_bad(passed: Pass) -> int | None:
+    """Return the first row that is not finite, whose observation is impossible, or None."""
+    good = np.isfinite(np.asarray(passed.log_likelihood))
+    for moments in (passed.predicted, passed.filtered):
+        good &= np.isfinite(np.asarray(moments.mean)).all(1) & np.isfinite(np.asarray(moments.covariance)).all((1, 2))
+    return None if good.all() else int(np.argmin(good))
+
+
+def _reason(passed: Pass, row: int, largest: float) -> str:
+    """Say what is wrong in a row; ``largest`` is the largest standard deviation before it."""
+    predicted = jax.tree_util.tree_map(lambda a: np.asarray(a[row]), passed.predicted)
+    variance = np.diagonal(predicted.covariance)
+    if not np.isfinite(predicted.mean).all():
+        return "the predicted mean is not finite"
+    if not np.isfinite(predicted.covariance).all():
+        return "the predicted covariance is not finite"
+    reached = float(np.sqrt(np.max(np.abs(variance), initial=0.0)))
+    grown = (f"; the largest predicted standard deviation is {reached:.3g}, and was {largest:.3g} before"
+             if reached > _HUGE * max(largest, 1.0) else "")
+    if variance.min(initial=0.0) < -_NEGATIVE * np.abs(variance).max(initial=0.0):
+        return "the predicted covariance has a negative variance" + grown
+    innovation, chol = np.asarray(passed.innovation[row]), np.asarray(passed.chol[row])
+    if not (np.isfinite(innovation).all() and np.isfinite(chol).all()):
+        return "the predicted observation or its covariance is not finite" + grown
+    if grown:
+        return "the filtered moments are lost to rounding" + grown
+    return "the innovation covariance is not positive definite"
