@@ -9,12 +9,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.filtering.predict import Moments, covariance_of, linearise_state
-from lfm_ppl.linalg import cholesky, congruence, matmul, solve_lower, solve_upper, wrapped
+from lfm_ppl.linalg import cholesky, congruence, matmul, safe_sqrt, solve_lower, solve_upper, wrapped
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.linearisation.sigma_points import SigmaPointRule
 from lfm_ppl.model.augment import StateSpaceModel
 
 _LOG_2PI = float(np.log(2.0 * np.pi))
+
+_LOST_MEAN, _LOST_VARIANCE = 1e-3, 1e3
+"""Errors of a filtered output, in standard deviations and variances of its noise, from which precision is lost."""
+
+_HARMLESS = 1e-6
+"""The same errors as shares of the observation (and of its square) that do no harm, however small the noise."""
 
 
 class Linearised(NamedTuple):
@@ -84,7 +90,8 @@ def update(ssm: StateSpaceModel, observation: Linearised, y: jax.Array, present:
            moments: Moments) -> Update:
     """Condition on the present entries of ``y`` (D,), with the covariance in Joseph's form.
 
-    The log likelihood is -inf where the innovation covariance is not positive definite.
+    The log likelihood is -inf where the innovation covariance is not positive definite to working precision, or where
+    the filtered moments are lost to rounding, next to a prediction that is larger by orders of magnitude.
     """
     mean, covariance = moments
     slope = jnp.where(present[:, None], observation.slope, 0.0)
@@ -95,13 +102,48 @@ def update(ssm: StateSpaceModel, observation: Linearised, y: jax.Array, present:
     both = present[:, None] & present[None, :]
     noise = jnp.where(both, observation.noise, jnp.eye(y.shape[0]))
     cross = matmul(covariance, slope.T)
-    factor = cholesky(matmul(slope, cross) + noise)
+    innovation_covariance = matmul(slope, cross) + noise
+    # A smaller pivot has no correct digit, and its sign is chance.
+    rounding = 4 * jnp.finfo(y.dtype).eps * jnp.abs(jnp.diagonal(innovation_covariance))
+    factor = cholesky(innovation_covariance, rounding)
     chol = factor.chol
     gain = solve_upper(chol, solve_lower(chol, cross.T)).T
     white = solve_lower(chol, innovation)
     diagonal = jnp.diagonal(chol)
     log_likelihood = -0.5 * ((white**2).sum() + present.sum() * _LOG_2PI) - jnp.log(diagonal).sum()
     kept = jnp.eye(mean.shape[0]) - matmul(gain, slope)
-    return Update(
-        Moments(mean + matmul(gain, innovation[:, None])[:, 0], congruence(kept, covariance) + congruence(gain, noise)),
-        jnp.where(factor.degenerate.any(), -jnp.inf, log_likelihood), innovation, chol, gain, slope, noise)
+    filtered = Moments(mean + matmul(gain, innovation[:, None])[:, 0],
+                       congruence(kept, covariance) + congruence(gain, noise))
+    failed = factor.degenerate.any() | _precision_lost(ssm, observation, y, present, moments, filtered, noise,
+                                                       solve_upper(chol, white))
+    return Update(filtered, jnp.where(failed, -jnp.inf, log_likelihood), innovation, chol, gain, slope, noise)
+
+
+def _precision_lost(ssm: StateSpaceModel, observation: Linearised, y: jax.Array, present: jax.Array,
+                    predicted: Moments, filtered: Moments, noise: jax.Array, weighted: jax.Array) -> jax.Array:
+    """Whether the filtered moments of an observed output are nothing but rounding errors.
+
+    Given the observation, the output has the residual R S^-1 v and the variance R - R S^-1 R <= R. Errors are some
+    1e-16 of the prediction, too large where an unstable model has sent that to infinity, or nearly.
+
+    Args:
+        ssm: the model.
+        observation: its linearisation about the predicted moments.
+        y: (D,).
+        present: (D,), whether an entry is.
+        predicted: moments before the observation.
+        filtered: moments after it.
+        noise: R (D, D).
+        weighted: (D,), S^-1 v.
+    """
+    y = jnp.where(present, y, 0.0)
+    moved = matmul(observation.slope, (filtered.mean - predicted.mean)[:, None])[:, 0]
+    error = y - (observation.value + moved) - matmul(noise, weighted[:, None])[:, 0]
+    for index in ssm.model.observation.angular:
+        error = error.at[index].set(wrapped(error[index]))
+    variance = jnp.abs((matmul(observation.slope, filtered.covariance) * observation.slope).sum(1))
+    own = jnp.abs(jnp.diagonal(noise))
+    lost = ((jnp.abs(error) > _LOST_MEAN * safe_sqrt(own) + _HARMLESS * jnp.abs(y))
+            | (variance > _LOST_VARIANCE * own + _HARMLESS * y**2))
+    # Zero, observed without noise, gives no scale to judge by.
+    return (present & lost & ((own > 0) | (y != 0))).any()

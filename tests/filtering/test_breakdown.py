@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import warnings
+from decimal import Decimal, localcontext
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from systems import DoubleWell, double_well
+from systems import DoubleWell, Linear, Outputs, double_well, whole_state
 
 import lfm_ppl as lfm
 from lfm_ppl.filtering.breakdown import breakdown
@@ -16,6 +17,7 @@ from lfm_ppl.filtering.schedule import schedule
 
 TIMES = np.array([0.5, 1.0, 9.0, 9.5])
 Y = np.array([0.4, 0.6, 0.5, 0.1])[:, None]
+RATES = np.array([0.76, -0.46])
 
 
 def test_the_row_and_the_step_are_named():
@@ -60,3 +62,61 @@ def test_compiled_code_says_nothing():
 def test_nothing_is_said_where_nothing_breaks_down():
     ssm = lfm.state_space(double_well())
     assert breakdown(ssm, lfm.Cubature(), schedule(ssm, TIMES, 10), Y) is None
+
+
+def unstable(noise):
+    """One state that grows and one that decays, whose sum is observed."""
+    return lfm.LatentForceModel(
+        Linear(jnp.diag(RATES), jnp.zeros((2, 0))), {},
+        lfm.GaussianObservation(Outputs(jnp.ones((1, 2))), jnp.array([noise])),
+        lfm.Gaussian(jnp.zeros(2), jnp.eye(2)), process_noise=0.5 * jnp.eye(2), initial_time=0.0)
+
+
+def exact_log_likelihood(times, y, noise):
+    """The Kalman filter of `unstable` in four hundred digits."""
+    decimal = np.vectorize(lambda value: Decimal(float(value)), otypes=[object])
+    with localcontext() as context:
+        context.prec = 400
+        rates, row, log_2pi = decimal(RATES), decimal(np.ones(2)), Decimal(2 * np.pi).ln()
+        mean, covariance, now, total = decimal(np.zeros(2)), decimal(np.eye(2)), Decimal(0), Decimal(0)
+        for time, value in zip(decimal(times), decimal(y), strict=True):
+            phi = np.array([(rate * (time - now)).exp() for rate in rates])
+            added = Decimal("0.25") * (phi**2 - 1) / (2 * rates)
+            mean, covariance, now = phi * mean, phi[:, None] * covariance * phi + np.diag(added), time
+            variance, innovation = row @ covariance @ row + Decimal(noise), value - row @ mean
+            total -= (innovation**2 / variance + variance.ln() + log_2pi) / 2
+            gain = covariance @ row / variance
+            mean, covariance = mean + gain * innovation, covariance - np.outer(gain, gain) * variance
+        return float(total)
+
+
+def test_what_grows_beyond_all_digits_is_impossible_or_right():
+    """After a gap of 169 a variance is 1e111, and what is left of it after an observation is rounding errors."""
+    y = np.array([0.3, -0.4, 0.2, 0.1, 0.5])
+    impossible = []
+    for gap in (1.0, 10.0, 20.0, 30.0, 40.0, 60.0, 100.0, 169.0):
+        times = np.array([0.5, gap, gap, gap + 0.01, gap + 1.0])
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", lfm.FilterWarning)
+            found = float(lfm.filter(unstable(1e-4), times, y).log_likelihood.sum())
+        impossible.append(found == -np.inf)
+        if not impossible[-1]:
+            assert found == pytest.approx(exact_log_likelihood(times, y, 1e-4), rel=1e-5), gap
+    assert impossible == [False] * 4 + [True] * 4
+
+
+def test_precision_lost_is_named():
+    times = np.array([0.5, 169.0, 169.0])
+    with pytest.warns(lfm.FilterWarning, match=r"row 1 \(time 169\): the filtered moments are lost to rounding; the "
+                                               r"largest predicted standard deviation is \S+e\+55.*tighter prior"):
+        lfm.filter(unstable(1e-4), times, np.zeros((3, 1)) + 0.1)
+
+
+@pytest.mark.parametrize("y", [0.0, 0.4])
+@pytest.mark.parametrize("noise", [0.0, 1e-20, 1e-12])
+def test_an_uncertain_start_and_little_noise_are_no_failure(noise, y):
+    """Also where the first observation is exactly zero."""
+    model = lfm.LatentForceModel(
+        Linear(-jnp.eye(1), jnp.ones((1, 1))), {"u": lfm.Matern(1.0, 1.0)},
+        lfm.GaussianObservation(whole_state, jnp.array([noise])), lfm.Gaussian(jnp.zeros(1), 1e7 * jnp.eye(1)))
+    assert np.isfinite(lfm.filter(model, TIMES, np.full((4, 1), y)).log_likelihood).all()
