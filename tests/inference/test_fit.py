@@ -463,6 +463,6 @@ def steep(times, y=None):
 @pytest.mark.parametrize("sampler", ["nuts", "map"])
 def test_nowhere_to_start_from_is_explained(sampler):
     times = np.array([0.0, 1.0, 2.0])
-    with pytest.warns(lfm.FilterWarning, match=r"at the prior median, the filter breaks down at row 1 \(time 1\), step"):
+    with pytest.warns(lfm.FilterWarning, match=r"at the prior median, the filter breaks down at row 1 \(time 1\)"):
         with pytest.raises((RuntimeError, ValueError), match="initial parameters|finite density"):
             lfm.fit(steep, times, np.ones((3, 1)), sampler=sampler, chains=1, warmup=2, samples=2, progress=False)
