@@ -104,7 +104,7 @@ def under_thermostat(method: str, store: str, functions: int, particles: int) ->
         y = jnp.full((len(problem.FINE), 3), jnp.nan).at[:, 1].set(weather)
         return rao_blackwellised(
             lambda heater: problem.under(method, store, functions, values, heater), problem.thermostat(set_points),
-            problem.FINE, key, y=y, start=FilterState(np.asarray(float(_LAST)), start.state, start.covariance),  # type: ignore[arg-type]
+            problem.FINE, key, y=y, start=FilterState(np.asarray(float(_LAST)), start.state, start.covariance),
             initial=on, particles=particles, steps=1)
 
     return jax.jit(run)
