@@ -98,7 +98,8 @@ def marginals_between(ssm: StateSpaceModel, rule: Rule, given: Branches, start: 
             left, right = _entry(about, index)
             share = jnp.where(here.length > 0, length / jnp.where(here.length > 0, here.length, 1.0), 0.0)
             middle = jax.tree_util.tree_map(lambda a, b: a + share * (b - a), left, right)
-            nearby = ((left, middle), (middle, right))
+            pair = lambda *ends: jax.tree_util.tree_map(lambda a, b: jnp.stack([a, b]), *ends)  # noqa: E731
+            nearby = pair(left, middle), pair(middle, right)
         now = piece(here.start, length, _entry(before, index), nearby[0], False).moments
         rest = piece(here.start + length, here.length - length, now, nearby[1], True)
         if jumps is not None:

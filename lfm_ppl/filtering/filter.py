@@ -14,8 +14,8 @@ from lfm_ppl.filtering.jumps import after_jump
 from lfm_ppl.filtering.predict import Moments, Prediction, predict_exact, predict_row, unmoved
 from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays, schedule
 from lfm_ppl.filtering.transition import LinearPart, constant_slope, exact, integrating_factor, linear_part
-from lfm_ppl.filtering.update import Linearised, linearise_observation, update
-from lfm_ppl.linalg import congruence, matmul, solve_lower
+from lfm_ppl.filtering.update import linearise_observation, update
+from lfm_ppl.linalg import solve_lower
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.linearisation.sigma_points import Cubature
 from lfm_ppl.model.augment import StateSpaceModel, state_space
@@ -48,22 +48,16 @@ class Pass(NamedTuple):
     steps: Any = None
 
 
-class GivenRows(NamedTuple):
-    """Rows as affine maps that are known before the scan: s(end) ~ value + phi (s(start) - point) + N(0, noise).
+class Points(NamedTuple):
+    """Moments about which a pass is linearised.
 
     Attributes:
-        point, value: (N, n).
-        phi, noise: (N, n, n).
-        observation: (N, ...), of the observation at the row's end.
-        observation_point: (N, n), about which that is linearised.
+        nodes: (N, J + 1, ...) at the ends of the steps of each row, before a jump.
+        ends: (N, ...) at the rows' ends, after it.
     """
 
-    point: jax.Array
-    value: jax.Array
-    phi: jax.Array
-    noise: jax.Array
-    observation: Linearised
-    observation_point: jax.Array
+    nodes: Moments
+    ends: Moments
 
 
 class Preparation(NamedTuple):
@@ -135,7 +129,7 @@ class FilterResult(eqx.Module):
 
 
 def forward(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, *, start: Moments | None = None,
-            given: GivenRows | None = None, keep: str = "likelihood") -> Pass:
+            about: Points | None = None, keep: str = "likelihood") -> Pass:
     """Run the one forward scan.
 
     Args:
@@ -144,8 +138,7 @@ def forward(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, *, s
         plan: the rows.
         y: (T, D), NaN where missing.
         start: moments at the initial time; the model's by default.
-        given: the rows' affine maps where these are known; by default each is found on the way, from the filter's own
-            moments.
+        about: linearise about these moments; the filter's own by default.
         keep: "likelihood" (log likelihoods only), "moments" (and the moments), "all" (what the smoother needs),
             "steps" (and the steps within the rows).
     """
@@ -153,31 +146,28 @@ def forward(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, *, s
     flow, invariant = keep in ("all", "steps"), ssm.time_invariant
     each = plan.steps if keep == "steps" and not invariant else 0
 
-    def predict(row: Rows, moments: Moments) -> Prediction:
+    def predict(row: Rows, moments: Moments, nodes: Moments | None) -> Prediction:
         transition = row_transition(ssm, plan, prepared, row)
         if invariant:
             one = predict_exact(ssm, transition, plan.steps, row.start, row.length, moments)
         else:
             move = lambda: predict_row(  # noqa: E731
-                ssm, rule, prepared.linear, transition, plan.steps, row.start, row.length, moments, flow=flow,
-                each=bool(each))
+                ssm, rule, prepared.linear, transition, plan.steps, row.start, row.length, moments, nodes,
+                flow, bool(each))
             stay = lambda: unmoved(moments, flow, each)  # noqa: E731
             one = jax.lax.cond(row.length > 0, move, stay) if plan.replicated else move()
         if prepared.jumps is not None:
             one = after_jump(ssm, prepared.jumps, row.jump, one, flow=flow or invariant)
         return one
 
-    def step(moments: Moments, inputs: tuple[Rows, jax.Array, GivenRows | None]) -> tuple[Moments, Pass]:
-        row, observed, known = inputs
-        if known is None:
-            one = predict(row, moments)
-            affine = linearise_observation(ssm, rule, prepared.jacobian, row.start + row.length,
-                                           jnp.maximum(row.observation, 0), one.moments)
-        else:
-            mean = known.value + matmul(known.phi, (moments.mean - known.point)[:, None])[:, 0]
-            covariance = congruence(known.phi, moments.covariance) + known.noise
-            one = Prediction(Moments(mean, covariance), known.phi, known.noise)
-            affine = known.observation.shifted(mean - known.observation_point)
+    def step(moments: Moments, inputs: tuple[Rows, jax.Array, Points | None]) -> tuple[Moments, Pass]:
+        row, observed, nearby = inputs
+        one = predict(row, moments, None if nearby is None else nearby.nodes)
+        centre = one.moments if nearby is None else nearby.ends
+        affine = linearise_observation(ssm, rule, prepared.jacobian, row.start + row.length,
+                                       jnp.maximum(row.observation, 0), centre)
+        if nearby is not None:
+            affine = affine.shifted(one.moments.mean - centre.mean)
         new = update(ssm, affine, observed, jnp.isfinite(observed), one.moments)
         out = Pass(new.log_likelihood)
         if keep != "likelihood":
@@ -191,7 +181,7 @@ def forward(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, *, s
     padded = jnp.concatenate([jnp.asarray(y, float), jnp.full((1, ssm.output_dim), jnp.nan)])
     rows = as_arrays(plan.rows)
     first = Moments(*ssm.initial()) if start is None else start
-    _, passed = jax.lax.scan(jax.checkpoint(step, prevent_cse=False), first, (rows, padded[rows.observation], given))
+    _, passed = jax.lax.scan(jax.checkpoint(step, prevent_cse=False), first, (rows, padded[rows.observation], about))
     return passed
 
 

@@ -86,7 +86,7 @@ def _integrated_offset(ssm: StateSpaceModel, transition: Exact, steps: int, star
 
 
 def predict_row(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Factor, steps: int, start: jax.Array,
-                length: jax.Array, moments: Moments, about: tuple[Moments, Moments] | None = None,
+                length: jax.Array, moments: Moments, about: Moments | None = None,
                 flow: bool = False, each: bool = False) -> Prediction:
     """Predict over a row in ``steps`` Runge-Kutta steps.
 
@@ -99,23 +99,27 @@ def predict_row(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Fa
         start: time at the row's start.
         length: of the row.
         moments: at its start.
-        about: linearise about these moments, at the row's start and end, and not about the filter's own.
+        about: linearise about these moments, (steps + 1, ...) at the ends of the steps, and not about the filter's own.
         flow: whether phi and noise of the whole row are wanted (for the smoother).
         each: whether those of each step are wanted, too.
     """
     h = length / steps
     spread = _smallest_spread(ssm, rule, factor, start, h, moments)
 
-    def step(carry: tuple, index: jax.Array) -> tuple[tuple, Prediction | None]:
+    def step(carry: tuple, at: tuple) -> tuple[tuple, Prediction | None]:
         now, phi, noise = carry
-        nodes = None if about is None else _between(about, index / steps, (index + 1) / steps)
+        index, ends = at
+        nodes = None if ends is None else _with_middle(*ends)
         one = _step(ssm, rule, linear, factor, start + index * h, h, now, spread, nodes)
         if flow:
             phi, noise = matmul(one.phi, phi), congruence(one.phi, noise) + one.noise
         return (one.moments, phi, noise), one if each else None
 
     carry = tuple(unmoved(moments, flow))[:3]
-    (moments, whole, added), within = jax.lax.scan(jax.checkpoint(step, prevent_cse=False), carry, jnp.arange(steps))
+    ends = None if about is None else (jax.tree_util.tree_map(lambda a: a[:-1], about),
+                                       jax.tree_util.tree_map(lambda a: a[1:], about))
+    (moments, whole, added), within = jax.lax.scan(
+        jax.checkpoint(step, prevent_cse=False), carry, (jnp.arange(steps), ends))
     return Prediction(moments, whole, added, within)
 
 
@@ -129,11 +133,9 @@ def unmoved(moments: Moments, flow: bool, each: int = 0) -> Prediction:
     return still
 
 
-def _between(about: tuple[Moments, Moments], *fractions: jax.Array) -> list[Moments]:
-    """Moments at the first, the middle and the last of two fractions of a row, linear in between."""
-    first, last = fractions
-    return [jax.tree_util.tree_map(lambda a, b: a + share * (b - a), *about)  # noqa: B023
-            for share in (first, 0.5 * (first + last), last)]
+def _with_middle(first: Moments, last: Moments) -> list[Moments]:
+    """Moments at the first, the middle and the last node of a step, linear in between."""
+    return [first, jax.tree_util.tree_map(lambda a, b: 0.5 * (a + b), first, last), last]
 
 
 def _smallest_spread(ssm: StateSpaceModel, rule: Rule, factor: Factor, t: jax.Array, h: jax.Array,

@@ -257,13 +257,13 @@ def smooth_on(ssm: StateSpaceModel, rule: Rule, plans: Plans, y: jax.Array, iter
     if plans.joint is None or plans.where is None:
         at = jnp.asarray(plan.requested)
         mean, covariance = (a[at + 1] for a in smoothed.moments)
-        joint = Joint(start, passed, at, None)
+        joint = Joint(start, passed._replace(steps=None), at, None)
     else:
         drawn, pieces, _ = _smooth_rows(ssm, rule, plans.joint, y, start, iterations, damping)
         at = jnp.asarray(plans.joint.requested)
-        joint = Joint(start, drawn, at, pieces.moments.covariance[at + 1])
+        joint = Joint(start, drawn._replace(steps=None), at, pieces.moments.covariance[at + 1])
         rows = (Branches(plan, passed.filtered, smoothed.moments, smoothed.adjoint, None) if found is None
-                else refined(ssm, plan, start, found, passed, smoothed))
+                else refined(ssm, plan, found, passed, smoothed))
         mean, covariance = marginals_between(ssm, rule, rows, start, plans.where)
     matrix, offset = jax.vmap(ssm.input_map)(times)
     observed = jnp.asarray(plan.observed)
@@ -280,7 +280,8 @@ def _smooth_rows(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array,
     found = None
     if iterations:
         found = posterior_linearisation(ssm, rule, plan, y, start, iterations, damping)
-    passed = forward(ssm, rule, plan, y, start=start, given=None if found is None else found.given, keep="all")
+    passed = forward(ssm, rule, plan, y, start=start, about=None if found is None else found.points,
+                     keep="steps" if iterations else "all")
     return passed, backward(passed, start, plan), found
 
 

@@ -124,11 +124,11 @@ class MarginalLikelihood(dist.Distribution):
 
     def _one_step_ahead(self, y: jax.Array) -> jax.Array:
         start = Moments(*self.ssm.initial())
-        given = None
+        about = None
         if self.iterations:
-            given = posterior_linearisation(self.ssm, self.rule, self.plan, y, start, self.iterations,
-                                            self.damping).given
-        passed = forward(self.ssm, self.rule, self.plan, y, start=start, given=given)
+            about = posterior_linearisation(self.ssm, self.rule, self.plan, y, start, self.iterations,
+                                            self.damping).points
+        passed = forward(self.ssm, self.rule, self.plan, y, start=start, about=about)
         return passed.log_likelihood[jnp.asarray(self.plan.observed)]
 
     def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
