@@ -63,7 +63,7 @@ def posterior_linearisation(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y:
         return (jax.tree_util.tree_map(lambda a, b: a + damping * (b - a), points, new), change), None
 
     first = smoothed(None), jnp.asarray(jnp.nan)
-    (points, change), _ = jax.lax.scan(jax.checkpoint(iterate), first, None, length=iterations - 1)
+    (points, change), _ = jax.lax.scan(iterate, first, None, length=iterations - 1)
     return Iterated(points, change)
 
 
@@ -88,32 +88,41 @@ def _nodes(ssm: StateSpaceModel, rule: Rule, plan: Schedule, passed: Pass, smoot
     with Phi from the node to the row's end.
     """
     needed = np.flatnonzero(_needed(ssm, rule))
-    total = ssm.state_dim
-    pick = jnp.asarray(np.eye(total)[needed])
-    ends = jax.tree_util.tree_map(lambda a: a[:, None], Moments(
-        matmul(pick, smoothed.moments.mean[..., None])[..., 0], congruence(pick, smoothed.moments.covariance)))
-    left, right = (jax.tree_util.tree_map(lambda a: a[part], ends)  # noqa: B023
-                   for part in (slice(None, -1), slice(1, None)))
+    pick = jnp.asarray(np.eye(ssm.state_dim)[needed])
     jumps = ssm.stack.jump_table()
-    if passed.steps is None or not needed.size:
-        nodes = jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a, *(b for _ in range(plan.steps))], axis=1),
-                                       left, right)
-        return Moments(matmul(nodes.mean[..., None, :], pick)[..., 0, :], congruence(pick.T, nodes.covariance))
-    inner = slice(0, None if jumps is not None else -1)
-    filtered = passed.steps.moments
-    to_end = _to_end(ssm, plan, passed)[0][:, 1:]
-    r, adjoint = smoothed.adjoint
 
-    def inside(mean: jax.Array, covariance: jax.Array, phi: jax.Array) -> Moments:
-        own = matmul(pick, covariance)
-        cross = matmul(own, phi.mT)
-        return Moments(matmul(pick, mean[..., None])[..., 0] + matmul(cross, r[:, None, :, None])[..., 0],
-                       matmul(own, pick.T) - congruence(cross, adjoint[:, None]))
+    def part(moments: Moments) -> Moments:
+        return Moments(matmul(pick, moments.mean[:, None])[:, 0], congruence(pick, moments.covariance))
 
-    within = inside(filtered.mean[:, inner], filtered.covariance[:, inner], to_end[:, inner])
-    parts = (left, within) if jumps is not None else (left, within, right)
-    nodes = jax.tree_util.tree_map(lambda *a: jnp.concatenate(a, axis=1), *parts)
-    return Moments(matmul(nodes.mean[..., None, :], pick)[..., 0, :], congruence(pick.T, nodes.covariance))
+    def row(at: tuple) -> Moments:
+        first, last, r, adjoint, jump, steps = at
+        first, last = part(first), part(last)
+        if steps is None or not needed.size:
+            return jax.tree_util.tree_map(lambda a, b: jnp.stack([a, *(b for _ in range(plan.steps))]), first, last)
+
+        def node(phi: jax.Array, step: Prediction) -> tuple[jax.Array, Moments]:
+            mean, covariance = step.moments
+            own = matmul(pick, covariance)
+            cross = matmul(own, phi.T)
+            inside = Moments((matmul(pick, mean[:, None]) + matmul(cross, r[:, None]))[:, 0],
+                             matmul(own, pick.T) - congruence(cross, adjoint))
+            return matmul(phi, step.phi), inside
+
+        identity = jnp.eye(ssm.state_dim)
+        to_end = identity
+        if jumps is not None:
+            still = Prediction(Moments(jnp.zeros(ssm.state_dim), identity), identity, identity)
+            to_end = after_jump(ssm, jumps, jump, still, flow=True).phi
+        _, inside = jax.lax.scan(node, to_end, steps, reverse=True)
+        if jumps is None:
+            inside = jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a[:-1], b[None]]), inside, last)
+        return jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a[None], b]), first, inside)
+
+    starts, ends = (jax.tree_util.tree_map(lambda a: a[part], smoothed.moments)  # noqa: B023
+                    for part in (slice(None, -1), slice(1, None)))
+    # Row by row: XLA makes one small program of a row's loop, where it treats all rows at once operation by operation.
+    nodes = jax.lax.map(row, (starts, ends, *smoothed.adjoint, jnp.asarray(plan.rows.jump), passed.steps))
+    return Moments(matmul(nodes.mean, pick), congruence(pick.T, nodes.covariance))
 
 
 def _to_end(ssm: StateSpaceModel, plan: Schedule, passed: Pass) -> tuple[jax.Array, jax.Array]:
