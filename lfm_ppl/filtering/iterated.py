@@ -57,14 +57,19 @@ def posterior_linearisation(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y:
     def iterate(carry: tuple[Points, jax.Array], _: None) -> tuple[tuple[Points, jax.Array], None]:
         points = carry[0]
         new = smoothed(points)
-        sd = safe_sqrt(jnp.diagonal(new.nodes.covariance, axis1=-2, axis2=-1))
-        change = jnp.abs(new.nodes.mean - points.nodes.mean) / jnp.where(sd > 0, sd, 1.0)
-        change = jnp.max(jnp.where(sd > 0, change, 0.0), initial=0.0)
+        change = jnp.maximum(_largest_change(points.nodes, new.nodes), _largest_change(points.ends, new.ends))
         return (jax.tree_util.tree_map(lambda a, b: a + damping * (b - a), points, new), change), None
 
     first = smoothed(None), jnp.asarray(jnp.nan)
     (points, change), _ = jax.lax.scan(iterate, first, None, length=iterations - 1)
     return Iterated(points, change)
+
+
+def _largest_change(old: Moments, new: Moments) -> jax.Array:
+    """Return the largest change of a mean, in standard deviations."""
+    sd = safe_sqrt(jnp.diagonal(new.covariance, axis1=-2, axis2=-1))
+    change = jnp.abs(new.mean - old.mean) / jnp.where(sd > 0, sd, 1.0)
+    return jnp.max(jnp.where(sd > 0, change, 0.0), initial=0.0)
 
 
 def _needed(ssm: StateSpaceModel, rule: Rule) -> np.ndarray:
