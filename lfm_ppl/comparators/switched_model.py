@@ -10,11 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import checks
-from lfm_ppl.filtering.filter import FilterState
-from lfm_ppl.filtering.jumps import after_jump
-from lfm_ppl.filtering.predict import Moments, predict_exact, predict_row
+from lfm_ppl.filtering.filter import FilterState, predict, preparation
+from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.schedule import Rows, Schedule, schedule
-from lfm_ppl.filtering.transition import exact, integrating_factor, linear_part
 from lfm_ppl.linearisation.taylor import Taylor
 from lfm_ppl.model.augment import StateSpaceModel, state_space
 from lfm_ppl.model.latent_force_model import LatentForceModel
@@ -136,26 +134,12 @@ def only_adds(build: Build) -> bool:
 def row_maps(ssm: StateSpaceModel, rule: SwitchingRule, plan: Schedule) -> Callable[[Rows], Affine]:
     """Return what makes the affine maps of a row, for a model that is linear; traceable."""
     total = ssm.state_dim
-    linear = linear_part(ssm, jnp.asarray(plan.initial_time, float))
     nothing = Moments(jnp.zeros(total), jnp.zeros((total, total)))
-    jumps = ssm.stack.jump_table()
-
-    def prepare(length: jax.Array) -> Any:
-        if ssm.time_invariant:
-            return exact(ssm, linear, length, plan.steps)
-        return integrating_factor(ssm, linear, length / plan.steps)
-
-    table = None if plan.lengths is None else jax.vmap(prepare)(jnp.asarray(plan.lengths))
+    prepared = preparation(ssm, plan)
 
     def make(row: Rows) -> Affine:
-        ready = prepare(row.length) if table is None else jax.tree_util.tree_map(lambda a: a[row.kind], table)
         # From a state that is zero and known, the mean at the end is the offset.
-        if ssm.time_invariant:
-            one = predict_exact(ssm, ready, plan.steps, row.start, row.length, nothing)
-        else:
-            one = predict_row(ssm, Taylor(), linear, ready, plan.steps, row.start, row.length, nothing, flow=True)
-        if jumps is not None:
-            one = after_jump(ssm, jumps, row.jump, one, flow=True)
+        one = predict(ssm, Taylor(), plan, prepared, row, nothing, flow=True)
         end = row.start + row.length
         observe = lambda s: ssm.observe(ssm.inputs(s, end), end)  # noqa: E731
         read = lambda s: rule.reading(*ssm.split(ssm.inputs(s, end)), end)  # noqa: E731

@@ -128,6 +128,22 @@ class FilterResult(eqx.Module):
     state: FilterState
 
 
+def predict(ssm: StateSpaceModel, rule: Rule, plan: Schedule, prepared: Preparation, row: Rows, moments: Moments,
+            nodes: Moments | None = None, flow: bool = False, each: bool = False) -> Prediction:
+    """Predict over a row, a jump at its end included; arguments as in `predict_row`."""
+    transition = row_transition(ssm, plan, prepared, row)
+    if ssm.time_invariant:
+        one = predict_exact(ssm, transition, plan.steps, row.start, row.length, moments)
+    else:
+        move = lambda: predict_row(  # noqa: E731
+            ssm, rule, prepared.linear, transition, plan.steps, row.start, row.length, moments, nodes, flow, each)
+        stay = lambda: unmoved(moments, flow, plan.steps if each else 0)  # noqa: E731
+        one = jax.lax.cond(row.length > 0, move, stay) if plan.replicated else move()
+    if prepared.jumps is not None:
+        one = after_jump(ssm, prepared.jumps, row.jump, one, flow=flow or ssm.time_invariant)
+    return one
+
+
 def forward(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, *, start: Moments | None = None,
             about: Points | None = None, keep: str = "likelihood") -> Pass:
     """Run the one forward scan.
@@ -143,26 +159,12 @@ def forward(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, *, s
             "steps" (and the steps within the rows).
     """
     prepared = preparation(ssm, plan)
-    flow, invariant = keep in ("all", "steps"), ssm.time_invariant
-    each = plan.steps if keep == "steps" and not invariant else 0
-
-    def predict(row: Rows, moments: Moments, nodes: Moments | None) -> Prediction:
-        transition = row_transition(ssm, plan, prepared, row)
-        if invariant:
-            one = predict_exact(ssm, transition, plan.steps, row.start, row.length, moments)
-        else:
-            move = lambda: predict_row(  # noqa: E731
-                ssm, rule, prepared.linear, transition, plan.steps, row.start, row.length, moments, nodes,
-                flow, bool(each))
-            stay = lambda: unmoved(moments, flow, each)  # noqa: E731
-            one = jax.lax.cond(row.length > 0, move, stay) if plan.replicated else move()
-        if prepared.jumps is not None:
-            one = after_jump(ssm, prepared.jumps, row.jump, one, flow=flow or invariant)
-        return one
+    flow = keep in ("all", "steps")
 
     def step(moments: Moments, inputs: tuple[Rows, jax.Array, Points | None]) -> tuple[Moments, Pass]:
         row, observed, nearby = inputs
-        one = predict(row, moments, None if nearby is None else nearby.nodes)
+        one = predict(ssm, rule, plan, prepared, row, moments, None if nearby is None else nearby.nodes, flow,
+                      keep == "steps")
         centre = one.moments if nearby is None else nearby.ends
         affine = linearise_observation(ssm, rule, prepared.jacobian, row.start + row.length,
                                        jnp.maximum(row.observation, 0), centre)
