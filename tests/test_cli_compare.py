@@ -35,7 +35,8 @@ def wanted(monkeypatch):
         one.folder.mkdir(parents=True, exist_ok=True)
         if one.report:
             one.report("1/1 task")
-        return catalogue.Report({"Rates": pd.DataFrame({"rate": [0.5]}, ["EKF"])}, [one.folder / "rates.csv"])
+        return catalogue.Report({"Rates": pd.DataFrame({"rate": [0.5]}, ["EKF"])}, [one.folder / "rates.csv"],
+                                ("1 of 1 cell is consistent.",))
 
     monkeypatch.setattr(catalogue, "experiment", lambda name: catalogue.Experiment(name, "summary", fake))
     return asked
@@ -69,6 +70,7 @@ def test_it_prints_tables_progress_and_files(run, wanted, tmp_path):
     code, out, err = run("compare ginzburg-landau --realisations 3 --conditional 7 --seed 5 --out here")
     assert code == 0
     assert "Rates" in out and "EKF  0.500" in out and "wrote    here/rates.csv" in out
+    assert out.index("EKF  0.500") < out.index("1 of 1 cell is consistent.") < out.index("time  ")
     assert err == "1/1 task\n"
     (one,) = wanted
     assert (one.realisations, one.conditional, one.seed, one.quick, one.overwrite) == (3, 7, 5, False, False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import shutil
 import sys
+import textwrap
 import time
 from pathlib import Path
 
@@ -32,8 +33,11 @@ def run(arguments: argparse.Namespace) -> int:
         None if arguments.quiet else lambda line: print(line, file=sys.stderr, flush=True),
         arguments.jobs or min(available_cpus(), _MOST_JOBS), arguments.data,
         tuple(arguments.satellites) if arguments.satellites else None, arguments.train_days, arguments.axes))
+    width = shutil.get_terminal_size().columns
     for title, table in found.tables.items():
-        print(f"\n{title}\n{tables.text_table(table, width=shutil.get_terminal_size().columns)}")
+        print(f"\n{title}\n{tables.text_table(table, width=width)}")
+    for note in found.notes:
+        print(f"\n{textwrap.fill(note, width)}")
     print(f"\ntime     {duration(time.perf_counter() - started)}")
     for path in found.written:
         print(f"wrote    {path}")

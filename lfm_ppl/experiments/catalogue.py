@@ -80,10 +80,12 @@ class Report(NamedTuple):
     Attributes:
         tables: title -> table, to be printed.
         written: the files.
+        notes: what to know when reading the tables, printed below them.
     """
 
     tables: dict[str, pd.DataFrame]
     written: list[Path]
+    notes: tuple[str, ...] = ()
 
 
 class Experiment(NamedTuple):
