@@ -11,8 +11,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from lfm_ppl.comparators.laplace import laplace
+from lfm_ppl.experiments import catalogue, scores
 from lfm_ppl.experiments.tasks import Task, write
-from lfm_ppl.experiments.transcription import ellipses, experiment, figures, problem, slices, tables
+from lfm_ppl.experiments.transcription import ellipses, experiment, figures, problem, report, slices, tables, verdict
 
 SATURATION, EXPONENTIAL = problem.CONFIGURATIONS[1], problem.CONFIGURATIONS[6]
 FEW = experiment.Settings(datasets=12, draws=400, burn_in=40)
@@ -208,6 +209,37 @@ def test_the_tables_count_what_was_found():
     assert not any(name.endswith("ESLS") for name in paired.index)
 
 
+@pytest.mark.parametrize("z, text, consistent", [
+    (-4.2, "consistent", True), (0.0, "consistent", True), (4.2, "consistent", True),
+    (-4.3, "lower than published (z = -4.3)", True), (-31.0, "lower than published (z = -31.0)", True),
+    (4.3, "higher than published (z = 4.3)", False), (np.nan, "-", False)])
+def test_a_verdict_is_two_sided_and_lower_is_consistent(z, text, consistent):
+    one = verdict.Verdict(z)
+    assert str(one) == text and one.consistent is consistent
+    assert one.lower == text.startswith("lower") and one.higher == text.startswith("higher")
+
+
+def test_each_published_cell_has_its_verdict():
+    """Errors of a known mean and standard error: one cell of each verdict, one without a standard error."""
+    published = problem.PUBLISHED["exponential"]
+
+    def errors(z, count=100):
+        spread = np.where(np.arange(count) % 2, 1.0, -1.0)  # of standard error 0.01, once it is scaled
+        return 0.01 * (spread * np.sqrt(count - 1) + z)
+
+    cells = {("exponential", method): {"rmse": published[method][0] + errors(z), "diverged": np.zeros(100, bool)}
+             for method, z in (("LA", 5.0), ("ESLS", -6.0), ("GFS", -2.0))}
+    cells["repression 1", "ESLS"] = {"rmse": np.array([0.4]), "diverged": np.array([False])}
+    table = tables.beside_published(cells)
+    assert table.loc["exponential", [f"{method} z" for method in published]].tolist() == pytest.approx([5, -6, -2])
+    assert table.loc["exponential", [f"{method} verdict" for method in published]].tolist() == [
+        "higher than published (z = 5.0)", "lower than published (z = -6.0)", "consistent"]
+    assert table.loc["repression 1", "ESLS verdict"] == "-"
+    assert scores.readable(table).loc["exponential", "ESLS verdict"] == "lower than published (z = -6.0)"
+    assert verdict.summary(tables.verdicts(table).values()) == (
+        "2 of 3 cells count as consistent with the published table, 1 of them lower than published; 1 higher.")
+
+
 @pytest.mark.slow
 def test_a_killed_run_ends_with_the_same_table(tmp_path, monkeypatch):
     """The experiment itself, stopped after three tasks and started again: the same tables but for the times."""
@@ -254,6 +286,20 @@ def test_what_is_stored_is_tabulated_and_drawn_without_computing(tmp_path):
     assert (tmp_path / "comparison.csv").read_text() == first
     with pytest.raises(ValueError, match="draws is 400 there and 800 now"):
         experiment.run(dataclasses.replace(FEW, draws=800), tmp_path)
+
+
+def test_the_report_says_how_many_cells_are_consistent_and_why_lower_ones_are_trusted(tmp_path, monkeypatch):
+    settings = experiment.Settings(datasets=2, configurations=(EXPONENTIAL.label,))
+    monkeypatch.setattr(experiment, "Settings", lambda **given: dataclasses.replace(settings, **given))
+    results = made_up(settings)
+    for one in experiment.all_tasks(settings):
+        results[one.name]["rmse"] = results[one.name]["rmse"] + [0.0, 1e-3]
+        write(one, results[one.name], tmp_path / experiment.TASKS)
+    found = report.run(catalogue.Wanted(tmp_path, realisations=2))
+    assert found.notes == (  # LA has one sound data set alone, ESLS 0.3005 (0.0005) for 0.290, GFS 0.6 for 0.358
+        "0 of 2 cells count as consistent with the published table, 0 of them lower than published; 2 higher.",
+        verdict.TRUST)
+    assert "higher than published" in (tmp_path / "published.md").read_text()
 
 
 def test_the_figures_are_labelled():

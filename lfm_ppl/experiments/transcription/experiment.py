@@ -65,7 +65,7 @@ class Comparison(NamedTuple):
         settings: that it ran with.
         cells: (configuration, method) -> the results of all its data sets.
         table: a row for each configuration and method.
-        published: RMSE and divergences beside the published ones.
+        published: RMSE and divergences beside the published ones, with a verdict on each RMSE.
         paired: every method against elliptical slice sampling.
     """
 

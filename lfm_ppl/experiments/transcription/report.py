@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.catalogue import Report, Wanted
-from lfm_ppl.experiments.transcription import experiment
+from lfm_ppl.experiments.transcription import experiment, tables, verdict
 
 SUMMARY = "transcription factors: Laplace, elliptical slice sampling and Gaussian smoothers, eight links, table 1"
 
@@ -25,4 +25,4 @@ def run(wanted: Wanted) -> Report:
             scores.readable(found.published),
         f"Means over {settings.datasets} data sets (standard errors)": scores.readable(found.table),
         "Against elliptical slice sampling on the same data sets": scores.readable(found.paired),
-    }, written)
+    }, written, (verdict.summary(tables.verdicts(found.published).values()), verdict.TRUST))

@@ -10,6 +10,7 @@ import pandas as pd
 from lfm_ppl.experiments.scores import mean_of, pair
 from lfm_ppl.experiments.tasks import Result
 from lfm_ppl.experiments.transcription import problem, slices
+from lfm_ppl.experiments.transcription.verdict import Verdict
 
 Cells = Mapping[tuple[str, str], Result]
 """(configuration, method) -> results of all data sets."""
@@ -54,13 +55,13 @@ def beside_published(cells: Cells) -> pd.DataFrame:
     """Return one row for each configuration: RMSE and divergences of the source's methods beside the published ones.
 
     ``z`` is the difference of the RMSE in standard errors of ours; the published mean over 100 data sets has an error
-    as large again. The source averages over the data sets on which no method failed. What Newton's method counts as a
-    failure there is not said in full; ``at modes`` is ``z`` over the data sets on which ours ends at a mode, and
-    ``no mode`` the number of others.
+    as large again. ``verdict`` says what that means, see `Verdict`. The source averages over the data sets on which no
+    method failed. What Newton's method counts as a failure there is not said in full; ``at modes`` is ``z`` over the
+    data sets on which ours ends at a mode, and ``no mode`` the number of others.
     """
     rows = {}
     for label, methods in problem.PUBLISHED.items():
-        row: dict[str, float] = {}
+        row: dict[str, float | str] = {}
         newton = cells.get((label, "LA"), {}).get("converged")
         at_modes = None if newton is None else np.asarray(newton, bool)
         if at_modes is not None:
@@ -71,15 +72,22 @@ def beside_published(cells: Cells) -> pd.DataFrame:
                 continue
             sound = ~np.asarray(found["diverged"], bool)
             ours = mean_of(found["rmse"][sound])
+            z = (ours.value - error) / ours.error
             row |= pair(method, ours)
-            row |= {f"{method} published": error, f"{method} z": (ours.value - error) / ours.error,
+            row |= {f"{method} published": error, f"{method} z": z, f"{method} verdict": str(Verdict(z)),
                     f"{method} div.": float((~sound).sum()), f"{method} div. published": float(diverged)}
             if at_modes is not None:
                 chosen = mean_of(found["rmse"][sound & at_modes])
                 row[f"{method} z at modes"] = (chosen.value - error) / chosen.error
         if any(label == one for one, _ in cells):
             rows[label] = row
-    return pd.DataFrame.from_dict(rows, orient="index", dtype=float)
+    return pd.DataFrame.from_dict(rows, orient="index")
+
+
+def verdicts(published: pd.DataFrame) -> dict[tuple[str, str], Verdict]:
+    """Return (configuration, method) -> verdict on each cell of the table of `beside_published`."""
+    return {(label, method): Verdict(float(row[f"{method} z"])) for label, row in published.iterrows()
+            for method in problem.PUBLISHED[label] if f"{method} z" in row}
 
 
 def against_slices(cells: Cells) -> pd.DataFrame:
