@@ -74,9 +74,10 @@ def breakdown(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: Any, start: M
     found, at = (passed, row) if step is None else (stepped, step)
     largest = float(np.sqrt(np.max(np.diagonal(before.covariance), initial=0.0)))
     reason = _reason(found, at, largest)
-    index = int(np.argmax(np.asarray(plan.observed) >= row))
-    time = float(rows.start[plan.observed[index]] + rows.length[plan.observed[index]])
-    where = f"row {index} (time {time:.6g})"
+    later = np.flatnonzero(np.asarray(plan.observed) >= row)
+    end = plan.observed[later[0]] if later.size else row
+    time = float(rows.start[end] + rows.length[end])
+    where = f"row {later[0]} (time {time:.6g})" if later.size else f"time {time:.6g}, after the last observation"
     if not ssm.time_invariant and step is not None:
         where += f", step {step + 1} of {count} from time {float(one.start):.6g} to {float(one.start + one.length):.6g}"
     remedy = ("Try a tighter prior, an observation noise that is not so small, or other units" if ssm.time_invariant
@@ -115,4 +116,4 @@ def _reason(passed: Pass, row: int, largest: float) -> str:
         return "the predicted observation or its covariance is not finite" + grown
     if grown:
         return "the filtered moments are lost to rounding" + grown
-    return "the innovation covariance is not positive definite"
+    return "the innovation covariance is not positive definite, or the filtered moments are lost to rounding"

@@ -15,7 +15,7 @@ from lfm_ppl.filtering.predict import Moments, Prediction, predict_exact, predic
 from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays, schedule
 from lfm_ppl.filtering.transition import LinearPart, constant_slope, exact, integrating_factor, linear_part
 from lfm_ppl.filtering.update import linearise_observation, update
-from lfm_ppl.linalg import solve_lower
+from lfm_ppl.linalg import congruence, matmul, safe_sqrt, solve_lower
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.linearisation.sigma_points import Cubature
 from lfm_ppl.model.augment import StateSpaceModel, state_space
@@ -170,7 +170,7 @@ def forward(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, *, s
                                        jnp.maximum(row.observation, 0), centre)
         if nearby is not None:
             affine = affine.shifted(one.moments.mean - centre.mean)
-        new = update(ssm, affine, observed, jnp.isfinite(observed), one.moments)
+        new = update(ssm, affine, observed, jnp.isfinite(observed), one.moments, scale)
         out = Pass(new.log_likelihood)
         if keep != "likelihood":
             out = out._replace(predicted=one.moments, filtered=new.moments, innovation=new.innovation,
@@ -183,8 +183,23 @@ def forward(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, *, s
     padded = jnp.concatenate([jnp.asarray(y, float), jnp.full((1, ssm.output_dim), jnp.nan)])
     rows = as_arrays(plan.rows)
     first = Moments(*ssm.initial()) if start is None else start
+    scale = _output_scale(ssm, plan, prepared, padded, first)
     _, passed = jax.lax.scan(jax.checkpoint(step, prevent_cse=False), first, (rows, padded[rows.observation], about))
     return passed
+
+
+def _output_scale(ssm: StateSpaceModel, plan: Schedule, prepared: Preparation, y: jax.Array,
+                  start: Moments) -> jax.Array:
+    """Return (D,), how large outputs are: their largest observation, or the prior's standard deviation if that is more.
+
+    The prior's is that through the constant part of the observation's Jacobian. An angle is at least one radian large.
+    """
+    matrix, _ = ssm.input_map(jnp.asarray(plan.initial_time, float))
+    prior = safe_sqrt(jnp.diagonal(congruence(matmul(prepared.jacobian, matrix), start.covariance)))
+    scale = jnp.maximum(jnp.max(jnp.where(jnp.isfinite(y), jnp.abs(y), 0.0), axis=0), prior)
+    for index in ssm.model.observation.angular:
+        scale = scale.at[index].max(1.0)
+    return jax.lax.stop_gradient(scale)
 
 
 def _observation_slope(ssm: StateSpaceModel, plan: Schedule) -> jax.Array:
@@ -263,7 +278,7 @@ def filter(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
         _check_start(start, times, ssm.state_dim)
     plan = schedule(ssm, times, steps, max_step, initial_time=None if start is None else start.time)
     model.check_at(plan.initial_time, len(plan.observed))
-    model.check_resolution(times)
+    model.check_resolution(times, y)
     y = check_observations(y, len(plan.observed), ssm.output_dim, empty=start is not None)
     warn_single_precision()
     begin = None if start is None else Moments(start.mean, start.covariance)

@@ -71,7 +71,7 @@ def schedule(ssm: StateSpaceModel, times: Any, steps: int, max_step: float | Non
         max_step: longest step; a longer interval gets more steps, in rows of ``steps`` each.
         at: (K,) further times at which the state is wanted, in any order.
         initial_time: overrides the model's (when the scan starts from a filter's state).
-        row_per_step: give every integration step a row of its own, so that the smoother reaches each.
+        row_per_step: give every integration step a row of its own, so that a particle smoother reaches each.
 
     Raises:
         ValueError, TypeError: see `lfm_ppl.model.augment.check_times`; non-positive steps; a requested time before
@@ -117,7 +117,8 @@ def _traced_origin(times: np.ndarray, origin: Any, jumps: tuple[float, ...], ste
     Every jump up to the last time has a row. Those at or before the initial time have length zero and do not jump.
     """
     if row_per_step:
-        raise ValueError("iterations with forces that jump need an initial_time that is known before compilation.")
+        raise ValueError("a row for each step, with forces that jump, needs an initial_time that is known before "
+                         "compilation.")
     origin = jnp.asarray(origin, float)
     indices = [index for index, jump in enumerate(jumps) if jump <= times[-1]]
     time = np.concatenate([np.asarray(jumps, float)[indices], times])
@@ -142,7 +143,7 @@ def _concrete(times: np.ndarray, origin: float, jumps: tuple[float, ...], steps:
     jump_index = [index for index, jump in enumerate(jumps) if origin < jump <= end]
     extra = np.setdiff1d(extra, [jumps[index] for index in jump_index])
     jump_time = np.asarray(jumps, float)[jump_index]
-    # Where the smoother looks at each step, a jump has a row of its own, so that the state just before it is a node.
+    # A particle smoother looks at each step: a jump has a row of its own, so that the state just before it is a node.
     before = jump_time if row_per_step else jump_time[:0]
     time = np.concatenate([before, jump_time, times, extra])
     # At equal times a jump comes before an observation.

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from lfm_ppl.filtering.filter import Pass
 from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.linalg import cholesky, matmul, semidefinite_root, solve_lower, solve_upper
+from lfm_ppl.linalg import matmul, semidefinite_root, solve_lower, solve_upper
 
 
 def smoothing_errors(key: jax.Array, passed: Pass, start: Moments, draws: int) -> jax.Array:
@@ -42,7 +42,7 @@ def smoothing_errors(key: jax.Array, passed: Pass, start: Moments, draws: int) -
     def simulate(error: jax.Array, row: tuple) -> tuple[jax.Array, tuple]:
         one, moving, observing = row
         error = matmul(one.phi, error) + matmul(semidefinite_root(one.noise), moving)
-        innovation = matmul(one.slope, error) + matmul(cholesky(one.obs_cov, keep=False).chol, observing)
+        innovation = matmul(one.slope, error) + matmul(semidefinite_root(one.obs_cov), observing)
         return error - matmul(one.gain, innovation), (error, innovation)
 
     def smooth(r: jax.Array, row: tuple) -> tuple[jax.Array, jax.Array]:

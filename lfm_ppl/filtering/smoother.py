@@ -82,7 +82,7 @@ class SmootherResult(eqx.Module):
         leave_one_out: (T,), log p(y_k | y_-k).
         residual: (T, D), standardised one-step-ahead residuals, NaN where missing.
         change: largest change of a smoothed mean in the last iteration, in smoothed standard deviations; NaN
-            without iterations.
+            with fewer than two iterations.
     """
 
     times: jax.Array
@@ -203,7 +203,7 @@ def smooth(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
     ssm = state_space(model)
     plans = smoothing_plans(ssm, times, steps, max_step, at, iterations)
     model.check_at(plans.rows.initial_time, np.shape(times)[0])
-    model.check_resolution(times)
+    model.check_resolution(times, y)
     y = check_observations(y, len(plans.rows.observed), ssm.output_dim)
     warn_single_precision()
     result = _run_smoother(ssm, rule, plans, y, iterations, damping)

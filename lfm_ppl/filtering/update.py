@@ -20,7 +20,7 @@ _LOST_MEAN, _LOST_VARIANCE = 1e-3, 1e3
 """Errors of a filtered output, in standard deviations and variances of its noise, from which precision is lost."""
 
 _HARMLESS = 1e-6
-"""The same errors as shares of the observation (and of its square) that do no harm, however small the noise."""
+"""The same errors as shares of an output's scale (and of its square) that do no harm, however small the noise."""
 
 
 class Linearised(NamedTuple):
@@ -87,11 +87,19 @@ def _spread(ssm: StateSpaceModel, rule: Rule, t: jax.Array, moments: Moments) ->
 
 
 def update(ssm: StateSpaceModel, observation: Linearised, y: jax.Array, present: jax.Array,
-           moments: Moments) -> Update:
+           moments: Moments, scale: jax.Array | None = None) -> Update:
     """Condition on the present entries of ``y`` (D,), with the covariance in Joseph's form.
 
     The log likelihood is -inf where the innovation covariance is not positive definite to working precision, or where
-    the filtered moments are lost to rounding, next to a prediction that is larger by orders of magnitude.
+    the filtered moments are lost to rounding: where an unstable model has sent the prediction to infinity, or nearly.
+
+    Args:
+        ssm: the model.
+        observation: its linearisation about the predicted moments.
+        y: (D,).
+        present: (D,), whether an entry is.
+        moments: predicted.
+        scale: (D,), how large the outputs are; None: rounding errors of the filtered moments are not asked for.
     """
     mean, covariance = moments
     slope = jnp.where(present[:, None], observation.slope, 0.0)
@@ -114,13 +122,16 @@ def update(ssm: StateSpaceModel, observation: Linearised, y: jax.Array, present:
     kept = jnp.eye(mean.shape[0]) - matmul(gain, slope)
     filtered = Moments(mean + matmul(gain, innovation[:, None])[:, 0],
                        congruence(kept, covariance) + congruence(gain, noise))
-    failed = factor.degenerate.any() | _precision_lost(ssm, observation, y, present, moments, filtered, noise,
-                                                       solve_upper(chol, white))
+    failed = factor.degenerate.any()
+    if scale is not None:
+        failed = failed | _precision_lost(ssm, observation, y, present, moments, filtered, noise,
+                                          solve_upper(chol, white), scale)
     return Update(filtered, jnp.where(failed, -jnp.inf, log_likelihood), innovation, chol, gain, slope, noise)
 
 
 def _precision_lost(ssm: StateSpaceModel, observation: Linearised, y: jax.Array, present: jax.Array,
-                    predicted: Moments, filtered: Moments, noise: jax.Array, weighted: jax.Array) -> jax.Array:
+                    predicted: Moments, filtered: Moments, noise: jax.Array, weighted: jax.Array,
+                    scale: jax.Array) -> jax.Array:
     """Whether the filtered moments of an observed output are nothing but rounding errors.
 
     Given the observation, the output has the residual R S^-1 v and the variance R - R S^-1 R <= R. Errors are some
@@ -135,6 +146,7 @@ def _precision_lost(ssm: StateSpaceModel, observation: Linearised, y: jax.Array,
         filtered: moments after it.
         noise: R (D, D).
         weighted: (D,), S^-1 v.
+        scale: (D,), of the outputs.
     """
     y = jnp.where(present, y, 0.0)
     moved = matmul(observation.slope, (filtered.mean - predicted.mean)[:, None])[:, 0]
@@ -143,7 +155,6 @@ def _precision_lost(ssm: StateSpaceModel, observation: Linearised, y: jax.Array,
         error = error.at[index].set(wrapped(error[index]))
     variance = jnp.abs((matmul(observation.slope, filtered.covariance) * observation.slope).sum(1))
     own = jnp.abs(jnp.diagonal(noise))
-    lost = ((jnp.abs(error) > _LOST_MEAN * safe_sqrt(own) + _HARMLESS * jnp.abs(y))
-            | (variance > _LOST_VARIANCE * own + _HARMLESS * y**2))
-    # Zero, observed without noise, gives no scale to judge by.
-    return (present & lost & ((own > 0) | (y != 0))).any()
+    lost = ((jnp.abs(error) > _LOST_MEAN * safe_sqrt(own) + _HARMLESS * scale)
+            | (variance > _LOST_VARIANCE * own + _HARMLESS * scale**2))
+    return (present & lost).any()

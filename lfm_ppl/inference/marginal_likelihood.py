@@ -84,7 +84,6 @@ class MarginalLikelihood(dist.Distribution):
         self.rule, self.steps, self.max_step = as_rule(rule), steps, max_step
         self.iterations, self.damping = iterations, damping
         model.check_at(self.plan.initial_time, np.shape(times)[0])
-        model.check_resolution(times)
         known = checks.concrete(times)
         if known is not None:
             model.check_span(float(known[0]), float(known[-1]))
@@ -118,6 +117,7 @@ class MarginalLikelihood(dist.Distribution):
         value = jnp.asarray(value, float)
         if value.ndim > 2:
             return jax.vmap(self.log_prob)(value)
+        self.model.check_resolution(self.times, value)
         # One failure makes the sum -inf, and with it the derivatives of the other terms zero.
         return finite_or_minus_infinity(lambda y: self._one_step_ahead(y).sum(),
                                         check_observations(value, *self.event_shape))

@@ -145,9 +145,9 @@ class LatentForceModel(eqx.Module):
         for name, force in self.forces.items():
             force.check_span(name, first, last)
 
-    def check_resolution(self, times: Any) -> None:
+    def check_resolution(self, times: Any, y: Any) -> None:
         """Warn (`lfm.ApproximationWarning`) of squared exponential forces of too low an order for data at ``times``."""
-        check_resolution(self, times)
+        check_resolution(self, times, y)
 
     def check_at(self, time: Any, rows: int) -> None:
         """Check what depends on where and how often the model is observed.

@@ -56,24 +56,25 @@ class Resolution(NamedTuple):
     signal_to_noise: float
 
 
-def check_resolution(model: LatentForceModel, times: Any) -> None:
-    """Warn of squared exponential forces whose order is too low for data at ``times``.
+def check_resolution(model: LatentForceModel, times: Any, y: Any) -> None:
+    """Warn of squared exponential forces whose order is too low for the data.
 
     It does nothing inside compiled code, or where a parameter is traced. See `resolutions` for what is computed.
 
     Args:
         model: the latent force model.
-        times: (T,), at which the data are.
+        times: (T,).
+        y: (T, D), NaN where missing; times at which nothing is observed do not count.
 
     Warns:
         ApproximationWarning: the estimated error of the log likelihood exceeds 0.1.
     """
-    for found in resolutions(model, times):
+    for found in resolutions(model, times, y):
         if found.error > TOLERANCE:
             warnings.warn(_message(found), ApproximationWarning, stacklevel=4)
 
 
-def resolutions(model: LatentForceModel, times: Any) -> list[Resolution]:
+def resolutions(model: LatentForceModel, times: Any, y: Any = None) -> list[Resolution]:
     r"""Estimate what the order of each squared exponential force does to the log likelihood of data at ``times``.
 
     For data y ~ N(0, K) from the exact process, whose covariance is K_n under the SDE, the error of the log likelihood
@@ -85,17 +86,27 @@ def resolutions(model: LatentForceModel, times: Any) -> list[Resolution]:
     for observations that are evenly spread. Of records of more than 20 lengthscales the first 20 are taken, and the
     mean and the variance scaled to the whole.
 
+    Args:
+        model: the latent force model.
+        times: (T,).
+        y: (T, D), NaN where missing; everything is observed by default.
+
     Returns:
-        One entry for each squared exponential force, also in sums; none where something is traced.
+        One entry for each squared exponential force, also in sums; none where something is traced, where fewer than two
+        times are observed, and for a model with process noise, which hides what the estimate does not know.
     """
     terms = [(name, column, term) for column, (name, force) in enumerate(zip(model.force_names, model.force_list,
                                                                              strict=True)) for term in _terms(force)]
     # Only now is anything computed: other models pass at no cost. In compiled code every new array is traced.
     if not any(isinstance(term, SquaredExponential) for *_, term in terms):
         return []
-    if checks.traced((model, times, jnp.zeros(()))):
+    if model.process_noise is not None or checks.traced((model, times, y, jnp.zeros(()))):
         return []
     known = np.asarray(times, float)
+    if y is not None and known.ndim == 1 and np.shape(y)[:1] == known.shape:
+        known = known[np.isfinite(np.asarray(y, float)).reshape(known.size, -1).any(axis=1)]
+    if known.size < 2:
+        return []
     linear = _linearised(model, known[0])
     if linear is None or known.ndim != 1 or not np.all(np.isfinite(known)):
         return []
@@ -134,7 +145,9 @@ def _linearised(model: LatentForceModel, time: float) -> _Linear | None:
     for function in (model.dynamics, model.observation.function):
         differentiate: Callable[..., Any] = jax.jacfwd(lambda x, u, f=function: jnp.asarray(f(x, u, t), float), (0, 1))
         slopes.extend(differentiate(x, u))
-    noise = model.observation.covariance_at(x, u, t, jnp.asarray(0))
+    covariance = model.observation.covariance
+    noise = (jnp.median(jnp.asarray(covariance), axis=0) if np.ndim(covariance) == 3
+             else model.observation.covariance_at(x, u, t, jnp.asarray(0)))
     parts = (*slopes, noise, model.initial_state.covariance)
     if checks.traced(parts):
         return None

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from systems import DoubleWell, Linear, Outputs, double_well, whole_state
+from systems import DoubleWell, Linear, Outputs, double_well, identity, motif, whole_state
 
 import lfm_ppl as lfm
 from lfm_ppl.filtering.breakdown import breakdown
@@ -120,3 +120,23 @@ def test_an_uncertain_start_and_little_noise_are_no_failure(noise, y):
         Linear(-jnp.eye(1), jnp.ones((1, 1))), {"u": lfm.Matern(1.0, 1.0)},
         lfm.GaussianObservation(whole_state, jnp.array([noise])), lfm.Gaussian(jnp.zeros(1), 1e7 * jnp.eye(1)))
     assert np.isfinite(lfm.filter(model, TIMES, np.full((4, 1), y)).log_likelihood).all()
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-18])
+def test_observations_that_cross_zero_without_noise_are_no_failure(noise):
+    """The scale of an output is that of all its observations: sin(pi) is 1e-16."""
+    model = motif(identity, genes=1, variance=1.0, noise_sd=np.sqrt(noise), order=1)
+    times = np.linspace(0.0, 2 * np.pi, 9)
+    assert np.isfinite(lfm.filter(model, times, np.sin(times)).log_likelihood).all()
+
+
+@pytest.mark.parametrize(("noise", "variance", "y"), [
+    (0.0, 1.0, 1e-6), (0.0, 1.0, 1e-9), (0.0, 1e4, 1e-6), (1e-16, 1e6, 1e-3), (1e-12, 1e8, 1e-3)])
+def test_small_observations_next_to_a_wide_prior_are_no_failure(noise, variance, y):
+    dynamics = Linear(jnp.array([[-0.5, 1.0, 0.0], [-1.0, -0.5, 0.3], [0.2, 0.0, -1.0]]), jnp.ones((3, 1)))
+    model = lfm.LatentForceModel(
+        dynamics, {"u": lfm.Matern(1.0, 1.0, order=2)},
+        lfm.GaussianObservation(Outputs(jnp.array([[1.0, 0.7, 0.0, 0.0]])), noise * jnp.ones(1)),
+        lfm.Gaussian(jnp.zeros(3), variance * jnp.eye(3)))
+    found = lfm.filter(model, np.linspace(0.0, 3.0, 5), np.full((5, 1), y))
+    assert np.isfinite(found.log_likelihood).all()

@@ -2,6 +2,7 @@
 
 import warnings
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -61,7 +62,7 @@ def test_functions_warn_and_name_the_force():
     coarse, fine = (model(lfm.SquaredExponential(1.0, 0.2, order), 0.01) for order in (4, 8))
     times, y = np.linspace(0.0, 1.0, 50), np.zeros((50, 1))
     for run in (lambda m: lfm.filter(m, times, y), lambda m: lfm.smooth(m, times, y),
-                lambda m: lfm.MarginalLikelihood(m, times)):
+                lambda m: lfm.MarginalLikelihood(m, times).log_prob(np.zeros((len(times), 1)))):
         with pytest.warns(lfm.ApproximationWarning, match=r"'drive'.*lengthscale 0\.2.*order=8.*Matern"):
             run(coarse)
         with warnings.catch_warnings():
@@ -89,10 +90,40 @@ def test_terms_of_sums_and_odd_cases():
     (found,) = resolutions(model(both, 0.01), times)
     (alone,) = resolutions(model(lfm.SquaredExponential(1.0, 0.2, 2), 0.01), times)
     assert TOLERANCE < found.error < alone.error  # a rough force hides the difference
-    for at in (times[:1], np.zeros(3), 1e6 * times, 1e-9 * times):
+    assert resolutions(model(lfm.SquaredExponential(1.0, 0.2), 0.1), times[:1]) == []
+    for at in (np.zeros(3), 1e6 * times, 1e-9 * times):
         (found,) = resolutions(model(lfm.SquaredExponential(1.0, 0.2), 0.1), at)
         assert found.error < TOLERANCE
     # Without noise nothing can be trusted, and a model that overflows is passed over.
     assert resolutions(model(lfm.SquaredExponential(1.0, 0.1), 1e-12), np.linspace(0, 1, 200))[0].error > TOLERANCE
     unstable = model(lfm.SquaredExponential(1.0, 1.0), 0.1, lambda x, u, t: x, lambda x, u, t: u + 1e5 * x)
     assert resolutions(unstable, times) == [] or resolutions(unstable, times)[0].error >= 0.0
+
+
+def test_only_what_is_observed_counts():
+    """A grid padded with missing values, for predictions, has the error of its observations."""
+    times = np.linspace(0.0, 10.0, 401)
+    y = np.full((401, 1), np.nan)
+    y[::40] = 0.5
+    one = model(lfm.SquaredExponential(1.0, 1.0, 4), 0.03)
+    (padded,) = resolutions(one, times, y)
+    (observed,) = resolutions(one, times[::40])
+    assert padded.error == observed.error < resolutions(one, times)[0].error
+
+
+def test_the_noise_of_most_rows_counts():
+    """A covariance for each time, the first of which is tiny."""
+    times = np.linspace(0.0, 10.0, 21)
+    one = model(lfm.SquaredExponential(1.0, 1.0, 4), 0.1)
+    varying = eqx.tree_at(lambda m: m.observation.covariance, one,
+                          jnp.full((21, 1, 1), 0.01).at[0].set(1e-12))
+    np.testing.assert_allclose(resolutions(varying, times)[0].error, resolutions(one, times)[0].error, rtol=1e-9)
+
+
+def test_a_model_with_process_noise_is_passed_over():
+    """Its own noise hides the difference, and is not in the estimate."""
+    times = np.linspace(0.0, 1.0, 50)
+    base = model(lfm.SquaredExponential(1.0, 0.2, 2), 0.01, lambda x, u, t: x)
+    noisy = lfm.LatentForceModel(base.dynamics, base.forces, base.observation, base.initial_state,
+                                 process_noise=0.3 * jnp.eye(1))
+    assert resolutions(base, times) and resolutions(noisy, times) == []
