@@ -105,6 +105,8 @@ def predict_row(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Fa
     """
     h = length / steps
     spread = _smallest_spread(ssm, rule, factor, start, h, moments)
+    if bent_by_forces_only(ssm, rule):
+        return _predict_by_quadrature(ssm, rule, linear, factor, steps, start, h, moments, spread, about, flow, each)
 
     def step(carry: tuple, at: tuple) -> tuple[tuple, Prediction | None]:
         now, phi, noise = carry
@@ -256,6 +258,96 @@ def _stage(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, t: jax.Array, m
         drift = drift + matmul(affine.slope, (mean - centre)[:, None])[:, 0]
     rest = drift - matmul(linear.rows, mean[:, None])[:, 0]
     return _Stage(rest, affine.slope - linear.rows, affine.extra if isinstance(affine.extra, jax.Array) else None)
+
+
+def bent_by_forces_only(ssm: StateSpaceModel, rule: Rule) -> bool:
+    """Whether what is left of the dynamics without its constant linear part depends on the forces alone.
+
+    Its slope K then reads nothing but the forces, which nothing moves but their own exact transition: K E K = 0.
+    """
+    structure = ssm.drift_structure
+    whole = isinstance(rule, SigmaPointRule) and rule.full_state
+    return not whole and all(index >= ssm.physical_dim for index in (*structure.points, *structure.averaged))
+
+
+def _predict_by_quadrature(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Factor, steps: int,
+                           start: jax.Array, h: jax.Array, moments: Moments, spread: jax.Array, about: Moments | None,
+                           flow: bool, each: bool) -> Prediction:
+    """Predict over a row in which only the forces bend the dynamics; the same numbers as `_step` step by step.
+
+    No stage then changes what a later one sees: the forces' moments at all nodes are known at the row's start, and the
+    Runge-Kutta method is Simpson's rule.
+    """
+    forces = slice(ssm.physical_dim, None)
+    half = factor.half[forces, forces]
+
+    def half_step(now: Moments, _: None) -> tuple[Moments, Moments]:
+        return Moments(matmul(half, now.mean[:, None])[:, 0],
+                       congruence(half, now.covariance) + factor.noise_half), now
+
+    first = Moments(moments.mean[forces], moments.covariance[forces, forces])
+    last, before = jax.lax.scan(half_step, first, None, length=2 * steps)
+    at_nodes = jax.tree_util.tree_map(lambda a, b: _by_steps(jnp.concatenate([a, b[None]])), before, last)
+    begins = start + jnp.arange(steps) * h
+    times = jnp.stack([begins, begins + 0.5 * h, just_before(begins + h, h)], axis=1)
+    nearby = None
+    if about is not None:
+        nearby = jax.tree_util.tree_map(
+            lambda a: jnp.stack([a[:-1], 0.5 * (a[:-1] + a[1:]), a[1:]], axis=1), about)
+
+    def node(t: jax.Array, now: Moments, near: Moments | None) -> _Stage:
+        # The physical state drops out.
+        mean = jnp.concatenate([jnp.zeros(ssm.physical_dim), now.mean])
+        covariance = lambda rows, _: congruence(rows[:, forces], now.covariance)  # noqa: E731
+        return _stage(ssm, rule, linear, t, mean, covariance, spread, near)
+
+    stages = jax.vmap(jax.vmap(node))(times, at_nodes, nearby)
+    maps = jax.vmap(lambda one: _simpson(factor, h, one, ssm.physical_dim))(stages)
+
+    def step(carry: tuple, one: tuple) -> tuple[tuple, Prediction | None]:
+        now, phi, noise = carry
+        own, offset, added = one
+        mean = matmul(factor.full, now.mean[:, None])[:, 0]
+        mean = jnp.concatenate([mean[:ssm.physical_dim] + offset, mean[forces]])
+        now = Moments(mean, congruence(own, now.covariance) + added)
+        if flow:
+            phi, noise = matmul(own, phi), congruence(own, noise) + added
+        return (now, phi, noise), Prediction(now, own, added) if each else None
+
+    (moments, whole, added), within = jax.lax.scan(step, tuple(unmoved(moments, flow))[:3], maps)
+    return Prediction(moments, whole, added, within)
+
+
+def _by_steps(nodes: jax.Array) -> jax.Array:
+    """First, middle and last (J, 3, ...) of each step, from 2 J + 1 nodes."""
+    return jnp.stack([nodes[:-2:2], nodes[1::2], nodes[2::2]], axis=1)
+
+
+def _simpson(factor: Factor, h: jax.Array, nodes: _Stage, size: int) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return Phi (n, n), the mean's increment (M,) and Q (n, n) of a step, from its first, middle and last node (3, ...).
+
+        Phi = E(h) + h / 6 (E(h) K_1 + 4 E(h/2) K_2 E(h/2) + K_3 E(h)),
+
+    and so is the mean. The middle node stands for the second and the third Runge-Kutta stage. Of these, Psi~ = I - Z
+    differs, since it is a stage's own.
+    """
+    half, full = factor.half, factor.full
+    half_x, full_x = half[:size, :size], full[:size, :size]
+    slope, rest = nodes.slope[:, :, size:], nodes.rest
+    middle = matmul(slope[1], half[size:, size:])
+    bend = matmul(full_x, slope[0]) + 4.0 * matmul(half_x, middle) + matmul(slope[2], full[size:, size:])
+    offset = matmul(full_x, rest[0][:, None])[:, 0] + 4.0 * matmul(half_x, rest[1][:, None])[:, 0] + rest[2]
+    bend = h / 6 * bend
+    pulled = matmul(factor.back_half[:size, :size], middle)
+    identity = jnp.eye(full.shape[0])
+    transports = [jnp.concatenate([full_x, full[:size, size:] + bend], axis=1)]
+    for inverse, on, back in ((0.5 * h * slope[0], half, factor.back_half), (0.5 * h * pulled, half, factor.back_half),
+                              (h * pulled, identity, factor.back_full)):
+        through = on[:size, size:] + matmul(bend - matmul(full_x, inverse), back[size:, size:])
+        transports.append(jnp.concatenate([on[:size, :size], through], axis=1))
+    diffusions = [None if nodes.diffusion is None else nodes.diffusion[index] for index in (0, 1, 1, 2)]
+    noise = _noise(factor, 3, transports, diffusions, [h / 6, h / 3, h / 3, h / 6], size)
+    return jnp.concatenate([transports[0], full[size:]]), h / 6 * offset, noise
 
 
 def _propagated(p: jax.Array, flow: jax.Array, noise: Any, force_noise: jax.Array, size: int) -> Any:
