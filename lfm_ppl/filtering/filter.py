@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -17,7 +18,7 @@ from lfm_ppl.filtering.transition import LinearPart, constant_slope, exact, inte
 from lfm_ppl.filtering.update import linearise_observation, update
 from lfm_ppl.linalg import congruence, matmul, safe_sqrt, solve_lower
 from lfm_ppl.linearisation.rule import Rule
-from lfm_ppl.linearisation.sigma_points import Cubature
+from lfm_ppl.linearisation.sigma_points import Cubature, SigmaPointRule
 from lfm_ppl.model.augment import StateSpaceModel, state_space
 from lfm_ppl.model.latent_force_model import LatentForceModel
 
@@ -31,7 +32,7 @@ class Pass(NamedTuple):
         phi, noise: (N, n, n), the affine map of the row.
         innovation, present, chol, gain, slope, obs_cov: of the update, (N, D), (N, D), (N, D, D), (N, n, D), (N, D, n),
             (N, D, D).
-        steps: predictions (N, J, ...) of the integration steps of each row.
+        steps: of the integration steps of each row, predictions (N, J, ...) or `Inside` (N, J, ...).
     """
 
     log_likelihood: jax.Array
@@ -48,16 +49,70 @@ class Pass(NamedTuple):
     steps: Any = None
 
 
+class Inside(NamedTuple):
+    """The states that a linearisation of the dynamics needs, k of them, at the ends of steps within a row.
+
+    Attributes:
+        moments: predicted, (J, k) and (J, k, k).
+        cross: (J, k, n), their covariance with the whole state at the row's end, a jump there included.
+    """
+
+    moments: Moments
+    cross: jax.Array
+
+
 class Points(NamedTuple):
     """Moments about which a pass is linearised.
 
     Attributes:
-        nodes: (N, J + 1, ...) at the ends of the steps of each row, before a jump.
-        ends: (N, ...) at the rows' ends, after it.
+        nodes: (N, J + 1, k), (N, J + 1, k, k) of the `needed` states at the ends of the steps of each row, before a
+            jump.
+        ends: (N, n), (N, n, n) at the rows' ends, after it.
     """
 
     nodes: Moments
     ends: Moments
+
+
+def needed(ssm: StateSpaceModel, rule: Rule) -> np.ndarray:
+    """Return (k,), the joint states whose moments a linearisation of the dynamics needs."""
+    if isinstance(rule, SigmaPointRule) and rule.full_state:
+        return np.arange(ssm.state_dim)
+    structure = ssm.drift_structure
+    inputs = np.isin(np.arange(ssm.input_dim), (*structure.points, *structure.averaged))
+    size = ssm.physical_dim
+    states = [np.full(force.state_dim, used) for force, used in zip(ssm.stack.forces, inputs[size:], strict=True)]
+    return np.flatnonzero(np.concatenate([inputs[:size], *states]))
+
+
+def completed(ssm: StateSpaceModel, rule: Rule, nodes: Moments) -> Moments:
+    """Return moments (..., n), (..., n, n) of the whole state from those of the needed ones; the others are zero."""
+    pick = jnp.asarray(np.eye(ssm.state_dim)[needed(ssm, rule)])
+    return Moments(matmul(nodes.mean[..., None, :], pick)[..., 0, :], congruence(pick.T, nodes.covariance))
+
+
+def _inside(ssm: StateSpaceModel, rule: Rule, plan: Schedule, prepared: Preparation, row: Rows, steps: Any) -> Inside:
+    """Return what the iterations need of a row from (mean, covariance with all states, phi) of its steps."""
+    mean, own, phi = steps
+    to_end = jnp.eye(ssm.state_dim)
+    if prepared.jumps is not None:
+        still = Prediction(Moments(jnp.zeros(ssm.state_dim), to_end), to_end, to_end)
+        to_end = after_jump(ssm, prepared.jumps, row.jump, still, flow=True).phi
+
+    def back(to_end: jax.Array, at: tuple) -> tuple[jax.Array, jax.Array]:
+        own, phi = at
+        return matmul(to_end, phi), matmul(own, to_end.T)
+
+    _, cross = jax.lax.scan(back, to_end, (own, phi), reverse=True)
+    return Inside(Moments(mean, _columns(own, needed(ssm, rule))), cross)
+
+
+def _columns(a: jax.Array, indices: np.ndarray) -> jax.Array:
+    """Return the entries at ``indices`` along the last axis; XLA fuses a slice, not a gather."""
+    first, count = (int(indices[0]), len(indices)) if len(indices) else (0, 0)
+    if np.array_equal(indices, first + np.arange(count)):
+        return a[..., first:first + count]
+    return a[..., indices]
 
 
 class Preparation(NamedTuple):
@@ -129,7 +184,8 @@ class FilterResult(eqx.Module):
 
 
 def predict(ssm: StateSpaceModel, rule: Rule, plan: Schedule, prepared: Preparation, row: Rows, moments: Moments,
-            nodes: Moments | None = None, flow: bool = False, each: bool = False) -> Prediction:
+            nodes: Moments | None = None, flow: bool = False,
+            each: Callable[[Prediction], Any] | None = None) -> Prediction:
     """Predict over a row, a jump at its end included; arguments as in `predict_row`."""
     transition = row_transition(ssm, plan, prepared, row)
     if ssm.time_invariant:
@@ -137,7 +193,7 @@ def predict(ssm: StateSpaceModel, rule: Rule, plan: Schedule, prepared: Preparat
     else:
         move = lambda: predict_row(  # noqa: E731
             ssm, rule, prepared.linear, transition, plan.steps, row.start, row.length, moments, nodes, flow, each)
-        stay = lambda: unmoved(moments, flow, plan.steps if each else 0)  # noqa: E731
+        stay = lambda: unmoved(moments, flow, each, plan.steps)  # noqa: E731
         one = jax.lax.cond(row.length > 0, move, stay) if plan.replicated else move()
     if prepared.jumps is not None:
         one = after_jump(ssm, prepared.jumps, row.jump, one, flow=flow or ssm.time_invariant)
@@ -156,15 +212,22 @@ def forward(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, *, s
         start: moments at the initial time; the model's by default.
         about: linearise about these moments; the filter's own by default.
         keep: "likelihood" (log likelihoods only), "moments" (and the moments), "all" (what the smoother needs),
-            "steps" (and the steps within the rows).
+            "steps" (and the steps within the rows), "inside" (instead of these, what the iterations need of them).
     """
     prepared = preparation(ssm, plan)
-    flow = keep in ("all", "steps")
+    flow = keep in ("all", "steps", "inside")
+    each: Callable[[Prediction], Any] | None = None
+    if keep == "steps":
+        each = lambda one: one  # noqa: E731
+    if keep == "inside" and not ssm.time_invariant:
+        used = needed(ssm, rule)
+        each = lambda one: (_columns(one.moments.mean, used), _columns(one.moments.covariance, used).T,  # noqa: E731
+                            one.phi)
 
     def step(moments: Moments, inputs: tuple[Rows, jax.Array, Points | None]) -> tuple[Moments, Pass]:
         row, observed, nearby = inputs
-        one = predict(ssm, rule, plan, prepared, row, moments, None if nearby is None else nearby.nodes, flow,
-                      keep == "steps")
+        nodes = None if nearby is None else completed(ssm, rule, nearby.nodes)
+        one = predict(ssm, rule, plan, prepared, row, moments, nodes, flow, each)
         centre = one.moments if nearby is None else nearby.ends
         affine = linearise_observation(ssm, rule, prepared.jacobian, row.start + row.length,
                                        jnp.maximum(row.observation, 0), centre)
@@ -176,8 +239,11 @@ def forward(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, *, s
             out = out._replace(predicted=one.moments, filtered=new.moments, innovation=new.innovation,
                                present=jnp.isfinite(observed), chol=new.chol)
         if flow:
+            steps = one.steps
+            if keep == "inside" and steps is not None:
+                steps = _inside(ssm, rule, plan, prepared, row, steps)
             out = out._replace(phi=one.phi, noise=one.noise, gain=new.gain, slope=new.slope, obs_cov=new.obs_cov,
-                               steps=one.steps)
+                               steps=steps)
         return new.moments, out
 
     padded = jnp.concatenate([jnp.asarray(y, float), jnp.full((1, ssm.output_dim), jnp.nan)])

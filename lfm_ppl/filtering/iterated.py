@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.filtering.between import Branches
-from lfm_ppl.filtering.filter import Pass, Points, forward
+from lfm_ppl.filtering.filter import Pass, Points, completed, forward, needed
 from lfm_ppl.filtering.jumps import after_jump
 from lfm_ppl.filtering.predict import Moments, Prediction
 from lfm_ppl.filtering.retrospect import combine, given_later
@@ -17,7 +17,6 @@ from lfm_ppl.filtering.rts import Smoothed, backward
 from lfm_ppl.filtering.schedule import Rows, Schedule
 from lfm_ppl.linalg import congruence, matmul, safe_sqrt
 from lfm_ppl.linearisation.rule import Rule
-from lfm_ppl.linearisation.sigma_points import SigmaPointRule
 from lfm_ppl.model.augment import StateSpaceModel
 
 
@@ -49,7 +48,7 @@ def posterior_linearisation(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y:
     Source: García-Fernández, Svensson and Särkkä (2017), IEEE Transactions on Signal Processing 65(21).
     """
     def smoothed(about: Points | None) -> Points:
-        passed = forward(ssm, rule, plan, y, start=start, about=about, keep="steps")
+        passed = forward(ssm, rule, plan, y, start=start, about=about, keep="inside")
         found = backward(passed, start, plan)
         ends = jax.tree_util.tree_map(lambda a: a[1:], found.moments)
         return Points(_nodes(ssm, rule, plan, passed, found), ends)
@@ -72,62 +71,32 @@ def _largest_change(old: Moments, new: Moments) -> jax.Array:
     return jnp.max(jnp.where(sd > 0, change, 0.0), initial=0.0)
 
 
-def _needed(ssm: StateSpaceModel, rule: Rule) -> np.ndarray:
-    """Return (n,), the joint states whose moments a linearisation of the dynamics needs."""
-    if isinstance(rule, SigmaPointRule) and rule.full_state:
-        return np.ones(ssm.state_dim, bool)
-    structure = ssm.drift_structure
-    inputs = np.isin(np.arange(ssm.input_dim), (*structure.points, *structure.averaged))
-    size = ssm.physical_dim
-    states = [np.full(force.state_dim, used) for force, used in zip(ssm.stack.forces, inputs[size:], strict=True)]
-    return np.concatenate([inputs[:size], *states])
-
-
 def _nodes(ssm: StateSpaceModel, rule: Rule, plan: Schedule, passed: Pass, smoothed: Smoothed) -> Moments:
-    """Return smoothed moments (N, J + 1, ...) of the needed states at the ends of the steps; others are zero.
+    """Return smoothed moments (N, J + 1, ...) of the needed states at the ends of the steps.
 
     Between a row's ends they are those of the adjoint at its end,
 
-        m + W r,    P - W Lambda W',    W = P Phi',
-
-    with Phi from the node to the row's end.
+        m + W r,    P - W Lambda W',    W = Cov(node, state at the row's end).
     """
-    needed = np.flatnonzero(_needed(ssm, rule))
-    pick = jnp.asarray(np.eye(ssm.state_dim)[needed])
-    jumps = ssm.stack.jump_table()
-
-    def part(moments: Moments) -> Moments:
-        return Moments(matmul(pick, moments.mean[:, None])[:, 0], congruence(pick, moments.covariance))
+    used = needed(ssm, rule)
+    pick = jnp.asarray(np.eye(ssm.state_dim)[used])
+    marginal = Moments(matmul(smoothed.moments.mean, pick.T), congruence(pick, smoothed.moments.covariance))
+    first, last = (jax.tree_util.tree_map(lambda a: a[part][:, None], marginal)  # noqa: B023
+                   for part in (slice(None, -1), slice(1, None)))
+    if passed.steps is None or not used.size:
+        return jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a, *(b for _ in range(plan.steps))], axis=1),
+                                      first, last)
 
     def row(at: tuple) -> Moments:
-        first, last, r, adjoint, jump, steps = at
-        first, last = part(first), part(last)
-        if steps is None or not needed.size:
-            return jax.tree_util.tree_map(lambda a, b: jnp.stack([a, *(b for _ in range(plan.steps))]), first, last)
+        (moments, cross), r, adjoint = at
+        return Moments(moments.mean + matmul(cross, r[:, None])[..., 0],
+                       moments.covariance - congruence(cross, adjoint))
 
-        def node(phi: jax.Array, step: Prediction) -> tuple[jax.Array, Moments]:
-            mean, covariance = step.moments
-            own = matmul(pick, covariance)
-            cross = matmul(own, phi.T)
-            inside = Moments((matmul(pick, mean[:, None]) + matmul(cross, r[:, None]))[:, 0],
-                             matmul(own, pick.T) - congruence(cross, adjoint))
-            return matmul(phi, step.phi), inside
-
-        identity = jnp.eye(ssm.state_dim)
-        to_end = identity
-        if jumps is not None:
-            still = Prediction(Moments(jnp.zeros(ssm.state_dim), identity), identity, identity)
-            to_end = after_jump(ssm, jumps, jump, still, flow=True).phi
-        _, inside = jax.lax.scan(node, to_end, steps, reverse=True)
-        if jumps is None:
-            inside = jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a[:-1], b[None]]), inside, last)
-        return jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a[None], b]), first, inside)
-
-    starts, ends = (jax.tree_util.tree_map(lambda a: a[part], smoothed.moments)  # noqa: B023
-                    for part in (slice(None, -1), slice(1, None)))
-    # Row by row: XLA makes one small program of a row's loop, where it treats all rows at once operation by operation.
-    nodes = jax.lax.map(row, (starts, ends, *smoothed.adjoint, jnp.asarray(plan.rows.jump), passed.steps))
-    return Moments(matmul(nodes.mean, pick), congruence(pick.T, nodes.covariance))
+    # Row by row: XLA makes one small program of a row, where it treats all rows at once operation by operation.
+    inside = jax.lax.map(row, (passed.steps, *smoothed.adjoint))
+    if ssm.stack.jump_table() is None:
+        inside = jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a[:, :-1], b], axis=1), inside, last)
+    return jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a, b], axis=1), first, inside)
 
 
 def _to_end(ssm: StateSpaceModel, plan: Schedule, passed: Pass) -> tuple[jax.Array, jax.Array]:
@@ -165,11 +134,12 @@ def per_step(plan: Schedule) -> Schedule:
                          requested=plan.requested * steps + steps - 1)
 
 
-def refined(ssm: StateSpaceModel, plan: Schedule, found: Iterated, passed: Pass, smoothed: Smoothed) -> Branches:
+def refined(ssm: StateSpaceModel, rule: Rule, plan: Schedule, found: Iterated, passed: Pass, smoothed: Smoothed) -> Branches:
     """Return the last pass of the iterations with a row for each integration step.
 
     Args:
         ssm: the model; its rows are not exact.
+        rule: the linearisation rule.
         plan: the rows.
         found: what the iterations left.
         passed: the forward scan about ``found.points``.
@@ -200,7 +170,7 @@ def refined(ssm: StateSpaceModel, plan: Schedule, found: Iterated, passed: Pass,
     def by_steps(inside: jax.Array, end: jax.Array) -> jax.Array:
         return flat(jnp.concatenate([inside, end[:, None]], axis=1))
 
-    nodes = found.points.nodes
+    nodes = completed(ssm, rule, found.points.nodes)
     return Branches(
         per_step(plan), tree(by_steps, filtered, passed.filtered),
         tree(lambda first, inside: jnp.concatenate([flat(jnp.concatenate([first[:-1, None], inside], axis=1)),

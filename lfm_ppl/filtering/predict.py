@@ -12,6 +12,7 @@ noise that reaches x through the nodes is regressed on it, plus a semi-definite 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -34,7 +35,7 @@ class Moments(NamedTuple):
 class Prediction(NamedTuple):
     """The moments at the end of a row, and its affine map s -> phi s + ... + N(0, noise) where that was asked for.
 
-    ``steps`` holds the same of each integration step (J, ...) where these were asked for.
+    ``steps`` holds what was asked for of each integration step (J, ...).
     """
 
     moments: Moments
@@ -87,7 +88,7 @@ def _integrated_offset(ssm: StateSpaceModel, transition: Exact, steps: int, star
 
 def predict_row(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Factor, steps: int, start: jax.Array,
                 length: jax.Array, moments: Moments, about: Moments | None = None,
-                flow: bool = False, each: bool = False) -> Prediction:
+                flow: bool = False, each: Callable[[Prediction], Any] | None = None) -> Prediction:
     """Predict over a row in ``steps`` Runge-Kutta steps.
 
     Args:
@@ -101,21 +102,21 @@ def predict_row(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Fa
         moments: at its start.
         about: linearise about these moments, (steps + 1, ...) at the ends of the steps, and not about the filter's own.
         flow: whether phi and noise of the whole row are wanted (for the smoother).
-        each: whether those of each step are wanted, too.
+        each: what is wanted of each step's prediction.
     """
     h = length / steps
     spread = _smallest_spread(ssm, rule, factor, start, h, moments)
     if bent_by_forces_only(ssm, rule):
         return _predict_by_quadrature(ssm, rule, linear, factor, steps, start, h, moments, spread, about, flow, each)
 
-    def step(carry: tuple, at: tuple) -> tuple[tuple, Prediction | None]:
+    def step(carry: tuple, at: tuple) -> tuple[tuple, Any]:
         now, phi, noise = carry
         index, ends = at
         nodes = None if ends is None else _with_middle(*ends)
         one = _step(ssm, rule, linear, factor, start + index * h, h, now, spread, nodes)
         if flow:
             phi, noise = matmul(one.phi, phi), congruence(one.phi, noise) + one.noise
-        return (one.moments, phi, noise), one if each else None
+        return (one.moments, phi, noise), None if each is None else each(one)
 
     carry = tuple(unmoved(moments, flow))[:3]
     ends = None if about is None else (jax.tree_util.tree_map(lambda a: a[:-1], about),
@@ -125,13 +126,15 @@ def predict_row(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Fa
     return Prediction(moments, whole, added, within)
 
 
-def unmoved(moments: Moments, flow: bool, each: int = 0) -> Prediction:
-    """Predict over a row of length zero, of ``each`` steps; the same structure as what `predict_row` returns."""
+def unmoved(moments: Moments, flow: bool, each: Callable[[Prediction], Any] | None = None,
+            steps: int = 0) -> Prediction:
+    """Predict over a row of length zero; the same structure as what `predict_row` returns."""
     size = moments.mean.shape[0]
     still = (Prediction(moments, jnp.eye(size), jnp.zeros((size, size))) if flow
              else Prediction(moments, jnp.zeros(0), jnp.zeros(0)))
-    if each:
-        still = still._replace(steps=jax.tree_util.tree_map(lambda a: jnp.broadcast_to(a, (each, *a.shape)), still))
+    if each is not None:
+        still = still._replace(
+            steps=jax.tree_util.tree_map(lambda a: jnp.broadcast_to(a, (steps, *a.shape)), each(still)))
     return still
 
 
@@ -272,50 +275,69 @@ def bent_by_forces_only(ssm: StateSpaceModel, rule: Rule) -> bool:
 
 def _predict_by_quadrature(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Factor, steps: int,
                            start: jax.Array, h: jax.Array, moments: Moments, spread: jax.Array, about: Moments | None,
-                           flow: bool, each: bool) -> Prediction:
+                           flow: bool, each: Callable[[Prediction], Any] | None) -> Prediction:
     """Predict over a row in which only the forces bend the dynamics; the same numbers as `_step` step by step.
 
     No stage then changes what a later one sees: the forces' moments at all nodes are known at the row's start, and the
     Runge-Kutta method is Simpson's rule.
     """
-    forces = slice(ssm.physical_dim, None)
-    half = factor.half[forces, forces]
+    size = ssm.physical_dim
+    half = factor.half[size:, size:]
 
     def half_step(now: Moments, _: None) -> tuple[Moments, Moments]:
         return Moments(matmul(half, now.mean[:, None])[:, 0],
                        congruence(half, now.covariance) + factor.noise_half), now
 
-    first = Moments(moments.mean[forces], moments.covariance[forces, forces])
-    last, before = jax.lax.scan(half_step, first, None, length=2 * steps)
-    at_nodes = jax.tree_util.tree_map(lambda a, b: _by_steps(jnp.concatenate([a, b[None]])), before, last)
+    last, before = jax.lax.scan(half_step, _forces_of(moments, size), None, length=2 * steps)
+    now = jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a, b[None]]), before, last)
+    near = now if about is None else jax.tree_util.tree_map(_with_middles, _forces_of(about, size))
     begins = start + jnp.arange(steps) * h
-    times = jnp.stack([begins, begins + 0.5 * h, just_before(begins + h, h)], axis=1)
-    nearby = None
-    if about is not None:
-        nearby = jax.tree_util.tree_map(
-            lambda a: jnp.stack([a[:-1], 0.5 * (a[:-1] + a[1:]), a[1:]], axis=1), about)
+    times = jnp.stack([begins, begins + 0.5 * h], axis=1).ravel()
+    ends = just_before(begins + h, h)
 
-    def node(t: jax.Array, now: Moments, near: Moments | None) -> _Stage:
-        # The physical state drops out.
-        mean = jnp.concatenate([jnp.zeros(ssm.physical_dim), now.mean])
-        covariance = lambda rows, _: congruence(rows[:, forces], now.covariance)  # noqa: E731
-        return _stage(ssm, rule, linear, t, mean, covariance, spread, near)
+    def node(t: jax.Array, mean: jax.Array, near: Moments) -> _Stage:
+        centre = jnp.concatenate([jnp.zeros(size), near.mean])  # the physical state drops out
+        covariance = lambda rows, _: congruence(rows[:, size:], near.covariance)  # noqa: E731
+        one = _stage(ssm, rule, linear, t, centre, covariance, spread, None)
+        if about is None:
+            return one
+        return one._replace(rest=one.rest + matmul(one.slope[:, size:], (mean - near.mean)[:, None])[:, 0])
 
-    stages = jax.vmap(jax.vmap(node))(times, at_nodes, nearby)
-    maps = jax.vmap(lambda one: _simpson(factor, h, one, ssm.physical_dim))(stages)
+    if _same_at_all_times(ssm):
+        nodes = jax.vmap(node)(jnp.append(times, ends[-1]), now.mean, near)
+        stages = jax.tree_util.tree_map(_by_steps, nodes)
+    else:
+        times = jnp.stack([begins, begins + 0.5 * h, ends], axis=1)
+        stages = jax.vmap(jax.vmap(node))(times, _by_steps(now.mean), jax.tree_util.tree_map(_by_steps, near))
 
-    def step(carry: tuple, one: tuple) -> tuple[tuple, Prediction | None]:
+    def step(carry: tuple, nodes: _Stage) -> tuple[tuple, Any]:
         now, phi, noise = carry
-        own, offset, added = one
+        own, offset, added = _simpson(factor, h, nodes, size)
         mean = matmul(factor.full, now.mean[:, None])[:, 0]
-        mean = jnp.concatenate([mean[:ssm.physical_dim] + offset, mean[forces]])
+        mean = jnp.concatenate([mean[:size] + offset, mean[size:]])
         now = Moments(mean, congruence(own, now.covariance) + added)
         if flow:
             phi, noise = matmul(own, phi), congruence(own, noise) + added
-        return (now, phi, noise), Prediction(now, own, added) if each else None
+        return (now, phi, noise), None if each is None else each(Prediction(now, own, added))
 
-    (moments, whole, added), within = jax.lax.scan(step, tuple(unmoved(moments, flow))[:3], maps)
+    (moments, whole, added), within = jax.lax.scan(step, tuple(unmoved(moments, flow))[:3], stages)
     return Prediction(moments, whole, added, within)
+
+
+def _same_at_all_times(ssm: StateSpaceModel) -> bool:
+    """Whether the dynamics, a function of the state, is the same at all times: an end of a step is the next one's start."""
+    return (ssm.constant_measurement and ssm.constant_mean and not ssm.drift_structure.offset_varies
+            and not callable(ssm.model.process_noise))
+
+
+def _forces_of(moments: Moments, size: int) -> Moments:
+    return Moments(moments.mean[..., size:], moments.covariance[..., size:, size:])
+
+
+def _with_middles(ends: jax.Array) -> jax.Array:
+    """The ends (J + 1, ...) of the steps with their middles between them, (2 J + 1, ...)."""
+    middles = 0.5 * (ends[:-1] + ends[1:])
+    return jnp.concatenate([jnp.stack([ends[:-1], middles], axis=1).reshape(-1, *ends.shape[1:]), ends[-1:]])
 
 
 def _by_steps(nodes: jax.Array) -> jax.Array:

@@ -263,7 +263,7 @@ def smooth_on(ssm: StateSpaceModel, rule: Rule, plans: Plans, y: jax.Array, iter
         at = jnp.asarray(plans.joint.requested)
         joint = Joint(start, drawn._replace(steps=None), at, pieces.moments.covariance[at + 1])
         rows = (Branches(plan, passed.filtered, smoothed.moments, smoothed.adjoint, None) if found is None
-                else refined(ssm, plan, found, passed, smoothed))
+                else refined(ssm, rule, plan, found, passed, smoothed))
         mean, covariance = marginals_between(ssm, rule, rows, start, plans.where)
     matrix, offset = jax.vmap(ssm.input_map)(times)
     observed = jnp.asarray(plan.observed)
