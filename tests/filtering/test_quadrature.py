@@ -1,0 +1,121 @@
+"""Where only the forces bend the dynamics, prediction is Simpson's rule: the numbers of the Runge-Kutta step."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from systems import whole_state
+
+import lfm_ppl as lfm
+from lfm_ppl.filtering import predict
+from lfm_ppl.filtering.predict import Moments, predict_row
+from lfm_ppl.filtering.transition import integrating_factor, linear_part
+
+DECAY = jnp.array([0.4, 0.9, 0.6])
+SENSITIVITY = jnp.array([1.0, 0.5, 0.7])
+
+
+def one_force(genes, link):
+    return lambda x, u, t: 0.1 + SENSITIVITY[:genes] * link(u[0]) - DECAY[:genes] * x
+
+
+def two_forces(genes, link):
+    return lambda x, u, t: SENSITIVITY[:genes] * link(u[0]) * jnp.tanh(u[1]) + 0.3 * u[1] - DECAY[:genes] * x
+
+
+def in_a_chain(genes, link):
+    """Each gene moves the next one, the second force enters linearly."""
+    return lambda x, u, t: link(u[0]) + 0.5 * u[1] + 0.2 * jnp.roll(x, 1) - DECAY[:genes] * x
+
+
+def in_time(genes, link):
+    return lambda x, u, t: (1.0 + 0.5 * jnp.sin(t)) * link(u[0]) + jnp.cos(t) * u[1] - DECAY[:genes] * x
+
+
+def noise_of_force(x, u, t):
+    return 0.1 * (1.0 + u[0] ** 2) * (1.0 + t) * jnp.ones((1, 1))
+
+
+CASES = {
+    "softplus": (one_force, 1, jax.nn.softplus, 1, None),
+    "exp, three genes": (one_force, 3, jnp.exp, 1, None),
+    "softplus, three genes, two forces": (two_forces, 3, jax.nn.softplus, 2, None),
+    "exp, chain": (in_a_chain, 3, jnp.exp, 2, 0.2 * jnp.eye(3)),
+    "exp, time": (in_time, 1, jnp.exp, 2, None),
+    "softplus, noise of the force": (one_force, 1, jax.nn.softplus, 1, noise_of_force),
+}
+RULES = {"cubature": lfm.Cubature(), "taylor": lfm.Taylor()}
+
+
+def case(name):
+    dynamics, genes, link, count, noise = CASES[name]
+    forces = {"first": lfm.Matern(1.0, 1.5, order=1), "second": lfm.Matern(0.7, 0.8, order=0)}
+    return lfm.state_space(lfm.LatentForceModel(
+        dynamics(genes, link), dict(list(forces.items())[:count]),
+        lfm.GaussianObservation(whole_state, 0.01 * jnp.ones(genes)),
+        lfm.Gaussian(jnp.ones(genes), jnp.zeros((genes, genes))), process_noise=noise))
+
+
+def starts(ssm):
+    """A known physical state, one of which nothing is known, and one that depends on the forces."""
+    mean, covariance = ssm.initial()
+    mean = mean + 0.3 * jnp.arange(1.0, ssm.state_dim + 1)
+    size = ssm.physical_dim
+    mixed = np.eye(ssm.state_dim) + 0.2 * np.tri(ssm.state_dim)
+    return Moments(jnp.stack([mean] * 3), jnp.stack([
+        covariance, covariance + jnp.diag(jnp.where(jnp.arange(ssm.state_dim) < size, 100.0, 0.0)),
+        jnp.asarray(mixed @ mixed.T)]))
+
+
+def nodes(ssm, steps):
+    """Moments at the ends of the steps, to linearise about."""
+    wave = jnp.sin(jnp.arange(steps + 1.0))
+    mean = jnp.linspace(-0.5, 0.5, ssm.state_dim) + wave[:, None]
+    return Moments(mean, (0.3 + 0.2 * wave**2)[:, None, None] * (jnp.eye(ssm.state_dim) + 0.1))
+
+
+def predictions(ssm, rule, steps):
+    """Of a row from all starts, about the filter's own moments and about given ones."""
+    linear = linear_part(ssm, jnp.zeros(()))
+    factor = integrating_factor(ssm, linear, jnp.asarray(1.5 / steps))
+
+    def row(moments, about):
+        return predict_row(ssm, rule, linear, factor, steps, jnp.asarray(0.7), jnp.asarray(1.5), moments, about,
+                           flow=True, each=lambda one: one)
+
+    def both(moments):
+        return row(moments, None), row(moments, nodes(ssm, steps))
+
+    return jax.tree_util.tree_map(np.asarray, jax.jit(jax.vmap(both))(starts(ssm)))
+
+
+@pytest.mark.parametrize("steps", [1, 3, 10])
+@pytest.mark.parametrize("name", CASES)
+def test_simpson_gives_the_numbers_of_runge_kutta(name, steps, monkeypatch):
+    ssm = case(name)
+    rule = RULES["taylor" if name == "softplus" and steps == 3 else "cubature"]
+    assert predict.bent_by_forces_only(ssm, rule)
+    found = predictions(ssm, rule, steps)
+    monkeypatch.setattr(predict, "bent_by_forces_only", lambda *_: False)
+    expected = predictions(ssm, rule, steps)
+    for one, other in zip(*map(jax.tree_util.tree_leaves, (found, expected)), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12 * np.abs(other).max())
+
+
+@pytest.mark.parametrize("dynamics", [
+    lambda x, u, t: u - x**3, lambda x, u, t: u * x, lambda x, u, t: u - (1.0 + t) * x,
+    lambda x, u, t: jnp.where(x > 0.0, u, -u)])
+def test_other_structures_keep_runge_kutta(dynamics):
+    model = lfm.LatentForceModel(dynamics, {"u": lfm.Matern(1.0, 1.0)},
+                                 lfm.GaussianObservation(whole_state, jnp.ones(1)),
+                                 lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
+    assert not predict.bent_by_forces_only(lfm.state_space(model), lfm.Cubature())
+
+
+def test_points_in_the_whole_state_keep_runge_kutta():
+    assert not predict.bent_by_forces_only(case("softplus"), lfm.Cubature(full_state=True))
+    noisy = lfm.LatentForceModel(one_force(1, jnp.exp), {"u": lfm.Matern(1.0, 1.0)},
+                                 lfm.GaussianObservation(whole_state, jnp.ones(1)),
+                                 lfm.Gaussian(jnp.zeros(1), jnp.eye(1)),
+                                 process_noise=lambda x, u, t: x[None])
+    assert not predict.bent_by_forces_only(lfm.state_space(noisy), lfm.Cubature())
