@@ -87,7 +87,13 @@ def needed(ssm: StateSpaceModel, rule: Rule) -> np.ndarray:
 
 def completed(ssm: StateSpaceModel, rule: Rule, nodes: Moments) -> Moments:
     """Return moments (..., n), (..., n, n) of the whole state from those of the needed ones; the others are zero."""
-    pick = jnp.asarray(np.eye(ssm.state_dim)[needed(ssm, rule)])
+    used = needed(ssm, rule)
+    if _contiguous(used):
+        first = int(used[0]) if used.size else 0
+        width = first, ssm.state_dim - first - used.size
+        still = ((0, 0),) * (nodes.mean.ndim - 1)
+        return Moments(jnp.pad(nodes.mean, (*still, width)), jnp.pad(nodes.covariance, (*still, width, width)))
+    pick = jnp.asarray(np.eye(ssm.state_dim)[used])
     return Moments(matmul(nodes.mean[..., None, :], pick)[..., 0, :], congruence(pick.T, nodes.covariance))
 
 
@@ -109,10 +115,14 @@ def _inside(ssm: StateSpaceModel, rule: Rule, plan: Schedule, prepared: Preparat
 
 def _columns(a: jax.Array, indices: np.ndarray) -> jax.Array:
     """Return the entries at ``indices`` along the last axis; XLA fuses a slice, not a gather."""
-    first, count = (int(indices[0]), len(indices)) if len(indices) else (0, 0)
-    if np.array_equal(indices, first + np.arange(count)):
-        return a[..., first:first + count]
-    return a[..., indices]
+    if not _contiguous(indices):
+        return a[..., indices]
+    first = int(indices[0]) if indices.size else 0
+    return a[..., first:first + indices.size]
+
+
+def _contiguous(indices: np.ndarray) -> bool:
+    return bool((np.diff(indices) == 1).all())
 
 
 class Preparation(NamedTuple):

@@ -134,7 +134,8 @@ def per_step(plan: Schedule) -> Schedule:
                          requested=plan.requested * steps + steps - 1)
 
 
-def refined(ssm: StateSpaceModel, rule: Rule, plan: Schedule, found: Iterated, passed: Pass, smoothed: Smoothed) -> Branches:
+def refined(ssm: StateSpaceModel, rule: Rule, plan: Schedule, found: Iterated, passed: Pass,
+            smoothed: Smoothed) -> Branches:
     """Return the last pass of the iterations with a row for each integration step.
 
     Args:

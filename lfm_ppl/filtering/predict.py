@@ -6,8 +6,9 @@ The filter's moments obey dm/dt = E[f] and dP/dt = A P + P A' + E[G G']. The cov
 
 and (m, Phi, W) is what the classical Runge-Kutta method integrates. Its weights are positive, so W, and with it P,
 is positive semi-definite at every stage and at the end, and the order is four. The linear part of the model
-(`transition`) is removed from A by its exact exponential, an integrating factor. The forces' own noise is exact: the
-noise that reaches x through the nodes is regressed on it, plus a semi-definite remainder.
+(`transition`) is removed from A by its exact exponential, an integrating factor. Where what is left of A reads the
+forces alone, the method is Simpson's rule. The forces' own noise is exact: the noise that reaches x through the nodes
+is regressed on it, plus a semi-definite remainder.
 """
 
 from __future__ import annotations
@@ -276,10 +277,10 @@ def bent_by_forces_only(ssm: StateSpaceModel, rule: Rule) -> bool:
 def _predict_by_quadrature(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Factor, steps: int,
                            start: jax.Array, h: jax.Array, moments: Moments, spread: jax.Array, about: Moments | None,
                            flow: bool, each: Callable[[Prediction], Any] | None) -> Prediction:
-    """Predict over a row in which only the forces bend the dynamics; the same numbers as `_step` step by step.
+    """Predict over a row in which only the forces bend the dynamics, to the same numbers as in steps of `_step`.
 
-    No stage then changes what a later one sees: the forces' moments at all nodes are known at the row's start, and the
-    Runge-Kutta method is Simpson's rule.
+    The forces' moments at all nodes are then known at the row's start, no stage changes what another one sees, and
+    the Runge-Kutta method is Simpson's rule.
     """
     size = ssm.physical_dim
     half = factor.half[size:, size:]
@@ -325,12 +326,13 @@ def _predict_by_quadrature(ssm: StateSpaceModel, rule: Rule, linear: LinearPart,
 
 
 def _same_at_all_times(ssm: StateSpaceModel) -> bool:
-    """Whether the dynamics, a function of the state, is the same at all times: an end of a step is the next one's start."""
+    """Whether the dynamics is one function of the state at all times: the end of a step is the start of the next."""
     return (ssm.constant_measurement and ssm.constant_mean and not ssm.drift_structure.offset_varies
             and not callable(ssm.model.process_noise))
 
 
 def _forces_of(moments: Moments, size: int) -> Moments:
+    """Moments of the forces' states, which follow ``size`` physical ones."""
     return Moments(moments.mean[..., size:], moments.covariance[..., size:, size:])
 
 
@@ -346,12 +348,12 @@ def _by_steps(nodes: jax.Array) -> jax.Array:
 
 
 def _simpson(factor: Factor, h: jax.Array, nodes: _Stage, size: int) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return Phi (n, n), the mean's increment (M,) and Q (n, n) of a step, from its first, middle and last node (3, ...).
+    """Return Phi (n, n), what the remainder adds to the mean (M,), and Q (n, n) of a step.
 
-        Phi = E(h) + h / 6 (E(h) K_1 + 4 E(h/2) K_2 E(h/2) + K_3 E(h)),
+        Phi = E(h) + h / 6 (E(h) K_1 + 4 E(h/2) K_2 E(h/2) + K_3 E(h)).
 
-    and so is the mean. The middle node stands for the second and the third Runge-Kutta stage. Of these, Psi~ = I - Z
-    differs, since it is a stage's own.
+    Its first, middle and last node are ``nodes`` (3, ...). The middle one is both the second and the third Runge-Kutta
+    stage; their Z, where Psi~ = I - Z is the inverse flow to a stage's node, differ.
     """
     half, full = factor.half, factor.full
     half_x, full_x = half[:size, :size], full[:size, :size]
