@@ -339,7 +339,8 @@ def _forces_of(moments: Moments, size: int) -> Moments:
 def _with_middles(ends: jax.Array) -> jax.Array:
     """The ends (J + 1, ...) of the steps with their middles between them, (2 J + 1, ...)."""
     middles = 0.5 * (ends[:-1] + ends[1:])
-    return jnp.concatenate([jnp.stack([ends[:-1], middles], axis=1).reshape(-1, *ends.shape[1:]), ends[-1:]])
+    pairs = jnp.stack([ends[:-1], middles], axis=1)
+    return jnp.concatenate([pairs.reshape(2 * len(middles), *ends.shape[1:]), ends[-1:]])
 
 
 def _by_steps(nodes: jax.Array) -> jax.Array:

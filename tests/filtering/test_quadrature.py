@@ -119,3 +119,20 @@ def test_points_in_the_whole_state_keep_runge_kutta():
                                  lfm.Gaussian(jnp.zeros(1), jnp.eye(1)),
                                  process_noise=lambda x, u, t: x[None])
     assert not predict.bent_by_forces_only(lfm.state_space(noisy), lfm.Cubature())
+
+
+def test_without_forces(monkeypatch):
+    """Linear dynamics with a noise that varies with time: there are no nodes to linearise about."""
+    model = lfm.LatentForceModel(
+        lambda x, u, t: jnp.cos(t) - x, {}, lfm.GaussianObservation(whole_state, jnp.array([0.1])),
+        lfm.Gaussian(jnp.ones(1), jnp.eye(1)), process_noise=lambda x, u, t: (1.0 + t) * jnp.ones((1, 1)))
+    assert predict.bent_by_forces_only(lfm.state_space(model), lfm.Cubature())
+
+    def log_likelihoods():
+        return [lfm.MarginalLikelihood(model, np.arange(4.0), steps=3, iterations=count).log_prob(jnp.ones((4, 1)))
+                for count in (0, 2)]
+
+    found = log_likelihoods()
+    assert lfm.smooth(model, np.arange(4.0), np.ones((4, 1)), at=[0.5, 3.5], steps=3, iterations=2).mean.shape == (2, 1)
+    monkeypatch.setattr(predict, "bent_by_forces_only", lambda *_: False)
+    np.testing.assert_allclose(found, log_likelihoods(), rtol=1e-12)
