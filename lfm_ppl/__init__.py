@@ -12,6 +12,7 @@ from lfm_ppl.comparators.particle_filter import ParticleFilterResult, particle_f
 from lfm_ppl.comparators.particle_smoother import ParticleSmootherResult, particle_smoother
 from lfm_ppl.comparators.rao_blackwellised import RaoBlackwellisedResult, rao_blackwellised
 from lfm_ppl.comparators.switched_simulation import SwitchedSimulation, simulate_switched
+from lfm_ppl.compilation import fast_loops
 from lfm_ppl.data import Data, read_csv
 from lfm_ppl.filtering.breakdown import FilterWarning
 from lfm_ppl.filtering.filter import FilterResult, FilterState, filter
@@ -123,6 +124,7 @@ __all__ = [
     "change_points",
     "check_accuracy",
     "correct_posterior",
+    "fast_loops",
     "filter",
     "fit",
     "fix",

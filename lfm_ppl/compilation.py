@@ -1,0 +1,35 @@
+"""How XLA compiles, set for a whole process before its first computation."""
+
+from __future__ import annotations
+
+import os
+
+_OPTION = "xla_cpu_small_while_loop_byte_threshold"
+_BYTES = 1_000_000
+_FLAG = "--xla_backend_extra_options="
+
+
+def fast_loops() -> None:
+    """Let XLA compile a loop over small matrices as one function, which its CPU runtime calls once.
+
+    JAX 0.10, the newest for Python 3.11, hands every operation of every pass through a loop to its runtime; with this
+    setting filters and their gradients take a half to a quarter of the time there. From JAX 0.12 on it is how loops are
+    compiled anyway. The option is added to the environment variable ``XLA_FLAGS``, which XLA reads at the first
+    computation: call this before it, as ``numpyro.set_host_device_count``. An option that is set already stays.
+    The command line does this by itself.
+
+    Example:
+        >>> import lfm_ppl as lfm
+        >>> lfm.fast_loops()
+    """
+    words = os.environ.get("XLA_FLAGS", "").split()
+    if any(_OPTION in word for word in words):
+        return
+    own = f"{_OPTION}={_BYTES}"
+    for index, word in enumerate(words):
+        if word.startswith(_FLAG):
+            words[index] = f"{word},{own}"  # the flag takes one list
+            break
+    else:
+        words.append(_FLAG + own)
+    os.environ["XLA_FLAGS"] = " ".join(words)
