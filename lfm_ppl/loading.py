@@ -13,6 +13,7 @@ and may define, each with a sensible default,
     UNITS        name -> unit
     OPTIONS      option -> (default, tuple of choices or a type, help)
     PARAMETERS   name of a sample site -> help, with its unit
+    TARGET_ACCEPT    acceptance that NUTS aims at, where its own 0.8 makes steps too long
 
 A ``model`` that has an argument ``outputs`` or ``units`` is told the names of the outputs and the
 units of the data, for ``LatentForceModel(..., output_names=outputs, units=units)``.
@@ -49,6 +50,7 @@ class ModelFile:
         units: name -> unit.
         options: option -> (default, tuple of choices or a type, help).
         parameters: name of a sample site -> help.
+        target_accept: acceptance that NUTS aims at; None for its own.
     """
 
     name: str
@@ -60,6 +62,7 @@ class ModelFile:
     units: Mapping[str, str]
     options: Mapping[str, tuple[Any, Any, str]]
     parameters: Mapping[str, str]
+    target_accept: float | None = None
     _simulate: Callable[..., Data] | None = None
     _prepare: Callable[[Data], Data] | None = None
     _anchors: Callable[[Data], Mapping[str, float]] | None = None
@@ -204,6 +207,9 @@ def _checked(path: Path, module: ModuleType) -> ModelFile:
     outputs = getattr(module, "OUTPUTS", None)
     if isinstance(outputs, str):
         raise ValueError(f'{path}: OUTPUTS must be a tuple of names, as in ("{outputs}",).')
+    target_accept = getattr(module, "TARGET_ACCEPT", None)
+    if target_accept is not None and not 0 < target_accept < 1:
+        raise ValueError(f"{path}: TARGET_ACCEPT must lie between 0 and 1, got {target_accept}.")
     return ModelFile(
         name=_name(path),
         path=path,
@@ -214,6 +220,7 @@ def _checked(path: Path, module: ModuleType) -> ModelFile:
         units=dict(getattr(module, "UNITS", {})),
         options=_checked_options(path, getattr(module, "OPTIONS", {})),
         parameters=dict(getattr(module, "PARAMETERS", {})),
+        target_accept=target_accept,
         _simulate=getattr(module, "simulate", None),
         _prepare=getattr(module, "prepare", None),
         _anchors=getattr(module, "anchors", None),

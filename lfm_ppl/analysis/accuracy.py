@@ -97,7 +97,7 @@ def check_accuracy(result: Any, numpyro_model: Callable, times: Any = None, y: A
     shape = (posterior.sizes["chain"], len(chosen))
     filtered = likelihoods.gaussian(problem).reshape(shape)
     rebuilding.check_likelihood(result, filtered, chosen)
-    doubled = likelihoods.gaussian_with_doubled_steps(problem).reshape(shape)
+    doubled = likelihoods.gaussian_with_finer_steps(problem).reshape(shape)
     found = _reference(kind, problem, filtered, particles, replicates, steps, seed, progress)
     report = assess(result, chosen, filtered, doubled, found, problem)
     arviz_data.add_group(result, GROUP, report.to_dataset())
@@ -145,7 +145,8 @@ def assess(result: Any, chosen: np.ndarray, filtered: np.ndarray, doubled: np.nd
         step_change_sd=float(change.std()), noise_sd=noise_sd, noise_share=_share(noise_sd, ratio),
         particles=reference.particles, checked=ratio.size,
         available=posterior.sizes["chain"] * posterior.sizes["draw"], impossible=int(np.isneginf(ratio).sum()),
-        sampler=str(attrs.get("sampler", "")), refit=_refit(attrs), steps=example.steps, max_step=example.max_step)
+        sampler=str(attrs.get("sampler", "")), refit=_refit(attrs), steps=example.steps, max_step=example.max_step,
+        tolerance=example.tolerance)
     verdict = judge(findings)
     sample = ("chain", "draw")
     variables = {

@@ -18,7 +18,6 @@ from lfm_ppl.inference.fixing import fix
 from lfm_ppl.inference.marginal_likelihood import Panel
 from lfm_ppl.inference.posterior import LikelihoodSite, likelihood_site
 
-_SETTINGS = ("rule", "steps", "max_step", "iterations")
 _TOLERANCE = 1e-6
 """Relative difference of log likelihoods between machines and versions that is rounding."""
 
@@ -87,10 +86,13 @@ def check_likelihood(result: Any, log_likelihood: np.ndarray, chosen: np.ndarray
 def _check_settings(site: LikelihoodSite, attrs: Mapping[str, Any]) -> None:
     example = site.example
     own = {"rule": example.rule.name, "steps": example.steps, "max_step": example.max_step,
-           "iterations": example.iterations}
-    for name in _SETTINGS:
-        if name in attrs and attrs[name] != own[name]:
-            raise ValueError(f"the result was made with {name} = {attrs[name]}, but the model has {name} = "
+           "iterations": example.iterations, "tolerance": example.tolerance}
+    if not set(own) & set(attrs):
+        return  # not made by `fit`
+    for name in own:
+        # What is None is not stored.
+        if attrs.get(name) != own[name]:
+            raise ValueError(f"the result was made with {name} = {attrs.get(name)}, but the model has {name} = "
                              f"{own[name]}; give the model as it was fitted.")
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from lfm_ppl.analysis.importance import LARGEST_K
+from lfm_ppl.analysis.likelihoods import finer_tolerance
 
 SHIFT = 0.1
 """Change of a mean, in posterior sds, that does not matter."""
@@ -44,7 +45,7 @@ class Findings(NamedTuple):
         impossible: number of draws that the reference gives a likelihood of zero.
         sampler: that made the draws.
         refit: the command that made the result; empty where it is not known.
-        steps, max_step: of the Gaussian filter.
+        steps, max_step, tolerance: of the Gaussian filter.
     """
 
     table: pd.DataFrame
@@ -62,6 +63,7 @@ class Findings(NamedTuple):
     refit: str
     steps: int
     max_step: float | None
+    tolerance: float | None = None
 
 
 class Verdict(NamedTuple):
@@ -87,13 +89,17 @@ def judge(found: Findings) -> Verdict:
 
 def _judged(found: Findings) -> tuple[str, str, str]:
     if not found.step_change_sd <= STEP_CHANGE:
-        finer = f"--steps {2 * found.steps}"
+        if found.tolerance is None:
+            finer, advice = f"--steps {2 * found.steps}", f"with {2 * found.steps} steps"
+        else:
+            tighter = finer_tolerance(found.tolerance)
+            finer, advice = f"--tolerance {tighter:g}", f"with a tolerance of {tighter:g}"
         if found.max_step is not None:
             finer += f" --max-step {found.max_step / 2:g}"
         reason = (f"the integration steps are too long: doubling them changes the log likelihood by amounts that vary "
                   f"by {found.step_change_sd:.2g} (sd) over the posterior, more than {STEP_CHANGE}.")
         if not found.refit:
-            return "re-run", f"{reason} Fit again with {2 * found.steps} steps.", ""
+            return "re-run", f"{reason} Fit again {advice}.", ""
         return "re-run", reason, f"{found.refit} {finer}"
     if found.exact:
         return "trust", "the model is linear with Gaussian noise, for which the filter is exact.", ""

@@ -236,7 +236,8 @@ def _add_inference(group: Any) -> None:
         "--target-accept",
         type=_fraction,
         metavar="P",
-        help="acceptance to aim at (default: 0.8 for nuts; for ram 0.234, or 0.44 for one parameter; half for pmmh)",
+        help="acceptance to aim at (default: the model's own or 0.8 for nuts; for ram 0.234, or 0.44 for one "
+        "parameter; half for pmmh)",
     )
     group.add_argument(
         "--particles",
@@ -264,6 +265,8 @@ def _add_approximation(group: Any) -> None:
     )
     group.add_argument("--steps", type=_whole(1), metavar="N", help="integration steps between observations")
     group.add_argument("--max-step", type=_positive, metavar="TIME", help="longest integration step")
+    group.add_argument("--tolerance", type=_positive, metavar="SD",
+                       help="largest error of an integration step, in standard deviations; steps then follow it")
     group.add_argument("--iterations", type=_whole(0), metavar="N", help="of posterior linearisation")
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from lfm_ppl import data, loading
 from lfm_ppl.cli import choices, results, session
 
-SETTINGS = ("rule", "steps", "max_step", "iterations")
+SETTINGS = ("rule", "steps", "max_step", "iterations", "tolerance")
 """Flags of the approximation; None where the user leaves one to the model."""
 
 _GRID = 241
@@ -124,12 +124,16 @@ def sample(
     import lfm_ppl
     from lfm_ppl.inference.settings import approximate
 
+    target_accept = arguments.target_accept
+    if target_accept is None and arguments.sampler == "nuts":
+        target_accept = model.target_accept
     numpyro_model = approximate(
         model.model,
         rule=choices.rule(arguments.rule),
         steps=arguments.steps,
         max_step=arguments.max_step,
         iterations=arguments.iterations,
+        tolerance=arguments.tolerance,
     )
     posterior = lfm_ppl.fit(
         numpyro_model,
@@ -144,7 +148,7 @@ def sample(
         at=at,
         sampler_options={
             name: value
-            for name, value in (("target_accept_prob", arguments.target_accept), ("particles", arguments.particles))
+            for name, value in (("target_accept_prob", target_accept), ("particles", arguments.particles))
             if value is not None
         },
         model_kwargs=model.keywords(observed, options),

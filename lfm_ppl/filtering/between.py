@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lfm_ppl.filtering.filter import integrate, preparation, step_transition
 from lfm_ppl.filtering.jumps import after_jump
-from lfm_ppl.filtering.predict import Moments, Prediction, predict_row
+from lfm_ppl.filtering.predict import Moments, Prediction
 from lfm_ppl.filtering.retrospect import combine, given_later
 from lfm_ppl.filtering.rts import at_start
 from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays
-from lfm_ppl.filtering.transition import integrating_factor, linear_part
 from lfm_ppl.linalg import congruence, matmul
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.augment import StateSpaceModel
@@ -80,14 +80,14 @@ def marginals_between(ssm: StateSpaceModel, rule: Rule, given: Branches, start: 
         where: the requested times.
     """
     plan, filtered, smoothed, adjoint, about = given
-    linear = linear_part(ssm, jnp.asarray(plan.initial_time, float))
+    prepared = preparation(ssm, plan)
+    linear, jumps = prepared.linear, prepared.jumps
     before = at_start(filtered, start)
     rows = as_arrays(plan.rows)
-    jumps = ssm.stack.jump_table()
 
     def piece(begin: jax.Array, length: jax.Array, moments: Moments, nearby: Any, flow: bool) -> Prediction:
-        factor = integrating_factor(ssm, linear, length / plan.steps)
-        return predict_row(ssm, rule, linear, factor, plan.steps, begin, length, moments, nearby, flow)
+        factor = step_transition(ssm, linear, plan, length)
+        return integrate(ssm, rule, plan, linear, factor, begin, length, moments, nearby, flow)
 
     def one(index: jax.Array, t: jax.Array, exactly: jax.Array) -> Moments:
         here: Rows = _entry(rows, index)
@@ -112,7 +112,11 @@ def marginals_between(ssm: StateSpaceModel, rule: Rule, given: Branches, start: 
         return jax.tree_util.tree_map(
             lambda inside, node, end: jnp.where(exactly, end, jnp.where(begins, node, inside)), inside, first, last)
 
-    return jax.vmap(one)(*(jnp.asarray(a) for a in where))
+    places = tuple(jnp.asarray(a) for a in where)
+    if plan.tolerance is not None:
+        # Side by side, every piece would make as many steps as may be tried.
+        return jax.lax.map(lambda place: one(*place), places)
+    return jax.vmap(one)(*places)
 
 
 def _entry(tree: Any, index: jax.Array) -> Any:

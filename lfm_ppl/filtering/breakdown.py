@@ -61,14 +61,16 @@ def breakdown(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: Any, start: M
         return None
     rows = jax.tree_util.tree_map(np.asarray, plan.rows)
     before = start if row == 0 else Moments(passed.filtered.mean[row - 1], passed.filtered.covariance[row - 1])
-    count = 1 if ssm.time_invariant else plan.steps
+    count = 1 if ssm.time_invariant or plan.tolerance is not None else plan.steps
     one = Rows(*(np.asarray(column)[row] for column in rows))
     width = one.length / count
     last = np.arange(count) == count - 1
     pieces = Rows(one.start + width * np.arange(count), np.full(count, width), np.where(last, one.observation, -1),
                   np.where(last, one.jump, -1), np.zeros(count, int))
     nodes = np.arange(count)
-    stepped = _run(ssm, rule, Schedule(pieces, None, nodes, nodes, pieces.start, 1, plan.initial_time), y, before)
+    by_step = plan._replace(rows=pieces, lengths=None, observed=nodes, requested=nodes, requested_times=pieces.start,
+                            steps=plan.steps if plan.tolerance is not None else 1, replicated=False)
+    stepped = _run(ssm, rule, by_step, y, before)
     step = _first_bad(stepped)
     # Steps of their own differ by rounding, and need not break down.
     found, at = (passed, row) if step is None else (stepped, step)
@@ -81,7 +83,8 @@ def breakdown(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: Any, start: M
     if not ssm.time_invariant and step is not None:
         where += f", step {step + 1} of {count} from time {float(one.start):.6g} to {float(one.start + one.length):.6g}"
     remedy = ("Try a tighter prior, an observation noise that is not so small, or other units" if ssm.time_invariant
-              else "Try more steps (steps=...), a longest step (max_step=...), another rule, or a tighter prior")
+              else "Try more steps (steps=...), a longest step (max_step=...), steps that follow a tolerance "
+              "(tolerance=1e-3), another rule, or a tighter prior")
     return f"the filter breaks down at {where}: {reason}. The log likelihood is -inf. {remedy}."
 
 

@@ -11,10 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import checks
+from lfm_ppl.filtering.adaptive import predict_row_adaptively
 from lfm_ppl.filtering.jumps import after_jump
 from lfm_ppl.filtering.predict import Moments, Prediction, predict_exact, predict_row, unmoved
 from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays, schedule
-from lfm_ppl.filtering.transition import LinearPart, constant_slope, exact, integrating_factor, linear_part
+from lfm_ppl.filtering.transition import Factor, LinearPart, constant_slope, exact, integrating_factor, linear_part
 from lfm_ppl.filtering.update import linearise_observation, update
 from lfm_ppl.linalg import congruence, matmul, safe_sqrt, solve_lower
 from lfm_ppl.linearisation.rule import Rule
@@ -145,20 +146,23 @@ def preparation(ssm: StateSpaceModel, plan: Schedule) -> Preparation:
     """Compute what the rows of a scan share."""
     linear = linear_part(ssm, jnp.asarray(plan.initial_time, float))
     lengths = None if plan.lengths is None else jnp.asarray(plan.lengths)
-    table = None if lengths is None else jax.vmap(lambda length: _transition(ssm, linear, plan, length))(lengths)
+    table = None if lengths is None else jax.vmap(lambda length: step_transition(ssm, linear, plan, length))(lengths)
     return Preparation(linear, _observation_slope(ssm, plan), table, ssm.stack.jump_table())
 
 
 def row_transition(ssm: StateSpaceModel, plan: Schedule, prepared: Preparation, row: Rows) -> Any:
     """Return the exact transition of a row, or the integrating factor of its steps."""
     if prepared.table is None:
-        return _transition(ssm, prepared.linear, plan, row.length)
+        return step_transition(ssm, prepared.linear, plan, row.length)
     return jax.tree_util.tree_map(lambda a: a[row.kind], prepared.table)
 
 
-def _transition(ssm: StateSpaceModel, linear: LinearPart, plan: Schedule, length: jax.Array) -> Any:
+def step_transition(ssm: StateSpaceModel, linear: LinearPart, plan: Schedule, length: jax.Array) -> Any:
+    """Return what a row of this length shares; None where the steps have lengths of their own."""
     if ssm.time_invariant:
         return exact(ssm, linear, length, plan.steps)
+    if plan.tolerance is not None:
+        return None
     return integrating_factor(ssm, linear, length / plan.steps)
 
 
@@ -201,13 +205,23 @@ def predict(ssm: StateSpaceModel, rule: Rule, plan: Schedule, prepared: Preparat
     if ssm.time_invariant:
         one = predict_exact(ssm, transition, plan.steps, row.start, row.length, moments)
     else:
-        move = lambda: predict_row(  # noqa: E731
-            ssm, rule, prepared.linear, transition, plan.steps, row.start, row.length, moments, nodes, flow, each)
+        move = lambda: integrate(  # noqa: E731
+            ssm, rule, plan, prepared.linear, transition, row.start, row.length, moments, nodes, flow, each)
         stay = lambda: unmoved(moments, flow, each, plan.steps)  # noqa: E731
         one = jax.lax.cond(row.length > 0, move, stay) if plan.replicated else move()
     if prepared.jumps is not None:
         one = after_jump(ssm, prepared.jumps, row.jump, one, flow=flow or ssm.time_invariant)
     return one
+
+
+def integrate(ssm: StateSpaceModel, rule: Rule, plan: Schedule, linear: LinearPart, factor: Factor | None,
+              start: jax.Array, length: jax.Array, moments: Moments, nodes: Moments | None = None, flow: bool = False,
+              each: Callable[[Prediction], Any] | None = None) -> Prediction:
+    """Predict over a row, or a part of one, in the plan's steps; arguments as in `predict_row`."""
+    if plan.tolerance is not None:
+        return predict_row_adaptively(ssm, rule, linear, plan.steps, plan.tolerance, start, length, moments, flow)
+    assert factor is not None
+    return predict_row(ssm, rule, linear, factor, plan.steps, start, length, moments, nodes, flow, each)
 
 
 def forward(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, *, start: Moments | None = None,
@@ -310,7 +324,8 @@ def check_observations(y: Any, count: int, outputs: int, empty: bool = False) ->
 
 
 def filter(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None, steps: int = 10,
-           max_step: float | None = None, start: FilterState | None = None) -> FilterResult:
+           max_step: float | None = None, start: FilterState | None = None,
+           tolerance: float | None = None) -> FilterResult:
     """Run the continuous-discrete Gaussian filter.
 
     Between observations the moments obey dm/dt = E[f], dP/dt = A P + P A' + E[G G'] with the rule's A; at an
@@ -327,6 +342,7 @@ def filter(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
             nothing need be observed at them (a prediction). The numbers are those of one pass, and as many new times
             as in an earlier call take no new compilation. (An observation covariance for each time holds those of the
             new times.)
+        tolerance: largest error of an integration step, in standard deviations, as in `lfm_ppl.MarginalLikelihood`.
 
     Returns:
         Log likelihoods, moments and residuals, by observation.
@@ -352,7 +368,8 @@ def filter(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
     ssm = state_space(model)
     if start is not None:
         _check_start(start, times, ssm.state_dim)
-    plan = schedule(ssm, times, steps, max_step, initial_time=None if start is None else start.time)
+    plan = schedule(ssm, times, steps, max_step, initial_time=None if start is None else start.time,
+                    tolerance=tolerance)
     model.check_at(plan.initial_time, len(plan.observed))
     model.check_resolution(times, y)
     y = check_observations(y, len(plan.observed), ssm.output_dim, empty=start is not None)

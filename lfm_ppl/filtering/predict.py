@@ -45,12 +45,25 @@ class Prediction(NamedTuple):
     steps: Any = None
 
 
-class _Stage(NamedTuple):
-    """What the dynamics gives at a Runge-Kutta node, the linear part removed."""
+class Stage(NamedTuple):
+    """What the dynamics gives at a Runge-Kutta node, the linear part removed.
+
+    Attributes:
+        rest: (M,), the drift's expectation less the linear part.
+        slope: (M, n), that of the linearised drift less the linear part.
+        diffusion: (M, M), expectation of G G'; None without process noise.
+    """
 
     rest: jax.Array
     slope: jax.Array
     diffusion: jax.Array | None
+
+
+class LastStage(NamedTuple):
+    """The fourth stage of a step, at its end, and the covariance (n, n) about which it was linearised."""
+
+    stage: Stage
+    covariance: jax.Array
 
 
 def predict_exact(ssm: StateSpaceModel, transition: Exact, steps: int, start: jax.Array, length: jax.Array,
@@ -106,7 +119,7 @@ def predict_row(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Fa
         each: what is wanted of each step's prediction.
     """
     h = length / steps
-    spread = _smallest_spread(ssm, rule, factor, start, h, moments)
+    spread = smallest_spread(ssm, rule, factor, start, h, moments)
     if bent_by_forces_only(ssm, rule):
         return _predict_by_quadrature(ssm, rule, linear, factor, steps, start, h, moments, spread, about, flow, each)
 
@@ -114,7 +127,7 @@ def predict_row(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Fa
         now, phi, noise = carry
         index, ends = at
         nodes = None if ends is None else _with_middle(*ends)
-        one = _step(ssm, rule, linear, factor, start + index * h, h, now, spread, nodes)
+        one, _ = step_on(ssm, rule, linear, factor, start + index * h, h, now, spread, nodes)
         if flow:
             phi, noise = matmul(one.phi, phi), congruence(one.phi, noise) + one.noise
         return (one.moments, phi, noise), None if each is None else each(one)
@@ -144,8 +157,8 @@ def _with_middle(first: Moments, last: Moments) -> list[Moments]:
     return [first, jax.tree_util.tree_map(lambda a, b: 0.5 * (a + b), first, last), last]
 
 
-def _smallest_spread(ssm: StateSpaceModel, rule: Rule, factor: Factor, t: jax.Array, h: jax.Array,
-                     moments: Moments) -> jax.Array:
+def smallest_spread(ssm: StateSpaceModel, rule: Rule, factor: Factor, t: jax.Array, h: jax.Array,
+                    moments: Moments) -> jax.Array:
     """The standard deviation below which a coordinate counts as known: 1e-6 of what it is or becomes in a step."""
     size = ssm.physical_dim
     matrix, offset = ssm.input_map(t)
@@ -191,20 +204,22 @@ def covariance_of(moments: Moments) -> Any:
     return lambda rows, of_forces: congruence(rows, moments.covariance)
 
 
-def _step(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Factor, t: jax.Array, h: jax.Array,
-          moments: Moments, spread: jax.Array, about: list[Moments] | None) -> Prediction:
+def step_on(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Factor, t: jax.Array, h: jax.Array,
+            moments: Moments, spread: jax.Array, about: list[Moments] | None = None,
+            first: Stage | None = None) -> tuple[Prediction, LastStage]:
+    """Make one Runge-Kutta step from time ``t`` to ``t + h``; ``first`` is its first stage where that is known."""
     m, p = moments
     size = ssm.physical_dim
     half, full, back_half, back_full = factor.half, factor.full, factor.back_half, factor.back_full
     half_x, full_x = half[:size], full[:size]
     identity = jnp.eye(ssm.state_dim)
 
-    def stage(index: int, time: jax.Array, mean: jax.Array, covariance: Any) -> _Stage:
+    def stage(index: int, time: jax.Array, mean: jax.Array, covariance: Any) -> Stage:
         node = None if about is None else about[(0, 1, 1, 2)[index]]
         return _stage(ssm, rule, linear, time, mean, covariance, spread, node)
 
     # Increments of the mean and of the flow are columns of one matrix (M, n + 1).
-    def increment(node: _Stage, flow: jax.Array) -> jax.Array:
+    def increment(node: Stage, flow: jax.Array) -> jax.Array:
         return jnp.concatenate([matmul(node.slope, flow), node.rest[:, None]], axis=1)
 
     start = jnp.concatenate([identity, m[:, None]], axis=1)
@@ -214,7 +229,7 @@ def _step(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Factor, 
         state = jnp.concatenate([base[:size] + change, base[size:]])
         return state[:, :-1], state[:, -1]
 
-    one = stage(0, t, m, covariance_of(moments))
+    one = stage(0, t, m, covariance_of(moments)) if first is None else first
     k1 = increment(one, identity)
     flow2, m2 = node(at_half, 0.5 * h * matmul(half[:size, :size], k1))
     q2 = lambda: _noise(factor, 0, [flow2[:size]], [one.diffusion], [0.5 * h], size)  # noqa: E731
@@ -232,7 +247,8 @@ def _step(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Factor, 
     flow4, m4 = node(at_full, h * matmul(half[:size, :size], k3))
     transport4 = half_x + matmul(_less(flow4[:size] - full_x, flow4, z3, size), back_half)
     q4 = lambda: _noise(factor, 2, [transport4], [three.diffusion], [h], size)  # noqa: E731
-    four = stage(3, just_before(t + h, h), m4, _propagated(p, flow4, q4, factor.noise_full, size))
+    covariance4 = _propagated(p, flow4, q4, factor.noise_full, size)
+    four = stage(3, just_before(t + h, h), m4, covariance4)
     k4 = increment(four, flow4)
     z4 = _inverse_flow(h, z3, back_half, three.slope, half, size)
 
@@ -244,11 +260,18 @@ def _step(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Factor, 
                   identity[:size] + matmul(_less(change, flow, z4, size), back_full)]
     diffusions = [node.diffusion for node in (one, two, three, four)]
     noise = _noise(factor, 3, transports, diffusions, [h / 6, h / 3, h / 3, h / 6], size)
-    return Prediction(Moments(mean, congruence(flow, p) + noise), flow, noise)
+    moments = Moments(mean, congruence(flow, p) + noise)
+    return Prediction(moments, flow, noise), LastStage(four, covariance4(identity, False))
+
+
+def linearised(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, t: jax.Array, moments: Moments,
+               spread: jax.Array) -> Stage:
+    """Linearise the dynamics about given moments, the linear part removed."""
+    return _stage(ssm, rule, linear, t, moments.mean, covariance_of(moments), spread, None)
 
 
 def _stage(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, t: jax.Array, mean: jax.Array, covariance: Any,
-           spread: jax.Array, about: Moments | None) -> _Stage:
+           spread: jax.Array, about: Moments | None) -> Stage:
     """Linearise the dynamics at a node about the filter's moments, or about those of ``about``."""
 
     def function(w: jax.Array) -> tuple[jax.Array, Any]:
@@ -261,7 +284,7 @@ def _stage(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, t: jax.Array, m
     if about is not None:
         drift = drift + matmul(affine.slope, (mean - centre)[:, None])[:, 0]
     rest = drift - matmul(linear.rows, mean[:, None])[:, 0]
-    return _Stage(rest, affine.slope - linear.rows, affine.extra if isinstance(affine.extra, jax.Array) else None)
+    return Stage(rest, affine.slope - linear.rows, affine.extra if isinstance(affine.extra, jax.Array) else None)
 
 
 def bent_by_forces_only(ssm: StateSpaceModel, rule: Rule) -> bool:
@@ -277,7 +300,7 @@ def bent_by_forces_only(ssm: StateSpaceModel, rule: Rule) -> bool:
 def _predict_by_quadrature(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Factor, steps: int,
                            start: jax.Array, h: jax.Array, moments: Moments, spread: jax.Array, about: Moments | None,
                            flow: bool, each: Callable[[Prediction], Any] | None) -> Prediction:
-    """Predict over a row in which only the forces bend the dynamics, to the same numbers as in steps of `_step`.
+    """Predict over a row in which only the forces bend the dynamics, to the same numbers as in steps of `step_on`.
 
     The forces' moments at all nodes are then known at the row's start, no stage changes what another one sees, and
     the Runge-Kutta method is Simpson's rule.
@@ -296,7 +319,7 @@ def _predict_by_quadrature(ssm: StateSpaceModel, rule: Rule, linear: LinearPart,
     times = jnp.stack([begins, begins + 0.5 * h], axis=1).ravel()
     ends = just_before(begins + h, h)
 
-    def node(t: jax.Array, mean: jax.Array, near: Moments) -> _Stage:
+    def node(t: jax.Array, mean: jax.Array, near: Moments) -> Stage:
         centre = jnp.concatenate([jnp.zeros(size), near.mean])  # the physical state drops out
         covariance = lambda rows, _: congruence(rows[:, size:], near.covariance)  # noqa: E731
         one = _stage(ssm, rule, linear, t, centre, covariance, spread, None)
@@ -311,7 +334,7 @@ def _predict_by_quadrature(ssm: StateSpaceModel, rule: Rule, linear: LinearPart,
         times = jnp.stack([begins, begins + 0.5 * h, ends], axis=1)
         stages = jax.vmap(jax.vmap(node))(times, _by_steps(now.mean), jax.tree_util.tree_map(_by_steps, near))
 
-    def step(carry: tuple, nodes: _Stage) -> tuple[tuple, Any]:
+    def step(carry: tuple, nodes: Stage) -> tuple[tuple, Any]:
         now, phi, noise = carry
         own, offset, added = _simpson(factor, h, nodes, size)
         mean = matmul(factor.full, now.mean[:, None])[:, 0]
@@ -348,7 +371,7 @@ def _by_steps(nodes: jax.Array) -> jax.Array:
     return jnp.stack([nodes[:-2:2], nodes[1::2], nodes[2::2]], axis=1)
 
 
-def _simpson(factor: Factor, h: jax.Array, nodes: _Stage, size: int) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _simpson(factor: Factor, h: jax.Array, nodes: Stage, size: int) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return Phi (n, n), what the remainder adds to the mean (M,), and Q (n, n) of a step.
 
         Phi = E(h) + h / 6 (E(h) K_1 + 4 E(h/2) K_2 E(h/2) + K_3 E(h)).

@@ -48,6 +48,8 @@ class Schedule(NamedTuple):
         steps: integration steps in each row.
         initial_time: when the scan starts.
         replicated: whether so many rows have length zero that it pays to branch around their prediction.
+        tolerance: of the error of a step, in standard deviations, where their length follows it; None for ``steps``
+            of equal length.
     """
 
     rows: Rows
@@ -58,10 +60,11 @@ class Schedule(NamedTuple):
     steps: int
     initial_time: Any
     replicated: bool = False
+    tolerance: float | None = None
 
 
 def schedule(ssm: StateSpaceModel, times: Any, steps: int, max_step: float | None = None, at: Any = None,
-             initial_time: Any = None, row_per_step: bool = False) -> Schedule:
+             initial_time: Any = None, row_per_step: bool = False, tolerance: float | None = None) -> Schedule:
     """Plan the scan.
 
     Args:
@@ -72,14 +75,19 @@ def schedule(ssm: StateSpaceModel, times: Any, steps: int, max_step: float | Non
         at: (K,) further times at which the state is wanted, in any order.
         initial_time: overrides the model's (when the scan starts from a filter's state).
         row_per_step: give every integration step a row of its own, so that a particle smoother reaches each.
+        tolerance: of the error of a step, see `Schedule`.
 
     Raises:
-        ValueError, TypeError: see `lfm_ppl.model.augment.check_times`; non-positive steps; a requested time before
-            the initial time; traced times together with what needs them concrete.
+        ValueError, TypeError: see `lfm_ppl.model.augment.check_times`; non-positive steps or tolerance; a requested
+            time before the initial time; traced times together with what needs them concrete.
     """
     checks.positive_integer("steps", steps, "It is the number of integration steps between two times.")
     if max_step is not None:
         checks.positive("max_step", max_step)
+    if tolerance is not None:
+        checks.positive("tolerance", tolerance)
+        plan = schedule(ssm, times, steps, max_step, at, initial_time, row_per_step)
+        return plan._replace(tolerance=float(tolerance))
     initial_time = ssm.model.initial_time if initial_time is None else initial_time
     known = check_times(times, initial_time)
     start = known[0] if initial_time is None and known is not None else initial_time

@@ -152,16 +152,20 @@ def _recoloured(errors: jax.Array, covariance: jax.Array, wanted: jax.Array) -> 
     return matmul(semidefinite_root(wanted), solve_lower(semidefinite_root(covariance), errors))
 
 
-def check_iterations(iterations: int, damping: float) -> None:
-    """Raise where the iterations are not a whole number >= 0 or the damping is outside (0, 1]."""
+def check_iterations(iterations: int, damping: float, tolerance: float | None = None) -> None:
+    """Raise where the iterations are not a whole number >= 0, the damping outside (0, 1], or there is a tolerance."""
     if iterations != 0:
         checks.positive_integer("iterations", iterations)
     if not 0 < damping <= 1:
         raise ValueError(f"damping must lie in (0, 1] (the share of each new iterate that is taken), got {damping}.")
+    if iterations and tolerance is not None:
+        raise ValueError("iterations need integration steps of equal length, whose ends all passes share, and with a "
+                         f"tolerance the steps follow the moments; leave out tolerance={tolerance:g} or iterations.")
 
 
 def smooth(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None, steps: int = 10,
-           max_step: float | None = None, at: Any = None, iterations: int = 0, damping: float = 0.7) -> SmootherResult:
+           max_step: float | None = None, at: Any = None, iterations: int = 0, damping: float = 0.7,
+           tolerance: float | None = None) -> SmootherResult:
     """Smooth: the state and the forces given all observations.
 
         m_s = m + G (m_s+ - m_p),  P_s = (I - G Phi) P (I - G Phi)' + G (Q + P_s+) G',  G = P Phi' P_p^-1.
@@ -177,6 +181,7 @@ def smooth(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
             The observation times by default. They change nothing elsewhere.
         iterations: of posterior linearisation, 0 for none.
         damping: share of each new iterate that is taken, in (0, 1].
+        tolerance: largest error of an integration step, in standard deviations, as in `lfm_ppl.MarginalLikelihood`.
 
     Returns:
         Moments at the requested times, forces by name, draws of trajectories, diagnostics.
@@ -199,9 +204,9 @@ def smooth(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
     de Jong (1989), Biometrika 76, for the leave-one-out conditionals.
     """
     rule = as_rule(rule)
-    check_iterations(iterations, damping)
+    check_iterations(iterations, damping, tolerance)
     ssm = state_space(model)
-    plans = smoothing_plans(ssm, times, steps, max_step, at, iterations)
+    plans = smoothing_plans(ssm, times, steps, max_step, at, iterations, tolerance)
     model.check_at(plans.rows.initial_time, np.shape(times)[0])
     model.check_resolution(times, y)
     y = check_observations(y, len(plans.rows.observed), ssm.output_dim)
@@ -229,9 +234,9 @@ class Plans(NamedTuple):
 
 
 def smoothing_plans(ssm: StateSpaceModel, times: Any, steps: int, max_step: float | None, at: Any,
-                    iterations: int) -> Plans:
+                    iterations: int, tolerance: float | None = None) -> Plans:
     """Plan a smoother's scans; a forecast goes on in rows as long as the data's median interval."""
-    joint = schedule(ssm, times, steps, max_step, at)
+    joint = schedule(ssm, times, steps, max_step, at, tolerance=tolerance)
     if at is None or ssm.time_invariant:
         return Plans(joint, None, None, joint.requested_times)
     known = np.asarray(times, float)
@@ -242,7 +247,7 @@ def smoothing_plans(ssm: StateSpaceModel, times: Any, steps: int, max_step: floa
         count = int(np.ceil((joint.requested_times.max() - known[-1]) / gap * (1 - 1e-12)))
         beyond = known[-1] + gap * np.arange(1, min(count, _LONGEST_FORECAST) + 1)
         beyond[-1] = max(beyond[-1], joint.requested_times.max())
-    base = schedule(ssm, times, steps, max_step, np.append(known[-1:], beyond))
+    base = schedule(ssm, times, steps, max_step, np.append(known[-1:], beyond), tolerance=tolerance)
     where = places(per_step(base) if iterations else base, joint.requested_times)
     return Plans(base, joint, where, joint.requested_times)
 

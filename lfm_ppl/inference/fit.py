@@ -199,6 +199,7 @@ def fit(
     attrs = {
         "model": name or getattr(numpyro_model, "__name__", "model"), "rule": site.example.rule.name,
         "steps": site.example.steps, "max_step": site.example.max_step, "iterations": site.example.iterations,
+        "tolerance": site.example.tolerance,
         "sampler": sampler, "seed": seed, "chains": chains, "warmup": warmup,
         "samples": samples, "fixed": json.dumps({k: np.asarray(v).tolist() for k, v in (fixed or {}).items()}),
         "wall_time_s": round(time.perf_counter() - started, 3), "versions": json.dumps(_versions()),
@@ -261,7 +262,7 @@ def _check_requested(example: MarginalLikelihood, times: Any, at: Any) -> None:
         return
     if np.ndim(times) != 1:
         raise ValueError("`at` needs one vector of times for all series; this panel has times of its own for each.")
-    schedule(example.ssm, times, example.steps, example.max_step, at)
+    schedule(example.ssm, times, example.steps, example.max_step, at, tolerance=example.tolerance)
 
 
 def _strategy(init: Any, model: Callable, arguments: tuple, keywords: dict, seed: int) -> Any:

@@ -55,6 +55,9 @@ class MarginalLikelihood(dist.Distribution):
         max_step: longest step; longer intervals get more.
         iterations: of posterior linearisation; 0 for none.
         damping: share of each new iterate that is taken.
+        tolerance: largest error of an integration step, in standard deviations. With it the length of the steps follows
+            the moments, for every parameter anew, for stiff models and for posteriors over slow and fast ones; up to
+            five times ``steps`` are tried. None: ``steps`` equal steps. Not with ``iterations``.
 
     Raises:
         ValueError, TypeError: as `lfm_ppl.filter`. In compiled code a failure is a log density of -inf.
@@ -72,17 +75,17 @@ class MarginalLikelihood(dist.Distribution):
 
     support = constraints.real_matrix
     pytree_data_fields = ("model", "times")
-    pytree_aux_fields = ("rule", "steps", "max_step", "iterations", "damping")
+    pytree_aux_fields = ("rule", "steps", "max_step", "iterations", "damping", "tolerance")
 
     def __init__(self, model: LatentForceModel, times: Any, rule: Rule | None = None, steps: int = 10,
-                 max_step: float | None = None, iterations: int = 0, damping: float = 0.7, *,
-                 validate_args: bool | None = None):
+                 max_step: float | None = None, iterations: int = 0, damping: float = 0.7,
+                 tolerance: float | None = None, *, validate_args: bool | None = None):
         if not isinstance(model, LatentForceModel):
             raise TypeError(f"model must be an lfm.LatentForceModel, got {type(model).__name__}.")
-        check_iterations(iterations, damping)
+        check_iterations(iterations, damping, tolerance)
         self.model, self.times = model, times
         self.rule, self.steps, self.max_step = as_rule(rule), steps, max_step
-        self.iterations, self.damping = iterations, damping
+        self.iterations, self.damping, self.tolerance = iterations, damping, tolerance
         model.check_at(self.plan.initial_time, np.shape(times)[0])
         known = checks.concrete(times)
         if known is not None:
@@ -99,7 +102,7 @@ class MarginalLikelihood(dist.Distribution):
     @functools.cached_property
     def plan(self) -> Schedule:
         """The rows of the scan."""
-        return schedule(self.ssm, self.times, self.steps, self.max_step)
+        return schedule(self.ssm, self.times, self.steps, self.max_step, tolerance=self.tolerance)
 
     def with_times(self, times: Any) -> MarginalLikelihood:
         """Return the same distribution for times that are known, where its own were traced."""
@@ -143,7 +146,8 @@ class MarginalLikelihood(dist.Distribution):
 
     def smooth(self, y: Any, at: Any = None) -> SmootherResult:
         """Smooth with this distribution's settings; see `lfm_ppl.smooth`."""
-        plans = smoothing_plans(self.ssm, self.times, self.steps, self.max_step, at, self.iterations)
+        plans = smoothing_plans(self.ssm, self.times, self.steps, self.max_step, at, self.iterations,
+                                self.tolerance)
         y = check_observations(y, *self.event_shape)
         return smooth_on(self.ssm, self.rule, plans, y, self.iterations, self.damping)
 
@@ -253,18 +257,20 @@ class Panel(dist.Distribution):
 
 
 def panel(build: Callable[..., LatentForceModel], parameters: Any, times: Any, rule: Rule | None = None,
-          steps: int = 10, max_step: float | None = None, iterations: int = 0, damping: float = 0.7) -> Panel:
+          steps: int = 10, max_step: float | None = None, iterations: int = 0, damping: float = 0.7,
+          tolerance: float | None = None) -> Panel:
     """Return many independent series as one distribution, for use inside ``numpyro.plate``.
 
     Args:
         build: maps the parameters of ONE series to its `LatentForceModel`; it may close over shared parameters.
         parameters: pytree of arrays with a leading axis (B,), one entry a series.
         times: (T,) for all, or (B, T); ragged series are padded: NaN in y, and times that repeat the last one.
-        rule: as in `MarginalLikelihood`, and so are the next four.
+        rule: as in `MarginalLikelihood`, and so are the next five.
         steps: integration steps between two consecutive times.
         max_step: longest step.
         iterations: of posterior linearisation.
         damping: share of each new iterate that is taken.
+        tolerance: largest error of an integration step, in standard deviations; None for equal steps.
 
     Returns:
         A distribution with batch shape (B,) and event shape (T, D).
@@ -283,5 +289,5 @@ def panel(build: Callable[..., LatentForceModel], parameters: Any, times: Any, r
         (2,)
     """
     settings = {"rule": as_rule(rule), "steps": steps, "max_step": max_step, "iterations": iterations,
-                "damping": damping}
+                "damping": damping, "tolerance": tolerance}
     return Panel(build, parameters, times, settings)

@@ -207,6 +207,10 @@ def over_draws(per_draw: Callable, draws: Mapping[str, Any], key: jax.Array, row
     """Return ``per_draw(parameters, key)`` for all draws (S, ...), in batches that bound the memory."""
     draws = {name: jnp.asarray(value) for name, value in draws.items()}
     count = next(iter(draws.values())).shape[0]
+    if known.example.tolerance is not None:
+        # Side by side, every draw would make as many steps as may be tried.
+        one_by_one = jax.jit(lambda d, k: jax.lax.map(lambda pair: per_draw(*pair), (d, k)))
+        return jax.tree_util.tree_map(np.asarray, one_by_one(draws, jax.random.split(key, count)))
     numbers = rows * known.example.ssm.state_dim**2 * 6
     batch = int(np.clip(_BATCH_NUMBERS // max(numbers, 1), 1, count))
     batches = -(-count // batch)

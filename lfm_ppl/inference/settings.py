@@ -8,7 +8,7 @@ from typing import Any
 from lfm_ppl.inference.likelihood_handler import LikelihoodHandler
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
 
-NAMES = ("rule", "steps", "max_step", "iterations", "damping")
+NAMES = ("rule", "steps", "max_step", "iterations", "damping", "tolerance")
 
 
 class approximate(LikelihoodHandler):  # noqa: N801 (an effect handler, named as NumPyro names its handlers)
@@ -16,8 +16,9 @@ class approximate(LikelihoodHandler):  # noqa: N801 (an effect handler, named as
 
     Args:
         fn: a NumPyro model with a site ``MarginalLikelihood`` or ``panel``.
-        **settings: any of ``rule``, ``steps``, ``max_step``, ``iterations`` and ``damping``; what
-            is None or left out stays as the model has it.
+        **settings: any of ``rule``, ``steps``, ``max_step``, ``iterations``, ``damping`` and ``tolerance``; what
+            is None or left out stays as the model has it. But ``steps`` or ``iterations`` without a tolerance are
+            steps of equal length, also where the model has a tolerance.
 
     Raises:
         TypeError: for a setting of another name.
@@ -58,7 +59,11 @@ class approximate(LikelihoodHandler):  # noqa: N801 (an effect handler, named as
     def replacement(self, likelihood: MarginalLikelihood | Panel, site: dict[str, Any]) -> Any:
         """Return the likelihood with the new settings."""
         if isinstance(likelihood, Panel):
-            settings = {**likelihood.settings, **self.settings}
+            settings = self._merged(likelihood.settings)
             return Panel(likelihood.build, likelihood.parameters, likelihood.times, settings)
-        settings = {name: getattr(likelihood, name) for name in NAMES} | self.settings
+        settings = self._merged({name: getattr(likelihood, name) for name in NAMES})
         return MarginalLikelihood(likelihood.model, likelihood.times, **settings)
+
+    def _merged(self, own: dict[str, Any]) -> dict[str, Any]:
+        equal = "steps" in self.settings or self.settings.get("iterations", 0) > 0
+        return {**own, **({"tolerance": None} if equal else {}), **self.settings}

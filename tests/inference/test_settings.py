@@ -75,3 +75,19 @@ def test_a_model_without_the_site_and_an_unknown_setting():
         trace(approximate(plain, steps=3), TIMES, 0.5)
     with pytest.raises(TypeError, match="unknown setting 'step'; known: rule, steps"):
         approximate(model, step=3)
+
+
+@pytest.mark.parametrize("given", [{"steps": 5}, {"iterations": 2}, {"steps": 5, "tolerance": 1e-4}, {"max_step": 0.5}])
+def test_steps_or_iterations_alone_are_equal_steps(given):
+    def tolerant(times, y=None):
+        numpyro.sample("y", lfm.MarginalLikelihood(build(1.0), times, steps=3, tolerance=1e-2), obs=y)
+
+    def tolerant_panel(times, y=None):
+        with numpyro.plate("series", 2):
+            numpyro.sample("y", lfm.panel(build, jnp.array([0.5, 1.0]), times, steps=3, tolerance=1e-2), obs=y)
+
+    kept = {"max_step"} >= set(given)
+    expected = given.get("tolerance", 1e-2 if kept else None)
+    assert trace(approximate(tolerant, **given), TIMES, Y)["y"]["fn"].tolerance == expected
+    panel = trace(approximate(tolerant_panel, **given), TIMES, jnp.stack([Y, Y]))["y"]["fn"]
+    assert panel.settings["tolerance"] == expected

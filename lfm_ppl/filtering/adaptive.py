@@ -1,0 +1,138 @@
+"""Prediction over a row in steps whose length follows the moments: short where these move fast, long where they rest.
+
+Where the fifth slope, which is the next step's first, takes the place of the fourth, Runge-Kutta's formula has order
+three. The difference of the two results,
+
+    e = h (k_4 - k_5) / 6,
+
+therefore estimates the error of a step at no cost. It is taken of the mean and of the covariance, in standard
+deviations. A step whose error is larger than the tolerance is made again with a shorter length; the next one has the
+length at which its error would be a little below it.
+
+How long the steps are is not differentiated: a derivative is that of the integration on the steps that were made.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from lfm_ppl.filtering.predict import (
+    LastStage,
+    Moments,
+    Prediction,
+    Stage,
+    linearised,
+    smallest_spread,
+    step_on,
+    unmoved,
+)
+from lfm_ppl.filtering.transition import LinearPart, integrating_factor
+from lfm_ppl.linalg import congruence, matmul
+from lfm_ppl.linearisation.rule import Rule
+from lfm_ppl.model.augment import StateSpaceModel
+
+_FIRST = 1 / 8
+"""Length of the first step that is tried, as a share of the row."""
+
+_SAFETY, _SHORTEST, _LONGEST = 0.9, 0.2, 5.0
+"""The next step is this share of the one whose error would be the tolerance, within these factors of the last."""
+
+_STABLE = 3.0
+"""Longest step, in units of one over the slope; Runge-Kutta's are unstable from 2.8 on, and overflow far above it."""
+
+_SHARE_OF_MEAN = 1e-3
+"""Share of the mean below which a standard deviation counts as no smaller: a state that is known has none."""
+
+_MOST = 5
+"""Most steps that are tried, as a multiple of the number of equal ones."""
+
+_BLOCK = 8
+"""Steps in a block; a block in which nothing is left to do is left out as a whole."""
+
+
+class _Position(NamedTuple):
+    """Where an integration stands: what is left of the row, the next length to try, and the affine map so far."""
+
+    left: jax.Array
+    length: jax.Array
+    moments: Moments
+    phi: jax.Array
+    noise: jax.Array
+    stage: Stage
+
+
+def predict_row_adaptively(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, steps: int, tolerance: float,
+                           start: jax.Array, length: jax.Array, moments: Moments, flow: bool = False) -> Prediction:
+    """Predict over a row in Runge-Kutta steps whose errors are below a tolerance.
+
+    Args:
+        ssm: the model.
+        rule: the linearisation rule.
+        linear: its constant linear part.
+        steps: a fifth of the steps that are tried at most; the moments are NaN where these do not suffice.
+        tolerance: of the error of a step in the mean and the covariance, in standard deviations.
+        start: time at the row's start.
+        length: of the row.
+        moments: at its start.
+        flow: whether phi and noise of the row are wanted (for the smoother).
+    """
+    spread = smallest_spread(ssm, rule, integrating_factor(ssm, linear, length), start, length, moments)
+    stop = jax.lax.stop_gradient
+
+    def attempt(now: _Position) -> _Position:
+        size = ssm.physical_dim
+        rate = stop(jnp.max(jnp.abs(now.stage.slope[:, :size]).sum(1), initial=0.0))
+        # Where this is shorter, a rejected step stays finite, and so does its derivative, which is not used.
+        length = jnp.minimum(now.length, _STABLE / (rate + 1e-300))
+        last = length >= now.left
+        h = jnp.where(last, now.left, length)
+        t = start + (length - now.left)
+        factor = integrating_factor(ssm, linear, h)
+        one, fourth = step_on(ssm, rule, linear, factor, t, h, now.moments, spread, first=now.stage)
+        fifth = linearised(ssm, rule, linear, t + h, one.moments, spread)
+        error = stop(_error(h, now.moments, one.moments, fourth, fifth)) / tolerance
+        # A step that is not finite is far too long, and is made again.
+        error = jnp.where(jnp.isfinite(error), error, jnp.inf)
+        growth = jnp.clip(_SAFETY * jnp.maximum(error, 1e-12) ** -0.25, _SHORTEST, _LONGEST)
+        phi, noise = now.phi, now.noise
+        if flow:
+            phi, noise = matmul(one.phi, phi), congruence(one.phi, noise) + one.noise
+        left = jnp.where(last, 0.0, now.left - h)
+        made = _Position(stop(left), stop(h * growth), one.moments, phi, noise, fifth)
+        again = now._replace(length=stop(h * growth))
+        accepted = error <= 1.0
+        # Not a selection: the derivative of a step that is not finite would spoil that of the one before.
+        return jax.lax.cond(accepted, lambda: made, lambda: again)
+
+    def unless_done(body):
+        return lambda now, _: (jax.lax.cond(now.left > 0, body, lambda same: same, now), None)
+
+    def block(now: _Position) -> _Position:
+        return jax.lax.scan(unless_done(attempt), now, None, length=_BLOCK)[0]
+
+    still = unmoved(moments, flow)
+    # After a breakdown every step would fail.
+    possible = jnp.isfinite(moments.mean).all() & jnp.isfinite(moments.covariance).all()
+    first = _Position(stop(jnp.where(possible, length, 0.0)), stop(_FIRST * length), moments, still.phi, still.noise,
+                      linearised(ssm, rule, linear, start, moments, spread))
+    body = jax.checkpoint(unless_done(block), prevent_cse=False)
+    end, _ = jax.lax.scan(body, first, None, length=-(-_MOST * steps // _BLOCK))
+    reached = jax.tree_util.tree_map(lambda a: jnp.where(end.left > 0, jnp.nan, a), end.moments)
+    return Prediction(reached, end.phi, end.noise)
+
+
+def _error(h: jax.Array, before: Moments, after: Moments, fourth: LastStage, fifth: Stage) -> jax.Array:
+    """Return the largest estimated error of the mean and the covariance of a step, in standard deviations."""
+    size = fifth.rest.shape[0]
+    variance = jnp.maximum(jnp.diagonal(before.covariance), jnp.diagonal(after.covariance))
+    sd = jnp.sqrt(jnp.maximum(variance, (_SHARE_OF_MEAN * after.mean) ** 2) + 1e-300)
+    mean = (fourth.stage.rest - fifth.rest) / sd[:size]
+    change = matmul(fourth.stage.slope, fourth.covariance) - matmul(fifth.slope, after.covariance)
+    change = change.at[:, :size].add(change[:, :size].T)
+    if fifth.diffusion is not None and fourth.stage.diffusion is not None:
+        change = change.at[:, :size].add(fourth.stage.diffusion - fifth.diffusion)
+    covariance = change / (sd[:size, None] * sd[None, :])
+    return h / 6 * jnp.maximum(jnp.max(jnp.abs(mean)), jnp.max(jnp.abs(covariance)))

@@ -1,0 +1,136 @@
+"""Steps whose length follows a tolerance, against many equal steps."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lfm_ppl as lfm
+from tests import systems
+
+TIMES = np.arange(0.0, 9.0, 2.0)
+Y = np.array([[1.5], [np.nan], [-1.8], [1.1], [4.0]])
+
+
+def double_well(parameters, rule=None, tolerance=None, steps=60):
+    alpha, beta, sigma = parameters
+    model = lfm.LatentForceModel(
+        systems.DoubleWell(alpha, beta), {}, lfm.GaussianObservation(lambda x, u, t: x, 0.01 * jnp.ones(1)),
+        lfm.Gaussian([0.0], [10.0]), process_noise=sigma * jnp.ones((1, 1)))
+    return lfm.MarginalLikelihood(model, TIMES, rule, steps=steps, tolerance=tolerance)
+
+
+def expression(parameters=(0.4, 0.8, 1.0), tolerance=None, steps=400, start=0.0, link=jax.nn.softplus, times=TIMES):
+    decay, sensitivity, lengthscale = parameters
+    model = lfm.LatentForceModel(
+        systems.Motif(jnp.array([1.0, 0.5]) * decay, jnp.array([0.5, 1.0]) * sensitivity, 0.1, link),
+        {"u": lfm.Matern(1.0, lengthscale)}, lfm.GaussianObservation(lambda x, u, t: x, 0.01 * jnp.ones(2)),
+        lfm.Gaussian([0.2, 0.3], [start, start]), initial_time=0.0)
+    return lfm.MarginalLikelihood(model, times, steps=steps, tolerance=tolerance)
+
+
+SLOW_TO_STIFF = jnp.array([[-1.0, 0.1, 2.0], [-0.2, 0.05, 0.7], [-4.0, 0.5, 4.0], [-12.0, 1.2, 5.5]])
+
+
+@pytest.mark.parametrize("rule", [lfm.Cubature(), lfm.Taylor()], ids=["cubature", "taylor"])
+def test_slow_and_stiff_models_are_integrated_to_the_tolerance(rule):
+    def log_prob(tolerance, steps):
+        return jax.jit(lambda all_: jax.lax.map(
+            lambda p: double_well(p, rule, tolerance, steps).log_prob(Y), all_))(SLOW_TO_STIFF)
+
+    exact = log_prob(None, 4000)
+    assert np.abs(log_prob(None, 20) - exact).max() > 0.1, "twenty equal steps do not do"
+    loose, tight = (np.abs(log_prob(tolerance, 300) - exact) for tolerance in (1e-2, 1e-4))
+    assert np.isfinite(exact).all()
+    assert np.all(loose < 0.1)
+    assert np.all(tight < 3e-3)
+    assert np.all(tight < loose), "a smaller tolerance is more accurate for every model"
+
+
+def test_gradients_are_those_of_the_exact_integration_in_both_modes():
+    at = SLOW_TO_STIFF[0]
+    adaptive = lambda p: double_well(p, tolerance=1e-5).log_prob(Y)  # noqa: E731
+    exact = jax.jit(jax.grad(lambda p: double_well(p, steps=2000).log_prob(Y)))(at)
+    reverse, forward = jax.jit(jax.grad(adaptive))(at), jax.jit(jax.jacfwd(adaptive))(at)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-10)
+    np.testing.assert_allclose(reverse, exact, rtol=1e-4)
+
+
+def test_a_rejected_step_does_not_spoil_the_derivative():
+    """A first step of an eighth of the interval would overflow."""
+    at = jnp.array([-3.0, 40.0, 5.0])
+    found = jax.jit(jax.value_and_grad(lambda p: double_well(p, tolerance=1e-3, steps=1000).log_prob(Y)))(at)
+    assert np.isfinite(found[0])
+    assert np.isfinite(found[1]).all()
+
+
+@pytest.mark.parametrize("start", [0.0, 1.0], ids=["known", "diffuse"])
+@pytest.mark.parametrize("link", [jax.nn.softplus, jnp.exp], ids=["softplus", "exp"])
+def test_driven_models(link, start):
+    y = np.array([[0.2, 0.4], [0.9, 1.0], [np.nan, 1.3], [0.8, 0.9], [0.7, np.nan]])
+    exact = expression(start=start, link=link).log_prob(y)
+    found = expression(tolerance=1e-6, steps=60, start=start, link=link).log_prob(y)
+    np.testing.assert_allclose(found, exact, atol=2e-4)
+
+
+def test_smoother_draws_and_requested_times():
+    y = np.array([[0.2, 0.4], [0.9, 1.0], [np.nan, 1.3], [0.8, 0.9], [0.7, np.nan]])
+    at = np.array([0.0, 0.7, 2.0, 5.1, 9.5])
+    exact, found = expression().smooth(y, at=at), expression(tolerance=1e-7, steps=60).smooth(y, at=at)
+    np.testing.assert_allclose(found.mean, exact.mean, atol=1e-4)
+    np.testing.assert_allclose(found.covariance, exact.covariance, atol=1e-4)
+    np.testing.assert_allclose(found.leave_one_out, exact.leave_one_out, atol=1e-3)
+    draws = found.sample(jax.random.key(0), 4000)
+    sd = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
+    np.testing.assert_allclose(draws.state.std(0)[1:], sd[1:, :2], rtol=0.05)
+    np.testing.assert_allclose(draws.forces["u"].std(0), found.force("u").sd, rtol=0.05)
+
+
+def test_requested_times_change_nothing():
+    y = np.full((5, 2), 0.7)
+    adaptive = expression(tolerance=1e-3, steps=60)
+    np.testing.assert_allclose(adaptive.smooth(y, at=[1.3, 4.0]).log_likelihood, adaptive.smooth(y).log_likelihood,
+                               rtol=1e-12)
+
+
+def test_replicates_gaps_and_a_row_of_its_own_for_each_call():
+    times = np.array([0.0, 0.0, 2.0, 2.0, 40.0])
+    y = np.full((5, 2), 0.7)
+    exact = expression(times=times, steps=2000).log_prob(y)
+    np.testing.assert_allclose(expression(times=times, tolerance=1e-6, steps=200).log_prob(y), exact, atol=1e-3)
+    whole = lfm.filter(expression().model, TIMES, y, tolerance=1e-4, steps=60)
+    first = lfm.filter(expression().model, TIMES[:3], y[:3], tolerance=1e-4, steps=60)
+    then = lfm.filter(expression().model, TIMES[3:], y[3:], tolerance=1e-4, steps=60, start=first.state)
+    np.testing.assert_allclose(then.log_likelihood, whole.log_likelihood[3:], rtol=1e-10)
+
+
+def test_side_by_side_as_one_by_one():
+    alone = [double_well(p, tolerance=1e-3).log_prob(Y) for p in SLOW_TO_STIFF]
+    together = jax.jit(jax.vmap(lambda p: double_well(p, tolerance=1e-3).log_prob(Y)))(SLOW_TO_STIFF)
+    np.testing.assert_allclose(together, alone, rtol=1e-9)
+    panel = lfm.panel(lambda p: double_well(p).model, SLOW_TO_STIFF, TIMES, steps=60, tolerance=1e-3)
+    np.testing.assert_allclose(panel.log_prob(np.broadcast_to(Y, (4, *Y.shape))), alone, rtol=1e-9)
+
+
+def test_a_linear_model_has_its_exact_transition():
+    model = lfm.LatentForceModel(
+        systems.Linear(jnp.array([[-0.5]]), jnp.array([[1.0]])), {"u": lfm.Matern(1.0, 1.0)},
+        lfm.GaussianObservation(lambda x, u, t: x, 0.01 * jnp.ones(1)), lfm.Gaussian([0.0], [1.0]))
+    exact = lfm.MarginalLikelihood(model, TIMES).log_prob(Y)
+    assert lfm.MarginalLikelihood(model, TIMES, tolerance=1e-1).log_prob(Y) == exact
+
+
+def test_too_few_steps_are_a_log_likelihood_of_minus_infinity_that_is_explained():
+    with pytest.warns(lfm.FilterWarning, match="breaks down at row 1.*not finite.*tolerance"):
+        result = lfm.filter(double_well(SLOW_TO_STIFF[3]).model, TIMES, Y, steps=1, tolerance=1e-9)
+    assert np.isneginf(np.asarray(result.log_likelihood).sum())
+
+
+def test_what_a_tolerance_cannot_be():
+    with pytest.raises(ValueError, match="tolerance must be finite and greater than zero"):
+        _ = double_well(SLOW_TO_STIFF[0], tolerance=0.0).plan
+    model = double_well(SLOW_TO_STIFF[0]).model
+    with pytest.raises(ValueError, match="equal length.*leave out tolerance=0.001 or iterations"):
+        lfm.MarginalLikelihood(model, TIMES, iterations=3, tolerance=1e-3)
+    with pytest.raises(ValueError, match="equal length.*leave out tolerance=0.001 or iterations"):
+        lfm.smooth(model, TIMES, Y, iterations=3, tolerance=1e-3)
