@@ -46,7 +46,9 @@ PARAMETERS = {
 }
 TRUTH = {"alpha": -1.0, "beta": 0.1, "sigma": 2.0}
 GRID = np.linspace(0.0, 50.0, 501)
-STEPS = 60  # between observations: after one that lies outside the wells, the mean moves fast
+TARGET_ACCEPT = 0.9  # of fast diffusions in deep wells the Gaussian filter's likelihood falls off as from a cliff
+TOLERANCE = 5e-3  # of an integration step, in sds: the posterior holds slow diffusions and very fast, stiff ones
+STEPS = 60  # equal ones, where steps cannot follow a tolerance: simulation, particles, iterations
 
 
 def build(alpha, beta, sigma, noise_sd, units=None, start=None) -> lfm.LatentForceModel:
@@ -88,7 +90,7 @@ def model(times, y=None, noise_sd: float = 0.1, units=None) -> None:
     alpha = numpyro.deterministic("alpha", linear * sigma**2)
     beta = numpyro.deterministic("beta", cubic * sigma**2)
     system = build(alpha, beta, sigma, noise_sd, units)
-    numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=STEPS), obs=y)
+    numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=STEPS, tolerance=TOLERANCE), obs=y)
 
 
 def simulate(seed: int = 2, noise_sd: float = 0.1) -> lfm.Data:
