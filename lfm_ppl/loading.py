@@ -208,8 +208,8 @@ def _checked(path: Path, module: ModuleType) -> ModelFile:
     if isinstance(outputs, str):
         raise ValueError(f'{path}: OUTPUTS must be a tuple of names, as in ("{outputs}",).')
     target_accept = getattr(module, "TARGET_ACCEPT", None)
-    if target_accept is not None and not 0 < target_accept < 1:
-        raise ValueError(f"{path}: TARGET_ACCEPT must lie between 0 and 1, got {target_accept}.")
+    if target_accept is not None and not (isinstance(target_accept, int | float) and 0 < target_accept < 1):
+        raise ValueError(f"{path}: TARGET_ACCEPT must lie between 0 and 1, got {target_accept!r}.")
     return ModelFile(
         name=_name(path),
         path=path,

@@ -13,7 +13,7 @@ PACKAGE = ROOT / "lfm_ppl"
 # Lower layers first. A module belongs to the longest name here that is a prefix of its own, and may
 # import from its own layer and from the layers below.
 LAYERS = (
-    ("checks", "linalg", "gradients", "data"),
+    ("checks", "compilation", "linalg", "gradients", "data"),
     ("forces",),
     ("model",),
     ("orbits",),

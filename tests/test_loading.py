@@ -133,6 +133,7 @@ def test_options_that_do_not_exist(model_file, name, text, message):
         ),
         ("def model(times): ...\nsimulate = 3", r"simulate must be a function, got 3"),
         ("def model(times): ...\nOPTIONS = {'a': 1}", r"OPTIONS\['a'\] must be \(default"),
+        ("def model(times): ...\nTARGET_ACCEPT = '0.9'", r"TARGET_ACCEPT must lie between 0 and 1, got '0.9'"),
         ("def model(times): ...\nTARGET_ACCEPT = 90", r"TARGET_ACCEPT must lie between 0 and 1, got 90"),
     ],
 )

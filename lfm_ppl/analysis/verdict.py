@@ -93,10 +93,11 @@ def _judged(found: Findings) -> tuple[str, str, str]:
             finer, advice = f"--steps {2 * found.steps}", f"with {2 * found.steps} steps"
         else:
             tighter = finer_tolerance(found.tolerance)
-            finer, advice = f"--tolerance {tighter:g}", f"with a tolerance of {tighter:g}"
+            finer = f"--steps {2 * found.steps} --tolerance {tighter:g}"
+            advice = f"with a tolerance of {tighter:g} and {2 * found.steps} steps"
         if found.max_step is not None:
             finer += f" --max-step {found.max_step / 2:g}"
-        reason = (f"the integration steps are too long: doubling them changes the log likelihood by amounts that vary "
+        reason = (f"the integration steps are too long: twice as many change the log likelihood by amounts that vary "
                   f"by {found.step_change_sd:.2g} (sd) over the posterior, more than {STEP_CHANGE}.")
         if not found.refit:
             return "re-run", f"{reason} Fit again {advice}.", ""

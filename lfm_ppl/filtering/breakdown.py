@@ -80,9 +80,11 @@ def breakdown(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: Any, start: M
     end = plan.observed[later[0]] if later.size else row
     time = float(rows.start[end] + rows.length[end])
     where = f"row {later[0]} (time {time:.6g})" if later.size else f"time {time:.6g}, after the last observation"
-    if not ssm.time_invariant and step is not None:
+    if count > 1 and step is not None:
         where += f", step {step + 1} of {count} from time {float(one.start):.6g} to {float(one.start + one.length):.6g}"
     remedy = ("Try a tighter prior, an observation noise that is not so small, or other units" if ssm.time_invariant
+              else "Try more steps (up to five times their number are tried), a larger tolerance, another rule, or a "
+              "tighter prior" if plan.tolerance is not None
               else "Try more steps (steps=...), a longest step (max_step=...), steps that follow a tolerance "
               "(tolerance=1e-3), another rule, or a tighter prior")
     return f"the filter breaks down at {where}: {reason}. The log likelihood is -inf. {remedy}."

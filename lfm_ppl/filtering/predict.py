@@ -327,7 +327,7 @@ def _predict_by_quadrature(ssm: StateSpaceModel, rule: Rule, linear: LinearPart,
             return one
         return one._replace(rest=one.rest + matmul(one.slope[:, size:], (mean - near.mean)[:, None])[:, 0])
 
-    if _same_at_all_times(ssm):
+    if same_at_all_times(ssm):
         nodes = jax.vmap(node)(jnp.append(times, ends[-1]), now.mean, near)
         stages = jax.tree_util.tree_map(_by_steps, nodes)
     else:
@@ -348,7 +348,7 @@ def _predict_by_quadrature(ssm: StateSpaceModel, rule: Rule, linear: LinearPart,
     return Prediction(moments, whole, added, within)
 
 
-def _same_at_all_times(ssm: StateSpaceModel) -> bool:
+def same_at_all_times(ssm: StateSpaceModel) -> bool:
     """Whether the dynamics is one function of the state at all times: the end of a step is the start of the next."""
     return (ssm.constant_measurement and ssm.constant_mean and not ssm.drift_structure.offset_varies
             and not callable(ssm.model.process_noise))

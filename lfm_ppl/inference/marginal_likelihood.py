@@ -85,7 +85,10 @@ class MarginalLikelihood(dist.Distribution):
         check_iterations(iterations, damping, tolerance)
         self.model, self.times = model, times
         self.rule, self.steps, self.max_step = as_rule(rule), steps, max_step
-        self.iterations, self.damping, self.tolerance = iterations, damping, tolerance
+        self.iterations, self.damping = iterations, damping
+        if tolerance is not None:
+            checks.positive("tolerance", tolerance, "It is in standard deviations, 0.001 for example.")
+        self.tolerance = None if tolerance is None else float(tolerance)
         model.check_at(self.plan.initial_time, np.shape(times)[0])
         known = checks.concrete(times)
         if known is not None:

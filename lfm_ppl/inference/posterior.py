@@ -204,10 +204,13 @@ def each(distribution: MarginalLikelihood | Panel, function: Callable, *argument
 
 def over_draws(per_draw: Callable, draws: Mapping[str, Any], key: jax.Array, rows: int,
                known: LikelihoodSite) -> dict[str, np.ndarray]:
-    """Return ``per_draw(parameters, key)`` for all draws (S, ...), in batches that bound the memory."""
+    """Return ``per_draw(parameters, key)`` for all draws (S, ...), in batches that bound the memory.
+
+    With steps that follow a tolerance it is one draw after another.
+    """
     draws = {name: jnp.asarray(value) for name, value in draws.items()}
     count = next(iter(draws.values())).shape[0]
-    if known.example.tolerance is not None:
+    if known.example.tolerance is not None and not known.example.ssm.time_invariant:
         # Side by side, every draw would make as many steps as may be tried.
         one_by_one = jax.jit(lambda d, k: jax.lax.map(lambda pair: per_draw(*pair), (d, k)))
         return jax.tree_util.tree_map(np.asarray, one_by_one(draws, jax.random.split(key, count)))

@@ -1,12 +1,15 @@
 """Steps whose length follows a tolerance, against many equal steps."""
 
+from typing import Any
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import systems
 
 import lfm_ppl as lfm
-from tests import systems
 
 TIMES = np.arange(0.0, 9.0, 2.0)
 Y = np.array([[1.5], [np.nan], [-1.8], [1.1], [4.0]])
@@ -73,6 +76,79 @@ def test_driven_models(link, start):
     np.testing.assert_allclose(found, exact, atol=2e-4)
 
 
+class Explicit(eqx.Module):
+    """(x - 0.1 x^3)(1 + 0.3 sin t) + input(t)."""
+
+    input: Any = None
+
+    def __call__(self, x, u, t):
+        value = (x - 0.1 * x**3) * (1.0 + 0.3 * jnp.sin(t))
+        return value if self.input is None else value + self.input(t)
+
+
+def explicit(input_=None, tolerance=None, steps=2000, force=None, initial_time=0.0, dispersion=None):
+    forces = {} if force is None else {"u": force}
+    drift = Explicit(input_)
+    dynamics = drift if force is None else (lambda x, u, t: drift(x, u, t) + jnp.tanh(u))
+    model = lfm.LatentForceModel(
+        dynamics, forces, lfm.GaussianObservation(lambda x, u, t: x, 0.1 * jnp.ones(1)), lfm.Gaussian([0.0], [1.0]),
+        process_noise=jnp.ones((1, 1)) if dispersion is None else dispersion, initial_time=initial_time)
+    return lfm.MarginalLikelihood(model, TIMES, steps=steps, tolerance=tolerance)
+
+
+STEPPED = lfm.Input(jnp.array([0.0, 2.0, 4.0, 6.0]), jnp.array([1.0, -2.0, 3.0, -1.0]))
+WITHIN = lfm.Input(jnp.array([0.0, 1.3, 4.7]), jnp.array([1.0, -2.0, 3.0]))
+
+
+@pytest.mark.parametrize("keywords", [
+    {}, {"input_": STEPPED}, {"input_": WITHIN}, {"force": lfm.Matern(1.0, 2.0, mean=lambda t: jnp.cos(t))},
+    {"force": systems.Kicked(0.3, (3.0, 5.0), 1.0, 2.0)},
+    {"dispersion": lambda x, u, t: (1.0 + 0.2 * jnp.sin(t) + 0.1 * jnp.tanh(x))[:, None]},
+], ids=["time", "input", "input within rows", "mean function", "jumps", "state-dependent noise"])
+def test_dynamics_that_depend_on_time(keywords):
+    exact = explicit(**keywords).log_prob(Y)
+    np.testing.assert_allclose(explicit(**keywords, tolerance=1e-6, steps=400).log_prob(Y), exact, atol=2e-3)
+
+
+def test_an_input_that_jumps_between_rows_takes_few_steps():
+    """Its jump lies at an observation, between the end of one row and the start of the next."""
+    found = explicit(STEPPED, tolerance=1e-4, steps=20).log_prob(Y)
+    np.testing.assert_allclose(found, explicit(STEPPED).log_prob(Y), atol=1e-3)
+
+
+def test_derivatives_with_respect_to_times():
+    def log_prob(t, tolerance, steps):
+        return explicit(initial_time=t, tolerance=tolerance, steps=steps).log_prob(Y)
+
+    exact = jax.grad(log_prob)(-0.7, None, 400)
+    np.testing.assert_allclose(jax.grad(log_prob)(-0.7, 1e-6, 100), exact, rtol=1e-3)
+    np.testing.assert_allclose(jax.jacfwd(log_prob)(-0.7, 1e-6, 100), exact, rtol=1e-3)
+
+
+class Cascade(eqx.Module):
+    """Each state makes the next one; ``units`` are those of the states."""
+
+    units: Any
+
+    def __call__(self, x, u, t):
+        x = x / self.units
+        made = jnp.concatenate([jax.nn.softplus(u), x[:-1] / (1.0 + x[:-1] ** 2)])
+        return (made - 0.5 * x) * self.units
+
+
+@pytest.mark.parametrize("units", [np.ones(4), np.array([1e-3, 1e3, 1.0, 30.0])], ids=["alike", "mixed units"])
+def test_a_cascade_from_a_known_zero_in_any_units(units):
+    def log_prob(tolerance, steps):
+        model = lfm.LatentForceModel(
+            Cascade(units), {"u": lfm.Matern(1.0, 2.0)},
+            lfm.GaussianObservation(lambda x, u, t: x[-1:] / units[-1], 0.01 * jnp.ones(1)),
+            lfm.Gaussian(np.zeros(4), np.zeros(4)), initial_time=-2.0)
+        return lfm.MarginalLikelihood(model, TIMES, steps=steps, tolerance=tolerance).log_prob(Y)
+
+    np.testing.assert_allclose(log_prob(1e-3, 30), log_prob(None, 400), rtol=2e-2)
+    np.testing.assert_allclose(log_prob(1e-5, 100), log_prob(None, 400), rtol=1e-3)
+
+
 def test_smoother_draws_and_requested_times():
     y = np.array([[0.2, 0.4], [0.9, 1.0], [np.nan, 1.3], [0.8, 0.9], [0.7, np.nan]])
     at = np.array([0.0, 0.7, 2.0, 5.1, 9.5])
@@ -121,14 +197,14 @@ def test_a_linear_model_has_its_exact_transition():
 
 
 def test_too_few_steps_are_a_log_likelihood_of_minus_infinity_that_is_explained():
-    with pytest.warns(lfm.FilterWarning, match="breaks down at row 1.*not finite.*tolerance"):
+    with pytest.warns(lfm.FilterWarning, match="breaks down at row 1.*not finite.*larger tolerance"):
         result = lfm.filter(double_well(SLOW_TO_STIFF[3]).model, TIMES, Y, steps=1, tolerance=1e-9)
     assert np.isneginf(np.asarray(result.log_likelihood).sum())
 
 
 def test_what_a_tolerance_cannot_be():
     with pytest.raises(ValueError, match="tolerance must be finite and greater than zero"):
-        _ = double_well(SLOW_TO_STIFF[0], tolerance=0.0).plan
+        double_well(SLOW_TO_STIFF[0], tolerance=0.0)
     model = double_well(SLOW_TO_STIFF[0]).model
     with pytest.raises(ValueError, match="equal length.*leave out tolerance=0.001 or iterations"):
         lfm.MarginalLikelihood(model, TIMES, iterations=3, tolerance=1e-3)

@@ -78,7 +78,13 @@ def test_shorter_steps_leave_no_failure():
 
 
 def test_gradients_equal_finite_differences(drawn):
-    _, evaluate, flat, values, gradients = drawn
+    name, evaluate, flat, values, gradients = drawn
+    if name == "ginzburg-landau":
+        # Where another number of steps meets the tolerance, the density itself jumps by a little.
+        file = loading.load(name)
+        data = file.simulate(seed=1)
+        equal = settings.approximate(file.model, steps=60)
+        evaluate, flat, values, gradients = _evaluate(equal, (data.times, data.y), file.keywords(data, {}))
     chosen = np.flatnonzero(np.isfinite(values))[:CHECKED]
     size = flat.shape[1]
     step = 1e-3 * np.array([1, -1, 2, -2])
