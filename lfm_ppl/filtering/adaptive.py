@@ -107,7 +107,6 @@ def predict_row_adaptively(ssm: StateSpaceModel, rule: Rule, linear: LinearPart,
         made = _Position(jnp.where(last, 0.0, now.left - h), stop(h * growth), one.moments, phi, noise, then)
         again = now._replace(length=stop(h * growth))
         accepted = (error <= 1.0) | (jnp.isfinite(error) & (h < _SHORT * length))
-        # Not a selection: the derivative of a step that is not finite would spoil that of the one before.
         return jax.lax.cond(accepted, lambda: made, lambda: again)
 
     def unless_done(body):
