@@ -230,7 +230,10 @@ def test_durations():
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries are left alone")
 def test_freed_memory_goes_back_to_the_system():
-    """Small blocks below one that stays: the C library keeps them when they are freed."""
+    """Small blocks below one that stays: the C library keeps them when they are freed.
+
+    Only whole pages go back, and blocks that fill holes between others free none: half of the memory is asked for.
+    """
     library = ctypes.CDLL("libc.so.6")
     library.malloc.restype, library.free.argtypes = ctypes.c_void_p, [ctypes.c_void_p]
     blocks = [library.malloc(4000) for _ in range(25_000)]
@@ -243,7 +246,7 @@ def test_freed_memory_goes_back_to_the_system():
     _return_memory()
     freed = before - resident()
     library.free(last)
-    assert freed > 80e6
+    assert freed > 0.5 * len(blocks) * 4000
 
 
 def resident():
