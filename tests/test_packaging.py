@@ -1,5 +1,6 @@
 """What is installed: the model files travel inside the package, and the checkout's serve itself."""
 
+import re
 import subprocess
 import sys
 import zipfile
@@ -51,3 +52,14 @@ def test_models_are_found_wherever_the_package_is(installed, request, tmp_path):
     assert Path(found.strip()) == (site / folder / "spring.py").resolve()
     listed = run([sys.executable, "-m", "lfm_ppl", "models"], tmp_path, site)
     assert all(name.removesuffix(".py").replace("_", "-") in listed for name in MODELS)
+
+
+def test_a_wheel_says_its_version_and_its_licence_and_that_it_is_typed(unpacked, tmp_path):
+    assert (unpacked / "lfm_ppl/py.typed").is_file()
+    (information,) = unpacked.glob("*.dist-info")
+    assert (information / "licenses/LICENSE").read_text() == (ROOT / "LICENSE").read_text()
+    metadata = (information / "METADATA").read_text()
+    assert "\nLicense-Expression: Apache-2.0\n" in metadata
+    (version,) = re.findall(r"^Version: (\S+)$", metadata, re.MULTILINE)
+    said = run([sys.executable, "-m", "lfm_ppl", "--version"], tmp_path, unpacked)
+    assert said == f"lfm_ppl {version}\n"
