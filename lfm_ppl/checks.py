@@ -7,11 +7,14 @@ gives a log likelihood of minus infinity instead.
 from __future__ import annotations
 
 import difflib
+import sys
+import warnings
 from collections.abc import Iterable, Sequence
 from typing import Any
 
 import jax
 import numpy as np
+from numpyro.util import is_prng_key
 
 
 def concrete(value: Any) -> np.ndarray | None:
@@ -22,6 +25,15 @@ def concrete(value: Any) -> np.ndarray | None:
 def traced(tree: Any) -> bool:
     """Whether a leaf of ``tree`` is a tracer."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree_util.tree_leaves(tree))
+
+
+def warn(message: str, category: type[Warning] = UserWarning) -> None:
+    """Warn at the user's line, the innermost one outside of the library."""
+    level, frame = 2, sys._getframe(1)
+    inside = ("lfm_ppl.", "equinox.", "jax.", "functools", "numpyro.")
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith(inside):
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, category, stacklevel=level)
 
 
 def positive(name: str, value: Any, remedy: str = "") -> None:
@@ -37,6 +49,15 @@ def positive_integer(name: str, value: Any, remedy: str = "") -> None:
         raise TypeError(f"{name} must be a whole number, got {value!r}. {remedy}".strip())
     if value < 1:
         raise ValueError(_message(name, "at least 1", value, remedy))
+
+
+def random_key(key: Any) -> None:
+    """Raise TypeError unless ``key`` is one JAX random key."""
+    if not is_prng_key(key):
+        got = repr(key) if isinstance(key, (int, np.integer)) else type(key).__name__
+        if shape := getattr(key, "shape", ()):
+            got += f" of shape {shape}"
+        raise TypeError(f"key, the first argument, must be a JAX random key, such as jax.random.key(0), got {got}.")
 
 
 def sizes(name: str, value: Any, meaning: Sequence[str]) -> None:

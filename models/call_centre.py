@@ -115,13 +115,13 @@ def arrivals(force, mean, scale, lengthscale, memory, period, functions, cycles)
             waves = waves + lfm.Resonator(period / k, scale / k, scale / k / jnp.sqrt(memory * period))
         return waves
     # A short distance in time is pi / period times as long on the circle.
-    kernel = lfm.PeriodicMatern(scale, lengthscale * np.pi / period, period, order=0)
+    kernel = lfm.forces.PeriodicMatern(scale, lengthscale * np.pi / period, period, order=0)
     if force == "periodic":
-        return lfm.Periodic(kernel, functions=functions, mean=mean)
+        return lfm.Periodic(kernel, functions=functions, mean=mean, explained_variance=0.0)
     changes = tuple(period * np.arange(1, cycles))
-    evolution = {"cqm": lambda: lfm.CQM(memory * period), "sqm": lambda: lfm.SQM(memory, changes),
-                 "wqm": lambda: lfm.WQM(1.0 / memory, changes)}[force]()
-    return lfm.QuasiPeriodic(kernel, evolution, functions=functions, mean=mean)
+    evolution = {"cqm": lambda: lfm.forces.CQM(memory * period), "sqm": lambda: lfm.forces.SQM(memory, changes),
+                 "wqm": lambda: lfm.forces.WQM(1.0 / memory, changes)}[force]()
+    return lfm.QuasiPeriodic(kernel, evolution, functions=functions, mean=mean, explained_variance=0.0)
 
 
 def build(mean, scale, noise_sd, lengthscale=None, memory=None, force="sqm", link="linear", service=10.0, period=840.0,

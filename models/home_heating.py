@@ -101,15 +101,15 @@ def residual_force(kind, scale, lengthscale, memory, functions, midnights, perio
         return sum(waves, lfm.Constant(scale))
     if kind not in RESIDUALS:
         raise ValueError(f"residual must be one of {', '.join(RESIDUALS)}, got {kind!r}.")
-    kernel = lfm.PeriodicMatern(scale, lengthscale, DAY, order=0)
+    kernel = lfm.forces.PeriodicMatern(scale, lengthscale, DAY, order=0)
     if kind == "periodic":
-        return lfm.Periodic(kernel, functions)
+        return lfm.Periodic(kernel, functions, explained_variance=0.0)
     evolution = {
-        "SQM": lambda: lfm.SQM(memory, midnights),
-        "CQM": lambda: lfm.CQM(DAY * memory),
-        "WQM": lambda: lfm.WQM(1.0 / memory, midnights),
+        "SQM": lambda: lfm.forces.SQM(memory, midnights),
+        "CQM": lambda: lfm.forces.CQM(DAY * memory),
+        "WQM": lambda: lfm.forces.WQM(1.0 / memory, midnights),
     }[kind]()
-    return lfm.QuasiPeriodic(kernel, evolution, functions)
+    return lfm.QuasiPeriodic(kernel, evolution, functions, explained_variance=0.0)
 
 
 def build(heater, residual, alpha, beta, noise_sd, outdoor, gamma=None, psi=None, units=None) -> lfm.LatentForceModel:

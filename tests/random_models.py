@@ -48,7 +48,7 @@ RULES = (lfm.Taylor(), lfm.Unscented(), lfm.Cubature(), lfm.GaussHermite(3), lfm
 
 
 def _kernel(scale, length, rate):
-    return lfm.PeriodicMatern(scale, jnp.clip(length, 0.3, 3.0), 1.0 + rate, order=2)
+    return lfm.forces.PeriodicMatern(scale, jnp.clip(length, 0.3, 3.0), 1.0 + rate, order=2)
 
 
 FORCES = {
@@ -57,19 +57,19 @@ FORCES = {
     "squared exponential 6": lambda s, n, r: lfm.SquaredExponential(s, n, order=6),
     "constant": lambda s, n, r: lfm.Constant(s),
     "Wiener velocity": lambda s, n, r: lfm.WienerVelocity(s, r),
-    "random walk": lambda s, n, r: lfm.RandomWalk(s, r),
+    "random walk": lambda s, n, r: lfm.forces.RandomWalk(s, r),
     "periodic": lambda s, n, r: lfm.Periodic(
-        lfm.PeriodicSquaredExponential(s, jnp.clip(n, 0.3, 3.0), 1.0 + r), functions=5),
-    "CQM": lambda s, n, r: lfm.QuasiPeriodic(_kernel(s, n, r), lfm.CQM(n), functions=5),
+        lfm.forces.PeriodicSquaredExponential(s, jnp.clip(n, 0.3, 3.0), 1.0 + r), functions=5),
+    "CQM": lambda s, n, r: lfm.QuasiPeriodic(_kernel(s, n, r), lfm.forces.CQM(n), functions=5),
     "Matern weights": lambda s, n, r: lfm.QuasiPeriodic(_kernel(s, n, r), lfm.Matern(1.0, n, order=1), functions=3),
-    "SQM": lambda s, n, r: lfm.QuasiPeriodic(_kernel(s, n, r), lfm.SQM(1.0 + r, CHANGES), functions=3),
-    "WQM": lambda s, n, r: lfm.QuasiPeriodic(_kernel(s, n, r), lfm.WQM(r, CHANGES), functions=3),
+    "SQM": lambda s, n, r: lfm.QuasiPeriodic(_kernel(s, n, r), lfm.forces.SQM(1.0 + r, CHANGES), functions=3),
+    "WQM": lambda s, n, r: lfm.QuasiPeriodic(_kernel(s, n, r), lfm.forces.WQM(r, CHANGES), functions=3),
     "resonator": lambda s, n, r: lfm.Resonator(1.0 + r, s, r, 0.1 * r),
-    "resonators": lambda s, n, r: lfm.resonators(_kernel(s, n, r), functions=3, noise=0.1 * r, damping=0.1),
-    "sparse spectrum": lambda s, n, r: lfm.SparseSpectrum(s, jnp.array([1.0, 2.3]) * (1 + r)),
+    "resonators": lambda s, n, r: lfm.forces.resonators(_kernel(s, n, r), functions=3, noise=0.1 * r, damping=0.1),
+    "sparse spectrum": lambda s, n, r: lfm.forces.SparseSpectrum(s, jnp.array([1.0, 2.3]) * (1 + r)),
     "sum": lambda s, n, r: Sum((lfm.Matern(s, n, order=1), lfm.Constant(r), lfm.Matern(s, r + 0.1, order=0))),
     "sum with CQM": lambda s, n, r: Sum((lfm.Matern(s, n, order=2),
-                                         lfm.QuasiPeriodic(_kernel(s, n, r), lfm.CQM(n), functions=3))),
+                                         lfm.QuasiPeriodic(_kernel(s, n, r), lfm.forces.CQM(n), functions=3))),
 }
 """Name -> force of a scale, a length and a rate."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import Any
 
 import equinox as eqx
@@ -29,7 +28,7 @@ class FilterWarning(UserWarning):
 
 
 def warn_of_breakdown(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: Any, start: Moments | None,
-                      log_likelihood: Any, stacklevel: int = 3) -> None:
+                      log_likelihood: Any) -> None:
     """Warn where a log likelihood is not finite; nothing happens in compiled code.
 
     Args:
@@ -39,13 +38,12 @@ def warn_of_breakdown(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: Any, 
         y: (T, D), NaN where missing.
         start: moments at the initial time; the model's by default.
         log_likelihood: what the filter found, of any shape.
-        stacklevel: as in `warnings.warn`.
     """
     if checks.traced((ssm, plan, y, start, log_likelihood)) or np.isfinite(np.asarray(log_likelihood)).all():
         return
-    warnings.warn(breakdown(ssm, rule, plan, y, start) or "the log likelihood is -inf, but the filter does not break "
-                  "down without posterior linearisation: try iterations=0, or more damping (a smaller share).",
-                  FilterWarning, stacklevel=stacklevel)
+    checks.warn(breakdown(ssm, rule, plan, y, start) or "the log likelihood is -inf, but the filter does not break "
+                "down without posterior linearisation: try iterations=0, or more damping (a smaller share).",
+                FilterWarning)
 
 
 def breakdown(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: Any, start: Moments | None = None) -> str | None:

@@ -375,7 +375,7 @@ def filter(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
     y = check_observations(y, len(plan.observed), ssm.output_dim, empty=start is not None)
     warn_single_precision()
     begin = None if start is None else Moments(start.mean, start.covariance)
-    result = _run_filter(ssm, rule, plan, y, jnp.asarray(times, float), begin)
+    result = filter_on(ssm, rule, plan, y, jnp.asarray(times, float), begin)
     known = checks.concrete(times)
     if known is not None:
         # A number also in a trace, so that another call there can go on from it with a plan of its own.
@@ -400,8 +400,9 @@ def _check_start(start: Any, times: Any, size: int) -> None:
 
 
 @eqx.filter_jit
-def _run_filter(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, times: jax.Array,
-                begin: Moments | None) -> FilterResult:
+def filter_on(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, times: jax.Array,
+              begin: Moments | None = None) -> FilterResult:
+    """Filter observations (T, D) at ``times`` on the rows of a plan; see `filter`."""
     passed = forward(ssm, rule, plan, y, start=begin, keep="moments")
     at = jax.tree_util.tree_map(lambda a: a[jnp.asarray(plan.observed)], passed)
     state = FilterState(times[-1], at.filtered.mean[-1], at.filtered.covariance[-1])

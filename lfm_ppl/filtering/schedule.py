@@ -92,6 +92,10 @@ def schedule(ssm: StateSpaceModel, times: Any, steps: int, max_step: float | Non
     known = check_times(times, initial_time)
     start = known[0] if initial_time is None and known is not None else initial_time
     origin = None if start is None else checks.concrete(start)
+    if known is not None and origin is not None:
+        requested = None if at is None else checks.concrete(at)
+        last = known[-1] if requested is None else max(known[-1], requested.max(initial=known[-1]))
+        ssm.model.check_inputs(float(origin), float(last))
     if known is not None and origin is None and ssm.stack.jump_times and max_step is None and at is None:
         return _traced_origin(known, start, ssm.stack.jump_times, steps, row_per_step)
     if known is None or origin is None:

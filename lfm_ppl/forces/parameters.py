@@ -26,7 +26,8 @@ def scalar_parameter(name: str, value: Any) -> jax.Array:
     if array.shape != ():
         raise ValueError(
             f"{name} must be one number, got an array of shape {array.shape}. "
-            "Make one force per value, or use jax.vmap over the construction."
+            "Make one force per value, or use jax.vmap over the construction; for many series, as in a "
+            "numpyro.plate, take lfm.panel."
         )
     return array
 

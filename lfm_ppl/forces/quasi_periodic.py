@@ -10,15 +10,18 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from lfm_ppl import checks
-from lfm_ppl.forces.basis import Basis, Eigenfunctions, Waves, spectrum, waves
+from lfm_ppl.forces.basis import Basis, Eigenfunctions, Waves, cycle_points, spectrum, waves
 from lfm_ppl.forces.constant import Constant
 from lfm_ppl.forces.parameters import mean_parameter
 from lfm_ppl.forces.periodic_kernels import Kernel
-from lfm_ppl.forces.sde import Force
+from lfm_ppl.forces.sde import ApproximationWarning, Force
 from lfm_ppl.linalg import safe_sqrt
 
 _POINTS = 100
 _MOST = 1024
+
+EXPLAINED_VARIANCE = 0.99
+"""Share of a kernel's variance that the functions of a force are to keep."""
 
 
 class QuasiPeriodic(Force):
@@ -32,7 +35,8 @@ class QuasiPeriodic(Force):
     kernel the covariance misses at no lag more than the eigenvalues left out, for others it does so on average over a
     cycle. Where those above 1/100 of the largest are kept, as by default, that is less than 0.01 of the variance for
     the periodic squared exponential and for order 2 of the periodic Matern, whatever the lengthscale; up to 0.015 for
-    order 1 and 0.064 for order 0. Rough kernels need more functions, that is a smaller gamma.
+    order 1 and 0.064 for order 0. Rough kernels need more functions, that is a smaller gamma. Functions that keep less
+    than ``explained_variance`` of the variance are reported, with the number that would keep it.
 
     A stationary kernel has the Fourier series ``sum_j q_j cos(2 pi j t / D)``, whose coefficients are integrals of
     the kernel, so that no eigen-decomposition is needed; each pair turns in its state and the force has constant
@@ -48,6 +52,10 @@ class QuasiPeriodic(Force):
         gamma: share of the largest eigenvalue above which one is significant.
         mean: a number, or a function of time.
         points: of Nystrom's method in a cycle, for kernels that are not stationary.
+        explained_variance: share of the kernel's variance that the functions are to keep; 0 where any will do.
+
+    Warns:
+        ApproximationWarning: outside of compiled code, where they keep less.
 
     Raises:
         ValueError: a kernel that is not positive definite, a number of functions that does not fit, or one that is not
@@ -71,10 +79,10 @@ class QuasiPeriodic(Force):
     mean: Any
 
     def __init__(self, kernel: Kernel, evolution: Force, functions: int | None = None, gamma: float = 0.01,
-                 mean: Any = 0.0, points: int = _POINTS):
+                 mean: Any = 0.0, points: int = _POINTS, explained_variance: float = EXPLAINED_VARIANCE):
         _check_kernel(kernel)
         if not isinstance(evolution, Force):
-            raise TypeError("evolution must be lfm.CQM, lfm.SQM, lfm.WQM or a force of scale 1, got "
+            raise TypeError("evolution must be CQM, SQM or WQM of lfm.forces, or a force of scale 1, got "
                             f"{type(evolution).__name__}.")
         level = checks.concrete(evolution.mean_at(0.0))
         if level is not None and level != 0.0:
@@ -82,6 +90,7 @@ class QuasiPeriodic(Force):
         checks.positive_integer("points", points)
         self.kernel, self.evolution, self.mean = kernel, evolution, mean_parameter(mean)
         self.basis = _basis(kernel, functions, gamma, points)
+        warn_of_lost_variance(kernel, self.basis, explained_variance, points)
 
     @property
     def period(self) -> jax.Array:
@@ -205,6 +214,10 @@ class Periodic(QuasiPeriodic):
         gamma: share of the largest eigenvalue above which one is significant.
         mean: a number, or a function of time.
         points: of Nystrom's method in a cycle, for kernels that are not stationary.
+        explained_variance: share of the kernel's variance that the functions are to keep; 0 where any will do.
+
+    Warns:
+        ApproximationWarning: as `QuasiPeriodic`.
 
     Raises:
         ValueError, TypeError: as `QuasiPeriodic`.
@@ -219,8 +232,8 @@ class Periodic(QuasiPeriodic):
     """
 
     def __init__(self, kernel: Kernel, functions: int | None = None, gamma: float = 0.01, mean: Any = 0.0,
-                 points: int = _POINTS):
-        super().__init__(kernel, Constant(1.0), functions, gamma, mean, points)
+                 points: int = _POINTS, explained_variance: float = EXPLAINED_VARIANCE):
+        super().__init__(kernel, Constant(1.0), functions, gamma, mean, points, explained_variance)
 
 
 def significant_functions(kernel: Kernel, gamma: float = 0.01, points: int = _POINTS) -> int:
@@ -250,7 +263,7 @@ def significant_functions(kernel: Kernel, gamma: float = 0.01, points: int = _PO
         raise ValueError(f"gamma must be below 1, got {gamma:g}. It is a share of the largest eigenvalue.")
     if checks.traced(kernel):
         raise ValueError("the number of functions sets the number of states, and cannot follow from traced parameters. "
-                         "Give functions=J; lfm.significant_functions(kernel) says how many for typical values. "
+                         "Give functions=J; lfm.forces.significant_functions(kernel) says how many for typical values. "
                          "(Inside compiled code, such as a NumPyro model, numbers become traced, too.)")
     if not kernel.stationary:
         values = spectrum(kernel, points)
@@ -286,6 +299,50 @@ def stationary_basis(kernel: Kernel, functions: int | None, gamma: float) -> Wav
     return waves(kernel, functions // 2)
 
 
+def warn_of_lost_variance(kernel: Kernel, basis: Basis, wanted: float, points: int = _POINTS) -> None:
+    """Warn where functions keep less than the share ``wanted`` of the variance; nothing happens in compiled code.
+
+    Raises:
+        ValueError: a share outside of [0, 1).
+    """
+    if not 0 <= wanted < 1:
+        raise ValueError(f"explained_variance must lie in [0, 1), a share of the kernel's variance, got {wanted!r}.")
+    if not wanted or checks.traced((kernel, basis, jnp.zeros(()) + 0.0)):
+        return
+    at = kernel.start if kernel.stationary else cycle_points(kernel, points)
+    total = float(jnp.mean(kernel(at, at)))
+    share = float(basis.eigenvalues().sum()) / total
+    if share >= wanted - 1e-9:
+        return
+    needed = _needed(kernel, wanted * total, points)
+    remedy = (f"functions={needed} would keep {wanted:.0%}" if needed is not None else
+              f"no number of functions up to {1 + 2 * _MOST if kernel.stationary else points} keeps {wanted:.0%}: take "
+              f"a smoother kernel{'' if kernel.stationary else ', more points'} or a longer lengthscale")
+    checks.warn(f"a periodic force keeps {np.floor(share * 1000) / 10:.1f}% of the variance of its kernel {kernel.name}"
+                f"{_parameters(kernel)} with {basis.count} functions; {remedy}. Where less will do, say so with "
+                f"explained_variance={np.floor(share * 100) / 100:.2f}.", ApproximationWarning)
+
+
+def _needed(kernel: Kernel, variance: float, points: int) -> int | None:
+    """Return the least number of functions that keep so much variance, None where there are too many."""
+    harmonics = 32
+    while True:
+        values = spectrum(kernel, harmonics if kernel.stationary else points)
+        if kernel.stationary:
+            values[1:] *= 2.0
+        enough = np.flatnonzero(np.cumsum(values) >= variance)
+        if enough.size:
+            return 1 + int(enough[0]) * (2 if kernel.stationary else 1)
+        if not kernel.stationary or harmonics >= _MOST:
+            return None
+        harmonics *= 2
+
+
+def _parameters(kernel: Kernel) -> str:
+    lengthscale = getattr(kernel, "lengthscale", None)
+    return "" if lengthscale is None else f" of lengthscale {float(lengthscale):.3g}"
+
+
 def _basis(kernel: Kernel, functions: int | None, gamma: float, points: int) -> Basis:
     if kernel.stationary:
         return stationary_basis(kernel, functions, gamma)
@@ -301,5 +358,5 @@ def _basis(kernel: Kernel, functions: int | None, gamma: float, points: int) -> 
 
 def _check_kernel(kernel: Kernel) -> None:
     if not isinstance(kernel, Kernel):
-        raise TypeError(f"kernel must be a periodic kernel such as lfm.PeriodicMatern, got {kernel!r}. Wrap a "
-                        "function k(t, s) in lfm.PeriodicKernel.")
+        raise TypeError(f"kernel must be a periodic kernel such as lfm.forces.PeriodicMatern, got {kernel!r}. Wrap a "
+                        "function k(t, s) in lfm.forces.PeriodicKernel.")

@@ -11,14 +11,14 @@ from lfm_ppl.forces.basis import Waves
 from lfm_ppl.forces.constant import Constant
 from lfm_ppl.forces.parameters import standard_deviation_parameter
 from lfm_ppl.forces.periodic_kernels import Kernel
-from lfm_ppl.forces.quasi_periodic import stationary_basis
+from lfm_ppl.forces.quasi_periodic import EXPLAINED_VARIANCE, stationary_basis, warn_of_lost_variance
 from lfm_ppl.forces.resonator import Resonator
 from lfm_ppl.forces.sum import Sum
 from lfm_ppl.linalg import safe_sqrt
 
 
 def resonators(kernel: Kernel, functions: int | None = None, gamma: float = 0.01, noise: Any = 0.0, damping: Any = 0.0,
-               mean: Any = 0.0) -> Sum:
+               mean: Any = 0.0, explained_variance: float = EXPLAINED_VARIANCE) -> Sum:
     """Return a level and resonators whose prior is a stationary periodic kernel.
 
     The leading eigenfunctions of such a kernel are a constant and pairs of cosine and sine, of frequencies j/D and
@@ -33,6 +33,10 @@ def resonators(kernel: Kernel, functions: int | None = None, gamma: float = 0.01
         noise: of each resonator, as a share of its scale, per time^(1/2); >= 0.
         damping: of each resonator, per unit of time; >= 0.
         mean: a number, or a function of time: the bias.
+        explained_variance: share of the kernel's variance that the resonators are to keep; 0 where any will do.
+
+    Warns:
+        ApproximationWarning: as `QuasiPeriodic`.
 
     Raises:
         ValueError: a kernel that is not stationary: its eigenfunctions are no oscillations of one frequency, and as
@@ -50,6 +54,7 @@ def resonators(kernel: Kernel, functions: int | None = None, gamma: float = 0.01
     """
     noise = standard_deviation_parameter("noise", noise)
     basis: Waves = stationary_basis(kernel, functions, gamma)
+    warn_of_lost_variance(kernel, basis, explained_variance)
     scales = safe_sqrt(basis.powers)
     found = [Resonator(kernel.period / (index + 1), scale, noise * scale, damping)
              for index, scale in enumerate(scales)]

@@ -10,6 +10,10 @@ from jax.typing import ArrayLike
 from lfm_ppl.forces.discretise import discretise_dispersion
 
 
+class ApproximationWarning(UserWarning):
+    """The SDE of a force differs from the process that it stands for, by more than can be left unsaid."""
+
+
 class Force(eqx.Module):
     """A Gaussian process u(t) with a state-space form, the prior of an unobserved force.
 

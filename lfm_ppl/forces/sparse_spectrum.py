@@ -124,7 +124,7 @@ def random_frequencies(key: jax.Array, prior: Force | Kernel, count: int) -> jax
         count: S.
 
     Raises:
-        TypeError: another prior.
+        TypeError: another prior, or a key that is none.
         ValueError: a kernel that is not stationary.
 
     Example:
@@ -135,6 +135,7 @@ def random_frequencies(key: jax.Array, prior: Force | Kernel, count: int) -> jax
 
     Source: Lazaro-Gredilla et al. (2010), section 3.
     """
+    checks.random_key(key)
     checks.positive_integer("count", count)
     if isinstance(prior, Matern):
         # (1 + (w / lam)^2)^-(p + 1) is the density of Student's t with 2 p + 1 degrees of freedom.

@@ -10,11 +10,21 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpyro
 import numpyro.distributions as dist
 from numpyro.distributions import constraints
+from numpyro.primitives import _PYRO_STACK
 
 from lfm_ppl import checks
-from lfm_ppl.filtering.filter import as_rule, check_observations, forward, warn_single_precision
+from lfm_ppl.filtering.breakdown import warn_of_breakdown
+from lfm_ppl.filtering.filter import (
+    FilterResult,
+    as_rule,
+    check_observations,
+    filter_on,
+    forward,
+    warn_single_precision,
+)
 from lfm_ppl.filtering.iterated import posterior_linearisation
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.schedule import Schedule, schedule
@@ -60,7 +70,11 @@ class MarginalLikelihood(dist.Distribution):
             five times ``steps`` are tried. None: ``steps`` equal steps. Not with ``iterations``.
 
     Raises:
-        ValueError, TypeError: as `lfm_ppl.filter`. In compiled code a failure is a log density of -inf.
+        ValueError, TypeError: as `lfm_ppl.filter`; also where it is used in a ``numpyro.plate``. In compiled code a
+            failure is a log density of -inf.
+
+    Warns:
+        FilterWarning: outside of compiled code, where a log density is -inf: which row and step breaks down, and how.
 
     Example:
         >>> import jax.numpy as jnp, lfm_ppl as lfm
@@ -116,7 +130,8 @@ class MarginalLikelihood(dist.Distribution):
 
     def log_prob_per_observation(self, value: Any) -> jax.Array:
         """Return (T,): log p(y_k | y_1:k-1) of the present entries of each observation."""
-        return finite_or_minus_infinity(self._one_step_ahead, check_observations(value, *self.event_shape))
+        y = check_observations(value, *self.event_shape)
+        return self._said(y, finite_or_minus_infinity(self._one_step_ahead, y))
 
     def log_prob(self, value: Any) -> jax.Array:
         """Return the log marginal likelihood of ``value`` (T, D), NaN where missing; batch dimensions may lead."""
@@ -125,8 +140,26 @@ class MarginalLikelihood(dist.Distribution):
             return jax.vmap(self.log_prob)(value)
         self.model.check_resolution(self.times, value)
         # One failure makes the sum -inf, and with it the derivatives of the other terms zero.
-        return finite_or_minus_infinity(lambda y: self._one_step_ahead(y).sum(),
-                                        check_observations(value, *self.event_shape))
+        y = check_observations(value, *self.event_shape)
+        return self._said(y, finite_or_minus_infinity(lambda y: self._one_step_ahead(y).sum(), y))
+
+    def _said(self, y: jax.Array, log_likelihood: jax.Array) -> jax.Array:
+        """Return the log likelihood; outside of compiled code say where the filter breaks down if it does."""
+        warn_of_breakdown(self.ssm, self.rule, self.plan, y, None, log_likelihood)
+        return log_likelihood
+
+    def expand(self, batch_shape: tuple[int, ...]) -> dist.Distribution:
+        """Return as many independent series with the same parameters; in a ``numpyro.plate`` that is an error.
+
+        Raises:
+            ValueError: in a plate, where several series are an `lfm_ppl.panel`.
+        """
+        if tuple(batch_shape) and any(isinstance(handler, numpyro.plate) for handler in _PYRO_STACK):
+            raise ValueError("an lfm.MarginalLikelihood is the distribution of one series, and cannot be repeated to "
+                             f"the batch shape {tuple(batch_shape)} of a numpyro.plate. For several series take "
+                             "lfm.panel(build, parameters, times) in the plate, with a leading axis of its size in "
+                             "parameters; for one series put the site outside of the plate.")
+        return super().expand(batch_shape)
 
     def _one_step_ahead(self, y: jax.Array) -> jax.Array:
         start = Moments(*self.ssm.initial())
@@ -146,6 +179,11 @@ class MarginalLikelihood(dist.Distribution):
             return run(key)
         keys = jax.random.split(key, int(np.prod(sample_shape)))
         return jax.vmap(run)(keys).reshape(*sample_shape, *self.event_shape)
+
+    def filter(self, y: Any) -> FilterResult:
+        """Filter with this distribution's rule and steps; see `lfm_ppl.filter`."""
+        y = check_observations(y, *self.event_shape)
+        return filter_on(self.ssm, self.rule, self.plan, y, jnp.asarray(self.times, float))
 
     def smooth(self, y: Any, at: Any = None) -> SmootherResult:
         """Smooth with this distribution's settings; see `lfm_ppl.smooth`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import checks
+from lfm_ppl.model.user_functions import Traced
 
 
 class Input(eqx.Module):
@@ -20,6 +22,9 @@ class Input(eqx.Module):
         values: (K,) or (K, C), for C signals.
         interpolation: "previous" holds each value until the next time, "linear" joins them. Before the first and after
             the last time the first and the last value hold.
+        outside: what a model does whose times go beyond the table: "warn", "hold" (nothing) or "error". It is looked at
+            where times and table are numbers, not in compiled code. The last value of "previous" may stand for an
+            interval as long as the one before; a table of one row is a constant, and ends nowhere.
 
     Raises:
         ValueError: times not increasing or not finite, values of another length or not finite, unknown interpolation.
@@ -37,14 +42,16 @@ class Input(eqx.Module):
     times: jax.Array
     values: jax.Array
     interpolation: str = eqx.field(static=True)
+    outside: str = eqx.field(static=True)
 
-    def __init__(self, times: Any, values: Any, interpolation: str = "previous"):
-        checks.one_of("interpolation", interpolation, ("previous", "linear"))
+    def __init__(self, times: Any, values: Any, interpolation: str = "previous", outside: str = "warn"):
+        checks.one_of("interpolation", interpolation, _INTERPOLATIONS)
+        checks.one_of("outside", outside, _OUTSIDE)
         checks.finite("input times", times)
         checks.finite("input values", values)
         self.times = jnp.atleast_1d(jnp.asarray(times, float))
         self.values = jnp.asarray(values, float)
-        self.interpolation = interpolation
+        self.interpolation, self.outside = interpolation, outside
         if self.times.ndim != 1 or self.times.size == 0 or self.values.shape[:1] != self.times.shape:
             raise ValueError(f"input values must have one row a time, and at least one: {self.times.shape} times, "
                              f"values of shape {self.values.shape}.")
@@ -55,11 +62,59 @@ class Input(eqx.Module):
 
     def __call__(self, t: Any) -> jax.Array:
         """Return the input at time ``t``: a scalar, or (C,)."""
-        after = jnp.searchsorted(self.times, t, side="right")
-        before = jnp.clip(after - 1, 0, self.times.shape[0] - 1)
-        if self.interpolation == "previous" or self.times.shape[0] == 1:
-            return self.values[before]
-        left = jnp.clip(before, 0, self.times.shape[0] - 2)
-        width = self.times[left + 1] - self.times[left]
-        fraction = jnp.clip((t - self.times[left]) / width, 0.0, 1.0)
-        return self.values[left] + fraction * (self.values[left + 1] - self.values[left])
+        return _READERS[self.interpolation, self.outside](self.times, self.values, t)
+
+
+def check_reads(functions: Sequence[Traced], first: float, last: float) -> None:
+    """Check that functions of (x, u, t) read no known input beyond its table where t goes from ``first`` to ``last``.
+
+    Raises:
+        ValueError: one does whose input has ``outside="error"``; with "warn" it is a warning.
+    """
+    beyond: dict[str, set[str]] = {"warn": set(), "error": set()}
+    for function in functions:
+        for name, table, when in (read for t in (first, last) for read in function.table_reads(_MARK, t)):
+            interpolation, outside = name[name.index(_MARK) + len(_MARK):].split("_")[:2]
+            if outside not in beyond or table.ndim != 1 or table.size < 2:
+                continue
+            end = table[-1] + (table[-1] - table[-2] if interpolation == "previous" else 0.0)
+            slack = 1e-9 * max(abs(table[0]), abs(end), abs(first), abs(last))
+            span = (f"the known input in {function.what}, whose table goes from {table[0]:g} to {table[-1]:g}, is read "
+                    "at")
+            if np.min(when) < table[0] - slack:
+                beyond[outside].add(f"{span} time {np.min(when):g}, where its first value holds")
+            if np.max(when) > end + slack:
+                beyond[outside].add(f"{span} time {np.max(when):g}, where its last value holds")
+    remedy = 'Give it values for these times, or say with lfm.Input(..., outside="hold") that they hold.'
+    if beyond["error"]:
+        raise ValueError(f"{'; '.join(sorted(beyond['error']))}. {remedy}")
+    if beyond["warn"]:
+        checks.warn(f"{'; '.join(sorted(beyond['warn']))}. {remedy}")
+
+
+def reads_inputs(function: Traced) -> bool:
+    """Whether a function reads a known input that does not simply hold beyond its table."""
+    return any(function.has(f"{_MARK}{way}_{outside}") for way, outside in _READERS if outside != "hold")
+
+
+def _reader(interpolation: str, outside: str) -> Callable[..., jax.Array]:
+    """Return the function that reads a table; its name stands in the jaxprs of what calls it."""
+
+    def read(times: jax.Array, values: jax.Array, t: jax.Array) -> jax.Array:
+        after = jnp.searchsorted(times, t, side="right")
+        before = jnp.clip(after - 1, 0, times.shape[0] - 1)
+        if interpolation == "previous" or times.shape[0] == 1:
+            return values[before]
+        left = jnp.clip(before, 0, times.shape[0] - 2)
+        width = times[left + 1] - times[left]
+        fraction = jnp.clip((t - times[left]) / width, 0.0, 1.0)
+        return values[left] + fraction * (values[left + 1] - values[left])
+
+    read.__name__ = read.__qualname__ = f"{_MARK}{interpolation}_{outside}"
+    return jax.jit(read)
+
+
+_MARK = "known_input_"
+_INTERPOLATIONS = ("previous", "linear")
+_OUTSIDE = ("warn", "hold", "error")
+_READERS = {(way, outside): _reader(way, outside) for way in _INTERPOLATIONS for outside in _OUTSIDE}

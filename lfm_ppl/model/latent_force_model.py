@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
@@ -13,8 +12,10 @@ import numpy as np
 
 from lfm_ppl import checks
 from lfm_ppl.forces.sde import Force
+from lfm_ppl.model.known_input import check_reads, reads_inputs
 from lfm_ppl.model.observation import Gaussian, GaussianObservation
 from lfm_ppl.model.resolution import check_resolution
+from lfm_ppl.model.user_functions import Traced, trace
 
 
 class LatentForceModel(eqx.Module):
@@ -36,8 +37,10 @@ class LatentForceModel(eqx.Module):
         units: unit of "time", of states, outputs and forces, by name.
 
     Raises:
-        ValueError, TypeError: f returns a wrong shape, or NaN at the prior mean; names repeat or are of a wrong
-            number; the process noise has a wrong shape.
+        ValueError, TypeError: f returns a wrong shape; a function takes an entry out of range, or is not made of JAX
+            operations; names repeat or are of a wrong number; the process noise has a wrong shape; a force was made in
+            single precision. Outside of compiled code also: a function is not finite at the prior mean. (One that
+            depends on time is tried where the initial time is known, here or with the data.)
 
     Example:
         >>> import jax.numpy as jnp
@@ -65,6 +68,7 @@ class LatentForceModel(eqx.Module):
     state_names: tuple[str, ...] = eqx.field(static=True)
     output_names: tuple[str, ...] = eqx.field(static=True)
     unit_items: tuple[tuple[str, str], ...] = eqx.field(static=True)
+    _reads_inputs: bool = eqx.field(static=True)
 
     def __init__(
         self,
@@ -92,12 +96,16 @@ class LatentForceModel(eqx.Module):
         if overlap := set(self.state_names) & set(self.force_names):
             raise ValueError(f"the name {sorted(overlap)[0]!r} is used for a state and for a force; rename one.")
         self.process_noise = process_noise if callable(process_noise) else _dispersion(process_noise, size)
-        self._check_dynamics(size)
-        self.output_names = _names("output_names", output_names, self._outputs(size), "y")
+        functions = self._traced()
+        self.output_names = _names("output_names", output_names, functions["observation"].shape.shape[0], "y")
         self.unit_items = tuple((units or {}).items())
         self.nonlinear_inputs = None if nonlinear_inputs is None else tuple(nonlinear_inputs)
         for name in self.nonlinear_inputs or ():
             checks.one_of("name in nonlinear_inputs", name, (*self.state_names, *self.force_names))
+        self._reads_inputs = any(reads_inputs(function) for function in functions.values())
+        self._check_precision()
+        if self.initial_time is not None or not any(function.depends_on_time for function in functions.values()):
+            self._check_finite(self.initial_time)
 
     @property
     def units(self) -> dict[str, str]:
@@ -109,24 +117,37 @@ class LatentForceModel(eqx.Module):
         """The forces in their order."""
         return tuple(self.forces[name] for name in self.force_names)
 
-    def _check_dynamics(self, size: int) -> None:
-        u = jax.ShapeDtypeStruct((len(self.force_names),), jnp.result_type(float))
-        x, t = self.initial_state.mean, jnp.zeros(())
-        found = _traced_shape("dynamics", "f(x, u, t)", self.dynamics, x, u, t)
-        if getattr(found, "shape", None) != (size,):
-            raise ValueError(f"dynamics must return one derivative for each of the {size} entries of "
-                             f"initial_state.mean, shape ({size},); it returned {getattr(found, 'shape', found)}.")
-        if not callable(self.process_noise) and self.process_noise is not None:
-            return
-        if callable(self.process_noise):
-            found = _traced_shape("process_noise", "(x, u, t)", self.process_noise, x, u, t)
-            if len(found.shape) != 2 or found.shape[0] != size:
-                raise ValueError(f"process_noise must return a dispersion matrix ({size}, S), got {found.shape}.")
-
-    def _outputs(self, size: int) -> int:
+    def _traced(self) -> dict[str, Traced]:
+        """Trace every function of the model, and check what is seen so; means of forces stand under their names."""
+        size = self.initial_state.mean.shape[0]
         u = jax.ShapeDtypeStruct((len(self.force_names),), jnp.result_type(float))
         arguments = (self.initial_state.mean, u, jnp.zeros(()))
-        found = _traced_shape("the observation function", "h(x, u, t)", self.observation.function, *arguments)
+        drift = trace("dynamics", "f(x, u, t)", self.dynamics, *arguments)
+        if getattr(drift.shape, "shape", None) != (size,):
+            raise ValueError(f"dynamics must return one derivative for each of the {size} entries of "
+                             f"initial_state.mean, shape ({size},); it returned "
+                             f"{getattr(drift.shape, 'shape', drift.shape)}.")
+        functions = {"dynamics": drift, "observation": self._traced_observation(arguments)}
+        if callable(self.process_noise):
+            noise = trace("process_noise", "(x, u, t)", self.process_noise, *arguments)
+            found: Any = getattr(noise.shape, "shape", ())
+            if len(found) != 2 or found[0] != size:
+                raise ValueError(f"process_noise must return a dispersion matrix ({size}, S), got {found}.")
+            functions["process_noise"] = noise
+        if callable(self.observation.covariance):
+            functions["covariance"] = trace("the observation covariance", "(x, u, t)", self.observation.covariance,
+                                            *arguments)
+        for function in functions.values():
+            function.check_indices(("x", "u"))
+        for name, force in self.forces.items():
+            if callable(force.mean):
+                functions[f"mean of {name}"] = trace(f"the mean of the force {name!r}", "(t)", force.mean_at,
+                                                     arguments[-1])
+        return functions
+
+    def _traced_observation(self, arguments: tuple) -> Traced:
+        traced = trace("the observation function", "h(x, u, t)", self.observation.function, *arguments)
+        found = traced.shape
         if len(getattr(found, "shape", ())) != 1:
             raise ValueError("the observation function must return a vector (D,), got "
                              f"{f'shape {found.shape}' if hasattr(found, 'shape') else type(found).__name__}. "
@@ -138,7 +159,21 @@ class LatentForceModel(eqx.Module):
                              f"({outputs}, {outputs}); it is {covariance.shape}.")
         if any(not 0 <= index < outputs for index in self.observation.angular):
             raise ValueError(f"angular indices must lie in 0..{outputs - 1}, got {self.observation.angular}.")
-        return outputs
+        return traced
+
+    def _check_precision(self) -> None:
+        """Raise where a force or the model was made in single precision, and JAX runs in double precision now."""
+        wanted = jnp.result_type(float)
+        parts = {**{f"the force {name!r}": force for name, force in self.forces.items()},
+                 "initial_state": self.initial_state, "the observation covariance": self.observation.covariance,
+                 "process_noise": self.process_noise}
+        for name, part in parts.items():
+            for leaf in jax.tree_util.tree_leaves(part):
+                found = getattr(leaf, "dtype", wanted)
+                if jnp.issubdtype(found, jnp.floating) and jnp.finfo(found).bits < jnp.finfo(wanted).bits:
+                    raise ValueError(f"{name} holds numbers in {found}, made before JAX was told to compute in "
+                                     f"{wanted}; seven digits of them are right. Call "
+                                     'jax.config.update("jax_enable_x64", True) first, and make it after that.')
 
     def check_span(self, first: float, last: float) -> None:
         """Check the forces against data from ``first`` to ``last``; raise ValueError where one does not suit them."""
@@ -164,37 +199,45 @@ class LatentForceModel(eqx.Module):
         if np.ndim(covariance) == 3 and np.shape(covariance)[0] != rows:
             raise ValueError(f"the observation covariance holds {np.shape(covariance)[0]} matrices, one for each time, "
                              f"but there are {rows} times.")
+        self._check_precision()
+        self._check_finite(time)
+
+    def check_inputs(self, first: float, last: float) -> None:
+        """Check that no known input ends before the model's times, from ``first`` to ``last``.
+
+        Raises:
+            ValueError: an input with ``outside="error"`` does; with "warn" it is a warning, with "hold" nothing.
+        """
+        if self._reads_inputs:
+            check_reads(tuple(self._traced().values()), first, last)
+
+    def _check_finite(self, time: Any) -> None:
+        """Try the functions at the prior mean, where that is known; ``time`` is None where it does not matter."""
         x = self.initial_state.mean
-        u = jnp.asarray([force.mean_at(time) for force in self.force_list], float)
-        if checks.traced((self, time, u)):
+        # Inside compiled code this is a tracer, whatever is known.
+        t = jnp.asarray(0.0 if time is None else time, float) + 0.0
+        if checks.traced((self, t)):
             return
-        where = f"at the prior mean x = {np.asarray(x)}, u = {np.asarray(u)}, t = {float(time):g}"
+        u = jnp.asarray([force.mean_at(t) for force in self.force_list], float)
+        if checks.traced(u):
+            return
+        when = "" if time is None else f", t = {float(time):g}"
+        where = f"at the prior mean x = {np.asarray(x)}, u = {np.asarray(u)}{when}"
         for label, function, names in (("dynamics", self.dynamics, self.state_names),
                                        ("observation function", self.observation.function, self.output_names)):
-            value = checks.concrete(function(x, u, jnp.asarray(time, float)))
+            value = checks.concrete(function(x, u, t))
             if value is not None and not np.all(np.isfinite(value)):
                 name = names[int(np.argmin(np.isfinite(value)))]
                 raise ValueError(f"the {label} returned {value} {where}: the entry for {name!r} is not finite. "
                                  "Change initial_state.mean, or guard the expression (for example jnp.maximum).")
         if callable(self.process_noise):
-            dispersion = checks.concrete(self.process_noise(x, u, jnp.asarray(time, float)))
+            dispersion = checks.concrete(self.process_noise(x, u, t))
             if dispersion is not None and not np.all(np.isfinite(dispersion)):
                 raise ValueError(f"process_noise is not finite {where}: {dispersion.tolist()}.")
-        if callable(covariance):
-            noise = checks.concrete(self.observation.covariance_at(x, u, jnp.asarray(time, float), jnp.asarray(0)))
+        if callable(self.observation.covariance):
+            noise = checks.concrete(self.observation.covariance_at(x, u, t, jnp.asarray(0)))
             if noise is not None:
                 checks.covariance_matrix(f"the observation covariance {where}", noise)
-
-
-def _traced_shape(what: str, form: str, function: Callable, *arguments: Any) -> Any:
-    """Return the shape of a function's value; a wrong number of arguments gets a message of its own."""
-    try:
-        inspect.signature(function).bind(*arguments)
-    except TypeError as error:
-        raise TypeError(f"{what} must take three arguments, {form}: {error}.") from None
-    except ValueError:  # no signature to be had
-        pass
-    return jax.eval_shape(function, *arguments)
 
 
 def _check_types(dynamics: Any, observation: Any, initial_state: Any) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from lfm_ppl import checks
-from lfm_ppl.forces.sde import Force
+from lfm_ppl.forces.sde import ApproximationWarning, Force
 from lfm_ppl.forces.squared_exponential import SquaredExponential
 from lfm_ppl.forces.sum import Sum
 
@@ -34,10 +34,6 @@ _COARSEST = 0.25
 """Longest step, in lengthscales, over which a force is taken to be linear in time."""
 _LEAST_NOISE = 1e-10
 """Observation noise that is assumed at least, relative to the variance of the signal; K is singular without."""
-
-
-class ApproximationWarning(UserWarning):
-    """The SDE of a force differs from the process that it stands for by more than the data can hide."""
 
 
 class Resolution(NamedTuple):

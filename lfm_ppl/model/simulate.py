@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpyro.util import is_prng_key
 
 from lfm_ppl import checks
 from lfm_ppl.linalg import matmul, semidefinite_root
@@ -61,12 +60,13 @@ def simulate(key: jax.Array, model: LatentForceModel, times: Any, steps: int = 5
 
     Source: Kloeden and Platen (1992), section 9.1.
     """
+    checks.random_key(key)
     checks.positive_integer("steps", steps)
     ssm = state_space(model)
-    check_times(times, model.initial_time)
+    known = check_times(times, model.initial_time)
+    if known is not None and not checks.traced(model.initial_time):
+        model.check_inputs(float(known[0] if model.initial_time is None else model.initial_time), float(known[-1]))
     model.check_at(times[0] if model.initial_time is None else model.initial_time, np.shape(times)[0])
-    if not is_prng_key(key):
-        raise TypeError(f"key must be a JAX random key, such as jax.random.key(0), got {key!r}.")
     times = jnp.asarray(times, float)
     start = times[0] if model.initial_time is None else jnp.asarray(model.initial_time, float)
     run = lambda key, times, start: simulate_on(ssm, key, times, start, steps)  # noqa: E731

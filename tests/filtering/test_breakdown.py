@@ -34,6 +34,19 @@ def test_the_row_and_the_step_are_named():
         assert np.isfinite(lfm.filter(steep, TIMES, Y, max_step=0.01).log_likelihood).all()
 
 
+def test_the_likelihood_says_it_outside_of_compiled_code():
+    likelihood = lfm.MarginalLikelihood(double_well(b=5.0), TIMES)
+    with pytest.warns(lfm.FilterWarning, match=r"row 2 \(time 9\), step \d of 10.*-inf.*steps=") as caught:
+        assert np.isneginf(likelihood.log_prob(Y))
+    assert caught[0].filename == __file__, "the user's line"
+    with pytest.warns(lfm.FilterWarning, match=r"row 2 \(time 9\)"):
+        assert np.isneginf(likelihood.log_prob_per_observation(Y)[2])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert np.isneginf(jax.jit(likelihood.log_prob)(Y))
+        assert np.isneginf(likelihood.log_prob(Y[None])).all()
+
+
 def test_a_start_is_where_the_last_window_ended():
     """Rows count from the window's first observation."""
     steep = double_well(b=5.0)

@@ -94,12 +94,13 @@ def test_names_of_a_result():
 
 
 def test_the_prior_mean_must_give_finite_values():
+    """Functions of time, which are not tried before the data say when."""
     observation = lfm.GaussianObservation(lambda x, u, t: x, jnp.ones(2))
-    model = lfm.LatentForceModel(lambda x, u, t: jnp.log(x), {}, observation,
+    model = lfm.LatentForceModel(lambda x, u, t: jnp.log(x) + 0.0 * t, {}, observation,
                                  lfm.Gaussian(jnp.array([1.0, -1.0]), jnp.eye(2)), state_names=("a", "b"))
     with pytest.raises(ValueError, match="dynamics returned.*'b' is not finite. Change initial_state.mean, or guard"):
         lfm.filter(model, TIMES, np.ones((3, 2)))
-    broken = lfm.GaussianObservation(lambda x, u, t: jnp.sqrt(x - 5.0), jnp.ones(1))
+    broken = lfm.GaussianObservation(lambda x, u, t: jnp.sqrt(x - 5.0) + 0.0 * t, jnp.ones(1))
     model = lfm.LatentForceModel(lambda x, u, t: -x, {}, broken, lfm.Gaussian(jnp.ones(1), jnp.eye(1)))
     with pytest.raises(ValueError, match="observation function returned.*'y0' is not finite"):
         lfm.filter(model, TIMES, Y)

@@ -10,19 +10,23 @@ from references import LinearLFM, Regression
 from systems import Linear, first_state, softplus
 
 import lfm_ppl as lfm
+from lfm_ppl import forces
+
+# Few functions make small tests.
+pytestmark = pytest.mark.filterwarnings("ignore:a periodic force keeps")
 
 PERIOD, POINTS = 3.0, (3.0, 6.0)
 TIMES = np.array([0.3, 1.0, 1.0, 2.5, 3.0, 4.4, 6.0, 7.7])
 Y = np.array([0.4, 0.6, 0.5, 0.1, np.nan, -0.3, 0.2, 0.9])[:, None]
 AT = np.array([0.0, 1.7, 3.0, 3.5, 6.0, 8.5])
-EVOLUTIONS = {"constant": lfm.Constant(1.0), "CQM": lfm.CQM(5.0), "SQM": lfm.SQM(1.5, POINTS),
-              "WQM": lfm.WQM(0.5, POINTS), "Matern-5/2": lfm.Matern(1.0, 4.0, order=2)}
+EVOLUTIONS = {"constant": lfm.Constant(1.0), "CQM": forces.CQM(5.0), "SQM": forces.SQM(1.5, POINTS),
+              "WQM": forces.WQM(0.5, POINTS), "Matern-5/2": lfm.Matern(1.0, 4.0, order=2)}
 RULES = {"Taylor": lfm.Taylor(), "unscented": lfm.Unscented(), "cubature": lfm.Cubature(),
          "Gauss-Hermite": lfm.GaussHermite(3), "central difference": lfm.CentralDifference()}
 
 
 def kernel(lengthscale=1.5, period=PERIOD):
-    return lfm.PeriodicSquaredExponential(1.0, lengthscale, period)
+    return forces.PeriodicSquaredExponential(1.0, lengthscale, period)
 
 
 def exact(evolution):
@@ -66,7 +70,8 @@ def test_a_driven_state_is_that_of_dense_algebra(evolution):
 
 def test_a_kernel_that_is_not_stationary_drives_a_state():
     """Its functions of time are integrated by Runge-Kutta steps; the reference has the same covariance."""
-    force = lfm.QuasiPeriodic(lfm.ModeratedPeriodicMatern(1.0, 1.0, PERIOD, 0.2, 2), lfm.SQM(1.5, POINTS), functions=5)
+    moderated = forces.ModeratedPeriodicMatern(1.0, 1.0, PERIOD, 0.2, 2)
+    force = lfm.QuasiPeriodic(moderated, forces.SQM(1.5, POINTS), functions=5)
     reference = dense("SQM")
     reference.process.kernels = [lambda t, s: np.asarray(force.sde_covariance(t, s))]
     reference.process.breaks = (1.5, 3.0, 4.5, 6.0, 7.5)
@@ -81,7 +86,7 @@ def test_every_rule_is_exact_where_nothing_is_curved(rule):
     def dynamics(x, u, t):
         return u - 0.7 * x + 0.0 * jnp.sin(t) * x
 
-    force = lfm.QuasiPeriodic(kernel(), lfm.WQM(0.5, POINTS), functions=9)
+    force = lfm.QuasiPeriodic(kernel(), forces.WQM(0.5, POINTS), functions=9)
     expected = lfm.filter(model(force), TIMES, Y).log_likelihood
     found = lfm.filter(model(force, dynamics), TIMES, Y, rule=RULES[rule], steps=20).log_likelihood
     np.testing.assert_allclose(found, expected, atol=1e-6)
@@ -94,7 +99,7 @@ def link(x, u, t):
 @pytest.mark.slow
 def test_iterations_across_jumps_converge_with_the_steps():
     """The state just before a jump is a node of its own, so that finer steps change little."""
-    one = model(lfm.QuasiPeriodic(kernel(), lfm.SQM(0.5, POINTS), functions=1), link)
+    one = model(lfm.QuasiPeriodic(kernel(), forces.SQM(0.5, POINTS), functions=1), link)
     coarse, fine = (lfm.smooth(one, TIMES, Y, steps=steps, iterations=2) for steps in (4, 8))
     assert abs(float(coarse.log_likelihood.sum() - fine.log_likelihood.sum())) < 1e-3
     np.testing.assert_allclose(coarse.mean, fine.mean, atol=1e-2)
@@ -102,7 +107,7 @@ def test_iterations_across_jumps_converge_with_the_steps():
 
 @pytest.mark.slow
 def test_asking_for_times_changes_nothing():
-    one = model(lfm.QuasiPeriodic(kernel(), lfm.SQM(0.5, POINTS), functions=1), link)
+    one = model(lfm.QuasiPeriodic(kernel(), forces.SQM(0.5, POINTS), functions=1), link)
     plain, asked = lfm.smooth(one, TIMES, Y, steps=4), lfm.smooth(one, TIMES, Y, steps=4, at=np.append(AT, TIMES))
     np.testing.assert_allclose(asked.log_likelihood, plain.log_likelihood, atol=1e-9)
     np.testing.assert_allclose(np.asarray(asked.mean)[len(AT):], plain.mean, atol=1e-8)
@@ -110,7 +115,7 @@ def test_asking_for_times_changes_nothing():
 
 def test_a_panel_is_a_loop():
     def build(p):
-        return model(lfm.QuasiPeriodic(kernel(p["lengthscale"], p["period"]), lfm.SQM(2.0, POINTS), functions=3))
+        return model(lfm.QuasiPeriodic(kernel(p["lengthscale"], p["period"]), forces.SQM(2.0, POINTS), functions=3))
 
     parameters = {"lengthscale": jnp.array([1.0, 2.0]), "period": jnp.array([3.0, 2.5])}
     y = jnp.stack([jnp.asarray(Y), 2.0 * jnp.asarray(Y)])
@@ -124,7 +129,7 @@ def test_gradients_of_the_likelihood_are_finite_differences():
     """By scale, lengthscale, period and the weights' lengthscale."""
 
     def value(p):
-        force = lfm.QuasiPeriodic(lfm.PeriodicMatern(p[0], p[1], p[2], 1), lfm.SQM(p[3], POINTS), functions=5)
+        force = lfm.QuasiPeriodic(forces.PeriodicMatern(p[0], p[1], p[2], 1), forces.SQM(p[3], POINTS), functions=5)
         return lfm.MarginalLikelihood(model(force), TIMES).log_prob(Y)
 
     point, h = jnp.array([1.2, 0.9, 2.8, 1.5]), 1e-5
@@ -136,7 +141,7 @@ def test_gradients_of_the_likelihood_are_finite_differences():
 def test_a_resonator_with_a_bias_is_that_of_dense_algebra():
     """Noise, damping and a mean; and the same for the sum that carries a kernel."""
     for force in (lfm.Resonator(3.0, 0.8, 0.3, 0.1, mean=1.5),
-                  lfm.resonators(kernel(), functions=5, noise=0.2, damping=0.1, mean=1.5)):
+                  forces.resonators(kernel(), functions=5, noise=0.2, damping=0.1, mean=1.5)):
         reference = dense("constant")
         reference.process.kernels = [lambda t, s, force=force: np.asarray(force.covariance(t, s))]
         reference.process.means = [lambda t: 1.5 + np.zeros_like(t)]
@@ -146,7 +151,7 @@ def test_a_resonator_with_a_bias_is_that_of_dense_algebra():
 
 def test_forces_on_a_grid_may_jump():
     """Their prior there is the product of the kernels."""
-    latent = lfm.LatentGrid(model(lfm.QuasiPeriodic(kernel(), lfm.SQM(1.5, POINTS), functions=5)), TIMES, 40)
+    latent = lfm.LatentGrid(model(lfm.QuasiPeriodic(kernel(), forces.SQM(1.5, POINTS), functions=5)), TIMES, 40)
     prior = np.asarray(latent.root[0] @ latent.root[0].T)
     np.testing.assert_allclose(prior, exact("SQM")(latent.grid[:, None], latent.grid), atol=1e-5)
 

@@ -48,11 +48,12 @@ FORCES = {
     "wqm": lambda s, ell: WQM(s, (1.0, 3.0)),
     "periodic": lambda s, ell: Periodic(PeriodicMatern(s, 1.2, 9.0 * ell, 2), functions=5),
     "periodic_exact": lambda s, ell: Periodic(PeriodicSquaredExponential(s, 4.0, 9.0 * ell), functions=11),
-    "periodic_moderated": lambda s, ell: Periodic(ModeratedPeriodicMatern(s, 1.2, 9.0 * ell, 0.1 / ell), functions=3),
+    "periodic_moderated": lambda s, ell: Periodic(ModeratedPeriodicMatern(s, 1.2, 9.0 * ell, 0.1 / ell), functions=3,
+                                                explained_variance=0.0),
     "quasi_periodic": lambda s, ell: QuasiPeriodic(
-        PeriodicMatern(s, 1.2, 9.0 * ell), Matern(1.0, 5.0 * ell), functions=3),
+        PeriodicMatern(s, 1.2, 9.0 * ell), Matern(1.0, 5.0 * ell), functions=3, explained_variance=0.0),
     "quasi_periodic_steps": lambda s, ell: QuasiPeriodic(
-        PeriodicSquaredExponential(s, 1.2, 9.0 * ell), SQM(2.0, (1.0, 3.0)), functions=3),
+        PeriodicSquaredExponential(s, 1.2, 9.0 * ell), SQM(2.0, (1.0, 3.0)), functions=3, explained_variance=0.0),
     "oscillator": lambda s, ell: Oscillator(s, ell),
     "jumping_sum": lambda s, ell: Oscillator(s, ell, (1.0, 3.0)) + Matern(s, ell),
 }

@@ -145,6 +145,25 @@ def test_in_a_plate(y, looped):
     assert np.all(np.isfinite(draws["y"]))
 
 
+def test_one_series_in_a_plate_is_an_error(y):
+    def model(times, y=None):
+        with numpyro.plate("series", 3):
+            numpyro.sample("y", lfm.MarginalLikelihood(build(0.5, LENGTHSCALE), times), obs=y)
+
+    with pytest.raises(ValueError, match=r"one series.*batch shape \(3,\) of a numpyro.plate.*take lfm.panel"):
+        handlers.trace(handlers.seed(model, 0)).get_trace(TIMES, y)
+    single = lfm.MarginalLikelihood(build(0.5, LENGTHSCALE), TIMES)
+    assert single.expand(()) is single
+
+    def vectors(times):
+        with numpyro.plate("series", 3):
+            lengthscale = numpyro.sample("lengthscale", dist.LogNormal(0.0, 0.5))
+            numpyro.sample("y", lfm.MarginalLikelihood(build(0.5, lengthscale), times))
+
+    with pytest.raises(ValueError, match=r"lengthscale must be one number.*numpyro.plate, take lfm.panel"):
+        handlers.trace(handlers.seed(vectors, 0)).get_trace(TIMES)
+
+
 def test_samples(y):
     distribution = panel(RATES, LENGTHSCALE)
     assert (distribution.batch_shape, distribution.event_shape) == ((3,), (len(TIMES), 1))

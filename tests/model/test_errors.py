@@ -95,15 +95,37 @@ def test_parts(call, message):
 
 
 def test_functions_are_tried_at_the_prior_mean():
-    variance = lfm.GaussianObservation(whole_state, lambda x, u, t: -jnp.ones(2))
+    model = make(observation=lfm.GaussianObservation(whole_state, lambda x, u, t: -t * jnp.ones(2)))
     with pytest.raises(ValueError, match="observation covariance at the prior mean x = .* t = 1 .*semi-definite"):
-        lfm.filter(make(observation=variance), [1.0], [[0.1, 0.2]])
+        lfm.filter(model, [1.0], [[0.1, 0.2]])
+    model = make(process_noise=lambda x, u, t: jnp.log(1.0 - t) * jnp.ones((2, 1)))
     with pytest.raises(ValueError, match="process_noise is not finite at the prior mean"):
-        lfm.filter(make(process_noise=lambda x, u, t: jnp.full((2, 1), jnp.nan)), [1.0], [[0.1, 0.2]])
+        lfm.filter(model, [1.0], [[0.1, 0.2]])
+
+
+@pytest.mark.parametrize("options, message", [
+    ({"dynamics": lambda x, u, t: jnp.log(x - 1.0)},
+     r"returned \[nan nan\] at the prior mean x = \[0. 0.\], u = \[0.\]: the entry for 'x0' is not finite.*guard"),
+    ({"dynamics": lambda x, u, t: -x / t, "initial_time": 0.0}, "at the prior mean .*, t = 0: the entry for 'x0'"),
+    ({"observation": lfm.GaussianObservation(lambda x, u, t: jnp.stack([x[0], 1.0 / u[0]]), jnp.ones(2))},
+     "the observation function returned .* the entry for 'y1' is not finite"),
+    ({"process_noise": lambda x, u, t: jnp.full((2, 1), jnp.nan)}, "process_noise is not finite at the prior mean"),
+    ({"observation": lfm.GaussianObservation(whole_state, lambda x, u, t: -jnp.ones(2))},
+     "observation covariance at the prior mean .* semi-definite"),
+])
+def test_functions_are_tried_at_construction(options, message):
+    with pytest.raises(ValueError, match=message):
+        make(**options)
+
+
+def test_functions_of_time_wait_for_one_where_none_is_known():
+    assert make(dynamics=lambda x, u, t: -x / t).initial_time is None
+    assert jax.jit(lambda mean: make(dynamics=lambda x, u, t: x / mean[0], initial_state=lfm.Gaussian(
+        mean, jnp.eye(2))).initial_state.mean)(jnp.zeros(2)).shape == (2,), "values are not known in compiled code"
 
 
 def test_keys_and_indices():
-    with pytest.raises(TypeError, match=r"key must be a JAX random key, such as jax.random.key\(0\), got 0"):
+    with pytest.raises(TypeError, match=r"key, the first argument, must be a JAX random key, such .*key\(0\), got 0"):
         lfm.simulate(0, make(), [1.0])
     for angular in ((True, False), (0.0,)):
         with pytest.raises(TypeError, match="angular must hold the indices"):

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from scipy.integrate import solve_ivp
 
 import lfm_ppl as lfm
@@ -71,3 +75,96 @@ def test_simulated_states_jump_with_the_input():
     model = pushed(lambda x, u, t: STEP(t) - x)
     drawn = lfm.simulate(jax.random.key(0), model, ROWS, steps=400)
     assert np.allclose(drawn.state[:, 0], response(lambda x, v: v - x), atol=1e-5)
+
+
+LINE = lfm.Input([0.0, 1.0, 2.0], [0.0, 5.0, 1.0], "linear")
+
+
+class Heated(eqx.Module):
+    """input(t - delay) - x, with the input among the module's fields."""
+
+    power: lfm.Input
+    delay: float = 0.0
+
+    def __call__(self, x, u, t):
+        return self.power(t - self.delay) - x
+
+
+def told(model, times=ROWS, **options):
+    """The messages of warnings of a smoother."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        lfm.smooth(model, times, np.zeros((len(times), 1)), steps=2, **options)
+    return [str(warning.message) for warning in caught]
+
+
+ENDED = "known input in dynamics, whose table goes from 0 to 2, is read at time 3, where its last value holds. Give it"
+
+
+@pytest.mark.parametrize("dynamics", [
+    Heated(LINE), lambda x, u, t: LINE(t) - x, jax.jit(lambda x, u, t: LINE(t) - x),
+    lambda x, u, t: jax.vmap(LINE)(t + jnp.arange(-1.0, 1.0)).sum() * x,
+], ids=["module", "closure", "compiled", "mapped"])
+def test_reading_beyond_the_table_is_told(dynamics):
+    model = pushed(dynamics)
+    (message,) = {text for text in told(model) if "last value" in text}
+    assert ENDED in message and 'outside="hold"' in message
+
+
+def test_reading_is_told_everywhere():
+    model, y = pushed(Heated(LINE)), np.zeros((4, 1))
+    for call in (lambda: lfm.filter(model, ROWS, y), lambda: lfm.MarginalLikelihood(model, ROWS).ssm,
+                 lambda: lfm.MarginalLikelihood(model, ROWS).plan,
+                 lambda: lfm.simulate(jax.random.key(0), model, ROWS, steps=2),
+                 lambda: lfm.MarginalLikelihood(pushed(Heated(LINE)), ROWS[:3]).smooth(y[:3], at=[2.5, 3.0])):
+        with pytest.warns(UserWarning, match="is read at time 3"):
+            call()
+    observation = lfm.GaussianObservation(lambda x, u, t: x + LINE(t), jnp.array([0.1]))
+    measured = lfm.LatentForceModel(lambda x, u, t: -x, {}, observation, PRIOR)
+    assert "known input in the observation function" in told(measured)[0]
+    noisy = lfm.LatentForceModel(lambda x, u, t: -x, {}, OBSERVATION, PRIOR, lambda x, u, t: LINE(t)[None, None])
+    assert "known input in process_noise" in told(noisy)[0]
+    pulled = lfm.LatentForceModel(lambda x, u, t: u - x, {"u": lfm.Matern(1.0, 1.0, mean=LINE)}, OBSERVATION, PRIOR)
+    assert "known input in the mean of the force 'u'" in told(pulled)[0]
+
+
+PRIOR = lfm.Gaussian(jnp.zeros(1), jnp.eye(1))
+OBSERVATION = lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1]))
+
+
+@pytest.mark.parametrize("dynamics, options, message", [
+    (Heated(LINE), {"times": ROWS[:3]}, None),
+    (Heated(LINE), {"times": ROWS[:3], "at": np.array([2.5])}, "is read at time 2.5, where its last value holds"),
+    (Heated(LINE, delay=1.0), {"times": ROWS + 1.0}, "is read at time 3, where its last"),
+    (Heated(LINE, delay=1.0), {}, "is read at time -1, where its first value holds"),
+    (Heated(LINE, delay=1.0), {"times": 1.0 + ROWS[:3]}, None),
+    (Heated(STEP), {}, None),
+    (Heated(STEP), {"at": np.array([3.5])}, "is read at time 3.5, where its last value holds"),
+    (Heated(lfm.Input([0.0], [2.0])), {}, None),
+    (Heated(lfm.Input([0.0, 1.0], [2.0, 1.0], "linear", outside="hold")), {}, None),
+    (lambda x, u, t: LINE(jnp.clip(t, 0.0, 2.0)) - x, {}, None),
+])
+def test_what_is_beyond(dynamics, options, message):
+    """A value that holds until the next time may do so after the last for as long as before; delays count."""
+    found = told(pushed(dynamics), **options)
+    assert (message is None and not found) or message in found[0]
+
+
+def test_reading_beyond_may_be_an_error():
+    model = pushed(Heated(lfm.Input([0.0, 1.0], [2.0, 1.0], "linear", outside="error")))
+    with pytest.raises(ValueError, match="whose table goes from 0 to 1, is read at time 3.*Give it values"):
+        lfm.filter(model, ROWS, np.zeros((4, 1)))
+    with pytest.raises(ValueError, match="unknown outside 'eror'. Did you mean 'error'"):
+        lfm.Input([0.0, 1.0], [2.0, 1.0], outside="eror")
+
+
+def test_compiled_code_says_what_is_known():
+    """Nothing of a table that is traced; the warning of one that is not comes while the program is traced."""
+    def traced(table):
+        return lfm.MarginalLikelihood(pushed(Heated(table)), ROWS).event_shape[0] * table.values[0]
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        jax.jit(traced)(LINE)
+    with pytest.warns(UserWarning, match="is read at time 3"):
+        jax.jit(lambda p: lfm.MarginalLikelihood(pushed(lambda x, u, t: LINE(t) - p * x), ROWS).event_shape[0] * p)(1.0)

@@ -93,7 +93,7 @@ def test_starts_at_the_initial_time_and_covers_equal_times():
 def test_a_jump_at_a_row_is_never_lost():
     """Rows whose end is not the sum of their steps to the last bit; each change point makes the force anew."""
     times = np.arange(40) * 0.1
-    force = lfm.SQM(1e-2, tuple(times[1:]))
+    force = lfm.forces.SQM(1e-2, tuple(times[1:]))
     model = lfm.LatentForceModel(lambda x, u, t: x, {"u": force}, lfm.GaussianObservation(
         lambda x, u, t: u, jnp.array([0.1])), lfm.Gaussian(jnp.zeros(0), jnp.zeros((0, 0))))
     drawn = lfm.simulate(jax.random.key(0), model, times, steps=3).forces["u"]

@@ -1,0 +1,37 @@
+"""Options of samplers that do not exist, or are arguments of `fit`, are named before anything is computed."""
+
+from __future__ import annotations
+
+import pytest
+
+import lfm_ppl as lfm
+from lfm_ppl.inference.options import check_options
+
+
+def never(times, y=None):
+    raise AssertionError("the model must not run")
+
+
+@pytest.mark.parametrize("sampler, options, message", [
+    ("nuts", {"target_accept": 0.9}, "unknown option of the sampler 'nuts' in sampler_options: 'target_accept'. "
+                                     "Did you mean 'target_accept_prob'"),
+    ("ram", {"target_accept": 0.3}, "the sampler 'ram' in sampler_options: 'target_accept'. Did you mean"),
+    ("pmmh", {"particle": 100}, "the sampler 'pmmh' in sampler_options: 'particle'. Did you mean 'particles'"),
+    ("nuts", {"particles": 100}, "'nuts' in sampler_options: 'particles'.*Known: "),
+    ("nuts", {"num_samples": 100}, "cannot hold 'num_samples': pass it as samples"),
+    ("ram", {"init_strategy": None}, "cannot hold 'init_strategy': pass it as init"),
+    ("map", {"restarts": 3}, "samplers nuts, ram, pmmh; 'map' takes none, got 'restarts'"),
+])
+def test_unknown_options(sampler, options, message):
+    with pytest.raises(ValueError, match=message):
+        lfm.fit(never, [0.0, 1.0], [[0.0], [1.0]], sampler=sampler, sampler_options=options)
+
+
+def test_options_that_are_known():
+    check_options("nuts", {"target_accept_prob": 0.9, "max_tree_depth": 8, "dense_mass": True})
+    check_options("ram", {"target_accept_prob": 0.3, "adapt": "throughout"})
+    check_options("pmmh", {"particles": 100, "delayed": True, "particle_steps": 20})
+    check_options("map", {})
+    check_options("nuts", None)
+    with pytest.raises(TypeError, match="sampler_options must map names to values"):
+        check_options("nuts", [("particles", 1)])
