@@ -17,6 +17,7 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     root = Path(__file__).resolve().parent.parent
     jax.config.update("jax_compilation_cache_dir", str(root / ".jax_cache"))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+os.environ["LFM_PPL_CACHE"] = "off"  # the command line keeps nothing in the home of who runs the tests
 
 
 def _asked_for(config: pytest.Config, mark: str) -> bool:

@@ -3,6 +3,8 @@
 import contextlib
 import io
 import json
+import os
+import re
 import shlex
 from pathlib import Path
 
@@ -239,6 +241,36 @@ def test_folders_are_numbered_and_not_left_empty(monkeypatch, tmp_path):
     with pytest.raises(FileExistsError, match="is a file"):
         with results.folder("spring", str(tmp_path / "lfm-results/spring-001/posterior.nc"), False):
             pass
+
+
+@pytest.mark.parametrize("line", [
+    "fit spring --out taken/result", "simulate spring --out taken/data.csv", "compare gps --out taken/result",
+])
+def test_a_path_that_cannot_be_written_is_told_first(run, tmp_path, monkeypatch, line):
+    monkeypatch.setattr("lfm_ppl.cli.session.start", lambda *asked: None)
+    monkeypatch.setattr("lfm_ppl.cli.fit.sample", lambda *task: pytest.fail("it was computed"))
+    (tmp_path / "taken").write_text("keep")
+    code, out, err = run(line)
+    assert code == 2 and "wrote" not in out
+    assert re.search(r"cannot write results into taken\S*: taken is a file. Nothing was computed; name .* --out", err)
+    assert (tmp_path / "taken").read_text() == "keep"
+
+
+def test_a_folder_that_cannot_be_written_is_told_first(run, tmp_path, monkeypatch):
+    monkeypatch.setattr("lfm_ppl.cli.fit.sample", lambda *task: pytest.fail("it was computed"))
+    (tmp_path / "locked").mkdir(mode=0o500)
+    if os.access(tmp_path / "locked", os.W_OK):  # the administrator may write anywhere
+        pytest.skip("this user may write into any folder")
+    for out in ("locked", "locked/result"):
+        code, _, err = run(f"fit spring --out {out}")
+        assert code == 2 and f"cannot write results into {out}: Permission denied. Nothing was computed" in err
+
+
+def test_the_default_folder_must_be_one(run, tmp_path, monkeypatch):
+    monkeypatch.setattr("lfm_ppl.cli.fit.sample", lambda *task: pytest.fail("it was computed"))
+    (tmp_path / "lfm-results").write_text("")
+    code, _, err = run("fit spring")
+    assert code == 2 and "cannot make the folder lfm-results/spring-001" in err and "--out" in err
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all."""
+"""Files that are there whole or not at all, and where a result is."""
 
 from __future__ import annotations
 
@@ -7,6 +7,27 @@ import os
 import uuid
 from collections.abc import Iterator
 from pathlib import Path
+
+POSTERIOR = "posterior.nc"
+"""The result in a folder that `lfm-ppl fit` wrote."""
+
+
+def locate(path: str | Path) -> Path:
+    """Return the file of a result: ``path`` itself, or the ``posterior.nc`` in it where it is a folder.
+
+    Raises:
+        FileNotFoundError: there is no such file or folder, or the folder holds no result.
+    """
+    path = Path(path)
+    if path.is_dir():
+        if not (path / POSTERIOR).is_file():
+            raise FileNotFoundError(f"{path} holds no {POSTERIOR}; expected a folder that `lfm-ppl fit` wrote, or a "
+                                    "netCDF file.")
+        return path / POSTERIOR
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no result {path}; expected a results folder, or a netCDF file such as "
+                                f"{POSTERIOR}.")
+    return path
 
 
 def refuse_existing(path: str | Path, overwrite: bool) -> Path:

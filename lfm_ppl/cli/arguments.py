@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable
 from typing import Any, NoReturn
 
+import lfm_ppl
 from lfm_ppl import checks
 from lfm_ppl.cli import check, compare, fit, models, plot, simulate, version
 from lfm_ppl.cli.choices import REFERENCES, RULES, SAMPLERS
@@ -32,13 +33,16 @@ def parser() -> argparse.ArgumentParser:
         epilog="Start with: lfm-ppl fit ginzburg-landau",
     )
     top.set_defaults(debug=False)
+    top.add_argument("--version", action="version", version=f"lfm_ppl {lfm_ppl.__version__}",
+                     help="print the version of lfm_ppl; `lfm-ppl version` prints those of what it stands on, too")
     commands = top.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for add in (_add_models, _add_simulate, _add_fit, _add_check, _add_compare, _add_plot, _add_version):
         add(commands)
     return top
 
 
-def _command(commands: Any, name: str, run: Callable[..., int], help_: str, examples: str) -> Any:
+def _command(commands: Any, name: str, run: Callable[..., int], help_: str, examples: str,
+             computes: bool = False) -> Any:
     command = commands.add_parser(
         name,
         help=help_,
@@ -49,6 +53,9 @@ def _command(commands: Any, name: str, run: Callable[..., int], help_: str, exam
     )
     command.set_defaults(run=run)
     command.add_argument("--debug", action="store_true", help="show where an error comes from")
+    if computes:
+        command.add_argument("--no-cache", action="store_true",
+                             help="compile anew, and keep no compiled programs in ~/.cache/lfm_ppl for the next run")
     return command
 
 
@@ -64,7 +71,7 @@ def _add_simulate(commands: Any) -> None:
         "  lfm-ppl fit transcription --data genes.csv --truth genes.truth.json"
     )
     help_ = "write a model's simulated data as a CSV file, with the truth beside it"
-    command = _command(commands, "simulate", simulate.run, help_, examples)
+    command = _command(commands, "simulate", simulate.run, help_, examples, computes=True)
     command.add_argument("model", metavar="MODEL", help=MODEL_HELP)
     command.add_argument("--out", metavar="FILE", help="CSV file to write (default: MODEL.csv)")
     command.add_argument("--seed", type=_whole(0), help="random seed (default: that of the model's default data)")
@@ -96,7 +103,7 @@ def _add_check(commands: Any) -> None:
         "  lfm-ppl check lfm-results/ginzburg-landau-001 --correct --overwrite"
     )
     help_ = "measure what the Gaussian filter's approximation does to a saved posterior, and correct it"
-    command = _command(commands, "check", check.run, help_, examples)
+    command = _command(commands, "check", check.run, help_, examples, computes=True)
     command.add_argument("result", metavar="RESULT", help="a results folder or a posterior.nc")
     command.add_argument(
         "--reference",
@@ -138,7 +145,7 @@ def _add_compare(commands: Any) -> None:
         "  lfm-ppl compare ginzburg-landau --realisations 50 --conditional 200 --out double-well"
     )
     help_ = "run a published experiment again, or go on with one that was stopped; without a name, list them"
-    command = _command(commands, "compare", compare.run, help_, examples)
+    command = _command(commands, "compare", compare.run, help_, examples, computes=True)
     command.add_argument("experiment", nargs="?", metavar="EXPERIMENT", help="see `lfm-ppl compare`")
     command.add_argument(
         "--realisations",
@@ -191,7 +198,7 @@ def _add_fit(commands: Any) -> None:
         "  lfm-ppl fit my_model.py --data mine.csv --rule gauss-hermite --steps 20 --out result"
     )
     help_ = "infer parameters and forces, and write posterior, summary and figures"
-    command = _command(commands, "fit", fit.run, help_, examples)
+    command = _command(commands, "fit", fit.run, help_, examples, computes=True)
     command.add_argument("model", metavar="MODEL", help=MODEL_HELP)
     _add_data(command.add_argument_group("data"))
     _add_inference(command.add_argument_group("inference"))

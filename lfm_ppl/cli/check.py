@@ -44,11 +44,12 @@ def run(arguments: argparse.Namespace) -> int:
             raise ValueError("--out names the folder of the corrected result; add --correct.")
         if arguments.delayed:
             raise ValueError("--delayed says how the corrected result is sampled; add --correct.")
-    path = results.locate(arguments.result)
+    path = files.locate(arguments.result)
     for name in (TABLE, FIGURE):
         files.refuse_existing(path.parent / name, arguments.overwrite)
+    results.writable(path.parent)
     posterior = arviz_data.load(path)
-    session.start(int(arviz_data.attributes(posterior).get("chains", 1)))
+    session.start(int(arviz_data.attributes(posterior).get("chains", 1)), not arguments.no_cache)
     task = _task(posterior, arguments.model)
     with contextlib.ExitStack() as stack:
         folder = None
@@ -144,13 +145,13 @@ def _write(report: Any, posterior: Any, path: Path) -> int:
 
 def _correct(task: Task, report: Any, arguments: argparse.Namespace, folder: Path) -> int:
     """Write the corrected result: by resampling where the weights are reliable, else by new chains."""
-    from lfm_ppl.analysis.correction import correct
+    from lfm_ppl.analysis.correction import correct_posterior
 
     started = time.perf_counter()
     if report.reliable:
         print(f"correct  resampling {report.log_weight.size} draws, worth {report.ess:.0f} after weighting"
               + (" (no chains are needed, and none are delayed)" if arguments.delayed else ""))
-        corrected = correct(task.posterior, task.model, model_kwargs=task.keywords, seed=arguments.seed)
+        corrected = correct_posterior(task.posterior, task.model, model_kwargs=task.keywords, seed=arguments.seed)
     else:
         corrected = _exact_chains(task, arguments)
     return fit.report(corrected, folder, time.perf_counter() - started, arguments.overwrite)

@@ -9,7 +9,7 @@ import textwrap
 import time
 from pathlib import Path
 
-from lfm_ppl.cli import session
+from lfm_ppl.cli import results, session
 
 _MOST_JOBS = 4
 """Processes that compute where nothing else is asked for; each takes one or two GiB."""
@@ -17,7 +17,7 @@ _MOST_JOBS = 4
 
 def run(arguments: argparse.Namespace) -> int:
     """List the experiments, or run one: what its folder holds already is not computed again."""
-    session.start(chains=1)
+    session.start(1, not arguments.no_cache)
     from lfm_ppl.analysis import tables
     from lfm_ppl.experiments import catalogue
     from lfm_ppl.experiments.tasks import available_cpus, duration
@@ -60,4 +60,5 @@ def _folder(arguments: argparse.Namespace, name: str) -> Path:
     folder = Path("lfm-results") / "compare" / kind if arguments.out is None else Path(arguments.out)
     if folder.exists() and not folder.is_dir():
         raise FileExistsError(f"{folder} is a file; expected the name of a folder for the results.")
+    results.writable(folder)
     return folder

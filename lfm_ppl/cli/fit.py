@@ -25,7 +25,7 @@ _GRID = 241
 
 def run(arguments: argparse.Namespace) -> int:
     """Fit, print the summary, and write the results; the posterior is on disk before any figure."""
-    session.start(arguments.chains)
+    session.start(arguments.chains, not arguments.no_cache)
     model = loading.load(arguments.model)
     options = choices.options(model, arguments.option)
     observed = _observed(arguments, model, options)
@@ -169,10 +169,10 @@ def sample(
 
 def report(posterior: Any, folder: Path, seconds: float, overwrite: bool) -> int:
     """Write and print everything; return 1 where a figure could not be drawn."""
-    from lfm_ppl.analysis import arviz_data, tables
+    from lfm_ppl.analysis import arviz_data, files, tables
     from lfm_ppl.analysis.plots import save_figures
 
-    written = [arviz_data.save(posterior, folder / results.POSTERIOR, overwrite)]
+    written = [arviz_data.save(posterior, folder / files.POSTERIOR, overwrite)]
     table = arviz_data.summary(posterior)
     written.append(tables.write_csv(table, folder / results.SUMMARY, overwrite))
     print(f"\n{tables.text_table(table, width=shutil.get_terminal_size().columns)}\n")

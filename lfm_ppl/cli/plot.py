@@ -10,11 +10,12 @@ from lfm_ppl.cli import results
 
 def run(arguments: argparse.Namespace) -> int:
     """Draw every figure that the result has the numbers for."""
-    from lfm_ppl.analysis import arviz_data
+    from lfm_ppl.analysis import arviz_data, files
     from lfm_ppl.analysis.plots import save_figures
 
-    path = results.locate(arguments.result)
+    path = files.locate(arguments.result)
     target = Path(arguments.out) if arguments.out else path.parent
+    results.writable(target)
     posterior = arviz_data.load(path)
     for written in save_figures(posterior, target, (arguments.format,), overwrite=arguments.overwrite):
         print(f"wrote {written}")

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 FOLDER = Path("lfm-results")
-POSTERIOR = "posterior.nc"
 SUMMARY = "summary.csv"
+
+_REMEDY = "Nothing was computed; name a folder that you may write with --out."
 
 
 @contextlib.contextmanager
@@ -25,25 +27,31 @@ def folder(name: str, out: str | None, overwrite: bool) -> Iterator[Path]:
 
     Raises:
         FileExistsError: if ``out`` holds files and ``overwrite`` is False.
+        OSError: the folder cannot be made or written.
     """
     chosen = _fresh(name) if out is None else _named(Path(out), overwrite)
     try:
+        writable(chosen)
         yield chosen
     finally:
         with contextlib.suppress(OSError):  # raised where it is not empty
             chosen.rmdir()
 
 
-def locate(result: str) -> Path:
-    """Return the posterior that ``result`` stands for: a netCDF file, or a folder with one."""
-    path = Path(result)
-    if path.is_dir():
-        if not (path / POSTERIOR).is_file():
-            raise ValueError(f"{path} holds no {POSTERIOR}; expected a folder that `fit` wrote.")
-        return path / POSTERIOR
-    if not path.is_file():
-        raise ValueError(f"there is no result {path}; expected a results folder or a .nc file.")
-    return path
+def writable(folder: Path) -> None:
+    """Raise OSError where files cannot be written into a folder, which is made where it does not exist.
+
+    The command line calls it before anything is computed: a file is written there and removed again.
+    """
+    above = next((path for path in (folder, *folder.parents) if path.is_file()), None)
+    if above is not None:
+        raise NotADirectoryError(f"cannot write results into {folder}: {above} is a file. {_REMEDY}")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise type(error)(f"cannot write results into {folder}: {error.strerror or error}. {_REMEDY}") from error
 
 
 def _fresh(name: str) -> Path:
@@ -53,7 +61,11 @@ def _fresh(name: str) -> Path:
         try:
             path.mkdir(parents=True)  # fails where another run has just made it
         except FileExistsError:
+            if not path.exists():  # a file stands where one of the folders above should be
+                raise NotADirectoryError(f"cannot make the folder {path}: {FOLDER} is no folder. {_REMEDY}") from None
             number += 1
+        except OSError as error:
+            raise type(error)(f"cannot make the folder {path}: {error.strerror or error}. {_REMEDY}") from error
         else:
             return path
 
@@ -61,10 +73,9 @@ def _fresh(name: str) -> Path:
 def _named(path: Path, overwrite: bool) -> Path:
     if path.exists() and not path.is_dir():
         raise FileExistsError(f"{path} is a file; expected the name of a folder for the results.")
-    if path.is_dir() and any(path.iterdir()) and not overwrite:
+    if path.is_dir() and not overwrite and any(path.iterdir()):
         raise FileExistsError(
             f"the folder {path} exists and holds files, which are kept. Name another one with "
             "--out, or replace them with --overwrite."
         )
-    path.mkdir(parents=True, exist_ok=True)
     return path

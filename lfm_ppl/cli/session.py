@@ -2,14 +2,34 @@
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
+import os
+import platform
+import warnings
+from pathlib import Path
+
 _MOST_DEVICES = 64
 
+SWITCH = "LFM_PPL_CACHE"
+"""Environment variable that keeps no compiled programs where it is "off"."""
 
-def start(chains: int) -> None:
-    """Enable float64 and fast loops, and make one device for each chain, so that chains run side by side.
+_SHORTEST_S = 0.2
+"""Programs that compile in less are not kept: a run makes dozens of them, which together save half a second."""
+
+_LARGEST = 2**30
+"""Bytes that the kept programs may take; a fit makes one to five million of them."""
+
+
+def start(chains: int, keep_programs: bool = True) -> None:
+    """Enable float64 and fast loops, make one device for each chain, and keep compiled programs for the next run.
 
     JAX counts its devices once, when the first array is made; after that the number is fixed. With
     fewer cores than chains the devices share them, which still beats one chain after another.
+
+    Args:
+        chains: that are to run side by side.
+        keep_programs: see `cache_folder`.
     """
     import jax
     import numpyro
@@ -19,3 +39,72 @@ def start(chains: int) -> None:
     jax.config.update("jax_enable_x64", True)
     fast_loops()
     numpyro.set_host_device_count(min(chains, _MOST_DEVICES))
+    if keep_programs and not jax.config.jax_compilation_cache_dir:  # type: ignore[attr-defined]
+        folder = cache_folder()
+        if folder is not None and _ready(folder):
+            jax.config.update("jax_compilation_cache_dir", str(folder))
+            jax.config.update("jax_persistent_cache_min_compile_time_secs", _SHORTEST_S)
+
+
+def cache_folder() -> Path | None:
+    """Return where compiled programs are kept; None where they are not.
+
+    The folder is ``$XDG_CACHE_HOME/lfm_ppl``, or ``~/.cache/lfm_ppl``, and in it one for each kind of CPU: programs
+    hold its instructions, and a home may be shared by several machines. The environment variable ``LFM_PPL_CACHE=off``
+    switches it off; a folder that ``JAX_COMPILATION_CACHE_DIR`` names takes its place.
+    """
+    if os.environ.get(SWITCH, "").lower() in ("off", "0", "no", "false"):
+        return None
+    base = os.environ.get("XDG_CACHE_HOME", "")
+    if not os.path.isabs(base):  # by the XDG specification, relative ones do not count
+        try:
+            base = str(Path.home() / ".cache")
+        except RuntimeError:  # nobody's home is known
+            return None
+    return Path(base) / "lfm_ppl" / hashlib.sha256(_cpu().encode()).hexdigest()[:12]
+
+
+def _cpu() -> str:
+    """Return what the CPU can do, as far as the system says."""
+    with contextlib.suppress(OSError), open("/proc/cpuinfo", encoding="utf-8", errors="replace") as lines:
+        for line in lines:
+            if line.lower().startswith(("flags", "features")):
+                return f"{platform.machine()} {line}"
+    return f"{platform.machine()} {platform.processor()}"
+
+
+def _ready(folder: Path) -> bool:
+    """Make the folder, for its owner alone since what is in it will be run, and keep it small; or say why not."""
+    try:
+        folder.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        folder.mkdir(mode=0o700, exist_ok=True)
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise PermissionError(f"no permission to write to {folder}")
+        status = folder.stat()
+        if hasattr(os, "getuid") and (status.st_uid != os.getuid() or status.st_mode & 0o022):
+            raise PermissionError(f"others may write to {folder}, and what is in it will be run")
+    except OSError as error:
+        warnings.warn(f"compiled programs are not kept for the next run: {error}. {SWITCH}=off or --no-cache silences "
+                      "this.", stacklevel=3)
+        return False
+    prune(folder.parent, _LARGEST)
+    return True
+
+
+def prune(folder: Path, largest: int) -> None:
+    """Remove the programs that were not used for longest until those in ``folder`` take at most ``largest`` bytes.
+
+    (JAX can bound its cache itself, but with another dependency and a lock around every access.)
+    """
+    found = []
+    for path in folder.glob("*/*-cache"):
+        with contextlib.suppress(OSError):  # another process may have removed it
+            status = path.stat()
+            found.append((max(status.st_atime, status.st_mtime), status.st_size, path))
+    total = sum(size for _, size, _ in found)
+    for _, size, path in sorted(found):
+        if total <= largest:
+            break
+        with contextlib.suppress(OSError):
+            path.unlink()
+            total -= size

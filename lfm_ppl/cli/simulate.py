@@ -7,7 +7,7 @@ import shlex
 
 from lfm_ppl import data, loading
 from lfm_ppl.analysis import files
-from lfm_ppl.cli import choices, session
+from lfm_ppl.cli import choices, results, session
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -16,7 +16,8 @@ def run(arguments: argparse.Namespace) -> int:
     options = choices.options(model, arguments.option)
     table = files.refuse_existing(arguments.out or f"{model.name}.csv", arguments.overwrite)
     beside = files.refuse_existing(table.with_suffix(".truth.json"), arguments.overwrite)
-    session.start(chains=1)
+    results.writable(table.parent)
+    session.start(1, not arguments.no_cache)
     simulated = model.simulate(seed=arguments.seed, **options)
     with files.writing(table, arguments.overwrite) as temporary:
         data.write_csv(simulated, temporary)
