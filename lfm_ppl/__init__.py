@@ -1,148 +1,138 @@
-"""Bayesian inference in latent force models, on NumPyro."""
+"""Bayesian inference in latent force models, on NumPyro.
 
-from lfm_ppl import orbits
-from lfm_ppl.analysis.accuracy import check_accuracy
-from lfm_ppl.analysis.correction import correct as correct_posterior
-from lfm_ppl.analysis.report import AccuracyReport
-from lfm_ppl.comparators.elliptical_slice import EllipticalSlice
-from lfm_ppl.comparators.fokker_planck import FokkerPlanckResult, fokker_planck
-from lfm_ppl.comparators.laplace import LaplaceResult, laplace
-from lfm_ppl.comparators.latent_grid import LatentGrid
-from lfm_ppl.comparators.particle_filter import ParticleFilterResult, particle_filter
-from lfm_ppl.comparators.particle_smoother import ParticleSmootherResult, particle_smoother
-from lfm_ppl.comparators.rao_blackwellised import RaoBlackwellisedResult, rao_blackwellised
-from lfm_ppl.comparators.switched_simulation import SwitchedSimulation, simulate_switched
-from lfm_ppl.compilation import fast_loops
-from lfm_ppl.data import Data, read_csv
-from lfm_ppl.filtering.breakdown import FilterWarning
-from lfm_ppl.filtering.filter import FilterResult, FilterState, filter
-from lfm_ppl.filtering.smoother import SmootherResult, smooth
-from lfm_ppl.forces import (
-    CQM,
-    SQM,
-    WQM,
-    Constant,
-    Force,
-    Kernel,
-    Matern,
-    ModeratedPeriodicMatern,
-    Periodic,
-    PeriodicKernel,
-    PeriodicMatern,
-    PeriodicSquaredExponential,
-    QuasiPeriodic,
-    RandomWalk,
-    Resonator,
-    SparseSpectrum,
-    SquaredExponential,
-    WienerVelocity,
-    change_points,
-    random_frequencies,
-    resonators,
-    significant_functions,
-)
-from lfm_ppl.inference.fit import ConvergenceWarning, fit
-from lfm_ppl.inference.fixing import fix
-from lfm_ppl.inference.map import MAPResult, map_estimate
-from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, panel
-from lfm_ppl.inference.on_latent_grid import on_latent_grid
-from lfm_ppl.inference.particle_marginal import ParticleMarginalRAM
-from lfm_ppl.inference.ram import RAM
-from lfm_ppl.linearisation.rule import Rule
-from lfm_ppl.linearisation.sigma_points import (
-    CentralDifference,
-    Cubature,
-    GaussHermite,
-    MonteCarlo,
-    Unscented,
-)
-from lfm_ppl.linearisation.taylor import Taylor
-from lfm_ppl.model.augment import StateSpaceModel, state_space
-from lfm_ppl.model.known_input import Input
-from lfm_ppl.model.latent_force_model import LatentForceModel
-from lfm_ppl.model.observation import Gaussian, GaussianObservation
-from lfm_ppl.model.resolution import ApproximationWarning
-from lfm_ppl.model.simulate import Simulation, simulate
-from lfm_ppl.model.switching import SwitchingRule, Thermostat
+A name is imported when it is asked for, so that ``import lfm_ppl`` costs next to nothing. What reads the source instead
+of running it, such as a type checker, finds the names among the imports; `_NAMES` says the same to Python.
+"""
 
-__version__ = "0.1.0"
+import importlib
+from typing import TYPE_CHECKING, Any
 
-__all__ = [
-    "AccuracyReport",
-    "ApproximationWarning",
-    "CQM",
-    "CentralDifference",
-    "Constant",
-    "ConvergenceWarning",
-    "Cubature",
-    "Data",
-    "EllipticalSlice",
-    "FilterResult",
-    "FilterState",
-    "FilterWarning",
-    "FokkerPlanckResult",
-    "Force",
-    "GaussHermite",
-    "Gaussian",
-    "GaussianObservation",
-    "Input",
-    "Kernel",
-    "LaplaceResult",
-    "LatentForceModel",
-    "LatentGrid",
-    "MAPResult",
-    "MarginalLikelihood",
-    "Matern",
-    "ModeratedPeriodicMatern",
-    "MonteCarlo",
-    "ParticleFilterResult",
-    "ParticleMarginalRAM",
-    "ParticleSmootherResult",
-    "Periodic",
-    "PeriodicKernel",
-    "PeriodicMatern",
-    "PeriodicSquaredExponential",
-    "QuasiPeriodic",
-    "RAM",
-    "RandomWalk",
-    "RaoBlackwellisedResult",
-    "Resonator",
-    "Rule",
-    "SQM",
-    "Simulation",
-    "SmootherResult",
-    "SparseSpectrum",
-    "SquaredExponential",
-    "StateSpaceModel",
-    "SwitchedSimulation",
-    "SwitchingRule",
-    "Taylor",
-    "Thermostat",
-    "Unscented",
-    "WQM",
-    "WienerVelocity",
-    "change_points",
-    "check_accuracy",
-    "correct_posterior",
-    "fast_loops",
-    "filter",
-    "fit",
-    "fix",
-    "fokker_planck",
-    "laplace",
-    "map_estimate",
-    "on_latent_grid",
-    "orbits",
-    "panel",
-    "particle_filter",
-    "particle_smoother",
-    "random_frequencies",
-    "rao_blackwellised",
-    "read_csv",
-    "resonators",
-    "significant_functions",
-    "simulate",
-    "simulate_switched",
-    "smooth",
-    "state_space",
-]
+if TYPE_CHECKING:
+    from lfm_ppl import forces as forces
+    from lfm_ppl import orbits as orbits
+    from lfm_ppl.analysis.accuracy import check_accuracy as check_accuracy
+    from lfm_ppl.analysis.arviz_data import load as load
+    from lfm_ppl.analysis.arviz_data import save as save
+    from lfm_ppl.analysis.correction import correct_posterior as correct_posterior
+    from lfm_ppl.comparators.elliptical_slice import EllipticalSlice as EllipticalSlice
+    from lfm_ppl.comparators.fokker_planck import fokker_planck as fokker_planck
+    from lfm_ppl.comparators.laplace import laplace as laplace
+    from lfm_ppl.comparators.latent_grid import LatentGrid as LatentGrid
+    from lfm_ppl.comparators.particle_filter import particle_filter as particle_filter
+    from lfm_ppl.comparators.particle_smoother import particle_smoother as particle_smoother
+    from lfm_ppl.comparators.rao_blackwellised import rao_blackwellised as rao_blackwellised
+    from lfm_ppl.comparators.switched_simulation import simulate_switched as simulate_switched
+    from lfm_ppl.compilation import fast_loops as fast_loops
+    from lfm_ppl.data import Data as Data
+    from lfm_ppl.data import read_csv as read_csv
+    from lfm_ppl.filtering.breakdown import FilterWarning as FilterWarning
+    from lfm_ppl.filtering.filter import FilterState as FilterState
+    from lfm_ppl.filtering.filter import filter as filter
+    from lfm_ppl.filtering.smoother import smooth as smooth
+    from lfm_ppl.forces import ApproximationWarning as ApproximationWarning
+    from lfm_ppl.forces import Constant as Constant
+    from lfm_ppl.forces import Force as Force
+    from lfm_ppl.forces import Matern as Matern
+    from lfm_ppl.forces import Periodic as Periodic
+    from lfm_ppl.forces import QuasiPeriodic as QuasiPeriodic
+    from lfm_ppl.forces import Resonator as Resonator
+    from lfm_ppl.forces import SquaredExponential as SquaredExponential
+    from lfm_ppl.forces import WienerVelocity as WienerVelocity
+    from lfm_ppl.inference.bound_model import BoundModel as BoundModel
+    from lfm_ppl.inference.bound_model import bind as bind
+    from lfm_ppl.inference.fit import ConvergenceWarning as ConvergenceWarning
+    from lfm_ppl.inference.fit import fit as fit
+    from lfm_ppl.inference.fixing import fix as fix
+    from lfm_ppl.inference.map import map_estimate as map_estimate
+    from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood as MarginalLikelihood
+    from lfm_ppl.inference.marginal_likelihood import panel as panel
+    from lfm_ppl.inference.on_latent_grid import on_latent_grid as on_latent_grid
+    from lfm_ppl.inference.particle_marginal import ParticleMarginalRAM as ParticleMarginalRAM
+    from lfm_ppl.inference.ram import RAM as RAM
+    from lfm_ppl.linearisation.rule import Rule as Rule
+    from lfm_ppl.linearisation.sigma_points import CentralDifference as CentralDifference
+    from lfm_ppl.linearisation.sigma_points import Cubature as Cubature
+    from lfm_ppl.linearisation.sigma_points import GaussHermite as GaussHermite
+    from lfm_ppl.linearisation.sigma_points import MonteCarlo as MonteCarlo
+    from lfm_ppl.linearisation.sigma_points import Unscented as Unscented
+    from lfm_ppl.linearisation.taylor import Taylor as Taylor
+    from lfm_ppl.model.augment import state_space as state_space
+    from lfm_ppl.model.known_input import Input as Input
+    from lfm_ppl.model.latent_force_model import LatentForceModel as LatentForceModel
+    from lfm_ppl.model.observation import Gaussian as Gaussian
+    from lfm_ppl.model.observation import GaussianObservation as GaussianObservation
+    from lfm_ppl.model.simulate import Simulation as Simulation
+    from lfm_ppl.model.simulate import simulate as simulate
+    from lfm_ppl.model.switching import SwitchingRule as SwitchingRule
+    from lfm_ppl.model.switching import Thermostat as Thermostat
+
+__version__ = "0.2.0"
+
+_PACKAGES = ("forces", "orbits")
+"""Specialised forces and their kernels; satellites."""
+
+_OTHER_PACKAGES = ("analysis", "comparators", "data", "filtering", "inference", "linearisation", "model")
+"""What `lfm_ppl.filtering.filter.FilterResult` and the like are found by, without an import of their own."""
+
+_NAMES = {
+    "analysis.accuracy": ("check_accuracy",),
+    "analysis.arviz_data": ("load", "save"),
+    "analysis.correction": ("correct_posterior",),
+    "comparators.elliptical_slice": ("EllipticalSlice",),
+    "comparators.fokker_planck": ("fokker_planck",),
+    "comparators.laplace": ("laplace",),
+    "comparators.latent_grid": ("LatentGrid",),
+    "comparators.particle_filter": ("particle_filter",),
+    "comparators.particle_smoother": ("particle_smoother",),
+    "comparators.rao_blackwellised": ("rao_blackwellised",),
+    "comparators.switched_simulation": ("simulate_switched",),
+    "compilation": ("fast_loops",),
+    "data": ("Data", "read_csv"),
+    "filtering.breakdown": ("FilterWarning",),
+    "filtering.filter": ("FilterState", "filter"),
+    "filtering.smoother": ("smooth",),
+    "forces": (
+        "ApproximationWarning", "Constant", "Force", "Matern", "Periodic", "QuasiPeriodic", "Resonator",
+        "SquaredExponential", "WienerVelocity",
+    ),
+    "inference.bound_model": ("BoundModel", "bind"),
+    "inference.fit": ("ConvergenceWarning", "fit"),
+    "inference.fixing": ("fix",),
+    "inference.map": ("map_estimate",),
+    "inference.marginal_likelihood": ("MarginalLikelihood", "panel"),
+    "inference.on_latent_grid": ("on_latent_grid",),
+    "inference.particle_marginal": ("ParticleMarginalRAM",),
+    "inference.ram": ("RAM",),
+    "linearisation.rule": ("Rule",),
+    "linearisation.sigma_points": ("CentralDifference", "Cubature", "GaussHermite", "MonteCarlo", "Unscented"),
+    "linearisation.taylor": ("Taylor",),
+    "model.augment": ("state_space",),
+    "model.known_input": ("Input",),
+    "model.latent_force_model": ("LatentForceModel",),
+    "model.observation": ("Gaussian", "GaussianObservation"),
+    "model.simulate": ("Simulation", "simulate"),
+    "model.switching": ("SwitchingRule", "Thermostat"),
+}
+"""Module -> the public names in it."""
+
+_MODULES = {name: module for module, names in _NAMES.items() for name in names}
+
+__all__ = sorted((*_MODULES, *_PACKAGES))
+
+
+if not TYPE_CHECKING:  # a type checker would take it as a promise of any name at all
+
+    def __getattr__(name: str) -> Any:
+        """Import a public name; Python asks here for what is not imported yet."""
+        if name in (*_PACKAGES, *_OTHER_PACKAGES):
+            return importlib.import_module(f"{__name__}.{name}")
+        if name not in _MODULES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        value = getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
+        globals()[name] = value
+        return value
+
+
+def __dir__() -> list[str]:
+    """Return the names that tab completion shows, imported or not."""
+    return sorted({*globals(), *__all__})

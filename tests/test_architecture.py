@@ -1,11 +1,14 @@
 """Imports point one way, models use the public API alone, and importing has no side effects."""
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+import lfm_ppl
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "lfm_ppl"
@@ -92,9 +95,25 @@ def test_the_package_itself_is_the_public_api_and_nothing_else():
     allowed = (ast.Import, ast.ImportFrom, ast.Assign, ast.AnnAssign)
     for node in tree.body:
         docstring = isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
-        assert docstring or isinstance(node, allowed), (
-            f"line {node.lineno}: only imports belong here"
-        )
+        lazy = isinstance(node, ast.If) and all(
+            isinstance(inner, ast.ImportFrom) or isinstance(inner, ast.FunctionDef) and inner.name == "__getattr__"
+            for inner in node.body)
+        listing = isinstance(node, ast.FunctionDef) and node.name == "__dir__"
+        assert docstring or lazy or listing or isinstance(node, allowed), f"line {node.lineno}: only imports go here"
+
+
+def test_type_checkers_see_the_names_that_are_imported_when_asked_for():
+    """The imports under TYPE_CHECKING are those that `__getattr__` makes, and each is exported (``as``)."""
+    tree = ast.parse((PACKAGE / "__init__.py").read_text(encoding="utf-8"))
+    typing, _ = (node for node in tree.body if isinstance(node, ast.If))
+    seen = {alias.asname: (node.module, alias.name) for node in typing.body for alias in node.names}
+    found = {name: (f"lfm_ppl.{module}", name) for name, module in lfm_ppl._MODULES.items()}
+    assert seen == found | {name: ("lfm_ppl", name) for name in lfm_ppl._PACKAGES}
+
+
+def test_no_module_takes_the_place_of_a_public_name():
+    """Importing lfm_ppl.fit, were there such a module, would make a module of the function `lfm.fit`."""
+    assert not set(modules()) & set(lfm_ppl._MODULES)
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "models").glob("*.py")), ids=lambda path: path.stem)
@@ -145,3 +164,46 @@ def test_importing_the_library_changes_no_global_setting():
         "print([k for k, v in jax.config.values.items() if before.get(k) != v])"
     )
     assert run(code) == "[]"
+
+
+def test_importing_the_library_imports_nothing_else():
+    """Neither its own parts, nor what they stand on: each comes with the first name that needs it."""
+    code = (
+        "import sys; before = set(sys.modules); import lfm_ppl; "
+        "print(sorted({name.split('.')[0] for name in set(sys.modules) - before} - {'lfm_ppl'}), "
+        "sorted(name for name in sys.modules if name.startswith('lfm_ppl.')))"
+    )
+    own = run(code)
+    assert own.endswith("] []"), own
+    assert not re.search("jax|numpyro|arviz|matplotlib|scipy|equinox", own), own
+
+
+def test_a_model_and_its_filter_import_no_satellites_figures_or_experiments():
+    code = (
+        "import sys; import lfm_ppl as lfm; lfm.Matern, lfm.LatentForceModel, lfm.filter, lfm.MarginalLikelihood; "
+        "print(sorted(name for name in sys.modules if name.startswith('lfm_ppl.') and name.count('.') == 1), "
+        "'matplotlib.pyplot' in sys.modules, 'arviz' in sys.modules)"
+    )
+    found = run(code)
+    assert found.endswith("False False") and "lfm_ppl.filtering" in found
+    for part in ("orbits", "analysis", "experiments", "comparators", "cli"):
+        assert f"lfm_ppl.{part}" not in found
+
+
+def test_names_imported_when_asked_for_are_ordinary_names():
+    """``import *``, pickling, isinstance, tab completion, the parts of the package, and a name that is none."""
+    code = """
+import pickle
+from lfm_ppl import *
+import lfm_ppl as lfm
+assert smooth is lfm.smooth and fit is lfm.fit and orbits is lfm.orbits
+force = lfm.Matern(1.0, 2.0)
+assert isinstance(pickle.loads(pickle.dumps(force)), lfm.Force) and pickle.loads(pickle.dumps(lfm.Matern)) is lfm.Matern
+assert set(lfm.__all__) <= set(dir(lfm)) and "__version__" in dir(lfm)
+assert lfm.forces.CQM.__module__ == "lfm_ppl.forces.weights" and lfm.orbits.read_sp3
+try:
+    lfm.matern
+except AttributeError as error:
+    print(error)
+"""
+    assert run(code) == "module 'lfm_ppl' has no attribute 'matern'"
