@@ -87,7 +87,7 @@ for label, model in (("linear", motif), ("softplus", softplus)):
     for sampler, settings in samplers.items():
         started = time.perf_counter()
         key = jax.random.key(12)
-        found[label, sampler] = calibration.calibrate(model, times, key=key, data_sets=data_sets, **settings)
+        found[label, sampler] = calibration.calibrate(key, model, times, data_sets=data_sets, **settings)
         seconds[label, sampler] = time.perf_counter() - started
 
 # %% [markdown]

@@ -117,8 +117,8 @@ times = np.arange(0.0, 60.0, 1.0)
 
 
 def model(period=10.0):
-    kernel = lfm.PeriodicMatern(scale=1.0, lengthscale=1.0, period=period, order=2)
-    steps = lfm.SQM(lengthscale=5.0, change_points=lfm.change_points(10.0, start=0.0, stop=60.0))
+    kernel = lfm.forces.PeriodicMatern(scale=1.0, lengthscale=1.0, period=period, order=2)
+    steps = lfm.forces.SQM(lengthscale=5.0, change_points=lfm.forces.change_points(10.0, start=0.0, stop=60.0))
     return lfm.LatentForceModel(
         dynamics=lambda x, u, t: u - 0.5 * x,
         forces={"u": lfm.QuasiPeriodic(kernel, steps, functions=7)},

@@ -75,7 +75,7 @@ def build(heater):
 
 set_point = lfm.Input([0.0, 6.0, 22.0], [16.0, 20.0, 16.0])
 times = np.arange(0.0, 24.0, 1 / 6)
-day = lfm.rao_blackwellised(build, lfm.Thermostat(set_point), times, jax.random.key(0), particles=1000)
+day = lfm.rao_blackwellised(jax.random.key(0), build, lfm.Thermostat(set_point), times, particles=1000)
 whole = lfm.simulate_switched(jax.random.key(1), build, lfm.Thermostat(set_point), times, paths=20_000)
 mean, sd = day.outputs.moments()
 pd.DataFrame({

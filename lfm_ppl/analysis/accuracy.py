@@ -89,7 +89,7 @@ def check_accuracy(result: Any, numpyro_model: Callable, times: Any = None, y: A
         raise ValueError("replicates must be at least 2: the noise of the particle filter is told from their spread.")
     _check_sampler(result)
     whole = rebuilding.problem(result, numpyro_model, times, y, model_kwargs)
-    ssm = whole.known.example.ssm
+    ssm = whole.example.ssm
     kind = _kind(reference, ssm)
     posterior = arviz_data.group(result, "posterior")
     chosen, rows = spread(posterior.sizes["chain"], posterior.sizes["draw"], draws)
@@ -139,7 +139,7 @@ def assess(result: Any, chosen: np.ndarray, filtered: np.ndarray, doubled: np.nd
     noisy = reference.estimates.shape[-1] > 1
     noise_sd = noise(averaged) if noisy else 0.0
     change = doubled - filtered
-    example, attrs = problem.known.example, arviz_data.attributes(result)
+    example, attrs = problem.example, arviz_data.attributes(result)
     findings = Findings(
         table=table, k=weights.k, threshold=weights.threshold, exact=reference.description.startswith(EXACT),
         step_change_sd=float(change.std()), noise_sd=noise_sd, noise_share=_share(noise_sd, ratio),

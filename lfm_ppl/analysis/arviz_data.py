@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from lfm_ppl.analysis import convergence, netcdf
+from lfm_ppl.analysis import convergence, files, netcdf
 from lfm_ppl.analysis.scalars import scalar_draws
 
 LIBRARY = "lfm_ppl"
@@ -122,10 +122,10 @@ def attributes(result: Any) -> dict[str, Any]:
 
 
 def save(result: Any, path: str | Path, overwrite: bool = False) -> Path:
-    """Write ``result`` to a netCDF file, through a temporary name.
+    """Write a result to a netCDF file, through a temporary name, so that the file is there whole or not at all.
 
     Args:
-        result: an ArviZ object.
+        result: what `lfm_ppl.fit` returned: every group, with coordinates, units and attributes, is kept.
         path: the file, for instance ``posterior.nc``; its folder is made.
         overwrite: replace a file that exists.
 
@@ -134,6 +134,17 @@ def save(result: Any, path: str | Path, overwrite: bool = False) -> Path:
 
     Raises:
         FileExistsError: ``path`` exists and ``overwrite`` is False.
+        IsADirectoryError: ``path`` is a folder.
+        TypeError: ``result`` is no ArviZ object.
+
+    Example:
+        >>> import tempfile, lfm_ppl as lfm
+        >>> result = build({"posterior": xr.Dataset({"decay": (("chain", "draw"), np.ones((4, 100)))})})
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     written = lfm.save(result, Path(folder) / "run" / "posterior.nc")
+        ...     again = lfm.load(written.parent)
+        >>> groups(again), type(again) is type(result)
+        (('posterior',), True)
     """
     datasets = {name: group(result, name) for name in groups(result)}
     attrs = {"inference_library": LIBRARY, **attributes(result)}
@@ -141,18 +152,22 @@ def save(result: Any, path: str | Path, overwrite: bool = False) -> Path:
 
 
 def load(path: str | Path) -> Any:
-    """Read a result that ``save`` wrote.
+    """Read a result that `save` or ``lfm-ppl fit`` wrote, whichever version of ArviZ it was written with.
 
     Args:
-        path: a netCDF file, for instance ``posterior.nc``.
+        path: a netCDF file, or a results folder with a ``posterior.nc``.
 
     Returns:
-        The ArviZ object, in memory.
+        The ArviZ object, in memory: an ``InferenceData`` on ArviZ 0.23, an ``xarray.DataTree`` on 1.x.
 
     Raises:
-        FileNotFoundError: there is no such file.
+        FileNotFoundError: there is no such file, or no ``posterior.nc`` in the folder.
         ValueError: it is not netCDF, not written by lfm_ppl, or holds no posterior.
+
+    Example:
+        See `save`.
     """
+    path = files.locate(path)
     datasets, attrs = netcdf.read(path)
     library = attrs.get("inference_library")
     if library != LIBRARY:

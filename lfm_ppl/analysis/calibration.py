@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from numpyro import handlers
-from numpyro.infer.util import log_likelihood
 
 from lfm_ppl import checks
 from lfm_ppl.analysis.files import writing
-from lfm_ppl.inference.posterior import likelihood_site
+from lfm_ppl.inference.bound_model import bind, likelihood_site
 
 LOG_LIKELIHOOD = "log likelihood"
 _SIMULATIONS = 20_000
@@ -31,7 +31,7 @@ class Calibration(NamedTuple):
     draws: int
 
 
-def calibrate(model: Callable, times: Any, kernel: Callable, key: jax.Array, *, data_sets: int = 200, draws: int = 63,
+def calibrate(key: jax.Array, model: Callable, times: Any, kernel: Callable, *, data_sets: int = 200, draws: int = 63,
               thin: int = 10, warmup: int = 500, batch: int | None = None) -> Calibration:
     """Rank true parameters among posterior draws, for many data sets that the model itself generates.
 
@@ -41,10 +41,10 @@ def calibrate(model: Callable, times: Any, kernel: Callable, key: jax.Array, *, 
     that is too wide, too narrow or shifted shows in the ranks.
 
     Args:
+        key: a JAX random key.
         model: NumPyro model ``model(times, y=None)`` with one likelihood site.
         times: (T,).
         kernel: maps a NumPyro model to an MCMC kernel, such as ``lfm.RAM`` or ``numpyro.infer.NUTS``.
-        key: a JAX random key.
         data_sets: number of replications.
         draws: L. With 63 the 64 possible ranks fall into 2, 4, 8, 16 or 32 bins of equal width.
         thin: steps of the chain between two of these; the draws must be nearly independent.
@@ -55,6 +55,7 @@ def calibrate(model: Callable, times: Any, kernel: Callable, key: jax.Array, *, 
         The ranks.
 
     Raises:
+        TypeError: ``key`` is no random key.
         ValueError: the model has no likelihood site, or a count is not a positive number.
 
     Example:
@@ -64,25 +65,27 @@ def calibrate(model: Callable, times: Any, kernel: Callable, key: jax.Array, *, 
         ...         lambda x, u, t: jnp.zeros(1), {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.ones(1)),
         ...         lfm.Gaussian(numpyro.sample("level", dist.Normal())[None], jnp.zeros((1, 1))))
         ...     numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
-        >>> found = calibrate(level, [0.0, 1.0], lfm.RAM, jax.random.key(0), data_sets=5, draws=7, warmup=20)
+        >>> found = calibrate(jax.random.key(0), level, [0.0, 1.0], lfm.RAM, data_sets=5, draws=7, warmup=20)
         >>> {name: rank.shape for name, rank in found.ranks.items()}
         {'level': (5,), 'log likelihood': (5,)}
 
     Source: Talts et al. (2018), Validating Bayesian inference algorithms with simulation-based calibration; Modrak et
     al. (2023), Bayesian Analysis, for the log likelihood as a test quantity.
     """
+    checks.random_key(key)
     for name, value in (("data_sets", data_sets), ("draws", draws), ("thin", thin), ("warmup", warmup)):
         checks.positive_integer(name, value)
     times = np.asarray(times, float)
-    site = likelihood_site(model, (times,), {}, key).name
+    site = likelihood_site(model, (times,), {}, key)
+    bound = bind(model, times, jnp.zeros_like(site.observed))
     truth_keys, chain_keys = jax.random.split(key)
 
     def one(keys: tuple[jax.Array, jax.Array]) -> dict[str, jax.Array]:
         trace = handlers.trace(handlers.seed(model, keys[0])).get_trace(times)
-        y = trace[site]["value"]
-        truth = {n: s["value"] for n, s in trace.items() if s["type"] == "sample" and n != site}
-        posterior = _chain(model, times, y, kernel(model), keys[1], draws, thin, warmup)
-        score = lambda theta: _score(model, times, y, theta)  # noqa: E731
+        y = trace[site.name]["value"]
+        truth = {name: trace[name]["value"] for name in bound.sites}
+        posterior = _chain(kernel(model), (times, y), keys[1], draws, thin, warmup)
+        score = lambda theta: bound.likelihood(theta, y).log_prob(y).sum()  # noqa: E731
         truth[LOG_LIKELIHOOD] = score(truth)
         posterior[LOG_LIKELIHOOD] = jax.lax.map(score, posterior)
         return {n: (posterior[n] < truth[n]).sum(0) for n in truth}
@@ -92,9 +95,7 @@ def calibrate(model: Callable, times: Any, kernel: Callable, key: jax.Array, *, 
     return Calibration(_scalars({name: np.asarray(value) for name, value in found.items()}), draws)
 
 
-def _chain(model: Callable, times: Any, y: Any, kernel: Any, key: jax.Array, draws: int, thin: int,
-           warmup: int) -> dict[str, jax.Array]:
-    arguments = (times, y)
+def _chain(kernel: Any, arguments: tuple, key: jax.Array, draws: int, thin: int, warmup: int) -> dict[str, jax.Array]:
     state = kernel.init(key, warmup, None, arguments, {})
     advance = lambda count, state: jax.lax.fori_loop(  # noqa: E731
         0, count, lambda _, s: kernel.sample(s, arguments, {}), state)
@@ -106,11 +107,6 @@ def _chain(model: Callable, times: Any, y: Any, kernel: Any, key: jax.Array, dra
 
     _, collected = jax.lax.scan(step, state, length=draws)
     return jax.vmap(kernel.postprocess_fn(arguments, {}))(collected)
-
-
-def _score(model: Callable, times: Any, y: Any, theta: Mapping[str, Any]) -> jax.Array:
-    (terms,) = log_likelihood(model, jax.tree.map(lambda a: a[None], dict(theta)), times, y).values()
-    return terms.sum()
 
 
 def _scalars(found: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

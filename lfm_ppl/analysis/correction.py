@@ -21,8 +21,9 @@ _DRAWN = ("trajectories", "posterior_predictive")
 _KINDS = {"states": "state", "forces": "force", "outputs": "output"}
 
 
-def correct(result: Any, numpyro_model: Callable, times: Any = None, y: Any = None, *,
-            model_kwargs: Mapping[str, Any] | None = None, trajectory_draws: int = 400, seed: int = 0) -> Any:
+def correct_posterior(result: Any, numpyro_model: Callable, times: Any = None, y: Any = None, *,
+                      model_kwargs: Mapping[str, Any] | None = None, trajectory_draws: int = 400,
+                      seed: int = 0) -> Any:
     """Return the corrected posterior: equally weighted draws, resampled by the weights of the accuracy report.
 
     Draws that the weights favour appear more than once, so that diagnostics of chains say nothing here; the report
@@ -86,8 +87,7 @@ def _paths(result: Any, numpyro_model: Callable, times: Any, y: Any, model_kwarg
     at = template["at"].values if "at" in template.coords else None
     chosen, rows = spread(picked.shape[0], picked.shape[1], count)
     problem = rebuilding.problem(result, numpyro_model, times, y, model_kwargs).at(picked.ravel()[rows])
-    found = trajectories(problem.model, (problem.times, problem.y), problem.keywords, problem.draws, problem.y, at,
-                         jax.random.key(seed), problem.known)
+    found = trajectories(jax.random.key(seed), problem.bound, problem.draws, at)
     groups = {}
     for name, old in templates.items():
         variables = {}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -14,9 +14,9 @@ from lfm_ppl.comparators import fokker_planck, particle_filter
 from lfm_ppl.comparators.observation_noise import check_noise
 from lfm_ppl.comparators.particle_filter import ParticleSettings
 from lfm_ppl.filtering.schedule import schedule
+from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
-from lfm_ppl.inference.posterior import LikelihoodSite, drawn, each, likelihood_site, over_draws
-from lfm_ppl.inference.settings import approximate
+from lfm_ppl.inference.posterior import each, over_draws
 from lfm_ppl.model.augment import StateSpaceModel
 
 _CHUNK = 8
@@ -30,23 +30,25 @@ _SCOUTS = 10
 
 
 class Problem(NamedTuple):
-    """A NumPyro model, its data, and draws of its parameters.
+    """A bound model, and draws of its parameters.
 
     Attributes:
-        model: the NumPyro model.
-        times: as `lfm_ppl.fit` takes them.
-        y: (T, D), or (B, T, D) for a panel.
-        keywords: keyword arguments of the model.
-        known: its likelihood site outside of compiled code.
+        bound: the model with its times and data.
         draws: site name -> (S, ...).
     """
 
-    model: Callable
-    times: Any
-    y: np.ndarray
-    keywords: Mapping[str, Any]
-    known: LikelihoodSite
+    bound: BoundModel
     draws: Mapping[str, np.ndarray]
+
+    @property
+    def example(self) -> MarginalLikelihood:
+        """The likelihood of one series at parameters from the prior."""
+        return self.bound.site.example
+
+    @property
+    def y(self) -> np.ndarray:
+        """The data, (T, D), or (B, T, D) for a panel."""
+        return np.asarray(self.bound.y)
 
     @property
     def size(self) -> int:
@@ -56,11 +58,7 @@ class Problem(NamedTuple):
     @property
     def series(self) -> int:
         """Number of series."""
-        return self.y.shape[0] if isinstance(self.known.distribution, Panel) else 1
-
-    def likelihood(self, parameters: Any, key: jax.Array) -> MarginalLikelihood | Panel:
-        """Return the likelihood under one draw, in compiled code too."""
-        return drawn(self.model, (self.times, self.y), self.keywords, key, parameters, self.known)
+        return self.y.shape[0] if isinstance(self.bound.site.distribution, Panel) else 1
 
     def at(self, rows: Any) -> Problem:
         """Return the same problem with some of the draws."""
@@ -92,16 +90,12 @@ def is_exact(ssm: StateSpaceModel) -> bool:
 
 def gaussian(problem: Problem) -> np.ndarray:
     """Return (S,): the log likelihoods of the Gaussian filter, summed over the series of a panel."""
+    bound = problem.bound
 
-    def one(distribution: MarginalLikelihood, y: jax.Array) -> jax.Array:
-        return distribution.log_prob(y)
+    def per_draw(values: Any, key: jax.Array, y: jax.Array) -> dict[str, jax.Array]:
+        return {"total": bound.likelihood(values, y).log_prob(bound.data(y)).sum()}
 
-    def per_draw(parameters: Any, key: jax.Array) -> dict[str, jax.Array]:
-        found = each(problem.likelihood(parameters, key), one, jnp.asarray(problem.y, float))
-        return {"total": found.sum()}
-
-    rows = len(np.ravel(problem.times))
-    return over_draws(per_draw, problem.draws, jax.random.key(0), rows, problem.known)["total"]
+    return over_draws(bound, "log likelihoods", per_draw, problem.draws, jax.random.key(0), bound.times.size)["total"]
 
 
 def finer_tolerance(tolerance: float) -> float:
@@ -111,12 +105,11 @@ def finer_tolerance(tolerance: float) -> float:
 
 def gaussian_with_finer_steps(problem: Problem) -> np.ndarray:
     """Return (S,): the log likelihoods of the Gaussian filter with about twice as many integration steps."""
-    example = problem.known.example
-    finer = approximate(problem.model, steps=2 * example.steps,
-                        max_step=None if example.max_step is None else example.max_step / 2,
-                        tolerance=None if example.tolerance is None else finer_tolerance(example.tolerance))
-    known = likelihood_site(finer, (problem.times, problem.y), problem.keywords, jax.random.key(0))
-    return gaussian(problem._replace(model=finer, known=known))
+    example = problem.example
+    finer = problem.bound.approximate(
+        steps=2 * example.steps, max_step=None if example.max_step is None else example.max_step / 2,
+        tolerance=None if example.tolerance is None else finer_tolerance(example.tolerance))
+    return gaussian(problem._replace(bound=finer))
 
 
 def on_grid(problem: Problem, steps: int | None, progress: bool) -> Reference:
@@ -125,16 +118,17 @@ def on_grid(problem: Problem, steps: int | None, progress: bool) -> Reference:
     Raises:
         ValueError: what the grid raises, for states of more than one dimension, no noise, and so on.
     """
-    layout = fokker_planck.choose_grid(_scouted(problem), problem.known.example.times, problem.y, tolerance=GRID_ERROR)
+    layout = fokker_planck.choose_grid(_scouted(problem), problem.example.times, problem.y, tolerance=GRID_ERROR)
+    bound = problem.bound
 
     def one(distribution: MarginalLikelihood, y: jax.Array) -> jax.Array:
         plan = schedule(distribution.ssm, distribution.times, steps or distribution.steps, distribution.max_step)
         return fokker_planck.log_likelihood(distribution.ssm, plan, y, layout)
 
-    def per_draw(parameters: Any, key: jax.Array) -> jax.Array:
-        return each(problem.likelihood(parameters, key), one, jnp.asarray(problem.y, float)).sum()
+    def per_draw(values: Any, key: jax.Array, y: jax.Array) -> jax.Array:
+        return each(bound.likelihood(values, y), one, bound.data(y)).sum()
 
-    found = _in_chunks(per_draw, "Fokker-Planck grid", progress)(problem, jax.random.key(0))
+    found = _in_chunks(("grid", layout, steps), per_draw, "Fokker-Planck grid", progress)(problem, jax.random.key(0))
     return Reference(found[:, None], f"Fokker-Planck equation on a grid of {layout.cells} cells")
 
 
@@ -156,7 +150,7 @@ def by_particles(problem: Problem, particles: int | None, replicates: int, steps
         target: of that sd.
         most_work: limit on the number of particle steps, from which that on N follows.
     """
-    example = problem.known.example
+    example = problem.example
     pilot_key, key = jax.random.split(key)
     limited = False
     chosen = particles or _FIRST_PARTICLES
@@ -182,7 +176,7 @@ _SAFETY = 1.2
 
 
 def _particle_run(problem: Problem, particles: int, replicates: int, steps: int | None, progress: bool) -> Callable:
-    known = problem.known.example
+    known = problem.example
     check_noise(known.ssm, known.plan.initial_time)
     settings = particle_filter.check_settings(known.ssm, ParticleSettings(particles))
 
@@ -190,24 +184,29 @@ def _particle_run(problem: Problem, particles: int, replicates: int, steps: int 
         plan = schedule(distribution.ssm, distribution.times, steps or distribution.steps, distribution.max_step)
         return particle_filter.log_likelihood(distribution.ssm, plan, y, key, settings)
 
-    def per_draw(parameters: Any, key: jax.Array) -> jax.Array:
-        distribution = problem.likelihood(parameters, key)
-        y = jnp.asarray(problem.y, float)
+    bound, series = problem.bound, problem.series
+
+    def per_draw(values: Any, key: jax.Array, y: jax.Array) -> jax.Array:
+        distribution = bound.likelihood(values, y)
+        y = bound.data(y)
 
         def replicate(key: jax.Array) -> jax.Array:
-            keys = jax.random.split(key, problem.series) if isinstance(distribution, Panel) else key
+            keys = jax.random.split(key, series) if isinstance(distribution, Panel) else key
             return each(distribution, one, y, keys).sum()
 
         return jax.lax.map(replicate, jax.random.split(key, replicates))
 
-    return _in_chunks(per_draw, f"particle filter, {particles:,} particles", progress)
+    name = ("particles", settings, replicates, steps)
+    return _in_chunks(name, per_draw, f"particle filter, {particles:,} particles", progress)
 
 
-def _in_chunks(per_draw: Callable, label: str, progress: bool) -> Callable[[Problem, jax.Array], np.ndarray]:
+def _in_chunks(name: Hashable, per_draw: Callable, label: str,
+               progress: bool) -> Callable[[Problem, jax.Array], np.ndarray]:
     """Return a function that maps over draws, a few at a time, with one compilation for any number of draws."""
-    run = jax.jit(lambda draws, keys: jax.lax.map(lambda pair: per_draw(*pair), (draws, keys)))
 
     def call(problem: Problem, key: jax.Array) -> np.ndarray:
+        run = problem.bound.compiled(("in chunks", name), lambda: jax.jit(
+            lambda draws, keys, y: jax.lax.map(lambda pair: per_draw(*pair, y), (draws, keys))))
         count = problem.size
         keys = jax.random.split(key, count)
         found = []
@@ -215,7 +214,7 @@ def _in_chunks(per_draw: Callable, label: str, progress: bool) -> Callable[[Prob
             _show(f"{label}: {start} of {count} draws", progress)
             index = np.minimum(np.arange(start, start + _CHUNK), count - 1)  # full chunks: one shape
             found.append(np.asarray(run({name: jnp.asarray(value[index]) for name, value in problem.draws.items()},
-                                        keys[index])))
+                                        keys[index], problem.bound.argument)))
         _show("", progress)
         return np.concatenate(found)[:count]
 
@@ -236,7 +235,7 @@ def _scouted(problem: Problem) -> list[Any]:
     found = []
     for row in rows:
         parameters = {name: jnp.asarray(value[row]) for name, value in problem.draws.items()}
-        distribution = problem.likelihood(parameters, jax.random.key(0))
+        distribution = problem.bound.likelihood(parameters)
         if isinstance(distribution, Panel):
             leaves = [jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf)[b], distribution.parameters)  # noqa: B023
                       for b in range(problem.series)]

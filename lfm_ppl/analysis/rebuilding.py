@@ -6,17 +6,12 @@ import json
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import jax
 import numpy as np
 import xarray as xr
-from numpyro import handlers
 
 from lfm_ppl.analysis import arviz_data
 from lfm_ppl.analysis.likelihoods import Problem
-from lfm_ppl.filtering.filter import check_observations
-from lfm_ppl.inference.fixing import fix
-from lfm_ppl.inference.marginal_likelihood import Panel
-from lfm_ppl.inference.posterior import LikelihoodSite, likelihood_site
+from lfm_ppl.inference.bound_model import BoundModel, LikelihoodSite, bind
 
 _TOLERANCE = 1e-6
 """Relative difference of log likelihoods between machines and versions that is rounding."""
@@ -53,17 +48,10 @@ def problem(result: Any, numpyro_model: Callable, times: Any = None, y: Any = No
     if times is None or y is None:
         stored = observations(result)
         times, y = stored[0] if times is None else times, stored[1] if y is None else y
-    keywords = dict(model_kwargs or {})
-    site = likelihood_site(numpyro_model, (times, y), keywords, jax.random.key(0))
-    _check_settings(site, attrs)
-    if isinstance(site.distribution, Panel):
-        y = np.asarray(site.distribution.checked(y))
-    else:
-        y = np.asarray(check_observations(y, *site.distribution.event_shape))
-    fixed = json.loads(attrs.get("fixed") or "{}")
-    model = fix(numpyro_model, fixed, labels=site.example.ssm.model.output_names) if fixed else numpyro_model
-    draws = _latent(model, (times, y), keywords, posterior)
-    return Problem(model, times, y, keywords, site, draws)
+    bound = bind(numpyro_model, times, y, **dict(model_kwargs or {}))
+    _check_settings(bound.site, attrs)
+    bound = bound.fix(json.loads(attrs.get("fixed") or "{}"))
+    return Problem(bound, _latent(bound, posterior))
 
 
 def check_likelihood(result: Any, log_likelihood: np.ndarray, chosen: np.ndarray) -> None:
@@ -96,21 +84,19 @@ def _check_settings(site: LikelihoodSite, attrs: Mapping[str, Any]) -> None:
                              f"{own[name]}; give the model as it was fitted.")
 
 
-def _latent(model: Callable, arguments: tuple, keywords: Mapping[str, Any], posterior: xr.Dataset) -> dict:
+def _latent(bound: BoundModel, posterior: xr.Dataset) -> dict:
     """Return the draws of the sample sites; deterministic ones the model computes itself."""
-    trace = handlers.trace(handlers.seed(model, jax.random.key(0))).get_trace(*arguments, **keywords)
+    shapes = {name: np.shape(value) for name, value in bound.constrain(np.zeros(bound.size)).items()}
     draws = {}
-    for name, site in trace.items():
-        if site["type"] != "sample" or site["is_observed"]:
-            continue
+    for name in bound.sites:
         stored = name.replace("/", ".")
         if stored not in posterior:
             known = ", ".join(map(str, posterior.data_vars))
             raise ValueError(f"the model samples {name!r}, of which the result has no draws (it has {known}); it is "
                              "not the model that the result was made with.")
         values = posterior[stored].transpose("chain", "draw", ...).values
-        if values.shape[2:] != np.shape(site["value"]):
-            raise ValueError(f"{name!r} has shape {np.shape(site['value'])} in the model and {values.shape[2:]} in the "
+        if values.shape[2:] != shapes[name]:
+            raise ValueError(f"{name!r} has shape {shapes[name]} in the model and {values.shape[2:]} in the "
                              "result; it is not the model that the result was made with.")
         draws[name] = values.reshape(-1, *values.shape[2:])
     if not draws:

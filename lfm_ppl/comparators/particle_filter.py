@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import logsumexp
-from numpyro.util import is_prng_key
 
 from lfm_ppl import checks
 from lfm_ppl.comparators.normals import normals
@@ -92,7 +91,7 @@ class Step(NamedTuple):
     ancestors: Any = None
 
 
-def particle_filter(model: LatentForceModel, times: Any, y: Any, key: jax.Array, *, particles: int = 10_000,
+def particle_filter(key: jax.Array, model: LatentForceModel, times: Any, y: Any, *, particles: int = 10_000,
                     steps: int = 20, max_step: float | None = None, resampling: str = "systematic",
                     threshold: float = 0.5, scheme: str = "auto", batch: int | None = None) -> ParticleFilterResult:
     """Run the bootstrap particle filter.
@@ -106,10 +105,10 @@ def particle_filter(model: LatentForceModel, times: Any, y: Any, key: jax.Array,
     as the steps discretise it), whatever the number of particles.
 
     Args:
+        key: a JAX random key.
         model: the latent force model.
         times: (T,), non-decreasing; equal times are replicates.
         y: (T, D), NaN where missing.
-        key: a JAX random key.
         particles: N.
         steps: integration steps between two consecutive times.
         max_step: longest step; longer intervals get more.
@@ -133,14 +132,15 @@ def particle_filter(model: LatentForceModel, times: Any, y: Any, key: jax.Array,
         >>> model = lfm.LatentForceModel(
         ...     lambda x, u, t: x - x**3, {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
         ...     lfm.Gaussian(jnp.zeros(1), jnp.eye(1)), process_noise=jnp.eye(1))
-        >>> result = lfm.particle_filter(model, jnp.arange(3.0), jnp.ones((3, 1)), jax.random.key(0), particles=100)
+        >>> result = lfm.particle_filter(jax.random.key(0), model, jnp.arange(3.0), jnp.ones((3, 1)), particles=100)
         >>> result.scheme
         'srk'
 
     Source: Gordon, Salmond and Smith (1993), IEE Proceedings F 140(2); Rössler (2010), SIAM J. Numer. Anal. 48(3).
     """
+    checks.random_key(key)
     ssm = state_space(model)
-    plan, y = checked(ssm, times, y, key, steps, max_step)
+    plan, y = checked(ssm, times, y, steps, max_step)
     settings = check_settings(ssm, ParticleSettings(particles, resampling, threshold, scheme, batch))
     return _run(ssm, plan, y, jnp.asarray(times, float), key, settings)
 
@@ -175,11 +175,9 @@ def log_likelihood(ssm: StateSpaceModel, plan: Schedule, y: jax.Array, key: jax.
     return jnp.where(jnp.isnan(total), -jnp.inf, total)
 
 
-def checked(ssm: StateSpaceModel, times: Any, y: Any, key: jax.Array, steps: int, max_step: float | None,
+def checked(ssm: StateSpaceModel, times: Any, y: Any, steps: int, max_step: float | None,
             at: Any = None, row_per_step: bool = False) -> tuple[Schedule, jax.Array]:
     """Check what a particle method is given, and return rows and observations."""
-    if not is_prng_key(key):
-        raise TypeError(f"key must be a JAX random key, such as jax.random.key(0), got {key!r}.")
     plan = schedule(ssm, times, steps, max_step, at, row_per_step=row_per_step)
     ssm.model.check_at(plan.initial_time, len(plan.observed))
     check_noise(ssm, plan.initial_time)

@@ -90,7 +90,7 @@ class ParticleSmootherResult(eqx.Module):
         return Paths(draws, draws.mean(axis=0), draws.std(axis=0, ddof=1))
 
 
-def particle_smoother(model: LatentForceModel, times: Any, y: Any, key: jax.Array, *, particles: int = 2_000,
+def particle_smoother(key: jax.Array, model: LatentForceModel, times: Any, y: Any, *, particles: int = 2_000,
                       draws: int = 200, at: Any = None, method: str = "auto", steps: int = 20,
                       max_step: float | None = None, resampling: str = "systematic", threshold: float = 0.5,
                       scheme: str = "auto") -> ParticleSmootherResult:
@@ -103,10 +103,10 @@ def particle_smoother(model: LatentForceModel, times: Any, y: Any, key: jax.Arra
     the last particles. All its trajectories meet in few particles when going back far, see ``distinct``.
 
     Args:
+        key: a JAX random key.
         model: the latent force model.
         times: (T,), non-decreasing.
         y: (T, D), NaN where missing.
-        key: a JAX random key.
         particles: N.
         draws: S, number of trajectories. (At least two, for their covariance.)
         at: (K,) times of the trajectories, between the initial time and any time after the data; by default ``times``.
@@ -131,18 +131,19 @@ def particle_smoother(model: LatentForceModel, times: Any, y: Any, key: jax.Arra
         ...     lambda x, u, t: x - x**3, {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
         ...     lfm.Gaussian(jnp.zeros(1), jnp.eye(1)), process_noise=jnp.eye(1))
         >>> result = lfm.particle_smoother(
-        ...     model, jnp.arange(3.0), jnp.ones((3, 1)), jax.random.key(0), particles=50, draws=10)
+        ...     jax.random.key(0), model, jnp.arange(3.0), jnp.ones((3, 1)), particles=50, draws=10)
         >>> result.method, result.draws.shape
         ('backward simulation', (10, 3, 1))
 
     Source: Godsill, Doucet and West (2004), JASA 99(465); Kitagawa (1996), J. Comput. Graph. Statist. 5(1).
     """
+    checks.random_key(key)
     checks.positive_integer("draws", draws)
     checks.one_of("method", method, ("auto", *METHODS))
     ssm = state_space(model)
     chosen, scheme = _method(ssm, method, scheme)
     per_step = chosen == BACKWARD and scheme == "euler"
-    plan, y = checked(ssm, times, y, key, steps, max_step, at, row_per_step=per_step)
+    plan, y = checked(ssm, times, y, steps, max_step, at, row_per_step=per_step)
     settings = check_settings(ssm, ParticleSettings(particles, resampling, threshold, scheme))
     rows = len(plan.rows.observation)
     if (needed := 8 * rows * particles * (ssm.state_dim + 2)) > _LARGEST_HISTORY:

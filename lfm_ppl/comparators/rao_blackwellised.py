@@ -24,7 +24,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import logsumexp
-from numpyro.util import is_prng_key
 
 from lfm_ppl import checks
 from lfm_ppl.comparators.mixture import Mixture
@@ -94,7 +93,7 @@ class _Settings(NamedTuple):
     shared: bool
 
 
-def rao_blackwellised(build: Build, rule: SwitchingRule, times: Any, key: jax.Array, *, y: Any = None,
+def rao_blackwellised(key: jax.Array, build: Build, rule: SwitchingRule, times: Any, *, y: Any = None,
                       start: FilterState | None = None, initial: Any = 0, decisions: Any = None,
                       particles: int = 1000, steps: int = 10, max_step: float | None = None,
                       resampling: str = "systematic", threshold: float = 0.5) -> RaoBlackwellisedResult:
@@ -105,10 +104,10 @@ def rao_blackwellised(build: Build, rule: SwitchingRule, times: Any, key: jax.Ar
     ``build`` makes new functions: compile what is called repeatedly.
 
     Args:
+        key: a JAX random key.
         build: from a value of the input to the `LatentForceModel` that holds while it has that value.
         rule: of the input, such as `lfm.Thermostat`.
         times: (T,), non-decreasing, at which the state is wanted or observed.
-        key: a JAX random key.
         y: (T, D), NaN where missing; None: nothing is observed, a prediction.
         start: the ``state`` of a filter's result, to go on from there; None: the model's initial state.
         initial: index in ``rule.values`` of the input at the start, or (N,), one for each particle.
@@ -133,7 +132,7 @@ def rao_blackwellised(build: Build, rule: SwitchingRule, times: Any, key: jax.Ar
         ...         lambda x, u, t: 0.1 * (5.0 - x) + 2.0 * heater + u, {"rest": lfm.Matern(0.3, 2.0)},
         ...         lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.01])),
         ...         lfm.Gaussian(jnp.array([18.0]), jnp.eye(1)))
-        >>> found = rao_blackwellised(house, lfm.Thermostat(20.0), jnp.arange(0.0, 24.0), jax.random.key(0))
+        >>> found = rao_blackwellised(jax.random.key(0), house, lfm.Thermostat(20.0), jnp.arange(0.0, 24.0))
         >>> mean, sd = found.outputs.moments()
         >>> mean.shape, bool(abs(mean[-1, 0] - 20.0) < 2.0)
         ((24, 1), True)
@@ -141,8 +140,7 @@ def rao_blackwellised(build: Build, rule: SwitchingRule, times: Any, key: jax.Ar
     Source: Doucet, de Freitas, Murphy and Russell (2000), Rao-Blackwellised particle filtering for dynamic Bayesian
     networks; Reece et al. (2014), Efficient state-space inference of periodic latent force models, section 9.
     """
-    if not is_prng_key(key):
-        raise TypeError(f"key must be a JAX random key, such as jax.random.key(0), got {key!r}.")
+    checks.random_key(key)
     checks.positive_integer("particles", particles)
     checks.one_of("resampling", resampling, RESAMPLING)
     if not 0.0 <= threshold <= 1.0:

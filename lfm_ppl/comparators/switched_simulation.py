@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from numpyro.util import is_prng_key
 
 from lfm_ppl import checks
 from lfm_ppl.comparators.normals import normals
@@ -78,8 +77,7 @@ def simulate_switched(key: jax.Array, build: Build, rule: SwitchingRule, times: 
         >>> simulate_switched(jax.random.key(0), house, lfm.Thermostat(20.0), jnp.arange(24.0), paths=5).state.shape
         (24, 5, 1)
     """
-    if not is_prng_key(key):
-        raise TypeError(f"key must be a JAX random key, such as jax.random.key(0), got {key!r}.")
+    checks.random_key(key)
     checks.positive_integer("paths", paths)
     ssms = switched(build, rule)
     schemes = tuple(choose_scheme(ssm, scheme) for ssm in ssms)

@@ -145,7 +145,8 @@ def _computed(tasks: list[Task], compute: Callable[[Task], Mapping[str, Any]], f
     waiting, context = iter(tasks), multiprocessing.get_context("spawn")
     begun = context.Value("i", 0)
     programs = jax.config.jax_compilation_cache_dir or _programs().name  # type: ignore[attr-defined]
-    with ProcessPoolExecutor(workers, context, _start_worker, (double, begun, workers, programs)) as pool:
+    shortest = jax.config.jax_persistent_cache_min_compile_time_secs  # type: ignore[attr-defined]
+    with ProcessPoolExecutor(workers, context, _start_worker, (double, begun, workers, programs, shortest)) as pool:
         # As many at a time as there are processes. After an error, or Ctrl-C, what has begun is let finish and kept.
         running = {pool.submit(_compute_and_write, compute, task, folder): task
                    for task in itertools.islice(waiting, workers)}
@@ -169,7 +170,7 @@ def _programs() -> tempfile.TemporaryDirectory[str]:
     return tempfile.TemporaryDirectory(prefix="lfm-ppl-")
 
 
-def _start_worker(double: bool, begun: Any, workers: int, programs: str) -> None:
+def _start_worker(double: bool, begun: Any, workers: int, programs: str, shortest: float) -> None:
     # Ctrl-C reaches every process of a terminal; the parent decides. If that is killed, there is nobody to work for.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
@@ -178,6 +179,7 @@ def _start_worker(double: bool, begun: Any, workers: int, programs: str) -> None
     _keep_to_share(number, workers)
     jax.config.update("jax_enable_x64", double)
     jax.config.update("jax_compilation_cache_dir", programs)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", shortest)
 
 
 def _keep_to_share(number: int, workers: int) -> None:

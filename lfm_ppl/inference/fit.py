@@ -13,30 +13,26 @@ from importlib import metadata
 from typing import Any
 
 import jax
-import jax.flatten_util
-import jax.numpy as jnp
 import numpy as np
 import xarray as xr
-from numpyro.infer import MCMC, NUTS, init_to_median
+from numpyro.infer import init_to_median, init_to_value
 
 from lfm_ppl import checks
 from lfm_ppl.analysis import arviz_data
 from lfm_ppl.analysis.scalars import units_attribute
 from lfm_ppl.filtering.breakdown import FilterWarning, breakdown
-from lfm_ppl.filtering.filter import check_observations
 from lfm_ppl.filtering.schedule import schedule
-from lfm_ppl.inference.fixing import fix
-from lfm_ppl.inference.map import map_estimate
-from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
+from lfm_ppl.inference import sampling
+from lfm_ppl.inference.bound_model import BoundModel, bind
+from lfm_ppl.inference.map import MAPResult, mode_of
+from lfm_ppl.inference.marginal_likelihood import Panel
+from lfm_ppl.inference.options import check_options
 from lfm_ppl.inference.particle_marginal import ParticleMarginalRAM
-from lfm_ppl.inference.posterior import LikelihoodSite, likelihood_site, scores, trajectories
+from lfm_ppl.inference.posterior import scores, trajectories
 from lfm_ppl.inference.ram import RAM
-from lfm_ppl.inference.unconstrained import UnconstrainedModel
+from lfm_ppl.inference.sampling import Transition
 
 SAMPLERS = ("nuts", "ram", "pmmh", "map")
-
-_FORWARD_MODE_LIMIT = 10
-"""Most unconstrained parameters for which forward-mode gradients are the faster ones."""
 
 _STEPS_A_DRAW = {"ram": 5, "pmmh": 1}
 """Steps for each parameter that make one draw: a random walk in d dimensions forgets in some multiple of d. A step of
@@ -44,15 +40,6 @@ particle-marginal RAM takes some hundred times as long as one of RAM, so that it
 
 _GRID = 200
 """Number of grid points of trajectories where no times are asked for."""
-
-_EXTRA_FIELDS = {
-    "nuts": {"diverging": "diverging", "accept_prob": "acceptance_rate", "num_steps": "n_steps", "energy": "energy",
-             "adapt_state.step_size": "step_size", "potential_energy": "lp"},
-    "ram": {"accept_prob": "acceptance_rate", "accepted": "accepted", "potential_energy": "lp"},
-    "pmmh": {"accept_prob": "acceptance_rate", "accepted": "accepted", "potential_energy": "lp",
-             "estimated": "estimated"},
-}
-
 
 class ConvergenceWarning(UserWarning):
     """A diagnostic says that the draws do not represent the posterior yet."""
@@ -148,6 +135,7 @@ def fit(
     """
     started = time.perf_counter()
     checks.one_of("sampler", sampler, SAMPLERS)
+    check_options(sampler, sampler_options)
     for label, value in (("chains", chains), ("samples", samples)):
         checks.positive_integer(label, value)
     if warmup != 0:
@@ -156,50 +144,36 @@ def fit(
         checks.positive_integer("thin", thin)
     if trajectory_draws != 0:
         checks.positive_integer("trajectory_draws", trajectory_draws)
-    keywords = dict(model_kwargs or {})
-    key = jax.random.key(seed)
-    keys = jax.random.split(key, 5)
-    site = likelihood_site(numpyro_model, (times, y), keywords, keys[0])
-    y = _checked(site, y)
-    _check_requested(site.example, times, at)
-    outputs = site.example.ssm.model.output_names
-    model = fix(numpyro_model, fixed, labels=outputs) if fixed else numpyro_model
-    arguments = (times, y)
-    space = UnconstrainedModel(model, arguments, keywords, keys[2])
-    size = space.draw(keys[2], init_to_median).size
-    if size == 0:
-        raise ValueError("the model has no parameters to sample; use lfm.smooth for the forces of a known model.")
-    particles = particle_steps = None
+    keys = jax.random.split(jax.random.key(seed), 5)
+    bound = bind(numpyro_model, times, y, **dict(model_kwargs or {}))
+    _check_requested(bound, at)
+    bound = bound.fix(fixed)
+    remarks: dict[str, Any]
     if sampler == "map":
-        with _start_explained(model, arguments, keywords, keys[2], space):
-            draws, stats, remarks = _mode(model, arguments, keywords, keys[1], samples, seed, init, size)
+        with _start_explained(bound):
+            draws, stats, remarks = _mode(bound, keys[1], samples, seed, init)
         chains, warmup = 1, 0
     else:
-        with _start_explained(model, arguments, keywords, keys[2], space):
-            strategy = _strategy(init, model, arguments, keywords, seed)
-            kernel, first = _kernel(sampler, model, arguments, keywords, strategy, sampler_options, keys[2], seed,
-                                    chains, init is not None, space, size)
-            thin = thin or _STEPS_A_DRAW.get(sampler, 0) * size or 1
-            draws, stats = _sample(kernel, sampler, arguments, keywords, keys[1], chains, warmup, samples, thin,
-                                   chain_method, progress, first)
-        remarks = {"thin": thin}
-        if isinstance(kernel, ParticleMarginalRAM) and kernel.tuned is not None:
-            particles, particle_steps = kernel.settings, kernel.particle_steps
-            remarks |= {"particles": kernel.tuned.particles, "log_likelihood_sd": kernel.tuned.sd,
-                        "delayed": int(kernel.delayed)}
-    flat = {label: value.reshape(-1, *value.shape[2:]) for label, value in draws.items()}
-    latent = _latent(model, arguments, keywords, keys[0], flat)
-    rated = _kept("scores of the observations", lambda: scores(
-        model, arguments, keywords, latent, y, site), None)
-    chosen, paths, grid = _kept("trajectories", lambda: _paths(
-        model, arguments, keywords, latent, site, y, at, trajectory_draws, chains, samples, keys[3], particles,
-        particle_steps),
+        with _start_explained(bound):
+            thin = thin or _STEPS_A_DRAW.get(sampler, 0) * bound.size or 1
+            transition, starts, remarks = _transition(sampler, bound, sampler_options, init, keys[2], seed, chains,
+                                                      warmup * thin)
+            collected = sampling.sample(keys[1], bound, transition, starts, warmup=warmup * thin, samples=samples,
+                                        thin=thin, chain_method=chain_method, progress=progress)
+        draws, stats = bound.constrain_draws(collected.z), _statistics(collected.statistics)
+        remarks["thin"] = thin
+    flat = {site: draws[site].reshape(-1, *draws[site].shape[2:]) for site in bound.sites}
+    rated = _kept("scores of the observations", lambda: scores(bound, flat), None)
+    particles = {name: remarks.pop(name, None) for name in ("particle_settings", "particle_steps")}
+    chosen, paths, grid = _kept(
+        "trajectories", lambda: _paths(keys[3], bound, flat, at, trajectory_draws, chains, samples, **particles),
         (None, None, None))
-    groups = _groups(site, draws, stats, rated, paths, chosen, grid, times, y, truth, chains, samples)
+    groups = _groups(bound, draws, stats, rated, paths, chosen, grid, truth)
+    example = bound.site.example
     attrs = {
-        "model": name or getattr(numpyro_model, "__name__", "model"), "rule": site.example.rule.name,
-        "steps": site.example.steps, "max_step": site.example.max_step, "iterations": site.example.iterations,
-        "tolerance": site.example.tolerance,
+        "model": name or getattr(numpyro_model, "__name__", "model"), "rule": example.rule.name,
+        "steps": example.steps, "max_step": example.max_step, "iterations": example.iterations,
+        "tolerance": example.tolerance,
         "sampler": sampler, "seed": seed, "chains": chains, "warmup": warmup,
         "samples": samples, "fixed": json.dumps({k: np.asarray(v).tolist() for k, v in (fixed or {}).items()}),
         "wall_time_s": round(time.perf_counter() - started, 3), "versions": json.dumps(_versions()),
@@ -213,27 +187,22 @@ def fit(
 
 
 @contextlib.contextmanager
-def _start_explained(model: Callable, arguments: tuple, keywords: dict, key: jax.Array,
-                     space: UnconstrainedModel) -> Iterator[None]:
+def _start_explained(bound: BoundModel) -> Iterator[None]:
     """Where no point to start from is found, say how the filter breaks down at the prior median."""
     try:
         yield
-    except (RuntimeError, ValueError) as error:
-        if "valid initial parameters" in str(error) or "finite density" in str(error):
-            _kept("reason why there is nowhere to start", lambda: _explain_start(
-                model, arguments, keywords, key, space), None)
+    except ValueError as error:
+        if "finite density" in str(error):
+            _kept("reason why there is nowhere to start", lambda: _explain_start(bound), None)
         raise
 
 
-def _explain_start(model: Callable, arguments: tuple, keywords: dict, key: jax.Array,
-                   space: UnconstrainedModel) -> None:
-    median = space.constrain(space.draw(key, init_to_median))
-    distribution = likelihood_site(model, arguments, keywords, key, median).distribution
-    y = jnp.asarray(arguments[1], float)
+def _explain_start(bound: BoundModel) -> None:
+    distribution = bound.likelihood(bound.draw(jax.random.key(0), init_to_median))
     several = isinstance(distribution, Panel)
     for index in range(distribution.batch_shape[0] if several else 1):
         one = distribution.series(index) if several else distribution
-        said = breakdown(one.ssm, one.rule, one.plan, (y[index] if several else y).reshape(one.event_shape))
+        said = breakdown(one.ssm, one.rule, one.plan, (bound.y[index] if several else bound.y).reshape(one.event_shape))
         if said is not None:
             series = f" of series {index}" if several else ""
             warnings.warn(f"at the prior median{series}, {said}", FilterWarning, stacklevel=6)
@@ -250,138 +219,125 @@ def _kept(what: str, compute: Callable[[], Any], otherwise: Any) -> Any:
         return otherwise
 
 
-def _checked(site: LikelihoodSite, y: Any) -> jax.Array:
-    if isinstance(site.distribution, Panel):
-        return site.distribution.checked(y)
-    return check_observations(y, *site.distribution.event_shape)
-
-
-def _check_requested(example: MarginalLikelihood, times: Any, at: Any) -> None:
+def _check_requested(bound: BoundModel, at: Any) -> None:
     """Raise before sampling what would stop the trajectories after it."""
     if at is None:
         return
-    if np.ndim(times) != 1:
+    if bound.times.ndim != 1:
         raise ValueError("`at` needs one vector of times for all series; this panel has times of its own for each.")
-    schedule(example.ssm, times, example.steps, example.max_step, at, tolerance=example.tolerance)
+    example = bound.site.example
+    schedule(example.ssm, bound.times, example.steps, example.max_step, at, tolerance=example.tolerance)
 
 
-def _strategy(init: Any, model: Callable, arguments: tuple, keywords: dict, seed: int) -> Any:
+def _strategy(init: Any, bound: BoundModel, seed: int) -> Any:
     if init is None:
         return init_to_median(num_samples=15)
     if isinstance(init, str):
         checks.one_of("init", init, ("map", "median"))
         if init == "median":
             return init_to_median(num_samples=15)
-        from numpyro.infer import init_to_value
-
-        mode = map_estimate(model, *arguments, seed=seed, model_kwargs=keywords)
-        return init_to_value(values=mode.parameters)
+        return init_to_value(values=mode_of(bound, seed=seed).parameters)
     if not callable(init):
         raise TypeError('init must be None, "map", "median" or a NumPyro strategy such as '
                         f"numpyro.infer.init_to_uniform, got {init!r}.")
     return init
 
 
-def _kernel(sampler: str, model: Callable, arguments: tuple, keywords: dict, strategy: Any,
-            options: Mapping[str, Any] | None, key: jax.Array, seed: int, chains: int,
-            chosen_start: bool, space: UnconstrainedModel, size: int) -> tuple[Any, Any]:
-    """Return the kernel and, for a random walk unless the user chose where to start, starting points."""
+def _transition(sampler: str, bound: BoundModel, options: Mapping[str, Any] | None, init: Any, key: jax.Array,
+                seed: int, chains: int, warmup: int) -> tuple[Transition, np.ndarray, dict[str, Any]]:
+    """Return how the chains move, where each of them starts (C, d), and what to remember of it."""
     options = dict(options or {})
-    few = size <= _FORWARD_MODE_LIMIT
+    strategy = _strategy(init, bound, seed)
     if sampler == "nuts":
-        options.setdefault("forward_mode_differentiation", few)
-        options.setdefault("dense_mass", few)  # a full mass matrix is cheap to learn for a handful of parameters
-        return NUTS(model, init_strategy=strategy, **options), None
+        transition = sampling.nuts(bound, warmup, options)
+        return transition, _starts(key, bound, strategy, chains, transition.evaluate), {}
     walk = RAM if sampler == "ram" else ParticleMarginalRAM
-    if "initial_covariance" in options:
-        return walk(model, init_strategy=strategy, **options), None
-    # A random walk that starts with the shape of the posterior needs no gradient afterwards, but learning that shape
-    # by rejection takes thousands of steps. The mode gives it; chains start at draws from its Laplace approximation.
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        mode = map_estimate(model, *arguments, seed=seed, model_kwargs=keywords, restarts=2,
-                            hessian="finite-differences", forward_mode=few)
-    if mode.unidentified or not np.all(np.isfinite(mode.covariance)):
-        return walk(model, init_strategy=strategy, **options), None
-    if sampler == "pmmh":
-        # At the mode, because a chain's own start may be a poor place to judge the estimate by.
-        options.setdefault("tune_at", space.unravel(jnp.asarray(mode.mode)))
-    kernel = walk(model, init_strategy=strategy, initial_covariance=mode.covariance, **options)
-    if chosen_start:
-        return kernel, None
+    mode = None
+    if "initial_covariance" not in options:
+        # A random walk that starts with the shape of the posterior needs no gradient afterwards, but learning that
+        # shape by rejection takes thousands of steps. The mode gives it; chains start at draws from its Laplace
+        # approximation.
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            mode = mode_of(bound, seed=seed, restarts=2)
+        if mode.unidentified or not np.all(np.isfinite(mode.covariance)):
+            mode = None
+    if mode is not None:
+        options["initial_covariance"] = mode.covariance
+        if sampler == "pmmh":
+            # At the mode, because a chain's own start may be a poor place to judge the estimate by.
+            options.setdefault("tune_at", bound.unravel(mode.mode))
+    kernel = walk(bound.model, **options)
+    starts = (_starts(key, bound, strategy, chains, bound.log_density) if mode is None or init is not None
+              else _about(key, bound, mode, chains))
+    if not isinstance(kernel, ParticleMarginalRAM):
+        return sampling.random_walk(bound, kernel, warmup), starts, {}
+    kernel.prepare(bound, starts[0])
+    assert kernel.tuned is not None
+    remarks = {"particles": kernel.tuned.particles, "log_likelihood_sd": kernel.tuned.sd,
+               "delayed": int(kernel.delayed), "particle_settings": kernel.settings,
+               "particle_steps": kernel.particle_steps}
+    return sampling.particle_marginal(bound, kernel, warmup), starts, remarks
+
+
+def _starts(key: jax.Array, bound: BoundModel, strategy: Any, chains: int, evaluate: Any) -> np.ndarray:
+    """Return a point (C, d) for each chain, by a NumPyro strategy, where what ``evaluate`` gives is finite."""
+    return np.stack([bound.start(each, strategy, evaluate=evaluate) for each in jax.random.split(key, chains)])
+
+
+def _about(key: jax.Array, bound: BoundModel, mode: MAPResult, chains: int) -> np.ndarray:
+    """Return draws (C, d) of the Laplace approximation, the mode itself where the density of a draw is zero."""
     root = np.linalg.cholesky(mode.covariance)
-    points = mode.mode + np.asarray(jax.random.normal(key, (chains, size))) @ root.T
-    possible = np.isfinite(np.asarray(jax.jit(jax.vmap(space.potential))(jnp.asarray(points))))
-    points = jnp.asarray(np.where(possible[:, None], points, mode.mode))
-    return kernel, jax.vmap(space.unravel)(points) if chains > 1 else space.unravel(points[0])
+    points = mode.mode + np.asarray(jax.random.normal(key, (chains, bound.size))) @ root.T
+    possible = [bool(np.isfinite(bound.log_density_gradient(point)[0])) for point in points]
+    return np.where(np.array(possible)[:, None], points, mode.mode)
 
 
-def _sample(kernel: Any, sampler: str, arguments: tuple, keywords: dict, key: jax.Array, chains: int, warmup: int,
-            samples: int, thin: int, chain_method: str | None, progress: bool, first: Any) -> tuple[dict, dict]:
-    if chain_method is None:
-        chain_method = "parallel" if jax.local_device_count() >= chains else "sequential"
-    checks.one_of("chain_method", chain_method, ("parallel", "vectorized", "sequential"))
-    mcmc = MCMC(kernel, num_warmup=warmup * thin, num_samples=samples * thin, thinning=thin, num_chains=chains,
-                chain_method=chain_method, progress_bar=progress)
-    mcmc.run(key, *arguments, extra_fields=tuple(_EXTRA_FIELDS[sampler]), init_params=first, **keywords)
-    extra = mcmc.get_extra_fields(group_by_chain=True)
-    stats = {new: np.asarray(extra[old]) for old, new in _EXTRA_FIELDS[sampler].items()}
-    stats["lp"] = -stats["lp"]
+def _statistics(collected: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    stats = {**collected, "lp": -collected["lp"]}
     if "n_steps" in stats:
         stats["tree_depth"] = np.ceil(np.log2(stats["n_steps"] + 1)).astype(int)
-    draws = {label: np.asarray(value) for label, value in mcmc.get_samples(group_by_chain=True).items()}
-    return draws, stats
+    return stats
 
 
-def _mode(model: Callable, arguments: tuple, keywords: dict, key: jax.Array, samples: int, seed: int,
-          init: Any, size: int) -> tuple[dict, dict, dict]:
+def _mode(bound: BoundModel, key: jax.Array, samples: int, seed: int, init: Any) -> tuple[dict, dict, dict]:
     if isinstance(init, str):
         checks.one_of("init", init, ("map", "median"))
         init = None
     # Second derivatives take longer to compile than everything else here takes to run.
-    mode = map_estimate(model, *arguments, seed=seed, model_kwargs=keywords, init=init, hessian="finite-differences",
-                        forward_mode=size <= _FORWARD_MODE_LIMIT)
+    mode = mode_of(bound, seed=seed, init=init)
     draws = {label: np.asarray(value)[None] for label, value in mode.sample(key, samples).items()}
     remarks = {"map_converged": int(mode.converged), "map_message": mode.message,
                "map_log_density": float(mode.log_density), "log_evidence": float(mode.log_evidence)}
     return draws, {}, remarks
 
 
-def _latent(model: Callable, arguments: tuple, keywords: dict, key: jax.Array, flat: dict) -> dict:
-    """The draws without deterministic sites, which the model computes itself."""
-    from numpyro import handlers
-
-    trace = handlers.trace(handlers.seed(model, key)).get_trace(*arguments, **keywords)
-    return {label: value for label, value in flat.items() if trace.get(label, {}).get("type") == "sample"}
-
-
-def _paths(model: Callable, arguments: tuple, keywords: dict, latent: dict, site: LikelihoodSite, y: Any, at: Any,
-           count: int, chains: int, samples: int, key: jax.Array,
-           particles: Any, particle_steps: int | None) -> tuple[np.ndarray, dict | None, np.ndarray | None]:
+def _paths(key: jax.Array, bound: BoundModel, draws: dict, at: Any, count: int, chains: int, samples: int,
+           particle_settings: Any, particle_steps: int | None) -> tuple[np.ndarray, dict | None, np.ndarray | None]:
     """Draw trajectories for draws that are spread evenly over each chain."""
     per_chain = min(samples, -(-count // chains))
     if per_chain == 0:
         return np.array([], int), None, None
     chosen = np.unique(np.linspace(0, samples - 1, per_chain).round().astype(int))
     rows = (np.arange(chains)[:, None] * samples + chosen).ravel()
-    times = np.asarray(arguments[0], float)
+    times = bound.times
     grid = None
     if times.ndim == 1:
-        origin = float(site.example.plan.initial_time)
+        origin = float(bound.site.example.plan.initial_time)
         grid = (np.union1d(np.linspace(min(origin, times[0]), times[-1], _GRID), times) if at is None
                 else np.atleast_1d(np.asarray(at, float)))
-    subset = {label: value[rows] for label, value in latent.items()}
-    paths = trajectories(model, arguments, keywords, subset, y, grid, key, site, particles, particle_steps)
+    subset = {site: value[rows] for site, value in draws.items()}
+    paths = trajectories(key, bound, subset, grid, particle_settings, particle_steps)
     return chosen, {k: v.reshape(chains, len(chosen), *v.shape[1:]) for k, v in paths.items()}, grid
 
 
-def _groups(site: LikelihoodSite, draws: dict, stats: dict, rated: dict | None, paths: dict | None, chosen: Any,
-            grid: np.ndarray | None, times: Any, y: Any, truth: Mapping[str, Any] | None, chains: int,
-            samples: int) -> dict[str, xr.Dataset]:
+def _groups(bound: BoundModel, draws: dict, stats: dict, rated: dict | None, paths: dict | None, chosen: Any,
+            grid: np.ndarray | None, truth: Mapping[str, Any] | None) -> dict[str, xr.Dataset]:
+    site, times, y = bound.site, bound.times, np.asarray(bound.y)
+    chains, samples = next(iter(draws.values())).shape[:2]
     model = site.example.ssm.model
     units = model.units
     panel = ("series",) if isinstance(site.distribution, Panel) else ()
-    times = np.asarray(times, float)
     per_series = times.ndim == 2
     along = ("series", "time") if panel else ("time",)
     coords: dict[str, Any] = {"chain": np.arange(chains), "draw": np.arange(samples)}

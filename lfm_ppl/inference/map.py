@@ -15,12 +15,8 @@ import numpy as np
 from numpyro.infer import init_to_median, init_to_sample
 
 from lfm_ppl import checks
+from lfm_ppl.inference.bound_model import BoundModel, bind_arguments
 from lfm_ppl.inference.optimise import Minimum, Objective, newton, quasi_newton
-from lfm_ppl.inference.unconstrained import (
-    UnconstrainedModel,
-    check_latent_sites,
-    coordinate_names,
-)
 
 _HESSIANS = ("autodiff", "finite-differences")
 _ATTEMPTS = 20
@@ -72,7 +68,7 @@ class MAPResult:
     _factor: np.ndarray = field(repr=False)
     _constrain: Callable = field(repr=False)
 
-    def sample(self, key: jax.Array, n: int) -> dict[str, jax.Array]:
+    def sample(self, key: jax.Array, n: int) -> dict[str, np.ndarray]:
         """Return ``n`` draws from the Laplace approximation, in constrained space.
 
         Args:
@@ -92,7 +88,7 @@ class MAPResult:
                 "finite. Use hessian='finite-differences', or sample the posterior with MCMC."
             )
         noise = jax.random.normal(key, (n, self.mode.size))
-        return jax.jit(jax.vmap(self._constrain))(self.mode + noise @ self._factor.T)
+        return self._constrain(self.mode + noise @ self._factor.T)
 
 
 def map_estimate(
@@ -104,7 +100,7 @@ def map_estimate(
     model_kwargs: Mapping[str, Any] | None = None,
     jacobian: bool = True,
     hessian: str = "autodiff",
-    forward_mode: bool = False,
+    forward_mode: bool | None = None,
     max_iterations: int = 1000,
 ) -> MAPResult:
     r"""Return the posterior mode of a NumPyro model and the Laplace approximation around it.
@@ -132,8 +128,8 @@ def map_estimate(
         hessian: ``"autodiff"``, or ``"finite-differences"`` of the gradient: about 9 digits instead
             of 15, no second derivatives, and for a latent force model less than half the time to
             compile.
-        forward_mode: take derivatives in forward mode: faster with a handful of parameters, and the
-            only one where the model loops with ``jax.lax.while_loop``.
+        forward_mode: take derivatives in forward mode, which is the only one where the model loops
+            with ``jax.lax.while_loop``; by default with up to ten parameters, where it is faster.
         max_iterations: of L-BFGS, for each start.
 
     Returns:
@@ -169,20 +165,25 @@ def map_estimate(
             "numpyro.enable_x64() before anything else.",
             stacklevel=2,
         )
-    check_latent_sites(model, args, model_kwargs or {}, jax.random.key(seed), "map_estimate")
-    problem = UnconstrainedModel(model, args, model_kwargs or {}, jax.random.key(seed))
-    target = problem.potential if jacobian else problem.constrained_potential
-    objective = Objective(target, forward_mode, hessian == "autodiff")
-    starts = _starts(problem, objective.value, init, restarts)
+    bound = bind_arguments(model, args, model_kwargs or {}, "map_estimate")
+    return mode_of(bound, init=init, restarts=restarts, seed=seed, jacobian=jacobian,
+                   exact_hessian=hessian == "autodiff", forward_mode=forward_mode, max_iterations=max_iterations)
+
+
+def mode_of(bound: BoundModel, *, init: Any = None, restarts: int = 4, seed: int = 0, jacobian: bool = True,
+            exact_hessian: bool = False, forward_mode: bool | None = None, max_iterations: int = 1000) -> MAPResult:
+    """Return the posterior mode of a bound model; arguments as in `map_estimate`."""
+    objective = bound.objective(jacobian, forward_mode, exact_hessian)
+    starts = _starts(bound, jax.random.key(seed), objective.value, init, restarts)
     ends = [quasi_newton(objective, start, max_iterations) for start in starts if start is not None]
-    reached = iter([-objective.value(end) for end in ends])
+    reached = iter([-end.value for end in ends])
     densities = np.array([-np.inf if start is None else next(reached) for start in starts])
-    minimum = newton(objective, min(ends, key=objective.value))
-    return _result(problem, objective, minimum, densities)
+    minimum = newton(objective, min(ends, key=lambda end: end.value).point)
+    return _result(bound, objective, minimum, densities, jacobian)
 
 
 def _starts(
-    model: UnconstrainedModel, value: Callable, init: Any, restarts: int
+    model: BoundModel, key: jax.Array, value: Callable, init: Any, restarts: int
 ) -> list[np.ndarray | None]:
     """Return one vector (d,) of finite density for each start, None where there is none."""
     first, attempts = init or init_to_median, _ATTEMPTS
@@ -191,7 +192,7 @@ def _starts(
             if name not in model.sites:
                 raise ValueError(checks.unknown("site in init", name, model.sites))
         first, attempts = partial(_init_to_given, init), 1
-    first_key, *keys = jax.random.split(model.key, restarts)
+    first_key, *keys = jax.random.split(key, restarts)
     start = _possible_start(model, value, first_key, first, attempts)
     if isinstance(init, Mapping) and start is None:
         raise ValueError(
@@ -210,10 +211,10 @@ def _starts(
 
 
 def _possible_start(
-    model: UnconstrainedModel, value: Callable, key: jax.Array, strategy: Callable, attempts: int
+    model: BoundModel, value: Callable, key: jax.Array, strategy: Callable, attempts: int
 ) -> np.ndarray | None:
     for attempt in jax.random.split(key, attempts):
-        flat = np.asarray(model.draw(attempt, strategy), float)
+        flat = model.draw(attempt, strategy)
         if np.isfinite(value(flat)):
             return flat
     return None
@@ -233,30 +234,27 @@ def _init_to_given(values: Mapping[str, Any], site: dict) -> Any:
 
 
 def _result(
-    problem: UnconstrainedModel, objective: Objective, minimum: Minimum, densities: np.ndarray
+    bound: BoundModel, objective: Objective, minimum: Minimum, densities: np.ndarray, jacobian: bool
 ) -> MAPResult:
-    point, curvature = minimum.point, minimum.curvature
-    unconstrained = {k: np.asarray(v) for k, v in problem.unravel(jnp.asarray(point)).items()}
-    values = {k: np.asarray(v) for k, v in jax.jit(problem.constrain)(jnp.asarray(point)).items()}
-    names = coordinate_names(unconstrained)
+    point, curvature, names = minimum.point, minimum.curvature, bound.names
+    unconstrained = {k: np.asarray(v) for k, v in bound.unravel(point).items()}
+    values = {k: np.asarray(v) for k, v in bound.constrain(point).items()}
     factor, log_determinant, unidentified = np.full((point.size,) * 2, np.nan), math.nan, ()
     if curvature is not None:
         factor, log_determinant = curvature.factor, curvature.log_determinant
         unidentified = tuple(names[i] for i in curvature.coordinates(curvature.flat))
     message = _verdict(minimum, names)
     if message:
-        warnings.warn(f"map_estimate did not converge: {message} {_REMEDY}", stacklevel=3)
+        warnings.warn(f"map_estimate did not converge: {message} {_REMEDY}", stacklevel=4)
     elif unidentified:
         warnings.warn(
             f"the posterior is flat at its mode in a direction of {', '.join(unidentified)}: their "
             "Laplace variances and the evidence mean nothing. Give these parameters an "
             "informative prior, or fix one of them.",
-            stacklevel=3,
+            stacklevel=4,
         )
     # The Jacobian belongs to the evidence whichever mode was asked for: the Hessian is over z.
-    energy = minimum.value
-    if objective.function != problem.potential:
-        energy = float(jax.jit(problem.potential)(jnp.asarray(point)))
+    energy = minimum.value if jacobian else -float(bound.log_density(point))
     return MAPResult(
         parameters={k: v for k, v in values.items() if k in unconstrained},
         deterministic={k: v for k, v in values.items() if k not in unconstrained},
@@ -272,7 +270,7 @@ def _result(
         restart_log_densities=densities,
         evaluations=objective.evaluations,
         _factor=factor,
-        _constrain=problem.constrain,
+        _constrain=bound.constrain_draws,
     )
 
 

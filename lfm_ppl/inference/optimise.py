@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,25 +16,41 @@ from lfm_ppl.inference.curvature import Curvature, decompose, finite_difference_
 _NEWTON_STEPS = 20
 _NEGLIGIBLE = 1e-16
 """Decrease of minus a log density that ends the search: the step is 1e-8 standard deviations."""
+_STRICT = {"maxcor": 20, "ftol": 1e-14, "gtol": 1e-7}
 _EXACT_NOISE, _DIFFERENCE_NOISE = 1e-12, 1e-7
 """Error of a Hessian scaled to a unit diagonal: differentiated twice, and by differences."""
 
 
+def value_and_gradient(function: Callable[..., jax.Array], forward_mode: bool) -> Callable[..., tuple]:
+    """Return the function that gives value and gradient of ``function(z, ...)`` with respect to z."""
+    if not forward_mode:
+        return jax.value_and_grad(function)
+
+    def twice(*arguments: Any) -> tuple[jax.Array, jax.Array]:
+        value = function(*arguments)
+        return value, value
+
+    return lambda *arguments: jax.jacfwd(twice, has_aux=True)(*arguments)[::-1]
+
+
 @dataclass
 class Objective:
-    """A function of a vector with its derivatives, compiled once each, in NumPy's terms.
+    """A function of a vector with its derivatives, each of them compiled, in NumPy's terms.
 
     Attributes:
-        function: traceable function of a vector (d,), returning a scalar.
-        forward_mode: take the gradient by forward mode, where reverse mode is slower or missing.
-        exact_hessian: differentiate twice, instead of taking differences of the gradient.
+        program: from a vector (d,) to the value and the gradient (d,).
+        hessian: from a vector (d,) to the Hessian (d, d); None: differences of the gradient.
         evaluations: number of values and gradients computed so far.
     """
 
-    function: Callable[[jax.Array], jax.Array]
-    forward_mode: bool = False
-    exact_hessian: bool = True
+    program: Callable[[Any], tuple[Any, Any]]
+    hessian: Callable[[Any], Any] | None = None
     evaluations: int = field(default=0, init=False)
+
+    @classmethod
+    def of(cls, function: Callable[[jax.Array], jax.Array]) -> Objective:
+        """Return the objective of a traceable function of a vector (d,), with derivatives in reverse mode."""
+        return cls(jax.jit(jax.value_and_grad(function)), jax.jit(jax.jacfwd(jax.jacrev(function))))
 
     def value(self, point: np.ndarray) -> float:
         """Return the value, infinite where it is not finite."""
@@ -44,34 +60,18 @@ class Objective:
     def value_and_gradient(self, point: np.ndarray) -> tuple[float, np.ndarray]:
         """Return the value and the gradient (d,)."""
         self.evaluations += 1
-        value, gradient = self._value_and_gradient(jnp.asarray(point))
+        value, gradient = self.program(jnp.asarray(point))
         return float(value), np.asarray(gradient, float)
 
     def curvature(self, point: np.ndarray) -> Curvature | None:
         """Return the curvature, None where no finite Hessian is to be had."""
         hessian, noise = None, _EXACT_NOISE
-        if self.exact_hessian:
-            hessian = np.asarray(self._hessian(jnp.asarray(point)), float)
+        if self.hessian is not None:
+            hessian = np.asarray(self.hessian(jnp.asarray(point)), float)
         if hessian is None or not np.all(np.isfinite(hessian)):
             gradient = lambda x: self.value_and_gradient(x)[1]  # noqa: E731
             hessian, noise = finite_difference_hessian(gradient, point), _DIFFERENCE_NOISE
         return decompose(hessian, noise) if np.all(np.isfinite(hessian)) else None
-
-    @cached_property
-    def _value_and_gradient(self) -> Callable:
-        if not self.forward_mode:
-            return jax.jit(jax.value_and_grad(self.function))
-
-        def twice(point: jax.Array) -> tuple[jax.Array, jax.Array]:
-            value = self.function(point)
-            return value, value
-
-        return jax.jit(lambda point: jax.jacfwd(twice, has_aux=True)(point)[::-1])
-
-    @cached_property
-    def _hessian(self) -> Callable:
-        inner = jax.jacfwd if self.forward_mode else jax.jacrev
-        return jax.jit(jax.jacfwd(inner(self.function)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,27 +95,52 @@ class Minimum:
     gradient: np.ndarray
 
 
-def quasi_newton(objective: Objective, start: np.ndarray, max_iterations: int) -> np.ndarray:
-    """Return the end point of L-BFGS from ``start`` (d,), where the objective is finite.
+class End(NamedTuple):
+    """The best point that a search met.
 
-    Where the objective is not finite the line search sees a wall of moderate height, because
-    interpolation through an enormous one would shorten the step to nothing.
+    Attributes:
+        point: shape (d,).
+        value: of the objective; infinite if it was finite nowhere.
     """
-    best = (objective.value(start), start)
-    highest = best[0]
+
+    point: np.ndarray
+    value: float
+
+
+def quasi_newton(objective: Objective, start: np.ndarray, max_iterations: int = 1000, *,
+                 bounds: np.ndarray | None = None,
+                 options: Mapping[str, float] | None = None) -> End:
+    """Return the lowest point that L-BFGS meets on its way from ``start``.
+
+    Where the objective or its gradient is not finite the line search sees a wall of moderate height, because
+    interpolation through an enormous one would shorten the step to nothing.
+
+    Args:
+        objective: what is minimised; it is evaluated nowhere but where the search asks for it.
+        start: (d,).
+        max_iterations: where the search ends at the latest.
+        bounds: (d, 2), least and largest value of each coordinate; None: there are none.
+        options: of SciPy's L-BFGS-B, in place of the strict ones that serve Newton's method afterwards.
+    """
+    best = End(np.asarray(start, float), np.inf)
+    highest = -np.inf
 
     def guarded(point: np.ndarray) -> tuple[float, np.ndarray]:
         nonlocal best, highest
         value, gradient = objective.value_and_gradient(point)
-        if not (np.isfinite(value) and np.all(np.isfinite(gradient))):
-            return highest + 10.0 * (1.0 + abs(highest - best[0])), np.zeros_like(point)
+        usable = np.isfinite(value) and np.all(np.isfinite(gradient))
+        if usable or best.value == np.inf and np.isfinite(value):
+            best = min(best, End(point.copy(), value), key=lambda end: end.value)
+        if not usable:
+            # Without a finite value there is nothing to turn back to: the search ends where the gradient is zero.
+            wall = highest + 10.0 * (1.0 + abs(highest - best.value)) if np.isfinite(highest) else 0.0
+            return wall, np.zeros_like(point)
         highest = max(highest, value)
-        best = min(best, (value, point.copy()), key=lambda pair: pair[0])
         return value, gradient
 
-    options = {"maxiter": max_iterations, "maxcor": 20, "ftol": 1e-14, "gtol": 1e-7}
-    scipy.optimize.minimize(guarded, start, jac=True, method="L-BFGS-B", options=options)
-    return best[1]
+    settings = {"maxiter": max_iterations, **(_STRICT if options is None else options)}
+    scipy.optimize.minimize(guarded, start, jac=True, method="L-BFGS-B", bounds=bounds, options=settings)
+    return best
 
 
 def newton(objective: Objective, point: np.ndarray) -> Minimum:

@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
-from numpyro import handlers
 from numpyro.distributions import constraints
-from numpyro.infer.util import potential_energy
 
 from lfm_ppl import checks
 from lfm_ppl.comparators.observation_noise import check_noise
 from lfm_ppl.comparators.particle_filter import ParticleSettings, check_settings, log_likelihood
 from lfm_ppl.filtering.schedule import schedule
+from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.likelihood_handler import LikelihoodHandler
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
-from lfm_ppl.inference.posterior import likelihood_site
 
 _REPLICATES = 64
 """Filters whose log likelihoods give the standard deviation of one; that is known to a tenth of itself then."""
@@ -72,7 +70,6 @@ class with_particles(LikelihoodHandler):  # noqa: N801 (an effect handler, named
         key: a JAX random key; another one gives another estimate.
         settings: checked settings of the filter.
         steps: integration steps between two times; None: those of the model.
-        times: of the site where the model's own are traced.
 
     Example:
         >>> import jax, jax.numpy as jnp, numpyro, lfm_ppl as lfm
@@ -88,8 +85,8 @@ class with_particles(LikelihoodHandler):  # noqa: N801 (an effect handler, named
     """
 
     def __init__(self, fn: Callable[..., Any] | None, key: jax.Array, settings: ParticleSettings,
-                 steps: int | None = None, times: Any = None) -> None:
-        self.key, self.settings, self.steps, self.times = key, settings, steps, times
+                 steps: int | None = None) -> None:
+        self.key, self.settings, self.steps = key, settings, steps
         super().__init__(fn)
 
     def complaint(self) -> str:
@@ -100,8 +97,6 @@ class with_particles(LikelihoodHandler):  # noqa: N801 (an effect handler, named
 
     def replacement(self, likelihood: MarginalLikelihood | Panel, site: dict[str, Any]) -> Any:
         """Return the estimate."""
-        if self.times is not None and checks.traced(likelihood.times):
-            likelihood = likelihood.with_times(self.times)
         return ParticleLikelihood(likelihood, self.key, self.settings, self.steps)
 
 
@@ -116,10 +111,7 @@ class ParticlePotential:
     """Potential energy of a model's unconstrained parameters, with the likelihood estimated by particles.
 
     Args:
-        model: a NumPyro model with one likelihood site.
-        args: its positional arguments, times first.
-        kwargs: its keyword arguments.
-        key: for what the model draws besides its sites.
+        bound: the model and its data.
         settings: of the filter; the scheme is chosen, and everything checked, here.
         steps: integration steps between two times; None: those of the model.
 
@@ -127,30 +119,25 @@ class ParticlePotential:
         ValueError: there is no likelihood site, or several; what the particle filter raises.
     """
 
-    def __init__(self, model: Callable, args: tuple, kwargs: Mapping[str, Any], key: jax.Array,
-                 settings: ParticleSettings, steps: int | None = None) -> None:
+    def __init__(self, bound: BoundModel, settings: ParticleSettings, steps: int | None = None) -> None:
         if steps is not None:
             checks.positive_integer("particle_steps", steps)
-        site = likelihood_site(model, args, kwargs, key)
-        check_noise(site.example.ssm, site.example.plan.initial_time)
-        self.settings = check_settings(site.example.ssm, settings)
-        self._call = (model, args, dict(kwargs), key, steps, site.distribution.times)
+        example = bound.site.example
+        check_noise(example.ssm, example.plan.initial_time)
+        self.settings = check_settings(example.ssm, settings)
+        self._bound, self._steps = bound, steps
 
-    def __call__(self, z: Any, key: jax.Array, particles: int | None = None,
-                 call: tuple[tuple, dict] | None = None) -> jax.Array:
+    def __call__(self, z: Any, key: jax.Array, particles: int | None = None, y: Any = None) -> jax.Array:
         """Return minus the log density at ``z``.
 
         Args:
-            z: unconstrained parameters.
+            z: (d,) unconstrained parameters.
             key: of the particle filter.
             particles: their number; None: that of the settings.
-            call: positional and keyword arguments of the model in place of its own, of the same shapes.
+            y: data in place of those that were bound, of the same shape.
         """
-        model, args, kwargs, own, steps, times = self._call
-        args, kwargs = call or (args, kwargs)
         settings = self.settings if particles is None else self.settings._replace(particles=particles)
-        seeded = handlers.seed(model, own)
-        return potential_energy(with_particles(seeded, key, settings, steps, times), args, kwargs, z)
+        return -self._bound.log_density_with(lambda model: with_particles(model, key, settings, self._steps), z, y)
 
     def tune(self, z: Any, key: jax.Array, target_sd: float = 1.0) -> Tuned:
         """Choose the number of particles for which the log likelihood at ``z`` has a standard deviation near 1.
@@ -159,7 +146,7 @@ class ParticlePotential:
         estimates, more cost more than they gain.
 
         Args:
-            z: unconstrained parameters, as central in the posterior as they are known to be.
+            z: (d,) unconstrained parameters, as central in the posterior as they are known to be.
             key: a JAX random key.
             target_sd: the standard deviation wanted.
 
@@ -190,8 +177,10 @@ class ParticlePotential:
 
         Estimates of zero count as the worst of the others; infinite where they are the majority.
         """
-        run = jax.jit(lambda z, keys: jax.lax.map(lambda k: self(z, k, particles), keys))
-        energies = np.asarray(run(z, jax.random.split(key, _REPLICATES)))
+        name = ("spread of estimates", self.settings._replace(particles=particles), self._steps)
+        run = self._bound.compiled(name, lambda: jax.jit(
+            lambda z, keys, y: jax.lax.map(lambda k: self(z, k, particles, y), keys)))
+        energies = np.asarray(run(z, jax.random.split(key, _REPLICATES), self._bound.argument))
         finite = np.isfinite(energies)
         if finite.mean() < 0.5:
             return float("inf")

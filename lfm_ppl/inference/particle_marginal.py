@@ -9,11 +9,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from numpyro.infer import init_to_median
 from numpyro.util import is_prng_key
 
 from lfm_ppl import checks
 from lfm_ppl.comparators.particle_filter import ParticleSettings
+from lfm_ppl.inference.bound_model import BoundModel, bind_arguments
 from lfm_ppl.inference.particle_likelihood import ParticlePotential, Tuned
 from lfm_ppl.inference.ram import RAM
 from lfm_ppl.inference.robust_metropolis import (
@@ -24,7 +26,6 @@ from lfm_ppl.inference.robust_metropolis import (
     finite_or_infinity,
     propose,
 )
-from lfm_ppl.inference.unconstrained import UnconstrainedModel
 
 _TARGET, _TARGET_ONE = 0.12, 0.21
 """Half of what RAM aims at: noise of sd one in the log likelihood halves the acceptance at any scale."""
@@ -91,6 +92,7 @@ class ParticleMarginalRAM(RAM):
     Attributes:
         delayed: whether acceptance is delayed.
         particle_steps: as given.
+        estimate: after the start, the estimated potential energy.
         tuned: after the start, the number of particles and the standard deviation of the log likelihood estimate
             (NaN where the data were traced).
 
@@ -143,7 +145,7 @@ class ParticleMarginalRAM(RAM):
         self._tune_at = tune_at
         self.particle_steps = particle_steps
         self._particles = particles
-        self._estimate: ParticlePotential | None = None
+        self.estimate: ParticlePotential | None = None
         self._tuned_for: Any = None
         self.tuned: Tuned | None = None
 
@@ -159,10 +161,11 @@ class ParticleMarginalRAM(RAM):
         start: RAMState = super().init(rng_key, num_warmup, init_params, model_args, model_kwargs)
         single = is_prng_key(rng_key)
         first_key = rng_key if single else rng_key[0]
-        self._prepare(start.z if single else jax.tree_util.tree_map(lambda leaf: leaf[0], start.z), model_args,
-                      model_kwargs or {})
+        first = start.z if single else jax.tree_util.tree_map(lambda leaf: leaf[0], start.z)
+        self._prepare(first, model_args, model_kwargs or {})
         estimate_key = jax.random.fold_in(first_key, 1)
-        estimate = jax.jit(partial(self._energy, (model_args, model_kwargs or {})))
+        y = model_args[-1] if model_args else None
+        estimate = jax.jit(partial(self._energy, y))
         if single:
             energy = estimate(start.z, estimate_key)
         else:
@@ -175,48 +178,56 @@ class ParticleMarginalRAM(RAM):
     @property
     def settings(self) -> ParticleSettings:
         """Settings of the particle filter, with the number of particles that was chosen."""
-        assert self._estimate is not None and self.tuned is not None, "init must be called first."
-        return self._estimate.settings._replace(particles=self.tuned.particles)
+        assert self.estimate is not None and self.tuned is not None, "init must be called first."
+        return self.estimate.settings._replace(particles=self.tuned.particles)
+
+    def prepare(self, bound: BoundModel, start: Any) -> None:
+        """Check the filter and choose the number of particles: with numbers, since it decides what is compiled.
+
+        Args:
+            bound: the model and its data.
+            start: (d,), where the number is chosen unless ``tune_at`` says otherwise.
+        """
+        self.estimate = ParticlePotential(bound, self._settings, self.particle_steps)
+        if checks.traced(bound.y):
+            # Data that are arguments of a compiled program: there is nothing to choose the number by.
+            if self._particles is None:
+                raise ValueError("the number of particles is chosen by the data, which are not known here; give "
+                                 "particles, or run with numbers (jit_model_args=False).")
+            self.tuned = Tuned(self._particles, float("nan"))
+            return
+        data = np.asarray(bound.y).tobytes()
+        if self.tuned is not None and data == self._tuned_for:
+            return
+        self._tuned_for = data
+        key = jax.random.key(0)
+        z = start if self._tune_at is None else ravel_pytree(self._tune_at)[0]
+        if checks.traced(z):
+            z = bound.draw(key, self._init_strategy)
+        if self._particles is None:
+            self.tuned = self.estimate.tune(z, key)
+        else:
+            self.tuned = Tuned(self._particles, self.estimate.spread(z, key, self._particles))
 
     def _prepare(self, start: Any, args: tuple, kwargs: dict) -> None:
-        """Check the filter and choose the number of particles: with numbers, since it decides what is compiled."""
         assert self.model is not None
         with jax.ensure_compile_time_eval():  # chains that run in parallel are initialised within a trace
-            key = jax.random.key(0)
-            self._estimate = ParticlePotential(self.model, args, kwargs, key, self._settings, self.particle_steps)
-            if checks.traced((args, kwargs)):
-                # Data that are arguments of a compiled program: there is nothing to choose the number by.
-                if self._particles is None:
-                    raise ValueError("the number of particles is chosen by the data, which are not known here; give "
-                                     "particles, or run with numbers (jit_model_args=False).")
-                self.tuned = Tuned(self._particles, float("nan"))
-                return
-            data = [np.asarray(leaf).tobytes() for leaf in jax.tree_util.tree_leaves((args, kwargs))
-                    if isinstance(leaf, (np.ndarray, jax.Array, float, int))]
-            if self.tuned is not None and data == self._tuned_for:
-                return
-            self._tuned_for = data
-            z = start if self._tune_at is None else self._tune_at
-            if checks.traced(z):
-                space = UnconstrainedModel(self.model, args, kwargs, key)
-                z = space.unravel(space.draw(key, self._init_strategy))
-            if self._particles is None:
-                self.tuned = self._estimate.tune(z, key)
-            else:
-                self.tuned = Tuned(self._particles, self._estimate.spread(z, key, self._particles))
+            self.prepare(bind_arguments(self.model, args, kwargs, "ParticleMarginalRAM"), ravel_pytree(start)[0])
 
     def sample(self, state: ParticleMarginalState, model_args: tuple,  # type: ignore[override]
                model_kwargs: dict | None) -> ParticleMarginalState:
         """Return the state after one step of every chain in ``state``."""
         surrogate = self._potential(model_args, model_kwargs or {}) if self.delayed else None
-        energy = partial(self._energy, (model_args, model_kwargs or {}))
-        one_chain = partial(particle_marginal_step, energy, surrogate, self._target_accept_prob, self._exponent,
-                            self._adapt_throughout)
+        one_chain = self.step(partial(self._energy, model_args[-1] if model_args else None), surrogate)
         return (one_chain if is_prng_key(state.rng_key) else jax.vmap(one_chain))(state)
 
-    def _energy(self, call: tuple[tuple, dict], z: Any, key: jax.Array) -> jax.Array:
-        assert self._estimate is not None and self.tuned is not None, "init must be called before sample."
-        return self._estimate(z, key, self.tuned.particles, call)
+    def step(self, estimate: Callable, surrogate: Callable | None) -> Callable:
+        """Return the step of one chain; arguments as in `particle_marginal_step`."""
+        return partial(particle_marginal_step, estimate, surrogate, *self.adaptation)
+
+    def _energy(self, y: Any, z: Any, key: jax.Array) -> jax.Array:
+        assert self.estimate is not None and self.tuned is not None, "init must be called before sample."
+        return self.estimate(ravel_pytree(z)[0], key, self.tuned.particles, y)
 
 
 def particle_marginal_step(

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable, Hashable, Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpyro import handlers
 
 from lfm_ppl import checks
 from lfm_ppl.comparators.particle_filter import ParticleSettings
 from lfm_ppl.comparators.particle_smoother import TRACING, draw_trajectories
 from lfm_ppl.filtering.schedule import schedule
+from lfm_ppl.inference.bound_model import BoundModel, signature
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
 from lfm_ppl.linalg import matmul, semidefinite_root
 from lfm_ppl.model.augment import StateSpaceModel
@@ -25,52 +25,8 @@ _BATCH_NUMBERS = 2_000_000
 """Numbers that the smoother may hold for one batch of draws; more draws go one batch after another."""
 
 
-class LikelihoodSite(NamedTuple):
-    """The likelihood site of a NumPyro model.
-
-    Attributes:
-        name: of the site.
-        distribution: the `MarginalLikelihood` or the panel.
-    """
-
-    name: str
-    distribution: MarginalLikelihood | Panel
-
-    @property
-    def example(self) -> MarginalLikelihood:
-        """The distribution of one series."""
-        if isinstance(self.distribution, Panel):
-            return self.distribution.first
-        return self.distribution
-
-
-def likelihood_site(model: Callable, arguments: tuple, keywords: Mapping[str, Any], key: jax.Array,
-                    parameters: Mapping[str, Any] | None = None) -> LikelihoodSite:
-    """Run a NumPyro model and return its one likelihood site.
-
-    Raises:
-        ValueError: the model has no such site, or several.
-    """
-    seeded = handlers.seed(handlers.substitute(model, data=dict(parameters or {})), key)
-    trace = handlers.trace(seeded).get_trace(*arguments, **keywords)
-    found = []
-    for name, site in trace.items():
-        distribution = site.get("fn")
-        # Masks and expansions wrap the distribution.
-        while hasattr(distribution, "base_dist") and not isinstance(distribution, (MarginalLikelihood, Panel)):
-            distribution = distribution.base_dist
-        if isinstance(distribution, (MarginalLikelihood, Panel)):
-            found.append(LikelihoodSite(name, distribution))
-    if len(found) != 1:
-        names = ", ".join(site.name for site in found) or "none"
-        raise ValueError("the model must have exactly one site numpyro.sample(name, lfm.MarginalLikelihood(...), "
-                         f"obs=y) (or lfm.panel); found {names}.")
-    return found[0]
-
-
-def scores(model: Callable, arguments: tuple, keywords: Mapping[str, Any], draws: Mapping[str, Any],
-           y: Any, known: LikelihoodSite) -> dict[str, np.ndarray]:
-    """Score the observations under each draw; ``known`` is the site outside of compiled code.
+def scores(bound: BoundModel, draws: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Score the observations under each draw, site name -> (S, ...).
 
     Returns:
         ``leave_one_out`` (S, ..., T), ``one_step_ahead`` (S, ..., T), ``residual`` (S, ..., T, D); the series of a
@@ -82,28 +38,21 @@ def scores(model: Callable, arguments: tuple, keywords: Mapping[str, Any], draws
         return {"leave_one_out": result.leave_one_out, "one_step_ahead": result.log_likelihood,
                 "residual": result.residual}
 
-    def per_draw(parameters: Any, key: jax.Array) -> dict[str, jax.Array]:
-        distribution = drawn(model, arguments, keywords, key, parameters, known)
-        return each(distribution, one, jnp.asarray(y, float))
+    def per_draw(values: Any, key: jax.Array, y: Any) -> dict[str, jax.Array]:
+        return each(bound.likelihood(values, y), one, bound.data(y))
 
-    return over_draws(per_draw, draws, jax.random.key(0), len(np.ravel(arguments[0])), known)
+    return over_draws(bound, "scores", per_draw, draws, jax.random.key(0), bound.times.size)
 
 
-def trajectories(model: Callable, arguments: tuple, keywords: Mapping[str, Any], draws: Mapping[str, Any], y: Any,
-                 at: Any, key: jax.Array, known: LikelihoodSite,
-                 particles: ParticleSettings | None = None,
-                 particle_steps: int | None = None) -> dict[str, np.ndarray]:
+def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at: Any,
+                 particles: ParticleSettings | None = None, particle_steps: int | None = None) -> dict[str, np.ndarray]:
     """Draw one trajectory for each draw of the parameters, given the data, and replicate the data along it.
 
     Args:
-        model: the NumPyro model.
-        arguments: its positional arguments, times first.
-        keywords: its keyword arguments.
-        draws: site name -> (S, ...).
-        y: (T, D), or (B, T, D) for a panel.
-        at: (K,) times of the trajectories, or None for the observation times.
         key: a JAX random key.
-        known: the site outside of compiled code, where its times are numbers.
+        bound: the model and its data.
+        draws: site name -> (S, ...).
+        at: (K,) times of the trajectories, or None for the observation times.
         particles: draw the trajectories with the particle smoother; None: with the Gaussian one.
         particle_steps: integration steps of the particles between two observations; None: the model's.
 
@@ -111,6 +60,7 @@ def trajectories(model: Callable, arguments: tuple, keywords: Mapping[str, Any],
         ``state`` (S, ..., K, M), ``force`` (S, ..., K, R), ``output`` (S, ..., K, D) free of noise, and ``y``
         (S, ..., T, D), the posterior predictive at the observation times.
     """
+    at = None if at is None else np.asarray(at, float)
     count = 0 if at is None else len(at)
 
     def one(distribution: MarginalLikelihood, y: jax.Array, key: jax.Array) -> dict[str, jax.Array]:
@@ -131,16 +81,16 @@ def trajectories(model: Callable, arguments: tuple, keywords: Mapping[str, Any],
         size = ssm.physical_dim
         return {"state": w[:stop, :size], "force": w[:stop, size:], "output": output[:stop], "y": replicated}
 
-    def per_draw(parameters: Any, key: jax.Array) -> dict[str, jax.Array]:
-        site_key, key = jax.random.split(key)
-        distribution = drawn(model, arguments, keywords, site_key, parameters, known)
-        observed = jnp.asarray(y, float)
-        keys = jax.random.split(key, observed.shape[0]) if isinstance(distribution, Panel) else key
-        return each(distribution, one, observed, keys)
+    def per_draw(values: Any, key: jax.Array, y: Any) -> dict[str, jax.Array]:
+        distribution = bound.likelihood(values, y)
+        y = bound.data(y)
+        keys = jax.random.split(key, y.shape[0]) if isinstance(distribution, Panel) else key
+        return each(distribution, one, y, keys)
 
-    rows = count + len(np.ravel(arguments[0]))
+    rows = count + bound.times.size
     width = 1 if particles is None else particles.particles
-    return over_draws(per_draw, draws, key, rows * width, known)
+    name = ("trajectories", signature(at), particles, particle_steps)
+    return over_draws(bound, name, per_draw, draws, key, rows * width)
 
 
 def _smoothed_path(distribution: MarginalLikelihood, y: jax.Array, at: Any,
@@ -185,16 +135,6 @@ def _steps_in_a_row(ssm: StateSpaceModel, times: Any, at: Any, steps: int) -> in
     return max(1, int(np.ceil(steps * min(float((rows.length / own).max()), 1.0) - 1e-9)))
 
 
-def drawn(model: Callable, arguments: tuple, keywords: Mapping[str, Any], key: jax.Array, parameters: Any,
-          known: LikelihoodSite) -> MarginalLikelihood | Panel:
-    """Return the likelihood under one draw, in compiled code too.
-
-    Times that the model converted to traced values are those of ``known``, the site outside of compiled code.
-    """
-    distribution = likelihood_site(model, arguments, keywords, key, parameters).distribution
-    return distribution.with_times(known.distribution.times) if checks.traced(distribution.times) else distribution
-
-
 def each(distribution: MarginalLikelihood | Panel, function: Callable, *arguments: Any) -> Any:
     """Return ``function(distribution, *arguments)``; of a panel, for each series, with the series as leading axis."""
     if isinstance(distribution, Panel):
@@ -202,23 +142,35 @@ def each(distribution: MarginalLikelihood | Panel, function: Callable, *argument
     return function(distribution, *arguments)
 
 
-def over_draws(per_draw: Callable, draws: Mapping[str, Any], key: jax.Array, rows: int,
-               known: LikelihoodSite) -> dict[str, np.ndarray]:
-    """Return ``per_draw(parameters, key)`` for all draws (S, ...), in batches that bound the memory.
+def over_draws(bound: BoundModel, name: Hashable, per_draw: Callable, draws: Mapping[str, Any], key: jax.Array,
+               rows: int) -> dict[str, np.ndarray]:
+    """Return ``per_draw(values, key, y)`` for all draws (S, ...), in batches that bound the memory.
 
     With steps that follow a tolerance it is one draw after another.
+
+    Args:
+        bound: the model and its data y.
+        name: everything that ``per_draw`` depends on besides the model, so that it is compiled once.
+        per_draw: maps site values, a random key and the model's ``argument`` to a pytree of arrays.
+        draws: site name -> (S, ...).
+        key: a JAX random key.
+        rows: of the scan over time, for the estimate of the memory.
     """
-    draws = {name: jnp.asarray(value) for name, value in draws.items()}
+    draws = {site: jnp.asarray(value) for site, value in draws.items()}
     count = next(iter(draws.values())).shape[0]
-    if known.example.tolerance is not None and not known.example.ssm.time_invariant:
+    example = bound.site.example
+    if example.tolerance is not None and not example.ssm.time_invariant:
         # Side by side, every draw would make as many steps as may be tried.
-        one_by_one = jax.jit(lambda d, k: jax.lax.map(lambda pair: per_draw(*pair), (d, k)))
-        return jax.tree_util.tree_map(np.asarray, one_by_one(draws, jax.random.split(key, count)))
-    numbers = rows * known.example.ssm.state_dim**2 * 6
+        one_by_one = bound.compiled(("one by one", name), lambda: jax.jit(
+            lambda d, k, y: jax.lax.map(lambda pair: per_draw(*pair, y), (d, k))))
+        return jax.tree_util.tree_map(np.asarray, one_by_one(draws, jax.random.split(key, count), bound.argument))
+    numbers = rows * example.ssm.state_dim**2 * 6
     batch = int(np.clip(_BATCH_NUMBERS // max(numbers, 1), 1, count))
     batches = -(-count // batch)
     # Repeat the last draws so that all batches are full: one shape, one compilation.
     index = np.minimum(np.arange(batches * batch), count - 1).reshape(batches, batch)
-    run = jax.jit(lambda d, k: jax.lax.map(lambda pair: jax.vmap(per_draw)(*pair), (d, k)))
-    found = run({name: value[index] for name, value in draws.items()}, jax.random.split(key, count)[index])
+    run = bound.compiled(("in batches", name), lambda: jax.jit(
+        lambda d, k, y: jax.lax.map(lambda pair: jax.vmap(per_draw, in_axes=(0, 0, None))(*pair, y), (d, k))))
+    found = run({site: value[index] for site, value in draws.items()}, jax.random.split(key, count)[index],
+                bound.argument)
     return jax.tree_util.tree_map(lambda a: np.asarray(a).reshape(a.shape[0] * a.shape[1], *a.shape[2:])[:count], found)

@@ -127,6 +127,11 @@ class RAM(MCMCKernel):
         """Field of the state that holds the parameters."""
         return "z"
 
+    @property
+    def adaptation(self) -> tuple[float | None, float, bool]:
+        """Acceptance to aim at, exponent of the adaptation, and whether it goes on after the warm-up."""
+        return self._target_accept_prob, self._exponent, self._adapt_throughout
+
     def get_diagnostics_str(self, state: RAMState) -> str:
         """Return the step size and the mean acceptance probability, for the progress bar."""
         return f"step size {state.step_size:.2e}. acc. prob={state.mean_accept_prob:.2f}"
@@ -161,7 +166,8 @@ class RAM(MCMCKernel):
         z, potential_energy = self._starting_point(
             model_key, init_params, model_args, model_kwargs or {}
         )
-        chol = jnp.asarray(self._initial_factor(z, single))
+        shapes = [leaf.shape if single else leaf.shape[1:] for leaf in jax.tree_util.tree_leaves(z)]
+        chol = jnp.asarray(self.initial_factor(sum(math.prod(shape) for shape in shapes)))
         start = partial(initial_state, chol=chol, num_warmup=num_warmup)
         state = (start if single else jax.vmap(start))(z, potential_energy, rng_key)
         self._sample_fn = self.sample
@@ -169,13 +175,7 @@ class RAM(MCMCKernel):
 
     def sample(self, state: RAMState, model_args: tuple, model_kwargs: dict | None) -> RAMState:
         """Return the state after one step of every chain in ``state``."""
-        one_chain = partial(
-            step,
-            self._potential(model_args, model_kwargs or {}),
-            self._target_accept_prob,
-            self._exponent,
-            self._adapt_throughout,
-        )
+        one_chain = partial(step, self._potential(model_args, model_kwargs or {}), *self.adaptation)
         return (one_chain if is_prng_key(state.rng_key) else jax.vmap(one_chain))(state)
 
     def _potential(self, model_args: tuple, model_kwargs: dict) -> Callable:
@@ -219,10 +219,8 @@ class RAM(MCMCKernel):
             )
         return z, jnp.where(jnp.isfinite(energy), energy, jnp.inf)
 
-    def _initial_factor(self, z: Any, single: bool) -> np.ndarray:
-        leaves = jax.tree_util.tree_leaves(z)
-        shapes = [leaf.shape if single else leaf.shape[1:] for leaf in leaves]
-        dimension = sum(math.prod(shape) for shape in shapes)
+    def initial_factor(self, dimension: int) -> np.ndarray:
+        """Return the first Cholesky factor of the proposal, (d, d), for d unconstrained parameters."""
         if dimension == 0:
             raise ValueError("RAM needs at least one parameter, but init_params holds none.")
         if self._initial_chol is None:

@@ -11,7 +11,7 @@ import xarray as xr
 import lfm_ppl as lfm
 from lfm_ppl.analysis import accuracy, arviz_data, importance, likelihoods, rebuilding
 from lfm_ppl.analysis.accuracy import check_accuracy
-from lfm_ppl.analysis.correction import correct
+from lfm_ppl.analysis.correction import correct_posterior
 from lfm_ppl.analysis.plots import plot_accuracy
 from lfm_ppl.analysis.report import AccuracyReport
 from lfm_ppl.analysis.verdict import Findings, judge
@@ -258,7 +258,7 @@ def test_the_corrected_posterior_is_the_exact_one_on_a_grid_of_parameters(bent):
     assert abs(row["corrected_mean"] - posteriors["exact"][1]) < 3.5 * row["corrected_mean_se"] + 0.01
     assert abs(row["corrected_sd"] / row["sd"] - posteriors["exact"][2] / posteriors["wrong"][2]) \
         < 3.5 * row["sd_ratio_se"] + 0.02
-    corrected = correct(replaced, well)
+    corrected = correct_posterior(replaced, well)
     again = arviz_data.group(corrected, "posterior")["depth"].values
     assert again.shape == (4, 100) and set(again.ravel()) <= set(draws.ravel())
     assert abs(again.mean() - posteriors["exact"][1]) < 4 * posteriors["exact"][2] / np.sqrt(report.ess)
@@ -285,7 +285,7 @@ def test_the_figure_is_readable(checked, readable):
 def test_correction_keeps_data_truth_and_the_layout_of_trajectories(checked):
     result, report = checked
     assert report.reliable
-    corrected = correct(result, well, trajectory_draws=6)
+    corrected = correct_posterior(result, well, trajectory_draws=6)
     old, new = (arviz_data.group(one, "trajectories") for one in (result, corrected))
     assert new["states"].dims == old["states"].dims and new["states"].shape == (1, 6, *old["states"].shape[2:])
     np.testing.assert_array_equal(new["at"], old["at"])

@@ -12,6 +12,7 @@ import pytest
 import xarray as xr
 from scipy import special
 
+import lfm_ppl as lfm
 from lfm_ppl.analysis import arviz_data, netcdf
 from lfm_ppl.analysis.scalars import (
     choose,
@@ -102,6 +103,19 @@ def test_round_trip_keeps_everything(tmp_path, result, datasets):
     assert os.listdir(path.parent) == ["posterior.nc"]
 
 
+def test_the_public_names_save_and_load_a_results_folder(tmp_path, result, datasets):
+    written = lfm.save(result, tmp_path / "run" / "posterior.nc")
+    for where in (written, written.parent, str(written.parent)):
+        loaded = lfm.load(where)
+        assert type(loaded) is type(result) and set(arviz_data.groups(loaded)) == set(datasets)
+    with pytest.raises(FileExistsError, match="overwrite=True"):
+        lfm.save(result, written)
+    assert lfm.save(loaded, written, overwrite=True) == written
+    with pytest.raises(TypeError, match=r"result must be what lfm\.fit or lfm\.load returned, got dict"):
+        lfm.save({}, tmp_path / "no.nc")
+    assert not (tmp_path / "no.nc").exists()
+
+
 def test_round_trip_of_awkward_attributes(tmp_path):
     attrs = {
         "versions": {"jax": "0.10", "arviz": None},
@@ -182,9 +196,9 @@ def test_failed_write_leaves_nothing(tmp_path):
 
 
 def test_load_explains_what_is_wrong(tmp_path, result):
-    with pytest.raises(FileNotFoundError, match=r"none\.nc does not exist; expected a netCDF"):
+    with pytest.raises(FileNotFoundError, match=r"there is no result .*none\.nc; expected a results folder, or a net"):
         arviz_data.load(tmp_path / "none.nc")
-    with pytest.raises(FileNotFoundError, match="is a folder"):
+    with pytest.raises(FileNotFoundError, match=r"holds no posterior\.nc; expected a folder that `lfm-ppl fit` wrote"):
         arviz_data.load(tmp_path)
     text = tmp_path / "text.nc"
     text.write_text("time,y\n0,1\n")

@@ -67,7 +67,7 @@ def conjugate():
             return lambda z: z
 
     run = lambda widen: calibration.calibrate(  # noqa: E731
-        level, np.arange(3.0), lambda model: Exact(widen), jax.random.key(5), data_sets=400, thin=1, warmup=1)
+        jax.random.key(5), level, np.arange(3.0), lambda model: Exact(widen), data_sets=400, thin=1, warmup=1)
     return run(1.0), run(1.6)
 
 
@@ -124,6 +124,6 @@ def test_mistakes(conjugate):
     with pytest.raises(ValueError, match="64 possible ranks, which do not fall into 10 bins"):
         plot_calibration(conjugate[0], bins=10)
     with pytest.raises(ValueError, match="data_sets must be at least 1"):
-        calibration.calibrate(lambda times, y=None: None, [0.0], lfm.RAM, jax.random.key(0), data_sets=0)
+        calibration.calibrate(jax.random.key(0), lambda times, y=None: None, [0.0], lfm.RAM, data_sets=0)
     with pytest.raises(ValueError, match="exactly one site"):
-        calibration.calibrate(lambda times, y=None: None, [0.0], lfm.RAM, jax.random.key(0))
+        calibration.calibrate(jax.random.key(0), lambda times, y=None: None, [0.0], lfm.RAM)

@@ -11,7 +11,7 @@ from lfm_ppl.analysis.arviz_data import group, summary
 from lfm_ppl.comparators.finite_volume import Grid
 from lfm_ppl.comparators.grid_filter import log_likelihood
 from lfm_ppl.filtering.schedule import schedule
-from lfm_ppl.inference.posterior import likelihood_site
+from lfm_ppl.inference.bound_model import likelihood_site
 from lfm_ppl.model.augment import state_space
 
 pytestmark = pytest.mark.slow

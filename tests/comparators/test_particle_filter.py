@@ -86,7 +86,7 @@ def test_several_outputs_with_missing_entries_and_correlated_noise():
 def test_filtering_moments_agree_with_the_kalman_filter():
     model = driven()
     exact = lfm.filter(model, TIMES, Y)
-    found = lfm.particle_filter(model, TIMES, Y, jax.random.key(1), particles=200_000)
+    found = lfm.particle_filter(jax.random.key(1), model, TIMES, Y, particles=200_000)
     sd = np.sqrt(np.asarray(exact.filtered_covariance)[:, [0, 1, 2], [0, 1, 2]])
     error = sd / np.sqrt(np.asarray(found.ess))[:, None]
     assert np.all(np.abs(found.mean - exact.filtered_mean) < 5.0 * error)
@@ -104,7 +104,7 @@ def test_the_double_well_agrees_with_the_grid():
     exact = fokker_planck(model, times, y, cells=300, bounds=(-3.2, 3.2))
     found = estimates(model, times, y, 400, 40, particles=300)
     assert_unbiased(found, float(exact.log_likelihood.sum()))
-    result = lfm.particle_filter(model, times, y, jax.random.key(0), particles=50_000, steps=40)
+    result = lfm.particle_filter(jax.random.key(0), model, times, y, particles=50_000, steps=40)
     error = np.asarray(exact.sd) / np.sqrt(np.asarray(result.ess))
     assert np.all(np.abs(result.mean[:, 0] - exact.mean) < 4.0 * error)
 
@@ -138,8 +138,8 @@ def test_angles_are_compared_on_the_circle():
 
     times, key = np.array([0.0, 1.0]), jax.random.key(0)
     y = np.array([[3.1], [2.9]])
-    wrapped = lfm.particle_filter(build((0,)), times, y - 2 * np.pi, key, particles=500)
-    plain = lfm.particle_filter(build(()), times, y, key, particles=500)
+    wrapped = lfm.particle_filter(key, build((0,)), times, y - 2 * np.pi, particles=500)
+    plain = lfm.particle_filter(key, build(()), times, y, particles=500)
     assert np.allclose(wrapped.log_likelihood, plain.log_likelihood, atol=1e-9)
 
 
@@ -161,16 +161,16 @@ def test_batches_bound_the_memory_and_nothing_else():
 def test_failure_is_minus_infinity():
     """No particle near the observation; a step so long that the particles leave the finite numbers."""
     far = np.array([[0.1], [1e200]])
-    result = lfm.particle_filter(relaxing(), [0.0, 1.0], far, jax.random.key(0), particles=50)
+    result = lfm.particle_filter(jax.random.key(0), relaxing(), [0.0, 1.0], far, particles=50)
     assert result.log_likelihood[1] == -np.inf and np.isfinite(result.log_likelihood[0])
-    explosive = lfm.particle_filter(double_well(variance=1e4, mean=50.0), [0.0, 50.0], [[np.nan], [0.3]],
-                                    jax.random.key(0), particles=50, steps=5)
+    explosive = lfm.particle_filter(jax.random.key(0), double_well(variance=1e4, mean=50.0), [0.0, 50.0],
+                                    [[np.nan], [0.3]], particles=50, steps=5)
     assert explosive.log_likelihood.sum() == -np.inf
 
 
 def test_some_exploding_particles_leave_the_others_alone():
     model = double_well(mean=0.0, variance=400.0)
-    result = lfm.particle_filter(model, [0.0, 4.0], [[np.nan], [0.9]], jax.random.key(0), particles=4000, steps=20)
+    result = lfm.particle_filter(jax.random.key(0), model, [0.0, 4.0], [[np.nan], [0.9]], particles=4000, steps=20)
     assert np.all(np.isfinite(result.log_likelihood)) and np.all(np.isfinite(result.mean))
 
 
@@ -178,9 +178,9 @@ def test_lost_particles_count_wherever_they_are_lost():
     """A drift that explodes from some starts: rows within an interval do not forgive what one row would not."""
     model = lfm.LatentForceModel(lambda x, u, t: x**2, {}, lfm.GaussianObservation(first_state, jnp.array([1.0])),
                                  lfm.Gaussian(jnp.array([0.0]), jnp.array([0.3])), process_noise=jnp.array([[0.01]]))
-    arguments = ([0.0, 4.0], [[np.nan], [0.0]], jax.random.key(0))
-    whole = lfm.particle_filter(model, *arguments, particles=20_000, steps=400, scheme="srk")
-    rows = lfm.particle_filter(model, *arguments, particles=20_000, steps=1, max_step=0.01, scheme="srk")
+    arguments = (jax.random.key(0), model, [0.0, 4.0], [[np.nan], [0.0]])
+    whole = lfm.particle_filter(*arguments, particles=20_000, steps=400, scheme="srk")
+    rows = lfm.particle_filter(*arguments, particles=20_000, steps=1, max_step=0.01, scheme="srk")
     lost = 1.0 - np.exp(float(whole.log_likelihood.sum()) + 0.5 * np.log(2 * np.pi))
     assert lost > 0.3  # the test has something to see
     assert np.isclose(whole.log_likelihood.sum(), rows.log_likelihood.sum(), atol=0.03)
@@ -190,7 +190,7 @@ def test_degeneracy_is_reported():
     """A precise observation after vague ones leaves few effective particles, and the report says where."""
     model = relaxing(noise=1e-4)
     y = np.array([[np.nan], [np.nan], [np.nan], [0.2], [np.nan]])
-    result = lfm.particle_filter(model, TIMES, y, jax.random.key(0), particles=1000)
+    result = lfm.particle_filter(jax.random.key(0), model, TIMES, y, particles=1000)
     smallest, where = result.minimum_ess
     assert where == 2.0 and smallest < 50.0 and result.resampled.tolist() == [False, False, False, True, False]
     assert np.isclose(smallest, result.ess.min())
@@ -272,7 +272,7 @@ def test_effective_sample_size():
 def test_errors(change, error, message):
     given = {"model": relaxing(), "times": TIMES, "y": Y, "key": jax.random.key(0)} | change
     with pytest.raises(error, match=message):
-        lfm.particle_filter(given.pop("model"), given.pop("times"), given.pop("y"), given.pop("key"), **given)
+        lfm.particle_filter(given.pop("key"), given.pop("model"), given.pop("times"), given.pop("y"), **given)
 
 
 def test_singular_noise_is_named():
@@ -280,4 +280,4 @@ def test_singular_noise_is_named():
         lambda x, u, t: -x, {}, lfm.GaussianObservation(Outputs(jnp.ones((2, 1))), jnp.ones((2, 2))),
         lfm.Gaussian(jnp.zeros(1), jnp.ones(1)), process_noise=jnp.eye(1))
     with pytest.raises(ValueError, match="singular"):
-        lfm.particle_filter(model, [0.0], np.zeros((1, 2)), jax.random.key(0))
+        lfm.particle_filter(jax.random.key(0), model, [0.0], np.zeros((1, 2)))

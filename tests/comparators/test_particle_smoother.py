@@ -30,7 +30,7 @@ def assert_close(found, mean, sd, draws, share=0.1):
 def test_backward_simulation_of_a_linear_model():
     """Against the Rauch-Tung-Striebel smoother, before, between and after the observations."""
     exact = lfm.smooth(linear(), TIMES, Y, at=AT)
-    found = lfm.particle_smoother(linear(), TIMES, Y, jax.random.key(0), particles=3000, draws=1500, at=AT)
+    found = lfm.particle_smoother(jax.random.key(0), linear(), TIMES, Y, particles=3000, draws=1500, at=AT)
     assert (found.method, found.scheme) == ("backward simulation", "exact")
     sd = np.sqrt(np.asarray(exact.covariance)[:, [0, 1], [0, 1]])
     assert_close(found, exact.mean, sd, 1500 / 2)
@@ -45,7 +45,7 @@ def test_backward_simulation_of_a_linear_model():
 
 def test_ancestor_tracing_of_a_linear_model():
     exact = lfm.smooth(linear(), TIMES, Y)
-    found = lfm.particle_smoother(linear(), TIMES, Y, jax.random.key(0), particles=20_000, draws=4000,
+    found = lfm.particle_smoother(jax.random.key(0), linear(), TIMES, Y, particles=20_000, draws=4000,
                                   method="ancestor tracing")
     assert found.method == "ancestor tracing"
     assert np.all(np.diff(found.distinct) >= 0)  # going back, trajectories meet
@@ -61,7 +61,7 @@ def test_the_double_well_agrees_with_the_grid():
     at = np.array([0.75, 1.5, 2.25, 4.0])
     exact = fokker_planck(model, times, y, at=at)
     for method, particles, draws in (("backward simulation", 3000, 1000), ("ancestor tracing", 40_000, 4000)):
-        found = lfm.particle_smoother(model, times, y, jax.random.key(2), particles=particles, draws=draws, at=at,
+        found = lfm.particle_smoother(jax.random.key(2), model, times, y, particles=particles, draws=draws, at=at,
                                       steps=75, method=method)
         assert found.method == method
         count = draws / 2 if method.startswith("back") else float(found.distinct.min()) / 4
@@ -70,7 +70,7 @@ def test_the_double_well_agrees_with_the_grid():
 
 def test_replicates_share_the_state():
     """Between observations at one time nothing moves: a trajectory has one value there."""
-    found = lfm.particle_smoother(double_well(), TIMES, Y, jax.random.key(0), particles=200, draws=50, steps=5)
+    found = lfm.particle_smoother(jax.random.key(0), double_well(), TIMES, Y, particles=200, draws=50, steps=5)
     assert found.method == "backward simulation" and found.scheme == "euler"
     assert np.array_equal(found.draws[:, 1], found.draws[:, 2])
 
@@ -87,8 +87,8 @@ def test_replicates_share_the_state():
 ], ids=["linear", "driven", "constant", "jumps"])
 def test_models_without_a_transition_density_are_traced(model, reason):
     with pytest.raises(ValueError, match=reason):
-        lfm.particle_smoother(model, TIMES, Y, jax.random.key(0), method="backward simulation")
-    found = lfm.particle_smoother(model, TIMES, Y, jax.random.key(0), particles=50, draws=10, steps=3)
+        lfm.particle_smoother(jax.random.key(0), model, TIMES, Y, method="backward simulation")
+    found = lfm.particle_smoother(jax.random.key(0), model, TIMES, Y, particles=50, draws=10, steps=3)
     assert found.method == "ancestor tracing" and np.all(np.isfinite(found.draws))
 
 
@@ -102,11 +102,11 @@ def test_models_without_a_transition_density_are_traced(model, reason):
 ])
 def test_errors(change, message):
     with pytest.raises(ValueError, match=message):
-        lfm.particle_smoother(double_well(), TIMES, Y, jax.random.key(0), **change)
+        lfm.particle_smoother(jax.random.key(0), double_well(), TIMES, Y, **change)
 
 
 def test_an_unknown_force_is_named():
-    found = lfm.particle_smoother(linear(), TIMES, Y, jax.random.key(0), particles=20, draws=5)
+    found = lfm.particle_smoother(jax.random.key(0), linear(), TIMES, Y, particles=20, draws=5)
     with pytest.raises(ValueError, match="unknown force 'v'"):
         found.force("v")
     with pytest.raises(ValueError, match="unknown state 'y'"):

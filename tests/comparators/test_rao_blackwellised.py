@@ -68,7 +68,7 @@ def agree(found, paths, inputs):
 
 @pytest.fixture(scope="module")
 def predicted():
-    return lfm.rao_blackwellised(house, THERMOSTAT, TIMES, jax.random.key(1), particles=1000)
+    return lfm.rao_blackwellised(jax.random.key(1), house, THERMOSTAT, TIMES, particles=1000)
 
 
 def test_the_prediction_is_that_of_a_hundred_times_the_plain_particles(predicted):
@@ -85,7 +85,7 @@ def test_simulated_paths_have_the_same_distribution(predicted):
 
 def test_an_input_that_changes_a_rate_has_covariances_of_its_own():
     assert only_adds(house) and not only_adds(leaky)
-    found = lfm.rao_blackwellised(leaky, THERMOSTAT, TIMES, jax.random.key(3), particles=1000)
+    found = lfm.rao_blackwellised(jax.random.key(3), leaky, THERMOSTAT, TIMES, particles=1000)
     assert found.outputs.variance.shape == (len(TIMES), 1000, 1)
     drawn = lfm.simulate_switched(jax.random.key(4), leaky, THERMOSTAT, TIMES, paths=100_000)
     agree(found, np.asarray(drawn.state[:, :, 0]), np.asarray(drawn.inputs))
@@ -93,11 +93,11 @@ def test_an_input_that_changes_a_rate_has_covariances_of_its_own():
 
 def test_between_decisions_nothing_is_drawn():
     """With one decision at the start, later moments are those of two Gaussians, and vary less than plain particles."""
-    found = lfm.rao_blackwellised(house, THERMOSTAT, TIMES, jax.random.key(5), particles=400, decisions=TIMES[:1])
+    found = lfm.rao_blackwellised(jax.random.key(5), house, THERMOSTAT, TIMES, particles=400, decisions=TIMES[:1])
     drawn = lfm.simulate_switched(jax.random.key(6), house, THERMOSTAT, TIMES, paths=40_000, decisions=TIMES[:1])
     agree(found, np.asarray(drawn.state[:, :, 0]), np.asarray(drawn.inputs))
     assert (found.inputs == found.inputs[0]).all()
-    heated = lfm.rao_blackwellised(house, lfm.Thermostat(100.0), TIMES, jax.random.key(5), particles=400,
+    heated = lfm.rao_blackwellised(jax.random.key(5), house, lfm.Thermostat(100.0), TIMES, particles=400,
                                    decisions=TIMES[:1])
     plain = heated.outputs.moments()[1][-1, 0] / np.sqrt(400)
     assert heated.outputs.error()[-1, 0] < 0.3 * plain
@@ -109,12 +109,12 @@ def test_an_input_that_never_changes_is_the_filter(build):
     y = 17.0 + np.sin(3 * TIMES)[:, None]
     y[[2, 3, 9]] = np.nan
     always = lfm.Thermostat(1e12, sensor_sd=1e9)  # so inaccurate a sensor says nothing of the state
-    found = lfm.rao_blackwellised(build, always, TIMES, jax.random.key(0), y=y, initial=1, particles=3)
+    found = lfm.rao_blackwellised(jax.random.key(0), build, always, TIMES, y=y, initial=1, particles=3)
     expected = lfm.filter(build(1.0), TIMES, y)
     np.testing.assert_allclose(found.log_likelihood, expected.log_likelihood, rtol=1e-8, atol=1e-10)
     np.testing.assert_allclose(found.mean, expected.filtered_mean, rtol=1e-7, atol=1e-7)
     np.testing.assert_allclose(found.covariance, expected.filtered_covariance, rtol=1e-7, atol=1e-8)
-    went_on = lfm.rao_blackwellised(build, always, TIMES[5:], jax.random.key(0), y=y[5:], initial=1, particles=3,
+    went_on = lfm.rao_blackwellised(jax.random.key(0), build, always, TIMES[5:], y=y[5:], initial=1, particles=3,
                                     start=lfm.filter(build(1.0), TIMES[:5], y[:5]).state)
     np.testing.assert_allclose(went_on.mean[-1], expected.filtered_mean[-1], rtol=1e-7, atol=1e-7)
 
@@ -123,7 +123,7 @@ def test_the_likelihood_is_that_of_weighted_paths():
     times = TIMES[:7]
     y = np.full((7, 1), np.nan)
     y[[2, 4, 6], 0] = [17.5, 18.2, 18.0]
-    found = lfm.rao_blackwellised(house, THERMOSTAT, times, jax.random.key(7), y=y, particles=4000)
+    found = lfm.rao_blackwellised(jax.random.key(7), house, THERMOSTAT, times, y=y, particles=4000)
     drawn = lfm.simulate_switched(jax.random.key(8), house, THERMOSTAT, times, paths=200_000)
     path = np.asarray(drawn.state[:, :, 0])
     weight = np.exp(sum(stats.norm(path[k], np.sqrt(NOISE)).logpdf(y[k, 0]) for k in (2, 4, 6)))
@@ -151,7 +151,7 @@ def test_forces_that_jump_are_followed():
         return lfm.LatentForceModel(model.dynamics, {"rest": Kicked(SCALE, LENGTH, order=0)}, model.observation,
                                     model.initial_state)
 
-    found = lfm.rao_blackwellised(kicked, THERMOSTAT, TIMES, jax.random.key(9), particles=1000)
+    found = lfm.rao_blackwellised(jax.random.key(9), kicked, THERMOSTAT, TIMES, particles=1000)
     drawn = lfm.simulate_switched(jax.random.key(10), kicked, THERMOSTAT, TIMES, paths=100_000)
     agree(found, np.asarray(drawn.state[:, :, 0]), np.asarray(drawn.inputs))
 
@@ -164,8 +164,9 @@ def test_one_compilation_serves_all_values():
         nonlocal count
         count += 1
         state = lfm.FilterState(0.0, start, jnp.eye(2))
-        return lfm.rao_blackwellised(lambda heater: house(heater, rate), lfm.Thermostat(set_point), TIMES[:3],
-                                     jax.random.key(0), start=state, initial=initial, particles=10).input_mean
+        return lfm.rao_blackwellised(
+            jax.random.key(0), lambda heater: house(heater, rate), lfm.Thermostat(set_point), TIMES[:3],
+            start=state, initial=initial, particles=10).input_mean
 
     cold = predict(0.3, 18.0, jnp.array([10.0, 0.0]), 0)
     warm = predict(0.1, 14.0, jnp.array([30.0, 0.0]), 1)
@@ -226,7 +227,7 @@ def test_bad_input(make, message):
 @pytest.mark.parametrize(("make", "message"), [
     (lambda: run(rule=20.0), "must be an lfm.SwitchingRule"),
     (lambda: lfm.simulate_switched(0, house, THERMOSTAT, TIMES), "JAX random key"),
-    (lambda: lfm.rao_blackwellised(house, THERMOSTAT, TIMES, 0), "JAX random key"),
+    (lambda: lfm.rao_blackwellised(0, house, THERMOSTAT, TIMES), "JAX random key"),
     (lambda: lfm.Thermostat([18.0, 20.0]), "lfm.Input"),
     (lambda: lfm.Thermostat(20.0, hysteresis=np.array([1.0, 2.0])), "hysteresis must be one number"),
 ])
@@ -236,7 +237,7 @@ def test_wrong_types(make, message):
 
 
 def run(build=house, rule=THERMOSTAT, particles=10, **keywords):
-    return lfm.rao_blackwellised(build, rule, TIMES[:3], jax.random.key(0), particles=particles, **keywords)
+    return lfm.rao_blackwellised(jax.random.key(0), build, rule, TIMES[:3], particles=particles, **keywords)
 
 
 def curved(heater):
@@ -265,7 +266,7 @@ def test_an_observation_comes_before_the_decision_at_its_time():
     drawn = lfm.simulate_switched(key, lamp, lfm.Thermostat(1000.0), times, steps=1)
     np.testing.assert_allclose(drawn.y[:, 0, 0], [17.0, 117.0, 117.0], atol=0.1)
     np.testing.assert_array_equal(drawn.inputs[:, 0], [1.0, 1.0, 1.0])
-    found = lfm.rao_blackwellised(lamp, lfm.Thermostat(1000.0), times, key, y=drawn.y[:, 0], particles=10, steps=1)
+    found = lfm.rao_blackwellised(key, lamp, lfm.Thermostat(1000.0), times, y=drawn.y[:, 0], particles=10, steps=1)
     np.testing.assert_allclose(found.outputs.moments()[0][:, 0], [17.0, 117.0, 117.0], atol=0.1)
     assert np.isfinite(found.log_likelihood).all() and found.log_likelihood[0] > 0.0
 

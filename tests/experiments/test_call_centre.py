@@ -6,8 +6,6 @@ import sys
 import warnings
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
@@ -17,6 +15,7 @@ import lfm_ppl as lfm
 from lfm_ppl.experiments import catalogue, scores, weighting
 from lfm_ppl.experiments.call_centre import counts, experiment, figures, posterior, problem, report, tables, tracking
 from lfm_ppl.experiments.tasks import write
+from lfm_ppl.inference.optimise import Objective
 
 DATA = Path(os.environ.get("LFM_DATA", "../shared/data")) / "calls"
 real = pytest.mark.skipif(not DATA.is_dir(), reason="the counts of real calls are not there (LFM_DATA)")
@@ -143,9 +142,7 @@ def test_the_densities_are_those_of_the_model():
     method, one = problem.Method("matern"), window()
     assert method.names == ("mean", "scale", "lengthscale", "noise_sd")
     z = np.log([6.5, 2.0, 100.0, 0.6])
-    negative, _ = tracking.energy(method, one.training, 0.0)(z)
-    both, _ = tracking.energy(method, one.training, 1.0)(z)
-    log_likelihood, log_prior = -negative, negative - both
+    log_likelihood, log_prior = problem.posterior(method).log_densities(z, one.training)
     medians, spread = np.log([6.0, 2.0, 168.0, 0.5]), np.array([0.5, 0.7, 0.7, 0.7])
     assert log_prior == pytest.approx(stats.norm(medians, spread).logpdf(z).sum(), rel=1e-9)
     m = sys.modules[problem.model_file().model.__module__]
@@ -156,14 +153,24 @@ def test_the_densities_are_those_of_the_model():
 
 def test_the_gradient_is_that_of_finite_differences():
     method, one = problem.Method("matern"), window()
-    value_and_gradient = tracking.energy(method, one.training, 1.0)
+    objective = problem.posterior(method).objective(one.training)
     z = np.log([6.5, 2.0, 150.0, 0.8])
-    _, gradient = value_and_gradient(z)
+    _, gradient = objective.value_and_gradient(z)
     steps = 1e-5 * np.eye(4)
-    expected = [(value_and_gradient(z + step)[0] - value_and_gradient(z - step)[0]) / 2e-5 for step in steps]
+    expected = [(objective.value(z + step) - objective.value(z - step)) / 2e-5 for step in steps]
     np.testing.assert_allclose(gradient, expected, rtol=1e-5, atol=1e-5)
     learnt = tracking.learn(method, one.training)
-    assert -learnt.log_likelihood < tracking.energy(method, one.training, 0.0)(z)[0]
+    assert -learnt.log_likelihood < problem.posterior(method).objective(one.training, 0.0).value(z)
+
+
+def searched(monkeypatch, value_and_gradient):
+    """Let searches be of ``value_and_gradient(z, prior)``, in the place of the posterior."""
+
+    class Posterior:
+        def objective(self, y, prior=1.0):
+            return Objective(lambda z: value_and_gradient(np.asarray(z), prior))
+
+    monkeypatch.setattr(problem, "posterior", lambda method: Posterior())
 
 
 def test_searches_from_several_starts_find_several_modes(monkeypatch):
@@ -172,14 +179,11 @@ def test_searches_from_several_starts_find_several_modes(monkeypatch):
     starts = np.log([[start[name] for name in method.names] for start in tracking.STARTS])
     wells, depth = starts + 0.05, np.array([3.0, -2.0, 30.0])
 
-    def energy(method, y, prior):
-        def value_and_gradient(z):
-            k = np.argmin(((z - wells) ** 2).sum(axis=1))
-            return 20 * ((z - wells[k]) ** 2).sum() + depth[k] + prior, 40 * (z - wells[k])
+    def value_and_gradient(z, prior):
+        k = np.argmin(((z - wells) ** 2).sum(axis=1))
+        return 20 * ((z - wells[k]) ** 2).sum() + depth[k] + prior, 40 * (z - wells[k])
 
-        return value_and_gradient
-
-    monkeypatch.setattr(tracking, "energy", energy)
+    searched(monkeypatch, value_and_gradient)
     found = tracking.modes(method, np.zeros((63, 1)), prior=1.0)
     np.testing.assert_allclose([one.z for one in found], wells[[1, 0]], atol=1e-4)
     assert [one.log_likelihood for one in found] == pytest.approx([1.0, -4.0])
@@ -188,8 +192,7 @@ def test_searches_from_several_starts_find_several_modes(monkeypatch):
     assert best.log_likelihood == pytest.approx(2.0) and best.evaluations > sum(one.evaluations for one in found)
     depth[:], wells[:] = 0.0, wells[0]
     assert len(tracking.modes(method, np.zeros((63, 1)))) == 1
-    wall = (tracking._WALL, np.zeros(len(method.names)))
-    monkeypatch.setattr(tracking, "energy", lambda *_: lambda z: wall)
+    searched(monkeypatch, lambda z, prior: (np.inf, np.zeros(len(method.names))))
     with pytest.raises(ValueError, match="not finite wherever a search for the parameters of sqm starts"):
         tracking.learn(method, np.zeros((63, 1)))
 
@@ -199,12 +202,12 @@ def test_a_lower_mode_without_curvature_is_none(monkeypatch):
     method = problem.Method("matern")
     points = [np.full(4, value) for value in (0.0, 3.0, 6.0)]
 
-    def value_and_gradient(z):
+    def value_and_gradient(z, prior):
         k = int(np.argmin([np.abs(z - point).max() for point in points]))
         signs = np.array([1.0, 1.0, 1.0, -1.0 if k == 1 else 1.0]) * (np.nan if k == 2 else 1.0)
         return 0.5 * signs @ (z - points[k]) ** 2, signs * (z - points[k])
 
-    monkeypatch.setattr(tracking, "energy", lambda *_: value_and_gradient)
+    searched(monkeypatch, value_and_gradient)
     for order, kept in (([0, 1, 2], [0]), ([1, 0, 2], [1, 0])):
         monkeypatch.setattr(tracking, "modes", lambda *_, order=order, **__: [
             tracking.Learnt(points[k], 0.0, 1) for k in order])
@@ -350,14 +353,14 @@ def test_weighted_draws_are_those_of_a_long_chain():
     weight = np.exp(weights.log_weight[0])
     mean = weight @ draws
     sd = np.sqrt(weight @ (draws - mean) ** 2)
-    density = jax.jit(jax.vmap(lambda z: sum(problem.log_densities(method, z, jnp.asarray(one.training)))))
+    density = lambda z: np.sum(problem.posterior(method).log_densities_of(z, one.training), axis=0)  # noqa: E731
     factor = np.linalg.cholesky((draws - mean).T @ ((draws - mean) * weight[:, None]))
     generator = np.random.default_rng(0)
     at = mean + generator.normal(size=(20, 5)) @ factor.T
-    value, kept = np.asarray(density(jnp.asarray(at))), []
+    value, kept = density(at), []
     for _ in range(600):
         proposed = at + 2.4 / np.sqrt(5) * generator.normal(size=at.shape) @ factor.T
-        new = np.asarray(density(jnp.asarray(proposed)))
+        new = density(proposed)
         accept = np.log(generator.uniform(size=20)) < new - value
         at, value = np.where(accept[:, None], proposed, at), np.where(accept, new, value)
         kept.append(at)
@@ -420,7 +423,7 @@ def test_weighted_draws_see_a_second_mode():
     scale = np.abs(first.point - second.point) / 2 + np.linalg.norm(first.curvature.factor, axis=1)
     wide = stats.multivariate_t(0.5 * (first.point + second.point), np.diag(scale**2), df=5)
     others = wide.rvs(60_000, random_state=1)
-    log_ratio = np.asarray(posterior._densities(method)(jnp.asarray(others), jnp.asarray(y))) - wide.logpdf(others)
+    log_ratio = np.sum(problem.posterior(method).log_densities_of(others, y), axis=0) - wide.logpdf(others)
     log_ratio = np.where(np.isfinite(log_ratio), log_ratio, -np.inf)
     plain, there = np.exp(log_ratio - special.logsumexp(log_ratio)), others[:, NOISE] < edge
     expected = plain[there].sum()

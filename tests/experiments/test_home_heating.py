@@ -92,15 +92,13 @@ def test_the_most_likely_parameters(window):
     """No residual: the search ends where nothing near is better."""
     model = ("none", "one store", 3)
     z, density = learning.most_likely(*model, window)
-    energy = learning._program(*model)
-    y, outdoor = window.y[:96], window.outdoor
-    value, gradient = energy(z, y, outdoor)
-    assert density == pytest.approx(-float(value))
+    objective = learning._posterior(*model).objective(learning._data(window))
+    value, gradient = objective.value_and_gradient(z)
+    assert density == pytest.approx(-value)
     np.testing.assert_allclose(gradient, 0.0, atol=1e-2)
     assert problem.names(*model[:2]) == ("alpha", "beta", "noise_sd")
-    for index in range(3):
-        step = 0.05 * np.eye(3)[index]
-        assert min(float(energy(z + step, y, outdoor)[0]), float(energy(z - step, y, outdoor)[0])) > float(value)
+    for step in 0.05 * np.eye(3):
+        assert min(objective.value(z + step), objective.value(z - step)) > value
 
 
 @pytest.mark.slow

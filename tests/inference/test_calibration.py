@@ -45,7 +45,7 @@ def assert_uniform(name, found, bins):
 
 @pytest.mark.slow
 def test_ram_is_calibrated_on_the_linear_motif():
-    found = calibration.calibrate(motif, TIMES, lfm.RAM, jax.random.key(11), data_sets=40, thin=40, warmup=1000)
+    found = calibration.calibrate(jax.random.key(11), motif, TIMES, lfm.RAM, data_sets=40, thin=40, warmup=1000)
     assert set(found.ranks) == {"decay", "sensitivity", "lengthscale", "noise_sd", "log likelihood"}
     assert_uniform("small_ram_linear", found, bins=8)
 
@@ -58,5 +58,5 @@ def test_samplers_are_calibrated(sampler, model):
         "nuts": {"kernel": lambda m: NUTS(m, forward_mode_differentiation=True), "thin": 3, "warmup": 300, "batch": 20},
         "ram": {"kernel": lfm.RAM, "thin": 60, "warmup": 2000},
     }[sampler]
-    found = calibration.calibrate(model, TIMES, key=jax.random.key(12), data_sets=240, **settings)
+    found = calibration.calibrate(jax.random.key(12), model, TIMES, data_sets=240, **settings)
     assert_uniform(f"{sampler}_{model.__name__}", found, bins=16)

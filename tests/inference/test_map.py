@@ -269,18 +269,53 @@ def test_narrow_valley():
     def rosenbrock(z):
         return jnp.sum(100 * (z[1:] - z[:-1] ** 2) ** 2 + (1 - z[:-1]) ** 2)
 
-    objective = Objective(rosenbrock)
+    objective = Objective.of(rosenbrock)
     end = quasi_newton(objective, np.array([-1.2, 1.0, -1.0, 1.5]), 1000)
-    minimum = newton(objective, end)
+    minimum = newton(objective, end.point)
     np.testing.assert_allclose(minimum.point, 1.0, atol=1e-9)
 
 
+def counted(function):
+    """Return an objective in NumPy's terms, and the points where it is evaluated."""
+    points = []
+
+    def program(z):
+        points.append(np.array(z))
+        return function(np.asarray(z))
+
+    return Objective(program), points
+
+
+def test_a_search_evaluates_nothing_of_its_own_and_stays_within_bounds():
+    objective, points = counted(lambda z: (float((z - 3.0) @ (z - 3.0)), 2 * (z - 3.0)))
+    end = quasi_newton(objective, np.array([0.5, 9.0]), bounds=np.array([[0.0, 1.0], [2.0, 8.0]]))
+    np.testing.assert_allclose(end.point, [1.0, 3.0], atol=1e-9)
+    assert end.value == pytest.approx(4.0) and objective.evaluations == len(points)
+    assert len({tuple(point) for point in points}) == len(points)
+    np.testing.assert_array_equal(points[0], [0.5, 8.0])
+    assert all(0.0 <= first <= 1.0 and 2.0 <= second <= 8.0 for first, second in points)
+    loose, points = counted(lambda z: (float(z @ z), 2 * z))
+    end = quasi_newton(loose, np.array([5.0, -9.0]), options={"gtol": 100.0})
+    assert len(points) == 1 and end.value == 106.0
+
+
+def test_a_search_turns_back_from_where_there_is_no_value_or_no_gradient():
+    for bad in ((np.nan, np.zeros(1)), (-np.inf, np.zeros(1)), (-9.0, np.full(1, np.nan))):
+        objective, points = counted(lambda z, bad=bad: bad if z[0] < -1.0 else (0.5 * float(z @ z), z))
+        end = quasi_newton(objective, np.array([40.0]), bounds=np.array([[-50.0, 50.0]]))
+        assert end.point == pytest.approx([0.0], abs=1e-6) and end.value == pytest.approx(0.0, abs=1e-12)
+    objective, points = counted(lambda z: (np.nan, np.zeros(2)))
+    end = quasi_newton(objective, np.ones(2))
+    assert end.value == np.inf and len(points) == 1
+    np.testing.assert_array_equal(end.point, np.ones(2))
+
+
 def test_a_saddle_point_has_negative_curvature():
-    minimum = newton(Objective(lambda z: z[0] ** 2 - z[1] ** 2 + z[1] ** 4), np.zeros(2))
+    minimum = newton(Objective.of(lambda z: z[0] ** 2 - z[1] ** 2 + z[1] ** 4), np.zeros(2))
     negative = minimum.curvature.values < 0
     assert list(minimum.curvature.coordinates(negative)) == [1]
     minimum = newton(
-        Objective(lambda z: z[0] ** 2 - z[1] ** 2 + z[1] ** 4), np.array([0.3, 0.1])
+        Objective.of(lambda z: z[0] ** 2 - z[1] ** 2 + z[1] ** 4), np.array([0.3, 0.1])
     )
     np.testing.assert_allclose(minimum.point, [0.0, math.sqrt(0.5)], atol=1e-8)
 

@@ -14,9 +14,10 @@ import lfm_ppl as lfm
 from lfm_ppl.analysis.arviz_data import ess, group
 from lfm_ppl.comparators.particle_filter import ParticleSettings
 from lfm_ppl.inference import particle_likelihood
+from lfm_ppl.inference.bound_model import bind
 from lfm_ppl.inference.particle_likelihood import ParticlePotential
 from lfm_ppl.inference.particle_marginal import ParticleMarginalState, particle_marginal_step
-from lfm_ppl.inference.posterior import likelihood_site, trajectories
+from lfm_ppl.inference.posterior import trajectories
 
 TIMES = np.array([0.0, 0.6, 1.5, 1.5, 2.7, 4.0])
 Y = np.array([[1.2], [0.7], [np.nan], [0.5], [-0.2], [0.4]])
@@ -102,8 +103,8 @@ def test_noise_and_a_wrong_surrogate_leave_the_target_alone(surrogate):
 def test_the_number_of_particles_is_chosen_for_an_sd_of_one():
     y = np.tile(Y, (4, 1))
     times = np.arange(24.0) / 4
-    potential = ParticlePotential(relaxing, (times, y), {}, jax.random.key(0), ParticleSettings(1))
-    z = {"rate": jnp.array(-0.5)}
+    potential = ParticlePotential(bind(relaxing, times, y), ParticleSettings(1))
+    z = jnp.array([-0.5])
     tuned = potential.tune(z, jax.random.key(1))
     run = jax.jit(jax.vmap(lambda key: potential(z, key, tuned.particles)))
     sd = float(run(jax.random.split(jax.random.key(2), 1000)).std())
@@ -119,9 +120,9 @@ def test_precise_observations_that_no_particle_meets_are_an_error(monkeypatch):
         rate = numpyro.sample("rate", dist.LogNormal(-0.5, 0.7))
         numpyro.sample("y", lfm.MarginalLikelihood(build(rate, noise=1e-20), times), obs=y)
 
-    potential = ParticlePotential(impossible, (TIMES, Y), {}, jax.random.key(0), ParticleSettings(1))
+    potential = ParticlePotential(bind(impossible, TIMES, Y), ParticleSettings(1))
     with pytest.raises(ValueError, match="out of reach"):
-        potential.tune({"rate": jnp.array(-0.5)}, jax.random.key(1))
+        potential.tune(jnp.array([-0.5]), jax.random.key(1))
 
 
 def test_a_panel():
@@ -134,9 +135,9 @@ def test_a_panel():
 
     y = np.stack([Y, np.full_like(Y, np.nan)])
     settings = ParticleSettings(500)
-    z = {"rate": jnp.array(-0.3)}
-    both = ParticlePotential(panel, (TIMES, y), {}, jax.random.key(0), settings)
-    one = ParticlePotential(relaxing, (TIMES, Y), {}, jax.random.key(0), settings)
+    z = jnp.array([-0.3])
+    both = ParticlePotential(bind(panel, TIMES, y), settings)
+    one = ParticlePotential(bind(relaxing, TIMES, Y), settings)
     run = lambda potential: jax.jit(jax.vmap(lambda key: potential(z, key)))(  # noqa: E731
         jax.random.split(jax.random.key(3), 200))
     mine, single = np.asarray(run(both)), np.asarray(run(one))  # a series that is all missing adds nothing
@@ -186,11 +187,10 @@ def test_a_likelihood_that_cannot_be_replaced_is_an_error(wrap):
 def test_trajectories_agree_with_the_exact_smoother_wherever_they_are_wanted():
     """Paths at single parameter values; a crowd of forecast times changes nothing elsewhere."""
     at = np.array([0.3, 1.0, 3.5])
-    site = likelihood_site(relaxing, (TIMES, Y), {}, jax.random.key(0))
     draws = {"rate": np.full(600, 0.6)}
     exact = lfm.smooth(build(0.6), TIMES, Y, at=at)
     for times in (at, np.concatenate([at, np.linspace(4.0, 8.0, 9)])):
-        found = trajectories(relaxing, (TIMES, Y), {}, draws, Y, times, jax.random.key(1), site,
+        found = trajectories(jax.random.key(1), bind(relaxing, TIMES, Y), draws, times,
                              ParticleSettings(200, scheme="srk"), 10)["state"][:, :3, 0]
         sd = np.sqrt(np.asarray(exact.covariance)[:, 0, 0])
         assert np.all(np.abs(found.mean(axis=0) - exact.mean[:, 0]) < 5.0 * sd / np.sqrt(600) + 0.02 * sd)

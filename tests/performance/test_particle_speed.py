@@ -24,7 +24,7 @@ def ours(scheme):
         lfm.Gaussian(jnp.zeros(1), jnp.array([10.0])), process_noise=jnp.array([[2.0]]))
     y = 3.0 * np.sign(np.sin(0.4 * np.arange(OBSERVATIONS) + 0.1))[:, None]
     times = 2.0 * np.arange(OBSERVATIONS)
-    return lambda: lfm.particle_filter(model, times, y, jax.random.key(0), particles=PARTICLES, steps=STEPS,
+    return lambda: lfm.particle_filter(jax.random.key(0), model, times, y, particles=PARTICLES, steps=STEPS,
                                        scheme=scheme).log_likelihood.sum().block_until_ready()
 
 

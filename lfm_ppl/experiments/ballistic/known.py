@@ -7,12 +7,8 @@ about as often as they say if the filter's likelihood is right.
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.experiments.ballistic import problem
@@ -48,18 +44,9 @@ def below(target: problem.Target) -> float:
     """
     alphas = target.z[0] + REACH * np.linspace(-1.0, 1.0, POINTS)
     points = np.stack([alphas, np.full(POINTS, target.z[1]), np.full(POINTS, target.z[2])], axis=1)
-    log_likelihood = np.asarray(_log_likelihoods()(jnp.asarray(points), jnp.asarray(target.y)))
+    log_likelihood, _ = problem.posterior().log_densities_of(points, target.y, _TOGETHER)
     density = np.where(np.isfinite(log_likelihood), np.exp(log_likelihood - np.nanmax(log_likelihood)), 0.0)
     if not np.isfinite(log_likelihood).any():
         raise ValueError("the filter breaks down at every drag on the grid.")
     total = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]))])
     return float(np.interp(target.z[0], alphas, total / total[-1]))
-
-
-@functools.cache
-def _log_likelihoods() -> Callable:
-    """Return log likelihoods (K,) at points (K, 3), compiled once for all targets."""
-    def all_(points: jax.Array, y: jax.Array) -> jax.Array:
-        return jax.lax.map(lambda z: problem.log_densities(z, y)[0], points, batch_size=_TOGETHER)
-
-    return jax.jit(all_)

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -24,7 +23,7 @@ from lfm_ppl.experiments.ballistic.tracking import blocks, judged
 from lfm_ppl.experiments.tasks import Result, Task
 from lfm_ppl.experiments.timing import timed
 from lfm_ppl.experiments.weighting import Weighted, moments, weighted
-from lfm_ppl.inference.optimise import Minimum, Objective, newton, quasi_newton
+from lfm_ppl.inference.optimise import Minimum, newton, quasi_newton
 
 START = np.log([5e-4, 30.0, 5.0])
 """Where every search starts: the prior medians."""
@@ -35,8 +34,7 @@ FURTHEST = 3.0
 among plausible values."""
 
 _TOGETHER = 10
-"""Parameter values that are computed at a time: a thousand no longer fit the CPU's cache, and take seven times as long
-each."""
+"""Paths that are smoothed at a time."""
 
 BLOCK = 10
 """Targets that are computed in one go, and stored in one file."""
@@ -93,12 +91,13 @@ def estimate(target: problem.Target, count: int, paths: int, seed: int) -> Resul
         paths: draws over which the smoothed paths are averaged.
         seed: of the draws.
     """
-    densities, one_path, smoothing = _programs()
+    (one_path, smoothing), posterior = _paths(), problem.posterior()
     y = jnp.asarray(target.y)
 
     def search() -> tuple[Minimum, Weighted]:
-        mode, likely = (_minimum(target.y, weight) for weight in (1.0, 0.0))
-        return likely, weighted(lambda draws: np.asarray(densities(jnp.asarray(draws), y)), [mode], count, seed)
+        objectives = [posterior.objective(y, prior) for prior in (1.0, 0.0)]
+        mode, likely = (newton(each, quasi_newton(each, START, 200).point) for each in objectives)
+        return likely, weighted(lambda draws: np.sum(posterior.log_densities_of(draws, y), axis=0), [mode], count, seed)
 
     seconds, (likely, (draws, weights, _)) = timed(search)
     weight = np.exp(weights.log_weight[0])
@@ -117,52 +116,13 @@ def estimate(target: problem.Target, count: int, paths: int, seed: int) -> Resul
         **judged("posterior", np.stack([one[0] for one in total]), np.stack([one[1] for one in total]), target)}
 
 
-@dataclass
-class _Energy(Objective):
-    """Minus the log posterior density of a target, or minus its log likelihood, from the one compiled program."""
-
-    y: Any = None
-    prior: float = 1.0
-
-    def value_and_gradient(self, point: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the value and the gradient (3,)."""
-        self.evaluations += 1
-        value, gradient = _energy_program()(jnp.asarray(point), self.y, self.prior)
-        return float(value), np.asarray(gradient)
-
-
-def _minimum(y: np.ndarray, prior: float) -> Minimum:
-    """Return the mode of the posterior (``prior`` 1) or of the likelihood (0)."""
-    given = jnp.asarray(y)
-    energy = _Energy(lambda z: _energy(z, given, prior), exact_hessian=False, y=given, prior=prior)
-    return newton(energy, quasi_newton(energy, START, 200))
-
-
-def _energy(z: jax.Array, y: jax.Array, prior: Any) -> jax.Array:
-    log_likelihood, log_prior = problem.log_densities(z, y)
-    return -log_likelihood - prior * log_prior
-
-
 @functools.cache
-def _energy_program() -> Callable:
-    """Return value and gradient, by forward mode, compiled once for all targets."""
-    def twice(*arguments: Any) -> tuple[jax.Array, jax.Array]:
-        value = _energy(*arguments)
-        return value, value
-
-    return jax.jit(lambda *arguments: jax.jacfwd(twice, has_aux=True)(*arguments)[::-1])
-
-
-@functools.cache
-def _programs() -> tuple[Callable, Callable, Callable]:
-    """Return densities of draws, and smoothed paths for one and for several, compiled once for all targets."""
+def _paths() -> tuple[Callable, Callable]:
+    """Return smoothed paths for one and for several z, compiled once for all targets."""
     def one(z: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return problem.paths_of(problem.likelihood(z).smooth(y))
+        return problem.paths_of(problem.posterior().likelihood(z).smooth(y))
 
-    def each(function: Callable) -> Callable:
-        return lambda all_, y: jax.lax.map(lambda z: function(z, y), all_, batch_size=_TOGETHER)
-
-    return jax.jit(each(lambda z, y: -_energy(z, y, 1.0))), jax.jit(one), jax.jit(each(one))
+    return jax.jit(one), jax.jit(lambda all_, y: jax.lax.map(lambda z: one(z, y), all_, batch_size=_TOGETHER))
 
 
 @functools.cache

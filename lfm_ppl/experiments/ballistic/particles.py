@@ -45,10 +45,10 @@ def compute(task: Task) -> Result:
     keys = jax.random.split(task.key)
 
     def filtering(key: jax.Array) -> Any:
-        return particle_filter(given, target.times, target.y, key, **options)
+        return particle_filter(key, given, target.times, target.y, **options)
 
     def smoothing(key: jax.Array) -> Any:
-        return particle_smoother(given, target.times, target.y, key, draws=task.settings["draws"], method=TRACING,
+        return particle_smoother(key, given, target.times, target.y, draws=task.settings["draws"], method=TRACING,
                                  **options)
 
     if options["particles"] not in _compiled:

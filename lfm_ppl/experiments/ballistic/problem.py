@@ -11,9 +11,10 @@ import numpy as np
 from numpyro import handlers
 
 from lfm_ppl import loading
+from lfm_ppl.experiments.posteriors import LogPosterior
+from lfm_ppl.inference.bound_model import bind
 from lfm_ppl.inference.fixing import fix
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
-from lfm_ppl.inference.posterior import likelihood_site
 from lfm_ppl.model.simulate import simulate
 
 NAMES = ("alpha", "scale", "lengthscale")
@@ -85,7 +86,7 @@ def _drawing() -> Any:
         keys = jax.random.split(key)
         trace = handlers.trace(handlers.seed(model(), keys[0])).get_trace(target(0).times)
         z = jnp.log(jnp.stack([trace[name]["value"] for name in NAMES]))
-        return z, simulate(keys[1], likelihood(z).model, fine, steps=5)
+        return z, simulate(keys[1], posterior().likelihood(z).model, fine, steps=5)
 
     return jax.jit(draw)
 
@@ -107,26 +108,18 @@ def model() -> Any:
     return fix(file.model, known)
 
 
-def likelihood(z: Any) -> MarginalLikelihood:
-    """Return the likelihood with parameters exp(z), which may be traced."""
-    values = dict(zip(NAMES, jnp.exp(jnp.asarray(z)), strict=True))
-    return likelihood_site(model(), (target(0).times,), {}, jax.random.key(0), values).example
+@functools.cache
+def posterior() -> LogPosterior:
+    """Return the posterior of a target; what is compiled for it serves all of them."""
+    with jax.ensure_compile_time_eval():
+        return LogPosterior(bind(model(), target(0).times, target(0).y), NAMES)
 
 
 @functools.cache
 def true_likelihood() -> MarginalLikelihood:
     """Return the likelihood at the truth: one object, so that what is compiled for it serves all targets."""
     with jax.ensure_compile_time_eval():
-        return likelihood(true_z())
-
-
-def log_densities(z: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the log likelihood log p(y | z) and the log prior density of z (3,)."""
-    values = dict(zip(NAMES, jnp.exp(z), strict=True))
-    seeded = handlers.seed(handlers.substitute(model(), data=values), jax.random.key(0))
-    trace = handlers.trace(seeded).get_trace(target(0).times)
-    prior = sum(trace[name]["fn"].log_prob(values[name]) for name in NAMES)
-    return trace["y"]["fn"].log_prob(y), prior + z.sum()
+        return posterior().likelihood(true_z())
 
 
 def paths_of(found: Any) -> tuple[jax.Array, jax.Array]:

@@ -8,12 +8,9 @@ tracks the test day; the estimates of all, mixed, stand for the prediction.
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from numpyro.infer import MCMC
 from scipy import special, stats
@@ -25,16 +22,11 @@ from lfm_ppl.experiments.call_centre.problem import FIRST, TESTED, Method, Windo
 from lfm_ppl.experiments.call_centre.tracking import Tracked
 from lfm_ppl.experiments.tasks import Result, Task
 from lfm_ppl.experiments.weighting import Weighted, weighted
-from lfm_ppl.inference.curvature import decompose, finite_difference_hessian
 from lfm_ppl.inference.optimise import Minimum
 
 ACCEPTED = 0.95
 """Acceptance that NUTS aims at: steps fine enough for the walls of the posterior, where arrivals exceed what is served
 and the log density falls by hundreds within a few standard deviations."""
-
-_TOGETHER = 10
-_NOISE = 1e-7
-"""Relative error of a Hessian by differences."""
 
 
 def tasks(settings: Any) -> list[Task]:
@@ -120,8 +112,8 @@ def posterior(method: Method, y: np.ndarray, count: int, seed: int) -> Weighted:
         count: draws that are weighted.
         seed: of them.
     """
-    density, given = _densities(method), jnp.asarray(y)
-    return weighted(lambda draws: np.asarray(density(jnp.asarray(draws), given)), modes(method, y), count, seed)
+    density = problem.posterior(method).log_densities_of
+    return weighted(lambda draws: np.sum(density(draws, y), axis=0), modes(method, y), count, seed)
 
 
 def modes(method: Method, y: np.ndarray) -> list[Minimum]:
@@ -129,26 +121,14 @@ def modes(method: Method, y: np.ndarray) -> list[Minimum]:
 
     A lower one without a positive definite curvature is none, but the edge of what is allowed or of a search.
     """
-    value_and_gradient = tracking.energy(method, y, 1.0)
+    objective = problem.posterior(method).objective(y)
 
     def with_curvature(point: np.ndarray) -> Minimum:
-        hessian = finite_difference_hessian(lambda z: value_and_gradient(z)[1], point)
-        curvature = decompose(hessian, _NOISE) if np.isfinite(hessian).all() else None
-        value, gradient = value_and_gradient(point)
-        return Minimum(point, value, curvature, 0.0, np.zeros_like(point), gradient)
+        value, gradient = objective.value_and_gradient(point)
+        return Minimum(point, value, objective.curvature(point), 0.0, np.zeros_like(point), gradient)
 
     highest, *lower = [with_curvature(one.z) for one in tracking.modes(method, y, prior=1.0)]
     return [highest, *(mode for mode in lower if mode.curvature is not None and mode.curvature.definite)]
-
-
-@functools.cache
-def _densities(method: Method) -> Callable:
-    """Return log posterior densities of draws, compiled once for all windows and each number of draws."""
-    def one(z: jax.Array, y: jax.Array) -> jax.Array:
-        log_likelihood, log_prior = problem.log_densities(method, z, y)
-        return log_likelihood + log_prior
-
-    return jax.jit(lambda draws, y: jax.lax.map(lambda z: one(z, y), draws, batch_size=_TOGETHER))
 
 
 def judge(found: list[Tracked], one: Window, name: str) -> dict[str, float]:

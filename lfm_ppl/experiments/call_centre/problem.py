@@ -13,7 +13,8 @@ from numpyro import handlers
 from lfm_ppl import loading
 from lfm_ppl.experiments.call_centre import counts
 from lfm_ppl.experiments.call_centre.counts import BIN, DAY, OPEN, Counts
-from lfm_ppl.inference.posterior import likelihood_site
+from lfm_ppl.experiments.posteriors import LogPosterior
+from lfm_ppl.inference.bound_model import bind, likelihood_site
 from lfm_ppl.model.known_input import Input
 
 UTILISATION = 0.7
@@ -147,19 +148,12 @@ def _names(method: Method) -> tuple[str, ...]:
     return tuple(name for name, site in trace.items() if site["type"] == "sample" and name != "y")
 
 
-def log_densities(method: Method, z: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the log likelihood of the training and the log prior density of z.
-
-    Args:
-        method: the model of the arrivals.
-        z: logarithms (P,) of its parameters.
-        y: (63, 1) logarithms of the readings.
-    """
-    values = dict(zip(method.names, jnp.exp(z), strict=True))
-    seeded = handlers.seed(handlers.substitute(model_file().model, data=values), jax.random.key(0))
-    trace = handlers.trace(seeded).get_trace(TRAINING, **method._asdict())
-    prior = sum(trace[name]["fn"].log_prob(value) for name, value in values.items())
-    return trace["y"]["fn"].log_prob(y), prior + z.sum()
+@functools.cache
+def posterior(method: Method) -> LogPosterior:
+    """Return the posterior given the training, readings (63, 1) as logarithms; compiled once for all windows."""
+    with jax.ensure_compile_time_eval():
+        bound = bind(model_file().model, TRAINING, np.zeros((len(TRAINING), 1)), **method._asdict())
+        return LogPosterior(bound, method.names, forward_mode=False)
 
 
 def system(method: Method, z: jax.Array, tested: jax.Array) -> Any:

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import optimize, stats
+from scipy import stats
 
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.call_centre import counts, problem
@@ -25,6 +25,7 @@ from lfm_ppl.experiments.call_centre.problem import FIRST, GRID, TESTED, Method,
 from lfm_ppl.experiments.tasks import Result, Task
 from lfm_ppl.filtering.filter import filter
 from lfm_ppl.filtering.smoother import smooth
+from lfm_ppl.inference.optimise import quasi_newton
 from lfm_ppl.linalg import congruence, matmul
 from lfm_ppl.model.augment import state_space
 
@@ -53,9 +54,6 @@ much wider, they hold next to nothing."""
 
 STEPS = 3
 """Integration steps in five minutes, about as long as those of the model file."""
-
-_WALL = 1e6
-"""Height of the wall where a density is not finite: a line search turns back from one that is not much higher."""
 
 _SEARCH = {"ftol": 1e-7, "gtol": 1e-3, "maxfun": 60}
 
@@ -102,42 +100,16 @@ def modes(method: Method, y: np.ndarray, prior: float = 0.0) -> list[Learnt]:
 
 def _searches(method: Method, y: np.ndarray, prior: float) -> list[Learnt]:
     """Return the ends of all searches, the highest first."""
-    low, high = np.log([LIMITS[name] for name in method.names]).T
-    value_and_gradient, found = energy(method, y, prior), []
+    bounds, found = np.log([LIMITS[name] for name in method.names]), []
     for start in STARTS:
-        one = optimize.minimize(value_and_gradient, np.log([start[name] for name in method.names]), jac=True,
-                                method="L-BFGS-B", bounds=list(zip(low, high, strict=True)), options=_SEARCH)
-        found.append(Learnt(one.x, -float(one.fun), int(one.nfev)))
-    there = [one for one in found if one.log_likelihood != -_WALL]
-    if not there:
+        objective = problem.posterior(method).objective(y, prior)
+        end = quasi_newton(objective, np.log([start[name] for name in method.names]), bounds=bounds, options=_SEARCH)
+        if np.isfinite(end.value):
+            found.append(Learnt(end.point, -end.value, objective.evaluations))
+    if not found:
         raise ValueError(f"the likelihood is not finite wherever a search for the parameters of {method.force} starts; "
                          "are there readings that no queue can have?")
-    return sorted(there, key=lambda one: -one.log_likelihood)
-
-
-def energy(method: Method, y: np.ndarray, prior: float) -> Callable[[np.ndarray], tuple[float, np.ndarray]]:
-    """Return the function of z that gives minus the log likelihood, less ``prior`` times the log prior, and gradient.
-
-    Where it is not finite it is `_WALL`.
-    """
-    program, given = _energy(method), jnp.asarray(y)
-
-    def value_and_gradient(z: np.ndarray) -> tuple[float, np.ndarray]:
-        value, gradient = program(jnp.asarray(z), given, prior)
-        return (float(value), np.asarray(gradient)) if np.isfinite(value) else (_WALL, np.zeros_like(z))
-
-    return value_and_gradient
-
-
-@functools.cache
-def _energy(method: Method) -> Callable:
-    """Return value and gradient, compiled once for all windows."""
-
-    def function(z: jax.Array, y: jax.Array, prior: jax.Array) -> jax.Array:
-        log_likelihood, log_prior = problem.log_densities(method, z, y)
-        return -log_likelihood - prior * log_prior
-
-    return jax.jit(jax.value_and_grad(function))
+    return sorted(found, key=lambda one: -one.log_likelihood)
 
 
 class Tracked(NamedTuple):

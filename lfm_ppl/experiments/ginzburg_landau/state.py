@@ -140,9 +140,9 @@ def _particles(data: problem.Realisation, settings: Any, key: jax.Array) -> Resu
     model = problem.true_system()
     keys = jax.random.split(key)
     filter_s, filtered = timed(_warm("particle filter", lambda: particle_filter(
-        model, data.fine, data.sparse, keys[0], particles=settings["particles"], steps=settings["steps"])))
+        keys[0], model, data.fine, data.sparse, particles=settings["particles"], steps=settings["steps"])))
     smoother_s, smoothed = timed(_warm("particle smoother", lambda: particle_smoother(
-        model, data.fine, data.sparse, keys[1], particles=settings["smoother_particles"],
+        keys[1], model, data.fine, data.sparse, particles=settings["smoother_particles"],
         draws=settings["smoother_draws"], steps=settings["smoother_steps"])))
     sd = np.sqrt(np.asarray(filtered.covariance)[:, 0, 0])
     draws = np.asarray(smoothed.draws)[:, :, 0]

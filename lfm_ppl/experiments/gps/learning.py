@@ -12,14 +12,14 @@ All this runs on departures from an orbit, as a linear regression: see `training
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-import scipy.optimize
 
 from lfm_ppl.experiments.gps.magnitudes import Prior
 from lfm_ppl.experiments.gps.training import Training, slope_of_held_out, slope_of_log_likelihood
+from lfm_ppl.inference.optimise import Objective, quasi_newton
 
 WEIGHT = 30.0
 """How many positions a fold counts for: neighbours in time are wrong together."""
@@ -46,25 +46,15 @@ class Target(NamedTuple):
         Raises:
             ValueError: the density there is not finite.
         """
-        highest = -np.inf
-
-        def descent(point: np.ndarray) -> tuple[float, np.ndarray]:
-            nonlocal highest
-            value, gradient = self.negative(point)
-            if not (np.isfinite(value) and np.isfinite(gradient).all()):  # a wall, from which the search turns back
-                return highest + 1e3, np.zeros_like(point)
-            highest = max(highest, value)
-            return value, gradient
-
         first = self.prior.mean if start is None else start
-        found = scipy.optimize.minimize(descent, first, jac=True, method="L-BFGS-B",
-                                        options={"maxfun": _EVALUATIONS}).x
-        if highest == -np.inf:  # not one value was finite: the search ends where it begins
+        found = quasi_newton(Objective(self.negative), first, options={"maxfun": _EVALUATIONS})
+        if not np.isfinite(found.value):
             raise ValueError(f"positions have no density at the first magnitudes of the search, {np.exp(first)}.")
-        return found
+        return found.point
 
-    def negative(self, point: np.ndarray) -> tuple[float, np.ndarray]:
+    def negative(self, point: Any) -> tuple[float, np.ndarray]:
         """Return minus the log density, and its gradient (d,)."""
+        point = np.asarray(point)
         value, gradient = self.evidence(point)
         away = (point - self.prior.mean) / self.prior.sd
         return 0.5 * float(away @ away) - value, away / self.prior.sd - gradient

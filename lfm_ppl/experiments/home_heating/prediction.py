@@ -103,8 +103,8 @@ def under_thermostat(method: str, store: str, functions: int, particles: int) ->
         values = learning.values_of(method, store, z, outdoor)
         y = jnp.full((len(problem.FINE), 3), jnp.nan).at[:, 1].set(weather)
         return rao_blackwellised(
-            lambda heater: problem.under(method, store, functions, values, heater), problem.thermostat(set_points),
-            problem.FINE, key, y=y, start=FilterState(np.asarray(float(_LAST)), start.state, start.covariance),
+            key, lambda heater: problem.under(method, store, functions, values, heater), problem.thermostat(set_points),
+            problem.FINE, y=y, start=FilterState(np.asarray(float(_LAST)), start.state, start.covariance),
             initial=on, particles=particles, steps=1)
 
     return jax.jit(run)

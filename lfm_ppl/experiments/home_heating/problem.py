@@ -16,8 +16,8 @@ from numpyro import handlers
 from lfm_ppl import loading
 from lfm_ppl.comparators.switched_simulation import simulate_switched
 from lfm_ppl.data import Data
+from lfm_ppl.inference.bound_model import likelihood_site
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
-from lfm_ppl.inference.posterior import likelihood_site
 from lfm_ppl.model.known_input import Input
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.switching import Thermostat

@@ -38,8 +38,8 @@ def compute(task: Task) -> Result:
     own = leading_parts(eigenfunctions(kernel, most), at)
     found: dict[str, list] = {method: [] for method in (*METHODS, "left out")}
     # The force of fewer functions is the sum of the first parts of the one with the most.
-    other = ([np.asarray(one.covariance(at, 0.0)) for one in resonators(kernel, own.shape[1]).forces]
-             if kernel.stationary else [])
+    other = ([np.asarray(one.covariance(at, 0.0))
+              for one in resonators(kernel, own.shape[1], explained_variance=0.0).forces] if kernel.stationary else [])
     for count in task.settings["functions"]:
         count = fitting(kernel, count)
         covariance = own[:, :count] @ own[:, :count].T
@@ -68,7 +68,7 @@ def leading_parts(force: Periodic, at: np.ndarray) -> np.ndarray:
 
 def eigenfunctions(kernel: Kernel, count: int, points: int = 200) -> Periodic:
     """Return the force of so many eigenfunctions, as far as the kernel has them."""
-    return Periodic(kernel, functions=fitting(kernel, count), points=points)
+    return Periodic(kernel, functions=fitting(kernel, count), points=points, explained_variance=0.0)
 
 
 def error(force: Force, at: np.ndarray, exact: np.ndarray) -> float:

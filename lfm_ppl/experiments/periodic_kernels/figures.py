@@ -90,7 +90,7 @@ def plot_eigenfunctions(*, width: str | float = "full") -> Figure:
     t = np.linspace(0.0, 2 * problem.PERIOD, 401)
     every = problem.kernels()
     for axes, name in zip(panels, ("periodic Matern-3_2", "moderated periodic Matern-3_2"), strict=True):
-        force = Periodic(every[name], functions=3)
+        force = Periodic(every[name], functions=3, explained_variance=0.0)
         for values, colour, line in zip(np.asarray(force.eigenfunctions(t)).T,
                                         (style.BLUE, style.VERMILLION, style.GREEN), ("-", "--", "-."), strict=True):
             axes.plot(t, values * np.sign(values[20] + 1e-9), color=colour, ls=line)

@@ -1,0 +1,430 @@
+"""The bound model: NumPyro's own densities and transforms, data as an argument, one compilation for all data sets."""
+
+import contextlib
+import logging
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
+from numpyro.infer import NUTS
+from numpyro.infer.util import ParamInfo, potential_energy
+
+import lfm_ppl as lfm
+from lfm_ppl.analysis.arviz_data import group
+from lfm_ppl.inference import bound_model, sampling
+from tests import systems
+
+TIMES = np.array([0.0, 0.7, 1.1, 2.0, 3.0])
+Y = np.array([[0.4, 0.3], [0.8, np.nan], [0.9, 0.5], [1.0, 0.4], [0.7, 0.2]])
+OTHER = np.array([[0.1, 0.5], [0.3, 0.2], [np.nan, np.nan], [0.6, 0.1], [0.9, 0.4]])
+
+
+def model(times, y=None, order=1):
+    """Non-linear, with a scalar and a vector site, a bounded one and a deterministic one."""
+    decay = numpyro.sample("decay", dist.LogNormal(0.0, 0.3))
+    noise_sd = numpyro.sample("noise_sd", dist.LogNormal(-2.0, 0.3).expand([2]).to_event(1))
+    lengthscale = numpyro.sample("lengthscale", dist.Uniform(0.5, 3.0))
+    numpyro.deterministic("half_life", jnp.log(2.0) / decay)
+    system = systems.motif(decay=decay, lengthscale=lengthscale, noise_sd=noise_sd, order=order)
+    numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=2), obs=y)
+
+
+@pytest.fixture(scope="module")
+def bound():
+    return lfm.bind(model, TIMES, Y)
+
+
+VALUES = {"decay": 0.8, "noise_sd": np.array([0.1, 0.2]), "lengthscale": 1.3}
+
+
+@contextlib.contextmanager
+def compilations():
+    """Collect the names of the functions that XLA compiles."""
+    seen = []
+
+    class Handler(logging.Handler):
+        def emit(self, record):
+            # "stage" brings an array to the device.
+            if record.getMessage().startswith("Compiling") and "jit(stage)" not in record.getMessage():
+                seen.append(record.getMessage()[:120])
+
+    logger, handler = logging.getLogger("jax"), Handler()
+    propagate, before = logger.propagate, jax.config.jax_log_compiles
+    logger.addHandler(handler)
+    logger.propagate = False
+    jax.config.update("jax_log_compiles", True)
+    try:
+        yield seen
+    finally:
+        jax.config.update("jax_log_compiles", before)
+        logger.removeHandler(handler)
+        logger.propagate = propagate
+
+
+def test_coordinates_are_named_and_values_come_back(bound):
+    assert bound.names == ("decay", "lengthscale", "noise_sd[0]", "noise_sd[1]")
+    assert bound.size == 4 and bound.sites and "decay" in repr(bound)
+    z = bound.unconstrain(VALUES)
+    back = bound.constrain(z)
+    assert float(back["half_life"]) == pytest.approx(np.log(2.0) / 0.8)
+    for name, value in VALUES.items():
+        np.testing.assert_allclose(back[name], value, rtol=1e-12)
+    several = bound.constrain_draws(np.stack([z, z + 0.1])[None])
+    assert several["noise_sd"].shape == (1, 2, 2) and several["half_life"].shape == (1, 2)
+    np.testing.assert_allclose(several["noise_sd"][0, 0], VALUES["noise_sd"], rtol=1e-12)
+
+
+@pytest.mark.parametrize("y", [Y, OTHER], ids=["its own data", "other data"])
+def test_the_density_is_numpyros_and_its_gradient_agrees_with_differences(bound, y):
+    z = np.array([-0.2, 0.3, -2.1, -1.8])
+    expected = -float(potential_energy(model, (TIMES, y), {}, bound.unravel(z)))
+    assert float(bound.log_density(z, y)) == pytest.approx(expected, rel=1e-12)
+    value, gradient = bound.log_density_gradient(z, y)
+    assert float(value) == pytest.approx(expected, rel=1e-12)
+    step = 1e-5
+    differences = [(float(bound.log_density(z + step * unit, y)) - float(bound.log_density(z - step * unit, y)))
+                   / (2 * step) for unit in np.eye(4)]
+    np.testing.assert_allclose(gradient, differences, rtol=1e-6, atol=1e-6)
+    prior = bound.log_prior(z, y)
+    assert float(bound.log_likelihood(z, y)) == pytest.approx(expected - float(prior), rel=1e-10)
+
+
+def test_many_data_sets_are_a_vmap(bound):
+    z = bound.unconstrain(VALUES)
+    both = jax.vmap(bound.log_density, in_axes=(None, 0))(z, jnp.stack([jnp.asarray(Y), jnp.asarray(OTHER)]))
+    np.testing.assert_allclose(both, [bound.log_density(z), bound.log_density(z, OTHER)], rtol=1e-12)
+
+
+def test_filter_and_smoother_at_a_draw_are_the_librarys(bound):
+    system = systems.motif(decay=0.8, lengthscale=1.3, noise_sd=VALUES["noise_sd"])
+    z = bound.unconstrain(VALUES)
+    expected = lfm.filter(system, TIMES, Y, steps=2)
+    for found in (bound.filter(z), bound.filter(VALUES)):
+        np.testing.assert_allclose(found.log_likelihood, expected.log_likelihood, rtol=1e-10)
+        np.testing.assert_allclose(found.filtered_mean, expected.filtered_mean, atol=1e-10)
+    assert float(found.log_likelihood.sum()) == pytest.approx(float(bound.log_likelihood(z)), rel=1e-10)
+    at = np.array([0.2, 3.5])
+    smoothed = lfm.smooth(system, TIMES, OTHER, steps=2, at=at)
+    again = bound.smooth(z, at, OTHER)
+    np.testing.assert_allclose(again.force("u").mean, smoothed.force("u").mean, atol=1e-10)
+    np.testing.assert_allclose(again.force("u").sd, smoothed.force("u").sd, atol=1e-10)
+
+
+def test_a_model_is_traced_once_whatever_the_data():
+    runs = []
+
+    def counted(times, y=None):
+        runs.append(y)
+        return model(times, y)
+
+    first = lfm.bind(counted, TIMES, Y)
+    z = first.unconstrain(VALUES)
+    first.log_density_gradient(z)
+    first.log_density(z)
+    before = len(runs)
+    with compilations() as compiled:
+        second = lfm.bind(counted, TIMES.copy(), OTHER)
+        second.log_density_gradient(z)
+        second.log_density(z)
+        first.with_data(OTHER).log_density(z)
+    assert compiled == [] and len(runs) == before + 1  # a look at what it computes now, without the filter
+    assert float(second.log_density(z)) != float(first.log_density(z))
+
+
+@pytest.mark.parametrize("change", [{"times": TIMES + 1.0}, {"y": Y[:, :1]}, {"order": 2}], ids=str)
+def test_what_decides_the_program_is_never_mixed_up(bound, change):
+    def sized(times, y=None, order=1):
+        count = 2 if y is None else y.shape[1]
+        rate = numpyro.sample("decay", dist.LogNormal(0.0, 0.3))
+        numpyro.sample("y", lfm.MarginalLikelihood(systems.motif(decay=rate, order=order, genes=count), times, steps=2),
+                       obs=y)
+
+    given = {"times": TIMES, "y": Y, **change}
+    times, y = given.pop("times"), given.pop("y")
+    lfm.bind(sized, TIMES, Y)
+    found = lfm.bind(sized, times, y, **given)
+    expected = -potential_energy(sized, (times, y), given, found.unravel(np.zeros(1)))
+    assert float(found.log_density(np.zeros(1))) == pytest.approx(float(expected), rel=1e-12)
+
+
+@pytest.mark.parametrize("sampler", ["nuts", "ram", "map"])
+def test_a_second_data_set_compiles_nothing_in_fit(sampler):
+    settings = {"sampler": sampler, "chains": 2, "warmup": 20, "samples": 20, "trajectory_draws": 8, "progress": False,
+                "chain_method": "vectorized", "fixed": {"lengthscale": 1.3}}
+    with pytest.warns() if sampler != "map" else contextlib.nullcontext():
+        lfm.fit(model, TIMES, Y, **settings)
+    with compilations() as compiled, pytest.warns() if sampler != "map" else contextlib.nullcontext():
+        found = lfm.fit(model, TIMES, OTHER, **settings)
+    assert compiled == []
+    np.testing.assert_array_equal(group(found, "observed_data")["y"].values, OTHER)
+
+
+def test_a_second_data_set_compiles_nothing_in_map_and_check():
+    settings = {"sampler": "map", "samples": 20, "trajectory_draws": 0, "progress": False}
+    checked = {"draws": 8, "particles": 20, "replicates": 2, "progress": False}
+    results = [lfm.fit(model, TIMES, y, **settings) for y in (Y, OTHER)]
+    lfm.map_estimate(model, TIMES, Y, restarts=1, hessian="finite-differences")
+    lfm.check_accuracy(results[0], model, **checked)
+    with compilations() as compiled:
+        lfm.map_estimate(model, TIMES, OTHER, restarts=1, hessian="finite-differences")
+        lfm.check_accuracy(results[1], model, **checked)
+    assert compiled == []
+
+
+def test_a_step_is_that_of_numpyros_nuts(bound):
+    z = bound.unconstrain(VALUES)
+    value, gradient = bound.log_density_gradient(z)
+    point = ParamInfo(bound.unravel(z), -value, bound.unravel(-gradient))
+    transition = sampling.nuts(bound, 30, {})
+    state = transition.start(jax.random.key(5), point, bound.y, None)
+    kernel = NUTS(model, forward_mode_differentiation=True, dense_mass=True)
+    kernel.init(jax.random.key(5), 30, point.z, (TIMES, Y), {})
+    step, expected = jax.jit(transition.step), jax.jit(lambda state: kernel.sample(state, (TIMES, Y), {}))
+    moved = 0
+    for _ in range(32):  # the whole warm-up, in which the mass matrix is learnt, and two steps more
+        mine, theirs = step(state, bound.y), expected(state)
+        assert int(mine.num_steps) == int(theirs.num_steps)
+        moved += int(mine.num_steps) > 1 and not np.array_equal(mine.z["decay"], state.z["decay"])
+        for name in mine.z:
+            np.testing.assert_allclose(mine.z[name], theirs.z[name], rtol=1e-6)
+        for one, other in zip(jax.tree.leaves(mine.adapt_state.inverse_mass_matrix),
+                              jax.tree.leaves(theirs.adapt_state.inverse_mass_matrix), strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-6)
+        np.testing.assert_allclose(mine.adapt_state.step_size, theirs.adapt_state.step_size, rtol=1e-6)
+        state = mine
+    assert moved >= 3
+
+
+def test_thinning_and_blocks_keep_the_last_step_of_each_draw(capfd):
+    bound = lfm.bind(model, TIMES, Y)
+    kernel = lfm.RAM(model, initial_scale=0.1)
+    starts = np.stack([bound.unconstrain(VALUES)] * 2)
+    run = lambda **more: sampling.sample(  # noqa: E731
+        jax.random.key(0), bound, sampling.random_walk(bound, kernel, 7), starts, warmup=7, **more).z
+    every = run(samples=30, chain_method="sequential")
+    np.testing.assert_allclose(run(samples=10, thin=3, chain_method="sequential"), every[:, 2::3], rtol=1e-12)
+    np.testing.assert_allclose(run(samples=30, chain_method="vectorized"), every, rtol=1e-8)
+    np.testing.assert_array_equal(run(samples=30, chain_method="sequential", progress=True), every)
+    assert "acceptance" in capfd.readouterr().err
+
+
+def test_fixed_parameters_and_settings(bound):
+    fixed = bound.fix({"decay": 0.8, "noise_sd[1]": 0.2})
+    assert fixed.names == ("lengthscale", "noise_sd[0]")
+    assert float(fixed.constrain(np.zeros(2))["noise_sd"][1]) == pytest.approx(0.2)
+    finer = bound.approximate(steps=9)
+    assert finer.site.example.steps == 9 and bound.site.example.steps == 2
+    assert bound.approximate(steps=9)._program is finer._program
+
+
+def test_a_model_that_asks_its_data_for_values():
+    def looks(times, y=None):
+        shift = float(np.nanmean(y))
+        rate = numpyro.sample("decay", dist.LogNormal(shift, 0.3))
+        numpyro.sample("y", lfm.MarginalLikelihood(systems.motif(decay=rate), times, steps=2), obs=y)
+
+    found = lfm.bind(looks, TIMES, Y)
+    expected = -float(potential_energy(looks, (TIMES, Y), {}, {"decay": jnp.array(0.1)}))
+    assert float(found.log_density(np.array([0.1]))) == pytest.approx(expected, rel=1e-12)
+    with pytest.raises(ValueError, match="asks its data for values.*with_data"):
+        found.log_density(np.array([0.1]), OTHER)
+    result = lfm.fit(looks, TIMES, Y, sampler="map", samples=5, trajectory_draws=2, progress=False)
+    assert group(result, "log_likelihood")["y"].shape == (1, 5, 5) and "forces" in group(result, "trajectories")
+    other = found.with_data(OTHER)
+    expected = -float(potential_energy(looks, (TIMES, OTHER), {}, {"decay": jnp.array(0.1)}))
+    assert float(other.log_density(np.array([0.1]))) == pytest.approx(expected, rel=1e-12)
+
+
+def test_times_that_a_model_computes_with_stay_known():
+    def hours(times, y=None):
+        rate = numpyro.sample("decay", dist.LogNormal(0.0, 0.3))
+        system = systems.motif(decay=rate)
+        numpyro.sample("y", lfm.MarginalLikelihood(system, jnp.asarray(times) * 2.0, steps=2), obs=y)
+
+    found = lfm.bind(hours, TIMES, Y).smooth({"decay": 1.2}, at=[0.5, 7.0])  # requested times need known ones
+    expected = lfm.smooth(systems.motif(decay=1.2), TIMES * 2.0, Y, steps=2, at=[0.5, 7.0])
+    np.testing.assert_allclose(found.force("u").mean, expected.force("u").mean, atol=1e-10)
+
+
+def test_a_panel():
+    def several(times, y=None):
+        decay = numpyro.sample("decay", dist.LogNormal(0.0, 0.3))
+        with numpyro.plate("series", 2):
+            numpyro.sample("y", lfm.panel(lambda p: systems.motif(decay=p), decay * jnp.ones(2), times, steps=2), obs=y)
+
+    both = np.stack([Y, OTHER])
+    found = lfm.bind(several, TIMES, both)
+    z = np.array([0.1])
+    parts = [lfm.MarginalLikelihood(systems.motif(decay=np.exp(0.1)), TIMES, steps=2).log_prob(y) for y in both]
+    assert float(found.log_likelihood(z)) == pytest.approx(float(sum(parts)), rel=1e-10)
+    with pytest.raises(ValueError, match="smooth takes one series"):
+        found.smooth(z)
+
+
+def _density_of(change, **start):
+    """Log densities of one model function before and after a variable that it reads has changed."""
+    state = {"power": 1.0, "noise": 0.1, "prior": 0.3, "steps": 2, "table": np.array([1.0, 2.0]), **start}
+
+    def reads(times, y=None):
+        decay = numpyro.sample("decay", dist.LogNormal(0.0, state["prior"]))
+        power, table = state["power"], state["table"]
+        system = lfm.LatentForceModel(
+            lambda x, u, t: jax.nn.softplus(u) * jnp.asarray(table) - decay * x**power, {"u": lfm.Matern(1.0, 1.0)},
+            lfm.GaussianObservation(lambda x, u, t: x, state["noise"] * jnp.ones(2)),
+            lfm.Gaussian(jnp.ones(2), 0.1 * jnp.eye(2)))
+        numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=state["steps"]), obs=y)
+
+    z, found = np.array([0.1]), []
+    for update in ({}, change):
+        state.update(update)
+        found.append((lfm.bind(reads, TIMES, Y), -float(potential_energy(reads, (TIMES, Y), {}, {"decay": z[0]}))))
+    return z, found
+
+
+@pytest.mark.parametrize("change", [{"power": 2.0}, {"noise": 0.2}, {"prior": 0.5}, {"steps": 3},
+                                    {"table": np.array([1.0, 2.1])}], ids=str)
+def test_a_variable_that_a_model_reads_may_change(change):
+    z, ((first, before), (second, after)) = _density_of(change)
+    assert second._program is not first._program and before != after
+    assert float(second.log_density(z)) == pytest.approx(after, rel=1e-12)
+
+
+def test_a_table_that_is_read_later_may_change():
+    """Nothing at the first time, or at any single point, tells the two models apart."""
+    table = {"values": np.array([0.0, 0.0, 0.0])}
+
+    def driven(times, y=None):
+        decay = numpyro.sample("decay", dist.LogNormal(0.0, 0.3))
+        known = lfm.Input(np.array([0.0, 1.5, 2.5]), table["values"], outside="hold")
+        system = lfm.LatentForceModel(
+            lambda x, u, t: u + known(t) - decay * x, {"u": lfm.Matern(1.0, 1.0)},
+            lfm.GaussianObservation(lambda x, u, t: x, 0.1 * jnp.ones(1)), lfm.Gaussian(jnp.ones(1), 0.1 * jnp.eye(1)))
+        numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=2), obs=y)
+
+    y, z = Y[:, :1], np.array([0.1])
+    for values in (table["values"], np.array([0.0, 0.0, 2.0])):
+        table["values"] = values
+        expected = -potential_energy(driven, (TIMES, y), {}, {"decay": z[0]})
+        assert float(lfm.bind(driven, TIMES, y).log_density(z)) == pytest.approx(float(expected), rel=1e-12)
+
+
+def test_times_may_follow_from_parameters_or_data():
+    def warped(times, y=None):
+        speed = numpyro.sample("speed", dist.LogNormal(0.0, 0.5))
+        system = systems.motif(initial_time=0.0)
+        numpyro.sample("y", lfm.MarginalLikelihood(system, jnp.asarray(times) * speed, steps=2), obs=y)
+
+    bound = lfm.bind(warped, TIMES, Y)
+    for z in (0.0, 0.7):
+        expected = -potential_energy(warped, (TIMES, Y), {}, {"speed": z})
+        assert float(bound.log_density(np.array([z]))) == pytest.approx(float(expected), rel=1e-12)
+
+    def packed(data):
+        decay = numpyro.sample("decay", dist.LogNormal(0.0, 0.3))
+        system = systems.motif(decay=decay)
+        numpyro.sample("y", lfm.MarginalLikelihood(system, data["times"], steps=2), obs=data["y"])
+
+    for times in (TIMES, 2.0 * TIMES):
+        data = {"times": jnp.asarray(times), "y": jnp.asarray(Y)}
+        found = bound_model.bind_arguments(packed, (data,), {}).log_density(np.array([0.1]))
+        expected = -potential_energy(packed, (data,), {}, {"decay": 0.1})
+        assert float(found) == pytest.approx(float(expected), rel=1e-12)
+
+
+def test_a_model_whose_variables_stay_is_bound_once():
+    _, ((first, _), (second, _)) = _density_of({"power": 1.0})
+    assert second._program is first._program
+
+
+def test_a_model_may_be_bound_first_in_compiled_code():
+    def prior(times, y=None):
+        model(times, y, order=0)
+
+    z = np.zeros(4)
+    inside = jax.jit(lambda z: lfm.bind(prior, TIMES, Y).log_prior(z))(z)
+    with_data = jax.jit(lambda z, y: lfm.bind(prior, TIMES, y).log_prior(z))(z, Y)
+    outside = lfm.bind(prior, TIMES, Y).log_prior(z)
+    np.testing.assert_allclose([inside, with_data], outside, rtol=1e-12)
+
+
+def test_programs_of_few_models_are_kept(monkeypatch):
+    monkeypatch.setattr(bound_model, "_MOST_PROGRAMS", 2)
+    bound_model._programs.clear()
+    for order in (0, 1, 2):
+        lfm.bind(model, TIMES, Y, order=order)
+    assert len(bound_model._programs) == 2
+
+
+def no_site(times, y=None):
+    numpyro.sample("decay", dist.LogNormal(0.0, 0.3))
+
+
+def discrete(times, y=None):
+    numpyro.sample("count", dist.Poisson(3.0))
+
+
+@pytest.mark.parametrize("arguments, error, message", [
+    ((model, TIMES, Y[:3]), ValueError, r"one column for each of the 2 outputs, shape \(5, 2\); got \(3, 2\)"),
+    ((3, TIMES, Y), TypeError, "model must be a NumPyro model"),
+    ((no_site, TIMES, Y), ValueError, "exactly one site"),
+    ((discrete, TIMES, Y), ValueError, "discrete latent sites: 'count'"),
+])
+def test_wrong_arguments(arguments, error, message):
+    with pytest.raises(error, match=message):
+        lfm.bind(*arguments)
+
+
+def test_traced_times_are_named():
+    with pytest.raises(TypeError, match="times decide what is compiled.*outside of jit"):
+        jax.jit(lambda t: lfm.bind(model, t, Y).log_density(np.zeros(4)))(TIMES)
+
+
+@pytest.mark.parametrize("values, message", [
+    ({"decay": 1.0}, "no value of 'noise_sd'"),
+    ({**VALUES, "delay": 1.0}, "unknown site in values 'delay'. Did you mean 'decay'"),
+    ({**VALUES, "decay": -1.0}, "outside of the support of the prior.*'decay'"),
+    ({**VALUES, "decay": np.ones(2)}, r"value of 'decay' must have shape \(\)"),
+])
+def test_wrong_values_are_named(bound, values, message):
+    with pytest.raises(ValueError, match=message):
+        bound.unconstrain(values)
+
+
+def test_observations_of_one_output_may_be_a_vector():
+    def single(times, y=None):
+        decay = numpyro.sample("decay", dist.LogNormal(0.0, 0.3))
+        numpyro.sample("y", lfm.MarginalLikelihood(systems.motif(decay=decay, genes=1), times, steps=2), obs=y)
+
+    z = np.array([0.1])
+    expected = lfm.bind(single, TIMES, Y[:, :1]).log_density(z)
+    assert float(lfm.bind(single, TIMES, Y[:, 0]).log_density(z)) == float(expected)
+
+
+def test_fixing_in_compiled_code_leaves_nothing_behind(bound):
+    values, z = {"decay": 0.8, "noise_sd": 0.1}, np.array([0.2])
+    inside = jax.jit(lambda z: bound.fix(values).log_prior(z))(z)
+    assert float(bound.fix(values).log_prior(z)) == pytest.approx(float(inside), rel=1e-12)
+    at = lambda decay: bound.fix({**values, "decay": decay}).log_prior(z)  # noqa: E731
+    assert np.isfinite(jax.jit(at)(0.8)) and np.isfinite(jax.grad(at)(0.8))
+
+
+@pytest.mark.parametrize("z, y, message", [
+    (np.zeros(3), Y, r"z must have shape \(4,\), one entry for each of decay, lengthscale"),
+    (np.zeros(4), Y[:4], "shape that was bound"),
+    (np.zeros(4), np.full((5, 2), np.inf), "y has infinite entries"),
+])
+def test_wrong_positions_and_data_are_named(bound, z, y, message):
+    with pytest.raises(ValueError, match=message):
+        bound.log_density(z, y)
+
+
+def test_data_of_another_type_are_taken(bound):
+    assert np.isfinite(bound.log_prior(np.zeros(4), np.ones((5, 2), int)))
+
+
+def test_other_data_must_have_the_same_shape(bound):
+    with pytest.raises(ValueError, match=r"shape that was bound, \(5, 2\), got \(3, 2\)"):
+        bound.with_data(Y[:3])
