@@ -7,6 +7,7 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -131,7 +132,7 @@ class MarginalLikelihood(dist.Distribution):
     def log_prob_per_observation(self, value: Any) -> jax.Array:
         """Return (T,): log p(y_k | y_1:k-1) of the present entries of each observation."""
         y = check_observations(value, *self.event_shape)
-        return self._said(y, finite_or_minus_infinity(self._one_step_ahead, y))
+        return self._said(y, self._kept(_log_likelihoods)(*self._parts(y)))
 
     def log_prob(self, value: Any) -> jax.Array:
         """Return the log marginal likelihood of ``value`` (T, D), NaN where missing; batch dimensions may lead."""
@@ -141,7 +142,7 @@ class MarginalLikelihood(dist.Distribution):
         self.model.check_resolution(self.times, value)
         # One failure makes the sum -inf, and with it the derivatives of the other terms zero.
         y = check_observations(value, *self.event_shape)
-        return self._said(y, finite_or_minus_infinity(lambda y: self._one_step_ahead(y).sum(), y))
+        return self._said(y, self._kept(_log_likelihood)(*self._parts(y)))
 
     def _said(self, y: jax.Array, log_likelihood: jax.Array) -> jax.Array:
         """Return the log likelihood; outside of compiled code say where the filter breaks down if it does."""
@@ -161,14 +162,12 @@ class MarginalLikelihood(dist.Distribution):
                              "parameters; for one series put the site outside of the plate.")
         return super().expand(batch_shape)
 
-    def _one_step_ahead(self, y: jax.Array) -> jax.Array:
-        start = Moments(*self.ssm.initial())
-        about = None
-        if self.iterations:
-            about = posterior_linearisation(self.ssm, self.rule, self.plan, y, start, self.iterations,
-                                            self.damping).points
-        passed = forward(self.ssm, self.rule, self.plan, y, start=start, about=about)
-        return passed.log_likelihood[jnp.asarray(self.plan.observed)]
+    def _parts(self, y: jax.Array) -> tuple:
+        return self.ssm, self.rule, self.plan, y, self.iterations, self.damping
+
+    def _kept(self, function: Callable) -> Callable:
+        """Return the function as a program that later calls share, where it would run operation by operation."""
+        return function if checks.traced((self.ssm, self.plan)) else _compiled(function)
 
     def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
         """Simulate the real model: (*sample_shape, T, D)."""
@@ -190,7 +189,30 @@ class MarginalLikelihood(dist.Distribution):
         plans = smoothing_plans(self.ssm, self.times, self.steps, self.max_step, at, self.iterations,
                                 self.tolerance)
         y = check_observations(y, *self.event_shape)
-        return smooth_on(self.ssm, self.rule, plans, y, self.iterations, self.damping)
+        return self._kept(smooth_on)(self.ssm, self.rule, plans, y, self.iterations, self.damping)
+
+
+def _one_step_ahead(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, iterations: int,
+                    damping: float) -> jax.Array:
+    start = Moments(*ssm.initial())
+    about = None
+    if iterations:
+        about = posterior_linearisation(ssm, rule, plan, y, start, iterations, damping).points
+    passed = forward(ssm, rule, plan, y, start=start, about=about)
+    return passed.log_likelihood[jnp.asarray(plan.observed)]
+
+
+def _log_likelihoods(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, iterations: int,
+                     damping: float) -> jax.Array:
+    return finite_or_minus_infinity(lambda y: _one_step_ahead(ssm, rule, plan, y, iterations, damping), y)
+
+
+def _log_likelihood(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, iterations: int,
+                    damping: float) -> jax.Array:
+    return finite_or_minus_infinity(lambda y: _one_step_ahead(ssm, rule, plan, y, iterations, damping).sum(), y)
+
+
+_compiled = functools.cache(eqx.filter_jit)
 
 
 class Panel(dist.Distribution):
