@@ -1,5 +1,7 @@
 """What every force must satisfy; the list of forces is in conftest.py."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -104,35 +106,46 @@ def test_process_noise_is_semidefinite(build):
         assert (eigenvalues[:, 0] >= -1e-13 * eigenvalues[:, -1]).all()
 
 
-@pytest.mark.parametrize("mode", [jax.jacfwd, jax.grad])
-def test_gradients_are_finite(build, mode):
-    def total(scale, ell, dt):
+@functools.cache
+def _derivatives(build):
+    def parts(point):
+        scale, ell, dt = point
         force = build(scale, ell)
-        transition, noise = force.discretise(dt)
-        return transition.sum() + noise.sum() + force.initial_covariance().sum()
+        return *force.discretise(dt), force.initial_covariance()
 
-    gradient = jax.jit(jax.vmap(mode(total, (0, 1, 2)), (None, None, 0)))
-    for lengthscale in EXTREME_LENGTHSCALES:
-        dts = lengthscale * jnp.array([0.0, 1e-8, 1.0, 30.0, 1e3, 1e6])
-        for value in gradient(SCALE, lengthscale, dts):
-            assert np.isfinite(value).all()
+    return jax.jit(jax.vmap(lambda point: (parts(point), jax.jacfwd(parts)(point), jax.jacrev(parts)(point))))
+
+
+def derivatives(build, points):
+    """Transition, noise and initial covariance at points (n, 3) of (scale, lengthscale, step), n <= 24.
+
+    Returns:
+        Values, derivatives in forward mode, derivatives in reverse mode: one compiled program for a force.
+    """
+    found = _derivatives(build)(np.resize(points, (24, 3)))
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[:len(points)], found)
+
+
+@pytest.mark.parametrize("mode", ["forward", "reverse"])
+def test_gradients_are_finite(build, mode):
+    points = [(SCALE, lengthscale, lengthscale * dt) for lengthscale in EXTREME_LENGTHSCALES
+              for dt in (0.0, 1e-8, 1.0, 30.0, 1e3, 1e6)]
+    _, forward, reverse = derivatives(build, np.array(points))
+    for derivative in forward if mode == "forward" else reverse:
+        assert np.isfinite(derivative).all()
 
 
 def test_gradient_equals_finite_differences(build):
-    def parts(point):
-        scale, ell, dt = point
-        transition, noise = build(scale, ell).discretise(dt)
-        return jnp.stack([transition, noise])
-
     h = 1e-5
     # Among the steps are some on either side of where the Matern noise changes its formula.
     points = np.array([[SCALE, LENGTHSCALE, x * LENGTHSCALE] for x in (0.01, 0.6, 4.0, 9.0)])
-    gradient = jax.jit(jax.vmap(jax.jacfwd(parts)))(points)
-    assert_allclose(gradient, jax.jit(jax.vmap(jax.jacrev(parts)))(points), rtol=1e-12, atol=1e-14)
-    parts = jax.jit(jax.vmap(parts))
-    for i, unit in enumerate(np.eye(3)):
-        difference = (parts(points + h * unit) - parts(points - h * unit)) / (2 * h)
-        assert_allclose(gradient[..., i], difference, rtol=1e-6, atol=3e-7)
+    _, forward, reverse = derivatives(build, points)
+    shifted = np.stack([points + sign * h * unit for unit in np.eye(3) for sign in (1, -1)])
+    values, _, _ = derivatives(build, shifted.reshape(-1, 3))
+    for gradient, backward, value in zip(forward[:2], reverse[:2], values[:2], strict=True):
+        assert_allclose(gradient, backward, rtol=1e-12, atol=1e-14)
+        for i, (ahead, behind) in enumerate(value.reshape(3, 2, *gradient.shape[:-1])):
+            assert_allclose(gradient[..., i], (ahead - behind) / (2 * h), rtol=1e-6, atol=3e-7)
 
 
 def test_covariance_of_the_sde_is_the_closed_form(build_exact):
@@ -151,9 +164,9 @@ def test_covariance_has_a_finite_gradient_at_lag_zero(build_exact):
     def covariance(scale, ell, lag):
         return build_exact(scale, ell).covariance(lag)
 
-    for lag in (0.0, 1e6 * LENGTHSCALE):
-        gradient = jax.grad(covariance, (0, 1, 2))(SCALE, LENGTHSCALE, lag)
-        assert np.isfinite(gradient).all()
+    gradient = jax.jit(jax.vmap(jax.grad(covariance, (0, 1, 2)), (None, None, 0)))
+    for derivative in gradient(SCALE, LENGTHSCALE, jnp.array([0.0, 1e6 * LENGTHSCALE])):
+        assert np.isfinite(derivative).all()
 
 
 def test_jit_and_vmap_over_parameters(build):
