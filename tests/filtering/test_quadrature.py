@@ -89,8 +89,13 @@ def predictions(ssm, rule, steps):
     return jax.tree_util.tree_map(np.asarray, jax.jit(jax.vmap(both))(starts(ssm)))
 
 
-@pytest.mark.parametrize("steps", [1, 3, 10])
-@pytest.mark.parametrize("name", CASES)
+# Every structure with one step, every number of steps and rule with the smallest structure.
+QUICK = {*((name, 1) for name in CASES), ("softplus", 3), ("softplus", 10)}
+
+
+@pytest.mark.parametrize("name, steps", [
+    pytest.param(name, steps, marks=() if (name, steps) in QUICK else pytest.mark.slow)
+    for name in CASES for steps in (1, 3, 10)])
 def test_simpson_gives_the_numbers_of_runge_kutta(name, steps, monkeypatch):
     ssm = case(name)
     rule = RULES["taylor" if name == "softplus" and steps == 3 else "cubature"]
@@ -135,4 +140,5 @@ def test_without_forces(monkeypatch):
     found = log_likelihoods()
     assert lfm.smooth(model, np.arange(4.0), np.ones((4, 1)), at=[0.5, 3.5], steps=3, iterations=2).mean.shape == (2, 1)
     monkeypatch.setattr(predict, "bent_by_forces_only", lambda *_: False)
+    jax.clear_caches()  # programs of this model, in which Simpson's rule is compiled
     np.testing.assert_allclose(found, log_likelihoods(), rtol=1e-12)
