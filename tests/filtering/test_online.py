@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import systems
 
 import lfm_ppl as lfm
 
@@ -78,12 +79,16 @@ def test_the_first_call_needs_an_observation():
         lfm.filter(MODEL, TIMES[:2], np.full((2, 1), np.nan), steps=3)
 
 
+def cubic(x, u, t):
+    return u - x**3
+
+
 def repeating(period_decay, lengthscale):
     """A model whose force jumps at 1.1 and 2.6; its parameters may be traced."""
     kernel = lfm.forces.PeriodicSquaredExponential(1.0, lengthscale, 1.5)
     force = lfm.QuasiPeriodic(kernel, lfm.forces.SQM(period_decay, (1.1, 2.6)), functions=3)
     return lfm.LatentForceModel(
-        lambda x, u, t: u - x**3, {"drive": force}, lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.04])),
+        cubic, {"drive": force}, lfm.GaussianObservation(systems.whole_state, jnp.array([0.04])),
         lfm.Gaussian(jnp.zeros(1), jnp.eye(1)), initial_time=0.0)
 
 
