@@ -47,8 +47,10 @@ def oscillator(**changes):
 
 def solved(model, forces, start):
     """The state at TIMES by an ODE solver of high order."""
+    dynamics = jax.jit(lambda x, u, t: model.dynamics(x, u, t))
+
     def slope(t, x):
-        return np.asarray(model.dynamics(jnp.asarray(x), jnp.asarray([f(t) for f in forces]), t))
+        return np.asarray(dynamics(x, np.array([float(f(t)) for f in forces]), t))
 
     found = solve_ivp(slope, (TIMES[0], TIMES[-1]), start, t_eval=np.unique(TIMES), rtol=1e-10, atol=1e-12,
                       method="LSODA")

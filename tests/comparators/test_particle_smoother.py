@@ -14,10 +14,14 @@ Y = np.array([[0.3], [0.5], [0.1], [np.nan], [-0.4]])
 AT = np.array([0.0, 0.35, 0.7, 2.5, 3.1, 4.0])
 
 
+def decay(x, u, t):
+    return u - 0.8 * x
+
+
 def linear(force=None):
     """A decay pushed by a force, of which the force alone has noise: over an interval it reaches both states."""
     return lfm.LatentForceModel(
-        lambda x, u, t: u - 0.8 * x, {"u": force or lfm.Matern(1.0, 1.3, 0)},
+        decay, {"u": force or lfm.Matern(1.0, 1.3, 0)},
         lfm.GaussianObservation(first_state, jnp.array([0.05])), lfm.Gaussian(jnp.zeros(1), jnp.array([0.5])))
 
 
