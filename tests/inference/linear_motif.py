@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
+import systems
 
 import lfm_ppl as lfm
 
@@ -27,9 +28,9 @@ def build(decay, lengthscale, noise_sd) -> lfm.LatentForceModel:
     size = np.shape(decay)[0]
     sensitivity = SENSITIVITY[:size]
     return lfm.LatentForceModel(
-        dynamics=lambda x, u, t: sensitivity * u[0] - decay * x,
+        dynamics=systems.Motif(decay, sensitivity, 0.0, systems.identity),
         forces={"drive": lfm.Matern(scale=1.0, lengthscale=lengthscale, order=1)},
-        observation=lfm.GaussianObservation(lambda x, u, t: x, noise_sd**2 * jnp.ones(size)),
+        observation=lfm.GaussianObservation(systems.whole_state, noise_sd**2 * jnp.ones(size)),
         initial_state=lfm.Gaussian(jnp.zeros(size), START_VARIANCE * jnp.eye(size)),
         output_names=("a", "b")[:size],
         units={"time": "h", "a": "nM", "b": "nM", "drive": "1/h"},

@@ -9,13 +9,13 @@ import numpy as np
 import numpyro
 import numpyro.distributions as dist
 import pytest
+import systems
 from numpyro.infer import NUTS
 from numpyro.infer.util import ParamInfo, potential_energy
 
 import lfm_ppl as lfm
 from lfm_ppl.analysis.arviz_data import group
 from lfm_ppl.inference import bound_model, sampling
-from tests import systems
 
 TIMES = np.array([0.0, 0.7, 1.1, 2.0, 3.0])
 Y = np.array([[0.4, 0.3], [0.8, np.nan], [0.9, 0.5], [1.0, 0.4], [0.7, 0.2]])
