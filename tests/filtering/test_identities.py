@@ -148,7 +148,8 @@ def test_steps_follow_max_step(model):
     assert np.abs(coarse.log_likelihood - fine.log_likelihood).max() > 0
 
 
-@pytest.mark.parametrize("cut", [1, 2, 3])
+@pytest.mark.parametrize("cut", [pytest.param(1, marks=pytest.mark.slow), 2,
+                                 pytest.param(3, marks=pytest.mark.slow)])
 def test_filter_goes_on_from_its_state(model, cut):
     """Also where the cut falls between two replicates."""
     whole = lfm.filter(model, TIMES, Y, steps=4)

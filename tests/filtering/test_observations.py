@@ -109,7 +109,7 @@ def test_non_linear_observation_by_points():
     assert np.isclose(found.filtered_mean[0, 0], m + 2 * m * v / variance * (0.7 - mean), rtol=1e-10)
 
 
-@pytest.mark.parametrize("link", [identity, softplus])
+@pytest.mark.parametrize("link", [identity, pytest.param(softplus, marks=pytest.mark.slow)])
 def test_jumps(link):
     """Across a jump the covariance function shrinks by the share; a jump comes before an observation at its time."""
     kicks, share = (0.6, 1.0, 2.0, 9.0), 0.3

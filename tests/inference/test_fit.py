@@ -460,7 +460,7 @@ def steep(times, y=None):
     numpyro.sample("y", lfm.MarginalLikelihood(model, times), obs=y)
 
 
-@pytest.mark.parametrize("sampler", ["nuts", "map"])
+@pytest.mark.parametrize("sampler", ["nuts", pytest.param("map", marks=pytest.mark.slow)])
 def test_nowhere_to_start_from_is_explained(sampler):
     times = np.array([0.0, 1.0, 2.0])
     with pytest.warns(lfm.FilterWarning, match=r"at the prior median, the filter breaks down at row 1 \(time 1\)"):

@@ -78,7 +78,8 @@ def test_default_data_fit_the_model_and_carry_their_truth(name, options):
     assert set(data.times) <= set(np.asarray(truth["times"])), "the truth is known at the data"
 
 
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", [
+    pytest.param(name, marks=[pytest.mark.slow] if name == "gps" else []) for name in MODELS])
 def test_default_data_depend_on_the_seed_alone(name):
     file = loading.load(name)
     first = file.simulate(seed=123)
