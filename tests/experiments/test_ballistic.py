@@ -51,6 +51,7 @@ def test_the_densities_are_those_of_the_model():
     assert log_likelihood == pytest.approx(float(problem.posterior().likelihood(z).log_prob(target.y)), rel=1e-10)
 
 
+@pytest.mark.slow
 def test_a_gaussian_smoother_tracks():
     """Its errors are those of its own mean, and its band is honest about them."""
     (task,) = [one for one in tracking.tasks(SMALL) if one.settings["method"] == "Taylor"]

@@ -151,6 +151,7 @@ def test_the_densities_are_those_of_the_model():
     assert log_likelihood == pytest.approx(float(given.log_prob(one.training)), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_the_gradient_is_that_of_finite_differences():
     method, one = problem.Method("matern"), window()
     objective = problem.posterior(method).objective(one.training)

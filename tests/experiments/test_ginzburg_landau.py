@@ -28,7 +28,8 @@ def test_the_realisations_are_those_of_the_model_file():
     np.testing.assert_array_equal(data.sparse[present], data.y)
 
 
-@pytest.mark.parametrize("method", problem.METHODS)
+@pytest.mark.parametrize("method", [
+    method if method == "CKF" else pytest.param(method, marks=pytest.mark.slow) for method in problem.METHODS])
 def test_every_method_filters_and_smooths(method):
     result = state.compute(task(state.tasks(SMALL), "state", problem.slug(method)))
     for what in ("filter", "smoother"):

@@ -346,6 +346,7 @@ def moments(times, axes, along, on_orbit, vector):
     return mean.ravel(), covariance.reshape(size, size) + problem.NOISE**2 * np.eye(size)
 
 
+@pytest.mark.slow
 def test_densities_of_positions_are_those_of_a_gaussian(freely):
     """Covariances by quadrature of the forces' covariance functions, densities by SciPy."""
     data, vector, mean, covariance = freely

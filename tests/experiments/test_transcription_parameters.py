@@ -27,6 +27,7 @@ def sites(data):
             "lengthscale": problem.LENGTHSCALE}
 
 
+@pytest.mark.slow
 def test_the_likelihood_at_the_truth_is_that_of_the_known_system():
     data = problem.data_set(SOFTPLUS, 4)
     with numpyro.handlers.substitute(data=sites(data)), numpyro.handlers.trace() as trace:
