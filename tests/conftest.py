@@ -16,7 +16,12 @@ jax.config.update("jax_enable_x64", True)
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     root = Path(__file__).resolve().parent.parent
     jax.config.update("jax_compilation_cache_dir", str(root / ".jax_cache"))
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+# Where an operation came from, with pytest's fifty frames for each, is written into no program.
+jax.config.update("jax_include_full_tracebacks_in_locations", False)
+jax.config.update("jax_traceback_in_locations_limit", 0)
+# Tracing makes millions of objects that live: looking through them for garbage took 7% of the time.
+gc.set_threshold(50_000, 20, 50)
 os.environ["LFM_PPL_CACHE"] = "off"  # the command line keeps nothing in the home of who runs the tests
 
 
@@ -28,13 +33,16 @@ def pytest_configure(config: pytest.Config) -> None:
     """Compile faster, before a backend exists, except where speed is measured.
 
     Without optimisations tests take two thirds of the time, since they compile more than they compute (but for slow
-    ones), and XLA's older emitters compile these small loops in half of what is left. Newer versions lack that switch,
-    and XLA ends the process at a switch that it does not know.
+    ones), and XLA's older emitters compile these small loops in half of what is left. A program is compiled in one
+    piece: by default XLA cuts it into 32, for threads that a test has not, and compiles what they share in each. Newer
+    versions may lack these switches, and XLA ends the process at a switch that it does not know.
     """
     if _asked_for(config, "performance"):
         return
     _keep_to_one_cpu(os.environ.get("PYTEST_XDIST_WORKER", ""))
     flags = [] if _asked_for(config, "slow") else ["--xla_backend_optimization_level=0"]
+    if jaxlib.version.__version_info__ < (0, 13):
+        flags.append("--xla_cpu_parallel_codegen_split_count=1")
     if jaxlib.version.__version_info__ < (0, 11):
         flags.append("--xla_cpu_use_fusion_emitters=false")
     os.environ["XLA_FLAGS"] = " ".join([*flags, os.environ.get("XLA_FLAGS", "")])
@@ -56,7 +64,15 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 
 @pytest.fixture(autouse=True, scope="module")
 def release_compiled_programs():
-    """Forget a file's compiled programs after it: each takes memory mappings, and Linux allows a process 65,530."""
+    """Forget compiled programs after a file where they have become many; until then later files use them too.
+
+    Linux allows a process 65,530 memory mappings, of which each program takes some, and a worker has 2 GiB.
+    """
     yield
+    with contextlib.suppress(OSError):  # /proc is Linux's
+        mappings = Path("/proc/self/maps").read_bytes().count(b"\n")
+        resident = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+        if mappings < 30_000 and resident < 2 * 2**30:
+            return
     jax.clear_caches()
     gc.collect()
