@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -73,7 +74,8 @@ def test_a_kernel_that_is_not_stationary_drives_a_state():
     moderated = forces.ModeratedPeriodicMatern(1.0, 1.0, PERIOD, 0.2, 2)
     force = lfm.QuasiPeriodic(moderated, forces.SQM(1.5, POINTS), functions=5)
     reference = dense("SQM")
-    reference.process.kernels = [lambda t, s: np.asarray(force.sde_covariance(t, s))]
+    covariance = eqx.filter_jit(force.sde_covariance)
+    reference.process.kernels = [lambda t, s: np.asarray(covariance(t, s))]
     reference.process.breaks = (1.5, 3.0, 4.5, 6.0, 7.5)
     found = lfm.filter(model(force), TIMES, Y, steps=40)
     assert abs(float(found.log_likelihood.sum()) - reference.log_likelihood(TIMES, Y)) < 1e-5
@@ -119,7 +121,7 @@ def test_a_panel_is_a_loop():
 
     parameters = {"lengthscale": jnp.array([1.0, 2.0]), "period": jnp.array([3.0, 2.5])}
     y = jnp.stack([jnp.asarray(Y), 2.0 * jnp.asarray(Y)])
-    found = lfm.panel(build, parameters, TIMES).log_prob(y)
+    found = jax.jit(lambda p, y: lfm.panel(build, p, TIMES).log_prob(y))(parameters, y)
     each = [lfm.MarginalLikelihood(build({"lengthscale": a, "period": b}), TIMES).log_prob(one)
             for a, b, one in zip((1.0, 2.0), (3.0, 2.5), y, strict=True)]
     np.testing.assert_allclose(found, each, rtol=1e-10)
@@ -143,7 +145,8 @@ def test_a_resonator_with_a_bias_is_that_of_dense_algebra():
     for force in (lfm.Resonator(3.0, 0.8, 0.3, 0.1, mean=1.5),
                   forces.resonators(kernel(), functions=5, noise=0.2, damping=0.1, mean=1.5)):
         reference = dense("constant")
-        reference.process.kernels = [lambda t, s, force=force: np.asarray(force.covariance(t, s))]
+        covariance = eqx.filter_jit(force.covariance)
+        reference.process.kernels = [lambda t, s, covariance=covariance: np.asarray(covariance(t, s))]
         reference.process.means = [lambda t: 1.5 + np.zeros_like(t)]
         found = lfm.filter(model(force), TIMES, Y)
         assert abs(float(found.log_likelihood.sum()) - reference.log_likelihood(TIMES, Y)) < 1e-8
