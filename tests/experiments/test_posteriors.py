@@ -6,12 +6,12 @@ import numpy as np
 import numpyro
 import numpyro.distributions as dist
 import pytest
+import systems
 from scipy import stats
 
 import lfm_ppl as lfm
 from lfm_ppl.experiments.posteriors import LogPosterior
 from lfm_ppl.inference.bound_model import bind_arguments
-from tests import systems
 
 TIMES = np.array([0.0, 0.7, 1.1, 2.0])
 SETS = [(jnp.array([[0.4], [0.8], [jnp.nan], [0.7]]) * factor, {"shift": jnp.asarray(factor)}) for factor in (1.0, 2.0)]
