@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -13,15 +14,18 @@ import numpy as np
 from lfm_ppl import checks
 from lfm_ppl.filtering.adaptive import predict_row_adaptively
 from lfm_ppl.filtering.jumps import after_jump
-from lfm_ppl.filtering.predict import Moments, Prediction, predict_exact, predict_row, unmoved
+from lfm_ppl.filtering.predict import FLOOR, Moments, Prediction, predict_exact, predict_row, unmoved
 from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays, schedule
 from lfm_ppl.filtering.transition import Factor, LinearPart, constant_slope, exact, integrating_factor, linear_part
-from lfm_ppl.filtering.update import linearise_observation, update
+from lfm_ppl.filtering.update import FAILED, linearise_observation, update
 from lfm_ppl.linalg import congruence, matmul, safe_sqrt, solve_lower
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.linearisation.sigma_points import Cubature, SigmaPointRule
 from lfm_ppl.model.augment import StateSpaceModel, state_space
 from lfm_ppl.model.latent_force_model import LatentForceModel
+
+_KEPT = jax.checkpoint_policies.save_only_these_names(FLOOR, FAILED)
+"""What a row keeps for its derivative besides its inputs: a few numbers that are not differentiated themselves."""
 
 
 class Pass(NamedTuple):
@@ -126,6 +130,31 @@ def _contiguous(indices: np.ndarray) -> bool:
     return bool((np.diff(indices) == 1).all())
 
 
+class Table:
+    """A function of the interval length, tabulated: all arrays that it returns make one row for each length.
+
+    The row is read, and in reverse mode written, at once; array by array that took many more operations to compile.
+
+    Args:
+        function: of a length, a scalar, to a pytree of arrays.
+        lengths: (U,).
+    """
+
+    def __init__(self, function: Callable[[jax.Array], Any], lengths: jax.Array) -> None:
+        leaves, self._tree = jax.tree_util.tree_flatten(jax.vmap(function)(lengths))
+        self._shapes = [leaf.shape[1:] for leaf in leaves]
+        self._rows = jnp.concatenate([leaf.reshape(len(lengths), -1) for leaf in leaves], axis=1) if leaves else None
+
+    def at(self, index: jax.Array) -> Any:
+        """Return what the function gave at one of the lengths."""
+        if self._rows is None:
+            return jax.tree_util.tree_unflatten(self._tree, [])
+        row = jax.lax.dynamic_index_in_dim(self._rows, index, keepdims=False)
+        parts = jnp.split(row, np.cumsum([math.prod(shape) for shape in self._shapes])[:-1])
+        return jax.tree_util.tree_unflatten(
+            self._tree, [part.reshape(shape) for part, shape in zip(parts, self._shapes, strict=True)])
+
+
 class Preparation(NamedTuple):
     """What the rows of a scan share.
 
@@ -138,7 +167,7 @@ class Preparation(NamedTuple):
 
     linear: LinearPart
     jacobian: jax.Array
-    table: Any
+    table: Table | None
     jumps: tuple[jax.Array, jax.Array] | None
 
 
@@ -146,7 +175,7 @@ def preparation(ssm: StateSpaceModel, plan: Schedule) -> Preparation:
     """Compute what the rows of a scan share."""
     linear = linear_part(ssm, jnp.asarray(plan.initial_time, float))
     lengths = None if plan.lengths is None else jnp.asarray(plan.lengths)
-    table = None if lengths is None else jax.vmap(lambda length: step_transition(ssm, linear, plan, length))(lengths)
+    table = None if lengths is None else Table(lambda length: step_transition(ssm, linear, plan, length), lengths)
     return Preparation(linear, _observation_slope(ssm, plan), table, ssm.stack.jump_table())
 
 
@@ -154,7 +183,7 @@ def row_transition(ssm: StateSpaceModel, plan: Schedule, prepared: Preparation, 
     """Return the exact transition of a row, or the integrating factor of its steps."""
     if prepared.table is None:
         return step_transition(ssm, prepared.linear, plan, row.length)
-    return jax.tree_util.tree_map(lambda a: a[row.kind], prepared.table)
+    return prepared.table.at(row.kind)
 
 
 def step_transition(ssm: StateSpaceModel, linear: LinearPart, plan: Schedule, length: jax.Array) -> Any:
@@ -274,7 +303,8 @@ def forward(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, *, s
     rows = as_arrays(plan.rows)
     first = Moments(*ssm.initial()) if start is None else start
     scale = _output_scale(ssm, plan, prepared, padded, first)
-    _, passed = jax.lax.scan(jax.checkpoint(step, prevent_cse=False), first, (rows, padded[rows.observation], about))
+    _, passed = jax.lax.scan(jax.checkpoint(step, prevent_cse=False, policy=_KEPT), first,
+                             (rows, padded[rows.observation], about))
     return passed
 
 

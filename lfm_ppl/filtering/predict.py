@@ -18,12 +18,16 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.ad_checkpoint import checkpoint_name
 
 from lfm_ppl.filtering.transition import Exact, Factor, LinearPart
 from lfm_ppl.linalg import congruence, matmul, outer_square, safe_sqrt
 from lfm_ppl.linearisation.rule import Inputs, Rule, selection
 from lfm_ppl.linearisation.sigma_points import SigmaPointRule
 from lfm_ppl.model.augment import InputStructure, StateSpaceModel, just_before
+
+FLOOR = "lfm_ppl: smallest standard deviation"
+"""Under this name `smallest_spread` is kept for the derivative of a row, and not computed again."""
 
 
 class Moments(NamedTuple):
@@ -173,7 +177,7 @@ def smallest_spread(ssm: StateSpaceModel, rule: Rule, factor: Factor, t: jax.Arr
         outputs = jnp.sqrt(jnp.diagonal(congruence(matrix[size:, size:], factor.noise_full)) + 1e-300)
         scale = (jnp.abs(w) + jnp.concatenate([change, outputs]))[jnp.asarray(ssm.drift_structure.points, int)]
     scale = jnp.where(jnp.isfinite(scale), scale, 0.0)
-    return jax.lax.stop_gradient(1e-6 * scale + 1e-150)
+    return checkpoint_name(jax.lax.stop_gradient(1e-6 * scale + 1e-150), FLOOR)
 
 
 def linearise_state(ssm: StateSpaceModel, rule: Rule, function: Any, structure: InputStructure, slope: jax.Array,
@@ -334,9 +338,12 @@ def _predict_by_quadrature(ssm: StateSpaceModel, rule: Rule, linear: LinearPart,
         times = jnp.stack([begins, begins + 0.5 * h, ends], axis=1)
         stages = jax.vmap(jax.vmap(node))(times, _by_steps(now.mean), jax.tree_util.tree_map(_by_steps, near))
 
-    def step(carry: tuple, nodes: Stage) -> tuple[tuple, Any]:
+    # Of all steps at once: what a loop computes it also stores, step by step, for its derivative.
+    maps = jax.vmap(lambda nodes: _simpson(factor, h, nodes, size))(stages)
+
+    def step(carry: tuple, of_step: tuple) -> tuple[tuple, Any]:
         now, phi, noise = carry
-        own, offset, added = _simpson(factor, h, nodes, size)
+        own, offset, added = of_step
         mean = matmul(factor.full, now.mean[:, None])[:, 0]
         mean = jnp.concatenate([mean[:size] + offset, mean[size:]])
         now = Moments(mean, congruence(own, now.covariance) + added)
@@ -344,7 +351,7 @@ def _predict_by_quadrature(ssm: StateSpaceModel, rule: Rule, linear: LinearPart,
             phi, noise = matmul(own, phi), congruence(own, noise) + added
         return (now, phi, noise), None if each is None else each(Prediction(now, own, added))
 
-    (moments, whole, added), within = jax.lax.scan(step, tuple(unmoved(moments, flow))[:3], stages)
+    (moments, whole, added), within = jax.lax.scan(step, tuple(unmoved(moments, flow))[:3], maps)
     return Prediction(moments, whole, added, within)
 
 

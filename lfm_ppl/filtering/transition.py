@@ -137,13 +137,23 @@ def integrating_factor(ssm: StateSpaceModel, linear: LinearPart, step: jax.Array
     columns = (root(0.5) * at_half, root(0.5) * inputs, root(1.0) * at_half,
                jnp.concatenate([root(1 / 6) * at_full, root(1 / 3) * at_half, root(1 / 3) * at_half,
                                 root(1 / 6) * inputs], axis=1))
-    if ssm.force_dim == 0:
-        regressions = tuple(c.T for c in columns)
-    else:
-        regressions = tuple(solve_semidefinite(noise, c).T for noise, c in
-                            zip((noise_half, noise_half, noise_full, noise_full), columns, strict=True))
     back_full = matmul(back_half, back_half)
+    regressions = _regressions(columns, noise_half, noise_full)
     return Factor(half, full, back_half, back_full, noise_half, noise_full, inputs, columns, regressions)
+
+
+def _regressions(columns: tuple[jax.Array, ...], noise_half: jax.Array, noise_full: jax.Array) -> tuple[jax.Array, ...]:
+    """Regress columns (nz, K) on the exact noise of half a step, the first two, and of a whole step: (K, nz) each."""
+    if not noise_half.shape[0]:
+        return tuple(column.T for column in columns)
+    widths = [column.shape[1] for column in columns]
+    sides = [jnp.concatenate(columns[:2], axis=1), jnp.concatenate(columns[2:], axis=1)]
+    # Side by side: one factorisation in the program.
+    sides[0] = jnp.pad(sides[0], ((0, 0), (0, sides[1].shape[1] - sides[0].shape[1])))
+    solved = jax.vmap(solve_semidefinite)(jnp.stack([noise_half, noise_full]), jnp.stack(sides)).mT
+    ends = np.cumsum(widths[:2]), np.cumsum(widths[2:])
+    return tuple(solved[side, end - width:end] for side in (0, 1)
+                 for end, width in zip(ends[side], widths[2 * side:2 * side + 2], strict=True))
 
 
 def _half_step(ssm: StateSpaceModel, linear: LinearPart, dt: jax.Array) -> tuple[jax.Array, jax.Array]:

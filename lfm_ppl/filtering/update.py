@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.ad_checkpoint import checkpoint_name
 
 from lfm_ppl.filtering.predict import Moments, covariance_of, linearise_state
 from lfm_ppl.linalg import cholesky, congruence, matmul, safe_sqrt, solve_lower, solve_upper, wrapped
@@ -15,6 +16,9 @@ from lfm_ppl.linearisation.sigma_points import SigmaPointRule
 from lfm_ppl.model.augment import StateSpaceModel
 
 _LOG_2PI = float(np.log(2.0 * np.pi))
+
+FAILED = "lfm_ppl: failed"
+"""Under this name it is kept for the derivative of a row whether its update failed, and not found out again."""
 
 _LOST_MEAN, _LOST_VARIANCE = 1e-3, 1e3
 """Errors of a filtered output, in standard deviations and variances of its noise, from which precision is lost."""
@@ -115,8 +119,10 @@ def update(ssm: StateSpaceModel, observation: Linearised, y: jax.Array, present:
     rounding = 4 * jnp.finfo(y.dtype).eps * jnp.abs(jnp.diagonal(innovation_covariance))
     factor = cholesky(innovation_covariance, rounding)
     chol = factor.chol
-    gain = solve_upper(chol, solve_lower(chol, cross.T)).T
-    white = solve_lower(chol, innovation)
+    # One solve for the gain and the innovation.
+    half = solve_lower(chol, jnp.concatenate([cross.T, innovation[:, None]], axis=1))
+    solved, white = solve_upper(chol, half), half[:, -1]
+    gain = solved[:, :-1].T
     diagonal = jnp.diagonal(chol)
     log_likelihood = -0.5 * ((white**2).sum() + present.sum() * _LOG_2PI) - jnp.log(diagonal).sum()
     kept = jnp.eye(mean.shape[0]) - matmul(gain, slope)
@@ -125,7 +131,8 @@ def update(ssm: StateSpaceModel, observation: Linearised, y: jax.Array, present:
     failed = factor.degenerate.any()
     if scale is not None:
         failed = failed | _precision_lost(ssm, observation, y, present, moments, filtered, noise,
-                                          solve_upper(chol, white), scale)
+                                          solved[:, -1], scale)
+    failed = checkpoint_name(failed, FAILED)
     return Update(filtered, jnp.where(failed, -jnp.inf, log_likelihood), innovation, chol, gain, slope, noise)
 
 
