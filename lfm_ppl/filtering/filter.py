@@ -98,7 +98,7 @@ def completed(ssm: StateSpaceModel, rule: Rule, nodes: Moments) -> Moments:
         width = first, ssm.state_dim - first - used.size
         still = ((0, 0),) * (nodes.mean.ndim - 1)
         return Moments(jnp.pad(nodes.mean, (*still, width)), jnp.pad(nodes.covariance, (*still, width, width)))
-    pick = jnp.asarray(np.eye(ssm.state_dim)[used])
+    pick = np.eye(ssm.state_dim)[used]
     return Moments(matmul(nodes.mean[..., None, :], pick)[..., 0, :], congruence(pick.T, nodes.covariance))
 
 

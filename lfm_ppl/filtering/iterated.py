@@ -79,7 +79,7 @@ def _nodes(ssm: StateSpaceModel, rule: Rule, plan: Schedule, passed: Pass, smoot
         m + W r,    P - W Lambda W',    W = Cov(node, state at the row's end).
     """
     used = needed(ssm, rule)
-    pick = jnp.asarray(np.eye(ssm.state_dim)[used])
+    pick = np.eye(ssm.state_dim)[used]
     marginal = Moments(matmul(smoothed.moments.mean, pick.T), congruence(pick, smoothed.moments.covariance))
     first, last = (jax.tree_util.tree_map(lambda a: a[part][:, None], marginal)  # noqa: B023
                    for part in (slice(None, -1), slice(1, None)))

@@ -195,7 +195,7 @@ def linearise_state(ssm: StateSpaceModel, rule: Rule, function: Any, structure: 
         return rule.linearise(on_state, inputs, everything, jnp.zeros((slope.shape[0], total)))
     chosen = (*structure.points, *structure.averaged)
     needed = isinstance(rule, SigmaPointRule) and bool(structure.points)
-    rows = matmul(jnp.asarray(selection(chosen, ssm.input_dim).T), matrix) if chosen else matrix[:0]
+    rows = matmul(selection(chosen, ssm.input_dim).T, matrix) if chosen else matrix[:0]
     of_forces = all(index >= ssm.physical_dim for index in chosen)
     spread_covariance = covariance(rows, of_forces) if needed else jnp.zeros((0, 0))
     w = matmul(matrix, mean[:, None])[:, 0] + offset

@@ -71,7 +71,7 @@ def constant_slope(function: Function, point: jax.Array, structure: InputStructu
     if not structure.constant:
         return jnp.zeros((outputs, point.shape[0]))
     part = partial_jacobian(function, point, structure.constant)
-    return matmul(part, jnp.asarray(selection(structure.constant, point.shape[0]).T))
+    return matmul(part, selection(structure.constant, point.shape[0]).T)
 
 
 def linear_part(ssm: StateSpaceModel, t: jax.Array) -> LinearPart:

@@ -5,6 +5,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 
 from lfm_ppl.forces.discretise import discretise_dispersion
@@ -72,9 +73,9 @@ class Force(eqx.Module):
         """Return the covariance (n, n) that a step of length dt adds, exact for any dt."""
         return self.discretise(dt)[1]
 
-    def measurement(self, t: ArrayLike) -> jax.Array:
-        """Return H(t) (n,); the first state by default."""
-        return jnp.zeros(self.state_dim).at[0].set(1.0)
+    def measurement(self, t: ArrayLike) -> jax.Array | np.ndarray:
+        """Return H(t) (n,); the first state by default. A constant one is best a NumPy array."""
+        return np.eye(self.state_dim)[0]
 
     def mean_at(self, t: ArrayLike) -> jax.Array:
         """Return the mean of the force at time t, a scalar."""

@@ -157,9 +157,9 @@ class SquaredExponential(Stretched):
         transition, noise = _discretise(self.order, jnp.minimum(self.rate * dt, _FAR))
         return transition, self.scale**2 * noise
 
-    def measurement(self, t: ArrayLike) -> jax.Array:
+    def measurement(self, t: ArrayLike) -> np.ndarray:
         """Return H (n,), the coefficients of b in units of lam."""
-        return jnp.asarray(self.unit.measurement)
+        return self.unit.measurement
 
     def covariance(self, t: ArrayLike, s: ArrayLike = 0.0) -> jax.Array:
         """Return k(t - s) of the exact process, elementwise."""

@@ -8,6 +8,8 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
 from jax.typing import ArrayLike
 
 from lfm_ppl.forces.sde import Force
@@ -55,9 +57,10 @@ class Stack(eqx.Module):
         pairs = [force.discretise(dt) for force in self.forces]
         return block_diagonal([p[0] for p in pairs]), block_diagonal([p[1] for p in pairs])
 
-    def measurement(self, t: ArrayLike) -> jax.Array:
+    def measurement(self, t: ArrayLike) -> jax.Array | np.ndarray:
         """Return H(t) (R, n), one row for each force."""
-        return block_diagonal([force.measurement(t)[None, :] for force in self.forces])
+        rows = [force.measurement(t)[None, :] for force in self.forces]
+        return block_diagonal(rows) if rows else np.zeros((0, 0))
 
     def mean_at(self, t: ArrayLike) -> jax.Array:
         """Return the means (R,) at time t."""
@@ -156,7 +159,7 @@ class Sum(Force):
         """Return transition (n, n) and process noise (n, n), block-diagonal."""
         return self.stack.discretise(dt)
 
-    def measurement(self, t: ArrayLike) -> jax.Array:
+    def measurement(self, t: ArrayLike) -> jax.Array | np.ndarray:
         """Return H(t) (n,), the measurements of the terms one after the other."""
         return self.stack.measurement(t).sum(0)
 
@@ -196,7 +199,9 @@ class Sum(Force):
 
 
 def block_diagonal(blocks: list[jax.Array]) -> jax.Array:
-    """Return the matrix with ``blocks`` (r_i, c_i) on its diagonal; (0, 0) without any."""
+    """Return the matrix with ``blocks`` (r_i, c_i) on its diagonal, in NumPy if all are; (0, 0) without any."""
+    if blocks and all(isinstance(block, np.ndarray) for block in blocks):
+        return scipy.linalg.block_diag(*blocks)
     return jax.scipy.linalg.block_diag(*blocks) if blocks else jnp.zeros((0, 0))
 
 

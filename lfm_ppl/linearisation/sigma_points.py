@@ -67,14 +67,14 @@ class SigmaPointRule(Rule):
         # Averaged coordinates given the points: rho = m_rho + gain xi, gain = P_rho,alpha L^-T.
         gain = _times_inverse_transpose(chol, inputs.covariance[count:, :count])
         root = jnp.concatenate([chol, gain]) if structure.averaged else chol
-        place = jnp.asarray(selection((*structure.points, *structure.averaged), size))
+        place = selection((*structure.points, *structure.averaged), size)
         spread = matmul(place, root)
         at = inputs.mean + matmul(nodes, spread.T)
         values, extras = jax.vmap(function)(at)
         value = (weights[:, None] * values).sum(0)
         if structure.averaged:
             jacobians, average = _average_jacobian(function, at, weights, structure.averaged)
-            slope = slope + matmul(average, jnp.asarray(selection(structure.averaged, size).T))
+            slope = slope + matmul(average, selection(structure.averaged, size).T)
             through_averaged = matmul(average, gain)
         else:
             jacobians, average, through_averaged = None, None, jnp.zeros(())
@@ -84,7 +84,7 @@ class SigmaPointRule(Rule):
         else:
             _, on_points = _average_jacobian(function, at, weights, structure.points)
             regression = matmul(on_points, chol) + through_averaged
-        slope = slope + matmul(on_points, jnp.asarray(selection(structure.points, size).T))
+        slope = slope + matmul(on_points, selection(structure.points, size).T)
         errors = values - value - matmul(nodes, regression.T)
         residual = matmul(matmul(errors.T, jnp.asarray(unit.residual_weights)), errors)
         if jacobians is not None:
@@ -122,7 +122,7 @@ def _without_points(function: Function, inputs: Inputs, structure: InputStructur
     value, extra = function(inputs.mean)
     if structure.averaged:
         part = partial_jacobian(function, inputs.mean, structure.averaged)
-        slope = slope + matmul(part, jnp.asarray(selection(structure.averaged, inputs.mean.shape[0]).T))
+        slope = slope + matmul(part, selection(structure.averaged, inputs.mean.shape[0]).T)
     return Affine(value, slope, jnp.zeros((value.shape[0],) * 2), extra)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from lfm_ppl.linalg import matmul
 from lfm_ppl.linearisation.rule import Affine, Function, Inputs, Rule, partial_jacobian, selection
 from lfm_ppl.model.augment import InputStructure
 
@@ -28,5 +29,5 @@ class Taylor(Rule):
         varying = (*structure.points, *structure.averaged)
         if varying:
             part = partial_jacobian(function, inputs.mean, varying)
-            slope = slope + part @ jnp.asarray(selection(varying, inputs.mean.shape[0]).T)
+            slope = slope + matmul(part, selection(varying, inputs.mean.shape[0]).T)
         return Affine(value, slope, jnp.zeros((value.shape[0],) * 2), extra)

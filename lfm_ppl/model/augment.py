@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import checks
-from lfm_ppl.forces.sum import Stack
+from lfm_ppl.forces.sum import Stack, block_diagonal
 from lfm_ppl.linalg import matmul
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.structure import Pattern, pattern
@@ -96,7 +96,7 @@ class StateSpaceModel(eqx.Module):
     def input_map(self, t: Any) -> tuple[jax.Array, jax.Array]:
         """Return K (M + R, n) and k (M + R,) of w = K s + k at time t."""
         size = self.physical_dim
-        matrix = jax.scipy.linalg.block_diag(jnp.eye(size), self.stack.measurement(t))
+        matrix = block_diagonal([np.eye(size), self.stack.measurement(t)])
         return matrix, jnp.concatenate([jnp.zeros(size), self.stack.mean_at(t)])
 
     def inputs(self, s: jax.Array, t: Any) -> jax.Array:
