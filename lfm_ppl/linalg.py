@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
 
 _FUSED_SIZE = 8
 """Largest dimension that is multiplied by broadcasting; XLA's CPU dot wins above it.
@@ -42,6 +44,8 @@ def matmul(a: jax.Array, b: jax.Array) -> jax.Array:
         return _taken(b, chosen, -2)
     if isinstance(b, np.ndarray) and (chosen := _selected(b.T)) is not None:
         return _taken(a, chosen, -1)
+    if a.shape[-1] == 1:
+        return a * b
     if max(*a.shape[-2:], *b.shape[-2:]) > _FUSED_SIZE:
         return jnp.matmul(a, b)
     return (a[..., :, :, None] * b[..., None, :, :]).sum(-2)
@@ -97,14 +101,24 @@ class Factor(NamedTuple):
     Attributes:
         chol: (n, n), lower triangular.
         degenerate: (n,), True where the pivot was at or below its floor.
+        inverse: (n, n), that of ``L``, with a zero row where the diagonal of ``L`` is zero; None for a large matrix.
     """
 
     chol: jax.Array
     degenerate: jax.Array
+    inverse: jax.Array | None = None
+
+    def solve_lower(self, b: jax.Array) -> jax.Array:
+        """Solve ``L X = B`` for ``B`` (n, m), as `solve_lower`."""
+        return solve_lower(self.chol, b) if self.inverse is None else matmul(self.inverse, b)
+
+    def solve_upper(self, b: jax.Array) -> jax.Array:
+        """Solve ``L' X = B`` for ``B`` (n, m), as `solve_upper`."""
+        return solve_upper(self.chol, b) if self.inverse is None else matmul(self.inverse.T, b)
 
 
 def cholesky(p: jax.Array, floor: jax.Array | float = 0.0, keep: bool = True) -> Factor:
-    """Factorise a positive semi-definite matrix column by column, in plain operations.
+    """Factorise a positive semi-definite matrix in plain operations.
 
     LAPACK's routine is a call that XLA cannot fuse and gives NaN, in value or gradient, for a singular matrix. Here a
     pivot at or below its floor is replaced, so that values and gradients stay finite.
@@ -116,29 +130,65 @@ def cholesky(p: jax.Array, floor: jax.Array | float = 0.0, keep: bool = True) ->
             which gives the semi-definite factor.
 
     Returns:
-        The factor and its degenerate pivots.
+        The factor, its degenerate pivots and its inverse.
     """
     size = p.shape[-1]
     if size == 0:
-        return Factor(p, jnp.zeros(0, bool))
+        return Factor(p, jnp.zeros(0, bool), p)
     floor = jnp.broadcast_to(jnp.asarray(floor, p.dtype), (size,))
     if size > _FUSED_SIZE:
         return _cholesky_in_a_loop(p, floor, keep)
+    factor = _eliminated(p, floor)
+    if keep:
+        return factor
+    dead = factor.degenerate
+    return Factor(jnp.where(dead, 0.0, factor.chol), dead, jnp.where(dead[:, None], 0.0, factor.inverse))
+
+
+@jax.custom_jvp
+def _eliminated(p: jax.Array, floor: jax.Array) -> Factor:
+    """Factorise with replaced pivots, by Gaussian elimination in (P, I), which becomes (L', L^-1) row by row."""
+    size = p.shape[-1]
     rows = np.arange(size)
-    columns: list[jax.Array] = []
-    degenerate = []
+    left = jnp.concatenate([p, jnp.eye(size, dtype=p.dtype)], axis=1)
+    found, degenerate = [], []
     for j in range(size):
-        column = p[:, j]
-        for previous in columns:
-            column = column - previous * previous[j]
-        positive = column[j] > floor[j]
+        pivot = left[j, j]
+        positive = pivot > floor[j]
         degenerate.append(~positive)
-        replacement = jnp.where(floor[j] > 0, floor[j], 1.0)
-        root = jnp.sqrt(jnp.where(positive, column[j], replacement))
-        diagonal = root if keep else jnp.where(positive, root, 0.0)
-        below = jnp.where(positive, column / root, 0.0)
-        columns.append(jnp.where(rows > j, below, jnp.where(rows == j, diagonal, 0.0)))
-    return Factor(jnp.stack(columns, axis=-1), jnp.stack(degenerate))
+        root = jnp.sqrt(jnp.where(positive, pivot, jnp.where(floor[j] > 0, floor[j], 1.0)))
+        row = left[j] / root
+        # A degenerate column of L is zero below its diagonal.
+        kept = jnp.where(positive | (np.arange(2 * size) >= size), row, 0.0)
+        found.append(jnp.where(np.arange(2 * size) == j, root, kept))
+        if j + 1 < size:
+            column = jnp.where(positive & (rows > j), left[:, j] / root, 0.0)
+            left = left - column[:, None] * row[None, :]
+    whole = jnp.stack(found)
+    return Factor(jnp.where(rows[:, None] >= rows, whole[:, :size].T, 0.0), jnp.stack(degenerate), whole[:, size:])
+
+
+@functools.partial(_eliminated.defjvp, symbolic_zeros=True)
+def _eliminated_jvp(primals: tuple, tangents: tuple) -> tuple[Factor, Factor]:
+    """Differentiate in closed form: dL = L F and d(L^-1) = -F L^-1, F the lower half of L^-1 dP L^-T.
+
+    A degenerate column of F is zero, but for the relative change of the pivot that was put in its place.
+    """
+    p, floor = primals
+    change, of_floor = tangents
+    factor = _eliminated(p, floor)
+    chol, degenerate, inverse = factor
+    assert inverse is not None
+    weight = np.tri(len(p)) - 0.5 * np.eye(len(p))
+    if isinstance(change, SymbolicZero):
+        lower = jnp.zeros_like(p)
+    else:
+        white = matmul(matmul(inverse, change), inverse.T)
+        lower = jnp.where(degenerate | (weight == 0), 0.0, weight * white)
+    if not isinstance(of_floor, SymbolicZero):
+        used = degenerate & (floor > 0)
+        lower = lower + jnp.diag(jnp.where(used, 0.5 * of_floor / jnp.where(used, floor, 1.0), 0.0))
+    return factor, Factor(matmul(chol, lower), np.zeros(degenerate.shape, jax.dtypes.float0), -matmul(lower, inverse))
 
 
 def _cholesky_in_a_loop(p: jax.Array, floor: jax.Array, keep: bool) -> Factor:
@@ -215,9 +265,9 @@ def solve_semidefinite(p: jax.Array, b: jax.Array, tolerance: float = 1e-14) -> 
     live = variance > 0
     scale = jnp.where(live, 1.0 / jnp.sqrt(jnp.where(live, variance, 1.0)), 0.0)
     factor = cholesky(p * scale[:, None] * scale[None, :], floor=tolerance, keep=False)
-    scaled = b * (scale[:, None] if b.ndim > 1 else scale)
-    solution = solve_upper(factor.chol, solve_lower(factor.chol, scaled))
-    return solution * (scale[:, None] if b.ndim > 1 else scale)
+    columns = b if b.ndim > 1 else b[:, None]
+    solution = factor.solve_upper(factor.solve_lower(columns * scale[:, None])) * scale[:, None]
+    return solution if b.ndim > 1 else solution[:, 0]
 
 
 def conditional_shares(p: jax.Array) -> jax.Array:

@@ -75,3 +75,54 @@ def test_gradients_stay_finite_where_nothing_varies():
     assert jax.grad(safe_sqrt)(0.0) == 0.0 and jax.grad(safe_sqrt)(-1.0) == 0.0
     solve = jax.grad(lambda s: solve_semidefinite(s * jnp.ones((2, 2)), s * jnp.ones(2)).sum())
     assert np.isfinite(solve(0.0)) and np.isfinite(solve(1.0))
+
+
+def by_columns(p, floor, keep):
+    """Factorise column by column, for JAX to differentiate operation by operation."""
+    rows, columns = np.arange(len(p)), []
+    for j in range(len(p)):
+        column = p[:, j] - sum((previous * previous[j] for previous in columns), jnp.zeros(len(p)))
+        positive = column[j] > floor[j]
+        root = jnp.sqrt(jnp.where(positive, column[j], jnp.where(floor[j] > 0, floor[j], 1.0)))
+        diagonal = root if keep else jnp.where(positive, root, 0.0)
+        below = jnp.where(positive, column / root, 0.0)
+        columns.append(jnp.where(rows > j, below, jnp.where(rows == j, diagonal, 0.0)))
+    chol = jnp.stack(columns, axis=-1)
+    return chol, solve_lower(chol, jnp.eye(len(p)))
+
+
+@pytest.mark.parametrize("keep", [True, False])
+@pytest.mark.parametrize("floor", [[0.0, 0.0, 0.0, 0.0], [0.0, 0.5, 0.0, 2.0], [0.3, 0.3, 0.3, 0.3]])
+@pytest.mark.parametrize("dead", [(), (0,), (1, 3), (2,)])
+def test_derivatives_of_a_factor_are_those_of_its_operations(keep, floor, dead):
+    """Forwards, backwards, twice and side by side, for regular and degenerate pivots, which depend on their floor."""
+    live = np.array([index not in dead for index in range(4)], float)
+    root = np.random.default_rng(0).normal(size=(4, 5)) * live[:, None]
+    weights = np.random.default_rng(1).normal(size=(2, 4, 4))
+
+    def of(factorise):
+        def value(z):
+            scaled = jnp.asarray(root) * (1.0 + z[0] * jnp.arange(5.0)) + 0.3 * z[1] * live[:, None]
+            found = factorise(outer_square(scaled), jnp.asarray(floor) * (1.0 + z[2]))
+            return sum((weight * jnp.tril(matrix)).sum() for weight, matrix in zip(weights, found, strict=True))
+
+        z = jnp.array([0.1, 0.2, 0.3])
+        grad = jax.grad(value)
+        return value(z), grad(z), jax.jacfwd(value)(z), jax.hessian(value)(z), jax.vmap(grad)(jnp.stack([z, -z]))
+
+    def factorise(p, floor):
+        factor = cholesky(p, floor, keep)
+        return factor.chol, factor.inverse
+
+    for found, expected in zip(of(factorise), of(lambda p, floor: by_columns(p, floor, keep)), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-12 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("indices", [(0, 1, 2), (2,), (2, 0), (1, -1, 2, 3), (-1, -1, 0)])
+def test_a_constant_matrix_that_selects_takes_slices(indices):
+    pick = np.array([np.eye(4)[index] if index >= 0 else np.zeros(4) for index in indices])
+    a = jnp.asarray(np.random.default_rng(0).normal(size=(2, 4, 4)))
+    assert np.array_equal(matmul(pick, a), pick @ a) and np.array_equal(matmul(a, pick.T), a @ pick.T)
+    assert np.array_equal(congruence(pick, definite(4)), pick @ definite(4) @ pick.T)
+    assert "dot" not in str(jax.make_jaxpr(lambda a: matmul(pick, a))(a))
+    assert isinstance(matmul(pick, np.eye(4)), np.ndarray)

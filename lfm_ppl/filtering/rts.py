@@ -12,7 +12,7 @@ from lfm_ppl.filtering.filter import Pass
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.retrospect import combine, given_later
 from lfm_ppl.filtering.schedule import Schedule
-from lfm_ppl.linalg import cholesky, congruence, matmul, solve_lower, solve_upper
+from lfm_ppl.linalg import cholesky, congruence, matmul, outer_square, solve_lower
 
 _LOG_2PI = float(np.log(2.0 * np.pi))
 
@@ -72,7 +72,8 @@ def backward(passed: Pass, start: Moments, plan: Schedule) -> Smoothed:
 def _leave_one_out(one: Pass, r: jax.Array, adjoint: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Log density of a row's observation given all others, and the adjoint at the row's end with it."""
     outputs = one.innovation.shape[0]
-    inverse = solve_upper(one.chol, solve_lower(one.chol, jnp.eye(outputs)))
+    root = solve_lower(one.chol, jnp.eye(outputs))
+    inverse = outer_square(root.T)
     white = matmul(inverse, one.innovation[:, None])[:, 0]
     u = white - matmul(one.gain.T, r[:, None])[:, 0]
     precision = inverse + congruence(one.gain.T, adjoint)

@@ -10,7 +10,7 @@ import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 
 from lfm_ppl.filtering.predict import Moments, covariance_of, linearise_state
-from lfm_ppl.linalg import cholesky, congruence, matmul, safe_sqrt, solve_lower, solve_upper, wrapped
+from lfm_ppl.linalg import cholesky, congruence, matmul, safe_sqrt, wrapped
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.linearisation.sigma_points import SigmaPointRule
 from lfm_ppl.model.augment import StateSpaceModel
@@ -120,8 +120,8 @@ def update(ssm: StateSpaceModel, observation: Linearised, y: jax.Array, present:
     factor = cholesky(innovation_covariance, rounding)
     chol = factor.chol
     # One solve for the gain and the innovation.
-    half = solve_lower(chol, jnp.concatenate([cross.T, innovation[:, None]], axis=1))
-    solved, white = solve_upper(chol, half), half[:, -1]
+    half = factor.solve_lower(jnp.concatenate([cross.T, innovation[:, None]], axis=1))
+    solved, white = factor.solve_upper(half), half[:, -1]
     gain = solved[:, :-1].T
     diagonal = jnp.diagonal(chol)
     log_likelihood = -0.5 * ((white**2).sum() + present.sum() * _LOG_2PI) - jnp.log(diagonal).sum()

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import checks
-from lfm_ppl.linalg import cholesky, congruence, matmul, outer_square, solve_lower, solve_upper
+from lfm_ppl.linalg import Factor, cholesky, congruence, matmul, outer_square
 from lfm_ppl.linearisation.rule import Affine, Function, Inputs, Rule, partial_jacobian, selection
 from lfm_ppl.model.augment import InputStructure
 
@@ -63,9 +63,10 @@ class SigmaPointRule(Rule):
         unit = self.points(len(structure.points))
         nodes, weights = jnp.asarray(unit.nodes), jnp.asarray(unit.weights)
         count, size = len(structure.points), inputs.mean.shape[0]
-        chol = cholesky(inputs.covariance[:count, :count], inputs.spread**2).chol
+        factor = cholesky(inputs.covariance[:count, :count], inputs.spread**2)
+        chol = factor.chol
         # Averaged coordinates given the points: rho = m_rho + gain xi, gain = P_rho,alpha L^-T.
-        gain = _times_inverse_transpose(chol, inputs.covariance[count:, :count])
+        gain = _times_inverse_transpose(factor, inputs.covariance[count:, :count])
         root = jnp.concatenate([chol, gain]) if structure.averaged else chol
         place = selection((*structure.points, *structure.averaged), size)
         spread = matmul(place, root)
@@ -80,7 +81,7 @@ class SigmaPointRule(Rule):
             jacobians, average, through_averaged = None, None, jnp.zeros(())
         if self.regresses:
             regression = matmul((weights[:, None] * values).T, nodes)
-            on_points = _times_inverse(chol, regression - through_averaged)
+            on_points = _times_inverse(factor, regression - through_averaged)
         else:
             _, on_points = _average_jacobian(function, at, weights, structure.points)
             regression = matmul(on_points, chol) + through_averaged
@@ -107,14 +108,14 @@ def _average_jacobian(function: Function, at: jax.Array, weights: jax.Array,
     return jacobians, (weights[:, None, None] * jacobians).sum(0)
 
 
-def _times_inverse_transpose(chol: jax.Array, b: jax.Array) -> jax.Array:
+def _times_inverse_transpose(factor: Factor, b: jax.Array) -> jax.Array:
     """Return ``B L^-T`` (m, n)."""
-    return solve_lower(chol, b.T).T
+    return factor.solve_lower(b.T).T
 
 
-def _times_inverse(chol: jax.Array, b: jax.Array) -> jax.Array:
+def _times_inverse(factor: Factor, b: jax.Array) -> jax.Array:
     """Return ``B L^-1`` (m, n)."""
-    return solve_upper(chol, b.T).T
+    return factor.solve_upper(b.T).T
 
 
 def _without_points(function: Function, inputs: Inputs, structure: InputStructure, slope: jax.Array) -> Affine:
