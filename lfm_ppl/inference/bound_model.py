@@ -332,14 +332,20 @@ class BoundModel:
         return program.once("site", find)
 
     @property
+    def has_likelihood(self) -> bool:
+        """Whether the model has one likelihood site: a filter."""
+        try:
+            return self.site is not None
+        except ValueError:
+            return False
+
+    @property
     def _known_times(self) -> Any:
         """Times of the likelihood site as numbers; None for a model without one, or whose times differ."""
         def find() -> Any:
-            try:
-                times = self.site.distribution.times
-            except ValueError:
+            if not self.has_likelihood or self._program.times_follow(self.y):
                 return None
-            return None if self._program.times_follow(self.y) else times
+            return self.site.distribution.times
 
         return self._program.once("times", find)
 

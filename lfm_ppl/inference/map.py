@@ -99,7 +99,7 @@ def map_estimate(
     seed: int = 0,
     model_kwargs: Mapping[str, Any] | None = None,
     jacobian: bool = True,
-    hessian: str = "autodiff",
+    hessian: str | None = None,
     forward_mode: bool | None = None,
     max_iterations: int = 1000,
 ) -> MAPResult:
@@ -127,7 +127,7 @@ def map_estimate(
         jacobian: which mode, see above.
         hessian: ``"autodiff"``, or ``"finite-differences"`` of the gradient: about 9 digits instead
             of 15, no second derivatives, and for a latent force model less than half the time to
-            compile.
+            compile. By default differences where the model has a filter, and ``"autodiff"`` elsewhere.
         forward_mode: take derivatives in forward mode, which is the only one where the model loops
             with ``jax.lax.while_loop``; by default with up to ten parameters, where it is faster.
         max_iterations: of L-BFGS, for each start.
@@ -158,7 +158,8 @@ def map_estimate(
     """
     checks.positive_integer("restarts", restarts)
     checks.positive_integer("max_iterations", max_iterations)
-    checks.one_of("hessian", hessian, _HESSIANS)
+    if hessian is not None:
+        checks.one_of("hessian", hessian, _HESSIANS)
     if jnp.result_type(float) != jnp.float64:
         warnings.warn(
             "map_estimate runs in float32, which is too coarse for a Hessian. Call "
@@ -166,8 +167,9 @@ def map_estimate(
             stacklevel=2,
         )
     bound = bind_arguments(model, args, model_kwargs or {}, "map_estimate")
+    exact = not bound.has_likelihood if hessian is None else hessian == "autodiff"
     return mode_of(bound, init=init, restarts=restarts, seed=seed, jacobian=jacobian,
-                   exact_hessian=hessian == "autodiff", forward_mode=forward_mode, max_iterations=max_iterations)
+                   exact_hessian=exact, forward_mode=forward_mode, max_iterations=max_iterations)
 
 
 def mode_of(bound: BoundModel, *, init: Any = None, restarts: int = 4, seed: int = 0, jacobian: bool = True,
