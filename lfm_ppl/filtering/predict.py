@@ -18,10 +18,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 
 from lfm_ppl.filtering.transition import Exact, Factor, LinearPart
-from lfm_ppl.linalg import congruence, matmul, outer_square, safe_sqrt
+from lfm_ppl.forces.sum import block_diagonal
+from lfm_ppl.linalg import congruence, matmul, outer_square, safe_sqrt, symmetric
 from lfm_ppl.linearisation.rule import Inputs, Rule, selection
 from lfm_ppl.linearisation.sigma_points import SigmaPointRule
 from lfm_ppl.model.augment import InputStructure, StateSpaceModel, just_before
@@ -236,21 +238,21 @@ def step_on(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Factor
     one = stage(0, t, m, covariance_of(moments)) if first is None else first
     k1 = increment(one, identity)
     flow2, m2 = node(at_half, 0.5 * h * matmul(half[:size, :size], k1))
-    q2 = lambda: _noise(factor, 0, [flow2[:size]], [one.diffusion], [0.5 * h], size)  # noqa: E731
+    q2 = lambda: _noise(factor, 0, flow2[:size][None], _together(one), jnp.reshape(0.5 * h, 1), size)  # noqa: E731
     two = stage(1, t + 0.5 * h, m2, _propagated(p, flow2, q2, factor.noise_half, size))
     k2 = increment(two, flow2)
     z2 = 0.5 * h * one.slope
 
     flow3, m3 = node(at_half, 0.5 * h * k2)
     transport3 = identity[:size] + matmul(_less(flow3[:size] - half_x, flow3, z2, size), back_half)
-    q3 = lambda: _noise(factor, 1, [transport3], [two.diffusion], [0.5 * h], size)  # noqa: E731
+    q3 = lambda: _noise(factor, 1, transport3[None], _together(two), jnp.reshape(0.5 * h, 1), size)  # noqa: E731
     three = stage(2, t + 0.5 * h, m3, _propagated(p, flow3, q3, factor.noise_half, size))
     k3 = increment(three, flow3)
     z3 = _inverse_flow(0.5 * h, z2, back_half, two.slope, half, size)
 
     flow4, m4 = node(at_full, h * matmul(half[:size, :size], k3))
     transport4 = half_x + matmul(_less(flow4[:size] - full_x, flow4, z3, size), back_half)
-    q4 = lambda: _noise(factor, 2, [transport4], [three.diffusion], [h], size)  # noqa: E731
+    q4 = lambda: _noise(factor, 2, transport4[None], _together(three), jnp.reshape(h, 1), size)  # noqa: E731
     covariance4 = _propagated(p, flow4, q4, factor.noise_full, size)
     four = stage(3, just_before(t + h, h), m4, covariance4)
     k4 = increment(four, flow4)
@@ -259,13 +261,19 @@ def step_on(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Factor
     weighted = matmul(full[:size, :size], k1) + 2.0 * matmul(half[:size, :size], k2 + k3) + k4
     flow, mean = node(at_full, h / 6 * weighted)
     change = flow[:size] - full_x
-    transports = [flow[:size], half_x + matmul(_less(change, flow, z2, size), back_half),
-                  half_x + matmul(_less(change, flow, z3, size), back_half),
-                  identity[:size] + matmul(_less(change, flow, z4, size), back_full)]
-    diffusions = [node.diffusion for node in (one, two, three, four)]
-    noise = _noise(factor, 3, transports, diffusions, [h / 6, h / 3, h / 3, h / 6], size)
+    transports = jnp.stack([flow[:size], half_x + matmul(_less(change, flow, z2, size), back_half),
+                            half_x + matmul(_less(change, flow, z3, size), back_half),
+                            identity[:size] + matmul(_less(change, flow, z4, size), back_full)])
+    weights = h * np.array([1 / 6, 1 / 3, 1 / 3, 1 / 6])
+    noise = _noise(factor, 3, transports, _together(one, two, three, four), weights, size)
     moments = Moments(mean, congruence(flow, p) + noise)
     return Prediction(moments, flow, noise), LastStage(four, covariance4(identity, False))
+
+
+def _together(*stages: Stage) -> jax.Array | None:
+    """Return the diffusions (K, M, M) of the stages; None without process noise."""
+    diffusions = [stage.diffusion for stage in stages if stage.diffusion is not None]
+    return jnp.stack(diffusions) if diffusions else None
 
 
 def linearised(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, t: jax.Array, moments: Moments,
@@ -388,21 +396,22 @@ def _simpson(factor: Factor, h: jax.Array, nodes: Stage, size: int) -> tuple[jax
     """
     half, full = factor.half, factor.full
     half_x, full_x = half[:size, :size], full[:size, :size]
-    slope, rest = nodes.slope[:, :, size:], nodes.rest
-    middle = matmul(slope[1], half[size:, size:])
-    bend = matmul(full_x, slope[0]) + 4.0 * matmul(half_x, middle) + matmul(slope[2], full[size:, size:])
-    offset = matmul(full_x, rest[0][:, None])[:, 0] + 4.0 * matmul(half_x, rest[1][:, None])[:, 0] + rest[2]
-    bend = h / 6 * bend
-    pulled = matmul(factor.back_half[:size, :size], middle)
-    identity = jnp.eye(full.shape[0])
-    transports = [jnp.concatenate([full_x, full[:size, size:] + bend], axis=1)]
-    for inverse, on, back in ((0.5 * h * slope[0], half, factor.back_half), (0.5 * h * pulled, half, factor.back_half),
-                              (h * pulled, identity, factor.back_full)):
-        through = on[:size, size:] + matmul(bend - matmul(full_x, inverse), back[size:, size:])
-        transports.append(jnp.concatenate([on[:size, :size], through], axis=1))
-    diffusions = [None if nodes.diffusion is None else nodes.diffusion[index] for index in (0, 1, 1, 2)]
-    noise = _noise(factor, 3, transports, diffusions, [h / 6, h / 3, h / 3, h / 6], size)
-    return jnp.concatenate([transports[0], full[size:]]), h / 6 * offset, noise
+    slope = nodes.slope[:, :, size:]
+    # What the remainder adds to the mean is one more column, which the forces' transition leaves alone.
+    beside = lambda forces: block_diagonal([forces, np.eye(1)])  # noqa: E731
+    first, second, third = jnp.concatenate([slope, nodes.rest[:, :, None]], axis=2)
+    middle = matmul(second, beside(half[size:, size:]))
+    whole = h / 6 * (matmul(full_x, first) + 4.0 * matmul(half_x, middle) + matmul(third, beside(full[size:, size:])))
+    bend, offset = whole[:, :-1], whole[:, -1]
+    pulled = matmul(factor.back_half[:size, :size], middle[:, :-1])
+    inverse = h * jnp.stack([0.5 * slope[0], 0.5 * pulled, pulled])
+    onward = jnp.stack([full[:size], half[:size], half[:size], jnp.eye(size, full.shape[0])])
+    back = jnp.stack([factor.back_half, factor.back_half, factor.back_full])[:, size:, size:]
+    bends = jnp.concatenate([bend[None], matmul(bend - matmul(full_x, inverse), back)])
+    transports = jnp.concatenate([onward[:, :, :size], onward[:, :, size:] + bends], axis=2)
+    diffusions = None if nodes.diffusion is None else jnp.stack([nodes.diffusion[index] for index in (0, 1, 1, 2)])
+    noise = _noise(factor, 3, transports, diffusions, h * np.array([1 / 6, 1 / 3, 1 / 3, 1 / 6]), size)
+    return jnp.concatenate([transports[0], full[size:]]), offset, noise
 
 
 def _propagated(p: jax.Array, flow: jax.Array, noise: Any, force_noise: jax.Array, size: int) -> Any:
@@ -429,21 +438,21 @@ def _inverse_flow(scale: jax.Array, before: jax.Array, back: jax.Array, slope: j
     return scale * (pulled - matmul(before[:, :size], pulled))
 
 
-def _noise(factor: Factor, stage: int, transports: list[jax.Array], diffusions: list[jax.Array | None],
-           weights: list[jax.Array], size: int) -> jax.Array:
-    """Return Q (n, n): noise at the nodes, carried on by ``transports`` (M, n), the forces' own part exact.
+def _noise(factor: Factor, stage: int, transports: jax.Array, diffusions: jax.Array | None, weights: jax.Array,
+           size: int) -> jax.Array:
+    """Return Q (n, n): noise at K nodes, carried on by ``transports`` (K, M, n), the forces' own part exact.
 
     The forces' noise at the nodes, ``columns``, is only a quadrature of the exact noise, but what reaches x together
     with it can be regressed on the exact one: N_x = G N_z + remainder, semi-definite for any G.
     """
     exact = factor.noise_full if stage >= 2 else factor.noise_half
-    through = jnp.concatenate([safe_sqrt(weight) * matmul(transport[:, size:], factor.inputs)
-                               for transport, weight in zip(transports, weights, strict=True)], axis=1)
+    through = safe_sqrt(weights)[:, None, None] * matmul(transports[:, :, size:], factor.inputs)
+    through = jnp.moveaxis(through, 0, 1).reshape(size, factor.columns[stage].shape[1])
     gain = matmul(through, factor.regressions[stage])
-    on_states = congruence(gain, exact) + outer_square(through - matmul(gain, factor.columns[stage]))
-    for transport, diffusion, weight in zip(transports, diffusions, weights, strict=True):
-        if diffusion is not None:
-            on_states = on_states + weight * congruence(transport[:, :size], diffusion)
     cross = matmul(gain, exact)
+    left = through - matmul(gain, factor.columns[stage])
+    on_states = symmetric(matmul(cross, gain.T)) + outer_square(left)
+    if diffusions is not None:
+        on_states = on_states + (weights[:, None, None] * congruence(transports[:, :, :size], diffusions)).sum(0)
     return jnp.concatenate([jnp.concatenate([on_states, cross], axis=1),
                             jnp.concatenate([cross.T, exact], axis=1)])
