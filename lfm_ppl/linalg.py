@@ -8,6 +8,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.ad_checkpoint import checkpoint_name
 from jax.custom_derivatives import SymbolicZero
 
 _FUSED_SIZE = 8
@@ -89,6 +90,11 @@ def symmetric(a: jax.Array) -> jax.Array:
     return 0.5 * (a + jnp.swapaxes(a, -1, -2))
 
 
+def diagonal(a: jax.Array) -> jax.Array:
+    """Return the diagonal (..., n) of matrices (..., n, n) by a mask, whose derivative is no scatter."""
+    return jnp.where(np.eye(a.shape[-1], dtype=bool), a, 0.0).sum(-1)
+
+
 def safe_sqrt(x: jax.Array) -> jax.Array:
     """Return the square root of max(x, 0), with a zero gradient where x <= 0."""
     positive = x > 0
@@ -117,7 +123,7 @@ class Factor(NamedTuple):
         return solve_upper(self.chol, b) if self.inverse is None else matmul(self.inverse.T, b)
 
 
-def cholesky(p: jax.Array, floor: jax.Array | float = 0.0, keep: bool = True) -> Factor:
+def cholesky(p: jax.Array, floor: jax.Array | float = 0.0, keep: bool = True, name: str | None = None) -> Factor:
     """Factorise a positive semi-definite matrix in plain operations.
 
     LAPACK's routine is a call that XLA cannot fuse and gives NaN, in value or gradient, for a singular matrix. Here a
@@ -128,6 +134,7 @@ def cholesky(p: jax.Array, floor: jax.Array | float = 0.0, keep: bool = True) ->
         floor: scalar or (n,), at or below which a pivot (a conditional variance) counts as degenerate.
         keep: a degenerate pivot is replaced by its floor (by 1 where that is zero); if False its column is zero,
             which gives the semi-definite factor.
+        name: under which a checkpoint may keep the factor for the derivative.
 
     Returns:
         The factor, its degenerate pivots and its inverse.
@@ -138,17 +145,21 @@ def cholesky(p: jax.Array, floor: jax.Array | float = 0.0, keep: bool = True) ->
     floor = jnp.broadcast_to(jnp.asarray(floor, p.dtype), (size,))
     if size > _FUSED_SIZE:
         return _cholesky_in_a_loop(p, floor, keep)
-    factor = _eliminated(p, floor)
+    factor = _eliminated(name, p, floor)
     if keep:
         return factor
     dead = factor.degenerate
     return Factor(jnp.where(dead, 0.0, factor.chol), dead, jnp.where(dead[:, None], 0.0, factor.inverse))
 
 
-@jax.custom_jvp
-def _eliminated(p: jax.Array, floor: jax.Array) -> Factor:
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _eliminated(name: str | None, p: jax.Array, floor: jax.Array) -> Factor:
     """Factorise with replaced pivots, by Gaussian elimination in (P, I), which becomes (L', L^-1) row by row."""
     size = p.shape[-1]
+    if size == 1:
+        positive = p > floor
+        root = jnp.sqrt(jnp.where(positive, p, jnp.where(floor > 0, floor, 1.0)))
+        return Factor(root, ~positive[0], 1.0 / root)
     rows = np.arange(size)
     left = jnp.concatenate([p, jnp.eye(size, dtype=p.dtype)], axis=1)
     found, degenerate = [], []
@@ -169,14 +180,16 @@ def _eliminated(p: jax.Array, floor: jax.Array) -> Factor:
 
 
 @functools.partial(_eliminated.defjvp, symbolic_zeros=True)
-def _eliminated_jvp(primals: tuple, tangents: tuple) -> tuple[Factor, Factor]:
+def _eliminated_jvp(name: str | None, primals: tuple, tangents: tuple) -> tuple[Factor, Factor]:
     """Differentiate in closed form: dL = L F and d(L^-1) = -F L^-1, F the lower half of L^-1 dP L^-T.
 
     A degenerate column of F is zero, but for the relative change of the pivot that was put in its place.
     """
     p, floor = primals
     change, of_floor = tangents
-    factor = _eliminated(p, floor)
+    factor = _eliminated(name, p, floor)
+    if name is not None:
+        factor = jax.tree_util.tree_map(lambda a: checkpoint_name(a, name), factor)
     chol, degenerate, inverse = factor
     assert inverse is not None
     weight = np.tri(len(p)) - 0.5 * np.eye(len(p))
@@ -261,7 +274,7 @@ def solve_semidefinite(p: jax.Array, b: jax.Array, tolerance: float = 1e-14) -> 
     The matrix is scaled to unit diagonal first, and directions whose conditional variance is below ``tolerance`` of
     their marginal variance carry no information: they get zero weight.
     """
-    variance = jnp.diagonal(p)
+    variance = diagonal(p)
     live = variance > 0
     scale = jnp.where(live, 1.0 / jnp.sqrt(jnp.where(live, variance, 1.0)), 0.0)
     factor = cholesky(p * scale[:, None] * scale[None, :], floor=tolerance, keep=False)
@@ -275,16 +288,16 @@ def conditional_shares(p: jax.Array) -> jax.Array:
 
     The least of them says by how much solving with ``P`` magnifies rounding errors.
     """
-    variance = jnp.diagonal(p)
+    variance = diagonal(p)
     live = variance > 0
     scale = jnp.where(live, 1.0 / jnp.sqrt(jnp.where(live, variance, 1.0)), 0.0)
-    pivots = jnp.diagonal(cholesky(p * scale[:, None] * scale[None, :], keep=False).chol) ** 2
+    pivots = diagonal(cholesky(p * scale[:, None] * scale[None, :], keep=False).chol) ** 2
     return jnp.where(live, pivots, 1.0)
 
 
 def semidefinite_root(p: jax.Array, tolerance: float = 1e-14) -> jax.Array:
     """Return a lower triangular ``L`` with ``L L' = P`` for a semi-definite ``P``; null directions are zero."""
-    variance = jnp.diagonal(p)
+    variance = diagonal(p)
     live = variance > 0
     sd = jnp.where(live, jnp.sqrt(jnp.where(live, variance, 1.0)), 0.0)
     inverse = jnp.where(live, 1.0 / jnp.where(live, sd, 1.0), 0.0)

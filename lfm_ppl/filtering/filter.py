@@ -17,15 +17,15 @@ from lfm_ppl.filtering.jumps import after_jump
 from lfm_ppl.filtering.predict import FLOOR, Moments, Prediction, predict_exact, predict_row, unmoved
 from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays, schedule
 from lfm_ppl.filtering.transition import Factor, LinearPart, constant_slope, exact, integrating_factor, linear_part
-from lfm_ppl.filtering.update import FAILED, linearise_observation, update
-from lfm_ppl.linalg import congruence, matmul, safe_sqrt, solve_lower
+from lfm_ppl.filtering.update import FACTOR, FAILED, linearise_observation, update
+from lfm_ppl.linalg import congruence, diagonal, matmul, safe_sqrt, solve_lower
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.linearisation.sigma_points import Cubature, SigmaPointRule
 from lfm_ppl.model.augment import StateSpaceModel, state_space
 from lfm_ppl.model.latent_force_model import LatentForceModel
 
-_KEPT = jax.checkpoint_policies.save_only_these_names(FLOOR, FAILED)
-"""What a row keeps for its derivative besides its inputs: a few numbers that are not differentiated themselves."""
+_KEPT = jax.checkpoint_policies.save_only_these_names(FLOOR, FAILED, FACTOR)
+"""What a row keeps for its derivative besides its inputs: a few numbers that take many operations."""
 
 
 class Pass(NamedTuple):
@@ -116,6 +116,13 @@ def _inside(ssm: StateSpaceModel, rule: Rule, plan: Schedule, prepared: Preparat
 
     _, cross = jax.lax.scan(back, to_end, (own, phi), reverse=True)
     return Inside(Moments(mean, _columns(own, needed(ssm, rule))), cross)
+
+
+def at_rows(a: jax.Array, rows: Any) -> jax.Array:
+    """Return the entries of ``a`` (N, ...) at rows; of all rows nothing is gathered, which is a scatter in reverse."""
+    if isinstance(rows, np.ndarray) and np.array_equal(rows, np.arange(a.shape[0])):
+        return a
+    return a[jnp.asarray(rows)]
 
 
 def _columns(a: jax.Array, indices: np.ndarray) -> jax.Array:
@@ -315,7 +322,7 @@ def _output_scale(ssm: StateSpaceModel, plan: Schedule, prepared: Preparation, y
     The prior's is that through the constant part of the observation's Jacobian. An angle is at least one radian large.
     """
     matrix, _ = ssm.input_map(jnp.asarray(plan.initial_time, float))
-    prior = safe_sqrt(jnp.diagonal(congruence(matmul(prepared.jacobian, matrix), start.covariance)))
+    prior = safe_sqrt(diagonal(congruence(matmul(prepared.jacobian, matrix), start.covariance)))
     scale = jnp.maximum(jnp.max(jnp.where(jnp.isfinite(y), jnp.abs(y), 0.0), axis=0), prior)
     for index in ssm.model.observation.angular:
         scale = scale.at[index].max(1.0)
@@ -434,7 +441,7 @@ def filter_on(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, ti
               begin: Moments | None = None) -> FilterResult:
     """Filter observations (T, D) at ``times`` on the rows of a plan; see `filter`."""
     passed = forward(ssm, rule, plan, y, start=begin, keep="moments")
-    at = jax.tree_util.tree_map(lambda a: a[jnp.asarray(plan.observed)], passed)
+    at = jax.tree_util.tree_map(lambda a: at_rows(a, plan.observed), passed)
     state = FilterState(times[-1], at.filtered.mean[-1], at.filtered.covariance[-1])
     return FilterResult(times, at.log_likelihood, at.predicted.mean, at.predicted.covariance, at.filtered.mean,
                         at.filtered.covariance, standardised(at, y), state)

@@ -23,7 +23,7 @@ from jax.ad_checkpoint import checkpoint_name
 
 from lfm_ppl.filtering.transition import Exact, Factor, LinearPart
 from lfm_ppl.forces.sum import block_diagonal
-from lfm_ppl.linalg import congruence, matmul, outer_square, safe_sqrt, symmetric
+from lfm_ppl.linalg import congruence, diagonal, matmul, outer_square, safe_sqrt, symmetric
 from lfm_ppl.linearisation.rule import Inputs, Rule, selection
 from lfm_ppl.linearisation.sigma_points import SigmaPointRule
 from lfm_ppl.model.augment import InputStructure, StateSpaceModel, just_before
@@ -172,11 +172,11 @@ def smallest_spread(ssm: StateSpaceModel, rule: Rule, factor: Factor, t: jax.Arr
     change = jnp.abs(ssm.drift(w, t)) * h
     if (dispersion := ssm.dispersion(w, t)) is not None:
         change = change + jnp.sqrt(h * (dispersion**2).sum(1) + 1e-300)
-    forces = jnp.sqrt(jnp.diagonal(factor.noise_full) + 1e-300)
+    forces = jnp.sqrt(diagonal(factor.noise_full) + 1e-300)
     if isinstance(rule, SigmaPointRule) and rule.full_state:
         scale = jnp.abs(moments.mean) + jnp.concatenate([change, forces])
     else:
-        outputs = jnp.sqrt(jnp.diagonal(congruence(matrix[size:, size:], factor.noise_full)) + 1e-300)
+        outputs = jnp.sqrt(diagonal(congruence(matrix[size:, size:], factor.noise_full)) + 1e-300)
         scale = (jnp.abs(w) + jnp.concatenate([change, outputs]))[jnp.asarray(ssm.drift_structure.points, int)]
     scale = jnp.where(jnp.isfinite(scale), scale, 0.0)
     return checkpoint_name(jax.lax.stop_gradient(1e-6 * scale + 1e-150), FLOOR)

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.forces.discretise import discretise
-from lfm_ppl.linalg import congruence, matmul, safe_sqrt, solve_semidefinite
+from lfm_ppl.linalg import congruence, diagonal, matmul, safe_sqrt, solve_semidefinite
 from lfm_ppl.linearisation.rule import Function, partial_jacobian, selection
 from lfm_ppl.model.augment import InputStructure, StateSpaceModel
 
@@ -167,5 +167,5 @@ def _half_step(ssm: StateSpaceModel, linear: LinearPart, dt: jax.Array) -> tuple
         lin = feedback(ssm, linear)
         phi, _ = discretise(lin, jnp.zeros_like(lin), dt)
         return phi.at[size:, size:].set(forces), noise
-    diagonal = jnp.exp(jnp.diagonal(linear.rows[:, :size]) * dt) if inside.any() else jnp.ones(size)
-    return jax.scipy.linalg.block_diag(jnp.diag(diagonal), forces), noise
+    decay = jnp.exp(diagonal(linear.rows[:, :size]) * dt) if inside.any() else jnp.ones(size)
+    return jax.scipy.linalg.block_diag(jnp.diag(decay), forces), noise

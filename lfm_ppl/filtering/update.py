@@ -10,15 +10,15 @@ import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 
 from lfm_ppl.filtering.predict import Moments, covariance_of, linearise_state
-from lfm_ppl.linalg import cholesky, congruence, matmul, safe_sqrt, wrapped
+from lfm_ppl.linalg import cholesky, congruence, diagonal, matmul, safe_sqrt, wrapped
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.linearisation.sigma_points import SigmaPointRule
 from lfm_ppl.model.augment import StateSpaceModel
 
 _LOG_2PI = float(np.log(2.0 * np.pi))
 
-FAILED = "lfm_ppl: failed"
-"""Under this name it is kept for the derivative of a row whether its update failed, and not found out again."""
+FAILED, FACTOR = "lfm_ppl: failed", "lfm_ppl: factor of the innovation covariance"
+"""Under these names they are kept for the derivative of a row, and not computed again."""
 
 _LOST_MEAN, _LOST_VARIANCE = 1e-3, 1e3
 """Errors of a filtered output, in standard deviations and variances of its noise, from which precision is lost."""
@@ -116,15 +116,14 @@ def update(ssm: StateSpaceModel, observation: Linearised, y: jax.Array, present:
     cross = matmul(covariance, slope.T)
     innovation_covariance = matmul(slope, cross) + noise
     # A smaller pivot has no correct digit, and its sign is chance.
-    rounding = 4 * jnp.finfo(y.dtype).eps * jnp.abs(jnp.diagonal(innovation_covariance))
-    factor = cholesky(innovation_covariance, rounding)
+    rounding = 4 * jnp.finfo(y.dtype).eps * jnp.abs(diagonal(innovation_covariance))
+    factor = cholesky(innovation_covariance, jax.lax.stop_gradient(rounding), name=FACTOR)
     chol = factor.chol
     # One solve for the gain and the innovation.
     half = factor.solve_lower(jnp.concatenate([cross.T, innovation[:, None]], axis=1))
     solved, white = factor.solve_upper(half), half[:, -1]
     gain = solved[:, :-1].T
-    diagonal = jnp.diagonal(chol)
-    log_likelihood = -0.5 * ((white**2).sum() + present.sum() * _LOG_2PI) - jnp.log(diagonal).sum()
+    log_likelihood = -0.5 * ((white**2).sum() + present.sum() * _LOG_2PI) - jnp.log(diagonal(chol)).sum()
     kept = jnp.eye(mean.shape[0]) - matmul(gain, slope)
     filtered = Moments(mean + matmul(gain, innovation[:, None])[:, 0],
                        congruence(kept, covariance) + congruence(gain, noise))
@@ -161,7 +160,7 @@ def _precision_lost(ssm: StateSpaceModel, observation: Linearised, y: jax.Array,
     for index in ssm.model.observation.angular:
         error = error.at[index].set(wrapped(error[index]))
     variance = jnp.abs((matmul(observation.slope, filtered.covariance) * observation.slope).sum(1))
-    own = jnp.abs(jnp.diagonal(noise))
+    own = jnp.abs(diagonal(noise))
     lost = ((jnp.abs(error) > _LOST_MEAN * safe_sqrt(own) + _HARMLESS * scale)
             | (variance > _LOST_VARIANCE * own + _HARMLESS * scale**2))
     return (present & lost).any()

@@ -21,6 +21,7 @@ from lfm_ppl.filtering.breakdown import warn_of_breakdown
 from lfm_ppl.filtering.filter import (
     FilterResult,
     as_rule,
+    at_rows,
     check_observations,
     filter_on,
     forward,
@@ -199,7 +200,7 @@ def _one_step_ahead(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Arr
     if iterations:
         about = posterior_linearisation(ssm, rule, plan, y, start, iterations, damping).points
     passed = forward(ssm, rule, plan, y, start=start, about=about)
-    return passed.log_likelihood[jnp.asarray(plan.observed)]
+    return at_rows(passed.log_likelihood, plan.observed)
 
 
 def _log_likelihoods(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, iterations: int,
