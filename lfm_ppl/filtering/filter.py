@@ -16,7 +16,15 @@ from lfm_ppl.filtering.adaptive import predict_row_adaptively
 from lfm_ppl.filtering.jumps import after_jump
 from lfm_ppl.filtering.predict import FLOOR, Moments, Prediction, predict_exact, predict_row, unmoved
 from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays, schedule
-from lfm_ppl.filtering.transition import Factor, LinearPart, constant_slope, exact, integrating_factor, linear_part
+from lfm_ppl.filtering.transition import (
+    Factor,
+    LinearPart,
+    constant_slope,
+    exact,
+    integrating_factor,
+    linear_part,
+    only_forces_bend,
+)
 from lfm_ppl.filtering.update import FACTOR, FAILED, linearise_observation, update
 from lfm_ppl.linalg import congruence, diagonal, matmul, safe_sqrt, solve_lower
 from lfm_ppl.linearisation.rule import Rule
@@ -26,6 +34,10 @@ from lfm_ppl.model.latent_force_model import LatentForceModel
 
 _KEPT = jax.checkpoint_policies.save_only_these_names(FLOOR, FAILED, FACTOR)
 """What a row keeps for its derivative besides its inputs: a few numbers that take many operations."""
+
+
+_LARGEST_TABULATED = 8
+"""Most force states whose transitions to all nodes of a row are tabulated; those of more are chained within the row."""
 
 
 class Pass(NamedTuple):
@@ -199,7 +211,9 @@ def step_transition(ssm: StateSpaceModel, linear: LinearPart, plan: Schedule, le
         return exact(ssm, linear, length, plan.steps)
     if plan.tolerance is not None:
         return None
-    return integrating_factor(ssm, linear, length / plan.steps)
+    # For large forces the transitions over all halves of a step are more than a row of the table should hold.
+    tabulated = only_forces_bend(ssm) and ssm.force_dim <= _LARGEST_TABULATED
+    return integrating_factor(ssm, linear, length / plan.steps, plan.steps if tabulated else None)
 
 
 class FilterState(NamedTuple):

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 
-from lfm_ppl.filtering.transition import Exact, Factor, LinearPart
+from lfm_ppl.filtering.transition import Exact, Factor, LinearPart, only_forces_bend
 from lfm_ppl.forces.sum import block_diagonal
 from lfm_ppl.linalg import congruence, diagonal, matmul, outer_square, safe_sqrt, symmetric
 from lfm_ppl.linearisation.rule import Inputs, Rule, selection
@@ -304,9 +304,8 @@ def bent_by_forces_only(ssm: StateSpaceModel, rule: Rule) -> bool:
 
     Its slope K then reads nothing but the forces, which nothing moves but their own exact transition: K E K = 0.
     """
-    structure = ssm.drift_structure
     whole = isinstance(rule, SigmaPointRule) and rule.full_state
-    return not whole and all(index >= ssm.physical_dim for index in (*structure.points, *structure.averaged))
+    return not whole and only_forces_bend(ssm)
 
 
 def _predict_by_quadrature(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Factor, steps: int,
@@ -320,12 +319,17 @@ def _predict_by_quadrature(ssm: StateSpaceModel, rule: Rule, linear: LinearPart,
     size = ssm.physical_dim
     half = factor.half[size:, size:]
 
-    def half_step(now: Moments, _: None) -> tuple[Moments, Moments]:
-        return Moments(matmul(half, now.mean[:, None])[:, 0],
-                       congruence(half, now.covariance) + factor.noise_half), now
+    first = _forces_of(moments, size)
+    if factor.halves is None:
+        def half_step(now: Moments, _: None) -> tuple[Moments, Moments]:
+            return Moments(matmul(half, now.mean[:, None])[:, 0],
+                           congruence(half, now.covariance) + factor.noise_half), now
 
-    last, before = jax.lax.scan(half_step, _forces_of(moments, size), None, length=2 * steps)
-    now = jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a, b[None]]), before, last)
+        last, before = jax.lax.scan(half_step, first, None, length=2 * steps)
+        now = jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a, b[None]]), before, last)
+    else:
+        flows, noises = factor.halves
+        now = Moments(matmul(flows, first.mean[:, None])[..., 0], congruence(flows, first.covariance) + noises)
     near = now if about is None else jax.tree_util.tree_map(_with_middles, _forces_of(about, size))
     begins = start + jnp.arange(steps) * h
     times = jnp.stack([begins, begins + 0.5 * h], axis=1).ravel()

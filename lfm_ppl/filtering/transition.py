@@ -52,7 +52,8 @@ class Factor(NamedTuple):
     bounded where it does not, while the true inverses of fast decays overflow. ``noise_half`` and ``noise_full`` are
     the exact covariances of the forces' noise, ``inputs`` (nz, S) its dispersion. ``columns`` (nz, K) stand for the
     forces' noise at the nodes of each later stage and of the whole step; ``regressions`` (K, nz) regress them on the
-    exact noise.
+    exact noise. ``halves`` are the transitions and the noise (2 J + 1, nz, nz) of the forces over 0, 1, ..., 2 J halves
+    of a step, where they were asked for.
     """
 
     half: jax.Array
@@ -64,6 +65,7 @@ class Factor(NamedTuple):
     inputs: jax.Array
     columns: tuple[jax.Array, ...]
     regressions: tuple[jax.Array, ...]
+    halves: tuple[jax.Array, jax.Array] | None = None
 
 
 def constant_slope(function: Function, point: jax.Array, structure: InputStructure, outputs: int) -> jax.Array:
@@ -122,9 +124,11 @@ def exact(ssm: StateSpaceModel, linear: LinearPart, length: jax.Array, steps: in
     return Exact(phi[:total, :total], noise[:total, :total], phi[:total, total], half, full)
 
 
-def integrating_factor(ssm: StateSpaceModel, linear: LinearPart, step: jax.Array) -> Factor:
-    """Return what a step of length ``step`` needs of the linear part."""
-    half, noise_half = _half_step(ssm, linear, 0.5 * step)
+def integrating_factor(ssm: StateSpaceModel, linear: LinearPart, step: jax.Array, steps: int | None = None) -> Factor:
+    """Return what a step of length ``step`` needs of the linear part, and ``halves`` of so many steps."""
+    halves = None if steps is None else jax.vmap(ssm.stack.discretise)(0.5 * step * np.arange(2 * steps + 1))
+    forces, noise_half = ssm.stack.discretise(0.5 * step) if halves is None else (halves[0][1], halves[1][1])
+    half = _half_step(ssm, linear, 0.5 * step, forces)
     full = matmul(half, half)
     identity = jnp.eye(ssm.state_dim)
     back_half = 4.0 * identity - 6.0 * half + 4.0 * full - matmul(full, half)
@@ -139,7 +143,13 @@ def integrating_factor(ssm: StateSpaceModel, linear: LinearPart, step: jax.Array
                                 root(1 / 6) * inputs], axis=1))
     back_full = matmul(back_half, back_half)
     regressions = _regressions(columns, noise_half, noise_full)
-    return Factor(half, full, back_half, back_full, noise_half, noise_full, inputs, columns, regressions)
+    return Factor(half, full, back_half, back_full, noise_half, noise_full, inputs, columns, regressions, halves)
+
+
+def only_forces_bend(ssm: StateSpaceModel) -> bool:
+    """Whether what is left of the dynamics without its constant linear part depends on the forces alone."""
+    structure = ssm.drift_structure
+    return all(index >= ssm.physical_dim for index in (*structure.points, *structure.averaged))
 
 
 def _regressions(columns: tuple[jax.Array, ...], noise_half: jax.Array, noise_full: jax.Array) -> tuple[jax.Array, ...]:
@@ -156,9 +166,9 @@ def _regressions(columns: tuple[jax.Array, ...], noise_half: jax.Array, noise_fu
                  for end, width in zip(ends[side], widths[2 * side:2 * side + 2], strict=True))
 
 
-def _half_step(ssm: StateSpaceModel, linear: LinearPart, dt: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _half_step(ssm: StateSpaceModel, linear: LinearPart, dt: jax.Array, forces: jax.Array) -> jax.Array:
+    """Return E(dt) (n, n) from the transition of the forces."""
     size = ssm.physical_dim
-    forces, noise = ssm.stack.discretise(dt)
     pattern = np.array(ssm.drift_structure.jacobian, bool).reshape(size, ssm.input_dim).copy()
     pattern[:, [j for j in range(ssm.input_dim) if j not in ssm.drift_structure.constant]] = False
     coupled = pattern[:, size:].any() and ssm.constant_measurement
@@ -166,6 +176,6 @@ def _half_step(ssm: StateSpaceModel, linear: LinearPart, dt: jax.Array) -> tuple
     if coupled or inside[~np.eye(size, dtype=bool)].any():
         lin = feedback(ssm, linear)
         phi, _ = discretise(lin, jnp.zeros_like(lin), dt)
-        return phi.at[size:, size:].set(forces), noise
+        return phi.at[size:, size:].set(forces)
     decay = jnp.exp(diagonal(linear.rows[:, :size]) * dt) if inside.any() else jnp.ones(size)
-    return jax.scipy.linalg.block_diag(jnp.diag(decay), forces), noise
+    return jax.scipy.linalg.block_diag(jnp.diag(decay), forces)
