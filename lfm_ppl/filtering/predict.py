@@ -65,6 +65,22 @@ class Stage(NamedTuple):
     diffusion: jax.Array | None
 
 
+class Node(NamedTuple):
+    """What the dynamics gives at a node where only the forces bend it.
+
+    Attributes:
+        remainder: (M, nz + 1), the slope of a `Stage` in the forces' states, and its ``rest`` as the last column.
+        diffusion: as in a `Stage`.
+    """
+
+    remainder: jax.Array
+    diffusion: jax.Array | None
+
+
+_FIRST_MIDDLE_LAST = slice(None, -2, 2), slice(1, None, 2), slice(2, None, 2)
+"""Of each of J steps, among their 2 J + 1 nodes."""
+
+
 class LastStage(NamedTuple):
     """The fourth stage of a step, at its end, and the covariance (n, n) about which it was linearised."""
 
@@ -270,7 +286,7 @@ def step_on(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Factor
     return Prediction(moments, flow, noise), LastStage(four, covariance4(identity, False))
 
 
-def _together(*stages: Stage) -> jax.Array | None:
+def _together(*stages: Stage | Node) -> jax.Array | None:
     """Return the diffusions (K, M, M) of the stages; None without process noise."""
     diffusions = [stage.diffusion for stage in stages if stage.diffusion is not None]
     return jnp.stack(diffusions) if diffusions else None
@@ -335,23 +351,26 @@ def _predict_by_quadrature(ssm: StateSpaceModel, rule: Rule, linear: LinearPart,
     times = jnp.stack([begins, begins + 0.5 * h], axis=1).ravel()
     ends = just_before(begins + h, h)
 
-    def node(t: jax.Array, mean: jax.Array, near: Moments) -> Stage:
+    def node(t: jax.Array, mean: jax.Array, near: Moments) -> Node:
         centre = jnp.concatenate([jnp.zeros(size), near.mean])  # the physical state drops out
         covariance = lambda rows, _: congruence(rows[:, size:], near.covariance)  # noqa: E731
         one = _stage(ssm, rule, linear, t, centre, covariance, spread, None)
-        if about is None:
-            return one
-        return one._replace(rest=one.rest + matmul(one.slope[:, size:], (mean - near.mean)[:, None])[:, 0])
+        slope, rest = one.slope[:, size:], one.rest
+        if about is not None:
+            rest = rest + matmul(slope, (mean - near.mean)[:, None])[:, 0]
+        return Node(jnp.concatenate([slope, rest[:, None]], axis=1), one.diffusion)
 
     if same_at_all_times(ssm):
         nodes = jax.vmap(node)(jnp.append(times, ends[-1]), now.mean, near)
-        stages = jax.tree_util.tree_map(_by_steps, nodes)
+        stages = [jax.tree_util.tree_map(lambda a: a[part], nodes) for part in _FIRST_MIDDLE_LAST]  # noqa: B023
     else:
-        times = jnp.stack([begins, begins + 0.5 * h, ends], axis=1)
-        stages = jax.vmap(jax.vmap(node))(times, _by_steps(now.mean), jax.tree_util.tree_map(_by_steps, near))
+        times = jnp.stack([begins, begins + 0.5 * h, ends])
+        by_node = lambda a: jnp.stack([a[part] for part in _FIRST_MIDDLE_LAST])  # noqa: E731
+        nodes = jax.vmap(jax.vmap(node))(times, by_node(now.mean), jax.tree_util.tree_map(by_node, near))
+        stages = [jax.tree_util.tree_map(lambda a: a[index], nodes) for index in range(3)]  # noqa: B023
 
     # Of all steps at once: what a loop computes it also stores, step by step, for its derivative.
-    maps = jax.vmap(lambda nodes: _simpson(factor, h, nodes, size))(stages)
+    maps = jax.vmap(lambda *nodes: _simpson(factor, h, nodes, size))(*stages)
 
     def step(carry: tuple, of_step: tuple) -> tuple[tuple, Any]:
         now, phi, noise = carry
@@ -385,35 +404,30 @@ def _with_middles(ends: jax.Array) -> jax.Array:
     return jnp.concatenate([pairs.reshape(2 * len(middles), *ends.shape[1:]), ends[-1:]])
 
 
-def _by_steps(nodes: jax.Array) -> jax.Array:
-    """First, middle and last (J, 3, ...) of each step, from 2 J + 1 nodes."""
-    return jnp.stack([nodes[:-2:2], nodes[1::2], nodes[2::2]], axis=1)
-
-
-def _simpson(factor: Factor, h: jax.Array, nodes: Stage, size: int) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _simpson(factor: Factor, h: jax.Array, nodes: tuple[Node, ...],
+             size: int) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return Phi (n, n), what the remainder adds to the mean (M,), and Q (n, n) of a step.
 
         Phi = E(h) + h / 6 (E(h) K_1 + 4 E(h/2) K_2 E(h/2) + K_3 E(h)).
 
-    Its first, middle and last node are ``nodes`` (3, ...). The middle one is both the second and the third Runge-Kutta
+    Its first, middle and last node are ``nodes``. The middle one is both the second and the third Runge-Kutta
     stage; their Z, where Psi~ = I - Z is the inverse flow to a stage's node, differ.
     """
     half, full = factor.half, factor.full
     half_x, full_x = half[:size, :size], full[:size, :size]
-    slope = nodes.slope[:, :, size:]
     # What the remainder adds to the mean is one more column, which the forces' transition leaves alone.
     beside = lambda forces: block_diagonal([forces, np.eye(1)])  # noqa: E731
-    first, second, third = jnp.concatenate([slope, nodes.rest[:, :, None]], axis=2)
+    first, second, third = (node.remainder for node in nodes)
     middle = matmul(second, beside(half[size:, size:]))
     whole = h / 6 * (matmul(full_x, first) + 4.0 * matmul(half_x, middle) + matmul(third, beside(full[size:, size:])))
     bend, offset = whole[:, :-1], whole[:, -1]
     pulled = matmul(factor.back_half[:size, :size], middle[:, :-1])
-    inverse = h * jnp.stack([0.5 * slope[0], 0.5 * pulled, pulled])
+    inverse = h * jnp.stack([0.5 * first[:, :-1], 0.5 * pulled, pulled])
     onward = jnp.stack([full[:size], half[:size], half[:size], jnp.eye(size, full.shape[0])])
     back = jnp.stack([factor.back_half, factor.back_half, factor.back_full])[:, size:, size:]
     bends = jnp.concatenate([bend[None], matmul(bend - matmul(full_x, inverse), back)])
     transports = jnp.concatenate([onward[:, :, :size], onward[:, :, size:] + bends], axis=2)
-    diffusions = None if nodes.diffusion is None else jnp.stack([nodes.diffusion[index] for index in (0, 1, 1, 2)])
+    diffusions = _together(nodes[0], nodes[1], nodes[1], nodes[2])
     noise = _noise(factor, 3, transports, diffusions, h * np.array([1 / 6, 1 / 3, 1 / 3, 1 / 6]), size)
     return jnp.concatenate([transports[0], full[size:]]), offset, noise
 
