@@ -135,7 +135,7 @@ def row_maps(ssm: StateSpaceModel, rule: SwitchingRule, plan: Schedule) -> Calla
     """Return what makes the affine maps of a row, for a model that is linear; traceable."""
     total = ssm.state_dim
     nothing = Moments(jnp.zeros(total), jnp.zeros((total, total)))
-    prepared = preparation(ssm, plan)
+    prepared = preparation(ssm, Taylor(), plan)
 
     def make(row: Rows) -> Affine:
         # From a state that is zero and known, the mean at the end is the offset.

@@ -80,13 +80,13 @@ def marginals_between(ssm: StateSpaceModel, rule: Rule, given: Branches, start: 
         where: the requested times.
     """
     plan, filtered, smoothed, adjoint, about = given
-    prepared = preparation(ssm, plan)
+    prepared = preparation(ssm, rule, plan)
     linear, jumps = prepared.linear, prepared.jumps
     before = at_start(filtered, start)
     rows = as_arrays(plan.rows)
 
     def piece(begin: jax.Array, length: jax.Array, moments: Moments, nearby: Any, flow: bool) -> Prediction:
-        factor = step_transition(ssm, linear, plan, length)
+        factor = step_transition(ssm, rule, linear, plan, length)
         return integrate(ssm, rule, plan, linear, factor, begin, length, moments, nearby, flow)
 
     def one(index: jax.Array, t: jax.Array, exactly: jax.Array) -> Moments:

@@ -14,16 +14,22 @@ import numpy as np
 from lfm_ppl import checks
 from lfm_ppl.filtering.adaptive import predict_row_adaptively
 from lfm_ppl.filtering.jumps import after_jump
-from lfm_ppl.filtering.predict import FLOOR, Moments, Prediction, predict_exact, predict_row, unmoved
+from lfm_ppl.filtering.predict import (
+    FLOOR,
+    Moments,
+    Prediction,
+    predict_exact,
+    predict_row,
+    row_factor,
+    unmoved,
+)
 from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays, schedule
 from lfm_ppl.filtering.transition import (
     Factor,
     LinearPart,
     constant_slope,
     exact,
-    integrating_factor,
     linear_part,
-    only_forces_bend,
 )
 from lfm_ppl.filtering.update import FACTOR, FAILED, linearise_observation, update
 from lfm_ppl.linalg import congruence, diagonal, matmul, safe_sqrt, solve_lower
@@ -34,10 +40,6 @@ from lfm_ppl.model.latent_force_model import LatentForceModel
 
 _KEPT = jax.checkpoint_policies.save_only_these_names(FLOOR, FAILED, FACTOR)
 """What a row keeps for its derivative besides its inputs: a few numbers that take many operations."""
-
-
-_LARGEST_TABULATED = 8
-"""Most force states whose transitions to all nodes of a row are tabulated; those of more are chained within the row."""
 
 
 class Pass(NamedTuple):
@@ -190,30 +192,28 @@ class Preparation(NamedTuple):
     jumps: tuple[jax.Array, jax.Array] | None
 
 
-def preparation(ssm: StateSpaceModel, plan: Schedule) -> Preparation:
+def preparation(ssm: StateSpaceModel, rule: Rule, plan: Schedule) -> Preparation:
     """Compute what the rows of a scan share."""
     linear = linear_part(ssm, jnp.asarray(plan.initial_time, float))
     lengths = None if plan.lengths is None else jnp.asarray(plan.lengths)
-    table = None if lengths is None else Table(lambda length: step_transition(ssm, linear, plan, length), lengths)
+    table = None if lengths is None else Table(lambda length: step_transition(ssm, rule, linear, plan, length), lengths)
     return Preparation(linear, _observation_slope(ssm, plan), table, ssm.stack.jump_table())
 
 
-def row_transition(ssm: StateSpaceModel, plan: Schedule, prepared: Preparation, row: Rows) -> Any:
+def row_transition(ssm: StateSpaceModel, rule: Rule, plan: Schedule, prepared: Preparation, row: Rows) -> Any:
     """Return the exact transition of a row, or the integrating factor of its steps."""
     if prepared.table is None:
-        return step_transition(ssm, prepared.linear, plan, row.length)
+        return step_transition(ssm, rule, prepared.linear, plan, row.length)
     return prepared.table.at(row.kind)
 
 
-def step_transition(ssm: StateSpaceModel, linear: LinearPart, plan: Schedule, length: jax.Array) -> Any:
+def step_transition(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, plan: Schedule, length: jax.Array) -> Any:
     """Return what a row of this length shares; None where the steps have lengths of their own."""
     if ssm.time_invariant:
         return exact(ssm, linear, length, plan.steps)
     if plan.tolerance is not None:
         return None
-    # For large forces the transitions over all halves of a step are more than a row of the table should hold.
-    tabulated = only_forces_bend(ssm) and ssm.force_dim <= _LARGEST_TABULATED
-    return integrating_factor(ssm, linear, length / plan.steps, plan.steps if tabulated else None)
+    return row_factor(ssm, rule, linear, length, plan.steps)
 
 
 class FilterState(NamedTuple):
@@ -251,7 +251,7 @@ def predict(ssm: StateSpaceModel, rule: Rule, plan: Schedule, prepared: Preparat
             nodes: Moments | None = None, flow: bool = False,
             each: Callable[[Prediction], Any] | None = None) -> Prediction:
     """Predict over a row, a jump at its end included; arguments as in `predict_row`."""
-    transition = row_transition(ssm, plan, prepared, row)
+    transition = row_transition(ssm, rule, plan, prepared, row)
     if ssm.time_invariant:
         one = predict_exact(ssm, transition, plan.steps, row.start, row.length, moments)
     else:
@@ -288,7 +288,7 @@ def forward(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, *, s
         keep: "likelihood" (log likelihoods only), "moments" (and the moments), "all" (what the smoother needs),
             "steps" (and the steps within the rows), "inside" (instead of these, what the iterations need of them).
     """
-    prepared = preparation(ssm, plan)
+    prepared = preparation(ssm, rule, plan)
     flow = keep in ("all", "steps", "inside")
     each: Callable[[Prediction], Any] | None = None
     if keep == "steps":

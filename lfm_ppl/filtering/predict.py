@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 
-from lfm_ppl.filtering.transition import Exact, Factor, LinearPart, only_forces_bend
+from lfm_ppl.filtering.transition import Exact, Factor, LinearPart, integrating_factor
 from lfm_ppl.forces.sum import block_diagonal
 from lfm_ppl.linalg import congruence, diagonal, matmul, outer_square, safe_sqrt, symmetric
 from lfm_ppl.linearisation.rule import Inputs, Rule, selection
@@ -281,7 +281,7 @@ def step_on(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Factor
                             half_x + matmul(_less(change, flow, z3, size), back_half),
                             identity[:size] + matmul(_less(change, flow, z4, size), back_full)])
     weights = h * np.array([1 / 6, 1 / 3, 1 / 3, 1 / 6])
-    noise = _noise(factor, 3, transports, _together(one, two, three, four), weights, size)
+    noise = _noise(factor, -1, transports, _together(one, two, three, four), weights, size)
     moments = Moments(mean, congruence(flow, p) + noise)
     return Prediction(moments, flow, noise), LastStage(four, covariance4(identity, False))
 
@@ -315,13 +315,20 @@ def _stage(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, t: jax.Array, m
     return Stage(rest, affine.slope - linear.rows, affine.extra if isinstance(affine.extra, jax.Array) else None)
 
 
+def row_factor(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, length: jax.Array, steps: int) -> Factor:
+    """Return the integrating factor of the steps of a row."""
+    quadrature = steps if bent_by_forces_only(ssm, rule) else None
+    return integrating_factor(ssm, linear, length / steps, quadrature)
+
+
 def bent_by_forces_only(ssm: StateSpaceModel, rule: Rule) -> bool:
     """Whether what is left of the dynamics without its constant linear part depends on the forces alone.
 
     Its slope K then reads nothing but the forces, which nothing moves but their own exact transition: K E K = 0.
     """
     whole = isinstance(rule, SigmaPointRule) and rule.full_state
-    return not whole and only_forces_bend(ssm)
+    structure = ssm.drift_structure
+    return not whole and all(index >= ssm.physical_dim for index in (*structure.points, *structure.averaged))
 
 
 def _predict_by_quadrature(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Factor, steps: int,
@@ -428,7 +435,7 @@ def _simpson(factor: Factor, h: jax.Array, nodes: tuple[Node, ...],
     bends = jnp.concatenate([bend[None], matmul(bend - matmul(full_x, inverse), back)])
     transports = jnp.concatenate([onward[:, :, :size], onward[:, :, size:] + bends], axis=2)
     diffusions = _together(nodes[0], nodes[1], nodes[1], nodes[2])
-    noise = _noise(factor, 3, transports, diffusions, h * np.array([1 / 6, 1 / 3, 1 / 3, 1 / 6]), size)
+    noise = _noise(factor, -1, transports, diffusions, h * np.array([1 / 6, 1 / 3, 1 / 3, 1 / 6]), size)
     return jnp.concatenate([transports[0], full[size:]]), offset, noise
 
 
@@ -463,7 +470,7 @@ def _noise(factor: Factor, stage: int, transports: jax.Array, diffusions: jax.Ar
     The forces' noise at the nodes, ``columns``, is only a quadrature of the exact noise, but what reaches x together
     with it can be regressed on the exact one: N_x = G N_z + remainder, semi-definite for any G.
     """
-    exact = factor.noise_full if stage >= 2 else factor.noise_half
+    exact = factor.noise_half if stage in (0, 1) else factor.noise_full
     through = safe_sqrt(weights)[:, None, None] * matmul(transports[:, :, size:], factor.inputs)
     through = jnp.moveaxis(through, 0, 1).reshape(size, factor.columns[stage].shape[1])
     gain = matmul(through, factor.regressions[stage])

@@ -21,6 +21,9 @@ from lfm_ppl.linalg import congruence, diagonal, matmul, safe_sqrt, solve_semide
 from lfm_ppl.linearisation.rule import Function, partial_jacobian, selection
 from lfm_ppl.model.augment import InputStructure, StateSpaceModel
 
+_LARGEST_TABULATED = 8
+"""Most force states whose transitions to all nodes of a row are tabulated; those of more are chained within the row."""
+
 
 class LinearPart(NamedTuple):
     """The constant linear part of the dynamics.
@@ -51,9 +54,9 @@ class Factor(NamedTuple):
     their inverses by 4 - 6 E + 4 E^2 - E^3 and its square: to the order of the step where it resolves ``Lin``, and
     bounded where it does not, while the true inverses of fast decays overflow. ``noise_half`` and ``noise_full`` are
     the exact covariances of the forces' noise, ``inputs`` (nz, S) its dispersion. ``columns`` (nz, K) stand for the
-    forces' noise at the nodes of each later stage and of the whole step; ``regressions`` (K, nz) regress them on the
-    exact noise. ``halves`` are the transitions and the noise (2 J + 1, nz, nz) of the forces over 0, 1, ..., 2 J halves
-    of a step, where they were asked for.
+    forces' noise at the nodes of each later stage (not by quadrature) and, the last, of the whole step; ``regressions``
+    (K, nz) regress them on the exact noise. ``halves`` are the transitions and the noise (2 J + 1, nz, nz) of the
+    forces over 0, 1, ..., 2 J halves of a step; None where they are chained.
     """
 
     half: jax.Array
@@ -124,9 +127,13 @@ def exact(ssm: StateSpaceModel, linear: LinearPart, length: jax.Array, steps: in
     return Exact(phi[:total, :total], noise[:total, :total], phi[:total, total], half, full)
 
 
-def integrating_factor(ssm: StateSpaceModel, linear: LinearPart, step: jax.Array, steps: int | None = None) -> Factor:
-    """Return what a step of length ``step`` needs of the linear part, and ``halves`` of so many steps."""
-    halves = None if steps is None else jax.vmap(ssm.stack.discretise)(0.5 * step * np.arange(2 * steps + 1))
+def integrating_factor(ssm: StateSpaceModel, linear: LinearPart, step: jax.Array,
+                       quadrature: int | None = None) -> Factor:
+    """Return what a step of length ``step`` needs of the linear part; for so many steps by ``quadrature`` only that."""
+    halves = None
+    # For large forces the transitions to all nodes are more than a row of a table should hold.
+    if quadrature is not None and ssm.force_dim <= _LARGEST_TABULATED:
+        halves = jax.vmap(ssm.stack.discretise)(0.5 * step * np.arange(2 * quadrature + 1))
     forces, noise_half = ssm.stack.discretise(0.5 * step) if halves is None else (halves[0][1], halves[1][1])
     half = _half_step(ssm, linear, 0.5 * step, forces)
     full = matmul(half, half)
@@ -142,20 +149,17 @@ def integrating_factor(ssm: StateSpaceModel, linear: LinearPart, step: jax.Array
                jnp.concatenate([root(1 / 6) * at_full, root(1 / 3) * at_half, root(1 / 3) * at_half,
                                 root(1 / 6) * inputs], axis=1))
     back_full = matmul(back_half, back_half)
+    columns = columns if quadrature is None else columns[-1:]
     regressions = _regressions(columns, noise_half, noise_full)
     return Factor(half, full, back_half, back_full, noise_half, noise_full, inputs, columns, regressions, halves)
 
 
-def only_forces_bend(ssm: StateSpaceModel) -> bool:
-    """Whether what is left of the dynamics without its constant linear part depends on the forces alone."""
-    structure = ssm.drift_structure
-    return all(index >= ssm.physical_dim for index in (*structure.points, *structure.averaged))
-
-
 def _regressions(columns: tuple[jax.Array, ...], noise_half: jax.Array, noise_full: jax.Array) -> tuple[jax.Array, ...]:
-    """Regress columns (nz, K) on the exact noise of half a step, the first two, and of a whole step: (K, nz) each."""
+    """Regress columns (nz, K) on the exact noise of half a step, the first two of four, and of a step: (K, nz) each."""
     if not noise_half.shape[0]:
         return tuple(column.T for column in columns)
+    if len(columns) == 1:
+        return (solve_semidefinite(noise_full, columns[0]).T,)
     widths = [column.shape[1] for column in columns]
     sides = [jnp.concatenate(columns[:2], axis=1), jnp.concatenate(columns[2:], axis=1)]
     # Side by side: one factorisation in the program.

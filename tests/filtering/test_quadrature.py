@@ -8,8 +8,8 @@ from systems import whole_state
 
 import lfm_ppl as lfm
 from lfm_ppl.filtering import predict
-from lfm_ppl.filtering.predict import Moments, predict_row
-from lfm_ppl.filtering.transition import integrating_factor, linear_part
+from lfm_ppl.filtering.predict import Moments, predict_row, row_factor
+from lfm_ppl.filtering.transition import linear_part
 
 DECAY = jnp.array([0.4, 0.9, 0.6])
 SENSITIVITY = jnp.array([1.0, 0.5, 0.7])
@@ -77,7 +77,7 @@ def nodes(ssm, steps):
 def predictions(ssm, rule, steps):
     """Of a row from all starts, about the filter's own moments and about given ones."""
     linear = linear_part(ssm, jnp.zeros(()))
-    factor = integrating_factor(ssm, linear, jnp.asarray(1.5 / steps))
+    factor = row_factor(ssm, rule, linear, jnp.asarray(1.5), steps)
 
     def row(moments, about):
         return predict_row(ssm, rule, linear, factor, steps, jnp.asarray(0.7), jnp.asarray(1.5), moments, about,
