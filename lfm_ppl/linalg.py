@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ dimension, and with it the time of compilation; a larger matrix is worked throug
 """
 
 
-def matmul(a: jax.Array, b: jax.Array) -> jax.Array:
+def matmul(a: jax.Array | np.ndarray, b: jax.Array | np.ndarray) -> Any:
     """Return the matrix product of two stacks of small matrices.
 
     ``C_ij = sum_k A_ik B_kj``, as a broadcast product and a sum when every dimension is at most 8:
@@ -32,7 +32,7 @@ def matmul(a: jax.Array, b: jax.Array) -> jax.Array:
         b: matrices ``B`` of shape (..., k, m); leading dimensions broadcast.
 
     Returns:
-        Products of shape (..., n, m).
+        Products of shape (..., n, m); a NumPy matrix for two of them.
 
     Example:
         >>> import jax.numpy as jnp
@@ -59,7 +59,7 @@ def _selected(matrix: np.ndarray) -> list[int] | None:
     return [int(row.argmax()) if row.any() else -1 for row in matrix]
 
 
-def _taken(a: jax.Array, indices: list[int], axis: int) -> jax.Array:
+def _taken(a: Any, indices: list[int], axis: int) -> jax.Array:
     """Return slices of ``a`` at indices along an axis, zeros where the index is -1; XLA fuses them, unlike a gather."""
     runs: list[list[int]] = []
     for index in indices:
@@ -79,7 +79,7 @@ def outer_square(a: jax.Array) -> jax.Array:
     return matmul(a, jnp.swapaxes(a, -1, -2))
 
 
-def congruence(a: jax.Array, p: jax.Array) -> jax.Array:
+def congruence(a: jax.Array | np.ndarray, p: jax.Array) -> jax.Array:
     """Return the symmetric matrix ``A P A'`` for ``A`` (..., n, k) and a symmetric ``P`` (..., k, k)."""
     transposed = np.swapaxes(a, -1, -2) if isinstance(a, np.ndarray) else jnp.swapaxes(a, -1, -2)
     return symmetric(matmul(matmul(a, p), transposed))

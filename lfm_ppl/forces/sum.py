@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -198,7 +199,7 @@ class Sum(Force):
         return self.stack.jump(index)
 
 
-def block_diagonal(blocks: list[jax.Array]) -> jax.Array:
+def block_diagonal(blocks: Sequence[jax.Array | np.ndarray]) -> Any:
     """Return the matrix with ``blocks`` (r_i, c_i) on its diagonal, in NumPy if all are; (0, 0) without any."""
     if blocks and all(isinstance(block, np.ndarray) for block in blocks):
         return scipy.linalg.block_diag(*blocks)
