@@ -14,8 +14,8 @@ from jax.custom_derivatives import SymbolicZero
 _FUSED_SIZE = 8
 """Largest dimension that is multiplied by broadcasting; XLA's CPU dot wins above it.
 
-Also the largest that is factorised and solved in unrolled operations. Their number grows with the cube of the
-dimension, and with it the time of compilation; a larger matrix is worked through in a loop over its columns.
+Also the largest that is factorised and solved in unrolled operations, whose number, and with it the time of
+compilation, grows with the dimension; a larger matrix is worked through in a loop over its columns.
 """
 
 

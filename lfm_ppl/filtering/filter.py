@@ -38,6 +38,9 @@ from lfm_ppl.linearisation.sigma_points import Cubature, SigmaPointRule
 from lfm_ppl.model.augment import StateSpaceModel, state_space
 from lfm_ppl.model.latent_force_model import LatentForceModel
 
+_FEW_LENGTHS = 16
+"""Distinct lengths of the rows up to which it costs nothing to tabulate more of each than the row would need."""
+
 _KEPT = jax.checkpoint_policies.save_only_these_names(FLOOR, FAILED, FACTOR)
 """What a row keeps for its derivative besides its inputs: a few numbers that take many operations."""
 
@@ -195,8 +198,10 @@ class Preparation(NamedTuple):
 def preparation(ssm: StateSpaceModel, rule: Rule, plan: Schedule) -> Preparation:
     """Compute what the rows of a scan share."""
     linear = linear_part(ssm, jnp.asarray(plan.initial_time, float))
-    lengths = None if plan.lengths is None else jnp.asarray(plan.lengths)
-    table = None if lengths is None else Table(lambda length: step_transition(ssm, rule, linear, plan, length), lengths)
+    table = None
+    if plan.lengths is not None:
+        few = len(plan.lengths) <= _FEW_LENGTHS
+        table = Table(lambda length: step_transition(ssm, rule, linear, plan, length, few), jnp.asarray(plan.lengths))
     return Preparation(linear, _observation_slope(ssm, plan), table, ssm.stack.jump_table())
 
 
@@ -207,13 +212,14 @@ def row_transition(ssm: StateSpaceModel, rule: Rule, plan: Schedule, prepared: P
     return prepared.table.at(row.kind)
 
 
-def step_transition(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, plan: Schedule, length: jax.Array) -> Any:
+def step_transition(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, plan: Schedule, length: jax.Array,
+                    tabulated: bool = False) -> Any:
     """Return what a row of this length shares; None where the steps have lengths of their own."""
     if ssm.time_invariant:
         return exact(ssm, linear, length, plan.steps)
     if plan.tolerance is not None:
         return None
-    return row_factor(ssm, rule, linear, length, plan.steps)
+    return row_factor(ssm, rule, linear, length, plan.steps, tabulated)
 
 
 class FilterState(NamedTuple):

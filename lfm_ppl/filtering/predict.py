@@ -77,6 +77,9 @@ class Node(NamedTuple):
     diffusion: jax.Array | None
 
 
+_LARGEST_TABULATED = 8
+"""Most force states whose transitions to all nodes of a row are tabulated; those of more are chained within the row."""
+
 _FIRST_MIDDLE_LAST = slice(None, -2, 2), slice(1, None, 2), slice(2, None, 2)
 """Of each of J steps, among their 2 J + 1 nodes."""
 
@@ -315,10 +318,12 @@ def _stage(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, t: jax.Array, m
     return Stage(rest, affine.slope - linear.rows, affine.extra if isinstance(affine.extra, jax.Array) else None)
 
 
-def row_factor(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, length: jax.Array, steps: int) -> Factor:
-    """Return the integrating factor of the steps of a row."""
-    quadrature = steps if bent_by_forces_only(ssm, rule) else None
-    return integrating_factor(ssm, linear, length / steps, quadrature)
+def row_factor(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, length: jax.Array, steps: int,
+               tabulated: bool = False) -> Factor:
+    """Return the integrating factor of the steps of a row; ``tabulated`` if it serves many rows, and may cost more."""
+    stages = not bent_by_forces_only(ssm, rule)
+    nodes = not stages and tabulated and ssm.force_dim <= _LARGEST_TABULATED
+    return integrating_factor(ssm, linear, length / steps, stages, steps if nodes else None)
 
 
 def bent_by_forces_only(ssm: StateSpaceModel, rule: Rule) -> bool:

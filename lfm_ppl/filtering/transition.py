@@ -21,9 +21,6 @@ from lfm_ppl.linalg import congruence, diagonal, matmul, safe_sqrt, solve_semide
 from lfm_ppl.linearisation.rule import Function, partial_jacobian, selection
 from lfm_ppl.model.augment import InputStructure, StateSpaceModel
 
-_LARGEST_TABULATED = 8
-"""Most force states whose transitions to all nodes of a row are tabulated; those of more are chained within the row."""
-
 
 class LinearPart(NamedTuple):
     """The constant linear part of the dynamics.
@@ -127,13 +124,20 @@ def exact(ssm: StateSpaceModel, linear: LinearPart, length: jax.Array, steps: in
     return Exact(phi[:total, :total], noise[:total, :total], phi[:total, total], half, full)
 
 
-def integrating_factor(ssm: StateSpaceModel, linear: LinearPart, step: jax.Array,
-                       quadrature: int | None = None) -> Factor:
-    """Return what a step of length ``step`` needs of the linear part; for so many steps by ``quadrature`` only that."""
+def integrating_factor(ssm: StateSpaceModel, linear: LinearPart, step: jax.Array, stages: bool = True,
+                       halves_of: int | None = None) -> Factor:
+    """Return what a step of length ``step`` needs of the linear part.
+
+    Args:
+        ssm: the model.
+        linear: its constant linear part.
+        step: length.
+        stages: whether the step has stages whose covariance is needed; not so where it is one of a quadrature.
+        halves_of: number of steps for which ``halves`` are wanted.
+    """
     halves = None
-    # For large forces the transitions to all nodes are more than a row of a table should hold.
-    if quadrature is not None and ssm.force_dim <= _LARGEST_TABULATED:
-        halves = jax.vmap(ssm.stack.discretise)(0.5 * step * np.arange(2 * quadrature + 1))
+    if halves_of is not None:
+        halves = jax.vmap(ssm.stack.discretise)(0.5 * step * np.arange(2 * halves_of + 1))
     forces, noise_half = ssm.stack.discretise(0.5 * step) if halves is None else (halves[0][1], halves[1][1])
     half = _half_step(ssm, linear, 0.5 * step, forces)
     full = matmul(half, half)
@@ -149,7 +153,7 @@ def integrating_factor(ssm: StateSpaceModel, linear: LinearPart, step: jax.Array
                jnp.concatenate([root(1 / 6) * at_full, root(1 / 3) * at_half, root(1 / 3) * at_half,
                                 root(1 / 6) * inputs], axis=1))
     back_full = matmul(back_half, back_half)
-    columns = columns if quadrature is None else columns[-1:]
+    columns = columns if stages else columns[-1:]
     regressions = _regressions(columns, noise_half, noise_full)
     return Factor(half, full, back_half, back_full, noise_half, noise_full, inputs, columns, regressions, halves)
 

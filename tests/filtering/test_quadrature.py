@@ -77,7 +77,7 @@ def nodes(ssm, steps):
 def predictions(ssm, rule, steps):
     """Of a row from all starts, about the filter's own moments and about given ones."""
     linear = linear_part(ssm, jnp.zeros(()))
-    factor = row_factor(ssm, rule, linear, jnp.asarray(1.5), steps)
+    factor = row_factor(ssm, rule, linear, jnp.asarray(1.5), steps, tabulated=steps != 3)
 
     def row(moments, about):
         return predict_row(ssm, rule, linear, factor, steps, jnp.asarray(0.7), jnp.asarray(1.5), moments, about,
