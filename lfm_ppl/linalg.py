@@ -111,8 +111,8 @@ class Factor(NamedTuple):
     """
 
     chol: jax.Array
-    degenerate: jax.Array
-    inverse: jax.Array | None = None
+    degenerate: Any
+    inverse: Any = None
 
     def solve_lower(self, b: jax.Array) -> jax.Array:
         """Solve ``L X = B`` for ``B`` (n, m), as `solve_lower`."""
@@ -191,7 +191,6 @@ def _eliminated_jvp(name: str | None, primals: tuple, tangents: tuple) -> tuple[
     if name is not None:
         factor = jax.tree_util.tree_map(lambda a: checkpoint_name(a, name), factor)
     chol, degenerate, inverse = factor
-    assert inverse is not None
     weight = np.tri(len(p)) - 0.5 * np.eye(len(p))
     if isinstance(change, SymbolicZero):
         lower = jnp.zeros_like(p)

@@ -149,11 +149,11 @@ def integrating_factor(ssm: StateSpaceModel, linear: LinearPart, step: jax.Array
     inputs = ssm.stack.dispersion()
     at_half, at_full = matmul(half_z, inputs), matmul(full_z, inputs)
     root = lambda weight: safe_sqrt(weight * step)  # noqa: E731
-    columns = (root(0.5) * at_half, root(0.5) * inputs, root(1.0) * at_half,
-               jnp.concatenate([root(1 / 6) * at_full, root(1 / 3) * at_half, root(1 / 3) * at_half,
-                                root(1 / 6) * inputs], axis=1))
+    columns: tuple[jax.Array, ...] = (jnp.concatenate(
+        [root(1 / 6) * at_full, root(1 / 3) * at_half, root(1 / 3) * at_half, root(1 / 6) * inputs], axis=1),)
+    if stages:
+        columns = (root(0.5) * at_half, root(0.5) * inputs, root(1.0) * at_half, *columns)
     back_full = matmul(back_half, back_half)
-    columns = columns if stages else columns[-1:]
     regressions = _regressions(columns, noise_half, noise_full)
     return Factor(half, full, back_half, back_full, noise_half, noise_full, inputs, columns, regressions, halves)
 

@@ -58,7 +58,7 @@ class Stack(eqx.Module):
         pairs = [force.discretise(dt) for force in self.forces]
         return block_diagonal([p[0] for p in pairs]), block_diagonal([p[1] for p in pairs])
 
-    def measurement(self, t: ArrayLike) -> jax.Array | np.ndarray:
+    def measurement(self, t: ArrayLike) -> Any:
         """Return H(t) (R, n), one row for each force."""
         rows = [force.measurement(t)[None, :] for force in self.forces]
         return block_diagonal(rows) if rows else np.zeros((0, 0))
