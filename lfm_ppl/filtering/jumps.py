@@ -16,7 +16,7 @@ def after_jump(ssm: StateSpaceModel, jumps: tuple[jax.Array, jax.Array], index: 
 
     Args:
         ssm: the model.
-        jumps: G and Q of all jumps, from `lfm_ppl.forces.sum.Stack.jump_table`.
+        jumps: G and Q of all jumps, from `lfm_ppl.forces.sde.Stack.jump_table`.
         index: of the jump; -1 for none.
         one: the prediction over the row.
         flow: whether it has phi and noise.

@@ -12,9 +12,8 @@ import numpy as np
 from scipy.linalg import expm
 
 from lfm_ppl import checks
-from lfm_ppl.forces.sde import ApproximationWarning, Force
+from lfm_ppl.forces.sde import ApproximationWarning, Force, Sum
 from lfm_ppl.forces.squared_exponential import SquaredExponential
-from lfm_ppl.forces.sum import Sum
 
 if TYPE_CHECKING:
     from lfm_ppl.model.latent_force_model import LatentForceModel

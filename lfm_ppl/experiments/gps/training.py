@@ -27,7 +27,7 @@ from lfm_ppl.experiments.gps.problem import NOISE, Arc
 from lfm_ppl.filtering.filter import forward
 from lfm_ppl.filtering.schedule import schedule
 from lfm_ppl.forces import Force, RandomWalk, Resonator
-from lfm_ppl.forces.sum import Sum
+from lfm_ppl.forces.sde import Sum
 from lfm_ppl.linalg import congruence, matmul, solve_lower
 from lfm_ppl.linearisation.taylor import Taylor
 from lfm_ppl.model.augment import state_space
