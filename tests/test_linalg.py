@@ -6,10 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import stats
 
 from lfm_ppl.linalg import (
     cholesky,
     congruence,
+    log_density,
+    masked,
     matmul,
     outer_square,
     safe_sqrt,
@@ -75,3 +78,24 @@ def test_gradients_stay_finite_where_nothing_varies():
     assert jax.grad(safe_sqrt)(0.0) == 0.0 and jax.grad(safe_sqrt)(-1.0) == 0.0
     solve = jax.grad(lambda s: solve_semidefinite(s * jnp.ones((2, 2)), s * jnp.ones(2)).sum())
     assert np.isfinite(solve(0.0)) and np.isfinite(solve(1.0))
+
+
+@pytest.mark.parametrize("missing", [(), (1,), (0, 2), (0, 1, 2)])
+def test_density_of_what_is_not_missing(missing):
+    covariance, residual = definite(3), np.array([0.3, -1.2, 0.7])
+    present = ~np.isin(np.arange(3), missing)
+
+    def density(residual, covariance):
+        some, matrix = masked(residual, covariance, jnp.isfinite(residual))
+        chol = cholesky(matrix).chol
+        return log_density(solve_lower(chol, some), chol, jnp.isfinite(residual))
+
+    given = jnp.where(present, residual, jnp.nan)
+    kept = np.ix_(present, present)
+    expected = stats.multivariate_normal.logpdf(residual[present], cov=covariance[kept]) if present.any() else 0.0
+    assert float(density(given, jnp.asarray(covariance))) == pytest.approx(expected, rel=1e-13)
+    by_residual, by_covariance = jax.grad(density, argnums=(0, 1))(given, jnp.asarray(covariance))
+    assert np.isfinite(by_residual).all() and np.isfinite(by_covariance).all()
+    assert not by_residual[~present].any() and not by_covariance[~present].any()
+    whole = jnp.stack([given, 2.0 * given])
+    assert np.allclose(jax.vmap(density, (0, None))(whole, covariance), [density(one, covariance) for one in whole])

@@ -11,7 +11,7 @@ import numpy as np
 from lfm_ppl.comparators.finite_volume import Chain, Grid, propagate, transition
 from lfm_ppl.comparators.grid_model import WEIGHTS, Cells, on_grid
 from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays
-from lfm_ppl.linalg import cholesky, solve_lower, wrapped
+from lfm_ppl.linalg import cholesky, log_density, masked, solve_lower, wrapped
 from lfm_ppl.model.augment import StateSpaceModel
 
 _LARGEST_TABLE = 2**25
@@ -19,8 +19,6 @@ _LARGEST_TABLE = 2**25
 
 _MATRIX_COST = 6.0
 """A transition matrix takes about as long as this many propagations of one vector of masses."""
-
-_LOG_2PI = float(np.log(2.0 * np.pi))
 
 
 class Densities(NamedTuple):
@@ -45,26 +43,16 @@ def _log_likelihood_of_cells(cells: Cells, index: jax.Array, y: jax.Array) -> ja
     present = jnp.isfinite(y)[:, None, None, :]
     residual = jnp.where(present, y[:, None, None, :], 0.0) - value
     residual = jnp.where(cells.angular, wrapped(residual), residual)
-    residual = jnp.where(present, residual, 0.0)
-    if y.shape[-1] == 1:
-        variance = noise[..., 0]
-        log = -0.5 * (residual**2 / variance + jnp.log(variance) + _LOG_2PI)
-        log = jnp.where(present, log, 0.0)[..., 0]
-    else:
-        log = _log_normal(residual, noise, present)
+    log = jnp.vectorize(_log_density, signature="(d),(d,d),(d)->()")(residual, noise, present)
     return jax.scipy.special.logsumexp(log + np.log(0.5 * WEIGHTS), axis=-1)
 
 
-def _log_normal(residual: jax.Array, noise: jax.Array, present: jax.Array) -> jax.Array:
-    """Log density (B, N, G) of the present entries of ``residual`` (B, N, G, D), zero in the others."""
-    both = present[..., :, None] & present[..., None, :]
-    matrix = jnp.where(both, noise, jnp.eye(noise.shape[-1]))
-    flat = matrix.reshape(-1, *matrix.shape[-2:])
-    factor = jax.vmap(cholesky)(flat)
-    chol = jnp.where(factor.degenerate.any(-1)[:, None, None], jnp.nan, factor.chol).reshape(matrix.shape)
-    white = jnp.vectorize(solve_lower, signature="(d,d),(d)->(d)")(chol, residual)
-    diagonal = jnp.diagonal(chol, axis1=-2, axis2=-1)
-    return -0.5 * ((white**2).sum(-1) + present.sum(-1) * _LOG_2PI) - jnp.log(diagonal).sum(-1)
+def _log_density(residual: jax.Array, noise: jax.Array, present: jax.Array) -> jax.Array:
+    """Return the log density of the present entries of a residual (D,); NaN where the noise has none."""
+    residual, noise = masked(residual, noise, present)
+    factor = cholesky(noise)
+    value = log_density(solve_lower(factor.chol, residual), factor.chol, present)
+    return jnp.where(factor.degenerate.any(), jnp.nan, value)
 
 
 class Moves(NamedTuple):

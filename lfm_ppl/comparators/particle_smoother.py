@@ -15,7 +15,7 @@ from lfm_ppl.comparators.stochastic_steps import choose_scheme
 from lfm_ppl.filtering.predict import exact_offset
 from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays
 from lfm_ppl.filtering.transition import Exact, exact, linear_part
-from lfm_ppl.linalg import cholesky, matmul, solve_lower
+from lfm_ppl.linalg import cholesky, log_density, matmul, solve_lower
 from lfm_ppl.model.augment import StateSpaceModel, state_space
 from lfm_ppl.model.latent_force_model import LatentForceModel
 
@@ -234,7 +234,8 @@ def _drawn_back(ssm: StateSpaceModel, settings: ParticleSettings, plan: Schedule
 
     def one(pair: tuple[jax.Array, jax.Array]) -> jax.Array:
         following, uniform = pair
-        density = jax.vmap(_log_normal, in_axes=(None, -1, -1 if chol.ndim == 3 else None))(following, mean, chol)
+        density = jax.vmap(lambda m, c: log_density(solve_lower(c, following - m), c),
+                           in_axes=(-1, -1 if chol.ndim == 3 else None))(mean, chol)
         return _choose_at(uniform, log_weights + jnp.where(jnp.isnan(density), -jnp.inf, density))
 
     size = max(1, min(later.shape[0], _BLOCK // state.shape[1]))
@@ -262,12 +263,6 @@ def _transition(ssm: StateSpaceModel, scheme: str, row: Rows, steps: int,
     if callable(ssm.model.process_noise):
         return jax.vmap(one, in_axes=-1, out_axes=(-1, -1))(state)
     return jax.vmap(one, in_axes=-1, out_axes=(-1, None))(state)
-
-
-def _log_normal(x: jax.Array, mean: jax.Array, chol: jax.Array) -> jax.Array:
-    """Return the log density up to its constant."""
-    white = solve_lower(chol, x - mean)
-    return -0.5 * (white**2).sum() - jnp.log(jnp.diagonal(chol)).sum()
 
 
 def _choose(key: jax.Array, log_weights: jax.Array) -> jax.Array:

@@ -6,15 +6,22 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from lfm_ppl.filtering.predict import Moments, covariance_of, linearise_state
-from lfm_ppl.linalg import cholesky, congruence, matmul, safe_sqrt, solve_lower, solve_upper, wrapped
+from lfm_ppl.linalg import (
+    cholesky,
+    congruence,
+    log_density,
+    masked,
+    matmul,
+    safe_sqrt,
+    solve_lower,
+    solve_upper,
+    wrapped,
+)
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.linearisation.sigma_points import SigmaPointRule
 from lfm_ppl.model.augment import StateSpaceModel
-
-_LOG_2PI = float(np.log(2.0 * np.pi))
 
 _LOST_MEAN, _LOST_VARIANCE = 1e-3, 1e3
 """Errors of a filtered output, in standard deviations and variances of its noise, from which precision is lost."""
@@ -106,9 +113,7 @@ def update(ssm: StateSpaceModel, observation: Linearised, y: jax.Array, present:
     residual = jnp.where(present, y, 0.0) - observation.value
     for index in ssm.model.observation.angular:
         residual = residual.at[index].set(wrapped(residual[index]))
-    innovation = jnp.where(present, residual, 0.0)
-    both = present[:, None] & present[None, :]
-    noise = jnp.where(both, observation.noise, jnp.eye(y.shape[0]))
+    innovation, noise = masked(residual, observation.noise, present)
     cross = matmul(covariance, slope.T)
     innovation_covariance = matmul(slope, cross) + noise
     # A smaller pivot has no correct digit, and its sign is chance.
@@ -117,8 +122,6 @@ def update(ssm: StateSpaceModel, observation: Linearised, y: jax.Array, present:
     chol = factor.chol
     gain = solve_upper(chol, solve_lower(chol, cross.T)).T
     white = solve_lower(chol, innovation)
-    diagonal = jnp.diagonal(chol)
-    log_likelihood = -0.5 * ((white**2).sum() + present.sum() * _LOG_2PI) - jnp.log(diagonal).sum()
     kept = jnp.eye(mean.shape[0]) - matmul(gain, slope)
     filtered = Moments(mean + matmul(gain, innovation[:, None])[:, 0],
                        congruence(kept, covariance) + congruence(gain, noise))
@@ -126,7 +129,8 @@ def update(ssm: StateSpaceModel, observation: Linearised, y: jax.Array, present:
     if scale is not None:
         failed = failed | _precision_lost(ssm, observation, y, present, moments, filtered, noise,
                                           solve_upper(chol, white), scale)
-    return Update(filtered, jnp.where(failed, -jnp.inf, log_likelihood), innovation, chol, gain, slope, noise)
+    return Update(filtered, jnp.where(failed, -jnp.inf, log_density(white, chol, present)), innovation, chol, gain,
+                  slope, noise)
 
 
 def _precision_lost(ssm: StateSpaceModel, observation: Linearised, y: jax.Array, present: jax.Array,
