@@ -1,7 +1,5 @@
 """The force protocol: a Gaussian process prior written as a linear SDE; several side by side, or added."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -184,11 +182,11 @@ class Force(eqx.Module):
             ValueError: nothing can be learned from such data, for example about a period longer than they are.
         """
 
-    def __add__(self, other: Force) -> Force:
+    def __add__(self, other: "Force") -> "Force":
         """Return the force that is the sum of two independent forces."""
         return Sum((self, other)) if isinstance(other, Force) else NotImplemented
 
-    def __radd__(self, other: Any) -> Force:
+    def __radd__(self, other: Any) -> "Force":
         """Return the force itself for 0 + force, with which ``sum(forces)`` begins."""
         return self if isinstance(other, int) and other == 0 else NotImplemented
 
