@@ -10,7 +10,7 @@ import numpy as np
 
 from lfm_ppl.comparators.finite_volume import Chain, Grid, propagate, transition
 from lfm_ppl.comparators.grid_model import WEIGHTS, Cells, on_grid
-from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays
+from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays, with_observations
 from lfm_ppl.linalg import cholesky, log_density, masked, solve_lower, wrapped
 from lfm_ppl.model.augment import StateSpaceModel
 
@@ -103,8 +103,8 @@ def forward(moving: Moves, plan: Schedule, y: jax.Array, keep: bool = False) -> 
         y: (B, T, D), NaN where missing; all B data sets have the same times.
         keep: whether to keep the masses.
     """
-    cells, rows = moving.cells, as_arrays(plan.rows)
-    padded = jnp.concatenate([jnp.asarray(y, float), jnp.full((y.shape[0], 1, y.shape[2]), jnp.nan)], axis=1)
+    cells = moving.cells
+    rows, by_row = with_observations(plan.rows, jnp.moveaxis(y, 1, 0))
     walks = cells.chain if cells.chain.up.ndim > 1 else None
     start = jnp.broadcast_to(cells.initial, (y.shape[0], cells.initial.shape[0]))
 
@@ -123,8 +123,8 @@ def forward(moving: Moves, plan: Schedule, y: jax.Array, keep: bool = False) -> 
         out = (jnp.where(any_present, total, 0.0), *((predicted, filtered) if keep else (None, None)))
         return (filtered, jnp.maximum(reach, filtered.max(0))), out
 
-    inputs = (rows, walks, jnp.moveaxis(padded, 1, 0)[rows.observation])
-    (_, reach), (log, predicted, filtered) = jax.lax.scan(step, (start, jnp.zeros(start.shape[1])), inputs)
+    carry = start, jnp.zeros(start.shape[1])
+    (_, reach), (log, predicted, filtered) = jax.lax.scan(step, carry, (rows, walks, by_row))
     return Densities(log, predicted, filtered, reach)
 
 

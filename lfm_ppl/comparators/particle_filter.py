@@ -17,7 +17,7 @@ from lfm_ppl.comparators.observation_noise import check_noise, log_density
 from lfm_ppl.comparators.resampling import RESAMPLING, effective_sample_size, resample
 from lfm_ppl.comparators.stochastic_steps import Prepared, advance, choose_scheme, prepare
 from lfm_ppl.filtering.filter import check_observations, warn_single_precision
-from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays, schedule
+from lfm_ppl.filtering.schedule import Rows, Schedule, schedule, with_observations
 from lfm_ppl.linalg import matmul, semidefinite_root
 from lfm_ppl.model.augment import StateSpaceModel, state_space
 from lfm_ppl.model.latent_force_model import LatentForceModel
@@ -205,7 +205,6 @@ def forward(ssm: StateSpaceModel, plan: Schedule, y: jax.Array, key: jax.Array, 
     state = mean[:, None] + matmul(semidefinite_root(covariance), normals(first_key, ssm.state_dim, size))
     table = None if plan.lengths is None else jax.vmap(
         lambda length: prepare(ssm, settings.scheme, length, plan.steps))(jnp.asarray(plan.lengths))
-    padded = jnp.concatenate([jnp.asarray(y, float), jnp.full((1, ssm.output_dim), jnp.nan)])
 
     def row(carry: tuple[jax.Array, jax.Array], inputs: tuple[Rows, jax.Array, jax.Array]) -> tuple[tuple, Any]:
         state, log_weights = carry
@@ -219,9 +218,9 @@ def forward(ssm: StateSpaceModel, plan: Schedule, y: jax.Array, key: jax.Array, 
         return (state, log_weights), keep(step)
 
     start = (state, jnp.full(size, -np.log(size)))
-    rows = as_arrays(plan.rows)
-    keys = jax.random.split(rows_key, rows.start.shape[0])
-    return jax.lax.scan(row, start, (rows, padded[rows.observation], keys))[1]
+    rows, by_row = with_observations(plan.rows, y)
+    keys = jax.random.split(rows_key, by_row.shape[0])
+    return jax.lax.scan(row, start, (rows, by_row, keys))[1]
 
 
 def _move(ssm: StateSpaceModel, settings: ParticleSettings, plan: Schedule, ready: Prepared, row: Rows,

@@ -42,7 +42,7 @@ from lfm_ppl.comparators.switched_model import (
 )
 from lfm_ppl.filtering.filter import FilterState, check_observations, warn_single_precision
 from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays
+from lfm_ppl.filtering.schedule import Rows, Schedule, with_observations
 from lfm_ppl.filtering.update import Linearised, Update, update
 from lfm_ppl.linalg import congruence, matmul, semidefinite_root, solve_semidefinite
 from lfm_ppl.model.augment import StateSpaceModel
@@ -163,7 +163,6 @@ def _run(ssms: tuple[StateSpaceModel, ...], rule: SwitchingRule, plan: Schedule,
          settings: _Settings) -> RaoBlackwellisedResult:
     size = settings.particles
     maps = [row_maps(ssm, rule, plan) for ssm in ssms]
-    padded = jnp.concatenate([y, jnp.full((1, y.shape[1]), jnp.nan)])
     equal = jnp.full(size, -np.log(size))
 
     def row(particles: _Particles, inputs: tuple[Rows, jax.Array, jax.Array, jax.Array]) -> tuple[_Particles, tuple]:
@@ -190,9 +189,8 @@ def _run(ssms: tuple[StateSpaceModel, ...], rule: SwitchingRule, plan: Schedule,
     first = _Particles(jnp.broadcast_to(begin.mean, (size, *begin.mean.shape)),
                        covariance if settings.shared else jnp.broadcast_to(covariance, (size, *covariance.shape)),
                        initial, equal)
-    rows = as_arrays(plan.rows)
     keys = jax.random.split(key, decides.shape[0])
-    _, kept = jax.lax.scan(row, first, (rows, padded[rows.observation], decides, keys))
+    _, kept = jax.lax.scan(row, first, (*with_observations(plan.rows, y), decides, keys))
     at = tuple(part[jnp.asarray(plan.observed)] for part in kept)
     mean, covariance, middle, variance, noise, log_weights, inputs, ess, log_likelihood = at
     return RaoBlackwellisedResult(times, log_likelihood, mean, covariance, Mixture(middle, variance, log_weights),

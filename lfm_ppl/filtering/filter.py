@@ -14,7 +14,7 @@ from lfm_ppl import checks
 from lfm_ppl.filtering.adaptive import predict_row_adaptively
 from lfm_ppl.filtering.jumps import after_jump
 from lfm_ppl.filtering.predict import Moments, Prediction, predict_exact, predict_row, unmoved
-from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays, schedule
+from lfm_ppl.filtering.schedule import Rows, Schedule, schedule, with_observations
 from lfm_ppl.filtering.transition import Factor, LinearPart, constant_slope, exact, integrating_factor, linear_part
 from lfm_ppl.filtering.update import linearise_observation, update
 from lfm_ppl.linalg import congruence, matmul, safe_sqrt, solve_lower
@@ -270,12 +270,10 @@ def forward(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, *, s
                                steps=steps)
         return new.moments, out
 
-    padded = jnp.concatenate([jnp.asarray(y, float), jnp.full((1, ssm.output_dim), jnp.nan)])
-    rows = as_arrays(plan.rows)
     first = Moments(*ssm.initial()) if start is None else start
-    scale = _output_scale(ssm, plan, prepared, padded, first)
-    _, passed = jax.lax.scan(jax.checkpoint(step, prevent_cse=False), first, (rows, padded[rows.observation], about))
-    return passed
+    scale = _output_scale(ssm, plan, prepared, jnp.asarray(y, float), first)
+    inputs = (*with_observations(plan.rows, y), about)
+    return jax.lax.scan(jax.checkpoint(step, prevent_cse=False), first, inputs)[1]
 
 
 def _output_scale(ssm: StateSpaceModel, plan: Schedule, prepared: Preparation, y: jax.Array,

@@ -219,3 +219,12 @@ def _distinct(length: np.ndarray, scale: float) -> tuple[np.ndarray | None, np.n
 def as_arrays(rows: Rows) -> Rows:
     """Return the rows as JAX arrays, which a scan can run over."""
     return jax.tree_util.tree_map(jnp.asarray, rows)
+
+
+def with_observations(rows: Rows, y: Any) -> tuple[Rows, jax.Array]:
+    """Return the rows as JAX arrays, and the entry of ``y`` (T, ...) at the end of each, NaN in rows without one."""
+    y = jnp.asarray(y, float)
+    # The index -1 of a row without an observation is that of the last entry.
+    padded = jnp.concatenate([y, jnp.full((1, *y.shape[1:]), jnp.nan)])
+    rows = as_arrays(rows)
+    return rows, padded[rows.observation]
