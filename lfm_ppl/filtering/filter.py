@@ -12,9 +12,9 @@ import numpy as np
 
 from lfm_ppl import checks
 from lfm_ppl.filtering.adaptive import predict_row_adaptively
-from lfm_ppl.filtering.jumps import after_jump
+from lfm_ppl.filtering.jumps import after_jump, jump_map
 from lfm_ppl.filtering.predict import Moments, Prediction, predict_exact, predict_row, unmoved
-from lfm_ppl.filtering.schedule import Rows, Schedule, schedule, with_observations
+from lfm_ppl.filtering.schedule import Rows, Schedule, by_length, schedule, with_observations
 from lfm_ppl.filtering.transition import Factor, LinearPart, constant_slope, exact, integrating_factor, linear_part
 from lfm_ppl.filtering.update import linearise_observation, update
 from lfm_ppl.linalg import congruence, matmul, safe_sqrt, solve_lower
@@ -103,8 +103,7 @@ def _inside(ssm: StateSpaceModel, rule: Rule, plan: Schedule, prepared: Preparat
     mean, own, phi = steps
     to_end = jnp.eye(ssm.state_dim)
     if prepared.jumps is not None:
-        still = Prediction(Moments(jnp.zeros(ssm.state_dim), to_end), to_end, to_end)
-        to_end = after_jump(ssm, prepared.jumps, row.jump, still, flow=True).phi
+        to_end, _ = jump_map(ssm, prepared.jumps, row.jump)
 
     def back(to_end: jax.Array, at: tuple) -> tuple[jax.Array, jax.Array]:
         own, phi = at
@@ -132,33 +131,28 @@ class Preparation(NamedTuple):
     Attributes:
         linear: the constant linear part of the dynamics.
         jacobian: (D, M + R), the constant part of the observation's.
-        table: transitions of the distinct lengths; None where they are computed row by row.
+        transition: from a row to what `step_transition` gives for its length.
         jumps: G and Q of the forces' jumps, None without any.
     """
 
     linear: LinearPart
     jacobian: jax.Array
-    table: Any
+    transition: Callable[[Rows], Any]
     jumps: tuple[jax.Array, jax.Array] | None
 
 
 def preparation(ssm: StateSpaceModel, plan: Schedule) -> Preparation:
     """Compute what the rows of a scan share."""
     linear = linear_part(ssm, jnp.asarray(plan.initial_time, float))
-    lengths = None if plan.lengths is None else jnp.asarray(plan.lengths)
-    table = None if lengths is None else jax.vmap(lambda length: step_transition(ssm, linear, plan, length))(lengths)
-    return Preparation(linear, _observation_slope(ssm, plan), table, ssm.stack.jump_table())
-
-
-def row_transition(ssm: StateSpaceModel, plan: Schedule, prepared: Preparation, row: Rows) -> Any:
-    """Return the exact transition of a row, or the integrating factor of its steps."""
-    if prepared.table is None:
-        return step_transition(ssm, prepared.linear, plan, row.length)
-    return jax.tree_util.tree_map(lambda a: a[row.kind], prepared.table)
+    transition = by_length(plan, lambda length: step_transition(ssm, linear, plan, length))
+    return Preparation(linear, _observation_slope(ssm, plan), transition, ssm.stack.jump_table())
 
 
 def step_transition(ssm: StateSpaceModel, linear: LinearPart, plan: Schedule, length: jax.Array) -> Any:
-    """Return what a row of this length shares; None where the steps have lengths of their own."""
+    """Return the exact transition over this length, or the integrating factor of its steps.
+
+    None where the steps have lengths of their own.
+    """
     if ssm.time_invariant:
         return exact(ssm, linear, length, plan.steps)
     if plan.tolerance is not None:
@@ -201,7 +195,7 @@ def predict(ssm: StateSpaceModel, rule: Rule, plan: Schedule, prepared: Preparat
             nodes: Moments | None = None, flow: bool = False,
             each: Callable[[Prediction], Any] | None = None) -> Prediction:
     """Predict over a row, a jump at its end included; arguments as in `predict_row`."""
-    transition = row_transition(ssm, plan, prepared, row)
+    transition = prepared.transition(row)
     if ssm.time_invariant:
         one = predict_exact(ssm, transition, plan.steps, row.start, row.length, moments)
     else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -219,6 +220,29 @@ def _distinct(length: np.ndarray, scale: float) -> tuple[np.ndarray | None, np.n
 def as_arrays(rows: Rows) -> Rows:
     """Return the rows as JAX arrays, which a scan can run over."""
     return jax.tree_util.tree_map(jnp.asarray, rows)
+
+
+def by_length(plan: Schedule, make: Callable[[jax.Array], Any]) -> Callable[[Rows], Any]:
+    """Return what gives ``make(length)`` of a row, computed once for every distinct length where these are few."""
+    if plan.lengths is None:
+        return lambda row: make(row.length)
+    table = jax.vmap(make)(jnp.asarray(plan.lengths))
+    return lambda row: jax.tree_util.tree_map(lambda a: a[row.kind], table)
+
+
+def per_step(plan: Schedule) -> Schedule:
+    """Return the plan with a row for each integration step."""
+    rows, steps = plan.rows, plan.steps
+    # In NumPy where the plan is known, so that requested times can be found in it before compilation.
+    xp: Any = np if isinstance(rows.length, np.ndarray) else jnp
+    index = np.tile(np.arange(steps), len(rows.length))
+    start, length, observation, jump = (xp.repeat(a, steps) for a in rows[:4])
+    last = index == steps - 1
+    length = length / steps
+    fine = Rows(start + index * length, length, xp.where(last, observation, -1), xp.where(last, jump, -1),
+                np.zeros_like(index))
+    return plan._replace(rows=fine, lengths=None, steps=1, observed=plan.observed * steps + steps - 1,
+                         requested=plan.requested * steps + steps - 1)
 
 
 def with_observations(rows: Rows, y: Any) -> tuple[Rows, jax.Array]:

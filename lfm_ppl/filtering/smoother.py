@@ -20,10 +20,10 @@ from lfm_ppl.filtering.filter import (
     standardised,
     warn_single_precision,
 )
-from lfm_ppl.filtering.iterated import Iterated, per_step, posterior_linearisation, refined
+from lfm_ppl.filtering.iterated import Iterated, posterior_linearisation, refined
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.rts import Smoothed, backward
-from lfm_ppl.filtering.schedule import Schedule, schedule
+from lfm_ppl.filtering.schedule import Schedule, per_step, schedule
 from lfm_ppl.filtering.simulation_smoother import smoothing_errors
 from lfm_ppl.linalg import congruence, matmul, safe_sqrt, semidefinite_root, solve_lower
 from lfm_ppl.linearisation.rule import Rule
