@@ -23,12 +23,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import logsumexp
 
 from lfm_ppl import checks
 from lfm_ppl.comparators.mixture import Mixture
 from lfm_ppl.comparators.normals import normals
-from lfm_ppl.comparators.resampling import RESAMPLING, effective_sample_size, resample
+from lfm_ppl.comparators.resampling import RESAMPLING, effective_sample_size, resample, reweighted
 from lfm_ppl.comparators.switched_model import (
     Affine,
     Build,
@@ -220,11 +219,7 @@ def _observe(ssm: StateSpaceModel, particles: _Particles, own: Affine, observed:
 
     new = jax.vmap(one, (0, at, at, 0, at), Update(Moments(0, at), 0, 0, at, at, at, at))(  # type: ignore[arg-type]
         value, own.slope, own.variance, particles.mean, particles.covariance)
-    joint = particles.log_weights + new.log_likelihood
-    total = logsumexp(joint)
-    # Where no particle explains the observation the estimate is zero; the particles go on as they are.
-    alive = jnp.isfinite(total)
-    log_weights = jnp.where(alive, joint - jnp.where(alive, total, 0.0), particles.log_weights)
+    log_weights, total = reweighted(particles.log_weights, new.log_likelihood, particles.log_weights)
     seen = jnp.isfinite(observed).any()
     return (particles._replace(mean=new.moments.mean, covariance=new.moments.covariance, log_weights=log_weights),
             jnp.where(seen, jnp.where(jnp.isnan(total), -jnp.inf, total), 0.0))

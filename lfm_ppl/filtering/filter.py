@@ -154,7 +154,7 @@ def step_transition(ssm: StateSpaceModel, linear: LinearPart, plan: Schedule, le
     None where the steps have lengths of their own.
     """
     if ssm.time_invariant:
-        return exact(ssm, linear, length, plan.steps)
+        return exact(ssm, length, plan.steps, linear)
     if plan.tolerance is not None:
         return None
     return integrating_factor(ssm, linear, length / plan.steps)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 
 from lfm_ppl.forces.discretise import discretise_dispersion
+from lfm_ppl.linalg import semidefinite_root
 
 
 class ApproximationWarning(UserWarning):
@@ -259,6 +260,11 @@ class Stack(eqx.Module):
         nothing = (jnp.eye(self.state_dim), jnp.zeros((self.state_dim, self.state_dim)))
         pairs = [*(self.jump(index) for index in range(len(self.jump_times))), nothing]
         return jnp.stack([pair[0] for pair in pairs]), jnp.stack([pair[1] for pair in pairs])
+
+    def jump_roots(self) -> tuple[jax.Array, jax.Array] | None:
+        """Return the same with a factor of Q, for draws: ``z <- G z + root N(0, I)``."""
+        table = self.jump_table()
+        return None if table is None else (table[0], jax.vmap(semidefinite_root)(table[1]))
 
 
 class Sum(Force):

@@ -25,10 +25,11 @@ from lfm_ppl import linalg, orbits
 from lfm_ppl.experiments.gps import magnitudes
 from lfm_ppl.experiments.gps.problem import NOISE, Arc
 from lfm_ppl.filtering.filter import forward
+from lfm_ppl.filtering.predict import compose
 from lfm_ppl.filtering.schedule import schedule
 from lfm_ppl.forces import Force, RandomWalk, Resonator
 from lfm_ppl.forces.sde import Sum
-from lfm_ppl.linalg import congruence, masked, matmul, solve_lower
+from lfm_ppl.linalg import masked, matmul, solve_lower
 from lfm_ppl.linearisation.taylor import Taylor
 from lfm_ppl.model.augment import state_space
 from lfm_ppl.model.latent_force_model import LatentForceModel
@@ -190,7 +191,7 @@ def _spread(system: LatentForceModel, times: np.ndarray) -> tuple[jax.Array, jax
     def step(carry: tuple, row: tuple) -> tuple[tuple, tuple]:
         flow, spread, cross = carry  # cross: covariances of the state with all positions up to now
         phi, noise, index = row
-        flow, spread = matmul(phi, flow), congruence(phi, spread) + noise
+        flow, spread = compose((flow, spread), (phi, noise))
         cross = matmul(phi, cross.reshape(size, -1)).reshape(size, count, 3).at[:, index].set(spread[:, :3])
         return (flow, spread, cross), (flow[:3], cross[:3])
 
