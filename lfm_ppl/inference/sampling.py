@@ -116,7 +116,8 @@ def particle_marginal(bound: BoundModel, kernel: ParticleMarginalRAM, warmup: in
     def start(key: jax.Array, point: ParamInfo, y: Any, chol: Any) -> ParticleMarginalState:
         energy = finite_or_infinity(estimate(y)(point.z, jax.random.fold_in(key, 1)))
         surrogate = point.potential_energy if kernel.delayed else jnp.zeros_like(energy)
-        return ParticleMarginalState(*initial_state(point.z, energy, key, chol, warmup), surrogate, jnp.array(False))
+        ram = initial_state(point.z, energy, key, chol, warmup)
+        return ParticleMarginalState(ram, surrogate, jnp.array(False), key)
 
     def step(state: ParticleMarginalState, y: Any) -> ParticleMarginalState:
         return kernel.step(estimate(y), _potential(bound, y) if kernel.delayed else None)(state)
