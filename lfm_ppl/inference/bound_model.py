@@ -12,7 +12,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import numpyro.distributions as dist
 from jax.extend.core import jaxpr_as_fun
 from jax.flatten_util import ravel_pytree
 from numpyro import handlers
@@ -95,10 +94,6 @@ class _at_known_times(LikelihoodHandler):  # noqa: N801 (an effect handler, name
         self.times = times
         super().__init__(fn)
 
-    def complaint(self) -> str:
-        """Return nothing: a likelihood inside a mask has times of its own."""
-        return ""
-
     def replacement(self, likelihood: MarginalLikelihood | Panel, site: dict[str, Any]) -> Any:
         """Return the likelihood at times that are known."""
         return likelihood.with_times(self.times) if checks.traced(likelihood.times) else likelihood
@@ -107,14 +102,9 @@ class _at_known_times(LikelihoodHandler):  # noqa: N801 (an effect handler, name
 class _without_likelihood(LikelihoodHandler):  # noqa: N801 (an effect handler, see above)
     """Leaves the prior alone."""
 
-    def complaint(self) -> str:
+    def missing(self) -> str:
         """Return what to say of a likelihood that cannot be told from the prior."""
         return "the likelihood stands inside a mask or an expansion, so that the prior cannot be told from it."
-
-    def replacement(self, likelihood: MarginalLikelihood | Panel, site: dict[str, Any]) -> Any:
-        """Return a likelihood of one."""
-        shape = likelihood.batch_shape + likelihood.event_shape
-        return dist.ImproperUniform(dist.constraints.real, (), shape).mask(False)
 
 
 class _ingredients(LikelihoodHandler):  # noqa: N801 (an effect handler, see above)
@@ -126,10 +116,6 @@ class _ingredients(LikelihoodHandler):  # noqa: N801 (an effect handler, see abo
         self.settings: list[str] = []
         self.times: list[Any] = []
         super().__init__()
-
-    def complaint(self) -> str:
-        """Return nothing: a likelihood inside a mask is run as a whole."""
-        return ""
 
     def replacement(self, likelihood: MarginalLikelihood | Panel, site: dict[str, Any]) -> Any:
         """Return a likelihood of one."""
@@ -145,8 +131,7 @@ class _ingredients(LikelihoodHandler):  # noqa: N801 (an effect handler, see abo
             one.rule, one.steps, one.max_step, one.iterations, one.damping, one.tolerance, model.state_names,
             model.output_names, model.force_names, model.units, model.nonlinear_inputs, model.observation.angular,
             ssm.stack.jump_times, site["name"])))
-        shape = likelihood.batch_shape + likelihood.event_shape
-        return dist.ImproperUniform(dist.constraints.real, (), shape).mask(False)
+        return super().replacement(likelihood, site)
 
 
 class _Program:

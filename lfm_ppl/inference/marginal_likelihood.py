@@ -175,10 +175,7 @@ class MarginalLikelihood(dist.Distribution):
         start = jnp.asarray(self.plan.initial_time, float)
         run = lambda k: simulate_on(self.ssm, k, jnp.asarray(self.times, float), start,  # noqa: E731
                                     _SIMULATION_STEPS * self.steps).y
-        if not sample_shape:
-            return run(key)
-        keys = jax.random.split(key, int(np.prod(sample_shape)))
-        return jax.vmap(run)(keys).reshape(*sample_shape, *self.event_shape)
+        return repeated(run, key, sample_shape)
 
     def filter(self, y: Any) -> FilterResult:
         """Filter with this distribution's rule and steps; see `lfm_ppl.filter`."""
@@ -280,10 +277,7 @@ class Panel(dist.Distribution):
             keys = jax.random.split(key, self.batch_shape[0])
             return self.mapped(lambda one, k: one.sample(k), keys)
 
-        if not sample_shape:
-            return draw(key)
-        keys = jax.random.split(key, int(np.prod(sample_shape)))
-        return jax.vmap(draw)(keys).reshape(*sample_shape, *self.batch_shape, *self.event_shape)
+        return repeated(draw, key, sample_shape)
 
     def checked(self, value: Any) -> jax.Array:
         """Return ``value`` as an array (B, T, D) after checking it."""
@@ -295,6 +289,14 @@ class Panel(dist.Distribution):
         if known is not None and np.isinf(known).any():
             raise ValueError("y has infinite entries; use NaN for a missing entry.")
         return jnp.asarray(value, float)
+
+
+def repeated(draw: Callable[[jax.Array], jax.Array], key: jax.Array, sample_shape: tuple[int, ...]) -> jax.Array:
+    """Return independent draws (*sample_shape, ...) of ``draw(key)``; one draw where the shape is empty."""
+    if not sample_shape:
+        return draw(key)
+    draws = jax.vmap(draw)(jax.random.split(key, int(np.prod(sample_shape))))
+    return draws.reshape(*sample_shape, *draws.shape[1:])
 
 
 def panel(build: Callable[..., LatentForceModel], parameters: Any, times: Any, rule: Rule | None = None,
