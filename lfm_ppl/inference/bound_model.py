@@ -42,6 +42,10 @@ _MOST_PROGRAMS = 8
 _MOST_COMPILED = 64
 """Functions that are kept of one model, such as smoothers with different requested times."""
 
+_lock = threading.RLock()
+"""Held while programs are looked up and models are traced: NumPyro's stack of handlers is one for all threads."""
+
+
 class LikelihoodSite(NamedTuple):
     """The likelihood site of a NumPyro model.
 
@@ -118,6 +122,8 @@ class _without_likelihood(LikelihoodHandler):  # noqa: N801 (an effect handler, 
 class _Program:
     """What data sets of one shape share: the model without its data, and all that was compiled for it.
 
+    Several threads may ask for its functions at once.
+
     Args:
         model: a NumPyro model.
         arguments: its positional arguments; None in the place of the data.
@@ -126,8 +132,6 @@ class _Program:
         keywords: its keyword arguments.
         data: the first data set; an example of its shape for what is traced.
         user: who asks, for messages.
-
-    Its functions may be asked for in several threads at once.
     """
 
     def __init__(self, model: Callable, arguments: tuple, place: int | None, keywords: Mapping[str, Any], data: Any,
@@ -136,7 +140,6 @@ class _Program:
         self.key = jax.random.key(0)
         self.fingerprint: Hashable = None  # that of a program which serves other data too
         self.compiled: OrderedDict[Hashable, Any] = OrderedDict()
-        self._lock = threading.RLock()
         self._seeded = handlers.seed(model, self.key)
         self.user = user
         trace = self._trace(data, self.key, init_to_median)
@@ -193,7 +196,7 @@ class _Program:
 
     def once(self, name: Hashable, make: Callable[[], Any]) -> Any:
         """Return what ``make`` returned when the name was first asked for; the latest of them are kept."""
-        with self._lock:
+        with _lock:
             if name in self.compiled:
                 self.compiled.move_to_end(name)
                 return self.compiled[name]
@@ -204,7 +207,6 @@ class _Program:
 
 
 _programs: OrderedDict[Hashable, _Program] = OrderedDict()
-_lock = threading.Lock()
 
 
 class BoundModel:
@@ -677,13 +679,11 @@ def bind_arguments(model: Callable, arguments: tuple, keywords: Mapping[str, Any
     key = signature((model, static, dict(keywords), jax.tree_util.tree_map(lambda leaf: (leaf.shape, str(leaf.dtype)),
                                                                            data)))
     kept = key is not None and not checks.traced(data)  # what is made of tracers must not outlive them
-    with _lock:
+    with _lock, jax.ensure_compile_time_eval():  # compiled code may be the first to bind the model
         program = _programs.pop(key, None) if kept else None
-    with jax.ensure_compile_time_eval():  # compiled code may be the first to bind the model
         if program is None or not _unchanged(program, data):
             program = _made(model, arguments, place, keywords, data, user)
-    if kept and program.fingerprint is not None:
-        with _lock:
+        if kept and program.fingerprint is not None:
             _programs[key] = program
             while len(_programs) > _MOST_PROGRAMS:
                 _programs.popitem(last=False)
