@@ -22,6 +22,7 @@ from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.linearisation.sigma_points import Cubature, SigmaPointRule
 from lfm_ppl.model.augment import StateSpaceModel, state_space
 from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.resolution import check_resolution
 
 
 class Pass(NamedTuple):
@@ -363,7 +364,7 @@ def filter(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
     plan = schedule(ssm, times, steps, max_step, initial_time=None if start is None else start.time,
                     tolerance=tolerance)
     model.check_at(plan.initial_time, len(plan.observed))
-    model.check_resolution(times, y)
+    check_resolution(model, times, y)
     y = check_observations(y, len(plan.observed), ssm.output_dim, empty=start is not None)
     warn_single_precision()
     begin = None if start is None else Moments(start.mean, start.covariance)

@@ -29,6 +29,7 @@ from lfm_ppl.linalg import congruence, matmul, safe_sqrt, semidefinite_root, sol
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.augment import StateSpaceModel, state_space
 from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.resolution import check_resolution
 
 _LONGEST_FORECAST = 10_000
 """Most rows of a forecast; a longer one gets a long last row (or `max_step`)."""
@@ -208,7 +209,7 @@ def smooth(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
     ssm = state_space(model)
     plans = smoothing_plans(ssm, times, steps, max_step, at, iterations, tolerance)
     model.check_at(plans.rows.initial_time, np.shape(times)[0])
-    model.check_resolution(times, y)
+    check_resolution(model, times, y)
     y = check_observations(y, len(plans.rows.observed), ssm.output_dim)
     warn_single_precision()
     result = _run_smoother(ssm, rule, plans, y, iterations, damping)

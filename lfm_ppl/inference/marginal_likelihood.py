@@ -38,6 +38,7 @@ from lfm_ppl.gradients import finite_or_minus_infinity
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.augment import StateSpaceModel, check_times, state_space
 from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.resolution import check_resolution
 from lfm_ppl.model.simulate import simulate_on
 
 _SIMULATION_STEPS = 5
@@ -138,7 +139,7 @@ class MarginalLikelihood(dist.Distribution):
         value = jnp.asarray(value, float)
         if value.ndim > 2:
             return jax.vmap(self.log_prob)(value)
-        self.model.check_resolution(self.times, value)
+        check_resolution(self.model, self.times, value)
         # One failure makes the sum -inf, and with it the derivatives of the other terms zero.
         y = check_observations(value, *self.event_shape)
         return self._said(y, finite_or_minus_infinity(lambda y: self._one_step_ahead(y).sum(), y))
