@@ -219,7 +219,9 @@ class EllipticalSlice(Kernel):
 
     def postprocess_fn(self, args: tuple, kwargs: dict) -> Callable:
         """Return the map from the latent to the latent and the deterministic sites."""
-        return partial(_with_deterministic, self._model, args, kwargs) if self._replay else identity
+        if self._model is None or not self._replay:
+            return identity
+        return partial(_with_deterministic, self._model, args, kwargs)
 
     def begin(self, rng_key: jax.Array, model_key: jax.Array, num_warmup: int, init_params: Any, args: tuple,
               kwargs: dict) -> EllipticalSliceState:

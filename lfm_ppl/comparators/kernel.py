@@ -54,7 +54,8 @@ class Kernel(MCMCKernel):
             model_kwargs: keyword arguments of the model.
         """
         split = jax.random.split if is_prng_key(rng_key) else jax.vmap(jax.random.split, out_axes=1)
-        state = self.begin(*split(rng_key), num_warmup, init_params, model_args, model_kwargs or {})
+        rng_key, model_key = split(rng_key)
+        state = self.begin(rng_key, model_key, num_warmup, init_params, model_args, model_kwargs or {})
         self._sample_fn = self.sample
         return state
 

@@ -220,7 +220,8 @@ def forward(ssm: StateSpaceModel, plan: Schedule, y: jax.Array, key: jax.Array, 
 def _move(moves: Moves, ready: Prepared, row: Rows, observed: jax.Array, key: jax.Array,
           state: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Move particles over a row, and score the observation at its end."""
-    state = moves.across(row, ready, *jax.random.split(key), state)
+    move_key, jump_key = jax.random.split(key)
+    state = moves.across(row, ready, move_key, jump_key, state)
     end = row.start + row.length
     density = jax.vmap(lambda s: log_observation(moves.ssm, s, end, jnp.maximum(row.observation, 0), observed),
                        in_axes=-1)(state)

@@ -169,8 +169,9 @@ class _Program:
 
     def record(self, y: Any) -> Recording:
         """Return what a run of the model with all its parameters and data traced leaves."""
-        return record(lambda z, y: potential_energy(self._seeded, self.call(y), self.keywords, self.unravel(z)),
-                      self.size, y)
+        with jax.ensure_compile_time_eval():  # compiled code may be the first to ask
+            return record(lambda z, y: potential_energy(self._seeded, self.call(y), self.keywords, self.unravel(z)),
+                          self.size, y)
 
     def draw_sites(self, y: Any, key: jax.Array, strategy: Callable) -> dict[str, jax.Array]:
         """Return unconstrained values of the latent sites by a NumPyro strategy."""

@@ -145,7 +145,7 @@ class ParticleMarginalRAM(RAM):
         self._tuned_for: Any = None
         self.tuned: Tuned | None = None
 
-    def init(  # type: ignore[override]
+    def init(
         self,
         rng_key: jax.Array,
         num_warmup: int,
