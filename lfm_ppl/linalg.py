@@ -11,6 +11,8 @@ import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 from jax.custom_derivatives import SymbolicZero
 
+_LOG_2PI = float(np.log(2.0 * np.pi))
+
 _FUSED_SIZE = 8
 """Largest dimension that is multiplied by broadcasting; XLA's CPU dot wins above it.
 
@@ -301,6 +303,31 @@ def semidefinite_root(p: jax.Array, tolerance: float = 1e-14) -> jax.Array:
     sd = jnp.where(live, jnp.sqrt(jnp.where(live, variance, 1.0)), 0.0)
     inverse = jnp.where(live, 1.0 / jnp.where(live, sd, 1.0), 0.0)
     return sd[:, None] * cholesky(p * inverse[:, None] * inverse[None, :], floor=tolerance, keep=False).chol
+
+
+def masked(residual: jax.Array, covariance: jax.Array, present: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Leave out missing entries: return the residual with zeros, the covariance with rows of the identity for them.
+
+    Args:
+        residual: (..., D), anything where missing.
+        covariance: (..., D, D); leading dimensions broadcast.
+        present: (..., D), whether an entry is.
+    """
+    both = present[..., :, None] & present[..., None, :]
+    return jnp.where(present, residual, 0.0), jnp.where(both, covariance, jnp.eye(present.shape[-1]))
+
+
+def log_density(white: jax.Array, chol: jax.Array, present: jax.Array | None = None) -> jax.Array:
+    """Return the log density (...) of the Gaussian N(0, L L') at a residual, its missing entries left out by `masked`.
+
+    Args:
+        white: (..., D), L^-1 times the residual.
+        chol: (..., D, D), the lower triangular L.
+        present: (..., D), whether an entry is; all are by default.
+    """
+    count = white.shape[-1] if present is None else present.sum(-1)
+    scale = jnp.log(diagonal(chol)).sum(-1)
+    return -0.5 * ((white**2).sum(-1) + count * _LOG_2PI) - scale
 
 
 def wrapped(angle: jax.Array) -> jax.Array:

@@ -6,10 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import stats
 
 from lfm_ppl.linalg import (
     cholesky,
     congruence,
+    log_density,
+    masked,
     matmul,
     outer_square,
     safe_sqrt,
@@ -126,3 +129,24 @@ def test_a_constant_matrix_that_selects_takes_slices(indices):
     assert np.array_equal(congruence(pick, definite(4)), pick @ definite(4) @ pick.T)
     assert "dot" not in str(jax.make_jaxpr(lambda a: matmul(pick, a))(a))
     assert isinstance(matmul(pick, np.eye(4)), np.ndarray)
+
+
+@pytest.mark.parametrize("missing", [(), (1,), (0, 2), (0, 1, 2)])
+def test_density_of_what_is_not_missing(missing):
+    covariance, residual = definite(3), np.array([0.3, -1.2, 0.7])
+    present = ~np.isin(np.arange(3), missing)
+
+    def density(residual, covariance):
+        some, matrix = masked(residual, covariance, jnp.isfinite(residual))
+        chol = cholesky(matrix).chol
+        return log_density(solve_lower(chol, some), chol, jnp.isfinite(residual))
+
+    given = jnp.where(present, residual, jnp.nan)
+    kept = np.ix_(present, present)
+    expected = stats.multivariate_normal.logpdf(residual[present], cov=covariance[kept]) if present.any() else 0.0
+    assert float(density(given, jnp.asarray(covariance))) == pytest.approx(expected, rel=1e-13)
+    by_residual, by_covariance = jax.grad(density, argnums=(0, 1))(given, jnp.asarray(covariance))
+    assert np.isfinite(by_residual).all() and np.isfinite(by_covariance).all()
+    assert not by_residual[~present].any() and not by_covariance[~present].any()
+    whole = jnp.stack([given, 2.0 * given])
+    assert np.allclose(jax.vmap(density, (0, None))(whole, covariance), [density(one, covariance) for one in whole])

@@ -19,8 +19,8 @@ from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
 from lfm_ppl.inference.posterior import each, over_draws
 from lfm_ppl.model.augment import StateSpaceModel
 
-_CHUNK = 8
-"""Draws between two signs of life; also how many the pilot run takes."""
+_PILOT = 8
+"""Draws that the pilot run takes."""
 
 GRID_ERROR = 1e-2
 """Discretisation error of a log likelihood that does not matter: most of it is common to all draws, and cancels."""
@@ -128,7 +128,7 @@ def on_grid(problem: Problem, steps: int | None, progress: bool) -> Reference:
     def per_draw(values: Any, key: jax.Array, y: jax.Array) -> jax.Array:
         return each(bound.likelihood(values, y), one, bound.data(y)).sum()
 
-    found = _in_chunks(("grid", layout, steps), per_draw, "Fokker-Planck grid", progress)(problem, jax.random.key(0))
+    found = _one_by_one(problem, jax.random.key(0), ("grid", layout, steps), per_draw, "Fokker-Planck grid", progress)
     return Reference(found[:, None], f"Fokker-Planck equation on a grid of {layout.cells} cells")
 
 
@@ -156,7 +156,7 @@ def by_particles(problem: Problem, particles: int | None, replicates: int, steps
     chosen = particles or _FIRST_PARTICLES
     run = _particle_run(problem, chosen, replicates, steps, progress)
     if particles is None:
-        rows = np.unique(np.linspace(0, problem.size - 1, _CHUNK).round().astype(int))
+        rows = np.unique(np.linspace(0, problem.size - 1, _PILOT).round().astype(int))
         sd = noise(run(problem.at(rows), pilot_key))
         wanted = chosen * (sd / target) ** 2 * _SAFETY if np.isfinite(sd) else np.inf
         plan = schedule(example.ssm, example.times, steps or example.steps, example.max_step)
@@ -197,28 +197,17 @@ def _particle_run(problem: Problem, particles: int, replicates: int, steps: int 
         return jax.lax.map(replicate, jax.random.split(key, replicates))
 
     name = ("particles", settings, replicates, steps)
-    return _in_chunks(name, per_draw, f"particle filter, {particles:,} particles", progress)
+    label = f"particle filter, {particles:,} particles"
+    return lambda problem, key: _one_by_one(problem, key, name, per_draw, label, progress)
 
 
-def _in_chunks(name: Hashable, per_draw: Callable, label: str,
-               progress: bool) -> Callable[[Problem, jax.Array], np.ndarray]:
-    """Return a function that maps over draws, a few at a time, with one compilation for any number of draws."""
-
-    def call(problem: Problem, key: jax.Array) -> np.ndarray:
-        run = problem.bound.compiled(("in chunks", name), lambda: jax.jit(
-            lambda draws, keys, y: jax.lax.map(lambda pair: per_draw(*pair, y), (draws, keys))))
-        count = problem.size
-        keys = jax.random.split(key, count)
-        found = []
-        for start in range(0, count, _CHUNK):
-            _show(f"{label}: {start} of {count} draws", progress)
-            index = np.minimum(np.arange(start, start + _CHUNK), count - 1)  # full chunks: one shape
-            found.append(np.asarray(run({name: jnp.asarray(value[index]) for name, value in problem.draws.items()},
-                                        keys[index], problem.bound.argument)))
-        _show("", progress)
-        return np.concatenate(found)[:count]
-
-    return call
+def _one_by_one(problem: Problem, key: jax.Array, name: Hashable, per_draw: Callable, label: str,
+                progress: bool) -> np.ndarray:
+    """Map over draws, one after another, and say how far that is."""
+    found = over_draws(problem.bound, name, per_draw, problem.draws, key,
+                       show=lambda done, count: _show(f"{label}: {done} of {count} draws", progress))
+    _show("", progress)
+    return found
 
 
 def _show(text: str, progress: bool) -> None:

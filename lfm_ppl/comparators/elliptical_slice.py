@@ -12,11 +12,11 @@ import numpy as np
 import numpyro.distributions as dist
 from numpyro import handlers
 from numpyro.infer import init_to_sample, init_to_uniform
-from numpyro.infer.mcmc import MCMCKernel
 from numpyro.infer.util import initialize_model
 from numpyro.util import identity, is_prng_key
 
 from lfm_ppl import checks
+from lfm_ppl.comparators.kernel import Kernel, check_start, floating, of_chains
 
 MAX_EVALUATIONS = 200
 """Angles tried in one step. By then the bracket is below 1e-20, and the proposal is the present point to rounding."""
@@ -172,7 +172,7 @@ class EllipticalSliceState(NamedTuple):
     rng_key: jax.Array
 
 
-class EllipticalSlice(MCMCKernel):
+class EllipticalSlice(Kernel):
     r"""Elliptical slice sampling of a model whose latent sites are all Gaussian a priori.
 
     A step draws v from the prior N(m, C) of all latent sites together and moves to a point of the ellipse
@@ -209,21 +209,9 @@ class EllipticalSlice(MCMCKernel):
     """
 
     def __init__(self, model: Callable, init_strategy: Callable = init_to_sample) -> None:
-        self._model = model
+        super().__init__(model)
         self._init_strategy = init_strategy
         self._replay = False
-        # MCMC takes a kernel without a _sample_fn for one that was not initialised
-        self._sample_fn: Callable | None = None
-
-    @property
-    def model(self) -> Callable:
-        """The NumPyro model."""
-        return self._model
-
-    @property
-    def sample_field(self) -> str:
-        """Field of the state that holds the parameters."""
-        return "z"
 
     def get_diagnostics_str(self, state: EllipticalSliceState) -> str:
         """Return the log likelihood and the last step's evaluations of it, for the progress bar."""
@@ -231,48 +219,29 @@ class EllipticalSlice(MCMCKernel):
 
     def postprocess_fn(self, args: tuple, kwargs: dict) -> Callable:
         """Return the map from the latent to the latent and the deterministic sites."""
-        return partial(_with_deterministic, self._model, args, kwargs) if self._replay else identity
+        if self._model is None or not self._replay:
+            return identity
+        return partial(_with_deterministic, self._model, args, kwargs)
 
-    def init(
-        self,
-        rng_key: jax.Array,
-        num_warmup: int,
-        init_params: Any = None,
-        model_args: tuple = (),
-        model_kwargs: dict | None = None,
-    ) -> EllipticalSliceState:
-        """Return the state before the first step.
-
-        Args:
-            rng_key: a key, or an array of keys, one for each vectorised chain.
-            num_warmup: number of warm-up steps; they are steps like all others.
-            init_params: site -> starting point; with a leading axis of chains where there are several keys.
-            model_args: positional arguments of the model.
-            model_kwargs: keyword arguments of the model.
-        """
-        kwargs = model_kwargs or {}
-        single = is_prng_key(rng_key)
-        rng_key, model_key = (jax.random.split if single else jax.vmap(jax.random.split, out_axes=1))(rng_key)
+    def begin(self, rng_key: jax.Array, model_key: jax.Array, num_warmup: int, init_params: Any, args: tuple,
+              kwargs: dict) -> EllipticalSliceState:
+        """Return the state before the first step; steps of the warm-up are like all others."""
+        assert self._model is not None
         with jax.ensure_compile_time_eval():  # chains that run in parallel are initialised within a trace
-            prior, trace = _gaussian_prior(self._model, model_args, kwargs)
+            prior, trace = _gaussian_prior(self._model, args, kwargs)
         self._replay = any(site["type"] == "deterministic" for site in trace.values())
         if init_params is None:
-            z = self._starting_point(model_key, model_args, kwargs)
+            z = self._starting_point(model_key, args, kwargs)
         else:
             shapes = {name: np.shape(trace[name]["value"]) for name in prior}
-            z = _checked_start(init_params, shapes, () if single else rng_key.shape[:1])
-        vectorised = (lambda function: function) if single else jax.vmap
-        value = vectorised(partial(_log_likelihood, self._model, model_args, kwargs))(z)
-        numbers = checks.concrete(value)
-        if numbers is not None and not np.all(np.isfinite(numbers)):
-            raise ValueError(
-                f"the starting point has log likelihood {numbers}, which must be finite. Start from another point: "
-                "MCMC.run(..., init_params=...), or EllipticalSlice(model, init_strategy=init_to_value(values=...))."
-            )
+            z = _checked_start(init_params, shapes, () if is_prng_key(rng_key) else rng_key.shape[:1])
+        value = of_chains(partial(_log_likelihood, self._model, args, kwargs), rng_key)(z)
+        check_start(value, "the starting point has log likelihood {}, which must be finite. Start from another point: "
+                           "MCMC.run(..., init_params=...), or EllipticalSlice(model, init_strategy=init_to_value("
+                           "values=...)).")
         value = jnp.where(jnp.isfinite(value), value, -jnp.inf)
         count = jnp.zeros(jnp.shape(value), int)
-        energy = -value - vectorised(partial(_log_prior, prior))(z)
-        self._sample_fn = self.sample
+        energy = -value - of_chains(partial(_log_prior, prior), rng_key)(z)
         return EllipticalSliceState(count, z, value, energy, count, prior, rng_key)
 
     def sample(
@@ -280,7 +249,7 @@ class EllipticalSlice(MCMCKernel):
     ) -> EllipticalSliceState:
         """Return the state after one step of every chain in ``state``."""
         prior = state.prior
-        assert prior is not None
+        assert prior is not None and self._model is not None
         log_likelihood = partial(_log_likelihood, self._model, model_args, model_kwargs or {})
 
         def one_chain(z: dict, value: jax.Array, key: jax.Array) -> tuple[SliceState, jax.Array, jax.Array]:
@@ -289,8 +258,7 @@ class EllipticalSlice(MCMCKernel):
             moved = elliptical_slice_step(key_step, SliceState(z, value), draw, log_likelihood, mean)
             return moved, -moved.log_likelihood - _log_prior(prior, moved.position), key
 
-        step = one_chain if is_prng_key(state.rng_key) else jax.vmap(one_chain)
-        moved, energy, rng_key = step(state.z, state.log_likelihood, state.rng_key)
+        moved, energy, rng_key = of_chains(one_chain, state.rng_key)(state.z, state.log_likelihood, state.rng_key)
         count = jnp.asarray(moved.evaluations)
         return EllipticalSliceState(state.i + 1, moved.position, moved.log_likelihood, energy, count, prior, rng_key)
 
@@ -312,10 +280,7 @@ class EllipticalSlice(MCMCKernel):
                 "init_strategy. Pass a point that the data allow: MCMC.run(..., init_params=...), or "
                 "EllipticalSlice(model, init_strategy=init_to_value(values=...))."
             ) from error
-        return jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf) * 1.0, info.param_info.z)
-
-    def __getstate__(self) -> dict:
-        return self.__dict__ | {"_sample_fn": None}
+        return floating(info.param_info.z)
 
 
 def _trace(model: Callable, args: tuple, kwargs: Mapping[str, Any], z: Mapping[str, Any]) -> dict[str, dict]:
@@ -444,4 +409,4 @@ def _checked_start(init_params: Any, shapes: Mapping[str, tuple[int, ...]], chai
     )
     if given != wanted:
         raise ValueError(f"init_params must be a dict of the latent sites with shapes {wanted}, got {given}.")
-    return {name: jnp.asarray(init_params[name]) * 1.0 for name in shapes}
+    return floating({name: init_params[name] for name in shapes})

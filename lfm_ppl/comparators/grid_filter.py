@@ -10,8 +10,8 @@ import numpy as np
 
 from lfm_ppl.comparators.finite_volume import Chain, Grid, propagate, transition
 from lfm_ppl.comparators.grid_model import WEIGHTS, Cells, on_grid
-from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays
-from lfm_ppl.linalg import cholesky, solve_lower, wrapped
+from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays, with_observations
+from lfm_ppl.linalg import cholesky, log_density, masked, solve_lower, wrapped
 from lfm_ppl.model.augment import StateSpaceModel
 
 _LARGEST_TABLE = 2**25
@@ -19,8 +19,6 @@ _LARGEST_TABLE = 2**25
 
 _MATRIX_COST = 6.0
 """A transition matrix takes about as long as this many propagations of one vector of masses."""
-
-_LOG_2PI = float(np.log(2.0 * np.pi))
 
 
 class Densities(NamedTuple):
@@ -45,26 +43,16 @@ def _log_likelihood_of_cells(cells: Cells, index: jax.Array, y: jax.Array) -> ja
     present = jnp.isfinite(y)[:, None, None, :]
     residual = jnp.where(present, y[:, None, None, :], 0.0) - value
     residual = jnp.where(cells.angular, wrapped(residual), residual)
-    residual = jnp.where(present, residual, 0.0)
-    if y.shape[-1] == 1:
-        variance = noise[..., 0]
-        log = -0.5 * (residual**2 / variance + jnp.log(variance) + _LOG_2PI)
-        log = jnp.where(present, log, 0.0)[..., 0]
-    else:
-        log = _log_normal(residual, noise, present)
+    log = jnp.vectorize(_log_density, signature="(d),(d,d),(d)->()")(residual, noise, present)
     return jax.scipy.special.logsumexp(log + np.log(0.5 * WEIGHTS), axis=-1)
 
 
-def _log_normal(residual: jax.Array, noise: jax.Array, present: jax.Array) -> jax.Array:
-    """Log density (B, N, G) of the present entries of ``residual`` (B, N, G, D), zero in the others."""
-    both = present[..., :, None] & present[..., None, :]
-    matrix = jnp.where(both, noise, jnp.eye(noise.shape[-1]))
-    flat = matrix.reshape(-1, *matrix.shape[-2:])
-    factor = jax.vmap(cholesky)(flat)
-    chol = jnp.where(factor.degenerate.any(-1)[:, None, None], jnp.nan, factor.chol).reshape(matrix.shape)
-    white = jnp.vectorize(solve_lower, signature="(d,d),(d)->(d)")(chol, residual)
-    diagonal = jnp.diagonal(chol, axis1=-2, axis2=-1)
-    return -0.5 * ((white**2).sum(-1) + present.sum(-1) * _LOG_2PI) - jnp.log(diagonal).sum(-1)
+def _log_density(residual: jax.Array, noise: jax.Array, present: jax.Array) -> jax.Array:
+    """Return the log density of the present entries of a residual (D,); NaN where the noise has none."""
+    residual, noise = masked(residual, noise, present)
+    factor = cholesky(noise)
+    value = log_density(solve_lower(factor.chol, residual), factor.chol, present)
+    return jnp.where(factor.degenerate.any(), jnp.nan, value)
 
 
 class Moves(NamedTuple):
@@ -115,8 +103,8 @@ def forward(moving: Moves, plan: Schedule, y: jax.Array, keep: bool = False) -> 
         y: (B, T, D), NaN where missing; all B data sets have the same times.
         keep: whether to keep the masses.
     """
-    cells, rows = moving.cells, as_arrays(plan.rows)
-    padded = jnp.concatenate([jnp.asarray(y, float), jnp.full((y.shape[0], 1, y.shape[2]), jnp.nan)], axis=1)
+    cells = moving.cells
+    rows, by_row = with_observations(plan.rows, jnp.moveaxis(y, 1, 0))
     walks = cells.chain if cells.chain.up.ndim > 1 else None
     start = jnp.broadcast_to(cells.initial, (y.shape[0], cells.initial.shape[0]))
 
@@ -135,8 +123,8 @@ def forward(moving: Moves, plan: Schedule, y: jax.Array, keep: bool = False) -> 
         out = (jnp.where(any_present, total, 0.0), *((predicted, filtered) if keep else (None, None)))
         return (filtered, jnp.maximum(reach, filtered.max(0))), out
 
-    inputs = (rows, walks, jnp.moveaxis(padded, 1, 0)[rows.observation])
-    (_, reach), (log, predicted, filtered) = jax.lax.scan(step, (start, jnp.zeros(start.shape[1])), inputs)
+    carry = start, jnp.zeros(start.shape[1])
+    (_, reach), (log, predicted, filtered) = jax.lax.scan(step, carry, (rows, walks, by_row))
     return Densities(log, predicted, filtered, reach)
 
 

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import logsumexp, ndtr
+from jax.scipy.stats import norm
 
 from lfm_ppl import checks
 
@@ -53,8 +54,7 @@ class Mixture(eqx.Module):
 
         NaN where that is, or where a component has no variance.
         """
-        away = jnp.asarray(value, float)[:, None, :] - self.mean
-        terms = -0.5 * (away**2 / self.variance + jnp.log(2 * np.pi * self.variance))
+        terms = norm.logpdf(jnp.asarray(value, float)[:, None, :], self.mean, jnp.sqrt(self.variance))
         return logsumexp(self.log_weights[:, :, None] + terms, axis=1)
 
     def quantiles(self, p: Any) -> jax.Array:

@@ -8,11 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl import checks
-from lfm_ppl.linalg import cholesky, solve_lower, wrapped
+from lfm_ppl import checks, linalg
+from lfm_ppl.linalg import cholesky, masked, solve_lower, wrapped
 from lfm_ppl.model.augment import StateSpaceModel
-
-_LOG_2PI = float(np.log(2.0 * np.pi))
 
 
 def log_density(ssm: StateSpaceModel, w: jax.Array, t: jax.Array, row: jax.Array,
@@ -33,12 +31,10 @@ def log_density(ssm: StateSpaceModel, w: jax.Array, t: jax.Array, row: jax.Array
     residual = jnp.where(present, y, 0.0) - ssm.observe(w, t)
     for index in ssm.model.observation.angular:
         residual = residual.at[index].set(wrapped(residual[index]))
-    residual = jnp.where(present, residual, 0.0)
-    both = present[:, None] & present[None, :]
-    factor = cholesky(jnp.where(both, ssm.noise_covariance(w, t, row), jnp.eye(y.shape[0])))
+    residual, noise = masked(residual, ssm.noise_covariance(w, t, row), present)
+    factor = cholesky(noise)
     white = solve_lower(factor.chol, residual)
-    value = -0.5 * ((white**2).sum() + present.sum() * _LOG_2PI) - jnp.log(jnp.diagonal(factor.chol)).sum()
-    return jnp.where(factor.degenerate.any(), -jnp.inf, value), white
+    return jnp.where(factor.degenerate.any(), -jnp.inf, linalg.log_density(white, factor.chol, present)), white
 
 
 def check_noise(ssm: StateSpaceModel, time: Any) -> None:

@@ -9,16 +9,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import logsumexp
 
 from lfm_ppl import checks
-from lfm_ppl.comparators.normals import normals
 from lfm_ppl.comparators.observation_noise import check_noise, log_density
-from lfm_ppl.comparators.resampling import RESAMPLING, effective_sample_size, resample
-from lfm_ppl.comparators.stochastic_steps import Prepared, advance, choose_scheme, prepare
+from lfm_ppl.comparators.resampling import RESAMPLING, effective_sample_size, resample, reweighted
+from lfm_ppl.comparators.stochastic_steps import Moves, Prepared, choose_scheme, first_particles
 from lfm_ppl.filtering.filter import check_observations, warn_single_precision
-from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays, schedule
-from lfm_ppl.linalg import matmul, semidefinite_root
+from lfm_ppl.filtering.schedule import Rows, Schedule, schedule, with_observations
 from lfm_ppl.model.augment import StateSpaceModel, state_space
 from lfm_ppl.model.latent_force_model import LatentForceModel
 
@@ -200,55 +197,36 @@ def forward(ssm: StateSpaceModel, plan: Schedule, y: jax.Array, key: jax.Array, 
             keep: Callable[[Step], Any]) -> Any:
     """Run over the rows and return ``keep`` of each, stacked."""
     first_key, rows_key = jax.random.split(key)
-    mean, covariance = ssm.initial()
     size = settings.particles
-    state = mean[:, None] + matmul(semidefinite_root(covariance), normals(first_key, ssm.state_dim, size))
-    table = None if plan.lengths is None else jax.vmap(
-        lambda length: prepare(ssm, settings.scheme, length, plan.steps))(jnp.asarray(plan.lengths))
-    padded = jnp.concatenate([jnp.asarray(y, float), jnp.full((1, ssm.output_dim), jnp.nan)])
+    state = first_particles(first_key, *ssm.initial(), size)
+    moves = Moves.over(ssm, settings.scheme, plan)
 
     def row(carry: tuple[jax.Array, jax.Array], inputs: tuple[Rows, jax.Array, jax.Array]) -> tuple[tuple, Any]:
         state, log_weights = carry
         one, observed, row_key = inputs
         keys = jax.random.split(row_key, 3)
-        ready = (prepare(ssm, settings.scheme, one.length, plan.steps) if table is None
-                 else jax.tree_util.tree_map(lambda a: a[one.kind], table))
+        ready = moves.ready(one)
         state, log_density = _in_batches(
-            lambda k, s: _move(ssm, settings, plan, ready, one, observed, k, s), keys[0], state, settings.batch)
+            lambda k, s: _move(moves, ready, one, observed, k, s), keys[0], state, settings.batch)
         state, log_weights, step = _weigh(settings, keys[1], state, log_weights, log_density, one.observation >= 0)
         return (state, log_weights), keep(step)
 
     start = (state, jnp.full(size, -np.log(size)))
-    rows = as_arrays(plan.rows)
-    keys = jax.random.split(rows_key, rows.start.shape[0])
-    return jax.lax.scan(row, start, (rows, padded[rows.observation], keys))[1]
+    rows, by_row = with_observations(plan.rows, y)
+    keys = jax.random.split(rows_key, by_row.shape[0])
+    return jax.lax.scan(row, start, (rows, by_row, keys))[1]
 
 
-def _move(ssm: StateSpaceModel, settings: ParticleSettings, plan: Schedule, ready: Prepared, row: Rows,
-          observed: jax.Array, key: jax.Array, state: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Move particles over a row, let the forces jump at its end, and score the observation there."""
+def _move(moves: Moves, ready: Prepared, row: Rows, observed: jax.Array, key: jax.Array,
+          state: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Move particles over a row, and score the observation at its end."""
     move_key, jump_key = jax.random.split(key)
-    move = lambda s: advance(  # noqa: E731
-        ssm, settings.scheme, ready, normals, move_key, s, row.start, row.length, plan.steps)
-    if plan.replicated:
-        state = jax.lax.cond(row.length > 0, move, lambda s: s, state)
-    else:
-        state = move(state)
-    jumps = ssm.stack.jump_table()
-    if jumps is not None:
-        state = jax.lax.cond(row.jump >= 0, lambda s: _jumped(ssm, jumps, row.jump, jump_key, s), lambda s: s, state)
+    state = moves.across(row, ready, move_key, jump_key, state)
     end = row.start + row.length
-    density = jax.vmap(lambda s: log_observation(ssm, s, end, jnp.maximum(row.observation, 0), observed),
+    density = jax.vmap(lambda s: log_observation(moves.ssm, s, end, jnp.maximum(row.observation, 0), observed),
                        in_axes=-1)(state)
     possible = jnp.isfinite(state).all(axis=0) & ~jnp.isnan(density)
     return state, jnp.where(possible, density, -jnp.inf)
-
-
-def _jumped(ssm: StateSpaceModel, jumps: tuple[jax.Array, jax.Array], index: jax.Array, key: jax.Array,
-            state: jax.Array) -> jax.Array:
-    noise = normals(key, ssm.force_dim, state.shape[1])
-    forces = matmul(jumps[0][index], state[ssm.physical_dim:]) + matmul(semidefinite_root(jumps[1][index]), noise)
-    return jnp.concatenate([state[:ssm.physical_dim], forces])
 
 
 def log_observation(ssm: StateSpaceModel, s: jax.Array, t: jax.Array, row: jax.Array, y: jax.Array) -> jax.Array:
@@ -260,11 +238,7 @@ def _weigh(settings: ParticleSettings, key: jax.Array, state: jax.Array, log_wei
            log_density: jax.Array, observed: jax.Array) -> tuple[jax.Array, jax.Array, Step]:
     size = settings.particles
     equal = jnp.full(size, -np.log(size))
-    joint = log_weights + log_density
-    total = logsumexp(joint)
-    # Where no particle explains the observation the estimate is zero for good; the particles go on as they are.
-    alive = jnp.isfinite(total)
-    log_weights = jnp.where(alive, joint - jnp.where(alive, total, 0.0), equal)
+    log_weights, total = reweighted(log_weights, log_density, equal)
     weights = jnp.exp(log_weights)
     ess = effective_sample_size(weights)
     needed = observed & (ess < settings.threshold * size) if settings.threshold < 1.0 else observed

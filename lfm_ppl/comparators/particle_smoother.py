@@ -14,8 +14,8 @@ from lfm_ppl.comparators.particle_filter import ParticleSettings, Step, check_se
 from lfm_ppl.comparators.stochastic_steps import choose_scheme
 from lfm_ppl.filtering.predict import exact_offset
 from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays
-from lfm_ppl.filtering.transition import Exact, exact, linear_part
-from lfm_ppl.linalg import cholesky, matmul, solve_lower
+from lfm_ppl.filtering.transition import exact
+from lfm_ppl.linalg import cholesky, log_density, matmul, solve_lower
 from lfm_ppl.model.augment import StateSpaceModel, state_space
 from lfm_ppl.model.latent_force_model import LatentForceModel
 
@@ -173,7 +173,7 @@ def _obstacle(ssm: StateSpaceModel) -> str:
     if ssm.stack.jump_times:
         return "a force jumps"
     if ssm.time_invariant:
-        noise = exact(ssm, linear_part(ssm, jnp.zeros(())), jnp.ones(()), 1).noise
+        noise = exact(ssm, jnp.ones(()), 1).noise
         return "" if _regular(noise) else "not every state of this linear model has noise"
     time = 0.0 if ssm.model.initial_time is None else ssm.model.initial_time
     w = jnp.concatenate([ssm.model.initial_state.mean, ssm.stack.mean_at(time)])
@@ -234,7 +234,8 @@ def _drawn_back(ssm: StateSpaceModel, settings: ParticleSettings, plan: Schedule
 
     def one(pair: tuple[jax.Array, jax.Array]) -> jax.Array:
         following, uniform = pair
-        density = jax.vmap(_log_normal, in_axes=(None, -1, -1 if chol.ndim == 3 else None))(following, mean, chol)
+        density = jax.vmap(lambda m, c: log_density(solve_lower(c, following - m), c),
+                           in_axes=(-1, -1 if chol.ndim == 3 else None))(mean, chol)
         return _choose_at(uniform, log_weights + jnp.where(jnp.isnan(density), -jnp.inf, density))
 
     size = max(1, min(later.shape[0], _BLOCK // state.shape[1]))
@@ -245,7 +246,7 @@ def _transition(ssm: StateSpaceModel, scheme: str, row: Rows, steps: int,
                 state: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return the means (n, N) of the next state, and the factor of its covariance, (n, n) or (n, n, N)."""
     if scheme == "exact":
-        whole: Exact = exact(ssm, linear_part(ssm, jnp.zeros(())), row.length, steps)
+        whole = exact(ssm, row.length, steps)
         offset = exact_offset(ssm, whole, steps, row.start, row.length)
         return matmul(whole.phi, state) + offset[:, None], cholesky(whole.noise).chol
     size = ssm.physical_dim
@@ -262,12 +263,6 @@ def _transition(ssm: StateSpaceModel, scheme: str, row: Rows, steps: int,
     if callable(ssm.model.process_noise):
         return jax.vmap(one, in_axes=-1, out_axes=(-1, -1))(state)
     return jax.vmap(one, in_axes=-1, out_axes=(-1, None))(state)
-
-
-def _log_normal(x: jax.Array, mean: jax.Array, chol: jax.Array) -> jax.Array:
-    """Return the log density up to its constant."""
-    white = solve_lower(chol, x - mean)
-    return -0.5 * (white**2).sum() - jnp.log(jnp.diagonal(chol)).sum()
 
 
 def _choose(key: jax.Array, log_weights: jax.Array) -> jax.Array:

@@ -23,12 +23,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import logsumexp
 
 from lfm_ppl import checks
 from lfm_ppl.comparators.mixture import Mixture
 from lfm_ppl.comparators.normals import normals
-from lfm_ppl.comparators.resampling import RESAMPLING, effective_sample_size, resample
+from lfm_ppl.comparators.resampling import RESAMPLING, effective_sample_size, resample, reweighted
 from lfm_ppl.comparators.switched_model import (
     Affine,
     Build,
@@ -42,7 +41,7 @@ from lfm_ppl.comparators.switched_model import (
 )
 from lfm_ppl.filtering.filter import FilterState, check_observations, warn_single_precision
 from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays
+from lfm_ppl.filtering.schedule import Rows, Schedule, with_observations
 from lfm_ppl.filtering.update import Linearised, Update, update
 from lfm_ppl.linalg import congruence, matmul, semidefinite_root, solve_semidefinite
 from lfm_ppl.model.augment import StateSpaceModel
@@ -163,7 +162,6 @@ def _run(ssms: tuple[StateSpaceModel, ...], rule: SwitchingRule, plan: Schedule,
          settings: _Settings) -> RaoBlackwellisedResult:
     size = settings.particles
     maps = [row_maps(ssm, rule, plan) for ssm in ssms]
-    padded = jnp.concatenate([y, jnp.full((1, y.shape[1]), jnp.nan)])
     equal = jnp.full(size, -np.log(size))
 
     def row(particles: _Particles, inputs: tuple[Rows, jax.Array, jax.Array, jax.Array]) -> tuple[_Particles, tuple]:
@@ -190,9 +188,8 @@ def _run(ssms: tuple[StateSpaceModel, ...], rule: SwitchingRule, plan: Schedule,
     first = _Particles(jnp.broadcast_to(begin.mean, (size, *begin.mean.shape)),
                        covariance if settings.shared else jnp.broadcast_to(covariance, (size, *covariance.shape)),
                        initial, equal)
-    rows = as_arrays(plan.rows)
     keys = jax.random.split(key, decides.shape[0])
-    _, kept = jax.lax.scan(row, first, (rows, padded[rows.observation], decides, keys))
+    _, kept = jax.lax.scan(row, first, (*with_observations(plan.rows, y), decides, keys))
     at = tuple(part[jnp.asarray(plan.observed)] for part in kept)
     mean, covariance, middle, variance, noise, log_weights, inputs, ess, log_likelihood = at
     return RaoBlackwellisedResult(times, log_likelihood, mean, covariance, Mixture(middle, variance, log_weights),
@@ -222,11 +219,7 @@ def _observe(ssm: StateSpaceModel, particles: _Particles, own: Affine, observed:
 
     new = jax.vmap(one, (0, at, at, 0, at), Update(Moments(0, at), 0, 0, at, at, at, at))(  # type: ignore[arg-type]
         value, own.slope, own.variance, particles.mean, particles.covariance)
-    joint = particles.log_weights + new.log_likelihood
-    total = logsumexp(joint)
-    # Where no particle explains the observation the estimate is zero; the particles go on as they are.
-    alive = jnp.isfinite(total)
-    log_weights = jnp.where(alive, joint - jnp.where(alive, total, 0.0), particles.log_weights)
+    log_weights, total = reweighted(particles.log_weights, new.log_likelihood, particles.log_weights)
     seen = jnp.isfinite(observed).any()
     return (particles._replace(mean=new.moments.mean, covariance=new.moments.covariance, log_weights=log_weights),
             jnp.where(seen, jnp.where(jnp.isnan(total), -jnp.inf, total), 0.0))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+from jax.scipy.special import logsumexp
 
 RESAMPLING = ("systematic", "stratified", "multinomial")
 
@@ -44,6 +45,18 @@ def resample(key: jax.Array, weights: jax.Array, scheme: str) -> jax.Array:
     found = jnp.searchsorted(cumulative, points * cumulative[-1], side="right")
     last = size - 1 - jnp.argmax(weights[::-1] > 0)
     return jnp.minimum(found, last).astype(int)
+
+
+def reweighted(log_weights: jax.Array, log_density: jax.Array, otherwise: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Multiply normalised weights (N,) by densities (N,); return the new weights, normalised, and the log of their sum.
+
+    Where no particle explains what was seen the estimate is zero for good, and the particles go on with the weights
+    ``otherwise``.
+    """
+    joint = log_weights + log_density
+    total = logsumexp(joint)
+    alive = jnp.isfinite(total)
+    return jnp.where(alive, joint - jnp.where(alive, total, 0.0), otherwise), total
 
 
 def effective_sample_size(weights: jax.Array) -> jax.Array:

@@ -15,8 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import checks
+from lfm_ppl.comparators.normals import normals
 from lfm_ppl.filtering.predict import exact_offset
-from lfm_ppl.filtering.transition import Exact, exact, linear_part
+from lfm_ppl.filtering.schedule import Rows, Schedule, by_length
+from lfm_ppl.filtering.transition import Exact, exact
 from lfm_ppl.forces.discretise import discretise
 from lfm_ppl.linalg import matmul, semidefinite_root
 from lfm_ppl.model.augment import StateSpaceModel, just_before
@@ -70,7 +72,7 @@ def choose_scheme(ssm: StateSpaceModel, wanted: str) -> str:
 def prepare(ssm: StateSpaceModel, scheme: str, length: jax.Array, steps: int) -> Prepared:
     """Return what the steps of a row of ``length`` share."""
     if scheme == "exact":
-        whole = exact(ssm, linear_part(ssm, jnp.zeros(())), length, steps)
+        whole = exact(ssm, length, steps)
         nothing = jnp.zeros((0, 0))
         return Prepared(nothing, nothing, semidefinite_root(whole.noise), whole)
     size, h = ssm.force_dim, length / steps
@@ -85,6 +87,53 @@ def prepare(ssm: StateSpaceModel, scheme: str, length: jax.Array, steps: int) ->
     forces, force_noise = ssm.stack.discretise(h)
     noise = noise.at[:size, :size].set(force_noise)
     return Prepared(forces, transition[size:, :size], semidefinite_root(noise))
+
+
+def first_particles(key: jax.Array, mean: jax.Array, covariance: jax.Array, count: int) -> jax.Array:
+    """Draw particles (n, N) of a Gaussian."""
+    return mean[:, None] + matmul(semidefinite_root(covariance), normals(key, mean.shape[0], count))
+
+
+class Moves(NamedTuple):
+    """How particles cross the rows of a plan.
+
+    Attributes:
+        ssm: the model.
+        scheme: one of `SCHEMES`.
+        plan: the rows.
+        ready: from a row to what `prepare` gives for its length.
+        jumps: of the forces, `Stack.jump_roots`.
+    """
+
+    ssm: StateSpaceModel
+    scheme: str
+    plan: Schedule
+    ready: Callable[[Rows], Prepared]
+    jumps: tuple[jax.Array, jax.Array] | None
+
+    @classmethod
+    def over(cls, ssm: StateSpaceModel, scheme: str, plan: Schedule) -> Moves:
+        """Prepare what the rows share."""
+        ready = by_length(plan, lambda length: prepare(ssm, scheme, length, plan.steps))
+        return cls(ssm, scheme, plan, ready, ssm.stack.jump_roots())
+
+    def across(self, row: Rows, ready: Prepared, move_key: jax.Array, jump_key: jax.Array,
+               state: jax.Array) -> jax.Array:
+        """Move particles (n, N) over a row, and let the forces jump at its end."""
+        size = self.ssm.physical_dim
+
+        def move(state: jax.Array) -> jax.Array:
+            return advance(self.ssm, self.scheme, ready, normals, move_key, state, row.start, row.length,
+                           self.plan.steps)
+
+        def jump(state: jax.Array) -> jax.Array:
+            gain, root = (table[row.jump] for table in self.jumps or ())
+            noise = matmul(root, normals(jump_key, self.ssm.force_dim, state.shape[1]))
+            return jnp.concatenate([state[:size], matmul(gain, state[size:]) + noise])
+
+        stay = lambda state: state  # noqa: E731
+        state = jax.lax.cond(row.length > 0, move, stay, state) if self.plan.replicated else move(state)
+        return state if self.jumps is None else jax.lax.cond(row.jump >= 0, jump, stay, state)
 
 
 def advance(ssm: StateSpaceModel, scheme: str, prepared: Prepared, draw: Callable, key: jax.Array, state: jax.Array,

@@ -10,12 +10,12 @@ import jax.numpy as jnp
 
 from lfm_ppl import checks
 from lfm_ppl.comparators.normals import normals
-from lfm_ppl.comparators.stochastic_steps import advance, choose_scheme, prepare
+from lfm_ppl.comparators.stochastic_steps import Moves, choose_scheme, first_particles
 from lfm_ppl.comparators.switched_model import Build, check_initial, first_moments, plan_rows, switched
 from lfm_ppl.filtering.filter import FilterState
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays
-from lfm_ppl.linalg import matmul, semidefinite_root
+from lfm_ppl.linalg import semidefinite_root
 from lfm_ppl.model.augment import StateSpaceModel
 from lfm_ppl.model.simulate import noisy_observation
 from lfm_ppl.model.switching import SwitchingRule
@@ -93,28 +93,16 @@ def _run(ssms: tuple[StateSpaceModel, ...], schemes: tuple[str, ...], rule: Swit
     ssm, paths = ssms[0], initial.shape[0]
     size = ssm.physical_dim
     first_key, rows_key, noise_key = jax.random.split(key, 3)
-    first = begin.mean[:, None] + matmul(semidefinite_root(begin.covariance), normals(first_key, ssm.state_dim, paths))
+    first = first_particles(first_key, *begin, paths)
     error = semidefinite_root(jnp.diag(rule.variance()))
-    tables = [None if plan.lengths is None else jax.vmap(
-        lambda length, own=own, scheme=scheme: prepare(own, scheme, length, plan.steps))(jnp.asarray(plan.lengths))
-        for own, scheme in zip(ssms, schemes, strict=True)]
-    jumps = [None if (table := own.stack.jump_table()) is None else (table[0], jax.vmap(semidefinite_root)(table[1]))
-             for own in ssms]
+    moves = [Moves.over(own, scheme, plan) for own, scheme in zip(ssms, schemes, strict=True)]
 
     def row(carry: tuple[jax.Array, jax.Array], inputs: tuple[Rows, jax.Array, jax.Array]) -> tuple[tuple, tuple]:
         state, index = carry
         one, decide, row_key = inputs
         move_key, jump_key, read_key = jax.random.split(row_key, 3)
         end = one.start + one.length
-        moved = []
-        for own, scheme, table, jump in zip(ssms, schemes, tables, jumps, strict=True):
-            ready = (prepare(own, scheme, one.length, plan.steps) if table is None
-                     else jax.tree_util.tree_map(lambda a: a[one.kind], table))
-            then = advance(own, scheme, ready, normals, move_key, state, one.start, one.length, plan.steps)
-            if jump is not None:
-                kick = matmul(jump[1][one.jump], normals(jump_key, own.force_dim, paths))
-                then = jnp.concatenate([then[:size], matmul(jump[0][one.jump], then[size:]) + kick])
-            moved.append(then)
+        moved = [move.across(one, move.ready(one), move_key, jump_key, state) for move in moves]
         state = jnp.take_along_axis(jnp.stack(moved), index[None, None, :], axis=0)[0]
         before = index
 

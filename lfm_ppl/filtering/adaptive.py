@@ -25,6 +25,7 @@ from lfm_ppl.filtering.predict import (
     Moments,
     Prediction,
     Stage,
+    compose,
     linearised,
     same_at_all_times,
     smallest_spread,
@@ -32,7 +33,7 @@ from lfm_ppl.filtering.predict import (
     unmoved,
 )
 from lfm_ppl.filtering.transition import LinearPart, integrating_factor
-from lfm_ppl.linalg import congruence, matmul
+from lfm_ppl.linalg import matmul
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.augment import StateSpaceModel, just_before
 
@@ -103,7 +104,7 @@ def predict_row_adaptively(ssm: StateSpaceModel, rule: Rule, linear: LinearPart,
         growth = jnp.clip(_SAFETY * jnp.maximum(error, 1e-12) ** -0.25, _SHORTEST, _LONGEST)
         phi, noise = now.phi, now.noise
         if flow:
-            phi, noise = matmul(one.phi, phi), congruence(one.phi, noise) + one.noise
+            phi, noise = compose((phi, noise), (one.phi, one.noise))
         made = _Position(jnp.where(last, 0.0, now.left - h), stop(h * growth), one.moments, phi, noise, then)
         again = now._replace(length=stop(h * growth))
         accepted = (error <= 1.0) | (jnp.isfinite(error) & (h < _SHORT * length))

@@ -8,12 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.filtering.filter import integrate, preparation, step_transition
+from lfm_ppl.filtering.filter import integrate, step_transition
 from lfm_ppl.filtering.jumps import after_jump
 from lfm_ppl.filtering.predict import Moments, Prediction
 from lfm_ppl.filtering.retrospect import combine, given_later
 from lfm_ppl.filtering.rts import at_start
 from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays
+from lfm_ppl.filtering.transition import linear_part
 from lfm_ppl.linalg import congruence, matmul
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.augment import StateSpaceModel
@@ -80,8 +81,7 @@ def marginals_between(ssm: StateSpaceModel, rule: Rule, given: Branches, start: 
         where: the requested times.
     """
     plan, filtered, smoothed, adjoint, about = given
-    prepared = preparation(ssm, rule, plan)
-    linear, jumps = prepared.linear, prepared.jumps
+    linear, jumps = linear_part(ssm, jnp.asarray(plan.initial_time, float)), ssm.stack.jump_table()
     before = at_start(filtered, start)
     rows = as_arrays(plan.rows)
 

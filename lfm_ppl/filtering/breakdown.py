@@ -12,7 +12,7 @@ import numpy as np
 from lfm_ppl import checks
 from lfm_ppl.filtering.filter import Pass, forward
 from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.filtering.schedule import Rows, Schedule
+from lfm_ppl.filtering.schedule import Rows, Schedule, per_step
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.augment import StateSpaceModel
 
@@ -60,15 +60,12 @@ def breakdown(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: Any, start: M
     rows = jax.tree_util.tree_map(np.asarray, plan.rows)
     before = start if row == 0 else Moments(passed.filtered.mean[row - 1], passed.filtered.covariance[row - 1])
     count = 1 if ssm.time_invariant or plan.tolerance is not None else plan.steps
-    one = Rows(*(np.asarray(column)[row] for column in rows))
-    width = one.length / count
-    last = np.arange(count) == count - 1
-    pieces = Rows(one.start + width * np.arange(count), np.full(count, width), np.where(last, one.observation, -1),
-                  np.where(last, one.jump, -1), np.zeros(count, int))
-    nodes = np.arange(count)
-    by_step = plan._replace(rows=pieces, lengths=None, observed=nodes, requested=nodes, requested_times=pieces.start,
-                            steps=plan.steps if plan.tolerance is not None else 1, replicated=False)
-    stepped = _run(ssm, rule, by_step, y, before)
+    one = Rows(*(column[row:row + 1] for column in rows))
+    first = np.zeros(1, int)
+    single = plan._replace(rows=one._replace(kind=first), lengths=None, observed=first, requested=first,
+                           requested_times=one.start, replicated=False)
+    stepped = _run(ssm, rule, single if plan.tolerance is not None else per_step(single._replace(steps=count)), y,
+                   before)
     step = _first_bad(stepped)
     # Steps of their own differ by rounding, and need not break down.
     found, at = (passed, row) if step is None else (stepped, step)
@@ -79,7 +76,7 @@ def breakdown(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: Any, start: M
     time = float(rows.start[end] + rows.length[end])
     where = f"row {later[0]} (time {time:.6g})" if later.size else f"time {time:.6g}, after the last observation"
     if count > 1 and step is not None:
-        where += f", step {step + 1} of {count} from time {float(one.start):.6g} to {float(one.start + one.length):.6g}"
+        where += f", step {step + 1} of {count} from time {one.start[0]:.6g} to {one.start[0] + one.length[0]:.6g}"
     remedy = ("Try a tighter prior, an observation noise that is not so small, or other units" if ssm.time_invariant
               else "Try more steps (up to five times their number are tried), a larger tolerance, another rule, or a "
               "tighter prior" if plan.tolerance is not None

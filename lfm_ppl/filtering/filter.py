@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -13,7 +12,7 @@ import numpy as np
 
 from lfm_ppl import checks
 from lfm_ppl.filtering.adaptive import predict_row_adaptively
-from lfm_ppl.filtering.jumps import after_jump
+from lfm_ppl.filtering.jumps import after_jump, jump_map
 from lfm_ppl.filtering.predict import (
     FLOOR,
     Moments,
@@ -23,20 +22,15 @@ from lfm_ppl.filtering.predict import (
     row_factor,
     unmoved,
 )
-from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays, schedule
-from lfm_ppl.filtering.transition import (
-    Factor,
-    LinearPart,
-    constant_slope,
-    exact,
-    linear_part,
-)
+from lfm_ppl.filtering.schedule import Rows, Schedule, by_length, schedule, with_observations
+from lfm_ppl.filtering.transition import Factor, LinearPart, constant_slope, exact, linear_part
 from lfm_ppl.filtering.update import FACTOR, FAILED, linearise_observation, update
 from lfm_ppl.linalg import congruence, diagonal, matmul, safe_sqrt, solve_lower
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.linearisation.sigma_points import Cubature, SigmaPointRule
 from lfm_ppl.model.augment import StateSpaceModel, state_space
 from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.resolution import check_resolution
 
 _FEW_LENGTHS = 16
 """Distinct lengths of the rows up to which it costs nothing to tabulate more of each than the row would need."""
@@ -124,8 +118,7 @@ def _inside(ssm: StateSpaceModel, rule: Rule, plan: Schedule, prepared: Preparat
     mean, own, phi = steps
     to_end = jnp.eye(ssm.state_dim)
     if prepared.jumps is not None:
-        still = Prediction(Moments(jnp.zeros(ssm.state_dim), to_end), to_end, to_end)
-        to_end = after_jump(ssm, prepared.jumps, row.jump, still, flow=True).phi
+        to_end, _ = jump_map(ssm, prepared.jumps, row.jump)
 
     def back(to_end: jax.Array, at: tuple) -> tuple[jax.Array, jax.Array]:
         own, phi = at
@@ -154,69 +147,38 @@ def _contiguous(indices: np.ndarray) -> bool:
     return bool((np.diff(indices) == 1).all())
 
 
-class Table:
-    """A function of the interval length, tabulated: all arrays that it returns make one row for each length.
-
-    The row is read, and in reverse mode written, at once; array by array that took many more operations to compile.
-
-    Args:
-        function: of a length, a scalar, to a pytree of arrays.
-        lengths: (U,).
-    """
-
-    def __init__(self, function: Callable[[jax.Array], Any], lengths: jax.Array) -> None:
-        leaves, self._tree = jax.tree_util.tree_flatten(jax.vmap(function)(lengths))
-        self._shapes = [leaf.shape[1:] for leaf in leaves]
-        self._rows = jnp.concatenate([leaf.reshape(len(lengths), -1) for leaf in leaves], axis=1) if leaves else None
-
-    def at(self, index: jax.Array) -> Any:
-        """Return what the function gave at one of the lengths."""
-        if self._rows is None:
-            return jax.tree_util.tree_unflatten(self._tree, [])
-        row = jax.lax.dynamic_index_in_dim(self._rows, index, keepdims=False)
-        parts = jnp.split(row, np.cumsum([math.prod(shape) for shape in self._shapes])[:-1])
-        return jax.tree_util.tree_unflatten(
-            self._tree, [part.reshape(shape) for part, shape in zip(parts, self._shapes, strict=True)])
-
-
 class Preparation(NamedTuple):
     """What the rows of a scan share.
 
     Attributes:
         linear: the constant linear part of the dynamics.
         jacobian: (D, M + R), the constant part of the observation's.
-        table: transitions of the distinct lengths; None where they are computed row by row.
+        transition: from a row to what `step_transition` gives for its length.
         jumps: G and Q of the forces' jumps, None without any.
     """
 
     linear: LinearPart
     jacobian: jax.Array
-    table: Table | None
+    transition: Callable[[Rows], Any]
     jumps: tuple[jax.Array, jax.Array] | None
 
 
 def preparation(ssm: StateSpaceModel, rule: Rule, plan: Schedule) -> Preparation:
     """Compute what the rows of a scan share."""
     linear = linear_part(ssm, jnp.asarray(plan.initial_time, float))
-    table = None
-    if plan.lengths is not None:
-        few = len(plan.lengths) <= _FEW_LENGTHS
-        table = Table(lambda length: step_transition(ssm, rule, linear, plan, length, few), jnp.asarray(plan.lengths))
-    return Preparation(linear, _observation_slope(ssm, plan), table, ssm.stack.jump_table())
-
-
-def row_transition(ssm: StateSpaceModel, rule: Rule, plan: Schedule, prepared: Preparation, row: Rows) -> Any:
-    """Return the exact transition of a row, or the integrating factor of its steps."""
-    if prepared.table is None:
-        return step_transition(ssm, rule, prepared.linear, plan, row.length)
-    return prepared.table.at(row.kind)
+    few = plan.lengths is not None and len(plan.lengths) <= _FEW_LENGTHS
+    transition = by_length(plan, lambda length: step_transition(ssm, rule, linear, plan, length, few))
+    return Preparation(linear, _observation_slope(ssm, plan), transition, ssm.stack.jump_table())
 
 
 def step_transition(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, plan: Schedule, length: jax.Array,
                     tabulated: bool = False) -> Any:
-    """Return what a row of this length shares; None where the steps have lengths of their own."""
+    """Return the exact transition over this length, or the integrating factor of its steps.
+
+    None where the steps have lengths of their own. What a row would compute for itself is ``tabulated``, too.
+    """
     if ssm.time_invariant:
-        return exact(ssm, linear, length, plan.steps)
+        return exact(ssm, length, plan.steps, linear)
     if plan.tolerance is not None:
         return None
     return row_factor(ssm, rule, linear, length, plan.steps, tabulated)
@@ -257,7 +219,7 @@ def predict(ssm: StateSpaceModel, rule: Rule, plan: Schedule, prepared: Preparat
             nodes: Moments | None = None, flow: bool = False,
             each: Callable[[Prediction], Any] | None = None) -> Prediction:
     """Predict over a row, a jump at its end included; arguments as in `predict_row`."""
-    transition = row_transition(ssm, rule, plan, prepared, row)
+    transition = prepared.transition(row)
     if ssm.time_invariant:
         one = predict_exact(ssm, transition, plan.steps, row.start, row.length, moments)
     else:
@@ -326,13 +288,10 @@ def forward(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, *, s
                                steps=steps)
         return new.moments, out
 
-    padded = jnp.concatenate([jnp.asarray(y, float), jnp.full((1, ssm.output_dim), jnp.nan)])
-    rows = as_arrays(plan.rows)
     first = Moments(*ssm.initial()) if start is None else start
-    scale = _output_scale(ssm, plan, prepared, padded, first)
-    _, passed = jax.lax.scan(jax.checkpoint(step, prevent_cse=False, policy=_KEPT), first,
-                             (rows, padded[rows.observation], about))
-    return passed
+    scale = _output_scale(ssm, plan, prepared, jnp.asarray(y, float), first)
+    inputs = (*with_observations(plan.rows, y), about)
+    return jax.lax.scan(jax.checkpoint(step, prevent_cse=False, policy=_KEPT), first, inputs)[1]
 
 
 def _output_scale(ssm: StateSpaceModel, plan: Schedule, prepared: Preparation, y: jax.Array,
@@ -428,7 +387,7 @@ def filter(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
     plan = schedule(ssm, times, steps, max_step, initial_time=None if start is None else start.time,
                     tolerance=tolerance)
     model.check_at(plan.initial_time, len(plan.observed))
-    model.check_resolution(times, y)
+    check_resolution(model, times, y)
     y = check_observations(y, len(plan.observed), ssm.output_dim, empty=start is not None)
     warn_single_precision()
     begin = None if start is None else Moments(start.mean, start.covariance)

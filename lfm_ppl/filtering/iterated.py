@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,11 +10,11 @@ import numpy as np
 
 from lfm_ppl.filtering.between import Branches
 from lfm_ppl.filtering.filter import Pass, Points, completed, forward, needed
-from lfm_ppl.filtering.jumps import after_jump
-from lfm_ppl.filtering.predict import Moments, Prediction
+from lfm_ppl.filtering.jumps import jump_map
+from lfm_ppl.filtering.predict import Moments, compose
 from lfm_ppl.filtering.retrospect import combine, given_later
 from lfm_ppl.filtering.rts import Smoothed, backward
-from lfm_ppl.filtering.schedule import Rows, Schedule
+from lfm_ppl.filtering.schedule import Schedule, per_step
 from lfm_ppl.linalg import congruence, matmul, safe_sqrt
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.augment import StateSpaceModel
@@ -105,33 +105,15 @@ def _to_end(ssm: StateSpaceModel, plan: Schedule, passed: Pass) -> tuple[jax.Arr
     identity = jnp.broadcast_to(jnp.eye(phi.shape[-1]), phi[:, 0].shape)
     last = identity, jnp.zeros_like(identity)
     if (jumps := ssm.stack.jump_table()) is not None:
-        still = Prediction(Moments(jnp.zeros(identity.shape[:2]), last[1]), *last)
-        jumped = jax.vmap(lambda jump, one: after_jump(ssm, jumps, jump, one, flow=True))(
-            jnp.asarray(plan.rows.jump), still)
-        last = jumped.phi, jumped.noise
+        last = jax.vmap(lambda index: jump_map(ssm, jumps, index))(jnp.asarray(plan.rows.jump))
 
     def step(later: tuple, one: tuple) -> tuple[tuple, tuple]:
-        now = matmul(later[0], one[0]), congruence(later[0], one[1]) + later[1]
+        now = compose(one, later)
         return now, now
 
     _, found = jax.lax.scan(step, last, tuple(jnp.moveaxis(a, 1, 0) for a in (phi, noise)), reverse=True)
     return (jnp.concatenate([jnp.moveaxis(found[0], 0, 1), last[0][:, None]], axis=1),
             jnp.concatenate([jnp.moveaxis(found[1], 0, 1), last[1][:, None]], axis=1))
-
-
-def per_step(plan: Schedule) -> Schedule:
-    """Return the plan with a row for each integration step."""
-    rows, steps = plan.rows, plan.steps
-    # In NumPy where the plan is known, so that requested times can be found in it before compilation.
-    xp: Any = np if isinstance(rows.length, np.ndarray) else jnp
-    index = np.tile(np.arange(steps), len(rows.length))
-    start, length, observation, jump, kind = (xp.repeat(a, steps) for a in rows)
-    last = index == steps - 1
-    length = length / steps
-    fine = Rows(start + index * length, length, xp.where(last, observation, -1), xp.where(last, jump, -1), kind)
-    lengths = None if plan.lengths is None else plan.lengths / steps
-    return plan._replace(rows=fine, lengths=lengths, steps=1, observed=plan.observed * steps + steps - 1,
-                         requested=plan.requested * steps + steps - 1)
 
 
 def refined(ssm: StateSpaceModel, rule: Rule, plan: Schedule, found: Iterated, passed: Pass,

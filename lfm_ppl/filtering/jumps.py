@@ -5,9 +5,15 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from lfm_ppl.filtering.predict import Moments, Prediction
-from lfm_ppl.linalg import congruence, matmul
+from lfm_ppl.filtering.predict import Prediction, compose, moved
 from lfm_ppl.model.augment import StateSpaceModel
+
+
+def jump_map(ssm: StateSpaceModel, jumps: tuple[jax.Array, jax.Array], index: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return the map s -> phi s + N(0, noise) of the joint state that a jump is; arguments as in `after_jump`."""
+    size = ssm.physical_dim
+    return (jax.scipy.linalg.block_diag(jnp.eye(size), jumps[0][index]),
+            jax.scipy.linalg.block_diag(jnp.zeros((size, size)), jumps[1][index]))
 
 
 def after_jump(ssm: StateSpaceModel, jumps: tuple[jax.Array, jax.Array], index: jax.Array, one: Prediction,
@@ -16,17 +22,14 @@ def after_jump(ssm: StateSpaceModel, jumps: tuple[jax.Array, jax.Array], index: 
 
     Args:
         ssm: the model.
-        jumps: G and Q of all jumps, from `lfm_ppl.forces.sum.Stack.jump_table`.
+        jumps: G and Q of all jumps, from `lfm_ppl.forces.sde.Stack.jump_table`.
         index: of the jump; -1 for none.
         one: the prediction over the row.
         flow: whether it has phi and noise.
     """
-    size = ssm.physical_dim
-    transition = jax.scipy.linalg.block_diag(jnp.eye(size), jumps[0][index])
-    added = jax.scipy.linalg.block_diag(jnp.zeros((size, size)), jumps[1][index])
-    moments = Moments(matmul(transition, one.moments.mean[:, None])[:, 0],
-                      congruence(transition, one.moments.covariance) + added)
+    jump = jump_map(ssm, jumps, index)
+    one = one._replace(moments=moved(one.moments, *jump))
     if not flow:
-        return one._replace(moments=moments)
-    return one._replace(moments=moments, phi=matmul(transition, one.phi),
-                        noise=congruence(transition, one.noise) + added)
+        return one
+    phi, noise = compose((one.phi, one.noise), jump)
+    return one._replace(phi=phi, noise=noise)

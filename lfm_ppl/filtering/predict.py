@@ -22,7 +22,7 @@ import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 
 from lfm_ppl.filtering.transition import Exact, Factor, LinearPart, integrating_factor
-from lfm_ppl.forces.sum import block_diagonal
+from lfm_ppl.forces.sde import block_diagonal
 from lfm_ppl.linalg import congruence, diagonal, matmul, outer_square, safe_sqrt, symmetric
 from lfm_ppl.linearisation.rule import Inputs, Rule, selection
 from lfm_ppl.linearisation.sigma_points import SigmaPointRule
@@ -91,12 +91,22 @@ class LastStage(NamedTuple):
     covariance: jax.Array
 
 
+def compose(first: tuple[jax.Array, jax.Array], then: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+    """Return phi and noise of two maps s -> phi s + N(0, noise), one after the other."""
+    return matmul(then[0], first[0]), congruence(then[0], first[1]) + then[1]
+
+
+def moved(moments: Moments, phi: jax.Array, noise: jax.Array) -> Moments:
+    """Return the moments of phi s + N(0, noise)."""
+    return Moments(matmul(phi, moments.mean[:, None])[:, 0], congruence(phi, moments.covariance) + noise)
+
+
 def predict_exact(ssm: StateSpaceModel, transition: Exact, steps: int, start: jax.Array, length: jax.Array,
                   moments: Moments) -> Prediction:
     """Predict through the exact transition of a linear time-invariant model."""
     phi, noise = transition.phi, transition.noise
-    mean = matmul(phi, moments.mean[:, None])[:, 0] + exact_offset(ssm, transition, steps, start, length)
-    return Prediction(Moments(mean, congruence(phi, moments.covariance) + noise), phi, noise)
+    mean, covariance = moved(moments, phi, noise)
+    return Prediction(Moments(mean + exact_offset(ssm, transition, steps, start, length), covariance), phi, noise)
 
 
 def exact_offset(ssm: StateSpaceModel, transition: Exact, steps: int, start: jax.Array,
@@ -150,18 +160,16 @@ def predict_row(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Fa
 
     def step(carry: tuple, at: tuple) -> tuple[tuple, Any]:
         now, phi, noise = carry
-        index, ends = at
-        nodes = None if ends is None else _with_middle(*ends)
+        index, nodes = at
         one, _ = step_on(ssm, rule, linear, factor, start + index * h, h, now, spread, nodes)
         if flow:
-            phi, noise = matmul(one.phi, phi), congruence(one.phi, noise) + one.noise
+            phi, noise = compose((phi, noise), (one.phi, one.noise))
         return (one.moments, phi, noise), None if each is None else each(one)
 
     carry = tuple(unmoved(moments, flow))[:3]
-    ends = None if about is None else (jax.tree_util.tree_map(lambda a: a[:-1], about),
-                                       jax.tree_util.tree_map(lambda a: a[1:], about))
+    nodes = jax.tree_util.tree_map(lambda ends: _by_steps(_with_middles(ends)), about)
     (moments, whole, added), within = jax.lax.scan(
-        jax.checkpoint(step, prevent_cse=False), carry, (jnp.arange(steps), ends))
+        jax.checkpoint(step, prevent_cse=False), carry, (jnp.arange(steps), nodes))
     return Prediction(moments, whole, added, within)
 
 
@@ -175,11 +183,6 @@ def unmoved(moments: Moments, flow: bool, each: Callable[[Prediction], Any] | No
         still = still._replace(
             steps=jax.tree_util.tree_map(lambda a: jnp.broadcast_to(a, (steps, *a.shape)), each(still)))
     return still
-
-
-def _with_middle(first: Moments, last: Moments) -> list[Moments]:
-    """Moments at the first, the middle and the last node of a step, linear in between."""
-    return [first, jax.tree_util.tree_map(lambda a, b: 0.5 * (a + b), first, last), last]
 
 
 def smallest_spread(ssm: StateSpaceModel, rule: Rule, factor: Factor, t: jax.Array, h: jax.Array,
@@ -230,9 +233,13 @@ def covariance_of(moments: Moments) -> Any:
 
 
 def step_on(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Factor, t: jax.Array, h: jax.Array,
-            moments: Moments, spread: jax.Array, about: list[Moments] | None = None,
+            moments: Moments, spread: jax.Array, about: Moments | None = None,
             first: Stage | None = None) -> tuple[Prediction, LastStage]:
-    """Make one Runge-Kutta step from time ``t`` to ``t + h``; ``first`` is its first stage where that is known."""
+    """Make one Runge-Kutta step from time ``t`` to ``t + h``.
+
+    Moments ``about`` which to linearise are those (3, ...) at its start, middle and end; ``first`` is its first stage
+    where that is known.
+    """
     m, p = moments
     size = ssm.physical_dim
     half, full, back_half, back_full = factor.half, factor.full, factor.back_half, factor.back_full
@@ -240,7 +247,7 @@ def step_on(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Factor
     identity = jnp.eye(ssm.state_dim)
 
     def stage(index: int, time: jax.Array, mean: jax.Array, covariance: Any) -> Stage:
-        node = None if about is None else about[(0, 1, 1, 2)[index]]
+        node = jax.tree_util.tree_map(lambda a: a[(0, 1, 1, 2)[index]], about)
         return _stage(ssm, rule, linear, time, mean, covariance, spread, node)
 
     # Increments of the mean and of the flow are columns of one matrix (M, n + 1).
@@ -350,8 +357,7 @@ def _predict_by_quadrature(ssm: StateSpaceModel, rule: Rule, linear: LinearPart,
     first = _forces_of(moments, size)
     if factor.halves is None:
         def half_step(now: Moments, _: None) -> tuple[Moments, Moments]:
-            return Moments(matmul(half, now.mean[:, None])[:, 0],
-                           congruence(half, now.covariance) + factor.noise_half), now
+            return moved(now, half, factor.noise_half), now
 
         last, before = jax.lax.scan(half_step, first, None, length=2 * steps)
         now = jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a, b[None]]), before, last)
@@ -391,7 +397,7 @@ def _predict_by_quadrature(ssm: StateSpaceModel, rule: Rule, linear: LinearPart,
         mean = jnp.concatenate([mean[:size] + offset, mean[size:]])
         now = Moments(mean, congruence(own, now.covariance) + added)
         if flow:
-            phi, noise = matmul(own, phi), congruence(own, noise) + added
+            phi, noise = compose((phi, noise), (own, added))
         return (now, phi, noise), None if each is None else each(Prediction(now, own, added))
 
     (moments, whole, added), within = jax.lax.scan(step, tuple(unmoved(moments, flow))[:3], maps)
@@ -414,6 +420,11 @@ def _with_middles(ends: jax.Array) -> jax.Array:
     middles = 0.5 * (ends[:-1] + ends[1:])
     pairs = jnp.stack([ends[:-1], middles], axis=1)
     return jnp.concatenate([pairs.reshape(2 * len(middles), *ends.shape[1:]), ends[-1:]])
+
+
+def _by_steps(nodes: jax.Array) -> jax.Array:
+    """First, middle and last (J, 3, ...) of each step, from 2 J + 1 nodes."""
+    return jnp.stack([nodes[:-2:2], nodes[1::2], nodes[2::2]], axis=1)
 
 
 def _simpson(factor: Factor, h: jax.Array, nodes: tuple[Node, ...],

@@ -6,15 +6,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from lfm_ppl.filtering.filter import Pass
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.retrospect import combine, given_later
 from lfm_ppl.filtering.schedule import Schedule
-from lfm_ppl.linalg import cholesky, congruence, diagonal, matmul, outer_square, solve_lower
-
-_LOG_2PI = float(np.log(2.0 * np.pi))
+from lfm_ppl.linalg import cholesky, congruence, diagonal, log_density, matmul, outer_square, solve_lower
 
 
 class Smoothed(NamedTuple):
@@ -79,8 +76,8 @@ def _leave_one_out(one: Pass, r: jax.Array, adjoint: jax.Array) -> tuple[jax.Arr
     precision = inverse + congruence(one.gain.T, adjoint)
     factor = cholesky(precision)
     # A missing entry has unit precision and u = 0, and so contributes nothing.
-    left_out = (jnp.log(diagonal(factor.chol)).sum() - 0.5 * (solve_lower(factor.chol, u) ** 2).sum()
-                - 0.5 * _LOG_2PI * one.present.sum())
+    left_out = (log_density(solve_lower(factor.chol, u), factor.chol, one.present)
+                + 2.0 * jnp.log(diagonal(factor.chol)).sum())  # C is a precision
     kept = jnp.eye(r.shape[0]) - matmul(one.gain, one.slope)
     r = matmul(one.slope.T, white[:, None])[:, 0] + matmul(kept.T, r[:, None])[:, 0]
     adjoint = congruence(one.slope.T, inverse) + congruence(kept.T, adjoint)

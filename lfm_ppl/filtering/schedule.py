@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -219,3 +221,60 @@ def _distinct(length: np.ndarray, scale: float) -> tuple[np.ndarray | None, np.n
 def as_arrays(rows: Rows) -> Rows:
     """Return the rows as JAX arrays, which a scan can run over."""
     return jax.tree_util.tree_map(jnp.asarray, rows)
+
+
+class _Table:
+    """A function of the interval length, tabulated: all arrays that it returns make one row for each length.
+
+    The row is read, and in reverse mode written, at once; array by array that took many more operations to compile.
+
+    Args:
+        function: of a length, a scalar, to a pytree of arrays.
+        lengths: (U,).
+    """
+
+    def __init__(self, function: Callable[[jax.Array], Any], lengths: jax.Array) -> None:
+        leaves, self._tree = jax.tree_util.tree_flatten(jax.vmap(function)(lengths))
+        self._shapes = [leaf.shape[1:] for leaf in leaves]
+        self._rows = jnp.concatenate([leaf.reshape(len(lengths), -1) for leaf in leaves], axis=1) if leaves else None
+
+    def at(self, index: jax.Array) -> Any:
+        """Return what the function gave at one of the lengths."""
+        if self._rows is None:
+            return jax.tree_util.tree_unflatten(self._tree, [])
+        row = jax.lax.dynamic_index_in_dim(self._rows, index, keepdims=False)
+        parts = jnp.split(row, np.cumsum([math.prod(shape) for shape in self._shapes])[:-1])
+        return jax.tree_util.tree_unflatten(
+            self._tree, [part.reshape(shape) for part, shape in zip(parts, self._shapes, strict=True)])
+
+
+def by_length(plan: Schedule, make: Callable[[jax.Array], Any]) -> Callable[[Rows], Any]:
+    """Return what gives ``make(length)`` of a row, computed once for every distinct length where these are few."""
+    if plan.lengths is None:
+        return lambda row: make(row.length)
+    table = _Table(make, jnp.asarray(plan.lengths))
+    return lambda row: table.at(row.kind)
+
+
+def per_step(plan: Schedule) -> Schedule:
+    """Return the plan with a row for each integration step."""
+    rows, steps = plan.rows, plan.steps
+    # In NumPy where the plan is known, so that requested times can be found in it before compilation.
+    xp: Any = np if isinstance(rows.length, np.ndarray) else jnp
+    index = np.tile(np.arange(steps), len(rows.length))
+    start, length, observation, jump = (xp.repeat(a, steps) for a in rows[:4])
+    last = index == steps - 1
+    length = length / steps
+    fine = Rows(start + index * length, length, xp.where(last, observation, -1), xp.where(last, jump, -1),
+                np.zeros_like(index))
+    return plan._replace(rows=fine, lengths=None, steps=1, observed=plan.observed * steps + steps - 1,
+                         requested=plan.requested * steps + steps - 1)
+
+
+def with_observations(rows: Rows, y: Any) -> tuple[Rows, jax.Array]:
+    """Return the rows as JAX arrays, and the entry of ``y`` (T, ...) at the end of each, NaN in rows without one."""
+    y = jnp.asarray(y, float)
+    # The index -1 of a row without an observation is that of the last entry.
+    padded = jnp.concatenate([y, jnp.full((1, *y.shape[1:]), jnp.nan)])
+    rows = as_arrays(rows)
+    return rows, padded[rows.observation]

@@ -20,15 +20,16 @@ from lfm_ppl.filtering.filter import (
     standardised,
     warn_single_precision,
 )
-from lfm_ppl.filtering.iterated import Iterated, per_step, posterior_linearisation, refined
+from lfm_ppl.filtering.iterated import Iterated, posterior_linearisation, refined
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.rts import Smoothed, backward
-from lfm_ppl.filtering.schedule import Schedule, schedule
+from lfm_ppl.filtering.schedule import Schedule, per_step, schedule
 from lfm_ppl.filtering.simulation_smoother import smoothing_errors
 from lfm_ppl.linalg import congruence, matmul, safe_sqrt, semidefinite_root, solve_lower
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.augment import StateSpaceModel, state_space
 from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.resolution import check_resolution
 
 _LONGEST_FORECAST = 10_000
 """Most rows of a forecast; a longer one gets a long last row (or `max_step`)."""
@@ -208,7 +209,7 @@ def smooth(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
     ssm = state_space(model)
     plans = smoothing_plans(ssm, times, steps, max_step, at, iterations, tolerance)
     model.check_at(plans.rows.initial_time, np.shape(times)[0])
-    model.check_resolution(times, y)
+    check_resolution(model, times, y)
     y = check_observations(y, len(plans.rows.observed), ssm.output_dim)
     warn_single_precision()
     result = _run_smoother(ssm, rule, plans, y, iterations, damping)

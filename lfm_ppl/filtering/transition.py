@@ -94,16 +94,18 @@ def feedback(ssm: StateSpaceModel, linear: LinearPart) -> jax.Array:
     return jnp.concatenate([linear.rows, below])
 
 
-def exact(ssm: StateSpaceModel, linear: LinearPart, length: jax.Array, steps: int) -> Exact:
+def exact(ssm: StateSpaceModel, length: jax.Array, steps: int, linear: LinearPart | None = None) -> Exact:
     """Return the transition of a linear time-invariant model over a row of ``length``.
 
-    The offset is exact where the mean is invariant; otherwise zero, and the filter integrates it with E(h/2), E(h).
+    Its ``linear`` part is that of any time. The offset is exact where the mean is invariant; otherwise zero, and the
+    filter integrates it with E(h/2), E(h).
     """
     size, total = ssm.physical_dim, ssm.state_dim
     if size == 0:
         phi, noise = ssm.stack.discretise(length)
         return Exact(phi, noise, jnp.zeros(total), phi, phi)
     t = jnp.zeros(())
+    linear = linear_part(ssm, t) if linear is None else linear
     matrix, shift = ssm.input_map(t)
     constant = jnp.zeros(total).at[:size].set(ssm.drift(shift, t)) if ssm.mean_invariant else jnp.zeros(total)
     lin = feedback(ssm, linear)

@@ -6,16 +6,13 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 
 from lfm_ppl.filtering.predict import Moments, covariance_of, linearise_state
-from lfm_ppl.linalg import cholesky, congruence, diagonal, matmul, safe_sqrt, wrapped
+from lfm_ppl.linalg import cholesky, congruence, diagonal, log_density, masked, matmul, safe_sqrt, wrapped
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.linearisation.sigma_points import SigmaPointRule
 from lfm_ppl.model.augment import StateSpaceModel
-
-_LOG_2PI = float(np.log(2.0 * np.pi))
 
 FAILED, FACTOR = "lfm_ppl: failed", "lfm_ppl: factor of the innovation covariance"
 """Under these names they are kept for the derivative of a row, and not computed again."""
@@ -110,9 +107,7 @@ def update(ssm: StateSpaceModel, observation: Linearised, y: jax.Array, present:
     residual = jnp.where(present, y, 0.0) - observation.value
     for index in ssm.model.observation.angular:
         residual = residual.at[index].set(wrapped(residual[index]))
-    innovation = jnp.where(present, residual, 0.0)
-    both = present[:, None] & present[None, :]
-    noise = jnp.where(both, observation.noise, jnp.eye(y.shape[0]))
+    innovation, noise = masked(residual, observation.noise, present)
     cross = matmul(covariance, slope.T)
     innovation_covariance = matmul(slope, cross) + noise
     # A smaller pivot has no correct digit, and its sign is chance.
@@ -123,7 +118,6 @@ def update(ssm: StateSpaceModel, observation: Linearised, y: jax.Array, present:
     half = factor.solve_lower(jnp.concatenate([cross.T, innovation[:, None]], axis=1))
     solved, white = factor.solve_upper(half), half[:, -1]
     gain = solved[:, :-1].T
-    log_likelihood = -0.5 * ((white**2).sum() + present.sum() * _LOG_2PI) - jnp.log(diagonal(chol)).sum()
     kept = jnp.eye(mean.shape[0]) - matmul(gain, slope)
     filtered = Moments(mean + matmul(gain, innovation[:, None])[:, 0],
                        congruence(kept, covariance) + congruence(gain, noise))
@@ -132,7 +126,8 @@ def update(ssm: StateSpaceModel, observation: Linearised, y: jax.Array, present:
         failed = failed | _precision_lost(ssm, observation, y, present, moments, filtered, noise,
                                           solved[:, -1], scale)
     failed = checkpoint_name(failed, FAILED)
-    return Update(filtered, jnp.where(failed, -jnp.inf, log_likelihood), innovation, chol, gain, slope, noise)
+    return Update(filtered, jnp.where(failed, -jnp.inf, log_density(white, chol, present)), innovation, chol, gain,
+                  slope, noise)
 
 
 def _precision_lost(ssm: StateSpaceModel, observation: Linearised, y: jax.Array, present: jax.Array,

@@ -13,7 +13,7 @@ from lfm_ppl.forces.parameters import standard_deviation_parameter
 from lfm_ppl.forces.periodic_kernels import Kernel
 from lfm_ppl.forces.quasi_periodic import EXPLAINED_VARIANCE, stationary_basis, warn_of_lost_variance
 from lfm_ppl.forces.resonator import Resonator
-from lfm_ppl.forces.sum import Sum
+from lfm_ppl.forces.sde import Sum
 from lfm_ppl.linalg import safe_sqrt
 
 

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import re
+import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import numpyro.distributions as dist
 from jax.extend.core import jaxpr_as_fun
 from jax.flatten_util import ravel_pytree
 from numpyro import handlers
@@ -24,6 +22,7 @@ from numpyro.infer.util import log_density as constrained_log_density
 from lfm_ppl import checks
 from lfm_ppl.filtering.filter import FilterResult, check_observations
 from lfm_ppl.filtering.smoother import SmootherResult
+from lfm_ppl.inference.fingerprint import Recording, record, signature
 from lfm_ppl.inference.fixing import fix
 from lfm_ppl.inference.likelihood_handler import LikelihoodHandler
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
@@ -42,6 +41,10 @@ _MOST_PROGRAMS = 8
 
 _MOST_COMPILED = 64
 """Functions that are kept of one model, such as smoothers with different requested times."""
+
+_lock = threading.RLock()
+"""Held while programs are looked up and models are traced: NumPyro's stack of handlers is one for all threads."""
+
 
 class LikelihoodSite(NamedTuple):
     """The likelihood site of a NumPyro model.
@@ -72,7 +75,11 @@ def likelihood_site(model: Callable, arguments: tuple, keywords: Mapping[str, An
         ValueError: the model has no such site, or several.
     """
     seeded = handlers.seed(handlers.substitute(model, data=dict(parameters or {})), key)
-    trace = handlers.trace(seeded).get_trace(*arguments, **keywords)
+    return _only(_likelihoods(handlers.trace(seeded).get_trace(*arguments, **keywords)))
+
+
+def _likelihoods(trace: Mapping[str, Any]) -> list[LikelihoodSite]:
+    """Return the likelihood sites of a trace."""
     found = []
     for name, site in trace.items():
         distribution = site.get("fn")
@@ -81,6 +88,10 @@ def likelihood_site(model: Callable, arguments: tuple, keywords: Mapping[str, An
             distribution = distribution.base_dist
         if isinstance(distribution, (MarginalLikelihood, Panel)):
             found.append(LikelihoodSite(name, distribution, site["value"]))
+    return found
+
+
+def _only(found: list[LikelihoodSite]) -> LikelihoodSite:
     if len(found) != 1:
         names = ", ".join(site.name for site in found) or "none"
         raise ValueError("the model must have exactly one site numpyro.sample(name, lfm.MarginalLikelihood(...), "
@@ -95,10 +106,6 @@ class _at_known_times(LikelihoodHandler):  # noqa: N801 (an effect handler, name
         self.times = times
         super().__init__(fn)
 
-    def complaint(self) -> str:
-        """Return nothing: a likelihood inside a mask has times of its own."""
-        return ""
-
     def replacement(self, likelihood: MarginalLikelihood | Panel, site: dict[str, Any]) -> Any:
         """Return the likelihood at times that are known."""
         return likelihood.with_times(self.times) if checks.traced(likelihood.times) else likelihood
@@ -107,50 +114,15 @@ class _at_known_times(LikelihoodHandler):  # noqa: N801 (an effect handler, name
 class _without_likelihood(LikelihoodHandler):  # noqa: N801 (an effect handler, see above)
     """Leaves the prior alone."""
 
-    def complaint(self) -> str:
+    def missing(self) -> str:
         """Return what to say of a likelihood that cannot be told from the prior."""
         return "the likelihood stands inside a mask or an expansion, so that the prior cannot be told from it."
-
-    def replacement(self, likelihood: MarginalLikelihood | Panel, site: dict[str, Any]) -> Any:
-        """Return a likelihood of one."""
-        shape = likelihood.batch_shape + likelihood.event_shape
-        return dist.ImproperUniform(dist.constraints.real, (), shape).mask(False)
-
-
-class _ingredients(LikelihoodHandler):  # noqa: N801 (an effect handler, see above)
-    """Runs everything of a likelihood that a user wrote, and not the filter: ``values``, and the other ``settings``."""
-
-    def __init__(self, at: jax.Array, t: jax.Array) -> None:
-        self.at, self.t = at, t
-        self.values: list[Any] = []
-        self.settings: list[str] = []
-        self.times: list[Any] = []
-        super().__init__()
-
-    def complaint(self) -> str:
-        """Return nothing: a likelihood inside a mask is run as a whole."""
-        return ""
-
-    def replacement(self, likelihood: MarginalLikelihood | Panel, site: dict[str, Any]) -> Any:
-        """Return a likelihood of one."""
-        one = likelihood.first if isinstance(likelihood, Panel) else likelihood
-        ssm, model = one.ssm, one.model
-        # Tracers, so that the functions themselves are recorded, and not what they are at one point.
-        t, w = self.t, jnp.full(ssm.input_dim, self.at)
-        self.times.append(likelihood.times)
-        self.values += eqx.filter(jax.tree_util.tree_leaves(likelihood), eqx.is_array_like) + [
-            ssm.drift(w, t), ssm.dispersion(w, t), ssm.observe(w, t), ssm.noise_covariance(w, t, 0), ssm.input_map(t),
-            ssm.initial(), ssm.stack.feedback(), ssm.stack.dispersion(), ssm.stack.jump_table()]
-        self.settings.append(str((
-            one.rule, one.steps, one.max_step, one.iterations, one.damping, one.tolerance, model.state_names,
-            model.output_names, model.force_names, model.units, model.nonlinear_inputs, model.observation.angular,
-            ssm.stack.jump_times, site["name"])))
-        shape = likelihood.batch_shape + likelihood.event_shape
-        return dist.ImproperUniform(dist.constraints.real, (), shape).mask(False)
 
 
 class _Program:
     """What data sets of one shape share: the model without its data, and all that was compiled for it.
+
+    Several threads may ask for its functions at once.
 
     Args:
         model: a NumPyro model.
@@ -166,12 +138,13 @@ class _Program:
                  user: str):
         self.model, self.arguments, self.place, self.keywords = model, arguments, place, dict(keywords)
         self.key = jax.random.key(0)
+        self.fingerprint: Hashable = None  # that of a program which serves other data too
         self.compiled: OrderedDict[Hashable, Any] = OrderedDict()
         self._seeded = handlers.seed(model, self.key)
         self.user = user
-        sites = self._latent_at(data, self.key, init_to_median)
-        self.medians = {name: site["value"] for name, site in sites.items()}
-        position = _unconstrained(sites)
+        trace = self._trace(data, self.key, init_to_median)
+        self._likelihoods = [site._replace(observed=None) for site in _likelihoods(trace)]
+        position = _unconstrained(latent_sites(trace))
         self.sites = tuple(position)
         self.names = coordinate_names(position)
         flat, self.unravel = ravel_pytree(position)
@@ -183,15 +156,26 @@ class _Program:
             return self.arguments
         return (*self.arguments[:self.place], y, *self.arguments[self.place + 1:])
 
-    def _latent_at(self, y: Any, key: jax.Array, strategy: Callable) -> dict[str, Any]:
+    def _trace(self, y: Any, key: jax.Array, strategy: Callable) -> dict[str, Any]:
         drawn = handlers.substitute(handlers.seed(self.model, key), substitute_fn=strategy)
-        sites = latent_sites(handlers.trace(drawn).get_trace(*self.call(y), **self.keywords))
-        check_latent(sites, self.user)
-        return sites
+        trace = handlers.trace(drawn).get_trace(*self.call(y), **self.keywords)
+        check_latent(latent_sites(trace), self.user)
+        return trace
+
+    @property
+    def site(self) -> LikelihoodSite:
+        """The likelihood site at the prior's medians."""
+        return _only(self._likelihoods)
+
+    def record(self, y: Any) -> Recording:
+        """Return what a run of the model with all its parameters and data traced leaves."""
+        with jax.ensure_compile_time_eval():  # compiled code may be the first to ask
+            return record(lambda z, y: potential_energy(self._seeded, self.call(y), self.keywords, self.unravel(z)),
+                          self.size, y)
 
     def draw_sites(self, y: Any, key: jax.Array, strategy: Callable) -> dict[str, jax.Array]:
         """Return unconstrained values of the latent sites by a NumPyro strategy."""
-        return _unconstrained(self._latent_at(y, key, strategy))
+        return _unconstrained(latent_sites(self._trace(y, key, strategy)))
 
     def prepared(self, wrap: Callable[[Callable], Callable] | None, times: Any) -> Callable:
         model = self._seeded if times is None else _at_known_times(self._seeded, times)
@@ -213,52 +197,17 @@ class _Program:
 
     def once(self, name: Hashable, make: Callable[[], Any]) -> Any:
         """Return what ``make`` returned when the name was first asked for; the latest of them are kept."""
-        if name in self.compiled:
-            self.compiled.move_to_end(name)
-        else:
-            self.compiled[name] = make()
+        with _lock:
+            if name in self.compiled:
+                self.compiled.move_to_end(name)
+                return self.compiled[name]
+            made = self.compiled[name] = make()
             while len(self.compiled) > _MOST_COMPILED:
                 self.compiled.popitem(last=False)
-        return self.compiled[name]
-
-    def fingerprint(self, y: Any) -> Hashable:
-        """Return what is equal for a model that computes the same, whatever its code has read in the meantime.
-
-        A model is a function that may read anything: the name of a variable says nothing of its present value. What it
-        computes is in the jaxpr of its prior, its dynamics and its observation, with the constants in it.
-        """
-        handlers_used = []
-
-        def run(z: jax.Array, y: Any, at: jax.Array, t: jax.Array) -> Any:
-            handler = _ingredients(at, t)
-            handlers_used.append(handler)
-            with handler:
-                energy = potential_energy(self._seeded, self.call(y), self.keywords, self.unravel(z))
-            return energy, [value for value in handler.values if value is not None]
-
-        traced = jax.make_jaxpr(run)(jnp.zeros(self.size), y, jnp.zeros(()), jnp.zeros(()))
-        constants = tuple((np.shape(one), _bytes(one)) for one in _constants(traced))
-        # What is left of functions in a jaxpr is their address.
-        return re.sub(r"0x[0-9a-f]+", "", str(traced.jaxpr)), constants, tuple(handlers_used[-1].settings)
-
-    def times_follow(self, y: Any) -> bool:
-        """Whether the times of the likelihood follow from parameters or data."""
-
-        def run(z: jax.Array, y: Any) -> Any:
-            handler = _ingredients(z.sum(), z.sum())
-            with handler:
-                potential_energy(self._seeded, self.call(y), self.keywords, self.unravel(z))
-            return handler.times
-
-        jaxpr = jax.make_jaxpr(run)(jnp.zeros(self.size), y).jaxpr
-        following = set(jaxpr.invars)
-        for equation in jaxpr.eqns:
-            if any(variable in following for variable in equation.invars if not hasattr(variable, "val")):
-                following |= set(equation.outvars)
-        return any(variable in following for variable in jaxpr.outvars if not hasattr(variable, "val"))
+            return made
 
 
-_programs: OrderedDict[Hashable, tuple[_Program, Hashable]] = OrderedDict()
+_programs: OrderedDict[Hashable, _Program] = OrderedDict()
 
 
 class BoundModel:
@@ -315,21 +264,14 @@ class BoundModel:
         """Whether gradients are taken in forward mode, which is faster for up to ten parameters."""
         return self.size <= FORWARD_MODE_LIMIT
 
-    @cached_property
+    @property
     def site(self) -> LikelihoodSite:
         """The likelihood site, at the prior's medians; its times, settings and names are those of every draw.
 
         Raises:
             ValueError: the model has no such site, or several.
         """
-        program = self._program
-
-        def find() -> LikelihoodSite:
-            with jax.ensure_compile_time_eval():
-                return likelihood_site(program.model, program.call(self.y), program.keywords, program.key,
-                                       program.medians)._replace(observed=None)
-
-        return program.once("site", find)
+        return self._program.site
 
     @property
     def has_likelihood(self) -> bool:
@@ -343,9 +285,10 @@ class BoundModel:
     def _known_times(self) -> Any:
         """Times of the likelihood site as numbers; None for a model without one, or whose times differ."""
         def find() -> Any:
-            if not self.has_likelihood or self._program.times_follow(self.y):
+            if not self.has_likelihood:
                 return None
-            return self.site.distribution.times
+            recording = self._program.once("recording", lambda: self._program.record(self.y))
+            return None if recording.times_follow else self.site.distribution.times
 
         return self._program.once("times", find)
 
@@ -633,10 +576,9 @@ class BoundModel:
         program = self._program
         make = lambda: _Program(change(program.model), program.arguments, program.place,  # noqa: E731
                                 program.keywords, self.y, program.user)
-        if name[1] is None or checks.traced(self.y):
-            return BoundModel(make(), self.y)
         with jax.ensure_compile_time_eval():  # compiled code may be the first to ask
-            return BoundModel(program.once(name, make), self.y)
+            passing = name[1] is None or checks.traced(self.y)
+            return BoundModel(make() if passing else program.once(name, make), self.y)
 
     def compiled(self, name: Hashable, make: Callable[[], Callable]) -> Callable:
         """Return a function that was made for this model under this name, for any data; made when first asked for.
@@ -743,40 +685,40 @@ def bind_arguments(model: Callable, arguments: tuple, keywords: Mapping[str, Any
     static = tuple(None if index == place else value for index, value in enumerate(arguments))
     key = signature((model, static, dict(keywords), jax.tree_util.tree_map(lambda leaf: (leaf.shape, str(leaf.dtype)),
                                                                            data)))
-    if checks.traced(data):
-        # What is made of tracers must not outlive them.
-        return BoundModel(_made(model, arguments, place, keywords, data, user), data)
-    program, before = (None, None) if key is None else _programs.pop(key, (None, None))
-    with jax.ensure_compile_time_eval():  # compiled code may be the first to bind the model
-        if program is not None and _fingerprint(program, data) != before:
-            program = None  # the same function, but not what it was
-        if program is None:
+    kept = key is not None and not checks.traced(data)  # what is made of tracers must not outlive them
+    with _lock, jax.ensure_compile_time_eval():  # compiled code may be the first to bind the model
+        program = _programs.pop(key, None) if kept else None
+        if program is None or not _unchanged(program, data):
             program = _made(model, arguments, place, keywords, data, user)
-            before = None if key is None or program.place != place else _fingerprint(program, data)
-    if before is not None:
-        _programs[key] = program, before
-        while len(_programs) > _MOST_PROGRAMS:
-            _programs.popitem(last=False)
+        if kept and program.fingerprint is not None:
+            _programs[key] = program
+            while len(_programs) > _MOST_PROGRAMS:
+                _programs.popitem(last=False)
     return BoundModel(program, data)
 
 
-def _fingerprint(program: _Program, data: Any) -> Hashable:
-    """Return the fingerprint of a program; None where it cannot be had, so that the program serves this data alone."""
+_REFUSALS = (TypeError, ValueError, IndexError, AttributeError)
+"""What is raised by code that asks a tracer for its value: JAX's errors for Python branches, NumPy functions and masks,
+attributes that NumPy's arrays alone have, and errors of this library, for times that are data and must be known."""
+
+
+def _unchanged(program: _Program, data: Any) -> bool:
+    """Whether a model, the same function as before, still computes what it did."""
     try:
-        return program.fingerprint(data)
-    except Exception:  # whatever is wrong with the model is told where it is used
-        return None
+        return program.record(data).fingerprint == program.fingerprint
+    except _REFUSALS:  # of a variable that the model reads; what is wrong with it is told where it is made anew
+        return False
 
 
 def _made(model: Callable, arguments: tuple, place: int | None, keywords: Mapping[str, Any], data: Any,
           user: str) -> _Program:
-    if place is None:
-        return _Program(model, arguments, None, keywords, None, user)
-    static = (*arguments[:place], None, *arguments[place + 1:])
+    """Return a program in two runs of the model, one with numbers and one with tracers."""
+    static = tuple(None if index == place else value for index, value in enumerate(arguments))
     try:
         program = _Program(model, static, place, keywords, data, user)
-        jax.eval_shape(lambda y: program.draw_sites(y, program.key, init_to_median), data)
-    except Exception:  # the model asks its last argument for values, or something is wrong with it, which is said here
+        program.fingerprint = program.once("recording", lambda: program.record(data)).fingerprint
+    except _REFUSALS:
+        # The model asks its last argument for values, which therefore is part of it; an error of its own is told now.
         return _Program(model, arguments, None, keywords, data, user)
     return program
 
@@ -791,22 +733,6 @@ def _traced_once(function: Callable, *example: Any) -> Callable:
     run, structure = jaxpr_as_fun(traced), jax.tree_util.tree_structure(shape)
     return jax.jit(lambda *arguments: jax.tree_util.tree_unflatten(
         structure, run(*jax.tree_util.tree_leaves(arguments))))
-
-
-def _constants(traced: Any) -> list[Any]:
-    """Return the constants of a jaxpr and of all within it."""
-    found = list(traced.consts) if hasattr(traced, "consts") else []
-    for equation in getattr(traced, "jaxpr", traced).eqns:
-        for value in equation.params.values():
-            for inner in value if isinstance(value, (tuple, list)) else [value]:
-                if hasattr(inner, "eqns") or hasattr(inner, "jaxpr"):
-                    found += _constants(inner)
-    return found
-
-
-def _bytes(constant: Any) -> bytes:
-    is_key = jax.dtypes.issubdtype(getattr(constant, "dtype", float), jax.dtypes.prng_key)
-    return np.asarray(jax.random.key_data(constant) if is_key else constant).tobytes()
 
 
 def _arrays(z: Any) -> Any:
@@ -828,17 +754,3 @@ def _as_data(y: Any) -> Any:
 def _shapes(y: Any) -> Any:
     """Return the data with their shapes in the place of arrays."""
     return jax.tree_util.tree_map(np.shape, y)
-
-
-def signature(value: Any) -> Hashable:
-    """Return what is equal for equal models and arguments; None where equality cannot be told."""
-    leaves, structure = jax.tree_util.tree_flatten(value)
-    if checks.traced(leaves):
-        return None
-    parts = tuple((np.shape(leaf), str(np.asarray(leaf).dtype), np.asarray(leaf).tobytes())
-                  if isinstance(leaf, (np.ndarray, np.generic, jax.Array)) else (type(leaf), leaf) for leaf in leaves)
-    try:
-        hash((structure, parts))
-    except TypeError:
-        return None
-    return structure, parts

@@ -16,15 +16,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
-from numpyro.primitives import Messenger
 
 from lfm_ppl import checks
+from lfm_ppl.inference.likelihood_handler import Handler
 from lfm_ppl.inference.pinned import Pinned, elementwise
 
 _ELEMENT = re.compile(r"^(?P<site>[^\[\]]+)\[(?P<label>[^\[\]]+)\]$")
 
 
-class fix(Messenger):  # noqa: N801 (an effect handler, named as NumPyro names its handlers)
+class fix(Handler):  # noqa: N801 (an effect handler, named as NumPyro names its handlers)
     """Effect handler that fixes parameters.
 
     Args:
@@ -61,20 +61,15 @@ class fix(Messenger):  # noqa: N801 (an effect handler, named as NumPyro names i
         self.sites: dict[str, bool] = {}
         super().__init__(fn)
 
-    def __enter__(self) -> fix:
-        """Start a run of the model."""
+    def begin(self) -> None:
+        """Forget the sites of the run before."""
         self.sites = {}
-        super().__enter__()
-        return self
 
-    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
-        """End the run; a name that the model never sampled is an error."""
-        super().__exit__(kind, error, trace)
-        if kind is None:
-            free = [name for name, observed in self.sites.items() if not observed]
-            for name in (*self.whole, *self.elements):
-                if name not in free:
-                    raise ValueError(checks.unknown("parameter to fix", name, free))
+    def complaint(self) -> str:
+        """Return what is wrong with a name that the model never sampled."""
+        free = [name for name, observed in self.sites.items() if not observed]
+        missing = [name for name in (*self.whole, *self.elements) if name not in free]
+        return checks.unknown("parameter to fix", missing[0], free) if missing else ""
 
     def process_message(self, msg: dict[str, Any]) -> None:
         """Condition a site that is fixed as a whole, pin the elements of the others."""

@@ -1,16 +1,40 @@
-"""Effect handlers that put something else in the place of a model's likelihood."""
+"""Effect handlers: those that judge a run of the model when it ends, and those that replace its likelihood."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any
 
+import numpyro.distributions as dist
 from numpyro.primitives import Messenger
 
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
 
 
-class LikelihoodHandler(Messenger):
+class Handler(Messenger):
+    """Effect handler that gathers something of every run of a model and may find fault with it at its end."""
+
+    def begin(self) -> None:
+        """Forget the run before."""
+
+    def complaint(self) -> str:
+        """Return the error of the run that has ended; nothing where all is well."""
+        return ""
+
+    def __enter__(self) -> Any:
+        """Start a run of the model."""
+        self.begin()
+        super().__enter__()
+        return self
+
+    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
+        """End the run."""
+        super().__exit__(kind, error, trace)
+        if kind is None and (message := self.complaint()):
+            raise ValueError(message)
+
+
+class LikelihoodHandler(Handler):
     """Replaces the distribution of every site ``MarginalLikelihood`` or ``panel``.
 
     Args:
@@ -22,24 +46,21 @@ class LikelihoodHandler(Messenger):
         super().__init__(fn)
 
     def replacement(self, likelihood: MarginalLikelihood | Panel, site: dict[str, Any]) -> Any:
-        """Return the distribution that takes the place of the likelihood of a site."""
-        raise NotImplementedError
+        """Return the distribution that takes the place of the likelihood of a site; by default a likelihood of one."""
+        shape = likelihood.batch_shape + likelihood.event_shape
+        return dist.ImproperUniform(dist.constraints.real, (), shape).mask(False)
+
+    def missing(self) -> str:
+        """Return the error of a model without such a site; nothing where that is no mistake."""
+        return ""
+
+    def begin(self) -> None:
+        """Forget the sites of the run before."""
+        self.found = False
 
     def complaint(self) -> str:
-        """Return the error of a model without such a site; nothing where that is no mistake."""
-        raise NotImplementedError
-
-    def __enter__(self) -> Any:
-        """Start a run of the model."""
-        self.found = False
-        super().__enter__()
-        return self
-
-    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
-        """End the run."""
-        super().__exit__(kind, error, trace)
-        if kind is None and not self.found and (message := self.complaint()):
-            raise ValueError(message)
+        """Return what is wrong where no site was found."""
+        return "" if self.found else self.missing()
 
     def process_message(self, msg: dict[str, Any]) -> None:
         """Replace the distribution of the site."""

@@ -40,6 +40,7 @@ from lfm_ppl.gradients import finite_or_minus_infinity
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.augment import StateSpaceModel, check_times, state_space
 from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.resolution import check_resolution
 from lfm_ppl.model.simulate import simulate_on
 
 _SIMULATION_STEPS = 5
@@ -140,7 +141,7 @@ class MarginalLikelihood(dist.Distribution):
         value = jnp.asarray(value, float)
         if value.ndim > 2:
             return jax.vmap(self.log_prob)(value)
-        self.model.check_resolution(self.times, value)
+        check_resolution(self.model, self.times, value)
         # One failure makes the sum -inf, and with it the derivatives of the other terms zero.
         y = check_observations(value, *self.event_shape)
         return self._said(y, self._kept(_log_likelihood)(*self._parts(y)))
@@ -175,10 +176,7 @@ class MarginalLikelihood(dist.Distribution):
         start = jnp.asarray(self.plan.initial_time, float)
         run = lambda k: simulate_on(self.ssm, k, jnp.asarray(self.times, float), start,  # noqa: E731
                                     _SIMULATION_STEPS * self.steps).y
-        if not sample_shape:
-            return run(key)
-        keys = jax.random.split(key, int(np.prod(sample_shape)))
-        return jax.vmap(run)(keys).reshape(*sample_shape, *self.event_shape)
+        return repeated(run, key, sample_shape)
 
     def filter(self, y: Any) -> FilterResult:
         """Filter with this distribution's rule and steps; see `lfm_ppl.filter`."""
@@ -303,10 +301,7 @@ class Panel(dist.Distribution):
             keys = jax.random.split(key, self.batch_shape[0])
             return self.mapped(lambda one, k: one.sample(k), keys)
 
-        if not sample_shape:
-            return draw(key)
-        keys = jax.random.split(key, int(np.prod(sample_shape)))
-        return jax.vmap(draw)(keys).reshape(*sample_shape, *self.batch_shape, *self.event_shape)
+        return repeated(draw, key, sample_shape)
 
     def checked(self, value: Any) -> jax.Array:
         """Return ``value`` as an array (B, T, D) after checking it."""
@@ -318,6 +313,14 @@ class Panel(dist.Distribution):
         if known is not None and np.isinf(known).any():
             raise ValueError("y has infinite entries; use NaN for a missing entry.")
         return jnp.asarray(value, float)
+
+
+def repeated(draw: Callable[[jax.Array], jax.Array], key: jax.Array, sample_shape: tuple[int, ...]) -> jax.Array:
+    """Return independent draws (*sample_shape, ...) of ``draw(key)``; one draw where the shape is empty."""
+    if not sample_shape:
+        return draw(key)
+    draws = jax.vmap(draw)(jax.random.split(key, int(np.prod(sample_shape))))
+    return draws.reshape(*sample_shape, *draws.shape[1:])
 
 
 def panel(build: Callable[..., LatentForceModel], parameters: Any, times: Any, rule: Rule | None = None,

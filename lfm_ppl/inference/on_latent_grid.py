@@ -15,7 +15,7 @@ from numpyro.distributions import constraints
 from lfm_ppl import checks
 from lfm_ppl.comparators.latent_grid import RULES, LatentGrid
 from lfm_ppl.inference.likelihood_handler import LikelihoodHandler
-from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
+from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel, repeated
 
 
 class GridLikelihood(dist.Distribution):
@@ -40,11 +40,7 @@ class GridLikelihood(dist.Distribution):
 
     def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
         """Draw observations given the forces: (*sample_shape, T, D)."""
-        run = lambda k: self.latent.observe(k, self.u, self.start)  # noqa: E731
-        if not sample_shape:
-            return run(key)
-        keys = jax.random.split(key, int(np.prod(sample_shape)))
-        return jax.vmap(run)(keys).reshape(*sample_shape, *self.event_shape)
+        return repeated(lambda k: self.latent.observe(k, self.u, self.start), key, sample_shape)
 
 
 class on_latent_grid(LikelihoodHandler):  # noqa: N801 (an effect handler, named as NumPyro names its handlers)
@@ -84,7 +80,7 @@ class on_latent_grid(LikelihoodHandler):  # noqa: N801 (an effect handler, named
         self.points, self.rule = points, rule
         super().__init__(fn)
 
-    def complaint(self) -> str:
+    def missing(self) -> str:
         """Return what to say of a model without forces that could be put on a grid."""
         return ("the model has no site numpyro.sample(name, lfm.MarginalLikelihood(...), obs=y) without mask, expand "
                 "or plate around it, whose forces could be put on a grid.")

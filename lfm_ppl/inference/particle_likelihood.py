@@ -89,7 +89,7 @@ class with_particles(LikelihoodHandler):  # noqa: N801 (an effect handler, named
         self.key, self.settings, self.steps = key, settings, steps
         super().__init__(fn)
 
-    def complaint(self) -> str:
+    def missing(self) -> str:
         """Return what to say of a model without a likelihood that could be replaced."""
         return ("the particle filter cannot stand in for the likelihood of this model: it needs a site "
                 "numpyro.sample(name, lfm.MarginalLikelihood(...), obs=y) without mask, expand or plate around it (or "

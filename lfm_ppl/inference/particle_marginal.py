@@ -14,6 +14,7 @@ from numpyro.infer import init_to_median
 from numpyro.util import is_prng_key
 
 from lfm_ppl import checks
+from lfm_ppl.comparators.kernel import of_chains
 from lfm_ppl.comparators.particle_filter import ParticleSettings
 from lfm_ppl.inference.bound_model import BoundModel, bind_arguments
 from lfm_ppl.inference.particle_likelihood import ParticlePotential, Tuned
@@ -35,27 +36,22 @@ _DELAYED = 0.5
 
 
 class ParticleMarginalState(NamedTuple):
-    """What the chain carries: the fields of `RAMState`, and two of its own.
+    """What the chain carries: the state of RAM, whose fields can be read as its own, and more.
 
     Attributes:
-        i, z, accept_prob, accepted, mean_accept_prob, step_size, chol_proposal, num_warmup, rng_key: as in `RAMState`.
-        potential_energy: minus the log of the ESTIMATED density at ``z``, from when ``z`` was proposed.
+        ram: its ``potential_energy`` is minus the log of the ESTIMATED density at ``z``, from when ``z`` was proposed.
         surrogate_energy: minus the log density at ``z`` with the Gaussian filter's likelihood; zero if not used.
         estimated: whether the last proposal reached the particle filter.
+        rng_key: random key of the next step, in the place of RAM's; ``MCMC`` replaces it after a warm-up.
     """
 
-    i: jax.Array
-    z: Any
-    potential_energy: jax.Array
-    accept_prob: jax.Array
-    accepted: jax.Array
-    mean_accept_prob: jax.Array
-    step_size: jax.Array
-    chol_proposal: jax.Array
-    num_warmup: jax.Array
-    rng_key: jax.Array
+    ram: RAMState
     surrogate_energy: jax.Array
     estimated: jax.Array
+    rng_key: jax.Array
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.ram, name)
 
 
 class ParticleMarginalRAM(RAM):
@@ -149,7 +145,7 @@ class ParticleMarginalRAM(RAM):
         self._tuned_for: Any = None
         self.tuned: Tuned | None = None
 
-    def init(  # type: ignore[override]
+    def init(
         self,
         rng_key: jax.Array,
         num_warmup: int,
@@ -172,8 +168,8 @@ class ParticleMarginalRAM(RAM):
             energy = jax.lax.map(lambda pair: estimate(*pair), (start.z, jax.random.split(estimate_key, len(rng_key))))
         energy = finite_or_infinity(energy)
         surrogate = start.potential_energy if self.delayed else jnp.zeros_like(energy)
-        return ParticleMarginalState(*start._replace(potential_energy=energy), surrogate,
-                                     jnp.zeros(np.shape(energy), bool))
+        return ParticleMarginalState(start._replace(potential_energy=energy), surrogate,
+                                     jnp.zeros(np.shape(energy), bool), start.rng_key)
 
     @property
     def settings(self) -> ParticleSettings:
@@ -219,7 +215,7 @@ class ParticleMarginalRAM(RAM):
         """Return the state after one step of every chain in ``state``."""
         surrogate = self._potential(model_args, model_kwargs or {}) if self.delayed else None
         one_chain = self.step(partial(self._energy, model_args[-1] if model_args else None), surrogate)
-        return (one_chain if is_prng_key(state.rng_key) else jax.vmap(one_chain))(state)
+        return of_chains(one_chain, state.rng_key)(state)
 
     def step(self, estimate: Callable, surrogate: Callable | None) -> Callable:
         """Return the step of one chain; arguments as in `particle_marginal_step`."""
@@ -252,8 +248,7 @@ def particle_marginal_step(
         The state ``n``.
     """
     rng_key, key_noise, key_accept, key_particles, key_first = jax.random.split(state.rng_key, 5)
-    ram = RAMState(*state[: len(RAMState._fields)])
-    proposal, noise = propose(ram, key_noise)
+    proposal, noise = propose(state.ram, key_noise)
     first = gain = jnp.zeros_like(state.surrogate_energy)
     passed = jnp.array(True)
     if surrogate is not None:
@@ -265,12 +260,11 @@ def particle_marginal_step(
                           lambda: jnp.full_like(state.potential_energy, jnp.inf))
     accept_prob = passed * acceptance(state.potential_energy - energy - gain)
     accepted = jax.random.uniform(key_accept) < accept_prob
-    moved = ram._replace(
+    moved = state.ram._replace(
         z=choose(accepted, proposal, state.z),
         potential_energy=jnp.where(accepted, energy, state.potential_energy),
         accepted=accepted,
-        rng_key=rng_key,
     )
     target = target_accept_prob or (_TARGET_ONE if noise.size == 1 else _TARGET)
     moved = adapted(moved, noise, accept_prob, target, exponent, throughout)
-    return ParticleMarginalState(*moved, jnp.where(accepted, first, state.surrogate_energy), passed)
+    return ParticleMarginalState(moved, jnp.where(accepted, first, state.surrogate_energy), passed, rng_key)

@@ -13,13 +13,17 @@ from lfm_ppl import checks
 from lfm_ppl.comparators.particle_filter import ParticleSettings
 from lfm_ppl.comparators.particle_smoother import TRACING, draw_trajectories
 from lfm_ppl.filtering.schedule import schedule
-from lfm_ppl.inference.bound_model import BoundModel, signature
+from lfm_ppl.inference.bound_model import BoundModel
+from lfm_ppl.inference.fingerprint import signature
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
 from lfm_ppl.linalg import matmul, semidefinite_root
 from lfm_ppl.model.augment import StateSpaceModel
 
 _FILTERS = 4
 """Particle filters from which the path of one draw is chosen."""
+
+_BATCH = 8
+"""Draws in a batch of those that go one after another."""
 
 _BATCH_NUMBERS = 2_000_000
 """Numbers that the smoother may hold for one batch of draws; more draws go one batch after another."""
@@ -143,10 +147,8 @@ def each(distribution: MarginalLikelihood | Panel, function: Callable, *argument
 
 
 def over_draws(bound: BoundModel, name: Hashable, per_draw: Callable, draws: Mapping[str, Any], key: jax.Array,
-               rows: int) -> dict[str, np.ndarray]:
-    """Return ``per_draw(values, key, y)`` for all draws (S, ...), in batches that bound the memory.
-
-    With steps that follow a tolerance it is one draw after another.
+               rows: int | None = None, show: Callable[[int, int], None] = lambda done, count: None) -> Any:
+    """Return ``per_draw(values, key, y)`` for all draws (S, ...), some at a time, with one compilation for any number.
 
     Args:
         bound: the model and its data y.
@@ -154,23 +156,26 @@ def over_draws(bound: BoundModel, name: Hashable, per_draw: Callable, draws: Map
         per_draw: maps site values, a random key and the model's ``argument`` to a pytree of arrays.
         draws: site name -> (S, ...).
         key: a JAX random key.
-        rows: of the scan over time, for the estimate of the memory.
+        rows: of the scan over time, from which follows how many draws the memory holds side by side; None: one draw
+            after another, as always with steps that follow a tolerance, of which each would make as many as are tried.
+        show: is told before each batch how many draws of how many are done.
     """
     draws = {site: jnp.asarray(value) for site, value in draws.items()}
     count = next(iter(draws.values())).shape[0]
     example = bound.site.example
-    if example.tolerance is not None and not example.ssm.time_invariant:
-        # Side by side, every draw would make as many steps as may be tried.
-        one_by_one = bound.compiled(("one by one", name), lambda: jax.jit(
-            lambda d, k, y: jax.lax.map(lambda pair: per_draw(*pair, y), (d, k))))
-        return jax.tree_util.tree_map(np.asarray, one_by_one(draws, jax.random.split(key, count), bound.argument))
-    numbers = rows * example.ssm.state_dim**2 * 6
-    batch = int(np.clip(_BATCH_NUMBERS // max(numbers, 1), 1, count))
-    batches = -(-count // batch)
-    # Repeat the last draws so that all batches are full: one shape, one compilation.
-    index = np.minimum(np.arange(batches * batch), count - 1).reshape(batches, batch)
-    run = bound.compiled(("in batches", name), lambda: jax.jit(
-        lambda d, k, y: jax.lax.map(lambda pair: jax.vmap(per_draw, in_axes=(0, 0, None))(*pair, y), (d, k))))
-    found = run({site: value[index] for site, value in draws.items()}, jax.random.split(key, count)[index],
-                bound.argument)
-    return jax.tree_util.tree_map(lambda a: np.asarray(a).reshape(a.shape[0] * a.shape[1], *a.shape[2:])[:count], found)
+    several = rows is not None and (example.tolerance is None or example.ssm.time_invariant)
+    numbers = (rows or 1) * example.ssm.state_dim**2 * 6
+    batch = int(np.clip(_BATCH_NUMBERS // max(numbers, 1), 1, count)) if several else _BATCH
+
+    def make() -> Callable:
+        one_by_one = lambda d, k, y: jax.lax.map(lambda pair: per_draw(*pair, y), (d, k))  # noqa: E731
+        return jax.jit(jax.vmap(per_draw, in_axes=(0, 0, None)) if several else one_by_one)
+
+    run, keys = bound.compiled(("over draws", several, name), make), jax.random.split(key, count)
+    found = []
+    for start in range(0, count, batch):
+        show(start, count)
+        index = np.minimum(np.arange(start, start + batch), count - 1)  # full batches: one shape
+        part = run({site: value[index] for site, value in draws.items()}, keys[index], bound.argument)
+        found.append(jax.tree_util.tree_map(np.asarray, part))
+    return jax.tree_util.tree_map(lambda *parts: np.concatenate(parts)[:count], *found)

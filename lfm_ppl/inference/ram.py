@@ -11,12 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from numpyro.infer import init_to_median
-from numpyro.infer.mcmc import MCMCKernel
 from numpyro.infer.util import initialize_model
 from numpyro.util import identity, is_prng_key
 
 from lfm_ppl import checks
-from lfm_ppl.inference.robust_metropolis import RAMState, initial_state, step
+from lfm_ppl.comparators.kernel import Kernel, check_start, floating, of_chains
+from lfm_ppl.inference.robust_metropolis import RAMState, finite_or_infinity, initial_state, step
 from lfm_ppl.inference.unconstrained import check_latent_sites
 
 _ADAPTATIONS = ("warmup", "throughout")
@@ -24,7 +24,7 @@ _OPTIMAL_SCALE = 2.38
 """Scale of the best Gaussian random walk on a Gaussian target of covariance I, times sqrt(d)."""
 
 
-class RAM(MCMCKernel):
+class RAM(Kernel):
     r"""Robust adaptive Metropolis: a random walk whose covariance is coerced to an acceptance rate.
 
     In the unconstrained space of the model, with ``U ~ N(0, I)``, propose ``x + S_n U``, accept
@@ -104,7 +104,7 @@ class RAM(MCMCKernel):
         checks.one_of("adapt", adapt, _ADAPTATIONS)
         if initial_scale is not None:
             checks.positive("initial_scale", initial_scale)
-        self._model = model
+        super().__init__(model)
         self._potential_fn = potential_fn
         self._target_accept_prob = target_accept_prob
         self._initial_scale = initial_scale
@@ -114,18 +114,6 @@ class RAM(MCMCKernel):
         self._init_strategy = init_strategy
         self._potential_fn_gen: Callable | None = None
         self._postprocess_fn: Callable | None = None
-        # MCMC takes a kernel without a _sample_fn for one that was not initialised
-        self._sample_fn: Callable | None = None
-
-    @property
-    def model(self) -> Callable | None:
-        """The NumPyro model, if there is one."""
-        return self._model
-
-    @property
-    def sample_field(self) -> str:
-        """Field of the state that holds the parameters."""
-        return "z"
 
     @property
     def adaptation(self) -> tuple[float | None, float, bool]:
@@ -142,41 +130,20 @@ class RAM(MCMCKernel):
             return identity
         return self._postprocess_fn(*args, **kwargs)
 
-    def init(
-        self,
-        rng_key: jax.Array,
-        num_warmup: int,
-        init_params: Any = None,
-        model_args: tuple = (),
-        model_kwargs: dict | None = None,
-    ) -> RAMState:
-        """Return the state before the first step.
-
-        Args:
-            rng_key: a key, or an array of keys, one for each vectorised chain.
-            num_warmup: number of warm-up steps.
-            init_params: unconstrained starting point; with a leading axis of chains where there are
-                several keys.
-            model_args: positional arguments of the model.
-            model_kwargs: keyword arguments of the model.
-        """
+    def begin(self, rng_key: jax.Array, model_key: jax.Array, num_warmup: int, init_params: Any, args: tuple,
+              kwargs: dict) -> RAMState:
+        """Return the state before the first step; ``init_params`` are unconstrained."""
+        z, potential_energy = self._starting_point(model_key, init_params, args, kwargs)
         single = is_prng_key(rng_key)
-        split = jax.random.split if single else jax.vmap(jax.random.split, out_axes=1)
-        rng_key, model_key = split(rng_key)
-        z, potential_energy = self._starting_point(
-            model_key, init_params, model_args, model_kwargs or {}
-        )
         shapes = [leaf.shape if single else leaf.shape[1:] for leaf in jax.tree_util.tree_leaves(z)]
         chol = jnp.asarray(self.initial_factor(sum(math.prod(shape) for shape in shapes)))
         start = partial(initial_state, chol=chol, num_warmup=num_warmup)
-        state = (start if single else jax.vmap(start))(z, potential_energy, rng_key)
-        self._sample_fn = self.sample
-        return state
+        return of_chains(start, rng_key)(z, potential_energy, rng_key)
 
     def sample(self, state: RAMState, model_args: tuple, model_kwargs: dict | None) -> RAMState:
         """Return the state after one step of every chain in ``state``."""
         one_chain = partial(step, self._potential(model_args, model_kwargs or {}), *self.adaptation)
-        return (one_chain if is_prng_key(state.rng_key) else jax.vmap(one_chain))(state)
+        return of_chains(one_chain, state.rng_key)(state)
 
     def _potential(self, model_args: tuple, model_kwargs: dict) -> Callable:
         if self._model is None:
@@ -188,9 +155,8 @@ class RAM(MCMCKernel):
     def _starting_point(
         self, rng_key: jax.Array, init_params: Any, model_args: tuple, model_kwargs: dict
     ) -> tuple[Any, jax.Array]:
-        single = is_prng_key(rng_key)
         if self._model is not None:
-            first_key = rng_key if single else rng_key[0]
+            first_key = rng_key if is_prng_key(rng_key) else rng_key[0]
             check_latent_sites(self._model, model_args, model_kwargs, first_key, "RAM")
             info, self._potential_fn_gen, self._postprocess_fn, _ = initialize_model(
                 rng_key,
@@ -208,16 +174,11 @@ class RAM(MCMCKernel):
                 "RAM with potential_fn does not know where to start. Pass MCMC.run(..., "
                 "init_params=point), with a leading axis of num_chains if there are several chains."
             )
-        z = jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf) * 1.0, init_params)
-        potential = self._potential(model_args, model_kwargs)
-        energy = (potential if single else jax.vmap(potential))(z)
-        values = checks.concrete(energy)
-        if values is not None and not np.all(np.isfinite(values)):
-            raise ValueError(
-                f"init_params has potential energy {values}, which must be finite. Start from "
-                "another point, for example from lfm.map_estimate(...).unconstrained."
-            )
-        return z, jnp.where(jnp.isfinite(energy), energy, jnp.inf)
+        z = floating(init_params)
+        energy = of_chains(self._potential(model_args, model_kwargs), rng_key)(z)
+        check_start(energy, "init_params has potential energy {}, which must be finite. Start from another point, for "
+                            "example from lfm.map_estimate(...).unconstrained.")
+        return z, finite_or_infinity(energy)
 
     def initial_factor(self, dimension: int) -> np.ndarray:
         """Return the first Cholesky factor of the proposal, (d, d), for d unconstrained parameters."""
@@ -232,9 +193,6 @@ class RAM(MCMCKernel):
             )
         scale = self._initial_scale or _OPTIMAL_SCALE / np.sqrt(dimension)
         return scale * self._initial_chol
-
-    def __getstate__(self) -> dict:
-        return self.__dict__ | {"_sample_fn": None}
 
 
 def _cholesky(covariance: Any) -> np.ndarray:

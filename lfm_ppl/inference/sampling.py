@@ -17,7 +17,8 @@ from numpyro.infer.util import ParamInfo
 
 from lfm_ppl import checks
 from lfm_ppl.inference import robust_metropolis
-from lfm_ppl.inference.bound_model import BoundModel, signature
+from lfm_ppl.inference.bound_model import BoundModel
+from lfm_ppl.inference.fingerprint import signature
 from lfm_ppl.inference.particle_marginal import ParticleMarginalRAM, ParticleMarginalState
 from lfm_ppl.inference.ram import RAM
 from lfm_ppl.inference.robust_metropolis import RAMState, finite_or_infinity, initial_state
@@ -116,7 +117,8 @@ def particle_marginal(bound: BoundModel, kernel: ParticleMarginalRAM, warmup: in
     def start(key: jax.Array, point: ParamInfo, y: Any, chol: Any) -> ParticleMarginalState:
         energy = finite_or_infinity(estimate(y)(point.z, jax.random.fold_in(key, 1)))
         surrogate = point.potential_energy if kernel.delayed else jnp.zeros_like(energy)
-        return ParticleMarginalState(*initial_state(point.z, energy, key, chol, warmup), surrogate, jnp.array(False))
+        ram = initial_state(point.z, energy, key, chol, warmup)
+        return ParticleMarginalState(ram, surrogate, jnp.array(False), key)
 
     def step(state: ParticleMarginalState, y: Any) -> ParticleMarginalState:
         return kernel.step(estimate(y), _potential(bound, y) if kernel.delayed else None)(state)

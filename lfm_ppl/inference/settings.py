@@ -46,7 +46,7 @@ class approximate(LikelihoodHandler):  # noqa: N801 (an effect handler, named as
         self.settings = {name: value for name, value in settings.items() if value is not None}
         super().__init__(fn)
 
-    def complaint(self) -> str:
+    def missing(self) -> str:
         """Return what to say of a model without a likelihood whose settings could be changed."""
         if not self.settings:
             return ""

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import checks
-from lfm_ppl.forces.sum import Stack, block_diagonal
+from lfm_ppl.forces.sde import Stack, block_diagonal
 from lfm_ppl.linalg import matmul
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.structure import Pattern, pattern

@@ -14,7 +14,6 @@ from lfm_ppl import checks
 from lfm_ppl.forces.sde import Force
 from lfm_ppl.model.known_input import check_reads, reads_inputs
 from lfm_ppl.model.observation import Gaussian, GaussianObservation
-from lfm_ppl.model.resolution import check_resolution
 from lfm_ppl.model.user_functions import Traced, trace
 
 
@@ -179,10 +178,6 @@ class LatentForceModel(eqx.Module):
         """Check the forces against data from ``first`` to ``last``; raise ValueError where one does not suit them."""
         for name, force in self.forces.items():
             force.check_span(name, first, last)
-
-    def check_resolution(self, times: Any, y: Any) -> None:
-        """Warn (`lfm.ApproximationWarning`) of squared exponential forces of too low an order for data at ``times``."""
-        check_resolution(self, times, y)
 
     def check_at(self, time: Any, rows: int) -> None:
         """Check what depends on where and how often the model is observed.

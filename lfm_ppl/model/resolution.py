@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,12 +12,9 @@ import numpy as np
 from scipy.linalg import expm
 
 from lfm_ppl import checks
-from lfm_ppl.forces.sde import ApproximationWarning, Force
+from lfm_ppl.forces.sde import ApproximationWarning, Force, Sum
 from lfm_ppl.forces.squared_exponential import SquaredExponential
-from lfm_ppl.forces.sum import Sum
-
-if TYPE_CHECKING:
-    from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.latent_force_model import LatentForceModel
 
 TOLERANCE = 0.1
 """Error of the log likelihood above which there is a warning."""

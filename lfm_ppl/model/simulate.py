@@ -80,8 +80,7 @@ def simulate_on(ssm: StateSpaceModel, key: jax.Array, times: jax.Array, start: j
     mean, covariance = ssm.initial()
     first = mean + matmul(semidefinite_root(covariance), jax.random.normal(initial, (ssm.state_dim, 1)))[:, 0]
     starts = jnp.concatenate([jnp.reshape(start, (1,)), times[:-1]])
-    table = ssm.stack.jump_table()
-    jumps = None if table is None else (table[0][:-1], jax.vmap(semidefinite_root)(table[1][:-1]))
+    jumps = ssm.stack.jump_roots()
 
     def row(state: jax.Array, inputs: tuple) -> tuple[jax.Array, jax.Array]:
         begin, end, row_key = inputs
@@ -150,7 +149,7 @@ def _cross_jumps(ssm: StateSpaceModel, jumps: Any, state: jax.Array, begin: jax.
         return jnp.where(here, jumped, forces), None
 
     def all_crossed(forces: jax.Array) -> jax.Array:
-        return jax.lax.scan(one, forces, (crossed, jnp.arange(len(times)), *jumps))[0]
+        return jax.lax.scan(one, forces, (crossed, jnp.arange(len(times)), *(a[:-1] for a in jumps)))[0]
 
     forces = jax.lax.cond(crossed.any(), all_crossed, lambda forces: forces, state[size:])
     return jnp.concatenate([state[:size], forces])

@@ -2,6 +2,7 @@
 
 import contextlib
 import logging
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
@@ -337,6 +338,33 @@ def test_times_may_follow_from_parameters_or_data():
 def test_a_model_whose_variables_stay_is_bound_once():
     _, ((first, _), (second, _)) = _density_of({"power": 1.0})
     assert second._program is first._program
+
+
+def test_binding_runs_a_model_as_often_as_it_must():
+    """With numbers and with tracers when it is new, with tracers to see that it is still the same."""
+    runs = []
+
+    def counted(times, y=None):
+        runs.append(None)
+        decay = numpyro.sample("decay", dist.LogNormal(0.0, 0.3))
+        numpyro.sample("y", lfm.MarginalLikelihood(systems.motif(decay=decay), times, steps=2), obs=y)
+
+    first = lfm.bind(counted, TIMES, Y)
+    assert first.site.name == "y" and len(runs) == 2
+    second = lfm.bind(counted, TIMES, OTHER)
+    assert second._program is first._program and second.site.example.steps == 2 and len(runs) == 3
+
+
+def test_threads_share_what_is_compiled():
+    def threaded(times, y=None):
+        decay = numpyro.sample("decay", dist.LogNormal(0.0, 0.3))
+        numpyro.sample("y", lfm.MarginalLikelihood(systems.motif(decay=decay), times, steps=2), obs=y)
+
+    bound, made = lfm.bind(threaded, TIMES, Y), []
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda _: bound.compiled("mine", lambda: made.append(None) or jnp.sin), range(8)))
+        others = list(pool.map(lambda y: float(lfm.bind(threaded, TIMES, y).log_density(np.array([0.1]))), [Y] * 4))
+    assert len(made) == 1 and set(found) == {jnp.sin} and len(set(others)) == 1
 
 
 def test_a_model_may_be_bound_first_in_compiled_code():

@@ -18,6 +18,7 @@ from lfm_ppl.inference.bound_model import bind
 from lfm_ppl.inference.particle_likelihood import ParticlePotential
 from lfm_ppl.inference.particle_marginal import ParticleMarginalState, particle_marginal_step
 from lfm_ppl.inference.posterior import trajectories
+from lfm_ppl.inference.robust_metropolis import initial_state
 
 TIMES = np.array([0.0, 0.6, 1.5, 1.5, 2.7, 4.0])
 Y = np.array([[1.2], [0.7], [np.nan], [0.5], [-0.2], [0.4]])
@@ -88,9 +89,8 @@ def test_noise_and_a_wrong_surrogate_leave_the_target_alone(surrogate):
 
     def chain(key):
         zero = jnp.zeros(())
-        start = ParticleMarginalState(
-            jnp.array(0), zero, zero, zero, jnp.array(False), zero, jnp.ones(()), 2.4 * jnp.eye(1), jnp.array(0), key,
-            zero if surrogate is None else surrogate(zero), jnp.array(False))
+        start = ParticleMarginalState(initial_state(zero, zero, key, 2.4 * jnp.eye(1), 0),
+                                      zero if surrogate is None else surrogate(zero), jnp.array(False), key)
         step = partial(particle_marginal_step, estimate, surrogate, None, 2 / 3, False)
         return jax.lax.scan(lambda s, _: ((new := step(s)), new.z), start, length=20_000)[1]
 

@@ -21,14 +21,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import solve_triangular
 
-from lfm_ppl import orbits
+from lfm_ppl import linalg, orbits
 from lfm_ppl.experiments.gps import magnitudes
 from lfm_ppl.experiments.gps.problem import NOISE, Arc
 from lfm_ppl.filtering.filter import forward
+from lfm_ppl.filtering.predict import compose
 from lfm_ppl.filtering.schedule import schedule
 from lfm_ppl.forces import Force, RandomWalk, Resonator
-from lfm_ppl.forces.sum import Sum
-from lfm_ppl.linalg import congruence, matmul, solve_lower
+from lfm_ppl.forces.sde import Sum
+from lfm_ppl.linalg import masked, matmul, solve_lower
 from lfm_ppl.linearisation.taylor import Taylor
 from lfm_ppl.model.augment import state_space
 from lfm_ppl.model.latent_force_model import LatentForceModel
@@ -190,7 +191,7 @@ def _spread(system: LatentForceModel, times: np.ndarray) -> tuple[jax.Array, jax
     def step(carry: tuple, row: tuple) -> tuple[tuple, tuple]:
         flow, spread, cross = carry  # cross: covariances of the state with all positions up to now
         phi, noise, index = row
-        flow, spread = matmul(phi, flow), congruence(phi, spread) + noise
+        flow, spread = compose((flow, spread), (phi, noise))
         cross = matmul(phi, cross.reshape(size, -1)).reshape(size, count, 3).at[:, index].set(spread[:, :3])
         return (flow, spread, cross), (flow[:3], cross[:3])
 
@@ -236,10 +237,9 @@ def _whitened(data: Regression, start: jax.Array, covariance: jax.Array, count: 
     """Whiten the first ``count`` entries of the positions."""
     y = data.y.ravel()[:count]
     present = jnp.isfinite(y)
-    both = present[:, None] & present[None, :]
-    chol, usable = _root(jnp.where(both, covariance[:count, :count], 0.0)
-                         + jnp.diag(jnp.where(present, NOISE**2, 1.0)))
-    known = jnp.concatenate([start[:count], jnp.where(present, y, 0.0)[:, None]], axis=1)
+    y, covariance = masked(y, covariance[:count, :count] + NOISE**2 * jnp.eye(count), present)
+    chol, usable = _root(covariance)
+    known = jnp.concatenate([start[:count], y[:, None]], axis=1)
     solved = solve_triangular(chol, jnp.where(present[:, None], known, 0.0), lower=True)
     return _Whitened(chol, present, solved[:, :-1], solved[:, -1], usable)
 
@@ -251,8 +251,8 @@ def log_likelihood(logarithms: jax.Array, data: Regression, axes: str) -> jax.Ar
     root, found = _root(jnp.eye(start.shape[1]) + white.start.T @ white.start)
     state = solve_triangular(root, solve_triangular(root, white.start.T @ white.y, lower=True), lower=True, trans=1)
     left = white.y - white.start @ state
-    value = (-0.5 * (left @ left + state @ state) - jnp.log(jnp.diagonal(white.chol)).sum()
-             - jnp.log(jnp.diagonal(root)).sum() - 0.5 * white.present.sum() * jnp.log(2 * jnp.pi))
+    value = (linalg.log_density(left, white.chol, white.present)
+             + linalg.log_density(state, root, jnp.zeros(state.shape)))
     return jnp.where(usable & white.usable & found, value, -jnp.inf)
 
 
@@ -289,9 +289,7 @@ def held_out(logarithms: jax.Array, data: Regression, axes: str) -> jax.Array:
 def log_density(error: jax.Array, covariance: jax.Array) -> jax.Array:
     """Return the log density (T,) of errors (T, 3) whose covariance is (T, 3, 3) and that of the positions."""
     chol = jnp.linalg.cholesky(covariance + NOISE**2 * jnp.eye(3))
-    white = jax.vmap(solve_lower)(chol, error)
-    return (-0.5 * (white**2).sum(1) - jnp.log(jnp.diagonal(chol, axis1=1, axis2=2)).sum(1)
-            - 1.5 * jnp.log(2 * jnp.pi))
+    return linalg.log_density(jax.vmap(solve_lower)(chol, error), chol)
 
 
 slope_of_log_likelihood: Any = functools.partial(jax.jit, static_argnums=(2,))(jax.value_and_grad(log_likelihood))

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 from jax.scipy.special import logsumexp
+from jax.scipy.stats import norm
 
 from lfm_ppl import checks
 from lfm_ppl.experiments import output, scores
@@ -187,7 +188,7 @@ def _posterior(task: Task) -> Result:
         truth, y = window.y[test, 0], jnp.asarray(prediction.masked(window.y))
         several = prediction.filtered_under_draws(*model)(jnp.asarray(scores.spread(draws, 100)), y, window.outdoor)
         mean, variance = several.mean[:, test], several.variance[:, test]
-        terms = -0.5 * ((truth - mean) ** 2 / variance + jnp.log(2 * np.pi * variance))
+        terms = norm.logpdf(truth, mean, jnp.sqrt(variance))
         point = prediction.known_heater(*model, window, z)
         rows.append({"ell": float((logsumexp(terms, axis=0) - np.log(len(mean))).sum()),
                      "rmse": scores.rmse(mean.mean(axis=0), truth), "point_ell": point["ahead_ell"],

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from scipy.stats import norm
 
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.periodic_kernels import problem
@@ -50,7 +51,7 @@ def compute(task: Task) -> Result:
     fixed = covariances(task, method, 0) if METHODS[method] == 0 or "sparse" not in method else None
     found = [predict(fixed or covariances(task, method, index), data[index]) for index in range(runs)]
     mean, variance = np.stack([one.mean for one in found]), np.stack([one.variance for one in found])
-    density = -0.5 * ((truth - mean) ** 2 / variance + np.log(2 * np.pi * variance))
+    density = norm.logpdf(truth, mean, np.sqrt(variance))
     return {"rmse": np.sqrt(np.mean((truth - mean) ** 2, axis=1)), "log likelihood": density.sum(axis=1),
             "coverage": np.mean(np.abs(truth - mean) < scores.Z * np.sqrt(variance), axis=1),
             "mean": mean[0], "variance": variance[0]}

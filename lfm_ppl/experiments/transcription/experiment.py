@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
+from scipy.stats import norm
 
 from lfm_ppl import checks
 from lfm_ppl.experiments import output, scores
@@ -124,7 +125,7 @@ def judged(found: Result, truth: np.ndarray) -> Result:
     if "stopped" in found:
         diverged |= ~np.asarray(found["stopped"], bool)
     return {"rmse": error, "coverage": (np.abs(z) <= scores.Z).mean(axis=1),
-            "nlpd": (0.5 * z**2 + np.log(sd) + 0.5 * np.log(2.0 * np.pi)).mean(axis=1), "diverged": diverged}
+            "nlpd": -norm.logpdf(truth, mean, sd).mean(axis=1), "diverged": diverged}
 
 
 def run(settings: Settings, folder: str | Path, *, overwrite: bool = False,
