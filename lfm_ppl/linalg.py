@@ -103,7 +103,7 @@ def safe_sqrt(x: jax.Array) -> jax.Array:
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
 
 
-class Factor(NamedTuple):
+class CholeskyFactor(NamedTuple):
     """A lower triangular factor ``L`` with ``P = L L'``, and the pivots that were not positive.
 
     Attributes:
@@ -125,7 +125,7 @@ class Factor(NamedTuple):
         return solve_upper(self.chol, b) if self.inverse is None else matmul(self.inverse.T, b)
 
 
-def cholesky(p: jax.Array, floor: jax.Array | float = 0.0, keep: bool = True, name: str | None = None) -> Factor:
+def cholesky(p: jax.Array, floor: jax.Array | float = 0.0, keep: bool = True, name: str | None = None) -> CholeskyFactor:
     """Factorise a positive semi-definite matrix in plain operations.
 
     LAPACK's routine is a call that XLA cannot fuse and gives NaN, in value or gradient, for a singular matrix. Here a
@@ -143,7 +143,7 @@ def cholesky(p: jax.Array, floor: jax.Array | float = 0.0, keep: bool = True, na
     """
     size = p.shape[-1]
     if size == 0:
-        return Factor(p, jnp.zeros(0, bool), p)
+        return CholeskyFactor(p, jnp.zeros(0, bool), p)
     floor = jnp.broadcast_to(jnp.asarray(floor, p.dtype), (size,))
     if size > _FUSED_SIZE:
         return _cholesky_in_a_loop(p, floor, keep)
@@ -151,17 +151,17 @@ def cholesky(p: jax.Array, floor: jax.Array | float = 0.0, keep: bool = True, na
     if keep:
         return factor
     dead = factor.degenerate
-    return Factor(jnp.where(dead, 0.0, factor.chol), dead, jnp.where(dead[:, None], 0.0, factor.inverse))
+    return CholeskyFactor(jnp.where(dead, 0.0, factor.chol), dead, jnp.where(dead[:, None], 0.0, factor.inverse))
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _eliminated(name: str | None, p: jax.Array, floor: jax.Array) -> Factor:
+def _eliminated(name: str | None, p: jax.Array, floor: jax.Array) -> CholeskyFactor:
     """Factorise with replaced pivots, by Gaussian elimination in (P, I), which becomes (L', L^-1) row by row."""
     size = p.shape[-1]
     if size == 1:
         positive = p > floor
         root = jnp.sqrt(jnp.where(positive, p, jnp.where(floor > 0, floor, 1.0)))
-        return Factor(root, ~positive[0], 1.0 / root)
+        return CholeskyFactor(root, ~positive[0], 1.0 / root)
     rows = np.arange(size)
     left = jnp.concatenate([p, jnp.eye(size, dtype=p.dtype)], axis=1)
     found, degenerate = [], []
@@ -178,11 +178,11 @@ def _eliminated(name: str | None, p: jax.Array, floor: jax.Array) -> Factor:
             column = jnp.where(positive & (rows > j), left[:, j] / root, 0.0)
             left = left - column[:, None] * row[None, :]
     whole = jnp.stack(found)
-    return Factor(jnp.where(rows[:, None] >= rows, whole[:, :size].T, 0.0), jnp.stack(degenerate), whole[:, size:])
+    return CholeskyFactor(jnp.where(rows[:, None] >= rows, whole[:, :size].T, 0.0), jnp.stack(degenerate), whole[:, size:])
 
 
 @functools.partial(_eliminated.defjvp, symbolic_zeros=True)
-def _eliminated_jvp(name: str | None, primals: tuple, tangents: tuple) -> tuple[Factor, Factor]:
+def _eliminated_jvp(name: str | None, primals: tuple, tangents: tuple) -> tuple[CholeskyFactor, CholeskyFactor]:
     """Differentiate in closed form: dL = L F and d(L^-1) = -F L^-1, F the lower half of L^-1 dP L^-T.
 
     A degenerate column of F is zero, but for the relative change of the pivot that was put in its place.
@@ -202,10 +202,10 @@ def _eliminated_jvp(name: str | None, primals: tuple, tangents: tuple) -> tuple[
     if not isinstance(of_floor, SymbolicZero):
         used = degenerate & (floor > 0)
         lower = lower + jnp.diag(jnp.where(used, 0.5 * of_floor / jnp.where(used, floor, 1.0), 0.0))
-    return factor, Factor(matmul(chol, lower), np.zeros(degenerate.shape, jax.dtypes.float0), -matmul(lower, inverse))
+    return factor, CholeskyFactor(matmul(chol, lower), np.zeros(degenerate.shape, jax.dtypes.float0), -matmul(lower, inverse))
 
 
-def _cholesky_in_a_loop(p: jax.Array, floor: jax.Array, keep: bool) -> Factor:
+def _cholesky_in_a_loop(p: jax.Array, floor: jax.Array, keep: bool) -> CholeskyFactor:
     """Factorise as `cholesky` does; each column is taken off what is left of the matrix."""
     rows = np.arange(p.shape[-1])
 
@@ -221,7 +221,7 @@ def _cholesky_in_a_loop(p: jax.Array, floor: jax.Array, keep: bool) -> Factor:
         return left - column[:, None] * column[None, :], (column, ~positive)
 
     _, (columns, degenerate) = jax.lax.scan(take, p, (jnp.arange(p.shape[-1]), floor))
-    return Factor(columns.T, degenerate)
+    return CholeskyFactor(columns.T, degenerate)
 
 
 def solve_lower(chol: jax.Array, b: jax.Array) -> jax.Array:

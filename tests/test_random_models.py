@@ -129,7 +129,7 @@ def _of_series(one: Structure, value: float, gradient: np.ndarray, slopes: tuple
 
 
 def _of_known_numbers(one: Structure, drawn: Series, found: dict) -> list[str]:
-    """The same outside of compiled code, where structure and schedule are planned from the numbers."""
+    """The same outside of compiled code, where structure and time grid are read off the numbers."""
     finite = np.flatnonzero(np.isfinite(np.asarray(found["log likelihood"])).all(1))
     if not finite.size:
         return []

@@ -13,7 +13,7 @@ import xarray as xr
 
 from lfm_ppl import checks
 from lfm_ppl.analysis import arviz_data, importance, likelihoods, rebuilding
-from lfm_ppl.analysis.likelihoods import Problem, Reference
+from lfm_ppl.analysis.likelihoods import PosteriorDraws, Reference
 from lfm_ppl.analysis.report import EXACT, GROUP, AccuracyReport
 from lfm_ppl.analysis.scalars import choose, scalar_draws
 from lfm_ppl.analysis.verdict import NOISE_SD, Findings, judge
@@ -92,7 +92,7 @@ def check_accuracy(result: Any, numpyro_model: Callable, times: Any = None, y: A
     ssm = whole.example.ssm
     kind = _kind(reference, ssm)
     posterior = arviz_data.group(result, "posterior")
-    chosen, rows = spread(posterior.sizes["chain"], posterior.sizes["draw"], draws)
+    chosen, rows = evenly_spaced(posterior.sizes["chain"], posterior.sizes["draw"], draws)
     problem = whole.at(rows)
     shape = (posterior.sizes["chain"], len(chosen))
     filtered = likelihoods.gaussian(problem).reshape(shape)
@@ -104,11 +104,11 @@ def check_accuracy(result: Any, numpyro_model: Callable, times: Any = None, y: A
     return report
 
 
-def spread(chains: int, samples: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+def evenly_spaced(chains: int, samples: int, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return which draws of each chain (S,), and of all chains one after another (C * S,), are about ``count`` in all.
 
     Example:
-        >>> spread(2, 100, 4)[1].tolist()
+        >>> evenly_spaced(2, 100, 4)[1].tolist()
         [0, 99, 100, 199]
     """
     per_chain = min(samples, -(-count // chains))
@@ -117,7 +117,7 @@ def spread(chains: int, samples: int, count: int) -> tuple[np.ndarray, np.ndarra
 
 
 def assess(result: Any, chosen: np.ndarray, filtered: np.ndarray, doubled: np.ndarray, reference: Reference,
-           problem: Problem) -> AccuracyReport:
+           problem: PosteriorDraws) -> AccuracyReport:
     """Return the report from log likelihoods at draws.
 
     Args:
@@ -231,7 +231,7 @@ def _noisy(ssm: StateSpaceModel) -> bool:
     return callable(noise) or (noise is not None and bool(np.any(np.asarray(noise))))
 
 
-def _reference(kind: str, problem: Problem, filtered: np.ndarray, particles: int | None, replicates: int,
+def _reference(kind: str, problem: PosteriorDraws, filtered: np.ndarray, particles: int | None, replicates: int,
                steps: int | None, seed: int, progress: bool) -> Reference:
     if kind == "none":
         return Reference(filtered.reshape(-1, 1), f"{EXACT}: for this linear model the Gaussian filter is exact")

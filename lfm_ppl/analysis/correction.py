@@ -12,7 +12,7 @@ import xarray as xr
 
 from lfm_ppl import checks
 from lfm_ppl.analysis import arviz_data, importance, rebuilding
-from lfm_ppl.analysis.accuracy import spread
+from lfm_ppl.analysis.accuracy import evenly_spaced
 from lfm_ppl.analysis.report import AccuracyReport
 from lfm_ppl.inference.posterior import trajectories
 
@@ -85,7 +85,7 @@ def _paths(result: Any, numpyro_model: Callable, times: Any, y: Any, model_kwarg
     templates = {name: arviz_data.group(result, name) for name in _DRAWN if arviz_data.has_group(result, name)}
     template = templates["trajectories"]
     at = template["at"].values if "at" in template.coords else None
-    chosen, rows = spread(picked.shape[0], picked.shape[1], count)
+    chosen, rows = evenly_spaced(picked.shape[0], picked.shape[1], count)
     problem = rebuilding.problem(result, numpyro_model, times, y, model_kwargs).at(picked.ravel()[rows])
     found = trajectories(jax.random.key(seed), problem.bound, problem.draws, at)
     groups = {}

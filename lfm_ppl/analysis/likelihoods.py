@@ -13,7 +13,7 @@ import numpy as np
 from lfm_ppl.comparators import fokker_planck, particle_filter
 from lfm_ppl.comparators.observation_noise import check_noise
 from lfm_ppl.comparators.particle_filter import ParticleSettings
-from lfm_ppl.filtering.schedule import schedule
+from lfm_ppl.filtering.schedule import build_time_grid
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
 from lfm_ppl.inference.posterior import each, over_draws
@@ -29,7 +29,7 @@ _SCOUTS = 10
 """Draws whose models the grid is laid out for: those with the smallest and largest parameters, and others between."""
 
 
-class Problem(NamedTuple):
+class PosteriorDraws(NamedTuple):
     """A bound model, and draws of its parameters.
 
     Attributes:
@@ -60,7 +60,7 @@ class Problem(NamedTuple):
         """Number of series."""
         return self.y.shape[0] if isinstance(self.bound.site.distribution, Panel) else 1
 
-    def at(self, rows: Any) -> Problem:
+    def at(self, rows: Any) -> PosteriorDraws:
         """Return the same problem with some of the draws."""
         return self._replace(draws={name: value[rows] for name, value in self.draws.items()})
 
@@ -88,7 +88,7 @@ def is_exact(ssm: StateSpaceModel) -> bool:
             and not observation.angular)
 
 
-def gaussian(problem: Problem) -> np.ndarray:
+def gaussian(problem: PosteriorDraws) -> np.ndarray:
     """Return (S,): the log likelihoods of the Gaussian filter, summed over the series of a panel."""
     bound = problem.bound
 
@@ -103,7 +103,7 @@ def finer_tolerance(tolerance: float) -> float:
     return tolerance / 16
 
 
-def gaussian_with_finer_steps(problem: Problem) -> np.ndarray:
+def gaussian_with_finer_steps(problem: PosteriorDraws) -> np.ndarray:
     """Return (S,): the log likelihoods of the Gaussian filter with about twice as many integration steps."""
     example = problem.example
     finer = problem.bound.approximate(
@@ -112,7 +112,7 @@ def gaussian_with_finer_steps(problem: Problem) -> np.ndarray:
     return gaussian(problem._replace(bound=finer))
 
 
-def on_grid(problem: Problem, steps: int | None, progress: bool) -> Reference:
+def on_grid(problem: PosteriorDraws, steps: int | None, progress: bool) -> Reference:
     """Return the log likelihoods by the Fokker-Planck equation on one grid for all draws.
 
     Raises:
@@ -122,8 +122,8 @@ def on_grid(problem: Problem, steps: int | None, progress: bool) -> Reference:
     bound = problem.bound
 
     def one(distribution: MarginalLikelihood, y: jax.Array) -> jax.Array:
-        plan = schedule(distribution.ssm, distribution.times, steps or distribution.steps, distribution.max_step)
-        return fokker_planck.log_likelihood(distribution.ssm, plan, y, layout)
+        time_grid = build_time_grid(distribution.ssm, distribution.times, steps or distribution.steps, distribution.max_step)
+        return fokker_planck.log_likelihood(distribution.ssm, time_grid, y, layout)
 
     def per_draw(values: Any, key: jax.Array, y: jax.Array) -> jax.Array:
         return each(bound.likelihood(values, y), one, bound.data(y)).sum()
@@ -132,7 +132,7 @@ def on_grid(problem: Problem, steps: int | None, progress: bool) -> Reference:
     return Reference(found[:, None], f"Fokker-Planck equation on a grid of {layout.cells} cells")
 
 
-def by_particles(problem: Problem, particles: int | None, replicates: int, steps: int | None, key: jax.Array,
+def by_particles(problem: PosteriorDraws, particles: int | None, replicates: int, steps: int | None, key: jax.Array,
                  progress: bool, noise: Callable[[np.ndarray], float], target: float, most_work: float) -> Reference:
     """Return replicates of the particle filter's estimates.
 
@@ -159,8 +159,8 @@ def by_particles(problem: Problem, particles: int | None, replicates: int, steps
         rows = np.unique(np.linspace(0, problem.size - 1, _PILOT).round().astype(int))
         sd = noise(run(problem.at(rows), pilot_key))
         wanted = chosen * (sd / target) ** 2 * _SAFETY if np.isfinite(sd) else np.inf
-        plan = schedule(example.ssm, example.times, steps or example.steps, example.max_step)
-        each_particle = problem.size * replicates * problem.series * np.shape(plan.rows.length)[0] * plan.steps
+        time_grid = build_time_grid(example.ssm, example.times, steps or example.steps, example.max_step)
+        each_particle = problem.size * replicates * problem.series * np.shape(time_grid.intervals.length)[0] * time_grid.steps
         most = max(chosen, most_work / each_particle)
         limited = wanted > most
         if wanted > chosen and most > chosen:
@@ -175,14 +175,14 @@ _SAFETY = 1.2
 """Margin of the number of particles over what the pilot run asks for, which is itself an estimate."""
 
 
-def _particle_run(problem: Problem, particles: int, replicates: int, steps: int | None, progress: bool) -> Callable:
+def _particle_run(problem: PosteriorDraws, particles: int, replicates: int, steps: int | None, progress: bool) -> Callable:
     known = problem.example
-    check_noise(known.ssm, known.plan.initial_time)
+    check_noise(known.ssm, known.time_grid.initial_time)
     settings = particle_filter.check_settings(known.ssm, ParticleSettings(particles))
 
     def one(distribution: MarginalLikelihood, y: jax.Array, key: jax.Array) -> jax.Array:
-        plan = schedule(distribution.ssm, distribution.times, steps or distribution.steps, distribution.max_step)
-        return particle_filter.log_likelihood(distribution.ssm, plan, y, key, settings)
+        time_grid = build_time_grid(distribution.ssm, distribution.times, steps or distribution.steps, distribution.max_step)
+        return particle_filter.log_likelihood(distribution.ssm, time_grid, y, key, settings)
 
     bound, series = problem.bound, problem.series
 
@@ -201,7 +201,7 @@ def _particle_run(problem: Problem, particles: int, replicates: int, steps: int 
     return lambda problem, key: _one_by_one(problem, key, name, per_draw, label, progress)
 
 
-def _one_by_one(problem: Problem, key: jax.Array, name: Hashable, per_draw: Callable, label: str,
+def _one_by_one(problem: PosteriorDraws, key: jax.Array, name: Hashable, per_draw: Callable, label: str,
                 progress: bool) -> np.ndarray:
     """Map over draws, one after another, and say how far that is."""
     found = over_draws(problem.bound, name, per_draw, problem.draws, key,
@@ -215,7 +215,7 @@ def _show(text: str, progress: bool) -> None:
         print(f"\r{text:<70}\r", end="", file=sys.stderr, flush=True)
 
 
-def _scouted(problem: Problem) -> list[Any]:
+def _scouted(problem: PosteriorDraws) -> list[Any]:
     """Return latent force models at draws that span the posterior, to lay out one grid for all."""
     flat = np.column_stack([np.reshape(value, (problem.size, -1)) for value in problem.draws.values()])
     extreme = np.concatenate([flat.argmin(axis=0), flat.argmax(axis=0)])

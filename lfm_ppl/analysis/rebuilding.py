@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from lfm_ppl.analysis import arviz_data
-from lfm_ppl.analysis.likelihoods import Problem
+from lfm_ppl.analysis.likelihoods import PosteriorDraws
 from lfm_ppl.inference.bound_model import BoundModel, LikelihoodSite, bind
 
 _TOLERANCE = 1e-6
@@ -36,7 +36,7 @@ def observations(result: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def problem(result: Any, numpyro_model: Callable, times: Any = None, y: Any = None,
-            model_kwargs: Mapping[str, Any] | None = None) -> Problem:
+            model_kwargs: Mapping[str, Any] | None = None) -> PosteriorDraws:
     """Return model, data and all draws (C * N, ...) of the sample sites, with the result's fixed parameters.
 
     Raises:
@@ -51,7 +51,7 @@ def problem(result: Any, numpyro_model: Callable, times: Any = None, y: Any = No
     bound = bind(numpyro_model, times, y, **dict(model_kwargs or {}))
     _check_settings(bound.site, attrs)
     bound = bound.fix(json.loads(attrs.get("fixed") or "{}"))
-    return Problem(bound, _latent(bound, posterior))
+    return PosteriorDraws(bound, _latent(bound, posterior))
 
 
 def check_likelihood(result: Any, log_likelihood: np.ndarray, chosen: np.ndarray) -> None:

@@ -26,7 +26,7 @@ _CHAINS, _WARMUP, _SAMPLES = 4, 500, 500
 _RECORD = ("model_file", "settings", "options", "data", "note")
 
 
-class Task(NamedTuple):
+class Check(NamedTuple):
     """What is checked: the result, its model and the keyword arguments of that."""
 
     posterior: Any
@@ -69,7 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
         return max(status, _correct(task, report, arguments, folder))
 
 
-def _task(posterior: Any, model_file: str | None) -> Task:
+def _task(posterior: Any, model_file: str | None) -> Check:
     """Rebuild the model from what the result remembers of it."""
     from lfm_ppl.analysis import arviz_data, rebuilding
     from lfm_ppl.analysis.scalars import unit_of
@@ -104,10 +104,10 @@ def _task(posterior: Any, model_file: str | None) -> Task:
     settings = json.loads(attrs.get("settings") or "{}")
     settings["rule"] = choices.rule(settings.get("rule"))
     numpyro_model = approximate(model.model, **settings)
-    return Task(posterior, model.name, numpyro_model, model.keywords(observed, options))
+    return Check(posterior, model.name, numpyro_model, model.keywords(observed, options))
 
 
-def _checked(task: Task, arguments: argparse.Namespace) -> Any:
+def _checked(task: Check, arguments: argparse.Namespace) -> Any:
     from lfm_ppl.analysis.accuracy import check_accuracy
 
     return check_accuracy(
@@ -143,7 +143,7 @@ def _write(report: Any, posterior: Any, path: Path) -> int:
     return 0
 
 
-def _correct(task: Task, report: Any, arguments: argparse.Namespace, folder: Path) -> int:
+def _correct(task: Check, report: Any, arguments: argparse.Namespace, folder: Path) -> int:
     """Write the corrected result: by resampling where the weights are reliable, else by new chains."""
     from lfm_ppl.analysis.correction import correct_posterior
 
@@ -157,7 +157,7 @@ def _correct(task: Task, report: Any, arguments: argparse.Namespace, folder: Pat
     return fit.report(corrected, folder, time.perf_counter() - started, arguments.overwrite)
 
 
-def _exact_chains(task: Task, arguments: argparse.Namespace) -> Any:
+def _exact_chains(task: Check, arguments: argparse.Namespace) -> Any:
     """Sample the exact posterior by particle-marginal RAM.
 
     Where the weights fail, the filter's likelihood is too small in a part of the posterior, and delayed acceptance,

@@ -107,13 +107,13 @@ def chain(velocity: jax.Array, diffusion: jax.Array, width: jax.Array | float) -
     Source: Scharfetter and Gummel (1969), IEEE Trans. Electron Devices 16; Chang and Cooper (1970), J. Comput. Phys. 6.
     """
     floor = 1e-12 * jnp.abs(velocity) * width + 1e-290
-    spread = jnp.maximum(diffusion, floor)
+    diffusivity = jnp.maximum(diffusion, floor)
     # NaN must stay NaN: it is how a failure in compiled code is known.
-    spread = jnp.where(jnp.isnan(diffusion), diffusion, spread)
-    ratio = velocity * width / spread
+    diffusivity = jnp.where(jnp.isnan(diffusion), diffusion, diffusivity)
+    ratio = velocity * width / diffusivity
     end = jnp.zeros((*velocity.shape[:-1], 1))
-    up = jnp.concatenate([spread / width**2 * bernoulli(-ratio), end], axis=-1)
-    down = jnp.concatenate([end, spread / width**2 * bernoulli(ratio)], axis=-1)
+    up = jnp.concatenate([diffusivity / width**2 * bernoulli(-ratio), end], axis=-1)
+    down = jnp.concatenate([end, diffusivity / width**2 * bernoulli(ratio)], axis=-1)
     return Chain(up, down)
 
 
@@ -224,9 +224,9 @@ def _gaussian_masses(edges: jax.Array, mean: jax.Array, variance: jax.Array) -> 
     # In the upper tail the difference of the complements keeps its digits.
     lower = jnp.where(below > 0, -above, below) / sd
     upper = jnp.where(below > 0, -below, above) / sd
-    spread = jax.scipy.stats.norm.cdf(upper) - jax.scipy.stats.norm.cdf(lower)
+    mass = jax.scipy.stats.norm.cdf(upper) - jax.scipy.stats.norm.cdf(lower)
     tent = jnp.maximum(1.0 - jnp.abs(0.5 * (below + above)) / (above - below), 0.0)
-    return jnp.where(known, tent, jnp.maximum(spread, 0.0))
+    return jnp.where(known, tent, jnp.maximum(mass, 0.0))
 
 
 def _probabilities(walk: Chain, fastest: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:

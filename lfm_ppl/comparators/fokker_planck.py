@@ -13,12 +13,12 @@ import numpy as np
 
 from lfm_ppl import checks
 from lfm_ppl.comparators.finite_volume import Grid
-from lfm_ppl.comparators.grid_choice import ROOM, Problem, choose, half_grid, second_order_error
+from lfm_ppl.comparators.grid_choice import ROOM, GridProblem, choose, half_grid, second_order_error
 from lfm_ppl.comparators.grid_filter import backward, forward, log_likelihood, moves
 from lfm_ppl.comparators.grid_model import Cells, on_grid, varies_with_time
 from lfm_ppl.comparators.observation_noise import check_noise
 from lfm_ppl.filtering.filter import check_observations, warn_single_precision
-from lfm_ppl.filtering.schedule import Schedule, schedule
+from lfm_ppl.filtering.schedule import TimeGrid, build_time_grid
 from lfm_ppl.linalg import safe_sqrt
 from lfm_ppl.model.augment import StateSpaceModel, state_space
 from lfm_ppl.model.latent_force_model import LatentForceModel
@@ -115,12 +115,12 @@ def fokker_planck(model: LatentForceModel, times: Any, y: Any, *, at: Any = None
     """
     ssm = _checked(model)
     checks.positive("tolerance", tolerance)
-    plan = schedule(ssm, times, steps, at=at)
-    y = _observations(ssm, plan, y)
+    time_grid = build_time_grid(ssm, times, steps, at=at)
+    y = _observations(ssm, time_grid, y)
     grid = choose_grid(model, times, y, cells=cells, bounds=bounds, steps=steps, tolerance=tolerance)
-    result = _run(on_grid(ssm, plan, grid, room=ROOM), plan, y[None], jnp.asarray(times, float), grid)
+    result = _run(on_grid(ssm, time_grid, grid, room=ROOM), time_grid, y[None], jnp.asarray(times, float), grid)
     total = np.asarray(result.log_likelihood.sum())
-    error = _error(Problem(ssm, schedule(ssm, times, steps)), schedule(ssm, times, 2 * steps), y[None], grid, total)
+    error = _error(GridProblem(ssm, build_time_grid(ssm, times, steps)), build_time_grid(ssm, times, 2 * steps), y[None], grid, total)
     if not error <= tolerance:
         warnings.warn(f"the estimated discretisation error of the log likelihood is {error:.2g}, above the tolerance "
                       f"{tolerance:g}, with {grid.cells} cells on [{grid.low:g}, {grid.high:g}] and steps={steps}. "
@@ -172,15 +172,15 @@ def choose_grid(models: LatentForceModel | Sequence[LatentForceModel], times: An
     problems = []
     for model in several:
         ssm = _checked(model)
-        problems.append(Problem(ssm, schedule(ssm, times, steps)))
-        if problems[-1].plan.lengths is None and checks.concrete(problems[-1].plan.rows.length) is None:
+        problems.append(GridProblem(ssm, build_time_grid(ssm, times, steps)))
+        if problems[-1].time_grid.lengths is None and checks.concrete(problems[-1].time_grid.intervals.length) is None:
             raise ValueError("the grid is chosen before compilation: times and initial_time must be known.")
     y = jnp.asarray(y) if np.ndim(y) == 3 else y
-    sets = [_observations(problems[0].ssm, problems[0].plan, one) for one in (y if np.ndim(y) == 3 else [y])]
+    sets = [_observations(problems[0].ssm, problems[0].time_grid, one) for one in (y if np.ndim(y) == 3 else [y])]
     if not sets:
         raise ValueError("y must hold at least one data set, got shape " f"{np.shape(y)}.")
     for problem in problems:
-        problem.ssm.model.check_at(problem.plan.initial_time, len(problem.plan.observed))
+        problem.ssm.model.check_at(problem.time_grid.initial_time, len(problem.time_grid.observed))
     warn_single_precision()
     return choose(problems, jnp.stack(sets), bounds, cells, tolerance)
 
@@ -221,33 +221,33 @@ def _checked_bounds(bounds: Any) -> tuple[float, float]:
     return low, high
 
 
-def _observations(ssm: StateSpaceModel, plan: Schedule, y: Any) -> jax.Array:
-    return check_observations(y, len(plan.observed), ssm.output_dim)
+def _observations(ssm: StateSpaceModel, time_grid: TimeGrid, y: Any) -> jax.Array:
+    return check_observations(y, len(time_grid.observed), ssm.output_dim)
 
 
-def _error(problem: Problem, finer: Schedule, y: jax.Array, grid: Grid, total: np.ndarray) -> float:
+def _error(problem: GridProblem, finer: TimeGrid, y: jax.Array, grid: Grid, total: np.ndarray) -> float:
     """Error of the log likelihood ``total``: of the cells, and of freezing the generator within steps."""
     half = half_grid(grid)
     coarse = problem.total(y, half)
     error = second_order_error(total - coarse, grid, half)
     if varies_with_time(problem.ssm):
         # Twice the steps leave a quarter of the error.
-        error += float(np.abs(coarse - Problem(problem.ssm, finer).total(y, half)).max()) * 4.0 / 3.0
+        error += float(np.abs(coarse - GridProblem(problem.ssm, finer).total(y, half)).max()) * 4.0 / 3.0
     return error
 
 
 @eqx.filter_jit
-def _run(cells: Cells, plan: Schedule, y: jax.Array, times: jax.Array, grid: Grid) -> FokkerPlanckResult:
-    moving = moves(cells, plan, 1)
-    passed = forward(moving, plan, y, keep=True)
-    smoothed = backward(moving, plan, passed)[:, 0][jnp.asarray(plan.requested)]
-    observed = jnp.asarray(plan.observed)
+def _run(cells: Cells, time_grid: TimeGrid, y: jax.Array, times: jax.Array, grid: Grid) -> FokkerPlanckResult:
+    moving = moves(cells, time_grid, 1)
+    passed = forward(moving, time_grid, y, keep=True)
+    smoothed = backward(moving, time_grid, passed)[:, 0][jnp.asarray(time_grid.requested)]
+    observed = jnp.asarray(time_grid.observed)
     predicted, filtered = passed.predicted[observed, 0], passed.filtered[observed, 0]
     centres = jnp.asarray(grid.centres)
     width = jnp.asarray(grid.width)
     return FokkerPlanckResult(
         times, centres, width, passed.log_likelihood[observed, 0], predicted / width, filtered / width,
-        *_moments(filtered, centres), jnp.asarray(plan.requested_times, float), smoothed / width,
+        *_moments(filtered, centres), jnp.asarray(time_grid.requested_times, float), smoothed / width,
         *_moments(smoothed, centres), jnp.asarray(jnp.nan), grid)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from lfm_ppl.comparators.finite_volume import Grid
 from lfm_ppl.comparators.grid_filter import total_and_reach
 from lfm_ppl.comparators.grid_model import Cells, drift_and_diffusion, on_grid
-from lfm_ppl.filtering.schedule import Schedule
+from lfm_ppl.filtering.schedule import TimeGrid
 from lfm_ppl.linalg import wrapped
 from lfm_ppl.model.augment import StateSpaceModel
 
@@ -36,11 +36,11 @@ ROOM = _LADDER[-1]
 _ATTEMPTS = 60
 
 
-class Problem(NamedTuple):
+class GridProblem(NamedTuple):
     """A model with the rows of its scan."""
 
     ssm: StateSpaceModel
-    plan: Schedule
+    time_grid: TimeGrid
 
     def cells(self, grid: Grid) -> Cells:
         """Put the model on a grid; not compiled, so that another model compiles nothing new.
@@ -48,7 +48,7 @@ class Problem(NamedTuple):
         Raises:
             ValueError: drift or dispersion are not finite on the grid, or the dispersion is zero all over it.
         """
-        cells = on_grid(self.ssm, self.plan, grid, room=ROOM)
+        cells = on_grid(self.ssm, self.time_grid, grid, room=ROOM)
         fine = np.isfinite(np.asarray(cells.chain.up + cells.chain.down))
         if not fine.all():
             place = grid.centres[int(np.argwhere(~fine)[0][-1])]
@@ -58,17 +58,17 @@ class Problem(NamedTuple):
 
     def total(self, y: jax.Array, grid: Grid) -> np.ndarray:
         """Return log p(y) (B,) of data sets (B, T, D)."""
-        return np.asarray(_run(self.cells(grid), self.plan, y)[0])
+        return np.asarray(_run(self.cells(grid), self.time_grid, y)[0])
 
     def reach(self, y: jax.Array, grid: Grid) -> np.ndarray:
         """Return the largest mass (N,) that any cell has."""
-        return np.asarray(_run(self.cells(grid), self.plan, y)[1])
+        return np.asarray(_run(self.cells(grid), self.time_grid, y)[1])
 
 
 _run = eqx.filter_jit(total_and_reach)
 
 
-def choose(problems: Sequence[Problem], y: jax.Array, bounds: tuple[float, float] | None, cells: int | None,
+def choose(problems: Sequence[GridProblem], y: jax.Array, bounds: tuple[float, float] | None, cells: int | None,
            tolerance: float) -> Grid:
     """Return a grid that serves all problems and data sets y (B, T, D); see `choose_grid`."""
     _check_dispersion(problems, bounds)
@@ -103,7 +103,7 @@ def second_order_error(change: np.ndarray, grid: Grid, half: Grid) -> float:
     return float(largest / ((grid.cells / half.cells) ** 2 - 1.0))
 
 
-def _discretisation_error(problems: Sequence[Problem], y: jax.Array, grid: Grid) -> float:
+def _discretisation_error(problems: Sequence[GridProblem], y: jax.Array, grid: Grid) -> float:
     half = half_grid(grid)
     with np.errstate(invalid="ignore"):
         return max(second_order_error(one.total(y, grid) - one.total(y, half), grid, half) for one in problems)
@@ -113,7 +113,7 @@ def _on_ladder(count: float) -> int:
     return next((cells for cells in _LADDER if cells >= count), _LADDER[-1])
 
 
-def _find_bounds(problems: Sequence[Problem], y: jax.Array) -> tuple[float, float]:
+def _find_bounds(problems: Sequence[GridProblem], y: jax.Array) -> tuple[float, float]:
     low, high = _first_bounds(problems)
     growth, cuts = 0.5, 0
     for _ in range(_ATTEMPTS):
@@ -134,19 +134,19 @@ def _find_bounds(problems: Sequence[Problem], y: jax.Array) -> tuple[float, floa
                      f"[{low:g}, {high:g}]. Does the drift let the state run away? If not, give bounds=(low, high).")
 
 
-def _first_bounds(problems: Sequence[Problem]) -> tuple[float, float]:
+def _first_bounds(problems: Sequence[GridProblem]) -> tuple[float, float]:
     """The initial distribution, widened by what the noise adds in the longest interval."""
     ends = []
-    for ssm, plan in problems:
+    for ssm, time_grid in problems:
         mean, covariance = (np.asarray(moment) for moment in ssm.initial())
-        _, diffusion = drift_and_diffusion(ssm, jnp.asarray(mean[0]), jnp.asarray(plan.initial_time, float))
-        spread = 8.0 * np.sqrt(covariance[0, 0]) + 6.0 * np.sqrt(2.0 * float(diffusion) * np.max(plan.rows.length))
-        spread = spread if np.isfinite(spread) and spread > 0 else max(1.0, abs(mean[0]))
-        ends.append((float(mean[0] - spread), float(mean[0] + spread)))
+        _, diffusion = drift_and_diffusion(ssm, jnp.asarray(mean[0]), jnp.asarray(time_grid.initial_time, float))
+        reach = 8.0 * np.sqrt(covariance[0, 0]) + 6.0 * np.sqrt(2.0 * float(diffusion) * np.max(time_grid.intervals.length))
+        reach = reach if np.isfinite(reach) and reach > 0 else max(1.0, abs(mean[0]))
+        ends.append((float(mean[0] - reach), float(mean[0] + reach)))
     return min(low for low, _ in ends), max(high for _, high in ends)
 
 
-def _largest_reach(problems: Sequence[Problem], y: jax.Array, grid: Grid) -> np.ndarray:
+def _largest_reach(problems: Sequence[GridProblem], y: jax.Array, grid: Grid) -> np.ndarray:
     reach = np.zeros(grid.cells)
     for problem in problems:
         one = problem.reach(y, grid)
@@ -158,35 +158,35 @@ def _largest_reach(problems: Sequence[Problem], y: jax.Array, grid: Grid) -> np.
     return reach
 
 
-def _first_cells(problems: Sequence[Problem], y: jax.Array, grid: Grid) -> float:
+def _first_cells(problems: Sequence[GridProblem], y: jax.Array, grid: Grid) -> float:
     """Cells as wide as two standard deviations of the sharpest likelihood, as a function of the state."""
     sharpest = 0.0
     for problem in problems:
         cells = problem.cells(grid)
-        slope = np.asarray(cells.value[..., -1, :] - cells.value[..., 0, :])
-        slope = np.asarray(wrapped(jnp.asarray(slope))) if np.any(cells.angular) else slope
+        change = np.asarray(cells.value[..., -1, :] - cells.value[..., 0, :])
+        change = np.asarray(wrapped(jnp.asarray(change))) if np.any(cells.angular) else change
         noise = np.broadcast_to(np.asarray(cells.noise)[:, :, 0], (*np.shape(cells.noise)[:2], *cells.noise.shape[-2:]))
         held = problem.reach(y, grid) > 1e-6
         noise = noise[:, held] if noise.shape[1] > 1 else noise
-        slope = slope[:, held]
-        information = (slope * np.linalg.solve(noise, slope[..., None])[..., 0]).sum(-1)
+        change = change[:, held]
+        information = (change * np.linalg.solve(noise, change[..., None])[..., 0]).sum(-1)
         sharpest = max(sharpest, float(np.max(information)))
     # The outermost of the five nodes are 0.906 of a cell's width apart.
     return 0.5 * grid.cells * float(np.sqrt(sharpest)) / 0.906
 
 
-def _check_dispersion(problems: Sequence[Problem], bounds: tuple[float, float] | None) -> None:
+def _check_dispersion(problems: Sequence[GridProblem], bounds: tuple[float, float] | None) -> None:
     low, high = _first_bounds(problems) if bounds is None else bounds
     places = jnp.linspace(low, high, 11)
-    for ssm, plan in problems:
-        t = jnp.asarray(plan.initial_time, float)
+    for ssm, time_grid in problems:
+        t = jnp.asarray(time_grid.initial_time, float)
         diffusion = jax.vmap(lambda s, ssm=ssm, t=t: drift_and_diffusion(ssm, s, t)[1])(places)
         if np.all(np.asarray(diffusion) == 0):
             raise ValueError(f"the process noise is zero everywhere between {low:g} and {high:g}: without noise the "
                              "state has no density that could spread over a grid. Use lfm.filter.")
 
 
-def _check_bounds(problems: Sequence[Problem], grid: Grid) -> None:
+def _check_bounds(problems: Sequence[GridProblem], grid: Grid) -> None:
     for problem in problems:
         held = float(problem.cells(grid).initial.sum())
         if held < 0.5:

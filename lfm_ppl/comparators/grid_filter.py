@@ -10,7 +10,7 @@ import numpy as np
 
 from lfm_ppl.comparators.finite_volume import Chain, Grid, propagate, transition
 from lfm_ppl.comparators.grid_model import WEIGHTS, Cells, on_grid
-from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays, with_observations
+from lfm_ppl.filtering.schedule import Intervals, TimeGrid, as_arrays, with_observations
 from lfm_ppl.linalg import cholesky, log_density, masked, solve_lower, wrapped
 from lfm_ppl.model.augment import StateSpaceModel
 
@@ -61,12 +61,12 @@ class Moves(NamedTuple):
     cells: Cells
     table: Any
 
-    def across(self, masses: jax.Array, row: Rows, walk: Chain | None, adjoint: bool = False) -> jax.Array:
+    def across(self, masses: jax.Array, row: Intervals, walk: Chain | None, adjoint: bool = False) -> jax.Array:
         """Move masses (B, N) over a row and its jump, or a function of the cell back over them."""
         if adjoint:
             masses = self._jump(masses, row.jump, True)
         if self.table is not None:
-            matrix = self.table[row.kind]
+            matrix = self.table[row.length_index]
             masses = masses @ (matrix if adjoint else matrix.T)
         elif walk is None:
             masses = propagate(self.cells.chain, row.length, masses, adjoint)
@@ -83,28 +83,28 @@ class Moves(NamedTuple):
         return jnp.where(index >= 0, masses @ (matrix if adjoint else matrix.T), masses)
 
 
-def moves(cells: Cells, plan: Schedule, batch: int) -> Moves:
+def moves(cells: Cells, time_grid: TimeGrid, batch: int) -> Moves:
     """Tabulate the transition matrices where that pays."""
     size = cells.initial.shape[0]
-    if plan.lengths is None or cells.chain.up.ndim > 1:
+    if time_grid.lengths is None or cells.chain.up.ndim > 1:
         return Moves(cells, None)
-    count, rows = np.shape(plan.lengths)[0], np.shape(plan.rows.length)[0]
+    count, rows = np.shape(time_grid.lengths)[0], np.shape(time_grid.intervals.length)[0]
     if count * size**2 > _LARGEST_TABLE or count * _MATRIX_COST > rows * (1.0 + batch / 4.0):
         return Moves(cells, None)
-    return Moves(cells, jax.lax.map(lambda length: transition(cells.chain, length), jnp.asarray(plan.lengths)))
+    return Moves(cells, jax.lax.map(lambda length: transition(cells.chain, length), jnp.asarray(time_grid.lengths)))
 
 
-def forward(moving: Moves, plan: Schedule, y: jax.Array, keep: bool = False) -> Densities:
+def forward(moving: Moves, time_grid: TimeGrid, y: jax.Array, keep: bool = False) -> Densities:
     """Run the filter.
 
     Args:
         moving: the model on the grid.
-        plan: the rows.
+        time_grid: the time grid.
         y: (B, T, D), NaN where missing; all B data sets have the same times.
         keep: whether to keep the masses.
     """
     cells = moving.cells
-    rows, by_row = with_observations(plan.rows, jnp.moveaxis(y, 1, 0))
+    rows, by_row = with_observations(time_grid.intervals, jnp.moveaxis(y, 1, 0))
     walks = cells.chain if cells.chain.up.ndim > 1 else None
     start = jnp.broadcast_to(cells.initial, (y.shape[0], cells.initial.shape[0]))
 
@@ -128,14 +128,14 @@ def forward(moving: Moves, plan: Schedule, y: jax.Array, keep: bool = False) -> 
     return Densities(log, predicted, filtered, reach)
 
 
-def backward(moving: Moves, plan: Schedule, passed: Densities) -> jax.Array:
+def backward(moving: Moves, time_grid: TimeGrid, passed: Densities) -> jax.Array:
     """Run the smoother; return masses (rows, B, N) at the rows' ends.
 
         s_k-1(i) = f_k-1(i) sum_j P(i -> j) s_k(j) / p_k(j)
 
     with the filtered masses f and the predicted ones p.
     """
-    cells, rows = moving.cells, as_arrays(plan.rows)
+    cells, rows = moving.cells, as_arrays(time_grid.intervals)
     walks = cells.chain if cells.chain.up.ndim > 1 else None
     start = jnp.broadcast_to(cells.initial, passed.filtered.shape[1:])[None]
     before = jnp.concatenate([start, passed.filtered[:-1]])
@@ -152,7 +152,7 @@ def backward(moving: Moves, plan: Schedule, passed: Densities) -> jax.Array:
     return ends
 
 
-def log_likelihood(ssm: StateSpaceModel, plan: Schedule, y: jax.Array, grid: Grid) -> jax.Array:
+def log_likelihood(ssm: StateSpaceModel, time_grid: TimeGrid, y: jax.Array, grid: Grid) -> jax.Array:
     """Return the log likelihood on the grid; for compiled code.
 
     The transition matrices are computed once for all data sets. A failure is minus infinity. Derivatives are to be
@@ -160,7 +160,7 @@ def log_likelihood(ssm: StateSpaceModel, plan: Schedule, y: jax.Array, grid: Gri
 
     Args:
         ssm: the state-space model, of state dimension one; it may hold traced parameters, also under `jax.vmap`.
-        plan: from `lfm_ppl.filtering.schedule.schedule(ssm, times, steps)`; its ``steps`` matter only where drift or
+        time_grid: from `lfm_ppl.filtering.schedule.build_time_grid(ssm, times, steps)`; its ``steps`` matter only where drift or
             dispersion depend on time: the generator is frozen at the middle of each of them.
         y: (T, D), or (B, T, D) for B data sets with the same times; NaN where missing.
         grid: the cells, from `choose_grid`.
@@ -170,27 +170,27 @@ def log_likelihood(ssm: StateSpaceModel, plan: Schedule, y: jax.Array, grid: Gri
 
     Example:
         >>> import jax.numpy as jnp, lfm_ppl as lfm
-        >>> from lfm_ppl.filtering.schedule import schedule
+        >>> from lfm_ppl.filtering.schedule import build_time_grid
         >>> ssm = lfm.state_space(lfm.LatentForceModel(
         ...     lambda x, u, t: x - x**3, {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
         ...     lfm.Gaussian(jnp.zeros(1), jnp.eye(1)), process_noise=jnp.eye(1)))
-        >>> plan = schedule(ssm, [0.0, 1.0, 2.0], 1)
-        >>> log_likelihood(ssm, plan, jnp.ones((5, 3, 1)), Grid(-6.0, 6.0, 100)).shape
+        >>> time_grid = build_time_grid(ssm, [0.0, 1.0, 2.0], 1)
+        >>> log_likelihood(ssm, time_grid, jnp.ones((5, 3, 1)), Grid(-6.0, 6.0, 100)).shape
         (5,)
     """
     y = jnp.asarray(y, float)
     sets = y if y.ndim == 3 else y[None]
-    total = total_log_likelihood(on_grid(ssm, plan, grid), plan, sets)
+    total = total_log_likelihood(on_grid(ssm, time_grid, grid), time_grid, sets)
     return total if y.ndim == 3 else total[0]
 
 
-def total_log_likelihood(cells: Cells, plan: Schedule, y: jax.Array) -> jax.Array:
+def total_log_likelihood(cells: Cells, time_grid: TimeGrid, y: jax.Array) -> jax.Array:
     """Return log p(y) (B,) of data sets y (B, T, D) for a model that is on the grid already."""
-    return total_and_reach(cells, plan, y)[0]
+    return total_and_reach(cells, time_grid, y)[0]
 
 
-def total_and_reach(cells: Cells, plan: Schedule, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+def total_and_reach(cells: Cells, time_grid: TimeGrid, y: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return besides the largest mass (N,) that any cell had; see `Densities`."""
-    passed = forward(moves(cells, plan, y.shape[0]), plan, y)
+    passed = forward(moves(cells, time_grid, y.shape[0]), time_grid, y)
     total = passed.log_likelihood.sum(0)
     return jnp.where(jnp.isfinite(total), total, -jnp.inf), passed.reach

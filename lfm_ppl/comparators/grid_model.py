@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.comparators.finite_volume import Chain, Grid, chain, gaussian_masses
-from lfm_ppl.filtering.schedule import Schedule, as_arrays
+from lfm_ppl.filtering.schedule import TimeGrid, as_arrays
 from lfm_ppl.model.augment import StateSpaceModel
 from lfm_ppl.model.structure import pattern
 
@@ -49,12 +49,12 @@ def varies_with_time(ssm: StateSpaceModel) -> bool:
     return bool(found.jacobian[:, size].any())
 
 
-def on_grid(ssm: StateSpaceModel, plan: Schedule, grid: Grid, room: int = 0) -> Cells:
+def on_grid(ssm: StateSpaceModel, time_grid: TimeGrid, grid: Grid, room: int = 0) -> Cells:
     """Put a model with a one-dimensional state on a grid.
 
     Args:
         ssm: the model, of state dimension one.
-        plan: the rows of the scan.
+        time_grid: the time grid of the scan.
         grid: the cells.
         room: evaluate the model's functions for as many cells at least, and drop the superfluous ones: outside
             compiled code, grids of different sizes then share their compiled operations.
@@ -63,9 +63,9 @@ def on_grid(ssm: StateSpaceModel, plan: Schedule, grid: Grid, room: int = 0) -> 
     jumps = None
     if ssm.stack.jump_times:
         jumps = jnp.stack([_jump(grid, *ssm.stack.jump(index)) for index in range(len(ssm.stack.jump_times))])
-    value, noise = _observations(ssm, plan, grid, room)
+    value, noise = _observations(ssm, time_grid, grid, room)
     angular = np.isin(np.arange(ssm.output_dim), ssm.model.observation.angular)
-    return Cells(_chains(ssm, plan, grid, room), jumps, gaussian_masses(grid, mean[0], covariance[0, 0]), value, noise,
+    return Cells(_chains(ssm, time_grid, grid, room), jumps, gaussian_masses(grid, mean[0], covariance[0, 0]), value, noise,
                  jnp.asarray(angular))
 
 
@@ -83,25 +83,25 @@ def _padded(points: np.ndarray, room: int) -> jax.Array:
     return jnp.asarray(np.pad(points, (0, max(room - len(points), 0)), mode="edge"))
 
 
-def _chains(ssm: StateSpaceModel, plan: Schedule, grid: Grid, room: int) -> Chain:
+def _chains(ssm: StateSpaceModel, time_grid: TimeGrid, grid: Grid, room: int) -> Chain:
     faces = _padded(grid.edges[1:-1], room)
 
     def at(t: jax.Array) -> Chain:
         def one(s: jax.Array) -> tuple[jax.Array, jax.Array]:
-            spread, slope = jax.jvp(lambda s: drift_and_diffusion(ssm, s, t)[1], (s,), (jnp.ones_like(s),))
-            return drift_and_diffusion(ssm, s, t)[0] - slope, spread
+            diffusion, derivative = jax.jvp(lambda s: drift_and_diffusion(ssm, s, t)[1], (s,), (jnp.ones_like(s),))
+            return drift_and_diffusion(ssm, s, t)[0] - derivative, diffusion
 
         return chain(*(a[: grid.cells - 1] for a in jax.vmap(one)(faces)), grid.width)
 
     if not varies_with_time(ssm):
-        return at(jnp.asarray(plan.initial_time, float))
-    rows = as_arrays(plan.rows)
-    middle = (np.arange(plan.steps) + 0.5) / plan.steps
+        return at(jnp.asarray(time_grid.initial_time, float))
+    rows = as_arrays(time_grid.intervals)
+    middle = (np.arange(time_grid.steps) + 0.5) / time_grid.steps
     return jax.vmap(jax.vmap(at))(rows.start[:, None] + rows.length[:, None] * middle)
 
 
-def _observations(ssm: StateSpaceModel, plan: Schedule, grid: Grid, room: int) -> tuple[jax.Array, jax.Array]:
-    rows, observed = as_arrays(plan.rows), jnp.asarray(plan.observed)
+def _observations(ssm: StateSpaceModel, time_grid: TimeGrid, grid: Grid, room: int) -> tuple[jax.Array, jax.Array]:
+    rows, observed = as_arrays(time_grid.intervals), jnp.asarray(time_grid.observed)
     times = (rows.start + rows.length)[observed]
     nodes = _padded(grid.centres, room)[:, None] + 0.5 * grid.width * NODES
     observation = ssm.model.observation
@@ -124,7 +124,7 @@ def _observations(ssm: StateSpaceModel, plan: Schedule, grid: Grid, room: int) -
         return jax.vmap(on_nodes)(*((times, several) if by_row else (times[:1], several[:1])))[:, : grid.cells]
 
     value = over(lambda w, t, row: ssm.observe(w, t), per_time, True)
-    return value, over(ssm.noise_covariance, per_row, varying)
+    return value, over(ssm.obs_cov, per_row, varying)
 
 
 def _noise_depends_on_time(ssm: StateSpaceModel) -> bool:

@@ -137,10 +137,10 @@ def run(latent: LatentGrid, y: jax.Array, method: str, iterations: int, toleranc
 
 
 def _newton(objective: Any) -> Any:
-    slope, curvature = jax.grad(objective), jax.hessian(objective)
+    gradient, curvature = jax.grad(objective), jax.hessian(objective)
 
     def step(now: _Search, tolerance: float) -> _Search:
-        direction = -jnp.linalg.solve(curvature(now.white), slope(now.white))
+        direction = -jnp.linalg.solve(curvature(now.white), gradient(now.white))
 
         def shorter(trial: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
             length = 0.5 * trial[0]
@@ -159,10 +159,10 @@ def _newton(objective: Any) -> Any:
 
 
 def _trust_region(objective: Any, residual: Any) -> Any:
-    slope, jacobian = jax.grad(objective), jax.jacrev(residual)
+    gradient, jacobian = jax.grad(objective), jax.jacrev(residual)
 
     def step(now: _Search, tolerance: float) -> _Search:
-        up, rows = slope(now.white), jacobian(now.white)
+        up, rows = gradient(now.white), jacobian(now.white)
         weight = 1.0 + now.damping
         # (weight I + J'J)^-1, by way of a matrix as large as there are observations.
         inner = weight * jnp.eye(rows.shape[0]) + rows @ rows.T

@@ -66,11 +66,11 @@ class LatentGrid(eqx.Module):
         ssm: the model in state-space form.
         times: (T,).
         grid: (G,).
-        nearby: (T, G), the forces at the observation times as combinations of those on the grid.
+        interpolation: (T, G), the forces at the observation times as combinations of those on the grid.
         weights: (M, T, K) of p_j at the K points that an observation needs, where A is diagonal; else (M, M, T, K), the
             first index for the state.
-        flow: e^(A (t_k - t_(k-1))), its diagonal (T, M) where A is diagonal, else (T, M, M).
-        between: (M, T, T), e^(A_j (t_k - t_l)) for l <= k, else 0, where A is diagonal and the observations are few;
+        transition: e^(A (t_k - t_(k-1))), its diagonal (T, M) where A is diagonal, else (T, M, M).
+        transitions: (M, T, T), e^(A_j (t_k - t_l)) for l <= k, else 0, where A is diagonal and the observations are few;
             else None.
         mean: (R, G), the forces' prior mean.
         root: (R, G, G), lower triangular factor of their prior covariance.
@@ -99,10 +99,10 @@ class LatentGrid(eqx.Module):
     ssm: StateSpaceModel
     times: np.ndarray
     grid: np.ndarray
-    nearby: np.ndarray
+    interpolation: np.ndarray
     weights: jax.Array
-    flow: jax.Array
-    between: jax.Array | None
+    transition: jax.Array
+    transitions: jax.Array | None
     mean: jax.Array
     root: jax.Array
     rule: str = eqx.field(static=True)
@@ -122,24 +122,24 @@ class LatentGrid(eqx.Module):
         check_noise(ssm, initial)
         self.ssm, self.times, self.rule = ssm, known, rule
         self.grid = _grid(points, initial, known)
-        self.nearby = np.stack([np.interp(known, self.grid, one) for one in np.eye(len(self.grid))], axis=1)
-        decay = linear_part(ssm, jnp.zeros(())).slope[:, : ssm.physical_dim]
+        self.interpolation = np.stack([np.interp(known, self.grid, one) for one in np.eye(len(self.grid))], axis=1)
+        decay = linear_part(ssm, jnp.zeros(())).jacobian[:, : ssm.physical_dim]
         first, pieces = _pieces(self.grid, known)
         self.first = tuple(first.tolist())
         gaps = np.diff(known, prepend=self.grid[0])
         if _diagonal(ssm):
             rates = jnp.diagonal(decay)
-            flow = lambda lengths: jnp.exp(rates * jnp.asarray(lengths)[..., None])  # noqa: E731
-            self.weights = _weights(pieces, flow, lambda h: _integrals(rates * h[..., None]), 1, rule)
-            self.flow, self.between = flow(gaps), None
+            transition = lambda lengths: jnp.exp(rates * jnp.asarray(lengths)[..., None])  # noqa: E731
+            self.weights = _weights(pieces, transition, lambda h: _integrals(rates * h[..., None]), 1, rule)
+            self.transition, self.transitions = transition(gaps), None
             if len(known) <= FEW:
                 elapsed = np.maximum(known[:, None] - known, 0.0)
-                self.between = jnp.moveaxis(flow(elapsed), -1, 0) * np.tri(len(known))
+                self.transitions = jnp.moveaxis(transition(elapsed), -1, 0) * np.tri(len(known))
         else:
-            flow = lambda lengths: _distinct(lambda h: _flow(decay, h)[0], lengths)  # noqa: E731
-            integrals = lambda lengths: _distinct(lambda h: _flow(decay, h)[1:], lengths)  # noqa: E731
-            self.weights = _weights(pieces, flow, integrals, 2, rule)
-            self.flow, self.between = flow(gaps), None
+            transition = lambda lengths: _distinct(lambda h: _transition(decay, h)[0], lengths)  # noqa: E731
+            integrals = lambda lengths: _distinct(lambda h: _transition(decay, h)[1:], lengths)  # noqa: E731
+            self.weights = _weights(pieces, transition, integrals, 2, rule)
+            self.transition, self.transitions = transition(gaps), None
         self.mean = jax.vmap(ssm.stack.mean_at)(jnp.asarray(self.grid)).T
         self.root = jnp.stack([_root(force, self.grid) for force in ssm.stack.forces])
         _check_factor(self)
@@ -172,10 +172,10 @@ class LatentGrid(eqx.Module):
         _check_shape("u", "(R, G)", u, self.mean.shape)
         _check_shape("start", "(M,)", first, self.ssm.model.initial_state.mean.shape)
         gained = self._gained(u)
-        if self.between is not None:
-            return jnp.einsum("jkl,lj->kj", self.between, gained.at[0].add(self.flow[0] * first))
-        after = jnp.multiply if self.flow.ndim == 2 else jnp.matmul
-        return jax.lax.scan(lambda x, row: (after(row[0], x) + row[1],) * 2, first, (self.flow, gained))[1]
+        if self.transitions is not None:
+            return jnp.einsum("jkl,lj->kj", self.transitions, gained.at[0].add(self.transition[0] * first))
+        after = jnp.multiply if self.transition.ndim == 2 else jnp.matmul
+        return jax.lax.scan(lambda x, row: (after(row[0], x) + row[1],) * 2, first, (self.transition, gained))[1]
 
     def _gained(self, u: jax.Array) -> jax.Array:
         """Return what the production since the observation before adds to the state (T, M)."""
@@ -228,7 +228,7 @@ class LatentGrid(eqx.Module):
         state = self.state(u, start)
         uses_forces = self.ssm.model.observation.varies_with_state or any(
             any(row[self.ssm.physical_dim:]) for row in self.ssm.observation_structure.jacobian)
-        forces = jnp.asarray(self.nearby) @ u.T if uses_forces else jnp.zeros((len(state), len(u)))
+        forces = jnp.asarray(self.interpolation) @ u.T if uses_forces else jnp.zeros((len(state), len(u)))
         return jnp.concatenate([state, forces], axis=1)
 
     def checked(self, y: Any) -> jax.Array:
@@ -333,14 +333,14 @@ def _pieces(grid: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, _Pieces]:
     return first, _Pieces(b - a, (a - start) / wide, (b - start) / wide, since, t - a, t - b)
 
 
-def _weights(pieces: _Pieces, flow: Callable, integrals: Callable, rank: int, rule: str) -> jax.Array:
+def _weights(pieces: _Pieces, transition: Callable, integrals: Callable, rank: int, rule: str) -> jax.Array:
     """Return the weights of the points, (M, T, C + 1) or (M, M, T, C + 1), from functions of arrays of lengths.
 
     Args:
         pieces: the cells.
-        flow: e^(A h).
+        transition: e^(A h).
         integrals: 1/h int_0^h e^(A (h - s)) ds and 1/h int_0^h e^(A (h - s)) s/h ds.
-        rank: of a flow: 1 for the diagonal of one, 2 for a matrix.
+        rank: of a transition: 1 for the diagonal of one, 2 for a matrix.
         rule: of integration.
     """
     def of(a: np.ndarray) -> jax.Array:
@@ -349,13 +349,13 @@ def _weights(pieces: _Pieces, flow: Callable, integrals: Callable, rank: int, ru
     after = jnp.multiply if rank == 1 else jnp.matmul
     length = of(pieces.length)
     if rule == "riemann":
-        at_point, at_next = length * flow(pieces.since_point), jnp.zeros(())
+        at_point, at_next = length * transition(pieces.since_point), jnp.zeros(())
     else:
         if rule == "trapezoid":
-            at_left, at_right = 0.5 * length * flow(pieces.since_left), 0.5 * length * flow(pieces.since_right)
+            at_left, at_right = 0.5 * length * transition(pieces.since_left), 0.5 * length * transition(pieces.since_right)
         else:
             whole, rising = integrals(pieces.length)
-            back = flow(pieces.since_right)
+            back = transition(pieces.since_right)
             at_left, at_right = length * after(back, whole - rising), length * after(back, rising)
         at_next = of(pieces.left) * at_left + of(pieces.right) * at_right
         at_point = at_left + at_right - at_next
@@ -379,11 +379,11 @@ def _integrals(z: jax.Array) -> tuple[jax.Array, jax.Array]:
     return 1.0 + z * second, second
 
 
-def _flow(slope: jax.Array, length: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _transition(jacobian: jax.Array, length: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return e^(A h), 1/h int_0^h e^(A (h - s)) ds and 1/h int_0^h e^(A (h - s)) s/h ds, from one exponential."""
-    size = slope.shape[0]
+    size = jacobian.shape[0]
     eye, zero = jnp.eye(size), jnp.zeros((size, size))
-    block = jnp.block([[slope * length, eye, zero], [zero, zero, eye], [zero, zero, zero]])
+    block = jnp.block([[jacobian * length, eye, zero], [zero, zero, eye], [zero, zero, zero]])
     found = jax.scipy.linalg.expm(block)
     return found[:size, :size], found[:size, size:2 * size], found[:size, 2 * size:]
 
@@ -411,9 +411,9 @@ def _check_production(latent: LatentGrid) -> None:
     """Raise where the dynamics are not finite at forces that the prior deems ordinary."""
     if checks.traced(latent):
         return
-    spread = np.sqrt((np.asarray(latent.root) ** 2).sum(axis=2))
+    sd = np.sqrt((np.asarray(latent.root) ** 2).sum(axis=2))
     for sign in (0.0, -3.0, 3.0):
-        made = np.asarray(jax.vmap(latent._production)(latent.mean.T + sign * spread.T, jnp.asarray(latent.grid)))
+        made = np.asarray(jax.vmap(latent._production)(latent.mean.T + sign * sd.T, jnp.asarray(latent.grid)))
         if not np.isfinite(made).all():
             where = int(np.flatnonzero(~np.isfinite(made).all(axis=1))[0])
             what = "the forces' prior mean" if sign == 0 else f"{abs(sign):g} prior standard deviations from their mean"

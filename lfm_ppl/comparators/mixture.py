@@ -81,9 +81,9 @@ def _quantiles(mixture: Mixture, p: jax.Array) -> jax.Array:
     def one(share: jax.Array) -> jax.Array:
         def halve(_: int, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
             middle = 0.5 * (ends[0] + ends[1])
-            spread = jnp.where(sd > 0, sd, 1.0)
+            scale = jnp.where(sd > 0, sd, 1.0)
             away = middle[:, None, :] - mixture.mean
-            below = jnp.where(sd > 0, ndtr(away / spread), (away >= 0).astype(float))
+            below = jnp.where(sd > 0, ndtr(away / scale), (away >= 0).astype(float))
             under = (weights * below).sum(1) < share
             return jnp.where(under, middle, ends[0]), jnp.where(under, ends[1], middle)
 

@@ -31,7 +31,7 @@ def log_density(ssm: StateSpaceModel, w: jax.Array, t: jax.Array, row: jax.Array
     residual = jnp.where(present, y, 0.0) - ssm.observe(w, t)
     for index in ssm.model.observation.angular:
         residual = residual.at[index].set(wrapped(residual[index]))
-    residual, noise = masked(residual, ssm.noise_covariance(w, t, row), present)
+    residual, noise = masked(residual, ssm.obs_cov(w, t, row), present)
     factor = cholesky(noise)
     white = solve_lower(factor.chol, residual)
     return jnp.where(factor.degenerate.any(), -jnp.inf, linalg.log_density(white, factor.chol, present)), white
@@ -42,7 +42,7 @@ def check_noise(ssm: StateSpaceModel, time: Any) -> None:
     w = jnp.concatenate([ssm.model.initial_state.mean, ssm.stack.mean_at(time)])
     own = ssm.model.observation.covariance
     rows = jnp.arange(1 if callable(own) or jnp.ndim(own) < 3 else own.shape[0])
-    covariance = checks.concrete(jax.vmap(lambda row: ssm.noise_covariance(w, jnp.asarray(time, float), row))(rows))
+    covariance = checks.concrete(jax.vmap(lambda row: ssm.obs_cov(w, jnp.asarray(time, float), row))(rows))
     if covariance is None:
         return
     if not np.isfinite(covariance).all():

@@ -15,7 +15,7 @@ from lfm_ppl.comparators.observation_noise import check_noise, log_density
 from lfm_ppl.comparators.resampling import RESAMPLING, effective_sample_size, resample, reweighted
 from lfm_ppl.comparators.stochastic_steps import Moves, Prepared, choose_scheme, first_particles
 from lfm_ppl.filtering.filter import check_observations, warn_single_precision
-from lfm_ppl.filtering.schedule import Rows, Schedule, schedule, with_observations
+from lfm_ppl.filtering.schedule import Intervals, TimeGrid, build_time_grid, with_observations
 from lfm_ppl.model.augment import StateSpaceModel, state_space
 from lfm_ppl.model.latent_force_model import LatentForceModel
 
@@ -137,19 +137,19 @@ def particle_filter(key: jax.Array, model: LatentForceModel, times: Any, y: Any,
     """
     checks.random_key(key)
     ssm = state_space(model)
-    plan, y = checked(ssm, times, y, steps, max_step)
+    grid, y = checked(ssm, times, y, steps, max_step)
     settings = check_settings(ssm, ParticleSettings(particles, resampling, threshold, scheme, batch))
-    return _run(ssm, plan, y, jnp.asarray(times, float), key, settings)
+    return _run(ssm, grid, y, jnp.asarray(times, float), key, settings)
 
 
 @eqx.filter_jit
-def _run(ssm: StateSpaceModel, plan: Schedule, y: jax.Array, times: jax.Array, key: jax.Array,
+def _run(ssm: StateSpaceModel, grid: TimeGrid, y: jax.Array, times: jax.Array, key: jax.Array,
          settings: ParticleSettings) -> ParticleFilterResult:
     def summary(step: Step) -> tuple:
         return step.log_likelihood, *_moments(step.state, step.log_weights), step.ess, step.resampled
 
-    kept = forward(ssm, plan, y, key, settings, summary)
-    observed = jnp.asarray(plan.observed)
+    kept = forward(ssm, grid, y, key, settings, summary)
+    observed = jnp.asarray(grid.observed)
     # What happens in rows between two observations belongs to the second.
     following = jnp.searchsorted(observed, jnp.arange(kept[0].shape[0]))
     total = jax.ops.segment_sum(kept[0], following, observed.shape[0] + 1)[:-1]
@@ -157,29 +157,29 @@ def _run(ssm: StateSpaceModel, plan: Schedule, y: jax.Array, times: jax.Array, k
     return ParticleFilterResult(times, total, mean, covariance, ess, resampled, settings.particles, settings.scheme)
 
 
-def log_likelihood(ssm: StateSpaceModel, plan: Schedule, y: jax.Array, key: jax.Array,
+def log_likelihood(ssm: StateSpaceModel, grid: TimeGrid, y: jax.Array, key: jax.Array,
                    settings: ParticleSettings) -> jax.Array:
     """Return the log of an unbiased estimate of the likelihood, for compiled code; a failure is -inf.
 
     Args:
         ssm: the model; it may hold traced parameters.
-        plan: the rows.
+        grid: the time grid.
         y: (T, D), NaN where missing.
         key: a JAX random key.
         settings: checked ones, see `check_settings`.
     """
-    total = forward(ssm, plan, y, key, settings, lambda step: step.log_likelihood).sum()
+    total = forward(ssm, grid, y, key, settings, lambda step: step.log_likelihood).sum()
     return jnp.where(jnp.isnan(total), -jnp.inf, total)
 
 
 def checked(ssm: StateSpaceModel, times: Any, y: Any, steps: int, max_step: float | None,
-            at: Any = None, row_per_step: bool = False) -> tuple[Schedule, jax.Array]:
+            at: Any = None, interval_per_step: bool = False) -> tuple[TimeGrid, jax.Array]:
     """Check what a particle method is given, and return rows and observations."""
-    plan = schedule(ssm, times, steps, max_step, at, row_per_step=row_per_step)
-    ssm.model.check_at(plan.initial_time, len(plan.observed))
-    check_noise(ssm, plan.initial_time)
+    grid = build_time_grid(ssm, times, steps, max_step, at, interval_per_step=interval_per_step)
+    ssm.model.check_at(grid.initial_time, len(grid.observed))
+    check_noise(ssm, grid.initial_time)
     warn_single_precision()
-    return plan, check_observations(y, len(plan.observed), ssm.output_dim)
+    return grid, check_observations(y, len(grid.observed), ssm.output_dim)
 
 
 def check_settings(ssm: StateSpaceModel, settings: ParticleSettings) -> ParticleSettings:
@@ -193,15 +193,15 @@ def check_settings(ssm: StateSpaceModel, settings: ParticleSettings) -> Particle
     return settings._replace(scheme=choose_scheme(ssm, settings.scheme))
 
 
-def forward(ssm: StateSpaceModel, plan: Schedule, y: jax.Array, key: jax.Array, settings: ParticleSettings,
+def forward(ssm: StateSpaceModel, grid: TimeGrid, y: jax.Array, key: jax.Array, settings: ParticleSettings,
             keep: Callable[[Step], Any]) -> Any:
     """Run over the rows and return ``keep`` of each, stacked."""
     first_key, rows_key = jax.random.split(key)
     size = settings.particles
     state = first_particles(first_key, *ssm.initial(), size)
-    moves = Moves.over(ssm, settings.scheme, plan)
+    moves = Moves.over(ssm, settings.scheme, grid)
 
-    def row(carry: tuple[jax.Array, jax.Array], inputs: tuple[Rows, jax.Array, jax.Array]) -> tuple[tuple, Any]:
+    def row(carry: tuple[jax.Array, jax.Array], inputs: tuple[Intervals, jax.Array, jax.Array]) -> tuple[tuple, Any]:
         state, log_weights = carry
         one, observed, row_key = inputs
         keys = jax.random.split(row_key, 3)
@@ -212,12 +212,12 @@ def forward(ssm: StateSpaceModel, plan: Schedule, y: jax.Array, key: jax.Array, 
         return (state, log_weights), keep(step)
 
     start = (state, jnp.full(size, -np.log(size)))
-    rows, by_row = with_observations(plan.rows, y)
+    rows, by_row = with_observations(grid.intervals, y)
     keys = jax.random.split(rows_key, by_row.shape[0])
     return jax.lax.scan(row, start, (rows, by_row, keys))[1]
 
 
-def _move(moves: Moves, ready: Prepared, row: Rows, observed: jax.Array, key: jax.Array,
+def _move(moves: Moves, ready: Prepared, row: Intervals, observed: jax.Array, key: jax.Array,
           state: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Move particles over a row, and score the observation at its end."""
     move_key, jump_key = jax.random.split(key)

@@ -13,7 +13,7 @@ from lfm_ppl import checks
 from lfm_ppl.comparators.particle_filter import ParticleSettings, Step, check_settings, checked, forward
 from lfm_ppl.comparators.stochastic_steps import choose_scheme
 from lfm_ppl.filtering.predict import exact_offset
-from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays
+from lfm_ppl.filtering.schedule import Intervals, TimeGrid, as_arrays
 from lfm_ppl.filtering.transition import exact
 from lfm_ppl.linalg import cholesky, log_density, matmul, solve_lower
 from lfm_ppl.model.augment import StateSpaceModel, state_space
@@ -143,15 +143,15 @@ def particle_smoother(key: jax.Array, model: LatentForceModel, times: Any, y: An
     ssm = state_space(model)
     chosen, scheme = _method(ssm, method, scheme)
     per_step = chosen == BACKWARD and scheme == "euler"
-    plan, y = checked(ssm, times, y, steps, max_step, at, row_per_step=per_step)
+    grid, y = checked(ssm, times, y, steps, max_step, at, interval_per_step=per_step)
     settings = check_settings(ssm, ParticleSettings(particles, resampling, threshold, scheme))
-    rows = len(plan.rows.observation)
+    rows = len(grid.intervals.observation)
     if (needed := 8 * rows * particles * (ssm.state_dim + 2)) > _LARGEST_HISTORY:
         raise ValueError(f"the particles of {rows} rows would take {needed / 2**30:.1f} GiB; smoothing keeps all of "
                          f"them. Take at most {particles * _LARGEST_HISTORY // needed} particles, or fewer steps.")
-    states, index, _ = eqx.filter_jit(draw_trajectories)(ssm, plan, y, key, settings, draws, chosen)
+    states, index, _ = eqx.filter_jit(draw_trajectories)(ssm, grid, y, key, settings, draws, chosen)
     distinct = np.array([len(np.unique(row)) for row in np.asarray(index)])
-    return ParticleSmootherResult(jnp.asarray(plan.requested_times, float), jnp.moveaxis(states, 0, 1),
+    return ParticleSmootherResult(jnp.asarray(grid.requested_times, float), jnp.moveaxis(states, 0, 1),
                                   jnp.asarray(distinct), ssm, chosen, settings.scheme)
 
 
@@ -173,7 +173,7 @@ def _obstacle(ssm: StateSpaceModel) -> str:
     if ssm.stack.jump_times:
         return "a force jumps"
     if ssm.time_invariant:
-        noise = exact(ssm, jnp.ones(()), 1).noise
+        noise = exact(ssm, jnp.ones(()), 1).process_cov
         return "" if _regular(noise) else "not every state of this linear model has noise"
     time = 0.0 if ssm.model.initial_time is None else ssm.model.initial_time
     w = jnp.concatenate([ssm.model.initial_state.mean, ssm.stack.mean_at(time)])
@@ -193,18 +193,18 @@ def _regular(covariance: jax.Array) -> bool:
     return bool((scale > 0).all() and np.linalg.eigvalsh(known / np.outer(scale, scale)).min() > 1e-10)
 
 
-def draw_trajectories(ssm: StateSpaceModel, plan: Schedule, y: jax.Array, key: jax.Array, settings: ParticleSettings,
+def draw_trajectories(ssm: StateSpaceModel, grid: TimeGrid, y: jax.Array, key: jax.Array, settings: ParticleSettings,
                       draws: int, method: str) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return trajectories (K, S, n), the particles (K, S) that they pass through, and the log likelihood estimate.
 
     For compiled code.
     """
     filter_key, last_key, back_key = jax.random.split(key, 3)
-    steps: Step = forward(ssm, plan, y, filter_key, settings, lambda step: step)
+    steps: Step = forward(ssm, grid, y, filter_key, settings, lambda step: step)
     last = _choose(last_key, jnp.broadcast_to(steps.log_weights[-1], (draws, settings.particles)))
-    rows = as_arrays(plan.rows)
+    rows = as_arrays(grid.intervals)
     before = jax.tree_util.tree_map(lambda a: a[:-1], (steps.state, steps.log_weights, steps.ancestors))
-    after = Rows(*(a[1:] for a in rows))
+    after = Intervals(*(a[1:] for a in rows))
     keys = jax.random.split(back_key, rows.start.shape[0])[1:]
 
     def back(carry: tuple[jax.Array, jax.Array], inputs: tuple) -> tuple[tuple, tuple]:
@@ -212,7 +212,7 @@ def draw_trajectories(ssm: StateSpaceModel, plan: Schedule, y: jax.Array, key: j
         later, index = carry
         traced = ancestors[index]
         if method == BACKWARD:
-            drawn = lambda: _drawn_back(ssm, settings, plan, row, state, log_weights, later, row_key)  # noqa: E731
+            drawn = lambda: _drawn_back(ssm, settings, grid, row, state, log_weights, later, row_key)  # noqa: E731
             index = jax.lax.cond(row.length > 0, drawn, lambda: traced)
         else:
             index = traced
@@ -223,14 +223,14 @@ def draw_trajectories(ssm: StateSpaceModel, plan: Schedule, y: jax.Array, key: j
     _, (states, indices) = jax.lax.scan(back, first, (before, after, keys), reverse=True)
     states = jnp.concatenate([states, first[0][None]])
     indices = jnp.concatenate([indices, last[None]])
-    requested = jnp.asarray(plan.requested)
+    requested = jnp.asarray(grid.requested)
     return states[requested], indices[requested], steps.log_likelihood.sum()
 
 
-def _drawn_back(ssm: StateSpaceModel, settings: ParticleSettings, plan: Schedule, row: Rows, state: jax.Array,
+def _drawn_back(ssm: StateSpaceModel, settings: ParticleSettings, grid: TimeGrid, row: Intervals, state: jax.Array,
                 log_weights: jax.Array, later: jax.Array, key: jax.Array) -> jax.Array:
     """Draw, for each later state (S, n), the particle that it comes from."""
-    mean, chol = _transition(ssm, settings.scheme, row, plan.steps, state)
+    mean, chol = _transition(ssm, settings.scheme, row, grid.steps, state)
 
     def one(pair: tuple[jax.Array, jax.Array]) -> jax.Array:
         following, uniform = pair
@@ -242,13 +242,13 @@ def _drawn_back(ssm: StateSpaceModel, settings: ParticleSettings, plan: Schedule
     return jax.lax.map(one, (later, jax.random.uniform(key, later.shape[:1])), batch_size=size)
 
 
-def _transition(ssm: StateSpaceModel, scheme: str, row: Rows, steps: int,
+def _transition(ssm: StateSpaceModel, scheme: str, row: Intervals, steps: int,
                 state: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return the means (n, N) of the next state, and the factor of its covariance, (n, n) or (n, n, N)."""
     if scheme == "exact":
         whole = exact(ssm, row.length, steps)
         offset = exact_offset(ssm, whole, steps, row.start, row.length)
-        return matmul(whole.phi, state) + offset[:, None], cholesky(whole.noise).chol
+        return matmul(whole.phi, state) + offset[:, None], cholesky(whole.process_cov).chol
     size = ssm.physical_dim
     forces, noise = ssm.stack.discretise(row.length)
 

@@ -29,8 +29,8 @@ from lfm_ppl.comparators.mixture import Mixture
 from lfm_ppl.comparators.normals import normals
 from lfm_ppl.comparators.resampling import RESAMPLING, effective_sample_size, resample, reweighted
 from lfm_ppl.comparators.switched_model import (
-    Affine,
     Build,
+    SwitchedMap,
     check_initial,
     check_linear,
     first_moments,
@@ -41,7 +41,7 @@ from lfm_ppl.comparators.switched_model import (
 )
 from lfm_ppl.filtering.filter import FilterState, check_observations, warn_single_precision
 from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.filtering.schedule import Rows, Schedule, with_observations
+from lfm_ppl.filtering.schedule import Intervals, TimeGrid, with_observations
 from lfm_ppl.filtering.update import Linearised, Update, update
 from lfm_ppl.linalg import congruence, matmul, semidefinite_root, solve_semidefinite
 from lfm_ppl.model.augment import StateSpaceModel
@@ -147,24 +147,24 @@ def rao_blackwellised(key: jax.Array, build: Build, rule: SwitchingRule, times: 
     ssms = switched(build, rule)
     for ssm in ssms:
         check_linear(ssm, rule)
-    plan, decides = plan_rows(ssms[0], times, decisions, start, steps, max_step)
+    grid, decides = plan_rows(ssms[0], times, decisions, start, steps, max_step)
     warn_single_precision()
-    shape = (len(plan.observed), ssms[0].output_dim)
+    shape = (len(grid.observed), ssms[0].output_dim)
     y = jnp.full(shape, jnp.nan) if y is None else check_observations(y, *shape, empty=True)
     settings = _Settings(particles, resampling, threshold, only_adds(build))
-    return _run(ssms, rule, plan, jnp.asarray(decides), y, jnp.asarray(times, float), first_moments(ssms[0], start),
+    return _run(ssms, rule, grid, jnp.asarray(decides), y, jnp.asarray(times, float), first_moments(ssms[0], start),
                 check_initial(initial, rule, particles), key, settings)
 
 
 @eqx.filter_jit
-def _run(ssms: tuple[StateSpaceModel, ...], rule: SwitchingRule, plan: Schedule, decides: jax.Array, y: jax.Array,
+def _run(ssms: tuple[StateSpaceModel, ...], rule: SwitchingRule, grid: TimeGrid, decides: jax.Array, y: jax.Array,
          times: jax.Array, begin: Moments, initial: jax.Array, key: jax.Array,
          settings: _Settings) -> RaoBlackwellisedResult:
     size = settings.particles
-    maps = [row_maps(ssm, rule, plan) for ssm in ssms]
+    maps = [row_maps(ssm, rule, grid) for ssm in ssms]
     equal = jnp.full(size, -np.log(size))
 
-    def row(particles: _Particles, inputs: tuple[Rows, jax.Array, jax.Array, jax.Array]) -> tuple[_Particles, tuple]:
+    def row(particles: _Particles, inputs: tuple[Intervals, jax.Array, jax.Array, jax.Array]) -> tuple[_Particles, tuple]:
         one, observed, decide, row_key = inputs
         read_key, resample_key = jax.random.split(row_key)
         under = jax.tree_util.tree_map(lambda *parts: jnp.stack(parts), *(make(one) for make in maps))
@@ -189,43 +189,43 @@ def _run(ssms: tuple[StateSpaceModel, ...], rule: SwitchingRule, plan: Schedule,
                        covariance if settings.shared else jnp.broadcast_to(covariance, (size, *covariance.shape)),
                        initial, equal)
     keys = jax.random.split(key, decides.shape[0])
-    _, kept = jax.lax.scan(row, first, (*with_observations(plan.rows, y), decides, keys))
-    at = tuple(part[jnp.asarray(plan.observed)] for part in kept)
+    _, kept = jax.lax.scan(row, first, (*with_observations(grid.intervals, y), decides, keys))
+    at = tuple(part[jnp.asarray(grid.observed)] for part in kept)
     mean, covariance, middle, variance, noise, log_weights, inputs, ess, log_likelihood = at
     return RaoBlackwellisedResult(times, log_likelihood, mean, covariance, Mixture(middle, variance, log_weights),
                                   Mixture(middle, variance + noise, log_weights), inputs, ess)
 
 
-def _of_particles(under: Affine, choice: jax.Array, shared: bool) -> Affine:
+def _of_particles(under: SwitchedMap, choice: jax.Array, shared: bool) -> SwitchedMap:
     """Return the map of each particle; matrices that all share stay one matrix."""
     own = jax.tree_util.tree_map(lambda part: part[0] if shared else part[choice], under)
     return own._replace(offset=under.offset[choice], shift=under.shift[choice], read_shift=under.read_shift[choice])
 
 
-def _move(particles: _Particles, own: Affine, shared: bool) -> _Particles:
+def _move(particles: _Particles, own: SwitchedMap, shared: bool) -> _Particles:
     move = lambda phi, p, q: congruence(phi, p) + q  # noqa: E731
     covariance = (move if shared else jax.vmap(move))(own.phi, particles.covariance, own.noise)
     return particles._replace(mean=_times(own.phi, particles.mean, shared) + own.offset, covariance=covariance)
 
 
-def _observe(ssm: StateSpaceModel, particles: _Particles, own: Affine, observed: jax.Array,
+def _observe(ssm: StateSpaceModel, particles: _Particles, own: SwitchedMap, observed: jax.Array,
              settings: _Settings) -> tuple[_Particles, jax.Array]:
     """Condition each particle on an observation, and weight it by that observation's density."""
     at = None if settings.shared else 0
-    value = _times(own.slope, particles.mean, settings.shared) + own.shift
+    value = _times(own.jacobian, particles.mean, settings.shared) + own.shift
 
-    def one(value: jax.Array, slope: jax.Array, noise: jax.Array, mean: jax.Array, covariance: jax.Array) -> Update:
-        return update(ssm, Linearised(value, slope, noise), observed, jnp.isfinite(observed), Moments(mean, covariance))
+    def one(value: jax.Array, jacobian: jax.Array, noise: jax.Array, mean: jax.Array, covariance: jax.Array) -> Update:
+        return update(ssm, Linearised(value, jacobian, noise), observed, jnp.isfinite(observed), Moments(mean, covariance))
 
     new = jax.vmap(one, (0, at, at, 0, at), Update(Moments(0, at), 0, 0, at, at, at, at))(  # type: ignore[arg-type]
-        value, own.slope, own.variance, particles.mean, particles.covariance)
+        value, own.jacobian, own.variance, particles.mean, particles.covariance)
     log_weights, total = reweighted(particles.log_weights, new.log_likelihood, particles.log_weights)
     seen = jnp.isfinite(observed).any()
     return (particles._replace(mean=new.moments.mean, covariance=new.moments.covariance, log_weights=log_weights),
             jnp.where(seen, jnp.where(jnp.isnan(total), -jnp.inf, total), 0.0))
 
 
-def _decide(rule: SwitchingRule, particles: _Particles, own: Affine, t: jax.Array, key: jax.Array,
+def _decide(rule: SwitchingRule, particles: _Particles, own: SwitchedMap, t: jax.Array, key: jax.Array,
             shared: bool) -> _Particles:
     """Draw the reading of each particle, condition the particle on it, and apply the rule."""
     middle = _times(own.reads, particles.mean, shared) + own.read_shift
@@ -233,10 +233,10 @@ def _decide(rule: SwitchingRule, particles: _Particles, own: Affine, t: jax.Arra
 
     def condition(reads: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         cross = matmul(covariance, reads.T)
-        spread = matmul(reads, cross) + error
-        gain = solve_semidefinite(spread, cross.T).T
+        innovation_cov = matmul(reads, cross) + error
+        gain = solve_semidefinite(innovation_cov, cross.T).T
         kept = jnp.eye(covariance.shape[0]) - matmul(gain, reads)
-        return semidefinite_root(spread), gain, congruence(kept, covariance) + congruence(gain, error)
+        return semidefinite_root(innovation_cov), gain, congruence(kept, covariance) + congruence(gain, error)
 
     root, gain, covariance = (condition if shared else jax.vmap(condition))(own.reads, particles.covariance)
     away = _times(root, normals(key, middle.shape[1], middle.shape[0]).T, shared)
@@ -245,19 +245,19 @@ def _decide(rule: SwitchingRule, particles: _Particles, own: Affine, t: jax.Arra
                               choice=choice.astype(particles.choice.dtype))
 
 
-def _summary(particles: _Particles, own: Affine, shared: bool) -> tuple[jax.Array, ...]:
+def _summary(particles: _Particles, own: SwitchedMap, shared: bool) -> tuple[jax.Array, ...]:
     """Return moments of the joint state, and the mixture of the outputs with its noise."""
     mean, covariance, _, log_weights = particles
     weights = jnp.exp(log_weights)
     whole = weights @ mean
     centred = mean - whole
     within = covariance if shared else jnp.tensordot(weights, covariance, 1)
-    spread = (congruence if shared else jax.vmap(congruence))(own.slope, covariance)
-    variance, noise = (jnp.diagonal(part, axis1=-2, axis2=-1) for part in (spread, own.variance))
+    innovation_cov = (congruence if shared else jax.vmap(congruence))(own.jacobian, covariance)
+    variance, noise = (jnp.diagonal(part, axis1=-2, axis2=-1) for part in (innovation_cov, own.variance))
     if shared:
         variance, noise = variance[None], noise[None]
     return (whole, within + (centred * weights[:, None]).T @ centred,
-            _times(own.slope, mean, shared) + own.shift, variance, noise, log_weights)
+            _times(own.jacobian, mean, shared) + own.shift, variance, noise, log_weights)
 
 
 def _times(matrix: jax.Array, vectors: jax.Array, shared: bool) -> jax.Array:

@@ -17,7 +17,7 @@ import numpy as np
 from lfm_ppl import checks
 from lfm_ppl.comparators.normals import normals
 from lfm_ppl.filtering.predict import exact_offset
-from lfm_ppl.filtering.schedule import Rows, Schedule, by_length
+from lfm_ppl.filtering.schedule import Intervals, TimeGrid, by_length
 from lfm_ppl.filtering.transition import Exact, exact
 from lfm_ppl.forces.discretise import discretise
 from lfm_ppl.linalg import matmul, semidefinite_root
@@ -74,7 +74,7 @@ def prepare(ssm: StateSpaceModel, scheme: str, length: jax.Array, steps: int) ->
     if scheme == "exact":
         whole = exact(ssm, length, steps)
         nothing = jnp.zeros((0, 0))
-        return Prepared(nothing, nothing, semidefinite_root(whole.noise), whole)
+        return Prepared(nothing, nothing, semidefinite_root(whole.process_cov), whole)
     size, h = ssm.force_dim, length / steps
     if size == 0:
         return Prepared(jnp.zeros((0, 0)), jnp.zeros((0, 0)), jnp.zeros((0, 0)))
@@ -95,36 +95,36 @@ def first_particles(key: jax.Array, mean: jax.Array, covariance: jax.Array, coun
 
 
 class Moves(NamedTuple):
-    """How particles cross the rows of a plan.
+    """How particles cross the rows of a time grid.
 
     Attributes:
         ssm: the model.
         scheme: one of `SCHEMES`.
-        plan: the rows.
+        grid: the time grid.
         ready: from a row to what `prepare` gives for its length.
         jumps: of the forces, `Stack.jump_roots`.
     """
 
     ssm: StateSpaceModel
     scheme: str
-    plan: Schedule
-    ready: Callable[[Rows], Prepared]
+    grid: TimeGrid
+    ready: Callable[[Intervals], Prepared]
     jumps: tuple[jax.Array, jax.Array] | None
 
     @classmethod
-    def over(cls, ssm: StateSpaceModel, scheme: str, plan: Schedule) -> Moves:
+    def over(cls, ssm: StateSpaceModel, scheme: str, grid: TimeGrid) -> Moves:
         """Prepare what the rows share."""
-        ready = by_length(plan, lambda length: prepare(ssm, scheme, length, plan.steps))
-        return cls(ssm, scheme, plan, ready, ssm.stack.jump_roots())
+        ready = by_length(grid, lambda length: prepare(ssm, scheme, length, grid.steps))
+        return cls(ssm, scheme, grid, ready, ssm.stack.jump_roots())
 
-    def across(self, row: Rows, ready: Prepared, move_key: jax.Array, jump_key: jax.Array,
+    def across(self, row: Intervals, ready: Prepared, move_key: jax.Array, jump_key: jax.Array,
                state: jax.Array) -> jax.Array:
         """Move particles (n, N) over a row, and let the forces jump at its end."""
         size = self.ssm.physical_dim
 
         def move(state: jax.Array) -> jax.Array:
             return advance(self.ssm, self.scheme, ready, normals, move_key, state, row.start, row.length,
-                           self.plan.steps)
+                           self.grid.steps)
 
         def jump(state: jax.Array) -> jax.Array:
             gain, root = (table[row.jump] for table in self.jumps or ())
@@ -132,7 +132,7 @@ class Moves(NamedTuple):
             return jnp.concatenate([state[:size], matmul(gain, state[size:]) + noise])
 
         stay = lambda state: state  # noqa: E731
-        state = jax.lax.cond(row.length > 0, move, stay, state) if self.plan.replicated else move(state)
+        state = jax.lax.cond(row.length > 0, move, stay, state) if self.grid.replicated else move(state)
         return state if self.jumps is None else jax.lax.cond(row.jump >= 0, jump, stay, state)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from lfm_ppl import checks
 from lfm_ppl.filtering.filter import FilterState, predict, preparation
 from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.filtering.schedule import Rows, Schedule, schedule
+from lfm_ppl.filtering.schedule import Intervals, TimeGrid, build_time_grid
 from lfm_ppl.linearisation.taylor import Taylor
 from lfm_ppl.model.augment import StateSpaceModel, state_space
 from lfm_ppl.model.latent_force_model import LatentForceModel
@@ -22,19 +22,19 @@ from lfm_ppl.model.switching import SwitchingRule
 Build = Callable[[Any], LatentForceModel]
 
 
-class Affine(NamedTuple):
+class SwitchedMap(NamedTuple):
     """A row under one value of the input: s -> phi s + offset + N(0, noise), and what is seen and read at its end.
 
     Attributes:
         phi, offset, noise: (n, n), (n,), (n, n).
-        slope, shift, variance: (D, n), (D,), (D, D) of the observation, y = slope s + shift + N(0, variance).
+        jacobian, shift, variance: (D, n), (D,), (D, D) of the observation, y = jacobian s + shift + N(0, variance).
         reads, read_shift: (p, n), (p,) of the reading of the rule, without its error.
     """
 
     phi: jax.Array
     offset: jax.Array
     noise: jax.Array
-    slope: jax.Array
+    jacobian: jax.Array
     shift: jax.Array
     variance: jax.Array
     reads: jax.Array
@@ -67,14 +67,14 @@ def switched(build: Build, rule: SwitchingRule) -> tuple[StateSpaceModel, ...]:
 
 
 def plan_rows(ssm: StateSpaceModel, times: Any, decisions: Any, start: FilterState | None, steps: int,
-              max_step: float | None) -> tuple[Schedule, np.ndarray]:
+              max_step: float | None) -> tuple[TimeGrid, np.ndarray]:
     """Return the rows, and which of them (K,) end with a decision."""
-    plan = schedule(ssm, times, steps, max_step, at=times if decisions is None else decisions,
+    grid = build_time_grid(ssm, times, steps, max_step, at=times if decisions is None else decisions,
                     initial_time=None if start is None else start.time)
-    decides = np.zeros(len(np.asarray(plan.rows.observation)), bool)
-    decides[plan.requested] = True
-    ssm.model.check_at(plan.initial_time, len(plan.observed))
-    return plan, decides
+    decides = np.zeros(len(np.asarray(grid.intervals.observation)), bool)
+    decides[grid.requested] = True
+    ssm.model.check_at(grid.initial_time, len(grid.observed))
+    return grid, decides
 
 
 def first_moments(ssm: StateSpaceModel, start: FilterState | None) -> Moments:
@@ -120,7 +120,7 @@ def only_adds(build: Build) -> bool:
         ssm, t = state_space(build(v[0])), v[1]
         w, stack = jnp.zeros(ssm.input_dim), ssm.stack
         parts = [jax.jacfwd(lambda w: ssm.drift(w, t))(w), jax.jacfwd(lambda w: ssm.observe(w, t))(w),
-                 ssm.noise_covariance(w, t, 0), ssm.dispersion(w, t), stack.feedback(), stack.dispersion(),
+                 ssm.obs_cov(w, t, 0), ssm.dispersion(w, t), stack.feedback(), stack.dispersion(),
                  stack.measurement(t), *(part for index in range(len(stack.jump_times)) for part in stack.jump(index))]
         return jnp.concatenate([jnp.ravel(part) for part in parts if part is not None])
 
@@ -131,21 +131,21 @@ def only_adds(build: Build) -> bool:
         return False  # build asks in Python for the value of the input: it may do anything
 
 
-def row_maps(ssm: StateSpaceModel, rule: SwitchingRule, plan: Schedule) -> Callable[[Rows], Affine]:
+def row_maps(ssm: StateSpaceModel, rule: SwitchingRule, grid: TimeGrid) -> Callable[[Intervals], SwitchedMap]:
     """Return what makes the affine maps of a row, for a model that is linear; traceable."""
     total = ssm.state_dim
     nothing = Moments(jnp.zeros(total), jnp.zeros((total, total)))
-    prepared = preparation(ssm, Taylor(), plan)
+    prepared = preparation(ssm, Taylor(), grid)
 
-    def make(row: Rows) -> Affine:
+    def make(row: Intervals) -> SwitchedMap:
         # From a state that is zero and known, the mean at the end is the offset.
-        one = predict(ssm, Taylor(), plan, prepared, row, nothing, flow=True)
+        one = predict(ssm, Taylor(), grid, prepared, row, nothing, with_map=True)
         end = row.start + row.length
         observe = lambda s: ssm.observe(ssm.inputs(s, end), end)  # noqa: E731
         read = lambda s: rule.reading(*ssm.split(ssm.inputs(s, end)), end)  # noqa: E731
         zero = nothing.mean
-        variance = ssm.noise_covariance(ssm.inputs(zero, end), end, jnp.maximum(row.observation, 0))
-        return Affine(one.phi, one.moments.mean, one.noise, jax.jacfwd(observe)(zero), observe(zero), variance,
+        variance = ssm.obs_cov(ssm.inputs(zero, end), end, jnp.maximum(row.observation, 0))
+        return SwitchedMap(one.phi, one.moments.mean, one.process_cov, jax.jacfwd(observe)(zero), observe(zero), variance,
                       jax.jacfwd(read)(zero), read(zero))
 
     return make

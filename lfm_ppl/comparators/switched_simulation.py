@@ -14,7 +14,7 @@ from lfm_ppl.comparators.stochastic_steps import Moves, choose_scheme, first_par
 from lfm_ppl.comparators.switched_model import Build, check_initial, first_moments, plan_rows, switched
 from lfm_ppl.filtering.filter import FilterState
 from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays
+from lfm_ppl.filtering.schedule import Intervals, TimeGrid, as_arrays
 from lfm_ppl.linalg import semidefinite_root
 from lfm_ppl.model.augment import StateSpaceModel
 from lfm_ppl.model.simulate import noisy_observation
@@ -81,13 +81,13 @@ def simulate_switched(key: jax.Array, build: Build, rule: SwitchingRule, times: 
     checks.positive_integer("paths", paths)
     ssms = switched(build, rule)
     schemes = tuple(choose_scheme(ssm, scheme) for ssm in ssms)
-    plan, decides = plan_rows(ssms[0], times, decisions, start, steps, max_step)
-    return _run(ssms, schemes, rule, plan, jnp.asarray(decides), jnp.asarray(times, float),
+    grid, decides = plan_rows(ssms[0], times, decisions, start, steps, max_step)
+    return _run(ssms, schemes, rule, grid, jnp.asarray(decides), jnp.asarray(times, float),
                 first_moments(ssms[0], start), check_initial(initial, rule, paths), key)
 
 
 @eqx.filter_jit
-def _run(ssms: tuple[StateSpaceModel, ...], schemes: tuple[str, ...], rule: SwitchingRule, plan: Schedule,
+def _run(ssms: tuple[StateSpaceModel, ...], schemes: tuple[str, ...], rule: SwitchingRule, grid: TimeGrid,
          decides: jax.Array, times: jax.Array, begin: Moments, initial: jax.Array,
          key: jax.Array) -> SwitchedSimulation:
     ssm, paths = ssms[0], initial.shape[0]
@@ -95,9 +95,9 @@ def _run(ssms: tuple[StateSpaceModel, ...], schemes: tuple[str, ...], rule: Swit
     first_key, rows_key, noise_key = jax.random.split(key, 3)
     first = first_particles(first_key, *begin, paths)
     error = semidefinite_root(jnp.diag(rule.variance()))
-    moves = [Moves.over(own, scheme, plan) for own, scheme in zip(ssms, schemes, strict=True)]
+    moves = [Moves.over(own, scheme, grid) for own, scheme in zip(ssms, schemes, strict=True)]
 
-    def row(carry: tuple[jax.Array, jax.Array], inputs: tuple[Rows, jax.Array, jax.Array]) -> tuple[tuple, tuple]:
+    def row(carry: tuple[jax.Array, jax.Array], inputs: tuple[Intervals, jax.Array, jax.Array]) -> tuple[tuple, tuple]:
         state, index = carry
         one, decide, row_key = inputs
         move_key, jump_key, read_key = jax.random.split(row_key, 3)
@@ -115,10 +115,10 @@ def _run(ssms: tuple[StateSpaceModel, ...], schemes: tuple[str, ...], rule: Swit
         index = jnp.where(decide, chosen, index)
         return (state, index), (state, before, index)
 
-    rows = as_arrays(plan.rows)
+    rows = as_arrays(grid.intervals)
     keys = jax.random.split(rows_key, decides.shape[0])
     _, kept = jax.lax.scan(row, (first, initial), (rows, decides, keys))
-    states, before, indices = (part[jnp.asarray(plan.observed)] for part in kept)
+    states, before, indices = (part[jnp.asarray(grid.observed)] for part in kept)
 
     def observe(s: jax.Array, t: jax.Array, index: jax.Array, key: jax.Array, row: jax.Array) -> tuple:
         inputs = [own.inputs(s, t) for own in ssms]

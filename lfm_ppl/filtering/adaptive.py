@@ -1,6 +1,6 @@
-"""Prediction over a row in steps whose length follows the moments: short where these move fast, long where they rest.
+"""Prediction over an interval in steps whose length follows the moments: short where these move fast, long where they rest.
 
-Where the fifth slope, which is the next step's first, takes the place of the fourth, Runge-Kutta's formula has order
+Where the fifth stage, which is the next step's first, takes the place of the fourth, Runge-Kutta's formula has order
 three. The difference of the two results,
 
     e = h (k_4 - k_5) / 6,
@@ -9,8 +9,8 @@ therefore estimates the error of a step at no cost. It is taken of the mean and 
 deviations. A step whose error is larger than the tolerance is made again with a shorter length; the next one has the
 length at which its error would be a little below it.
 
-How the row is divided is not differentiated: a derivative is that of the integration on the steps that were made, the
-last of which ends with the row.
+How the interval is divided is not differentiated: a derivative is that of the integration on the steps that were made, the
+last of which ends with the interval.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from lfm_ppl.filtering.predict import (
     Stage,
     compose,
     linearised,
+    minimum_sd,
     same_at_all_times,
-    smallest_spread,
     step_on,
     unmoved,
 )
@@ -38,7 +38,7 @@ from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.augment import StateSpaceModel, just_before
 
 _FIRST = 1 / 8
-"""Length of the first step that is tried, as a share of the row."""
+"""Length of the first step that is tried, as a share of the interval."""
 
 _SAFETY, _SHORTEST, _LONGEST = 0.9, 0.2, 5.0
 """The next step is this share of the one whose error would be the tolerance, within these factors of the last."""
@@ -47,7 +47,7 @@ _STABLE = 10.0
 """Longest step, in units of one over the fastest rate: Runge-Kutta is unstable from 2.8 on and overflows far above."""
 
 _SHORT = 1e-3
-"""Share of a row that is made whatever its error, which of a state that starts from a known zero is never small."""
+"""Share of an interval that is made whatever its error, which of a state that starts from a known zero is never small."""
 
 _SHARE_OF_MEAN = 1e-3
 """Share of the mean below which a standard deviation counts as no smaller: a state that is known has none."""
@@ -60,19 +60,19 @@ _BLOCK = 8
 
 
 class _Position(NamedTuple):
-    """Where an integration stands: what is left of the row, the next length to try, and the affine map so far."""
+    """Where an integration stands: what is left of the interval, the next length to try, and the affine map so far."""
 
     left: jax.Array
     length: jax.Array
     moments: Moments
     phi: jax.Array
-    noise: jax.Array
+    process_cov: jax.Array
     stage: Stage
 
 
-def predict_row_adaptively(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, steps: int, tolerance: float,
-                           start: jax.Array, length: jax.Array, moments: Moments, flow: bool = False) -> Prediction:
-    """Predict over a row in Runge-Kutta steps whose errors are below a tolerance.
+def predict_interval_adaptively(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, steps: int, tolerance: float,
+                           start: jax.Array, length: jax.Array, moments: Moments, with_map: bool = False) -> Prediction:
+    """Predict over an interval in Runge-Kutta steps whose errors are below a tolerance.
 
     Args:
         ssm: the model.
@@ -80,32 +80,32 @@ def predict_row_adaptively(ssm: StateSpaceModel, rule: Rule, linear: LinearPart,
         linear: its constant linear part.
         steps: a fifth of the steps that are tried at most; the moments are NaN where these do not suffice.
         tolerance: of the error of a step in the mean and the covariance, in standard deviations.
-        start: time at the row's start.
-        length: of the row.
+        start: time at the interval's start.
+        length: of the interval.
         moments: at its start.
-        flow: whether phi and noise of the row are wanted (for the smoother).
+        with_map: whether phi and process_cov of the interval are wanted (for the smoother).
     """
-    spread = smallest_spread(ssm, rule, integrating_factor(ssm, linear, length), start, length, moments)
+    min_sd = minimum_sd(ssm, rule, integrating_factor(ssm, linear, length), start, length, moments)
     stop = jax.lax.stop_gradient
 
     def attempt(now: _Position) -> _Position:
         # Where this is shorter, a rejected step stays finite, and so does its derivative, which is not used.
-        trial = stop(jnp.minimum(now.length, _STABLE / _fastest_rate(now.stage.slope)))
+        trial = stop(jnp.minimum(now.length, _STABLE / _fastest_rate(now.stage.jacobian)))
         last = trial >= now.left
         h = jnp.where(last, now.left, trial)
         t = start + (length - now.left)
         factor = integrating_factor(ssm, linear, h)
-        one, fourth = step_on(ssm, rule, linear, factor, t, h, now.moments, spread, first=now.stage)
-        fifth = linearised(ssm, rule, linear, just_before(t + h, h), one.moments, spread)
-        then = fifth if same_at_all_times(ssm) else linearised(ssm, rule, linear, t + h, one.moments, spread)
+        one, fourth = step_on(ssm, rule, linear, factor, t, h, now.moments, min_sd, first=now.stage)
+        fifth = linearised(ssm, rule, linear, just_before(t + h, h), one.moments, min_sd)
+        then = fifth if same_at_all_times(ssm) else linearised(ssm, rule, linear, t + h, one.moments, min_sd)
         error = stop(_error(h, now.moments, one.moments, fourth, fifth)) / tolerance
         # A step that is not finite is far too long, and is made again.
         error = jnp.where(jnp.isfinite(error), error, jnp.inf)
         growth = jnp.clip(_SAFETY * jnp.maximum(error, 1e-12) ** -0.25, _SHORTEST, _LONGEST)
-        phi, noise = now.phi, now.noise
-        if flow:
-            phi, noise = compose((phi, noise), (one.phi, one.noise))
-        made = _Position(jnp.where(last, 0.0, now.left - h), stop(h * growth), one.moments, phi, noise, then)
+        phi, process_cov = now.phi, now.process_cov
+        if with_map:
+            phi, process_cov = compose((phi, process_cov), (one.phi, one.process_cov))
+        made = _Position(jnp.where(last, 0.0, now.left - h), stop(h * growth), one.moments, phi, process_cov, then)
         again = now._replace(length=stop(h * growth))
         accepted = (error <= 1.0) | (jnp.isfinite(error) & (h < _SHORT * length))
         return jax.lax.cond(accepted, lambda: made, lambda: again)
@@ -116,25 +116,25 @@ def predict_row_adaptively(ssm: StateSpaceModel, rule: Rule, linear: LinearPart,
     def block(now: _Position) -> _Position:
         return jax.lax.scan(unless_done(attempt), now, None, length=_BLOCK)[0]
 
-    still = unmoved(moments, flow)
+    still = unmoved(moments, with_map)
     # After a breakdown every step would fail.
     possible = jnp.isfinite(moments.mean).all() & jnp.isfinite(moments.covariance).all()
-    first = _Position(jnp.where(possible, length, 0.0), stop(_FIRST * length), moments, still.phi, still.noise,
-                      linearised(ssm, rule, linear, start, moments, spread))
+    first = _Position(jnp.where(possible, length, 0.0), stop(_FIRST * length), moments, still.phi, still.process_cov,
+                      linearised(ssm, rule, linear, start, moments, min_sd))
     body = jax.checkpoint(unless_done(block), prevent_cse=False)
     end, _ = jax.lax.scan(body, first, None, length=-(-_MOST * steps // _BLOCK))
     reached = jax.tree_util.tree_map(lambda a: jnp.where(end.left > 0, jnp.nan, a), end.moments)
-    return Prediction(reached, end.phi, end.noise)
+    return Prediction(reached, end.phi, end.process_cov)
 
 
-def _fastest_rate(slope: jax.Array) -> jax.Array:
-    """Estimate the largest modulus of an eigenvalue of the slope (M, n) in the physical state, |K^8|^(1/8).
+def _fastest_rate(jacobian: jax.Array) -> jax.Array:
+    """Estimate the largest modulus of an eigenvalue of the Jacobian (M, n) in the physical state, |K^8|^(1/8).
 
     The units of the states matter little: a ratio of 1,000 between them makes it 2.4 times as large at most.
     """
-    size = slope.shape[0]
-    largest = jnp.maximum(jnp.max(jnp.abs(slope[:, :size]), initial=0.0), 1e-300)
-    power = slope[:, :size] / largest
+    size = jacobian.shape[0]
+    largest = jnp.maximum(jnp.max(jnp.abs(jacobian[:, :size]), initial=0.0), 1e-300)
+    power = jacobian[:, :size] / largest
     for _ in range(3):
         power = matmul(power, power)
     return largest * jnp.maximum(jnp.max(jnp.abs(power), initial=0.0), 1e-100) ** 0.125
@@ -146,7 +146,7 @@ def _error(h: jax.Array, before: Moments, after: Moments, fourth: LastStage, fif
     variance = jnp.maximum(jnp.diagonal(before.covariance), jnp.diagonal(after.covariance))
     sd = jnp.sqrt(jnp.maximum(variance, (_SHARE_OF_MEAN * after.mean) ** 2) + 1e-300)
     mean = (fourth.stage.rest - fifth.rest) / sd[:size]
-    change = matmul(fourth.stage.slope, fourth.covariance) - matmul(fifth.slope, after.covariance)
+    change = matmul(fourth.stage.jacobian, fourth.covariance) - matmul(fifth.jacobian, after.covariance)
     change = change.at[:, :size].add(change[:, :size].T)
     if fifth.diffusion is not None and fourth.stage.diffusion is not None:
         change = change.at[:, :size].add(fourth.stage.diffusion - fifth.diffusion)

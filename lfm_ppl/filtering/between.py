@@ -11,9 +11,9 @@ import numpy as np
 from lfm_ppl.filtering.filter import integrate, step_transition
 from lfm_ppl.filtering.jumps import after_jump
 from lfm_ppl.filtering.predict import Moments, Prediction
-from lfm_ppl.filtering.retrospect import combine, given_later
+from lfm_ppl.filtering.retrospect import smoothed_moments, smoothing_kernel
 from lfm_ppl.filtering.rts import at_start
-from lfm_ppl.filtering.schedule import Rows, Schedule, as_arrays
+from lfm_ppl.filtering.schedule import Intervals, TimeGrid, as_arrays
 from lfm_ppl.filtering.transition import linear_part
 from lfm_ppl.linalg import congruence, matmul
 from lfm_ppl.linearisation.rule import Rule
@@ -21,99 +21,99 @@ from lfm_ppl.model.augment import StateSpaceModel
 
 
 class Places(NamedTuple):
-    """Where requested times lie among the rows.
+    """Where requested times lie among the intervals.
 
     Attributes:
-        row: (K,) the row that contains the time.
+        interval: (K,) the interval that contains the time.
         time: (K,).
-        at_end: (K,) whether it is the row's end.
+        at_end: (K,) whether it is the interval's end.
     """
 
-    row: Any
+    interval: Any
     time: Any
     at_end: Any
 
 
-def places(plan: Schedule, times: Any) -> Places:
-    """Find times among the rows of a plan that is known before compilation."""
+def places(grid: TimeGrid, times: Any) -> Places:
+    """Find times among the intervals of a time grid that is known before compilation."""
     times = np.asarray(times, float)
-    ends = np.append(np.asarray(plan.rows.start)[1:], plan.rows.start[-1] + plan.rows.length[-1])
+    ends = np.append(np.asarray(grid.intervals.start)[1:], grid.intervals.start[-1] + grid.intervals.length[-1])
     tolerance = 1e-13 * (1.0 + np.abs(times))
     row = np.minimum(np.searchsorted(ends, times - tolerance, side="left"), len(ends) - 1)
     at_end = np.abs(times - ends[row]) <= tolerance
-    # Of several rows that end at this time (replicates), the last.
+    # Of several intervals that end at this time (replicates), the last.
     last = np.searchsorted(ends, ends[row] + tolerance, side="right") - 1
     return Places(np.where(at_end, last, row), times, at_end)
 
 
 class Branches(NamedTuple):
-    """Rows from whose starts the marginals within them branch off.
+    """Intervals from whose starts the marginals within them branch off.
 
     Attributes:
-        plan: the rows.
+        grid: the time grid.
         filtered: (N, ...) at their ends.
         smoothed: (N + 1, ...) at the nodes.
-        adjoint: r and Lambda at the rows' ends.
-        about: moments (N, ...) at the rows' starts and ends to linearise about; None: the filter's own.
+        adjoint: r and Lambda at the intervals' ends.
+        linearization_point: moments (N, ...) at the intervals' starts and ends to linearise about; None: the filter's own.
     """
 
-    plan: Schedule
+    grid: TimeGrid
     filtered: Moments
     smoothed: Moments
     adjoint: tuple[jax.Array, jax.Array]
-    about: tuple[Moments, Moments] | None
+    linearization_point: tuple[Moments, Moments] | None
 
 
-def marginals_between(ssm: StateSpaceModel, rule: Rule, given: Branches, start: Moments, where: Places) -> Moments:
-    """Return smoothed moments at any times within the rows.
+def dense_output(ssm: StateSpaceModel, rule: Rule, given: Branches, start: Moments, where: Places) -> Moments:
+    """Return smoothed moments at any times within the intervals.
 
-    Each time branches off on its own: the filter's moments at the start of its row are predicted up to it, and on to
-    the end of the row, whence what the later observations say comes back through the second piece. The steps of the
+    Each time branches off on its own: the filter's moments at the start of its interval are predicted up to it, and on to
+    the end of the interval, whence what the later observations say comes back through the second piece. The steps of the
     scan itself are not cut, so that asking for times changes nothing, neither there nor at other requested times.
 
-    The pieces therefore differ from the row by an integration error, which `combine` keeps from being magnified.
+    The pieces therefore differ from the interval by an integration error, which `smoothed_moments` keeps from being magnified.
 
     Args:
         ssm: the model.
         rule: the linearisation rule.
-        given: the rows, and what is known of them.
+        given: the intervals, and what is known of them.
         start: moments at the initial time.
         where: the requested times.
     """
-    plan, filtered, smoothed, adjoint, about = given
-    linear, jumps = linear_part(ssm, jnp.asarray(plan.initial_time, float)), ssm.stack.jump_table()
+    grid, filtered, smoothed, adjoint, linearization_point = given
+    linear, jumps = linear_part(ssm, jnp.asarray(grid.initial_time, float)), ssm.stack.jump_table()
     before = at_start(filtered, start)
-    rows = as_arrays(plan.rows)
+    intervals = as_arrays(grid.intervals)
 
-    def piece(begin: jax.Array, length: jax.Array, moments: Moments, nearby: Any, flow: bool) -> Prediction:
-        factor = step_transition(ssm, rule, linear, plan, length)
-        return integrate(ssm, rule, plan, linear, factor, begin, length, moments, nearby, flow)
+    def piece(begin: jax.Array, length: jax.Array, moments: Moments, points: Any, with_map: bool) -> Prediction:
+        factor = step_transition(ssm, rule, linear, grid, length)
+        return integrate(ssm, rule, grid, linear, factor, begin, length, moments, points, with_map)
 
     def one(index: jax.Array, t: jax.Array, exactly: jax.Array) -> Moments:
-        here: Rows = _entry(rows, index)
+        here: Intervals = _entry(intervals, index)
         first, last = _entry(smoothed, index), _entry(smoothed, index + 1)
         length = jnp.clip(t - here.start, 0.0, here.length)
-        nearby: tuple[Any, Any] = (None, None)
-        if about is not None:
-            left, right = _entry(about, index)
+        points: tuple[Any, Any] = (None, None)
+        if linearization_point is not None:
+            left, right = _entry(linearization_point, index)
             share = jnp.where(here.length > 0, length / jnp.where(here.length > 0, here.length, 1.0), 0.0)
             middle = jax.tree_util.tree_map(lambda a, b: a + share * (b - a), left, right)
             pair = lambda *ends: jax.tree_util.tree_map(lambda a, b: jnp.stack([a, b]), *ends)  # noqa: E731
-            nearby = pair(left, middle), pair(middle, right)
-        now = piece(here.start, length, _entry(before, index), nearby[0], False).moments
-        rest = piece(here.start + length, here.length - length, now, nearby[1], True)
+            points = pair(left, middle), pair(middle, right)
+        now = piece(here.start, length, _entry(before, index), points[0], False).moments
+        rest = piece(here.start + length, here.length - length, now, points[1], True)
         if jumps is not None:
-            rest = after_jump(ssm, jumps, here.jump, rest, flow=True)
-        gain, conditional = given_later(now, rest.moments, rest.phi, rest.noise)
+            rest = after_jump(ssm, jumps, here.jump, rest, with_map=True)
+        gain, conditional = smoothing_kernel(now, rest.moments, rest.phi, rest.process_cov)
         r, curvature = adjoint[0][index], adjoint[1][index]
         back = matmul(rest.phi.T, r[:, None])[:, 0], congruence(rest.phi.T, curvature)
-        inside = combine(now, rest.moments, last, gain, conditional, *back)
+        inside = smoothed_moments(now, rest.moments, last, gain, conditional, *back)
         begins = length == 0
         return jax.tree_util.tree_map(
             lambda inside, node, end: jnp.where(exactly, end, jnp.where(begins, node, inside)), inside, first, last)
 
     places = tuple(jnp.asarray(a) for a in where)
-    if plan.tolerance is not None:
+    if grid.tolerance is not None:
         # Side by side, every piece would make as many steps as may be tried.
         return jax.lax.map(lambda place: one(*place), places)
     return jax.vmap(one)(*places)

@@ -12,7 +12,7 @@ import numpy as np
 from lfm_ppl import checks
 from lfm_ppl.filtering.filter import Pass, forward
 from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.filtering.schedule import Rows, Schedule, per_step
+from lfm_ppl.filtering.schedule import Intervals, TimeGrid, per_step
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.augment import StateSpaceModel
 
@@ -27,67 +27,67 @@ class FilterWarning(UserWarning):
     """The filter breaks down: its log likelihood is -inf. The message says where, how, and what to try."""
 
 
-def warn_of_breakdown(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: Any, start: Moments | None,
+def warn_of_breakdown(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, start: Moments | None,
                       log_likelihood: Any) -> None:
     """Warn where a log likelihood is not finite; nothing happens in compiled code.
 
     Args:
         ssm: the model.
         rule: the linearisation rule.
-        plan: the rows.
+        grid: the time grid.
         y: (T, D), NaN where missing.
         start: moments at the initial time; the model's by default.
         log_likelihood: what the filter found, of any shape.
     """
-    if checks.traced((ssm, plan, y, start, log_likelihood)) or np.isfinite(np.asarray(log_likelihood)).all():
+    if checks.traced((ssm, grid, y, start, log_likelihood)) or np.isfinite(np.asarray(log_likelihood)).all():
         return
-    checks.warn(breakdown(ssm, rule, plan, y, start) or "the log likelihood is -inf, but the filter does not break "
+    checks.warn(breakdown(ssm, rule, grid, y, start) or "the log likelihood is -inf, but the filter does not break "
                 "down without posterior linearisation: try iterations=0, or more damping (a smaller share).",
                 FilterWarning)
 
 
-def breakdown(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: Any, start: Moments | None = None) -> str | None:
+def breakdown(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, start: Moments | None = None) -> str | None:
     """Return where and how the filter breaks down and what to try, None where it does not. Arguments must be concrete.
 
     The filter runs once more, and through the row that breaks down step by step.
     """
     y = jnp.asarray(y, float)
     start = Moments(*ssm.initial()) if start is None else start
-    passed = _run(ssm, rule, plan, y, start)
+    passed = _run(ssm, rule, grid, y, start)
     row = _first_bad(passed)
     if row is None:
         return None
-    rows = jax.tree_util.tree_map(np.asarray, plan.rows)
+    rows = jax.tree_util.tree_map(np.asarray, grid.intervals)
     before = start if row == 0 else Moments(passed.filtered.mean[row - 1], passed.filtered.covariance[row - 1])
-    count = 1 if ssm.time_invariant or plan.tolerance is not None else plan.steps
-    one = Rows(*(column[row:row + 1] for column in rows))
+    count = 1 if ssm.time_invariant or grid.tolerance is not None else grid.steps
+    one = Intervals(*(column[row:row + 1] for column in rows))
     first = np.zeros(1, int)
-    single = plan._replace(rows=one._replace(kind=first), lengths=None, observed=first, requested=first,
+    single = grid._replace(intervals=one._replace(length_index=first), lengths=None, observed=first, requested=first,
                            requested_times=one.start, replicated=False)
-    stepped = _run(ssm, rule, single if plan.tolerance is not None else per_step(single._replace(steps=count)), y,
+    stepped = _run(ssm, rule, single if grid.tolerance is not None else per_step(single._replace(steps=count)), y,
                    before)
     step = _first_bad(stepped)
     # Steps of their own differ by rounding, and need not break down.
     found, at = (passed, row) if step is None else (stepped, step)
     largest = float(np.sqrt(np.max(np.diagonal(before.covariance), initial=0.0)))
     reason = _reason(found, at, largest)
-    later = np.flatnonzero(np.asarray(plan.observed) >= row)
-    end = plan.observed[later[0]] if later.size else row
+    later = np.flatnonzero(np.asarray(grid.observed) >= row)
+    end = grid.observed[later[0]] if later.size else row
     time = float(rows.start[end] + rows.length[end])
     where = f"row {later[0]} (time {time:.6g})" if later.size else f"time {time:.6g}, after the last observation"
     if count > 1 and step is not None:
         where += f", step {step + 1} of {count} from time {one.start[0]:.6g} to {one.start[0] + one.length[0]:.6g}"
     remedy = ("Try a tighter prior, an observation noise that is not so small, or other units" if ssm.time_invariant
               else "Try more steps (up to five times their number are tried), a larger tolerance, another rule, or a "
-              "tighter prior" if plan.tolerance is not None
+              "tighter prior" if grid.tolerance is not None
               else "Try more steps (steps=...), a longest step (max_step=...), steps that follow a tolerance "
               "(tolerance=1e-3), another rule, or a tighter prior")
     return f"the filter breaks down at {where}: {reason}. The log likelihood is -inf. {remedy}."
 
 
 @eqx.filter_jit
-def _run(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, start: Moments) -> Pass:
-    return forward(ssm, rule, plan, y, start=start, keep="moments")
+def _run(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments) -> Pass:
+    return forward(ssm, rule, grid, y, start=start, keep="moments")
 
 
 def _first_bad(passed: Pass) -> int | None:

@@ -1,4 +1,4 @@
-"""THE filter: one forward scan over the rows, for any rule and any model."""
+"""THE filter: one forward scan over the intervals, for any rule and any model."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import checks
-from lfm_ppl.filtering.adaptive import predict_row_adaptively
+from lfm_ppl.filtering.adaptive import predict_interval_adaptively
 from lfm_ppl.filtering.jumps import after_jump, jump_map
 from lfm_ppl.filtering.predict import (
     FLOOR,
     Moments,
     Prediction,
     predict_exact,
-    predict_row,
+    predict_interval,
     row_factor,
     unmoved,
 )
-from lfm_ppl.filtering.schedule import Rows, Schedule, by_length, schedule, with_observations
-from lfm_ppl.filtering.transition import Factor, LinearPart, constant_slope, exact, linear_part
+from lfm_ppl.filtering.schedule import Intervals, TimeGrid, build_time_grid, by_length, with_observations
+from lfm_ppl.filtering.transition import IntegratingFactor, LinearPart, constant_jacobian, exact, linear_part
 from lfm_ppl.filtering.update import FACTOR, FAILED, linearise_observation, update
 from lfm_ppl.linalg import congruence, diagonal, matmul, safe_sqrt, solve_lower
 from lfm_ppl.linearisation.rule import Rule
@@ -33,44 +33,44 @@ from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.resolution import check_resolution
 
 _FEW_LENGTHS = 16
-"""Distinct lengths of the rows up to which it costs nothing to tabulate more of each than the row would need."""
+"""Distinct lengths of the intervals up to which it costs nothing to tabulate more of each than the interval would need."""
 
 _KEPT = jax.checkpoint_policies.save_only_these_names(FLOOR, FAILED, FACTOR)
-"""What a row keeps for its derivative besides its inputs: a few numbers that take many operations."""
+"""What an interval keeps for its derivative besides its inputs: a few numbers that take many operations."""
 
 
 class Pass(NamedTuple):
-    """What a forward scan leaves, one entry a row; ``None`` where it was not asked for.
+    """What a forward scan leaves, one entry per interval; ``None`` where it was not asked for.
 
     Attributes:
-        log_likelihood: (N,) of each row's observation, zero without one.
-        predicted, filtered: moments (N, n), (N, n, n) at the row's end, before and after the observation.
-        phi, noise: (N, n, n), the affine map of the row.
-        innovation, present, chol, gain, slope, obs_cov: of the update, (N, D), (N, D), (N, D, D), (N, n, D), (N, D, n),
+        log_likelihood: (N,) of each interval's observation, zero without one.
+        predicted, filtered: moments (N, n), (N, n, n) at the interval's end, before and after the observation.
+        phi, process_cov: (N, n, n), the affine map of the interval.
+        innovation, present, chol, gain, jacobian, obs_cov: of the update, (N, D), (N, D), (N, D, D), (N, n, D), (N, D, n),
             (N, D, D).
-        steps: of the integration steps of each row, predictions (N, J, ...) or `Inside` (N, J, ...).
+        steps: of the integration steps of each interval, predictions (N, J, ...) or `Inside` (N, J, ...).
     """
 
     log_likelihood: jax.Array
     predicted: Any = None
     filtered: Any = None
     phi: Any = None
-    noise: Any = None
+    process_cov: Any = None
     innovation: Any = None
     present: Any = None
     chol: Any = None
     gain: Any = None
-    slope: Any = None
+    jacobian: Any = None
     obs_cov: Any = None
     steps: Any = None
 
 
 class Inside(NamedTuple):
-    """The states that a linearisation of the dynamics needs, k of them, at the ends of steps within a row.
+    """The states that a linearisation of the dynamics needs, k of them, at the ends of steps within an interval.
 
     Attributes:
         moments: predicted, (J, k) and (J, k, k).
-        cross: (J, k, n), their covariance with the whole state at the row's end, a jump there included.
+        cross: (J, k, n), their covariance with the whole state at the interval's end, a jump there included.
     """
 
     moments: Moments
@@ -81,9 +81,9 @@ class Points(NamedTuple):
     """Moments about which a pass is linearised.
 
     Attributes:
-        nodes: (N, J + 1, k), (N, J + 1, k, k) of the `needed` states at the ends of the steps of each row, before a
+        nodes: (N, J + 1, k), (N, J + 1, k, k) of the `needed` states at the ends of the steps of each interval, before a
             jump.
-        ends: (N, n), (N, n, n) at the rows' ends, after it.
+        ends: (N, n), (N, n, n) at the intervals' ends, after it.
     """
 
     nodes: Moments
@@ -113,12 +113,12 @@ def completed(ssm: StateSpaceModel, rule: Rule, nodes: Moments) -> Moments:
     return Moments(matmul(nodes.mean[..., None, :], pick)[..., 0, :], congruence(pick.T, nodes.covariance))
 
 
-def _inside(ssm: StateSpaceModel, rule: Rule, plan: Schedule, prepared: Preparation, row: Rows, steps: Any) -> Inside:
-    """Return what the iterations need of a row from (mean, covariance with all states, phi) of its steps."""
+def _inside(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, prepared: Preparation, interval: Intervals, steps: Any) -> Inside:
+    """Return what the iterations need of an interval from (mean, covariance with all states, phi) of its steps."""
     mean, own, phi = steps
     to_end = jnp.eye(ssm.state_dim)
     if prepared.jumps is not None:
-        to_end, _ = jump_map(ssm, prepared.jumps, row.jump)
+        to_end, _ = jump_map(ssm, prepared.jumps, interval.jump)
 
     def back(to_end: jax.Array, at: tuple) -> tuple[jax.Array, jax.Array]:
         own, phi = at
@@ -128,11 +128,11 @@ def _inside(ssm: StateSpaceModel, rule: Rule, plan: Schedule, prepared: Preparat
     return Inside(Moments(mean, _columns(own, needed(ssm, rule))), cross)
 
 
-def at_rows(a: jax.Array, rows: Any) -> jax.Array:
-    """Return the entries of ``a`` (N, ...) at rows; of all rows nothing is gathered, which is a scatter in reverse."""
-    if isinstance(rows, np.ndarray) and np.array_equal(rows, np.arange(a.shape[0])):
+def at_rows(a: jax.Array, intervals: Any) -> jax.Array:
+    """Return the entries of ``a`` (N, ...) at intervals; of all intervals nothing is gathered, which is a scatter in reverse."""
+    if isinstance(intervals, np.ndarray) and np.array_equal(intervals, np.arange(a.shape[0])):
         return a
-    return a[jnp.asarray(rows)]
+    return a[jnp.asarray(intervals)]
 
 
 def _columns(a: jax.Array, indices: np.ndarray) -> jax.Array:
@@ -148,40 +148,40 @@ def _contiguous(indices: np.ndarray) -> bool:
 
 
 class Preparation(NamedTuple):
-    """What the rows of a scan share.
+    """What the intervals of a scan share.
 
     Attributes:
         linear: the constant linear part of the dynamics.
         jacobian: (D, M + R), the constant part of the observation's.
-        transition: from a row to what `step_transition` gives for its length.
+        transition: from an interval to what `step_transition` gives for its length.
         jumps: G and Q of the forces' jumps, None without any.
     """
 
     linear: LinearPart
     jacobian: jax.Array
-    transition: Callable[[Rows], Any]
+    transition: Callable[[Intervals], Any]
     jumps: tuple[jax.Array, jax.Array] | None
 
 
-def preparation(ssm: StateSpaceModel, rule: Rule, plan: Schedule) -> Preparation:
-    """Compute what the rows of a scan share."""
-    linear = linear_part(ssm, jnp.asarray(plan.initial_time, float))
-    few = plan.lengths is not None and len(plan.lengths) <= _FEW_LENGTHS
-    transition = by_length(plan, lambda length: step_transition(ssm, rule, linear, plan, length, few))
-    return Preparation(linear, _observation_slope(ssm, plan), transition, ssm.stack.jump_table())
+def preparation(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid) -> Preparation:
+    """Compute what the intervals of a scan share."""
+    linear = linear_part(ssm, jnp.asarray(grid.initial_time, float))
+    few = grid.lengths is not None and len(grid.lengths) <= _FEW_LENGTHS
+    transition = by_length(grid, lambda length: step_transition(ssm, rule, linear, grid, length, few))
+    return Preparation(linear, _observation_jacobian(ssm, grid), transition, ssm.stack.jump_table())
 
 
-def step_transition(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, plan: Schedule, length: jax.Array,
+def step_transition(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, grid: TimeGrid, length: jax.Array,
                     tabulated: bool = False) -> Any:
     """Return the exact transition over this length, or the integrating factor of its steps.
 
-    None where the steps have lengths of their own. What a row would compute for itself is ``tabulated``, too.
+    None where the steps have lengths of their own. What an interval would compute for itself is ``tabulated``, too.
     """
     if ssm.time_invariant:
-        return exact(ssm, length, plan.steps, linear)
-    if plan.tolerance is not None:
+        return exact(ssm, length, grid.steps, linear)
+    if grid.tolerance is not None:
         return None
-    return row_factor(ssm, rule, linear, length, plan.steps, tabulated)
+    return row_factor(ssm, rule, linear, length, grid.steps, tabulated)
 
 
 class FilterState(NamedTuple):
@@ -200,7 +200,7 @@ class FilterResult(eqx.Module):
         log_likelihood: (T,), log p(y_k | y_1:k-1) of the entries that are present.
         predicted_mean, predicted_covariance: (T, n), (T, n, n) of the joint state, before each observation.
         filtered_mean, filtered_covariance: after it.
-        residual: (T, D), innovations whitened by their Cholesky factor: independent standard normals for a true
+        whitened_innovation: (T, D), innovations whitened by their Cholesky factor: independent standard normals for a true
             linear model; NaN where missing.
         state: time and moments after the last observation.
     """
@@ -211,53 +211,53 @@ class FilterResult(eqx.Module):
     predicted_covariance: jax.Array
     filtered_mean: jax.Array
     filtered_covariance: jax.Array
-    residual: jax.Array
+    whitened_innovation: jax.Array
     state: FilterState
 
 
-def predict(ssm: StateSpaceModel, rule: Rule, plan: Schedule, prepared: Preparation, row: Rows, moments: Moments,
-            nodes: Moments | None = None, flow: bool = False,
+def predict(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, prepared: Preparation, interval: Intervals, moments: Moments,
+            nodes: Moments | None = None, with_map: bool = False,
             each: Callable[[Prediction], Any] | None = None) -> Prediction:
-    """Predict over a row, a jump at its end included; arguments as in `predict_row`."""
-    transition = prepared.transition(row)
+    """Predict over an interval, a jump at its end included; arguments as in `predict_interval`."""
+    transition = prepared.transition(interval)
     if ssm.time_invariant:
-        one = predict_exact(ssm, transition, plan.steps, row.start, row.length, moments)
+        one = predict_exact(ssm, transition, grid.steps, interval.start, interval.length, moments)
     else:
         move = lambda: integrate(  # noqa: E731
-            ssm, rule, plan, prepared.linear, transition, row.start, row.length, moments, nodes, flow, each)
-        stay = lambda: unmoved(moments, flow, each, plan.steps)  # noqa: E731
-        one = jax.lax.cond(row.length > 0, move, stay) if plan.replicated else move()
+            ssm, rule, grid, prepared.linear, transition, interval.start, interval.length, moments, nodes, with_map, each)
+        stay = lambda: unmoved(moments, with_map, each, grid.steps)  # noqa: E731
+        one = jax.lax.cond(interval.length > 0, move, stay) if grid.replicated else move()
     if prepared.jumps is not None:
-        one = after_jump(ssm, prepared.jumps, row.jump, one, flow=flow or ssm.time_invariant)
+        one = after_jump(ssm, prepared.jumps, interval.jump, one, with_map=with_map or ssm.time_invariant)
     return one
 
 
-def integrate(ssm: StateSpaceModel, rule: Rule, plan: Schedule, linear: LinearPart, factor: Factor | None,
-              start: jax.Array, length: jax.Array, moments: Moments, nodes: Moments | None = None, flow: bool = False,
+def integrate(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, linear: LinearPart, factor: IntegratingFactor | None,
+              start: jax.Array, length: jax.Array, moments: Moments, nodes: Moments | None = None, with_map: bool = False,
               each: Callable[[Prediction], Any] | None = None) -> Prediction:
-    """Predict over a row, or a part of one, in the plan's steps; arguments as in `predict_row`."""
-    if plan.tolerance is not None:
-        return predict_row_adaptively(ssm, rule, linear, plan.steps, plan.tolerance, start, length, moments, flow)
+    """Predict over an interval, or a part of one, in the grid's steps; arguments as in `predict_interval`."""
+    if grid.tolerance is not None:
+        return predict_interval_adaptively(ssm, rule, linear, grid.steps, grid.tolerance, start, length, moments, with_map)
     assert factor is not None
-    return predict_row(ssm, rule, linear, factor, plan.steps, start, length, moments, nodes, flow, each)
+    return predict_interval(ssm, rule, linear, factor, grid.steps, start, length, moments, nodes, with_map, each)
 
 
-def forward(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, *, start: Moments | None = None,
-            about: Points | None = None, keep: str = "likelihood") -> Pass:
+def forward(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, *, start: Moments | None = None,
+            linearization_point: Points | None = None, keep: str = "likelihood") -> Pass:
     """Run the one forward scan.
 
     Args:
         ssm: the model.
         rule: the linearisation rule.
-        plan: the rows.
+        grid: the time grid.
         y: (T, D), NaN where missing.
         start: moments at the initial time; the model's by default.
-        about: linearise about these moments; the filter's own by default.
+        linearization_point: linearise about these moments; the filter's own by default.
         keep: "likelihood" (log likelihoods only), "moments" (and the moments), "all" (what the smoother needs),
-            "steps" (and the steps within the rows), "inside" (instead of these, what the iterations need of them).
+            "steps" (and the steps within the intervals), "inside" (instead of these, what the iterations need of them).
     """
-    prepared = preparation(ssm, rule, plan)
-    flow = keep in ("all", "steps", "inside")
+    prepared = preparation(ssm, rule, grid)
+    with_map = keep in ("all", "steps", "inside")
     each: Callable[[Prediction], Any] | None = None
     if keep == "steps":
         each = lambda one: one  # noqa: E731
@@ -266,41 +266,41 @@ def forward(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, *, s
         each = lambda one: (_columns(one.moments.mean, used), _columns(one.moments.covariance, used).T,  # noqa: E731
                             one.phi)
 
-    def step(moments: Moments, inputs: tuple[Rows, jax.Array, Points | None]) -> tuple[Moments, Pass]:
-        row, observed, nearby = inputs
-        nodes = None if nearby is None else completed(ssm, rule, nearby.nodes)
-        one = predict(ssm, rule, plan, prepared, row, moments, nodes, flow, each)
-        centre = one.moments if nearby is None else nearby.ends
-        affine = linearise_observation(ssm, rule, prepared.jacobian, row.start + row.length,
-                                       jnp.maximum(row.observation, 0), centre)
-        if nearby is not None:
+    def step(moments: Moments, inputs: tuple[Intervals, jax.Array, Points | None]) -> tuple[Moments, Pass]:
+        interval, observed, point = inputs
+        nodes = None if point is None else completed(ssm, rule, point.nodes)
+        one = predict(ssm, rule, grid, prepared, interval, moments, nodes, with_map, each)
+        centre = one.moments if point is None else point.ends
+        affine = linearise_observation(ssm, rule, prepared.jacobian, interval.start + interval.length,
+                                       jnp.maximum(interval.observation, 0), centre)
+        if point is not None:
             affine = affine.shifted(one.moments.mean - centre.mean)
         new = update(ssm, affine, observed, jnp.isfinite(observed), one.moments, scale)
         out = Pass(new.log_likelihood)
         if keep != "likelihood":
             out = out._replace(predicted=one.moments, filtered=new.moments, innovation=new.innovation,
                                present=jnp.isfinite(observed), chol=new.chol)
-        if flow:
+        if with_map:
             steps = one.steps
             if keep == "inside" and steps is not None:
-                steps = _inside(ssm, rule, plan, prepared, row, steps)
-            out = out._replace(phi=one.phi, noise=one.noise, gain=new.gain, slope=new.slope, obs_cov=new.obs_cov,
+                steps = _inside(ssm, rule, grid, prepared, interval, steps)
+            out = out._replace(phi=one.phi, process_cov=one.process_cov, gain=new.gain, jacobian=new.jacobian, obs_cov=new.obs_cov,
                                steps=steps)
         return new.moments, out
 
     first = Moments(*ssm.initial()) if start is None else start
-    scale = _output_scale(ssm, plan, prepared, jnp.asarray(y, float), first)
-    inputs = (*with_observations(plan.rows, y), about)
+    scale = _output_scale(ssm, grid, prepared, jnp.asarray(y, float), first)
+    inputs = (*with_observations(grid.intervals, y), linearization_point)
     return jax.lax.scan(jax.checkpoint(step, prevent_cse=False, policy=_KEPT), first, inputs)[1]
 
 
-def _output_scale(ssm: StateSpaceModel, plan: Schedule, prepared: Preparation, y: jax.Array,
+def _output_scale(ssm: StateSpaceModel, grid: TimeGrid, prepared: Preparation, y: jax.Array,
                   start: Moments) -> jax.Array:
     """Return (D,), how large outputs are: their largest observation, or the prior's standard deviation if that is more.
 
     The prior's is that through the constant part of the observation's Jacobian. An angle is at least one radian large.
     """
-    matrix, _ = ssm.input_map(jnp.asarray(plan.initial_time, float))
+    matrix, _ = ssm.input_map(jnp.asarray(grid.initial_time, float))
     prior = safe_sqrt(diagonal(congruence(matmul(prepared.jacobian, matrix), start.covariance)))
     scale = jnp.maximum(jnp.max(jnp.where(jnp.isfinite(y), jnp.abs(y), 0.0), axis=0), prior)
     for index in ssm.model.observation.angular:
@@ -308,11 +308,11 @@ def _output_scale(ssm: StateSpaceModel, plan: Schedule, prepared: Preparation, y
     return jax.lax.stop_gradient(scale)
 
 
-def _observation_slope(ssm: StateSpaceModel, plan: Schedule) -> jax.Array:
+def _observation_jacobian(ssm: StateSpaceModel, grid: TimeGrid) -> jax.Array:
     """The constant part of the observation's Jacobian; the same at every point and time."""
-    t = jnp.asarray(plan.initial_time, float)
+    t = jnp.asarray(grid.initial_time, float)
     w = ssm.inputs(ssm.initial()[0], t)
-    return constant_slope(lambda v: (ssm.observe(v, t), ()), w, ssm.observation_structure, ssm.output_dim)
+    return constant_jacobian(lambda v: (ssm.observe(v, t), ()), w, ssm.observation_structure, ssm.output_dim)
 
 
 def check_observations(y: Any, count: int, outputs: int, empty: bool = False) -> jax.Array:
@@ -384,23 +384,23 @@ def filter(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
     ssm = state_space(model)
     if start is not None:
         _check_start(start, times, ssm.state_dim)
-    plan = schedule(ssm, times, steps, max_step, initial_time=None if start is None else start.time,
+    grid = build_time_grid(ssm, times, steps, max_step, initial_time=None if start is None else start.time,
                     tolerance=tolerance)
-    model.check_at(plan.initial_time, len(plan.observed))
+    model.check_at(grid.initial_time, len(grid.observed))
     check_resolution(model, times, y)
-    y = check_observations(y, len(plan.observed), ssm.output_dim, empty=start is not None)
+    y = check_observations(y, len(grid.observed), ssm.output_dim, empty=start is not None)
     warn_single_precision()
     begin = None if start is None else Moments(start.mean, start.covariance)
-    result = filter_on(ssm, rule, plan, y, jnp.asarray(times, float), begin)
+    result = filter_on(ssm, rule, grid, y, jnp.asarray(times, float), begin)
     known = checks.concrete(times)
     if known is not None:
-        # A number also in a trace, so that another call there can go on from it with a plan of its own.
+        # A number also in a trace, so that another call there can go on from it with a time grid of its own.
         last = np.asarray(known[-1], float)
         result = eqx.tree_at(lambda r: r.state.time, result, last)
     # It runs the filter itself, so that its module imports this one.
     from lfm_ppl.filtering.breakdown import warn_of_breakdown
 
-    warn_of_breakdown(ssm, rule, plan, y, begin, result.log_likelihood)
+    warn_of_breakdown(ssm, rule, grid, y, begin, result.log_likelihood)
     return result
 
 
@@ -416,17 +416,17 @@ def _check_start(start: Any, times: Any, size: int) -> None:
 
 
 @eqx.filter_jit
-def filter_on(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, times: jax.Array,
+def filter_on(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, times: jax.Array,
               begin: Moments | None = None) -> FilterResult:
-    """Filter observations (T, D) at ``times`` on the rows of a plan; see `filter`."""
-    passed = forward(ssm, rule, plan, y, start=begin, keep="moments")
-    at = jax.tree_util.tree_map(lambda a: at_rows(a, plan.observed), passed)
+    """Filter observations (T, D) at ``times`` on the intervals of a time grid; see `filter`."""
+    passed = forward(ssm, rule, grid, y, start=begin, keep="moments")
+    at = jax.tree_util.tree_map(lambda a: at_rows(a, grid.observed), passed)
     state = FilterState(times[-1], at.filtered.mean[-1], at.filtered.covariance[-1])
     return FilterResult(times, at.log_likelihood, at.predicted.mean, at.predicted.covariance, at.filtered.mean,
-                        at.filtered.covariance, standardised(at, y), state)
+                        at.filtered.covariance, whitened_innovations(at, y), state)
 
 
-def standardised(passed: Pass, y: jax.Array) -> jax.Array:
+def whitened_innovations(passed: Pass, y: jax.Array) -> jax.Array:
     """Return innovations whitened by their Cholesky factor, (T, D), NaN where missing."""
     return jnp.where(jnp.isfinite(y), jax.vmap(solve_lower)(passed.chol, passed.innovation), jnp.nan)
 

@@ -12,9 +12,9 @@ from lfm_ppl.filtering.between import Branches
 from lfm_ppl.filtering.filter import Pass, Points, completed, forward, needed
 from lfm_ppl.filtering.jumps import jump_map
 from lfm_ppl.filtering.predict import Moments, compose
-from lfm_ppl.filtering.retrospect import combine, given_later
+from lfm_ppl.filtering.retrospect import smoothed_moments, smoothing_kernel
 from lfm_ppl.filtering.rts import Smoothed, backward
-from lfm_ppl.filtering.schedule import Schedule, per_step
+from lfm_ppl.filtering.schedule import TimeGrid, per_step
 from lfm_ppl.linalg import congruence, matmul, safe_sqrt
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.augment import StateSpaceModel
@@ -32,14 +32,14 @@ class Iterated(NamedTuple):
     change: jax.Array
 
 
-def posterior_linearisation(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, start: Moments,
+def posterior_linearisation(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments,
                             iterations: int, damping: float) -> Iterated:
     """Iterate: smooth, linearise about the smoothed marginals, smooth again.
 
     Args:
         ssm: the model.
         rule: the linearisation rule.
-        plan: the rows.
+        grid: the time grid.
         y: (T, D), NaN where missing.
         start: moments at the initial time.
         iterations: fixed number, so that the result is a smooth function of the parameters.
@@ -47,11 +47,11 @@ def posterior_linearisation(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y:
 
     Source: García-Fernández, Svensson and Särkkä (2017), IEEE Transactions on Signal Processing 65(21).
     """
-    def smoothed(about: Points | None) -> Points:
-        passed = forward(ssm, rule, plan, y, start=start, about=about, keep="inside")
-        found = backward(passed, start, plan)
+    def smoothed(linearization_point: Points | None) -> Points:
+        passed = forward(ssm, rule, grid, y, start=start, linearization_point=linearization_point, keep="inside")
+        found = backward(passed, start, grid)
         ends = jax.tree_util.tree_map(lambda a: a[1:], found.moments)
-        return Points(_nodes(ssm, rule, plan, passed, found), ends)
+        return Points(_nodes(ssm, rule, grid, passed, found), ends)
 
     def iterate(carry: tuple[Points, jax.Array], _: None) -> tuple[tuple[Points, jax.Array], None]:
         points = carry[0]
@@ -71,12 +71,12 @@ def _largest_change(old: Moments, new: Moments) -> jax.Array:
     return jnp.max(jnp.where(sd > 0, change, 0.0), initial=0.0)
 
 
-def _nodes(ssm: StateSpaceModel, rule: Rule, plan: Schedule, passed: Pass, smoothed: Smoothed) -> Moments:
+def _nodes(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, passed: Pass, smoothed: Smoothed) -> Moments:
     """Return smoothed moments (N, J + 1, ...) of the needed states at the ends of the steps.
 
-    Between a row's ends they are those of the adjoint at its end,
+    Between an interval's ends they are those of the adjoint at its end,
 
-        m + W r,    P - W Lambda W',    W = Cov(node, state at the row's end).
+        m + W r,    P - W Lambda W',    W = Cov(node, state at the interval's end).
     """
     used = needed(ssm, rule)
     pick = np.eye(ssm.state_dim)[used]
@@ -84,7 +84,7 @@ def _nodes(ssm: StateSpaceModel, rule: Rule, plan: Schedule, passed: Pass, smoot
     first, last = (jax.tree_util.tree_map(lambda a: a[part][:, None], marginal)  # noqa: B023
                    for part in (slice(None, -1), slice(1, None)))
     if passed.steps is None or not used.size:
-        return jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a, *(b for _ in range(plan.steps))], axis=1),
+        return jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a, *(b for _ in range(grid.steps))], axis=1),
                                       first, last)
 
     def row(at: tuple) -> Moments:
@@ -92,61 +92,61 @@ def _nodes(ssm: StateSpaceModel, rule: Rule, plan: Schedule, passed: Pass, smoot
         return Moments(moments.mean + matmul(cross, r[:, None])[..., 0],
                        moments.covariance - congruence(cross, adjoint))
 
-    # Row by row: XLA makes one small program of a row, where it treats all rows at once operation by operation.
+    # Interval by interval: XLA makes one small program of an interval, where it treats all intervals at once operation by operation.
     inside = jax.lax.map(row, (passed.steps, *smoothed.adjoint))
     if ssm.stack.jump_table() is None:
         inside = jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a[:, :-1], b], axis=1), inside, last)
     return jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a, b], axis=1), first, inside)
 
 
-def _to_end(ssm: StateSpaceModel, plan: Schedule, passed: Pass) -> tuple[jax.Array, jax.Array]:
-    """Return phi and noise (N, J + 1, n, n) from the ends of the steps to that of the row, a jump there included."""
-    phi, noise = passed.steps.phi, passed.steps.noise
+def _to_end(ssm: StateSpaceModel, grid: TimeGrid, passed: Pass) -> tuple[jax.Array, jax.Array]:
+    """Return phi and process_cov (N, J + 1, n, n) from the ends of the steps to that of the interval, a jump there included."""
+    phi, process_cov = passed.steps.phi, passed.steps.process_cov
     identity = jnp.broadcast_to(jnp.eye(phi.shape[-1]), phi[:, 0].shape)
     last = identity, jnp.zeros_like(identity)
     if (jumps := ssm.stack.jump_table()) is not None:
-        last = jax.vmap(lambda index: jump_map(ssm, jumps, index))(jnp.asarray(plan.rows.jump))
+        last = jax.vmap(lambda index: jump_map(ssm, jumps, index))(jnp.asarray(grid.intervals.jump))
 
     def step(later: tuple, one: tuple) -> tuple[tuple, tuple]:
         now = compose(one, later)
         return now, now
 
-    _, found = jax.lax.scan(step, last, tuple(jnp.moveaxis(a, 1, 0) for a in (phi, noise)), reverse=True)
+    _, found = jax.lax.scan(step, last, tuple(jnp.moveaxis(a, 1, 0) for a in (phi, process_cov)), reverse=True)
     return (jnp.concatenate([jnp.moveaxis(found[0], 0, 1), last[0][:, None]], axis=1),
             jnp.concatenate([jnp.moveaxis(found[1], 0, 1), last[1][:, None]], axis=1))
 
 
-def refined(ssm: StateSpaceModel, rule: Rule, plan: Schedule, found: Iterated, passed: Pass,
+def refined(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, found: Iterated, passed: Pass,
             smoothed: Smoothed) -> Branches:
-    """Return the last pass of the iterations with a row for each integration step.
+    """Return the last pass of the iterations with an interval for each integration step.
 
     Args:
-        ssm: the model; its rows are not exact.
+        ssm: the model; its intervals are not exact.
         rule: the linearisation rule.
-        plan: the rows.
+        grid: the time grid.
         found: what the iterations left.
         passed: the forward scan about ``found.points``.
         smoothed: the backward scan over that.
     """
     tree = jax.tree_util.tree_map
     flat = lambda a: a.reshape(-1, *a.shape[2:])  # noqa: E731
-    to_end = _to_end(ssm, plan, passed)
+    to_end = _to_end(ssm, grid, passed)
     ends = tree(lambda a: a[1:], smoothed.moments)
     r, adjoint = smoothed.adjoint
 
     def row(now: Moments, to_end: tuple, predicted: Moments, end: Moments, r: jax.Array,
             adjoint: jax.Array) -> tuple[Moments, tuple[jax.Array, jax.Array]]:
-        def node(now: Moments, phi: jax.Array, noise: jax.Array) -> tuple[Moments, tuple[jax.Array, jax.Array]]:
-            gain, conditional = given_later(now, predicted, phi, noise)
+        def node(now: Moments, phi: jax.Array, process_cov: jax.Array) -> tuple[Moments, tuple[jax.Array, jax.Array]]:
+            gain, conditional = smoothing_kernel(now, predicted, phi, process_cov)
             back = matmul(phi.T, r[:, None])[:, 0], congruence(phi.T, adjoint)
-            return combine(now, predicted, end, gain, conditional, *back), back
+            return smoothed_moments(now, predicted, end, gain, conditional, *back), back
 
         return jax.vmap(node)(now, *to_end)
 
     filtered = tree(lambda a: a[:, :-1], passed.steps.moments)
     inside, back = jax.vmap(row)(filtered, tuple(a[:, 1:-1] for a in to_end), passed.predicted, ends, r, adjoint)
-    # In a row without length every node is its start, but for the observation and the jump at its end.
-    still = jnp.asarray(plan.rows.length) == 0
+    # In an interval without length every node is its start, but for the observation and the jump at its end.
+    still = jnp.asarray(grid.intervals.length) == 0
     inside = tree(lambda a, b: jnp.where(still.reshape(-1, *(1,) * (a.ndim - 1)), b[:-1, None], a), inside,
                   smoothed.moments)
 
@@ -155,7 +155,7 @@ def refined(ssm: StateSpaceModel, rule: Rule, plan: Schedule, found: Iterated, p
 
     nodes = completed(ssm, rule, found.points.nodes)
     return Branches(
-        per_step(plan), tree(by_steps, filtered, passed.filtered),
+        per_step(grid), tree(by_steps, filtered, passed.filtered),
         tree(lambda first, inside: jnp.concatenate([flat(jnp.concatenate([first[:-1, None], inside], axis=1)),
                                                     first[-1:]]), smoothed.moments, inside),
         (by_steps(back[0], r), by_steps(back[1], adjoint)),

@@ -1,4 +1,4 @@
-r"""Prediction: the mean and the flow of the linearised system over one row of the scan.
+r"""Prediction: the mean and the transition matrix of the linearised system over one interval of the scan.
 
 The filter's moments obey dm/dt = E[f] and dP/dt = A P + P A' + E[G G']. The covariance is carried as
 
@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 
-from lfm_ppl.filtering.transition import Exact, Factor, LinearPart, integrating_factor
+from lfm_ppl.filtering.transition import Exact, IntegratingFactor, LinearPart, integrating_factor
 from lfm_ppl.forces.sde import block_diagonal
 from lfm_ppl.linalg import congruence, diagonal, matmul, outer_square, safe_sqrt, symmetric
 from lfm_ppl.linearisation.rule import Inputs, Rule, selection
@@ -29,7 +29,7 @@ from lfm_ppl.linearisation.sigma_points import SigmaPointRule
 from lfm_ppl.model.augment import InputStructure, StateSpaceModel, just_before
 
 FLOOR = "lfm_ppl: smallest standard deviation"
-"""Under this name `smallest_spread` is kept for the derivative of a row, and not computed again."""
+"""Under this name `smallest_spread` is kept for the derivative of an interval, and not computed again."""
 
 
 class Moments(NamedTuple):
@@ -40,14 +40,14 @@ class Moments(NamedTuple):
 
 
 class Prediction(NamedTuple):
-    """The moments at the end of a row, and its affine map s -> phi s + ... + N(0, noise) where that was asked for.
+    """The moments at the end of an interval, and its affine map s -> phi s + ... + N(0, process_cov) where that was asked for.
 
     ``steps`` holds what was asked for of each integration step (J, ...).
     """
 
     moments: Moments
     phi: Any
-    noise: Any
+    process_cov: Any
     steps: Any = None
 
 
@@ -56,12 +56,12 @@ class Stage(NamedTuple):
 
     Attributes:
         rest: (M,), the drift's expectation less the linear part.
-        slope: (M, n), that of the linearised drift less the linear part.
+        jacobian: (M, n), that of the linearised drift less the linear part.
         diffusion: (M, M), expectation of G G'; None without process noise.
     """
 
     rest: jax.Array
-    slope: jax.Array
+    jacobian: jax.Array
     diffusion: jax.Array | None
 
 
@@ -69,7 +69,7 @@ class Node(NamedTuple):
     """What the dynamics gives at a node where only the forces bend it.
 
     Attributes:
-        remainder: (M, nz + 1), the slope of a `Stage` in the forces' states, and its ``rest`` as the last column.
+        remainder: (M, nz + 1), the Jacobian of a `Stage` in the forces' states, and its ``rest`` as the last column.
         diffusion: as in a `Stage`.
     """
 
@@ -78,7 +78,7 @@ class Node(NamedTuple):
 
 
 _LARGEST_TABULATED = 8
-"""Most force states whose transitions to all nodes of a row are tabulated; those of more are chained within the row."""
+"""Most force states whose transitions to all nodes of an interval are tabulated; those of more are chained within the interval."""
 
 _FIRST_MIDDLE_LAST = slice(None, -2, 2), slice(1, None, 2), slice(2, None, 2)
 """Of each of J steps, among their 2 J + 1 nodes."""
@@ -92,26 +92,26 @@ class LastStage(NamedTuple):
 
 
 def compose(first: tuple[jax.Array, jax.Array], then: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-    """Return phi and noise of two maps s -> phi s + N(0, noise), one after the other."""
+    """Return phi and process_cov of two maps s -> phi s + N(0, process_cov), one after the other."""
     return matmul(then[0], first[0]), congruence(then[0], first[1]) + then[1]
 
 
-def moved(moments: Moments, phi: jax.Array, noise: jax.Array) -> Moments:
-    """Return the moments of phi s + N(0, noise)."""
-    return Moments(matmul(phi, moments.mean[:, None])[:, 0], congruence(phi, moments.covariance) + noise)
+def moved(moments: Moments, phi: jax.Array, process_cov: jax.Array) -> Moments:
+    """Return the moments of phi s + N(0, process_cov)."""
+    return Moments(matmul(phi, moments.mean[:, None])[:, 0], congruence(phi, moments.covariance) + process_cov)
 
 
 def predict_exact(ssm: StateSpaceModel, transition: Exact, steps: int, start: jax.Array, length: jax.Array,
                   moments: Moments) -> Prediction:
     """Predict through the exact transition of a linear time-invariant model."""
-    phi, noise = transition.phi, transition.noise
-    mean, covariance = moved(moments, phi, noise)
-    return Prediction(Moments(mean + exact_offset(ssm, transition, steps, start, length), covariance), phi, noise)
+    phi, process_cov = transition.phi, transition.process_cov
+    mean, covariance = moved(moments, phi, process_cov)
+    return Prediction(Moments(mean + exact_offset(ssm, transition, steps, start, length), covariance), phi, process_cov)
 
 
 def exact_offset(ssm: StateSpaceModel, transition: Exact, steps: int, start: jax.Array,
                  length: jax.Array) -> jax.Array:
-    """Return (n,), what an exact transition adds to phi s over a row that begins at ``start``."""
+    """Return (n,), what an exact transition adds to phi s over an interval that begins at ``start``."""
     if ssm.mean_invariant or not ssm.physical_dim:
         return transition.offset
     return _integrated_offset(ssm, transition, steps, start, length / steps)
@@ -135,10 +135,10 @@ def _integrated_offset(ssm: StateSpaceModel, transition: Exact, steps: int, star
     return offset[:, 0]
 
 
-def predict_row(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Factor, steps: int, start: jax.Array,
-                length: jax.Array, moments: Moments, about: Moments | None = None,
-                flow: bool = False, each: Callable[[Prediction], Any] | None = None) -> Prediction:
-    """Predict over a row in ``steps`` Runge-Kutta steps.
+def predict_interval(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: IntegratingFactor, steps: int, start: jax.Array,
+                length: jax.Array, moments: Moments, linearization_point: Moments | None = None,
+                with_map: bool = False, each: Callable[[Prediction], Any] | None = None) -> Prediction:
+    """Predict over an interval in ``steps`` Runge-Kutta steps.
 
     Args:
         ssm: the model.
@@ -146,38 +146,38 @@ def predict_row(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Fa
         linear: its constant linear part.
         factor: the integrating factor of one step.
         steps: number of steps.
-        start: time at the row's start.
-        length: of the row.
+        start: time at the interval's start.
+        length: of the interval.
         moments: at its start.
-        about: linearise about these moments, (steps + 1, ...) at the ends of the steps, and not about the filter's own.
-        flow: whether phi and noise of the whole row are wanted (for the smoother).
+        linearization_point: linearise about these moments, (steps + 1, ...) at the ends of the steps, and not about the filter's own.
+        with_map: whether phi and process_cov of the whole interval are wanted (for the smoother).
         each: what is wanted of each step's prediction.
     """
     h = length / steps
-    spread = smallest_spread(ssm, rule, factor, start, h, moments)
+    min_sd = minimum_sd(ssm, rule, factor, start, h, moments)
     if bent_by_forces_only(ssm, rule):
-        return _predict_by_quadrature(ssm, rule, linear, factor, steps, start, h, moments, spread, about, flow, each)
+        return _predict_by_quadrature(ssm, rule, linear, factor, steps, start, h, moments, min_sd, linearization_point, with_map, each)
 
     def step(carry: tuple, at: tuple) -> tuple[tuple, Any]:
-        now, phi, noise = carry
+        now, phi, process_cov = carry
         index, nodes = at
-        one, _ = step_on(ssm, rule, linear, factor, start + index * h, h, now, spread, nodes)
-        if flow:
-            phi, noise = compose((phi, noise), (one.phi, one.noise))
-        return (one.moments, phi, noise), None if each is None else each(one)
+        one, _ = step_on(ssm, rule, linear, factor, start + index * h, h, now, min_sd, nodes)
+        if with_map:
+            phi, process_cov = compose((phi, process_cov), (one.phi, one.process_cov))
+        return (one.moments, phi, process_cov), None if each is None else each(one)
 
-    carry = tuple(unmoved(moments, flow))[:3]
-    nodes = jax.tree_util.tree_map(lambda ends: _by_steps(_with_middles(ends)), about)
+    carry = tuple(unmoved(moments, with_map))[:3]
+    nodes = jax.tree_util.tree_map(lambda ends: _by_steps(_with_middles(ends)), linearization_point)
     (moments, whole, added), within = jax.lax.scan(
         jax.checkpoint(step, prevent_cse=False), carry, (jnp.arange(steps), nodes))
     return Prediction(moments, whole, added, within)
 
 
-def unmoved(moments: Moments, flow: bool, each: Callable[[Prediction], Any] | None = None,
+def unmoved(moments: Moments, with_map: bool, each: Callable[[Prediction], Any] | None = None,
             steps: int = 0) -> Prediction:
-    """Predict over a row of length zero; the same structure as what `predict_row` returns."""
+    """Predict over an interval of length zero; the same structure as what `predict_interval` returns."""
     size = moments.mean.shape[0]
-    still = (Prediction(moments, jnp.eye(size), jnp.zeros((size, size))) if flow
+    still = (Prediction(moments, jnp.eye(size), jnp.zeros((size, size))) if with_map
              else Prediction(moments, jnp.zeros(0), jnp.zeros(0)))
     if each is not None:
         still = still._replace(
@@ -185,7 +185,7 @@ def unmoved(moments: Moments, flow: bool, each: Callable[[Prediction], Any] | No
     return still
 
 
-def smallest_spread(ssm: StateSpaceModel, rule: Rule, factor: Factor, t: jax.Array, h: jax.Array,
+def minimum_sd(ssm: StateSpaceModel, rule: Rule, factor: IntegratingFactor, t: jax.Array, h: jax.Array,
                     moments: Moments) -> jax.Array:
     """The standard deviation below which a coordinate counts as known: 1e-6 of what it is or becomes in a step."""
     size = ssm.physical_dim
@@ -194,19 +194,19 @@ def smallest_spread(ssm: StateSpaceModel, rule: Rule, factor: Factor, t: jax.Arr
     change = jnp.abs(ssm.drift(w, t)) * h
     if (dispersion := ssm.dispersion(w, t)) is not None:
         change = change + jnp.sqrt(h * (dispersion**2).sum(1) + 1e-300)
-    forces = jnp.sqrt(diagonal(factor.noise_full) + 1e-300)
+    forces = jnp.sqrt(diagonal(factor.force_cov_full) + 1e-300)
     if isinstance(rule, SigmaPointRule) and rule.full_state:
         scale = jnp.abs(moments.mean) + jnp.concatenate([change, forces])
     else:
-        outputs = jnp.sqrt(diagonal(congruence(matrix[size:, size:], factor.noise_full)) + 1e-300)
+        outputs = jnp.sqrt(diagonal(congruence(matrix[size:, size:], factor.force_cov_full)) + 1e-300)
         scale = (jnp.abs(w) + jnp.concatenate([change, outputs]))[jnp.asarray(ssm.drift_structure.points, int)]
     scale = jnp.where(jnp.isfinite(scale), scale, 0.0)
     return checkpoint_name(jax.lax.stop_gradient(1e-6 * scale + 1e-150), FLOOR)
 
 
-def linearise_state(ssm: StateSpaceModel, rule: Rule, function: Any, structure: InputStructure, slope: jax.Array,
-                    t: jax.Array, mean: jax.Array, covariance: Any, spread: jax.Array) -> Any:
-    """Linearise a function of w = K s + k about a Gaussian in s; the slope that comes back is (D, n).
+def linearise_state(ssm: StateSpaceModel, rule: Rule, function: Any, structure: InputStructure, jacobian: jax.Array,
+                    t: jax.Array, mean: jax.Array, covariance: Any, min_sd: jax.Array) -> Any:
+    """Linearise a function of w = K s + k about a Gaussian in s; the Jacobian that comes back is (D, n).
 
     ``covariance`` is a function of a matrix C that returns C P C', so that only what the rule needs is formed.
     """
@@ -214,17 +214,17 @@ def linearise_state(ssm: StateSpaceModel, rule: Rule, function: Any, structure: 
     if isinstance(rule, SigmaPointRule) and rule.full_state:
         total = ssm.state_dim
         everything = InputStructure(tuple(range(total)), (), (), (), True)
-        inputs = Inputs(mean, covariance(jnp.eye(total), False), spread)
+        inputs = Inputs(mean, covariance(jnp.eye(total), False), min_sd)
         on_state = lambda s: function(matmul(matrix, s[:, None])[:, 0] + offset)  # noqa: E731
-        return rule.linearise(on_state, inputs, everything, jnp.zeros((slope.shape[0], total)))
+        return rule.linearise(on_state, inputs, everything, jnp.zeros((jacobian.shape[0], total)))
     chosen = (*structure.points, *structure.averaged)
     needed = isinstance(rule, SigmaPointRule) and bool(structure.points)
     rows = matmul(selection(chosen, ssm.input_dim).T, matrix) if chosen else matrix[:0]
     of_forces = all(index >= ssm.physical_dim for index in chosen)
-    spread_covariance = covariance(rows, of_forces) if needed else jnp.zeros((0, 0))
+    chosen_covariance = covariance(rows, of_forces) if needed else jnp.zeros((0, 0))
     w = matmul(matrix, mean[:, None])[:, 0] + offset
-    affine = rule.linearise(function, Inputs(w, spread_covariance, spread), structure, slope)
-    return affine._replace(slope=matmul(affine.slope, matrix))
+    affine = rule.linearise(function, Inputs(w, chosen_covariance, min_sd), structure, jacobian)
+    return affine._replace(jacobian=matmul(affine.jacobian, matrix))
 
 
 def covariance_of(moments: Moments) -> Any:
@@ -232,8 +232,8 @@ def covariance_of(moments: Moments) -> Any:
     return lambda rows, of_forces: congruence(rows, moments.covariance)
 
 
-def step_on(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Factor, t: jax.Array, h: jax.Array,
-            moments: Moments, spread: jax.Array, about: Moments | None = None,
+def step_on(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: IntegratingFactor, t: jax.Array, h: jax.Array,
+            moments: Moments, min_sd: jax.Array, linearization_point: Moments | None = None,
             first: Stage | None = None) -> tuple[Prediction, LastStage]:
     """Make one Runge-Kutta step from time ``t`` to ``t + h``.
 
@@ -247,12 +247,12 @@ def step_on(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Factor
     identity = jnp.eye(ssm.state_dim)
 
     def stage(index: int, time: jax.Array, mean: jax.Array, covariance: Any) -> Stage:
-        node = jax.tree_util.tree_map(lambda a: a[(0, 1, 1, 2)[index]], about)
-        return _stage(ssm, rule, linear, time, mean, covariance, spread, node)
+        node = jax.tree_util.tree_map(lambda a: a[(0, 1, 1, 2)[index]], linearization_point)
+        return _stage(ssm, rule, linear, time, mean, covariance, min_sd, node)
 
-    # Increments of the mean and of the flow are columns of one matrix (M, n + 1).
-    def increment(node: Stage, flow: jax.Array) -> jax.Array:
-        return jnp.concatenate([matmul(node.slope, flow), node.rest[:, None]], axis=1)
+    # Increments of the mean and of the transition matrix are columns of one matrix (M, n + 1).
+    def increment(node: Stage, phi: jax.Array) -> jax.Array:
+        return jnp.concatenate([matmul(node.jacobian, phi), node.rest[:, None]], axis=1)
 
     start = jnp.concatenate([identity, m[:, None]], axis=1)
     at_half, at_full = matmul(half, start), matmul(full, start)
@@ -263,37 +263,37 @@ def step_on(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Factor
 
     one = stage(0, t, m, covariance_of(moments)) if first is None else first
     k1 = increment(one, identity)
-    flow2, m2 = node(at_half, 0.5 * h * matmul(half[:size, :size], k1))
-    q2 = lambda: _noise(factor, 0, flow2[:size][None], _together(one), jnp.reshape(0.5 * h, 1), size)  # noqa: E731
-    two = stage(1, t + 0.5 * h, m2, _propagated(p, flow2, q2, factor.noise_half, size))
-    k2 = increment(two, flow2)
-    z2 = 0.5 * h * one.slope
+    phi2, m2 = node(at_half, 0.5 * h * matmul(half[:size, :size], k1))
+    q2 = lambda: _process_cov(factor, 0, phi2[:size][None], _together(one), jnp.reshape(0.5 * h, 1), size)  # noqa: E731
+    two = stage(1, t + 0.5 * h, m2, _propagated(p, phi2, q2, factor.force_cov_half, size))
+    k2 = increment(two, phi2)
+    z2 = 0.5 * h * one.jacobian
 
-    flow3, m3 = node(at_half, 0.5 * h * k2)
-    transport3 = identity[:size] + matmul(_less(flow3[:size] - half_x, flow3, z2, size), back_half)
-    q3 = lambda: _noise(factor, 1, transport3[None], _together(two), jnp.reshape(0.5 * h, 1), size)  # noqa: E731
-    three = stage(2, t + 0.5 * h, m3, _propagated(p, flow3, q3, factor.noise_half, size))
-    k3 = increment(three, flow3)
-    z3 = _inverse_flow(0.5 * h, z2, back_half, two.slope, half, size)
+    phi3, m3 = node(at_half, 0.5 * h * k2)
+    transport3 = identity[:size] + matmul(_less(phi3[:size] - half_x, phi3, z2, size), back_half)
+    q3 = lambda: _process_cov(factor, 1, transport3[None], _together(two), jnp.reshape(0.5 * h, 1), size)  # noqa: E731
+    three = stage(2, t + 0.5 * h, m3, _propagated(p, phi3, q3, factor.force_cov_half, size))
+    k3 = increment(three, phi3)
+    z3 = _inverse_transition(0.5 * h, z2, back_half, two.jacobian, half, size)
 
-    flow4, m4 = node(at_full, h * matmul(half[:size, :size], k3))
-    transport4 = half_x + matmul(_less(flow4[:size] - full_x, flow4, z3, size), back_half)
-    q4 = lambda: _noise(factor, 2, transport4[None], _together(three), jnp.reshape(h, 1), size)  # noqa: E731
-    covariance4 = _propagated(p, flow4, q4, factor.noise_full, size)
+    phi4, m4 = node(at_full, h * matmul(half[:size, :size], k3))
+    transport4 = half_x + matmul(_less(phi4[:size] - full_x, phi4, z3, size), back_half)
+    q4 = lambda: _process_cov(factor, 2, transport4[None], _together(three), jnp.reshape(h, 1), size)  # noqa: E731
+    covariance4 = _propagated(p, phi4, q4, factor.force_cov_full, size)
     four = stage(3, just_before(t + h, h), m4, covariance4)
-    k4 = increment(four, flow4)
-    z4 = _inverse_flow(h, z3, back_half, three.slope, half, size)
+    k4 = increment(four, phi4)
+    z4 = _inverse_transition(h, z3, back_half, three.jacobian, half, size)
 
     weighted = matmul(full[:size, :size], k1) + 2.0 * matmul(half[:size, :size], k2 + k3) + k4
-    flow, mean = node(at_full, h / 6 * weighted)
-    change = flow[:size] - full_x
-    transports = jnp.stack([flow[:size], half_x + matmul(_less(change, flow, z2, size), back_half),
-                            half_x + matmul(_less(change, flow, z3, size), back_half),
-                            identity[:size] + matmul(_less(change, flow, z4, size), back_full)])
+    phi, mean = node(at_full, h / 6 * weighted)
+    change = phi[:size] - full_x
+    transports = jnp.stack([phi[:size], half_x + matmul(_less(change, phi, z2, size), back_half),
+                            half_x + matmul(_less(change, phi, z3, size), back_half),
+                            identity[:size] + matmul(_less(change, phi, z4, size), back_full)])
     weights = h * np.array([1 / 6, 1 / 3, 1 / 3, 1 / 6])
-    noise = _noise(factor, -1, transports, _together(one, two, three, four), weights, size)
-    moments = Moments(mean, congruence(flow, p) + noise)
-    return Prediction(moments, flow, noise), LastStage(four, covariance4(identity, False))
+    process_cov = _process_cov(factor, -1, transports, _together(one, two, three, four), weights, size)
+    moments = Moments(mean, congruence(phi, p) + process_cov)
+    return Prediction(moments, phi, process_cov), LastStage(four, covariance4(identity, False))
 
 
 def _together(*stages: Stage | Node) -> jax.Array | None:
@@ -303,31 +303,31 @@ def _together(*stages: Stage | Node) -> jax.Array | None:
 
 
 def linearised(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, t: jax.Array, moments: Moments,
-               spread: jax.Array) -> Stage:
+               min_sd: jax.Array) -> Stage:
     """Linearise the dynamics about given moments, the linear part removed."""
-    return _stage(ssm, rule, linear, t, moments.mean, covariance_of(moments), spread, None)
+    return _stage(ssm, rule, linear, t, moments.mean, covariance_of(moments), min_sd, None)
 
 
 def _stage(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, t: jax.Array, mean: jax.Array, covariance: Any,
-           spread: jax.Array, about: Moments | None) -> Stage:
+           min_sd: jax.Array, linearization_point: Moments | None) -> Stage:
     """Linearise the dynamics at a node about the filter's moments, or about those of ``about``."""
 
     def function(w: jax.Array) -> tuple[jax.Array, Any]:
         dispersion = ssm.dispersion(w, t)
         return ssm.drift(w, t), () if dispersion is None else outer_square(dispersion)
 
-    centre, known = (mean, covariance) if about is None else (about.mean, covariance_of(about))
-    affine = linearise_state(ssm, rule, function, ssm.drift_structure, linear.slope, t, centre, known, spread)
+    centre, known = (mean, covariance) if linearization_point is None else (linearization_point.mean, covariance_of(linearization_point))
+    affine = linearise_state(ssm, rule, function, ssm.drift_structure, linear.jacobian, t, centre, known, min_sd)
     drift = affine.value
-    if about is not None:
-        drift = drift + matmul(affine.slope, (mean - centre)[:, None])[:, 0]
+    if linearization_point is not None:
+        drift = drift + matmul(affine.jacobian, (mean - centre)[:, None])[:, 0]
     rest = drift - matmul(linear.rows, mean[:, None])[:, 0]
-    return Stage(rest, affine.slope - linear.rows, affine.extra if isinstance(affine.extra, jax.Array) else None)
+    return Stage(rest, affine.jacobian - linear.rows, affine.extra if isinstance(affine.extra, jax.Array) else None)
 
 
 def row_factor(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, length: jax.Array, steps: int,
-               tabulated: bool = False) -> Factor:
-    """Return the integrating factor of the steps of a row; ``tabulated`` if it serves many rows, and may cost more."""
+               tabulated: bool = False) -> IntegratingFactor:
+    """Return the integrating factor of the steps of an interval; ``tabulated`` if it serves many intervals, and may cost more."""
     stages = not bent_by_forces_only(ssm, rule)
     nodes = not stages and tabulated and ssm.force_dim <= _LARGEST_TABULATED
     return integrating_factor(ssm, linear, length / steps, stages, steps if nodes else None)
@@ -336,19 +336,19 @@ def row_factor(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, length: jax
 def bent_by_forces_only(ssm: StateSpaceModel, rule: Rule) -> bool:
     """Whether what is left of the dynamics without its constant linear part depends on the forces alone.
 
-    Its slope K then reads nothing but the forces, which nothing moves but their own exact transition: K E K = 0.
+    Its Jacobian K then reads nothing but the forces, which nothing moves but their own exact transition: K E K = 0.
     """
     whole = isinstance(rule, SigmaPointRule) and rule.full_state
     structure = ssm.drift_structure
     return not whole and all(index >= ssm.physical_dim for index in (*structure.points, *structure.averaged))
 
 
-def _predict_by_quadrature(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Factor, steps: int,
-                           start: jax.Array, h: jax.Array, moments: Moments, spread: jax.Array, about: Moments | None,
-                           flow: bool, each: Callable[[Prediction], Any] | None) -> Prediction:
-    """Predict over a row in which only the forces bend the dynamics, to the same numbers as in steps of `step_on`.
+def _predict_by_quadrature(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: IntegratingFactor, steps: int,
+                           start: jax.Array, h: jax.Array, moments: Moments, min_sd: jax.Array, linearization_point: Moments | None,
+                           with_map: bool, each: Callable[[Prediction], Any] | None) -> Prediction:
+    """Predict over an interval in which only the forces bend the dynamics, to the same numbers as in steps of `step_on`.
 
-    The forces' moments at all nodes are then known at the row's start, no stage changes what another one sees, and
+    The forces' moments at all nodes are then known at the interval's start, no stage changes what another one sees, and
     the Runge-Kutta method is Simpson's rule.
     """
     size = ssm.physical_dim
@@ -357,14 +357,14 @@ def _predict_by_quadrature(ssm: StateSpaceModel, rule: Rule, linear: LinearPart,
     first = _forces_of(moments, size)
     if factor.halves is None:
         def half_step(now: Moments, _: None) -> tuple[Moments, Moments]:
-            return moved(now, half, factor.noise_half), now
+            return moved(now, half, factor.force_cov_half), now
 
         last, before = jax.lax.scan(half_step, first, None, length=2 * steps)
         now = jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a, b[None]]), before, last)
     else:
         flows, noises = factor.halves
         now = Moments(matmul(flows, first.mean[:, None])[..., 0], congruence(flows, first.covariance) + noises)
-    near = now if about is None else jax.tree_util.tree_map(_with_middles, _forces_of(about, size))
+    near = now if linearization_point is None else jax.tree_util.tree_map(_with_middles, _forces_of(linearization_point, size))
     begins = start + jnp.arange(steps) * h
     times = jnp.stack([begins, begins + 0.5 * h], axis=1).ravel()
     ends = just_before(begins + h, h)
@@ -372,11 +372,11 @@ def _predict_by_quadrature(ssm: StateSpaceModel, rule: Rule, linear: LinearPart,
     def node(t: jax.Array, mean: jax.Array, near: Moments) -> Node:
         centre = jnp.concatenate([jnp.zeros(size), near.mean])  # the physical state drops out
         covariance = lambda rows, _: congruence(rows[:, size:], near.covariance)  # noqa: E731
-        one = _stage(ssm, rule, linear, t, centre, covariance, spread, None)
-        slope, rest = one.slope[:, size:], one.rest
-        if about is not None:
-            rest = rest + matmul(slope, (mean - near.mean)[:, None])[:, 0]
-        return Node(jnp.concatenate([slope, rest[:, None]], axis=1), one.diffusion)
+        one = _stage(ssm, rule, linear, t, centre, covariance, min_sd, None)
+        jacobian, rest = one.jacobian[:, size:], one.rest
+        if linearization_point is not None:
+            rest = rest + matmul(jacobian, (mean - near.mean)[:, None])[:, 0]
+        return Node(jnp.concatenate([jacobian, rest[:, None]], axis=1), one.diffusion)
 
     if same_at_all_times(ssm):
         nodes = jax.vmap(node)(jnp.append(times, ends[-1]), now.mean, near)
@@ -391,16 +391,16 @@ def _predict_by_quadrature(ssm: StateSpaceModel, rule: Rule, linear: LinearPart,
     maps = jax.vmap(lambda *nodes: _simpson(factor, h, nodes, size))(*stages)
 
     def step(carry: tuple, of_step: tuple) -> tuple[tuple, Any]:
-        now, phi, noise = carry
+        now, phi, process_cov = carry
         own, offset, added = of_step
         mean = matmul(factor.full, now.mean[:, None])[:, 0]
         mean = jnp.concatenate([mean[:size] + offset, mean[size:]])
         now = Moments(mean, congruence(own, now.covariance) + added)
-        if flow:
-            phi, noise = compose((phi, noise), (own, added))
-        return (now, phi, noise), None if each is None else each(Prediction(now, own, added))
+        if with_map:
+            phi, process_cov = compose((phi, process_cov), (own, added))
+        return (now, phi, process_cov), None if each is None else each(Prediction(now, own, added))
 
-    (moments, whole, added), within = jax.lax.scan(step, tuple(unmoved(moments, flow))[:3], maps)
+    (moments, whole, added), within = jax.lax.scan(step, tuple(unmoved(moments, with_map))[:3], maps)
     return Prediction(moments, whole, added, within)
 
 
@@ -427,14 +427,14 @@ def _by_steps(nodes: jax.Array) -> jax.Array:
     return jnp.stack([nodes[:-2:2], nodes[1::2], nodes[2::2]], axis=1)
 
 
-def _simpson(factor: Factor, h: jax.Array, nodes: tuple[Node, ...],
+def _simpson(factor: IntegratingFactor, h: jax.Array, nodes: tuple[Node, ...],
              size: int) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return Phi (n, n), what the remainder adds to the mean (M,), and Q (n, n) of a step.
 
         Phi = E(h) + h / 6 (E(h) K_1 + 4 E(h/2) K_2 E(h/2) + K_3 E(h)).
 
     Its first, middle and last node are ``nodes``. The middle one is both the second and the third Runge-Kutta
-    stage; their Z, where Psi~ = I - Z is the inverse flow to a stage's node, differ.
+    stage; their Z, where Psi~ = I - Z is the inverse transition to a stage's node, differ.
     """
     half, full = factor.half, factor.full
     half_x, full_x = half[:size, :size], full[:size, :size]
@@ -451,42 +451,42 @@ def _simpson(factor: Factor, h: jax.Array, nodes: tuple[Node, ...],
     bends = jnp.concatenate([bend[None], matmul(bend - matmul(full_x, inverse), back)])
     transports = jnp.concatenate([onward[:, :, :size], onward[:, :, size:] + bends], axis=2)
     diffusions = _together(nodes[0], nodes[1], nodes[1], nodes[2])
-    noise = _noise(factor, -1, transports, diffusions, h * np.array([1 / 6, 1 / 3, 1 / 3, 1 / 6]), size)
-    return jnp.concatenate([transports[0], full[size:]]), offset, noise
+    process_cov = _process_cov(factor, -1, transports, diffusions, h * np.array([1 / 6, 1 / 3, 1 / 3, 1 / 6]), size)
+    return jnp.concatenate([transports[0], full[size:]]), offset, process_cov
 
 
-def _propagated(p: jax.Array, flow: jax.Array, noise: Any, force_noise: jax.Array, size: int) -> Any:
+def _propagated(p: jax.Array, phi: jax.Array, process_cov: Any, force_cov: jax.Array, size: int) -> Any:
     """Return the function C -> C (Phi P Phi' + Q) C' of a stage."""
 
     def covariance(rows: jax.Array, of_forces: bool) -> jax.Array:
         if of_forces:
             inner = rows[:, size:]
-            return congruence(matmul(inner, flow[size:, size:]), p[size:, size:]) + congruence(inner, force_noise)
-        return congruence(matmul(rows, flow), p) + congruence(rows, noise())
+            return congruence(matmul(inner, phi[size:, size:]), p[size:, size:]) + congruence(inner, force_cov)
+        return congruence(matmul(rows, phi), p) + congruence(rows, process_cov())
 
     return covariance
 
 
-def _less(change: jax.Array, flow: jax.Array, inverse: jax.Array, size: int) -> jax.Array:
-    """Rows of E(c_i) (Phi~_i Psi~_j - I): the change of the flow less what happened before the node j."""
-    return change - matmul(flow[:size, :size], inverse)
+def _less(change: jax.Array, phi: jax.Array, inverse: jax.Array, size: int) -> jax.Array:
+    """Rows of E(c_i) (Phi~_i Psi~_j - I): the change of the transition matrix less what happened before the node j."""
+    return change - matmul(phi[:size, :size], inverse)
 
 
-def _inverse_flow(scale: jax.Array, before: jax.Array, back: jax.Array, slope: jax.Array, half: jax.Array,
+def _inverse_transition(scale: jax.Array, before: jax.Array, back: jax.Array, jacobian: jax.Array, half: jax.Array,
                   size: int) -> jax.Array:
-    """Next stage of Z, where Psi~ = I - Z is the inverse flow in the interaction picture."""
-    pulled = matmul(back[:size, :size], matmul(slope, half))
+    """Next stage of Z, where Psi~ = I - Z is the inverse transition in the interaction picture."""
+    pulled = matmul(back[:size, :size], matmul(jacobian, half))
     return scale * (pulled - matmul(before[:, :size], pulled))
 
 
-def _noise(factor: Factor, stage: int, transports: jax.Array, diffusions: jax.Array | None, weights: jax.Array,
+def _process_cov(factor: IntegratingFactor, stage: int, transports: jax.Array, diffusions: jax.Array | None, weights: jax.Array,
            size: int) -> jax.Array:
     """Return Q (n, n): noise at K nodes, carried on by ``transports`` (K, M, n), the forces' own part exact.
 
     The forces' noise at the nodes, ``columns``, is only a quadrature of the exact noise, but what reaches x together
     with it can be regressed on the exact one: N_x = G N_z + remainder, semi-definite for any G.
     """
-    exact = factor.noise_half if stage in (0, 1) else factor.noise_full
+    exact = factor.force_cov_half if stage in (0, 1) else factor.force_cov_full
     through = safe_sqrt(weights)[:, None, None] * matmul(transports[:, :, size:], factor.inputs)
     through = jnp.moveaxis(through, 0, 1).reshape(size, factor.columns[stage].shape[1])
     gain = matmul(through, factor.regressions[stage])

@@ -14,7 +14,7 @@ from lfm_ppl.linalg import (
 )
 
 
-def given_later(now: Moments, predicted: Moments, phi: jax.Array, noise: jax.Array) -> tuple[jax.Array, jax.Array]:
+def smoothing_kernel(now: Moments, predicted: Moments, phi: jax.Array, process_cov: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return the gain G = P Phi' P_p^-1, and the covariance C now given the state at the later time.
 
     C = (I - G Phi) P (I - G Phi)' + G Q G', a sum of squares.
@@ -23,18 +23,18 @@ def given_later(now: Moments, predicted: Moments, phi: jax.Array, noise: jax.Arr
         now: filtered, m and P.
         predicted: m_p and P_p at the later time.
         phi: Phi, from now to the later time.
-        noise: Q, gained on the way.
+        process_cov: Q, gained on the way.
     """
     gain = solve_semidefinite(predicted.covariance, matmul(phi, now.covariance)).T
     kept = jnp.eye(phi.shape[0]) - matmul(gain, phi)
-    return gain, congruence(kept, now.covariance) + congruence(gain, noise)
+    return gain, congruence(kept, now.covariance) + congruence(gain, process_cov)
 
 
-def combine(now: Moments, predicted: Moments, later: Moments, gain: jax.Array, conditional: jax.Array, r: jax.Array,
+def smoothed_moments(now: Moments, predicted: Moments, later: Moments, gain: jax.Array, conditional: jax.Array, r: jax.Array,
             adjoint: jax.Array) -> Moments:
     """Return smoothed moments at a time from the filtered ones there.
 
-    Rauch, Tung and Striebel's way goes through the smoothed moments at a later time, with G and C of `given_later`,
+    Rauch, Tung and Striebel's way goes through the smoothed moments at a later time, with G and C of `smoothing_kernel`,
 
         m + G (m_s - m_p),    C + G P_s G',
 

@@ -9,18 +9,18 @@ import jax.numpy as jnp
 
 from lfm_ppl.filtering.filter import Pass
 from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.filtering.retrospect import combine, given_later
-from lfm_ppl.filtering.schedule import Schedule
+from lfm_ppl.filtering.retrospect import smoothed_moments, smoothing_kernel
+from lfm_ppl.filtering.schedule import TimeGrid
 from lfm_ppl.linalg import cholesky, congruence, diagonal, log_density, matmul, outer_square, solve_lower
 
 
 class Smoothed(NamedTuple):
-    """What the backward scan leaves: nodes are the initial time and each row's end.
+    """What the backward scan leaves: nodes are the initial time and each interval's end.
 
     Attributes:
         moments: smoothed, at the N + 1 nodes.
-        leave_one_out: (N,), log p(y_k | all other observations), zero in rows without one.
-        adjoint: r (N, n) and Lambda (N, n, n) at the row's end, its observation and all later ones included: the
+        leave_one_out: (N,), log p(y_k | all other observations), zero in intervals without one.
+        adjoint: r (N, n) and Lambda (N, n, n) at the interval's end, its observation and all later ones included: the
             smoothed mean there is m_p + P_p r, the covariance P_p - P_p Lambda P_p.
     """
 
@@ -30,31 +30,31 @@ class Smoothed(NamedTuple):
 
 
 def at_start(filtered: Moments, start: Moments) -> Moments:
-    """Return the filtered moments (N, ...) at the rows' starts."""
+    """Return the filtered moments (N, ...) at the intervals' starts."""
     return jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a[None], b[:-1]]), start, filtered)
 
 
-def backward(passed: Pass, start: Moments, plan: Schedule) -> Smoothed:
+def backward(passed: Pass, start: Moments, grid: TimeGrid) -> Smoothed:
     """Run the one backward scan.
 
     Moments follow Rauch, Tung and Striebel, with the gain from a semi-definite solve and the covariance as a sum of
-    squares, or the adjoint of Bryson and Frazier, r and Lambda, which needs no inverse of a covariance (`combine` says
+    squares, or the adjoint of Bryson and Frazier, r and Lambda, which needs no inverse of a covariance (`smoothed_moments` says
     when). With u = S^-1 v - K' r and C = S^-1 + K' Lambda K, an observation given all the others is
     N(y - C^-1 u, C^-1).
     """
-    length = jnp.asarray(plan.rows.length)
-    still = (length == 0) & (jnp.asarray(plan.rows.jump) < 0)
+    length = jnp.asarray(grid.intervals.length)
+    still = (length == 0) & (jnp.asarray(grid.intervals.jump) < 0)
     before = at_start(passed.filtered, start)
     size = start.mean.shape[0]
 
     def step(carry: tuple, row: tuple) -> tuple[tuple, tuple]:
         later, r, adjoint = carry
         at, one, at_rest = row
-        gain, conditional = given_later(at, one.predicted, one.phi, one.noise)
+        gain, conditional = smoothing_kernel(at, one.predicted, one.phi, one.process_cov)
         left_out, r, adjoint = _leave_one_out(one, r, adjoint)
         back = matmul(one.phi.T, r[:, None])[:, 0], congruence(one.phi.T, adjoint)
-        smoothed = combine(at, one.predicted, later, gain, conditional, *back)
-        # Nothing happens in a row without length but for the observation at its end.
+        smoothed = smoothed_moments(at, one.predicted, later, gain, conditional, *back)
+        # Nothing happens in an interval without length but for the observation at its end.
         smoothed = jax.tree_util.tree_map(lambda a, b: jnp.where(at_rest, a, b), later, smoothed)
         return (smoothed, *back), (later, left_out, (r, adjoint))
 
@@ -67,7 +67,7 @@ def backward(passed: Pass, start: Moments, plan: Schedule) -> Smoothed:
 
 
 def _leave_one_out(one: Pass, r: jax.Array, adjoint: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Log density of a row's observation given all others, and the adjoint at the row's end with it."""
+    """Log density of an interval's observation given all others, and the adjoint at the interval's end with it."""
     outputs = one.innovation.shape[0]
     root = solve_lower(one.chol, jnp.eye(outputs))
     inverse = outer_square(root.T)
@@ -78,7 +78,7 @@ def _leave_one_out(one: Pass, r: jax.Array, adjoint: jax.Array) -> tuple[jax.Arr
     # A missing entry has unit precision and u = 0, and so contributes nothing.
     left_out = (log_density(solve_lower(factor.chol, u), factor.chol, one.present)
                 + 2.0 * jnp.log(diagonal(factor.chol)).sum())  # C is a precision
-    kept = jnp.eye(r.shape[0]) - matmul(one.gain, one.slope)
-    r = matmul(one.slope.T, white[:, None])[:, 0] + matmul(kept.T, r[:, None])[:, 0]
-    adjoint = congruence(one.slope.T, inverse) + congruence(kept.T, adjoint)
+    kept = jnp.eye(r.shape[0]) - matmul(one.gain, one.jacobian)
+    r = matmul(one.jacobian.T, white[:, None])[:, 0] + matmul(kept.T, r[:, None])[:, 0]
+    adjoint = congruence(one.jacobian.T, inverse) + congruence(kept.T, adjoint)
     return left_out, r, adjoint

@@ -11,7 +11,7 @@ from lfm_ppl.linalg import matmul, semidefinite_root, solve_lower, solve_upper
 
 
 def smoothing_errors(key: jax.Array, passed: Pass, start: Moments, draws: int) -> jax.Array:
-    """Draw what the smoothed mean is off by: (N, n, draws) at the rows' ends, jointly Gaussian over the rows.
+    """Draw what the smoothed mean is off by: (N, n, draws) at the intervals' ends, jointly Gaussian over the intervals.
 
     A trajectory s+ and observations y+ of the linearised model are simulated, and the draw is s+ - E[s+ | y+], which
     has the law of s - E[s | y]. With the filter's gains only its errors are needed,
@@ -41,14 +41,14 @@ def smoothing_errors(key: jax.Array, passed: Pass, start: Moments, draws: int) -
 
     def simulate(error: jax.Array, row: tuple) -> tuple[jax.Array, tuple]:
         one, moving, observing = row
-        error = matmul(one.phi, error) + matmul(semidefinite_root(one.noise), moving)
-        innovation = matmul(one.slope, error) + matmul(semidefinite_root(one.obs_cov), observing)
+        error = matmul(one.phi, error) + matmul(semidefinite_root(one.process_cov), moving)
+        innovation = matmul(one.jacobian, error) + matmul(semidefinite_root(one.obs_cov), observing)
         return error - matmul(one.gain, innovation), (error, innovation)
 
     def smooth(r: jax.Array, row: tuple) -> tuple[jax.Array, jax.Array]:
         one, error, innovation = row
         white = solve_upper(one.chol, solve_lower(one.chol, innovation))
-        r = matmul(one.slope.T, white - matmul(one.gain.T, r)) + r
+        r = matmul(one.jacobian.T, white - matmul(one.gain.T, r)) + r
         return matmul(one.phi.T, r), error - matmul(one.predicted.covariance, r)
 
     _, (errors, innovations) = jax.lax.scan(simulate, first, (passed, *standard))

@@ -10,20 +10,20 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import checks
-from lfm_ppl.filtering.between import Branches, Places, marginals_between, places
+from lfm_ppl.filtering.between import Branches, Places, dense_output, places
 from lfm_ppl.filtering.breakdown import warn_of_breakdown
 from lfm_ppl.filtering.filter import (
     Pass,
     as_rule,
     check_observations,
     forward,
-    standardised,
     warn_single_precision,
+    whitened_innovations,
 )
 from lfm_ppl.filtering.iterated import Iterated, posterior_linearisation, refined
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.rts import Smoothed, backward
-from lfm_ppl.filtering.schedule import Schedule, per_step, schedule
+from lfm_ppl.filtering.schedule import TimeGrid, build_time_grid, per_step
 from lfm_ppl.filtering.simulation_smoother import smoothing_errors
 from lfm_ppl.linalg import congruence, matmul, safe_sqrt, semidefinite_root, solve_lower
 from lfm_ppl.linearisation.rule import Rule
@@ -32,7 +32,7 @@ from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.resolution import check_resolution
 
 _LONGEST_FORECAST = 10_000
-"""Most rows of a forecast; a longer one gets a long last row (or `max_step`)."""
+"""Most intervals of a forecast; a longer one gets a long last interval (or `max_step`)."""
 
 class Marginal(NamedTuple):
     """Mean (K,) and standard deviation (K,) of one force or state at the requested times."""
@@ -60,9 +60,9 @@ class Joint(NamedTuple):
 
     Attributes:
         start: moments at the initial time.
-        passed: forward scan over rows that end at the requested times, among others.
+        passed: forward scan over intervals that end at the requested times, among others.
         requested: (K,) the requested times among these.
-        covariance: (K, n, n), smoothed by that scan; None where it is that of the result. In rows that are cut at the
+        covariance: (K, n, n), smoothed by that scan; None where it is that of the result. In intervals that are cut at the
             requested times integration errors differ, and draws take the result's moments.
     """
 
@@ -81,7 +81,7 @@ class SmootherResult(eqx.Module):
         input_mean, input_covariance: (K, M + R), (K, M + R, M + R) of w = (x, u).
         log_likelihood: (T,), log p(y_k | y_1:k-1).
         leave_one_out: (T,), log p(y_k | y_-k).
-        residual: (T, D), standardised one-step-ahead residuals, NaN where missing.
+        whitened_innovation: (T, D), innovations whitened by their Cholesky factor, NaN where missing.
         change: largest change of a smoothed mean in the last iteration, in smoothed standard deviations; NaN
             with fewer than two iterations.
     """
@@ -93,7 +93,7 @@ class SmootherResult(eqx.Module):
     input_covariance: jax.Array
     log_likelihood: jax.Array
     leave_one_out: jax.Array
-    residual: jax.Array
+    whitened_innovation: jax.Array
     change: jax.Array
     _joint: Joint
     _input_map: Any
@@ -207,39 +207,39 @@ def smooth(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
     rule = as_rule(rule)
     check_iterations(iterations, damping, tolerance)
     ssm = state_space(model)
-    plans = smoothing_plans(ssm, times, steps, max_step, at, iterations, tolerance)
-    model.check_at(plans.rows.initial_time, np.shape(times)[0])
+    grids = smoothing_grids(ssm, times, steps, max_step, at, iterations, tolerance)
+    model.check_at(grids.marginals.initial_time, np.shape(times)[0])
     check_resolution(model, times, y)
-    y = check_observations(y, len(plans.rows.observed), ssm.output_dim)
+    y = check_observations(y, len(grids.marginals.observed), ssm.output_dim)
     warn_single_precision()
-    result = _run_smoother(ssm, rule, plans, y, iterations, damping)
-    warn_of_breakdown(ssm, rule, plans.rows, y, None, result.log_likelihood)
+    result = _run_smoother(ssm, rule, grids, y, iterations, damping)
+    warn_of_breakdown(ssm, rule, grids.marginals, y, None, result.log_likelihood)
     return result
 
 
-class Plans(NamedTuple):
+class SmoothingGrids(NamedTuple):
     """The scans of a smoother.
 
     Attributes:
-        rows: of the likelihood and the marginals.
-        joint: for draws of trajectories, with rows that end at the requested times too; None where ``rows`` serves:
-            without requested times, and for a model whose rows are exact whatever their length.
-        where: the requested times among ``rows``; None where ``joint`` is.
+        marginals: of the likelihood and the marginals.
+        joint: for draws of trajectories, with intervals that end at the requested times too; None where ``marginals`` serves:
+            without requested times, and for a model whose intervals are exact whatever their length.
+        where: the requested times among ``marginals``; None where ``joint`` is.
         times: (K,) requested times.
     """
 
-    rows: Schedule
-    joint: Schedule | None
+    marginals: TimeGrid
+    joint: TimeGrid | None
     where: Places | None
     times: Any
 
 
-def smoothing_plans(ssm: StateSpaceModel, times: Any, steps: int, max_step: float | None, at: Any,
-                    iterations: int, tolerance: float | None = None) -> Plans:
-    """Plan a smoother's scans; a forecast goes on in rows as long as the data's median interval."""
-    joint = schedule(ssm, times, steps, max_step, at, tolerance=tolerance)
+def smoothing_grids(ssm: StateSpaceModel, times: Any, steps: int, max_step: float | None, at: Any,
+                    iterations: int, tolerance: float | None = None) -> SmoothingGrids:
+    """Lay out the time grids of a smoother; a forecast goes on in intervals as long as the data's median interval."""
+    joint = build_time_grid(ssm, times, steps, max_step, at, tolerance=tolerance)
     if at is None or ssm.time_invariant:
-        return Plans(joint, None, None, joint.requested_times)
+        return SmoothingGrids(joint, None, None, joint.requested_times)
     known = np.asarray(times, float)
     beyond = np.array([])
     if joint.requested_times.max() > known[-1]:
@@ -248,47 +248,47 @@ def smoothing_plans(ssm: StateSpaceModel, times: Any, steps: int, max_step: floa
         count = int(np.ceil((joint.requested_times.max() - known[-1]) / gap * (1 - 1e-12)))
         beyond = known[-1] + gap * np.arange(1, min(count, _LONGEST_FORECAST) + 1)
         beyond[-1] = max(beyond[-1], joint.requested_times.max())
-    base = schedule(ssm, times, steps, max_step, np.append(known[-1:], beyond), tolerance=tolerance)
+    base = build_time_grid(ssm, times, steps, max_step, np.append(known[-1:], beyond), tolerance=tolerance)
     where = places(per_step(base) if iterations else base, joint.requested_times)
-    return Plans(base, joint, where, joint.requested_times)
+    return SmoothingGrids(base, joint, where, joint.requested_times)
 
 
-def smooth_on(ssm: StateSpaceModel, rule: Rule, plans: Plans, y: jax.Array, iterations: int,
+def smooth_on(ssm: StateSpaceModel, rule: Rule, grids: SmoothingGrids, y: jax.Array, iterations: int,
               damping: float) -> SmootherResult:
-    """The same on plans, without checks; for compiled code."""
-    plan = plans.rows
+    """The same on time grids, without checks; for compiled code."""
+    grid = grids.marginals
     start = Moments(*ssm.initial())
-    passed, smoothed, found = _smooth_rows(ssm, rule, plan, y, start, iterations, damping)
-    times = jnp.asarray(plans.times, float)
-    if plans.joint is None or plans.where is None:
-        at = jnp.asarray(plan.requested)
+    passed, smoothed, found = _smooth_rows(ssm, rule, grid, y, start, iterations, damping)
+    times = jnp.asarray(grids.times, float)
+    if grids.joint is None or grids.where is None:
+        at = jnp.asarray(grid.requested)
         mean, covariance = (a[at + 1] for a in smoothed.moments)
         joint = Joint(start, passed._replace(steps=None), at, None)
     else:
-        drawn, pieces, _ = _smooth_rows(ssm, rule, plans.joint, y, start, iterations, damping)
-        at = jnp.asarray(plans.joint.requested)
+        drawn, pieces, _ = _smooth_rows(ssm, rule, grids.joint, y, start, iterations, damping)
+        at = jnp.asarray(grids.joint.requested)
         joint = Joint(start, drawn._replace(steps=None), at, pieces.moments.covariance[at + 1])
-        rows = (Branches(plan, passed.filtered, smoothed.moments, smoothed.adjoint, None) if found is None
-                else refined(ssm, rule, plan, found, passed, smoothed))
-        mean, covariance = marginals_between(ssm, rule, rows, start, plans.where)
+        branches = (Branches(grid, passed.filtered, smoothed.moments, smoothed.adjoint, None) if found is None
+                else refined(ssm, rule, grid, found, passed, smoothed))
+        mean, covariance = dense_output(ssm, rule, branches, start, grids.where)
     matrix, offset = jax.vmap(ssm.input_map)(times)
-    observed = jnp.asarray(plan.observed)
+    observed = jnp.asarray(grid.observed)
     at_data = jax.tree_util.tree_map(lambda a: a[observed], passed._replace(steps=None))
     return SmootherResult(
         times, mean, covariance, matmul(matrix, mean[..., None])[..., 0] + offset, congruence(matrix, covariance),
-        at_data.log_likelihood, smoothed.leave_one_out[observed], standardised(at_data, y),
+        at_data.log_likelihood, smoothed.leave_one_out[observed], whitened_innovations(at_data, y),
         jnp.asarray(jnp.nan) if found is None else found.change, joint, (matrix, offset),
         ssm.model.state_names, ssm.model.force_names)
 
 
-def _smooth_rows(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, start: Moments, iterations: int,
+def _smooth_rows(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments, iterations: int,
                  damping: float) -> tuple[Pass, Smoothed, Iterated | None]:
     found = None
     if iterations:
-        found = posterior_linearisation(ssm, rule, plan, y, start, iterations, damping)
-    passed = forward(ssm, rule, plan, y, start=start, about=None if found is None else found.points,
+        found = posterior_linearisation(ssm, rule, grid, y, start, iterations, damping)
+    passed = forward(ssm, rule, grid, y, start=start, linearization_point=None if found is None else found.points,
                      keep="steps" if iterations else "all")
-    return passed, backward(passed, start, plan), found
+    return passed, backward(passed, start, grid), found
 
 
 _run_smoother = eqx.filter_jit(smooth_on)

@@ -26,30 +26,30 @@ class LinearPart(NamedTuple):
     """The constant linear part of the dynamics.
 
     Attributes:
-        slope: (M, M + R), Jacobian in the constant inputs, zero in the others.
+        jacobian: (M, M + R), Jacobian in the constant inputs, zero in the others.
         rows: (M, n), the rows [J, B] of ``Lin``.
     """
 
-    slope: jax.Array
+    jacobian: jax.Array
     rows: jax.Array
 
 
 class Exact(NamedTuple):
-    """Transition of a linear time-invariant model over a row: s -> phi s + offset + N(0, noise)."""
+    """Transition of a linear time-invariant model over an interval: s -> phi s + offset + N(0, process_cov)."""
 
     phi: jax.Array
-    noise: jax.Array
+    process_cov: jax.Array
     offset: jax.Array
     half: jax.Array
     full: jax.Array
 
 
-class Factor(NamedTuple):
+class IntegratingFactor(NamedTuple):
     """What a Runge-Kutta step of length h needs of the linear part.
 
     ``half`` and ``full`` are E(h/2) and E(h), the exponential of ``Lin``. ``back_half`` and ``back_full`` approximate
     their inverses by 4 - 6 E + 4 E^2 - E^3 and its square: to the order of the step where it resolves ``Lin``, and
-    bounded where it does not, while the true inverses of fast decays overflow. ``noise_half`` and ``noise_full`` are
+    bounded where it does not, while the true inverses of fast decays overflow. ``force_cov_half`` and ``force_cov_full`` are
     the exact covariances of the forces' noise, ``inputs`` (nz, S) its dispersion. ``columns`` (nz, K) stand for the
     forces' noise at the nodes of each later stage (not by quadrature) and, the last, of the whole step; ``regressions``
     (K, nz) regress them on the exact noise. ``halves`` are the transitions and the noise (2 J + 1, nz, nz) of the
@@ -60,15 +60,15 @@ class Factor(NamedTuple):
     full: jax.Array
     back_half: jax.Array
     back_full: jax.Array
-    noise_half: jax.Array
-    noise_full: jax.Array
+    force_cov_half: jax.Array
+    force_cov_full: jax.Array
     inputs: jax.Array
     columns: tuple[jax.Array, ...]
     regressions: tuple[jax.Array, ...]
     halves: tuple[jax.Array, jax.Array] | None = None
 
 
-def constant_slope(function: Function, point: jax.Array, structure: InputStructure, outputs: int) -> jax.Array:
+def constant_jacobian(function: Function, point: jax.Array, structure: InputStructure, outputs: int) -> jax.Array:
     """Return the Jacobian (D, N) in the constant inputs, zero elsewhere; it is the same at every point."""
     if not structure.constant:
         return jnp.zeros((outputs, point.shape[0]))
@@ -81,10 +81,10 @@ def linear_part(ssm: StateSpaceModel, t: jax.Array) -> LinearPart:
     mean, _ = ssm.initial()
     matrix, offset = ssm.input_map(t)
     function = lambda w: (ssm.drift(w, t), ())  # noqa: E731
-    slope = constant_slope(function, matmul(matrix, mean[:, None])[:, 0] + offset, ssm.drift_structure,
+    jacobian = constant_jacobian(function, matmul(matrix, mean[:, None])[:, 0] + offset, ssm.drift_structure,
                            ssm.physical_dim)
-    usable = slope if ssm.constant_measurement else slope * (np.arange(ssm.input_dim) < ssm.physical_dim)
-    return LinearPart(slope, matmul(usable, matrix) if ssm.physical_dim else jnp.zeros((0, ssm.state_dim)))
+    usable = jacobian if ssm.constant_measurement else jacobian * (np.arange(ssm.input_dim) < ssm.physical_dim)
+    return LinearPart(jacobian, matmul(usable, matrix) if ssm.physical_dim else jnp.zeros((0, ssm.state_dim)))
 
 
 def feedback(ssm: StateSpaceModel, linear: LinearPart) -> jax.Array:
@@ -95,15 +95,15 @@ def feedback(ssm: StateSpaceModel, linear: LinearPart) -> jax.Array:
 
 
 def exact(ssm: StateSpaceModel, length: jax.Array, steps: int, linear: LinearPart | None = None) -> Exact:
-    """Return the transition of a linear time-invariant model over a row of ``length``.
+    """Return the transition of a linear time-invariant model over an interval of ``length``.
 
     Its ``linear`` part is that of any time. The offset is exact where the mean is invariant; otherwise zero, and the
     filter integrates it with E(h/2), E(h).
     """
     size, total = ssm.physical_dim, ssm.state_dim
     if size == 0:
-        phi, noise = ssm.stack.discretise(length)
-        return Exact(phi, noise, jnp.zeros(total), phi, phi)
+        phi, process_cov = ssm.stack.discretise(length)
+        return Exact(phi, process_cov, jnp.zeros(total), phi, phi)
     t = jnp.zeros(())
     linear = linear_part(ssm, t) if linear is None else linear
     matrix, shift = ssm.input_map(t)
@@ -115,19 +115,19 @@ def exact(ssm: StateSpaceModel, length: jax.Array, steps: int, linear: LinearPar
         matmul(ssm.stack.dispersion(), ssm.stack.dispersion().T), jnp.zeros((1, 1)))
     # One more state that is constantly one carries the offset.
     augmented = jnp.zeros((total + 1, total + 1)).at[:total, :total].set(lin).at[:total, total].set(constant)
-    phi, noise = discretise(augmented, diffusion, length)
-    forces, force_noise = ssm.stack.discretise(length)
+    phi, process_cov = discretise(augmented, diffusion, length)
+    forces, force_cov = ssm.stack.discretise(length)
     phi = phi.at[size:total, size:total].set(forces)
-    noise = noise.at[size:total, size:total].set(force_noise) if size else noise
+    process_cov = process_cov.at[size:total, size:total].set(force_cov) if size else process_cov
     half = full = phi[:total, :total]
     if not ssm.mean_invariant:
         half, _ = discretise(lin, jnp.zeros_like(lin), 0.5 * length / steps)
         full = matmul(half, half)
-    return Exact(phi[:total, :total], noise[:total, :total], phi[:total, total], half, full)
+    return Exact(phi[:total, :total], process_cov[:total, :total], phi[:total, total], half, full)
 
 
 def integrating_factor(ssm: StateSpaceModel, linear: LinearPart, step: jax.Array, stages: bool = True,
-                       halves_of: int | None = None) -> Factor:
+                       halves_of: int | None = None) -> IntegratingFactor:
     """Return what a step of length ``step`` needs of the linear part.
 
     Args:
@@ -140,14 +140,14 @@ def integrating_factor(ssm: StateSpaceModel, linear: LinearPart, step: jax.Array
     halves = None
     if halves_of is not None:
         halves = jax.vmap(ssm.stack.discretise)(0.5 * step * np.arange(2 * halves_of + 1))
-    forces, noise_half = ssm.stack.discretise(0.5 * step) if halves is None else (halves[0][1], halves[1][1])
+    forces, force_cov_half = ssm.stack.discretise(0.5 * step) if halves is None else (halves[0][1], halves[1][1])
     half = _half_step(ssm, linear, 0.5 * step, forces)
     full = matmul(half, half)
     identity = jnp.eye(ssm.state_dim)
     back_half = 4.0 * identity - 6.0 * half + 4.0 * full - matmul(full, half)
     size = ssm.physical_dim
     half_z, full_z = half[size:, size:], full[size:, size:]
-    noise_full = congruence(half_z, noise_half) + noise_half
+    force_cov_full = congruence(half_z, force_cov_half) + force_cov_half
     inputs = ssm.stack.dispersion()
     at_half, at_full = matmul(half_z, inputs), matmul(full_z, inputs)
     root = lambda weight: safe_sqrt(weight * step)  # noqa: E731
@@ -156,21 +156,21 @@ def integrating_factor(ssm: StateSpaceModel, linear: LinearPart, step: jax.Array
     if stages:
         columns = (root(0.5) * at_half, root(0.5) * inputs, root(1.0) * at_half, *columns)
     back_full = matmul(back_half, back_half)
-    regressions = _regressions(columns, noise_half, noise_full)
-    return Factor(half, full, back_half, back_full, noise_half, noise_full, inputs, columns, regressions, halves)
+    regressions = _regressions(columns, force_cov_half, force_cov_full)
+    return IntegratingFactor(half, full, back_half, back_full, force_cov_half, force_cov_full, inputs, columns, regressions, halves)
 
 
-def _regressions(columns: tuple[jax.Array, ...], noise_half: jax.Array, noise_full: jax.Array) -> tuple[jax.Array, ...]:
+def _regressions(columns: tuple[jax.Array, ...], force_cov_half: jax.Array, force_cov_full: jax.Array) -> tuple[jax.Array, ...]:
     """Regress columns (nz, K) on the exact noise of half a step, the first two of four, and of a step: (K, nz) each."""
-    if not noise_half.shape[0]:
+    if not force_cov_half.shape[0]:
         return tuple(column.T for column in columns)
     if len(columns) == 1:
-        return (solve_semidefinite(noise_full, columns[0]).T,)
+        return (solve_semidefinite(force_cov_full, columns[0]).T,)
     widths = [column.shape[1] for column in columns]
     sides = [jnp.concatenate(columns[:2], axis=1), jnp.concatenate(columns[2:], axis=1)]
     # Side by side: one factorisation in the program.
     sides[0] = jnp.pad(sides[0], ((0, 0), (0, sides[1].shape[1] - sides[0].shape[1])))
-    solved = jax.vmap(solve_semidefinite)(jnp.stack([noise_half, noise_full]), jnp.stack(sides)).mT
+    solved = jax.vmap(solve_semidefinite)(jnp.stack([force_cov_half, force_cov_full]), jnp.stack(sides)).mT
     ends = np.cumsum(widths[:2]), np.cumsum(widths[2:])
     return tuple(solved[side, end - width:end] for side in (0, 1)
                  for end, width in zip(ends[side], widths[2 * side:2 * side + 2], strict=True))

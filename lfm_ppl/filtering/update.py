@@ -25,15 +25,15 @@ _HARMLESS = 1e-6
 
 
 class Linearised(NamedTuple):
-    """An observation as an affine map of the state: y ~ value + slope (s - point) + N(0, noise)."""
+    """An observation as an affine map of the state: y ~ value + jacobian (s - point) + N(0, obs_cov)."""
 
     value: jax.Array
-    slope: jax.Array
-    noise: jax.Array
+    jacobian: jax.Array
+    obs_cov: jax.Array
 
     def shifted(self, change: jax.Array) -> Linearised:
         """Return the same map with its point moved by ``change`` (n,)."""
-        return self._replace(value=self.value + matmul(self.slope, change[:, None])[:, 0])
+        return self._replace(value=self.value + matmul(self.jacobian, change[:, None])[:, 0])
 
 
 class Update(NamedTuple):
@@ -45,7 +45,7 @@ class Update(NamedTuple):
         innovation: (D,), zero where missing.
         chol: (D, D), Cholesky factor of the innovation covariance, the identity where missing.
         gain: (n, D).
-        slope: (D, n), zero rows where missing.
+        jacobian: (D, n), zero rows where missing.
         obs_cov: (D, D), covariance of the observation given the state, the identity where missing.
     """
 
@@ -54,11 +54,11 @@ class Update(NamedTuple):
     innovation: jax.Array
     chol: jax.Array
     gain: jax.Array
-    slope: jax.Array
+    jacobian: jax.Array
     obs_cov: jax.Array
 
 
-def linearise_observation(ssm: StateSpaceModel, rule: Rule, slope: jax.Array, t: jax.Array, row: jax.Array,
+def linearise_observation(ssm: StateSpaceModel, rule: Rule, jacobian: jax.Array, t: jax.Array, row: jax.Array,
                           centre: Moments) -> Linearised:
     """Linearise the observation about given moments."""
     angular = ssm.model.observation.angular
@@ -70,14 +70,14 @@ def linearise_observation(ssm: StateSpaceModel, rule: Rule, slope: jax.Array, t:
         for index in angular:
             # Averages are taken on the branch of the angle that is centred on the mean.
             value = value.at[index].set(middle[index] + wrapped(value[index] - middle[index]))
-        return value, ssm.noise_covariance(w, t, row)
+        return value, ssm.obs_cov(w, t, row)
 
-    affine = linearise_state(ssm, rule, function, ssm.observation_structure, slope, t, centre.mean,
-                             covariance_of(centre), _spread(ssm, rule, t, centre))
-    return Linearised(affine.value, affine.slope, affine.residual + affine.extra)
+    affine = linearise_state(ssm, rule, function, ssm.observation_structure, jacobian, t, centre.mean,
+                             covariance_of(centre), _min_sd(ssm, rule, t, centre))
+    return Linearised(affine.value, affine.jacobian, affine.residual_cov + affine.extra)
 
 
-def _spread(ssm: StateSpaceModel, rule: Rule, t: jax.Array, moments: Moments) -> jax.Array:
+def _min_sd(ssm: StateSpaceModel, rule: Rule, t: jax.Array, moments: Moments) -> jax.Array:
     """As in the prediction: the standard deviation below which a coordinate counts as known."""
     if isinstance(rule, SigmaPointRule) and rule.full_state:
         scale = moments.mean
@@ -103,13 +103,13 @@ def update(ssm: StateSpaceModel, observation: Linearised, y: jax.Array, present:
         scale: (D,), how large the outputs are; None: rounding errors of the filtered moments are not asked for.
     """
     mean, covariance = moments
-    slope = jnp.where(present[:, None], observation.slope, 0.0)
+    jacobian = jnp.where(present[:, None], observation.jacobian, 0.0)
     residual = jnp.where(present, y, 0.0) - observation.value
     for index in ssm.model.observation.angular:
         residual = residual.at[index].set(wrapped(residual[index]))
-    innovation, noise = masked(residual, observation.noise, present)
-    cross = matmul(covariance, slope.T)
-    innovation_covariance = matmul(slope, cross) + noise
+    innovation, obs_cov = masked(residual, observation.obs_cov, present)
+    cross = matmul(covariance, jacobian.T)
+    innovation_covariance = matmul(jacobian, cross) + obs_cov
     # A smaller pivot has no correct digit, and its sign is chance.
     rounding = 4 * jnp.finfo(y.dtype).eps * jnp.abs(diagonal(innovation_covariance))
     factor = cholesky(innovation_covariance, jax.lax.stop_gradient(rounding), name=FACTOR)
@@ -118,20 +118,20 @@ def update(ssm: StateSpaceModel, observation: Linearised, y: jax.Array, present:
     half = factor.solve_lower(jnp.concatenate([cross.T, innovation[:, None]], axis=1))
     solved, white = factor.solve_upper(half), half[:, -1]
     gain = solved[:, :-1].T
-    kept = jnp.eye(mean.shape[0]) - matmul(gain, slope)
+    kept = jnp.eye(mean.shape[0]) - matmul(gain, jacobian)
     filtered = Moments(mean + matmul(gain, innovation[:, None])[:, 0],
-                       congruence(kept, covariance) + congruence(gain, noise))
+                       congruence(kept, covariance) + congruence(gain, obs_cov))
     failed = factor.degenerate.any()
     if scale is not None:
-        failed = failed | _precision_lost(ssm, observation, y, present, moments, filtered, noise,
+        failed = failed | _precision_lost(ssm, observation, y, present, moments, filtered, obs_cov,
                                           solved[:, -1], scale)
     failed = checkpoint_name(failed, FAILED)
     return Update(filtered, jnp.where(failed, -jnp.inf, log_density(white, chol, present)), innovation, chol, gain,
-                  slope, noise)
+                  jacobian, obs_cov)
 
 
 def _precision_lost(ssm: StateSpaceModel, observation: Linearised, y: jax.Array, present: jax.Array,
-                    predicted: Moments, filtered: Moments, noise: jax.Array, weighted: jax.Array,
+                    predicted: Moments, filtered: Moments, obs_cov: jax.Array, weighted: jax.Array,
                     scale: jax.Array) -> jax.Array:
     """Whether the filtered moments of an observed output are nothing but rounding errors.
 
@@ -145,17 +145,17 @@ def _precision_lost(ssm: StateSpaceModel, observation: Linearised, y: jax.Array,
         present: (D,), whether an entry is.
         predicted: moments before the observation.
         filtered: moments after it.
-        noise: R (D, D).
+        obs_cov: R (D, D).
         weighted: (D,), S^-1 v.
         scale: (D,), of the outputs.
     """
     y = jnp.where(present, y, 0.0)
-    moved = matmul(observation.slope, (filtered.mean - predicted.mean)[:, None])[:, 0]
-    error = y - (observation.value + moved) - matmul(noise, weighted[:, None])[:, 0]
+    moved = matmul(observation.jacobian, (filtered.mean - predicted.mean)[:, None])[:, 0]
+    error = y - (observation.value + moved) - matmul(obs_cov, weighted[:, None])[:, 0]
     for index in ssm.model.observation.angular:
         error = error.at[index].set(wrapped(error[index]))
-    variance = jnp.abs((matmul(observation.slope, filtered.covariance) * observation.slope).sum(1))
-    own = jnp.abs(diagonal(noise))
+    variance = jnp.abs((matmul(observation.jacobian, filtered.covariance) * observation.jacobian).sum(1))
+    own = jnp.abs(diagonal(obs_cov))
     lost = ((jnp.abs(error) > _LOST_MEAN * safe_sqrt(own) + _HARMLESS * scale)
             | (variance > _LOST_VARIANCE * own + _HARMLESS * scale**2))
     return (present & lost).any()

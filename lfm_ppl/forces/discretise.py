@@ -55,9 +55,9 @@ def discretise(
     feedback, diffusion, dt = _as_arrays(feedback, diffusion, dt)
     series, step, doublings = _start(feedback, dt)
     nodes, weights = _quadrature(series)
-    flow = (powers(nodes, len(series))[:, :, None, None] * series).sum(1)
-    spread = matmul(matmul(flow, diffusion), flow.mT)
-    noise = step * (weights[:, None, None] * spread).sum(0)
+    transition = (powers(nodes, len(series))[:, :, None, None] * series).sum(1)
+    integrand = matmul(matmul(transition, diffusion), transition.mT)
+    noise = step * (weights[:, None, None] * integrand).sum(0)
     return double(series.sum(0), noise, doublings, max_doublings)
 
 

@@ -161,7 +161,7 @@ def _discretise_jvp(order, primals, tangents):
 
 
 def _short_noise(x, constants):
-    """Return ``c int_0^x v(y) v(y)' dy`` (n, n), where v(y) is the last column of the flow."""
+    """Return ``c int_0^x v(y) v(y)' dy`` (n, n), where v(y) is the last column of the transition matrix."""
     y = x * constants.nodes
     last = constants.polynomial[:, :, -1]
     weight = np.sqrt(constants.density * constants.weights)

@@ -21,7 +21,7 @@ from lfm_ppl import checks
 from lfm_ppl.analysis import arviz_data
 from lfm_ppl.analysis.scalars import units_attribute
 from lfm_ppl.filtering.breakdown import FilterWarning, breakdown
-from lfm_ppl.filtering.schedule import schedule
+from lfm_ppl.filtering.schedule import build_time_grid
 from lfm_ppl.inference import sampling
 from lfm_ppl.inference.bound_model import BoundModel, bind
 from lfm_ppl.inference.map import MAPResult, mode_of
@@ -202,7 +202,7 @@ def _explain_start(bound: BoundModel) -> None:
     several = isinstance(distribution, Panel)
     for index in range(distribution.batch_shape[0] if several else 1):
         one = distribution.series(index) if several else distribution
-        said = breakdown(one.ssm, one.rule, one.plan, (bound.y[index] if several else bound.y).reshape(one.event_shape))
+        said = breakdown(one.ssm, one.rule, one.time_grid, (bound.y[index] if several else bound.y).reshape(one.event_shape))
         if said is not None:
             series = f" of series {index}" if several else ""
             warnings.warn(f"at the prior median{series}, {said}", FilterWarning, stacklevel=6)
@@ -226,7 +226,7 @@ def _check_requested(bound: BoundModel, at: Any) -> None:
     if bound.times.ndim != 1:
         raise ValueError("`at` needs one vector of times for all series; this panel has times of its own for each.")
     example = bound.site.example
-    schedule(example.ssm, bound.times, example.steps, example.max_step, at, tolerance=example.tolerance)
+    build_time_grid(example.ssm, bound.times, example.steps, example.max_step, at, tolerance=example.tolerance)
 
 
 def _strategy(init: Any, bound: BoundModel, seed: int) -> Any:
@@ -323,7 +323,7 @@ def _paths(key: jax.Array, bound: BoundModel, draws: dict, at: Any, count: int, 
     times = bound.times
     grid = None
     if times.ndim == 1:
-        origin = float(bound.site.example.plan.initial_time)
+        origin = float(bound.site.example.time_grid.initial_time)
         grid = (np.union1d(np.linspace(min(origin, times[0]), times[-1], _GRID), times) if at is None
                 else np.atleast_1d(np.asarray(at, float)))
     subset = {site: value[rows] for site, value in draws.items()}

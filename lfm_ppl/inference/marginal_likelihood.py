@@ -29,12 +29,12 @@ from lfm_ppl.filtering.filter import (
 )
 from lfm_ppl.filtering.iterated import posterior_linearisation
 from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.filtering.schedule import Schedule, schedule
+from lfm_ppl.filtering.schedule import TimeGrid, build_time_grid
 from lfm_ppl.filtering.smoother import (
     SmootherResult,
     check_iterations,
     smooth_on,
-    smoothing_plans,
+    smoothing_grids,
 )
 from lfm_ppl.gradients import finite_or_minus_infinity
 from lfm_ppl.linearisation.rule import Rule
@@ -106,7 +106,7 @@ class MarginalLikelihood(dist.Distribution):
         if tolerance is not None:
             checks.positive("tolerance", tolerance, "It is in standard deviations, 0.001 for example.")
         self.tolerance = None if tolerance is None else float(tolerance)
-        model.check_at(self.plan.initial_time, np.shape(times)[0])
+        model.check_at(self.time_grid.initial_time, np.shape(times)[0])
         known = checks.concrete(times)
         if known is not None:
             model.check_span(float(known[0]), float(known[-1]))
@@ -120,14 +120,14 @@ class MarginalLikelihood(dist.Distribution):
         return state_space(self.model)
 
     @functools.cached_property
-    def plan(self) -> Schedule:
+    def time_grid(self) -> TimeGrid:
         """The rows of the scan."""
-        return schedule(self.ssm, self.times, self.steps, self.max_step, tolerance=self.tolerance)
+        return build_time_grid(self.ssm, self.times, self.steps, self.max_step, tolerance=self.tolerance)
 
     def with_times(self, times: Any) -> MarginalLikelihood:
         """Return the same distribution for times that are known, where its own were traced."""
         other = copy.copy(self)
-        other.__dict__.pop("plan", None)
+        other.__dict__.pop("time_grid", None)
         other.times = times
         return other
 
@@ -148,7 +148,7 @@ class MarginalLikelihood(dist.Distribution):
 
     def _said(self, y: jax.Array, log_likelihood: jax.Array) -> jax.Array:
         """Return the log likelihood; outside of compiled code say where the filter breaks down if it does."""
-        warn_of_breakdown(self.ssm, self.rule, self.plan, y, None, log_likelihood)
+        warn_of_breakdown(self.ssm, self.rule, self.time_grid, y, None, log_likelihood)
         return log_likelihood
 
     def expand(self, batch_shape: tuple[int, ...]) -> dist.Distribution:
@@ -165,15 +165,15 @@ class MarginalLikelihood(dist.Distribution):
         return super().expand(batch_shape)
 
     def _parts(self, y: jax.Array) -> tuple:
-        return self.ssm, self.rule, self.plan, y, self.iterations, self.damping
+        return self.ssm, self.rule, self.time_grid, y, self.iterations, self.damping
 
     def _kept(self, function: Callable) -> Callable:
         """Return the function as a program that later calls share, where it would run operation by operation."""
-        return function if checks.traced((self.ssm, self.plan)) else _compiled(function)
+        return function if checks.traced((self.ssm, self.time_grid)) else _compiled(function)
 
     def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
         """Simulate the real model: (*sample_shape, T, D)."""
-        start = jnp.asarray(self.plan.initial_time, float)
+        start = jnp.asarray(self.time_grid.initial_time, float)
         run = lambda k: simulate_on(self.ssm, k, jnp.asarray(self.times, float), start,  # noqa: E731
                                     _SIMULATION_STEPS * self.steps).y
         return repeated(run, key, sample_shape)
@@ -181,34 +181,34 @@ class MarginalLikelihood(dist.Distribution):
     def filter(self, y: Any) -> FilterResult:
         """Filter with this distribution's rule and steps; see `lfm_ppl.filter`."""
         y = check_observations(y, *self.event_shape)
-        return filter_on(self.ssm, self.rule, self.plan, y, jnp.asarray(self.times, float))
+        return filter_on(self.ssm, self.rule, self.time_grid, y, jnp.asarray(self.times, float))
 
     def smooth(self, y: Any, at: Any = None) -> SmootherResult:
         """Smooth with this distribution's settings; see `lfm_ppl.smooth`."""
-        plans = smoothing_plans(self.ssm, self.times, self.steps, self.max_step, at, self.iterations,
+        grids = smoothing_grids(self.ssm, self.times, self.steps, self.max_step, at, self.iterations,
                                 self.tolerance)
         y = check_observations(y, *self.event_shape)
-        return self._kept(smooth_on)(self.ssm, self.rule, plans, y, self.iterations, self.damping)
+        return self._kept(smooth_on)(self.ssm, self.rule, grids, y, self.iterations, self.damping)
 
 
-def _one_step_ahead(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, iterations: int,
+def _one_step_ahead(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, iterations: int,
                     damping: float) -> jax.Array:
     start = Moments(*ssm.initial())
-    about = None
+    linearization_point = None
     if iterations:
-        about = posterior_linearisation(ssm, rule, plan, y, start, iterations, damping).points
-    passed = forward(ssm, rule, plan, y, start=start, about=about)
-    return at_rows(passed.log_likelihood, plan.observed)
+        linearization_point = posterior_linearisation(ssm, rule, grid, y, start, iterations, damping).points
+    passed = forward(ssm, rule, grid, y, start=start, linearization_point=linearization_point)
+    return at_rows(passed.log_likelihood, grid.observed)
 
 
-def _log_likelihoods(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, iterations: int,
+def _log_likelihoods(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, iterations: int,
                      damping: float) -> jax.Array:
-    return finite_or_minus_infinity(lambda y: _one_step_ahead(ssm, rule, plan, y, iterations, damping), y)
+    return finite_or_minus_infinity(lambda y: _one_step_ahead(ssm, rule, grid, y, iterations, damping), y)
 
 
-def _log_likelihood(ssm: StateSpaceModel, rule: Rule, plan: Schedule, y: jax.Array, iterations: int,
+def _log_likelihood(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, iterations: int,
                     damping: float) -> jax.Array:
-    return finite_or_minus_infinity(lambda y: _one_step_ahead(ssm, rule, plan, y, iterations, damping).sum(), y)
+    return finite_or_minus_infinity(lambda y: _one_step_ahead(ssm, rule, grid, y, iterations, damping).sum(), y)
 
 
 _compiled = functools.cache(eqx.filter_jit)

@@ -112,7 +112,7 @@ def quasi_newton(objective: Objective, start: np.ndarray, max_iterations: int = 
                  options: Mapping[str, float] | None = None) -> End:
     """Return the lowest point that L-BFGS meets on its way from ``start``.
 
-    Where the objective or its gradient is not finite the line search sees a wall of moderate height, because
+    Where the objective or its gradient is not finite the line search sees a moderate penalty, because
     interpolation through an enormous one would shorten the step to nothing.
 
     Args:
@@ -133,8 +133,8 @@ def quasi_newton(objective: Objective, start: np.ndarray, max_iterations: int = 
             best = min(best, End(point.copy(), value), key=lambda end: end.value)
         if not usable:
             # Without a finite value there is nothing to turn back to: the search ends where the gradient is zero.
-            wall = highest + 10.0 * (1.0 + abs(highest - best.value)) if np.isfinite(highest) else 0.0
-            return wall, np.zeros_like(point)
+            penalty = highest + 10.0 * (1.0 + abs(highest - best.value)) if np.isfinite(highest) else 0.0
+            return penalty, np.zeros_like(point)
         highest = max(highest, value)
         return value, gradient
 

@@ -14,7 +14,7 @@ from numpyro.distributions import constraints
 from lfm_ppl import checks
 from lfm_ppl.comparators.observation_noise import check_noise
 from lfm_ppl.comparators.particle_filter import ParticleSettings, check_settings, log_likelihood
-from lfm_ppl.filtering.schedule import schedule
+from lfm_ppl.filtering.schedule import build_time_grid
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.likelihood_handler import LikelihoodHandler
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
@@ -54,8 +54,8 @@ class ParticleLikelihood(dist.Distribution):
         return self._one(self.base, value, self.key)
 
     def _one(self, base: MarginalLikelihood, y: jax.Array, key: jax.Array) -> jax.Array:
-        plan = schedule(base.ssm, base.times, self.steps or base.steps, base.max_step)
-        return log_likelihood(base.ssm, plan, y, key, self.settings)
+        grid = build_time_grid(base.ssm, base.times, self.steps or base.steps, base.max_step)
+        return log_likelihood(base.ssm, grid, y, key, self.settings)
 
     def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
         """Simulate the model, as ``base`` does."""
@@ -123,7 +123,7 @@ class ParticlePotential:
         if steps is not None:
             checks.positive_integer("particle_steps", steps)
         example = bound.site.example
-        check_noise(example.ssm, example.plan.initial_time)
+        check_noise(example.ssm, example.time_grid.initial_time)
         self.settings = check_settings(example.ssm, settings)
         self._bound, self._steps = bound, steps
 
@@ -158,7 +158,7 @@ class ParticlePotential:
         checks.positive("target_sd", target_sd)
         particles = 200
         for attempt in range(8):
-            sd = self.spread(z, jax.random.fold_in(key, attempt), particles)
+            sd = self.sd_of_estimates(z, jax.random.fold_in(key, attempt), particles)
             wanted = int(np.ceil(particles * np.clip((sd / target_sd) ** 2, 1 / 64, 8.0)))
             close = particles / 1.4 < wanted < particles * 1.4
             if close or (particles == _FEWEST and wanted <= _FEWEST):
@@ -172,7 +172,7 @@ class ParticlePotential:
                          f"{target_sd:g} is out of reach. The observations may be too precise, or too many, for a "
                          "bootstrap filter, or the starting point is far from the posterior; give particles yourself.")
 
-    def spread(self, z: Any, key: jax.Array, particles: int) -> float:
+    def sd_of_estimates(self, z: Any, key: jax.Array, particles: int) -> float:
         """Return the standard deviation of the log likelihood estimate at ``z``, from 64 of them.
 
         Estimates of zero count as the worst of the others; infinite where they are the majority.

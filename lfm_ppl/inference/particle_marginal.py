@@ -203,7 +203,7 @@ class ParticleMarginalRAM(RAM):
         if self._particles is None:
             self.tuned = self.estimate.tune(z, key)
         else:
-            self.tuned = Tuned(self._particles, self.estimate.spread(z, key, self._particles))
+            self.tuned = Tuned(self._particles, self.estimate.sd_of_estimates(z, key, self._particles))
 
     def _prepare(self, start: Any, args: tuple, kwargs: dict) -> None:
         assert self.model is not None

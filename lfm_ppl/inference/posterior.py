@@ -12,7 +12,7 @@ import numpy as np
 from lfm_ppl import checks
 from lfm_ppl.comparators.particle_filter import ParticleSettings
 from lfm_ppl.comparators.particle_smoother import TRACING, draw_trajectories
-from lfm_ppl.filtering.schedule import schedule
+from lfm_ppl.filtering.schedule import build_time_grid
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.fingerprint import signature
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
@@ -40,7 +40,7 @@ def scores(bound: BoundModel, draws: Mapping[str, Any]) -> dict[str, np.ndarray]
     def one(distribution: MarginalLikelihood, y: jax.Array) -> dict[str, jax.Array]:
         result = distribution.smooth(y)
         return {"leave_one_out": result.leave_one_out, "one_step_ahead": result.log_likelihood,
-                "residual": result.residual}
+                "residual": result.whitened_innovation}
 
     def per_draw(values: Any, key: jax.Array, y: Any) -> dict[str, jax.Array]:
         return each(bound.likelihood(values, y), one, bound.data(y))
@@ -78,7 +78,7 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
             w, when = _particle_path(distribution, y, both, path_key, particles, particle_steps or distribution.steps)
         output = jax.vmap(ssm.observe)(w, when)
         row = jnp.arange(times.shape[0])
-        covariance = jax.vmap(ssm.noise_covariance)(w[count:], times, row)
+        covariance = jax.vmap(ssm.obs_cov)(w[count:], times, row)
         noise = jax.random.normal(noise_key, (*output[count:].shape, 1))
         replicated = output[count:] + matmul(jax.vmap(semidefinite_root)(covariance), noise)[..., 0]
         stop = count or None
@@ -114,11 +114,11 @@ def _particle_path(distribution: MarginalLikelihood, y: jax.Array, at: Any, key:
     to its estimate of the likelihood gives a path of the right one as the number of filters grows, too.
     """
     ssm, times = distribution.ssm, distribution.times
-    plan = schedule(ssm, times, _steps_in_a_row(ssm, times, at, steps), distribution.max_step, at)
+    grid = build_time_grid(ssm, times, _steps_in_a_row(ssm, times, at, steps), distribution.max_step, at)
     path_keys, choice = jax.random.split(key, _FILTERS + 1)[:-1], jax.random.fold_in(key, _FILTERS)
-    states, _, total = jax.lax.map(lambda k: draw_trajectories(ssm, plan, y, k, particles, 1, TRACING), path_keys)
+    states, _, total = jax.lax.map(lambda k: draw_trajectories(ssm, grid, y, k, particles, 1, TRACING), path_keys)
     best = jax.random.categorical(choice, jnp.where(jnp.isneginf(total).all(), 0.0, total))
-    when = jnp.asarray(plan.requested_times, float)
+    when = jnp.asarray(grid.requested_times, float)
     return jax.vmap(ssm.inputs)(states[best][:, 0], when), when
 
 
@@ -127,7 +127,7 @@ def _steps_in_a_row(ssm: StateSpaceModel, times: Any, at: Any, steps: int) -> in
     known = checks.concrete(times)
     if at is None or known is None:
         return steps
-    rows = schedule(ssm, known, 1, None, at).rows
+    rows = build_time_grid(ssm, known, 1, None, at).intervals
     ends = np.asarray(rows.start + rows.length)
     marks = np.unique(np.append(known, rows.start[0]))
     if len(marks) == 1:

@@ -16,19 +16,19 @@ Function = Callable[[jax.Array], tuple[jax.Array, Any]]
 """Maps inputs (N,) to a value (D,) and a pytree of arrays of which only the expectation is asked."""
 
 
-class Affine(NamedTuple):
-    """An affine approximation ``f(v) ~ value + slope (v - mean)`` with residual covariance.
+class AffineMap(NamedTuple):
+    """An affine approximation ``f(v) ~ value + jacobian (v - mean)`` with residual covariance.
 
     Attributes:
         value: (D,), E[f].
-        slope: (D, N), ``A`` with ``A P = Cov(f, v)``; the Jacobian in directions without variance.
-        residual: (D, D), ``Omega = Cov(f) - A P A'``.
+        jacobian: (D, N), ``A`` with ``A P = Cov(f, v)``; the Jacobian in directions without variance.
+        residual_cov: (D, D), ``Omega = Cov(f) - A P A'``.
         extra: expectation of the second output of the function.
     """
 
     value: jax.Array
-    slope: jax.Array
-    residual: jax.Array
+    jacobian: jax.Array
+    residual_cov: jax.Array
     extra: Any
 
 
@@ -38,26 +38,26 @@ class Inputs(NamedTuple):
     Attributes:
         mean: (N,).
         covariance: (a + r, a + r), of the points' and the averaged coordinates, in this order.
-        spread: (a,), the smallest standard deviation that counts as one, for the points' coordinates. A rule
+        min_sd: (a,), the smallest standard deviation that counts as one, for the points' coordinates. A rule
             differentiates over at least this distance where the variance is zero.
     """
 
     mean: jax.Array
     covariance: jax.Array
-    spread: jax.Array
+    min_sd: jax.Array
 
 
 class Rule(eqx.Module):
     """A linearisation rule."""
 
-    def linearise(self, function: Function, inputs: Inputs, structure: InputStructure, slope: jax.Array) -> Affine:
+    def linearise(self, function: Function, inputs: Inputs, structure: InputStructure, jacobian: jax.Array) -> AffineMap:
         """Linearise ``function`` about a Gaussian.
 
         Args:
             function: maps (N,) to (D,) and extra arrays.
             inputs: the Gaussian.
             structure: which inputs take points, which are linear given the points, which are linear.
-            slope: (D, N), the Jacobian in the constant inputs, zero elsewhere.
+            jacobian: (D, N), the Jacobian in the constant inputs, zero elsewhere.
 
         Returns:
             The affine approximation.

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import checks
-from lfm_ppl.linalg import Factor, cholesky, congruence, matmul, outer_square
-from lfm_ppl.linearisation.rule import Affine, Function, Inputs, Rule, partial_jacobian, selection
+from lfm_ppl.linalg import CholeskyFactor, cholesky, congruence, matmul, outer_square
+from lfm_ppl.linearisation.rule import AffineMap, Function, Inputs, Rule, partial_jacobian, selection
 from lfm_ppl.model.augment import InputStructure
 
 
@@ -38,7 +38,7 @@ class SigmaPointRule(Rule):
         b = sum w_i f(v_i),    A = (sum w_i f(v_i) xi_i') L^-1,    Omega = Cov(f) - A P A'.
 
     The points lie in the non-linear inputs alone. Inputs that are linear given these follow them by their conditional
-    mean, and their slope is the expectation of the Jacobian (Stein's lemma).
+    mean, and their Jacobian is the expectation of the Jacobian (Stein's lemma).
 
     Attributes:
         full_state: whether the points lie in the whole joint state, as in the papers, and not in the non-linear
@@ -48,7 +48,7 @@ class SigmaPointRule(Rule):
     full_state: bool = eqx.field(static=True, default=False, kw_only=True)
 
     regresses: ClassVar[bool] = True
-    """Whether the slope in the points' coordinates is the regression on the nodes; if not, it is the average Jacobian.
+    """Whether the Jacobian in the points' coordinates is the regression on the nodes; if not, it is the average Jacobian.
     The two agree in expectation (Stein's lemma), but a regression on nodes that are correlated beyond second order
     divides their sampling error by the standard deviation of the input, however small that is."""
 
@@ -56,26 +56,26 @@ class SigmaPointRule(Rule):
         """Return nodes and weights for ``dim`` >= 1 dimensions."""
         raise NotImplementedError
 
-    def linearise(self, function: Function, inputs: Inputs, structure: InputStructure, slope: jax.Array) -> Affine:
+    def linearise(self, function: Function, inputs: Inputs, structure: InputStructure, jacobian: jax.Array) -> AffineMap:
         """See `Rule.linearise`."""
         if not structure.points:
-            return _without_points(function, inputs, structure, slope)
+            return _without_points(function, inputs, structure, jacobian)
         unit = self.points(len(structure.points))
         nodes, weights = jnp.asarray(unit.nodes), jnp.asarray(unit.weights)
         count, size = len(structure.points), inputs.mean.shape[0]
-        factor = cholesky(inputs.covariance[:count, :count], inputs.spread**2)
+        factor = cholesky(inputs.covariance[:count, :count], inputs.min_sd**2)
         chol = factor.chol
         # Averaged coordinates given the points: rho = m_rho + gain xi, gain = P_rho,alpha L^-T.
         gain = _times_inverse_transpose(factor, inputs.covariance[count:, :count])
         root = jnp.concatenate([chol, gain]) if structure.averaged else chol
         place = selection((*structure.points, *structure.averaged), size)
-        spread = matmul(place, root)
-        at = inputs.mean + matmul(nodes, spread.T)
+        root_of_inputs = matmul(place, root)
+        at = inputs.mean + matmul(nodes, root_of_inputs.T)
         values, extras = jax.vmap(function)(at)
         value = (weights[:, None] * values).sum(0)
         if structure.averaged:
             jacobians, average = _average_jacobian(function, at, weights, structure.averaged)
-            slope = slope + matmul(average, selection(structure.averaged, size).T)
+            jacobian = jacobian + matmul(average, selection(structure.averaged, size).T)
             through_averaged = matmul(average, gain)
         else:
             jacobians, average, through_averaged = None, None, jnp.zeros(())
@@ -85,14 +85,14 @@ class SigmaPointRule(Rule):
         else:
             _, on_points = _average_jacobian(function, at, weights, structure.points)
             regression = matmul(on_points, chol) + through_averaged
-        slope = slope + matmul(on_points, selection(structure.points, size).T)
+        jacobian = jacobian + matmul(on_points, selection(structure.points, size).T)
         errors = values - value - matmul(nodes, regression.T)
         residual = matmul(matmul(errors.T, jnp.asarray(unit.residual_weights)), errors)
         if jacobians is not None:
             rest = inputs.covariance[count:, count:] - outer_square(gain)
             deviations = jax.vmap(lambda j: congruence(j - average, rest))(jacobians)
             residual = residual + (weights[:, None, None] * deviations).sum(0)
-        return Affine(value, slope, residual, self._expectation(function, inputs, weights, unit, extras))
+        return AffineMap(value, jacobian, residual, self._expectation(function, inputs, weights, unit, extras))
 
     def _expectation(self, function: Function, inputs: Inputs, weights: jax.Array, unit: UnitPoints, extras):
         # With a negative weight the average of covariances need not be one: take the value at the mean.
@@ -108,23 +108,23 @@ def _average_jacobian(function: Function, at: jax.Array, weights: jax.Array,
     return jacobians, (weights[:, None, None] * jacobians).sum(0)
 
 
-def _times_inverse_transpose(factor: Factor, b: jax.Array) -> jax.Array:
+def _times_inverse_transpose(factor: CholeskyFactor, b: jax.Array) -> jax.Array:
     """Return ``B L^-T`` (m, n)."""
     return factor.solve_lower(b.T).T
 
 
-def _times_inverse(factor: Factor, b: jax.Array) -> jax.Array:
+def _times_inverse(factor: CholeskyFactor, b: jax.Array) -> jax.Array:
     """Return ``B L^-1`` (m, n)."""
     return factor.solve_upper(b.T).T
 
 
-def _without_points(function: Function, inputs: Inputs, structure: InputStructure, slope: jax.Array) -> Affine:
+def _without_points(function: Function, inputs: Inputs, structure: InputStructure, jacobian: jax.Array) -> AffineMap:
     """A function that is linear at every time: exact."""
     value, extra = function(inputs.mean)
     if structure.averaged:
         part = partial_jacobian(function, inputs.mean, structure.averaged)
-        slope = slope + matmul(part, selection(structure.averaged, inputs.mean.shape[0]).T)
-    return Affine(value, slope, jnp.zeros((value.shape[0],) * 2), extra)
+        jacobian = jacobian + matmul(part, selection(structure.averaged, inputs.mean.shape[0]).T)
+    return AffineMap(value, jacobian, jnp.zeros((value.shape[0],) * 2), extra)
 
 
 class Unscented(SigmaPointRule):
@@ -208,7 +208,7 @@ class GaussHermite(SigmaPointRule):
     def __check_init__(self):
         checks.positive_integer("order", self.order)
         if self.order < 2:
-            raise ValueError("order must be at least 2: one point has no slope; lfm.Taylor() is the rule with one.")
+            raise ValueError("order must be at least 2: one point has no Jacobian; lfm.Taylor() is the rule with one.")
 
     def points(self, dim: int) -> UnitPoints:
         """See `SigmaPointRule.points`."""
@@ -263,7 +263,7 @@ class MonteCarlo(SigmaPointRule):
     """Random points, drawn once: the Monte Carlo Kalman filter.
 
     The draws are antithetic and whitened, so that their mean is zero and their covariance the identity: a linear
-    function is treated exactly. The slope is the average Jacobian over the draws, so that a known or nearly known
+    function is treated exactly. The Jacobian is the average Jacobian over the draws, so that a known or nearly known
     state does no harm. The likelihood is a smooth, deterministic function of the parameters.
 
     Args:

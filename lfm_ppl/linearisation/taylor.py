@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from lfm_ppl.linalg import matmul
-from lfm_ppl.linearisation.rule import Affine, Function, Inputs, Rule, partial_jacobian, selection
+from lfm_ppl.linearisation.rule import AffineMap, Function, Inputs, Rule, partial_jacobian, selection
 from lfm_ppl.model.augment import InputStructure
 
 
@@ -23,11 +23,11 @@ class Taylor(Rule):
     Source: Hartikainen (2013), section 2.3; Jazwinski (1970).
     """
 
-    def linearise(self, function: Function, inputs: Inputs, structure: InputStructure, slope: jax.Array) -> Affine:
+    def linearise(self, function: Function, inputs: Inputs, structure: InputStructure, jacobian: jax.Array) -> AffineMap:
         """See `Rule.linearise`."""
         value, extra = function(inputs.mean)
         varying = (*structure.points, *structure.averaged)
         if varying:
             part = partial_jacobian(function, inputs.mean, varying)
-            slope = slope + matmul(part, selection(varying, inputs.mean.shape[0]).T)
-        return Affine(value, slope, jnp.zeros((value.shape[0],) * 2), extra)
+            jacobian = jacobian + matmul(part, selection(varying, inputs.mean.shape[0]).T)
+        return AffineMap(value, jacobian, jnp.zeros((value.shape[0],) * 2), extra)

@@ -123,7 +123,7 @@ class StateSpaceModel(eqx.Module):
         x, u = self.split(w)
         return jnp.asarray(self.model.observation.function(x, u, t), float)
 
-    def noise_covariance(self, w: jax.Array, t: Any, row: Any) -> jax.Array:
+    def obs_cov(self, w: jax.Array, t: Any, row: Any) -> jax.Array:
         """Return R (D, D)."""
         x, u = self.split(w)
         return self.model.observation.covariance_at(x, u, t, row)

@@ -163,18 +163,18 @@ def _estimate(linear: _Linear, times: np.ndarray, force: SquaredExponential, col
     grid = np.linspace(0.0, window, (points - 1) * substeps + 1)
     response, initial = _responses(linear, grid, substeps)
 
-    def spread(kernel: np.ndarray, source: int) -> np.ndarray:
+    def mapped(kernel: np.ndarray, source: int) -> np.ndarray:
         return response[:, :, source] @ kernel @ response[:, :, source].T
 
     true, of_sde = force.covariances(grid[:, None] - grid)
-    signal = spread(true, column)
+    signal = mapped(true, column)
     noise = np.kron(np.eye(points), linear.noise * (points / count))
     exact = signal + noise + initial @ initial.T
     for source, other in rest:
-        exact = exact + spread(_covariance(other, grid), source)
+        exact = exact + mapped(_covariance(other, grid), source)
     exact = exact + _LEAST_NOISE * signal.diagonal().max() * np.eye(len(exact))
     try:
-        factor, approximate = (np.linalg.cholesky(m) for m in (exact, exact + spread(of_sde - true, column)))
+        factor, approximate = (np.linalg.cholesky(m) for m in (exact, exact + mapped(of_sde - true, column)))
         ratio = np.linalg.solve(approximate, factor)
         values = np.linalg.eigvalsh(ratio.T @ ratio)
     except np.linalg.LinAlgError:
@@ -191,7 +191,7 @@ def _responses(linear: _Linear, grid: np.ndarray, substeps: int) -> tuple[np.nda
     step = grid[1] if grid.size > 1 else 0.0
     block = np.zeros((size + sources, size + sources))
     block[:size, :size], block[:size, size:] = linear.a * step, linear.b * step
-    flow = expm(block)
+    transition = expm(block)
     values, vectors = np.linalg.eigh(linear.initial)
     start = vectors * np.sqrt(np.maximum(values, 0.0))
     state = np.zeros((size, grid.size, sources))
@@ -199,9 +199,9 @@ def _responses(linear: _Linear, grid: np.ndarray, substeps: int) -> tuple[np.nda
     for index in range(grid.size):
         if index:
             # u is taken as the mean of both ends of the step.
-            state = np.einsum("ij,jkr->ikr", flow[:size, :size], state)
-            state[:, index - 1: index + 1] += 0.5 * flow[:size, None, size:]
-            start = flow[:size, :size] @ start
+            state = np.einsum("ij,jkr->ikr", transition[:size, :size], state)
+            state[:, index - 1: index + 1] += 0.5 * transition[:size, None, size:]
+            start = transition[:size, :size] @ start
         if index % substeps == 0:
             output = np.einsum("ij,jkr->ikr", linear.c, state)
             output[:, index] += linear.d

@@ -116,7 +116,7 @@ def _simulation_step(ssm: StateSpaceModel, state: jax.Array, t: jax.Array, h: ja
 
     x = state[:size]
     now = ssm.inputs(state, t)
-    slope = ssm.drift(now, t)
+    first = ssm.drift(now, t)
     dispersion = ssm.dispersion(now, t)
     kick = jnp.zeros(size)
     if dispersion is not None:
@@ -127,10 +127,10 @@ def _simulation_step(ssm: StateSpaceModel, state: jax.Array, t: jax.Array, h: ja
     def drift(change: jax.Array, z: jax.Array, time: jax.Array) -> jax.Array:
         return ssm.drift(ssm.inputs(jnp.concatenate([x + change, z]), time), time)
 
-    second = drift(0.5 * (h * slope + kick), halfway, t + 0.5 * h)
+    second = drift(0.5 * (h * first + kick), halfway, t + 0.5 * h)
     third = drift(0.5 * (h * second + kick), halfway, t + 0.5 * h)
     last = drift(h * third + kick, forces, end)
-    return jnp.concatenate([x + h / 6 * (slope + 2 * second + 2 * third + last) + kick, forces])
+    return jnp.concatenate([x + h / 6 * (first + 2 * second + 2 * third + last) + kick, forces])
 
 
 def _cross_jumps(ssm: StateSpaceModel, jumps: Any, state: jax.Array, begin: jax.Array, end: jax.Array,
@@ -158,6 +158,6 @@ def _cross_jumps(ssm: StateSpaceModel, jumps: Any, state: jax.Array, begin: jax.
 def noisy_observation(ssm: StateSpaceModel, w: jax.Array, t: jax.Array, key: jax.Array,
                       index: jax.Array) -> jax.Array:
     """Draw the observation (D,) of row ``index`` at the inputs w (M + R,) and time t."""
-    covariance = ssm.noise_covariance(w, t, index)
+    covariance = ssm.obs_cov(w, t, index)
     draw = jax.random.normal(key, (covariance.shape[0], 1))
     return ssm.observe(w, t) + matmul(semidefinite_root(covariance), draw)[:, 0]

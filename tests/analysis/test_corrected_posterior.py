@@ -10,7 +10,7 @@ from lfm_ppl import loading
 from lfm_ppl.analysis.arviz_data import group, summary
 from lfm_ppl.comparators.finite_volume import Grid
 from lfm_ppl.comparators.grid_filter import log_likelihood
-from lfm_ppl.filtering.schedule import schedule
+from lfm_ppl.filtering.schedule import build_time_grid
 from lfm_ppl.inference.bound_model import likelihood_site
 from lfm_ppl.model.augment import state_space
 
@@ -42,7 +42,7 @@ def exact(wells):
         values = {"sigma": jnp.exp(node[0]), "linear": node[1], "cubic": jnp.exp(node[2])}
         site = likelihood_site(model, (times,), {}, jax.random.key(0), values)
         ssm = state_space(site.distribution.model)
-        return log_likelihood(ssm, schedule(ssm, times, 1), y, Grid(-9.0, 9.0, 220))
+        return log_likelihood(ssm, build_time_grid(ssm, times, 1), y, Grid(-9.0, 9.0, 220))
 
     found = np.asarray(jax.jit(lambda n: jax.lax.map(one, n))(jnp.asarray(nodes)))
     # The model's priors, in the coordinates of the nodes: normal for all three.

@@ -10,7 +10,7 @@ from systems import double_well, first_state, whole_state
 
 import lfm_ppl as lfm
 from lfm_ppl.comparators.fokker_planck import Grid, choose_grid, fokker_planck, log_likelihood
-from lfm_ppl.filtering.schedule import schedule
+from lfm_ppl.filtering.schedule import build_time_grid
 from lfm_ppl.forces import Force
 
 TIMES = np.array([0.1, 0.45, 0.45, 0.8, 1.5, 1.7, 2.9, 3.0, 4.2])
@@ -119,8 +119,8 @@ WELL_Y = np.array([0.7, 1.1, np.nan, -0.2, -0.9, -0.6])[:, None]
 
 def test_second_order_in_the_width_of_a_cell():
     ssm = lfm.state_space(WELL)
-    plan = schedule(ssm, WELL_TIMES, 1)
-    value = {n: float(log_likelihood(ssm, plan, WELL_Y, Grid(-2.5, 2.5, n))) for n in (50, 100, 200, 800)}
+    time_grid = build_time_grid(ssm, WELL_TIMES, 1)
+    value = {n: float(log_likelihood(ssm, time_grid, WELL_Y, Grid(-2.5, 2.5, n))) for n in (50, 100, 200, 800)}
     errors = [abs(value[n] - value[800]) for n in (50, 100, 200)]
     # The error of the fine grid itself adds at most a fifteenth to the last one.
     orders = np.log2(np.array(errors[:-1]) / errors[1:])
@@ -208,7 +208,7 @@ def test_a_likelihood_as_narrow_as_a_cell_is_integrated():
         model = ornstein_uhlenbeck(noise=sd**2, variance=1.0)
         ssm = lfm.state_space(model)
         for y in (0.0, 0.05, 0.13):
-            found = log_likelihood(ssm, schedule(ssm, [0.0], 1), [[y]], grid)
+            found = log_likelihood(ssm, build_time_grid(ssm, [0.0], 1), [[y]], grid)
             exact = -0.5 * (y - 0.5) ** 2 / (1.0 + sd**2) - 0.5 * np.log(2 * np.pi * (1.0 + sd**2))
             # Within half a cell the density changes by at most |y - 0.5| 0.05; quadrature adds a percent.
             assert abs(float(found) - exact) < 0.035
@@ -233,11 +233,11 @@ def parameters(theta):
 @pytest.mark.parametrize("times", [WELL_TIMES, WELL_TIMES**1.1], ids=["equal intervals", "any intervals"])
 def test_batches_and_vmap_equal_loops(times):
     ssm, grid = lfm.state_space(WELL), Grid(-3.0, 3.0, 60)
-    plan = schedule(ssm, times, 1)
+    time_grid = build_time_grid(ssm, times, 1)
     sets = np.stack([WELL_Y, WELL_Y[::-1], 0.5 * WELL_Y])
-    run = jax.jit(lambda y: log_likelihood(ssm, plan, y, grid))
+    run = jax.jit(lambda y: log_likelihood(ssm, time_grid, y, grid))
     np.testing.assert_allclose(run(sets), [run(y) for y in sets], rtol=1e-12)
-    one = jax.jit(lambda theta: log_likelihood(lfm.state_space(parameters(theta)), plan, jnp.asarray(WELL_Y), grid))
+    one = jax.jit(lambda theta: log_likelihood(lfm.state_space(parameters(theta)), time_grid, jnp.asarray(WELL_Y), grid))
     thetas = jnp.array([[1.5, 0.8], [0.7, 1.1], [2.0, 0.3]])
     loop = [one(theta) for theta in thetas]
     np.testing.assert_allclose(jax.jit(jax.vmap(one))(thetas), loop, rtol=1e-12)
@@ -246,8 +246,8 @@ def test_batches_and_vmap_equal_loops(times):
 
 def test_derivatives_in_forward_mode():
     ssm, grid = lfm.state_space(WELL), Grid(-3.0, 3.0, 60)
-    plan = schedule(ssm, WELL_TIMES, 1)
-    one = jax.jit(lambda theta: log_likelihood(lfm.state_space(parameters(theta)), plan, jnp.asarray(WELL_Y), grid))
+    time_grid = build_time_grid(ssm, WELL_TIMES, 1)
+    one = jax.jit(lambda theta: log_likelihood(lfm.state_space(parameters(theta)), time_grid, jnp.asarray(WELL_Y), grid))
     theta = jnp.array([1.5, 0.8])
     slope = jax.jit(jax.jacfwd(one))(theta)
     for index, step in enumerate(1e-5 * np.eye(2)):
@@ -256,9 +256,9 @@ def test_derivatives_in_forward_mode():
 
 def test_failure_in_compiled_code_is_minus_infinity():
     ssm, grid = lfm.state_space(WELL), Grid(-3.0, 3.0, 40)
-    plan = schedule(ssm, WELL_TIMES, 1)
+    time_grid = build_time_grid(ssm, WELL_TIMES, 1)
     run = jax.jit(lambda b, noise: log_likelihood(
-        lfm.state_space(double_well(noise=noise, b=b)), plan, jnp.asarray(WELL_Y), grid))
+        lfm.state_space(double_well(noise=noise, b=b)), time_grid, jnp.asarray(WELL_Y), grid))
     assert np.isfinite(run(1.0, 0.1))
     for bad in ((np.nan, 0.1), (1.0, 0.0), (np.inf, 0.1), (1.0, np.nan)):
         assert run(*bad) == -np.inf
@@ -268,9 +268,9 @@ def test_the_chosen_grid_is_as_accurate_as_asked():
     tolerance = 2e-3
     grid = choose_grid(WELL, WELL_TIMES, WELL_Y, tolerance=tolerance)
     ssm = lfm.state_space(WELL)
-    plan = schedule(ssm, WELL_TIMES, 1)
+    time_grid = build_time_grid(ssm, WELL_TIMES, 1)
     wide = Grid(grid.low - 0.5, grid.high + 0.5, int(3 * grid.cells * (1 + 1 / (grid.high - grid.low))))
-    found, better = (float(log_likelihood(ssm, plan, WELL_Y, g)) for g in (grid, wide))
+    found, better = (float(log_likelihood(ssm, time_grid, WELL_Y, g)) for g in (grid, wide))
     assert abs(found - better) < tolerance
     result = fokker_planck(WELL, WELL_TIMES, WELL_Y, tolerance=tolerance)
     assert result.grid == grid and result.error < tolerance

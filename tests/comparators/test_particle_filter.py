@@ -12,7 +12,7 @@ import lfm_ppl as lfm
 from lfm_ppl.comparators.normals import normals
 from lfm_ppl.comparators.particle_filter import ParticleSettings, check_settings, log_likelihood
 from lfm_ppl.comparators.resampling import RESAMPLING, effective_sample_size, resample
-from lfm_ppl.filtering.schedule import schedule
+from lfm_ppl.filtering.schedule import build_time_grid
 from lfm_ppl.model.augment import state_space
 
 TIMES = np.array([0.0, 0.7, 0.7, 2.0, 3.1])
@@ -40,10 +40,10 @@ def driven(noise=0.09, order=1):
 def estimates(model, times, y, runs, steps=1, key=0, **settings):
     """(runs,) log likelihood estimates from one compiled program."""
     ssm = state_space(model)
-    plan = schedule(ssm, times, steps)
+    grid = build_time_grid(ssm, times, steps)
     chosen = check_settings(ssm, ParticleSettings(**settings))
     keys = jax.random.split(jax.random.key(key), runs)
-    run = jax.jit(jax.vmap(lambda k: log_likelihood(ssm, plan, y, k, chosen)))
+    run = jax.jit(jax.vmap(lambda k: log_likelihood(ssm, grid, y, k, chosen)))
     return np.asarray(run(keys))
 
 
@@ -155,8 +155,8 @@ def test_batches_bound_the_memory_and_nothing_else():
 
     def temporaries(batch):
         ssm = state_space(motif())
-        plan, chosen = schedule(ssm, TIMES, 2), ParticleSettings(200_000, scheme="srk", batch=batch)
-        run = jax.jit(lambda key: log_likelihood(ssm, plan, np.ones((5, 2)), key, chosen))
+        grid, chosen = build_time_grid(ssm, TIMES, 2), ParticleSettings(200_000, scheme="srk", batch=batch)
+        run = jax.jit(lambda key: log_likelihood(ssm, grid, np.ones((5, 2)), key, chosen))
         return run.lower(jax.random.key(0)).compile().memory_analysis().temp_size_in_bytes
 
     assert temporaries(2_000) < 0.8 * temporaries(None)
@@ -202,13 +202,13 @@ def test_degeneracy_is_reported():
 
 def test_parameters_do_not_recompile():
     ssm = [state_space(double_well(a=jnp.asarray(a))) for a in (-1.0, -0.5)]
-    plan = schedule(ssm[0], TIMES, 5)
+    grid = build_time_grid(ssm[0], TIMES, 5)
     count = []
 
     @eqx.filter_jit
     def run(ssm, key):
         count.append(1)
-        return log_likelihood(ssm, plan, Y, key, ParticleSettings(50, scheme="srk"))
+        return log_likelihood(ssm, grid, Y, key, ParticleSettings(50, scheme="srk"))
 
     values = [float(run(one, jax.random.key(0))) for one in ssm]
     assert len(count) == 1 and values[0] != values[1]

@@ -13,7 +13,7 @@ from systems import DoubleWell, Linear, Outputs, double_well, identity, motif, w
 
 import lfm_ppl as lfm
 from lfm_ppl.filtering.breakdown import breakdown
-from lfm_ppl.filtering.schedule import schedule
+from lfm_ppl.filtering.schedule import build_time_grid
 
 TIMES = np.array([0.5, 1.0, 9.0, 9.5])
 Y = np.array([0.4, 0.6, 0.5, 0.1])[:, None]
@@ -74,7 +74,7 @@ def test_compiled_code_says_nothing():
 
 def test_nothing_is_said_where_nothing_breaks_down():
     ssm = lfm.state_space(double_well())
-    assert breakdown(ssm, lfm.Cubature(), schedule(ssm, TIMES, 10), Y) is None
+    assert breakdown(ssm, lfm.Cubature(), build_time_grid(ssm, TIMES, 10), Y) is None
 
 
 def unstable(noise):

@@ -13,9 +13,9 @@ from systems import Linear, Oscillator, Outputs, double_well, first_state, ident
 import lfm_ppl as lfm
 from lfm_ppl.filtering.filter import forward
 from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.filtering.retrospect import given_later
+from lfm_ppl.filtering.retrospect import smoothing_kernel
 from lfm_ppl.filtering.rts import at_start, backward
-from lfm_ppl.filtering.schedule import schedule
+from lfm_ppl.filtering.schedule import build_time_grid
 
 TIMES = np.array([0.0, 0.01, 0.5, 0.5, 1.2, 2.0])
 Y = np.array([0.4, 0.40002, 0.43, 0.43, np.nan, 0.3])[:, None]
@@ -42,12 +42,12 @@ def passes(model, variance, noise):
     model = eqx.tree_at(lambda m: (m.initial_state.covariance, m.observation.covariance), model,
                         (variance * jnp.eye(len(model.state_names)), noise * jnp.ones(1)))
     ssm = lfm.state_space(model)
-    plan = schedule(ssm, TIMES, 1)
-    passed = forward(ssm, lfm.Cubature(), plan, jnp.asarray(Y), keep="all")
+    grid = build_time_grid(ssm, TIMES, 1)
+    passed = forward(ssm, lfm.Cubature(), grid, jnp.asarray(Y), keep="all")
     start = Moments(*ssm.initial())
-    smoothed = backward(passed, start, plan)
-    _, conditional = jax.vmap(given_later)(at_start(passed.filtered, start), passed.predicted, passed.phi, passed.noise)
-    return (passed.predicted.covariance, passed.filtered.covariance, passed.noise, smoothed.moments.covariance,
+    smoothed = backward(passed, start, grid)
+    _, conditional = jax.vmap(smoothing_kernel)(at_start(passed.filtered, start), passed.predicted, passed.phi, passed.process_cov)
+    return (passed.predicted.covariance, passed.filtered.covariance, passed.process_cov, smoothed.moments.covariance,
             conditional), passed.log_likelihood, smoothed.leave_one_out
 
 

@@ -184,10 +184,10 @@ def test_filter(name):
     close(found.log_likelihood.sum(), case.reference.log_likelihood(case.times, case.y))
     present = np.isfinite(case.y)
     # Whitened residuals are another way to write the same quadratic form.
-    assert np.array_equal(np.isfinite(found.residual), present)
+    assert np.array_equal(np.isfinite(found.whitened_innovation), present)
     whole = case.reference.joint(case.times, case.y)
     residual, k = whole[1][present.ravel()], whole[2][np.ix_(present.ravel(), present.ravel())]
-    close(np.nansum(np.asarray(found.residual) ** 2), residual @ np.linalg.solve(k, residual))
+    close(np.nansum(np.asarray(found.whitened_innovation) ** 2), residual @ np.linalg.solve(k, residual))
 
 
 def test_initial_time_defaults_to_the_first_observation():

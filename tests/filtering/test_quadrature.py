@@ -8,7 +8,7 @@ from systems import whole_state
 
 import lfm_ppl as lfm
 from lfm_ppl.filtering import predict
-from lfm_ppl.filtering.predict import Moments, predict_row, row_factor
+from lfm_ppl.filtering.predict import Moments, predict_interval, row_factor
 from lfm_ppl.filtering.transition import linear_part
 
 DECAY = jnp.array([0.4, 0.9, 0.6])
@@ -80,8 +80,8 @@ def predictions(ssm, rule, steps):
     factor = row_factor(ssm, rule, linear, jnp.asarray(1.5), steps, tabulated=steps != 3)
 
     def row(moments, about):
-        return predict_row(ssm, rule, linear, factor, steps, jnp.asarray(0.7), jnp.asarray(1.5), moments, about,
-                           flow=True, each=lambda one: one)
+        return predict_interval(ssm, rule, linear, factor, steps, jnp.asarray(0.7), jnp.asarray(1.5), moments, about,
+                           with_map=True, each=lambda one: one)
 
     def both(moments):
         return row(moments, None), row(moments, nodes(ssm, steps))

@@ -16,7 +16,7 @@ from lfm_ppl import loading
 from lfm_ppl.filtering.filter import forward
 from lfm_ppl.filtering.iterated import posterior_linearisation
 from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.filtering.schedule import schedule
+from lfm_ppl.filtering.schedule import build_time_grid
 
 TIMES = np.array([0.0, 0.0, 2.0, 4.0, 4.0, 6.0, 12.0, 14.0])  # replicates and a gap
 AT = np.array([0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 9.0, 14.0, 15.0, 20.0])  # ends with a forecast
@@ -106,14 +106,14 @@ def test_nodes_after_a_known_start_are_those_of_dense_algebra():
     """Five genes that one force moves from a known start: the covariance of their state is nearly singular."""
     model = motif(softplus, genes=5, noise_sd=0.0682)
     ssm = lfm.state_space(model)
-    plan = schedule(ssm, TIMES, 3)
+    grid = build_time_grid(ssm, TIMES, 3)
     y = jnp.asarray(observed(5, softplus))
     start = Moments(*ssm.initial())
 
     @jax.jit
     def run(y):
-        passed = forward(ssm, lfm.Cubature(), plan, y, start=start, keep="steps")
-        return passed, posterior_linearisation(ssm, lfm.Cubature(), plan, y, start, 1, 1.0).points.nodes
+        passed = forward(ssm, lfm.Cubature(), grid, y, start=start, keep="steps")
+        return passed, posterior_linearisation(ssm, lfm.Cubature(), grid, y, start, 1, 1.0).points.nodes
 
     passed, nodes = jax.tree_util.tree_map(np.asarray, run(y))
     force = 5
@@ -124,11 +124,11 @@ def test_nodes_after_a_known_start_are_those_of_dense_algebra():
     before = []  # the transposed transition from each earlier node to now, times its prior covariance
     for row in range(len(TIMES)):
         for step in range(3):
-            phi, noise = passed.steps.phi[row, step], passed.steps.noise[row, step]
+            phi, noise = passed.steps.phi[row, step], passed.steps.process_cov[row, step]
             current = phi @ current @ phi.T + noise
             before = [phi @ one for one in before] + [current]
         blocks.append(list(before))
-        slopes.append(passed.slope[row])
+        slopes.append(passed.jacobian[row])
         noises.append(passed.obs_cov[row])
     count = 3 * len(TIMES)
     gram = np.zeros((5 * len(TIMES),) * 2)
@@ -144,16 +144,16 @@ def test_nodes_after_a_known_start_are_those_of_dense_algebra():
             gram[5 * i:5 * i + 5, at] = part.T
         gram[at, at] += noises[j]
     # Nodes after an observation: Cov(node, observation i) = (Phi(i -> node) P(i))[force] H_i'.
-    flow = [np.eye(size)]
+    with_map = [np.eye(size)]
     for node in range(count):
-        flow.append(passed.steps.phi[node // 3, node % 3])
+        with_map.append(passed.steps.phi[node // 3, node % 3])
     marginal = [np.asarray(start.covariance)]
     for node in range(count):
-        marginal.append(flow[node + 1] @ marginal[-1] @ flow[node + 1].T + passed.steps.noise[node // 3, node % 3])
+        marginal.append(with_map[node + 1] @ marginal[-1] @ with_map[node + 1].T + passed.steps.process_cov[node // 3, node % 3])
     for i in range(len(TIMES)):
         moved = marginal[3 * i + 3]
         for node in range(3 * i + 3, count):
-            moved = flow[node + 1] @ moved
+            moved = with_map[node + 1] @ moved
             cross[node, 5 * i:5 * i + 5] = moved[force] @ slopes[i].T
     variance = np.array([marginal[node + 1][force, force] for node in range(count)])
     expected = variance - np.einsum("ij,ij->i", cross, np.linalg.solve(gram, cross.T).T)

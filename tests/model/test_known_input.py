@@ -114,7 +114,7 @@ def test_reading_beyond_the_table_is_told(dynamics):
 def test_reading_is_told_everywhere():
     model, y = pushed(Heated(LINE)), np.zeros((4, 1))
     for call in (lambda: lfm.filter(model, ROWS, y), lambda: lfm.MarginalLikelihood(model, ROWS).ssm,
-                 lambda: lfm.MarginalLikelihood(model, ROWS).plan,
+                 lambda: lfm.MarginalLikelihood(model, ROWS).time_grid,
                  lambda: lfm.simulate(jax.random.key(0), model, ROWS, steps=2),
                  lambda: lfm.MarginalLikelihood(pushed(Heated(LINE)), ROWS[:3]).smooth(y[:3], at=[2.5, 3.0])):
         with pytest.warns(UserWarning, match="is read at time 3"):

@@ -41,9 +41,9 @@ def test_one_step_between_measurements_is_exact():
 
 def test_rare_measurements_get_more_steps():
     data = loading.load("ballistic").simulate()
-    plans = [likelihood_site(loading.load("ballistic").model, (times,), {}, jax.random.key(0)).example.plan
+    grids = [likelihood_site(loading.load("ballistic").model, (times,), {}, jax.random.key(0)).example.time_grid
              for times in (data.times, data.times[::20])]
-    longest = [float(np.max(plan.rows.length)) / plan.steps for plan in plans]
+    longest = [float(np.max(grid.intervals.length)) / grid.steps for grid in grids]
     assert longest[0] == pytest.approx(30 / 119)
     assert longest[1] <= module("ballistic").LONGEST_STEP
 

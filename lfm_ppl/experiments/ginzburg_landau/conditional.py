@@ -15,7 +15,7 @@ from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.ginzburg_landau import grid, problem
 from lfm_ppl.experiments.tasks import Result, Task
 from lfm_ppl.experiments.timing import timed
-from lfm_ppl.filtering.schedule import schedule
+from lfm_ppl.filtering.schedule import build_time_grid
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.model.augment import state_space
 
@@ -131,9 +131,9 @@ def _particle_program(particles: int, steps: int, times: tuple[float, ...], shap
     def run(y: jax.Array, keys: jax.Array) -> jax.Array:
         def one(theta: jax.Array, row: jax.Array, key: jax.Array) -> jax.Array:
             ssm = state_space(problem.system(theta))
-            plan = schedule(ssm, np.array(times), steps)
+            time_grid = build_time_grid(ssm, np.array(times), steps)
             settings = particle_filter.check_settings(ssm, particle_filter.ParticleSettings(particles))
-            return particle_filter.log_likelihood(ssm, plan, row, key, settings)
+            return particle_filter.log_likelihood(ssm, time_grid, row, key, settings)
 
         points = jnp.asarray(thetas(count))
 

@@ -13,7 +13,7 @@ import numpy as np
 from lfm_ppl.comparators import grid_filter
 from lfm_ppl.comparators.finite_volume import Grid
 from lfm_ppl.experiments.ginzburg_landau import problem
-from lfm_ppl.filtering.schedule import schedule
+from lfm_ppl.filtering.schedule import build_time_grid
 from lfm_ppl.model.augment import state_space
 
 _END = 12.0
@@ -34,7 +34,7 @@ def log_likelihoods(points: Any, y: jax.Array, times: np.ndarray, count: int) ->
 
     def one(theta: jax.Array) -> jax.Array:
         ssm = state_space(problem.system(theta))
-        return grid_filter.log_likelihood(ssm, schedule(ssm, times, 1), y, cells_of(count))
+        return grid_filter.log_likelihood(ssm, build_time_grid(ssm, times, 1), y, cells_of(count))
 
     # The transition matrix of a parameter value serves all data sets.
     return jax.lax.map(one, jnp.asarray(points)).T
@@ -75,8 +75,8 @@ def moments_program(count: int, draws: int, fine: tuple[float, ...]) -> Callable
 
 def _both(theta: Any, sparse: jax.Array, fine: np.ndarray, count: int) -> tuple[jax.Array, jax.Array, jax.Array]:
     ssm = state_space(problem.system(theta))
-    plan = schedule(ssm, fine, 1)
-    moving = grid_filter.moves(grid_filter.on_grid(ssm, plan, cells_of(count)), plan, 1)
-    passed = grid_filter.forward(moving, plan, sparse[None], keep=True)
-    smoothed = grid_filter.backward(moving, plan, passed)
+    time_grid = build_time_grid(ssm, fine, 1)
+    moving = grid_filter.moves(grid_filter.on_grid(ssm, time_grid, cells_of(count)), time_grid, 1)
+    passed = grid_filter.forward(moving, time_grid, sparse[None], keep=True)
+    smoothed = grid_filter.backward(moving, time_grid, passed)
     return passed.log_likelihood.sum(), passed.filtered[:, 0], smoothed[:, 0]

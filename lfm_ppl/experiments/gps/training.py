@@ -26,7 +26,7 @@ from lfm_ppl.experiments.gps import magnitudes
 from lfm_ppl.experiments.gps.problem import NOISE, Arc
 from lfm_ppl.filtering.filter import forward
 from lfm_ppl.filtering.predict import compose
-from lfm_ppl.filtering.schedule import schedule
+from lfm_ppl.filtering.schedule import build_time_grid
 from lfm_ppl.forces import Force, RandomWalk, Resonator
 from lfm_ppl.forces.sde import Sum
 from lfm_ppl.linalg import masked, matmul, solve_lower
@@ -176,27 +176,27 @@ def _response(near: orbits.Neighbourhood, axes: jax.Array, periods: jax.Array | 
             lambda x, u, t: near(x, near.on_orbit + axis * u[0], t), {"force": force},
             GaussianObservation(lambda x, u, t: x[:3], jnp.ones(3)), Gaussian(jnp.zeros(6), jnp.eye(6)),
             process_noise=push)
-        return _spread(system, at)
+        return _position_covariances(system, at)
 
     return jax.lax.map(one, (axes, periods, noises, whites))
 
 
-def _spread(system: LatentForceModel, times: np.ndarray) -> tuple[jax.Array, jax.Array]:
+def _position_covariances(system: LatentForceModel, times: np.ndarray) -> tuple[jax.Array, jax.Array]:
     """Return the response (3 T, n) of all positions to the first state, and their covariance (3 T, 3 T) by noise."""
     ssm = state_space(system)
-    plan = schedule(ssm, times, steps_of(times), None)
-    passed = forward(ssm, Taylor(), plan, jnp.full((len(times), 3), jnp.nan), keep="all")
+    grid = build_time_grid(ssm, times, steps_of(times), None)
+    passed = forward(ssm, Taylor(), grid, jnp.full((len(times), 3), jnp.nan), keep="all")
     size, count = ssm.state_dim, len(times)
 
     def step(carry: tuple, row: tuple) -> tuple[tuple, tuple]:
-        flow, spread, cross = carry  # cross: covariances of the state with all positions up to now
+        phi_so_far, covariance, cross = carry  # cross: covariances of the state with all positions up to now
         phi, noise, index = row
-        flow, spread = compose((flow, spread), (phi, noise))
-        cross = matmul(phi, cross.reshape(size, -1)).reshape(size, count, 3).at[:, index].set(spread[:, :3])
-        return (flow, spread, cross), (flow[:3], cross[:3])
+        phi_so_far, covariance = compose((phi_so_far, covariance), (phi, noise))
+        cross = matmul(phi, cross.reshape(size, -1)).reshape(size, count, 3).at[:, index].set(covariance[:, :3])
+        return (phi_so_far, covariance, cross), (phi_so_far[:3], cross[:3])
 
     first = (jnp.eye(size), jnp.zeros((size, size)), jnp.zeros((size, count, 3)))
-    _, (response, lower) = jax.lax.scan(step, first, (passed.phi, passed.noise, jnp.arange(count)))
+    _, (response, lower) = jax.lax.scan(step, first, (passed.phi, passed.process_cov, jnp.arange(count)))
     lower = lower.reshape(3 * count, 3 * count)  # zero above the diagonal blocks, which are whole
     late = np.repeat(np.arange(count), 3)
     return response.reshape(3 * count, size), jnp.where(late[:, None] >= late[None, :], lower, lower.T)
@@ -278,10 +278,10 @@ def held_out(logarithms: jax.Array, data: Regression, axes: str) -> jax.Array:
         left = solve_triangular(root, (start[3 * seen:] - later.T @ first).T, lower=True)
         mean = later.T @ y + left.T @ solve_triangular(root, first.T @ y, lower=True)
         reduced, added = (part.reshape(-1, count - seen, 3) for part in (later, left))
-        spread = (own[seen:] - jnp.einsum("mti,mtj->tij", reduced, reduced)
+        held_out_covariance = (own[seen:] - jnp.einsum("mti,mtj->tij", reduced, reduced)
                   + jnp.einsum("mti,mtj->tij", added, added))
         error = jnp.where(known[seen:, None], data.y[seen:], 0.0) - mean.reshape(-1, 3)
-        density = jnp.where(known[seen:], log_density(error, spread), 0.0)
+        density = jnp.where(known[seen:], log_density(error, held_out_covariance), 0.0)
         total, usable = total + density.sum() / jnp.maximum(known[seen:].sum(), 1), usable & found
     return jnp.where(usable & jnp.isfinite(total), total, -jnp.inf)
 
