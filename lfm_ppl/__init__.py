@@ -10,18 +10,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from lfm_ppl import forces as forces
     from lfm_ppl import orbits as orbits
-    from lfm_ppl.analysis.accuracy import check_accuracy as check_accuracy
-    from lfm_ppl.analysis.arviz_data import load as load
-    from lfm_ppl.analysis.arviz_data import save as save
-    from lfm_ppl.analysis.correction import correct_posterior as correct_posterior
-    from lfm_ppl.comparators.elliptical_slice import EllipticalSlice as EllipticalSlice
-    from lfm_ppl.comparators.fokker_planck import fokker_planck as fokker_planck
-    from lfm_ppl.comparators.laplace import laplace as laplace
-    from lfm_ppl.comparators.latent_grid import LatentGrid as LatentGrid
-    from lfm_ppl.comparators.particle_filter import particle_filter as particle_filter
-    from lfm_ppl.comparators.particle_smoother import particle_smoother as particle_smoother
-    from lfm_ppl.comparators.rao_blackwellised import rao_blackwellised as rao_blackwellised
-    from lfm_ppl.comparators.switched_simulation import simulate_switched as simulate_switched
     from lfm_ppl.compilation import fast_loops as fast_loops
     from lfm_ppl.data import Data as Data
     from lfm_ppl.data import read_csv as read_csv
@@ -29,6 +17,9 @@ if TYPE_CHECKING:
     from lfm_ppl.filtering.filter import FilterState as FilterState
     from lfm_ppl.filtering.filter import filter as filter
     from lfm_ppl.filtering.smoother import smooth as smooth
+    from lfm_ppl.fitting import ConvergenceWarning as ConvergenceWarning
+    from lfm_ppl.fitting import fit as fit
+    from lfm_ppl.fokker_planck_grid.fokker_planck import fokker_planck as fokker_planck
     from lfm_ppl.forces import ApproximationWarning as ApproximationWarning
     from lfm_ppl.forces import Constant as Constant
     from lfm_ppl.forces import Force as Force
@@ -40,15 +31,16 @@ if TYPE_CHECKING:
     from lfm_ppl.forces import WienerVelocity as WienerVelocity
     from lfm_ppl.inference.bound_model import BoundModel as BoundModel
     from lfm_ppl.inference.bound_model import bind as bind
-    from lfm_ppl.inference.fit import ConvergenceWarning as ConvergenceWarning
-    from lfm_ppl.inference.fit import fit as fit
-    from lfm_ppl.inference.fixing import fix as fix
+    from lfm_ppl.inference.handlers.fixing import fix as fix
+    from lfm_ppl.inference.handlers.on_latent_grid import on_latent_grid as on_latent_grid
+    from lfm_ppl.inference.kernels.elliptical_slice import EllipticalSlice as EllipticalSlice
+    from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalRAM as ParticleMarginalRAM
+    from lfm_ppl.inference.kernels.ram import RAM as RAM
     from lfm_ppl.inference.map import map_estimate as map_estimate
     from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood as MarginalLikelihood
     from lfm_ppl.inference.marginal_likelihood import panel as panel
-    from lfm_ppl.inference.on_latent_grid import on_latent_grid as on_latent_grid
-    from lfm_ppl.inference.particle_marginal import ParticleMarginalRAM as ParticleMarginalRAM
-    from lfm_ppl.inference.ram import RAM as RAM
+    from lfm_ppl.latent_grid.laplace import laplace as laplace
+    from lfm_ppl.latent_grid.latent_grid import LatentGrid as LatentGrid
     from lfm_ppl.linearisation.rule import Rule as Rule
     from lfm_ppl.linearisation.sigma_points import CentralDifference as CentralDifference
     from lfm_ppl.linearisation.sigma_points import Cubature as Cubature
@@ -56,36 +48,47 @@ if TYPE_CHECKING:
     from lfm_ppl.linearisation.sigma_points import MonteCarlo as MonteCarlo
     from lfm_ppl.linearisation.sigma_points import Unscented as Unscented
     from lfm_ppl.linearisation.taylor import Taylor as Taylor
-    from lfm_ppl.model.augment import state_space as state_space
-    from lfm_ppl.model.known_input import Input as Input
+    from lfm_ppl.model.gaussian import Gaussian as Gaussian
+    from lfm_ppl.model.inputs import Input as Input
     from lfm_ppl.model.latent_force_model import LatentForceModel as LatentForceModel
-    from lfm_ppl.model.observation import Gaussian as Gaussian
     from lfm_ppl.model.observation import GaussianObservation as GaussianObservation
     from lfm_ppl.model.simulate import Simulation as Simulation
     from lfm_ppl.model.simulate import simulate as simulate
-    from lfm_ppl.model.switching import SwitchingRule as SwitchingRule
-    from lfm_ppl.model.switching import Thermostat as Thermostat
+    from lfm_ppl.model.state_space import state_space as state_space
+    from lfm_ppl.particles.particle_filter import particle_filter as particle_filter
+    from lfm_ppl.particles.particle_smoother import particle_smoother as particle_smoother
+    from lfm_ppl.results.accuracy import check_accuracy as check_accuracy
+    from lfm_ppl.results.arviz_data import load as load
+    from lfm_ppl.results.arviz_data import save as save
+    from lfm_ppl.results.correction import correct_posterior as correct_posterior
+    from lfm_ppl.switching.rao_blackwellised import rao_blackwellised as rao_blackwellised
+    from lfm_ppl.switching.rule import SwitchingRule as SwitchingRule
+    from lfm_ppl.switching.rule import Thermostat as Thermostat
+    from lfm_ppl.switching.switched_simulation import simulate_switched as simulate_switched
 
 __version__ = "0.2.0"
 
 _PACKAGES = ("forces", "orbits")
 """Specialised forces and their kernels; satellites."""
 
-_OTHER_PACKAGES = ("analysis", "comparators", "data", "filtering", "inference", "linearisation", "model")
+_OTHER_PACKAGES = (
+    "data", "filtering", "fokker_planck_grid", "inference", "latent_grid", "linearisation", "model", "particles", "results",
+    "switching",
+)
 """What `lfm_ppl.filtering.filter.FilterResult` and the like are found by, without an import of their own."""
 
 _NAMES = {
-    "analysis.accuracy": ("check_accuracy",),
-    "analysis.arviz_data": ("load", "save"),
-    "analysis.correction": ("correct_posterior",),
-    "comparators.elliptical_slice": ("EllipticalSlice",),
-    "comparators.fokker_planck": ("fokker_planck",),
-    "comparators.laplace": ("laplace",),
-    "comparators.latent_grid": ("LatentGrid",),
-    "comparators.particle_filter": ("particle_filter",),
-    "comparators.particle_smoother": ("particle_smoother",),
-    "comparators.rao_blackwellised": ("rao_blackwellised",),
-    "comparators.switched_simulation": ("simulate_switched",),
+    "results.accuracy": ("check_accuracy",),
+    "results.arviz_data": ("load", "save"),
+    "results.correction": ("correct_posterior",),
+    "inference.kernels.elliptical_slice": ("EllipticalSlice",),
+    "fokker_planck_grid.fokker_planck": ("fokker_planck",),
+    "latent_grid.laplace": ("laplace",),
+    "latent_grid.latent_grid": ("LatentGrid",),
+    "particles.particle_filter": ("particle_filter",),
+    "particles.particle_smoother": ("particle_smoother",),
+    "switching.rao_blackwellised": ("rao_blackwellised",),
+    "switching.switched_simulation": ("simulate_switched",),
     "compilation": ("fast_loops",),
     "data": ("Data", "read_csv"),
     "filtering.breakdown": ("FilterWarning",),
@@ -96,22 +99,23 @@ _NAMES = {
         "SquaredExponential", "WienerVelocity",
     ),
     "inference.bound_model": ("BoundModel", "bind"),
-    "inference.fit": ("ConvergenceWarning", "fit"),
-    "inference.fixing": ("fix",),
+    "fitting": ("ConvergenceWarning", "fit"),
+    "inference.handlers.fixing": ("fix",),
     "inference.map": ("map_estimate",),
     "inference.marginal_likelihood": ("MarginalLikelihood", "panel"),
-    "inference.on_latent_grid": ("on_latent_grid",),
-    "inference.particle_marginal": ("ParticleMarginalRAM",),
-    "inference.ram": ("RAM",),
+    "inference.handlers.on_latent_grid": ("on_latent_grid",),
+    "inference.kernels.particle_marginal": ("ParticleMarginalRAM",),
+    "inference.kernels.ram": ("RAM",),
     "linearisation.rule": ("Rule",),
     "linearisation.sigma_points": ("CentralDifference", "Cubature", "GaussHermite", "MonteCarlo", "Unscented"),
     "linearisation.taylor": ("Taylor",),
-    "model.augment": ("state_space",),
-    "model.known_input": ("Input",),
+    "model.state_space": ("state_space",),
+    "model.inputs": ("Input",),
     "model.latent_force_model": ("LatentForceModel",),
-    "model.observation": ("Gaussian", "GaussianObservation"),
+    "model.gaussian": ("Gaussian",),
+    "model.observation": ("GaussianObservation",),
     "model.simulate": ("Simulation", "simulate"),
-    "model.switching": ("SwitchingRule", "Thermostat"),
+    "switching.rule": ("SwitchingRule", "Thermostat"),
 }
 """Module -> the public names in it."""
 

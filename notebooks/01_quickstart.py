@@ -32,8 +32,8 @@ import numpy as np
 import numpyro.distributions as dist
 
 import lfm_ppl as lfm
-from lfm_ppl.analysis import plots, tables
-from lfm_ppl.analysis.arviz_data import group, summary
+from lfm_ppl.results import plots, tables
+from lfm_ppl.results.arviz_data import group, summary
 
 quick = bool(os.environ.get("LFM_QUICK"))
 size = dict(chains=2, warmup=50, samples=50) if quick else dict(chains=4, warmup=1000, samples=1000)

@@ -37,8 +37,8 @@ import pandas as pd
 
 import lfm_ppl as lfm
 from lfm_ppl import loading
-from lfm_ppl.analysis import plots, tables
-from lfm_ppl.analysis.arviz_data import convergence_warnings, group, summary
+from lfm_ppl.results import plots, tables
+from lfm_ppl.results.arviz_data import convergence_warnings, group, summary
 
 quick = bool(os.environ.get("LFM_QUICK"))
 size = dict(chains=2, warmup=50, samples=50) if quick else dict(chains=4, warmup=1000, samples=1000)

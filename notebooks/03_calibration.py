@@ -34,7 +34,7 @@ import pandas as pd
 from numpyro.infer import NUTS
 
 import lfm_ppl as lfm
-from lfm_ppl.analysis import calibration, plots
+from lfm_ppl.results import calibration, plots
 
 quick = bool(os.environ.get("LFM_QUICK"))
 data_sets = 8 if quick else 240

@@ -18,14 +18,15 @@ PACKAGE = ROOT / "lfm_ppl"
 LAYERS = (
     ("checks", "compilation", "linalg", "gradients", "data"),
     ("forces",),
+    ("linearisation",),
     ("model",),
     ("orbits",),
-    ("linearisation",),
     ("filtering",),
-    ("comparators",),
+    ("particles", "fokker_planck_grid", "latent_grid"),
+    ("switching",),
     ("inference",),
-    ("analysis",),
-    ("inference.fit",),
+    ("results",),
+    ("fitting",),
     ("loading",),
     ("experiments",),
     ("cli", "__main__"),
@@ -186,7 +187,7 @@ def test_a_model_and_its_filter_import_no_satellites_figures_or_experiments():
     )
     found = run(code)
     assert found.endswith("False False") and "lfm_ppl.filtering" in found
-    for part in ("orbits", "analysis", "experiments", "comparators", "cli"):
+    for part in ("orbits", "particles", "fokker_planck_grid", "results", "experiments", "switching", "cli"):
         assert f"lfm_ppl.{part}" not in found
 
 

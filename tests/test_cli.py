@@ -13,8 +13,8 @@ import pandas as pd
 import pytest
 
 from lfm_ppl import loading
-from lfm_ppl.analysis import arviz_data
 from lfm_ppl.cli import choices, main, results
+from lfm_ppl.results import arviz_data
 
 FIGURES = {"fit.png", "forces.png", "states.png", "trace.png", "pairs.png", "residuals.png"}
 
@@ -210,7 +210,7 @@ def test_a_figure_that_fails_does_not_cost_the_draws(run, motif, tmp_path, monke
     def fail(*args, **kwargs):
         raise RuntimeError("no ink")
 
-    monkeypatch.setattr("lfm_ppl.analysis.plots.save_figures", fail)
+    monkeypatch.setattr("lfm_ppl.results.plots.save_figures", fail)
     code, out, err = run(f"fit {motif} --out r")
     assert code == 1
     assert "no ink" in err and "lfm-ppl plot r --overwrite" in err

@@ -13,8 +13,8 @@ import pytest
 import xarray as xr
 
 import lfm_ppl as lfm
-from lfm_ppl.analysis import arviz_data
 from lfm_ppl.cli import main, session
+from lfm_ppl.results import arviz_data
 
 ROOT = Path(__file__).resolve().parent.parent
 

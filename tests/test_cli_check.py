@@ -7,9 +7,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from lfm_ppl.analysis import arviz_data
-from lfm_ppl.analysis.report import AccuracyReport
 from lfm_ppl.cli import main
+from lfm_ppl.results import arviz_data
+from lfm_ppl.results.report import AccuracyReport
 
 WELL = '''"""A double well in noise."""
 import jax.numpy as jnp

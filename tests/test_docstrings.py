@@ -15,8 +15,8 @@ MODULES = sorted(
 
 
 COSTLY = tuple(f"lfm_ppl.{name}" for name in (
-    "analysis.accuracy", "analysis.calibration", "comparators.laplace", "inference.particle_marginal",
-    "inference.settings"))
+    "inference.handlers.settings", "inference.kernels.particle_marginal", "latent_grid.laplace", "results.accuracy",
+    "results.calibration"))
 """Modules whose examples take several seconds to compile; these are run with -m slow."""
 
 

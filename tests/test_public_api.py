@@ -10,7 +10,7 @@ import pytest
 
 import lfm_ppl as lfm
 from lfm_ppl import orbits
-from lfm_ppl.analysis import calibration
+from lfm_ppl.results import calibration
 
 KEYS = ("key", "rng_key")
 

@@ -37,7 +37,7 @@ class Check(NamedTuple):
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the accuracy report, store it beside and in the result, and write the corrected result if asked."""
-    from lfm_ppl.analysis import arviz_data, files
+    from lfm_ppl.results import arviz_data, files
 
     if not arguments.correct:
         if arguments.out is not None:
@@ -71,9 +71,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _task(posterior: Any, model_file: str | None) -> Check:
     """Rebuild the model from what the result remembers of it."""
-    from lfm_ppl.analysis import arviz_data, rebuilding
-    from lfm_ppl.analysis.scalars import unit_of
-    from lfm_ppl.inference.settings import approximate
+    from lfm_ppl.inference.handlers.settings import approximate
+    from lfm_ppl.results import arviz_data, rebuilding
+    from lfm_ppl.results.scalars import unit_of
 
     attrs = arviz_data.attributes(posterior)
     chosen = model_file or attrs.get("model_file")
@@ -108,7 +108,7 @@ def _task(posterior: Any, model_file: str | None) -> Check:
 
 
 def _checked(task: Check, arguments: argparse.Namespace) -> Any:
-    from lfm_ppl.analysis.accuracy import check_accuracy
+    from lfm_ppl.results.accuracy import check_accuracy
 
     return check_accuracy(
         task.posterior,
@@ -124,9 +124,9 @@ def _checked(task: Check, arguments: argparse.Namespace) -> Any:
 
 def _write(report: Any, posterior: Any, path: Path) -> int:
     """Store the report in the result and beside it; return 1 where the figure could not be drawn."""
-    from lfm_ppl.analysis import arviz_data, files, tables
-    from lfm_ppl.analysis.plots import plot_accuracy
-    from lfm_ppl.analysis.report import GROUP
+    from lfm_ppl.results import arviz_data, files, tables
+    from lfm_ppl.results.plots import plot_accuracy
+    from lfm_ppl.results.report import GROUP
 
     # The file again, not what was read before the computation: somebody may have added to it.
     stored = arviz_data.add_group(arviz_data.load(path), GROUP, report.to_dataset())
@@ -145,7 +145,7 @@ def _write(report: Any, posterior: Any, path: Path) -> int:
 
 def _correct(task: Check, report: Any, arguments: argparse.Namespace, folder: Path) -> int:
     """Write the corrected result: by resampling where the weights are reliable, else by new chains."""
-    from lfm_ppl.analysis.correction import correct_posterior
+    from lfm_ppl.results.correction import correct_posterior
 
     started = time.perf_counter()
     if report.reliable:
@@ -164,7 +164,7 @@ def _exact_chains(task: Check, arguments: argparse.Namespace) -> Any:
     which screens proposals with it, mixes worse than it saves; so it is left to the user.
     """
     import lfm_ppl
-    from lfm_ppl.analysis import arviz_data, rebuilding
+    from lfm_ppl.results import arviz_data, rebuilding
 
     attrs = arviz_data.attributes(task.posterior)
     times, y = rebuilding.observations(task.posterior)

@@ -18,9 +18,9 @@ _MOST_JOBS = 4
 def run(arguments: argparse.Namespace) -> int:
     """List the experiments, or run one: what its folder holds already is not computed again."""
     session.start(1, not arguments.no_cache)
-    from lfm_ppl.analysis import tables
     from lfm_ppl.experiments import catalogue
     from lfm_ppl.experiments.tasks import available_cpus, duration
+    from lfm_ppl.results import tables
 
     if arguments.experiment is None:
         _list()

@@ -122,7 +122,7 @@ def sample(
         at: times of the trajectories; None: a grid over the data.
     """
     import lfm_ppl
-    from lfm_ppl.inference.settings import approximate
+    from lfm_ppl.inference.handlers.settings import approximate
 
     target_accept = arguments.target_accept
     if target_accept is None and arguments.sampler == "nuts":
@@ -169,8 +169,8 @@ def sample(
 
 def report(posterior: Any, folder: Path, seconds: float, overwrite: bool) -> int:
     """Write and print everything; return 1 where a figure could not be drawn."""
-    from lfm_ppl.analysis import arviz_data, files, tables
-    from lfm_ppl.analysis.plots import save_figures
+    from lfm_ppl.results import arviz_data, files, tables
+    from lfm_ppl.results.plots import save_figures
 
     written = [arviz_data.save(posterior, folder / files.POSTERIOR, overwrite)]
     table = arviz_data.summary(posterior)

@@ -10,8 +10,8 @@ from lfm_ppl.cli import results
 
 def run(arguments: argparse.Namespace) -> int:
     """Draw every figure that the result has the numbers for."""
-    from lfm_ppl.analysis import arviz_data, files
-    from lfm_ppl.analysis.plots import save_figures
+    from lfm_ppl.results import arviz_data, files
+    from lfm_ppl.results.plots import save_figures
 
     path = files.locate(arguments.result)
     target = Path(arguments.out) if arguments.out else path.parent

@@ -6,8 +6,8 @@ import argparse
 import shlex
 
 from lfm_ppl import data, loading
-from lfm_ppl.analysis import files
 from lfm_ppl.cli import choices, results, session
+from lfm_ppl.results import files
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -8,10 +8,10 @@ from pathlib import Path
 import pandas as pd
 from matplotlib.figure import Figure
 
-from lfm_ppl.analysis.files import writing
-from lfm_ppl.analysis.plots import style
-from lfm_ppl.analysis.tables import write_csv, write_markdown
 from lfm_ppl.experiments import scores
+from lfm_ppl.results.files import writing
+from lfm_ppl.results.plots import style
+from lfm_ppl.results.tables import write_csv, write_markdown
 
 
 def save(folder: str | Path, tables: Mapping[str, pd.DataFrame], figures: Mapping[str, Figure],

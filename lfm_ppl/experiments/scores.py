@@ -11,7 +11,7 @@ import xarray as xr
 from scipy.interpolate import CubicSpline
 
 from lfm_ppl import checks
-from lfm_ppl.analysis import arviz_data
+from lfm_ppl.results import arviz_data
 
 Z = 1.959963984540054
 """Half the width of a 95% interval, in standard deviations."""

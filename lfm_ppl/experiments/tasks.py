@@ -27,7 +27,7 @@ import jax
 import numpy as np
 
 from lfm_ppl import checks
-from lfm_ppl.analysis.files import writing
+from lfm_ppl.results.files import writing
 
 Result = dict[str, Any]
 """Name -> number or small array."""

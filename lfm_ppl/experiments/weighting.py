@@ -17,8 +17,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy import special, stats
 
-from lfm_ppl.analysis import importance
 from lfm_ppl.inference.optimise import Minimum
+from lfm_ppl.results import importance
 
 FREEDOM = (3, 5)
 """Degrees of freedom of the first and the second t distribution."""

@@ -35,7 +35,7 @@ from lfm_ppl.filtering.predict import (
 from lfm_ppl.filtering.transition import LinearPart, integrating_factor
 from lfm_ppl.linalg import matmul
 from lfm_ppl.linearisation.rule import Rule
-from lfm_ppl.model.augment import StateSpaceModel, just_before
+from lfm_ppl.model.state_space import StateSpaceModel, just_before
 
 _FIRST = 1 / 8
 """Length of the first step that is tried, as a share of the interval."""

@@ -12,9 +12,9 @@ import numpy as np
 from lfm_ppl import checks
 from lfm_ppl.filtering.filter import Pass, forward
 from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.filtering.schedule import Intervals, TimeGrid, per_step
+from lfm_ppl.filtering.time_grid import Intervals, TimeGrid, per_step
 from lfm_ppl.linearisation.rule import Rule
-from lfm_ppl.model.augment import StateSpaceModel
+from lfm_ppl.model.state_space import StateSpaceModel
 
 _NEGATIVE = 1e-8
 """Share of the largest variance so far by which one must be negative to be no rounding error."""

@@ -22,15 +22,15 @@ from lfm_ppl.filtering.predict import (
     row_factor,
     unmoved,
 )
-from lfm_ppl.filtering.schedule import Intervals, TimeGrid, build_time_grid, by_length, with_observations
+from lfm_ppl.filtering.time_grid import Intervals, TimeGrid, build_time_grid, by_length, with_observations
 from lfm_ppl.filtering.transition import IntegratingFactor, LinearPart, constant_jacobian, exact, linear_part
 from lfm_ppl.filtering.update import FACTOR, FAILED, linearise_observation, update
 from lfm_ppl.linalg import congruence, diagonal, matmul, safe_sqrt, solve_lower
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.linearisation.sigma_points import Cubature, SigmaPointRule
-from lfm_ppl.model.augment import StateSpaceModel, state_space
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.resolution import check_resolution
+from lfm_ppl.model.state_space import StateSpaceModel, state_space
 
 _FEW_LENGTHS = 16
 """Distinct lengths of the intervals up to which it costs nothing to tabulate more of each than the interval would need."""

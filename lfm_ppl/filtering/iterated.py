@@ -8,16 +8,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.filtering.between import Branches
+from lfm_ppl.filtering.dense_output import Branches
 from lfm_ppl.filtering.filter import Pass, Points, completed, forward, needed
 from lfm_ppl.filtering.jumps import jump_map
 from lfm_ppl.filtering.predict import Moments, compose
-from lfm_ppl.filtering.retrospect import smoothed_moments, smoothing_kernel
 from lfm_ppl.filtering.rts import Smoothed, backward
-from lfm_ppl.filtering.schedule import TimeGrid, per_step
+from lfm_ppl.filtering.smoothing_kernel import smoothed_moments, smoothing_kernel
+from lfm_ppl.filtering.time_grid import TimeGrid, per_step
 from lfm_ppl.linalg import congruence, matmul, safe_sqrt
 from lfm_ppl.linearisation.rule import Rule
-from lfm_ppl.model.augment import StateSpaceModel
+from lfm_ppl.model.state_space import StateSpaceModel
 
 
 class Iterated(NamedTuple):

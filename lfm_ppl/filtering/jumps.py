@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from lfm_ppl.filtering.predict import Prediction, compose, moved
-from lfm_ppl.model.augment import StateSpaceModel
+from lfm_ppl.model.state_space import StateSpaceModel
 
 
 def jump_map(ssm: StateSpaceModel, jumps: tuple[jax.Array, jax.Array], index: jax.Array) -> tuple[jax.Array, jax.Array]:

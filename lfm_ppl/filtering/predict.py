@@ -26,7 +26,8 @@ from lfm_ppl.forces.sde import block_diagonal
 from lfm_ppl.linalg import congruence, diagonal, matmul, outer_square, safe_sqrt, symmetric
 from lfm_ppl.linearisation.rule import Inputs, Rule, selection
 from lfm_ppl.linearisation.sigma_points import SigmaPointRule
-from lfm_ppl.model.augment import InputStructure, StateSpaceModel, just_before
+from lfm_ppl.linearisation.structure import InputStructure
+from lfm_ppl.model.state_space import StateSpaceModel, just_before
 
 FLOOR = "lfm_ppl: smallest standard deviation"
 """Under this name `smallest_spread` is kept for the derivative of an interval, and not computed again."""

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 
 from lfm_ppl.filtering.filter import Pass
 from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.filtering.retrospect import smoothed_moments, smoothing_kernel
-from lfm_ppl.filtering.schedule import TimeGrid
+from lfm_ppl.filtering.smoothing_kernel import smoothed_moments, smoothing_kernel
+from lfm_ppl.filtering.time_grid import TimeGrid
 from lfm_ppl.linalg import cholesky, congruence, diagonal, log_density, matmul, outer_square, solve_lower
 
 

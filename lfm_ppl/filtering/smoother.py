@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import checks
-from lfm_ppl.filtering.between import Branches, Places, dense_output, places
 from lfm_ppl.filtering.breakdown import warn_of_breakdown
+from lfm_ppl.filtering.dense_output import Branches, Places, dense_output, places
 from lfm_ppl.filtering.filter import (
     Pass,
     as_rule,
@@ -23,13 +23,13 @@ from lfm_ppl.filtering.filter import (
 from lfm_ppl.filtering.iterated import Iterated, posterior_linearisation, refined
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.rts import Smoothed, backward
-from lfm_ppl.filtering.schedule import TimeGrid, build_time_grid, per_step
 from lfm_ppl.filtering.simulation_smoother import smoothing_errors
+from lfm_ppl.filtering.time_grid import TimeGrid, build_time_grid, per_step
 from lfm_ppl.linalg import congruence, matmul, safe_sqrt, semidefinite_root, solve_lower
 from lfm_ppl.linearisation.rule import Rule
-from lfm_ppl.model.augment import StateSpaceModel, state_space
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.resolution import check_resolution
+from lfm_ppl.model.state_space import StateSpaceModel, state_space
 
 _LONGEST_FORECAST = 10_000
 """Most intervals of a forecast; a longer one gets a long last interval (or `max_step`)."""

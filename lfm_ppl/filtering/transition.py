@@ -19,7 +19,8 @@ import numpy as np
 from lfm_ppl.forces.discretise import discretise
 from lfm_ppl.linalg import congruence, diagonal, matmul, safe_sqrt, solve_semidefinite
 from lfm_ppl.linearisation.rule import Function, partial_jacobian, selection
-from lfm_ppl.model.augment import InputStructure, StateSpaceModel
+from lfm_ppl.linearisation.structure import InputStructure
+from lfm_ppl.model.state_space import StateSpaceModel
 
 
 class LinearPart(NamedTuple):

@@ -12,7 +12,7 @@ from lfm_ppl.filtering.predict import Moments, covariance_of, linearise_state
 from lfm_ppl.linalg import cholesky, congruence, diagonal, log_density, masked, matmul, safe_sqrt, wrapped
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.linearisation.sigma_points import SigmaPointRule
-from lfm_ppl.model.augment import StateSpaceModel
+from lfm_ppl.model.state_space import StateSpaceModel
 
 FAILED, FACTOR = "lfm_ppl: failed", "lfm_ppl: factor of the innovation covariance"
 """Under these names they are kept for the derivative of a row, and not computed again."""

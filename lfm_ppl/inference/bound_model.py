@@ -23,11 +23,11 @@ from lfm_ppl import checks
 from lfm_ppl.filtering.filter import FilterResult, check_observations
 from lfm_ppl.filtering.smoother import SmootherResult
 from lfm_ppl.inference.fingerprint import Recording, record, signature
-from lfm_ppl.inference.fixing import fix
-from lfm_ppl.inference.likelihood_handler import LikelihoodHandler
+from lfm_ppl.inference.handlers.fixing import fix
+from lfm_ppl.inference.handlers.likelihood_handler import LikelihoodHandler
+from lfm_ppl.inference.handlers.settings import approximate
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
 from lfm_ppl.inference.optimise import Objective, value_and_gradient
-from lfm_ppl.inference.settings import approximate
 from lfm_ppl.inference.unconstrained import check_latent, coordinate_names, latent_sites
 
 FORWARD_MODE_LIMIT = 10

@@ -29,19 +29,19 @@ from lfm_ppl.filtering.filter import (
 )
 from lfm_ppl.filtering.iterated import posterior_linearisation
 from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.filtering.schedule import TimeGrid, build_time_grid
 from lfm_ppl.filtering.smoother import (
     SmootherResult,
     check_iterations,
     smooth_on,
     smoothing_grids,
 )
+from lfm_ppl.filtering.time_grid import TimeGrid, build_time_grid
 from lfm_ppl.gradients import finite_or_minus_infinity
 from lfm_ppl.linearisation.rule import Rule
-from lfm_ppl.model.augment import StateSpaceModel, check_times, state_space
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.resolution import check_resolution
 from lfm_ppl.model.simulate import simulate_on
+from lfm_ppl.model.state_space import StateSpaceModel, check_times, state_space
 
 _SIMULATION_STEPS = 5
 """Steps of the simulator for one integration step of the filter: its paths are rougher than moments."""

@@ -10,14 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import checks
-from lfm_ppl.comparators.particle_filter import ParticleSettings
-from lfm_ppl.comparators.particle_smoother import TRACING, draw_trajectories
-from lfm_ppl.filtering.schedule import build_time_grid
+from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.fingerprint import signature
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
 from lfm_ppl.linalg import matmul, semidefinite_root
-from lfm_ppl.model.augment import StateSpaceModel
+from lfm_ppl.model.state_space import StateSpaceModel
+from lfm_ppl.particles.particle_filter import ParticleSettings
+from lfm_ppl.particles.particle_smoother import TRACING, draw_trajectories
 
 _FILTERS = 4
 """Particle filters from which the path of one draw is chosen."""

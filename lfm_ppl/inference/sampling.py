@@ -16,12 +16,12 @@ from numpyro.infer import NUTS
 from numpyro.infer.util import ParamInfo
 
 from lfm_ppl import checks
-from lfm_ppl.inference import robust_metropolis
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.fingerprint import signature
-from lfm_ppl.inference.particle_marginal import ParticleMarginalRAM, ParticleMarginalState
-from lfm_ppl.inference.ram import RAM
-from lfm_ppl.inference.robust_metropolis import RAMState, finite_or_infinity, initial_state
+from lfm_ppl.inference.kernels import robust_metropolis
+from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalRAM, ParticleMarginalState
+from lfm_ppl.inference.kernels.ram import RAM
+from lfm_ppl.inference.kernels.robust_metropolis import RAMState, finite_or_infinity, initial_state
 
 CHAIN_METHODS = ("parallel", "vectorized", "sequential")
 

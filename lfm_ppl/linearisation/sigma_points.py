@@ -13,7 +13,7 @@ import numpy as np
 from lfm_ppl import checks
 from lfm_ppl.linalg import CholeskyFactor, cholesky, congruence, matmul, outer_square
 from lfm_ppl.linearisation.rule import AffineMap, Function, Inputs, Rule, partial_jacobian, selection
-from lfm_ppl.model.augment import InputStructure
+from lfm_ppl.linearisation.structure import InputStructure
 
 
 class UnitPoints(NamedTuple):

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from lfm_ppl.linalg import matmul
 from lfm_ppl.linearisation.rule import AffineMap, Function, Inputs, Rule, partial_jacobian, selection
-from lfm_ppl.model.augment import InputStructure
+from lfm_ppl.linearisation.structure import InputStructure
 
 
 class Taylor(Rule):

@@ -12,8 +12,9 @@ import numpy as np
 
 from lfm_ppl import checks
 from lfm_ppl.forces.sde import Force
-from lfm_ppl.model.known_input import check_reads, reads_inputs
-from lfm_ppl.model.observation import Gaussian, GaussianObservation
+from lfm_ppl.model.gaussian import Gaussian
+from lfm_ppl.model.inputs import check_reads, reads_inputs
+from lfm_ppl.model.observation import GaussianObservation
 from lfm_ppl.model.user_functions import Traced, trace
 
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from lfm_ppl import checks
 from lfm_ppl.linalg import matmul, semidefinite_root
-from lfm_ppl.model.augment import StateSpaceModel, check_times, just_before, state_space
 from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.state_space import StateSpaceModel, check_times, just_before, state_space
 
 
 class Simulation(NamedTuple):

@@ -12,8 +12,8 @@ import numpy as np
 
 from lfm_ppl import checks
 from lfm_ppl.forces import Force
+from lfm_ppl.model.gaussian import Gaussian
 from lfm_ppl.model.latent_force_model import LatentForceModel
-from lfm_ppl.model.observation import Gaussian
 from lfm_ppl.orbits import frames
 from lfm_ppl.orbits.deterministic import Orbit, propagate
 from lfm_ppl.orbits.environment import Environment

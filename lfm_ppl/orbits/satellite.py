@@ -12,8 +12,9 @@ import numpy as np
 
 from lfm_ppl import checks
 from lfm_ppl.forces import Constant, Force, RandomWalk, Resonator
+from lfm_ppl.model.gaussian import Gaussian
 from lfm_ppl.model.latent_force_model import LatentForceModel
-from lfm_ppl.model.observation import Gaussian, GaussianObservation
+from lfm_ppl.model.observation import GaussianObservation
 from lfm_ppl.orbits import frames
 from lfm_ppl.orbits.environment import NANO, Environment
 

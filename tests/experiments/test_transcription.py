@@ -10,10 +10,10 @@ import pandas as pd
 import pytest
 from scipy.integrate import solve_ivp
 
-from lfm_ppl.comparators.laplace import laplace
 from lfm_ppl.experiments import catalogue, scores
 from lfm_ppl.experiments.tasks import Task, write
 from lfm_ppl.experiments.transcription import ellipses, experiment, figures, problem, report, slices, tables, verdict
+from lfm_ppl.latent_grid.laplace import laplace
 
 SATURATION, EXPONENTIAL = problem.CONFIGURATIONS[1], problem.CONFIGURATIONS[6]
 FEW = experiment.Settings(datasets=12, draws=400, burn_in=40)

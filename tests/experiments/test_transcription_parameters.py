@@ -9,11 +9,11 @@ import numpy as np
 import numpyro
 import pytest
 
-from lfm_ppl.analysis import arviz_data
 from lfm_ppl.experiments import catalogue
 from lfm_ppl.experiments.tasks import Task
 from lfm_ppl.experiments.transcription import parameters, parameters_report, problem
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
+from lfm_ppl.results import arviz_data
 
 FEW = dataclasses.replace(parameters_report.quick(), links=tuple(parameters.LINKS))
 SOFTPLUS = parameters.LINKS["softplus"]

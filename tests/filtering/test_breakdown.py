@@ -13,7 +13,7 @@ from systems import DoubleWell, Linear, Outputs, double_well, identity, motif, w
 
 import lfm_ppl as lfm
 from lfm_ppl.filtering.breakdown import breakdown
-from lfm_ppl.filtering.schedule import build_time_grid
+from lfm_ppl.filtering.time_grid import build_time_grid
 
 TIMES = np.array([0.5, 1.0, 9.0, 9.5])
 Y = np.array([0.4, 0.6, 0.5, 0.1])[:, None]

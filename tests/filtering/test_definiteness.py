@@ -13,9 +13,9 @@ from systems import Linear, Oscillator, Outputs, double_well, first_state, ident
 import lfm_ppl as lfm
 from lfm_ppl.filtering.filter import forward
 from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.filtering.retrospect import smoothing_kernel
 from lfm_ppl.filtering.rts import at_start, backward
-from lfm_ppl.filtering.schedule import build_time_grid
+from lfm_ppl.filtering.smoothing_kernel import smoothing_kernel
+from lfm_ppl.filtering.time_grid import build_time_grid
 
 TIMES = np.array([0.0, 0.01, 0.5, 0.5, 1.2, 2.0])
 Y = np.array([0.4, 0.40002, 0.43, 0.43, np.nan, 0.3])[:, None]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lfm_ppl as lfm
-from lfm_ppl.model.augment import state_space
+from lfm_ppl.model.state_space import state_space
 
 TIMES = np.linspace(0.0, 15.0, 13)
 AT = np.linspace(0.0, 15.0, 91)

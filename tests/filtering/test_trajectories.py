@@ -16,7 +16,7 @@ from lfm_ppl import loading
 from lfm_ppl.filtering.filter import forward
 from lfm_ppl.filtering.iterated import posterior_linearisation
 from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.filtering.schedule import build_time_grid
+from lfm_ppl.filtering.time_grid import build_time_grid
 
 TIMES = np.array([0.0, 0.0, 2.0, 4.0, 4.0, 6.0, 12.0, 14.0])  # replicates and a gap
 AT = np.array([0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 9.0, 14.0, 15.0, 20.0])  # ends with a forecast

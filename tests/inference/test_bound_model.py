@@ -15,8 +15,8 @@ from numpyro.infer import NUTS
 from numpyro.infer.util import ParamInfo, potential_energy
 
 import lfm_ppl as lfm
-from lfm_ppl.analysis.arviz_data import group
 from lfm_ppl.inference import bound_model, sampling
+from lfm_ppl.results.arviz_data import group
 
 TIMES = np.array([0.0, 0.7, 1.1, 2.0, 3.0])
 Y = np.array([[0.4, 0.3], [0.8, np.nan], [0.9, 0.5], [1.0, 0.4], [0.7, 0.2]])

@@ -9,7 +9,7 @@ import pytest
 from numpyro.infer import MCMC, NUTS, Predictive
 from numpyro.infer.util import initialize_model, potential_energy
 
-from lfm_ppl.inference.fixing import fix
+from lfm_ppl.inference.handlers.fixing import fix
 
 COVARIANCE = np.array([[1.0, 0.8, 0.3], [0.8, 1.0, 0.5], [0.3, 0.5, 1.0]])
 LABELS = ("a", "b", "c")

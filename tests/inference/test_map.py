@@ -12,9 +12,9 @@ from numpyro.infer import init_to_uniform
 from scipy.special import gammaln
 
 from lfm_ppl.inference.curvature import decompose
+from lfm_ppl.inference.kernels.ram import RAM
 from lfm_ppl.inference.map import map_estimate
 from lfm_ppl.inference.optimise import Objective, newton, quasi_newton
-from lfm_ppl.inference.ram import RAM
 
 RNG = np.random.default_rng(0)
 DESIGN = RNG.normal(size=(12, 3))

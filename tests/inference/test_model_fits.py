@@ -7,7 +7,7 @@ import pytest
 
 import lfm_ppl as lfm
 from lfm_ppl import loading
-from lfm_ppl.analysis import arviz_data
+from lfm_ppl.results import arviz_data
 
 
 def fitted(name, **keywords):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 import lfm_ppl as lfm
-from lfm_ppl.inference.options import check_options
+from lfm_ppl.inference.kernels.options import check_options
 
 
 def never(times, y=None):

@@ -11,14 +11,14 @@ import pytest
 from numpyro.infer import MCMC
 
 import lfm_ppl as lfm
-from lfm_ppl.analysis.arviz_data import ess, group
-from lfm_ppl.comparators.particle_filter import ParticleSettings
 from lfm_ppl.inference import particle_likelihood
 from lfm_ppl.inference.bound_model import bind
+from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalState, particle_marginal_step
+from lfm_ppl.inference.kernels.robust_metropolis import initial_state
 from lfm_ppl.inference.particle_likelihood import ParticlePotential
-from lfm_ppl.inference.particle_marginal import ParticleMarginalState, particle_marginal_step
 from lfm_ppl.inference.posterior import trajectories
-from lfm_ppl.inference.robust_metropolis import initial_state
+from lfm_ppl.particles.particle_filter import ParticleSettings
+from lfm_ppl.results.arviz_data import ess, group
 
 TIMES = np.array([0.0, 0.6, 1.5, 1.5, 2.7, 4.0])
 Y = np.array([[1.2], [0.7], [np.nan], [0.5], [-0.2], [0.4]])

@@ -10,7 +10,7 @@ from numpyro.infer import Predictive
 from numpyro.infer.util import log_density, potential_energy
 
 from lfm_ppl import loading
-from lfm_ppl.inference import settings
+from lfm_ppl.inference.handlers import settings
 
 DRAWS = 1000
 FEW = 100

@@ -14,8 +14,8 @@ import pytest
 from numpyro.diagnostics import effective_sample_size
 from numpyro.infer import MCMC, init_to_uniform
 
-from lfm_ppl.inference.ram import RAM
-from lfm_ppl.inference.robust_metropolis import adapt, rank_one_update
+from lfm_ppl.inference.kernels.ram import RAM
+from lfm_ppl.inference.kernels.robust_metropolis import adapt, rank_one_update
 
 ROOT = Path(__file__).resolve().parents[2]
 STATISTICS = ("accept_prob", "accepted", "potential_energy", "mean_accept_prob", "step_size")
@@ -236,7 +236,7 @@ def test_conjugate_model_with_a_deterministic_site():
 CHAIN_METHODS = """
 import jax, numpy as np, numpyro, numpyro.distributions as dist
 from numpyro.infer import MCMC, init_to_uniform
-from lfm_ppl.inference.ram import RAM
+from lfm_ppl.inference.kernels.ram import RAM
 
 numpyro.enable_x64()
 assert jax.local_device_count() == 2

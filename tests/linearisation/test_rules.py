@@ -10,7 +10,7 @@ from references import gauss_hermite
 
 import lfm_ppl as lfm
 from lfm_ppl.linearisation.rule import Inputs
-from lfm_ppl.model.augment import InputStructure
+from lfm_ppl.linearisation.structure import InputStructure
 
 RULES = [lfm.Taylor(), lfm.Cubature(), lfm.Unscented(), lfm.Unscented(0.8, 2.0, 1.0), lfm.GaussHermite(3),
          lfm.GaussHermite(5), lfm.CentralDifference(), lfm.CentralDifference(1.2), lfm.MonteCarlo(50, seed=1)]

@@ -7,7 +7,7 @@ import pytest
 
 import lfm_ppl as lfm
 from lfm_ppl import loading
-from lfm_ppl.analysis.arviz_data import group, summary
+from lfm_ppl.results.arviz_data import group, summary
 
 MODELS = sorted(loading.available())
 

@@ -12,7 +12,7 @@ import pytest
 
 import lfm_ppl as lfm
 from lfm_ppl import loading
-from lfm_ppl.analysis.arviz_data import group, summary
+from lfm_ppl.results.arviz_data import group, summary
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 P53 = Path(os.environ.get("LFM_DATA", ROOT.parent / "shared" / "data")) / "p53" / "p53_targets.csv"

@@ -9,7 +9,7 @@ import pytest
 
 import lfm_ppl as lfm
 from lfm_ppl import orbits
-from lfm_ppl.model.augment import state_space
+from lfm_ppl.model.state_space import state_space
 from lfm_ppl.orbits import deviations, geopotential
 from lfm_ppl.orbits.environment import PER_HOUR2
 

@@ -9,7 +9,7 @@ from numpyro.infer import MCMC, init_to_uniform
 from lfm_ppl.experiments import chains
 from lfm_ppl.experiments.ballistic import problem
 from lfm_ppl.experiments.tasks import Result, Task
-from lfm_ppl.inference.ram import RAM
+from lfm_ppl.inference.kernels.ram import RAM
 
 SAMPLERS = ("NUTS", "RAM")
 

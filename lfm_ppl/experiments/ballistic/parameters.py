@@ -16,7 +16,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.analysis import importance
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.ballistic import problem
 from lfm_ppl.experiments.ballistic.tracking import blocks, judged
@@ -24,6 +23,7 @@ from lfm_ppl.experiments.tasks import Result, Task
 from lfm_ppl.experiments.timing import timed
 from lfm_ppl.experiments.weighting import Weighted, moments, weighted
 from lfm_ppl.inference.optimise import Minimum, newton, quasi_newton
+from lfm_ppl.results import importance
 
 START = np.log([5e-4, 30.0, 5.0])
 """Where every search starts: the prior medians."""

@@ -13,7 +13,7 @@ from numpyro import handlers
 from lfm_ppl import loading
 from lfm_ppl.experiments.posteriors import LogPosterior
 from lfm_ppl.inference.bound_model import bind
-from lfm_ppl.inference.fixing import fix
+from lfm_ppl.inference.handlers.fixing import fix
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.model.simulate import simulate
 

@@ -15,7 +15,6 @@ import numpy as np
 from numpyro.infer import MCMC
 from scipy import special, stats
 
-from lfm_ppl.analysis import importance
 from lfm_ppl.experiments import chains, scores
 from lfm_ppl.experiments.call_centre import problem, tracking
 from lfm_ppl.experiments.call_centre.problem import FIRST, TESTED, Method, Window
@@ -23,6 +22,7 @@ from lfm_ppl.experiments.call_centre.tracking import Tracked
 from lfm_ppl.experiments.tasks import Result, Task
 from lfm_ppl.experiments.weighting import Weighted, weighted
 from lfm_ppl.inference.optimise import Minimum
+from lfm_ppl.results import importance
 
 ACCEPTED = 0.95
 """Acceptance that NUTS aims at: steps fine enough for the walls of the posterior, where arrivals exceed what is served

@@ -15,7 +15,7 @@ from lfm_ppl.experiments.call_centre import counts
 from lfm_ppl.experiments.call_centre.counts import BIN, DAY, OPEN, Counts
 from lfm_ppl.experiments.posteriors import LogPosterior
 from lfm_ppl.inference.bound_model import bind, likelihood_site
-from lfm_ppl.model.known_input import Input
+from lfm_ppl.model.inputs import Input
 
 UTILISATION = 0.7
 """Mean rate of arrivals over all days, as a share of `SERVICE`: the queue of a middling Thursday then reaches some 25

@@ -27,7 +27,7 @@ from lfm_ppl.filtering.filter import filter
 from lfm_ppl.filtering.smoother import smooth
 from lfm_ppl.inference.optimise import quasi_newton
 from lfm_ppl.linalg import congruence, matmul
-from lfm_ppl.model.augment import state_space
+from lfm_ppl.model.state_space import state_space
 
 METHODS = {"SQM": "sqm", "CQM": "cqm", "WQM": "wqm", "periodic": "periodic", "Matern": "matern",
            "resonator": "resonator"}

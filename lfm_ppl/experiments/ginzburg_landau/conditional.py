@@ -10,14 +10,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.comparators import particle_filter
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.ginzburg_landau import grid, problem
 from lfm_ppl.experiments.tasks import Result, Task
 from lfm_ppl.experiments.timing import timed
-from lfm_ppl.filtering.schedule import build_time_grid
+from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
-from lfm_ppl.model.augment import state_space
+from lfm_ppl.model.state_space import state_space
+from lfm_ppl.particles import particle_filter
 
 INTERVALS = {"alpha": (-2.0, 1.5), "beta": (0.04, 1.5), "sigma": (1.0, 16.0)}
 """Where the flat priors lie."""

@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.comparators import grid_filter
-from lfm_ppl.comparators.finite_volume import Grid
 from lfm_ppl.experiments.ginzburg_landau import problem
-from lfm_ppl.filtering.schedule import build_time_grid
-from lfm_ppl.model.augment import state_space
+from lfm_ppl.filtering.time_grid import build_time_grid
+from lfm_ppl.fokker_planck_grid import grid_filter
+from lfm_ppl.fokker_planck_grid.finite_volume import Grid
+from lfm_ppl.model.state_space import state_space
 
 _END = 12.0
 """The grid reaches from -12 to 12. At the truth, paths of 50 units of time stay within -7.5 and 7.5."""

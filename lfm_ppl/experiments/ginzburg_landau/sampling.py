@@ -16,9 +16,9 @@ from lfm_ppl.experiments.ginzburg_landau import grid, problem, state
 from lfm_ppl.experiments.tasks import Result, Task
 from lfm_ppl.experiments.timing import timed
 from lfm_ppl.filtering.smoother import smooth
-from lfm_ppl.inference.particle_marginal import ParticleMarginalRAM
-from lfm_ppl.inference.ram import RAM
-from lfm_ppl.inference.settings import approximate
+from lfm_ppl.inference.handlers.settings import approximate
+from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalRAM
+from lfm_ppl.inference.kernels.ram import RAM
 
 
 class Sampler(NamedTuple):

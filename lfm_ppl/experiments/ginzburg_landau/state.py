@@ -10,14 +10,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.comparators.particle_filter import particle_filter
-from lfm_ppl.comparators.particle_smoother import particle_smoother
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.ginzburg_landau import grid, problem
 from lfm_ppl.experiments.tasks import Result, Task
 from lfm_ppl.experiments.timing import timed
 from lfm_ppl.filtering.filter import filter as gaussian_filter
 from lfm_ppl.filtering.smoother import smooth
+from lfm_ppl.particles.particle_filter import particle_filter
+from lfm_ppl.particles.particle_smoother import particle_smoother
 
 MARKS = (11.8, 31.0)
 """Times whose densities are kept: those of the source's figure, though its path is another one. After them comes the

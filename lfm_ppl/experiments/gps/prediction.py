@@ -17,8 +17,8 @@ from lfm_ppl.filtering.filter import FilterState, filter
 from lfm_ppl.filtering.smoother import smooth
 from lfm_ppl.linalg import congruence, matmul
 from lfm_ppl.linearisation.taylor import Taylor
-from lfm_ppl.model.augment import state_space
-from lfm_ppl.model.observation import Gaussian
+from lfm_ppl.model.gaussian import Gaussian
+from lfm_ppl.model.state_space import state_space
 
 _LATEST = 6.0
 """Hours before the end of training that determine the latest state."""

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import orbits
-from lfm_ppl.model.observation import Gaussian
+from lfm_ppl.model.gaussian import Gaussian
 from lfm_ppl.model.simulate import simulate
 
 NOISE = 5e-5

@@ -26,14 +26,15 @@ from lfm_ppl.experiments.gps import magnitudes
 from lfm_ppl.experiments.gps.problem import NOISE, Arc
 from lfm_ppl.filtering.filter import forward
 from lfm_ppl.filtering.predict import compose
-from lfm_ppl.filtering.schedule import build_time_grid
+from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.forces import Force, RandomWalk, Resonator
 from lfm_ppl.forces.sde import Sum
 from lfm_ppl.linalg import masked, matmul, solve_lower
 from lfm_ppl.linearisation.taylor import Taylor
-from lfm_ppl.model.augment import state_space
+from lfm_ppl.model.gaussian import Gaussian
 from lfm_ppl.model.latent_force_model import LatentForceModel
-from lfm_ppl.model.observation import Gaussian, GaussianObservation
+from lfm_ppl.model.observation import GaussianObservation
+from lfm_ppl.model.state_space import state_space
 
 _LONGEST = 0.5
 """Hours from one position to the next in learning; closer ones say the same."""

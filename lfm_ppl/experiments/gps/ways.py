@@ -25,10 +25,11 @@ from lfm_ppl.experiments.tasks import Result
 from lfm_ppl.filtering.filter import filter
 from lfm_ppl.filtering.smoother import smooth
 from lfm_ppl.forces import Matern
-from lfm_ppl.inference.ram import RAM
+from lfm_ppl.inference.kernels.ram import RAM
 from lfm_ppl.linearisation.taylor import Taylor
+from lfm_ppl.model.gaussian import Gaussian
 from lfm_ppl.model.latent_force_model import LatentForceModel
-from lfm_ppl.model.observation import Gaussian, GaussianObservation
+from lfm_ppl.model.observation import GaussianObservation
 
 WAYS = ("held out, averaged", "held out, mode", "marginal likelihood, mode", "marginal likelihood, posterior",
         "smoothed forces, mode")

@@ -16,9 +16,9 @@ from lfm_ppl.experiments.home_heating import problem
 from lfm_ppl.experiments.posteriors import LogPosterior
 from lfm_ppl.experiments.tasks import Result
 from lfm_ppl.inference.bound_model import bind_arguments
-from lfm_ppl.inference.fixing import fix
+from lfm_ppl.inference.handlers.fixing import fix
+from lfm_ppl.inference.kernels.ram import RAM
 from lfm_ppl.inference.optimise import quasi_newton
-from lfm_ppl.inference.ram import RAM
 
 SAMPLERS = ("RAM", "NUTS")
 _ITERATIONS = 60

@@ -12,12 +12,12 @@ import numpy as np
 from jax.scipy.special import ndtr
 from scipy.stats import norm
 
-from lfm_ppl.comparators.rao_blackwellised import RaoBlackwellisedResult, rao_blackwellised
 from lfm_ppl.experiments.home_heating import learning, problem
 from lfm_ppl.experiments.tasks import Result
 from lfm_ppl.filtering.filter import FilterState
 from lfm_ppl.filtering.filter import filter as gaussian_filter
 from lfm_ppl.filtering.smoother import smooth
+from lfm_ppl.switching.rao_blackwellised import RaoBlackwellisedResult, rao_blackwellised
 
 EVERY = 3
 """Hours between two measurements where a day is tracked; the source has 100 minutes."""

@@ -14,13 +14,13 @@ import pandas as pd
 from numpyro import handlers
 
 from lfm_ppl import loading
-from lfm_ppl.comparators.switched_simulation import simulate_switched
 from lfm_ppl.data import Data
 from lfm_ppl.inference.bound_model import likelihood_site
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
-from lfm_ppl.model.known_input import Input
+from lfm_ppl.model.inputs import Input
 from lfm_ppl.model.latent_force_model import LatentForceModel
-from lfm_ppl.model.switching import Thermostat
+from lfm_ppl.switching.rule import Thermostat
+from lfm_ppl.switching.switched_simulation import simulate_switched
 
 METHODS = ("SQM", "CQM", "WQM", "periodic", "none", "matern", "resonator")
 STORES = ("one store", "envelope")

@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from lfm_ppl.analysis.plots import style
 from lfm_ppl.experiments.periodic_kernels import covariance, problem, regression
 from lfm_ppl.experiments.scores import Z
 from lfm_ppl.experiments.tasks import Result
@@ -26,6 +25,7 @@ from lfm_ppl.forces import (
     change_points,
     random_frequencies,
 )
+from lfm_ppl.results.plots import style
 
 _LINES = {covariance.EIGENFUNCTIONS: (style.BLUE, "-", "o"), covariance.RESONATORS: (style.GREEN, "--", "s"),
           covariance.RANDOM: (style.VERMILLION, "-.", "^")}

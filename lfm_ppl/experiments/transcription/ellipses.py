@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from lfm_ppl.comparators.latent_grid import LatentGrid
-from lfm_ppl.comparators.normals import normals
 from lfm_ppl.experiments.transcription import problem
+from lfm_ppl.latent_grid.latent_grid import LatentGrid
+from lfm_ppl.particles.normals import normals
 
 RULE = "riemann"
 """Integration rule, the source's."""

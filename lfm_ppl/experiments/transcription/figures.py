@@ -10,10 +10,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from lfm_ppl.analysis.plots import style
 from lfm_ppl.experiments.scores import Z
 from lfm_ppl.experiments.tasks import Result
 from lfm_ppl.experiments.transcription import problem
+from lfm_ppl.results.plots import style
 
 COLOURS = {"LA": style.VERMILLION, "LA, trust region": style.ORANGE, "ESLS": style.GREY, "GFS": style.BLUE,
            "GHS(7)": style.SKY, "iterated GHS(7)": style.GREEN}

@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.comparators import laplace
-from lfm_ppl.comparators.latent_grid import LatentGrid
 from lfm_ppl.experiments.timing import timed
 from lfm_ppl.experiments.transcription import problem
 from lfm_ppl.experiments.transcription.smoothers import rates, saturation
+from lfm_ppl.latent_grid import laplace
+from lfm_ppl.latent_grid.latent_grid import LatentGrid
 
 ITERATIONS, TOLERANCE = 300, 1e-6
 

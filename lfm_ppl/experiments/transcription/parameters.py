@@ -12,17 +12,17 @@ import numpyro
 import numpyro.distributions as dist
 from numpyro.infer import MCMC, NUTS, init_to_uniform
 
-from lfm_ppl.analysis import importance
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.tasks import Result, Task
 from lfm_ppl.experiments.timing import timed
 from lfm_ppl.experiments.transcription import problem
 from lfm_ppl.filtering.smoother import smooth
+from lfm_ppl.inference.handlers.on_latent_grid import on_latent_grid
+from lfm_ppl.inference.kernels.ram import RAM
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
-from lfm_ppl.inference.on_latent_grid import on_latent_grid
-from lfm_ppl.inference.ram import RAM
 from lfm_ppl.linearisation.sigma_points import GaussHermite
 from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.results import importance
 
 RULE, STEPS = GaussHermite(7), 6
 AT = np.linspace(0.0, problem.END, 61)

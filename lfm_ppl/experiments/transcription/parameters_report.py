@@ -13,12 +13,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from lfm_ppl import checks
-from lfm_ppl.analysis.plots import style
 from lfm_ppl.experiments import output, scores
 from lfm_ppl.experiments.catalogue import Report, Wanted
 from lfm_ppl.experiments.scores import Estimate, Z, mean_of, pair, readable
 from lfm_ppl.experiments.tasks import Result, run_tasks
 from lfm_ppl.experiments.transcription import parameters, problem
+from lfm_ppl.results.plots import style
 
 TASKS = "tasks"
 SUMMARY = "transcription factors with unknown rates: the marginal posterior against that of the force as latent sites"

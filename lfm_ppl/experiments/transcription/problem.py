@@ -14,8 +14,9 @@ import numpy as np
 from lfm_ppl import checks
 from lfm_ppl.experiments.tasks import Result, Task
 from lfm_ppl.forces import Matern
+from lfm_ppl.model.gaussian import Gaussian
 from lfm_ppl.model.latent_force_model import LatentForceModel
-from lfm_ppl.model.observation import Gaussian, GaussianObservation
+from lfm_ppl.model.observation import GaussianObservation
 
 GENES, END, OBSERVED, POINTS = 3, 15.0, 13, 363
 SCALE, LENGTHSCALE, NOISE = 1.0, 2.0, 0.1

@@ -13,13 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from lfm_ppl.analysis import arviz_data
-from lfm_ppl.comparators.elliptical_slice import SliceState, elliptical_slice_step
-from lfm_ppl.comparators.latent_grid import LatentGrid
-from lfm_ppl.comparators.normals import normals
 from lfm_ppl.experiments.timing import timed
 from lfm_ppl.experiments.transcription import ellipses, problem
 from lfm_ppl.experiments.transcription.smoothers import rates, saturation
+from lfm_ppl.inference.kernels.elliptical_slice import SliceState, elliptical_slice_step
+from lfm_ppl.latent_grid.latent_grid import LatentGrid
+from lfm_ppl.particles.normals import normals
+from lfm_ppl.results import arviz_data
 
 CHAINS = 4
 KEPT = 625

@@ -1,1 +1,0 @@
-"""Slower, more exact or simpler ways to the same quantities, for models that the Gaussian filter approximates."""

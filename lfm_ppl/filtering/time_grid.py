@@ -1,0 +1,280 @@
+"""From times to the intervals of the one forward scan, decided before compilation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lfm_ppl import checks
+from lfm_ppl.model.state_space import StateSpaceModel, check_times
+
+_LARGEST_TABLE = 1024
+"""Most interval lengths whose transitions are tabulated ahead of the scan; more are computed interval by interval."""
+
+_REPLICATED = 0.2
+"""Share of intervals of length zero from which a branch costs less than the predictions that it saves."""
+
+
+class Intervals(NamedTuple):
+    """The intervals of the scan, one entry each: a prediction, perhaps a jump, perhaps an observation.
+
+    Attributes:
+        start: (N,) time at which the interval starts.
+        length: (N,) its length, >= 0.
+        observation: (N,) index of the observation at its end, -1 where there is none.
+        jump: (N,) index of the jump of the forces at its end, before the observation; -1 where there is none.
+        length_index: (N,) index of its length in `TimeGrid.lengths`; zero where that is None.
+    """
+
+    start: Any
+    length: Any
+    observation: Any
+    jump: Any
+    length_index: Any
+
+
+class TimeGrid(NamedTuple):
+    """The intervals, and where results are found among them.
+
+    Attributes:
+        intervals: the scan's intervals.
+        lengths: (U,) distinct lengths, None where there are too many or they are traced.
+        observed: (T,) interval of each observation.
+        requested: (K,) interval of each requested time.
+        requested_times: (K,).
+        steps: integration steps in each interval.
+        initial_time: when the scan starts.
+        replicated: whether so many intervals have length zero that it pays to branch around their prediction.
+        tolerance: of the error of a step, in standard deviations, where their length follows it; None for ``steps``
+            of equal length.
+    """
+
+    intervals: Intervals
+    lengths: Any
+    observed: Any
+    requested: Any
+    requested_times: Any
+    steps: int
+    initial_time: Any
+    replicated: bool = False
+    tolerance: float | None = None
+
+
+def build_time_grid(ssm: StateSpaceModel, times: Any, steps: int, max_step: float | None = None, at: Any = None,
+             initial_time: Any = None, interval_per_step: bool = False, tolerance: float | None = None) -> TimeGrid:
+    """Lay out the intervals of the scan.
+
+    Args:
+        ssm: the model; its forces' jump times become intervals.
+        times: (T,) observation times, non-decreasing.
+        steps: integration steps between two consecutive times.
+        max_step: longest step; a longer interval gets more steps, in intervals of ``steps`` each.
+        at: (K,) further times at which the state is wanted, in any order.
+        initial_time: overrides the model's (when the scan starts from a filter's state).
+        interval_per_step: give every integration step an interval of its own, so that a particle smoother reaches each.
+        tolerance: of the error of a step, see `TimeGrid`.
+
+    Raises:
+        ValueError, TypeError: see `lfm_ppl.model.state_space.check_times`; non-positive steps or tolerance; a requested
+            time before the initial time; traced times together with what needs them concrete.
+    """
+    checks.positive_integer("steps", steps, "It is the number of integration steps between two times.")
+    if max_step is not None:
+        checks.positive("max_step", max_step)
+    if tolerance is not None:
+        checks.positive("tolerance", tolerance)
+        grid = build_time_grid(ssm, times, steps, max_step, at, initial_time, interval_per_step)
+        return grid._replace(tolerance=float(tolerance))
+    initial_time = ssm.model.initial_time if initial_time is None else initial_time
+    known = check_times(times, initial_time)
+    start = known[0] if initial_time is None and known is not None else initial_time
+    origin = None if start is None else checks.concrete(start)
+    if known is not None and origin is not None:
+        requested = None if at is None else checks.concrete(at)
+        last = known[-1] if requested is None else max(known[-1], requested.max(initial=known[-1]))
+        ssm.model.check_inputs(float(origin), float(last))
+    if known is not None and origin is None and ssm.stack.jump_times and max_step is None and at is None:
+        return _traced_origin(known, start, ssm.stack.jump_times, steps, interval_per_step)
+    if known is None or origin is None:
+        return _traced(ssm, times, steps, max_step, at, initial_time, interval_per_step)
+    return _concrete(known, float(origin), ssm.stack.jump_times, steps, max_step, at, interval_per_step)
+
+
+def _traced(ssm: StateSpaceModel, times: Any, steps: int, max_step: Any, at: Any, initial_time: Any,
+            interval_per_step: bool) -> TimeGrid:
+    if max_step is not None or at is not None or ssm.stack.jump_times:
+        raise ValueError("max_step, requested times and forces with jumps need times (the first two also an "
+                         "initial_time or `start`) that are known before compilation; pass NumPy arrays rather than "
+                         "traced values, and do not convert them with jnp inside the model.")
+    times = jnp.asarray(times, float)
+    origin = times[:1] if initial_time is None else jnp.reshape(jnp.asarray(initial_time, float), (1,))
+    start = jnp.concatenate([origin, times[:-1]])
+    pieces = steps if interval_per_step else 1
+    width = jnp.repeat((times - start) / pieces, pieces)
+    start = jnp.repeat(start, pieces) + width * np.tile(np.arange(pieces), times.shape[0])
+    observation = np.full(times.shape[0] * pieces, -1)
+    ends = np.arange(times.shape[0]) * pieces + pieces - 1
+    observation[ends] = np.arange(times.shape[0])
+    intervals = Intervals(start, width, observation, np.full(observation.shape, -1), np.zeros_like(observation))
+    return TimeGrid(intervals, None, ends, ends, times, 1 if interval_per_step else steps, origin[0])
+
+
+def _traced_origin(times: np.ndarray, origin: Any, jumps: tuple[float, ...], steps: int,
+                   interval_per_step: bool) -> TimeGrid:
+    """Lay out the intervals for times that are known and forces that jump, where the initial time is not known.
+
+    Every jump up to the last time has an interval. Those at or before the initial time have length zero and do not jump.
+    """
+    if interval_per_step:
+        raise ValueError("an interval for each step, with forces that jump, needs an initial_time that is known before "
+                         "compilation.")
+    origin = jnp.asarray(origin, float)
+    indices = [index for index, jump in enumerate(jumps) if jump <= times[-1]]
+    time = np.concatenate([np.asarray(jumps, float)[indices], times])
+    jump = np.concatenate([indices, np.full(len(times), -1)]).astype(int)
+    observation = np.concatenate([np.full(len(indices), -1), np.arange(len(times))])
+    # At equal times a jump comes before an observation.
+    order = np.lexsort((observation, time))
+    time, jump, observation = time[order], jump[order], observation[order]
+    end = jnp.where(jump >= 0, jnp.maximum(time, origin), time)
+    begin = jnp.concatenate([origin[None], jnp.maximum(end[:-1], origin)])
+    intervals = Intervals(begin, end - begin, observation, jnp.where(time > origin, jump, -1), np.zeros_like(jump))
+    observed = np.flatnonzero(observation >= 0)
+    return TimeGrid(intervals, None, observed, observed, times, steps, origin)
+
+
+def _concrete(times: np.ndarray, origin: float, jumps: tuple[float, ...], steps: int, max_step: float | None,
+              at: Any, interval_per_step: bool) -> TimeGrid:
+    requested = times if at is None else _requested(at, origin)
+    # An interval ends at each observation, each jump after the origin, and each requested time that is neither.
+    extra = np.setdiff1d(requested, times)
+    end = max(times[-1], requested.max(initial=-np.inf))
+    jump_index = [index for index, jump in enumerate(jumps) if origin < jump <= end]
+    extra = np.setdiff1d(extra, [jumps[index] for index in jump_index])
+    jump_time = np.asarray(jumps, float)[jump_index]
+    # A particle smoother looks at each step: a jump has an interval of its own, so that the state just before it is a node.
+    before = jump_time if interval_per_step else jump_time[:0]
+    time = np.concatenate([before, jump_time, times, extra])
+    # At equal times a jump comes before an observation.
+    rank = np.repeat([0, 1, 2, 3], [len(before), len(jump_time), len(times), len(extra)])
+    observation = np.full(len(time), -1)
+    observation[rank == 2] = np.arange(len(times))
+    jump = np.full(len(time), -1)
+    jump[rank == 1] = jump_index
+    order = np.lexsort((observation, rank, time))
+    time, observation, jump = time[order], observation[order], jump[order]
+    begin = np.append(origin, time[:-1])
+    gap = time - begin
+    pieces = np.ones(len(time), int)
+    if max_step is not None:
+        pieces = np.maximum(1, np.ceil(gap / (max_step * steps) * (1 - 1e-12)).astype(int))
+    if interval_per_step:
+        pieces = np.where(gap > 0, pieces * steps, 1)
+        steps = 1
+    event = np.repeat(np.arange(len(time)), pieces)
+    piece = np.arange(len(event)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    width = (gap / pieces)[event]
+    last = piece == pieces[event] - 1
+    lengths, length_index = _distinct(width, max(abs(time[-1]), abs(origin)))
+    intervals = Intervals(begin[event] + piece * width, width, np.where(last, observation[event], -1),
+                np.where(last, jump[event], -1), length_index)
+    row_of_event = np.flatnonzero(last)
+    observed = np.empty(len(times), int)
+    observed[observation[observation >= 0]] = row_of_event[observation >= 0]
+    found = observed if at is None else row_of_event[np.searchsorted(time, requested, side="right") - 1]
+    replicated = bool(np.mean(width == 0) >= _REPLICATED)
+    return TimeGrid(intervals, lengths, observed, found, requested, steps, np.asarray(origin), replicated)
+
+
+def _requested(at: Any, origin: float) -> np.ndarray:
+    known = checks.concrete(at)
+    if known is None:
+        raise ValueError("the requested times `at` must be known before compilation; pass a NumPy array.")
+    known = np.atleast_1d(known).astype(float)
+    checks.finite("at", known)
+    if known.ndim != 1 or known.size == 0:
+        raise ValueError(f"at must be a vector of at least one time, got shape {known.shape}.")
+    if known.min() < origin:
+        raise ValueError(f"at[{int(known.argmin())}] = {known.min():g} lies before the initial time {origin:g}; set "
+                         "the model's initial_time earlier to look further back.")
+    return known
+
+
+def _distinct(length: np.ndarray, scale: float) -> tuple[np.ndarray | None, np.ndarray]:
+    """Group lengths that differ by the rounding of the times they are differences of."""
+    tolerance = 8 * np.finfo(float).eps * scale
+    order = np.argsort(length, kind="stable")
+    new = np.concatenate([[True], np.diff(length[order]) > tolerance])
+    length_index = np.empty(len(length), int)
+    length_index[order] = np.cumsum(new) - 1
+    lengths = length[order][new]
+    if len(lengths) > _LARGEST_TABLE:
+        return None, np.zeros_like(length_index)
+    return lengths, length_index
+
+
+def as_arrays(intervals: Intervals) -> Intervals:
+    """Return the intervals as JAX arrays, which a scan can run over."""
+    return jax.tree_util.tree_map(jnp.asarray, intervals)
+
+
+class _Table:
+    """A function of the interval length, tabulated: all arrays that it returns make one row for each length.
+
+    The interval is read, and in reverse mode written, at once; array by array that took many more operations to compile.
+
+    Args:
+        function: of a length, a scalar, to a pytree of arrays.
+        lengths: (U,).
+    """
+
+    def __init__(self, function: Callable[[jax.Array], Any], lengths: jax.Array) -> None:
+        leaves, self._tree = jax.tree_util.tree_flatten(jax.vmap(function)(lengths))
+        self._shapes = [leaf.shape[1:] for leaf in leaves]
+        self._rows = jnp.concatenate([leaf.reshape(len(lengths), -1) for leaf in leaves], axis=1) if leaves else None
+
+    def at(self, index: jax.Array) -> Any:
+        """Return what the function gave at one of the lengths."""
+        if self._rows is None:
+            return jax.tree_util.tree_unflatten(self._tree, [])
+        row = jax.lax.dynamic_index_in_dim(self._rows, index, keepdims=False)
+        parts = jnp.split(row, np.cumsum([math.prod(shape) for shape in self._shapes])[:-1])
+        return jax.tree_util.tree_unflatten(
+            self._tree, [part.reshape(shape) for part, shape in zip(parts, self._shapes, strict=True)])
+
+
+def by_length(grid: TimeGrid, make: Callable[[jax.Array], Any]) -> Callable[[Intervals], Any]:
+    """Return what gives ``make(length)`` of an interval, computed once for every distinct length where these are few."""
+    if grid.lengths is None:
+        return lambda row: make(row.length)
+    table = _Table(make, jnp.asarray(grid.lengths))
+    return lambda row: table.at(row.length_index)
+
+
+def per_step(grid: TimeGrid) -> TimeGrid:
+    """Return the time grid with an interval for each integration step."""
+    intervals, steps = grid.intervals, grid.steps
+    # In NumPy where the time grid is known, so that requested times can be found in it before compilation.
+    xp: Any = np if isinstance(intervals.length, np.ndarray) else jnp
+    index = np.tile(np.arange(steps), len(intervals.length))
+    start, length, observation, jump = (xp.repeat(a, steps) for a in intervals[:4])
+    last = index == steps - 1
+    length = length / steps
+    fine = Intervals(start + index * length, length, xp.where(last, observation, -1), xp.where(last, jump, -1),
+                np.zeros_like(index))
+    return grid._replace(intervals=fine, lengths=None, steps=1, observed=grid.observed * steps + steps - 1,
+                         requested=grid.requested * steps + steps - 1)
+
+
+def with_observations(intervals: Intervals, y: Any) -> tuple[Intervals, jax.Array]:
+    """Return the intervals as JAX arrays, and the entry of ``y`` (T, ...) at the end of each, NaN in intervals without one."""
+    y = jnp.asarray(y, float)
+    # The index -1 of an interval without an observation is that of the last entry.
+    padded = jnp.concatenate([y, jnp.full((1, *y.shape[1:]), jnp.nan)])
+    intervals = as_arrays(intervals)
+    return intervals, padded[intervals.observation]

@@ -1,0 +1,1 @@
+"""Densities of a one-dimensional state on a grid, by finite volumes in the Fokker-Planck equation."""

@@ -1,0 +1,257 @@
+"""The Fokker-Planck reference: exact filtering and smoothing densities of a one-dimensional state, on a grid."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lfm_ppl import checks
+from lfm_ppl.filtering.filter import check_observations, warn_single_precision
+from lfm_ppl.filtering.time_grid import TimeGrid, build_time_grid
+from lfm_ppl.fokker_planck_grid.finite_volume import Grid
+from lfm_ppl.fokker_planck_grid.grid_choice import ROOM, GridProblem, choose, half_grid, second_order_error
+from lfm_ppl.fokker_planck_grid.grid_filter import backward, forward, log_likelihood, moves
+from lfm_ppl.fokker_planck_grid.grid_model import Cells, on_grid, varies_with_time
+from lfm_ppl.linalg import safe_sqrt
+from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.observation_noise import check_noise
+from lfm_ppl.model.state_space import StateSpaceModel, state_space
+
+__all__ = ["FokkerPlanckResult", "Grid", "choose_grid", "fokker_planck", "log_likelihood"]
+
+_FEWEST_CELLS = 8
+
+
+class FokkerPlanckResult(eqx.Module):
+    """The outcome of `fokker_planck`.
+
+    The state is the physical one, or that of the only force where there is no physical state (the force without its
+    mean). Densities are averages over cells, per unit of the state; they sum to one times ``1 / width``. Moments are
+    those of the masses at the cells' centres.
+
+    Attributes:
+        times: (T,).
+        x: (N,) centres of the cells.
+        width: of a cell.
+        log_likelihood: (T,), log p(y_k | y_1:k-1) of the entries that are present.
+        predicted: (T, N) densities before each observation. Probability of the initial state beyond the grid is left
+            out; with automatic bounds there is some only where the first observation falls on the initial time and
+            rules it out.
+        filtered: (T, N) densities after it.
+        mean, sd: (T,) of the filtered densities.
+        smoothed_times: (K,) requested times.
+        smoothed: (K, N) densities given all observations.
+        smoothed_mean, smoothed_sd: (K,).
+        error: estimate of the discretisation error of the total log likelihood, >= 0.
+        grid: the cells.
+    """
+
+    times: jax.Array
+    x: jax.Array
+    width: jax.Array
+    log_likelihood: jax.Array
+    predicted: jax.Array
+    filtered: jax.Array
+    mean: jax.Array
+    sd: jax.Array
+    smoothed_times: jax.Array
+    smoothed: jax.Array
+    smoothed_mean: jax.Array
+    smoothed_sd: jax.Array
+    error: jax.Array
+    grid: Grid = eqx.field(static=True)
+
+
+def fokker_planck(model: LatentForceModel, times: Any, y: Any, *, at: Any = None, cells: int | None = None,
+                  bounds: tuple[float, float] | None = None, steps: int = 1,
+                  tolerance: float = 1e-3) -> FokkerPlanckResult:
+    """Filter and smooth a one-dimensional state exactly, up to a grid's resolution.
+
+    Between observations the density obeys the Fokker-Planck equation
+
+        dp/dt = -d/dx [b p] + d^2/dx^2 [D p],    D = g^2 / 2    (Ito),
+
+    by finite volumes with exponentially fitted fluxes and reflecting ends, and by the exact exponential of their
+    generator; at an observation it is multiplied with the likelihood, averaged over each cell. Errors are of second
+    order in the width of a cell.
+
+    Args:
+        model: of state dimension one: one physical state with process noise, or one force of one state alone.
+        times: (T,), non-decreasing.
+        y: (T, D), NaN where missing.
+        at: (K,) times at which smoothed densities are wanted, also after the last observation; the observation times
+            by default.
+        cells: number of cells; chosen by `choose_grid` by default.
+        bounds: (low, high), the ends of the grid, where the state is reflected; chosen by default.
+        steps: between two consecutive times, where drift or dispersion depend on time: they are frozen at the middle
+            of each step, which is of second order. Without effect otherwise.
+        tolerance: wanted accuracy of the total log likelihood.
+
+    Returns:
+        Densities, moments, log likelihoods, and an estimate of their error by comparison with half the cells (and
+        twice the steps). Where it exceeds the tolerance there is a warning.
+
+    Raises:
+        ValueError, TypeError: a state of more dimensions; no process noise or no observation noise, so that densities
+            or likelihoods do not exist; bad bounds or cells; times and y as in `lfm_ppl.filter`.
+
+    Example:
+        >>> import jax.numpy as jnp, lfm_ppl as lfm
+        >>> model = lfm.LatentForceModel(
+        ...     lambda x, u, t: x - x**3, {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        ...     lfm.Gaussian(jnp.zeros(1), jnp.eye(1)), process_noise=jnp.eye(1))
+        >>> result = fokker_planck(model, [0.0, 1.0], jnp.ones((2, 1)), cells=200)
+        >>> result.filtered.shape, bool(result.error < 1e-3)
+        ((2, 200), True)
+
+    Source: Scharfetter and Gummel (1969), IEEE Trans. Electron Devices 16, for the fluxes; Jazwinski (1970),
+    section 6.3, for the filter; Kitagawa (1987), J. Am. Stat. Assoc. 82, for both passes on a grid.
+    """
+    ssm = _checked(model)
+    checks.positive("tolerance", tolerance)
+    time_grid = build_time_grid(ssm, times, steps, at=at)
+    y = _observations(ssm, time_grid, y)
+    grid = choose_grid(model, times, y, cells=cells, bounds=bounds, steps=steps, tolerance=tolerance)
+    result = _run(on_grid(ssm, time_grid, grid, room=ROOM), time_grid, y[None], jnp.asarray(times, float), grid)
+    total = np.asarray(result.log_likelihood.sum())
+    error = _error(GridProblem(ssm, build_time_grid(ssm, times, steps)), build_time_grid(ssm, times, 2 * steps), y[None], grid, total)
+    if not error <= tolerance:
+        warnings.warn(f"the estimated discretisation error of the log likelihood is {error:.2g}, above the tolerance "
+                      f"{tolerance:g}, with {grid.cells} cells on [{grid.low:g}, {grid.high:g}] and steps={steps}. "
+                      "Raise cells (and steps, where the model depends on time), or the tolerance.", stacklevel=2)
+    return eqx.tree_at(lambda r: r.error, result, jnp.asarray(error))
+
+
+def choose_grid(models: LatentForceModel | Sequence[LatentForceModel], times: Any, y: Any, *, cells: int | None = None,
+                bounds: tuple[float, float] | None = None, steps: int = 1, tolerance: float = 1e-3) -> Grid:
+    """Choose one grid for one model, or for several, such as draws of the parameters.
+
+    The ends are moved until every density that is propagated or filtered holds less than 1e-10 of its mass next to
+    them. The number of cells is raised until the error of the log likelihood, estimated from half the cells at second
+    order, is below the tolerance, for every model and data set.
+
+    Args:
+        models: one model or a sequence; parameters must be known.
+        times: (T,), non-decreasing.
+        y: (T, D), or (B, T, D) for B data sets; NaN where missing.
+        cells: number of cells, not to be chosen.
+        bounds: (low, high), not to be chosen.
+        steps: as in `fokker_planck`.
+        tolerance: of the total log likelihood of each data set.
+
+    Returns:
+        The grid. Where 2048 cells are not enough there is a warning.
+
+    Raises:
+        ValueError, TypeError: as `fokker_planck`; also where no bounds are found.
+
+    Example:
+        >>> import jax.numpy as jnp, lfm_ppl as lfm
+        >>> model = lfm.LatentForceModel(
+        ...     lambda x, u, t: -x, {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        ...     lfm.Gaussian(jnp.zeros(1), jnp.eye(1)), process_noise=jnp.eye(1))
+        >>> choose_grid(model, [0.0, 1.0], jnp.ones((2, 1)), bounds=(-8.0, 8.0), cells=100).width
+        0.16
+    """
+    checks.positive("tolerance", tolerance)
+    if cells is not None:
+        checks.positive_integer("cells", cells, "It is the number of cells of the grid.")
+        if cells < _FEWEST_CELLS:
+            raise ValueError(f"cells must be at least {_FEWEST_CELLS} to hold a density, got {cells}.")
+    if bounds is not None:
+        bounds = _checked_bounds(bounds)
+    several = [models] if isinstance(models, LatentForceModel) else list(models)
+    if not several:
+        raise ValueError("models must hold at least one model, got none.")
+    problems = []
+    for model in several:
+        ssm = _checked(model)
+        problems.append(GridProblem(ssm, build_time_grid(ssm, times, steps)))
+        if problems[-1].time_grid.lengths is None and checks.concrete(problems[-1].time_grid.intervals.length) is None:
+            raise ValueError("the grid is chosen before compilation: times and initial_time must be known.")
+    y = jnp.asarray(y) if np.ndim(y) == 3 else y
+    sets = [_observations(problems[0].ssm, problems[0].time_grid, one) for one in (y if np.ndim(y) == 3 else [y])]
+    if not sets:
+        raise ValueError("y must hold at least one data set, got shape " f"{np.shape(y)}.")
+    for problem in problems:
+        problem.ssm.model.check_at(problem.time_grid.initial_time, len(problem.time_grid.observed))
+    warn_single_precision()
+    return choose(problems, jnp.stack(sets), bounds, cells, tolerance)
+
+
+def _checked(model: Any) -> StateSpaceModel:
+    """Convert a model after checking that its density exists on a grid."""
+    if not isinstance(model, LatentForceModel):
+        raise TypeError(f"model must be an lfm.LatentForceModel, got {type(model).__name__}.")
+    if jnp.result_type(float) != jnp.float64:
+        raise ValueError("the Fokker-Planck grid needs double precision. Call "
+                         'jax.config.update("jax_enable_x64", True) before anything else.')
+    ssm = state_space(model)
+    if ssm.state_dim != 1:
+        states, forces = (", ".join(names) or "none" for names in (model.state_names, model.force_names))
+        raise ValueError(f"the Fokker-Planck grid holds a state of one dimension, but the joint state of this model "
+                         f"has {ssm.state_dim}: {ssm.physical_dim} physical ({states}) and {ssm.force_dim} of forces "
+                         f"({forces}). Use the particle filter, lfm.particle_filter, instead.")
+    if checks.traced(model):
+        raise ValueError("the parameters of the model must be known: the grid and its error are found before "
+                         "compilation. In compiled code use the log_likelihood of lfm_ppl.fokker_planck_grid.fokker_planck, "
+                         "on a grid from choose_grid.")
+    noise = model.process_noise if ssm.physical_dim else ssm.stack.dispersion()
+    if noise is None or (not callable(noise) and not np.any(np.asarray(noise))):
+        what = "process_noise is zero" if ssm.physical_dim else f"the force {model.force_names[0]!r} has no noise"
+        raise ValueError(f"{what}: without noise the state has no density that could spread over a grid. Give the "
+                         "state process_noise, or use lfm.filter.")
+    check_noise(ssm, 0.0)
+    return ssm
+
+
+def _checked_bounds(bounds: Any) -> tuple[float, float]:
+    if np.shape(bounds) != (2,):
+        raise ValueError(f"bounds must be two numbers, (low, high), got {bounds!r}.")
+    checks.finite("bounds", bounds)
+    low, high = (float(end) for end in bounds)
+    if not low < high:
+        raise ValueError(f"bounds must be (low, high) with low < high, got ({low:g}, {high:g}).")
+    return low, high
+
+
+def _observations(ssm: StateSpaceModel, time_grid: TimeGrid, y: Any) -> jax.Array:
+    return check_observations(y, len(time_grid.observed), ssm.output_dim)
+
+
+def _error(problem: GridProblem, finer: TimeGrid, y: jax.Array, grid: Grid, total: np.ndarray) -> float:
+    """Error of the log likelihood ``total``: of the cells, and of freezing the generator within steps."""
+    half = half_grid(grid)
+    coarse = problem.total(y, half)
+    error = second_order_error(total - coarse, grid, half)
+    if varies_with_time(problem.ssm):
+        # Twice the steps leave a quarter of the error.
+        error += float(np.abs(coarse - GridProblem(problem.ssm, finer).total(y, half)).max()) * 4.0 / 3.0
+    return error
+
+
+@eqx.filter_jit
+def _run(cells: Cells, time_grid: TimeGrid, y: jax.Array, times: jax.Array, grid: Grid) -> FokkerPlanckResult:
+    moving = moves(cells, time_grid, 1)
+    passed = forward(moving, time_grid, y, keep=True)
+    smoothed = backward(moving, time_grid, passed)[:, 0][jnp.asarray(time_grid.requested)]
+    observed = jnp.asarray(time_grid.observed)
+    predicted, filtered = passed.predicted[observed, 0], passed.filtered[observed, 0]
+    centres = jnp.asarray(grid.centres)
+    width = jnp.asarray(grid.width)
+    return FokkerPlanckResult(
+        times, centres, width, passed.log_likelihood[observed, 0], predicted / width, filtered / width,
+        *_moments(filtered, centres), jnp.asarray(time_grid.requested_times, float), smoothed / width,
+        *_moments(smoothed, centres), jnp.asarray(jnp.nan), grid)
+
+
+def _moments(masses: jax.Array, centres: jax.Array) -> tuple[jax.Array, jax.Array]:
+    masses = masses / masses.sum(-1, keepdims=True)
+    mean = (masses * centres).sum(-1)
+    return mean, safe_sqrt((masses * (centres - mean[:, None]) ** 2).sum(-1))

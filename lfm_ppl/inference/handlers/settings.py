@@ -1,0 +1,69 @@
+"""Change the approximation that a NumPyro model's likelihood uses, without changing the model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from lfm_ppl.inference.handlers.likelihood_handler import LikelihoodHandler
+from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
+
+NAMES = ("rule", "steps", "max_step", "iterations", "damping", "tolerance")
+
+
+class approximate(LikelihoodHandler):  # noqa: N801 (an effect handler, named as NumPyro names its handlers)
+    """Effect handler that replaces settings of the likelihood, such as the linearisation rule.
+
+    Args:
+        fn: a NumPyro model with a site ``MarginalLikelihood`` or ``panel``.
+        **settings: any of ``rule``, ``steps``, ``max_step``, ``iterations``, ``damping`` and ``tolerance``; what
+            is None or left out stays as the model has it. But ``steps`` or ``iterations`` without a tolerance are
+            steps of equal length, also where the model has a tolerance.
+
+    Raises:
+        TypeError: for a setting of another name.
+        ValueError: when the model runs, if it has no such site; and what ``MarginalLikelihood``
+            raises for a setting that it does not take.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, numpyro, lfm_ppl as lfm
+        >>> def model(times, y=None):
+        ...     system = lfm.LatentForceModel(
+        ...         lambda x, u, t: u - x**3, {"u": lfm.Matern(1.0, 1.0)},
+        ...         lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        ...         lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
+        ...     numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
+        >>> finer = approximate(model, rule=lfm.GaussHermite(7), steps=20)
+        >>> run = numpyro.handlers.seed(finer, jax.random.key(0))
+        >>> numpyro.handlers.trace(run).get_trace(jnp.arange(3.0))["y"]["fn"].steps
+        20
+    """
+
+    def __init__(self, fn: Callable[..., Any] | None = None, **settings: Any) -> None:
+        unknown = sorted(set(settings) - set(NAMES))
+        if unknown:
+            raise TypeError(f"unknown setting {unknown[0]!r}; known: {', '.join(NAMES)}.")
+        self.settings = {name: value for name, value in settings.items() if value is not None}
+        super().__init__(fn)
+
+    def missing(self) -> str:
+        """Return what to say of a model without a likelihood whose settings could be changed."""
+        if not self.settings:
+            return ""
+        return (
+            f"the model has no likelihood whose {', '.join(self.settings)} could be set: "
+            "expected a site numpyro.sample(name, lfm.MarginalLikelihood(...), obs=y) or a "
+            "panel."
+        )
+
+    def replacement(self, likelihood: MarginalLikelihood | Panel, site: dict[str, Any]) -> Any:
+        """Return the likelihood with the new settings."""
+        if isinstance(likelihood, Panel):
+            settings = self._merged(likelihood.settings)
+            return Panel(likelihood.build, likelihood.parameters, likelihood.times, settings)
+        settings = self._merged({name: getattr(likelihood, name) for name in NAMES})
+        return MarginalLikelihood(likelihood.model, likelihood.times, **settings)
+
+    def _merged(self, own: dict[str, Any]) -> dict[str, Any]:
+        equal = "steps" in self.settings or self.settings.get("iterations", 0) > 0
+        return {**own, **({"tolerance": None} if equal else {}), **self.settings}

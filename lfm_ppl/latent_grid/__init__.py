@@ -1,0 +1,1 @@
+"""Forces on a grid of times, and the state as an explicit function of them."""

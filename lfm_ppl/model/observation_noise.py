@@ -1,0 +1,58 @@
+"""The density of an observation given the state, and what it asks of the noise."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lfm_ppl import checks, linalg
+from lfm_ppl.linalg import cholesky, masked, solve_lower, wrapped
+from lfm_ppl.model.state_space import StateSpaceModel
+
+
+def log_density(ssm: StateSpaceModel, w: jax.Array, t: jax.Array, row: jax.Array,
+                y: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Score the present entries of an observation.
+
+    Args:
+        ssm: the model.
+        w: (M + R,), state and forces.
+        t: the time.
+        row: of the observation, where each has a noise covariance of its own.
+        y: (D,), NaN where missing.
+
+    Returns:
+        log p(y | w), zero where all entries are missing; the residual (D,) in units of the noise.
+    """
+    present = jnp.isfinite(y)
+    residual = jnp.where(present, y, 0.0) - ssm.observe(w, t)
+    for index in ssm.model.observation.angular:
+        residual = residual.at[index].set(wrapped(residual[index]))
+    residual, noise = masked(residual, ssm.obs_cov(w, t, row), present)
+    factor = cholesky(noise)
+    white = solve_lower(factor.chol, residual)
+    return jnp.where(factor.degenerate.any(), -jnp.inf, linalg.log_density(white, factor.chol, present)), white
+
+
+def check_noise(ssm: StateSpaceModel, time: Any) -> None:
+    """Raise ValueError where the observation noise has no density at the prior mean (where that is known)."""
+    w = jnp.concatenate([ssm.model.initial_state.mean, ssm.stack.mean_at(time)])
+    own = ssm.model.observation.covariance
+    rows = jnp.arange(1 if callable(own) or jnp.ndim(own) < 3 else own.shape[0])
+    covariance = checks.concrete(jax.vmap(lambda row: ssm.obs_cov(w, jnp.asarray(time, float), row))(rows))
+    if covariance is None:
+        return
+    if not np.isfinite(covariance).all():
+        raise ValueError("the covariance of the observation noise is not finite at the prior mean.")
+    scale = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0))
+    for name, sd in zip(ssm.model.output_names, scale.min(axis=0), strict=True):
+        if sd == 0.0:
+            raise ValueError(f"the observation noise of {name!r} is zero, so that an observation has no density given "
+                             "the state. Give it a positive variance.")
+    smallest = np.linalg.eigvalsh(covariance / (scale[:, :, None] * scale[:, None, :])).min(axis=1)
+    if smallest.min() < 1e-13:
+        raise ValueError("the covariance of the observation noise is singular, so that an observation has no density "
+                         f"given the state: {covariance[smallest.argmin()].tolist()}. Leave out the redundant outputs.")

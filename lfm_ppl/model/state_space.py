@@ -1,0 +1,232 @@
+"""Latent force model -> state-space model: forces become linear SDEs, stacked under the physical state."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lfm_ppl import checks
+from lfm_ppl.forces.sde import Stack, block_diagonal
+from lfm_ppl.linalg import matmul
+from lfm_ppl.linearisation.structure import InputStructure
+from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.structure import Pattern, pattern
+
+
+class StateSpaceModel(eqx.Module):
+    """The joint state s = (x, z) of physical state and forces, as the filters see it.
+
+        dx = f(w, t) dt + G(w, t) dB,   dz = F z dt + L dbeta,   w = (x, u) = K(t) s + k(t),
+        y_k = h(w(t_k), t_k) + r_k.
+
+    Attributes:
+        model: the latent force model.
+        stack: its forces side by side.
+        drift_structure: how f uses w.
+        observation_structure: how h uses w.
+        constant_measurement: whether K does not depend on time.
+        constant_mean: whether k does not depend on time.
+    """
+
+    model: LatentForceModel
+    stack: Stack
+    drift_structure: InputStructure = eqx.field(static=True)
+    observation_structure: InputStructure = eqx.field(static=True)
+    constant_measurement: bool = eqx.field(static=True)
+    constant_mean: bool = eqx.field(static=True)
+
+    @property
+    def physical_dim(self) -> int:
+        """M, the number of physical states."""
+        return self.model.initial_state.mean.shape[0]
+
+    @property
+    def force_dim(self) -> int:
+        """Number of states of all forces."""
+        return self.stack.state_dim
+
+    @property
+    def state_dim(self) -> int:
+        """n, the number of joint states."""
+        return self.physical_dim + self.force_dim
+
+    @property
+    def input_dim(self) -> int:
+        """M + R, the number of inputs of f and h."""
+        return self.physical_dim + len(self.stack.forces)
+
+    @property
+    def output_dim(self) -> int:
+        """D, the number of outputs."""
+        return len(self.model.output_names)
+
+    def initial(self) -> tuple[jax.Array, jax.Array]:
+        """Return mean (n,) and covariance (n, n) of s at the initial time."""
+        prior = self.model.initial_state
+        mean = jnp.concatenate([prior.mean, jnp.zeros(self.force_dim, prior.mean.dtype)])
+        return mean, jax.scipy.linalg.block_diag(prior.covariance, self.stack.initial_covariance())
+
+    def input_map(self, t: Any) -> tuple[jax.Array, jax.Array]:
+        """Return K (M + R, n) and k (M + R,) of w = K s + k at time t."""
+        size = self.physical_dim
+        matrix = block_diagonal([np.eye(size), self.stack.measurement(t)])
+        return matrix, jnp.concatenate([jnp.zeros(size), self.stack.mean_at(t)])
+
+    def inputs(self, s: jax.Array, t: Any) -> jax.Array:
+        """Return w = (x, u) (M + R,) at the joint state s (n,) and time t."""
+        matrix, offset = self.input_map(t)
+        return matmul(matrix, s[:, None])[:, 0] + offset
+
+    def split(self, w: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return x (M,) and u (R,) of w."""
+        return w[: self.physical_dim], w[self.physical_dim:]
+
+    def drift(self, w: jax.Array, t: Any) -> jax.Array:
+        """Return f (M,)."""
+        x, u = self.split(w)
+        return jnp.asarray(self.model.dynamics(x, u, t), float)
+
+    def dispersion(self, w: jax.Array, t: Any) -> jax.Array | None:
+        """Return G (M, S), None where there is no process noise."""
+        noise = self.model.process_noise
+        return noise(*self.split(w), t) if callable(noise) else noise
+
+    def observe(self, w: jax.Array, t: Any) -> jax.Array:
+        """Return h (D,)."""
+        x, u = self.split(w)
+        return jnp.asarray(self.model.observation.function(x, u, t), float)
+
+    def obs_cov(self, w: jax.Array, t: Any, row: Any) -> jax.Array:
+        """Return R (D, D)."""
+        x, u = self.split(w)
+        return self.model.observation.covariance_at(x, u, t, row)
+
+    @property
+    def time_invariant(self) -> bool:
+        """Whether the model is linear with constant coefficients, apart from additive terms in the mean."""
+        uses_forces = any(any(row[self.physical_dim:]) for row in self.drift_structure.jacobian)
+        constant = self.constant_measurement or not uses_forces
+        return self.drift_structure.linear and constant and not callable(self.model.process_noise)
+
+    @property
+    def mean_invariant(self) -> bool:
+        """Whether, besides, the additive terms of the mean are constant."""
+        return self.time_invariant and not self.drift_structure.offset_varies and self.constant_mean
+
+
+def state_space(model: LatentForceModel) -> StateSpaceModel:
+    """Convert a latent force model; its structure is read off its functions.
+
+    Raises:
+        ValueError: ``nonlinear_inputs`` leaves out an input that enters non-linearly; the message names it.
+    """
+    stack = Stack(model.force_list)
+    size, total = len(model.state_names), len(model.state_names) + len(stack.forces)
+    if total == 0:
+        raise ValueError("the model has neither states nor forces.")
+
+    def on_inputs(function: Callable[..., Any]) -> Callable[[jax.Array], jax.Array]:
+        return lambda v: jnp.ravel(jnp.asarray(function(v[:size], v[size:total], v[total]), float))
+
+    drift = pattern(on_inputs(model.dynamics), total + 1)
+    extra = _dependence(on_inputs(model.process_noise), total) if callable(model.process_noise) else ()
+    observe = pattern(on_inputs(model.observation.function), total + 1)
+    varying = (_dependence(on_inputs(model.observation.covariance), total)
+               if model.observation.varies_with_state else ())
+    declared = None
+    if model.nonlinear_inputs is not None:
+        names = (*model.state_names, *model.force_names)
+        declared = tuple(names.index(name) for name in model.nonlinear_inputs)
+        _check_declared(on_inputs(model.dynamics), declared, names, drift)
+    return StateSpaceModel(
+        model, stack,
+        _classify(drift, extra, declared), _classify(observe, varying, None),
+        not pattern(lambda v: jnp.ravel(stack.measurement(v[0])), 1).jacobian.any(),
+        not pattern(lambda v: stack.mean_at(v[0]), 1).jacobian.any(),
+    )
+
+
+def _dependence(function: Callable[[jax.Array], jax.Array], total: int) -> tuple[int, ...]:
+    found = np.asarray(pattern(function, total + 1).jacobian.any(axis=0))
+    return tuple(int(index) for index in np.flatnonzero(found[:total]))
+
+
+def _classify(found: Pattern, extra: tuple[int, ...], declared: tuple[int, ...] | None) -> InputStructure:
+    """Split the inputs into points, averaged and constant ones. The last input of the pattern is time."""
+    total = found.hessian.shape[0] - 1
+    curved = found.hessian[:total, :total]
+    nonlinear = [j for j in range(total) if curved[j].any()]
+    if declared is not None:
+        points = sorted(set(declared) | set(extra))
+    else:
+        # Inputs without a curved pair among themselves are linear given the others. Taken greedily, fewest pairs
+        # first, later inputs (the forces) first among equals: that leaves few coordinates for the points.
+        linear_given: list[int] = []
+        for j in sorted(nonlinear, key=lambda j: (curved[j].sum(), -j)):
+            if j not in extra and not curved[j, [*linear_given, j]].any():
+                linear_given.append(j)
+        points = sorted((set(nonlinear) - set(linear_given)) | set(extra))
+    others = [j for j in range(total) if j not in points]
+    averaged = tuple(j for j in others if found.hessian[j].any())
+    return InputStructure(
+        tuple(points), averaged, tuple(j for j in others if j not in averaged),
+        tuple(tuple(bool(v) for v in row[:total]) for row in found.jacobian),
+        bool(found.jacobian[:, total].any()),
+    )
+
+
+def _check_declared(function: Callable[[jax.Array], jax.Array], declared: tuple[int, ...], names: tuple[str, ...],
+                    found: Pattern) -> None:
+    """Compare a declaration with second derivatives at random inputs (tracers take random values too)."""
+    total = len(names)
+    undeclared = [j for j in range(total) if j not in declared]
+    if not found.hessian[np.ix_(undeclared, undeclared)].any():
+        return
+    closed = jax.make_jaxpr(function)(jnp.zeros(total + 1))
+    generator = np.random.default_rng(0)
+    with jax.ensure_compile_time_eval():
+        consts = [generator.uniform(0.5, 1.5, np.shape(value)) if isinstance(value, jax.core.Tracer) else value
+                  for value in closed.consts]
+        hessian = jax.hessian(lambda v: jnp.stack(jax.core.eval_jaxpr(closed.jaxpr, consts, v))[0])
+        curvature = np.max([np.nan_to_num(np.abs(hessian(jnp.asarray(generator.normal(size=total + 1))))).max(axis=0)
+                            for _ in range(5)], axis=0)
+    wrong = [(i, j) for i in undeclared for j in undeclared if curvature[i, j] > 1e-12]
+    if wrong:
+        i, j = wrong[0]
+        pair = f"{names[i]!r}" if i == j else f"{names[i]!r} together with {names[j]!r}"
+        raise ValueError(f"nonlinear_inputs leaves out {pair}, but the dynamics is not linear in it. Add it, or leave "
+                         "nonlinear_inputs at None: the structure is then found automatically.")
+
+
+def just_before(t: jax.Array, step: jax.Array) -> jax.Array:
+    """Return the end ``t`` of a step as its own last node: a known input that jumps there has not jumped yet."""
+    return t - 8 * jnp.finfo(jnp.result_type(float)).eps * (jnp.abs(t) + jnp.abs(step))
+
+
+def check_times(times: Any, initial_time: Any) -> np.ndarray | None:
+    """Check observation times; return them as NumPy, or None where they are traced.
+
+    Raises:
+        ValueError: not a vector, empty, not finite, not sorted, or before the initial time; the message names the row.
+    """
+    if np.ndim(times) != 1 or np.shape(times)[0] == 0:
+        raise ValueError(f"times must be a vector (T,) with at least one entry, got shape {np.shape(times)}.")
+    checks.finite("times", times)
+    known = checks.concrete(times)
+    if known is None:
+        return None
+    back = np.flatnonzero(np.diff(known) < 0)
+    if back.size:
+        row = int(back[0]) + 1
+        raise ValueError(f"times must not go back: row {row} is {known[row]:g} after {known[row - 1]:g}. Sort the "
+                         "rows by time; equal times are replicates and are fine.")
+    start = None if initial_time is None else checks.concrete(initial_time)
+    if start is not None and known[0] < start:
+        raise ValueError(f"times[0] = {known[0]:g} lies before the model's initial_time = {float(start):g}; set "
+                         "initial_time to the first time or earlier.")
+    return known.astype(float)

@@ -1,0 +1,1 @@
+"""Particle methods: forces exact, states by stochastic Runge-Kutta steps."""

@@ -1,0 +1,242 @@
+"""How wrong is a posterior of the Gaussian filter? Its likelihood against an exact one, and what follows."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import numpy as np
+import xarray as xr
+
+from lfm_ppl import checks
+from lfm_ppl.model.state_space import StateSpaceModel
+from lfm_ppl.results import arviz_data, importance, likelihoods, rebuilding
+from lfm_ppl.results.likelihoods import PosteriorDraws, Reference
+from lfm_ppl.results.report import EXACT, GROUP, AccuracyReport
+from lfm_ppl.results.scalars import choose, scalar_draws
+from lfm_ppl.results.verdict import NOISE_SD, Findings, judge
+
+REFERENCES = ("auto", "grid", "particles")
+
+_LARGEST_VARIANCE = 100.0
+"""Of the noise of a log ratio, where all replicates but one find the data impossible."""
+
+_MOST_WORK = 2e10
+"""Limit on particle steps of a check: some ten minutes on two cores for a small model."""
+
+
+def check_accuracy(result: Any, numpyro_model: Callable, times: Any = None, y: Any = None, *, reference: str = "auto",
+                   draws: int = 200, particles: int | None = None, replicates: int = 4, steps: int | None = None,
+                   model_kwargs: Mapping[str, Any] | None = None, seed: int = 0,
+                   progress: bool = True) -> AccuracyReport:
+    """Ask a posterior of the Gaussian filter how wrong it is, and what the exact one looks like.
+
+    At draws theta_i of the posterior, the likelihood of the Gaussian filter is compared with an exact one. Their ratios
+    w_i = p(y | theta_i) / p_filter(y | theta_i) are importance weights that turn the filter's posterior into the exact
+    one. Pareto smoothing makes them usable and tells, by its k, whether they are.
+
+    A particle filter estimates the likelihood without bias, so that its ratios are right on average; its noise is
+    measured by independent replicates, kept below 0.3 in each log ratio, and part of every standard error.
+
+    Args:
+        result: of `lfm_ppl.fit`; the report is stored in it, as the group ``accuracy``.
+        numpyro_model: the model that was fitted, with the same settings.
+        times: as in the fit; by default what the result holds.
+        y: as in the fit; by default what the result holds.
+        reference: "grid" (Fokker-Planck equation; one state), "particles", or "auto": the grid for one state with
+            noise, else particles, and none where the filter is exact, for linear models with Gaussian noise.
+        draws: number of posterior draws to compare at, spread evenly over the chains.
+        particles: in each run of the particle filter; by default as many as keep the noise low.
+        replicates: runs of the particle filter for each draw, at least 2.
+        steps: integration steps of the reference between two observations; by default those of the fit.
+        model_kwargs: keyword arguments of the model, as in the fit.
+        seed: of the particle filter.
+        progress: write to standard error how far it is.
+
+    Returns:
+        The report; ``print`` it.
+
+    Raises:
+        ValueError, TypeError: an unknown reference; a grid for several states or without noise; a result without its
+            data; a model that is not the one of the result; draws of a sampler that is exact already.
+
+    Example:
+        >>> import jax.numpy as jnp, numpyro, numpyro.distributions as dist, lfm_ppl as lfm
+        >>> def model(times, y=None):
+        ...     rate = numpyro.sample("rate", dist.LogNormal(0.0, 0.5))
+        ...     system = lfm.LatentForceModel(
+        ...         lambda x, u, t: u - rate * x, {"u": lfm.Matern(1.0, 1.0)},
+        ...         lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        ...         lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
+        ...     numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
+        >>> result = lfm.fit(model, np.arange(5.0), np.ones((5, 1)), sampler="map", samples=50, progress=False)
+        >>> check_accuracy(result, model, progress=False).verdict.word
+        'trust'
+
+    Source: Vehtari et al. (2024), JMLR 25(72), for the smoothing; Andrieu and Roberts (2009), Annals of Statistics
+    37(2), for exactness with unbiased estimates of the likelihood.
+    """
+    checks.one_of("reference", reference, REFERENCES)
+    checks.positive_integer("draws", draws)
+    for name, value in (("particles", particles), ("steps", steps)):
+        if value is not None:
+            checks.positive_integer(name, value)
+    checks.positive_integer("replicates", replicates)
+    if replicates < 2:
+        raise ValueError("replicates must be at least 2: the noise of the particle filter is told from their spread.")
+    _check_sampler(result)
+    whole = rebuilding.problem(result, numpyro_model, times, y, model_kwargs)
+    ssm = whole.example.ssm
+    kind = _kind(reference, ssm)
+    posterior = arviz_data.group(result, "posterior")
+    chosen, rows = evenly_spaced(posterior.sizes["chain"], posterior.sizes["draw"], draws)
+    problem = whole.at(rows)
+    shape = (posterior.sizes["chain"], len(chosen))
+    filtered = likelihoods.gaussian(problem).reshape(shape)
+    rebuilding.check_likelihood(result, filtered, chosen)
+    doubled = likelihoods.gaussian_with_finer_steps(problem).reshape(shape)
+    found = _reference(kind, problem, filtered, particles, replicates, steps, seed, progress)
+    report = assess(result, chosen, filtered, doubled, found, problem)
+    arviz_data.add_group(result, GROUP, report.to_dataset())
+    return report
+
+
+def evenly_spaced(chains: int, samples: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return which draws of each chain (S,), and of all chains one after another (C * S,), are about ``count`` in all.
+
+    Example:
+        >>> evenly_spaced(2, 100, 4)[1].tolist()
+        [0, 99, 100, 199]
+    """
+    per_chain = min(samples, -(-count // chains))
+    chosen = np.unique(np.linspace(0, samples - 1, per_chain).round().astype(int))
+    return chosen, (np.arange(chains)[:, None] * samples + chosen).ravel()
+
+
+def assess(result: Any, chosen: np.ndarray, filtered: np.ndarray, doubled: np.ndarray, reference: Reference,
+           problem: PosteriorDraws) -> AccuracyReport:
+    """Return the report from log likelihoods at draws.
+
+    Args:
+        result: with the posterior.
+        chosen: (S,), which draws of each chain.
+        filtered: (C, S), log likelihoods of the Gaussian filter.
+        doubled: (C, S), with twice as many steps.
+        reference: log likelihoods of the reference.
+        problem: model and data.
+    """
+    posterior = arviz_data.group(result, "posterior")
+    averaged = importance.average(reference.estimates.reshape(*filtered.shape, -1))
+    ratio = averaged.log_mean - filtered
+    efficiency = _relative_efficiency(filtered)
+    weights = importance.smooth(ratio, efficiency)
+    all_draws = scalar_draws(posterior)
+    varying = {label: all_draws[label] for label in choose(all_draws, None)}
+    table = importance.corrected_moments(varying, chosen, weights.log_weight)
+    noisy = reference.estimates.shape[-1] > 1
+    noise_sd = noise(averaged) if noisy else 0.0
+    change = doubled - filtered
+    example, attrs = problem.example, arviz_data.attributes(result)
+    findings = Findings(
+        table=table, k=weights.k, threshold=weights.threshold, exact=reference.description.startswith(EXACT),
+        step_change_sd=float(change.std()), noise_sd=noise_sd, noise_share=_share(noise_sd, ratio),
+        particles=reference.particles, checked=ratio.size,
+        available=posterior.sizes["chain"] * posterior.sizes["draw"], impossible=int(np.isneginf(ratio).sum()),
+        sampler=str(attrs.get("sampler", "")), refit=_refit(attrs), steps=example.steps, max_step=example.max_step,
+        tolerance=example.tolerance)
+    verdict = judge(findings)
+    sample = ("chain", "draw")
+    variables = {
+        "log_likelihood": (sample, filtered), "log_likelihood_reference": (sample, averaged.log_mean),
+        "log_likelihood_doubled_steps": (sample, doubled), "log_weight": (sample, weights.log_weight),
+        "noise_sd": (sample, np.sqrt(averaged.variance) if noisy else np.zeros_like(ratio)),
+        **{name: ("parameter", table[name].to_numpy()) for name in table.columns},
+    }
+    coords = {"chain": posterior["chain"].values if "chain" in posterior.coords else np.arange(filtered.shape[0]),
+              "draw": posterior["draw"].values[chosen] if "draw" in posterior.coords else chosen,
+              "parameter": list(table.index)}
+    return AccuracyReport(xr.Dataset(variables, coords, {
+        "reference": reference.description, "pareto_k": weights.k, "threshold": weights.threshold,
+        "ess": efficiency * weights.ess,
+        "particles": reference.particles, "particles_limited": int(reference.limited), "noise_sd": noise_sd,
+        "noise_share": findings.noise_share, "step_change_mean": float(change.mean()),
+        "step_change_sd": findings.step_change_sd, "steps": example.steps, "available_draws": findings.available,
+        "verdict": verdict.word, "reason": verdict.reason, "command": verdict.command}))
+
+
+def noise(averaged: importance.Averaged) -> float:
+    """Return the root mean square, over draws, of the noise sd of averaged log likelihoods."""
+    known = averaged.variance[~np.isnan(averaged.variance)]
+    return float(np.sqrt(np.minimum(known, _LARGEST_VARIANCE).mean())) if known.size else np.inf
+
+
+def _share(noise_sd: float, ratio: np.ndarray) -> float:
+    variance = float(np.var(ratio[np.isfinite(ratio)]))
+    return min(noise_sd**2 / variance, 1.0) if variance > 0.0 else 0.0
+
+
+def _refit(attrs: Mapping[str, Any]) -> str:
+    """Return the command that made a result, in the words that it remembers; empty for results of `lfm_ppl.fit`."""
+    if not attrs.get("model_file"):
+        return ""
+    words = ["lfm-ppl", "fit", str(attrs["model_file"])]
+    if attrs.get("data", "simulated") != "simulated":
+        words += ["--data", str(attrs["data"])]
+    if attrs.get("sampler", "nuts") != "nuts":
+        words += ["--sampler", str(attrs["sampler"])]
+    rule = json.loads(attrs.get("settings") or "{}").get("rule")
+    words += ["--rule", rule] if rule else []
+    for flag, stored in (("--option", "options"), ("--set", "fixed")):
+        for name, value in json.loads(attrs.get(stored) or "{}").items():
+            text = ",".join(f"{one:.12g}" for one in value) if isinstance(value, list) else str(value)
+            words += [flag, f"{name}={text}"]
+    return shlex.join(words)
+
+
+def _relative_efficiency(log_likelihood: np.ndarray) -> float:
+    """Return how many independent draws each draw is worth, at most 1."""
+    error = arviz_data.mcse_mean(log_likelihood)
+    if not error > 0.0:
+        return 1.0
+    return float(np.clip(log_likelihood.var(ddof=1) / error**2 / log_likelihood.size, 0.01, 1.0))
+
+
+def _check_sampler(result: Any) -> None:
+    sampler = str(arviz_data.attributes(result).get("sampler", ""))
+    if sampler not in ("", "nuts", "ram", "map"):
+        raise ValueError(f"the draws of this result come from {sampler}, which samples the exact posterior already; "
+                         "the check is for posteriors of the Gaussian filter (samplers nuts, ram and map).")
+
+
+def _kind(reference: str, ssm: StateSpaceModel) -> str:
+    """Return "grid", "particles" or "none"."""
+    one_state = ssm.state_dim == 1
+    if reference == "grid" and not one_state:
+        names = (*ssm.model.state_names, *ssm.model.force_names)
+        raise ValueError(f"reference='grid' takes models of one state; this one has {ssm.state_dim}, of "
+                         f"{', '.join(names)} (a force counts with its derivatives). Use reference='particles'.")
+    if reference != "auto":
+        return reference
+    if likelihoods.is_exact(ssm):
+        return "none"
+    return "grid" if one_state and _noisy(ssm) else "particles"
+
+
+def _noisy(ssm: StateSpaceModel) -> bool:
+    """Whether noise enters the one state, so that it has a density."""
+    noise = ssm.model.process_noise if ssm.physical_dim else ssm.stack.dispersion()
+    return callable(noise) or (noise is not None and bool(np.any(np.asarray(noise))))
+
+
+def _reference(kind: str, problem: PosteriorDraws, filtered: np.ndarray, particles: int | None, replicates: int,
+               steps: int | None, seed: int, progress: bool) -> Reference:
+    if kind == "none":
+        return Reference(filtered.reshape(-1, 1), f"{EXACT}: for this linear model the Gaussian filter is exact")
+    if kind == "grid":
+        return likelihoods.on_grid(problem, steps, progress)
+    return likelihoods.by_particles(
+        problem, particles, replicates, steps, jax.random.key(seed), progress,
+        lambda estimates: noise(importance.average(estimates)), NOISE_SD, _MOST_WORK)

@@ -1,0 +1,355 @@
+"""The result of a fit as an ArviZ object, on ArviZ 0.23 and on ArviZ 1.x.
+
+ArviZ 0.23 keeps groups in an ``InferenceData``, ArviZ 1.x in an ``xarray.DataTree``. This module
+alone knows the difference; everything else asks for a group by name and gets an xarray dataset.
+"""
+
+from __future__ import annotations
+
+import functools
+import warnings
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from lfm_ppl.results import convergence, files, netcdf
+from lfm_ppl.results.scalars import scalar_draws
+
+LIBRARY = "lfm_ppl"
+
+_SMALLEST_TAIL = 5
+"""Fewest importance ratios that a Pareto distribution can be fitted to."""
+
+_HOW_TO_GET = {
+    "posterior": "lfm.fit",
+    "sample_stats": "lfm.fit",
+    "log_likelihood": "lfm.fit",
+    "one_step_ahead": "lfm.fit",
+    "posterior_predictive": "lfm.fit with trajectory_draws above zero",
+    "trajectories": "lfm.fit with trajectory_draws above zero",
+    "observed_data": "lfm.fit",
+    "accuracy": "lfm.check_accuracy, or `lfm-ppl check`",
+    "truth": "lfm.fit on data that were simulated and carry their truth (lfm.Data.truth)",
+}
+
+
+def build(groups: Mapping[str, xr.Dataset], attrs: Mapping[str, Any] | None = None) -> Any:
+    """Return an ArviZ object of ``groups``: an InferenceData (ArviZ 0.23) or a DataTree (1.x).
+
+    Args:
+        groups: group name -> dataset; datasets without variables are left out.
+        attrs: attributes of the result as a whole, such as model, rule and seed.
+
+    Returns:
+        The ArviZ object. A ``/`` in the name of a variable (NumPyro's scopes) becomes ``.``,
+        because neither netCDF nor DataTree can hold it.
+
+    Raises:
+        TypeError: a group is not an xarray dataset.
+
+    Example:
+        >>> draws = xr.Dataset({"decay": (("chain", "draw"), np.ones((4, 100)))})
+        >>> result = build({"posterior": draws}, {"seed": 0})
+        >>> groups(result)
+        ('posterior',)
+    """
+    kept = {name: _checked(name, dataset) for name, dataset in groups.items()}
+    kept = {name: dataset for name, dataset in kept.items() if dataset.data_vars}
+    attrs = {"inference_library": LIBRARY, **(attrs or {})}
+    if not _uses_datatree():
+        return _arviz().InferenceData(attrs=attrs, **kept)
+    tree = xr.DataTree.from_dict({f"/{name}": dataset for name, dataset in kept.items()})
+    tree.attrs = attrs
+    return tree
+
+
+def groups(result: Any) -> tuple[str, ...]:
+    """Return the names of the groups of ``result``."""
+    if isinstance(result, xr.DataTree):
+        return tuple(str(name) for name in result.children)
+    if hasattr(result, "groups") and callable(result.groups):
+        return tuple(result.groups())
+    raise TypeError(
+        f"result must be what lfm.fit or lfm.load returned, got {type(result).__name__}."
+    )
+
+
+def has_group(result: Any, name: str) -> bool:
+    """Return whether ``result`` holds a group called ``name``."""
+    return name in groups(result)
+
+
+def group(result: Any, name: str) -> xr.Dataset:
+    """Return a group of ``result`` as a dataset.
+
+    Raises:
+        ValueError: there is no such group; the message says how to get it.
+    """
+    if not has_group(result, name):
+        remedy = _HOW_TO_GET.get(name)
+        raise ValueError(
+            f"the result has no group {name!r}; it has {', '.join(groups(result)) or 'none'}."
+            + (f" {name!r} comes from {remedy}." if remedy else "")
+        )
+    found = result[name]
+    return found.to_dataset() if isinstance(found, xr.DataTree) else found
+
+
+def add_group(result: Any, name: str, dataset: xr.Dataset) -> Any:
+    """Put ``dataset`` into ``result`` as the group ``name``, replacing one of that name.
+
+    Returns:
+        ``result``, which is changed in place.
+    """
+    dataset = _checked(name, dataset)
+    if isinstance(result, xr.DataTree):
+        result[name] = xr.DataTree(dataset)
+        return result
+    if has_group(result, name):
+        del result[name]
+    result[name] = dataset
+    return result
+
+
+def attributes(result: Any) -> dict[str, Any]:
+    """Return the attributes of ``result`` as a whole: model, rule, seed, versions..."""
+    return dict(result.attrs)
+
+
+def save(result: Any, path: str | Path, overwrite: bool = False) -> Path:
+    """Write a result to a netCDF file, through a temporary name, so that the file is there whole or not at all.
+
+    Args:
+        result: what `lfm_ppl.fit` returned: every group, with coordinates, units and attributes, is kept.
+        path: the file, for instance ``posterior.nc``; its folder is made.
+        overwrite: replace a file that exists.
+
+    Returns:
+        ``path`` as a Path.
+
+    Raises:
+        FileExistsError: ``path`` exists and ``overwrite`` is False.
+        IsADirectoryError: ``path`` is a folder.
+        TypeError: ``result`` is no ArviZ object.
+
+    Example:
+        >>> import tempfile, lfm_ppl as lfm
+        >>> result = build({"posterior": xr.Dataset({"decay": (("chain", "draw"), np.ones((4, 100)))})})
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     written = lfm.save(result, Path(folder) / "run" / "posterior.nc")
+        ...     again = lfm.load(written.parent)
+        >>> groups(again), type(again) is type(result)
+        (('posterior',), True)
+    """
+    datasets = {name: group(result, name) for name in groups(result)}
+    attrs = {"inference_library": LIBRARY, **attributes(result)}
+    return netcdf.write(datasets, attrs, path, overwrite)
+
+
+def load(path: str | Path) -> Any:
+    """Read a result that `save` or ``lfm-ppl fit`` wrote, whichever version of ArviZ it was written with.
+
+    Args:
+        path: a netCDF file, or a results folder with a ``posterior.nc``.
+
+    Returns:
+        The ArviZ object, in memory: an ``InferenceData`` on ArviZ 0.23, an ``xarray.DataTree`` on 1.x.
+
+    Raises:
+        FileNotFoundError: there is no such file, or no ``posterior.nc`` in the folder.
+        ValueError: it is not netCDF, not written by lfm_ppl, or holds no posterior.
+
+    Example:
+        See `save`.
+    """
+    path = files.locate(path)
+    datasets, attrs = netcdf.read(path)
+    library = attrs.get("inference_library")
+    if library != LIBRARY:
+        raise ValueError(
+            f"{path} was not written by lfm_ppl (its inference_library is {library!r}). "
+            "Read it with ArviZ itself, arviz.from_netcdf."
+        )
+    if "posterior" not in datasets:
+        raise ValueError(
+            f"{path} holds no posterior; its groups are {', '.join(datasets) or 'none'}. "
+            "Expected the file that lfm.save or `lfm-ppl fit` wrote."
+        )
+    return build(datasets, attrs)
+
+
+def rhat(result: Any) -> pd.Series:
+    """Return the rank-normalised split R-hat of every scalar parameter, by label.
+
+    NaN where it does not exist: one chain, fewer than four draws, a constant or non-finite chain.
+    Source: Vehtari et al. (2021), Bayesian Analysis 16(2), eq. 3 and section 4.1.
+    """
+    return _diagnostic(result, lambda draws: _arviz().rhat(draws), min_chains=2)
+
+
+def ess(result: Any, method: str = "bulk") -> pd.Series:
+    """Return the effective sample size of every scalar parameter, by label.
+
+    Args:
+        result: an ArviZ object with a posterior.
+        method: "bulk", or "tail" for the smaller one of the 5% and 95% quantiles.
+    """
+    if method == "tail":
+        # ArviZ 1.x has another default probability than 0.23.
+        return _diagnostic(
+            result, lambda draws: _arviz().ess(draws, method="tail", prob=(0.05, 0.95))
+        )
+    return _diagnostic(result, lambda draws: _arviz().ess(draws, method=method))
+
+
+def summary(result: Any) -> pd.DataFrame:
+    """Return one row per scalar parameter, the same on every version of ArviZ.
+
+    Args:
+        result: an ArviZ object with a posterior.
+
+    Returns:
+        Columns mean, sd, q2.5, q97.5 (quantiles in percent), mcse_mean, ess_bulk, ess_tail, r_hat;
+        rows labelled ``noise_sd`` or ``decay[CDKN1A]``. Resampled draws are no chains: the effective size is that of
+        the importance weights, and there is no R-hat.
+
+    Raises:
+        ValueError: the result has no posterior.
+
+    Example:
+        >>> draws = np.random.default_rng(0).normal(size=(4, 100))
+        >>> posterior = xr.Dataset({"decay": (("chain", "draw"), draws)})
+        >>> list(summary(build({"posterior": posterior})).index)
+        ['decay']
+    """
+    draws = scalar_draws(group(result, "posterior"))
+    quantiles = {label: np.quantile(values, (0.025, 0.975)) for label, values in draws.items()}
+    resampled = attributes(result).get("effective_draws")
+    table = pd.DataFrame(
+        {
+            "mean": {label: values.mean() for label, values in draws.items()},
+            "sd": {label: _sd(values) for label, values in draws.items()},
+            "q2.5": {label: low for label, (low, _) in quantiles.items()},
+            "q97.5": {label: high for label, (_, high) in quantiles.items()},
+            "mcse_mean": _diagnostic(result, lambda values: _arviz().mcse(values, method="mean")),
+            "ess_bulk": ess(result, "bulk"),
+            "ess_tail": ess(result, "tail"),
+            "r_hat": rhat(result),
+        },
+        index=list(draws),
+        dtype=float,
+    )
+    if resampled is not None:
+        table["mcse_mean"] = table["sd"] / np.sqrt(resampled)
+        table["ess_bulk"] = float(resampled)
+        table[["ess_tail", "r_hat"]] = np.nan
+    return table
+
+
+def convergence_warnings(result: Any) -> list[str]:
+    """Return what is wrong with the draws of ``result``, one message per finding.
+
+    R-hat above 1.01, bulk or tail effective sample size below 100 per chain, divergences. Draws
+    from a Laplace approximation (sampler "map") are independent, and give none.
+
+    Args:
+        result: an ArviZ object with a posterior, and sample_stats where there are any.
+
+    Returns:
+        Messages that name the parameters, their values, and what to do; empty if all is well.
+    """
+    if attributes(result).get("sampler") == "map" or "effective_draws" in attributes(result):
+        return []
+    sizes = group(result, "posterior").sizes
+    stats = group(result, "sample_stats") if has_group(result, "sample_stats") else {}
+    divergences = int(stats["diverging"].sum()) if "diverging" in stats else 0
+    return convergence.messages(summary(result), sizes["chain"], sizes["draw"], divergences)
+
+
+def mcse_mean(values: np.ndarray) -> float:
+    """Return the Monte Carlo standard error of the mean of (chain, draw) values.
+
+    It is the sd over the root of the effective sample size, which counts as at most the number of values; zero where
+    all are equal, NaN where one is not finite. With fewer than four draws a chain, they count as independent.
+    """
+    if not np.isfinite(values).all() or values.size < 2:
+        return np.nan
+    if np.ptp(values) == 0.0:
+        return 0.0
+    size = float(values.size)
+    if values.shape[1] >= 4:
+        size = min(float(_arviz().ess(values, method="mean")), size)
+    return float(values.std(ddof=1) / np.sqrt(size))
+
+
+def psis(log_ratio: np.ndarray, relative_efficiency: float = 1.0) -> tuple[np.ndarray, float]:
+    """Return Pareto-smoothed, normalised log weights (S,) and the Pareto shape k of log ratios (S,).
+
+    k is -inf where the largest ratios are all equal, and +inf where there are too few to tell.
+    Source: Vehtari et al. (2024), Pareto smoothed importance sampling, JMLR 25(72).
+    """
+    raw = log_ratio - log_ratio.max()
+    raw = raw - np.log(np.exp(raw).sum())
+    tail = int(min(0.2 * raw.size, 3.0 * np.sqrt(raw.size / relative_efficiency)))
+    if tail < _SMALLEST_TAIL:
+        return raw, np.inf
+    if np.ptp(np.sort(raw)[-tail - 1 :]) == 0.0:
+        return raw, -np.inf
+    if _uses_datatree():
+        from arviz_stats.base import array_stats
+
+        # ArviZ 1.x takes the log of what is divided by.
+        smoothed, k = array_stats.psislw(-raw, r_eff=relative_efficiency)
+    else:
+        smoothed, k = _arviz().psislw(raw.copy(), relative_efficiency)
+    if not np.isfinite(k):  # ties leave too few distinct ratios
+        return raw, np.inf
+    return np.asarray(smoothed), float(k)
+
+
+def _diagnostic(
+    result: Any, measure: Callable[[np.ndarray], Any], min_chains: int = 1
+) -> pd.Series:
+    """Apply ``measure`` to the (chain, draw) array of every scalar where it is defined."""
+    values = {}
+    for label, draws in scalar_draws(group(result, "posterior")).items():
+        defined = (
+            draws.shape[0] >= min_chains
+            and draws.shape[1] >= 4
+            and np.all(np.isfinite(draws))
+            and np.ptp(draws) > 0.0
+        )
+        values[label] = float(measure(draws)) if defined else np.nan
+    return pd.Series(values, dtype=float)
+
+
+def _sd(values: np.ndarray) -> float:
+    if values.size < 2 or not np.isfinite(values).all():
+        return np.nan
+    return 0.0 if np.ptp(values) == 0.0 else float(values.std(ddof=1))  # the mean of equal numbers may be rounded
+
+
+def _checked(name: str, dataset: Any) -> xr.Dataset:
+    if not isinstance(dataset, xr.Dataset):
+        raise TypeError(f"group {name!r} must be an xarray.Dataset, got {type(dataset).__name__}.")
+    scoped = [variable for variable in dataset.data_vars if "/" in str(variable)]
+    return dataset.rename({variable: str(variable).replace("/", ".") for variable in scoped})
+
+
+def _uses_datatree() -> bool:
+    return int(_arviz().__version__.split(".")[0]) >= 1
+
+
+@functools.cache
+def _arviz() -> ModuleType:
+    # Imported on first use: it takes two seconds. ArviZ 0.23 announces ArviZ 1.x at import, which
+    # the reader of our output can do nothing about.
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", r"\s*ArviZ is undergoing a major", FutureWarning)
+        import arviz
+    return arviz

@@ -1,0 +1,100 @@
+"""The corrected posterior as a result of its own: draws resampled by their importance weights."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from datetime import UTC, datetime
+from typing import Any
+
+import jax
+import numpy as np
+import xarray as xr
+
+from lfm_ppl import checks
+from lfm_ppl.inference.posterior import trajectories
+from lfm_ppl.results import arviz_data, importance, rebuilding
+from lfm_ppl.results.accuracy import evenly_spaced
+from lfm_ppl.results.report import AccuracyReport
+
+_KEPT = ("observed_data", "truth")
+_DRAWN = ("trajectories", "posterior_predictive")
+_KINDS = {"states": "state", "forces": "force", "outputs": "output"}
+
+
+def correct_posterior(result: Any, numpyro_model: Callable, times: Any = None, y: Any = None, *,
+                      model_kwargs: Mapping[str, Any] | None = None, trajectory_draws: int = 400,
+                      seed: int = 0) -> Any:
+    """Return the corrected posterior: equally weighted draws, resampled by the weights of the accuracy report.
+
+    Draws that the weights favour appear more than once, so that diagnostics of chains say nothing here; the report
+    gives the effective number of draws. Trajectories are new: those of the Gaussian smoother at the corrected
+    parameters.
+
+    Args:
+        result: of `lfm_ppl.fit`, with the report that `check_accuracy` stored; check at many draws (1,000) first.
+        numpyro_model: the model that was fitted.
+        times: as in the fit; by default what the result holds.
+        y: as in the fit; by default what the result holds.
+        model_kwargs: keyword arguments of the model, as in the fit.
+        trajectory_draws: number of draws for which trajectories are drawn, where the result has some; 0: none.
+        seed: of the resampling and the trajectories.
+
+    Returns:
+        An ArviZ object with the groups posterior, observed_data, truth, trajectories and posterior_predictive, where
+        the result has them, and its attributes.
+
+    Raises:
+        ValueError: there is no report, or its weights cannot be relied on.
+    """
+    if trajectory_draws != 0:
+        checks.positive_integer("trajectory_draws", trajectory_draws)
+    report = AccuracyReport.of(result)
+    if not report.reliable:
+        raise ValueError(f"the importance weights cannot be relied on: Pareto k = {report.k:.2f}, not below "
+                         f"{report.threshold:.2f}. Check at more draws, or sample the exact posterior with "
+                         'lfm.fit(..., sampler="pmmh").')
+    posterior = arviz_data.group(result, "posterior").transpose("chain", "draw", ...)
+    chains, size = report.log_weight.shape
+    chosen = np.searchsorted(posterior["draw"].values, report.dataset["draw"].values)
+    of_all = (np.arange(chains)[:, None] * posterior.sizes["draw"] + chosen).ravel()
+    picked = of_all[importance.resample(report.log_weight, chains * size, seed)].reshape(chains, size)
+    groups = {"posterior": _taken(posterior, picked)}
+    groups |= {name: arviz_data.group(result, name) for name in _KEPT if arviz_data.has_group(result, name)}
+    if trajectory_draws and arviz_data.has_group(result, "trajectories"):
+        groups |= _paths(result, numpyro_model, times, y, model_kwargs, picked, trajectory_draws, seed)
+    attrs = arviz_data.attributes(result)
+    attrs |= {"sampler": f"{attrs.get('sampler', 'unknown')} + importance resampling", "chains": chains,
+              "samples": size, "reference": report.reference, "pareto_k": report.k, "effective_draws": report.ess,
+              "created_at": datetime.now(UTC).isoformat(timespec="seconds")}
+    return arviz_data.build(groups, attrs)
+
+
+def _taken(posterior: xr.Dataset, picked: np.ndarray) -> xr.Dataset:
+    """Return draws ``picked`` (C, S), which count through all chains, as chains of their own."""
+    chain, draw = np.divmod(picked, posterior.sizes["draw"])
+    index = {"chain": xr.DataArray(chain, dims=("to_chain", "to_draw")),
+             "draw": xr.DataArray(draw, dims=("to_chain", "to_draw"))}
+    taken = posterior.isel(index).drop_vars(["chain", "draw"], errors="ignore")
+    taken = taken.rename({"to_chain": "chain", "to_draw": "draw"}).transpose("chain", "draw", ...)
+    return taken.assign_coords(chain=np.arange(picked.shape[0]), draw=np.arange(picked.shape[1]))
+
+
+def _paths(result: Any, numpyro_model: Callable, times: Any, y: Any, model_kwargs: Mapping[str, Any] | None,
+           picked: np.ndarray, count: int, seed: int) -> dict[str, xr.Dataset]:
+    """Draw trajectories at some of the picked draws, laid out as those of ``result``."""
+    templates = {name: arviz_data.group(result, name) for name in _DRAWN if arviz_data.has_group(result, name)}
+    template = templates["trajectories"]
+    at = template["at"].values if "at" in template.coords else None
+    chosen, rows = evenly_spaced(picked.shape[0], picked.shape[1], count)
+    problem = rebuilding.problem(result, numpyro_model, times, y, model_kwargs).at(picked.ravel()[rows])
+    found = trajectories(jax.random.key(seed), problem.bound, problem.draws, at)
+    groups = {}
+    for name, old in templates.items():
+        variables = {}
+        for label, variable in old.data_vars.items():
+            kind = _KINDS[str(label)] if name == "trajectories" else "y"
+            values = found[kind].reshape(picked.shape[0], len(chosen), *found[kind].shape[1:])
+            variables[label] = (variable.transpose("chain", "draw", ...).dims, values, variable.attrs)
+        coords = {key: value for key, value in old.coords.items() if key not in ("chain", "draw")}
+        groups[name] = xr.Dataset(variables, coords | {"chain": np.arange(picked.shape[0]), "draw": chosen})
+    return groups

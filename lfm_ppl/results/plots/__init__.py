@@ -1,0 +1,21 @@
+"""Figures of a result, at the sizes of a paper. Nothing here touches pyplot or the global style."""
+
+from lfm_ppl.results.plots.accuracy import plot_accuracy
+from lfm_ppl.results.plots.calibration import plot_calibration
+from lfm_ppl.results.plots.chains import plot_trace
+from lfm_ppl.results.plots.pairs import plot_pairs
+from lfm_ppl.results.plots.residuals import plot_residuals
+from lfm_ppl.results.plots.saving import save_figures
+from lfm_ppl.results.plots.trajectories import plot_fit, plot_forces, plot_states
+
+__all__ = [
+    "plot_accuracy",
+    "plot_calibration",
+    "plot_fit",
+    "plot_forces",
+    "plot_pairs",
+    "plot_residuals",
+    "plot_states",
+    "plot_trace",
+    "save_figures",
+]

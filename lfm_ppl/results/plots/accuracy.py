@@ -1,0 +1,155 @@
+"""Figure of the accuracy report: the importance ratios, and each parameter before and after correction."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from lfm_ppl.results.arviz_data import group
+from lfm_ppl.results.plots import style
+from lfm_ppl.results.plots.chains import known_truth, parameter_units
+from lfm_ppl.results.report import AccuracyReport
+from lfm_ppl.results.scalars import choose, scalar_draws
+
+MAX_PANELS = 11
+_BELOW = -30.0
+"""Log weights, relative to the largest, that a drawing cannot tell from zero."""
+
+
+@style.styled
+def plot_accuracy(
+    result: Any, parameters: Sequence[str] | None = None, *, width: str | float = "column"
+) -> Figure:
+    """Draw what `lfm_ppl.check_accuracy` found.
+
+    First the log importance ratio of each draw against its log likelihood under the Gaussian
+    filter, both relative to their mean: a level cloud leaves the posterior as it is, a slope or a
+    curve moves it. Then, for each scalar parameter, the density of the Gaussian filter's posterior
+    (all draws) and that of the corrected one (weighted draws), the means of both, and the true
+    value where it is known.
+
+    Args:
+        result: with the groups posterior and accuracy, and truth where there is one.
+        parameters: names such as ``decay`` or ``decay[CDKN1A]``; None for all that vary, up to 11.
+        width: "column" (3.4 in), "full" (7 in), or inches.
+
+    Returns:
+        A figure with the panel of the ratios and one panel per scalar parameter.
+
+    Raises:
+        ValueError: there is no report, or a parameter is unknown.
+    """
+    report = AccuracyReport.of(result)
+    draws = scalar_draws(group(result, "posterior"))
+    labels, note = style.first_of(choose(draws, parameters), parameters, MAX_PANELS, "parameters")
+    truth, units, table = known_truth(result), parameter_units(result), report.table
+    columns = 2 if style.is_narrow(width) else 3
+    rows = math.ceil((len(labels) + 1) / columns)
+    figure = style.new_figure(width, 1.2 * rows + 0.6)
+    panels = list(figure.subplots(rows, columns, squeeze=False).flat)
+    for spare in panels[len(labels) + 1 :]:
+        spare.remove()
+    for axes in panels[: len(labels) + 1]:
+        style.tidy(axes, x_ticks=3, y_ticks=3)
+    _draw_ratios(panels[0], report)
+    at = np.searchsorted(group(result, "posterior")["draw"].values, report.dataset["draw"].values)
+    weight = np.exp(report.log_weight).ravel()
+    for axes, label in zip(panels[1:], labels, strict=False):
+        _draw_densities(axes, draws[label], draws[label][:, at].ravel(), weight)
+        if label in table.index and report.reliable:
+            _mark_means(axes, table.loc[label, "mean"], table.loc[label, "corrected_mean"])
+        if label in truth:
+            axes.axvline(truth[label], **_TRUTH)
+        unit = f"{style.scale(axes.xaxis)} {units.get(label, '')}".strip()
+        axes.set_xlabel(style.with_unit(label, unit, 24))
+    _legend(figure, any(label in truth for label in labels), report.reliable)
+    if note:
+        style.note_below(figure, note)
+    return figure
+
+
+_TRUTH: dict[str, Any] = {"color": style.BLACK, "lw": 0.9, "ls": (0, (4, 2))}
+
+
+def _draw_ratios(axes: Axes, report: AccuracyReport) -> None:
+    filtered, ratio = report.dataset["log_likelihood"].values.ravel(), report.log_ratio.ravel()
+    seen = np.isfinite(ratio)
+    x, y = filtered[seen] - filtered[seen].mean(), ratio[seen] - ratio[seen].mean()
+    axes.axhline(0.0, color=style.GREY, lw=0.6)
+    sd = report.dataset["noise_sd"].values.ravel()[seen]
+    if np.nanmax(sd) > 0.0:
+        sd = np.where(np.isfinite(sd), sd, 0.0)
+        axes.errorbar(x, y, yerr=sd, fmt="none", ecolor=style.SKY, elinewidth=0.4, zorder=1)
+    axes.plot(x, y, color=style.BLUE, ls="", marker="o", ms=1.8, mew=0, alpha=0.6, zorder=2)
+    if np.ptp(y) < 1e-6:
+        axes.set_ylim(-1.0, 1.0)
+    axes.set_xlabel("log likelihood, relative")
+    axes.set_ylabel("log ratio, relative")
+    reliable = "reliable" if report.reliable else "not reliable"
+    axes.set_title("the filter is exact" if report.exact else f"k = {report.k:.2f} ({reliable})")
+
+
+def _draw_densities(
+    axes: Axes, values: np.ndarray, subset: np.ndarray, weight: np.ndarray
+) -> None:
+    flat = values.ravel()
+    grid = np.linspace(*_range(flat, subset, weight), 200)
+    before = _density(grid, flat, np.full(flat.size, 1.0 / flat.size))
+    width = _bandwidth(subset, weight, grid)
+    # What the weights change on the subset, as for the moments: the subset's own chance cancels.
+    equal = np.full(subset.size, 1.0 / subset.size)
+    change = _density(grid, subset, weight, width) - _density(grid, subset, equal, width)
+    axes.fill_between(grid, before, color=style.SKY, alpha=0.5, lw=0)
+    axes.plot(grid, np.maximum(before + change, 0.0), color=style.VERMILLION, lw=1.1)
+    axes.set_ylim(0.0, None)
+    axes.set_yticks([])
+    axes.spines["left"].set_visible(False)
+
+
+def _range(values: np.ndarray, subset: np.ndarray, weight: np.ndarray) -> tuple[float, float]:
+    low, high = np.quantile(values, (0.005, 0.995))
+    used = subset[weight > weight.max() * np.exp(_BELOW)]
+    low, high = min(low, np.quantile(used, 0.005)), max(high, np.quantile(used, 0.995))
+    room = 0.12 * (high - low)
+    return low - room, high + room
+
+
+def _bandwidth(values: np.ndarray, weight: np.ndarray, grid: np.ndarray) -> float:
+    """Return Silverman's bandwidth for weighted values."""
+    sd = np.sqrt(weight @ (values - weight @ values) ** 2)
+    return max(1.06 * sd * (weight**2).sum() ** 0.2, 1e-3 * (grid[-1] - grid[0]))
+
+
+def _density(
+    grid: np.ndarray, values: np.ndarray, weight: np.ndarray, bandwidth: float | None = None
+) -> np.ndarray:
+    """Return a Gaussian kernel density estimate."""
+    bandwidth = bandwidth or _bandwidth(values, weight, grid)
+    kernel = np.exp(-0.5 * ((grid[:, None] - values) / bandwidth) ** 2)
+    return kernel @ weight / (bandwidth * np.sqrt(2.0 * np.pi))
+
+
+def _mark_means(axes: Axes, before: float, after: float) -> None:
+    """Mark the means under the densities."""
+    where = axes.get_xaxis_transform()
+    for mean, colour in ((before, style.BLUE), (after, style.VERMILLION)):
+        axes.plot(mean, 0.04, color=colour, marker="^", ms=4, mew=0, ls="", transform=where, zorder=4)
+
+
+def _legend(figure: Figure, truth: bool, means: bool) -> None:
+    handles: list[Any] = [
+        Patch(color=style.SKY, alpha=0.5, label="Gaussian filter"),
+        Line2D([], [], color=style.VERMILLION, lw=1.1, label="corrected"),
+    ]
+    if means:
+        handles.append(Line2D([], [], color=style.GREY, marker="^", ms=4, mew=0, ls="", label="mean"))
+    if truth:
+        handles.append(Line2D([], [], label="truth", **_TRUTH))
+    style.legend_above(figure, handles)

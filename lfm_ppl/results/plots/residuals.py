@@ -1,0 +1,158 @@
+"""Figure of the one-step-ahead residuals: over time, against the normal, and their whiteness."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
+
+from lfm_ppl.results.arviz_data import group
+from lfm_ppl.results.plots import style
+from lfm_ppl.results.plots.trajectories import pick, time_unit
+from lfm_ppl.results.residuals import (
+    autocorrelation,
+    default_lags,
+    mean_residuals,
+    normal_scores,
+    residual_tests,
+)
+
+MAX_OUTPUTS = 4
+_ENVELOPE = "#DDDDDD"
+
+
+@style.styled
+def plot_residuals(
+    result: Any, outputs: Sequence[str] | None = None, *, width: str | float = "column"
+) -> Figure:
+    """Draw the standardised one-step-ahead residuals of each output in three panels.
+
+    Over time: posterior means, with the 95% interval over the draws as a thin bar, and the lines
+    within which 95% of N(0, 1) lie. Normal Q-Q: with the pointwise 95% envelope of an N(0, 1)
+    sample. Autocorrelation: with the 95% bounds of white noise. p-values stand above the panels.
+
+    Args:
+        result: with the group one_step_ahead.
+        outputs: names; None for all, up to 4.
+        width: "column" (3.4 in), "full" (7 in), or inches.
+
+    Returns:
+        A figure with three panels per output.
+
+    Raises:
+        ValueError: the group is missing, or an output is unknown.
+
+    Example:
+        >>> from lfm_ppl.results.arviz_data import build
+        >>> residual = np.random.default_rng(0).normal(size=(1, 1, 50, 1))
+        >>> scores = xr.Dataset({"residual": (("chain", "draw", "time", "output"), residual)})
+        >>> scores = scores.assign_coords({"time": np.arange(50.0), "output": ["position"]})
+        >>> figure = plot_residuals(build({"one_step_ahead": scores}))
+        >>> [axes.get_title(loc="left") for axes in figure.axes]
+        ['position', 'KS p = 0.56', 'Ljung-Box p = 0.11']
+    """
+    draws = group(result, "one_step_ahead")["residual"].transpose("chain", "draw", "time", "output")
+    names, note = style.first_of(pick(draws, "output", outputs), outputs, MAX_OUTPUTS, "outputs")
+    means, tests = mean_residuals(result), residual_tests(result)
+    figure, rows = _panels(width, len(names))
+    for name, (over_time, quantiles, lags) in zip(names, rows, strict=True):
+        series = means.sel(output=name)
+        _draw_over_time(over_time, series, draws.sel(output=name))
+        over_time.set_title(name, fontweight="bold")
+        over_time.set_ylabel("residual (sd)")
+        _draw_quantiles(quantiles, series.values, tests.loc[name])
+        _draw_autocorrelation(lags, series.values, tests.loc[name])
+    style.label_time([row[0] for row in rows], time_unit(result))
+    for row in rows if style.is_narrow(width) else rows[-1:]:
+        row[1].set_xlabel("normal quantile")
+        row[2].set_xlabel("lag (observations)")
+    style.legend_above(
+        figure,
+        [
+            Line2D([], [], color=style.BLUE, ls="", marker="o", ms=2.6, label="posterior mean"),
+            Patch(color=_ENVELOPE, label="95% if the model holds"),
+        ],
+    )
+    if note:
+        style.note_below(figure, note)
+    return figure
+
+
+def _panels(width: str | float, count: int) -> tuple[Figure, list[tuple[Axes, Axes, Axes]]]:
+    narrow = style.is_narrow(width)
+    figure = style.new_figure(width, (2.75 if narrow else 1.55) * count + 0.55)
+    rows = []
+    if narrow:
+        grid = figure.add_gridspec(2 * count, 2, height_ratios=[1.0, 1.15] * count)
+        places = [(grid[2 * k, :], grid[2 * k + 1, 0], grid[2 * k + 1, 1]) for k in range(count)]
+    else:
+        grid = figure.add_gridspec(count, 3, width_ratios=[1.7, 1.0, 1.0])
+        places = [(grid[k, 0], grid[k, 1], grid[k, 2]) for k in range(count)]
+    for number, place in enumerate(places):
+        over_time, quantiles, lags = (figure.add_subplot(cell) for cell in place)
+        for axes in (over_time, quantiles, lags):
+            style.tidy(axes)
+        over_time.tick_params(labelbottom=narrow or number == count - 1)
+        rows.append((over_time, quantiles, lags))
+    return figure, rows
+
+
+def _draw_over_time(axes: Axes, series: xr.DataArray, draws: xr.DataArray) -> None:
+    times = series["time"].values
+    axes.axhspan(-1.96, 1.96, color=_ENVELOPE, lw=0, zorder=0)
+    axes.axhline(0.0, color=style.GREY, lw=0.6, zorder=1)
+    if len(times) <= 200:
+        low, high = np.quantile(draws.values, (0.025, 0.975), axis=(0, 1))
+        axes.vlines(times, low, high, color=style.SKY, lw=0.8, zorder=2)
+    size = 2.6 if len(times) <= 150 else 1.2
+    axes.plot(times, series, color=style.BLUE, ls="", marker="o", ms=size, mew=0, zorder=3)
+    pad = 0.03 * (times[-1] - times[0]) or 0.5
+    axes.set_xlim(times[0] - pad, times[-1] + pad)  # the same for all outputs, missing or not
+    reach = max(3.0, 1.1 * np.nanmax(np.abs(series.values), initial=0.0))
+    axes.set_ylim(-reach, reach)
+
+
+def _draw_quantiles(axes: Axes, series: np.ndarray, test: pd.Series) -> None:
+    ordered = np.sort(series[np.isfinite(series)])
+    median, low, high = normal_scores(len(ordered))
+    axes.fill_between(median, low, high, color=_ENVELOPE, lw=0, zorder=0)
+    axes.plot(median, median, color=style.GREY, lw=0.6, zorder=1)
+    axes.plot(median, ordered, color=style.BLUE, ls="", marker="o", ms=2.2, mew=0, zorder=2)
+    reach = 1.08 * np.max(median, initial=1.0)
+    axes.set_xlim(-reach, reach)
+    axes.set_ylabel("residual quantile")
+    axes.set_title(_p_value("KS", test["ks_p"]))
+
+
+def _draw_autocorrelation(axes: Axes, series: np.ndarray, test: pd.Series) -> None:
+    count = int(test["count"])
+    lags = min(max(default_lags(count), 10), max(count - 1, 1))
+    rho, pairs = autocorrelation(series, lags) if count > 1 else (np.full(lags, np.nan), None)
+    lag = np.arange(1, lags + 1)
+    if pairs is not None:
+        bound = 1.96 / np.sqrt(np.maximum(pairs, 1))
+        axes.stairs(
+            bound, np.arange(lags + 1) + 0.5, baseline=-bound, fill=True, color=_ENVELOPE, zorder=0
+        )
+        axes.vlines(lag, 0.0, rho, color=style.BLUE, lw=1.4, zorder=2)
+    axes.axhline(0.0, color=style.GREY, lw=0.6, zorder=1)
+    reach = max(0.6, 1.1 * np.nanmax(np.abs(rho), initial=0.0))
+    axes.set_ylim(-reach, reach)
+    axes.set_xlim(0.5, lags + 0.5)
+    axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))
+    axes.set_ylabel("autocorrelation")
+    axes.set_title(_p_value("Ljung-Box", test["ljung_box_p"]))
+
+
+def _p_value(test: str, p: float) -> str:
+    if not np.isfinite(p):
+        return f"{test}: few data"
+    return f"{test} p < 0.001" if p < 0.001 else f"{test} p = {p:.2g}"

@@ -1,0 +1,124 @@
+"""All figures of a result, as files."""
+
+from __future__ import annotations
+
+import itertools
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from matplotlib.backend_bases import FigureCanvasBase
+from matplotlib.figure import Figure
+
+from lfm_ppl.results.arviz_data import group, has_group
+from lfm_ppl.results.files import refuse_existing, writing
+from lfm_ppl.results.plots import accuracy, chains, pairs, residuals, style, trajectories
+from lfm_ppl.results.scalars import choose, scalar_draws
+
+MAX_PAGES = 5
+Draw = Callable[..., Figure]
+
+
+def save_figures(
+    result: Any,
+    folder: str | Path,
+    formats: Sequence[str] = ("png",),
+    *,
+    width: str | float = "full",
+    overwrite: bool = False,
+) -> list[Path]:
+    """Draw every figure that ``result`` has the groups for, and write it to ``folder``.
+
+    The figures are fit, forces, states, trace, pairs, residuals and accuracy. What does not fit on one page
+    goes to numbered ones, such as ``trace-1.png`` and ``trace-2.png``, five at most. Every file is
+    written under a temporary name and renamed.
+
+    Args:
+        result: an ArviZ object.
+        folder: made where it does not exist.
+        formats: endings that matplotlib can write: png, pdf, svg, eps...
+        width: "column" (3.4 in), "full" (7 in), or inches.
+        overwrite: replace files that exist.
+
+    Returns:
+        The paths written, in the order of the figures.
+
+    Raises:
+        ValueError: a format is unknown.
+        FileExistsError: a file exists and ``overwrite`` is False; nothing is drawn then.
+
+    Example:
+        >>> import tempfile
+        >>> import numpy as np
+        >>> import xarray as xr
+        >>> from lfm_ppl.results.arviz_data import build
+        >>> draws = np.random.default_rng(0).normal(size=(4, 100))
+        >>> result = build({"posterior": xr.Dataset({"decay": (("chain", "draw"), draws)})})
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     [path.name for path in save_figures(result, folder, ("png", "pdf"))]
+        ['trace.png', 'trace.pdf', 'pairs.png', 'pairs.pdf']
+    """
+    formats = [formats] if isinstance(formats, str) else list(formats)
+    formats = [ending.lower().removeprefix(".") for ending in formats]
+    known = FigureCanvasBase.get_supported_filetypes()
+    for ending in formats:
+        if ending not in known:
+            raise ValueError(f"unknown figure format {ending!r}; known: {', '.join(known)}.")
+    pages = list(_pages(result, width))
+    paths = [Path(folder) / f"{name}.{ending}" for name, _, _ in pages for ending in formats]
+    for path in paths:
+        refuse_existing(path, overwrite)
+    for name, draw, names in pages:
+        figure = draw(result, names, width=width)
+        figure.set_layout_engine("none")  # laid out already; each format would do it again
+        for ending in formats:
+            with writing(Path(folder) / f"{name}.{ending}", overwrite) as temporary:
+                with style.in_style():
+                    figure.savefig(temporary, format=ending)
+    return paths
+
+
+def _pages(result: Any, width: str | float) -> Iterator[tuple[str, Draw, list[str] | None]]:
+    """Yield file name, function and the names to draw, for each page of each figure."""
+    for kind, draw in (
+        ("output", trajectories.plot_fit),
+        ("force", trajectories.plot_forces),
+        ("state", trajectories.plot_states),
+    ):
+        names = trajectories.trajectory_names(result, kind)
+        if kind == "output" and not has_group(result, "observed_data"):
+            continue
+        title = "fit" if kind == "output" else f"{kind}s"
+        yield from _numbered(title, draw, names, trajectories.MAX_PANELS)
+    if has_group(result, "posterior"):
+        labels = choose(scalar_draws(group(result, "posterior")), None)
+        yield from _numbered("trace", chains.plot_trace, labels, chains.MAX_ROWS)
+        if labels:
+            # Pages would miss most pairs; the figure itself says how to choose others.
+            yield "pairs", pairs.plot_pairs, None
+    if has_group(result, "one_step_ahead"):
+        names = [str(name) for name in group(result, "one_step_ahead")["output"].values]
+        yield from _numbered("residuals", residuals.plot_residuals, names, residuals.MAX_OUTPUTS)
+    if has_group(result, "accuracy"):
+        yield "accuracy", accuracy.plot_accuracy, None
+
+
+def _numbered(
+    title: str, draw: Draw, names: list[str], size: int
+) -> Iterator[tuple[str, Draw, list[str]]]:
+    pages = [list(page) for page in _batches(names, size)]
+    if len(pages) > MAX_PAGES:
+        warnings.warn(
+            f"{title}: drawing the first {MAX_PAGES * size} of {len(names)}; call "
+            f"{draw.__name__} with names for the others.",
+            stacklevel=4,
+        )
+    for number, page in enumerate(pages[:MAX_PAGES], start=1):
+        yield (f"{title}-{number}" if len(pages) > 1 else title), draw, page
+
+
+def _batches(names: list[str], size: int) -> Iterator[tuple[str, ...]]:
+    iterator = iter(names)
+    while batch := tuple(itertools.islice(iterator, size)):
+        yield batch

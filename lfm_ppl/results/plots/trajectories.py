@@ -1,0 +1,279 @@
+"""Figures over time: the fit to the data, the forces, the states."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from lfm_ppl.checks import unknown
+from lfm_ppl.results.arviz_data import group, has_group
+from lfm_ppl.results.plots import style
+from lfm_ppl.results.scalars import unit_of
+
+MAX_PANELS = 12
+_MANY = 150  # measurements
+_INTERVAL = (0.025, 0.975)
+_NOISE_FREE, _PREDICTIVE, _FORCE = "#8FBFDE", "#D3E4F1", "#9AD3C1"  # tints of the line colours
+
+
+@style.styled
+def plot_fit(
+    result: Any, outputs: Sequence[str] | None = None, *, width: str | float = "column"
+) -> Figure:
+    """Draw the data of each output with the posterior of what was measured.
+
+    The inner band holds 95% of the noise-free output, the outer one 95% of new measurements. The
+    outer band is exact at the measurement times; between them it is the inner band widened by the
+    difference of the two, interpolated linearly. Replicates are pooled.
+
+    Args:
+        result: with the groups observed_data and trajectories, and posterior_predictive for the
+            outer band.
+        outputs: names; None for all, up to 12.
+        width: "column" (3.4 in), "full" (7 in), or inches.
+
+    Returns:
+        A figure with one panel per output. Missing values are marked above the time axis.
+
+    Raises:
+        ValueError: a group is missing, or an output is unknown.
+
+    Example:
+        >>> from lfm_ppl.results.arviz_data import build
+        >>> time = np.linspace(0.0, 9.0, 10)
+        >>> dims = ("chain", "draw", "at", "output")
+        >>> mean = xr.Dataset({"outputs": (dims, np.ones((2, 5, 10, 1)))})
+        >>> data = xr.Dataset({"y": (("time", "output"), np.ones((10, 1)), {"units": "nM"})})
+        >>> mean = mean.assign_coords({"at": time, "output": ["mRNA"]})
+        >>> data = data.assign_coords({"time": time, "output": ["mRNA"]})
+        >>> figure = plot_fit(build({"trajectories": mean, "observed_data": data}))
+        >>> figure.axes[0].get_ylabel()
+        'mRNA (nM)'
+    """
+    observed = group(result, "observed_data")["y"].transpose("time", "output")
+    noise_free = _trajectories(result, "output")
+    predictive = _predictive(result)
+    names, note = style.first_of(pick(observed, "output", outputs), outputs, MAX_PANELS, "outputs")
+    figure, panels = style.small_multiples(width, len(names), 1.35)
+    for axes, name in zip(panels, names, strict=True):
+        data = observed.sel(output=name)
+        time, mean, low, high = _band(noise_free.sel(output=name))
+        if predictive is not None:
+            outer = _widened(predictive.sel(output=name), time, low, high)
+            axes.fill_between(*outer, color=_PREDICTIVE, lw=0, zorder=1)
+        axes.fill_between(time, low, high, color=_NOISE_FREE, lw=0, zorder=2)
+        axes.plot(time, mean, color=style.BLUE, zorder=3)
+        _draw_data(axes, data)
+        style.label_values(axes, name, unit_of(observed, name))
+    style.label_time(panels, time_unit(result))
+    figure.align_ylabels(panels)
+    handles: list[Artist] = [Line2D([], [], label="data", **_data_style(observed.sizes["time"]))]
+    handles += [Line2D([], [], color=style.BLUE, label="posterior mean")]
+    handles += [Patch(color=_NOISE_FREE, label="95%, noise-free")]
+    if predictive is not None:
+        handles += [Patch(color=_PREDICTIVE, label="95%, new data")]
+    if np.isnan(observed.sel(output=names)).any():
+        handles += [Line2D([], [], label="missing", **_missing_style(observed.sizes["time"]))]
+    style.legend_above(figure, handles)
+    if note:
+        style.note_below(figure, note)
+    return figure
+
+
+@style.styled
+def plot_forces(
+    result: Any, forces: Sequence[str] | None = None, *, width: str | float = "column"
+) -> Figure:
+    """Draw the posterior mean of each force with a 95% band, and the truth where it is known.
+
+    Args:
+        result: with the group trajectories, and truth where it is known.
+        forces: names; None for all, up to 12.
+        width: "column" (3.4 in), "full" (7 in), or inches.
+
+    Returns:
+        A figure with one panel per force.
+
+    Raises:
+        ValueError: the result holds no force trajectories, or a force is unknown.
+
+    Example:
+        >>> from lfm_ppl.results.arviz_data import build
+        >>> dims = ("chain", "draw", "at", "force")
+        >>> draws = xr.Dataset({"forces": (dims, np.zeros((2, 5, 10, 1)))})
+        >>> draws = draws.assign_coords({"at": np.linspace(0.0, 9.0, 10), "force": ["p53"]})
+        >>> figure = plot_forces(build({"trajectories": draws}), ["p53"], width="full")
+        >>> [axes.get_ylabel() for axes in figure.axes]
+        ['p53']
+    """
+    return _panels(result, "force", forces, width, (style.GREEN, _FORCE))
+
+
+@style.styled
+def plot_states(
+    result: Any, states: Sequence[str] | None = None, *, width: str | float = "column"
+) -> Figure:
+    """Draw the posterior mean of each state with a 95% band, and the truth where it is known.
+
+    Args:
+        result: with the group trajectories, and truth where it is known.
+        states: names; None for all, up to 12.
+        width: "column" (3.4 in), "full" (7 in), or inches.
+
+    Returns:
+        A figure with one panel per state.
+
+    Raises:
+        ValueError: the result holds no state trajectories, or a state is unknown.
+
+    Example:
+        >>> from lfm_ppl.results.arviz_data import build
+        >>> dims = ("chain", "draw", "at", "state")
+        >>> draws = xr.Dataset({"states": (dims, np.zeros((2, 5, 10, 2)))})
+        >>> draws = draws.assign_coords({"at": np.linspace(0.0, 9.0, 10), "state": ["x", "v"]})
+        >>> [axes.get_ylabel() for axes in plot_states(build({"trajectories": draws})).axes]
+        ['x', 'v']
+    """
+    return _panels(result, "state", states, width, (style.BLUE, _NOISE_FREE))
+
+
+def time_unit(result: Any) -> str:
+    """Return the unit of time, empty where the result does not know it."""
+    for name, coordinate in (("observed_data", "time"), ("trajectories", "at")):
+        if has_group(result, name) and coordinate in (found := group(result, name)).coords:
+            if unit := unit_of(found[coordinate]):
+                return unit
+    return ""
+
+
+def trajectory_names(result: Any, kind: str) -> list[str]:
+    """Return the names of the forces, states or outputs that ``result`` has trajectories of."""
+    if not has_group(result, "trajectories") or kind not in group(result, "trajectories").dims:
+        return []
+    return [str(name) for name in group(result, "trajectories")[kind].values]
+
+
+def pick(variable: xr.DataArray, kind: str, wanted: Sequence[str] | None) -> list[str]:
+    """Return the names along ``kind`` to draw: those wanted, or all; refuse unknown ones."""
+    known = [str(name) for name in variable[kind].values]
+    if wanted is None:
+        return known
+    wanted = [wanted] if isinstance(wanted, str) else list(wanted)
+    for name in wanted:
+        if name not in known:
+            raise ValueError(unknown(kind, name, known))
+    if not wanted:
+        raise ValueError(f"{kind}s is empty; name at least one of {', '.join(known)}.")
+    return wanted
+
+
+def _panels(
+    result: Any,
+    kind: str,
+    wanted: Sequence[str] | None,
+    width: str | float,
+    colours: tuple[str, str],
+) -> Figure:
+    draws = _trajectories(result, kind)
+    truth = group(result, "truth").get(f"{kind}s") if has_group(result, "truth") else None
+    names, note = style.first_of(pick(draws, kind, wanted), wanted, MAX_PANELS, f"{kind}s")
+    figure, panels = style.small_multiples(width, len(names), 1.25)
+    line, tint = colours
+    known = False
+    for axes, name in zip(panels, names, strict=True):
+        time, mean, low, high = _band(draws.sel({kind: name}))
+        axes.fill_between(time, low, high, color=tint, lw=0, zorder=1)
+        axes.plot(time, mean, color=line, zorder=2)
+        if truth is not None and name in truth[kind].values:
+            true = truth.sel({kind: name})
+            axes.plot(true["at_truth"], true, color=style.BLACK, lw=0.9, ls=(0, (4, 2)), zorder=3)
+            known = True
+        style.label_values(axes, name, unit_of(draws, name))
+    style.label_time(panels, time_unit(result))
+    figure.align_ylabels(panels)
+    handles = [Line2D([], [], color=line, label="posterior mean"), Patch(color=tint, label="95%")]
+    if known:
+        handles += [Line2D([], [], color=style.BLACK, lw=0.9, ls=(0, (4, 2)), label="truth")]
+    style.legend_above(figure, handles)
+    if note:
+        style.note_below(figure, note)
+    return figure
+
+
+def _trajectories(result: Any, kind: str) -> xr.DataArray:
+    dataset = group(result, "trajectories")
+    if f"{kind}s" not in dataset or dataset.sizes[kind] == 0:
+        raise ValueError(
+            f"the result holds no {kind} trajectories; its group trajectories has "
+            f"{', '.join(map(str, dataset.data_vars))}. They come from lfm.fit with "
+            f"trajectory_draws above zero, for a model that has {kind}s."
+        )
+    return dataset[f"{kind}s"].transpose("chain", "draw", "at", kind)
+
+
+def _predictive(result: Any) -> xr.DataArray | None:
+    if not has_group(result, "posterior_predictive"):
+        return None
+    return group(result, "posterior_predictive")["y"].transpose("chain", "draw", "time", "output")
+
+
+def _band(draws: xr.DataArray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return times, mean and the ends of the 95% interval of draws (chain, draw, at)."""
+    flat = draws.values.reshape(-1, draws.sizes["at"])
+    low, high = np.quantile(flat, _INTERVAL, axis=0)
+    return draws["at"].values, flat.mean(axis=0), low, high
+
+
+def _widened(
+    predictive: xr.DataArray, at: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return times from the first to the last measurement and the predictive interval there."""
+    measured, which = np.unique(predictive["time"].values, return_inverse=True)
+    draws = predictive.values.reshape(-1, predictive.sizes["time"])
+    ends = np.array([np.quantile(draws[:, which == k], _INTERVAL) for k in range(len(measured))])
+    below = ends[:, 0] - np.interp(measured, at, low)
+    above = ends[:, 1] - np.interp(measured, at, high)
+    grid = np.union1d(measured, at[(at >= measured[0]) & (at <= measured[-1])])
+    return (
+        grid,
+        np.interp(grid, at, low) + np.interp(grid, measured, below),
+        np.interp(grid, at, high) + np.interp(grid, measured, above),
+    )
+
+
+def _draw_data(axes: Axes, data: xr.DataArray) -> None:
+    times, values = data["time"].values, data.values
+    missing = np.isnan(values)
+    axes.plot(
+        times[~missing],
+        values[~missing],
+        rasterized=len(times) > 5000,
+        **_data_style(len(times)),
+    )
+    axes.plot(
+        times[missing],
+        np.full(missing.sum(), 0.04),
+        transform=axes.get_xaxis_transform(),
+        **_missing_style(len(times)),
+    )
+
+
+def _data_style(count: int) -> dict[str, Any]:
+    """Return how to draw ``count`` values: many of them small, and under the line of the mean."""
+    common = {"ls": "", "marker": "o"}
+    if count > _MANY:
+        return {**common, "color": style.GREY, "ms": 1.5, "mew": 0, "zorder": 2.5}
+    return {**common, "color": style.BLACK, "ms": 2.6, "mec": "white", "mew": 0.3, "zorder": 4}
+
+
+def _missing_style(count: int) -> dict[str, Any]:
+    size = 2 if count > _MANY else 3
+    return {"color": style.GREY, "ls": "", "marker": "x", "ms": size, "mew": 0.8, "zorder": 5}

@@ -1,0 +1,104 @@
+"""From a stored result and its NumPyro model back to what the model says of the data at each draw."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from lfm_ppl.inference.bound_model import BoundModel, LikelihoodSite, bind
+from lfm_ppl.results import arviz_data
+from lfm_ppl.results.likelihoods import PosteriorDraws
+
+_TOLERANCE = 1e-6
+"""Relative difference of log likelihoods between machines and versions that is rounding."""
+
+
+def observations(result: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return the times and the observations that ``result`` was made from.
+
+    Returns:
+        times (T,) or (B, T), and y (T, D) or (B, T, D).
+
+    Raises:
+        ValueError: the result holds no data.
+    """
+    data = arviz_data.group(result, "observed_data")
+    names = [name for name in data.data_vars if name != "times"]
+    if len(names) != 1 or ("times" not in data and "time" not in data.coords):
+        raise ValueError(f"the group observed_data holds {', '.join(map(str, data.variables)) or 'nothing'}; expected "
+                         "one variable of observations and their times. Pass times and y.")
+    times = data["times"] if "times" in data else data["time"]
+    return np.asarray(times.values, float), np.asarray(data[names[0]].values, float)
+
+
+def problem(result: Any, numpyro_model: Callable, times: Any = None, y: Any = None,
+            model_kwargs: Mapping[str, Any] | None = None) -> PosteriorDraws:
+    """Return model, data and all draws (C * N, ...) of the sample sites, with the result's fixed parameters.
+
+    Raises:
+        ValueError: the result holds no posterior or no data; or the model is not the one that it was made with: other
+            settings, other parameters.
+    """
+    posterior = arviz_data.group(result, "posterior")
+    attrs = arviz_data.attributes(result)
+    if times is None or y is None:
+        stored = observations(result)
+        times, y = stored[0] if times is None else times, stored[1] if y is None else y
+    bound = bind(numpyro_model, times, y, **dict(model_kwargs or {}))
+    _check_settings(bound.site, attrs)
+    bound = bound.fix(json.loads(attrs.get("fixed") or "{}"))
+    return PosteriorDraws(bound, _latent(bound, posterior))
+
+
+def check_likelihood(result: Any, log_likelihood: np.ndarray, chosen: np.ndarray) -> None:
+    """Compare log likelihoods (C, S) at draws ``chosen`` (S,) of each chain with those that the result records.
+
+    Raises:
+        ValueError: they differ: the model, its options or the data are others than those of the result.
+    """
+    if not arviz_data.has_group(result, "one_step_ahead"):
+        return
+    recorded = arviz_data.group(result, "one_step_ahead")["log_density"].transpose("chain", "draw", ...)
+    recorded = recorded.isel(draw=chosen).values.reshape(*log_likelihood.shape, -1).sum(axis=-1)
+    difference = np.abs(recorded - log_likelihood)
+    if np.any(difference > _TOLERANCE * (1.0 + np.abs(recorded))):
+        raise ValueError(f"the model gives other log likelihoods than the result records, by up to {difference.max():g}"
+                         " at its draws: the model, its options or the data are not those that the result was made "
+                         "with. Fit again, or give what was used then.")
+
+
+def _check_settings(site: LikelihoodSite, attrs: Mapping[str, Any]) -> None:
+    example = site.example
+    own = {"rule": example.rule.name, "steps": example.steps, "max_step": example.max_step,
+           "iterations": example.iterations, "tolerance": example.tolerance}
+    if not set(own) & set(attrs):
+        return  # not made by `fit`
+    for name in own:
+        # What is None is not stored.
+        if attrs.get(name) != own[name]:
+            raise ValueError(f"the result was made with {name} = {attrs.get(name)}, but the model has {name} = "
+                             f"{own[name]}; give the model as it was fitted.")
+
+
+def _latent(bound: BoundModel, posterior: xr.Dataset) -> dict:
+    """Return the draws of the sample sites; deterministic ones the model computes itself."""
+    shapes = {name: np.shape(value) for name, value in bound.constrain(np.zeros(bound.size)).items()}
+    draws = {}
+    for name in bound.sites:
+        stored = name.replace("/", ".")
+        if stored not in posterior:
+            known = ", ".join(map(str, posterior.data_vars))
+            raise ValueError(f"the model samples {name!r}, of which the result has no draws (it has {known}); it is "
+                             "not the model that the result was made with.")
+        values = posterior[stored].transpose("chain", "draw", ...).values
+        if values.shape[2:] != shapes[name]:
+            raise ValueError(f"{name!r} has shape {shapes[name]} in the model and {values.shape[2:]} in the "
+                             "result; it is not the model that the result was made with.")
+        draws[name] = values.reshape(-1, *values.shape[2:])
+    if not draws:
+        raise ValueError("the model has no parameters that are sampled, so there is nothing to check.")
+    return draws

@@ -1,0 +1,130 @@
+"""Are the one-step-ahead residuals standard normal and white, as a right model makes them?"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from scipy import stats
+
+from lfm_ppl.results.arviz_data import group
+
+MIN_OBSERVATIONS = 8
+
+
+def mean_residuals(result: Any) -> xr.DataArray:
+    """Return the posterior mean of the standardised one-step-ahead residuals (time, output).
+
+    A residual is e_k = L_k^-1 (y_k - E[y_k | y_1..k-1, theta]), with L_k L_k' the predictive
+    covariance. Where the model holds, e_k is independent N(0, 1). NaN stands for a missing value.
+
+    Args:
+        result: with the group one_step_ahead.
+
+    Raises:
+        ValueError: the group is missing.
+    """
+    residual = group(result, "one_step_ahead")["residual"]
+    return residual.mean(("chain", "draw"), skipna=False).transpose("time", "output")
+
+
+def autocorrelation(residual: np.ndarray, lags: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the autocorrelation of a series with gaps, and how many pairs each lag has.
+
+    rho_h = mean of (e_k - m)(e_k+h - m) over the pairs that are both there, divided by the mean of
+    (e_k - m)^2. Lags count observations, also where these are not equally spaced in time.
+
+    Args:
+        residual: shape (T,), NaN where missing.
+        lags: the largest lag.
+
+    Returns:
+        rho and the number of pairs, both of shape (lags,), for lags 1, 2, ...; rho is NaN for a
+        lag without pairs.
+    """
+    centred = residual - np.nanmean(residual)
+    variance = np.nanmean(centred**2)
+    rho, pairs = np.full(lags, np.nan), np.zeros(lags, int)
+    for lag in range(1, min(lags, len(residual) - 1) + 1):
+        products = centred[:-lag] * centred[lag:]
+        pairs[lag - 1] = np.isfinite(products).sum()
+        if pairs[lag - 1] and variance > 0:
+            rho[lag - 1] = np.nanmean(products) / variance
+    return rho, pairs
+
+
+def ljung_box(residual: np.ndarray, lags: int) -> float:
+    """Return the p-value of the Ljung-Box test of whiteness.
+
+    Q = n (n + 2) sum_h r_h^2 / (n - h) is chi-squared with ``lags`` degrees of freedom for white
+    residuals, where r_h = (1 - h / n) rho_h; with gaps the number of pairs replaces n - h.
+    Source: Ljung and Box (1978), Biometrika 65(2), eq. 1.2.
+
+    Args:
+        residual: shape (T,), NaN where missing.
+        lags: how many lags to sum.
+    """
+    rho, pairs = autocorrelation(residual, lags)
+    count = np.isfinite(residual).sum()
+    there = np.isfinite(rho)
+    if not there.any():
+        return float("nan")
+    statistic = (count + 2) / count * np.sum(pairs[there] * rho[there] ** 2)
+    return float(stats.chi2.sf(statistic, there.sum()))
+
+
+def residual_tests(result: Any) -> pd.DataFrame:
+    """Return, for each output, whether its residuals look standard normal and white.
+
+    Args:
+        result: with the group one_step_ahead.
+
+    Returns:
+        One row per output: count, mean, sd, ks_p (Kolmogorov-Smirnov against N(0, 1)), ljung_box_p
+        and lags. The p-values take the parameters as known, and so are a little too large. They
+        are NaN below 8 observations.
+
+    Raises:
+        ValueError: the group one_step_ahead is missing.
+    """
+    residual = mean_residuals(result)
+    rows = {}
+    for name in residual["output"].values:
+        series = residual.sel(output=name).values
+        there = series[np.isfinite(series)]
+        count = len(there)
+        lags = default_lags(count)
+        enough = count >= MIN_OBSERVATIONS
+        rows[str(name)] = {
+            "count": count,
+            "mean": there.mean() if count else np.nan,
+            "sd": there.std(ddof=1) if count > 1 else np.nan,
+            "ks_p": stats.kstest(there, "norm").pvalue if enough else np.nan,
+            "ljung_box_p": ljung_box(series, lags) if enough else np.nan,
+            "lags": lags,
+        }
+    frame = pd.DataFrame.from_dict(rows, orient="index")
+    return frame.astype({"count": int, "lags": int})
+
+
+def default_lags(count: int) -> int:
+    """Return how many lags ``count`` observations can support: a fifth of them, 1 to 20."""
+    return int(np.clip(count // 5, 1, 20))
+
+
+def normal_scores(count: int, level: float = 0.95) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return where ``count`` ordered N(0, 1) values are expected, with a pointwise interval.
+
+    The i-th smallest of n uniform values is Beta(i, n + 1 - i): its median and its quantiles are
+    carried to the normal scale.
+
+    Returns:
+        Median, lower and upper end, each of shape (count,).
+    """
+    i = np.arange(1, count + 1)
+    tail = (1.0 - level) / 2.0
+    quantiles = [stats.beta.ppf(q, i, count + 1 - i) for q in (0.5, tail, 1.0 - tail)]
+    median, low, high = stats.norm.ppf(quantiles)
+    return median, low, high

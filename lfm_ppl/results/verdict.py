@@ -1,0 +1,173 @@
+"""What the numbers of an accuracy report mean, in words, and what to do next."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from lfm_ppl.results.importance import LARGEST_K
+from lfm_ppl.results.likelihoods import finer_tolerance
+
+SHIFT = 0.1
+"""Change of a mean, in posterior sds, that does not matter."""
+
+WIDTH = 0.1
+"""Relative change of an sd that does not matter."""
+
+STEP_CHANGE = 0.1
+"""Variation over the posterior of the log likelihood's change under doubled steps that does not matter."""
+
+NOISE_SD = 0.3
+"""Noise of a log ratio that does not matter."""
+
+LEAST_DRAWS = 40
+"""Fewer draws have no tail to fit a Pareto distribution to."""
+
+_SIGMAS = 2.0
+_NAMED = 4
+
+
+class Findings(NamedTuple):
+    """What a verdict rests on; see `lfm_ppl.results.accuracy.AccuracyReport` for the numbers.
+
+    Attributes:
+        table: of the parameters.
+        k, threshold: Pareto shape and where it stops being reliable.
+        exact: whether the filter is exact and no reference was run.
+        step_change_sd: sd over the draws of the change of the log likelihood under doubled steps.
+        noise_sd, noise_share: of the log ratios; zero of an exact reference.
+        particles: of the reference; zero where there are none.
+        checked: number of draws with ratios.
+        available: number of draws of the posterior.
+        impossible: number of draws that the reference gives a likelihood of zero.
+        sampler: that made the draws.
+        refit: the command that made the result; empty where it is not known.
+        steps, max_step, tolerance: of the Gaussian filter.
+    """
+
+    table: pd.DataFrame
+    k: float
+    threshold: float
+    exact: bool
+    step_change_sd: float
+    noise_sd: float
+    noise_share: float
+    particles: int
+    checked: int
+    available: int
+    impossible: int
+    sampler: str
+    refit: str
+    steps: int
+    max_step: float | None
+    tolerance: float | None = None
+
+
+class Verdict(NamedTuple):
+    """A word (trust, corrected or re-run), the reason, and the command to type next (empty for none)."""
+
+    word: str
+    reason: str
+    command: str
+
+
+def judge(found: Findings) -> Verdict:
+    """Return the verdict on a Gaussian-filter posterior.
+
+    - "re-run" where the integration steps are too long, or the importance ratios too uneven to correct with;
+    - "corrected" where some mean or sd is off, and the importance weights can be relied on;
+    - "trust" otherwise: every mean within 0.1 sd and every sd within 10% of the corrected one, or within two Monte
+      Carlo standard errors.
+    """
+    word, reason, command = _judged(found)
+    notes = _notes(found)
+    return Verdict(word, " ".join([reason, *notes]), command)
+
+
+def _judged(found: Findings) -> tuple[str, str, str]:
+    if not found.step_change_sd <= STEP_CHANGE:
+        if found.tolerance is None:
+            finer, advice = f"--steps {2 * found.steps}", f"with {2 * found.steps} steps"
+        else:
+            tighter = finer_tolerance(found.tolerance)
+            finer = f"--steps {2 * found.steps} --tolerance {tighter:g}"
+            advice = f"with a tolerance of {tighter:g} and {2 * found.steps} steps"
+        if found.max_step is not None:
+            finer += f" --max-step {found.max_step / 2:g}"
+        reason = (f"the integration steps are too long: twice as many change the log likelihood by amounts that vary "
+                  f"by {found.step_change_sd:.2g} (sd) over the posterior, more than {STEP_CHANGE}.")
+        if not found.refit:
+            return "re-run", f"{reason} Fit again {advice}.", ""
+        return "re-run", reason, f"{found.refit} {finer}"
+    if found.exact:
+        return "trust", "the model is linear with Gaussian noise, for which the filter is exact.", ""
+    if not found.k < found.threshold:
+        return "re-run", *_unreliable(found)
+    shifted = _changed(found.table)
+    if shifted:
+        reason = (f"the Gaussian filter has moved {_listed(shifted)}; the importance weights can be relied on "
+                  f"(k = {found.k:.2f}, below {found.threshold:.2f}), and so can the corrected mean and sd.")
+        return "corrected", reason, "lfm-ppl check RESULT --correct --overwrite"
+    reason = (f"no mean is off by more than {SHIFT} sd and no sd by more than {WIDTH:.0%}, beyond Monte Carlo error "
+              f"(k = {found.k:.2f}, below {found.threshold:.2f}).")
+    unseen = _SIGMAS * float(np.nanmax(found.table["shift_se"], initial=0.0))
+    if unseen <= 2.0 * SHIFT:
+        return "trust", reason, ""
+    more = min(math.ceil(found.checked * (unseen / (2.0 * SHIFT)) ** 2 / 100) * 100, found.available)
+    reason += f" Shifts up to {unseen:.2f} sd cannot be told from Monte Carlo error with {found.checked} draws."
+    return "trust", reason, f"lfm-ppl check RESULT --draws {more} --overwrite" if more > found.checked else ""
+
+
+def _unreliable(found: Findings) -> tuple[str, str]:
+    if not math.isfinite(found.k) and found.checked < min(LEAST_DRAWS, found.available):
+        return (f"{found.checked} draws are too few for a Pareto k.",
+                f"lfm-ppl check RESULT --draws {min(200, found.available)} --overwrite")
+    digits = 2 if f"{found.k:.2f}" != f"{found.threshold:.2f}" else 4
+    start = (f"k = {found.k:.{digits}f} is not below {found.threshold:.{digits}f}, so that the importance weights "
+             "cannot be relied on")
+    if found.noise_share > 0.5:
+        reason = (f"{start}; {found.noise_share:.0%} of the variance of the log ratios is noise of the particle "
+                  "filter, which makes k larger.")
+        return reason, f"lfm-ppl check RESULT --particles {4 * found.particles} --overwrite"
+    # The threshold rises with the number of draws.
+    needed = math.ceil(10.0 ** (1.0 / (1.0 - found.k))) if 0.0 < found.k < LARGEST_K else math.inf
+    if found.checked < needed <= found.available:
+        more = min(2 * int(needed), found.available)  # a margin, because k itself is an estimate
+        return f"{start} with {found.checked} draws.", f"lfm-ppl check RESULT --draws {more} --overwrite"
+    return (f"{start}: the posterior of the Gaussian filter is too far from the exact one. Delayed acceptance, or "
+            "`lfm-ppl fit` with --sampler pmmh, samples the exact one.", "lfm-ppl check RESULT --correct --overwrite")
+
+
+def _changed(table: pd.DataFrame) -> list[str]:
+    """Name the parameters whose mean or sd is off, the worst first."""
+    found = []
+    for label, row in table.iterrows():
+        shift, width = abs(row["shift"]), abs(row["sd_ratio"] - 1.0)
+        parts = []
+        if shift > max(SHIFT, _SIGMAS * row["shift_se"]):
+            parts.append(f"the mean of {label} (by {-row['shift']:+.2f} +- {row['shift_se']:.2f} sd)")
+        if width > max(WIDTH, _SIGMAS * row["sd_ratio_se"]):
+            parts.append(f"the sd of {label} (to {1.0 / row['sd_ratio']:.2f} times the exact one)")
+        found += [(max(shift, width), part) for part in parts]
+    return [part for _, part in sorted(found, reverse=True)]
+
+
+def _notes(found: Findings) -> list[str]:
+    notes = []
+    if found.sampler == "map" and not found.exact:
+        notes.append("The draws come from a Laplace approximation at the mode, whose own error is not seen here.")
+    if found.noise_sd > NOISE_SD:
+        notes.append(f"The noise of the particle filter (sd {found.noise_sd:.2f} of a log ratio) is above {NOISE_SD}; "
+                     "it is part of the Monte Carlo errors, which more --particles lower.")
+    if found.impossible:
+        notes.append(f"The reference finds the data impossible at {found.impossible} of {found.checked} draws; they "
+                     "have weight zero.")
+    return notes
+
+
+def _listed(names: list[str]) -> str:
+    more = len(names) - _NAMED
+    return ", ".join(names[:_NAMED]) + (f" and {more} more" if more > 0 else "")

@@ -1,0 +1,1 @@
+"""Linear models with a discrete input under a known rule."""

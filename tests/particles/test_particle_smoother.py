@@ -1,0 +1,118 @@
+"""Trajectories of the particle smoother against exact smoothers."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from systems import Kicked, double_well, first_state, motif, softplus
+
+import lfm_ppl as lfm
+from lfm_ppl.fokker_planck_grid.fokker_planck import fokker_planck
+
+TIMES = np.array([0.0, 0.7, 0.7, 2.0, 3.1])
+Y = np.array([[0.3], [0.5], [0.1], [np.nan], [-0.4]])
+AT = np.array([0.0, 0.35, 0.7, 2.5, 3.1, 4.0])
+
+
+def decay(x, u, t):
+    return u - 0.8 * x
+
+
+def linear(force=None):
+    """A decay pushed by a force, of which the force alone has noise: over an interval it reaches both states."""
+    return lfm.LatentForceModel(
+        decay, {"u": force or lfm.Matern(1.0, 1.3, 0)},
+        lfm.GaussianObservation(first_state, jnp.array([0.05])), lfm.Gaussian(jnp.zeros(1), jnp.array([0.5])))
+
+
+def assert_close(found, mean, sd, draws, share=0.1):
+    """Means within five standard errors of ``draws`` independent trajectories, standard deviations within a share."""
+    assert np.all(np.abs(found.mean - mean) < 5.0 * sd / np.sqrt(draws))
+    assert np.allclose(np.sqrt(np.asarray(found.covariance)[:, 0, 0]), sd[:, 0], rtol=share)
+
+
+def test_backward_simulation_of_a_linear_model():
+    """Against the Rauch-Tung-Striebel smoother, before, between and after the observations."""
+    exact = lfm.smooth(linear(), TIMES, Y, at=AT)
+    found = lfm.particle_smoother(jax.random.key(0), linear(), TIMES, Y, particles=3000, draws=1500, at=AT)
+    assert (found.method, found.scheme) == ("backward simulation", "exact")
+    sd = np.sqrt(np.asarray(exact.covariance)[:, [0, 1], [0, 1]])
+    assert_close(found, exact.mean, sd, 1500 / 2)
+    force = found.force("u")
+    assert np.allclose(force.mean, found.mean[:, 1]) and force.draws.shape == (1500, 6)
+    assert np.all(np.abs(force.mean - exact.force("u").mean) < 5.0 * exact.force("u").sd / np.sqrt(750))
+    # Two states of one trajectory: the covariance of the exact joint distribution, too.
+    drawn = exact.sample(jax.random.key(1), 4000).state[:, :, 0]
+    ours = np.corrcoef(np.asarray(found.draws)[:, :, 0].T)
+    assert np.abs(ours - np.corrcoef(np.asarray(drawn).T)).max() < 5.0 / np.sqrt(750)
+
+
+def test_ancestor_tracing_of_a_linear_model():
+    exact = lfm.smooth(linear(), TIMES, Y)
+    found = lfm.particle_smoother(jax.random.key(0), linear(), TIMES, Y, particles=20_000, draws=4000,
+                                  method="ancestor tracing")
+    assert found.method == "ancestor tracing"
+    assert np.all(np.diff(found.distinct) >= 0)  # going back, trajectories meet
+    sd = np.sqrt(np.asarray(exact.covariance)[:, [0, 1], [0, 1]])
+    assert_close(found, exact.mean, sd, float(found.distinct.min()) / 4)
+
+
+@pytest.mark.slow
+def test_the_double_well_agrees_with_the_grid():
+    """Both methods; Euler's steps of 1/50 leave an error below the Monte Carlo error."""
+    model, times = double_well(mean=0.0), np.array([0.0, 1.5, 3.0, 4.0])
+    y = np.array([[0.8], [0.1], [-0.9], [-0.8]])
+    at = np.array([0.75, 1.5, 2.25, 4.0])
+    exact = fokker_planck(model, times, y, at=at)
+    for method, particles, draws in (("backward simulation", 3000, 1000), ("ancestor tracing", 40_000, 4000)):
+        found = lfm.particle_smoother(jax.random.key(2), model, times, y, particles=particles, draws=draws, at=at,
+                                      steps=75, method=method)
+        assert found.method == method
+        count = draws / 2 if method.startswith("back") else float(found.distinct.min()) / 4
+        assert_close(found, np.asarray(exact.smoothed_mean)[:, None], np.asarray(exact.smoothed_sd)[:, None], count)
+
+
+def test_replicates_share_the_state():
+    """Between observations at one time nothing moves: a trajectory has one value there."""
+    found = lfm.particle_smoother(jax.random.key(0), double_well(), TIMES, Y, particles=200, draws=50, steps=5)
+    assert found.method == "backward simulation" and found.scheme == "euler"
+    assert np.array_equal(found.draws[:, 1], found.draws[:, 2])
+
+
+@pytest.mark.parametrize("model, reason", [
+    (linear(lfm.Constant(1.0)), "not every state of this linear model"),
+    (motif(softplus, genes=1), "not every physical state"),
+    (lfm.LatentForceModel(lambda x, u, t: u - x**3, {"u": lfm.Constant(1.0)},
+                          lfm.GaussianObservation(first_state, jnp.array([0.1])),
+                          lfm.Gaussian(jnp.zeros(1), jnp.ones(1)), process_noise=jnp.eye(1)), "states without noise"),
+    (lfm.LatentForceModel(lambda x, u, t: u - x**3, {"u": Kicked(0.3, (0.6,), 1.0, 1.3, 0)},
+                          lfm.GaussianObservation(first_state, jnp.array([0.1])),
+                          lfm.Gaussian(jnp.zeros(1), jnp.ones(1)), process_noise=jnp.eye(1)), "a force jumps"),
+], ids=["linear", "driven", "constant", "jumps"])
+def test_models_without_a_transition_density_are_traced(model, reason):
+    with pytest.raises(ValueError, match=reason):
+        lfm.particle_smoother(jax.random.key(0), model, TIMES, Y, method="backward simulation")
+    found = lfm.particle_smoother(jax.random.key(0), model, TIMES, Y, particles=50, draws=10, steps=3)
+    assert found.method == "ancestor tracing" and np.all(np.isfinite(found.draws))
+
+
+@pytest.mark.parametrize("change, message", [
+    ({"draws": 0}, "draws must be at least 1"),
+    ({"method": "backwards"}, "'backward simulation'"),
+    ({"particles": 0}, "particles must be at least 1"),
+    ({"particles": 50_000_000}, "GiB"),
+    ({"at": [-3.0]}, "before the initial time"),
+    ({"method": "backward simulation", "scheme": "srk"}, "by the scheme"),
+])
+def test_errors(change, message):
+    with pytest.raises(ValueError, match=message):
+        lfm.particle_smoother(jax.random.key(0), double_well(), TIMES, Y, **change)
+
+
+def test_an_unknown_force_is_named():
+    found = lfm.particle_smoother(jax.random.key(0), linear(), TIMES, Y, particles=20, draws=5)
+    with pytest.raises(ValueError, match="unknown force 'v'"):
+        found.force("v")
+    with pytest.raises(ValueError, match="unknown state 'y'"):
+        found.state("y")
+    assert np.array_equal(found.state("x0").draws, found.draws[:, :, 0])

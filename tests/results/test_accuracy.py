@@ -1,0 +1,391 @@
+"""The accuracy report: importance weights against closed forms, and the Gaussian filter against exact likelihoods."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
+import xarray as xr
+
+import lfm_ppl as lfm
+from lfm_ppl.results import accuracy, arviz_data, importance, likelihoods, rebuilding
+from lfm_ppl.results.accuracy import check_accuracy
+from lfm_ppl.results.correction import correct_posterior
+from lfm_ppl.results.plots import plot_accuracy
+from lfm_ppl.results.report import AccuracyReport
+from lfm_ppl.results.verdict import Findings, judge
+
+TIMES = np.arange(6.0)
+Y = np.array([[0.9], [1.1], [np.nan], [0.8], [1.2], [0.7]])
+
+# The exact posterior is N(TARGET_MEAN, TARGET_SD^2), the wrong one N(WRONG_MEAN, WRONG_SD^2).
+TARGET_MEAN, TARGET_SD, WRONG_MEAN, WRONG_SD = 1.3, 0.9, 1.0, 1.0
+
+
+def log_ratio(x):
+    return (-0.5 * ((x - TARGET_MEAN) / TARGET_SD) ** 2 - np.log(TARGET_SD)
+            + 0.5 * ((x - WRONG_MEAN) / WRONG_SD) ** 2 + np.log(WRONG_SD))
+
+
+def autoregressive(generator, chains, samples, coefficient):
+    """Draws of N(WRONG_MEAN, WRONG_SD^2) in chains with a known autocorrelation."""
+    x = np.empty((chains, samples))
+    x[:, 0] = generator.normal(size=chains)
+    for t in range(1, samples):
+        x[:, t] = coefficient * x[:, t - 1] + np.sqrt(1 - coefficient**2) * generator.normal(size=chains)
+    return WRONG_MEAN + WRONG_SD * x
+
+
+def test_average_is_the_log_of_the_mean_with_the_variance_of_the_jackknife():
+    sd, replicates = 0.4, 4
+    generator = np.random.default_rng(0)
+    noise = generator.normal(-0.5 * sd**2, sd, (20_000, replicates))  # mean one on the scale of the likelihood
+    found = importance.average(3.0 + noise)
+    assert abs(np.exp(found.log_mean - 3.0).mean() - 1.0) < 4 * np.sqrt(np.expm1(sd**2) / noise.size)
+    # The spread over 20,000 draws is known to 0.5%; the jackknife's bias is of second order in the variance, 0.16 / 4.
+    np.testing.assert_allclose(np.sqrt(found.variance.mean()), found.log_mean.std(), rtol=0.04)
+    np.testing.assert_allclose(importance.average(np.array([[1.0, 1.0]])).log_mean, [1.0])
+    assert importance.average(np.full((1, 3), -np.inf)).log_mean[0] == -np.inf
+    assert np.isnan(importance.average(np.zeros((2, 1))).variance).all()
+
+
+@pytest.mark.parametrize("coefficient", [0.0, 0.6], ids=["independent", "autocorrelated"])
+@pytest.mark.parametrize("noise", [0.0, 0.3], ids=["exact ratios", "noisy ratios"])
+def test_corrected_moments_are_right_within_calibrated_errors(coefficient, noise):
+    """z-scores over 300 repetitions against the closed form: mean zero, sd one."""
+    generator = np.random.default_rng(1)
+    chosen = np.linspace(0, 399, 100).round().astype(int)
+    scores = []
+    for _ in range(300):
+        x = autoregressive(generator, 4, 400, coefficient)
+        ratio = log_ratio(x[:, chosen]) + generator.normal(-0.5 * noise**2, noise, (4, len(chosen)))
+        weights = importance.smooth(ratio)
+        row = importance.corrected_moments({"x": x}, chosen, weights.log_weight).loc["x"]
+        sd = row["sd"]
+        scores.append([(row["corrected_mean"] - TARGET_MEAN) / row["corrected_mean_se"],
+                       (row["sd_ratio"] - TARGET_SD / WRONG_SD) / row["sd_ratio_se"],
+                       (row["shift"] * sd - (TARGET_MEAN - WRONG_MEAN)) / (row["shift_se"] * sd)])
+    scores = np.array(scores)
+    # sd of a mean of 300 z-scores 0.06, of their sd 0.04; smoothing and normalising have biases below a tenth of an sd.
+    assert np.all(np.abs(scores.mean(axis=0)) < 0.3), scores.mean(axis=0)
+    assert np.all(np.abs(scores.std(axis=0) - 1.0) < 0.17), scores.std(axis=0)
+
+
+def test_without_a_difference_nothing_changes():
+    x = np.random.default_rng(0).normal(size=(4, 100))
+    chosen = np.arange(0, 100, 10)
+    weights = importance.smooth(np.full((4, 10), 2.5))
+    assert weights.k == -np.inf and weights.reliable
+    np.testing.assert_allclose(weights.ess, 40.0)
+    row = importance.corrected_moments({"x": x, "fixed": np.ones((4, 100))}, chosen, weights.log_weight)
+    assert abs(row.loc["x", "shift"]) < 1e-12 and abs(row.loc["x", "sd_ratio"] - 1.0) < 1e-12
+    assert row.loc["fixed"].tolist() == [1, 0, 1, 0, 0, 0, 1, 0, 0]
+
+
+def test_k_tells_heavy_tails():
+    """Ratios that are Pareto variables of shape k have tails of shape k."""
+    uniform = np.random.default_rng(3).uniform(size=(1, 4000))
+    for k in (0.2, 0.5, 0.9):
+        found = importance.smooth(-k * np.log(uniform))
+        assert abs(found.k - k) < 0.2  # 190 tail draws: sd (1 + k) / sqrt(190), at most 0.14
+        assert found.reliable == (found.k < 0.7)
+    assert importance.smooth(np.arange(4.0)[None]).k == np.inf  # too few draws
+    with pytest.raises(ValueError, match="likelihood of zero"):
+        importance.smooth(np.full((2, 10), -np.inf))
+    with pytest.raises(ValueError, match="NaN"):
+        importance.smooth(np.array([[0.0, np.nan]]))
+
+
+def test_an_impossible_draw_has_no_weight():
+    ratio = np.random.default_rng(0).normal(size=(1, 200))
+    ratio[0, :3] = -np.inf
+    assert np.all(importance.smooth(ratio).log_weight[0, :3] == -np.inf)
+
+
+def test_resampling_copies_in_proportion():
+    weight = np.array([[0.5, 0.125], [0.25, 0.125]])
+    count = np.bincount(importance.resample(np.log(weight), 800, seed=1), minlength=4)
+    np.testing.assert_array_equal(count, [400, 100, 200, 100])
+
+
+def findings(**changes):
+    table = importance.corrected_moments({"rate": np.random.default_rng(0).normal(size=(4, 50))}, np.arange(50),
+                                         np.full((4, 50), -np.log(200)))
+    rows = {name: changes.pop(name) for name in list(changes) if name in table.columns}
+    table = table.assign(**rows)
+    return Findings(**{"table": table, "k": 0.2, "threshold": 0.565, "exact": False, "step_change_sd": 0.0,
+                       "noise_sd": 0.0, "noise_share": 0.0, "particles": 0, "checked": 200, "available": 4000,
+                       "impossible": 0, "sampler": "nuts", "refit": "lfm-ppl fit well", "steps": 10,
+                       "max_step": None, **changes})
+
+
+@pytest.mark.parametrize(
+    ("changes", "word", "reason", "command"),
+    [
+        ({}, "trust", "no mean is off", ""),
+        ({"exact": True}, "trust", "the filter is exact", ""),
+        ({"shift": 0.3, "shift_se": 0.2}, "trust", "Shifts up to 0.40 sd cannot be told", "--draws 800"),
+        ({"shift": 0.3, "shift_se": 0.05}, "corrected", "the mean of rate (by -0.30 +- 0.05 sd)", "--correct"),
+        ({"sd_ratio": 0.8, "sd_ratio_se": 0.05}, "corrected", "the sd of rate (to 1.25 times", "--correct"),
+        ({"k": 0.6}, "re-run", "with 200 draws", "--draws 634"),
+        ({"k": 0.6, "available": 200}, "re-run", "too far from the exact one", "check RESULT --correct"),
+        ({"k": 0.9}, "re-run", "sampler pmmh", "check RESULT --correct"),
+        ({"k": 0.9, "noise_share": 0.8, "particles": 500}, "re-run", "80% of the variance", "--particles 2000"),
+        ({"k": np.inf, "checked": 10}, "re-run", "10 draws are too few", "--draws 200"),
+        ({"step_change_sd": 0.2}, "re-run", "vary by 0.2", "lfm-ppl fit well --steps 20"),
+        ({"step_change_sd": np.nan, "max_step": 0.5}, "re-run", "too long", "--steps 20 --max-step 0.25"),
+        ({"noise_sd": 0.5}, "trust", "The noise of the particle filter (sd 0.50", ""),
+        ({"sampler": "map"}, "trust", "Laplace", ""),
+        ({"impossible": 3}, "trust", "impossible at 3 of 200", ""),
+    ],
+)
+def test_verdicts(changes, word, reason, command):
+    verdict = judge(findings(**changes))
+    assert verdict.word == word
+    assert reason in verdict.reason
+    assert command in verdict.command and bool(command) == bool(verdict.command)
+
+
+def relaxation(times, y=None):
+    """Linear, one state with noise: the Gaussian filter is exact."""
+    rate = numpyro.sample("rate", dist.LogNormal(-0.5, 0.5))
+    numpyro.deterministic("half_life", jnp.log(2.0) / rate)
+    system = lfm.LatentForceModel(
+        lambda x, u, t: -rate * x, {}, lfm.GaussianObservation(lambda x, u, t: x, 0.1 * jnp.ones(1)),
+        lfm.Gaussian(jnp.zeros(1), jnp.eye(1)), process_noise=jnp.array([[0.7]]))
+    numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=3), obs=y)
+
+
+def well(times, y=None, noise=0.5):
+    """A double well, far from linear."""
+    depth = numpyro.sample("depth", dist.LogNormal(0.0, 0.4))
+    system = lfm.LatentForceModel(
+        lambda x, u, t: depth * (x - x**3), {}, lfm.GaussianObservation(lambda x, u, t: x, noise**2 * jnp.ones(1)),
+        lfm.Gaussian(jnp.zeros(1), jnp.eye(1)), process_noise=jnp.array([[0.7]]))
+    numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=10), obs=y)
+
+
+def fitted(model, **keywords):
+    return lfm.fit(model, TIMES, Y, sampler="map", samples=400, trajectory_draws=10, progress=False, **keywords)
+
+
+@pytest.fixture(scope="module")
+def linear():
+    return fitted(relaxation)
+
+
+@pytest.fixture(scope="module")
+def bent():
+    return fitted(well, truth={"parameters": {"depth": 1.0}})
+
+
+@pytest.fixture(scope="module")
+def checked(bent):
+    """The double well against the grid."""
+    return bent, check_accuracy(bent, well, draws=100, progress=False)
+
+
+def test_a_linear_model_needs_no_reference(linear):
+    report = check_accuracy(linear, relaxation, progress=False)
+    assert report.exact and report.verdict.word == "trust"
+    assert np.all(report.log_ratio == 0.0)
+    assert np.all(report.table[["shift", "shift_se"]] == 0.0)
+    assert np.abs(report.step_change).max() < 1e-8
+    assert "Gaussian filter is exact" in report.text(width=100)
+
+
+@pytest.mark.slow
+def test_ratios_of_a_linear_model_are_zero_on_the_grid(linear):
+    report = check_accuracy(linear, relaxation, reference="grid", draws=40, progress=False)
+    assert np.abs(report.log_ratio).max() < 2 * likelihoods.GRID_ERROR
+    assert report.verdict.word == "trust" and "grid" in report.reference
+    assert report.table["shift"].abs().max() < 0.01
+    assert set(report.table.index) == {"rate", "half_life"}
+
+
+def test_ratios_of_a_linear_model_are_zero_up_to_the_noise_of_particles(linear):
+    report = check_accuracy(linear, relaxation, reference="particles", draws=60, particles=200, seed=1, progress=False)
+    z = report.log_ratio / np.sqrt((report.dataset["noise_sd"].values ** 2).mean())
+    assert abs(z.mean()) < 0.5 + 0.5 * report.noise_sd  # 60 draws; the log of a mean is low by half its variance
+    assert 0.7 < z.std() < 1.4, z.std()
+    assert 0.5 < report.noise_share <= 1.0
+    assert report.verdict.word != "corrected"
+
+
+@pytest.mark.slow
+def test_particles_and_grid_agree(bent):
+    result, exact = bent, check_accuracy(bent, well, draws=400, progress=False)
+    copy = arviz_data.build({"posterior": arviz_data.group(result, "posterior"),
+                             "observed_data": arviz_data.group(result, "observed_data")},
+                            arviz_data.attributes(result))
+    noisy = check_accuracy(copy, well, reference="particles", draws=400, particles=300, progress=False)
+    np.testing.assert_array_equal(noisy.dataset["draw"], exact.dataset["draw"])
+    difference = noisy.log_ratio - exact.log_ratio
+    assert 0.02 < noisy.noise_sd < 0.1
+    # The log of a mean is low by half its variance; 400 draws.
+    assert abs(difference.mean()) < likelihoods.GRID_ERROR + 0.5 * noisy.noise_sd**2 + 4 * noisy.noise_sd / np.sqrt(400)
+    assert abs(difference.std() / noisy.noise_sd - 1.0) < 0.2  # 4 sd / sqrt(800), and the grid's error
+    both = noisy.table.loc["depth"], exact.table.loc["depth"]
+    assert abs(both[0]["shift"] - both[1]["shift"]) < 4 * both[0]["shift_se"]
+
+
+@pytest.mark.slow
+def test_the_corrected_posterior_is_the_exact_one_on_a_grid_of_parameters(bent):
+    """Importance weights from draws of the wrong posterior against quadrature with the exact likelihood."""
+    result = bent
+    problem = rebuilding.problem(result, well)
+    nodes = np.linspace(0.15, 5.0, 60)
+    posteriors = {}
+    at = problem._replace(draws={"depth": nodes})
+    prior = np.asarray(dist.LogNormal(0.0, 0.4).log_prob(nodes))
+    exact = likelihoods.on_grid(at, None, False).estimates[:, 0]
+    wrong = likelihoods.gaussian(at)
+    for name, log in (("exact", exact), ("wrong", wrong)):
+        density = np.exp(log + prior - (log + prior).max())
+        density /= density.sum()
+        mean = density @ nodes
+        posteriors[name] = density, mean, np.sqrt(density @ (nodes - mean) ** 2)
+    # 4 chains of independent draws from the wrong posterior, by inversion between the nodes.
+    cumulative = np.cumsum(posteriors["wrong"][0]) - 0.5 * posteriors["wrong"][0]
+    draws = np.interp(np.random.default_rng(0).uniform(size=(4, 100)), cumulative, nodes)
+    replaced = arviz_data.build({"posterior": xr.Dataset({"depth": (("chain", "draw"), draws)}),
+                                 "observed_data": arviz_data.group(result, "observed_data")}, {"sampler": "nuts"})
+    report = check_accuracy(replaced, well, draws=400, progress=False)
+    row = report.table.loc["depth"]
+    assert report.reliable
+    assert abs(posteriors["exact"][1] - posteriors["wrong"][1]) > 0.15 * posteriors["wrong"][2]
+    assert abs(row["corrected_mean"] - posteriors["exact"][1]) < 3.5 * row["corrected_mean_se"] + 0.01
+    assert abs(row["corrected_sd"] / row["sd"] - posteriors["exact"][2] / posteriors["wrong"][2]) \
+        < 3.5 * row["sd_ratio_se"] + 0.02
+    corrected = correct_posterior(replaced, well)
+    again = arviz_data.group(corrected, "posterior")["depth"].values
+    assert again.shape == (4, 100) and set(again.ravel()) <= set(draws.ravel())
+    assert abs(again.mean() - posteriors["exact"][1]) < 4 * posteriors["exact"][2] / np.sqrt(report.ess)
+    assert arviz_data.attributes(corrected)["sampler"] == "nuts + importance resampling"
+
+
+def test_the_report_survives_the_file(checked, tmp_path):
+    result, report = checked
+    path = arviz_data.save(result, tmp_path / "posterior.nc")
+    again = AccuracyReport.of(arviz_data.load(path))
+    xr.testing.assert_identical(report.to_dataset(), again.to_dataset())
+    assert str(again) == str(report) and again.verdict == report.verdict
+    assert again.table.equals(report.table)
+
+
+def test_the_figure_is_readable(checked, readable):
+    for width in ("column", "full"):
+        figure = plot_accuracy(checked[0], width=width)
+        readable(figure)
+        assert [axes.get_xlabel() for axes in figure.axes] == ["log likelihood, relative", "depth"]
+    assert "k = " in figure.axes[0].get_title(loc="left")
+
+
+def test_correction_keeps_data_truth_and_the_layout_of_trajectories(checked):
+    result, report = checked
+    assert report.reliable
+    corrected = correct_posterior(result, well, trajectory_draws=6)
+    old, new = (arviz_data.group(one, "trajectories") for one in (result, corrected))
+    assert new["states"].dims == old["states"].dims and new["states"].shape == (1, 6, *old["states"].shape[2:])
+    np.testing.assert_array_equal(new["at"], old["at"])
+    assert arviz_data.group(corrected, "posterior_predictive")["y"].shape == (1, 6, 6, 1)
+    assert {"observed_data", "truth"} <= set(arviz_data.groups(corrected))
+
+
+@pytest.mark.slow
+def test_a_panel_is_the_sum_of_its_series():
+    def build(p):
+        return lfm.LatentForceModel(
+            lambda x, u, t: p["rate"] * (x - x**3), {},
+            lfm.GaussianObservation(lambda x, u, t: x, 0.1 * jnp.ones(1)),
+            lfm.Gaussian(jnp.zeros(1), jnp.eye(1)), process_noise=jnp.array([[0.7]]))
+
+    def panel(times, y=None):
+        rate = numpyro.sample("rate", dist.LogNormal(0.0, 0.3))
+        with numpyro.plate("series", 2):
+            numpyro.sample("y", lfm.panel(build, {"rate": jnp.repeat(rate, 2)}, times, steps=5), obs=y)
+
+    def single(times, y=None):
+        rate = numpyro.sample("rate", dist.LogNormal(0.0, 0.3))
+        numpyro.sample("y", lfm.MarginalLikelihood(build({"rate": rate}), times, steps=5), obs=y)
+
+    draws = xr.Dataset({"rate": (("chain", "draw"), np.linspace(0.5, 1.5, 8).reshape(2, 4))})
+    result = arviz_data.build({"posterior": draws})
+    run = lambda model, y, **keywords: check_accuracy(  # noqa: E731
+        result, model, TIMES, y, draws=8, progress=False, **keywords)
+    alone, together = run(single, Y), run(panel, np.stack([Y, Y]))
+    np.testing.assert_allclose(together.log_ratio, 2 * alone.log_ratio, atol=4 * likelihoods.GRID_ERROR)
+    particles = run(panel, np.stack([Y, Y]), reference="particles", particles=1000)
+    assert np.abs(particles.log_ratio - together.log_ratio).max() < 5 * particles.noise_sd + 0.02
+
+
+def test_enough_particles_are_found(bent):
+    """The pilot raises the number until the noise is below its target."""
+    problem = rebuilding.problem(bent, well).at(np.arange(0, 400, 25))
+    noise = lambda e: accuracy.noise(importance.average(e))  # noqa: E731
+    found = likelihoods.by_particles(problem, None, 2, None, jax.random.key(0), False, noise, 0.02, 1e12)
+    assert found.particles > 1000 and not found.limited
+    assert noise(found.estimates) < 0.03
+    limited = likelihoods.by_particles(problem, None, 2, None, jax.random.key(0), False, noise, 0.001, 1e6)
+    assert limited.particles == 1000 and limited.limited
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"reference": "exact"}, "unknown reference 'exact'"),
+        ({"draws": 0}, "draws must be at least 1"),
+        ({"particles": 0}, "particles must be at least 1"),
+        ({"replicates": 1}, "replicates must be at least 2"),
+        ({"steps": 0}, "steps must be at least 1"),
+        ({"model_kwargs": {"noise": 0.3}}, "gives other log likelihoods than the result records"),
+        ({"y": 2 * Y}, "gives other log likelihoods than the result records"),
+        ({"y": Y[:3]}, "y"),
+    ],
+)
+def test_mistakes(bent, changes, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        check_accuracy(bent, well, progress=False, **changes)
+
+
+def test_mistakes_about_the_result(bent, linear):
+    posterior, observed = (arviz_data.group(bent, name) for name in ("posterior", "observed_data"))
+    with pytest.raises(ValueError, match="no group 'observed_data'"):
+        check_accuracy(arviz_data.build({"posterior": posterior}), well)
+    with pytest.raises(ValueError, match="the model samples 'rate', of which the result has no draws"):
+        check_accuracy(arviz_data.build({"posterior": posterior, "observed_data": observed}), relaxation)
+    with pytest.raises(ValueError, match="made with steps = 10, but the model has steps = 3"):
+        check_accuracy(bent, relaxation)
+    with pytest.raises(ValueError, match="come from pmmh, which samples the exact posterior already"):
+        check_accuracy(arviz_data.build({"posterior": posterior}, {"sampler": "pmmh"}), well)
+    with pytest.raises(ValueError, match="no group 'accuracy'"):
+        AccuracyReport.of(arviz_data.build({"posterior": posterior}))
+
+
+def test_the_grid_takes_one_state(linear):
+    def two(times, y=None):
+        rate = numpyro.sample("rate", dist.LogNormal(0.0, 0.3))
+        system = lfm.LatentForceModel(
+            lambda x, u, t: u - rate * x**3, {"u": lfm.Matern(1.0, 1.0)},
+            lfm.GaussianObservation(lambda x, u, t: x, jnp.ones(1)), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
+        numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
+
+    draws = arviz_data.build({"posterior": arviz_data.group(linear, "posterior")})
+    with pytest.raises(ValueError, match="takes models of one state; this one has 3"):
+        check_accuracy(draws, two, TIMES, Y, reference="grid")
+
+
+@pytest.mark.slow
+def test_fixed_parameters_stay_fixed():
+    def model(times, y=None):
+        depth = numpyro.sample("depth", dist.LogNormal(0.0, 0.4))
+        sd = numpyro.sample("sd", dist.LogNormal(-1.0, 0.4))
+        system = lfm.LatentForceModel(
+            lambda x, u, t: depth * (x - x**3), {}, lfm.GaussianObservation(lambda x, u, t: x, sd**2 * jnp.ones(1)),
+            lfm.Gaussian(jnp.zeros(1), jnp.eye(1)), process_noise=jnp.array([[0.7]]))
+        numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=10), obs=y)
+
+    result = fitted(model, fixed={"sd": 0.3})
+    report = check_accuracy(result, model, reference="particles", particles=50, draws=8, progress=False)
+    assert list(report.table.index) == ["depth"]

@@ -1,0 +1,67 @@
+"""All figures as files."""
+
+import os
+from importlib import import_module
+
+import matplotlib.image
+import pytest
+import xarray as xr
+
+from lfm_ppl.results import arviz_data
+from lfm_ppl.results.plots import save_figures
+
+ALL = ["fit", "forces", "states", "trace", "pairs", "residuals"]
+
+
+def test_every_figure_in_every_format(tmp_path, result):
+    folder = tmp_path / "new" / "figures"
+    paths = save_figures(result, folder, ("pdf", ".SVG"), width="column")
+    expected = [f"{name}.{ending}" for name in ALL for ending in ("pdf", "svg")]
+    assert [path.name for path in paths] == expected
+    assert sorted(os.listdir(folder)) == sorted(expected)
+    assert all(path.read_bytes().startswith(b"%PDF") for path in folder.glob("*.pdf"))
+    assert "CDKN1A (a.u.)" in (folder / "fit.svg").read_text(encoding="utf-8")  # text, not outlines
+
+
+def test_figures_without_their_group_are_left_out(tmp_path, datasets):
+    kept = {name: datasets[name] for name in ("posterior", "observed_data")}
+    paths = save_figures(arviz_data.build(kept), tmp_path, "png")
+    assert [path.name for path in paths] == ["trace.png", "pairs.png"]
+    kept["trajectories"] = datasets["trajectories"].drop_dims(["force", "output"])
+    kept["posterior"] = kept["posterior"][["anchor"]]
+    paths = save_figures(arviz_data.build(kept), tmp_path, "png")
+    assert [path.name for path in paths] == ["states.png"]
+    assert matplotlib.image.imread(paths[0]).shape[1] == 7.0 * 300
+    only = arviz_data.build({"observed_data": xr.Dataset({"y": ("time", [1.0])})})
+    assert save_figures(only, tmp_path) == []
+
+
+def test_nothing_is_overwritten_unasked(tmp_path, datasets):
+    states = datasets["trajectories"].drop_dims(["force", "output"])
+    result = arviz_data.build({"trajectories": states})
+    (tmp_path / "states.pdf").write_text("mine")
+    with pytest.raises(FileExistsError, match=r"states\.pdf exists already"):
+        save_figures(result, tmp_path, ("png", "pdf"))
+    assert os.listdir(tmp_path) == ["states.pdf"]
+    save_figures(result, tmp_path, ("png", "pdf"), overwrite=True)
+    assert len(os.listdir(tmp_path)) == 2
+    assert (tmp_path / "states.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_unknown_format(tmp_path, result):
+    with pytest.raises(ValueError, match="unknown figure format 'bmp'; known: .*png"):
+        save_figures(result, tmp_path, ["bmp"])
+    assert not os.listdir(tmp_path)
+
+
+def test_long_lists_go_to_numbered_pages(tmp_path, crowded, monkeypatch):
+    saving = import_module("lfm_ppl.results.plots.saving")
+    trajectories = arviz_data.group(crowded, "trajectories")
+    data = arviz_data.group(crowded, "observed_data")
+    small = arviz_data.build({"trajectories": trajectories, "observed_data": data})
+    paths = save_figures(small, tmp_path, width="column")
+    assert [path.name for path in paths] == ["fit-1.png", "fit-2.png"]
+    monkeypatch.setattr(saving, "MAX_PAGES", 1)
+    with pytest.warns(UserWarning, match="fit: drawing the first 12 of 15; call plot_fit"):
+        save_figures(small, tmp_path / "one")
+    assert os.listdir(tmp_path / "one") == ["fit-1.png"]

@@ -1,0 +1,468 @@
+import json
+import warnings
+
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
+import xarray as xr
+from numpyro.infer import init_to_uniform
+from scipy import stats
+from scipy.interpolate import CubicSpline
+
+import lfm_ppl as lfm
+from lfm_ppl.results import arviz_data
+from tests.inference import linear_motif as motif
+
+TIMES = motif.TIMES
+FORECAST = np.array([0.0, 0.7, 2.5, 3.2, 4.6, 6.0])
+NEAR = 1e-7
+"""Relative width of priors that make the parameters all but known."""
+
+
+@pytest.fixture(scope="module")
+def y():
+    return motif.data()
+
+
+def quiet_fit(*arguments, **keywords):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", lfm.ConvergenceWarning)
+        return lfm.fit(*arguments, progress=False, **keywords)
+
+
+@pytest.fixture(scope="module")
+def nuts(y):
+    """Two short chains of NUTS, with one element of a vector fixed."""
+    return quiet_fit(motif.model, TIMES, y, sampler="nuts", chains=2, warmup=60, samples=40, trajectory_draws=10,
+                     at=FORECAST, fixed={"decay[b]": 1.2}, chain_method="vectorized", name="motif",
+                     truth={"times": TIMES, "forces": {"drive": np.sin(TIMES)}, "state": np.ones((len(TIMES), 2)),
+                            "parameters": motif.THETA})
+
+
+@pytest.fixture(scope="module")
+def known(y):
+    """Independent draws for parameters that are all but known."""
+    return quiet_fit(motif.model, TIMES, y, sampler="map", samples=2000, trajectory_draws=2000, at=FORECAST, seed=3,
+                     model_kwargs={"spread": NEAR})
+
+
+def group(result, name):
+    return arviz_data.group(result, name)
+
+
+# Groups, dimensions, coordinates, units and attributes
+
+
+def test_groups_and_dimensions(nuts):
+    expected = {
+        "posterior": {"decay": ("chain", "draw", "output"), "lengthscale": ("chain", "draw"),
+                      "noise_sd": ("chain", "draw")},
+        "log_likelihood": {"y": ("chain", "draw", "time")},
+        "one_step_ahead": {"log_density": ("chain", "draw", "time"), "residual": ("chain", "draw", "time", "output")},
+        "posterior_predictive": {"y": ("chain", "draw", "time", "output")},
+        "trajectories": {"forces": ("chain", "draw", "at", "force"), "states": ("chain", "draw", "at", "state"),
+                         "outputs": ("chain", "draw", "at", "output")},
+        "observed_data": {"y": ("time", "output")},
+        "truth": {"forces": ("at_truth", "force"), "states": ("at_truth", "state"), "decay": ("output",),
+                  "lengthscale": (), "noise_sd": ()},
+    }
+    assert set(arviz_data.groups(nuts)) == {*expected, "sample_stats"}
+    for name, variables in expected.items():
+        dataset = group(nuts, name)
+        assert {variable: dataset[variable].dims for variable in dataset.data_vars} == variables
+
+
+def test_coordinates_carry_names_times_and_units(nuts, y):
+    posterior, paths = group(nuts, "posterior"), group(nuts, "trajectories")
+    assert posterior["output"].values.tolist() == ["a", "b"]
+    assert (posterior.sizes["chain"], posterior.sizes["draw"]) == (2, 40)
+    assert paths["force"].values.tolist() == ["drive"]
+    assert paths["state"].values.tolist() == ["x0", "x1"]
+    assert (paths.sizes["chain"], paths.sizes["draw"]) == (2, 5)
+    assert set(paths["draw"].values) <= set(posterior["draw"].values)
+    np.testing.assert_array_equal(paths["at"], FORECAST)
+    observed = group(nuts, "observed_data")
+    np.testing.assert_array_equal(observed["time"], TIMES)
+    np.testing.assert_array_equal(observed["y"], y)
+    for name in ("log_likelihood", "one_step_ahead", "posterior_predictive"):
+        np.testing.assert_array_equal(group(nuts, name)["time"], TIMES)
+        assert group(nuts, name)["time"].attrs["units"] == "h"
+    assert paths["at"].attrs["units"] == "h"
+    assert paths["forces"].attrs["units"] == "1/h"
+    assert observed["y"].attrs["units"] == "nM"
+
+
+def test_attributes_say_how_it_was_made(nuts):
+    attrs = arviz_data.attributes(nuts)
+    assert (attrs["model"], attrs["sampler"], attrs["rule"], attrs["steps"]) == ("motif", "nuts", "Cubature()", 10)
+    assert (attrs["seed"], attrs["chains"], attrs["warmup"], attrs["samples"]) == (0, 2, 60, 40)
+    assert json.loads(attrs["fixed"]) == {"decay[b]": 1.2}
+    assert set(json.loads(attrs["versions"])) >= {"lfm_ppl", "jax", "numpyro", "arviz", "python"}
+    assert attrs["wall_time_s"] > 0
+    assert attrs["created_at"].startswith("20")
+
+
+def test_sample_statistics(nuts):
+    statistics = group(nuts, "sample_stats")
+    assert set(statistics.data_vars) == {"diverging", "acceptance_rate", "n_steps", "tree_depth", "energy", "step_size",
+                                    "lp"}
+    assert all(statistics[name].dims == ("chain", "draw") for name in statistics.data_vars)
+    assert statistics["diverging"].dtype == bool
+    assert ((statistics["acceptance_rate"] >= 0) & (statistics["acceptance_rate"] <= 1)).all()
+    assert (statistics["n_steps"] <= 2 ** statistics["tree_depth"] - 1).all()
+    # H = U + K, with K >= 0
+    assert (statistics["energy"] >= -statistics["lp"] - 1e-9).all()
+
+
+def test_fixed_element_keeps_its_value_and_the_others_move(nuts):
+    decay = group(nuts, "posterior")["decay"]
+    np.testing.assert_allclose(decay.sel(output="b"), 1.2, rtol=1e-12)
+    assert np.ptp(decay.sel(output="a").values) > 0
+
+
+def test_file_round_trip(nuts, known, tmp_path):
+    for index, result in enumerate((nuts, known)):
+        path = arviz_data.save(result, tmp_path / f"{index}.nc")
+        loaded = arviz_data.load(path)
+        assert set(arviz_data.groups(loaded)) == set(arviz_data.groups(result))
+        assert arviz_data.attributes(loaded) == arviz_data.attributes(result)
+        for name in arviz_data.groups(result):
+            xr.testing.assert_identical(group(loaded, name), group(result, name))
+
+
+# Predictive densities
+
+
+def test_conditionals_equal_the_exact_ones_at_every_draw(nuts, y):
+    posterior, conditional = group(nuts, "posterior"), group(nuts, "log_likelihood")["y"]
+    ahead = group(nuts, "one_step_ahead")["log_density"]
+    for chain, draw in ((0, 0), (1, 17), (1, 39)):
+        theta = {name: posterior[name].values[chain, draw] for name in motif.THETA}
+        whole = motif.log_density(y, **theta)
+        np.testing.assert_allclose(ahead.values[chain, draw].sum(), whole, rtol=1e-8)
+        for row in range(len(TIMES)):
+            without, before = y.copy(), y.copy()
+            without[row] = np.nan
+            before[row:] = np.nan
+            exact = whole - motif.log_density(without, **theta)
+            np.testing.assert_allclose(conditional.values[chain, draw, row], exact, rtol=1e-8, atol=1e-9)
+            until = y.copy()
+            until[row + 1 :] = np.nan
+            step = motif.log_density(until, **theta) - motif.log_density(before, **theta)
+            np.testing.assert_allclose(ahead.values[chain, draw, row], step, rtol=1e-8, atol=1e-9)
+
+
+def test_residuals_are_missing_where_data_are(nuts, y):
+    residual = group(nuts, "one_step_ahead")["residual"].values
+    np.testing.assert_array_equal(np.isnan(residual).all((0, 1)), np.isnan(y))
+    np.testing.assert_array_equal(np.isnan(residual).any((0, 1)), np.isnan(y))
+
+
+def one_parameter(times, y=None):
+    """The motif with its first decay unknown; a posterior on a line can be integrated exactly."""
+    decay = numpyro.sample("decay", dist.LogNormal(np.log(0.5), 0.5))
+    system = motif.build(jnp.stack([decay, jnp.asarray(1.2)]), 1.5, 0.2)
+    numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
+
+
+@pytest.fixture(scope="module")
+def line(y):
+    return quiet_fit(one_parameter, TIMES, y, sampler="ram", chains=4, warmup=500, samples=1000, trajectory_draws=0,
+                     chain_method="vectorized")
+
+
+@pytest.fixture(scope="module")
+def density():
+    """The standardised log decay on a grid, log prior densities there, and the log likelihood of any y there."""
+    nodes = np.linspace(-4.5, 4.5, 91)
+    covariances = [motif.observation_covariance(TIMES, np.array([0.5 * np.exp(0.5 * z), 1.2]), 1.5, 0.2) for z in nodes]
+
+    def log_likelihood(y):
+        present = np.isfinite(y).ravel()
+        normal = [stats.multivariate_normal(cov=c[np.ix_(present, present)]) for c in covariances]
+        return np.array([one.logpdf(y.ravel()[present]) for one in normal])
+
+    return nodes, stats.norm.logpdf(nodes), log_likelihood
+
+
+@pytest.mark.slow
+def test_loo_equals_refitting_without_each_observation(line, y, density):
+    # p(y_k | y_-k) = Z(y) / Z(y_-k), with evidences Z by quadrature: exact refits
+    nodes, prior, log_likelihood = density
+
+    def evidence(y):
+        return np.log(np.diff(nodes)[0]) + np.logaddexp.reduce(prior + log_likelihood(y))
+
+    exact = np.empty(len(TIMES))
+    for row in range(len(TIMES)):
+        without = y.copy()
+        without[row] = np.nan
+        exact[row] = evidence(y) - evidence(without)
+    import arviz as az
+
+    found = az.loo(line, pointwise=True)
+    pointwise = np.asarray(found.loo_i if hasattr(found, "loo_i") else found.elpd_i)
+    # Standard error of the log of an importance-sampling mean of 1 / p(y_k | y_-k, theta), at the effective sample size
+    inverse = np.exp(-group(line, "log_likelihood")["y"].values.reshape(4000, -1))
+    size = arviz_data.ess(line)["decay"]
+    error = inverse.std(0) / inverse.mean(0) / np.sqrt(size)
+    np.testing.assert_array_less(np.abs(pointwise - exact), 4.5 * error + 1e-6)
+    total = float(found.elpd_loo if hasattr(found, "elpd_loo") else found.elpd)
+    assert abs(total - exact.sum()) < 4.5 * error.sum()
+    assert error.sum() < 0.2
+
+
+@pytest.mark.slow
+def test_ram_posterior_on_a_line(line, y, density):
+    nodes, prior, log_likelihood = density
+    # The density of the unconstrained parameter log(decay) = log(0.5) + z / 2
+    values = prior + log_likelihood(y) - np.log(0.5)
+    weights = np.exp(values - values.max())
+    weights /= weights.sum()
+    mean, size = weights @ nodes, arviz_data.ess(line)["decay"]
+    sd = np.sqrt(weights @ (nodes - mean) ** 2)
+    drawn = (np.log(group(line, "posterior")["decay"].values) - np.log(0.5)) / 0.5
+    assert abs(drawn.mean() - mean) < 4.5 * sd / np.sqrt(size)
+    assert abs(drawn.std() / sd - 1) < 4.5 / np.sqrt(size)
+    statistics = group(line, "sample_stats")
+    assert set(statistics.data_vars) == {"acceptance_rate", "accepted", "lp"}
+    assert 0.3 < float(statistics["accepted"].mean()) < 0.6  # towards 0.44 in one dimension
+    at = CubicSpline(nodes, values)(drawn[0, :20])
+    np.testing.assert_allclose(statistics["lp"].values[0, :20], at, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_no_trajectories_where_none_are_asked_for(line):
+    assert "trajectories" not in arviz_data.groups(line)
+    assert "posterior_predictive" not in arviz_data.groups(line)
+
+
+# Trajectories
+
+
+@pytest.fixture(scope="module")
+def exact(y):
+    """Means and covariance of x(TIMES), u(FORECAST), x(FORECAST) given the data, parameters known."""
+    return motif.posterior(y, FORECAST, **motif.THETA)
+
+
+def assert_moments(draws, mean, covariance):
+    """Draws (n, d) against a Gaussian: whitened, they are independent standard normals."""
+    count = len(draws)
+    values, vectors = np.linalg.eigh(covariance)
+    kept = values > 1e-9 * values.max()
+    white = (draws - mean) @ vectors[:, kept] / np.sqrt(values[kept])
+    assert np.abs(white.mean(0)).max() < 4.5 / np.sqrt(count)
+    error = np.abs(white.T @ white / count - np.eye(kept.sum()))
+    assert error.max() < 4.5 * np.sqrt(2.0 / count)
+
+
+def test_trajectories_have_the_exact_joint_distribution(known, exact):
+    paths = group(known, "trajectories")
+    mean, covariance = exact
+    start = 2 * len(TIMES)
+    forces = paths["forces"].values[0, :, :, 0]
+    states = paths["states"].values[0].reshape(len(forces), -1)
+    assert_moments(np.concatenate([forces, states], axis=1), mean[start:], covariance[start:, start:])
+    np.testing.assert_array_equal(paths["outputs"], paths["states"])
+
+
+def test_posterior_predictive_is_the_smoothed_state_and_noise(known, exact):
+    replicated = group(known, "posterior_predictive")["y"].values[0]
+    mean, covariance = exact
+    size = 2 * len(TIMES)
+    noise = motif.THETA["noise_sd"] ** 2 * np.eye(size)
+    assert_moments(replicated.reshape(len(replicated), -1), mean[:size], covariance[:size, :size] + noise)
+
+
+def test_trajectories_agree_with_smooth(known, y):
+    smoothed = lfm.smooth(motif.build(**motif.THETA), TIMES, y, at=FORECAST)
+    forces = group(known, "trajectories")["forces"].sel(force="drive").values[0]
+    mean, sd = (np.asarray(part) for part in smoothed.force("drive"))
+    count = len(forces)
+    assert np.abs((forces.mean(0) - mean) / sd).max() < 4.5 / np.sqrt(count)
+    assert np.abs(forces.std(0) / sd - 1).max() < 4.5 / np.sqrt(2 * count)
+    # A forecast widens towards the prior
+    assert sd[-1] > sd[-2] > sd[-3]
+
+
+def test_mode_of_known_parameters(known):
+    attrs = arviz_data.attributes(known)
+    assert (attrs["sampler"], attrs["chains"], attrs["warmup"]) == ("map", 1, 0)
+    assert attrs["map_converged"] == 1
+    assert "sample_stats" not in arviz_data.groups(known)
+    posterior = group(known, "posterior")
+    np.testing.assert_allclose(posterior["noise_sd"], motif.THETA["noise_sd"], rtol=10 * NEAR)
+    # With known parameters the evidence is the likelihood
+    np.testing.assert_allclose(attrs["log_evidence"], motif.log_density(motif.data(), **motif.THETA), atol=1e-4)
+
+
+# Panels
+
+
+def shared(times, y=None):
+    """Two series with decays of their own and one noise level."""
+    noise_sd = numpyro.sample("noise_sd", dist.LogNormal(-1.5, 0.3))
+    with numpyro.plate("series", 2):
+        decay = numpyro.sample("decay", dist.LogNormal(0.0, 0.3))
+        build = lambda p: motif.build(p[None], 1.5, noise_sd)  # noqa: E731
+        numpyro.sample("y", lfm.panel(build, decay, times), obs=y)
+
+
+def test_panel(tmp_path):
+    times = TIMES[:4]
+    y = np.stack([motif.data(seed=s, missing=False)[:4, :1] for s in (1, 2)])
+    y[1, 3] = np.nan
+    result = quiet_fit(shared, times, y, sampler="ram", chains=2, warmup=20, samples=10, trajectory_draws=4,
+                       at=[0.0, 2.0], chain_method="vectorized", sampler_options={"adapt": "throughout"})
+    sizes = {name: dict(group(result, name).sizes) for name in arviz_data.groups(result)}
+    assert sizes["posterior"] == {"chain": 2, "draw": 10, "decay_dim_0": 2}
+    assert sizes["log_likelihood"] == {"chain": 2, "draw": 10, "series": 2, "time": 4}
+    assert sizes["one_step_ahead"] == {"chain": 2, "draw": 10, "series": 2, "time": 4, "output": 1}
+    assert sizes["posterior_predictive"] == {"chain": 2, "draw": 2, "series": 2, "time": 4, "output": 1}
+    assert sizes["trajectories"] == {"chain": 2, "draw": 2, "series": 2, "at": 2, "force": 1, "state": 1, "output": 1}
+    assert sizes["observed_data"] == {"series": 2, "time": 4, "output": 1}
+    posterior, ahead = group(result, "posterior"), group(result, "one_step_ahead")["log_density"].values
+    for series in range(2):
+        theta = (posterior["decay"].values[1, 9, series, None], 1.5, posterior["noise_sd"].values[1, 9])
+        exact = motif.log_density(y[series], *theta, times=times)
+        np.testing.assert_allclose(ahead[1, 9, series].sum(), exact, rtol=1e-8)
+    loaded = arviz_data.load(arviz_data.save(result, tmp_path / "panel.nc"))
+    for name in arviz_data.groups(result):
+        xr.testing.assert_identical(group(loaded, name), group(result, name))
+    with pytest.raises(ValueError, match=r"\(2, 4, 1\) \(series, times, outputs\), got \(2, 3, 1\)"):
+        lfm.fit(shared, times, y[:, :3])
+
+
+# Reproducibility and warnings
+
+
+def test_the_same_seed_gives_the_same_result(y):
+    settings = {"sampler": "ram", "chains": 1, "warmup": 5, "samples": 5, "trajectory_draws": 2, "at": [1.0, 5.0],
+                "init": init_to_uniform}
+    with pytest.warns(lfm.ConvergenceWarning) as warned:
+        first = lfm.fit(one_parameter, TIMES, y, progress=False, **settings)
+    said = " ".join(str(w.message) for w in warned)
+    assert "R-hat needs at least two chains and there is one" in said
+    assert "chains=4" in said
+    assert "effective sample size is below 100 (100 per chain) for decay" in said
+    assert "Raise samples" in said
+    again = quiet_fit(one_parameter, TIMES, y, **settings)
+    other = quiet_fit(one_parameter, TIMES, y, **settings, seed=1)
+    for name in ("posterior", "trajectories", "posterior_predictive", "log_likelihood"):
+        xr.testing.assert_identical(group(again, name), group(first, name))
+        assert not group(other, name).equals(group(first, name))
+    attrs = arviz_data.attributes(first)
+    assert attrs["model"] == "one_parameter"
+    assert attrs["thin"] == 5, "for each parameter"
+    assert attrs["seed"] == 0
+
+
+def converted(times, y=None, start=None, max_step=None):
+    """One decay; the model turns its times into a JAX array, and may say when the prior holds."""
+    decay = numpyro.sample("decay", dist.LogNormal(np.log(0.5), 0.5))
+    system = lfm.LatentForceModel(
+        lambda x, u, t: u - decay * x, {"u": lfm.Matern(1.0, 1.5)},
+        lfm.GaussianObservation(lambda x, u, t: x, 0.04 * jnp.ones(1)), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)),
+        initial_time=start)
+    times = times if max_step else jnp.asarray(times)
+    numpyro.sample("y", lfm.MarginalLikelihood(system, times, max_step=max_step), obs=y)
+
+
+@pytest.mark.parametrize("keywords", [pytest.param({}, marks=pytest.mark.slow), {"start": -1.0, "max_step": 0.1}],
+                         ids=["times as JAX array", "initial time"])
+def test_times_are_known_to_everything_after_sampling(y, keywords):
+    result = quiet_fit(converted, TIMES, y[:, :1], sampler="nuts", chains=1, warmup=5, samples=4, trajectory_draws=2,
+                       at=[0.5, 9.0], model_kwargs=keywords)
+    assert set(arviz_data.groups(result)) >= {"trajectories", "log_likelihood", "posterior_predictive"}
+    assert group(result, "trajectories")["forces"].sizes["at"] == 2
+    decay = float(group(result, "posterior")["decay"][0, 3])
+    values = {"decay": jnp.asarray(decay)}
+    with numpyro.handlers.seed(rng_seed=0), numpyro.handlers.substitute(data=values):
+        trace = numpyro.handlers.trace(converted).get_trace(TIMES, y[:, :1], **keywords)
+    whole = trace["y"]["fn"].log_prob(y[:, :1])
+    np.testing.assert_allclose(group(result, "one_step_ahead")["log_density"][0, 3].sum(), whole, rtol=1e-9)
+
+
+def test_what_fails_after_sampling_does_not_cost_the_draws(y, monkeypatch):
+    def broken(*arguments):
+        raise TypeError("no such thing")
+
+    monkeypatch.setattr("lfm_ppl.fitting.scores", broken)
+    with pytest.warns(UserWarning, match="scores of the observations could not be computed.*TypeError: no such thing"):
+        result = lfm.fit(one_parameter, TIMES, y, sampler="map", samples=5, trajectory_draws=0)
+    assert group(result, "posterior")["decay"].shape == (1, 5)
+    assert "log_likelihood" not in arviz_data.groups(result)
+
+
+# Errors
+
+
+@pytest.mark.parametrize(("change", "error", "message"), [
+    ({"sampler": "nut"}, ValueError, r"unknown sampler 'nut'\. Did you mean 'nuts'.*Known: nuts, ram, pmmh, map"),
+    ({"sampler": "hmc"}, ValueError, "unknown sampler 'hmc'.*Known: nuts, ram, pmmh, map"),
+    ({"chains": 0}, ValueError, "chains must be at least 1"),
+    ({"samples": 2.5}, TypeError, "samples must be a whole number, got 2.5"),
+    ({"thin": 0}, ValueError, "thin must be at least 1"),
+    ({"warmup": -1}, ValueError, "warmup must be at least 1"),
+    ({"trajectory_draws": -3}, ValueError, "trajectory_draws must be at least 1"),
+    ({"init": "mode"}, ValueError, "unknown init 'mode'.*Known: map, median"),
+    ({"init": 3}, TypeError, "init must be None"),
+    ({"chain_method": "threads"}, ValueError, "unknown chain_method 'threads'.*Known: parallel, vectorized"),
+    ({"fixed": {"decoy": 1.0}}, ValueError, r"unknown parameter to fix 'decoy'\. Did you mean 'decay'"),
+    ({"fixed": {"decay[c]": 1.0}}, ValueError, "unknown element of decay 'c'.*Known: a, b"),
+    ({"fixed": {"decay": 0.5, "lengthscale": 1.0, "noise_sd": 0.1}}, ValueError, "no parameters to sample"),
+    ({"fixed": {"decay": 0.5, "lengthscale": 1.0, "noise_sd": 0.1}, "sampler": "ram"}, ValueError, "no parameters"),
+    ({"at": [-1.0]}, ValueError, "lies before the initial time"),
+    ({"model_kwargs": {"width": 2}}, TypeError, "width"),
+])
+def test_wrong_arguments(y, change, error, message):
+    with pytest.raises(error, match=message):
+        lfm.fit(motif.model, TIMES, y, **{"progress": False, **change})
+
+
+@pytest.mark.parametrize(("times", "data", "message"), [
+    (TIMES, np.zeros((7, 2)), r"one row for each of the 8 times.*shape \(8, 2\); got \(7, 2\)"),
+    (TIMES, np.zeros((8, 3)), r"shape \(8, 2\); got \(8, 3\)"),
+    (TIMES, np.zeros(8), r"shape \(8, 2\); got \(8,\)"),
+    (TIMES, np.full((8, 2), np.nan), "every entry of y is missing"),
+    (TIMES, np.full((8, 2), np.inf), r"y\[0, 0\] is infinite"),
+    (TIMES[::-1], np.zeros((8, 2)), "times must not go back: row 1"),
+    (np.append(TIMES[:-1], np.nan), np.zeros((8, 2)), "times must be finite"),
+])
+def test_wrong_data(times, data, message):
+    with pytest.raises(ValueError, match=message):
+        lfm.fit(motif.model, times, data, progress=False)
+
+
+def test_a_model_needs_exactly_one_likelihood_site(y):
+    def without(times, y=None):
+        numpyro.sample("y", dist.Normal(numpyro.sample("level", dist.Normal()), 1.0).expand(np.shape(y)), obs=y)
+
+    def twice(times, y=None):
+        motif.model(times, y)
+        numpyro.sample("z", lfm.MarginalLikelihood(motif.build(**motif.THETA), times), obs=y)
+
+    with pytest.raises(ValueError, match="exactly one site .*MarginalLikelihood.*found none"):
+        lfm.fit(without, TIMES, y)
+    with pytest.raises(ValueError, match="exactly one site .*found y, z"):
+        lfm.fit(twice, TIMES, y)
+
+
+def steep(times, y=None):
+    """A cubic force far too strong for ten steps between observations."""
+    strength = numpyro.sample("strength", dist.LogNormal(10.0, 0.1))
+    model = lfm.LatentForceModel(
+        lambda x, u, t: u - strength * x**3, {"u": lfm.Matern(1.0, 1.0)},
+        lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])), lfm.Gaussian(jnp.ones(1), jnp.eye(1)))
+    numpyro.sample("y", lfm.MarginalLikelihood(model, times), obs=y)
+
+
+@pytest.mark.parametrize("sampler", ["nuts", pytest.param("map", marks=pytest.mark.slow)])
+def test_nowhere_to_start_from_is_explained(sampler):
+    times = np.array([0.0, 1.0, 2.0])
+    with pytest.warns(lfm.FilterWarning, match=r"at the prior median, the filter breaks down at row 1 \(time 1\)"):
+        with pytest.raises((RuntimeError, ValueError), match="initial parameters|finite density"):
+            lfm.fit(steep, times, np.ones((3, 1)), sampler=sampler, chains=1, warmup=2, samples=2, progress=False)
