@@ -72,8 +72,8 @@ _PACKAGES = ("forces", "orbits")
 """Specialised forces and their kernels; satellites."""
 
 _OTHER_PACKAGES = (
-    "data", "filtering", "fokker_planck_grid", "inference", "latent_grid", "linearisation", "model", "particles", "results",
-    "switching",
+    "data", "filtering", "fokker_planck_grid", "inference", "latent_grid", "linearisation", "model", "particles",
+    "results", "switching",
 )
 """What `lfm_ppl.filtering.filter.FilterResult` and the like are found by, without an import of their own."""
 

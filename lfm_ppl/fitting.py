@@ -202,7 +202,8 @@ def _explain_start(bound: BoundModel) -> None:
     several = isinstance(distribution, Panel)
     for index in range(distribution.batch_shape[0] if several else 1):
         one = distribution.series(index) if several else distribution
-        said = breakdown(one.ssm, one.rule, one.time_grid, (bound.y[index] if several else bound.y).reshape(one.event_shape))
+        said = breakdown(one.ssm, one.rule, one.time_grid,
+                         (bound.y[index] if several else bound.y).reshape(one.event_shape))
         if said is not None:
             series = f" of series {index}" if several else ""
             warnings.warn(f"at the prior median{series}, {said}", FilterWarning, stacklevel=6)
@@ -405,7 +406,7 @@ def _truth(truth: Mapping[str, Any], named: dict, units: Mapping[str, str], draw
     if known:
         coords["force"] = known
         variables["forces"] = (("at_truth", "force"), np.stack([np.asarray(forces[n]) for n in known], axis=1),
-                              units_attribute(known, units))
+                               units_attribute(known, units))
     if truth.get("state") is not None and np.ndim(truth["state"]) == 2:
         coords["state"] = named["state"]
         variables["states"] = (("at_truth", "state"), np.asarray(truth["state"]),

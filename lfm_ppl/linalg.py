@@ -125,7 +125,8 @@ class CholeskyFactor(NamedTuple):
         return solve_upper(self.chol, b) if self.inverse is None else matmul(self.inverse.T, b)
 
 
-def cholesky(p: jax.Array, floor: jax.Array | float = 0.0, keep: bool = True, name: str | None = None) -> CholeskyFactor:
+def cholesky(p: jax.Array, floor: jax.Array | float = 0.0, keep: bool = True,
+             name: str | None = None) -> CholeskyFactor:
     """Factorise a positive semi-definite matrix in plain operations.
 
     LAPACK's routine is a call that XLA cannot fuse and gives NaN, in value or gradient, for a singular matrix. Here a
@@ -178,7 +179,8 @@ def _eliminated(name: str | None, p: jax.Array, floor: jax.Array) -> CholeskyFac
             column = jnp.where(positive & (rows > j), left[:, j] / root, 0.0)
             left = left - column[:, None] * row[None, :]
     whole = jnp.stack(found)
-    return CholeskyFactor(jnp.where(rows[:, None] >= rows, whole[:, :size].T, 0.0), jnp.stack(degenerate), whole[:, size:])
+    return CholeskyFactor(jnp.where(rows[:, None] >= rows, whole[:, :size].T, 0.0), jnp.stack(degenerate),
+                          whole[:, size:])
 
 
 @functools.partial(_eliminated.defjvp, symbolic_zeros=True)
@@ -202,7 +204,8 @@ def _eliminated_jvp(name: str | None, primals: tuple, tangents: tuple) -> tuple[
     if not isinstance(of_floor, SymbolicZero):
         used = degenerate & (floor > 0)
         lower = lower + jnp.diag(jnp.where(used, 0.5 * of_floor / jnp.where(used, floor, 1.0), 0.0))
-    return factor, CholeskyFactor(matmul(chol, lower), np.zeros(degenerate.shape, jax.dtypes.float0), -matmul(lower, inverse))
+    return factor, CholeskyFactor(matmul(chol, lower), np.zeros(degenerate.shape, jax.dtypes.float0),
+                                  -matmul(lower, inverse))
 
 
 def _cholesky_in_a_loop(p: jax.Array, floor: jax.Array, keep: bool) -> CholeskyFactor:

@@ -1,4 +1,4 @@
-"""Prediction over an interval in steps whose length follows the moments: short where these move fast, long where they rest.
+"""Prediction in steps whose length follows the moments: short where these move fast, long where they rest.
 
 Where the fifth stage, which is the next step's first, takes the place of the fourth, Runge-Kutta's formula has order
 three. The difference of the two results,
@@ -9,8 +9,8 @@ therefore estimates the error of a step at no cost. It is taken of the mean and 
 deviations. A step whose error is larger than the tolerance is made again with a shorter length; the next one has the
 length at which its error would be a little below it.
 
-How the interval is divided is not differentiated: a derivative is that of the integration on the steps that were made, the
-last of which ends with the interval.
+How the interval is divided is not differentiated: a derivative is that of the integration on the steps that were made,
+the last of which ends with the interval.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _STABLE = 10.0
 """Longest step, in units of one over the fastest rate: Runge-Kutta is unstable from 2.8 on and overflows far above."""
 
 _SHORT = 1e-3
-"""Share of an interval that is made whatever its error, which of a state that starts from a known zero is never small."""
+"""Share of an interval made whatever its error, which of a state that starts from a known zero is never small."""
 
 _SHARE_OF_MEAN = 1e-3
 """Share of the mean below which a standard deviation counts as no smaller: a state that is known has none."""
@@ -71,7 +71,8 @@ class _Position(NamedTuple):
 
 
 def predict_interval_adaptively(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, steps: int, tolerance: float,
-                           start: jax.Array, length: jax.Array, moments: Moments, with_map: bool = False) -> Prediction:
+                                start: jax.Array, length: jax.Array, moments: Moments,
+                                with_map: bool = False) -> Prediction:
     """Predict over an interval in Runge-Kutta steps whose errors are below a tolerance.
 
     Args:

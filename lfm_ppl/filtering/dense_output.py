@@ -54,7 +54,8 @@ class Branches(NamedTuple):
         filtered: (N, ...) at their ends.
         smoothed: (N + 1, ...) at the nodes.
         adjoint: r and Lambda at the intervals' ends.
-        linearization_point: moments (N, ...) at the intervals' starts and ends to linearise about; None: the filter's own.
+        linearization_point: moments (N, ...) at the intervals' starts and ends to linearise about; None: the filter's
+            own.
     """
 
     grid: TimeGrid
@@ -67,11 +68,12 @@ class Branches(NamedTuple):
 def dense_output(ssm: StateSpaceModel, rule: Rule, given: Branches, start: Moments, where: Places) -> Moments:
     """Return smoothed moments at any times within the intervals.
 
-    Each time branches off on its own: the filter's moments at the start of its interval are predicted up to it, and on to
-    the end of the interval, whence what the later observations say comes back through the second piece. The steps of the
-    scan itself are not cut, so that asking for times changes nothing, neither there nor at other requested times.
+    Each time branches off on its own: the filter's moments at the start of its interval are predicted up to it, and on
+    to the end of the interval, whence what the later observations say comes back through the second piece. The steps of
+    the scan itself are not cut, so that asking for times changes nothing, neither there nor at other requested times.
 
-    The pieces therefore differ from the interval by an integration error, which `smoothed_moments` keeps from being magnified.
+    The pieces therefore differ from the interval by an integration error, which `smoothed_moments` keeps from being
+    magnified.
 
     Args:
         ssm: the model.

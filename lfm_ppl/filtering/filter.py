@@ -33,7 +33,7 @@ from lfm_ppl.model.resolution import check_resolution
 from lfm_ppl.model.state_space import StateSpaceModel, state_space
 
 _FEW_LENGTHS = 16
-"""Distinct lengths of the intervals up to which it costs nothing to tabulate more of each than the interval would need."""
+"""Distinct lengths of the intervals up to which it costs nothing to tabulate more of each than is needed."""
 
 _KEPT = jax.checkpoint_policies.save_only_these_names(FLOOR, FAILED, FACTOR)
 """What an interval keeps for its derivative besides its inputs: a few numbers that take many operations."""
@@ -46,8 +46,8 @@ class Pass(NamedTuple):
         log_likelihood: (N,) of each interval's observation, zero without one.
         predicted, filtered: moments (N, n), (N, n, n) at the interval's end, before and after the observation.
         phi, process_cov: (N, n, n), the affine map of the interval.
-        innovation, present, chol, gain, jacobian, obs_cov: of the update, (N, D), (N, D), (N, D, D), (N, n, D), (N, D, n),
-            (N, D, D).
+        innovation, present, chol, gain, jacobian, obs_cov: of the update, (N, D), (N, D), (N, D, D), (N, n, D), (N, D,
+            n), (N, D, D).
         steps: of the integration steps of each interval, predictions (N, J, ...) or `Inside` (N, J, ...).
     """
 
@@ -81,8 +81,8 @@ class Points(NamedTuple):
     """Moments about which a pass is linearised.
 
     Attributes:
-        nodes: (N, J + 1, k), (N, J + 1, k, k) of the `needed` states at the ends of the steps of each interval, before a
-            jump.
+        nodes: (N, J + 1, k), (N, J + 1, k, k) of the `needed` states at the ends of the steps of each interval, before
+            a jump.
         ends: (N, n), (N, n, n) at the intervals' ends, after it.
     """
 
@@ -113,7 +113,8 @@ def completed(ssm: StateSpaceModel, rule: Rule, nodes: Moments) -> Moments:
     return Moments(matmul(nodes.mean[..., None, :], pick)[..., 0, :], congruence(pick.T, nodes.covariance))
 
 
-def _inside(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, prepared: Preparation, interval: Intervals, steps: Any) -> Inside:
+def _inside(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, prepared: Preparation, interval: Intervals,
+            steps: Any) -> Inside:
     """Return what the iterations need of an interval from (mean, covariance with all states, phi) of its steps."""
     mean, own, phi = steps
     to_end = jnp.eye(ssm.state_dim)
@@ -129,7 +130,7 @@ def _inside(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, prepared: Preparat
 
 
 def at_rows(a: jax.Array, intervals: Any) -> jax.Array:
-    """Return the entries of ``a`` (N, ...) at intervals; of all intervals nothing is gathered, which is a scatter in reverse."""
+    """Return the entries of ``a`` (N, ...) at some intervals; without a gather, in reverse a scatter, for all of them."""
     if isinstance(intervals, np.ndarray) and np.array_equal(intervals, np.arange(a.shape[0])):
         return a
     return a[jnp.asarray(intervals)]
@@ -200,8 +201,8 @@ class FilterResult(eqx.Module):
         log_likelihood: (T,), log p(y_k | y_1:k-1) of the entries that are present.
         predicted_mean, predicted_covariance: (T, n), (T, n, n) of the joint state, before each observation.
         filtered_mean, filtered_covariance: after it.
-        whitened_innovation: (T, D), innovations whitened by their Cholesky factor: independent standard normals for a true
-            linear model; NaN where missing.
+        whitened_innovation: (T, D), innovations whitened by their Cholesky factor: independent standard normals for a
+            true linear model; NaN where missing.
         state: time and moments after the last observation.
     """
 
@@ -215,8 +216,8 @@ class FilterResult(eqx.Module):
     state: FilterState
 
 
-def predict(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, prepared: Preparation, interval: Intervals, moments: Moments,
-            nodes: Moments | None = None, with_map: bool = False,
+def predict(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, prepared: Preparation, interval: Intervals,
+            moments: Moments, nodes: Moments | None = None, with_map: bool = False,
             each: Callable[[Prediction], Any] | None = None) -> Prediction:
     """Predict over an interval, a jump at its end included; arguments as in `predict_interval`."""
     transition = prepared.transition(interval)
@@ -224,7 +225,8 @@ def predict(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, prepared: Preparat
         one = predict_exact(ssm, transition, grid.steps, interval.start, interval.length, moments)
     else:
         move = lambda: integrate(  # noqa: E731
-            ssm, rule, grid, prepared.linear, transition, interval.start, interval.length, moments, nodes, with_map, each)
+            ssm, rule, grid, prepared.linear, transition, interval.start, interval.length, moments, nodes, with_map,
+            each)
         stay = lambda: unmoved(moments, with_map, each, grid.steps)  # noqa: E731
         one = jax.lax.cond(interval.length > 0, move, stay) if grid.replicated else move()
     if prepared.jumps is not None:
@@ -233,11 +235,12 @@ def predict(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, prepared: Preparat
 
 
 def integrate(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, linear: LinearPart, factor: IntegratingFactor | None,
-              start: jax.Array, length: jax.Array, moments: Moments, nodes: Moments | None = None, with_map: bool = False,
-              each: Callable[[Prediction], Any] | None = None) -> Prediction:
+              start: jax.Array, length: jax.Array, moments: Moments, nodes: Moments | None = None,
+              with_map: bool = False, each: Callable[[Prediction], Any] | None = None) -> Prediction:
     """Predict over an interval, or a part of one, in the grid's steps; arguments as in `predict_interval`."""
     if grid.tolerance is not None:
-        return predict_interval_adaptively(ssm, rule, linear, grid.steps, grid.tolerance, start, length, moments, with_map)
+        return predict_interval_adaptively(ssm, rule, linear, grid.steps, grid.tolerance, start, length, moments,
+                                           with_map)
     assert factor is not None
     return predict_interval(ssm, rule, linear, factor, grid.steps, start, length, moments, nodes, with_map, each)
 
@@ -284,8 +287,8 @@ def forward(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, *, s
             steps = one.steps
             if keep == "inside" and steps is not None:
                 steps = _inside(ssm, rule, grid, prepared, interval, steps)
-            out = out._replace(phi=one.phi, process_cov=one.process_cov, gain=new.gain, jacobian=new.jacobian, obs_cov=new.obs_cov,
-                               steps=steps)
+            out = out._replace(phi=one.phi, process_cov=one.process_cov, gain=new.gain, jacobian=new.jacobian,
+                               obs_cov=new.obs_cov, steps=steps)
         return new.moments, out
 
     first = Moments(*ssm.initial()) if start is None else start
@@ -385,7 +388,7 @@ def filter(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
     if start is not None:
         _check_start(start, times, ssm.state_dim)
     grid = build_time_grid(ssm, times, steps, max_step, initial_time=None if start is None else start.time,
-                    tolerance=tolerance)
+                           tolerance=tolerance)
     model.check_at(grid.initial_time, len(grid.observed))
     check_resolution(model, times, y)
     y = check_observations(y, len(grid.observed), ssm.output_dim, empty=start is not None)

@@ -92,7 +92,8 @@ def _nodes(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, passed: Pass, smoot
         return Moments(moments.mean + matmul(cross, r[:, None])[..., 0],
                        moments.covariance - congruence(cross, adjoint))
 
-    # Interval by interval: XLA makes one small program of an interval, where it treats all intervals at once operation by operation.
+    # Interval by interval: XLA makes one small program of an interval, where it treats all intervals at once operation
+    # by operation.
     inside = jax.lax.map(row, (passed.steps, *smoothed.adjoint))
     if ssm.stack.jump_table() is None:
         inside = jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a[:, :-1], b], axis=1), inside, last)
@@ -100,7 +101,7 @@ def _nodes(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, passed: Pass, smoot
 
 
 def _to_end(ssm: StateSpaceModel, grid: TimeGrid, passed: Pass) -> tuple[jax.Array, jax.Array]:
-    """Return phi and process_cov (N, J + 1, n, n) from the ends of the steps to that of the interval, a jump there included."""
+    """Return phi and process_cov (N, J + 1, n, n) from the ends of the steps to that of the interval, after a jump."""
     phi, process_cov = passed.steps.phi, passed.steps.process_cov
     identity = jnp.broadcast_to(jnp.eye(phi.shape[-1]), phi[:, 0].shape)
     last = identity, jnp.zeros_like(identity)

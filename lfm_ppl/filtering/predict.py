@@ -41,7 +41,7 @@ class Moments(NamedTuple):
 
 
 class Prediction(NamedTuple):
-    """The moments at the end of an interval, and its affine map s -> phi s + ... + N(0, process_cov) where that was asked for.
+    """The moments at the end of an interval, and its map s -> phi s + ... + N(0, process_cov) where asked for.
 
     ``steps`` holds what was asked for of each integration step (J, ...).
     """
@@ -79,7 +79,7 @@ class Node(NamedTuple):
 
 
 _LARGEST_TABULATED = 8
-"""Most force states whose transitions to all nodes of an interval are tabulated; those of more are chained within the interval."""
+"""Most force states whose transitions to all nodes of an interval are tabulated; those of more are chained in it."""
 
 _FIRST_MIDDLE_LAST = slice(None, -2, 2), slice(1, None, 2), slice(2, None, 2)
 """Of each of J steps, among their 2 J + 1 nodes."""
@@ -136,9 +136,9 @@ def _integrated_offset(ssm: StateSpaceModel, transition: Exact, steps: int, star
     return offset[:, 0]
 
 
-def predict_interval(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: IntegratingFactor, steps: int, start: jax.Array,
-                length: jax.Array, moments: Moments, linearization_point: Moments | None = None,
-                with_map: bool = False, each: Callable[[Prediction], Any] | None = None) -> Prediction:
+def predict_interval(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: IntegratingFactor, steps: int,
+                     start: jax.Array, length: jax.Array, moments: Moments, linearization_point: Moments | None = None,
+                     with_map: bool = False, each: Callable[[Prediction], Any] | None = None) -> Prediction:
     """Predict over an interval in ``steps`` Runge-Kutta steps.
 
     Args:
@@ -150,14 +150,16 @@ def predict_interval(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, facto
         start: time at the interval's start.
         length: of the interval.
         moments: at its start.
-        linearization_point: linearise about these moments, (steps + 1, ...) at the ends of the steps, and not about the filter's own.
+        linearization_point: linearise about these moments, (steps + 1, ...) at the ends of the steps, and not about the
+            filter's own.
         with_map: whether phi and process_cov of the whole interval are wanted (for the smoother).
         each: what is wanted of each step's prediction.
     """
     h = length / steps
     min_sd = minimum_sd(ssm, rule, factor, start, h, moments)
     if bent_by_forces_only(ssm, rule):
-        return _predict_by_quadrature(ssm, rule, linear, factor, steps, start, h, moments, min_sd, linearization_point, with_map, each)
+        return _predict_by_quadrature(ssm, rule, linear, factor, steps, start, h, moments, min_sd, linearization_point,
+                                      with_map, each)
 
     def step(carry: tuple, at: tuple) -> tuple[tuple, Any]:
         now, phi, process_cov = carry
@@ -187,7 +189,7 @@ def unmoved(moments: Moments, with_map: bool, each: Callable[[Prediction], Any] 
 
 
 def minimum_sd(ssm: StateSpaceModel, rule: Rule, factor: IntegratingFactor, t: jax.Array, h: jax.Array,
-                    moments: Moments) -> jax.Array:
+               moments: Moments) -> jax.Array:
     """The standard deviation below which a coordinate counts as known: 1e-6 of what it is or becomes in a step."""
     size = ssm.physical_dim
     matrix, offset = ssm.input_map(t)
@@ -317,7 +319,9 @@ def _stage(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, t: jax.Array, m
         dispersion = ssm.dispersion(w, t)
         return ssm.drift(w, t), () if dispersion is None else outer_square(dispersion)
 
-    centre, known = (mean, covariance) if linearization_point is None else (linearization_point.mean, covariance_of(linearization_point))
+    centre, known = mean, covariance
+    if linearization_point is not None:
+        centre, known = linearization_point.mean, covariance_of(linearization_point)
     affine = linearise_state(ssm, rule, function, ssm.drift_structure, linear.jacobian, t, centre, known, min_sd)
     drift = affine.value
     if linearization_point is not None:
@@ -328,7 +332,7 @@ def _stage(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, t: jax.Array, m
 
 def row_factor(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, length: jax.Array, steps: int,
                tabulated: bool = False) -> IntegratingFactor:
-    """Return the integrating factor of the steps of an interval; ``tabulated`` if it serves many intervals, and may cost more."""
+    """Return the integrating factor of an interval's steps; one ``tabulated`` for many intervals may cost more."""
     stages = not bent_by_forces_only(ssm, rule)
     nodes = not stages and tabulated and ssm.force_dim <= _LARGEST_TABULATED
     return integrating_factor(ssm, linear, length / steps, stages, steps if nodes else None)
@@ -345,9 +349,10 @@ def bent_by_forces_only(ssm: StateSpaceModel, rule: Rule) -> bool:
 
 
 def _predict_by_quadrature(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: IntegratingFactor, steps: int,
-                           start: jax.Array, h: jax.Array, moments: Moments, min_sd: jax.Array, linearization_point: Moments | None,
-                           with_map: bool, each: Callable[[Prediction], Any] | None) -> Prediction:
-    """Predict over an interval in which only the forces bend the dynamics, to the same numbers as in steps of `step_on`.
+                           start: jax.Array, h: jax.Array, moments: Moments, min_sd: jax.Array,
+                           linearization_point: Moments | None, with_map: bool,
+                           each: Callable[[Prediction], Any] | None) -> Prediction:
+    """Predict over an interval in which only the forces bend the dynamics, to the numbers of the steps of `step_on`.
 
     The forces' moments at all nodes are then known at the interval's start, no stage changes what another one sees, and
     the Runge-Kutta method is Simpson's rule.
@@ -363,9 +368,12 @@ def _predict_by_quadrature(ssm: StateSpaceModel, rule: Rule, linear: LinearPart,
         last, before = jax.lax.scan(half_step, first, None, length=2 * steps)
         now = jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a, b[None]]), before, last)
     else:
-        flows, noises = factor.halves
-        now = Moments(matmul(flows, first.mean[:, None])[..., 0], congruence(flows, first.covariance) + noises)
-    near = now if linearization_point is None else jax.tree_util.tree_map(_with_middles, _forces_of(linearization_point, size))
+        transitions, covariances = factor.halves
+        now = Moments(matmul(transitions, first.mean[:, None])[..., 0],
+                      congruence(transitions, first.covariance) + covariances)
+    near = now
+    if linearization_point is not None:
+        near = jax.tree_util.tree_map(_with_middles, _forces_of(linearization_point, size))
     begins = start + jnp.arange(steps) * h
     times = jnp.stack([begins, begins + 0.5 * h], axis=1).ravel()
     ends = just_before(begins + h, h)
@@ -474,14 +482,14 @@ def _less(change: jax.Array, phi: jax.Array, inverse: jax.Array, size: int) -> j
 
 
 def _inverse_transition(scale: jax.Array, before: jax.Array, back: jax.Array, jacobian: jax.Array, half: jax.Array,
-                  size: int) -> jax.Array:
+                        size: int) -> jax.Array:
     """Next stage of Z, where Psi~ = I - Z is the inverse transition in the interaction picture."""
     pulled = matmul(back[:size, :size], matmul(jacobian, half))
     return scale * (pulled - matmul(before[:, :size], pulled))
 
 
-def _process_cov(factor: IntegratingFactor, stage: int, transports: jax.Array, diffusions: jax.Array | None, weights: jax.Array,
-           size: int) -> jax.Array:
+def _process_cov(factor: IntegratingFactor, stage: int, transports: jax.Array, diffusions: jax.Array | None,
+                 weights: jax.Array, size: int) -> jax.Array:
     """Return Q (n, n): noise at K nodes, carried on by ``transports`` (K, M, n), the forces' own part exact.
 
     The forces' noise at the nodes, ``columns``, is only a quadrature of the exact noise, but what reaches x together

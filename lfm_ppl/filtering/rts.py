@@ -38,9 +38,9 @@ def backward(passed: Pass, start: Moments, grid: TimeGrid) -> Smoothed:
     """Run the one backward scan.
 
     Moments follow Rauch, Tung and Striebel, with the gain from a semi-definite solve and the covariance as a sum of
-    squares, or the adjoint of Bryson and Frazier, r and Lambda, which needs no inverse of a covariance (`smoothed_moments` says
-    when). With u = S^-1 v - K' r and C = S^-1 + K' Lambda K, an observation given all the others is
-    N(y - C^-1 u, C^-1).
+    squares, or the adjoint of Bryson and Frazier, r and Lambda, which needs no inverse of a covariance
+    (`smoothed_moments` says when). With u = S^-1 v - K' r and C = S^-1 + K' Lambda K, an observation given all the
+    others is N(y - C^-1 u, C^-1).
     """
     length = jnp.asarray(grid.intervals.length)
     still = (length == 0) & (jnp.asarray(grid.intervals.jump) < 0)

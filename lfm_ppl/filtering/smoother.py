@@ -62,8 +62,8 @@ class Joint(NamedTuple):
         start: moments at the initial time.
         passed: forward scan over intervals that end at the requested times, among others.
         requested: (K,) the requested times among these.
-        covariance: (K, n, n), smoothed by that scan; None where it is that of the result. In intervals that are cut at the
-            requested times integration errors differ, and draws take the result's moments.
+        covariance: (K, n, n), smoothed by that scan; None where it is that of the result. In intervals that are cut at
+            the requested times integration errors differ, and draws take the result's moments.
     """
 
     start: Moments
@@ -222,8 +222,8 @@ class SmoothingGrids(NamedTuple):
 
     Attributes:
         marginals: of the likelihood and the marginals.
-        joint: for draws of trajectories, with intervals that end at the requested times too; None where ``marginals`` serves:
-            without requested times, and for a model whose intervals are exact whatever their length.
+        joint: for draws of trajectories, with intervals that end at the requested times too; None where ``marginals``
+            serves: without requested times, and for a model whose intervals are exact whatever their length.
         where: the requested times among ``marginals``; None where ``joint`` is.
         times: (K,) requested times.
     """
@@ -269,7 +269,7 @@ def smooth_on(ssm: StateSpaceModel, rule: Rule, grids: SmoothingGrids, y: jax.Ar
         at = jnp.asarray(grids.joint.requested)
         joint = Joint(start, drawn._replace(steps=None), at, pieces.moments.covariance[at + 1])
         branches = (Branches(grid, passed.filtered, smoothed.moments, smoothed.adjoint, None) if found is None
-                else refined(ssm, rule, grid, found, passed, smoothed))
+                    else refined(ssm, rule, grid, found, passed, smoothed))
         mean, covariance = dense_output(ssm, rule, branches, start, grids.where)
     matrix, offset = jax.vmap(ssm.input_map)(times)
     observed = jnp.asarray(grid.observed)

@@ -14,7 +14,8 @@ from lfm_ppl.linalg import (
 )
 
 
-def smoothing_kernel(now: Moments, predicted: Moments, phi: jax.Array, process_cov: jax.Array) -> tuple[jax.Array, jax.Array]:
+def smoothing_kernel(now: Moments, predicted: Moments, phi: jax.Array,
+                     process_cov: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return the gain G = P Phi' P_p^-1, and the covariance C now given the state at the later time.
 
     C = (I - G Phi) P (I - G Phi)' + G Q G', a sum of squares.
@@ -30,11 +31,12 @@ def smoothing_kernel(now: Moments, predicted: Moments, phi: jax.Array, process_c
     return gain, congruence(kept, now.covariance) + congruence(gain, process_cov)
 
 
-def smoothed_moments(now: Moments, predicted: Moments, later: Moments, gain: jax.Array, conditional: jax.Array, r: jax.Array,
-            adjoint: jax.Array) -> Moments:
+def smoothed_moments(now: Moments, predicted: Moments, later: Moments, gain: jax.Array, conditional: jax.Array,
+                     r: jax.Array, adjoint: jax.Array) -> Moments:
     """Return smoothed moments at a time from the filtered ones there.
 
-    Rauch, Tung and Striebel's way goes through the smoothed moments at a later time, with G and C of `smoothing_kernel`,
+    Rauch, Tung and Striebel's way goes through the smoothed moments at a later time, with G and C of
+    `smoothing_kernel`,
 
         m + G (m_s - m_p),    C + G P_s G',
 

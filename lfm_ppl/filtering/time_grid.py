@@ -66,7 +66,8 @@ class TimeGrid(NamedTuple):
 
 
 def build_time_grid(ssm: StateSpaceModel, times: Any, steps: int, max_step: float | None = None, at: Any = None,
-             initial_time: Any = None, interval_per_step: bool = False, tolerance: float | None = None) -> TimeGrid:
+                    initial_time: Any = None, interval_per_step: bool = False,
+                    tolerance: float | None = None) -> TimeGrid:
     """Lay out the intervals of the scan.
 
     Args:
@@ -128,7 +129,8 @@ def _traced_origin(times: np.ndarray, origin: Any, jumps: tuple[float, ...], ste
                    interval_per_step: bool) -> TimeGrid:
     """Lay out the intervals for times that are known and forces that jump, where the initial time is not known.
 
-    Every jump up to the last time has an interval. Those at or before the initial time have length zero and do not jump.
+    Every jump up to the last time has an interval. Those at or before the initial time have length zero and do not
+    jump.
     """
     if interval_per_step:
         raise ValueError("an interval for each step, with forces that jump, needs an initial_time that is known before "
@@ -157,7 +159,8 @@ def _concrete(times: np.ndarray, origin: float, jumps: tuple[float, ...], steps:
     jump_index = [index for index, jump in enumerate(jumps) if origin < jump <= end]
     extra = np.setdiff1d(extra, [jumps[index] for index in jump_index])
     jump_time = np.asarray(jumps, float)[jump_index]
-    # A particle smoother looks at each step: a jump has an interval of its own, so that the state just before it is a node.
+    # A particle smoother looks at each step: a jump has an interval of its own, so that the state just before it is a
+    # node.
     before = jump_time if interval_per_step else jump_time[:0]
     time = np.concatenate([before, jump_time, times, extra])
     # At equal times a jump comes before an observation.
@@ -182,7 +185,7 @@ def _concrete(times: np.ndarray, origin: float, jumps: tuple[float, ...], steps:
     last = piece == pieces[event] - 1
     lengths, length_index = _distinct(width, max(abs(time[-1]), abs(origin)))
     intervals = Intervals(begin[event] + piece * width, width, np.where(last, observation[event], -1),
-                np.where(last, jump[event], -1), length_index)
+                          np.where(last, jump[event], -1), length_index)
     row_of_event = np.flatnonzero(last)
     observed = np.empty(len(times), int)
     observed[observation[observation >= 0]] = row_of_event[observation >= 0]
@@ -226,7 +229,8 @@ def as_arrays(intervals: Intervals) -> Intervals:
 class _Table:
     """A function of the interval length, tabulated: all arrays that it returns make one row for each length.
 
-    The interval is read, and in reverse mode written, at once; array by array that took many more operations to compile.
+    The interval is read, and in reverse mode written, at once; array by array that took many more operations to
+    compile.
 
     Args:
         function: of a length, a scalar, to a pytree of arrays.
@@ -249,7 +253,7 @@ class _Table:
 
 
 def by_length(grid: TimeGrid, make: Callable[[jax.Array], Any]) -> Callable[[Intervals], Any]:
-    """Return what gives ``make(length)`` of an interval, computed once for every distinct length where these are few."""
+    """Return what gives ``make(length)`` of an interval, computed once for each distinct length where these are few."""
     if grid.lengths is None:
         return lambda row: make(row.length)
     table = _Table(make, jnp.asarray(grid.lengths))
@@ -266,13 +270,13 @@ def per_step(grid: TimeGrid) -> TimeGrid:
     last = index == steps - 1
     length = length / steps
     fine = Intervals(start + index * length, length, xp.where(last, observation, -1), xp.where(last, jump, -1),
-                np.zeros_like(index))
+                     np.zeros_like(index))
     return grid._replace(intervals=fine, lengths=None, steps=1, observed=grid.observed * steps + steps - 1,
                          requested=grid.requested * steps + steps - 1)
 
 
 def with_observations(intervals: Intervals, y: Any) -> tuple[Intervals, jax.Array]:
-    """Return the intervals as JAX arrays, and the entry of ``y`` (T, ...) at the end of each, NaN in intervals without one."""
+    """Return the intervals as JAX arrays, and the entry of ``y`` (T, ...) at the end of each, NaN where it has none."""
     y = jnp.asarray(y, float)
     # The index -1 of an interval without an observation is that of the last entry.
     padded = jnp.concatenate([y, jnp.full((1, *y.shape[1:]), jnp.nan)])

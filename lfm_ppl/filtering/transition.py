@@ -50,11 +50,11 @@ class IntegratingFactor(NamedTuple):
 
     ``half`` and ``full`` are E(h/2) and E(h), the exponential of ``Lin``. ``back_half`` and ``back_full`` approximate
     their inverses by 4 - 6 E + 4 E^2 - E^3 and its square: to the order of the step where it resolves ``Lin``, and
-    bounded where it does not, while the true inverses of fast decays overflow. ``force_cov_half`` and ``force_cov_full`` are
-    the exact covariances of the forces' noise, ``inputs`` (nz, S) its dispersion. ``columns`` (nz, K) stand for the
-    forces' noise at the nodes of each later stage (not by quadrature) and, the last, of the whole step; ``regressions``
-    (K, nz) regress them on the exact noise. ``halves`` are the transitions and the noise (2 J + 1, nz, nz) of the
-    forces over 0, 1, ..., 2 J halves of a step; None where they are chained.
+    bounded where it does not, while the true inverses of fast decays overflow. ``force_cov_half`` and
+    ``force_cov_full`` are the exact covariances of the forces' noise, ``inputs`` (nz, S) its dispersion. ``columns``
+    (nz, K) stand for the forces' noise at the nodes of each later stage (not by quadrature) and, the last, of the whole
+    step; ``regressions`` (K, nz) regress them on the exact noise. ``halves`` are the transitions and the noise (2 J +
+    1, nz, nz) of the forces over 0, 1, ..., 2 J halves of a step; None where they are chained.
     """
 
     half: jax.Array
@@ -83,7 +83,7 @@ def linear_part(ssm: StateSpaceModel, t: jax.Array) -> LinearPart:
     matrix, offset = ssm.input_map(t)
     function = lambda w: (ssm.drift(w, t), ())  # noqa: E731
     jacobian = constant_jacobian(function, matmul(matrix, mean[:, None])[:, 0] + offset, ssm.drift_structure,
-                           ssm.physical_dim)
+                                 ssm.physical_dim)
     usable = jacobian if ssm.constant_measurement else jacobian * (np.arange(ssm.input_dim) < ssm.physical_dim)
     return LinearPart(jacobian, matmul(usable, matrix) if ssm.physical_dim else jnp.zeros((0, ssm.state_dim)))
 
@@ -158,10 +158,12 @@ def integrating_factor(ssm: StateSpaceModel, linear: LinearPart, step: jax.Array
         columns = (root(0.5) * at_half, root(0.5) * inputs, root(1.0) * at_half, *columns)
     back_full = matmul(back_half, back_half)
     regressions = _regressions(columns, force_cov_half, force_cov_full)
-    return IntegratingFactor(half, full, back_half, back_full, force_cov_half, force_cov_full, inputs, columns, regressions, halves)
+    return IntegratingFactor(half, full, back_half, back_full, force_cov_half, force_cov_full, inputs, columns,
+                             regressions, halves)
 
 
-def _regressions(columns: tuple[jax.Array, ...], force_cov_half: jax.Array, force_cov_full: jax.Array) -> tuple[jax.Array, ...]:
+def _regressions(columns: tuple[jax.Array, ...], force_cov_half: jax.Array,
+                 force_cov_full: jax.Array) -> tuple[jax.Array, ...]:
     """Regress columns (nz, K) on the exact noise of half a step, the first two of four, and of a step: (K, nz) each."""
     if not force_cov_half.shape[0]:
         return tuple(column.T for column in columns)

@@ -120,7 +120,8 @@ def fokker_planck(model: LatentForceModel, times: Any, y: Any, *, at: Any = None
     grid = choose_grid(model, times, y, cells=cells, bounds=bounds, steps=steps, tolerance=tolerance)
     result = _run(on_grid(ssm, time_grid, grid, room=ROOM), time_grid, y[None], jnp.asarray(times, float), grid)
     total = np.asarray(result.log_likelihood.sum())
-    error = _error(GridProblem(ssm, build_time_grid(ssm, times, steps)), build_time_grid(ssm, times, 2 * steps), y[None], grid, total)
+    error = _error(GridProblem(ssm, build_time_grid(ssm, times, steps)), build_time_grid(ssm, times, 2 * steps),
+                   y[None], grid, total)
     if not error <= tolerance:
         warnings.warn(f"the estimated discretisation error of the log likelihood is {error:.2g}, above the tolerance "
                       f"{tolerance:g}, with {grid.cells} cells on [{grid.low:g}, {grid.high:g}] and steps={steps}. "
@@ -200,8 +201,8 @@ def _checked(model: Any) -> StateSpaceModel:
                          f"({forces}). Use the particle filter, lfm.particle_filter, instead.")
     if checks.traced(model):
         raise ValueError("the parameters of the model must be known: the grid and its error are found before "
-                         "compilation. In compiled code use the log_likelihood of lfm_ppl.fokker_planck_grid.fokker_planck, "
-                         "on a grid from choose_grid.")
+                         "compilation. In compiled code use the log_likelihood of "
+                         "lfm_ppl.fokker_planck_grid.fokker_planck, on a grid from choose_grid.")
     noise = model.process_noise if ssm.physical_dim else ssm.stack.dispersion()
     if noise is None or (not callable(noise) and not np.any(np.asarray(noise))):
         what = "process_noise is zero" if ssm.physical_dim else f"the force {model.force_names[0]!r} has no noise"

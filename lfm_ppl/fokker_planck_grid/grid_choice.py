@@ -140,7 +140,8 @@ def _first_bounds(problems: Sequence[GridProblem]) -> tuple[float, float]:
     for ssm, time_grid in problems:
         mean, covariance = (np.asarray(moment) for moment in ssm.initial())
         _, diffusion = drift_and_diffusion(ssm, jnp.asarray(mean[0]), jnp.asarray(time_grid.initial_time, float))
-        reach = 8.0 * np.sqrt(covariance[0, 0]) + 6.0 * np.sqrt(2.0 * float(diffusion) * np.max(time_grid.intervals.length))
+        longest = np.max(time_grid.intervals.length)
+        reach = 8.0 * np.sqrt(covariance[0, 0]) + 6.0 * np.sqrt(2.0 * float(diffusion) * longest)
         reach = reach if np.isfinite(reach) and reach > 0 else max(1.0, abs(mean[0]))
         ends.append((float(mean[0] - reach), float(mean[0] + reach)))
     return min(low for low, _ in ends), max(high for _, high in ends)

@@ -160,8 +160,8 @@ def log_likelihood(ssm: StateSpaceModel, time_grid: TimeGrid, y: jax.Array, grid
 
     Args:
         ssm: the state-space model, of state dimension one; it may hold traced parameters, also under `jax.vmap`.
-        time_grid: from `lfm_ppl.filtering.time_grid.build_time_grid(ssm, times, steps)`; its ``steps`` matter only where drift or
-            dispersion depend on time: the generator is frozen at the middle of each of them.
+        time_grid: from `lfm_ppl.filtering.time_grid.build_time_grid(ssm, times, steps)`; its ``steps`` matter only
+            where drift or dispersion depend on time: the generator is frozen at the middle of each of them.
         y: (T, D), or (B, T, D) for B data sets with the same times; NaN where missing.
         grid: the cells, from `choose_grid`.
 

@@ -65,8 +65,8 @@ def on_grid(ssm: StateSpaceModel, time_grid: TimeGrid, grid: Grid, room: int = 0
         jumps = jnp.stack([_jump(grid, *ssm.stack.jump(index)) for index in range(len(ssm.stack.jump_times))])
     value, noise = _observations(ssm, time_grid, grid, room)
     angular = np.isin(np.arange(ssm.output_dim), ssm.model.observation.angular)
-    return Cells(_chains(ssm, time_grid, grid, room), jumps, gaussian_masses(grid, mean[0], covariance[0, 0]), value, noise,
-                 jnp.asarray(angular))
+    return Cells(_chains(ssm, time_grid, grid, room), jumps, gaussian_masses(grid, mean[0], covariance[0, 0]), value,
+                 noise, jnp.asarray(angular))
 
 
 def drift_and_diffusion(ssm: StateSpaceModel, s: jax.Array, t: Any) -> tuple[jax.Array, jax.Array]:

@@ -70,8 +70,8 @@ class LatentGrid(eqx.Module):
         weights: (M, T, K) of p_j at the K points that an observation needs, where A is diagonal; else (M, M, T, K), the
             first index for the state.
         transition: e^(A (t_k - t_(k-1))), its diagonal (T, M) where A is diagonal, else (T, M, M).
-        transitions: (M, T, T), e^(A_j (t_k - t_l)) for l <= k, else 0, where A is diagonal and the observations are few;
-            else None.
+        transitions: (M, T, T), e^(A_j (t_k - t_l)) for l <= k, else 0, where A is diagonal and the observations are
+            few; else None.
         mean: (R, G), the forces' prior mean.
         root: (R, G, G), lower triangular factor of their prior covariance.
         rule: as given.
@@ -352,7 +352,8 @@ def _weights(pieces: _Pieces, transition: Callable, integrals: Callable, rank: i
         at_point, at_next = length * transition(pieces.since_point), jnp.zeros(())
     else:
         if rule == "trapezoid":
-            at_left, at_right = 0.5 * length * transition(pieces.since_left), 0.5 * length * transition(pieces.since_right)
+            at_left = 0.5 * length * transition(pieces.since_left)
+            at_right = 0.5 * length * transition(pieces.since_right)
         else:
             whole, rising = integrals(pieces.length)
             back = transition(pieces.since_right)

@@ -50,7 +50,8 @@ class Inputs(NamedTuple):
 class Rule(eqx.Module):
     """A linearisation rule."""
 
-    def linearise(self, function: Function, inputs: Inputs, structure: InputStructure, jacobian: jax.Array) -> AffineMap:
+    def linearise(self, function: Function, inputs: Inputs, structure: InputStructure,
+                  jacobian: jax.Array) -> AffineMap:
         """Linearise ``function`` about a Gaussian.
 
         Args:

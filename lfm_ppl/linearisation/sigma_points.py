@@ -48,7 +48,7 @@ class SigmaPointRule(Rule):
     full_state: bool = eqx.field(static=True, default=False, kw_only=True)
 
     regresses: ClassVar[bool] = True
-    """Whether the Jacobian in the points' coordinates is the regression on the nodes; if not, it is the average Jacobian.
+    """Whether the Jacobian in the points' coordinates is the regression on the nodes, or the average of Jacobians.
     The two agree in expectation (Stein's lemma), but a regression on nodes that are correlated beyond second order
     divides their sampling error by the standard deviation of the input, however small that is."""
 
@@ -56,7 +56,8 @@ class SigmaPointRule(Rule):
         """Return nodes and weights for ``dim`` >= 1 dimensions."""
         raise NotImplementedError
 
-    def linearise(self, function: Function, inputs: Inputs, structure: InputStructure, jacobian: jax.Array) -> AffineMap:
+    def linearise(self, function: Function, inputs: Inputs, structure: InputStructure,
+                  jacobian: jax.Array) -> AffineMap:
         """See `Rule.linearise`."""
         if not structure.points:
             return _without_points(function, inputs, structure, jacobian)

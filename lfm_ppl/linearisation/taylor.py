@@ -23,7 +23,8 @@ class Taylor(Rule):
     Source: Hartikainen (2013), section 2.3; Jazwinski (1970).
     """
 
-    def linearise(self, function: Function, inputs: Inputs, structure: InputStructure, jacobian: jax.Array) -> AffineMap:
+    def linearise(self, function: Function, inputs: Inputs, structure: InputStructure,
+                  jacobian: jax.Array) -> AffineMap:
         """See `Rule.linearise`."""
         value, extra = function(inputs.mean)
         varying = (*structure.points, *structure.averaged)

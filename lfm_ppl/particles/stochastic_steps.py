@@ -185,7 +185,7 @@ def advance(ssm: StateSpaceModel, scheme: str, prepared: Prepared, draw: Callabl
 
 
 def srk(ssm: StateSpaceModel, prepared: Prepared, h: jax.Array, t: jax.Array, s: jax.Array,
-         noise: tuple[jax.Array, jax.Array], kick: jax.Array) -> jax.Array:
+        noise: tuple[jax.Array, jax.Array], kick: jax.Array) -> jax.Array:
     r"""Rössler's SRA1, strong order 1.5 for additive noise.
 
         K_1 = f(x, u, t),    K_2 = f(x + 3/4 h K_1 + 3/2 G J/h, u + 3/2 (mean of u - u), t + 3/4 h),
@@ -212,7 +212,7 @@ def srk(ssm: StateSpaceModel, prepared: Prepared, h: jax.Array, t: jax.Array, s:
 
 
 def milstein(ssm: StateSpaceModel, prepared: Prepared, h: jax.Array, t: jax.Array, s: jax.Array,
-              noise: tuple[jax.Array, jax.Array], kick: jax.Array) -> jax.Array:
+             noise: tuple[jax.Array, jax.Array], kick: jax.Array) -> jax.Array:
     """Add half of (dG/dx G) (DeltaB DeltaB' - h I) to Euler's step: strong order 1 for commutative noise.
 
     A dispersion that depends on a force adds no term where the force is smooth (Matern of order 1 and more).
@@ -237,7 +237,7 @@ def milstein(ssm: StateSpaceModel, prepared: Prepared, h: jax.Array, t: jax.Arra
 
 
 def euler(ssm: StateSpaceModel, prepared: Prepared, h: jax.Array, t: jax.Array, s: jax.Array,
-           noise: tuple[jax.Array, jax.Array], kick: jax.Array) -> jax.Array:
+          noise: tuple[jax.Array, jax.Array], kick: jax.Array) -> jax.Array:
     """Euler and Maruyama's step: strong order 1/2, and 1 for additive noise."""
     size = ssm.physical_dim
     x, z = s[:size], s[size:]
@@ -250,7 +250,7 @@ def euler(ssm: StateSpaceModel, prepared: Prepared, h: jax.Array, t: jax.Array, 
 
 
 def force_inputs(ssm: StateSpaceModel, prepared: Prepared, h: jax.Array, t: jax.Array, x: jax.Array, z: jax.Array,
-            kick: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+                 kick: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return z at the end, the inputs w = (x, u) at the start, and u of the second stage of `srk`."""
     if ssm.force_dim == 0:
         return z, x, jnp.zeros(0)

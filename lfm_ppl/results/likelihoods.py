@@ -123,7 +123,8 @@ def on_grid(problem: PosteriorDraws, steps: int | None, progress: bool) -> Refer
     bound = problem.bound
 
     def one(distribution: MarginalLikelihood, y: jax.Array) -> jax.Array:
-        time_grid = build_time_grid(distribution.ssm, distribution.times, steps or distribution.steps, distribution.max_step)
+        time_grid = build_time_grid(distribution.ssm, distribution.times, steps or distribution.steps,
+                                    distribution.max_step)
         return fokker_planck.log_likelihood(distribution.ssm, time_grid, y, layout)
 
     def per_draw(values: Any, key: jax.Array, y: jax.Array) -> jax.Array:
@@ -161,7 +162,8 @@ def by_particles(problem: PosteriorDraws, particles: int | None, replicates: int
         sd = noise(run(problem.at(rows), pilot_key))
         wanted = chosen * (sd / target) ** 2 * _SAFETY if np.isfinite(sd) else np.inf
         time_grid = build_time_grid(example.ssm, example.times, steps or example.steps, example.max_step)
-        each_particle = problem.size * replicates * problem.series * np.shape(time_grid.intervals.length)[0] * time_grid.steps
+        steps_made = np.shape(time_grid.intervals.length)[0] * time_grid.steps
+        each_particle = problem.size * replicates * problem.series * steps_made
         most = max(chosen, most_work / each_particle)
         limited = wanted > most
         if wanted > chosen and most > chosen:
@@ -176,13 +178,15 @@ _SAFETY = 1.2
 """Margin of the number of particles over what the pilot run asks for, which is itself an estimate."""
 
 
-def _particle_run(problem: PosteriorDraws, particles: int, replicates: int, steps: int | None, progress: bool) -> Callable:
+def _particle_run(problem: PosteriorDraws, particles: int, replicates: int, steps: int | None,
+                  progress: bool) -> Callable:
     known = problem.example
     check_noise(known.ssm, known.time_grid.initial_time)
     settings = particle_filter.check_settings(known.ssm, ParticleSettings(particles))
 
     def one(distribution: MarginalLikelihood, y: jax.Array, key: jax.Array) -> jax.Array:
-        time_grid = build_time_grid(distribution.ssm, distribution.times, steps or distribution.steps, distribution.max_step)
+        time_grid = build_time_grid(distribution.ssm, distribution.times, steps or distribution.steps,
+                                    distribution.max_step)
         return particle_filter.log_likelihood(distribution.ssm, time_grid, y, key, settings)
 
     bound, series = problem.bound, problem.series

@@ -164,7 +164,8 @@ def _run(ssms: tuple[StateSpaceModel, ...], rule: SwitchingRule, grid: TimeGrid,
     maps = [row_maps(ssm, rule, grid) for ssm in ssms]
     equal = jnp.full(size, -np.log(size))
 
-    def row(particles: _Particles, inputs: tuple[Intervals, jax.Array, jax.Array, jax.Array]) -> tuple[_Particles, tuple]:
+    def row(particles: _Particles,
+            inputs: tuple[Intervals, jax.Array, jax.Array, jax.Array]) -> tuple[_Particles, tuple]:
         one, observed, decide, row_key = inputs
         read_key, resample_key = jax.random.split(row_key)
         under = jax.tree_util.tree_map(lambda *parts: jnp.stack(parts), *(make(one) for make in maps))
@@ -215,7 +216,8 @@ def _observe(ssm: StateSpaceModel, particles: _Particles, own: SwitchedMap, obse
     value = _times(own.jacobian, particles.mean, settings.shared) + own.shift
 
     def one(value: jax.Array, jacobian: jax.Array, noise: jax.Array, mean: jax.Array, covariance: jax.Array) -> Update:
-        return update(ssm, Linearised(value, jacobian, noise), observed, jnp.isfinite(observed), Moments(mean, covariance))
+        return update(ssm, Linearised(value, jacobian, noise), observed, jnp.isfinite(observed),
+                      Moments(mean, covariance))
 
     new = jax.vmap(one, (0, at, at, 0, at), Update(Moments(0, at), 0, 0, at, at, at, at))(  # type: ignore[arg-type]
         value, own.jacobian, own.variance, particles.mean, particles.covariance)

@@ -70,7 +70,7 @@ def plan_rows(ssm: StateSpaceModel, times: Any, decisions: Any, start: FilterSta
               max_step: float | None) -> tuple[TimeGrid, np.ndarray]:
     """Return the rows, and which of them (K,) end with a decision."""
     grid = build_time_grid(ssm, times, steps, max_step, at=times if decisions is None else decisions,
-                    initial_time=None if start is None else start.time)
+                           initial_time=None if start is None else start.time)
     decides = np.zeros(len(np.asarray(grid.intervals.observation)), bool)
     decides[grid.requested] = True
     ssm.model.check_at(grid.initial_time, len(grid.observed))
@@ -145,7 +145,7 @@ def row_maps(ssm: StateSpaceModel, rule: SwitchingRule, grid: TimeGrid) -> Calla
         read = lambda s: rule.reading(*ssm.split(ssm.inputs(s, end)), end)  # noqa: E731
         zero = nothing.mean
         variance = ssm.obs_cov(ssm.inputs(zero, end), end, jnp.maximum(row.observation, 0))
-        return SwitchedMap(one.phi, one.moments.mean, one.process_cov, jax.jacfwd(observe)(zero), observe(zero), variance,
-                      jax.jacfwd(read)(zero), read(zero))
+        return SwitchedMap(one.phi, one.moments.mean, one.process_cov, jax.jacfwd(observe)(zero), observe(zero),
+                           variance, jax.jacfwd(read)(zero), read(zero))
 
     return make

@@ -144,16 +144,17 @@ def test_nodes_after_a_known_start_are_those_of_dense_algebra():
             gram[5 * i:5 * i + 5, at] = part.T
         gram[at, at] += noises[j]
     # Nodes after an observation: Cov(node, observation i) = (Phi(i -> node) P(i))[force] H_i'.
-    with_map = [np.eye(size)]
+    transitions = [np.eye(size)]
     for node in range(count):
-        with_map.append(passed.steps.phi[node // 3, node % 3])
+        transitions.append(passed.steps.transitions[node // 3, node % 3])
     marginal = [np.asarray(start.covariance)]
     for node in range(count):
-        marginal.append(with_map[node + 1] @ marginal[-1] @ with_map[node + 1].T + passed.steps.process_cov[node // 3, node % 3])
+        own = passed.steps.process_cov[node // 3, node % 3]
+        marginal.append(transitions[node + 1] @ marginal[-1] @ transitions[node + 1].T + own)
     for i in range(len(TIMES)):
         moved = marginal[3 * i + 3]
         for node in range(3 * i + 3, count):
-            moved = with_map[node + 1] @ moved
+            moved = transitions[node + 1] @ moved
             cross[node, 5 * i:5 * i + 5] = moved[force] @ slopes[i].T
     variance = np.array([marginal[node + 1][force, force] for node in range(count)])
     expected = variance - np.einsum("ij,ij->i", cross, np.linalg.solve(gram, cross.T).T)

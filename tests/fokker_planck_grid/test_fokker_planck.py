@@ -237,7 +237,8 @@ def test_batches_and_vmap_equal_loops(times):
     sets = np.stack([WELL_Y, WELL_Y[::-1], 0.5 * WELL_Y])
     run = jax.jit(lambda y: log_likelihood(ssm, time_grid, y, grid))
     np.testing.assert_allclose(run(sets), [run(y) for y in sets], rtol=1e-12)
-    one = jax.jit(lambda theta: log_likelihood(lfm.state_space(parameters(theta)), time_grid, jnp.asarray(WELL_Y), grid))
+    one = jax.jit(lambda theta: log_likelihood(lfm.state_space(parameters(theta)), time_grid, jnp.asarray(WELL_Y),
+                                               grid))
     thetas = jnp.array([[1.5, 0.8], [0.7, 1.1], [2.0, 0.3]])
     loop = [one(theta) for theta in thetas]
     np.testing.assert_allclose(jax.jit(jax.vmap(one))(thetas), loop, rtol=1e-12)
@@ -247,7 +248,8 @@ def test_batches_and_vmap_equal_loops(times):
 def test_derivatives_in_forward_mode():
     ssm, grid = lfm.state_space(WELL), Grid(-3.0, 3.0, 60)
     time_grid = build_time_grid(ssm, WELL_TIMES, 1)
-    one = jax.jit(lambda theta: log_likelihood(lfm.state_space(parameters(theta)), time_grid, jnp.asarray(WELL_Y), grid))
+    one = jax.jit(lambda theta: log_likelihood(lfm.state_space(parameters(theta)), time_grid, jnp.asarray(WELL_Y),
+                                               grid))
     theta = jnp.array([1.5, 0.8])
     slope = jax.jit(jax.jacfwd(one))(theta)
     for index, step in enumerate(1e-5 * np.eye(2)):

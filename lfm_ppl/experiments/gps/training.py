@@ -280,7 +280,7 @@ def held_out(logarithms: jax.Array, data: Regression, axes: str) -> jax.Array:
         mean = later.T @ y + left.T @ solve_triangular(root, first.T @ y, lower=True)
         reduced, added = (part.reshape(-1, count - seen, 3) for part in (later, left))
         held_out_covariance = (own[seen:] - jnp.einsum("mti,mtj->tij", reduced, reduced)
-                  + jnp.einsum("mti,mtj->tij", added, added))
+                               + jnp.einsum("mti,mtj->tij", added, added))
         error = jnp.where(known[seen:, None], data.y[seen:], 0.0) - mean.reshape(-1, 3)
         density = jnp.where(known[seen:], log_density(error, held_out_covariance), 0.0)
         total, usable = total + density.sum() / jnp.maximum(known[seen:].sum(), 1), usable & found
