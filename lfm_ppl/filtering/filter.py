@@ -130,7 +130,7 @@ def _inside(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, prepared: Preparat
 
 
 def at_rows(a: jax.Array, intervals: Any) -> jax.Array:
-    """Return the entries of ``a`` (N, ...) at some intervals; without a gather, in reverse a scatter, for all of them."""
+    """Return entries of ``a`` (N, ...) at some intervals; for all of them without a gather, a scatter in reverse."""
     if isinstance(intervals, np.ndarray) and np.array_equal(intervals, np.arange(a.shape[0])):
         return a
     return a[jnp.asarray(intervals)]

@@ -146,7 +146,7 @@ def test_nodes_after_a_known_start_are_those_of_dense_algebra():
     # Nodes after an observation: Cov(node, observation i) = (Phi(i -> node) P(i))[force] H_i'.
     transitions = [np.eye(size)]
     for node in range(count):
-        transitions.append(passed.steps.transitions[node // 3, node % 3])
+        transitions.append(passed.steps.phi[node // 3, node % 3])
     marginal = [np.asarray(start.covariance)]
     for node in range(count):
         own = passed.steps.process_cov[node // 3, node % 3]
