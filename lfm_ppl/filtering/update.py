@@ -114,20 +114,19 @@ def update(ssm: StateSpaceModel, observation: Linearised, y: jax.Array, present:
     rounding = 4 * jnp.finfo(y.dtype).eps * jnp.abs(diagonal(innovation_covariance))
     factor = cholesky(innovation_covariance, jax.lax.stop_gradient(rounding), name=FACTOR)
     chol = factor.chol
-    # One solve for the gain and the innovation.
-    half = factor.solve_lower(jnp.concatenate([cross.T, innovation[:, None]], axis=1))
-    solved, white = factor.solve_upper(half), half[:, -1]
-    gain = solved[:, :-1].T
+    # The gain does not see the innovation: it is one for all means that share a covariance.
+    gain = factor.solve_upper(factor.solve_lower(cross.T)).T
+    white = factor.solve_lower(innovation[:, None])
     kept = jnp.eye(mean.shape[0]) - matmul(gain, jacobian)
     filtered = Moments(mean + matmul(gain, innovation[:, None])[:, 0],
                        congruence(kept, covariance) + congruence(gain, obs_cov))
     failed = factor.degenerate.any()
     if scale is not None:
         failed = failed | _precision_lost(ssm, observation, y, present, moments, filtered, obs_cov,
-                                          solved[:, -1], scale)
+                                          factor.solve_upper(white)[:, 0], scale)
     failed = checkpoint_name(failed, FAILED)
-    return Update(filtered, jnp.where(failed, -jnp.inf, log_density(white, chol, present)), innovation, chol, gain,
-                  jacobian, obs_cov)
+    log_likelihood = jnp.where(failed, -jnp.inf, log_density(white[:, 0], chol, present))
+    return Update(filtered, log_likelihood, innovation, chol, gain, jacobian, obs_cov)
 
 
 def _precision_lost(ssm: StateSpaceModel, observation: Linearised, y: jax.Array, present: jax.Array,

@@ -21,7 +21,7 @@ Y = np.where(np.arange(24) % 5 == 3, np.nan, np.random.default_rng(1).normal(siz
 def same(parts, whole):
     """Every field of the parts, one after the other, equals that of the whole."""
     for name in ("times", "log_likelihood", "predicted_mean", "predicted_covariance", "filtered_mean",
-                 "filtered_covariance", "residual"):
+                 "filtered_covariance", "whitened_innovation"):
         joined = np.concatenate([getattr(part, name) for part in parts])
         np.testing.assert_allclose(joined, getattr(whole, name), rtol=1e-10, atol=1e-12, err_msg=name)
 

@@ -213,7 +213,7 @@ def test_many_observations_are_those_of_few(build, monkeypatch):
     looped = LatentGrid(model, times, 31)
     monkeypatch.setattr("lfm_ppl.latent_grid.latent_grid.FEW", 100)
     single = LatentGrid(model, times, 31)
-    assert looped.between is None and (single.between is None) == (build is oscillator)
+    assert looped.transitions is None and (single.transitions is None) == (build is oscillator)
     u = looped.force(jax.random.normal(jax.random.key(0), looped.mean.shape))
     assert np.allclose(looped.state(u), single.state(u), rtol=1e-12, atol=1e-12)
     longer = LatentGrid(model, times, 3001)  # many points: the forces are cut out, not what they produce
