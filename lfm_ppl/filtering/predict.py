@@ -30,7 +30,7 @@ from lfm_ppl.linearisation.structure import InputStructure
 from lfm_ppl.model.state_space import StateSpaceModel, just_before
 
 FLOOR = "lfm_ppl: smallest standard deviation"
-"""Under this name `smallest_spread` is kept for the derivative of an interval, and not computed again."""
+"""Under this name `minimum_sd` is kept for the derivative of an interval, and not computed again."""
 
 
 class Moments(NamedTuple):
@@ -240,8 +240,8 @@ def step_on(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Integr
             first: Stage | None = None) -> tuple[Prediction, LastStage]:
     """Make one Runge-Kutta step from time ``t`` to ``t + h``.
 
-    Moments ``about`` which to linearise are those (3, ...) at its start, middle and end; ``first`` is its first stage
-    where that is known.
+    ``linearization_point`` holds the moments (3, ...) at its start, middle and end about which to linearise;
+    ``first`` is its first stage where that is known.
     """
     m, p = moments
     size = ssm.physical_dim
@@ -313,7 +313,7 @@ def linearised(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, t: jax.Arra
 
 def _stage(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, t: jax.Array, mean: jax.Array, covariance: Any,
            min_sd: jax.Array, linearization_point: Moments | None) -> Stage:
-    """Linearise the dynamics at a node about the filter's moments, or about those of ``about``."""
+    """Linearise the dynamics at a node about the filter's moments, or about ``linearization_point``."""
 
     def function(w: jax.Array) -> tuple[jax.Array, Any]:
         dispersion = ssm.dispersion(w, t)

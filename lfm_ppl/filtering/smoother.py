@@ -221,7 +221,7 @@ class SmoothingGrids(NamedTuple):
     """The scans of a smoother.
 
     Attributes:
-        marginals: of the likelihood and the marginals.
+        marginals: of the scan that gives the likelihood and the smoothed moments.
         joint: for draws of trajectories, with intervals that end at the requested times too; None where ``marginals``
             serves: without requested times, and for a model whose intervals are exact whatever their length.
         where: the requested times among ``marginals``; None where ``joint`` is.

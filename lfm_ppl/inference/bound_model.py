@@ -43,7 +43,10 @@ _MOST_COMPILED = 64
 """Functions that are kept of one model, such as smoothers with different requested times."""
 
 _lock = threading.RLock()
-"""Held while programs are looked up and models are traced: NumPyro's stack of handlers is one for all threads."""
+"""Held while programs are looked up and made, so that threads share them.
+
+NumPyro's stack of handlers is one for all threads: a function that runs the model, as each does when it is called for
+the first time, must not do so in two threads at once."""
 
 
 class LikelihoodSite(NamedTuple):
@@ -122,7 +125,7 @@ class _without_likelihood(LikelihoodHandler):  # noqa: N801 (an effect handler, 
 class _Program:
     """What data sets of one shape share: the model without its data, and all that was compiled for it.
 
-    Several threads may ask for its functions at once.
+    Several threads may ask for its functions at once. The first call of each traces the model: make it in one thread.
 
     Args:
         model: a NumPyro model.

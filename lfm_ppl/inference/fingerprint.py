@@ -88,7 +88,7 @@ class _ingredients(LikelihoodHandler):  # noqa: N801 (an effect handler, named a
         # Tracers, so that the functions themselves are recorded, and not what they are at one point.
         t, w = self.t, jnp.full(ssm.input_dim, self.at)
         self.times.append(likelihood.times)
-        self.values += eqx.filter(jax.tree_util.tree_leaves(likelihood), eqx.is_array_like) + [
+        self.values += eqx.filter(jax.tree_util.tree_leaves((likelihood, one.rule)), eqx.is_array_like) + [
             ssm.drift(w, t), ssm.dispersion(w, t), ssm.observe(w, t), ssm.obs_cov(w, t, 0), ssm.input_map(t),
             ssm.initial(), ssm.stack.feedback(), ssm.stack.dispersion(), ssm.stack.jump_table()]
         self.settings.append(str((

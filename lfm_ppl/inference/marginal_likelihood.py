@@ -7,7 +7,6 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -121,7 +120,7 @@ class MarginalLikelihood(dist.Distribution):
 
     @functools.cached_property
     def time_grid(self) -> TimeGrid:
-        """The rows of the scan."""
+        """The time grid of the scan."""
         return build_time_grid(self.ssm, self.times, self.steps, self.max_step, tolerance=self.tolerance)
 
     def with_times(self, times: Any) -> MarginalLikelihood:
@@ -134,7 +133,7 @@ class MarginalLikelihood(dist.Distribution):
     def log_prob_per_observation(self, value: Any) -> jax.Array:
         """Return (T,): log p(y_k | y_1:k-1) of the present entries of each observation."""
         y = check_observations(value, *self.event_shape)
-        return self._said(y, self._kept(_log_likelihoods)(*self._parts(y)))
+        return self._said(y, finite_or_minus_infinity(self._one_step_ahead, y))
 
     def log_prob(self, value: Any) -> jax.Array:
         """Return the log marginal likelihood of ``value`` (T, D), NaN where missing; batch dimensions may lead."""
@@ -144,7 +143,7 @@ class MarginalLikelihood(dist.Distribution):
         check_resolution(self.model, self.times, value)
         # One failure makes the sum -inf, and with it the derivatives of the other terms zero.
         y = check_observations(value, *self.event_shape)
-        return self._said(y, self._kept(_log_likelihood)(*self._parts(y)))
+        return self._said(y, finite_or_minus_infinity(lambda y: self._one_step_ahead(y).sum(), y))
 
     def _said(self, y: jax.Array, log_likelihood: jax.Array) -> jax.Array:
         """Return the log likelihood; outside of compiled code say where the filter breaks down if it does."""
@@ -164,12 +163,14 @@ class MarginalLikelihood(dist.Distribution):
                              "parameters; for one series put the site outside of the plate.")
         return super().expand(batch_shape)
 
-    def _parts(self, y: jax.Array) -> tuple:
-        return self.ssm, self.rule, self.time_grid, y, self.iterations, self.damping
-
-    def _kept(self, function: Callable) -> Callable:
-        """Return the function as a program that later calls share, where it would run operation by operation."""
-        return function if checks.traced((self.ssm, self.time_grid)) else _compiled(function)
+    def _one_step_ahead(self, y: jax.Array) -> jax.Array:
+        start = Moments(*self.ssm.initial())
+        point = None
+        if self.iterations:
+            point = posterior_linearisation(self.ssm, self.rule, self.time_grid, y, start, self.iterations,
+                                            self.damping).points
+        passed = forward(self.ssm, self.rule, self.time_grid, y, start=start, linearization_point=point)
+        return at_rows(passed.log_likelihood, self.time_grid.observed)
 
     def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
         """Simulate the real model: (*sample_shape, T, D)."""
@@ -188,30 +189,7 @@ class MarginalLikelihood(dist.Distribution):
         grids = smoothing_grids(self.ssm, self.times, self.steps, self.max_step, at, self.iterations,
                                 self.tolerance)
         y = check_observations(y, *self.event_shape)
-        return self._kept(smooth_on)(self.ssm, self.rule, grids, y, self.iterations, self.damping)
-
-
-def _one_step_ahead(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, iterations: int,
-                    damping: float) -> jax.Array:
-    start = Moments(*ssm.initial())
-    linearization_point = None
-    if iterations:
-        linearization_point = posterior_linearisation(ssm, rule, grid, y, start, iterations, damping).points
-    passed = forward(ssm, rule, grid, y, start=start, linearization_point=linearization_point)
-    return at_rows(passed.log_likelihood, grid.observed)
-
-
-def _log_likelihoods(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, iterations: int,
-                     damping: float) -> jax.Array:
-    return finite_or_minus_infinity(lambda y: _one_step_ahead(ssm, rule, grid, y, iterations, damping), y)
-
-
-def _log_likelihood(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, iterations: int,
-                    damping: float) -> jax.Array:
-    return finite_or_minus_infinity(lambda y: _one_step_ahead(ssm, rule, grid, y, iterations, damping).sum(), y)
-
-
-_compiled = functools.cache(eqx.filter_jit)
+        return smooth_on(self.ssm, self.rule, grids, y, self.iterations, self.damping)
 
 
 class Panel(dist.Distribution):

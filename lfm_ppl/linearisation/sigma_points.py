@@ -209,7 +209,7 @@ class GaussHermite(SigmaPointRule):
     def __check_init__(self):
         checks.positive_integer("order", self.order)
         if self.order < 2:
-            raise ValueError("order must be at least 2: one point has no Jacobian; lfm.Taylor() is the rule with one.")
+            raise ValueError("order must be at least 2: one point gives no slope; lfm.Taylor() is the rule with one.")
 
     def points(self, dim: int) -> UnitPoints:
         """See `SigmaPointRule.points`."""

@@ -345,3 +345,23 @@ def test_errors_name_the_argument_and_the_remedy(y):
         likelihood.log_prob(np.where(np.arange(16).reshape(8, 2) == 2, np.inf, 0.0))
     with pytest.raises(ValueError, match="every entry of y is missing"):
         likelihood.log_prob(np.full((8, 2), np.nan))
+
+
+def test_functions_may_read_what_changes():
+    """A value that the dynamics reads from elsewhere is its present one, a number or what JAX differentiates."""
+    read = {}
+    dynamics = lambda x, u, t: u - read["rate"] * x  # noqa: E731
+    observation = lambda x, u, t: x  # noqa: E731
+    times = np.arange(3.0)
+
+    def log_prob(rate):
+        read["rate"] = rate
+        model = lfm.LatentForceModel(dynamics, {"u": lfm.Matern(1.0, 1.0)},
+                                     lfm.GaussianObservation(observation, jnp.array([0.1])), lfm.Gaussian([0.0], [1.0]))
+        return lfm.MarginalLikelihood(model, times).log_prob(np.sin(times)[:, None])
+
+    low, high = float(log_prob(1.0 - 1e-5)), float(log_prob(1.0 + 1e-5))
+    assert low != high
+    for _ in range(2):
+        assert float(jax.grad(log_prob)(1.0)) == pytest.approx((high - low) / 2e-5, rel=1e-6)
+    assert float(log_prob(1.0 - 1e-5)) == low
