@@ -1,10 +1,6 @@
 import math
-import os
 import pickle
-import subprocess
-import sys
 from functools import partial
-from pathlib import Path
 
 import blackjax
 import jax
@@ -17,6 +13,7 @@ from numpyro import handlers
 from numpyro.diagnostics import effective_sample_size
 from numpyro.infer import MCMC, init_to_value
 from numpyro.infer.util import log_density
+from processes import on_two_devices
 from scipy.stats import kstest
 
 from lfm_ppl.inference.kernels.elliptical_slice import (
@@ -26,7 +23,6 @@ from lfm_ppl.inference.kernels.elliptical_slice import (
     elliptical_slice_step,
 )
 
-ROOT = Path(__file__).resolve().parents[2]
 FIELDS = ("evaluations", "log_likelihood", "potential_energy", "i")
 
 
@@ -418,17 +414,7 @@ print("same")
 
 @pytest.mark.slow
 def test_chain_methods_give_the_same_draws():
-    # two CPU devices, for chains that really run in parallel, exist in a fresh process only
-    environment = os.environ | {
-        "XLA_FLAGS": os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=2",
-        "JAX_PLATFORMS": "cpu",
-        "JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir or "",
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-    }
-    result = subprocess.run(
-        [sys.executable, "-c", CHAIN_METHODS],
-        capture_output=True, text=True, cwd=ROOT, env=environment, timeout=300,
-    )  # fmt: skip
+    result = on_two_devices(CHAIN_METHODS)
     assert result.stdout.strip() == "same", result.stderr
 
 

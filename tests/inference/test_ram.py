@@ -1,9 +1,5 @@
 import math
-import os
 import pickle
-import subprocess
-import sys
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -13,11 +9,11 @@ import numpyro.distributions as dist
 import pytest
 from numpyro.diagnostics import effective_sample_size
 from numpyro.infer import MCMC, init_to_uniform
+from processes import on_two_devices
 
 from lfm_ppl.inference.kernels.ram import RAM
 from lfm_ppl.inference.kernels.robust_metropolis import adapt, rank_one_update
 
-ROOT = Path(__file__).resolve().parents[2]
 STATISTICS = ("accept_prob", "accepted", "potential_energy", "mean_accept_prob", "step_size")
 CHAINS, WARMUP = 8, 40_000
 SCALES = np.diag([1.0, 0.5, 2.0, 1.0, 1.5])
@@ -261,17 +257,7 @@ print("same")
 
 
 def test_chain_methods_give_the_same_draws():
-    # two CPU devices, for chains that really run in parallel, exist in a fresh process only
-    environment = os.environ | {
-        "XLA_FLAGS": os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=2",
-        "JAX_PLATFORMS": "cpu",
-        "JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir or "",
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-    }
-    result = subprocess.run(
-        [sys.executable, "-c", CHAIN_METHODS],
-        capture_output=True, text=True, cwd=ROOT, env=environment, timeout=300,
-    )  # fmt: skip
+    result = on_two_devices(CHAIN_METHODS)
     assert result.stdout.strip() == "same", result.stderr
 
 
