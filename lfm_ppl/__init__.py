@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from lfm_ppl.compilation import fast_loops as fast_loops
     from lfm_ppl.data import Data as Data
     from lfm_ppl.data import read_csv as read_csv
+    from lfm_ppl.data import read_table as read_table
     from lfm_ppl.filtering.breakdown import FilterWarning as FilterWarning
     from lfm_ppl.filtering.filter import FilterState as FilterState
     from lfm_ppl.filtering.filter import filter as filter
@@ -90,7 +91,7 @@ _NAMES = {
     "switching.rao_blackwellised": ("rao_blackwellised",),
     "switching.switched_simulation": ("simulate_switched",),
     "compilation": ("fast_loops",),
-    "data": ("Data", "read_csv"),
+    "data": ("Data", "read_csv", "read_table"),
     "filtering.breakdown": ("FilterWarning",),
     "filtering.filter": ("FilterState", "filter"),
     "filtering.smoother": ("smooth",),

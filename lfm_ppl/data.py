@@ -1,8 +1,8 @@
-"""Observations as a user has them: a CSV file, or a simulated data set with its truth.
+"""Observations as a user has them: a CSV file, a table of another library, or a simulated data set with its truth.
 
-A file has a header, a time column, and one column per output. Empty cells are missing values,
-repeated times are replicates. Every complaint names the file, the row as an editor counts it (the
-header is row 1), and the column.
+A table has a header, a time column, one column per output, and one per known input. Empty cells are missing values,
+repeated times are replicates; times are numbers, or dates. Every complaint names the file, the row as an editor counts
+it (the header is row 1), and the column.
 """
 
 from __future__ import annotations
@@ -13,14 +13,33 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from lfm_ppl import checks
+from lfm_ppl import calendar_time, checks, table
+from lfm_ppl.table import Table
 
-TIME_UNITS = ("ms", "s", "min", "h", "hr", "hours", "d", "days", "weeks", "yr", "years")
-MISSING = ("", "na", "nan", "n/a", "null")
+if TYPE_CHECKING:
+    from lfm_ppl.model.inputs import Input
+
+MISSING = ("", "na", "nan", "n/a", "null", "nat", "none")
+INTERPOLATIONS = ("previous", "linear")
+_DATE_NAMES = ("date", "datetime", "timestamp")
+
+
+class InputTable(NamedTuple):
+    """A known input as it was measured.
+
+    Attributes:
+        times: (K,), increasing.
+        values: (K,).
+        interpolation: "previous" or "linear".
+    """
+
+    times: np.ndarray
+    values: np.ndarray
+    interpolation: str = "previous"
 
 
 @dataclass(frozen=True)
@@ -35,6 +54,8 @@ class Data:
         truth: for simulated data, a mapping with any of ``times`` (K,), ``forces`` (name -> (K,)),
             ``state`` (K, M) and ``parameters`` (name -> array).
         note: what was done to the numbers, to be printed with the results.
+        inputs: known inputs by name; `known_inputs` gives them as functions of time.
+        origin: the calendar time of t = 0 as ISO 8601 text, where the times were dates.
 
     Raises:
         ValueError: if the shapes do not fit together or the times go back.
@@ -51,6 +72,8 @@ class Data:
     units: Mapping[str, str] = field(default_factory=dict)
     truth: Mapping[str, Any] | None = None
     note: str = ""
+    inputs: Mapping[str, InputTable] = field(default_factory=dict)
+    origin: str | None = None
 
     def __post_init__(self) -> None:
         """Convert to arrays and check that the shapes fit together."""
@@ -71,21 +94,37 @@ class Data:
                 f"{self.times[index - 1]:g} at index {index}. Sort the observations by time."
             )
 
+    def known_inputs(self) -> dict[str, Input]:
+        """Return the known inputs as functions of time, for the ``inputs`` argument of a model."""
+        # Here and not before: arrays made before float64 is enabled stay in float32.
+        from lfm_ppl.model.inputs import Input
+
+        return {name: Input(*table) for name, table in self.inputs.items()}
+
 
 def read_csv(
-    path: str | Path, outputs: Sequence[str] | None = None, time_column: str | None = None
+    path: str | Path,
+    outputs: Sequence[str] | None = None,
+    time_column: str | None = None,
+    inputs: Sequence[str] | Mapping[str, str] = (),
+    time_unit: str | None = None,
 ) -> Data:
-    r"""Read observations from a comma-separated file.
+    r"""Read observations and known inputs from a comma-separated file.
 
     Args:
         path: the file. Lines that start with ``#`` and blank lines are skipped.
-        outputs: the columns to read, in this order. None: every column but the time and
+        outputs: the columns to read, in this order. None: every column but the time, the inputs and
             ``replicate``.
         time_column: the name of the time column. None: ``time``, ``t`` or ``time_UNIT``, as in
-            ``time_h``, which also sets the unit of time.
+            ``time_h``, which also sets the unit of time; else ``date``, ``datetime``, ``timestamp``, or the only
+            column that begins with a date.
+        inputs: columns of known inputs; or a mapping column -> "previous" (a value holds until the next, the default)
+            or "linear". Empty cells are left out: the input is interpolated over them.
+        time_unit: unit of times that are dates (ms, s, min, h, d, weeks, years). None: that of the time between rows.
 
     Returns:
-        The observations; empty cells (and NA, NaN) are NaN.
+        The observations; empty cells (and NA, NaN) are NaN. Dates (ISO 8601, with an offset from UTC in each row, or in
+        none) become numbers since the midnight before the first of them, which is the `Data.origin`.
 
     Raises:
         ValueError: with file, row and column, for a file that is empty or not comma-separated
@@ -100,36 +139,77 @@ def read_csv(
         >>> data = read_csv(path)
         >>> data.outputs, data.units, data.times.tolist()
         (('a', 'b'), {'time': 'h'}, [0.0, 0.0, 2.0])
+        >>> _ = path.write_text("date,T,heater\n2026-01-05 06:00,18.1,0\n2026-01-05 07:00,18.4,1\n")
+        >>> data = read_csv(path, inputs=["heater"])
+        >>> data.times.tolist(), data.units, data.origin, float(data.inputs["heater"](7.5))
+        ([6.0, 7.0], {'time': 'h'}, '2026-01-05T00:00:00', 1.0)
     """
-    path = Path(path)
-    header, rows = _read_table(path)
-    time_name = _find_time(path, header, time_column)
-    names = _find_outputs(path, header, time_name, outputs)
-    columns = {name: header.index(name) for name in (time_name, *names)}
-    times = np.array([_time(path, line, time_name, row[columns[time_name]]) for line, row in rows])
-    _check_order(path, [line for line, _ in rows], times)
-    y = np.array(
-        [[_value(path, line, name, row[columns[name]]) for name in names] for line, row in rows]
-    )
-    if np.all(np.isnan(y)):
-        raise ValueError(f"{path}: every value of {', '.join(names)} is missing.")
-    unit = _unit_of(time_name)
-    return Data(times, y, tuple(names), units={"time": unit} if unit else {})
+    return _read(table.from_csv(path), outputs, time_column, inputs, time_unit)
+
+
+def read_table(
+    frame: Any,
+    outputs: Sequence[str] | None = None,
+    time_column: str | None = None,
+    inputs: Sequence[str] | Mapping[str, str] = (),
+    time_unit: str | None = None,
+) -> Data:
+    """Read observations and known inputs from a table in memory.
+
+    Args:
+        frame: a pandas DataFrame or Series (an index of dates, or one with a name, is a column), a polars DataFrame,
+            an xarray Dataset or DataArray along time, or a mapping of column names to values.
+        outputs: see `read_csv`; so are the others.
+        time_column: its name.
+        inputs: columns of known inputs.
+        time_unit: unit of times that are dates.
+
+    Returns:
+        The observations.
+
+    Raises:
+        ValueError: as for `read_csv`; rows are counted from 0.
+        TypeError: no such table.
+
+    Example:
+        >>> import pandas as pd
+        >>> hours = pd.date_range("2026-01-05", periods=3, freq="h")
+        >>> read_table(pd.DataFrame({"T": [18.1, None, 18.4]}, index=hours)).y.ravel()
+        array([18.1,  nan, 18.4])
+    """
+    return _read(table.from_frame(frame), outputs, time_column, inputs, time_unit)
+
+
+def as_data(data: Any) -> Data:
+    """Return data as they are, or read from a table (`read_table`) whose every column is the time or an output.
+
+    Raises:
+        TypeError: neither.
+    """
+    if isinstance(data, Data):
+        return data
+    if table.is_table(data):
+        return read_table(data)
+    raise TypeError("without y the data must be lfm.Data, a DataFrame or an xarray Dataset, got "
+                    f"{type(data).__name__}. Pass times and y.")
 
 
 def write_csv(data: Data, path: str | Path) -> None:
     """Write observations so that :func:`read_csv` reads the same numbers back.
+
+    Known inputs follow the outputs, with their values at the times of the rows.
 
     Args:
         data: the observations; a NaN becomes an empty cell.
         path: the file, which is replaced if it exists.
     """
     unit = data.units.get("time", "")
-    time_name = f"time_{unit}" if unit in TIME_UNITS else "time"
+    time_name = f"time_{unit}" if unit in calendar_time.SECONDS else "time"
+    known = [function(data.times) for function in data.known_inputs().values()]
     with open(path, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow([time_name, *data.outputs])
-        for time, row in zip(data.times, data.y, strict=True):
+        writer.writerow([time_name, *data.outputs, *data.inputs])
+        for time, row in zip(data.times, np.column_stack([data.y, *known]), strict=True):
             cells = ["" if math.isnan(value) else repr(float(value)) for value in row]
             writer.writerow([repr(float(time)), *cells])
 
@@ -155,124 +235,149 @@ def read_truth(path: str | Path) -> dict[str, Any]:
     return truth
 
 
-def _read_table(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Return the header and the numbered rows, all of the header's length."""
-    try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file, strict=True)
-            lines = [
-                (reader.line_num, [cell.strip() for cell in row])
-                for row in reader
-                if any(cell.strip() for cell in row) and not row[0].lstrip().startswith("#")
-            ]
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"{path} is not a comma-separated text file (UTF-8): {error}.") from None
-    except IsADirectoryError:
-        raise ValueError(f"{path} is a folder, not a CSV file.") from None
-    if not lines:
-        raise ValueError(f"{path} is empty; expected a header row and one row per time.")
-    first, header = lines[0]
-    _check_header(path, first, header)
-    if len(lines) == 1:
-        raise ValueError(f"{path} has a header and no rows; expected one row per time.")
-    for line, row in lines[1:]:
-        if len(row) != len(header):
-            raise ValueError(
-                f"{path}, row {line}: {len(row)} cells, but the header has {len(header)} columns. "
-                "Leave a missing value empty, and write decimals with a point."
-            )
-    return header, lines[1:]
+def _read(source: Table, outputs: Sequence[str] | None, time_column: str | None,
+          inputs: Sequence[str] | Mapping[str, str], time_unit: str | None) -> Data:
+    """Return the observations in a table; arguments as for `read_csv`."""
+    if time_unit is not None:
+        checks.one_of("time_unit", time_unit, calendar_time.SECONDS)
+    if isinstance(inputs, str):
+        raise TypeError(f"inputs must be a sequence of column names, such as [{inputs!r}], got the text {inputs!r}.")
+    wanted = dict(inputs) if isinstance(inputs, Mapping) else dict.fromkeys(inputs, "previous")
+    time_name = _find_time(source, time_column)
+    others = [name for name in source.columns if name != time_name]
+    for name in wanted:
+        if name not in others:
+            raise ValueError(f"{source.label}: {checks.unknown('input column', name, others)}")
+    names = _find_outputs(source, [name for name in others if name not in wanted], time_name, outputs)
+    if both := sorted(set(names) & set(wanted)):
+        raise ValueError(f"the column {both[0]!r} is named as an output and as an input; it can be one of them.")
+    times, unit, origin = _times(source, time_name, time_unit)
+    y = np.array([[_value(source, row, name) for name in names] for row in range(len(times))])
+    if np.all(np.isnan(y)):
+        raise ValueError(f"{source.label}: every value of {', '.join(names)} is missing.")
+    return Data(times, y, tuple(names), units={"time": unit} if unit else {}, origin=origin,
+                inputs={name: _input(source, name, way, times) for name, way in wanted.items()})
 
 
-def _check_header(path: Path, line: int, header: list[str]) -> None:
-    for separator, name in ((";", "semicolons"), ("\t", "tabs")):
-        if len(header) == 1 and separator in header[0]:
-            raise ValueError(
-                f"{path} is separated by {name}; expected commas between columns and a point in "
-                "decimals. Export it as comma-separated CSV."
-            )
-    repeated = sorted({name for name in header if header.count(name) > 1})
-    if repeated:
-        where = [i + 1 for i, name in enumerate(header) if name == repeated[0]]
-        raise ValueError(
-            f"{path}, row {line}: the column name {repeated[0]!r} stands {len(where)} times "
-            f"(columns {', '.join(map(str, where))}). Give each column its own name."
-        )
-
-
-def _find_time(path: Path, header: list[str], time_column: str | None) -> str:
+def _find_time(source: Table, time_column: str | None) -> str:
+    header = list(source.columns)
     if time_column is not None:
         if time_column not in header:
-            raise ValueError(f"{path}: {checks.unknown('time column', time_column, header)}")
+            raise ValueError(f"{source.label}: {checks.unknown('time column', time_column, header)}")
         return time_column
-    found = [name for name in header if name.lower() == "time" or name == "t" or _unit_of(name)]
-    if not found:
-        raise ValueError(
-            f"{path} has no time column; expected `time`, `t` or `time_h`, got the columns "
-            f"{', '.join(header)}. Name it with --time-column (time_column=)."
-        )
-    if len(found) > 1:
-        raise ValueError(
-            f"{path} has several time columns: {', '.join(found)}. Name one with --time-column "
-            "(time_column=)."
-        )
-    return found[0]
+    for test in (
+        lambda name: name.lower() == "time" or name == "t" or _unit_of(name),
+        lambda name: name.lower() in _DATE_NAMES,
+        lambda name: calendar_time.is_date(next((cell for cell in source.columns[name] if not _missing(cell)), None)),
+    ):
+        found = [name for name in header if test(name)]
+        if len(found) > 1:
+            raise ValueError(f"{source.label} has several time columns: {', '.join(found)}. Name one with "
+                             "--time-column (time_column=).")
+        if found:
+            return found[0]
+    raise ValueError(f"{source.label} has no time column; expected `time`, `t`, `time_h`, or one of dates, got the "
+                     f"columns {', '.join(header)}. Name it with --time-column (time_column=).")
 
 
-def _find_outputs(
-    path: Path, header: list[str], time_name: str, outputs: Sequence[str] | None
-) -> list[str]:
-    others = [name for name in header if name != time_name]
+def _find_outputs(source: Table, others: Sequence[str], time_name: str, outputs: Sequence[str] | None) -> list[str]:
     if outputs is None:
         names = [name for name in others if name and name.lower() != "replicate"]
         if not names:
-            raise ValueError(f"{path} has no column beside the time {time_name!r}.")
+            raise ValueError(f"{source.label} has no column beside the time {time_name!r}"
+                             f"{' and the inputs' if len(source.columns) > len(others) + 1 else ''}.")
         return names
     if isinstance(outputs, str):
         raise TypeError(f"outputs must be a sequence of column names, such as [{outputs!r}], got the text {outputs!r}.")
     if not len(outputs) or len(set(outputs)) < len(outputs):
         raise ValueError(f"outputs must name at least one column, and each of them once; got {list(outputs)}.")
+    known = [name for name in source.columns if name != time_name]
     for name in outputs:
-        if name not in others:
-            raise ValueError(f"{path}: {checks.unknown('output column', name, others)}")
+        if name not in known:
+            raise ValueError(f"{source.label}: {checks.unknown('output column', name, known)}")
     return list(outputs)
 
 
 def _unit_of(time_name: str) -> str | None:
     """Return h for ``time_h``; None where the name carries no unit."""
     stem, _, unit = time_name.partition("_")
-    return unit if stem.lower() == "time" and unit in TIME_UNITS else None
+    return unit if stem.lower() == "time" and unit in calendar_time.SECONDS else None
 
 
-def _time(path: Path, line: int, name: str, cell: str) -> float:
-    value = _value(path, line, name, cell)
-    if math.isnan(value):
-        raise ValueError(f"{path}, row {line}, column {name!r}: the time is missing.")
-    return value
+def _times(source: Table, name: str, unit: str | None) -> tuple[np.ndarray, str | None, str | None]:
+    """Return times (T,), their unit and their origin, None where the table does not say."""
+    cells = source.columns[name]
+    if missing := [row for row, cell in enumerate(cells) if _missing(cell)]:
+        raise ValueError(f"{source.place(missing[0], name)}: the time is missing.")
+    if not calendar_time.is_date(cells[0]):
+        times = np.array([_value(source, row, name) for row in range(len(cells))])
+        _check_order(source, times, [f"{time:g}" for time in times])
+        own = _unit_of(name)
+        if own is not None and unit not in (None, own):
+            raise ValueError(f"{source.label}: the column {name!r} says that its unit is {own}, and --time-unit "
+                             f"(time_unit=) says {unit}.")
+        return times, own or unit, None
+    stamps = []
+    for row, cell in enumerate(cells):
+        try:
+            stamps.append(calendar_time.parse(cell))
+        except ValueError:
+            raise ValueError(f"{source.place(row, name)}: expected a date such as 2026-03-31 or 2026-03-31T18:00, got "
+                             f"{cell!r}.") from None
+        if (stamps[-1].tzinfo is None) != (stamps[0].tzinfo is None):
+            raise ValueError(f"{source.place(row, name)}: some dates have an offset from UTC and others have none: "
+                             f"{cells[0]!s} and {cell!s}.")
+    back = " A clock that is set back for winter needs offsets from UTC." if stamps[0].tzinfo is None else ""
+    times, origin, unit = calendar_time.since_midnight(stamps, unit or _unit_of(name))
+    _check_order(source, times, [str(cell) for cell in cells], back)
+    return times, unit, origin
 
 
-def _value(path: Path, line: int, name: str, cell: str) -> float:
-    if cell.lower() in MISSING:
-        return math.nan
+def _input(source: Table, name: str, interpolation: str, times: np.ndarray) -> InputTable:
+    """Return the column of a known input without its empty cells.
+
+    Raises:
+        ValueError: it is empty, has no value at the first time, or two values at one time.
+    """
+    checks.one_of(f"interpolation of {name}", interpolation, INTERPOLATIONS)
+    values = np.array([_value(source, row, name) for row in range(len(times))])
+    known = np.flatnonzero(np.isfinite(values))
+    if not known.size or times[known[0]] > times[0]:
+        raise ValueError(f"{source.place(0, name)}: the known input has no value at the first time; fill the cell.")
+    kept, first = np.unique(times[known], return_index=True)
+    for row in known:
+        before = values[known[first[np.searchsorted(kept, times[row])]]]
+        if values[row] != before:
+            raise ValueError(f"{source.place(row, name)}: the known input is {values[row]:g} here and {before:g} in "
+                             "another row of the same time.")
+    return InputTable(kept, values[known[first]], interpolation)
+
+
+def _missing(cell: Any) -> bool:
+    if cell is None or isinstance(cell, str):
+        return cell is None or cell.strip().lower() in MISSING
+    return bool(cell != cell)  # NaN, and pandas' NaT
+
+
+def _value(source: Table, row: int, name: str) -> float:
+    cell = source.columns[name][row]
     try:
+        if _missing(cell):
+            return math.nan
         value = float(cell)
-    except ValueError:
-        raise ValueError(
-            f"{path}, row {line}, column {name!r}: expected a number or an empty cell, got "
-            f"{cell!r}. If the column is not an output, name the outputs."
-        ) from None
+    except (TypeError, ValueError):  # a TypeError is pandas' NA, or a cell that is no scalar
+        if type(cell).__name__ == "NAType":
+            return math.nan
+        raise ValueError(f"{source.place(row, name)}: expected a number or an empty cell, got {cell!r}. If the column "
+                         "is not an output, name the outputs.") from None
     if not math.isfinite(value):
-        raise ValueError(
-            f"{path}, row {line}, column {name!r}: expected a finite number, got {cell!r}."
-        )
+        raise ValueError(f"{source.place(row, name)}: expected a finite number, got {cell!r}.")
     return value
 
 
-def _check_order(path: Path, lines: list[int], times: np.ndarray) -> None:
+def _check_order(source: Table, times: np.ndarray, said: Sequence[str], more: str = "") -> None:
     back = np.flatnonzero(np.diff(times) < 0)
     if back.size:
         k = int(back[0]) + 1
-        raise ValueError(
-            f"{path}, row {lines[k]}: the time goes back from {times[k - 1]:g} to {times[k]:g}. "
-            "Sort the rows by time; replicates are rows with the same time."
-        )
+        raise ValueError(f"{source.label}, row {source.rows[k]}: the time goes back from {said[k - 1]} to {said[k]}. "
+                         f"Sort the rows by time; replicates are rows with the same time.{more}")

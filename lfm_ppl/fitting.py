@@ -18,6 +18,7 @@ import xarray as xr
 from numpyro.infer import init_to_median, init_to_value
 
 from lfm_ppl import checks
+from lfm_ppl.data import as_data
 from lfm_ppl.filtering.breakdown import FilterWarning, breakdown
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference import sampling
@@ -30,6 +31,7 @@ from lfm_ppl.inference.marginal_likelihood import Panel
 from lfm_ppl.inference.posterior import scores, trajectories
 from lfm_ppl.inference.sampling import Transition
 from lfm_ppl.results import arviz_data
+from lfm_ppl.results.inputs import remember
 from lfm_ppl.results.scalars import units_attribute
 
 SAMPLERS = ("nuts", "ram", "pmmh", "map")
@@ -48,7 +50,7 @@ class ConvergenceWarning(UserWarning):
 def fit(
     numpyro_model: Callable,
     times: Any,
-    y: Any,
+    y: Any = None,
     *,
     sampler: str = "nuts",
     chains: int = 4,
@@ -72,7 +74,8 @@ def fit(
     Args:
         numpyro_model: ``model(times, y=None, **model_kwargs)`` with one site
             ``numpyro.sample(name, lfm.MarginalLikelihood(...), obs=y)``, or a `lfm.panel` in a plate.
-        times: (T,), non-decreasing.
+        times: (T,), non-decreasing. Or, without ``y``, the whole data: `lfm.Data`, a DataFrame of pandas or polars or
+            an xarray Dataset (see `lfm.read_table`); the model then gets the known inputs as its argument ``inputs``.
         y: (T, D), NaN where missing; (B, T, D) for a panel.
         sampler: "nuts", "ram" (robust adaptive Metropolis), "pmmh" (particle-marginal RAM: a particle filter estimates
             the likelihood, and the posterior is exact up to its integration steps), or "map" (posterior mode; the draws
@@ -109,7 +112,7 @@ def fit(
           and for "pmmh" from the particle smoother;
         - ``posterior_predictive``: replicated data along these trajectories. (``numpyro.infer.Predictive`` with the
           same draws simulates NEW forces instead.)
-        - ``observed_data``, and ``truth`` where known.
+        - ``observed_data``, and ``truth`` and ``constant_data`` (known inputs) where there are any.
 
     Raises:
         ValueError, TypeError: unknown sampler, wrong shapes, parameters to fix that do not exist, and so on.
@@ -145,6 +148,11 @@ def fit(
     if trajectory_draws != 0:
         checks.positive_integer("trajectory_draws", trajectory_draws)
     keys = jax.random.split(jax.random.key(seed), 5)
+    data = None
+    if y is None:
+        data = as_data(times)
+        times, y, truth = data.times, data.y, data.truth if truth is None else truth
+        model_kwargs = {**({"inputs": data.known_inputs()} if data.inputs else {}), **(model_kwargs or {})}
     bound = bind(numpyro_model, times, y, **dict(model_kwargs or {}))
     _check_requested(bound, at)
     bound = bound.fix(fixed)
@@ -178,6 +186,7 @@ def fit(
         "samples": samples, "fixed": json.dumps({k: np.asarray(v).tolist() for k, v in (fixed or {}).items()}),
         "wall_time_s": round(time.perf_counter() - started, 3), "versions": json.dumps(_versions()),
         "created_at": datetime.now(UTC).isoformat(timespec="seconds"), **remarks,
+        **({} if data is None else remember(groups, data)),
     }
     result = arviz_data.build(groups, {k: v for k, v in attrs.items() if v is not None})
     if sampler != "map":

@@ -10,13 +10,15 @@ and may define, each with a sensible default,
     prepare(data) -> lfm.Data                   turns a user's file into what ``model`` takes
     anchors(data) -> dict                       parameters that are fixed for such data unless freed
     OUTPUTS      names of the outputs; None: any number of them, the columns of the data file
+    INPUTS       known inputs: name -> "previous" or "linear", how they are interpolated
     UNITS        name -> unit
     OPTIONS      option -> (default, tuple of choices or a type, help)
     PARAMETERS   name of a sample site -> help, with its unit
     TARGET_ACCEPT    acceptance that NUTS aims at, where its own 0.8 makes steps too long
 
 A ``model`` that has an argument ``outputs`` or ``units`` is told the names of the outputs and the
-units of the data, for ``LatentForceModel(..., output_names=outputs, units=units)``.
+units of the data, for ``LatentForceModel(..., output_names=outputs, units=units)``. One that has an argument ``inputs``
+gets the known inputs of the data: name -> `lfm.Input`, a function of time.
 """
 
 from __future__ import annotations
@@ -27,13 +29,13 @@ import os
 import sys
 import traceback
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from lfm_ppl import checks
-from lfm_ppl.data import Data
+from lfm_ppl.data import INTERPOLATIONS, Data
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,7 @@ class ModelFile:
         units: name -> unit.
         options: option -> (default, tuple of choices or a type, help).
         parameters: name of a sample site -> help.
+        inputs: known inputs that the model takes: name -> interpolation.
         target_accept: acceptance that NUTS aims at; None for its own.
     """
 
@@ -62,6 +65,7 @@ class ModelFile:
     units: Mapping[str, str]
     options: Mapping[str, tuple[Any, Any, str]]
     parameters: Mapping[str, str]
+    inputs: Mapping[str, str] = field(default_factory=dict)
     target_accept: float | None = None
     _simulate: Callable[..., Data] | None = None
     _prepare: Callable[[Data], Data] | None = None
@@ -100,7 +104,12 @@ class ModelFile:
         """Return the keyword arguments of ``model`` for this data and these options."""
         keywords = {name: default for name, (default, _, _) in self.options.items()} | dict(options)
         taken = inspect.signature(self.model).parameters
-        told = {"outputs": data.outputs, "units": dict(data.units)}
+        told = {"outputs": data.outputs, "units": dict(data.units), "inputs": data.known_inputs()}
+        if data.inputs and "inputs" not in taken:
+            raise ValueError(f"{self.path}: the data have the known input {next(iter(data.inputs))!r}, and model(...) "
+                             "has no argument `inputs` to take it by.")
+        if lacking := [name for name in self.inputs if name not in data.inputs]:
+            raise ValueError(f"{self.name} needs the known input {lacking[0]!r}, which the data do not have.")
         return keywords | {name: value for name, value in told.items() if name in taken}
 
     def option(self, name: str, text: str) -> Any:
@@ -220,6 +229,7 @@ def _checked(path: Path, module: ModuleType) -> ModelFile:
         units=dict(getattr(module, "UNITS", {})),
         options=_checked_options(path, getattr(module, "OPTIONS", {})),
         parameters=dict(getattr(module, "PARAMETERS", {})),
+        inputs=_checked_inputs(path, getattr(module, "INPUTS", {})),
         target_accept=target_accept,
         _simulate=getattr(module, "simulate", None),
         _prepare=getattr(module, "prepare", None),
@@ -236,6 +246,14 @@ def _checked_options(path: Path, options: Mapping[str, Any]) -> dict[str, tuple[
                 f"got {entry!r}."
             )
     return dict(options)
+
+
+def _checked_inputs(path: Path, inputs: Any) -> dict[str, str]:
+    valid = isinstance(inputs, Mapping) and all(way in INTERPOLATIONS for way in inputs.values())
+    if not valid:
+        raise ValueError(f"{path}: INPUTS must be a mapping of names to {' or '.join(INTERPOLATIONS)}, as in "
+                         f'{{"heater": "previous"}}, got {inputs!r}.')
+    return dict(inputs)
 
 
 def _convert(kind: type, text: str) -> Any:

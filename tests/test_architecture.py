@@ -16,11 +16,11 @@ PACKAGE = ROOT / "lfm_ppl"
 # Lower layers first. A module belongs to the longest name here that is a prefix of its own, and may
 # import from its own layer and from the layers below.
 LAYERS = (
-    ("checks", "compilation", "linalg", "gradients", "data"),
+    ("checks", "compilation", "linalg", "gradients", "calendar_time", "table"),
     ("forces",),
     ("linearisation",),
     ("model",),
-    ("orbits",),
+    ("orbits", "data"),
     ("filtering",),
     ("particles", "fokker_planck_grid", "latent_grid"),
     ("switching",),

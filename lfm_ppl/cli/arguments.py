@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Any, NoReturn
 
 import lfm_ppl
-from lfm_ppl import checks
+from lfm_ppl import calendar_time, checks
 from lfm_ppl.cli import check, compare, fit, models, plot, simulate, version
 from lfm_ppl.cli.choices import REFERENCES, RULES, SAMPLERS
 
@@ -205,7 +205,7 @@ def _add_fit(commands: Any) -> None:
     _add_approximation(command.add_argument_group("approximation (default: the model's own)"))
     out = command.add_argument_group("results")
     out.add_argument("--out", metavar="DIR", help="folder to write (default: lfm-results/MODEL-001, -002, ...)")
-    out.add_argument("--until", type=float, metavar="TIME", help="forecast to this time (default: none)")
+    out.add_argument("--until", metavar="TIME", help="forecast to this time, a number or a date (default: none)")
     out.add_argument("--overwrite", action="store_true", help="write into a folder with files")
     out.add_argument("--quiet", action="store_true", help="no progress bar (there is none without a terminal)")
 
@@ -217,8 +217,14 @@ def _add_data(group: Any) -> None:
         help="CSV: a time column, one column per output, empty cells missing, repeated times for "
         "replicates (default: the model's simulated data)",
     )
-    group.add_argument("--time-column", metavar="NAME", help="the time column (default: time, t or time_h)")
+    group.add_argument("--time-column", metavar="NAME",
+                       help="the time column, of numbers or dates (default: time, t or time_h, else one of dates)")
+    group.add_argument("--time-unit", type=_one_of("unit of time", calendar_time.SECONDS), metavar="UNIT",
+                       help=f"unit of times that are dates: {', '.join(calendar_time.SECONDS)} (default: by the gaps)")
     group.add_argument("--outputs", metavar="A,B,...", help="the columns to use (default: those of the model)")
+    group.add_argument("--inputs", metavar="A,B:linear,...",
+                       help="columns of known inputs, in the model's order; a value holds until the next row, or with "
+                       ":linear is joined to it by a line (default: columns of the names that the model gives)")
     group.add_argument("--truth", metavar="FILE", help="the truth that `simulate` wrote, to be drawn in figures")
 
 

@@ -23,7 +23,7 @@ _DRAWS, _DRAWS_TO_CORRECT = 200, 1000
 _CHAINS, _WARMUP, _SAMPLES = 4, 500, 500
 """Of the chains that correct a result from the posterior mode, which has none itself."""
 
-_RECORD = ("model_file", "settings", "options", "data", "note")
+_RECORD = ("model_file", "settings", "options", "data", "note", "time_origin")
 
 
 class Check(NamedTuple):
@@ -73,6 +73,7 @@ def _task(posterior: Any, model_file: str | None) -> Check:
     """Rebuild the model from what the result remembers of it."""
     from lfm_ppl.inference.handlers.settings import approximate
     from lfm_ppl.results import arviz_data, rebuilding
+    from lfm_ppl.results.inputs import inputs_of
     from lfm_ppl.results.scalars import unit_of
 
     attrs = arviz_data.attributes(posterior)
@@ -96,7 +97,7 @@ def _task(posterior: Any, model_file: str | None) -> Check:
                          f"{', '.join(model.outputs)}. Give the file that it was made with.")
     (variable,) = (group[name] for name in group.data_vars)
     units = {name: unit for name in outputs if (unit := unit_of(variable, name))}
-    observed = data.Data(times, y, outputs, units={**model.units, **units})
+    observed = data.Data(times, y, outputs, units={**model.units, **units}, inputs=inputs_of(posterior))
     options = json.loads(attrs.get("options") or "{}")
     unknown = sorted(set(options) - set(model.options))
     if unknown:
@@ -186,8 +187,9 @@ def _exact_chains(task: Check, arguments: argparse.Namespace) -> Any:
         fixed=json.loads(attrs.get("fixed") or "{}"), name=task.name, progress=_progress(arguments),
     )  # fmt: skip
     corrected.attrs.update({name: attrs[name] for name in _RECORD if name in attrs})
-    if arviz_data.has_group(task.posterior, "truth"):
-        arviz_data.add_group(corrected, "truth", arviz_data.group(task.posterior, "truth"))
+    for group in ("truth", "constant_data"):
+        if arviz_data.has_group(task.posterior, group):
+            arviz_data.add_group(corrected, group, arviz_data.group(task.posterior, group))
     return corrected
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from lfm_ppl import data, loading
+from lfm_ppl import calendar_time, data, loading
 from lfm_ppl.cli import choices, results, session
 
 SETTINGS = ("rule", "steps", "max_step", "iterations", "tolerance")
@@ -30,7 +30,7 @@ def run(arguments: argparse.Namespace) -> int:
     options = choices.options(model, arguments.option)
     observed = _observed(arguments, model, options)
     fixed = choices.fixed(arguments.set, model.anchors(observed))
-    at = _requested(observed.times, arguments.until)
+    at = _requested(observed, arguments.until)
     if arguments.target_accept is not None and arguments.sampler == "map":
         raise ValueError("--target-accept is for the samplers nuts, ram and pmmh; map accepts and rejects nothing.")
     if arguments.particles is not None and arguments.sampler != "pmmh":
@@ -46,7 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _observed(arguments: argparse.Namespace, model: loading.ModelFile, options: dict[str, Any]) -> data.Data:
     """Return the data to fit: the user's file as the model takes it, or the model's own."""
     if arguments.data is None:
-        for flag in ("outputs", "time_column", "truth"):
+        for flag in ("outputs", "inputs", "time_column", "time_unit", "truth"):
             if getattr(arguments, flag) is not None:
                 flag = flag.replace("_", "-")
                 raise ValueError(f"--{flag} says how to read a data file; give one with --data.")
@@ -59,21 +59,46 @@ def _observed(arguments: argparse.Namespace, model: loading.ModelFile, options: 
                 f"{model.name} has {len(model.outputs)} outputs ({', '.join(model.outputs)}); "
                 f"--outputs names {len(columns)} columns."
             )
-    observed = data.read_csv(arguments.data, columns, arguments.time_column)
-    if model.outputs is not None:
-        observed = dataclasses.replace(observed, outputs=model.outputs)
+    inputs = _inputs(arguments.inputs, model)
+    observed = data.read_csv(arguments.data, columns, arguments.time_column, dict(inputs.values()), arguments.time_unit)
+    observed = dataclasses.replace(observed, outputs=model.outputs or observed.outputs,
+                                   inputs={name: observed.inputs[column] for name, (column, _) in inputs.items()})
     if arguments.truth is not None:
         observed = dataclasses.replace(observed, truth=data.read_truth(arguments.truth))
     return model.prepare(observed)
 
 
-def _requested(times: np.ndarray, until: float | None) -> np.ndarray | None:
+def _inputs(given: str | None, model: loading.ModelFile) -> dict[str, tuple[str, str]]:
+    """Return the known inputs to read: name -> column of the file, interpolation.
+
+    Args:
+        given: ``A,B:linear``, columns in the order of the model's inputs; None: columns of these names.
+        model: what takes them.
+    """
+    if given is None:
+        return {name: (name, way) for name, way in model.inputs.items()}
+    columns = [tuple(part.strip() for part in text.partition(":")[::2]) for text in given.split(",")]
+    names = list(model.inputs) or [column for column, _ in columns]
+    if len(names) != len(columns) or len(set(columns)) < len(columns):
+        known = ", ".join(names)
+        raise ValueError(f"{model.name} takes {len(names)} known inputs ({known}); --inputs names {len(columns)} "
+                         "columns, which must be as many, each of them once.")
+    return {name: (column, way or model.inputs.get(name, "previous"))
+            for name, (column, way) in zip(names, columns, strict=True)}
+
+
+def _requested(observed: data.Data, until: str | None) -> np.ndarray | None:
     """Return the times of the trajectories where they go beyond the data; None: the library's own grid."""
     if until is None:
         return None
-    if not (np.isfinite(until) and until > times[-1]):
-        raise ValueError(f"--until takes a time after the last observation, at {times[-1]:g}, got {until:g}.")
-    return np.union1d(np.linspace(times[0], until, _GRID), times)
+    times = observed.times
+    try:
+        end = calendar_time.position(until, observed.origin, observed.units.get("time", ""))
+    except ValueError as error:
+        raise ValueError(f"--until: {error}") from None
+    if not (np.isfinite(end) and end > times[-1]):
+        raise ValueError(f"--until takes a time after the last observation, at {times[-1]:g}, got {until}.")
+    return np.union1d(np.linspace(times[0], end, _GRID), times)
 
 
 def _print_task(
@@ -88,6 +113,10 @@ def _print_task(
     size = f"{len(observed.times)} rows of {', '.join(observed.outputs)}"
     print(f"model    {model.name}: {model.summary}" if model.summary else f"model    {model.name}")
     print(f"data     {source}: {size}" + (f"; {missing} values missing" if missing else ""))
+    if observed.inputs:
+        print("inputs   " + ", ".join(f"{name} ({table.interpolation})" for name, table in observed.inputs.items()))
+    if observed.origin is not None:
+        print(f"time     in {observed.units['time']} since {observed.origin.replace('T', ' ')}")
     if options:
         print("options  " + ", ".join(f"{name} = {value}" for name, value in options.items()))
     anchors = model.anchors(observed)
@@ -137,8 +166,7 @@ def sample(
     )
     posterior = lfm_ppl.fit(
         numpyro_model,
-        observed.times,
-        observed.y,
+        observed,
         sampler=arguments.sampler,
         chains=arguments.chains,
         warmup=arguments.warmup,
@@ -153,7 +181,6 @@ def sample(
         },
         model_kwargs=model.keywords(observed, options),
         fixed=fixed,
-        truth=observed.truth,
         progress=not arguments.quiet and sys.stderr.isatty(),  # in a log file a bar is noise
         name=model.name,
     )

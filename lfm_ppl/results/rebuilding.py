@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from lfm_ppl.inference.bound_model import BoundModel, LikelihoodSite, bind
-from lfm_ppl.results import arviz_data
+from lfm_ppl.results import arviz_data, inputs
 from lfm_ppl.results.likelihoods import PosteriorDraws
 
 _TOLERANCE = 1e-6
@@ -48,7 +48,7 @@ def problem(result: Any, numpyro_model: Callable, times: Any = None, y: Any = No
     if times is None or y is None:
         stored = observations(result)
         times, y = stored[0] if times is None else times, stored[1] if y is None else y
-    bound = bind(numpyro_model, times, y, **dict(model_kwargs or {}))
+    bound = bind(numpyro_model, times, y, **inputs.keywords(result, model_kwargs))
     _check_settings(bound.site, attrs)
     bound = bound.fix(json.loads(attrs.get("fixed") or "{}"))
     return PosteriorDraws(bound, _latent(bound, posterior))

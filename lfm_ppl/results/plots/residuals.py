@@ -16,7 +16,7 @@ from matplotlib.ticker import MaxNLocator
 
 from lfm_ppl.results.arviz_data import group
 from lfm_ppl.results.plots import style
-from lfm_ppl.results.plots.trajectories import pick, time_unit
+from lfm_ppl.results.plots.trajectories import pick, time_origin, time_unit
 from lfm_ppl.results.residuals import (
     autocorrelation,
     default_lags,
@@ -70,7 +70,7 @@ def plot_residuals(
         over_time.set_ylabel("residual (sd)")
         _draw_quantiles(quantiles, series.values, tests.loc[name])
         _draw_autocorrelation(lags, series.values, tests.loc[name])
-    style.label_time([row[0] for row in rows], time_unit(result))
+    style.label_time([row[0] for row in rows], time_unit(result), time_origin(result))
     for row in rows if style.is_narrow(width) else rows[-1:]:
         row[1].set_xlabel("normal quantile")
         row[2].set_xlabel("lag (observations)")

@@ -12,10 +12,14 @@ from collections.abc import Callable, Sequence
 from typing import Any, ParamSpec
 
 import matplotlib.style
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
+from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, num2date
 from matplotlib.figure import Figure
-from matplotlib.ticker import Formatter, MaxNLocator
+from matplotlib.ticker import Formatter, Locator, MaxNLocator
+
+from lfm_ppl import calendar_time
 
 WIDTHS = {"column": 3.4, "full": 7.0}  # inches: one column of a two-column paper, and both
 
@@ -24,6 +28,9 @@ BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 YELLOW, BLUE, VERMILLION, PURPLE = "#F0E442", "#0072B2", "#D55E00", "#CC79A7"
 GREY = "#707070"
 CHAIN_COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, BLACK, YELLOW)
+
+_SHARED = ("%d %b %Y", "%b %Y", "%Y")
+"""What the ticks of an axis of dates may share, which then stands once beside it: the day, the month or the year."""
 
 SMALL = 7.0
 STYLE = {
@@ -192,9 +199,69 @@ def in_a_row(width: str | float, count: int, height: float, **shared: Any) -> tu
     return figure, list(grid.flat)
 
 
-def label_time(panels: Sequence[Axes], unit: str) -> None:
-    """Write "time" and its unit under the panels that show x tick labels."""
+class Dates(Formatter):
+    """Tick labels of calendar time, for an axis whose numbers are times since an origin."""
+
+    def __init__(self, origin: str, unit: str) -> None:
+        self.origin, self.unit = origin, unit
+        self.dates = ConciseDateFormatter(AutoDateLocator(), show_offset=False)
+
+    def days(self, times: Any) -> np.ndarray:
+        """Return times as Matplotlib's dates."""
+        return calendar_time.days_of(times, self.origin, self.unit)
+
+    def common(self, ticks: Sequence[float]) -> str:
+        """Return what all ticks share and their labels leave out: the year, the month, the day."""
+        shown = [num2date(day) for day in self.days(ticks)]
+        return next((kinds.pop() for form in _SHARED if len(kinds := {day.strftime(form) for day in shown}) == 1), "")
+
+    def __call__(self, x: float, pos: int | None = None) -> str:
+        """Return the label of one time by itself, as under the mouse."""
+        return num2date(float(self.days(x))).strftime("%Y-%m-%d %H:%M")
+
+    def format_ticks(self, values: Sequence[float]) -> list[str]:
+        """Return the labels of ticks, each as short as what stands beside it allows."""
+        return self.dates.format_ticks(list(self.days(values)))
+
+
+class DateTicks(Locator):
+    """Ticks at round dates and times of day, for the axis of `Dates`."""
+
+    def __init__(self, dates: Dates, ticks: int) -> None:
+        self.dates = dates
+        self.inner = AutoDateLocator(minticks=3, maxticks=ticks)
+
+    def __call__(self) -> np.ndarray:
+        """Return the ticks of the interval that the axis shows."""
+        assert self.axis is not None
+        return self.tick_values(*self.axis.get_view_interval())
+
+    def tick_values(self, vmin: float, vmax: float) -> np.ndarray:
+        """Return the ticks of an interval."""
+        start, end = self.dates.days((vmin, vmax))
+        days = np.asarray(self.inner.tick_values(num2date(start), num2date(end)))
+        return vmin + (days - start) * ((vmax - vmin) / (end - start))
+
+
+def label_time(panels: Sequence[Axes], unit: str, origin: str = "") -> None:
+    """Write "time" and its unit, or its dates, under the panels that show x tick labels.
+
+    Args:
+        panels: whose x axis is time.
+        unit: of time.
+        origin: the calendar time of t = 0 as ISO 8601 text; empty: times are plain numbers.
+    """
     for axes in panels:
+        if origin and unit in calendar_time.SECONDS:
+            dates = Dates(origin, unit)
+            ticks = DateTicks(dates, 6)
+            axes.xaxis.set_major_formatter(dates)
+            axes.xaxis.set_major_locator(ticks)
+            if axes.xaxis.get_tick_params()["labelbottom"]:
+                low, high = axes.get_xlim()
+                shown = [tick for tick in ticks.tick_values(low, high) if low <= tick <= high]
+                axes.set_xlabel(with_unit("time", dates.common(shown), 40))
+            continue
         power = scale(axes.xaxis)
         if axes.xaxis.get_tick_params()["labelbottom"]:
             axes.set_xlabel(with_unit("time", f"{power} {unit}".strip(), 40))

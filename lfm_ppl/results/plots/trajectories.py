@@ -14,7 +14,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from lfm_ppl.checks import unknown
-from lfm_ppl.results.arviz_data import group, has_group
+from lfm_ppl.results.arviz_data import attributes, group, has_group
+from lfm_ppl.results.inputs import ORIGIN
 from lfm_ppl.results.plots import style
 from lfm_ppl.results.scalars import unit_of
 
@@ -73,7 +74,7 @@ def plot_fit(
         axes.plot(time, mean, color=style.BLUE, zorder=3)
         _draw_data(axes, data)
         style.label_values(axes, name, unit_of(observed, name))
-    style.label_time(panels, time_unit(result))
+    style.label_time(panels, time_unit(result), time_origin(result))
     figure.align_ylabels(panels)
     handles: list[Artist] = [Line2D([], [], label="data", **_data_style(observed.sizes["time"]))]
     handles += [Line2D([], [], color=style.BLUE, label="posterior mean")]
@@ -154,6 +155,11 @@ def time_unit(result: Any) -> str:
     return ""
 
 
+def time_origin(result: Any) -> str:
+    """Return the calendar time of t = 0, empty where times are plain numbers."""
+    return str(attributes(result).get(ORIGIN, ""))
+
+
 def trajectory_names(result: Any, kind: str) -> list[str]:
     """Return the names of the forces, states or outputs that ``result`` has trajectories of."""
     if not has_group(result, "trajectories") or kind not in group(result, "trajectories").dims:
@@ -197,7 +203,7 @@ def _panels(
             axes.plot(true["at_truth"], true, color=style.BLACK, lw=0.9, ls=(0, (4, 2)), zorder=3)
             known = True
         style.label_values(axes, name, unit_of(draws, name))
-    style.label_time(panels, time_unit(result))
+    style.label_time(panels, time_unit(result), time_origin(result))
     figure.align_ylabels(panels)
     handles = [Line2D([], [], color=line, label="posterior mean"), Patch(color=tint, label="95%")]
     if known:

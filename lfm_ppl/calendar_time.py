@@ -1,0 +1,121 @@
+"""Calendar time: dates and times of day as numbers of a unit since an origin, and back.
+
+The origin is the midnight before the first time, on the clock of the data, so that a force with a daily or weekly
+period knows the time of day. Differences are those of absolute time: with an offset from UTC in every row, the hour
+that a change to summer time leaves out or repeats is counted right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import UTC, date, datetime, time, timedelta
+from typing import Any
+
+import numpy as np
+
+SECONDS = {
+    "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "hr": 3600.0, "hours": 3600.0, "d": 86400.0, "days": 86400.0,
+    "weeks": 604800.0, "yr": 31557600.0, "years": 31557600.0,
+}
+"""Unit of time -> its length in seconds; a year is 365.25 days."""
+
+_INFERRED = (("years", 300 * 86400.0), ("d", 86400.0), ("h", 3600.0), ("min", 60.0), ("s", 1.0))
+"""Unit -> the median gap, in seconds, from which on it is chosen."""
+
+
+def is_date(cell: Any) -> bool:
+    """Whether a cell of a table holds a date or a time of a calendar, and not a number."""
+    if isinstance(cell, (date, np.datetime64)):
+        return True
+    if not isinstance(cell, str) or not any(mark in cell for mark in "-:"):
+        return False  # 20190412 is a number
+    try:
+        parse(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def parse(cell: Any) -> datetime:
+    """Return the time that a cell stands for: ISO 8601 text, a date, a `datetime`, or NumPy's or pandas' of these.
+
+    Raises:
+        ValueError: it stands for none.
+    """
+    if hasattr(cell, "to_pydatetime"):  # pandas
+        cell = cell.to_pydatetime(warn=False)
+    if isinstance(cell, np.datetime64):
+        cell = cell.astype("datetime64[us]").item()
+    if isinstance(cell, datetime):
+        return cell
+    if isinstance(cell, date):
+        return datetime.combine(cell, time())
+    if not isinstance(cell, str):
+        raise ValueError(f"{cell!r} is no date")
+    return datetime.fromisoformat(cell.strip())
+
+
+def since_midnight(stamps: Sequence[datetime], unit: str | None = None) -> tuple[np.ndarray, str, str]:
+    """Return times as numbers since the midnight before the first of them.
+
+    Args:
+        stamps: all with an offset from UTC, or all without.
+        unit: one of `SECONDS`; None: the largest of years, d, h, min and s that is at most the median gap.
+
+    Returns:
+        times (T,), the origin as ISO 8601 text, and the unit.
+
+    Example:
+        >>> stamps = [datetime.fromisoformat(text) for text in ("2019-12-23 06:00", "2019-12-23 07:30")]
+        >>> since_midnight(stamps)
+        (array([6. , 7.5]), '2019-12-23T00:00:00', 'h')
+    """
+    first = min(stamps)
+    origin = datetime.combine(first.date(), time(), first.tzinfo)
+    seconds = np.array([(stamp - origin).total_seconds() for stamp in stamps])
+    if unit is None:
+        gaps = np.diff(seconds)
+        gap = float(np.median(gaps[gaps > 0])) if np.any(gaps > 0) else 1.0
+        unit = next((name for name, least in _INFERRED if gap >= least), "s")
+    return seconds / SECONDS[unit], origin.isoformat(), unit
+
+
+def position(text: str, origin: str | None, unit: str) -> float:
+    """Return where a date, or a number written as text, lies on the axis of times.
+
+    Args:
+        text: a number, or ISO 8601.
+        origin: of the axis, as `since_midnight` gives it; None: its times are plain numbers.
+        unit: of the axis.
+
+    Raises:
+        ValueError: text that is neither, or a date where the times are plain numbers; or only one of text and origin
+            has an offset from UTC.
+
+    Example:
+        >>> position("2019-12-24T12:00", "2019-12-23T00:00:00", "h"), position("3.5", None, "h")
+        (36.0, 3.5)
+    """
+    try:
+        return float(text)
+    except ValueError:
+        pass
+    try:
+        stamp = parse(text)
+    except ValueError:
+        raise ValueError(f"expected a number or a date such as 2026-03-31 or 2026-03-31T18:00, got {text!r}.") from None
+    if origin is None:
+        raise ValueError(f"the times of the data are plain numbers, so the date {text!r} means nothing; give a number.")
+    start = datetime.fromisoformat(origin)
+    if stamp.tzinfo is None:
+        stamp = stamp.replace(tzinfo=start.tzinfo)  # the clock of the data
+    elif start.tzinfo is None:
+        raise ValueError(f"{text!r} has an offset from UTC and the times of the data have none; leave it out.")
+    return (stamp - start).total_seconds() / SECONDS[unit]
+
+
+def days_of(times: Any, origin: str, unit: str) -> np.ndarray:
+    """Return times as days since 1970-01-01, on the clock of the origin: what Matplotlib draws dates by."""
+    start = datetime.fromisoformat(origin).replace(tzinfo=UTC)
+    epoch = datetime(1970, 1, 1, tzinfo=UTC)
+    return (start - epoch) / timedelta(days=1) + np.asarray(times, float) * (SECONDS[unit] / SECONDS["d"])
