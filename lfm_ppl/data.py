@@ -54,7 +54,8 @@ class Data:
         truth: for simulated data, a mapping with any of ``times`` (K,), ``forces`` (name -> (K,)),
             ``state`` (K, M) and ``parameters`` (name -> array).
         note: what was done to the numbers, to be printed with the results.
-        inputs: known inputs by name; `known_inputs` gives them as functions of time.
+        inputs: known inputs: name -> (times, values) or (times, values, "linear"), or an `lfm.Input`; kept as
+            `InputTable`. `known_inputs` gives them as functions of time.
         origin: the calendar time of t = 0 as ISO 8601 text, where the times were dates.
 
     Raises:
@@ -80,6 +81,7 @@ class Data:
         object.__setattr__(self, "times", np.asarray(self.times, dtype=float))
         object.__setattr__(self, "y", np.asarray(self.y, dtype=float))
         object.__setattr__(self, "outputs", tuple(self.outputs))
+        object.__setattr__(self, "inputs", {name: _table_of(name, given) for name, given in self.inputs.items()})
         expected = (len(self.times), len(self.outputs))
         if self.times.ndim != 1 or self.y.shape != expected:
             raise ValueError(
@@ -141,7 +143,7 @@ def read_csv(
         (('a', 'b'), {'time': 'h'}, [0.0, 0.0, 2.0])
         >>> _ = path.write_text("date,T,heater\n2026-01-05 06:00,18.1,0\n2026-01-05 07:00,18.4,1\n")
         >>> data = read_csv(path, inputs=["heater"])
-        >>> data.times.tolist(), data.units, data.origin, float(data.inputs["heater"](7.5))
+        >>> data.times.tolist(), data.units, data.origin, float(data.known_inputs()["heater"](7.5))
         ([6.0, 7.0], {'time': 'h'}, '2026-01-05T00:00:00', 1.0)
     """
     return _read(table.from_csv(path), outputs, time_column, inputs, time_unit)
@@ -351,6 +353,21 @@ def _input(source: Table, name: str, interpolation: str, times: np.ndarray) -> I
             raise ValueError(f"{source.place(row, name)}: the known input is {values[row]:g} here and {before:g} in "
                              "another row of the same time.")
     return InputTable(kept, values[known[first]], interpolation)
+
+
+def _table_of(name: str, given: Any) -> InputTable:
+    """Return a known input as it is kept.
+
+    Raises:
+        TypeError: neither a tuple of times and values nor an `lfm.Input`.
+    """
+    if all(hasattr(given, part) for part in InputTable._fields):  # a table, or an Input
+        given = tuple(getattr(given, part) for part in InputTable._fields)
+    if not (isinstance(given, tuple) and 2 <= len(given) <= 3):
+        raise TypeError(f"the known input {name!r} must be (times, values), (times, values, interpolation) or an "
+                        f"lfm.Input, got {type(given).__name__}.")
+    times, values, *way = given
+    return InputTable(np.asarray(times, float), np.asarray(values, float), *way)
 
 
 def _missing(cell: Any) -> bool:

@@ -20,10 +20,9 @@ variance gained in a day is 1/memory of the first day's. `lengthscale` is that o
 of its chord, at 1 about a third of a day; of `matern` it is in hours. With the envelope there are two more sites,
 `gamma` and `psi`; some residuals have fewer sites or, the resonator, others.
 
-A data file has the columns time_h (hours, midnight a multiple of 24), indoor, outdoor and heater. The heater is
-its power from that time to the next, in any unit, as a share of full power, say: it is the known input, must not be
-missing, and is reproduced as it is, so that its own residuals are zero. Outdoor mean, scale and lengthscale are
-taken from the outdoor column unless they are freed.
+A data file has a time column (dates, or time_h with midnight a multiple of 24), the outputs indoor and outdoor, and
+the known input heater: its power from that time to the next, in any unit, as a share of full power, say. Outdoor mean,
+scale and lengthscale are taken from the outdoor column unless they are freed.
 
 The default data are four days of hourly measurements under a thermostat that decides every ten minutes; the heater
 is the share of each hour that it was on.
@@ -45,7 +44,8 @@ import numpyro.distributions as dist
 
 import lfm_ppl as lfm
 
-OUTPUTS = ("indoor", "outdoor", "heater")
+OUTPUTS = ("indoor", "outdoor")
+INPUTS = {"heater": "previous"}
 UNITS = {"time": "h", "indoor": "degC", "outdoor": "degC", "heater": "1", "walls": "degC", "air": "degC",
          "weather": "degC", "residual": "K/h"}
 RESIDUALS = ("SQM", "CQM", "WQM", "periodic", "matern", "resonator", "none")
@@ -66,7 +66,6 @@ PARAMETERS = {
     "outdoor_lengthscale": "its lengthscale (h)",
 }
 DAY, OUTDOOR_NOISE = 24.0, 0.1
-READ_ERROR = 1e-3  # of the heater's column, which the model reproduces
 START = (18.0, 3.0, 15.0, 5.0)  # mean and standard deviation of the first temperatures of air and walls (degC)
 HARMONICS = 4  # of the resonator
 TRUTH = {
@@ -144,8 +143,8 @@ def build(heater, residual, alpha, beta, noise_sd, outdoor, gamma=None, psi=None
         forces={"weather": lfm.Matern(scale, lengthscale, order=1, mean=mean),
                 **({} if residual is None else {"residual": residual})},
         observation=lfm.GaussianObservation(
-            lambda x, u, t: jnp.stack([x[0], u[0], jnp.asarray(heater(t), float)]),
-            jnp.stack([jnp.asarray(noise_sd, float) ** 2, jnp.asarray(OUTDOOR_NOISE**2), jnp.asarray(READ_ERROR**2)])),
+            lambda x, u, t: jnp.stack([x[0], u[0]]),
+            jnp.stack([jnp.asarray(noise_sd, float) ** 2, jnp.asarray(OUTDOOR_NOISE**2)])),
         initial_state=lfm.Gaussian(jnp.array(START[::2][:size]), jnp.diag(jnp.array(START[1::2][:size]) ** 2)),
         state_names=("air", "walls")[:size],
         output_names=OUTPUTS,
@@ -153,13 +152,14 @@ def build(heater, residual, alpha, beta, noise_sd, outdoor, gamma=None, psi=None
     )
 
 
-def model(times, y=None, residual: str = "SQM", envelope: bool = False, functions: int = 5, units=None) -> None:
+def model(times, y=None, inputs=None, residual: str = "SQM", envelope: bool = False, functions: int = 5,
+          units=None) -> None:
     """Sample the parameters of home and residual, and score the temperatures.
 
     Args:
         times: hours, shape (T,), midnight a multiple of 24.
-        y: indoor, outdoor and heater, shape (T, 3); temperatures may be missing (NaN). None draws temperatures from the
-            prior, with the heater on in the morning and in the evening.
+        y: indoor and outdoor, shape (T, 2), NaN where missing. None draws temperatures from the prior.
+        inputs: ``{"heater": function of time}``; None: on in the morning and in the evening.
         residual: the force R, one of RESIDUALS.
         envelope: whether the walls are a second store of heat.
         functions: eigenfunctions of the periodic kernel, an odd number.
@@ -193,7 +193,7 @@ def model(times, y=None, residual: str = "SQM", envelope: bool = False, function
     force = None
     if residual != "none":
         force = residual_force(residual, functions=functions, midnights=_midnights(times, residual), **hyper)
-    system = build(_heater(times, y), force, noise_sd=noise_sd, outdoor=outdoor, units=units, **rates)
+    system = build(_heater(inputs), force, noise_sd=noise_sd, outdoor=outdoor, units=units, **rates)
     numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=1), obs=y)
 
 
@@ -214,15 +214,12 @@ def anchors(data: lfm.Data) -> dict[str, float]:
 
 
 def prepare(data: lfm.Data) -> lfm.Data:
-    """Check the heater's column of a data file.
+    """Check the heater of a data file.
 
     Raises:
-        ValueError: a missing value, or no heating at all.
+        ValueError: no heating at all.
     """
-    heater = data.y[:, 2]
-    if np.isnan(heater).any():
-        row = int(np.argmax(np.isnan(heater)))
-        raise ValueError(f"the heater is missing at time {data.times[row]:g}; it is a known input, so fill the gap.")
+    heater = data.inputs["heater"].values
     if not np.any(heater != heater[0]):
         raise ValueError(f"the heater is {heater[0]:g} all the time, so that nothing can be said of it; expected the "
                          "power of a heater that is switched.")
@@ -254,10 +251,10 @@ def simulate(seed: int = 0, residual: str = "SQM", envelope: bool = False, funct
     on = np.asarray(drawn.inputs[:, 0])
     # From each hour to the next; nothing follows the last one.
     share = np.append(on[:-1].reshape(-1, DECISIONS).mean(axis=1), on[-1])
-    y = np.column_stack([np.asarray(drawn.y)[hourly, 0, :2], share])
     extra = {"gamma": 0.05, "psi": 0.05} if envelope else {}
     return lfm.Data(
-        times=fine[hourly], y=y, outputs=OUTPUTS, units=UNITS,
+        times=fine[hourly], y=np.asarray(drawn.y)[hourly, 0], outputs=OUTPUTS, units=UNITS,
+        inputs={"heater": (fine[hourly], share, "previous")},
         truth={"times": fine, "state": drawn.state[:, 0],
                "forces": {name: path[:, 0] for name, path in drawn.forces.items()}, "parameters": TRUTH | extra})
 
@@ -288,9 +285,9 @@ def _midnights(times, residual: str) -> tuple[float, ...]:
     return tuple(DAY * np.arange(np.floor(times[0] / DAY) + 1, np.floor(last / DAY) + 1))
 
 
-def _heater(times, y):
+def _heater(inputs):
     """Return the heater as a function of time."""
-    if y is None:
-        return lambda t: jnp.where((jnp.mod(t, DAY) >= 6.0) & (jnp.mod(t, DAY) < 9.0)
-                                   | (jnp.mod(t, DAY) >= 16.0) & (jnp.mod(t, DAY) < 22.0), 1.0, 0.0)
-    return lfm.Input(times, jnp.asarray(y)[:, 2])
+    if inputs is not None:
+        return inputs["heater"]
+    return lambda t: jnp.where((jnp.mod(t, DAY) >= 6.0) & (jnp.mod(t, DAY) < 9.0)
+                               | (jnp.mod(t, DAY) >= 16.0) & (jnp.mod(t, DAY) < 22.0), 1.0, 0.0)

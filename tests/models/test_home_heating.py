@@ -20,16 +20,17 @@ HYPER = {"scale": 0.2, "lengthscale": 0.5, "memory": 3.0, "period": 24.0, "noise
 
 def system(times=TIMES, heater=HEATER, **options):
     """Return the model with known parameters."""
-    y = np.column_stack([np.full((len(times), 2), np.nan), np.resize(heater, len(times))])
-    return likelihood_site(FILE.model, (times, y), options, jax.random.key(0), RATES | HYPER).example.model
+    inputs = {"heater": lfm.Input(times, np.resize(heater, len(times)))}
+    return likelihood_site(FILE.model, (times, np.full((len(times), 2), np.nan)), {**options, "inputs": inputs},
+                           jax.random.key(0), RATES | HYPER).example.model
 
 
 @pytest.mark.parametrize("envelope", [False, True], ids=["one store", "envelope"])
 def test_the_expected_temperatures_solve_the_equations(envelope):
     """Without residual, and the temperature outside at its mean, equations 73, or 74 and 75 of the source."""
     model = system(residual="none", envelope=envelope)
-    y = np.full((13, 3), np.nan)
-    y[0] = [18.0, 4.0, 0.0]  # what is expected at the start
+    y = np.full((13, 2), np.nan)
+    y[0] = [18.0, 4.0]  # what is expected at the start
     found = np.asarray(lfm.filter(model, TIMES, y, steps=5).predicted_mean)
 
     def slope(t, x):
@@ -68,7 +69,7 @@ def test_the_outdoor_process_is_read_off_its_measurements():
     root = np.linalg.cholesky(9.0 * (1.0 + lag) * np.exp(-lag) + 1e-10 * np.eye(len(times)))
     outdoor = 6.0 + root @ np.random.default_rng(0).normal(size=len(times))
     outdoor[100:110] = np.nan
-    data = lfm.Data(times, np.column_stack([outdoor, outdoor, np.zeros_like(times)]), FILE.outputs)
+    data = lfm.Data(times, np.column_stack([outdoor, outdoor]), FILE.outputs)
     found = FILE.anchors(data)
     # 600 hours hold some 30 independent values.
     assert found["outdoor_mean"] == pytest.approx(6.0, abs=4 * 3.0 / np.sqrt(30))
@@ -82,15 +83,19 @@ def test_the_default_home_keeps_to_its_set_points():
     hour = data.times % 24
     day, night = (hour >= 12) & (hour < 22), (hour >= 3) & (hour < 6)
     assert abs(np.nanmean(data.y[day, 0]) - 20.0) < 0.5 and abs(np.nanmean(data.y[night, 0]) - 16.0) < 0.5
-    assert set(np.round(6 * data.y[:, 2], 6)) <= set(range(7))
+    assert set(np.round(6 * data.inputs["heater"].values, 6)) <= set(range(7))
 
 
-@pytest.mark.parametrize(("heater", "message"), [
-    ([0.0, np.nan, 1.0], "missing at time 1"), ([0.5, 0.5, 0.5], "all the time")])
-def test_a_heater_that_says_nothing_is_refused(heater, message):
-    data = lfm.Data(np.arange(3.0), np.column_stack([np.ones((3, 2)), heater]), FILE.outputs)
-    with pytest.raises(ValueError, match=message):
+def test_a_heater_that_says_nothing_is_refused():
+    times = np.arange(3.0)
+    data = lfm.Data(times, np.ones((3, 2)), FILE.outputs, inputs={"heater": (times, 0.5 * np.ones(3))})
+    with pytest.raises(ValueError, match=r"0.5 all the time"):
         FILE.prepare(data)
+
+
+def test_a_home_without_its_heater_is_refused():
+    with pytest.raises(ValueError, match="home-heating needs the known input 'heater'"):
+        FILE.keywords(lfm.Data(np.arange(3.0), np.ones((3, 2)), FILE.outputs), {})
 
 
 def test_an_unknown_residual_is_refused():

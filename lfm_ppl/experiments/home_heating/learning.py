@@ -70,8 +70,10 @@ def _model(method: str, store: str, functions: int) -> Callable[[Any], None]:
     """Return the NumPyro model of the first four days, a function of `_data`."""
     def model(data: tuple[jax.Array, dict[str, jax.Array]]) -> None:
         y, outdoor = data
+        times = problem.TIMES[:problem.TRAIN]
+        temperatures, inputs = problem.given(y, times)
         fixed = fix(problem.model_file().model, outdoor)
-        fixed(problem.TIMES[:problem.TRAIN], y, **problem.keywords(method, store, functions))
+        fixed(times, temperatures, inputs=inputs, **problem.keywords(method, store, functions))
 
     return model
 

@@ -68,8 +68,8 @@ def filtered(method: str, store: str, functions: int) -> Callable[..., Filtered]
 
     def run(z: jax.Array, y: jax.Array, outdoor: dict[str, Any]) -> Filtered:
         values = learning.values_of(method, store, z, outdoor)
-        given = problem.site(method, store, functions, values, y)
-        found = gaussian_filter(given.model, problem.TIMES, y, steps=1)
+        home = problem.site(method, store, functions, values, y).model
+        found = gaussian_filter(home, problem.TIMES, problem.given(y)[0], steps=1)
         return Filtered(found.filtered_mean[:, 0], found.filtered_covariance[:, 0, 0] + values["noise_sd"] ** 2,
                         found.filtered_mean[_LAST], found.filtered_covariance[_LAST])
 
@@ -89,7 +89,8 @@ def smoothed(method: str, store: str, functions: int) -> Callable[..., tuple[jax
 
     def run(z: jax.Array, y: jax.Array, outdoor: dict[str, Any]) -> tuple[jax.Array, jax.Array]:
         values = learning.values_of(method, store, z, outdoor)
-        found = smooth(problem.site(method, store, functions, values, y).model, problem.TIMES, y, steps=1)
+        home = problem.site(method, store, functions, values, y).model
+        found = smooth(home, problem.TIMES, problem.given(y)[0], steps=1)
         return found.force("residual").mean, found.force("residual").sd
 
     return jax.jit(run)
@@ -102,7 +103,7 @@ def under_thermostat(method: str, store: str, functions: int, particles: int) ->
     def run(key: jax.Array, z: jax.Array, outdoor: dict[str, Any], start: Filtered, weather: jax.Array,
             set_points: jax.Array, on: jax.Array) -> RaoBlackwellisedResult:
         values = learning.values_of(method, store, z, outdoor)
-        y = jnp.full((len(problem.FINE), 3), jnp.nan).at[:, 1].set(weather)
+        y = jnp.full((len(problem.FINE), 2), jnp.nan).at[:, 1].set(weather)
         return rao_blackwellised(
             key, lambda heater: problem.under(method, store, functions, values, heater), problem.thermostat(set_points),
             problem.FINE, y=y, start=FilterState(np.asarray(float(_LAST)), start.state, start.covariance),

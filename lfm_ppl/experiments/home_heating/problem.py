@@ -19,6 +19,7 @@ from lfm_ppl.inference.bound_model import likelihood_site
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.model.inputs import Input
 from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.observation import GaussianObservation
 from lfm_ppl.switching.rule import Thermostat
 from lfm_ppl.switching.switched_simulation import simulate_switched
 
@@ -44,6 +45,7 @@ _HOME = {"alpha": 0.1, "beta": 2.5, "scale": 0.3, "lengthscale": 0.5, "memory": 
          "outdoor_mean": 6.0, "outdoor_scale": 3.0, "outdoor_lengthscale": 10.0, "gamma": 0.05, "psi": 0.05}
 """The simulated home, that of the model file's default data and its walls."""
 
+_METER_ERROR = 1e-3
 _VARIED = ("alpha", "beta", "scale", "gamma", "psi")
 _FUNCTIONS = 15
 
@@ -115,15 +117,22 @@ def house(folder: str) -> tuple[Window, ...]:
 
 
 def _window(y: np.ndarray, **more: Any) -> Window:
-    learnt = Data(TIMES[:TRAIN], y[:TRAIN], model_file().outputs or ())
+    learnt = Data(TIMES[:TRAIN], y[:TRAIN, :2], model_file().outputs or ())
     return Window(y, model_file().anchors(learnt), **more)
 
 
 def site(method: str, store: str, functions: int, values: dict[str, Any], y: Any,
          times: np.ndarray = TIMES) -> MarginalLikelihood:
-    """Return the likelihood of ``times`` with these parameters, which may be traced, and the heater of ``y``."""
-    return likelihood_site(model_file().model, (times, y), keywords(method, store, functions), jax.random.key(0),
-                           values).example
+    """Return the likelihood of ``times`` with these parameters, which may be traced, and the heater of ``y`` (T, 3)."""
+    y, inputs = given(y, times)
+    return likelihood_site(model_file().model, (times, y), {**keywords(method, store, functions), "inputs": inputs},
+                           jax.random.key(0), values).example
+
+
+def given(y: Any, times: np.ndarray = TIMES) -> tuple[jax.Array, dict[str, Input]]:
+    """Split measurements (T, 3) into temperatures (T, 2) and the known input."""
+    y = jnp.asarray(y)
+    return y[:, :2], {"heater": Input(times, y[:, 2])}
 
 
 def under(method: str, store: str, functions: int, values: dict[str, Any], heater: Any) -> LatentForceModel:
@@ -148,7 +157,7 @@ def medians(method: str, store: str) -> np.ndarray:
 def _priors(method: str, store: str) -> dict[str, Any]:
     with jax.ensure_compile_time_eval():
         seeded = handlers.seed(model_file().model, jax.random.key(0))
-        trace = handlers.trace(seeded).get_trace(TIMES, np.zeros((len(TIMES), 3)), **keywords(method, store, 3))
+        trace = handlers.trace(seeded).get_trace(TIMES, np.zeros((len(TIMES), 2)), **keywords(method, store, 3))
     return {name: one["fn"] for name, one in trace.items() if one["type"] == "sample" and not one["is_observed"]}
 
 
@@ -186,11 +195,19 @@ def _simulator(store: str) -> Any:
     times = np.arange(len(TIMES) * PER_HOUR + 1) / PER_HOUR
 
     def draw(key: jax.Array, values: dict[str, Any], points: jax.Array) -> tuple[jax.Array, jax.Array]:
-        build = lambda heater: under("SQM", store, _FUNCTIONS, values, heater)  # noqa: E731
+        build = lambda heater: _metered(under("SQM", store, _FUNCTIONS, values, heater), heater)  # noqa: E731
         found = simulate_switched(key, build, thermostat(points), times, steps=1)
         return found.y[:, 0], found.inputs[:, 0]
 
     return jax.jit(draw)
+
+
+def _metered(home: LatentForceModel, heater: Any) -> LatentForceModel:
+    """Return a home whose heater has a meter, a third output: the errors of the simulated homes are drawn for three."""
+    own = home.observation
+    observation = GaussianObservation(
+        lambda x, u, t: jnp.append(own.function(x, u, t), heater), jnp.append(own.covariance, _METER_ERROR**2))
+    return LatentForceModel(home.dynamics, home.forces, observation, home.initial_state, state_names=home.state_names)
 
 
 def thermostat(set_points: Any) -> Thermostat:
