@@ -24,7 +24,15 @@ from lfm_ppl.filtering.predict import (
 )
 from lfm_ppl.filtering.time_grid import Intervals, TimeGrid, build_time_grid, by_length, with_observations
 from lfm_ppl.filtering.transition import IntegratingFactor, LinearPart, constant_jacobian, exact, linear_part
-from lfm_ppl.filtering.update import FACTOR, FAILED, linearise_observation, update
+from lfm_ppl.filtering.update import (
+    FACTOR,
+    FAILED,
+    Sites,
+    linearise_observation,
+    predictor_variance,
+    update,
+    update_by_sites,
+)
 from lfm_ppl.linalg import congruence, diagonal, matmul, safe_sqrt, solve_lower
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.linearisation.sigma_points import Cubature, SigmaPointRule
@@ -49,6 +57,7 @@ class Pass(NamedTuple):
         innovation, present, chol, gain, jacobian, obs_cov: of the update, (N, D), (N, D), (N, D, D), (N, n, D), (N, D,
             n), (N, D, D).
         steps: of the integration steps of each interval, predictions (N, J, ...) or `Inside` (N, J, ...).
+        site_terms: (N, ...), of updates by sites; these leave no chol and no obs_cov.
     """
 
     log_likelihood: jax.Array
@@ -63,6 +72,7 @@ class Pass(NamedTuple):
     jacobian: Any = None
     obs_cov: Any = None
     steps: Any = None
+    site_terms: Any = None
 
 
 class Inside(NamedTuple):
@@ -246,7 +256,8 @@ def integrate(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, linear: LinearPa
 
 
 def forward(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, *, start: Moments | None = None,
-            linearization_point: Points | None = None, keep: str = "likelihood") -> Pass:
+            linearization_point: Points | None = None, keep: str = "likelihood",
+            sites: Sites | Callable[..., Sites] | None = None) -> Pass:
     """Run the one forward scan.
 
     Args:
@@ -258,6 +269,9 @@ def forward(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, *, s
         linearization_point: linearise about these moments; the filter's own by default.
         keep: "likelihood" (log likelihoods only), "moments" (and the moments), "all" (what the smoother needs),
             "steps" (and the steps within the intervals), "inside" (instead of these, what the iterations need of them).
+        sites: (T, D) each, of an observation family: pseudo-observations in the place of ``y``, whose log likelihoods
+            are then integrals of the sites. Or what makes those of a row from the mean (D,) and the covariance (D, D)
+            of the predictor as predicted, the row's index, and its entries of y.
     """
     prepared = preparation(ssm, rule, grid)
     with_map = keep in ("all", "steps", "inside")
@@ -269,8 +283,8 @@ def forward(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, *, s
         each = lambda one: (_columns(one.moments.mean, used), _columns(one.moments.covariance, used).T,  # noqa: E731
                             one.phi)
 
-    def step(moments: Moments, inputs: tuple[Intervals, jax.Array, Points | None]) -> tuple[Moments, Pass]:
-        interval, observed, point = inputs
+    def step(moments: Moments, inputs: tuple[Intervals, jax.Array, Points | None, Any]) -> tuple[Moments, Pass]:
+        interval, observed, point, given = inputs
         nodes = None if point is None else completed(ssm, rule, point.nodes)
         one = predict(ssm, rule, grid, prepared, interval, moments, nodes, with_map, each)
         centre = one.moments if point is None else point.ends
@@ -278,11 +292,16 @@ def forward(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, *, s
                                        jnp.maximum(interval.observation, 0), centre)
         if point is not None:
             affine = affine.shifted(one.moments.mean - centre.mean)
-        new = update(ssm, affine, observed, jnp.isfinite(observed), one.moments, scale)
+        if sites is None:
+            new = update(ssm, affine, observed, jnp.isfinite(observed), one.moments, scale)
+        else:
+            at = (sites(affine.value, predictor_variance(affine, one.moments), jnp.maximum(interval.observation, 0),
+                        observed) if callable(sites) else Sites(*given))
+            new = update_by_sites(affine, at, one.moments)
         out = Pass(new.log_likelihood)
         if keep != "likelihood":
             out = out._replace(predicted=one.moments, filtered=new.moments, innovation=new.innovation,
-                               present=jnp.isfinite(observed), chol=new.chol)
+                               present=jnp.isfinite(observed), chol=new.chol, site_terms=new.site_terms)
         if with_map:
             steps = one.steps
             if keep == "inside" and steps is not None:
@@ -292,8 +311,12 @@ def forward(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, *, s
         return new.moments, out
 
     first = Moments(*ssm.initial()) if start is None else start
-    scale = _output_scale(ssm, grid, prepared, jnp.asarray(y, float), first)
-    inputs = (*with_observations(grid.intervals, y), linearization_point)
+    scale = _output_scale(ssm, grid, prepared, jnp.asarray(y, float), first) if sites is None else None
+    by_row = None
+    if sites is not None and not callable(sites):
+        padded = with_observations(grid.intervals, jnp.stack(sites, axis=1))[1]
+        by_row = jnp.moveaxis(jnp.where(jnp.isnan(padded), 0.0, padded), 1, 0)
+    inputs = (*with_observations(grid.intervals, y), linearization_point, by_row if by_row is None else tuple(by_row))
     return jax.lax.scan(jax.checkpoint(step, prevent_cse=False, policy=_KEPT), first, inputs)[1]
 
 

@@ -258,8 +258,8 @@ def _check_types(dynamics: Any, observation: Any, initial_state: Any) -> None:
         raise TypeError(f"dynamics must be callable as f(x, u, t), got {type(dynamics).__name__}.")
     if not isinstance(observation, (GaussianObservation, ObservationFamily)):
         raise TypeError("observation must be an lfm.GaussianObservation, or a family such as lfm.PoissonObservation, "
-                        f"got {type(observation).__name__}. Wrap the function: lfm.GaussianObservation(lambda x, u, t: x, "
-                        "variances).")
+                        f"got {type(observation).__name__}. Wrap the function: "
+                        "lfm.GaussianObservation(lambda x, u, t: x, variances).")
     if not isinstance(initial_state, Gaussian):
         raise TypeError(f"initial_state must be an lfm.Gaussian, got {type(initial_state).__name__}.")
 
