@@ -37,6 +37,7 @@ from lfm_ppl.linalg import congruence, diagonal, matmul, safe_sqrt, solve_lower
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.linearisation.sigma_points import Cubature, SigmaPointRule
 from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.resolution import check_resolution
 from lfm_ppl.model.state_space import StateSpaceModel, state_space
 
@@ -341,11 +342,14 @@ def _observation_jacobian(ssm: StateSpaceModel, grid: TimeGrid) -> jax.Array:
     return constant_jacobian(lambda v: (ssm.observe(v, t), ()), w, ssm.observation_structure, ssm.output_dim)
 
 
-def check_observations(y: Any, count: int, outputs: int, empty: bool = False) -> jax.Array:
+def check_observations(y: Any, count: int, outputs: int, empty: bool = False,
+                       model: LatentForceModel | None = None) -> jax.Array:
     """Return y as an array (T, D) after checking it; that nothing is observed is fine if ``empty``.
 
+    Of a ``model`` with an observation family the entries must be such as the family gives.
+
     Raises:
-        ValueError: a wrong shape, infinite entries, or nothing observed at all.
+        ValueError: a wrong shape, infinite entries, nothing observed at all, or data that the family cannot give.
     """
     shape = np.shape(y)
     if shape == (count,) and outputs == 1:
@@ -362,6 +366,8 @@ def check_observations(y: Any, count: int, outputs: int, empty: bool = False) ->
             raise ValueError(f"y[{row}, {column}] is infinite; use NaN for a missing entry.")
         if np.isnan(known).all() and not empty:
             raise ValueError("every entry of y is missing (NaN); there is nothing to learn from.")
+        if model is not None and isinstance(model.observation, ObservationFamily):
+            model.observation.check_data(known)
     return jnp.asarray(y, float)
 
 
@@ -371,7 +377,8 @@ def filter(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
     """Run the continuous-discrete Gaussian filter.
 
     Between observations the moments obey dm/dt = E[f], dP/dt = A P + P A' + E[G G'] with the rule's A; at an
-    observation they are conditioned on it.
+    observation they are conditioned on it. Of an observation family the moments of the predictor given an observation
+    are those of its tilted prediction (assumed density filtering).
 
     Args:
         model: the latent force model.
@@ -414,7 +421,7 @@ def filter(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
                            tolerance=tolerance)
     model.check_at(grid.initial_time, len(grid.observed))
     check_resolution(model, times, y)
-    y = check_observations(y, len(grid.observed), ssm.output_dim, empty=start is not None)
+    y = check_observations(y, len(grid.observed), ssm.output_dim, start is not None, model)
     warn_single_precision()
     begin = None if start is None else Moments(start.mean, start.covariance)
     result = filter_on(ssm, rule, grid, y, jnp.asarray(times, float), begin)
@@ -445,15 +452,25 @@ def _check_start(start: Any, times: Any, size: int) -> None:
 def filter_on(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, times: jax.Array,
               begin: Moments | None = None) -> FilterResult:
     """Filter observations (T, D) at ``times`` on the intervals of a time grid; see `filter`."""
-    passed = forward(ssm, rule, grid, y, start=begin, keep="moments")
+    log_likelihood = None
+    if isinstance(ssm.model.observation, ObservationFamily):
+        # Sites are refined by passes of this filter, so that their module imports this one.
+        from lfm_ppl.filtering.sites import assumed_density_filter
+
+        log_likelihood, passed = assumed_density_filter(ssm, rule, grid, y, begin)
+    else:
+        passed = forward(ssm, rule, grid, y, start=begin, keep="moments")
     at = jax.tree_util.tree_map(lambda a: at_rows(a, grid.observed), passed)
     state = FilterState(times[-1], at.filtered.mean[-1], at.filtered.covariance[-1])
-    return FilterResult(times, at.log_likelihood, at.predicted.mean, at.predicted.covariance, at.filtered.mean,
-                        at.filtered.covariance, whitened_innovations(at, y), state)
+    return FilterResult(times, at.log_likelihood if log_likelihood is None else log_likelihood, at.predicted.mean,
+                        at.predicted.covariance, at.filtered.mean, at.filtered.covariance,
+                        whitened_innovations(at, y), state)
 
 
 def whitened_innovations(passed: Pass, y: jax.Array) -> jax.Array:
-    """Return innovations whitened by their Cholesky factor, (T, D), NaN where missing."""
+    """Return innovations whitened by their Cholesky factor, (T, D), NaN where missing and for a family."""
+    if passed.chol is None:
+        return jnp.full(y.shape, jnp.nan)
     return jnp.where(jnp.isfinite(y), jax.vmap(solve_lower)(passed.chol, passed.innovation), jnp.nan)
 
 

@@ -31,6 +31,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lfm_ppl import checks
 from lfm_ppl.filtering.filter import Pass, Points, at_rows, forward
 from lfm_ppl.filtering.iterated import smoothed_nodes
 from lfm_ppl.filtering.predict import Moments
@@ -38,7 +39,7 @@ from lfm_ppl.filtering.quadrature import Marginal, Tilted, expectations, tilted_
 from lfm_ppl.filtering.rts import Predictor, Smoothed, backward
 from lfm_ppl.filtering.time_grid import TimeGrid
 from lfm_ppl.filtering.update import Sites
-from lfm_ppl.linalg import diagonal
+from lfm_ppl.linalg import diagonal, inverse_and_log_det, matmul
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel
@@ -72,6 +73,30 @@ class SiteSettings(NamedTuple):
     damping: float = 1.0
     sweeps: int = 200
     relinearisations: int = 8
+
+
+def as_settings(sites: Any, iterations: int = 0) -> SiteSettings:
+    """Return settings of the sites from themselves, or from the name of a method.
+
+    Args:
+        sites: settings, the name of a method, or None for expectation propagation.
+        iterations: of posterior linearisation, which are the joint sweeps of a model that is not linear; 0: as the
+            settings have it.
+
+    Raises:
+        ValueError, TypeError: an unknown method, or a number out of its range.
+    """
+    settings = sites if isinstance(sites, SiteSettings) else SiteSettings("ep" if sites is None else sites)
+    checks.one_of("method of the sites", settings.method, METHODS)
+    for name in ("power", "damping"):
+        if not 0.0 < getattr(settings, name) <= 1.0:
+            raise ValueError(f"{name} of the sites must lie in (0, 1], got {getattr(settings, name)}.")
+    if settings.method != "ep" and settings.power != 1.0:
+        raise ValueError(f"power={settings.power} is one of expectation propagation; leave it out with method "
+                         f"{settings.method!r}.")
+    checks.positive_integer("sweeps", settings.sweeps)
+    checks.positive_integer("relinearisations", settings.relinearisations)
+    return settings._replace(relinearisations=iterations) if iterations else settings
 
 
 class EntryTerms(Protocol):
@@ -236,16 +261,20 @@ def new_sites(terms: EntryTerms, sites: Sites, at: Cavity, settings: SiteSetting
     return sites._replace(nu=mix(sites.nu, nu), tau=mix(sites.tau, tau)), change
 
 
+def gaussian_terms(sites: Sites, cavity: Marginal, power: float) -> jax.Array:
+    """Return log int N(f; cavity) t(f)^power df, an entry each."""
+    nu, tau, v = power * sites.nu, power * sites.tau, cavity.variance
+    away, grown = cavity.mean - sites.centre, 1.0 + tau * v
+    grown = jnp.where(grown > 0, grown, 1.0)
+    return ((nu - 0.5 * tau * away) * away - 0.5 * jnp.log(grown) + 0.5 * (nu - tau * away) ** 2 * v / grown)
+
+
 def log_evidence_terms(terms: Any, sites: Sites, at: Cavity, settings: SiteSettings) -> jax.Array:
     """Return what each entry (T, D) adds to the integral of all sites, zero where missing."""
     nu, tau = sites.nu, sites.tau
     if settings.method == "ep":
-        a, (m, v) = settings.power, at.cavity
-        m, grown = m - sites.centre, 1.0 + a * tau * v
-        pull = nu - tau * m
-        gaussian = (a * (nu - 0.5 * tau * m) * m - 0.5 * jnp.log(jnp.where(grown > 0, grown, 1.0))
-                    + 0.5 * (a * pull) ** 2 * v / grown)
-        value = (terms.tilted(at.cavity, at.marginal, a).log_partition - gaussian) / a
+        a = settings.power
+        value = (terms.tilted(at.cavity, at.marginal, a).log_partition - gaussian_terms(sites, at.cavity, a)) / a
     else:
         m, v = at.marginal
         away = m - sites.centre
@@ -421,6 +450,60 @@ def _until_converged(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, settings:
     carry = sweep((first, None, jnp.asarray(jnp.inf), jnp.asarray(settings.damping), jnp.asarray(0)))
     sites, at, change, _, count = jax.lax.while_loop(going, sweep, carry)
     return Converged(sites, at, change, count, (change < _TOLERANCE) & at.valid.all())
+
+
+class Prequential(NamedTuple):
+    """What assumed density filtering leaves.
+
+    Attributes:
+        log_likelihood: (T,), log p(y_k | y_1:k-1).
+        passed: the forward scan, (N, ...).
+    """
+
+    log_likelihood: jax.Array
+    passed: Pass
+
+
+def assumed_density_filter(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array,
+                           start: Moments | None = None) -> Prequential:
+    """Filter data of a family: each observation's site is made from its prediction, once.
+
+    Source: Maybeck (1982), Stochastic Models, Estimation and Control 2, section 12.7.
+    """
+    family = ssm.model.observation
+    assert isinstance(family, ObservationFamily)
+    passed = forward(ssm, rule, grid, y, start=start, keep="moments", sites=assumed_density(family))
+    at = jax.tree_util.tree_map(lambda a: at_rows(a, grid.observed), passed.site_terms)
+    variance = diagonal(at.variance)
+    cavity, found = jax.vmap(lambda row, m, v, y: assumed_tilted(
+        lambda f: row_log_prob(family, row, f, y), m, v))(jnp.arange(len(y)), at.value, variance, y)
+    # An entry's own term stands in the place of its site; one entry a row: this is log Z of the tilted prediction.
+    gaussian = gaussian_terms(at.sites, cavity, 1.0)
+    entries = jnp.where(jnp.isfinite(y), found.log_partition - gaussian, 0.0).sum(1)
+    return Prequential(at_rows(passed.log_likelihood, grid.observed) + entries, passed)
+
+
+def leave_one_out(predictor: Predictor, sites: Sites, entries: jax.Array) -> jax.Array:
+    """Return (T,), log p(y_k | all other rows), from what is smoothed with the converged sites.
+
+    It is the integral of a row's sites under the predictor N(m, F) without them, and what its entries add to that. With
+    V = F (I + T F)^-1 and m smoothed, F = V (I - T V)^-1.
+
+    Args:
+        predictor: smoothed, (T, ...).
+        sites: (T, D) each.
+        entries: (T, D), of `log_evidence_terms`.
+    """
+
+    def row(mean: jax.Array, covariance: jax.Array, sites: Sites) -> jax.Array:
+        # log|I + T F| = -log|I - T V|; and with a = m - c the exponent is that of the smoothed moments.
+        kept, log_det = inverse_and_log_det(jnp.eye(mean.shape[0]) - sites.tau[:, None] * covariance)
+        away = matmul(kept.T, (mean - sites.centre - matmul(covariance, sites.nu[:, None])[:, 0])[:, None])[:, 0]
+        pull = sites.nu - sites.tau * away
+        return (((sites.nu - 0.5 * sites.tau * away) * away).sum() + 0.5 * log_det
+                + 0.5 * (pull * matmul(covariance, pull[:, None])[:, 0]).sum())
+
+    return jax.vmap(row)(predictor.mean, predictor.covariance, sites) + entries.sum(1)
 
 
 class Evidence(NamedTuple):

@@ -232,7 +232,7 @@ class LatentGrid(eqx.Module):
 
     def checked(self, y: Any) -> jax.Array:
         """Check observations (T, D), and return them as an array."""
-        return check_observations(y, len(self.times), self.ssm.output_dim)
+        return check_observations(y, len(self.times), self.ssm.output_dim, model=self.ssm.model)
 
     def _production(self, u: jax.Array, t: jax.Array) -> jax.Array:
         """Return p (M,): the dynamics without the state."""
