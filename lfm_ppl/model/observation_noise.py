@@ -62,6 +62,13 @@ def noisy_observation(ssm: StateSpaceModel, w: jax.Array, t: jax.Array, key: jax
     return predictor + matmul(semidefinite_root(covariance), draw)[:, 0]
 
 
+def require_gaussian(ssm: StateSpaceModel, method: str, instead: str) -> None:
+    """Raise ValueError for an observation family, where a method is one of Gaussian observations."""
+    if isinstance(ssm.model.observation, ObservationFamily):
+        raise ValueError(f"{method} takes an lfm.GaussianObservation, and the observation of this model is of the "
+                         f"family {type(ssm.model.observation).__name__}. Use {instead} instead.")
+
+
 def check_noise(ssm: StateSpaceModel, time: Any) -> None:
     """Raise ValueError where the observation noise has no density at the prior mean (where that is known)."""
     if isinstance(ssm.model.observation, ObservationFamily):
