@@ -62,6 +62,12 @@ def noisy_observation(ssm: StateSpaceModel, w: jax.Array, t: jax.Array, key: jax
     return predictor + matmul(semidefinite_root(covariance), draw)[:, 0]
 
 
+def expected_observation(ssm: StateSpaceModel, w: jax.Array, t: jax.Array) -> jax.Array:
+    """Return what is observed on average (D,) at inputs w (M + R,) and a time: free of noise, on the data's scale."""
+    family, predictor = ssm.model.observation, ssm.observe(w, t)
+    return family.typical().mean(predictor) if isinstance(family, ObservationFamily) else predictor
+
+
 def require_gaussian(ssm: StateSpaceModel, method: str, instead: str) -> None:
     """Raise ValueError for an observation family, where a method is one of Gaussian observations."""
     if isinstance(ssm.model.observation, ObservationFamily):

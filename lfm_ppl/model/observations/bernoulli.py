@@ -49,6 +49,10 @@ class BernoulliObservation(ObservationFamily):
         probability = jnp.exp(PROBABILITIES[self.link].log_probability(predictor))
         return jax.random.bernoulli(key, probability, predictor.shape).astype(predictor.dtype)
 
+    def mean(self, predictor: jax.Array) -> jax.Array:
+        """Return the expected values, the probabilities of yes, (D,)."""
+        return jnp.exp(PROBABILITIES[self.link].log_probability(predictor))
+
     def problem(self, y: np.ndarray) -> tuple[np.ndarray, str]:
         """Data are zeros and ones."""
         return (y != 0) & (y != 1), "0 (no) or 1 (yes)"

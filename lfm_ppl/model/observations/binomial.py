@@ -54,6 +54,10 @@ class BinomialObservation(ObservationFamily):
         probability = jnp.exp(PROBABILITIES[self.link].log_probability(predictor))
         return jax.random.binomial(key, self.total_count, probability, predictor.shape).astype(predictor.dtype)
 
+    def mean(self, predictor: jax.Array) -> jax.Array:
+        """Return the expected counts (D,)."""
+        return self.total_count * jnp.exp(PROBABILITIES[self.link].log_probability(predictor))
+
     def problem(self, y: np.ndarray) -> tuple[np.ndarray, str]:
         """Counts are whole numbers from zero to the number of trials."""
         return not_counts(y) | (y > np.asarray(self.total_count)), "counts: whole numbers from zero to total_count"

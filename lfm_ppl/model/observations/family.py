@@ -54,6 +54,10 @@ class ObservationFamily(eqx.Module):
     def sample(self, key: jax.Array, predictor: jax.Array) -> jax.Array:
         """Draw entries (D,) under ``predictor`` (D,)."""
 
+    def mean(self, predictor: jax.Array) -> jax.Array:
+        """Return what the entries (D,) are on average under ``predictor``, for plots: here the predictor itself."""
+        return predictor
+
     def problem(self, y: np.ndarray) -> tuple[np.ndarray, str] | None:
         """Say what data (T, D) cannot be: where (T, D), and what they must be. Of missing entries nothing is asked."""
         return None
@@ -73,6 +77,10 @@ class ObservationFamily(eqx.Module):
             return self
         names = list(rows)
         return eqx.tree_at(lambda family: [getattr(family, name) for name in names], self, list(rows.values()))
+
+    def typical(self) -> ObservationFamily:
+        """Return the family with parameters (T, D) averaged over the rows, for times that are no row of the data."""
+        return _averaged(self)
 
     # What the rest of the library asks of any observation.
 
@@ -141,6 +149,15 @@ class ObservationFamily(eqx.Module):
             row, column = np.argwhere(wrong)[0]
             raise ValueError(f"y[{row}, {column + first_column}] is {known[row, column]:g}, but "
                              f"{type(self).__name__} needs {expected}; use NaN for a missing entry.")
+
+
+def _averaged(family: ObservationFamily) -> ObservationFamily:
+    rows = {name: jnp.mean(getattr(family, name), axis=0) for name in family.per_entry
+            if np.ndim(getattr(family, name)) == 2}
+    if not rows:
+        return family
+    names = list(rows)
+    return eqx.tree_at(lambda one: [getattr(one, name) for name in names], family, list(rows.values()))
 
 
 def parameter(name: str, value: Any, positive: bool = True) -> jax.Array:

@@ -64,6 +64,10 @@ class Observation(ObservationFamily):
         """Draw entries (D,)."""
         return self.make(predictor).sample(key).astype(predictor.dtype)
 
+    def mean(self, predictor: jax.Array) -> jax.Array:
+        """Return the distribution's mean (D,)."""
+        return jnp.asarray(self.make(predictor).mean, float)
+
     def check_data(self, y: Any, first_column: int = 0) -> None:
         """Raise ValueError where an entry lies outside of the distribution's support."""
         known = checks.concrete(y)

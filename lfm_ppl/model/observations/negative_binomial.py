@@ -62,6 +62,10 @@ class NegativeBinomialObservation(ObservationFamily):
         rate = self.exposure * RATES[self.link].rate(predictor) * jax.random.gamma(rate_key, c) / c
         return jax.random.poisson(count_key, rate, predictor.shape).astype(predictor.dtype)
 
+    def mean(self, predictor: jax.Array) -> jax.Array:
+        """Return the expected counts (D,)."""
+        return self.exposure * RATES[self.link].rate(predictor)
+
     def problem(self, y: np.ndarray) -> tuple[np.ndarray, str]:
         """Counts are whole numbers >= 0."""
         return not_counts(y), "counts: whole numbers of at least zero"

@@ -57,6 +57,10 @@ class PoissonObservation(ObservationFamily):
         rate = self.exposure * RATES[self.link].rate(predictor)
         return jax.random.poisson(key, rate, predictor.shape).astype(predictor.dtype)
 
+    def mean(self, predictor: jax.Array) -> jax.Array:
+        """Return the expected counts (D,)."""
+        return self.exposure * RATES[self.link].rate(predictor)
+
     def problem(self, y: np.ndarray) -> tuple[np.ndarray, str]:
         """Counts are whole numbers >= 0."""
         return not_counts(y), "counts: whole numbers of at least zero"

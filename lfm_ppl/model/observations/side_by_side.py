@@ -88,6 +88,14 @@ class Observations(ObservationFamily):
         return jnp.concatenate([part.sample(one, predictor[columns])
                                 for one, (part, columns) in zip(keys, self._each(), strict=True)])
 
+    def mean(self, predictor: jax.Array) -> jax.Array:
+        """Return what the entries are on average (D,)."""
+        return jnp.concatenate([part.mean(predictor[columns]) for part, columns in self._each()])
+
+    def typical(self) -> Observations:
+        """Return the families with parameters averaged over the rows."""
+        return eqx.tree_at(lambda family: family.parts, self, tuple(part.typical() for part in self.parts))
+
     def at(self, row: Any) -> Observations:
         """Return the families of one row of the data."""
         return eqx.tree_at(lambda family: family.parts, self, tuple(part.at(row) for part in self.parts))
