@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from lfm_ppl.filtering.breakdown import FilterWarning as FilterWarning
     from lfm_ppl.filtering.filter import FilterState as FilterState
     from lfm_ppl.filtering.filter import filter as filter
+    from lfm_ppl.filtering.sites import SiteSettings as SiteSettings
     from lfm_ppl.filtering.smoother import smooth as smooth
     from lfm_ppl.fitting import ConvergenceWarning as ConvergenceWarning
     from lfm_ppl.fitting import fit as fit
@@ -53,6 +54,15 @@ if TYPE_CHECKING:
     from lfm_ppl.model.inputs import Input as Input
     from lfm_ppl.model.latent_force_model import LatentForceModel as LatentForceModel
     from lfm_ppl.model.observation import GaussianObservation as GaussianObservation
+    from lfm_ppl.model.observations.bernoulli import BernoulliObservation as BernoulliObservation
+    from lfm_ppl.model.observations.binomial import BinomialObservation as BinomialObservation
+    from lfm_ppl.model.observations.censored import CensoredObservation as CensoredObservation
+    from lfm_ppl.model.observations.family import ObservationFamily as ObservationFamily
+    from lfm_ppl.model.observations.generic import Observation as Observation
+    from lfm_ppl.model.observations.negative_binomial import NegativeBinomialObservation as NegativeBinomialObservation
+    from lfm_ppl.model.observations.poisson import PoissonObservation as PoissonObservation
+    from lfm_ppl.model.observations.side_by_side import Observations as Observations
+    from lfm_ppl.model.observations.student_t import StudentTObservation as StudentTObservation
     from lfm_ppl.model.simulate import Simulation as Simulation
     from lfm_ppl.model.simulate import simulate as simulate
     from lfm_ppl.model.state_space import state_space as state_space
@@ -94,6 +104,7 @@ _NAMES = {
     "data": ("Data", "read_csv", "read_table"),
     "filtering.breakdown": ("FilterWarning",),
     "filtering.filter": ("FilterState", "filter"),
+    "filtering.sites": ("SiteSettings",),
     "filtering.smoother": ("smooth",),
     "forces": (
         "ApproximationWarning", "Constant", "Force", "Matern", "Periodic", "QuasiPeriodic", "Resonator",
@@ -115,6 +126,15 @@ _NAMES = {
     "model.latent_force_model": ("LatentForceModel",),
     "model.gaussian": ("Gaussian",),
     "model.observation": ("GaussianObservation",),
+    "model.observations.bernoulli": ("BernoulliObservation",),
+    "model.observations.binomial": ("BinomialObservation",),
+    "model.observations.censored": ("CensoredObservation",),
+    "model.observations.family": ("ObservationFamily",),
+    "model.observations.generic": ("Observation",),
+    "model.observations.negative_binomial": ("NegativeBinomialObservation",),
+    "model.observations.poisson": ("PoissonObservation",),
+    "model.observations.side_by_side": ("Observations",),
+    "model.observations.student_t": ("StudentTObservation",),
     "model.simulate": ("Simulation", "simulate"),
     "switching.rule": ("SwitchingRule", "Thermostat"),
 }

@@ -272,6 +272,27 @@ def _substitute(triangle: jax.Array, b: jax.Array, reverse: bool) -> jax.Array:
     return jax.lax.scan(solve, jnp.zeros(b.shape, jnp.result_type(triangle, b)), rows, reverse=reverse)[0]
 
 
+def inverse_and_log_det(a: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return A^-1 and log |det A| of ``I + T F`` (n, n), T diagonal and F positive semi-definite.
+
+    By elimination without pivoting: for T >= 0 such a matrix is a positive definite one but for a scaling of rows and
+    columns, and needs none. Entries of T may be negative, and so may determinants.
+    """
+    size = a.shape[-1]
+    if size == 1:
+        return 1.0 / a, jnp.log(jnp.abs(a[0, 0]))
+    if size > _FUSED_SIZE:
+        return jnp.linalg.inv(a), jnp.linalg.slogdet(a)[1]
+    left = jnp.concatenate([a, jnp.eye(size, dtype=a.dtype)], axis=1)
+    log_det = jnp.zeros((), a.dtype)
+    rows = np.arange(size)
+    for j in range(size):
+        log_det = log_det + jnp.log(jnp.abs(left[j, j]))
+        row = left[j] / left[j, j]
+        left = jnp.where((rows == j)[:, None], row, left - left[:, j, None] * row)
+    return left[:, size:], log_det
+
+
 def solve_semidefinite(p: jax.Array, b: jax.Array, tolerance: float = 1e-14) -> jax.Array:
     """Solve ``P X = B`` for a positive semi-definite ``P`` (n, n) and ``B`` (n, m) in the range of ``P``.
 
@@ -290,13 +311,15 @@ def solve_semidefinite(p: jax.Array, b: jax.Array, tolerance: float = 1e-14) -> 
 def conditional_shares(p: jax.Array) -> jax.Array:
     """Return the variance of each coordinate given those before it, as a share (n,) of its own; 1 where that is zero.
 
-    The least of them says by how much solving with ``P`` magnifies rounding errors.
+    The least of them says by how much solving with ``P`` magnifies rounding errors; it is -inf where a variance is
+    negative.
     """
     variance = diagonal(p)
     live = variance > 0
     scale = jnp.where(live, 1.0 / jnp.sqrt(jnp.where(live, variance, 1.0)), 0.0)
     pivots = diagonal(cholesky(p * scale[:, None] * scale[None, :], keep=False).chol) ** 2
-    return jnp.where(live, pivots, 1.0)
+    # Sites of negative precision leave what is no covariance: nothing is solved with it.
+    return jnp.where(live, pivots, jnp.where(variance < 0, -jnp.inf, 1.0))
 
 
 def semidefinite_root(p: jax.Array, tolerance: float = 1e-14) -> jax.Array:

@@ -12,8 +12,10 @@ import numpy as np
 from lfm_ppl import checks
 from lfm_ppl.filtering.filter import Pass, forward
 from lfm_ppl.filtering.predict import Moments
+from lfm_ppl.filtering.sites import FamilyTerms, SiteSettings, refine
 from lfm_ppl.filtering.time_grid import Intervals, TimeGrid, per_step
 from lfm_ppl.linearisation.rule import Rule
+from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel
 
 _NEGATIVE = 1e-8
@@ -28,7 +30,7 @@ class FilterWarning(UserWarning):
 
 
 def warn_of_breakdown(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, start: Moments | None,
-                      log_likelihood: Any) -> None:
+                      log_likelihood: Any, sites: SiteSettings | None = None) -> None:
     """Warn where a log likelihood is not finite; nothing happens in compiled code.
 
     Args:
@@ -38,12 +40,40 @@ def warn_of_breakdown(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, 
         y: (T, D), NaN where missing.
         start: moments at the initial time; the model's by default.
         log_likelihood: what the filter found, of any shape.
+        sites: how those of an observation family were refined; None where the filter ran alone.
     """
     if checks.traced((ssm, grid, y, start, log_likelihood)) or np.isfinite(np.asarray(log_likelihood)).all():
+        return
+    if isinstance(ssm.model.observation, ObservationFamily):
+        checks.warn(_site_trouble(ssm, rule, grid, y, start, sites), FilterWarning)
         return
     checks.warn(breakdown(ssm, rule, grid, y, start) or "the log likelihood is -inf, but the filter does not break "
                 "down without posterior linearisation: try iterations=0, or more damping (a smaller share).",
                 FilterWarning)
+
+
+def _site_trouble(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, start: Moments | None,
+                  settings: SiteSettings | None) -> str:
+    """Say which sites do not converge, or what else is wrong with a family's log likelihood."""
+    remedy = ("Try a smaller share of each new site, sites=lfm.SiteSettings(damping=0.5), half powers, "
+              "sites=lfm.SiteSettings(power=0.5), or a tighter prior")
+    if settings is None:
+        return ("the log likelihood of the observation family is -inf: the data are impossible under the prediction, "
+                "or the filter breaks down. Try a tighter prior, or more steps (steps=...).")
+    y = jnp.asarray(y, float)
+    family = ssm.model.observation
+    assert isinstance(family, ObservationFamily)
+    begin = Moments(*ssm.initial()) if start is None else start
+    found = eqx.filter_jit(refine)(ssm, rule, grid, y, FamilyTerms(family, y), settings, begin).found
+    bad = ~np.asarray(found.cavity.valid) | ~np.isfinite(np.asarray(found.sites.tau))
+    where = ""
+    if bad.any():
+        row, column = np.argwhere(bad)[0]
+        where = f"; the first without a cavity is y[{row}, {column}]"
+    if bool(found.converged):
+        return "the log likelihood of the observation family is not finite, though its sites converge. " + remedy + "."
+    return (f"the sites of the observation family do not converge in {int(found.sweeps)} sweeps (the last changes one "
+            f"by {float(found.change):.2g}){where}. The log likelihood is -inf. {remedy}.")
 
 
 def breakdown(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, start: Moments | None = None) -> str | None:

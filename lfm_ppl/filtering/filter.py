@@ -24,11 +24,20 @@ from lfm_ppl.filtering.predict import (
 )
 from lfm_ppl.filtering.time_grid import Intervals, TimeGrid, build_time_grid, by_length, with_observations
 from lfm_ppl.filtering.transition import IntegratingFactor, LinearPart, constant_jacobian, exact, linear_part
-from lfm_ppl.filtering.update import FACTOR, FAILED, linearise_observation, update
+from lfm_ppl.filtering.update import (
+    FACTOR,
+    FAILED,
+    Sites,
+    linearise_observation,
+    predictor_variance,
+    update,
+    update_by_sites,
+)
 from lfm_ppl.linalg import congruence, diagonal, matmul, safe_sqrt, solve_lower
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.linearisation.sigma_points import Cubature, SigmaPointRule
 from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.resolution import check_resolution
 from lfm_ppl.model.state_space import StateSpaceModel, state_space
 
@@ -49,6 +58,7 @@ class Pass(NamedTuple):
         innovation, present, chol, gain, jacobian, obs_cov: of the update, (N, D), (N, D), (N, D, D), (N, n, D), (N, D,
             n), (N, D, D).
         steps: of the integration steps of each interval, predictions (N, J, ...) or `Inside` (N, J, ...).
+        site_terms: (N, ...), of updates by sites; these leave no chol and no obs_cov.
     """
 
     log_likelihood: jax.Array
@@ -63,6 +73,7 @@ class Pass(NamedTuple):
     jacobian: Any = None
     obs_cov: Any = None
     steps: Any = None
+    site_terms: Any = None
 
 
 class Inside(NamedTuple):
@@ -246,7 +257,8 @@ def integrate(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, linear: LinearPa
 
 
 def forward(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, *, start: Moments | None = None,
-            linearization_point: Points | None = None, keep: str = "likelihood") -> Pass:
+            linearization_point: Points | None = None, keep: str = "likelihood",
+            sites: Sites | Callable[..., Sites] | None = None) -> Pass:
     """Run the one forward scan.
 
     Args:
@@ -258,6 +270,9 @@ def forward(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, *, s
         linearization_point: linearise about these moments; the filter's own by default.
         keep: "likelihood" (log likelihoods only), "moments" (and the moments), "all" (what the smoother needs),
             "steps" (and the steps within the intervals), "inside" (instead of these, what the iterations need of them).
+        sites: (T, D) each, of an observation family: pseudo-observations in the place of ``y``, whose log likelihoods
+            are then integrals of the sites. Or what makes those of a row from the mean (D,) and the covariance (D, D)
+            of the predictor as predicted, the row's index, and its entries of y.
     """
     prepared = preparation(ssm, rule, grid)
     with_map = keep in ("all", "steps", "inside")
@@ -269,8 +284,8 @@ def forward(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, *, s
         each = lambda one: (_columns(one.moments.mean, used), _columns(one.moments.covariance, used).T,  # noqa: E731
                             one.phi)
 
-    def step(moments: Moments, inputs: tuple[Intervals, jax.Array, Points | None]) -> tuple[Moments, Pass]:
-        interval, observed, point = inputs
+    def step(moments: Moments, inputs: tuple[Intervals, jax.Array, Points | None, Any]) -> tuple[Moments, Pass]:
+        interval, observed, point, given = inputs
         nodes = None if point is None else completed(ssm, rule, point.nodes)
         one = predict(ssm, rule, grid, prepared, interval, moments, nodes, with_map, each)
         centre = one.moments if point is None else point.ends
@@ -278,11 +293,16 @@ def forward(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, *, s
                                        jnp.maximum(interval.observation, 0), centre)
         if point is not None:
             affine = affine.shifted(one.moments.mean - centre.mean)
-        new = update(ssm, affine, observed, jnp.isfinite(observed), one.moments, scale)
+        if sites is None:
+            new = update(ssm, affine, observed, jnp.isfinite(observed), one.moments, scale)
+        else:
+            at = (sites(affine.value, predictor_variance(affine, one.moments), jnp.maximum(interval.observation, 0),
+                        observed) if callable(sites) else Sites(*given))
+            new = update_by_sites(affine, at, one.moments)
         out = Pass(new.log_likelihood)
         if keep != "likelihood":
             out = out._replace(predicted=one.moments, filtered=new.moments, innovation=new.innovation,
-                               present=jnp.isfinite(observed), chol=new.chol)
+                               present=jnp.isfinite(observed), chol=new.chol, site_terms=new.site_terms)
         if with_map:
             steps = one.steps
             if keep == "inside" and steps is not None:
@@ -292,8 +312,12 @@ def forward(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, *, s
         return new.moments, out
 
     first = Moments(*ssm.initial()) if start is None else start
-    scale = _output_scale(ssm, grid, prepared, jnp.asarray(y, float), first)
-    inputs = (*with_observations(grid.intervals, y), linearization_point)
+    scale = _output_scale(ssm, grid, prepared, jnp.asarray(y, float), first) if sites is None else None
+    by_row = None
+    if sites is not None and not callable(sites):
+        padded = with_observations(grid.intervals, jnp.stack(sites, axis=1))[1]
+        by_row = jnp.moveaxis(jnp.where(jnp.isnan(padded), 0.0, padded), 1, 0)
+    inputs = (*with_observations(grid.intervals, y), linearization_point, by_row if by_row is None else tuple(by_row))
     return jax.lax.scan(jax.checkpoint(step, prevent_cse=False, policy=_KEPT), first, inputs)[1]
 
 
@@ -318,11 +342,14 @@ def _observation_jacobian(ssm: StateSpaceModel, grid: TimeGrid) -> jax.Array:
     return constant_jacobian(lambda v: (ssm.observe(v, t), ()), w, ssm.observation_structure, ssm.output_dim)
 
 
-def check_observations(y: Any, count: int, outputs: int, empty: bool = False) -> jax.Array:
+def check_observations(y: Any, count: int, outputs: int, empty: bool = False,
+                       model: LatentForceModel | None = None) -> jax.Array:
     """Return y as an array (T, D) after checking it; that nothing is observed is fine if ``empty``.
 
+    Of a ``model`` with an observation family the entries must be such as the family gives.
+
     Raises:
-        ValueError: a wrong shape, infinite entries, or nothing observed at all.
+        ValueError: a wrong shape, infinite entries, nothing observed at all, or data that the family cannot give.
     """
     shape = np.shape(y)
     if shape == (count,) and outputs == 1:
@@ -339,6 +366,8 @@ def check_observations(y: Any, count: int, outputs: int, empty: bool = False) ->
             raise ValueError(f"y[{row}, {column}] is infinite; use NaN for a missing entry.")
         if np.isnan(known).all() and not empty:
             raise ValueError("every entry of y is missing (NaN); there is nothing to learn from.")
+        if model is not None and isinstance(model.observation, ObservationFamily):
+            model.observation.check_data(known)
     return jnp.asarray(y, float)
 
 
@@ -348,7 +377,8 @@ def filter(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
     """Run the continuous-discrete Gaussian filter.
 
     Between observations the moments obey dm/dt = E[f], dP/dt = A P + P A' + E[G G'] with the rule's A; at an
-    observation they are conditioned on it.
+    observation they are conditioned on it. Of an observation family the moments of the predictor given an observation
+    are those of its tilted prediction (assumed density filtering).
 
     Args:
         model: the latent force model.
@@ -391,7 +421,7 @@ def filter(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
                            tolerance=tolerance)
     model.check_at(grid.initial_time, len(grid.observed))
     check_resolution(model, times, y)
-    y = check_observations(y, len(grid.observed), ssm.output_dim, empty=start is not None)
+    y = check_observations(y, len(grid.observed), ssm.output_dim, start is not None, model)
     warn_single_precision()
     begin = None if start is None else Moments(start.mean, start.covariance)
     result = filter_on(ssm, rule, grid, y, jnp.asarray(times, float), begin)
@@ -422,15 +452,25 @@ def _check_start(start: Any, times: Any, size: int) -> None:
 def filter_on(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, times: jax.Array,
               begin: Moments | None = None) -> FilterResult:
     """Filter observations (T, D) at ``times`` on the intervals of a time grid; see `filter`."""
-    passed = forward(ssm, rule, grid, y, start=begin, keep="moments")
+    log_likelihood = None
+    if isinstance(ssm.model.observation, ObservationFamily):
+        # Sites are refined by passes of this filter, so that their module imports this one.
+        from lfm_ppl.filtering.sites import assumed_density_filter
+
+        log_likelihood, passed = assumed_density_filter(ssm, rule, grid, y, begin)
+    else:
+        passed = forward(ssm, rule, grid, y, start=begin, keep="moments")
     at = jax.tree_util.tree_map(lambda a: at_rows(a, grid.observed), passed)
     state = FilterState(times[-1], at.filtered.mean[-1], at.filtered.covariance[-1])
-    return FilterResult(times, at.log_likelihood, at.predicted.mean, at.predicted.covariance, at.filtered.mean,
-                        at.filtered.covariance, whitened_innovations(at, y), state)
+    return FilterResult(times, at.log_likelihood if log_likelihood is None else log_likelihood, at.predicted.mean,
+                        at.predicted.covariance, at.filtered.mean, at.filtered.covariance,
+                        whitened_innovations(at, y), state)
 
 
 def whitened_innovations(passed: Pass, y: jax.Array) -> jax.Array:
-    """Return innovations whitened by their Cholesky factor, (T, D), NaN where missing."""
+    """Return innovations whitened by their Cholesky factor, (T, D), NaN where missing and for a family."""
+    if passed.chol is None:
+        return jnp.full(y.shape, jnp.nan)
     return jnp.where(jnp.isfinite(y), jax.vmap(solve_lower)(passed.chol, passed.innovation), jnp.nan)
 
 

@@ -50,8 +50,7 @@ def posterior_linearisation(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y:
     def smoothed(linearization_point: Points | None) -> Points:
         passed = forward(ssm, rule, grid, y, start=start, linearization_point=linearization_point, keep="inside")
         found = backward(passed, start, grid)
-        ends = jax.tree_util.tree_map(lambda a: a[1:], found.moments)
-        return Points(_nodes(ssm, rule, grid, passed, found), ends)
+        return smoothed_nodes(ssm, rule, grid, passed, found)
 
     def iterate(carry: tuple[Points, jax.Array], _: None) -> tuple[tuple[Points, jax.Array], None]:
         points = carry[0]
@@ -62,6 +61,12 @@ def posterior_linearisation(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y:
     first = smoothed(None), jnp.asarray(jnp.nan)
     (points, change), _ = jax.lax.scan(iterate, first, None, length=iterations - 1)
     return Iterated(points, change)
+
+
+def smoothed_nodes(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, passed: Pass, smoothed: Smoothed) -> Points:
+    """Return the smoothed moments about which the next pass is linearised, of a pass that kept what is "inside"."""
+    ends = jax.tree_util.tree_map(lambda a: a[1:], smoothed.moments)
+    return Points(_nodes(ssm, rule, grid, passed, smoothed), ends)
 
 
 def _largest_change(old: Moments, new: Moments) -> jax.Array:

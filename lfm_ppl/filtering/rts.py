@@ -14,6 +14,22 @@ from lfm_ppl.filtering.time_grid import TimeGrid
 from lfm_ppl.linalg import cholesky, congruence, diagonal, log_density, matmul, outer_square, solve_lower
 
 
+class Predictor(NamedTuple):
+    """A family's predictor given all sites, and what tells the site of an entry from the others.
+
+    Attributes:
+        mean: (N, D).
+        covariance: (N, D, D).
+        score: u (N, D).
+        precision: C (N, D, D): a pseudo-observation given all others is N(z - C^-1 u, C^-1).
+    """
+
+    mean: jax.Array
+    covariance: jax.Array
+    score: jax.Array
+    precision: jax.Array
+
+
 class Smoothed(NamedTuple):
     """What the backward scan leaves: nodes are the initial time and each interval's end.
 
@@ -22,11 +38,13 @@ class Smoothed(NamedTuple):
         leave_one_out: (N,), log p(y_k | all other observations), zero in intervals without one.
         adjoint: r (N, n) and Lambda (N, n, n) at the interval's end, its observation and all later ones included: the
             smoothed mean there is m_p + P_p r, the covariance P_p - P_p Lambda P_p.
+        predictor: (N, ...), of a pass with sites; None of any other. Its leave-one-out terms are zero.
     """
 
     moments: Moments
     leave_one_out: jax.Array
     adjoint: tuple[jax.Array, jax.Array]
+    predictor: Predictor | None = None
 
 
 def at_start(filtered: Moments, start: Moments) -> Moments:
@@ -51,19 +69,48 @@ def backward(passed: Pass, start: Moments, grid: TimeGrid) -> Smoothed:
         later, r, adjoint = carry
         at, one, at_rest = row
         gain, conditional = smoothing_kernel(at, one.predicted, one.phi, one.process_cov)
-        left_out, r, adjoint = _leave_one_out(one, r, adjoint)
+        if one.site_terms is None:
+            left_out, r, adjoint = _leave_one_out(one, r, adjoint)
+            predictor = None
+        else:
+            left_out = jnp.zeros(())
+            predictor, r, adjoint = _predictor(one, later, r, adjoint)
         back = matmul(one.phi.T, r[:, None])[:, 0], congruence(one.phi.T, adjoint)
         smoothed = smoothed_moments(at, one.predicted, later, gain, conditional, *back)
         # Nothing happens in an interval without length but for the observation at its end.
         smoothed = jax.tree_util.tree_map(lambda a, b: jnp.where(at_rest, a, b), later, smoothed)
-        return (smoothed, *back), (later, left_out, (r, adjoint))
+        return (smoothed, *back), (later, left_out, (r, adjoint), predictor)
 
     last = Moments(passed.filtered.mean[-1], passed.filtered.covariance[-1])
     carry = (last, jnp.zeros(size), jnp.zeros((size, size)))
-    (first, _, _), (ends, left_out, adjoint) = jax.lax.scan(
+    (first, _, _), (ends, left_out, adjoint, predictor) = jax.lax.scan(
         step, carry, (before, passed._replace(steps=None), still), reverse=True)
     moments = jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a[None], b]), first, ends)
-    return Smoothed(moments, left_out, adjoint)
+    return Smoothed(moments, left_out, adjoint, predictor)
+
+
+def _predictor(one: Pass, later: Moments, r: jax.Array,
+               adjoint: jax.Array) -> tuple[Predictor, jax.Array, jax.Array]:
+    """The predictor at an interval's end given all sites, and the adjoint there with the sites at it.
+
+    ``later`` holds the smoothed moments at the interval's end, r and Lambda what comes after it.
+    """
+    terms, jacobian = one.site_terms, one.jacobian
+    u = terms.score - matmul(one.gain.T, r[:, None])[:, 0]
+    precision = terms.precision + congruence(one.gain.T, adjoint)
+    # f = value + H (s - m_p) + e: of e the adjoint says what it does of s.
+    residual_cov = terms.residual_cov
+    mean = (terms.value + matmul(jacobian, (later.mean - one.predicted.mean)[:, None])[:, 0]
+            + matmul(residual_cov, u[:, None])[:, 0])
+    kept = jnp.eye(r.shape[0]) - matmul(one.gain, jacobian)
+    shared = matmul(matmul(jacobian, one.predicted.covariance),
+                    matmul(kept.T, matmul(adjoint, one.gain)) - matmul(jacobian.T, terms.precision))
+    shared = matmul(shared, residual_cov)
+    covariance = (congruence(jacobian, later.covariance) + residual_cov - congruence(residual_cov, precision)
+                  + shared + shared.T)
+    r = matmul(jacobian.T, terms.score[:, None])[:, 0] + matmul(kept.T, r[:, None])[:, 0]
+    adjoint = congruence(jacobian.T, terms.precision) + congruence(kept.T, adjoint)
+    return Predictor(mean, covariance, u, precision), r, adjoint
 
 
 def _leave_one_out(one: Pass, r: jax.Array, adjoint: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:

@@ -7,7 +7,17 @@ import jax.numpy as jnp
 
 from lfm_ppl.filtering.filter import Pass
 from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.linalg import matmul, semidefinite_root, solve_lower, solve_upper
+from lfm_ppl.filtering.smoothing_kernel import smoothing_kernel
+from lfm_ppl.linalg import (
+    cholesky,
+    conditional_shares,
+    congruence,
+    masked,
+    matmul,
+    semidefinite_root,
+    solve_lower,
+    solve_upper,
+)
 
 
 def smoothing_errors(key: jax.Array, passed: Pass, start: Moments, draws: int) -> jax.Array:
@@ -33,6 +43,10 @@ def smoothing_errors(key: jax.Array, passed: Pass, start: Moments, draws: int) -
 
     Source: Durbin and Koopman (2002), Biometrika 89(3); de Jong and Shephard (1995), Biometrika 82(2).
     """
+    if passed.site_terms is not None:
+        negative = (passed.site_terms.sites.tau < 0).any()
+        return jax.lax.cond(negative, lambda: _backward_sampled(key, passed, start, draws),
+                            lambda: smoothing_errors(key, _as_observations(passed), start, draws))
     rows, size = passed.phi.shape[:2]
     outputs = passed.innovation.shape[-1]
     keys = jax.random.split(key, 3)
@@ -54,3 +68,46 @@ def smoothing_errors(key: jax.Array, passed: Pass, start: Moments, draws: int) -
     _, (errors, innovations) = jax.lax.scan(simulate, first, (passed, *standard))
     _, drawn = jax.lax.scan(smooth, jnp.zeros((size, draws)), (passed, errors, innovations), reverse=True)
     return drawn
+
+
+def _as_observations(passed: Pass) -> Pass:
+    """Return a pass with sites, of which no precision is negative, as one with observations of variances 1 / tau."""
+
+    def row(one: Pass) -> Pass:
+        terms = one.site_terms
+        present = terms.sites.tau > 0
+        variance = jnp.diag(1.0 / jnp.where(present, terms.sites.tau, 1.0))
+        _, obs_cov = masked(terms.value, terms.residual_cov + variance, present)
+        jacobian = jnp.where(present[:, None], one.jacobian, 0.0)
+        chol = cholesky(congruence(jacobian, one.predicted.covariance) + obs_cov).chol
+        return one._replace(chol=chol, obs_cov=obs_cov, jacobian=jacobian, site_terms=None)
+
+    return jax.vmap(row)(passed._replace(steps=None))
+
+
+def _backward_sampled(key: jax.Array, passed: Pass, start: Moments, draws: int) -> jax.Array:
+    """Draw errors as `smoothing_errors` does, from the last interval to the first, each state given the next.
+
+    Where sites have negative precisions, filtered covariances may be no covariances, but that of a state given the next
+    and all sites is one.
+    """
+    rows, size = passed.phi.shape[:2]
+    standard = jax.random.normal(key, (rows, size, draws))
+    last = matmul(semidefinite_root(passed.filtered.covariance[-1]), standard[-1])
+
+    def step(error: jax.Array, row: tuple) -> tuple[jax.Array, jax.Array]:
+        now, predicted, phi, process_cov, noise = row
+        gain, conditional = smoothing_kernel(now, predicted, phi, process_cov)
+        through = matmul(phi, now.covariance)
+        general = matmul(jnp.linalg.pinv(predicted.covariance, rtol=1e-13, hermitian=True), through).T
+        proper = jnp.min(conditional_shares(predicted.covariance)) > 0
+        gain = jnp.where(proper, gain, general)
+        conditional = jnp.where(proper, conditional, now.covariance - congruence(general, predicted.covariance))
+        error = matmul(gain, error) + matmul(semidefinite_root(conditional), noise)
+        return error, error
+
+    tree = jax.tree_util.tree_map
+    inputs = (tree(lambda a: a[:-1], passed.filtered), tree(lambda a: a[1:], passed.predicted), passed.phi[1:],
+              passed.process_cov[1:], standard[:-1])
+    _, drawn = jax.lax.scan(step, last, inputs, reverse=True)
+    return jnp.concatenate([drawn, last[None]])

@@ -15,6 +15,7 @@ from lfm_ppl.filtering.dense_output import Branches, Places, dense_output, place
 from lfm_ppl.filtering.filter import (
     Pass,
     as_rule,
+    at_rows,
     check_observations,
     forward,
     warn_single_precision,
@@ -24,10 +25,20 @@ from lfm_ppl.filtering.iterated import Iterated, posterior_linearisation, refine
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.rts import Smoothed, backward
 from lfm_ppl.filtering.simulation_smoother import smoothing_errors
+from lfm_ppl.filtering.sites import (
+    FamilyTerms,
+    SiteSettings,
+    as_settings,
+    assumed_density_filter,
+    is_linear,
+    leave_one_out,
+)
+from lfm_ppl.filtering.sites import evidence as site_evidence
 from lfm_ppl.filtering.time_grid import TimeGrid, build_time_grid, per_step
 from lfm_ppl.linalg import congruence, matmul, safe_sqrt, semidefinite_root, solve_lower
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.resolution import check_resolution
 from lfm_ppl.model.state_space import StateSpaceModel, state_space
 
@@ -166,7 +177,7 @@ def check_iterations(iterations: int, damping: float, tolerance: float | None = 
 
 def smooth(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None, steps: int = 10,
            max_step: float | None = None, at: Any = None, iterations: int = 0, damping: float = 0.7,
-           tolerance: float | None = None) -> SmootherResult:
+           tolerance: float | None = None, sites: SiteSettings | str | None = None) -> SmootherResult:
     """Smooth: the state and the forces given all observations.
 
         m_s = m + G (m_s+ - m_p),  P_s = (I - G Phi) P (I - G Phi)' + G (Q + P_s+) G',  G = P Phi' P_p^-1.
@@ -183,6 +194,8 @@ def smooth(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
         iterations: of posterior linearisation, 0 for none.
         damping: share of each new iterate that is taken, in (0, 1].
         tolerance: largest error of an integration step, in standard deviations, as in `lfm_ppl.MarginalLikelihood`.
+        sites: of an observation family, how its sites are refined: "ep" (the default), "variational", "laplace", or
+            `lfm_ppl.SiteSettings`.
 
     Returns:
         Moments at the requested times, forces by name, draws of trajectories, diagnostics.
@@ -206,14 +219,15 @@ def smooth(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
     """
     rule = as_rule(rule)
     check_iterations(iterations, damping, tolerance)
+    settings = as_settings(sites, iterations)
     ssm = state_space(model)
     grids = smoothing_grids(ssm, times, steps, max_step, at, iterations, tolerance)
     model.check_at(grids.marginals.initial_time, np.shape(times)[0])
     check_resolution(model, times, y)
-    y = check_observations(y, len(grids.marginals.observed), ssm.output_dim)
+    y = check_observations(y, len(grids.marginals.observed), ssm.output_dim, model=model)
     warn_single_precision()
-    result = _run_smoother(ssm, rule, grids, y, iterations, damping)
-    warn_of_breakdown(ssm, rule, grids.marginals, y, None, result.log_likelihood)
+    result = _run_smoother(ssm, rule, grids, y, iterations, damping, settings)
+    warn_of_breakdown(ssm, rule, grids.marginals, y, None, result.log_likelihood, settings)
     return result
 
 
@@ -249,23 +263,24 @@ def smoothing_grids(ssm: StateSpaceModel, times: Any, steps: int, max_step: floa
         beyond = known[-1] + gap * np.arange(1, min(count, _LONGEST_FORECAST) + 1)
         beyond[-1] = max(beyond[-1], joint.requested_times.max())
     base = build_time_grid(ssm, times, steps, max_step, np.append(known[-1:], beyond), tolerance=tolerance)
-    where = places(per_step(base) if iterations else base, joint.requested_times)
+    by_step = iterations or (isinstance(ssm.model.observation, ObservationFamily) and not is_linear(ssm))
+    where = places(per_step(base) if by_step else base, joint.requested_times)
     return SmoothingGrids(base, joint, where, joint.requested_times)
 
 
 def smooth_on(ssm: StateSpaceModel, rule: Rule, grids: SmoothingGrids, y: jax.Array, iterations: int,
-              damping: float) -> SmootherResult:
+              damping: float, settings: SiteSettings) -> SmootherResult:
     """The same on time grids, without checks; for compiled code."""
     grid = grids.marginals
     start = Moments(*ssm.initial())
-    passed, smoothed, found = _smooth_rows(ssm, rule, grid, y, start, iterations, damping)
+    passed, smoothed, found, scored = _smooth_rows(ssm, rule, grid, y, start, iterations, damping, settings)
     times = jnp.asarray(grids.times, float)
     if grids.joint is None or grids.where is None:
         at = jnp.asarray(grid.requested)
         mean, covariance = (a[at + 1] for a in smoothed.moments)
         joint = Joint(start, passed._replace(steps=None), at, None)
     else:
-        drawn, pieces, _ = _smooth_rows(ssm, rule, grids.joint, y, start, iterations, damping)
+        drawn, pieces, *_ = _smooth_rows(ssm, rule, grids.joint, y, start, iterations, damping, settings)
         at = jnp.asarray(grids.joint.requested)
         joint = Joint(start, drawn._replace(steps=None), at, pieces.moments.covariance[at + 1])
         branches = (Branches(grid, passed.filtered, smoothed.moments, smoothed.adjoint, None) if found is None
@@ -274,21 +289,41 @@ def smooth_on(ssm: StateSpaceModel, rule: Rule, grids: SmoothingGrids, y: jax.Ar
     matrix, offset = jax.vmap(ssm.input_map)(times)
     observed = jnp.asarray(grid.observed)
     at_data = jax.tree_util.tree_map(lambda a: a[observed], passed._replace(steps=None))
+    one_step_ahead, left_out = scored or (at_data.log_likelihood, smoothed.leave_one_out[observed])
     return SmootherResult(
         times, mean, covariance, matmul(matrix, mean[..., None])[..., 0] + offset, congruence(matrix, covariance),
-        at_data.log_likelihood, smoothed.leave_one_out[observed], whitened_innovations(at_data, y),
+        one_step_ahead, left_out, whitened_innovations(at_data, y),
         jnp.asarray(jnp.nan) if found is None else found.change, joint, (matrix, offset),
         ssm.model.state_names, ssm.model.force_names)
 
 
 def _smooth_rows(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments, iterations: int,
-                 damping: float) -> tuple[Pass, Smoothed, Iterated | None]:
+                 damping: float, settings: SiteSettings) -> tuple[Pass, Smoothed, Iterated | None, tuple | None]:
+    """Smooth on one time grid; of a family also its one-step-ahead and leave-one-out terms."""
+    if isinstance(ssm.model.observation, ObservationFamily):
+        return _smooth_family(ssm, rule, grid, y, start, settings, ssm.model.observation)
     found = None
     if iterations:
         found = posterior_linearisation(ssm, rule, grid, y, start, iterations, damping)
     passed = forward(ssm, rule, grid, y, start=start, linearization_point=None if found is None else found.points,
                      keep="steps" if iterations else "all")
-    return passed, backward(passed, start, grid), found
+    return passed, backward(passed, start, grid), found, None
+
+
+def _smooth_family(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments,
+                   settings: SiteSettings, family: ObservationFamily) -> tuple:
+    found = site_evidence(ssm, rule, grid, y, FamilyTerms(family, y), settings, start,
+                          keep="all" if is_linear(ssm) else "steps")
+    smoothed = backward(found.passed, start, grid)
+    assert smoothed.predictor is not None
+    refined_sites = found.refined.found
+    at = jax.tree_util.tree_map(lambda a: at_rows(a, grid.observed), smoothed.predictor)
+    failed = lambda a: jnp.where(refined_sites.converged, a, -jnp.inf)  # noqa: E731
+    scored = (failed(assumed_density_filter(ssm, rule, grid, y, start).log_likelihood),
+              failed(leave_one_out(at, refined_sites.sites, found.entries)))
+    points = found.refined.points
+    iterated = None if points is None else Iterated(points, refined_sites.change)
+    return found.passed, smoothed, iterated, scored
 
 
 _run_smoother = eqx.filter_jit(smooth_on)

@@ -9,7 +9,18 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 
 from lfm_ppl.filtering.predict import Moments, covariance_of, linearise_state
-from lfm_ppl.linalg import cholesky, congruence, diagonal, log_density, masked, matmul, safe_sqrt, wrapped
+from lfm_ppl.linalg import (
+    cholesky,
+    congruence,
+    diagonal,
+    inverse_and_log_det,
+    log_density,
+    masked,
+    matmul,
+    safe_sqrt,
+    symmetric,
+    wrapped,
+)
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.linearisation.sigma_points import SigmaPointRule
 from lfm_ppl.model.state_space import StateSpaceModel
@@ -36,6 +47,44 @@ class Linearised(NamedTuple):
         return self._replace(value=self.value + matmul(self.jacobian, change[:, None])[:, 0])
 
 
+class Sites(NamedTuple):
+    """Gaussian pseudo-observations of the predictor f, unnormalised: exp(nu (f - c) - tau (f - c)^2 / 2) an entry.
+
+    The parameters are natural ones, and tau may be negative. The point c only keeps numbers small.
+
+    Attributes:
+        centre: c (..., D).
+        nu: (..., D).
+        tau: (..., D).
+    """
+
+    centre: jax.Array
+    nu: jax.Array
+    tau: jax.Array
+
+
+class SiteTerms(NamedTuple):
+    """What the backward scan needs of an update by sites; f = value + H (s - m_p) + e, e ~ N(0, residual_cov).
+
+    Attributes:
+        value: (D,), the predicted mean of f.
+        variance: F = H P H' + residual_cov (D, D).
+        residual_cov: (D, D), of what the linearisation leaves out.
+        shrinkage: (I + T F)^-1 (D, D), with T = diag(tau).
+        precision: (I + T F)^-1 T (D, D), the S^-1 of an observation.
+        score: (I + T F)^-1 (nu - T (value - c)) (D,), the S^-1 v of an observation.
+        sites: as they were used.
+    """
+
+    value: jax.Array
+    variance: jax.Array
+    residual_cov: jax.Array
+    shrinkage: jax.Array
+    precision: jax.Array
+    score: jax.Array
+    sites: Sites
+
+
 class Update(NamedTuple):
     """The filtered moments and what the smoother and the diagnostics need.
 
@@ -47,15 +96,17 @@ class Update(NamedTuple):
         gain: (n, D).
         jacobian: (D, n), zero rows where missing.
         obs_cov: (D, D), covariance of the observation given the state, the identity where missing.
+        site_terms: of an update by sites, which has neither chol nor obs_cov.
     """
 
     moments: Moments
     log_likelihood: jax.Array
     innovation: jax.Array
-    chol: jax.Array
+    chol: Any
     gain: jax.Array
     jacobian: jax.Array
-    obs_cov: jax.Array
+    obs_cov: Any
+    site_terms: SiteTerms | None = None
 
 
 def linearise_observation(ssm: StateSpaceModel, rule: Rule, jacobian: jax.Array, t: jax.Array, row: jax.Array,
@@ -127,6 +178,53 @@ def update(ssm: StateSpaceModel, observation: Linearised, y: jax.Array, present:
     failed = checkpoint_name(failed, FAILED)
     log_likelihood = jnp.where(failed, -jnp.inf, log_density(white[:, 0], chol, present))
     return Update(filtered, log_likelihood, innovation, chol, gain, jacobian, obs_cov)
+
+
+def predictor_variance(observation: Linearised, moments: Moments) -> jax.Array:
+    """Return the covariance F (D, D) of a family's predictor."""
+    return congruence(observation.jacobian, moments.covariance) + observation.obs_cov
+
+
+def update_by_sites(observation: Linearised, sites: Sites, moments: Moments) -> Update:
+    r"""Multiply the predicted moments with Gaussian sites in natural parameters.
+
+    With f ~ N(m, F) as predicted and d = f - c,
+
+        log \int N(f; m, F) prod_i t_i(f_i) df
+            = -log|I + T F| / 2 + nu'(m - c) - (m - c)'T(m - c) / 2 + b'F (I + T F)^-1 b / 2,    b = nu - T (m - c),
+
+    and the covariance in Joseph's form, (I - K H) P (I - K H)' + P H' M T M' H P + K Omega K' with M = (I + T F)^-1
+    and K = P H' M T. Nothing is divided by tau, which may be zero (nothing is observed) or negative.
+
+    Args:
+        observation: the predictor, linearised about the predicted moments; its ``obs_cov`` is what that leaves out.
+        sites: (D,) each.
+        moments: predicted.
+
+    Returns:
+        An update whose log likelihood is the integral above.
+
+    Source: Minka (2001), Expectation propagation; Rasmussen and Williams (2006), section 3.6.
+    """
+    mean, covariance = moments
+    jacobian, residual_cov = observation.jacobian, observation.obs_cov
+    cross = matmul(covariance, jacobian.T)
+    variance = symmetric(matmul(jacobian, cross)) + residual_cov
+    away = observation.value - sites.centre
+    shrinkage, log_det = inverse_and_log_det(jnp.eye(away.shape[0]) + sites.tau[:, None] * variance)
+    precision = symmetric(shrinkage * sites.tau[None, :])
+    pull = sites.nu - sites.tau * away
+    score = matmul(shrinkage, pull[:, None])[:, 0]
+    gain = matmul(cross, precision)
+    kept = jnp.eye(mean.shape[0]) - matmul(gain, jacobian)
+    through = matmul(cross, shrinkage)
+    filtered = Moments(mean + matmul(cross, score[:, None])[:, 0],
+                       congruence(kept, covariance) + symmetric(matmul(through * sites.tau, through.T))
+                       + congruence(gain, residual_cov))
+    log_integral = ((sites.nu - 0.5 * sites.tau * away) * away).sum() - 0.5 * log_det + 0.5 * (
+        pull * matmul(variance, score[:, None])[:, 0]).sum()
+    terms = SiteTerms(observation.value, variance, residual_cov, shrinkage, precision, score, sites)
+    return Update(filtered, log_integral, pull, None, gain, jacobian, None, terms)
 
 
 def _precision_lost(ssm: StateSpaceModel, observation: Linearised, y: jax.Array, present: jax.Array,

@@ -20,7 +20,7 @@ from lfm_ppl.fokker_planck_grid.grid_filter import backward, forward, log_likeli
 from lfm_ppl.fokker_planck_grid.grid_model import Cells, on_grid, varies_with_time
 from lfm_ppl.linalg import safe_sqrt
 from lfm_ppl.model.latent_force_model import LatentForceModel
-from lfm_ppl.model.observation_noise import check_noise
+from lfm_ppl.model.observation_noise import check_noise, require_gaussian
 from lfm_ppl.model.state_space import StateSpaceModel, state_space
 
 __all__ = ["FokkerPlanckResult", "Grid", "choose_grid", "fokker_planck", "log_likelihood"]
@@ -208,6 +208,7 @@ def _checked(model: Any) -> StateSpaceModel:
         what = "process_noise is zero" if ssm.physical_dim else f"the force {model.force_names[0]!r} has no noise"
         raise ValueError(f"{what}: without noise the state has no density that could spread over a grid. Give the "
                          "state process_noise, or use lfm.filter.")
+    require_gaussian(ssm, "the Fokker-Planck grid", "the particle filter, lfm.particle_filter,")
     check_noise(ssm, 0.0)
     return ssm
 

@@ -14,6 +14,7 @@ import numpy as np
 from lfm_ppl import checks
 from lfm_ppl.inference.handlers.likelihood_handler import LikelihoodHandler
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
+from lfm_ppl.model.observations.family import ObservationFamily
 
 
 class Recording(NamedTuple):
@@ -91,8 +92,11 @@ class _ingredients(LikelihoodHandler):  # noqa: N801 (an effect handler, named a
         self.values += eqx.filter(jax.tree_util.tree_leaves((likelihood, one.rule)), eqx.is_array_like) + [
             ssm.drift(w, t), ssm.dispersion(w, t), ssm.observe(w, t), ssm.obs_cov(w, t, 0), ssm.input_map(t),
             ssm.initial(), ssm.stack.feedback(), ssm.stack.dispersion(), ssm.stack.jump_table()]
+        if isinstance(model.observation, ObservationFamily):
+            f = ssm.observe(w, t)
+            self.values.append(model.observation.at(0).log_prob(f, f))
         self.settings.append(str((
-            one.rule, one.steps, one.max_step, one.iterations, one.damping, one.tolerance, model.state_names,
+            one.rule, one.steps, one.max_step, one.iterations, one.damping, one.tolerance, one.sites, model.state_names,
             model.output_names, model.force_names, model.units, model.nonlinear_inputs, model.observation.angular,
             ssm.stack.jump_times, site["name"])))
         return super().replacement(likelihood, site)

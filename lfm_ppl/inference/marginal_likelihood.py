@@ -28,6 +28,7 @@ from lfm_ppl.filtering.filter import (
 )
 from lfm_ppl.filtering.iterated import posterior_linearisation
 from lfm_ppl.filtering.predict import Moments
+from lfm_ppl.filtering.sites import FamilyTerms, SiteSettings, as_settings, assumed_density_filter, evidence
 from lfm_ppl.filtering.smoother import (
     SmootherResult,
     check_iterations,
@@ -38,6 +39,7 @@ from lfm_ppl.filtering.time_grid import TimeGrid, build_time_grid
 from lfm_ppl.gradients import finite_or_minus_infinity
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.resolution import check_resolution
 from lfm_ppl.model.simulate import simulate_on
 from lfm_ppl.model.state_space import StateSpaceModel, check_times, state_space
@@ -70,6 +72,10 @@ class MarginalLikelihood(dist.Distribution):
         tolerance: largest error of an integration step, in standard deviations. With it the length of the steps follows
             the moments, for every parameter anew, for stiff models and for posteriors over slow and fast ones; up to
             five times ``steps`` are tried. None: ``steps`` equal steps. Not with ``iterations``.
+        sites: of an observation family, how its sites are refined: "ep" (expectation propagation, the default),
+            "variational", "laplace", or `lfm_ppl.SiteSettings`. The log density is then the log evidence of the
+            converged sites, and -inf where they do not converge. Where the model is not linear it is linearised about
+            smoothed moments, ``iterations`` times (8 by default).
 
     Raises:
         ValueError, TypeError: as `lfm_ppl.filter`; also where it is used in a ``numpyro.plate``. In compiled code a
@@ -91,11 +97,12 @@ class MarginalLikelihood(dist.Distribution):
 
     support = constraints.real_matrix
     pytree_data_fields = ("model", "times")
-    pytree_aux_fields = ("rule", "steps", "max_step", "iterations", "damping", "tolerance")
+    pytree_aux_fields = ("rule", "steps", "max_step", "iterations", "damping", "tolerance", "sites")
 
     def __init__(self, model: LatentForceModel, times: Any, rule: Rule | None = None, steps: int = 10,
                  max_step: float | None = None, iterations: int = 0, damping: float = 0.7,
-                 tolerance: float | None = None, *, validate_args: bool | None = None):
+                 tolerance: float | None = None, sites: SiteSettings | str | None = None, *,
+                 validate_args: bool | None = None):
         if not isinstance(model, LatentForceModel):
             raise TypeError(f"model must be an lfm.LatentForceModel, got {type(model).__name__}.")
         check_iterations(iterations, damping, tolerance)
@@ -105,6 +112,10 @@ class MarginalLikelihood(dist.Distribution):
         if tolerance is not None:
             checks.positive("tolerance", tolerance, "It is in standard deviations, 0.001 for example.")
         self.tolerance = None if tolerance is None else float(tolerance)
+        self.sites = None if sites is None else as_settings(sites)
+        if sites is not None and not isinstance(model.observation, ObservationFamily):
+            raise ValueError("sites are for an observation family such as lfm.PoissonObservation; the observation of "
+                             "this model is Gaussian, whose filter needs none. Leave out sites.")
         model.check_at(self.time_grid.initial_time, np.shape(times)[0])
         known = checks.concrete(times)
         if known is not None:
@@ -132,8 +143,8 @@ class MarginalLikelihood(dist.Distribution):
 
     def log_prob_per_observation(self, value: Any) -> jax.Array:
         """Return (T,): log p(y_k | y_1:k-1) of the present entries of each observation."""
-        y = check_observations(value, *self.event_shape)
-        return self._said(y, finite_or_minus_infinity(self._one_step_ahead, y))
+        y = check_observations(value, *self.event_shape, model=self.model)
+        return self._said(y, finite_or_minus_infinity(self._one_step_ahead, y), alone=True)
 
     def log_prob(self, value: Any) -> jax.Array:
         """Return the log marginal likelihood of ``value`` (T, D), NaN where missing; batch dimensions may lead."""
@@ -142,12 +153,26 @@ class MarginalLikelihood(dist.Distribution):
             return jax.vmap(self.log_prob)(value)
         check_resolution(self.model, self.times, value)
         # One failure makes the sum -inf, and with it the derivatives of the other terms zero.
-        y = check_observations(value, *self.event_shape)
+        y = check_observations(value, *self.event_shape, model=self.model)
+        if isinstance(self.model.observation, ObservationFamily):
+            return self._said(y, finite_or_minus_infinity(self._evidence, y))
         return self._said(y, finite_or_minus_infinity(lambda y: self._one_step_ahead(y).sum(), y))
 
-    def _said(self, y: jax.Array, log_likelihood: jax.Array) -> jax.Array:
-        """Return the log likelihood; outside of compiled code say where the filter breaks down if it does."""
-        warn_of_breakdown(self.ssm, self.rule, self.time_grid, y, None, log_likelihood)
+    @property
+    def _site_settings(self) -> SiteSettings:
+        return as_settings(self.sites, self.iterations)
+
+    def _evidence(self, y: jax.Array) -> jax.Array:
+        terms = FamilyTerms(self.model.observation, y)
+        return evidence(self.ssm, self.rule, self.time_grid, y, terms, self._site_settings).log_evidence
+
+    def _said(self, y: jax.Array, log_likelihood: jax.Array, alone: bool = False) -> jax.Array:
+        """Return the log likelihood; outside of compiled code say what breaks down if something does.
+
+        Of a family, the filter ``alone`` was run or its sites were refined.
+        """
+        warn_of_breakdown(self.ssm, self.rule, self.time_grid, y, None, log_likelihood,
+                          None if alone else self._site_settings)
         return log_likelihood
 
     def expand(self, batch_shape: tuple[int, ...]) -> dist.Distribution:
@@ -165,6 +190,8 @@ class MarginalLikelihood(dist.Distribution):
 
     def _one_step_ahead(self, y: jax.Array) -> jax.Array:
         start = Moments(*self.ssm.initial())
+        if isinstance(self.model.observation, ObservationFamily):
+            return assumed_density_filter(self.ssm, self.rule, self.time_grid, y, start).log_likelihood
         point = None
         if self.iterations:
             point = posterior_linearisation(self.ssm, self.rule, self.time_grid, y, start, self.iterations,
@@ -181,15 +208,15 @@ class MarginalLikelihood(dist.Distribution):
 
     def filter(self, y: Any) -> FilterResult:
         """Filter with this distribution's rule and steps; see `lfm_ppl.filter`."""
-        y = check_observations(y, *self.event_shape)
+        y = check_observations(y, *self.event_shape, model=self.model)
         return filter_on(self.ssm, self.rule, self.time_grid, y, jnp.asarray(self.times, float))
 
     def smooth(self, y: Any, at: Any = None) -> SmootherResult:
         """Smooth with this distribution's settings; see `lfm_ppl.smooth`."""
         grids = smoothing_grids(self.ssm, self.times, self.steps, self.max_step, at, self.iterations,
                                 self.tolerance)
-        y = check_observations(y, *self.event_shape)
-        return smooth_on(self.ssm, self.rule, grids, y, self.iterations, self.damping)
+        y = check_observations(y, *self.event_shape, model=self.model)
+        return smooth_on(self.ssm, self.rule, grids, y, self.iterations, self.damping, self._site_settings)
 
 
 class Panel(dist.Distribution):
@@ -303,19 +330,20 @@ def repeated(draw: Callable[[jax.Array], jax.Array], key: jax.Array, sample_shap
 
 def panel(build: Callable[..., LatentForceModel], parameters: Any, times: Any, rule: Rule | None = None,
           steps: int = 10, max_step: float | None = None, iterations: int = 0, damping: float = 0.7,
-          tolerance: float | None = None) -> Panel:
+          tolerance: float | None = None, sites: SiteSettings | str | None = None) -> Panel:
     """Return many independent series as one distribution, for use inside ``numpyro.plate``.
 
     Args:
         build: maps the parameters of ONE series to its `LatentForceModel`; it may close over shared parameters.
         parameters: pytree of arrays with a leading axis (B,), one entry a series.
         times: (T,) for all, or (B, T); ragged series are padded: NaN in y, and times that repeat the last one.
-        rule: as in `MarginalLikelihood`, and so are the next five.
+        rule: as in `MarginalLikelihood`, and so are the next six.
         steps: integration steps between two consecutive times.
         max_step: longest step.
         iterations: of posterior linearisation.
         damping: share of each new iterate that is taken.
         tolerance: largest error of an integration step, in standard deviations; None for equal steps.
+        sites: of an observation family.
 
     Returns:
         A distribution with batch shape (B,) and event shape (T, D).
@@ -334,5 +362,5 @@ def panel(build: Callable[..., LatentForceModel], parameters: Any, times: Any, r
         (2,)
     """
     settings = {"rule": as_rule(rule), "steps": steps, "max_step": max_step, "iterations": iterations,
-                "damping": damping, "tolerance": tolerance}
+                "damping": damping, "tolerance": tolerance, "sites": sites}
     return Panel(build, parameters, times, settings)

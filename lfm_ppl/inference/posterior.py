@@ -14,7 +14,7 @@ from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.fingerprint import signature
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
-from lfm_ppl.linalg import matmul, semidefinite_root
+from lfm_ppl.model.observation_noise import expected_observation, noisy_observation
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.particles.particle_filter import ParticleSettings
 from lfm_ppl.particles.particle_smoother import TRACING, draw_trajectories
@@ -61,7 +61,8 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
         particle_steps: integration steps of the particles between two observations; None: the model's.
 
     Returns:
-        ``state`` (S, ..., K, M), ``force`` (S, ..., K, R), ``output`` (S, ..., K, D) free of noise, and ``y``
+        ``state`` (S, ..., K, M), ``force`` (S, ..., K, R), ``output`` (S, ..., K, D) free of noise (what is
+        expected of a family), and ``y``
         (S, ..., T, D), the posterior predictive at the observation times.
     """
     at = None if at is None else np.asarray(at, float)
@@ -76,11 +77,10 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
             w, when = _smoothed_path(distribution, y, both, path_key)
         else:
             w, when = _particle_path(distribution, y, both, path_key, particles, particle_steps or distribution.steps)
-        output = jax.vmap(ssm.observe)(w, when)
-        row = jnp.arange(times.shape[0])
-        covariance = jax.vmap(ssm.obs_cov)(w[count:], times, row)
-        noise = jax.random.normal(noise_key, (*output[count:].shape, 1))
-        replicated = output[count:] + matmul(jax.vmap(semidefinite_root)(covariance), noise)[..., 0]
+        output = jax.vmap(lambda w, t: expected_observation(ssm, w, t))(w, when)
+        rows = jnp.arange(times.shape[0])
+        replicated = jax.vmap(lambda w, t, key, row: noisy_observation(ssm, w, t, key, row))(
+            w[count:], times, jax.random.split(noise_key, times.shape[0]), rows)
         stop = count or None
         size = ssm.physical_dim
         return {"state": w[:stop, :size], "force": w[:stop, size:], "output": output[:stop], "y": replicated}

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 
 from lfm_ppl import checks
 from lfm_ppl.latent_grid.latent_grid import LatentGrid
+from lfm_ppl.model.observation_noise import require_gaussian
 
 METHODS = ("trust-region", "newton")
 
@@ -102,6 +103,9 @@ def laplace(latent: LatentGrid, y: Any, method: str = "trust-region", *, iterati
     if not isinstance(latent, LatentGrid):
         raise TypeError(f"latent must be a lfm.LatentGrid, got {type(latent).__name__}.")
     checks.one_of("method", method, METHODS)
+    if method == "trust-region":
+        require_gaussian(latent.ssm, "method 'trust-region', whose steps are those of least squares,",
+                         "method='newton'")
     checks.positive_integer("iterations", iterations)
     checks.positive("tolerance", tolerance)
     return run(latent, latent.checked(y), method, iterations, tolerance)

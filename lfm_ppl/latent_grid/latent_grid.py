@@ -21,8 +21,7 @@ from lfm_ppl.filtering.transition import linear_part
 from lfm_ppl.forces.sde import Force
 from lfm_ppl.linalg import semidefinite_root
 from lfm_ppl.model.latent_force_model import LatentForceModel
-from lfm_ppl.model.observation_noise import check_noise, log_density
-from lfm_ppl.model.simulate import noisy_observation
+from lfm_ppl.model.observation_noise import check_noise, log_density, noisy_observation
 from lfm_ppl.model.state_space import StateSpaceModel, check_times, state_space
 
 RULES = ("riemann", "trapezoid", "linear")
@@ -233,7 +232,7 @@ class LatentGrid(eqx.Module):
 
     def checked(self, y: Any) -> jax.Array:
         """Check observations (T, D), and return them as an array."""
-        return check_observations(y, len(self.times), self.ssm.output_dim)
+        return check_observations(y, len(self.times), self.ssm.output_dim, model=self.ssm.model)
 
     def _production(self, u: jax.Array, t: jax.Array) -> jax.Array:
         """Return p (M,): the dynamics without the state."""

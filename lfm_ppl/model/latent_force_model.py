@@ -15,6 +15,7 @@ from lfm_ppl.forces.sde import Force
 from lfm_ppl.model.gaussian import Gaussian
 from lfm_ppl.model.inputs import check_reads, reads_inputs
 from lfm_ppl.model.observation import GaussianObservation
+from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.user_functions import Traced, trace
 
 
@@ -59,7 +60,7 @@ class LatentForceModel(eqx.Module):
 
     dynamics: Callable[..., jax.Array]
     forces: dict[str, Force]
-    observation: GaussianObservation
+    observation: GaussianObservation | ObservationFamily
     initial_state: Gaussian
     process_noise: Any
     initial_time: Any
@@ -74,7 +75,7 @@ class LatentForceModel(eqx.Module):
         self,
         dynamics: Callable[..., jax.Array],
         forces: Mapping[str, Force] | Sequence[tuple[str, Force]],
-        observation: GaussianObservation,
+        observation: GaussianObservation | ObservationFamily,
         initial_state: Gaussian,
         process_noise: Any = None,
         initial_time: Any = None,
@@ -85,7 +86,8 @@ class LatentForceModel(eqx.Module):
     ):
         _check_types(dynamics, observation, initial_state)
         self.force_names, self.forces = _named_forces(forces)
-        self.dynamics, self.observation, self.initial_state = dynamics, observation, initial_state
+        self.dynamics, self.initial_state = dynamics, initial_state
+        self.observation = self._resolved(observation)
         if initial_time is not None:
             checks.finite("initial_time", initial_time)
         # Kept as NumPy where it is known: inside jit jnp.asarray would make a tracer of it, too late to plan rows by.
@@ -98,6 +100,8 @@ class LatentForceModel(eqx.Module):
         self.process_noise = process_noise if callable(process_noise) else _dispersion(process_noise, size)
         functions = self._traced()
         self.output_names = _names("output_names", output_names, functions["observation"].shape.shape[0], "y")
+        if isinstance(self.observation, ObservationFamily):
+            self.observation.check_shapes(len(self.output_names))
         self.unit_items = tuple((units or {}).items())
         self.nonlinear_inputs = None if nonlinear_inputs is None else tuple(nonlinear_inputs)
         for name in self.nonlinear_inputs or ():
@@ -116,6 +120,19 @@ class LatentForceModel(eqx.Module):
     def force_list(self) -> tuple[Force, ...]:
         """The forces in their order."""
         return tuple(self.forces[name] for name in self.force_names)
+
+    def _resolved(self, observation: Any) -> GaussianObservation | ObservationFamily:
+        """Return the observation, a family told the number of its outputs."""
+        if not isinstance(observation, ObservationFamily):
+            return observation
+        u = jax.ShapeDtypeStruct((len(self.force_names),), jnp.result_type(float))
+
+        def size(function: Callable) -> int:
+            traced = trace("the observation function", "h(x, u, t)", function, self.initial_state.mean, u,
+                           jnp.zeros(()))
+            return _vector_size(traced.shape)
+
+        return observation.resolved(size)
 
     def _traced(self) -> dict[str, Traced]:
         """Trace every function of the model, and check what is seen so; means of forces stand under their names."""
@@ -147,12 +164,7 @@ class LatentForceModel(eqx.Module):
 
     def _traced_observation(self, arguments: tuple) -> Traced:
         traced = trace("the observation function", "h(x, u, t)", self.observation.function, *arguments)
-        found = traced.shape
-        if len(getattr(found, "shape", ())) != 1:
-            raise ValueError("the observation function must return a vector (D,), got "
-                             f"{f'shape {found.shape}' if hasattr(found, 'shape') else type(found).__name__}. "
-                             "For one output, return x[:1] or jnp.array([...]).")
-        outputs = found.shape[0]
+        outputs = _vector_size(traced.shape)
         covariance = jax.eval_shape(self.observation.covariance_at, *arguments, 0)
         if covariance.shape != (outputs, outputs):
             raise ValueError(f"the observation has {outputs} components, so its covariance must be ({outputs},) or "
@@ -191,6 +203,8 @@ class LatentForceModel(eqx.Module):
             ValueError: a function is not finite there, the observation covariance is no covariance, or there is not
                 one matrix for each observation.
         """
+        if isinstance(self.observation, ObservationFamily):
+            self.observation.check_rows(rows)
         covariance = self.observation.covariance
         if np.ndim(covariance) == 3 and np.shape(covariance)[0] != rows:
             raise ValueError(f"the observation covariance holds {np.shape(covariance)[0]} matrices, one for each time, "
@@ -226,6 +240,9 @@ class LatentForceModel(eqx.Module):
                 name = names[int(np.argmin(np.isfinite(value)))]
                 raise ValueError(f"the {label} returned {value} {where}: the entry for {name!r} is not finite. "
                                  "Change initial_state.mean, or guard the expression (for example jnp.maximum).")
+            if value is not None and function is self.observation.function and isinstance(self.observation,
+                                                                                           ObservationFamily):
+                self.observation.check_predictor(value, where, names)
         if callable(self.process_noise):
             dispersion = checks.concrete(self.process_noise(x, u, t))
             if dispersion is not None and not np.all(np.isfinite(dispersion)):
@@ -239,11 +256,20 @@ class LatentForceModel(eqx.Module):
 def _check_types(dynamics: Any, observation: Any, initial_state: Any) -> None:
     if not callable(dynamics):
         raise TypeError(f"dynamics must be callable as f(x, u, t), got {type(dynamics).__name__}.")
-    if not isinstance(observation, GaussianObservation):
-        raise TypeError(f"observation must be an lfm.GaussianObservation, got {type(observation).__name__}. Wrap the "
-                        "function: lfm.GaussianObservation(lambda x, u, t: x, variances).")
+    if not isinstance(observation, (GaussianObservation, ObservationFamily)):
+        raise TypeError("observation must be an lfm.GaussianObservation, or a family such as lfm.PoissonObservation, "
+                        f"got {type(observation).__name__}. Wrap the function: "
+                        "lfm.GaussianObservation(lambda x, u, t: x, variances).")
     if not isinstance(initial_state, Gaussian):
         raise TypeError(f"initial_state must be an lfm.Gaussian, got {type(initial_state).__name__}.")
+
+
+def _vector_size(found: Any) -> int:
+    if len(getattr(found, "shape", ())) != 1:
+        raise ValueError("the observation function must return a vector (D,), got "
+                         f"{f'shape {found.shape}' if hasattr(found, 'shape') else type(found).__name__}. "
+                         "For one output, return x[:1] or jnp.array([...]).")
+    return found.shape[0]
 
 
 def _named_forces(forces: Any) -> tuple[tuple[str, ...], dict[str, Force]]:

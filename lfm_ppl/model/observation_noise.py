@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import checks, linalg
-from lfm_ppl.linalg import cholesky, masked, solve_lower, wrapped
+from lfm_ppl.linalg import cholesky, masked, matmul, semidefinite_root, solve_lower, wrapped
+from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel
 
 
@@ -25,9 +26,13 @@ def log_density(ssm: StateSpaceModel, w: jax.Array, t: jax.Array, row: jax.Array
         y: (D,), NaN where missing.
 
     Returns:
-        log p(y | w), zero where all entries are missing; the residual (D,) in units of the noise.
+        log p(y | w), zero where all entries are missing; the residual (D,) in units of the noise, NaN for a family,
+        which has no such unit.
     """
     present = jnp.isfinite(y)
+    family = ssm.model.observation
+    if isinstance(family, ObservationFamily):
+        return entry_log_prob(ssm, w, t, row, y).sum(), jnp.full(y.shape, jnp.nan)
     residual = jnp.where(present, y, 0.0) - ssm.observe(w, t)
     for index in ssm.model.observation.angular:
         residual = residual.at[index].set(wrapped(residual[index]))
@@ -37,8 +42,43 @@ def log_density(ssm: StateSpaceModel, w: jax.Array, t: jax.Array, row: jax.Array
     return jnp.where(factor.degenerate.any(), -jnp.inf, linalg.log_density(white, factor.chol, present)), white
 
 
+def entry_log_prob(ssm: StateSpaceModel, w: jax.Array, t: jax.Array, row: Any, y: jax.Array) -> jax.Array:
+    """Return log p(y_d | w) (D,) of a family's entries, zero where missing; arguments as in `log_density`."""
+    family, present = ssm.model.observation, jnp.isfinite(y)
+    assert isinstance(family, ObservationFamily)
+    predictor = ssm.observe(w, t)
+    # A missing entry must not put NaN into a derivative; any value in the support does.
+    value = family.at(row).log_prob(predictor, jnp.where(present, y, 1.0))
+    return jnp.where(present, value, 0.0)
+
+
+def noisy_observation(ssm: StateSpaceModel, w: jax.Array, t: jax.Array, key: jax.Array, row: Any) -> jax.Array:
+    """Draw the observation (D,) of a row at the inputs w (M + R,) and time t."""
+    family, predictor = ssm.model.observation, ssm.observe(w, t)
+    if isinstance(family, ObservationFamily):
+        return family.at(row).sample(key, predictor)
+    covariance = ssm.obs_cov(w, t, row)
+    draw = jax.random.normal(key, (covariance.shape[0], 1))
+    return predictor + matmul(semidefinite_root(covariance), draw)[:, 0]
+
+
+def expected_observation(ssm: StateSpaceModel, w: jax.Array, t: jax.Array) -> jax.Array:
+    """Return what is observed on average (D,) at inputs w (M + R,) and a time: free of noise, on the data's scale."""
+    family, predictor = ssm.model.observation, ssm.observe(w, t)
+    return family.typical().mean(predictor) if isinstance(family, ObservationFamily) else predictor
+
+
+def require_gaussian(ssm: StateSpaceModel, method: str, instead: str) -> None:
+    """Raise ValueError for an observation family, where a method is one of Gaussian observations."""
+    if isinstance(ssm.model.observation, ObservationFamily):
+        raise ValueError(f"{method} takes an lfm.GaussianObservation, and the observation of this model is of the "
+                         f"family {type(ssm.model.observation).__name__}. Use {instead} instead.")
+
+
 def check_noise(ssm: StateSpaceModel, time: Any) -> None:
     """Raise ValueError where the observation noise has no density at the prior mean (where that is known)."""
+    if isinstance(ssm.model.observation, ObservationFamily):
+        return
     w = jnp.concatenate([ssm.model.initial_state.mean, ssm.stack.mean_at(time)])
     own = ssm.model.observation.covariance
     rows = jnp.arange(1 if callable(own) or jnp.ndim(own) < 3 else own.shape[0])

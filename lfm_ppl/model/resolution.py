@@ -15,6 +15,7 @@ from lfm_ppl import checks
 from lfm_ppl.forces.sde import ApproximationWarning, Force, Sum
 from lfm_ppl.forces.squared_exponential import SquaredExponential
 from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.observations.family import ObservationFamily
 
 TOLERANCE = 0.1
 """Error of the log likelihood above which there is a warning."""
@@ -92,6 +93,8 @@ def resolutions(model: LatentForceModel, times: Any, y: Any = None) -> list[Reso
                                                                              strict=True)) for term in _terms(force)]
     # Only now is anything computed: other models pass at no cost. In compiled code every new array is traced.
     if not any(isinstance(term, SquaredExponential) for *_, term in terms):
+        return []
+    if isinstance(model.observation, ObservationFamily):
         return []
     if model.process_noise is not None or checks.traced((model, times, y, jnp.zeros(()))):
         return []

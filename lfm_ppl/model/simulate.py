@@ -11,6 +11,7 @@ import numpy as np
 from lfm_ppl import checks
 from lfm_ppl.linalg import matmul, semidefinite_root
 from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.observation_noise import noisy_observation
 from lfm_ppl.model.state_space import StateSpaceModel, check_times, just_before, state_space
 
 
@@ -153,11 +154,3 @@ def _cross_jumps(ssm: StateSpaceModel, jumps: Any, state: jax.Array, begin: jax.
 
     forces = jax.lax.cond(crossed.any(), all_crossed, lambda forces: forces, state[size:])
     return jnp.concatenate([state[:size], forces])
-
-
-def noisy_observation(ssm: StateSpaceModel, w: jax.Array, t: jax.Array, key: jax.Array,
-                      index: jax.Array) -> jax.Array:
-    """Draw the observation (D,) of row ``index`` at the inputs w (M + R,) and time t."""
-    covariance = ssm.obs_cov(w, t, index)
-    draw = jax.random.normal(key, (covariance.shape[0], 1))
-    return ssm.observe(w, t) + matmul(semidefinite_root(covariance), draw)[:, 0]

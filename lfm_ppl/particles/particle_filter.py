@@ -179,7 +179,7 @@ def checked(ssm: StateSpaceModel, times: Any, y: Any, steps: int, max_step: floa
     ssm.model.check_at(grid.initial_time, len(grid.observed))
     check_noise(ssm, grid.initial_time)
     warn_single_precision()
-    return grid, check_observations(y, len(grid.observed), ssm.output_dim)
+    return grid, check_observations(y, len(grid.observed), ssm.output_dim, model=ssm.model)
 
 
 def check_settings(ssm: StateSpaceModel, settings: ParticleSettings) -> ParticleSettings:

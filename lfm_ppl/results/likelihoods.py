@@ -16,6 +16,7 @@ from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
 from lfm_ppl.inference.posterior import each, over_draws
 from lfm_ppl.model.observation_noise import check_noise
+from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.particles import particle_filter
 from lfm_ppl.particles.particle_filter import ParticleSettings
@@ -85,6 +86,8 @@ class Reference(NamedTuple):
 def is_exact(ssm: StateSpaceModel) -> bool:
     """Whether the Gaussian filter computes the exact likelihood: linear dynamics and observation, Gaussian noise."""
     observation = ssm.model.observation
+    if isinstance(observation, ObservationFamily):
+        return False
     return (ssm.time_invariant and ssm.observation_structure.linear and not observation.varies_with_state
             and not observation.angular)
 

@@ -15,6 +15,7 @@ from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.time_grid import Intervals, TimeGrid, build_time_grid
 from lfm_ppl.linearisation.taylor import Taylor
 from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.observation_noise import require_gaussian
 from lfm_ppl.model.state_space import StateSpaceModel, state_space
 from lfm_ppl.model.structure import pattern
 from lfm_ppl.switching.rule import SwitchingRule
@@ -101,6 +102,7 @@ def check_initial(initial: Any, rule: SwitchingRule, particles: int) -> jax.Arra
 
 def check_linear(ssm: StateSpaceModel, rule: SwitchingRule) -> None:
     """Raise ValueError unless model and reading are linear in states and forces."""
+    require_gaussian(ssm, "the Rao-Blackwellised particle filter", "lfm.particle_filter")
     names = (*ssm.model.state_names, *ssm.model.force_names)
     for what, structure in (("dynamics", ssm.drift_structure), ("observation", ssm.observation_structure)):
         if structure.points:

@@ -13,7 +13,7 @@ from lfm_ppl.filtering.filter import FilterState
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.time_grid import Intervals, TimeGrid, as_arrays
 from lfm_ppl.linalg import semidefinite_root
-from lfm_ppl.model.simulate import noisy_observation
+from lfm_ppl.model.observation_noise import noisy_observation
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.particles.normals import normals
 from lfm_ppl.particles.stochastic_steps import Moves, choose_scheme, first_particles

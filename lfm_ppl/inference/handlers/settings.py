@@ -8,7 +8,7 @@ from typing import Any
 from lfm_ppl.inference.handlers.likelihood_handler import LikelihoodHandler
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
 
-NAMES = ("rule", "steps", "max_step", "iterations", "damping", "tolerance")
+NAMES = ("rule", "steps", "max_step", "iterations", "damping", "tolerance", "sites")
 
 
 class approximate(LikelihoodHandler):  # noqa: N801 (an effect handler, named as NumPyro names its handlers)
@@ -16,8 +16,8 @@ class approximate(LikelihoodHandler):  # noqa: N801 (an effect handler, named as
 
     Args:
         fn: a NumPyro model with a site ``MarginalLikelihood`` or ``panel``.
-        **settings: any of ``rule``, ``steps``, ``max_step``, ``iterations``, ``damping`` and ``tolerance``; what
-            is None or left out stays as the model has it. But ``steps`` or ``iterations`` without a tolerance are
+        **settings: any of ``rule``, ``steps``, ``max_step``, ``iterations``, ``damping``, ``tolerance`` and ``sites``;
+            what is None or left out stays as the model has it. But ``steps`` or ``iterations`` without a tolerance are
             steps of equal length, also where the model has a tolerance.
 
     Raises:

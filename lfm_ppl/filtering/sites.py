@@ -1,0 +1,536 @@
+r"""Sites: Gaussian pseudo-observations in the place of what is not Gaussian, refined until they do not change.
+
+An entry of the data, or a constraint, is a factor p_i(f_i) of the predictor f = h(x, u, t) at a row. Its site
+t_i(f_i) = exp(nu (f_i - c) - tau (f_i - c)^2 / 2) stands for it in THE filter and THE smoother. A sweep is one pass of
+each; then, entry by entry, with q the smoothed marginal and q_-i = q / t_i^a the cavity,
+
+    expectation propagation   t_i^a = (Gaussian of the moments of q_-i p_i^a) / q_-i,
+    variational               nu, tau from the derivatives of E_q log p_i by the mean and the variance of q,
+    Laplace                   nu, tau from those of log p_i at the mean of q,
+
+and the log evidence, with I the integral of all sites that the filter gives,
+
+    EP            log I + sum_i [log Z_i - log int q_-i t_i^a] / a,    Z_i = int q_-i p_i^a,
+    variational   log I + sum_i [E_q log p_i - E_q log t_i],
+    Laplace       log I + sum_i [log p_i - log t_i](mean of q).
+
+The first two are stationary in the sites and in the cavities where these do not change, so that a gradient holds both
+fixed and costs that of one filter.
+
+What is not Gaussian enters by `EntryTerms`: a colleague of `FamilyTerms` needs ``tilted`` alone, in closed form if it
+has one, to be refined by EP.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lfm_ppl import checks
+from lfm_ppl.filtering.filter import Pass, Points, at_rows, forward
+from lfm_ppl.filtering.iterated import smoothed_nodes
+from lfm_ppl.filtering.predict import Moments
+from lfm_ppl.filtering.quadrature import Marginal, Tilted, expectations, tilted_moments
+from lfm_ppl.filtering.rts import Predictor, Smoothed, backward
+from lfm_ppl.filtering.time_grid import TimeGrid
+from lfm_ppl.filtering.update import Sites
+from lfm_ppl.linalg import diagonal, inverse_and_log_det, matmul
+from lfm_ppl.linearisation.rule import Rule
+from lfm_ppl.model.observations.family import ObservationFamily
+from lfm_ppl.model.state_space import StateSpaceModel
+
+METHODS = ("ep", "variational", "laplace")
+
+_TOLERANCE = 1e-8
+"""Largest change of a site in a sweep, in units of the marginal (nu times its sd, tau times its variance)."""
+
+_SEARCH = 12
+"""Steps of the search for the mode of a tilted distribution."""
+
+_WHOLE = 0.5
+"""Share of the marginal's precision from its own site, from which the cavity is taken from leave-one-out terms."""
+
+
+class SiteSettings(NamedTuple):
+    """How sites are refined; hashable, so that compiled code can take it as static.
+
+    Attributes:
+        method: "ep", "variational" or "laplace".
+        power: a of power EP, in (0, 1].
+        damping: share of each new site that is taken at first; it is halved where changes grow.
+        sweeps: most sweeps.
+        relinearisations: sweeps in which the sites and the points of linearisation are refined together, before the
+            points are held fixed; for models that are not linear.
+    """
+
+    method: str = "ep"
+    power: float = 1.0
+    damping: float = 1.0
+    sweeps: int = 200
+    relinearisations: int = 8
+
+
+def as_settings(sites: Any, iterations: int = 0) -> SiteSettings:
+    """Return settings of the sites from themselves, or from the name of a method.
+
+    Args:
+        sites: settings, the name of a method, or None for expectation propagation.
+        iterations: of posterior linearisation, which are the joint sweeps of a model that is not linear; 0: as the
+            settings have it.
+
+    Raises:
+        ValueError, TypeError: an unknown method, or a number out of its range.
+    """
+    settings = sites if isinstance(sites, SiteSettings) else SiteSettings("ep" if sites is None else sites)
+    checks.one_of("method of the sites", settings.method, METHODS)
+    for name in ("power", "damping"):
+        if not 0.0 < getattr(settings, name) <= 1.0:
+            raise ValueError(f"{name} of the sites must lie in (0, 1], got {getattr(settings, name)}.")
+    if settings.method != "ep" and settings.power != 1.0:
+        raise ValueError(f"power={settings.power} is one of expectation propagation; leave it out with method "
+                         f"{settings.method!r}.")
+    checks.positive_integer("sweeps", settings.sweeps)
+    checks.positive_integer("relinearisations", settings.relinearisations)
+    return settings._replace(relinearisations=iterations) if iterations else settings
+
+
+class EntryTerms(Protocol):
+    """What sites stand for: one factor an entry, of arrays (T, D). An entry without a factor has log Z = 0."""
+
+    def tilted(self, cavity: Marginal, near: Marginal, power: float) -> Tilted:
+        """Return log int N(f; cavity) p(f)^power df, and mean and variance of the product, normalised; (T, D) each.
+
+        Args:
+            cavity: mean and variance of each entry given everything else.
+            near: its marginal as it stands, about where the product lies; of use to a quadrature.
+            power: of the factor.
+        """
+
+    @property
+    def present(self) -> jax.Array:
+        """(T, D), whether an entry has a factor."""
+
+
+class FamilyTerms(eqx.Module):
+    """The factors of data under an observation family.
+
+    Attributes:
+        family: the observation family.
+        y: (T, D), NaN where missing.
+    """
+
+    family: ObservationFamily
+    y: jax.Array
+
+    @property
+    def present(self) -> jax.Array:
+        """(T, D), whether an entry is."""
+        return jnp.isfinite(self.y)
+
+    def log_prob(self, f: jax.Array) -> jax.Array:
+        """Return log p(y | f), entry by entry, zero where missing; ``f`` is (..., T, D)."""
+        if f.ndim > 2:
+            return jax.vmap(self.log_prob)(f)
+        return jax.vmap(lambda row, f, y: row_log_prob(self.family, row, f, y))(jnp.arange(len(f)), f, self.y)
+
+    def tilted(self, cavity: Marginal, near: Marginal, power: float) -> Tilted:
+        """Return the tilted moments by quadrature."""
+        return tilted_moments(lambda f: power * self.log_prob(f), cavity, near)
+
+
+def row_log_prob(family: ObservationFamily, row: Any, f: jax.Array, y: jax.Array) -> jax.Array:
+    """Return log p(y_d | f_d) (D,) of a row, zero where missing."""
+    present = jnp.isfinite(y)
+    # A missing entry must not put NaN into a derivative.
+    return jnp.where(present, family.at(row).log_prob(f, jnp.where(present, y, 1.0)), 0.0)
+
+
+class Cavity(NamedTuple):
+    """Marginals of the predictor (T, D), and what is left of them without an entry's own site.
+
+    Attributes:
+        cavity: without the site (to its power).
+        marginal: with it.
+        valid: whether both have a positive variance.
+    """
+
+    cavity: Marginal
+    marginal: Marginal
+    valid: jax.Array
+
+
+class Converged(NamedTuple):
+    """Where the sweeps end.
+
+    Attributes:
+        sites: (T, D) each.
+        cavity: of the last sweep.
+        change: largest change of a site in it.
+        sweeps: how many were made.
+        converged: whether the change is below 1e-8 and every cavity valid.
+    """
+
+    sites: Sites
+    cavity: Cavity
+    change: jax.Array
+    sweeps: jax.Array
+    converged: jax.Array
+
+
+class Refined(NamedTuple):
+    """Sites and the points of linearisation.
+
+    Attributes:
+        found: where the sweeps ended; fixed numbers for a derivative.
+        points: about which the model is linearised; None for a linear model.
+    """
+
+    found: Converged
+    points: Points | None
+
+
+# --- one sweep
+
+
+def cavities(predictor: Predictor, sites: Sites, present: jax.Array, power: float) -> Cavity:
+    """Take an entry's own site, to a power, out of its marginal.
+
+    With s = 1 - a tau v the cavity has the variance v / s and, from c, the mean (m - a v nu) / s. Where a site
+    outweighs everything else these are differences of nearly equal numbers, and the leave-one-out terms of the
+    smoother, s = C / tau and the mean (nu - u / s) / tau, are not.
+
+    Args:
+        predictor: smoothed, (T, ...).
+        sites: (T, D) each.
+        present: (T, D).
+        power: a.
+    """
+    m, v = predictor.mean - sites.centre, diagonal(predictor.covariance)
+    nu, tau = sites.nu, sites.tau
+    share = power * tau * v
+    whole = (share > _WHOLE) & (power == 1.0)
+    safe_tau = jnp.where(whole, tau, 1.0)
+    left = jnp.where(whole, diagonal(predictor.precision) / safe_tau, 1.0 - share)
+    valid = (left > 0) & (v > 0) & jnp.isfinite(m)
+    left = jnp.where(valid, left, 1.0)
+    mean = jnp.where(whole, (nu - predictor.score / left) / safe_tau, (m - power * v * nu) / left)
+    v = jnp.where(valid, v, 1.0)
+    marginal = Marginal(jnp.where(valid, predictor.mean, 0.0), v)
+    cavity = Marginal(jnp.where(valid, sites.centre + mean, 0.0), v / left)
+    return Cavity(cavity, marginal, valid | ~present)
+
+
+def _ep(terms: EntryTerms, sites: Sites, at: Cavity, power: float) -> tuple[jax.Array, jax.Array]:
+    found = terms.tilted(at.cavity, at.marginal, power)
+    c, v = at.cavity.mean - sites.centre, at.cavity.variance
+    nu = ((found.mean - sites.centre) / found.variance - c / v) / power
+    return nu, (1.0 / found.variance - 1.0 / v) / power
+
+
+def _variational(terms: Any, sites: Sites, at: Cavity, power: float) -> tuple[jax.Array, jax.Array]:
+    _, by_mean, by_variance = expectations(terms.log_prob, at.marginal)
+    tau = -2.0 * by_variance
+    return by_mean + tau * (at.marginal.mean - sites.centre), tau
+
+
+def _laplace(terms: Any, sites: Sites, at: Cavity, power: float) -> tuple[jax.Array, jax.Array]:
+    m = at.marginal.mean
+    first = jax.grad(lambda f: terms.log_prob(f).sum())
+    slope, curvature = jax.jvp(first, (m,), (jnp.ones_like(m),))
+    return slope - curvature * (m - sites.centre), -curvature
+
+
+_NEW_SITES: dict[str, Callable] = {"ep": _ep, "variational": _variational, "laplace": _laplace}
+
+
+def new_sites(terms: EntryTerms, sites: Sites, at: Cavity, settings: SiteSettings,
+              damping: Any) -> tuple[Sites, jax.Array]:
+    """Return damped new sites, and the largest change of one; where a cavity is not valid its site is kept."""
+    nu, tau = _NEW_SITES[settings.method](terms, sites, at, settings.power)
+    usable = terms.present & at.valid & jnp.isfinite(nu) & jnp.isfinite(tau)
+    nu, tau = (jnp.where(usable, new, old) for new, old in ((nu, sites.nu), (tau, sites.tau)))
+    v = at.marginal.variance
+    change = jnp.maximum(jnp.abs(nu - sites.nu) * jnp.sqrt(v), jnp.abs(tau - sites.tau) * v)
+    change = jnp.max(jnp.where(usable | ~terms.present, change, jnp.inf), initial=0.0)
+    mix = lambda old, new: old + damping * (new - old)  # noqa: E731
+    return sites._replace(nu=mix(sites.nu, nu), tau=mix(sites.tau, tau)), change
+
+
+def gaussian_terms(sites: Sites, cavity: Marginal, power: float) -> jax.Array:
+    """Return log int N(f; cavity) t(f)^power df, an entry each."""
+    nu, tau, v = power * sites.nu, power * sites.tau, cavity.variance
+    away, grown = cavity.mean - sites.centre, 1.0 + tau * v
+    grown = jnp.where(grown > 0, grown, 1.0)
+    return ((nu - 0.5 * tau * away) * away - 0.5 * jnp.log(grown) + 0.5 * (nu - tau * away) ** 2 * v / grown)
+
+
+def log_evidence_terms(terms: Any, sites: Sites, at: Cavity, settings: SiteSettings) -> jax.Array:
+    """Return what each entry (T, D) adds to the integral of all sites, zero where missing."""
+    nu, tau = sites.nu, sites.tau
+    if settings.method == "ep":
+        a = settings.power
+        value = (terms.tilted(at.cavity, at.marginal, a).log_partition - gaussian_terms(sites, at.cavity, a)) / a
+    else:
+        m, v = at.marginal
+        away = m - sites.centre
+        gaussian = (nu - 0.5 * tau * away) * away
+        if settings.method == "variational":
+            value = expectations(terms.log_prob, at.marginal)[0] - gaussian + 0.5 * tau * v
+        else:
+            value = terms.log_prob(m) - gaussian
+    return jnp.where(terms.present, value, 0.0)
+
+
+# --- first sites
+
+
+def assumed_density(family: ObservationFamily) -> Callable[..., Sites]:
+    """Return what makes the sites of a row in the forward scan itself, with the prediction as their cavity.
+
+    It is the first pass of EP, and assumed density filtering. In rows of several entries, of which the prediction is
+    correlated, precisions are at least zero.
+    """
+
+    def sites(mean: jax.Array, covariance: jax.Array, row: jax.Array, y: jax.Array) -> Sites:
+        log_prob = lambda f: row_log_prob(family, row, f, y)  # noqa: E731
+        cavity, found = assumed_tilted(log_prob, mean, diagonal(covariance))
+        present = jnp.isfinite(y) & jnp.isfinite(found.log_partition) & (found.variance > 0)
+        variance = jnp.where(present, found.variance, 1.0)
+        tau = jnp.where(present, 1.0 / variance - 1.0 / cavity.variance, 0.0)
+        nu = jnp.where(present, (found.mean - mean) / variance, 0.0)
+        if mean.shape[0] > 1:
+            nu = jnp.where(tau < 0, (found.mean - mean) / cavity.variance, nu)
+            tau = jnp.maximum(tau, 0.0)
+        return Sites(mean, nu, tau)
+
+    return sites
+
+
+def assumed_tilted(log_prob: Callable, mean: jax.Array, variance: jax.Array) -> tuple[Marginal, Tilted]:
+    """Return a prediction of a row's predictor (D,), and the moments of it tilted by log p."""
+    # A predictor that is known has a variance of zero, or of rounding errors.
+    cavity = Marginal(mean, jnp.maximum(variance, 1e-20 * (1e-6 + mean**2)))
+    near = _mode(log_prob, cavity)
+    for _ in range(2):
+        found = tilted_moments(jax.vmap(log_prob), cavity, near)
+        good = jnp.isfinite(found.log_partition) & (found.variance > 0)
+        near = Marginal(jnp.where(good, found.mean, near.mean), jnp.where(good, found.variance, near.variance))
+    return cavity, found
+
+
+def _mode(log_prob: Callable, cavity: Marginal) -> Marginal:
+    """Return the mode of N(f; cavity) p(f), entry by entry, and the variance from the curvature there."""
+    first = jax.grad(lambda f: log_prob(f).sum())
+
+    def objective(f: jax.Array) -> jax.Array:
+        return log_prob(f) - 0.5 * (f - cavity.mean) ** 2 / cavity.variance
+
+    def precision(f: jax.Array) -> tuple[jax.Array, jax.Array]:
+        slope, curvature = jax.jvp(first, (f,), (jnp.ones_like(f),))
+        curvature = jnp.where(jnp.isfinite(curvature), jnp.minimum(curvature, 0.0), 0.0)
+        return slope, 1.0 / cavity.variance - curvature
+
+    def step(carry: tuple, _: None) -> tuple[tuple, None]:
+        f, value, radius = carry
+        slope, total = precision(f)
+        move = (slope - (f - cavity.mean) / cavity.variance) / total
+        tried = f + jnp.clip(jnp.where(jnp.isfinite(move), move, 0.0), -radius, radius)
+        new = objective(tried)
+        better = new > value
+        return (jnp.where(better, tried, f), jnp.where(better, new, value),
+                jnp.where(better, 3.0 * radius, 0.25 * radius)), None
+
+    start = cavity.mean, objective(cavity.mean), 4.0 * jnp.sqrt(cavity.variance)
+    (f, _, _), _ = jax.lax.scan(step, start, None, length=_SEARCH)
+    return Marginal(f, 1.0 / precision(f)[1])
+
+
+# --- all sweeps
+
+
+def is_linear(ssm: StateSpaceModel) -> bool:
+    """Whether no pass depends on about which moments the model is linearised."""
+    return (ssm.drift_structure.linear and ssm.observation_structure.linear
+            and not callable(ssm.model.process_noise))
+
+
+def refine(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, terms: EntryTerms, settings: SiteSettings,
+           start: Moments, first: Sites | None = None) -> Refined:
+    """Refine sites until they do not change.
+
+    A model that is not linear is first smoothed a fixed number of times, and after each pass linearised about the
+    smoothed moments and its sites refined; all of that has a derivative. Then the points of linearisation stay, and the
+    sites are refined until they do not change, with no derivative.
+
+    Args:
+        ssm: the model.
+        rule: the linearisation rule.
+        grid: the time grid.
+        y: (T, D), NaN where there is no factor; only that is asked of it where ``first`` is given.
+        terms: what the sites stand for.
+        settings: how they are refined.
+        start: moments at the initial time.
+        first: sites to begin with; None: by `assumed_density`, of a model with an observation family.
+    """
+    points = None
+    if first is None:
+        family = ssm.model.observation
+        assert isinstance(family, ObservationFamily)
+        if is_linear(ssm):
+            held = _held(lambda y, start: _first(ssm, rule, grid, y, start, family), y, start)
+        else:
+            held = _first(ssm, rule, grid, y, start, family)
+        first = held
+    if not is_linear(ssm):
+        first, points = _joint_sweeps(ssm, rule, grid, y, terms, settings, start, first)
+    # The terms hold functions, so that they are closed over, and no argument.
+    found = _held(lambda *a: _until_converged(ssm, rule, grid, settings, terms, *a), y, start, first, points)
+    return Refined(found, points)
+
+
+def _held(function: Callable, *arguments: Any) -> Any:
+    """Return ``function(*arguments)`` without a derivative, by what it closes over either."""
+    converted, closed_over = jax.closure_convert(function, *arguments)
+    hold = lambda tree: jax.tree_util.tree_map(_stop, tree)  # noqa: E731
+    return hold(converted(*hold(arguments), *hold(closed_over)))
+
+
+def _stop(leaf: Any) -> Any:
+    return jax.lax.stop_gradient(leaf) if isinstance(leaf, (jax.Array, np.ndarray)) else leaf
+
+
+def _first(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments,
+           family: ObservationFamily) -> Sites:
+    passed = forward(ssm, rule, grid, y, start=start, keep="moments", sites=assumed_density(family))
+    return Sites(*(at_rows(a, grid.observed) for a in passed.site_terms.sites))
+
+
+def _smoothed(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments, sites: Sites,
+              points: Points | None, keep: str) -> tuple[Pass, Smoothed, Predictor]:
+    passed = forward(ssm, rule, grid, y, start=start, linearization_point=points, keep=keep, sites=sites)
+    smoothed = backward(passed, start, grid)
+    predictor = Predictor(*(at_rows(a, grid.observed) for a in smoothed.predictor))
+    return passed, smoothed, predictor
+
+
+def _joint_sweeps(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, terms: EntryTerms,
+                  settings: SiteSettings, start: Moments, first: Sites) -> tuple[Sites, Points]:
+    def sweep(sites: Sites, points: Points | None) -> tuple[Sites, Points]:
+        passed, smoothed, predictor = _smoothed(ssm, rule, grid, y, start, sites, points, "inside")
+        at = cavities(predictor, sites, terms.present, settings.power)
+        sites, _ = new_sites(terms, sites, at, settings, settings.damping)
+        return sites, smoothed_nodes(ssm, rule, grid, passed, smoothed)
+
+    carry = sweep(first, None)
+    (sites, points), _ = jax.lax.scan(lambda carry, _: (sweep(*carry), None), carry, None,
+                                      length=max(settings.relinearisations - 1, 0))
+    return sites, points
+
+
+def _until_converged(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, settings: SiteSettings, terms: EntryTerms,
+                     y: jax.Array, start: Moments, first: Sites, points: Points | None) -> Converged:
+    def sweep(carry: tuple) -> tuple:
+        sites, _, last, damping, count = carry
+        _, _, predictor = _smoothed(ssm, rule, grid, y, start, sites, points, "all")
+        at = cavities(predictor, sites, terms.present, settings.power)
+        # Two sites that answer each other overshoot; taking less of each new one ends that.
+        sites, change = new_sites(terms, sites, at, settings, damping)
+        damping = jnp.where(change > last, jnp.maximum(0.5 * damping, 0.05), damping)
+        return sites, at, change, damping, count + 1
+
+    def going(carry: tuple) -> jax.Array:
+        change, count = carry[2], carry[4]
+        return ~(change < _TOLERANCE) & (count < settings.sweeps)
+
+    carry = sweep((first, None, jnp.asarray(jnp.inf), jnp.asarray(settings.damping), jnp.asarray(0)))
+    sites, at, change, _, count = jax.lax.while_loop(going, sweep, carry)
+    return Converged(sites, at, change, count, (change < _TOLERANCE) & at.valid.all())
+
+
+class Prequential(NamedTuple):
+    """What assumed density filtering leaves.
+
+    Attributes:
+        log_likelihood: (T,), log p(y_k | y_1:k-1).
+        passed: the forward scan, (N, ...).
+    """
+
+    log_likelihood: jax.Array
+    passed: Pass
+
+
+def assumed_density_filter(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array,
+                           start: Moments | None = None) -> Prequential:
+    """Filter data of a family: each observation's site is made from its prediction, once.
+
+    Source: Maybeck (1982), Stochastic Models, Estimation and Control 2, section 12.7.
+    """
+    family = ssm.model.observation
+    assert isinstance(family, ObservationFamily)
+    passed = forward(ssm, rule, grid, y, start=start, keep="moments", sites=assumed_density(family))
+    at = jax.tree_util.tree_map(lambda a: at_rows(a, grid.observed), passed.site_terms)
+    variance = diagonal(at.variance)
+    cavity, found = jax.vmap(lambda row, m, v, y: assumed_tilted(
+        lambda f: row_log_prob(family, row, f, y), m, v))(jnp.arange(len(y)), at.value, variance, y)
+    # An entry's own term stands in the place of its site; one entry a row: this is log Z of the tilted prediction.
+    gaussian = gaussian_terms(at.sites, cavity, 1.0)
+    entries = jnp.where(jnp.isfinite(y), found.log_partition - gaussian, 0.0).sum(1)
+    return Prequential(at_rows(passed.log_likelihood, grid.observed) + entries, passed)
+
+
+def leave_one_out(predictor: Predictor, sites: Sites, entries: jax.Array) -> jax.Array:
+    """Return (T,), log p(y_k | all other rows), from what is smoothed with the converged sites.
+
+    It is the integral of a row's sites under the predictor N(m, F) without them, and what its entries add to that. With
+    V = F (I + T F)^-1 and m smoothed, F = V (I - T V)^-1.
+
+    Args:
+        predictor: smoothed, (T, ...).
+        sites: (T, D) each.
+        entries: (T, D), of `log_evidence_terms`.
+    """
+
+    def row(mean: jax.Array, covariance: jax.Array, sites: Sites) -> jax.Array:
+        # log|I + T F| = -log|I - T V|; and with a = m - c the exponent is that of the smoothed moments.
+        kept, log_det = inverse_and_log_det(jnp.eye(mean.shape[0]) - sites.tau[:, None] * covariance)
+        away = matmul(kept.T, (mean - sites.centre - matmul(covariance, sites.nu[:, None])[:, 0])[:, None])[:, 0]
+        pull = sites.nu - sites.tau * away
+        return (((sites.nu - 0.5 * sites.tau * away) * away).sum() + 0.5 * log_det
+                + 0.5 * (pull * matmul(covariance, pull[:, None])[:, 0]).sum())
+
+    return jax.vmap(row)(predictor.mean, predictor.covariance, sites) + entries.sum(1)
+
+
+class Evidence(NamedTuple):
+    """What the evidence is made of.
+
+    Attributes:
+        log_evidence: log p(y), -inf where the sites do not converge.
+        entries: (T, D), what each entry adds to the integral of the sites.
+        passed: the forward scan with the sites.
+        refined: the sites.
+    """
+
+    log_evidence: jax.Array
+    entries: jax.Array
+    passed: Pass
+    refined: Refined
+
+
+def evidence(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, terms: EntryTerms,
+             settings: SiteSettings, start: Moments | None = None, first: Sites | None = None,
+             keep: str = "likelihood") -> Evidence:
+    """Return the log evidence of a model under a family, with a derivative; arguments as in `refine` and `forward`."""
+    start = Moments(*ssm.initial()) if start is None else start
+    refined = refine(ssm, rule, grid, y, terms, settings, start, first)
+    found = refined.found
+    passed = forward(ssm, rule, grid, y, start=start, linearization_point=refined.points, keep=keep,
+                     sites=found.sites)
+    entries = log_evidence_terms(terms, found.sites, found.cavity, settings)
+    total = passed.log_likelihood.sum() + entries.sum()
+    return Evidence(jnp.where(found.converged, total, -jnp.inf), entries, passed, refined)

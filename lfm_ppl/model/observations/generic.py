@@ -1,0 +1,82 @@
+"""Any NumPyro distribution as an observation family."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro.distributions as dist
+
+from lfm_ppl import checks
+from lfm_ppl.model.observations.family import ObservationFamily
+
+
+class Observation(ObservationFamily):
+    r"""Observations from any NumPyro distribution, entry by entry.
+
+        y_kd ~ make(f_k)_d,    f_k = h(x, u, t_k).
+
+    Args:
+        function: ``h(x, u, t) -> (D,)``, the predictor f.
+        make: from a predictor (D,) to a NumPyro distribution of batch shape (D,), whose entry d depends on entry d of
+            the predictor alone. It may close over parameters that are sampled.
+
+    Raises:
+        TypeError: ``make`` is not callable, or does not return a NumPyro distribution.
+        ValueError: the distribution is not one of D independent numbers.
+
+    Example:
+        >>> import jax.numpy as jnp, numpyro.distributions as dist
+        >>> family = Observation(lambda x, u, t: u, lambda f: dist.ZeroInflatedPoisson(0.5, jnp.exp(f)))
+        >>> family.log_prob(jnp.zeros(1), jnp.zeros(1)).round(4).tolist()
+        [-0.3799]
+    """
+
+    make: Callable[[jax.Array], dist.Distribution]
+    per_entry: ClassVar[tuple[str, ...]] = ()
+
+    def __init__(self, function: Callable[..., jax.Array], make: Callable[[jax.Array], dist.Distribution]):
+        if not callable(make):
+            raise TypeError("make must map a predictor to a NumPyro distribution, such as "
+                            f"lambda f: dist.Poisson(jnp.exp(f)); got {type(make).__name__}.")
+        self.function, self.make = function, make
+
+    def check_shapes(self, outputs: int) -> None:
+        """Raise where ``make`` does not give a distribution of as many independent numbers as there are outputs."""
+        found: list[Any] = []
+        jax.eval_shape(lambda f: found.append(self.make(f)), jnp.zeros(outputs))
+        if not isinstance(found[0], dist.Distribution):
+            raise TypeError("make must return a NumPyro distribution, such as dist.Poisson(jnp.exp(f)); it returned "
+                            f"{type(found[0]).__name__}.")
+        if found[0].event_shape or found[0].batch_shape != (outputs,):
+            raise ValueError(f"make must return a distribution of {outputs} independent numbers, batch shape "
+                             f"({outputs},) and event shape (); it has {found[0].batch_shape} and "
+                             f"{found[0].event_shape}. Its parameters follow from the predictor, entry by entry.")
+
+    def log_prob(self, predictor: jax.Array, y: jax.Array) -> jax.Array:
+        """Return the log densities (D,)."""
+        return self.make(predictor).log_prob(y)
+
+    def sample(self, key: jax.Array, predictor: jax.Array) -> jax.Array:
+        """Draw entries (D,)."""
+        return self.make(predictor).sample(key).astype(predictor.dtype)
+
+    def mean(self, predictor: jax.Array) -> jax.Array:
+        """Return the distribution's mean (D,)."""
+        return jnp.asarray(self.make(predictor).mean, float)
+
+    def check_data(self, y: Any, first_column: int = 0) -> None:
+        """Raise ValueError where an entry lies outside of the distribution's support."""
+        known = checks.concrete(y)
+        if known is None:
+            return
+        support = self.make(jnp.zeros(known.shape[1])).support
+        inside = np.broadcast_to(np.asarray(support(jnp.asarray(known))), known.shape)
+        wrong = ~inside & np.isfinite(known)
+        if wrong.any():
+            row, column = np.argwhere(wrong)[0]
+            raise ValueError(f"y[{row}, {column + first_column}] is {known[row, column]:g}, outside of the support of "
+                             f"the distribution ({support}); use NaN for a missing entry.")

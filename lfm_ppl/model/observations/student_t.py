@@ -1,0 +1,54 @@
+"""Measurements with gross errors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+from jax.scipy.special import gammaln
+
+from lfm_ppl.model.observations.family import ObservationFamily, parameter
+
+
+class StudentTObservation(ObservationFamily):
+    r"""Measurements with Student's t errors, which gross errors do not move far.
+
+        y_kd = f_kd + s e,    e ~ t_v,    f_k = h(x, u, t_k).
+
+    Args:
+        function: ``h(x, u, t) -> (D,)``.
+        df: degrees of freedom v > 0: a number, (D,) or (T, D); it may be sampled.
+        scale: s > 0: a number, (D,) or (T, D); it may be sampled.
+
+    Raises:
+        ValueError: df or scale is not positive.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> StudentTObservation(lambda x, u, t: x, 1.0, 1.0).log_prob(jnp.zeros(1), jnp.zeros(1)).round(4).tolist()
+        [-1.1447]
+
+    Source: Lange, Little and Taylor (1989), Journal of the American Statistical Association 84.
+    """
+
+    df: jax.Array
+    scale: jax.Array
+    per_entry: ClassVar[tuple[str, ...]] = ("df", "scale")
+
+    def __init__(self, function: Callable[..., jax.Array], df: Any, scale: Any):
+        self.function = function
+        self.df = parameter("df", df)
+        self.scale = parameter("scale", scale)
+
+    def log_prob(self, predictor: jax.Array, y: jax.Array) -> jax.Array:
+        """Return the log densities (D,)."""
+        v, s = self.df, self.scale
+        constant = gammaln(0.5 * (v + 1.0)) - gammaln(0.5 * v) - 0.5 * jnp.log(jnp.pi * v) - jnp.log(s)
+        return constant - 0.5 * (v + 1.0) * jnp.log1p(((y - predictor) / s) ** 2 / v)
+
+    def sample(self, key: jax.Array, predictor: jax.Array) -> jax.Array:
+        """Draw measurements (D,)."""
+        df = jnp.broadcast_to(self.df, predictor.shape)
+        return predictor + self.scale * jax.random.t(key, df)

@@ -1,0 +1,270 @@
+"""The site engine against dense Gaussian algebra, importance sampling, differences and unrolled differentiation."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from references import matern
+from scipy import stats
+
+import lfm_ppl as lfm
+from lfm_ppl.filtering.filter import as_rule, forward
+from lfm_ppl.filtering.predict import Moments
+from lfm_ppl.filtering.rts import backward
+from lfm_ppl.filtering.sites import (
+    FamilyTerms,
+    SiteSettings,
+    assumed_density,
+    cavities,
+    log_evidence_terms,
+    new_sites,
+)
+from lfm_ppl.filtering.time_grid import build_time_grid
+from lfm_ppl.filtering.update import Linearised, Sites, update_by_sites
+
+TIMES = np.linspace(0.0, 8.0, 20)
+THETA = jnp.array([0.1, 0.05, -0.1])
+DRAWS = 100_000
+
+
+def force(x, u, t):
+    return u
+
+
+def process(observation, scale=1.0, lengthscale=1.3):
+    """A Matern-3/2 process that is observed itself."""
+    return lfm.LatentForceModel(lambda x, u, t: jnp.zeros(0), {"u": lfm.Matern(scale, lengthscale)}, observation,
+                                lfm.Gaussian(jnp.zeros(0), jnp.zeros((0, 0))))
+
+
+def covariance(theta):
+    kernel = matern(np.exp(theta[0]), 1.3 * np.exp(theta[1]), 1)
+    return kernel(TIMES[:, None], TIMES)
+
+
+# Name -> (observation of theta, log p(y | f, theta), data given the process).
+FAMILIES: dict[str, Any] = {
+    "Poisson": (lambda th: lfm.PoissonObservation(lambda x, u, t: u + th[2]),
+                lambda y, f, th: stats.poisson.logpmf(y, np.exp(f + th[2])),
+                lambda rng, f: rng.poisson(np.exp(f))),
+    "negative binomial": (lambda th: lfm.NegativeBinomialObservation(force, 2.0 * jnp.exp(th[2])),
+                          lambda y, f, th: stats.nbinom.logpmf(y, 2 * np.exp(th[2]), 1 / (
+                              1 + np.exp(f) / 2 / np.exp(th[2]))),
+                          lambda rng, f: rng.poisson(np.exp(f) * rng.gamma(2.0, 0.5, f.size))),
+    "Bernoulli": (lambda th: lfm.BernoulliObservation(lambda x, u, t: 2.0 * u + th[2]),
+                  lambda y, f, th: -np.logaddexp(0.0, -(2 * y - 1) * (2.0 * f + th[2])),
+                  lambda rng, f: rng.uniform(size=f.size) < 1 / (1 + np.exp(-2 * f))),
+    "Student-t": (lambda th: lfm.StudentTObservation(force, 4.0, 0.2 * jnp.exp(th[2])),
+                  lambda y, f, th: stats.t.logpdf(y, 4.0, f, 0.2 * np.exp(th[2])),
+                  lambda rng, f: f + 0.2 * rng.standard_t(4, f.size) + 4.0 * (np.arange(f.size) % 7 == 3)),
+}
+
+
+def data(name):
+    rng = np.random.default_rng(1)
+    f = np.linalg.cholesky(covariance(np.zeros(3)) + 1e-12 * np.eye(TIMES.size)) @ rng.normal(size=TIMES.size)
+    return FAMILIES[name][2](rng, f).astype(float)[:, None]
+
+
+def likelihood(name, theta, sites=None):
+    model = process(FAMILIES[name][0](theta), jnp.exp(theta[0]), 1.3 * jnp.exp(theta[1]))
+    return lfm.MarginalLikelihood(model, TIMES, sites=sites)
+
+
+def importance(name, y, mean, cov):
+    """Log evidence, its standard error, and posterior means and sds, by draws from a Gaussian near the posterior."""
+    theta, k = np.asarray(THETA), covariance(np.asarray(THETA))
+    rng = np.random.default_rng(2)
+    root, prior = np.linalg.cholesky(cov), np.linalg.cholesky(k)
+    white = rng.normal(size=(DRAWS, TIMES.size))
+    f = mean + white @ root.T
+    log_weight = (FAMILIES[name][1](y.T, f, theta).sum(1) - 0.5 * (np.linalg.solve(prior, f.T) ** 2).sum(0)
+                  - np.log(np.diag(prior)).sum() + 0.5 * (white**2).sum(1) + np.log(np.diag(root)).sum())
+    weight = np.exp(log_weight - log_weight.max())
+    error = weight.std() / weight.mean() / np.sqrt(DRAWS)
+    share = weight / weight.sum()
+    first = share @ f
+    return log_weight.max() + np.log(weight.mean()), error, first, np.sqrt(share @ (f - first) ** 2)
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_evidence_and_posterior_against_importance_sampling(name):
+    """The proposal is dense algebra with the smoothed marginals' own precisions; its weights correct it."""
+    y, k = data(name), covariance(np.asarray(THETA))
+    distribution = likelihood(name, THETA)
+    result = distribution.smooth(y)
+    mean, sd = result.force("u")
+    # Sites from the marginals: any proposal is right, and this one is near.
+    draws = result.sample(jax.random.key(0), 4000).forces["u"]
+    cov = np.cov(np.asarray(draws).T) * 1.1
+    log_z, error, first, spread = importance(name, y, np.asarray(mean), cov)
+    assert error < 0.02
+    assert abs(float(distribution.log_prob(y)) - log_z) < 0.05 + 4 * error
+    assert np.abs(mean - first).max() < 0.05 * np.min(spread) + 4 * error * spread.max()
+    assert np.abs(sd / spread - 1).max() < 0.03 + 4 * error
+    assert np.isfinite(k).all()
+
+
+def differences(value, theta, h=1e-3):
+    """Derivatives by differences of fourth order."""
+    return [(8 * (value(theta + h * e) - value(theta - h * e)) - value(theta + 2 * h * e) + value(theta - 2 * h * e))
+            / (12 * h) for e in np.eye(theta.size)]
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+@pytest.mark.parametrize("sites", [None, SiteSettings(power=0.5), SiteSettings("variational")],
+                         ids=["EP", "power EP", "variational"])
+def test_gradient_is_that_of_the_value(name, sites):
+    """By differences of fourth order; the sites are held fixed, and what the family's parameters do is not."""
+    if name != "Poisson" and sites is not None:
+        pytest.skip("one family for each method")
+    y = data(name)
+    value = jax.jit(lambda theta: likelihood(name, theta, sites).log_prob(y))
+    gradient = np.asarray(jax.jit(jax.grad(lambda theta: likelihood(name, theta, sites).log_prob(y)))(THETA))
+    np.testing.assert_allclose(gradient, differences(value, THETA), atol=2e-7)
+
+
+def test_gradient_is_that_of_all_sweeps():
+    """Differentiate through 25 sweeps, cavities and all, with nothing held fixed."""
+    y = jnp.asarray(data("Poisson"))
+    settings = SiteSettings()
+
+    def unrolled(theta):
+        distribution = likelihood("Poisson", theta)
+        ssm, rule = distribution.ssm, as_rule(None)
+        grid, start = build_time_grid(ssm, TIMES, 1), Moments(*ssm.initial())
+        terms = FamilyTerms(distribution.model.observation, y)
+        first = forward(ssm, rule, grid, y, start=start, keep="moments", sites=assumed_density(terms.family))
+
+        def sweep(carry, _):
+            sites = carry[0]
+            passed = forward(ssm, rule, grid, y, start=start, keep="all", sites=sites)
+            at = cavities(backward(passed, start, grid).predictor, sites, terms.present, 1.0)
+            return (new_sites(terms, sites, at, settings, 1.0)[0], at), None
+
+        sites = first.site_terms.sites
+        at = jax.eval_shape(lambda s: sweep((s, None), None)[0][1], sites)
+        blank = jax.tree_util.tree_map(lambda a: jnp.ones(a.shape, a.dtype), at)
+        (sites, at), _ = jax.lax.scan(sweep, (sites, blank), None, length=25)
+        passed = forward(ssm, rule, grid, y, start=start, sites=sites)
+        return passed.log_likelihood.sum() + log_evidence_terms(terms, sites, at, settings).sum()
+
+    value, gradient = jax.jit(jax.value_and_grad(unrolled))(THETA)
+    expected, held = jax.jit(jax.value_and_grad(lambda th: likelihood("Poisson", th).log_prob(y)))(THETA)
+    assert value == pytest.approx(float(expected), abs=1e-11)
+    np.testing.assert_allclose(gradient, held, rtol=0, atol=1e-8)
+
+
+def test_with_gaussian_sites_it_is_the_gaussian_filter():
+    """Value and gradient, two outputs of which one also mixes the forces, missing entries."""
+    rng = np.random.default_rng(0)
+    y = rng.normal(size=(TIMES.size, 2))
+    y[3, 0] = y[7] = np.nan
+
+    def log_prob(theta, wrap):
+        gaussian = lfm.GaussianObservation(lambda x, u, t: jnp.concatenate([u, 2.0 * x - u]),
+                                           jnp.array([0.04, 0.3]) * jnp.exp(theta[2]))
+        model = lfm.LatentForceModel(
+            lambda x, u, t: u - theta[1] * x, {"u": lfm.Matern(jnp.exp(theta[0]), 1.3)}, wrap(gaussian),
+            lfm.Gaussian(jnp.ones(1), 0.5 * jnp.eye(1)))
+        return lfm.MarginalLikelihood(model, TIMES).log_prob(y)
+
+    expected, gradient = jax.jit(jax.value_and_grad(lambda th: log_prob(th, lambda g: g)))(THETA)
+    found, of_sites = jax.jit(jax.value_and_grad(lambda th: log_prob(th, lfm.Observations)))(THETA)
+    assert found == pytest.approx(float(expected), rel=1e-12)
+    np.testing.assert_allclose(of_sites, gradient, rtol=1e-12, atol=1e-11)
+
+
+def test_update_in_natural_parameters_against_dense_algebra():
+    """Three entries, a negative precision and one of zero, and what a linearisation leaves out."""
+    rng = np.random.default_rng(0)
+    root, h = rng.normal(size=(4, 4)), rng.normal(size=(3, 4))
+    p, omega = root @ root.T, np.diag([0.1, 0.0, 0.2])
+    m, value, centre, nu = rng.normal(size=4), rng.normal(size=3), rng.normal(size=3), rng.normal(size=3)
+    tau = np.array([2.0, -0.02, 0.0])
+    # The joint state (s, e) has the precision of the prior and of the sites.
+    prior = np.zeros((7, 7))
+    prior[:4, :4], prior[4:, 4:] = p, omega + 1e-13 * np.eye(3)
+    both = np.concatenate([h, np.eye(3)], axis=1)
+    precision = np.linalg.inv(prior) + both.T @ np.diag(tau) @ both
+    posterior = np.linalg.inv(precision)
+    shift = both.T @ (nu - tau * (value - centre))
+    found = update_by_sites(Linearised(jnp.asarray(value), jnp.asarray(h), jnp.asarray(omega)),
+                            Sites(*map(jnp.asarray, (centre, nu, tau))), Moments(jnp.asarray(m), jnp.asarray(p)))
+    np.testing.assert_allclose(found.moments.mean, m + (posterior @ shift)[:4], rtol=1e-8)
+    np.testing.assert_allclose(found.moments.covariance, posterior[:4, :4], rtol=1e-8)
+    away = value - centre
+    integral = (nu @ away - 0.5 * away @ (tau * away) + 0.5 * shift @ posterior @ shift
+                - 0.5 * np.linalg.slogdet(prior)[1] - 0.5 * np.linalg.slogdet(precision)[1])
+    assert found.log_likelihood == pytest.approx(integral, rel=1e-6)
+
+
+def test_leave_one_out_terms_are_differences_of_evidences():
+    """EP's own approximation of both; and one-step-ahead terms add up to nearly the evidence."""
+    y = data("Poisson")
+    distribution = likelihood("Poisson", THETA)
+    without = y.copy()
+    without[5] = np.nan
+    log_prob = jax.jit(lambda y: distribution.log_prob(y))
+    result = distribution.smooth(y)
+    assert result.leave_one_out[5] == pytest.approx(float(log_prob(y) - log_prob(without)), abs=0.02)
+    assert distribution.log_prob_per_observation(y).sum() == pytest.approx(float(log_prob(y)), abs=0.2)
+
+
+def test_draws_are_those_of_the_smoothed_moments_where_precisions_are_negative():
+    y = data("Student-t")
+    result = likelihood("Student-t", THETA).smooth(y, np.linspace(0.0, 9.0, 5))
+    draws = np.asarray(result.sample(jax.random.key(1), 20_000).forces["u"])
+    mean, sd = map(np.asarray, result.force("u"))
+    assert np.abs(draws.mean(0) - mean).max() < 5 * sd.max() / np.sqrt(20_000)
+    assert np.abs(draws.std(0) / sd - 1).max() < 5 / np.sqrt(2 * 20_000)
+
+
+def test_what_is_missing_changes_nothing():
+    """Times without an observation, and rows of which one entry is missing."""
+    y = data("Poisson")
+    more = np.insert(y, 4, np.nan, axis=0)
+    times = np.insert(TIMES, 4, TIMES[4] - 0.1)
+    model = process(FAMILIES["Poisson"][0](THETA), jnp.exp(THETA[0]), 1.3 * jnp.exp(THETA[1]))
+    assert lfm.MarginalLikelihood(model, times).log_prob(more) == pytest.approx(
+        float(likelihood("Poisson", THETA).log_prob(y)), abs=1e-9)
+
+
+def test_sites_that_do_not_converge_are_minus_infinity_with_a_finite_gradient_and_a_warning():
+    y = data("Student-t")
+    short = SiteSettings(sweeps=2)
+    with pytest.warns(lfm.FilterWarning, match="do not converge in 2 sweeps .* Try a smaller share"):
+        assert likelihood("Student-t", THETA, short).log_prob(y) == -np.inf
+    value, gradient = jax.jit(jax.value_and_grad(lambda th: likelihood("Student-t", th, short).log_prob(y)))(THETA)
+    assert value == -np.inf and np.all(gradient == 0.0)
+
+
+def test_settings_of_the_sites_are_checked():
+    for settings, message in (("expectation", "unknown method of the sites"), (SiteSettings(power=0.0), "power"),
+                              (SiteSettings("laplace", power=0.5), "power=0.5")):
+        with pytest.raises(ValueError, match=message):
+            likelihood("Poisson", THETA, settings)
+    with pytest.raises(ValueError, match="sites are for an observation family"):
+        lfm.MarginalLikelihood(process(lfm.GaussianObservation(force, jnp.ones(1))), TIMES, sites="ep")
+
+
+def pushed(theta):
+    """Counts of a state whose production is softplus of a force."""
+    return lfm.LatentForceModel(
+        lambda x, u, t: jnp.exp(theta[1]) * (jax.nn.softplus(u) - 0.5 * x), {"u": lfm.Matern(jnp.exp(theta[0]), 2.0)},
+        lfm.PoissonObservation(lambda x, u, t: x, "softplus", exposure=jnp.exp(theta[2])),
+        lfm.Gaussian(jnp.ones(1), 0.1 * jnp.eye(1)))
+
+
+@pytest.mark.slow
+def test_non_linear_dynamics_against_particles_and_differences():
+    theta = jnp.array([0.0, 0.0, 1.5])
+    y = lfm.simulate(jax.random.key(1), pushed(theta), TIMES).y
+    log_prob = jax.jit(lambda th: lfm.MarginalLikelihood(pushed(th), TIMES, steps=4).log_prob(y))
+    gradient = jax.jit(jax.grad(lambda th: lfm.MarginalLikelihood(pushed(th), TIMES, steps=4).log_prob(y)))(theta)
+    np.testing.assert_allclose(gradient, differences(log_prob, theta), atol=1e-6)
+    runs = [float(lfm.particle_filter(jax.random.key(k), pushed(theta), TIMES, y, particles=20_000, steps=8
+                                      ).log_likelihood.sum()) for k in range(8)]
+    assert abs(float(log_prob(theta)) - np.mean(runs)) < 0.2 + 4 * np.std(runs) / np.sqrt(8)

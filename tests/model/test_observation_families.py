@@ -1,0 +1,150 @@
+"""Observation families: densities against SciPy, draws against densities, and errors of data and parameters."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro.distributions as dist
+import pytest
+from scipy import special, stats
+
+import lfm_ppl as lfm
+from lfm_ppl.model.observations.links import PROBABILITIES, RATES
+
+PREDICTOR = np.array([0.3, -1.0, 0.9])
+COUNTS = np.array([0.0, 3.0, 7.0])
+
+
+def state(x, u, t):
+    return x
+
+
+def censored(y, f):
+    """Left at 0, right at 5, noise 0.5."""
+    return np.where(y <= 0.0, stats.norm.logcdf(0.0, f, 0.5),
+                    np.where(y >= 5.0, stats.norm.logsf(5.0, f, 0.5), stats.norm.logpdf(y, f, 0.5)))
+
+
+def binned(y, f):
+    return np.log(stats.norm.cdf(y + 0.5, f, 0.5) - stats.norm.cdf(y - 0.5, f, 0.5))
+
+
+CASES = {
+    "Poisson": (lfm.PoissonObservation(state, exposure=2.0), COUNTS,
+                lambda y, f: stats.poisson.logpmf(y, 2 * np.exp(f))),
+    "Poisson, softplus": (lfm.PoissonObservation(state, "softplus"), COUNTS,
+                          lambda y, f: stats.poisson.logpmf(y, np.log1p(np.exp(f)))),
+    "negative binomial": (lfm.NegativeBinomialObservation(state, 2.5), COUNTS,
+                          lambda y, f: stats.nbinom.logpmf(y, 2.5, 2.5 / (2.5 + np.exp(f)))),
+    "binomial": (lfm.BinomialObservation(state, 9), COUNTS, lambda y, f: stats.binom.logpmf(y, 9, special.expit(f))),
+    "Bernoulli": (lfm.BernoulliObservation(state), np.array([0.0, 1.0, 1.0]),
+                  lambda y, f: stats.bernoulli.logpmf(y.astype(int), special.expit(f))),
+    "Bernoulli, probit": (lfm.BernoulliObservation(state, "probit"), np.array([0.0, 1.0, 1.0]),
+                          lambda y, f: stats.bernoulli.logpmf(y.astype(int), stats.norm.cdf(f))),
+    "Student-t": (lfm.StudentTObservation(state, 4.0, 0.5), COUNTS, lambda y, f: stats.t.logpdf(y, 4.0, f, 0.5)),
+    "censored": (lfm.CensoredObservation(state, 0.5, left=0.0, right=5.0), np.array([0.0, 0.8, 5.0]), censored),
+    "binned": (lfm.CensoredObservation(state, 0.5, width=1.0), np.array([0.0, -1.0, 3.0]), binned),
+    "any distribution": (lfm.Observation(state, lambda f: dist.Geometric(logits=f)), COUNTS,
+                         lambda y, f: stats.geom.logpmf(y + 1, special.expit(f))),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_log_prob(name):
+    family, y, expected = CASES[name]
+    np.testing.assert_allclose(family.log_prob(jnp.asarray(PREDICTOR), jnp.asarray(y)), expected(y, PREDICTOR),
+                               rtol=1e-11)
+
+
+@pytest.mark.parametrize("name", [name for name in CASES if "Student" not in name])
+def test_draws_have_these_densities(name):
+    """Mean and variance of 20,000 draws against those of the density, to five standard errors."""
+    family, _, log_prob = CASES[name]
+    draws = np.asarray(jax.vmap(lambda key: family.sample(key, jnp.asarray(PREDICTOR)))(
+        jax.random.split(jax.random.key(0), 20_000)))
+    if name == "censored":
+        values, weight = np.linspace(0.0, 5.0, 100_001), 5.0 / 100_000
+        probability = np.exp(log_prob(values[:, None], PREDICTOR)) * np.where((values == 0) | (values == 5), 1.0,
+                                                                              weight)[:, None]
+    else:
+        values = np.arange(-10.0, 400.0)
+        with np.errstate(divide="ignore"):
+            probability = np.nan_to_num(np.exp(log_prob(values[:, None], PREDICTOR)))
+    mean = (probability * values[:, None]).sum(0)
+    if name not in ("censored", "binned"):
+        np.testing.assert_allclose(family.mean(jnp.asarray(PREDICTOR)), mean, rtol=1e-6, atol=1e-9)
+    central = [(probability * (values[:, None] - mean) ** power).sum(0) for power in (2, 4)]
+    assert np.all(np.abs(draws.mean(0) - mean) < 5 * np.sqrt(central[0] / len(draws)))
+    error = np.sqrt((central[1] - central[0] ** 2) / len(draws))
+    assert np.all(np.abs(draws.var(0) - central[0]) < 5 * error + 1e-3 * central[0])
+
+
+@pytest.mark.parametrize("f", [-800.0, -40.0, 0.0, 40.0])
+def test_links_neither_underflow_nor_lose_their_derivatives(f):
+    for link in (RATES["softplus"], RATES["exp"]):
+        assert np.isfinite(link.log_rate(f)) and np.isfinite(jax.grad(link.log_rate)(f))
+    for name in ("logit", "probit"):
+        for log_probability in PROBABILITIES[name]:
+            value = log_probability(jnp.asarray(f))
+            assert np.isfinite(value) and value <= 0.0 and np.isfinite(jax.grad(log_probability)(f))
+
+
+def model(observation, mean=0.0):
+    return lfm.LatentForceModel(lambda x, u, t: -x, {}, observation, lfm.Gaussian(mean * jnp.ones(2), jnp.eye(2)))
+
+
+@pytest.mark.parametrize("family, entry, needs", [
+    (lfm.PoissonObservation(state), -1.0, "counts: whole numbers of at least zero"),
+    (lfm.NegativeBinomialObservation(state, 2.0), 0.5, "counts: whole numbers of at least zero"),
+    (lfm.BinomialObservation(state, 4), 5.0, "counts: whole numbers from zero to total_count"),
+    (lfm.BernoulliObservation(state), 2.0, r"0 \(no\) or 1 \(yes\)"),
+    (lfm.Observation(state, lambda f: dist.Poisson(jnp.exp(f))), -2.0, None),
+], ids=lambda value: type(value).__name__ if isinstance(value, lfm.ObservationFamily) else "")
+def test_data_that_a_family_cannot_give_are_errors_that_name_row_and_column(family, entry, needs):
+    y = np.array([[0.0, np.nan], [1.0, entry]])
+    message = rf"y\[1, 1\] is {entry:g}, " + (f"but {type(family).__name__} needs {needs}" if needs else "outside")
+    for call in (lambda: lfm.filter(model(family), [0.0, 1.0], y), lambda: lfm.smooth(model(family), [0.0, 1.0], y),
+                 lambda: lfm.MarginalLikelihood(model(family), [0.0, 1.0]).log_prob(y)):
+        with pytest.raises(ValueError, match=message):
+            call()
+
+
+def test_columns_of_families_side_by_side_keep_their_numbers():
+    both = lfm.Observations(lfm.GaussianObservation(lambda x, u, t: x, jnp.ones(2)), lfm.BernoulliObservation(state))
+    with pytest.raises(ValueError, match=r"y\[0, 3\] is 0.5, but BernoulliObservation needs 0"):
+        lfm.filter(model(both), [0.0], np.array([[0.3, -2.0, 1.0, 0.5]]))
+
+
+@pytest.mark.parametrize("make, message", [
+    (lambda: lfm.StudentTObservation(state, 0.0, 1.0), "df must be finite and greater than zero"),
+    (lambda: lfm.StudentTObservation(state, 4.0, -1.0), "scale must be finite and greater than zero"),
+    (lambda: lfm.NegativeBinomialObservation(state, [1.0, -1.0]), "concentration must be finite and greater"),
+    (lambda: lfm.PoissonObservation(state, "log"), "unknown link 'log'.*Known: exp, softplus, identity"),
+    (lambda: lfm.CensoredObservation(state, 1.0, left=2.0, right=1.0), "left must lie below right"),
+    (lambda: model(lfm.PoissonObservation(state, exposure=np.ones(3))),
+     r"exposure of PoissonObservation must be .*\(2,\)"),
+    (lambda: lfm.filter(model(lfm.PoissonObservation(state, exposure=np.ones((3, 2)))), [0.0], [[1.0, 1.0]]),
+     "exposure of PoissonObservation has 3 rows, one for each time, but there are 1 times"),
+    (lambda: model(lfm.PoissonObservation(lambda x, u, t: x[0])), "must return a vector"),
+    (lambda: model(lfm.PoissonObservation(state), mean=800.0), "the law of the output 'y0' is not finite at the prior"),
+    (lambda: model(lfm.Observation(state, lambda f: dist.Poisson(1.0))), r"batch shape \(2,\)"),
+    (lambda: lfm.Observations(lfm.GaussianObservation(state, jnp.eye(2))), "needs variances"),
+    (lambda: model(lambda x, u, t: x), "or a family such as lfm.PoissonObservation"),
+])
+def test_errors(make, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        make()
+
+
+def test_simulation_draws_from_the_family():
+    both = lfm.Observations(lfm.PoissonObservation(lambda x, u, t: x[:1]), lfm.BernoulliObservation(lambda x, u, t: x))
+    y = np.asarray(lfm.simulate(jax.random.key(0), model(both), np.arange(4.0)).y)
+    assert y.shape == (4, 3) and np.all(y == np.round(y)) and np.isin(y[:, 1:], (0.0, 1.0)).all()
+
+
+def test_a_particle_filter_weighs_with_the_family():
+    """One observation of a known predictor: the estimate is its probability."""
+    known = lfm.LatentForceModel(lambda x, u, t: -x, {}, lfm.PoissonObservation(state),
+                                 lfm.Gaussian(jnp.array([0.7]), jnp.zeros((1, 1))))
+    found = lfm.particle_filter(jax.random.key(0), known, [0.0], [[3.0]], particles=10)
+    assert found.log_likelihood[0] == pytest.approx(stats.poisson.logpmf(3, np.exp(0.7)), abs=1e-12)
+    assert lfm.filter(known, [0.0], [[3.0]]).log_likelihood[0] == pytest.approx(found.log_likelihood[0], abs=1e-7)
