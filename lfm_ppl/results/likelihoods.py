@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Hashable, Mapping
 from typing import Any, NamedTuple
 
@@ -15,6 +14,7 @@ from lfm_ppl.fokker_planck_grid import fokker_planck
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
 from lfm_ppl.inference.posterior import each, over_draws
+from lfm_ppl.inference.progress import Counter
 from lfm_ppl.model.observation_noise import check_noise
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.particles import particle_filter
@@ -209,15 +209,10 @@ def _particle_run(problem: PosteriorDraws, particles: int, replicates: int, step
 def _one_by_one(problem: PosteriorDraws, key: jax.Array, name: Hashable, per_draw: Callable, label: str,
                 progress: bool) -> np.ndarray:
     """Map over draws, one after another, and say how far that is."""
-    found = over_draws(problem.bound, name, per_draw, problem.draws, key,
-                       show=lambda done, count: _show(f"{label}: {done} of {count} draws", progress))
-    _show("", progress)
+    counter = Counter(label, shown=progress)
+    found = over_draws(problem.bound, name, per_draw, problem.draws, key, show=counter)
+    counter.close()
     return found
-
-
-def _show(text: str, progress: bool) -> None:
-    if progress:
-        print(f"\r{text:<70}\r", end="", file=sys.stderr, flush=True)
 
 
 def _scouted(problem: PosteriorDraws) -> list[Any]:
