@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -194,7 +193,7 @@ def fit(
         "trajectory_draws": trajectory_draws, "parameters": bound.names, "model": checkpoints.digest(fingerprint),
         "times": checkpoints.digest(bound.times), "data": checkpoints.digest(bound.y),
         "times of the trajectories": None if at is None else checkpoints.digest(np.asarray(at, float)),
-        "versions": {k: v for k, v in _versions().items() if k != "arviz"}, "float64": jax.config.jax_enable_x64,
+        "versions": checkpoints.versions(),
     }  # fmt: skip
     run = None
     if checkpoint is not None:
@@ -208,7 +207,8 @@ def fit(
         seconds = time.perf_counter() - started if run is None else run.seconds
         attrs = {
             "model": name or getattr(numpyro_model, "__name__", "model"), **described,
-            "wall_time_s": round(seconds, 3), "versions": json.dumps(_versions()),
+            "wall_time_s": round(seconds, 3),
+            "versions": json.dumps(checkpoints.versions() | {"arviz": metadata.version("arviz")}),
             "created_at": datetime.now(UTC).isoformat(timespec="seconds"), **remarks, "partial": partial,
             "run": None if run is None else run.record, **dict(attributes or {}),
         }
@@ -546,14 +546,3 @@ def _truth(truth: Mapping[str, Any], named: dict, units: Mapping[str, str], draw
         if label in draws:
             variables[label] = (tuple(dims), value)
     return xr.Dataset(variables, coords)
-
-
-def _versions() -> dict[str, str]:
-    names = ("lfm_ppl", "jax", "jaxlib", "numpyro", "arviz", "numpy", "equinox")
-    found = {"python": sys.version.split()[0]}
-    for name in names:
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found

@@ -18,11 +18,12 @@ class Interruption:
     set another one wants something else. The command line sets Python's handler for SIGTERM, too.
 
     Attributes:
-        requested: whether somebody has asked to stop.
+        requests: how often somebody has asked to stop. Counted also where KeyboardInterrupt is raised, because that may
+            be lost: Python ignores what is raised within a callback of the garbage collector, of which JAX has one.
     """
 
     def __init__(self) -> None:
-        self.requested = False
+        self.requests = 0
         self._deferring = False
         self._replaced: list[int] = []
 
@@ -43,7 +44,7 @@ class Interruption:
         self._deferring = True
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        if self.requested or not self._deferring:
+        self.requests += 1
+        if self.requests > 1 or not self._deferring:
             raise KeyboardInterrupt
-        self.requested = True
         print("\nstopping after this block of draws; once more to stop at once", file=sys.stderr, flush=True)

@@ -239,7 +239,7 @@ def sample(key: jax.Array, bound: BoundModel, transition: Transition, starts: np
 
     with Progress(total, saved.done, progress) as shown, Interruption() as stop:
         try:
-            while now[-1] < total and not stop.requested:
+            while now[-1] < total and not stop.requests:
                 state, store, lower = now
                 upper, began = min(lower + pace.steps, total), time.perf_counter()
                 state, store = jax.block_until_ready(run(state, store, lower, upper, warmup, thin, bound.argument))
@@ -252,7 +252,7 @@ def sample(key: jax.Array, bound: BoundModel, transition: Transition, starts: np
                 shown.advance(upper, lambda: Stage(  # noqa: B023 (called at once)
                     drawn(upper), samples, _divergences(store, drawn(upper)), transition.describe(state)))  # noqa: B023
         except KeyboardInterrupt:
-            if stop.requested:
+            if stop.requests > 1:
                 raise
         if on_disk < now[-1]:
             keep(*now)

@@ -19,12 +19,15 @@ import hashlib
 import json
 import re
 import shutil
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.inference.sampling import Saved
@@ -32,7 +35,7 @@ from lfm_ppl.results import arviz_data
 from lfm_ppl.results.files import POSTERIOR, writing
 
 FOLDER = "checkpoint"
-_RUN, _SETUP, _STATE = "run.json", "setup.json", "state.npz"
+_RUN, _SETUP, _STATE, _LOCK = "run.json", "setup.json", "state.npz", "lock"
 
 _EVERY_S = 1.0
 """Shortest time between two states on disk."""
@@ -180,7 +183,7 @@ class Checkpoint:
     def close(self) -> None:
         """Let another process go on; nothing is left where no chain has started."""
         self._release()
-        if not self.started and not any(self._own.glob("*.npz")):
+        if not self.started and not any(self._own.rglob("*.npz")):
             shutil.rmtree(self._own, ignore_errors=True)
 
     def _rows(self, name: str) -> Path:
@@ -225,8 +228,6 @@ class Checkpoint:
             self._lock.close()
             self._lock = None
 
-
-_LOCK = "lock"
 
 
 class Parts:
@@ -295,6 +296,17 @@ def digest(*values: Any) -> str:
 _DIGEST = "sha256:"
 
 
+def versions() -> dict[str, str]:
+    """Return the versions of all that numbers depend on, and their precision."""
+    found = {"python": sys.version.split()[0], "precision": str(np.dtype(jnp.result_type(float)))}
+    for name in ("lfm_ppl", "jax", "jaxlib", "numpyro", "numpy", "equinox"):
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
 def check_same(folder: str | Path, kept: Mapping[str, Any], record: Mapping[str, Any]) -> None:
     """Raise ValueError where two records differ, with all in which they do."""
     record = _plain(record)
@@ -346,7 +358,7 @@ def check_folder(folder: str | Path, resume: bool, overwrite: bool) -> None:
     folder = Path(folder)
     if folder.exists() and not folder.is_dir():
         raise FileExistsError(f"{folder} is a file; expected the name of a folder for the run.")
-    kept = (folder / FOLDER / _RUN).is_file()
+    kept = is_kept(folder)
     if resume and not kept and not (folder / POSTERIOR).is_file() and folder.is_dir() and any(folder.iterdir()):
         raise FileNotFoundError(f"{folder} holds files, but no run to go on with. Name the folder in which it was "
                                 "begun.")
@@ -356,6 +368,23 @@ def check_folder(folder: str | Path, resume: bool, overwrite: bool) -> None:
                               + " another folder, or replace it with overwrite=True (--overwrite).")
 
 
+def is_kept(folder: str | Path) -> bool:
+    """Whether there is an unfinished run in this folder."""
+    return (Path(folder) / FOLDER / _RUN).is_file()
+
+
+def is_finished(folder: str | Path) -> bool:
+    """Whether there is a result in this folder, and no unfinished run."""
+    return (Path(folder) / POSTERIOR).is_file() and not is_kept(folder)
+
+
+def forget(folder: str | Path) -> None:
+    """Remove what is kept in a folder, and the folder where it holds nothing else."""
+    shutil.rmtree(Path(folder) / FOLDER, ignore_errors=True)
+    with contextlib.suppress(OSError):  # raised where it is not empty
+        Path(folder).rmdir()
+
+
 def finished(folder: str | Path, record: Mapping[str, Any]) -> Any:
     """Return the result of a run that is finished; None where it is not.
 
@@ -363,7 +392,7 @@ def finished(folder: str | Path, record: Mapping[str, Any]) -> Any:
         ValueError: it is the result of another run; the message says in what that differs.
     """
     path = Path(folder) / POSTERIOR
-    if (Path(folder) / FOLDER / _RUN).is_file() or not path.is_file():
+    if not is_finished(folder):
         return None
     result = arviz_data.load(path)
     kept = arviz_data.attributes(result).get("run")
@@ -376,7 +405,7 @@ def finished(folder: str | Path, record: Mapping[str, Any]) -> Any:
 
 def begin_or_resume(folder: str | Path, record: Mapping[str, Any], resume: bool) -> Checkpoint:
     """Go on with the run in a folder if asked to and there is one; begin one otherwise."""
-    if resume and (Path(folder) / FOLDER / _RUN).is_file():
+    if resume and is_kept(folder):
         return Checkpoint.resume(folder, record)
     return Checkpoint.begin(folder, record)
 
