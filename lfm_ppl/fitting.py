@@ -259,7 +259,7 @@ def fit(
                     keys[3], bound, flat, at, trajectory_draws, chains, samples, **particles,
                     show=Counter("trajectories", shown=progress), parts=run and run.parts("trajectories")), drawn)
             except KeyboardInterrupt:
-                partial = _BARE if rated is None else f"{_BARE}, but for the scores"
+                partial = _BARE if rated is None else "all draws and their scores, without trajectories"
         result = stored(built(draws, stats, remarks, rated, drawn, partial))
         if run is not None and partial is None:
             run.finish()
