@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import json
-import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -24,13 +24,17 @@ from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference import sampling
 from lfm_ppl.inference.bound_model import BoundModel, bind
 from lfm_ppl.inference.kernels.options import check_options
-from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalRAM
+from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalRAM, Tuned
 from lfm_ppl.inference.kernels.ram import RAM
 from lfm_ppl.inference.map import MAPResult, mode_of
 from lfm_ppl.inference.marginal_likelihood import Panel
 from lfm_ppl.inference.posterior import scores, trajectories
+from lfm_ppl.inference.progress import Counter
 from lfm_ppl.inference.sampling import Transition
 from lfm_ppl.results import arviz_data
+from lfm_ppl.results import checkpoint as checkpoints
+from lfm_ppl.results.checkpoint import Checkpoint
+from lfm_ppl.results.files import POSTERIOR
 from lfm_ppl.results.inputs import remember
 from lfm_ppl.results.scalars import units_attribute
 
@@ -68,6 +72,10 @@ def fit(
     progress: bool = True,
     truth: Mapping[str, Any] | None = None,
     name: str | None = None,
+    checkpoint: str | Path | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+    attributes: Mapping[str, Any] | None = None,
 ) -> Any:
     """Fit a latent force model: sample its parameters, then its forces given them.
 
@@ -96,9 +104,20 @@ def fit(
             ``{"target_accept_prob": 0.95}`` or ``{"particles": 500, "delayed": True}``.
         chain_method: "parallel", "vectorized" or "sequential"; by default parallel where there are as many devices as
             chains (``numpyro.set_host_device_count(chains)`` before JAX starts), sequential otherwise.
-        progress: show a progress bar.
+        progress: show on standard error how far it is: a bar, or a line every 30 s where there is no terminal.
         truth: of simulated data (``lfm.Data.truth``), stored beside the results for plots.
         name: of the model, for the record.
+        checkpoint: a folder to keep the run in while it goes on: the state of the chains and their draws, written at
+            least every few seconds, and a ``posterior.nc`` with the draws so far, in the end with the whole result.
+            A process that is killed loses the last block of draws.
+        resume: go on with the run in ``checkpoint``, to the same draws as if it had not been stopped. Everything must
+            be as it was: model, data, settings and versions. A run that is finished is read and returned; in a folder
+            that is empty or does not exist a new one begins.
+        overwrite: replace a result or an unfinished run in ``checkpoint``.
+        attributes: further attributes of the result.
+
+    Ctrl-C ends the sampling after the present block of steps, some two seconds, and the draws so far are returned, with
+    an attribute ``partial`` and a warning. Another one raises KeyboardInterrupt.
 
     Returns:
         An ArviZ object (``InferenceData`` on ArviZ 0.23, ``xarray.DataTree`` on 1.x) with the groups
@@ -115,9 +134,13 @@ def fit(
         - ``observed_data``, and ``truth`` and ``constant_data`` (known inputs) where there are any.
 
     Raises:
-        ValueError, TypeError: unknown sampler, wrong shapes, parameters to fix that do not exist, and so on.
+        ValueError, TypeError: unknown sampler, wrong shapes, parameters to fix that do not exist, and so on; a run to
+            go on with that was of something else.
+        FileExistsError, FileNotFoundError: the folder holds a result or a run; no run to go on with.
+        KeyboardInterrupt: Ctrl-C before there was a draw, or a second one.
 
     Warns:
+        UserWarning: the result is partial.
         ConvergenceWarning: R-hat above 1.01, fewer than 100 effective draws a chain, divergences; each with a remedy.
         FilterWarning: no point to start from was found (which is an error): where the filter breaks down at the prior
             median, and how.
@@ -147,6 +170,10 @@ def fit(
         checks.positive_integer("thin", thin)
     if trajectory_draws != 0:
         checks.positive_integer("trajectory_draws", trajectory_draws)
+    if checkpoint is None and resume:
+        raise ValueError("resume goes on with a run that a folder keeps; name the folder, checkpoint=...")
+    if checkpoint is not None:
+        checkpoints.check_folder(checkpoint, resume, overwrite)
     keys = jax.random.split(jax.random.key(seed), 5)
     data = None
     if y is None:
@@ -155,44 +182,122 @@ def fit(
         model_kwargs = {**({"inputs": data.known_inputs()} if data.inputs else {}), **(model_kwargs or {})}
     bound = bind(numpyro_model, times, y, **dict(model_kwargs or {}))
     _check_requested(bound, at)
+    fingerprint = bound.fingerprint
     bound = bound.fix(fixed)
-    remarks: dict[str, Any]
     if sampler == "map":
-        with _start_explained(bound):
-            draws, stats, remarks = _mode(bound, keys[1], samples, seed, init)
-        chains, warmup = 1, 0
+        chains, warmup, thin, method = 1, 0, None, None
     else:
-        with _start_explained(bound):
-            thin = thin or _STEPS_A_DRAW.get(sampler, 0) * bound.size or 1
-            transition, starts, remarks = _transition(sampler, bound, sampler_options, init, keys[2], seed, chains,
-                                                      warmup * thin)
-            collected = sampling.sample(keys[1], bound, transition, starts, warmup=warmup * thin, samples=samples,
-                                        thin=thin, chain_method=chain_method, progress=progress)
-        draws, stats = bound.constrain_draws(collected.z), _statistics(collected.statistics)
-        remarks["thin"] = thin
-    flat = {site: draws[site].reshape(-1, *draws[site].shape[2:]) for site in bound.sites}
-    rated = _kept("scores of the observations", lambda: scores(bound, flat), None)
-    particles = {name: remarks.pop(name, None) for name in ("particle_settings", "particle_steps")}
-    chosen, paths, grid = _kept(
-        "trajectories", lambda: _paths(keys[3], bound, flat, at, trajectory_draws, chains, samples, **particles),
-        (None, None, None))
-    groups = _groups(bound, draws, stats, rated, paths, chosen, grid, truth)
+        thin = thin or _STEPS_A_DRAW.get(sampler, 0) * bound.size or 1
+        method = sampling.available_method(chain_method, chains)
     example = bound.site.example
-    attrs = {
-        "model": name or getattr(numpyro_model, "__name__", "model"), "rule": example.rule.name,
-        "steps": example.steps, "max_step": example.max_step, "iterations": example.iterations,
-        "tolerance": example.tolerance,
-        "sampler": sampler, "seed": seed, "chains": chains, "warmup": warmup,
-        "samples": samples, "fixed": json.dumps({k: np.asarray(v).tolist() for k, v in (fixed or {}).items()}),
-        "wall_time_s": round(time.perf_counter() - started, 3), "versions": json.dumps(_versions()),
-        "created_at": datetime.now(UTC).isoformat(timespec="seconds"), **remarks,
-        **({} if data is None else remember(groups, data)),
+    described = {
+        "rule": example.rule.name, "steps": example.steps, "max_step": example.max_step,
+        "iterations": example.iterations, "tolerance": example.tolerance, "sampler": sampler, "seed": seed,
+        "chains": chains, "warmup": warmup, "samples": samples,
+        "fixed": json.dumps({k: np.asarray(v).tolist() for k, v in (fixed or {}).items()}),
     }
-    result = arviz_data.build(groups, {k: v for k, v in attrs.items() if v is not None})
+    record = {
+        **described, "thin": thin, "chain_method": method, "init": init, "sampler_options": dict(sampler_options or {}),
+        "trajectory_draws": trajectory_draws, "parameters": bound.names, "model": checkpoints.digest(fingerprint),
+        "times": checkpoints.digest(bound.times), "data": checkpoints.digest(bound.y),
+        "times of the trajectories": None if at is None else checkpoints.digest(np.asarray(at, float)),
+        "versions": checkpoints.versions(),
+    }  # fmt: skip
+    run = None
+    if checkpoint is not None:
+        if resume and (finished := checkpoints.finished(checkpoint, record)) is not None:
+            return finished
+        run = checkpoints.begin_or_resume(checkpoint, record, resume)
+
+    def built(draws: dict, stats: dict, remarks: dict, rated: Any = None, drawn: tuple = (None, None, None),
+              partial: str | None = None) -> Any:
+        chosen, paths, grid = drawn
+        seconds = time.perf_counter() - started if run is None else run.seconds
+        attrs = {
+            "model": name or getattr(numpyro_model, "__name__", "model"), **described,
+            "wall_time_s": round(seconds, 3),
+            "versions": json.dumps(checkpoints.versions() | {"arviz": metadata.version("arviz")}),
+            "created_at": datetime.now(UTC).isoformat(timespec="seconds"), **remarks, "partial": partial,
+            "run": None if run is None else run.record, **dict(attributes or {}),
+        }
+        groups = _groups(bound, draws, stats, rated, paths, chosen, grid, truth)
+        attrs |= {} if data is None else remember(groups, data)
+        return arviz_data.build(groups, {k: v for k, v in attrs.items() if v is not None})
+
+    def stored(result: Any) -> Any:
+        if run is not None:
+            arviz_data.save(result, run.folder / POSTERIOR, overwrite=True)
+        return result
+
+    partial = None
+    with checkpoints.closing(run):
+        if sampler == "map":
+            with _start_explained(bound):
+                draws, stats, remarks = _mode(bound, keys[1], samples, seed, init, run)
+        else:
+            with _start_explained(bound):
+                setup = run.setup if run is not None and run.started else None
+                transition, starts, remarks = _transition(sampler, bound, sampler_options, init, keys[2], seed, chains,
+                                                          warmup * thin, setup)
+                if run is not None and setup is None:
+                    run.setup = {key: remarks[key] for key in ("particles", "log_likelihood_sd") if key in remarks}
+                remarks["thin"] = thin
+                shown = {key: value for key, value in remarks.items() if key not in _OF_PARTICLES}
+                if run is not None:
+                    run.look = lambda rows: _kept("partial result", lambda: stored(built(
+                        *_draws(bound, rows, samples), shown, partial=_some(rows["z"].shape[1], samples))), None)
+                collected = sampling.sample(keys[1], bound, transition, starts, warmup=warmup * thin, samples=samples,
+                                            thin=thin, chain_method=method, progress=progress, keeper=run)
+            if collected.z.shape[1] == 0:
+                raise KeyboardInterrupt(f"stopped in the warm-up, after {collected.done:,} of {collected.total:,} "
+                                        "steps; there are no draws yet")
+            if collected.done < collected.total:
+                partial = _some(collected.z.shape[1], samples)
+            draws, stats = _draws(bound, {"z": collected.z, **collected.statistics}, samples)
+        particles = {label: remarks.pop(label, None) for label in _OF_PARTICLES}
+        flat = {site: draws[site].reshape(-1, *draws[site].shape[2:]) for site in bound.sites}
+        rated: Any = None
+        drawn: tuple = (None, None, None)
+        if partial is None:
+            if run is not None:  # the draws are safe, whatever comes
+                stored(built(draws, stats, remarks, partial=_BARE))
+            try:
+                rated = _kept("scores of the observations", lambda: scores(
+                    bound, flat, show=Counter("scores", shown=progress), parts=run and run.parts("scores")), None)
+                drawn = _kept("trajectories", lambda: _paths(
+                    keys[3], bound, flat, at, trajectory_draws, chains, samples, **particles,
+                    show=Counter("trajectories", shown=progress), parts=run and run.parts("trajectories")), drawn)
+            except KeyboardInterrupt:
+                partial = _BARE if rated is None else "all draws and their scores, without trajectories"
+        result = stored(built(draws, stats, remarks, rated, drawn, partial))
+        if run is not None and partial is None:
+            run.finish()
+    if partial is not None:
+        warnings.warn(f"the run was stopped, and its result is partial: {partial}.", stacklevel=2)
     if sampler != "map":
         for message in arviz_data.convergence_warnings(result):
             warnings.warn(message, ConvergenceWarning, stacklevel=2)
     return result
+
+
+_OF_PARTICLES = ("particle_settings", "particle_steps")
+"""What the trajectories of pmmh need to know of its particles."""
+
+_BARE = "all draws, without scores and trajectories"
+
+
+def _some(draws: int, samples: int) -> str:
+    return f"{draws} of {samples} draws a chain, without scores and trajectories"
+
+
+def _draws(bound: BoundModel, rows: Mapping[str, np.ndarray], samples: int) -> tuple[dict, dict]:
+    """Return site name -> draws, and the statistics, of rows that the chains left."""
+    z = rows["z"]
+    count = z.shape[1]
+    # As many rows as there will be in the end: compiled once.
+    whole = z if count == samples else np.concatenate([z, np.repeat(z[:, -1:], samples - count, axis=1)], axis=1)
+    draws = {site: values[:, :count] for site, values in bound.constrain_draws(whole).items()}
+    return draws, _statistics({name: values for name, values in rows.items() if name != "z"})
 
 
 @contextlib.contextmanager
@@ -254,14 +359,26 @@ def _strategy(init: Any, bound: BoundModel, seed: int) -> Any:
 
 
 def _transition(sampler: str, bound: BoundModel, options: Mapping[str, Any] | None, init: Any, key: jax.Array,
-                seed: int, chains: int, warmup: int) -> tuple[Transition, np.ndarray, dict[str, Any]]:
-    """Return how the chains move, where each of them starts (C, d), and what to remember of it."""
+                seed: int, chains: int, warmup: int,
+                setup: Mapping[str, Any] | None) -> tuple[Transition, np.ndarray | None, dict[str, Any]]:
+    """Return how the chains move, where each of them starts (C, d), and what to remember of it.
+
+    Chains that go on start nowhere: all that their transition needs to know is in ``setup``.
+    """
     options = dict(options or {})
+    walk = RAM if sampler == "ram" else ParticleMarginalRAM
+    if setup is not None:
+        if sampler == "nuts":
+            return sampling.nuts(bound, warmup, options), None, {}
+        kernel = walk(bound.model, **options)
+        if not isinstance(kernel, ParticleMarginalRAM):
+            return sampling.random_walk(bound, kernel, warmup), None, {}
+        kernel.prepare(bound, None, Tuned(int(setup["particles"]), float(setup["log_likelihood_sd"])))
+        return sampling.particle_marginal(bound, kernel, warmup), None, _remarks(kernel)
     strategy = _strategy(init, bound, seed)
     if sampler == "nuts":
         transition = sampling.nuts(bound, warmup, options)
         return transition, _starts(key, bound, strategy, chains, transition.evaluate), {}
-    walk = RAM if sampler == "ram" else ParticleMarginalRAM
     mode = None
     if "initial_covariance" not in options:
         # A random walk that starts with the shape of the posterior needs no gradient afterwards, but learning that
@@ -283,11 +400,13 @@ def _transition(sampler: str, bound: BoundModel, options: Mapping[str, Any] | No
     if not isinstance(kernel, ParticleMarginalRAM):
         return sampling.random_walk(bound, kernel, warmup), starts, {}
     kernel.prepare(bound, starts[0])
+    return sampling.particle_marginal(bound, kernel, warmup), starts, _remarks(kernel)
+
+
+def _remarks(kernel: ParticleMarginalRAM) -> dict[str, Any]:
     assert kernel.tuned is not None
-    remarks = {"particles": kernel.tuned.particles, "log_likelihood_sd": kernel.tuned.sd,
-               "delayed": int(kernel.delayed), "particle_settings": kernel.settings,
-               "particle_steps": kernel.particle_steps}
-    return sampling.particle_marginal(bound, kernel, warmup), starts, remarks
+    return {"particles": kernel.tuned.particles, "log_likelihood_sd": kernel.tuned.sd, "delayed": int(kernel.delayed),
+            "particle_settings": kernel.settings, "particle_steps": kernel.particle_steps}
 
 
 def _starts(key: jax.Array, bound: BoundModel, strategy: Any, chains: int, evaluate: Any) -> np.ndarray:
@@ -310,20 +429,27 @@ def _statistics(collected: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return stats
 
 
-def _mode(bound: BoundModel, key: jax.Array, samples: int, seed: int, init: Any) -> tuple[dict, dict, dict]:
+def _mode(bound: BoundModel, key: jax.Array, samples: int, seed: int, init: Any,
+          run: Checkpoint | None) -> tuple[dict, dict, dict]:
     if isinstance(init, str):
         checks.one_of("init", init, ("map", "median"))
         init = None
-    # Second derivatives take longer to compile than everything else here takes to run.
-    mode = mode_of(bound, seed=seed, init=init)
-    draws = {label: np.asarray(value)[None] for label, value in mode.sample(key, samples).items()}
-    remarks = {"map_converged": int(mode.converged), "map_message": mode.message,
-               "map_log_density": float(mode.log_density), "log_evidence": float(mode.log_evidence)}
-    return draws, {}, remarks
+
+    def compute() -> dict[str, Any]:
+        # Second derivatives take longer to compile than everything else here takes to run.
+        mode = mode_of(bound, seed=seed, init=init)
+        remarks = {"map_converged": int(mode.converged), "map_message": mode.message,
+                   "map_log_density": float(mode.log_density), "log_evidence": float(mode.log_evidence)}
+        return {"": np.asarray(json.dumps(remarks)), **mode.sample(key, samples)}
+
+    found = compute() if run is None else run.once("mode", compute)
+    remarks = json.loads(str(found.pop("")))
+    return {label: np.asarray(value)[None] for label, value in found.items()}, {}, remarks
 
 
 def _paths(key: jax.Array, bound: BoundModel, draws: dict, at: Any, count: int, chains: int, samples: int,
-           particle_settings: Any, particle_steps: int | None) -> tuple[np.ndarray, dict | None, np.ndarray | None]:
+           particle_settings: Any, particle_steps: int | None,
+           **more: Any) -> tuple[np.ndarray, dict | None, np.ndarray | None]:
     """Draw trajectories for draws that are spread evenly over each chain."""
     per_chain = min(samples, -(-count // chains))
     if per_chain == 0:
@@ -337,7 +463,7 @@ def _paths(key: jax.Array, bound: BoundModel, draws: dict, at: Any, count: int, 
         grid = (np.union1d(np.linspace(min(origin, times[0]), times[-1], _GRID), times) if at is None
                 else np.atleast_1d(np.asarray(at, float)))
     subset = {site: value[rows] for site, value in draws.items()}
-    paths = trajectories(key, bound, subset, grid, particle_settings, particle_steps)
+    paths = trajectories(key, bound, subset, grid, particle_settings, particle_steps, **more)
     return chosen, {k: v.reshape(chains, len(chosen), *v.shape[1:]) for k, v in paths.items()}, grid
 
 
@@ -429,14 +555,3 @@ def _truth(truth: Mapping[str, Any], named: dict, units: Mapping[str, str], draw
         if label in draws:
             variables[label] = (tuple(dims), value)
     return xr.Dataset(variables, coords)
-
-
-def _versions() -> dict[str, str]:
-    names = ("lfm_ppl", "jax", "jaxlib", "numpyro", "arviz", "numpy", "equinox")
-    found = {"python": sys.version.split()[0]}
-    for name in names:
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found

@@ -7,8 +7,7 @@ import warnings
 from collections.abc import Sequence
 
 from lfm_ppl.cli.arguments import parser
-
-_INTERRUPTED = 130
+from lfm_ppl.cli.interruption import INTERRUPTED
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -19,15 +18,16 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     Returns:
         0 after success, 1 where results were saved and a figure could not be drawn, 2 after an
-        error, which is one line on standard error unless ``--debug`` is given.
+        error, which is one line on standard error unless ``--debug`` is given, 130 after Ctrl-C.
     """
     arguments = parser().parse_args(argv)
+    arguments.line = list(sys.argv[1:] if argv is None else argv)
     warnings.showwarning = _show_warning
     try:
         return int(arguments.run(arguments))
     except KeyboardInterrupt:
         print("lfm-ppl: interrupted", file=sys.stderr)
-        return _INTERRUPTED
+        return INTERRUPTED
     except BrokenPipeError:  # the reader of a pipe, such as `head`, has seen enough
         sys.stderr.close()
         return 0

@@ -131,7 +131,9 @@ def _add_check(commands: Any) -> None:
     command.add_argument("--model", metavar="FILE", help="the model file, where the result does not know it")
     command.add_argument("--out", metavar="DIR", help="folder of the corrected result (default: RESULT/corrected)")
     command.add_argument("--overwrite", action="store_true", help="replace an earlier report and corrected result")
-    command.add_argument("--quiet", action="store_true", help="no progress (there is none without a terminal)")
+    command.add_argument("--resume", action="store_true", help="go on with a check that was stopped or killed")
+    command.add_argument("--quiet", action="store_true",
+                         help="no progress (a line that is redrawn, or one every 30 s where there is no terminal)")
 
 
 def _add_compare(commands: Any) -> None:
@@ -195,6 +197,7 @@ def _add_fit(commands: Any) -> None:
         "  lfm-ppl fit transcription --data genes.csv --option link=saturation\n"
         "  lfm-ppl fit transcription --data p53.csv --set 'decay[CDKN1A]=0.8'\n"
         "  lfm-ppl fit spring --until 40 --target-accept 0.95\n"
+        "  lfm-ppl fit spring --out result --resume\n"
         "  lfm-ppl fit my_model.py --data mine.csv --rule gauss-hermite --steps 20 --out result"
     )
     help_ = "infer parameters and forces, and write posterior, summary and figures"
@@ -207,7 +210,10 @@ def _add_fit(commands: Any) -> None:
     out.add_argument("--out", metavar="DIR", help="folder to write (default: lfm-results/MODEL-001, -002, ...)")
     out.add_argument("--until", metavar="TIME", help="forecast to this time, a number or a date (default: none)")
     out.add_argument("--overwrite", action="store_true", help="write into a folder with files")
-    out.add_argument("--quiet", action="store_true", help="no progress bar (there is none without a terminal)")
+    out.add_argument("--resume", action="store_true",
+                     help="go on with the run in --out that was stopped or killed, to the very same draws")
+    out.add_argument("--quiet", action="store_true",
+                     help="no progress (a bar, or a line every 30 s where there is no terminal)")
 
 
 def _add_data(group: Any) -> None:

@@ -15,10 +15,14 @@ from typing import Any, NamedTuple
 
 from lfm_ppl import data, loading
 from lfm_ppl.cli import choices, fit, results, session
+from lfm_ppl.cli.interruption import INTERRUPTED, Watch, watched
 
 TABLE = "accuracy.csv"
 FIGURE = "accuracy.png"
 CORRECTED = "corrected"
+UNFINISHED = "unfinished-check"
+"""Folder beside the result in which log likelihoods are kept until the check is done."""
+
 _DRAWS, _DRAWS_TO_CORRECT = 200, 1000
 _CHAINS, _WARMUP, _SAMPLES = 4, 500, 500
 """Of the chains that correct a result from the posterior mode, which has none itself."""
@@ -37,16 +41,18 @@ class Check(NamedTuple):
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the accuracy report, store it beside and in the result, and write the corrected result if asked."""
-    from lfm_ppl.results import arviz_data, files
+    from lfm_ppl.results import arviz_data, checkpoint, files
 
     if not arguments.correct:
         if arguments.out is not None:
             raise ValueError("--out names the folder of the corrected result; add --correct.")
         if arguments.delayed:
             raise ValueError("--delayed says how the corrected result is sampled; add --correct.")
+    if arguments.resume and arguments.overwrite:
+        raise ValueError("--resume goes on with a check that was stopped, --overwrite begins another one; choose one.")
     path = files.locate(arguments.result)
     for name in (TABLE, FIGURE):
-        files.refuse_existing(path.parent / name, arguments.overwrite)
+        files.refuse_existing(path.parent / name, arguments.overwrite or arguments.resume)
     results.writable(path.parent)
     posterior = arviz_data.load(path)
     session.start(int(arviz_data.attributes(posterior).get("chains", 1)), not arguments.no_cache)
@@ -55,18 +61,34 @@ def run(arguments: argparse.Namespace) -> int:
         folder = None
         if arguments.correct:
             out = arguments.out or str(path.parent / CORRECTED)
-            folder = stack.enter_context(results.folder(task.name, out, arguments.overwrite))
-        report = _checked(task, arguments)
-        for message in arviz_data.convergence_warnings(posterior):
-            warnings.warn(f"the draws that are checked: {message}", stacklevel=1)
-        print(f"\n{report.text(result=shlex.quote(arguments.result))}\n")
-        status = _write(report, task.posterior, path)
-        if folder is None:
-            return status
-        if report.exact:
-            print("the filter is exact: there is nothing to correct")
-            return status
-        return max(status, _correct(task, report, arguments, folder))
+            folder = stack.enter_context(results.folder(task.name, out, arguments.overwrite, arguments.resume))
+            checkpoint.check_folder(folder, arguments.resume, arguments.overwrite)
+        go_on = f"go on with: {_again(arguments)}"
+        watch = stack.enter_context(watched(lambda: go_on))
+        try:
+            report = _checked(task, arguments, path.parent / UNFINISHED)
+            for message in arviz_data.convergence_warnings(posterior):
+                warnings.warn(f"the draws that are checked: {message}", stacklevel=1)
+            print(f"\n{report.text(result=shlex.quote(arguments.result))}\n")
+            status = _write(report, task.posterior, path)
+            if folder is not None and report.exact:
+                print("the filter is exact: there is nothing to correct")
+            elif folder is not None:
+                status = max(status, _correct(task, report, arguments, folder, watch))
+        except KeyboardInterrupt as error:
+            print(f"\nlfm-ppl: {str(error) or 'stopped'}; {go_on}", file=sys.stderr)
+            return INTERRUPTED
+        if status == INTERRUPTED:
+            print(f"resume   {_again(arguments)}")
+        else:
+            checkpoint.forget(path.parent / UNFINISHED)
+        return status
+
+
+def _again(arguments: argparse.Namespace) -> str:
+    """Return the command that goes on with this check."""
+    return shlex.join(["lfm-ppl", *(word for word in arguments.line if word not in ("--overwrite", "--resume")),
+                       "--resume"])
 
 
 def _task(posterior: Any, model_file: str | None) -> Check:
@@ -108,7 +130,7 @@ def _task(posterior: Any, model_file: str | None) -> Check:
     return Check(posterior, model.name, numpyro_model, model.keywords(observed, options))
 
 
-def _checked(task: Check, arguments: argparse.Namespace) -> Any:
+def _checked(task: Check, arguments: argparse.Namespace, folder: Path) -> Any:
     from lfm_ppl.results.accuracy import check_accuracy
 
     return check_accuracy(
@@ -119,7 +141,9 @@ def _checked(task: Check, arguments: argparse.Namespace) -> Any:
         particles=arguments.particles,
         model_kwargs=task.keywords,
         seed=arguments.seed,
-        progress=_progress(arguments),
+        progress=not arguments.quiet,
+        checkpoint=folder,
+        resume=arguments.resume,
     )
 
 
@@ -144,8 +168,9 @@ def _write(report: Any, posterior: Any, path: Path) -> int:
     return 0
 
 
-def _correct(task: Check, report: Any, arguments: argparse.Namespace, folder: Path) -> int:
+def _correct(task: Check, report: Any, arguments: argparse.Namespace, folder: Path, watch: Watch | None) -> int:
     """Write the corrected result: by resampling where the weights are reliable, else by new chains."""
+    from lfm_ppl.results import arviz_data
     from lfm_ppl.results.correction import correct_posterior
 
     started = time.perf_counter()
@@ -154,11 +179,18 @@ def _correct(task: Check, report: Any, arguments: argparse.Namespace, folder: Pa
               + (" (no chains are needed, and none are delayed)" if arguments.delayed else ""))
         corrected = correct_posterior(task.posterior, task.model, model_kwargs=task.keywords, seed=arguments.seed)
     else:
-        corrected = _exact_chains(task, arguments)
-    return fit.report(corrected, folder, time.perf_counter() - started, arguments.overwrite)
+        corrected = _exact_chains(task, arguments, folder)
+    partial = arviz_data.attributes(corrected).get("partial")
+    if partial is not None and watch is not None:
+        watch.answered()
+    status = fit.report(corrected, folder, time.perf_counter() - started, arguments.overwrite or arguments.resume)
+    if partial is None:
+        return status
+    print(f"partial  {partial}")
+    return INTERRUPTED
 
 
-def _exact_chains(task: Check, arguments: argparse.Namespace) -> Any:
+def _exact_chains(task: Check, arguments: argparse.Namespace, folder: Path) -> Any:
     """Sample the exact posterior by particle-marginal RAM.
 
     Where the weights fail, the filter's likelihood is too small in a part of the posterior, and delayed acceptance,
@@ -184,14 +216,12 @@ def _exact_chains(task: Check, arguments: argparse.Namespace) -> Any:
     corrected = lfm_ppl.fit(
         task.model, times, y, sampler="pmmh", sampler_options=options, chains=chains, warmup=warmup, samples=samples,
         seed=arguments.seed, at=at, trajectory_draws=0 if at is None else 400, model_kwargs=task.keywords,
-        fixed=json.loads(attrs.get("fixed") or "{}"), name=task.name, progress=_progress(arguments),
+        fixed=json.loads(attrs.get("fixed") or "{}"), name=task.name, progress=not arguments.quiet,
+        checkpoint=folder, resume=arguments.resume, overwrite=arguments.overwrite,
+        attributes={name: attrs[name] for name in _RECORD if name in attrs},
     )  # fmt: skip
-    corrected.attrs.update({name: attrs[name] for name in _RECORD if name in attrs})
     for group in ("truth", "constant_data"):
         if arviz_data.has_group(task.posterior, group):
             arviz_data.add_group(corrected, group, arviz_data.group(task.posterior, group))
     return corrected
 
-
-def _progress(arguments: argparse.Namespace) -> bool:
-    return not arguments.quiet and sys.stderr.isatty()

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import json
+import shlex
 import shutil
 import sys
 import time
@@ -15,6 +17,7 @@ import numpy as np
 
 from lfm_ppl import calendar_time, data, loading
 from lfm_ppl.cli import choices, results, session
+from lfm_ppl.cli.interruption import INTERRUPTED, watched
 
 SETTINGS = ("rule", "steps", "max_step", "iterations", "tolerance")
 """Flags of the approximation; None where the user leaves one to the model."""
@@ -25,6 +28,8 @@ _GRID = 241
 
 def run(arguments: argparse.Namespace) -> int:
     """Fit, print the summary, and write the results; the posterior is on disk before any figure."""
+    from lfm_ppl.results import arviz_data, checkpoint
+
     session.start(arguments.chains, not arguments.no_cache)
     model = loading.load(arguments.model)
     options = choices.options(model, arguments.option)
@@ -35,12 +40,49 @@ def run(arguments: argparse.Namespace) -> int:
         raise ValueError("--target-accept is for the samplers nuts, ram and pmmh; map accepts and rejects nothing.")
     if arguments.particles is not None and arguments.sampler != "pmmh":
         raise ValueError(f"--particles is for the sampler pmmh; {arguments.sampler} uses none.")
-    with results.folder(model.name, arguments.out, arguments.overwrite) as folder:
+    if arguments.resume and arguments.out is None:
+        raise ValueError("--resume goes on with the run in a folder; name the folder with --out.")
+    if arguments.resume and arguments.overwrite:
+        raise ValueError("--resume goes on with the run in a folder, --overwrite begins another one; choose one.")
+    with results.folder(model.name, arguments.out, arguments.overwrite, arguments.resume) as folder:
+        checkpoint.check_folder(folder, arguments.resume, arguments.overwrite)
+        finished = arguments.resume and checkpoint.is_finished(folder)
         _print_task(arguments, model, observed, options, fixed)
         started = time.perf_counter()
-        posterior = sample(arguments, model, observed, options, fixed, at)
-        seconds = time.perf_counter() - started
-        return report(posterior, folder, seconds, arguments.overwrite)
+        go_on = f"go on with: {_again(arguments, folder)}"
+        with watched(lambda: go_on if checkpoint.is_kept(folder) else _nothing_left(folder)) as watch:
+            try:
+                posterior = sample(arguments, model, observed, options, fixed, folder, at)
+            except KeyboardInterrupt as error:
+                said = str(error) or "stopped before there were draws"
+                print(f"\nlfm-ppl: {said}" + (f"; {go_on}" if checkpoint.is_kept(folder) else ""), file=sys.stderr)
+                return INTERRUPTED
+            partial = arviz_data.attributes(posterior).get("partial")
+            if watch is not None and partial is not None:
+                watch.answered()
+            if finished and partial is None:
+                print(f"\nthe run in {folder} is finished; nothing was changed")
+                return 0
+            seconds = time.perf_counter() - started
+            status = report(posterior, folder, seconds, arguments.overwrite or arguments.resume)
+        if partial is None:
+            return status
+        print(f"partial  {partial}\nresume   {_again(arguments, folder)}")
+        return INTERRUPTED
+
+
+def _again(arguments: argparse.Namespace, folder: Path) -> str:
+    """Return the command that goes on with this run."""
+    line = [word for word in arguments.line if word not in ("--overwrite", "--resume")]
+    if arguments.out is None:
+        line += ["--out", str(folder)]
+    return shlex.join(["lfm-ppl", *line, "--resume"])
+
+
+def _nothing_left(folder: Path) -> str:
+    with contextlib.suppress(OSError):  # raised where it is not empty
+        folder.rmdir()
+    return "nothing was sampled yet"
 
 
 def _observed(arguments: argparse.Namespace, model: loading.ModelFile, options: dict[str, Any]) -> data.Data:
@@ -138,9 +180,10 @@ def sample(
     observed: data.Data,
     options: dict[str, Any],
     fixed: dict[str, Any],
+    folder: Path,
     at: np.ndarray | None = None,
 ) -> Any:
-    """Return the ArviZ object of a fit, with a record of the options and the data.
+    """Return the ArviZ object of a fit, with a record of the options and the data; kept in a folder meanwhile.
 
     Args:
         arguments: the sampler's and the approximation's settings.
@@ -148,6 +191,7 @@ def sample(
         observed: the data, as the model takes them.
         options: the model's options.
         fixed: parameters that are not learnt.
+        folder: of the result.
         at: times of the trajectories; None: a grid over the data.
     """
     import lfm_ppl
@@ -164,7 +208,15 @@ def sample(
         iterations=arguments.iterations,
         tolerance=arguments.tolerance,
     )
-    posterior = lfm_ppl.fit(
+    # What `lfm-ppl check` rebuilds the model from, in the words of the command line.
+    attributes = {
+        "model_file": model.name if loading.available().get(model.name) == model.path else str(model.path),
+        "settings": json.dumps({name: getattr(arguments, name) for name in SETTINGS}),
+        "options": json.dumps(options), "data": arguments.data or "simulated",
+    }  # fmt: skip
+    if observed.note:
+        attributes["note"] = observed.note
+    return lfm_ppl.fit(
         numpyro_model,
         observed,
         sampler=arguments.sampler,
@@ -181,36 +233,34 @@ def sample(
         },
         model_kwargs=model.keywords(observed, options),
         fixed=fixed,
-        progress=not arguments.quiet and sys.stderr.isatty(),  # in a log file a bar is noise
+        progress=not arguments.quiet,
         name=model.name,
+        checkpoint=folder,
+        resume=arguments.resume,
+        overwrite=arguments.overwrite,
+        attributes=attributes,
     )
-    # What `lfm-ppl check` rebuilds the model from, in the words of the command line.
-    posterior.attrs["model_file"] = model.name if loading.available().get(model.name) == model.path else str(model.path)
-    posterior.attrs["settings"] = json.dumps({name: getattr(arguments, name) for name in SETTINGS})
-    posterior.attrs["options"] = json.dumps(options)
-    posterior.attrs["data"] = arguments.data or "simulated"
-    if observed.note:
-        posterior.attrs["note"] = observed.note
-    return posterior
 
 
 def report(posterior: Any, folder: Path, seconds: float, overwrite: bool) -> int:
-    """Write and print everything; return 1 where a figure could not be drawn."""
+    """Write and print everything, of a partial result all but figures; return 1 where a figure could not be drawn."""
     from lfm_ppl.results import arviz_data, files, tables
     from lfm_ppl.results.plots import save_figures
 
-    written = [arviz_data.save(posterior, folder / files.POSTERIOR, overwrite)]
+    # A run that was kept on its way has left a partial result, or the whole one, under this name.
+    written = [arviz_data.save(posterior, folder / files.POSTERIOR, overwrite=True)]
     table = arviz_data.summary(posterior)
     written.append(tables.write_csv(table, folder / results.SUMMARY, overwrite))
     print(f"\n{tables.text_table(table, width=shutil.get_terminal_size().columns)}\n")
     status = 0
+    attrs = arviz_data.attributes(posterior)
     try:
-        written += save_figures(posterior, folder, overwrite=overwrite)
+        if "partial" not in attrs:
+            written += save_figures(posterior, folder, overwrite=overwrite)
     except Exception as error:  # the draws are safe; a figure is no reason to end with an error
         print(f"lfm-ppl: the figures could not be drawn: {error}", file=sys.stderr)
         print(f"         try again with: lfm-ppl plot {folder} --overwrite", file=sys.stderr)
         status = 1
-    attrs = arviz_data.attributes(posterior)
     if "log_likelihood_sd" in attrs:
         print(f"particles {attrs['particles']}; the log likelihood estimate has a standard deviation of "
               f"{attrs['log_likelihood_sd']:.2f} (near 1 is best)")

@@ -14,13 +14,14 @@ _REMEDY = "Nothing was computed; name a folder that you may write with --out."
 
 
 @contextlib.contextmanager
-def folder(name: str, out: str | None, overwrite: bool) -> Iterator[Path]:
+def folder(name: str, out: str | None, overwrite: bool, resume: bool = False) -> Iterator[Path]:
     """Make the folder for the results, and remove it again where nothing was put into it.
 
     Args:
         name: of the model.
         out: the folder that the user wants; None: the next of ``lfm-results/NAME-001``, ...
         overwrite: whether ``out`` may hold files already.
+        resume: whether ``out`` holds a run to go on with.
 
     Yields:
         The folder, which exists.
@@ -29,7 +30,7 @@ def folder(name: str, out: str | None, overwrite: bool) -> Iterator[Path]:
         FileExistsError: if ``out`` holds files and ``overwrite`` is False.
         OSError: the folder cannot be made or written.
     """
-    chosen = _fresh(name) if out is None else _named(Path(out), overwrite)
+    chosen = _fresh(name) if out is None else _named(Path(out), overwrite or resume)
     try:
         writable(chosen)
         yield chosen

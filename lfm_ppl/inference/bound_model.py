@@ -263,6 +263,11 @@ class BoundModel:
         return self._program.model
 
     @property
+    def fingerprint(self) -> Hashable:
+        """Equal for models that compute the same; None where the model asks its data for values."""
+        return self._program.fingerprint
+
+    @property
     def forward_mode(self) -> bool:
         """Whether gradients are taken in forward mode, which is faster for up to ten parameters."""
         return self.size <= FORWARD_MODE_LIMIT

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -29,8 +29,22 @@ _BATCH_NUMBERS = 2_000_000
 """Numbers that the smoother may hold for one batch of draws; more draws go one batch after another."""
 
 
-def scores(bound: BoundModel, draws: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Score the observations under each draw, site name -> (S, ...).
+class Parts(Protocol):
+    """Keeps batches of what is computed from draws, by their first draw."""
+
+    def get(self, start: int) -> Any:
+        """Return a batch; None where it is not known."""
+
+    def put(self, start: int, part: Any) -> None:
+        """Keep a batch, a pytree of dicts or an array."""
+
+    def flush(self) -> None:
+        """Keep all that was put, now."""
+
+
+def scores(bound: BoundModel, draws: Mapping[str, Any], *, show: Callable[[int, int], None] = lambda done, count: None,
+           parts: Parts | None = None) -> dict[str, np.ndarray]:
+    """Score the observations under each draw, site name -> (S, ...); ``show`` and ``parts`` as in `over_draws`.
 
     Returns:
         ``leave_one_out`` (S, ..., T), ``one_step_ahead`` (S, ..., T), ``residual`` (S, ..., T, D); the series of a
@@ -45,11 +59,13 @@ def scores(bound: BoundModel, draws: Mapping[str, Any]) -> dict[str, np.ndarray]
     def per_draw(values: Any, key: jax.Array, y: Any) -> dict[str, jax.Array]:
         return each(bound.likelihood(values, y), one, bound.data(y))
 
-    return over_draws(bound, "scores", per_draw, draws, jax.random.key(0), bound.times.size)
+    return over_draws(bound, "scores", per_draw, draws, jax.random.key(0), bound.times.size, show, parts)
 
 
 def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at: Any,
-                 particles: ParticleSettings | None = None, particle_steps: int | None = None) -> dict[str, np.ndarray]:
+                 particles: ParticleSettings | None = None, particle_steps: int | None = None, *,
+                 show: Callable[[int, int], None] = lambda done, count: None,
+                 parts: Parts | None = None) -> dict[str, np.ndarray]:
     """Draw one trajectory for each draw of the parameters, given the data, and replicate the data along it.
 
     Args:
@@ -59,6 +75,8 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
         at: (K,) times of the trajectories, or None for the observation times.
         particles: draw the trajectories with the particle smoother; None: with the Gaussian one.
         particle_steps: integration steps of the particles between two observations; None: the model's.
+        show: as in `over_draws`, and so is the next.
+        parts: keeps batches.
 
     Returns:
         ``state`` (S, ..., K, M), ``force`` (S, ..., K, R), ``output`` (S, ..., K, D) free of noise (what is
@@ -94,7 +112,7 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
     rows = count + bound.times.size
     width = 1 if particles is None else particles.particles
     name = ("trajectories", signature(at), particles, particle_steps)
-    return over_draws(bound, name, per_draw, draws, key, rows * width)
+    return over_draws(bound, name, per_draw, draws, key, rows * width, show, parts)
 
 
 def _smoothed_path(distribution: MarginalLikelihood, y: jax.Array, at: Any,
@@ -147,7 +165,8 @@ def each(distribution: MarginalLikelihood | Panel, function: Callable, *argument
 
 
 def over_draws(bound: BoundModel, name: Hashable, per_draw: Callable, draws: Mapping[str, Any], key: jax.Array,
-               rows: int | None = None, show: Callable[[int, int], None] = lambda done, count: None) -> Any:
+               rows: int | None = None, show: Callable[[int, int], None] = lambda done, count: None,
+               parts: Parts | None = None) -> Any:
     """Return ``per_draw(values, key, y)`` for all draws (S, ...), some at a time, with one compilation for any number.
 
     Args:
@@ -159,6 +178,7 @@ def over_draws(bound: BoundModel, name: Hashable, per_draw: Callable, draws: Map
         rows: of the scan over time, from which follows how many draws the memory holds side by side; None: one draw
             after another, as always with steps that follow a tolerance, of which each would make as many as are tried.
         show: is told before each batch how many draws of how many are done.
+        parts: keeps the batches, and knows those of an earlier run.
     """
     draws = {site: jnp.asarray(value) for site, value in draws.items()}
     count = next(iter(draws.values())).shape[0]
@@ -175,7 +195,14 @@ def over_draws(bound: BoundModel, name: Hashable, per_draw: Callable, draws: Map
     found = []
     for start in range(0, count, batch):
         show(start, count)
-        index = np.minimum(np.arange(start, start + batch), count - 1)  # full batches: one shape
-        part = run({site: value[index] for site, value in draws.items()}, keys[index], bound.argument)
-        found.append(jax.tree_util.tree_map(np.asarray, part))
+        part = None if parts is None else parts.get(start)
+        if part is None:
+            index = np.minimum(np.arange(start, start + batch), count - 1)  # full batches: one shape
+            part = run({site: value[index] for site, value in draws.items()}, keys[index], bound.argument)
+            part = jax.tree_util.tree_map(np.asarray, part)
+            if parts is not None:
+                parts.put(start, part)
+        found.append(part)
+    if parts is not None:
+        parts.flush()
     return jax.tree_util.tree_map(lambda *parts: np.concatenate(parts)[:count], *found)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import sys
+import time
 import warnings
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from operator import attrgetter
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -18,15 +18,20 @@ from numpyro.infer.util import ParamInfo
 from lfm_ppl import checks
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.fingerprint import signature
+from lfm_ppl.inference.interruption import Interruption
 from lfm_ppl.inference.kernels import robust_metropolis
 from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalRAM, ParticleMarginalState
 from lfm_ppl.inference.kernels.ram import RAM
 from lfm_ppl.inference.kernels.robust_metropolis import RAMState, finite_or_infinity, initial_state
+from lfm_ppl.inference.progress import Progress, Stage
 
 CHAIN_METHODS = ("parallel", "vectorized", "sequential")
 
-_BLOCKS = 20
-"""Parts of a run between two signs of life."""
+BLOCK_S = 2.0
+"""Time that a block of steps is to take: that long, and no longer, Ctrl-C waits for it."""
+
+_GROWTH = 8
+"""Most that a block may be longer than the one before it: steps of the warm-up differ in length."""
 
 
 class Transition(NamedTuple):
@@ -146,56 +151,176 @@ class Draws(NamedTuple):
     """What chains collected.
 
     Attributes:
-        z: (C, N, d) unconstrained draws.
+        z: (C, N, d) unconstrained draws; fewer than were asked for where the run was stopped.
         statistics: name -> (C, N, ...).
+        done: steps that were taken.
+        total: steps that were asked for.
     """
 
     z: np.ndarray
     statistics: dict[str, np.ndarray]
+    done: int
+    total: int
 
 
-def sample(key: jax.Array, bound: BoundModel, transition: Transition, starts: np.ndarray, *, warmup: int, samples: int,
-           thin: int = 1, chain_method: str | None = None, progress: bool = False) -> Draws:
-    """Run chains; the same seed gives the same draws whatever the chain method and the progress bar.
+class Saved(NamedTuple):
+    """Where chains stood.
 
-    Warm-up and sampling are one program, in which the data are an argument: another data set compiles nothing.
+    Attributes:
+        done: steps that were taken.
+        leaves: arrays of the state of all chains, in order.
+        rows: "z" and the name of each statistic -> (C, N, ...), of which the first draws are known.
+    """
+
+    done: int
+    leaves: list[np.ndarray]
+    rows: dict[str, np.ndarray]
+
+
+class Keeper(Protocol):
+    """Keeps chains while they run."""
+
+    def restore(self) -> Saved | None:
+        """Return where an earlier run stood; None where there is none."""
+
+    def due(self) -> bool:
+        """Whether it is time to save again."""
+
+    def save(self, saved: Saved, draws: int) -> None:
+        """Keep where chains stand, with so many draws of each."""
+
+
+def sample(key: jax.Array, bound: BoundModel, transition: Transition, starts: np.ndarray | None, *, warmup: int,
+           samples: int, thin: int = 1, chain_method: str | None = None, progress: bool = False,
+           keeper: Keeper | None = None) -> Draws:
+    """Run chains; the same seed gives the same draws whatever the blocks, the progress bar, and stops on the way.
+
+    Warm-up and sampling are one program, in which the data are an argument: another data set compiles nothing. It is
+    called for a block of steps at a time, as many as take about `BLOCK_S`. Ctrl-C ends the run after the present block.
 
     Args:
         key: a JAX random key.
         bound: the model and its data.
         transition: of the sampler.
-        starts: (C, d), where each chain starts; the density is finite there.
+        starts: (C, d), where each chain starts; the density is finite there. None where ``keeper`` has their state.
         warmup: steps before the first draw that is kept.
         samples: N, draws in each chain.
         thin: steps that make one draw.
         chain_method: "parallel" (a device for each chain), "vectorized" or "sequential"; None: parallel where there are
             enough devices, sequential otherwise.
-        progress: show a bar on standard error.
+        progress: show on standard error how far it is.
+        keeper: keeps the state of the chains and their draws, and knows those of an earlier run.
+
+    Raises:
+        KeyboardInterrupt: the second Ctrl-C.
     """
+    total = warmup + samples * thin
+    saved = None if keeper is None else keeper.restore()
+    if saved is not None and saved.done == total:
+        return _draws(saved.rows, samples, total, total)
+    if saved is None:
+        assert starts is not None
+        saved = _first(key, bound, transition, starts, samples)
+        if keeper is not None:
+            keeper.save(saved, 0)
+    chains = len(saved.leaves[0])
+    method = available_method(chain_method, chains)
+    block = bound.compiled(("block", transition.identity, method), lambda: _block(transition, _recorder(transition),
+                                                                                  method))
+    run = _one_by_one(block, chains) if method == "sequential" else block
+    state = _on_device(saved.leaves, _like(bound, transition, chains))
+    now = (state, jax.tree_util.tree_map(jnp.asarray, saved.rows), saved.done)
+    pace, on_disk = _Pace(), saved.done
+    drawn = lambda done: max((done - warmup) // thin, 0)  # noqa: E731
+
+    def keep(state: Any, store: Any, done: int) -> None:
+        if keeper is not None:
+            keeper.save(Saved(done, _on_host(state), jax.tree_util.tree_map(np.asarray, store)), drawn(done))
+
+    with Progress(total, saved.done, progress) as shown, Interruption() as stop:
+        try:
+            while now[-1] < total and not stop.requests:
+                state, store, lower = now
+                upper, began = min(lower + pace.steps, total), time.perf_counter()
+                state, store = jax.block_until_ready(run(state, store, lower, upper, warmup, thin, bound.argument))
+                now = state, store, upper
+                pace.took(time.perf_counter() - began)
+                stop.defer()
+                if keeper is not None and upper < total and keeper.due():
+                    keep(*now)
+                    on_disk = upper
+                shown.advance(upper, lambda: Stage(  # noqa: B023 (called at once)
+                    drawn(upper), samples, _divergences(store, drawn(upper)), transition.describe(state)))  # noqa: B023
+        except KeyboardInterrupt:
+            if stop.requests > 1:
+                raise
+        if on_disk < now[-1]:
+            keep(*now)
+    _, store, done = now
+    return _draws(jax.tree_util.tree_map(np.asarray, store), drawn(done), done, total)
+
+
+class _Pace:
+    """Chooses how many steps make a block, by the time that the last one took."""
+
+    def __init__(self) -> None:
+        self.steps = 1
+        self._compiled = False
+
+    def took(self, seconds: float) -> None:
+        """Learn what a block took; the first one takes as long as the compilation."""
+        if self._compiled:
+            self.steps = max(1, int(self.steps * min(BLOCK_S / max(seconds, 1e-9), _GROWTH)))
+        self._compiled = True
+
+
+def _first(key: jax.Array, bound: BoundModel, transition: Transition, starts: np.ndarray, samples: int) -> Saved:
+    """Return the state before the first step."""
     chains = len(starts)
-    method = _method(chain_method, chains)
-    points = _points(bound, transition, starts)
-    keys = jax.random.split(key, chains)
     begin = bound.compiled(("start", transition.identity), lambda: jax.jit(
         jax.vmap(transition.start, in_axes=(0, 0, None, None))))
-    state = begin(keys, points, bound.argument, transition.extra)
-    record = _recorder(transition)
-    store = jax.tree_util.tree_map(lambda leaf: jnp.zeros((chains, samples, *leaf.shape[1:]), leaf.dtype),
-                                   jax.eval_shape(jax.vmap(record), state))
-    block = bound.compiled(("block", transition.identity, method), lambda: _block(transition, record, method))
-    total = warmup + samples * thin
-    edges = [0, total] if not progress else list(np.unique(np.linspace(0, total, _BLOCKS + 1).astype(int)))
-    run = _one_by_one(block, chains) if method == "sequential" else block
-    with _Bar(total, progress) as bar:
-        for lower, upper in zip(edges[:-1], edges[1:], strict=True):
-            state, store = run(state, store, int(lower), int(upper), warmup, thin, bound.argument)
-            if progress:
-                bar.advance(int(upper), transition.describe(jax.block_until_ready(state)))
-    collected = jax.tree_util.tree_map(np.asarray, store)
-    return Draws(collected.pop("z"), collected)
+    state = begin(jax.random.split(key, chains), _points(bound, transition, starts), bound.argument, transition.extra)
+    row = jax.eval_shape(jax.vmap(_recorder(transition)), state)
+    return Saved(0, _on_host(state), {name: np.zeros((chains, samples, *leaf.shape[1:]), leaf.dtype)
+                                      for name, leaf in row.items()})
 
 
-def _method(chosen: str | None, chains: int) -> str:
+def _like(bound: BoundModel, transition: Transition, chains: int) -> Any:
+    """Return shapes and types of the state of all chains."""
+    unravel = jax.vmap(bound.unravel)
+
+    def start(keys: jax.Array, z: jax.Array, energy: jax.Array) -> Any:
+        points = ParamInfo(unravel(z), energy, unravel(z))
+        return jax.vmap(transition.start, in_axes=(0, 0, None, None))(keys, points, bound.argument, transition.extra)
+
+    return jax.eval_shape(start, jax.random.split(jax.random.key(0), chains), jnp.zeros((chains, bound.size)),
+                          jnp.zeros(chains))
+
+
+def _on_host(state: Any) -> list[np.ndarray]:
+    return [np.asarray(jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf)
+            for leaf in jax.tree_util.tree_leaves(state)]
+
+
+def _on_device(leaves: Sequence[np.ndarray], like: Any) -> Any:
+    """Return the state whose arrays are ``leaves``; the inverse of `_on_host`."""
+    shapes, structure = jax.tree_util.tree_flatten(like)
+    return jax.tree_util.tree_unflatten(structure, [
+        jax.random.wrap_key_data(jnp.asarray(leaf)) if jnp.issubdtype(shape.dtype, jax.dtypes.prng_key)
+        else jnp.asarray(leaf, shape.dtype) for leaf, shape in zip(leaves, shapes, strict=True)])
+
+
+def _draws(rows: Mapping[str, np.ndarray], count: int, done: int, total: int) -> Draws:
+    collected = {name: np.asarray(values)[:, :count] for name, values in rows.items()}
+    return Draws(collected.pop("z"), collected, done, total)
+
+
+def _divergences(store: Mapping[str, jax.Array], draws: int) -> int:
+    return int(np.asarray(store["diverging"])[:, :draws].sum()) if "diverging" in store else 0
+
+
+def available_method(chosen: str | None, chains: int) -> str:
+    """Return how chains run side by side on the devices that there are; arguments as in `sample`."""
     enough = jax.local_device_count() >= chains
     if chosen is None:
         return "parallel" if enough else "sequential"
@@ -203,7 +328,7 @@ def _method(chosen: str | None, chains: int) -> str:
     if chosen == "parallel" and not enough:
         warnings.warn(f"there are {jax.local_device_count()} devices for {chains} parallel chains, so that they run "
                       f"one after another; call numpyro.set_host_device_count({chains}) before JAX starts.",
-                      stacklevel=4)
+                      stacklevel=3)
         return "sequential"
     return chosen
 
@@ -253,28 +378,3 @@ def _one_by_one(block: Callable, chains: int) -> Callable:
         return jax.tree_util.tree_map(lambda *leaves: jnp.stack(leaves), *found)
 
     return run
-
-
-class _Bar:
-    """A progress bar over all steps, or none."""
-
-    def __init__(self, total: int, shown: bool) -> None:
-        self._done, self._bar = 0, None
-        if shown:
-            from tqdm.auto import tqdm
-
-            self._bar = tqdm(total=total, file=sys.stderr)
-
-    def __enter__(self) -> _Bar:
-        return self
-
-    def __exit__(self, *error: Any) -> None:
-        if self._bar is not None:
-            self._bar.close()
-
-    def advance(self, done: int, words: str) -> None:
-        """Show that so many steps are done."""
-        if self._bar is not None:
-            self._bar.set_postfix_str(words, refresh=False)
-            self._bar.update(done - self._done)
-        self._done = done

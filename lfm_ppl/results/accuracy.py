@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -14,6 +15,7 @@ import xarray as xr
 from lfm_ppl import checks
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.results import arviz_data, importance, likelihoods, rebuilding
+from lfm_ppl.results import checkpoint as checkpoints
 from lfm_ppl.results.likelihoods import PosteriorDraws, Reference
 from lfm_ppl.results.report import EXACT, GROUP, AccuracyReport
 from lfm_ppl.results.scalars import choose, scalar_draws
@@ -30,8 +32,8 @@ _MOST_WORK = 2e10
 
 def check_accuracy(result: Any, numpyro_model: Callable, times: Any = None, y: Any = None, *, reference: str = "auto",
                    draws: int = 200, particles: int | None = None, replicates: int = 4, steps: int | None = None,
-                   model_kwargs: Mapping[str, Any] | None = None, seed: int = 0,
-                   progress: bool = True) -> AccuracyReport:
+                   model_kwargs: Mapping[str, Any] | None = None, seed: int = 0, progress: bool = True,
+                   checkpoint: str | Path | None = None, resume: bool = False) -> AccuracyReport:
     """Ask a posterior of the Gaussian filter how wrong it is, and what the exact one looks like.
 
     At draws theta_i of the posterior, the likelihood of the Gaussian filter is compared with an exact one. Their ratios
@@ -55,6 +57,10 @@ def check_accuracy(result: Any, numpyro_model: Callable, times: Any = None, y: A
         model_kwargs: keyword arguments of the model, as in the fit.
         seed: of the particle filter.
         progress: write to standard error how far it is.
+        checkpoint: a folder to keep log likelihoods in while others are computed, every few seconds. They stay there,
+            in a folder ``checkpoint``, for whoever takes them up after the report is stored.
+        resume: go on with a check that ``checkpoint`` keeps, of the same result with the same settings; begin one where
+            it keeps none.
 
     Returns:
         The report; ``print`` it.
@@ -93,15 +99,29 @@ def check_accuracy(result: Any, numpyro_model: Callable, times: Any = None, y: A
     kind = _kind(reference, ssm)
     posterior = arviz_data.group(result, "posterior")
     chosen, rows = evenly_spaced(posterior.sizes["chain"], posterior.sizes["draw"], draws)
-    problem = whole.at(rows)
+    kept = None
+    if checkpoint is not None:
+        kept = checkpoints.begin_or_resume(checkpoint, {
+            "reference": reference, "draws": draws, "particles": particles, "replicates": replicates, "steps": steps,
+            "seed": seed, "model": checkpoints.digest(whole.bound.fingerprint), "data": checkpoints.digest(whole.y),
+            "draws of the result": checkpoints.digest(*whole.draws.values()), "versions": checkpoints.versions(),
+        }, resume)  # fmt: skip
+    with checkpoints.closing(kept):
+        report = _report(result, whole.at(rows)._replace(parts=kept and kept.parts), chosen, kind, particles,
+                         replicates, steps, seed, progress)
+    arviz_data.add_group(result, GROUP, report.to_dataset())
+    return report
+
+
+def _report(result: Any, problem: PosteriorDraws, chosen: np.ndarray, kind: str, particles: int | None,
+            replicates: int, steps: int | None, seed: int, progress: bool) -> AccuracyReport:
+    posterior = arviz_data.group(result, "posterior")
     shape = (posterior.sizes["chain"], len(chosen))
     filtered = likelihoods.gaussian(problem).reshape(shape)
     rebuilding.check_likelihood(result, filtered, chosen)
     doubled = likelihoods.gaussian_with_finer_steps(problem).reshape(shape)
     found = _reference(kind, problem, filtered, particles, replicates, steps, seed, progress)
-    report = assess(result, chosen, filtered, doubled, found, problem)
-    arviz_data.add_group(result, GROUP, report.to_dataset())
-    return report
+    return assess(result, chosen, filtered, doubled, found, problem)
 
 
 def evenly_spaced(chains: int, samples: int, count: int) -> tuple[np.ndarray, np.ndarray]:

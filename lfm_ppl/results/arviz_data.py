@@ -216,7 +216,8 @@ def summary(result: Any) -> pd.DataFrame:
     Returns:
         Columns mean, sd, q2.5, q97.5 (quantiles in percent), mcse_mean, ess_bulk, ess_tail, r_hat;
         rows labelled ``noise_sd`` or ``decay[CDKN1A]``. Resampled draws are no chains: the effective size is that of
-        the importance weights, and there is no R-hat.
+        the importance weights, and there is no R-hat. A run that was stopped has a column more, ``partial``, which says
+        what there is.
 
     Raises:
         ValueError: the result has no posterior.
@@ -248,6 +249,8 @@ def summary(result: Any) -> pd.DataFrame:
         table["mcse_mean"] = table["sd"] / np.sqrt(resampled)
         table["ess_bulk"] = float(resampled)
         table[["ess_tail", "r_hat"]] = np.nan
+    if (partial := attributes(result).get("partial")) is not None:
+        table["partial"] = str(partial).split(",", 1)[0]
     return table
 
 

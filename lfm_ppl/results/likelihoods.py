@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Hashable, Mapping
 from typing import Any, NamedTuple
 
@@ -14,7 +13,8 @@ from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.fokker_planck_grid import fokker_planck
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
-from lfm_ppl.inference.posterior import each, over_draws
+from lfm_ppl.inference.posterior import Parts, each, over_draws
+from lfm_ppl.inference.progress import Counter
 from lfm_ppl.model.observation_noise import check_noise
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel
@@ -37,10 +37,16 @@ class PosteriorDraws(NamedTuple):
     Attributes:
         bound: the model with its times and data.
         draws: site name -> (S, ...).
+        parts: maps the name of what is computed to what keeps its batches; None: they are not kept.
     """
 
     bound: BoundModel
     draws: Mapping[str, np.ndarray]
+    parts: Callable[[str], Parts] | None = None
+
+    def kept(self, name: str) -> Parts | None:
+        """Return what keeps the batches of a computation."""
+        return None if self.parts is None else self.parts(name)
 
     @property
     def example(self) -> MarginalLikelihood:
@@ -92,14 +98,15 @@ def is_exact(ssm: StateSpaceModel) -> bool:
             and not observation.angular)
 
 
-def gaussian(problem: PosteriorDraws) -> np.ndarray:
+def gaussian(problem: PosteriorDraws, name: str = "log likelihoods") -> np.ndarray:
     """Return (S,): the log likelihoods of the Gaussian filter, summed over the series of a panel."""
     bound = problem.bound
 
     def per_draw(values: Any, key: jax.Array, y: jax.Array) -> dict[str, jax.Array]:
         return {"total": bound.likelihood(values, y).log_prob(bound.data(y)).sum()}
 
-    return over_draws(bound, "log likelihoods", per_draw, problem.draws, jax.random.key(0), bound.times.size)["total"]
+    return over_draws(bound, "log likelihoods", per_draw, problem.draws, jax.random.key(0), bound.times.size,
+                      parts=problem.kept(name))["total"]
 
 
 def finer_tolerance(tolerance: float) -> float:
@@ -113,7 +120,7 @@ def gaussian_with_finer_steps(problem: PosteriorDraws) -> np.ndarray:
     finer = problem.bound.approximate(
         steps=2 * example.steps, max_step=None if example.max_step is None else example.max_step / 2,
         tolerance=None if example.tolerance is None else finer_tolerance(example.tolerance))
-    return gaussian(problem._replace(bound=finer))
+    return gaussian(problem._replace(bound=finer), "log likelihoods with finer steps")
 
 
 def on_grid(problem: PosteriorDraws, steps: int | None, progress: bool) -> Reference:
@@ -162,7 +169,9 @@ def by_particles(problem: PosteriorDraws, particles: int | None, replicates: int
     run = _particle_run(problem, chosen, replicates, steps, progress)
     if particles is None:
         rows = np.unique(np.linspace(0, problem.size - 1, _PILOT).round().astype(int))
-        sd = noise(run(problem.at(rows), pilot_key))
+        few = problem.at(rows)
+        sd = noise(run(few._replace(parts=lambda name: problem.parts(f"pilot {name}")) if problem.parts else few,
+                       pilot_key))
         wanted = chosen * (sd / target) ** 2 * _SAFETY if np.isfinite(sd) else np.inf
         time_grid = build_time_grid(example.ssm, example.times, steps or example.steps, example.max_step)
         steps_made = np.shape(time_grid.intervals.length)[0] * time_grid.steps
@@ -212,15 +221,10 @@ def _particle_run(problem: PosteriorDraws, particles: int, replicates: int, step
 def _one_by_one(problem: PosteriorDraws, key: jax.Array, name: Hashable, per_draw: Callable, label: str,
                 progress: bool) -> np.ndarray:
     """Map over draws, one after another, and say how far that is."""
-    found = over_draws(problem.bound, name, per_draw, problem.draws, key,
-                       show=lambda done, count: _show(f"{label}: {done} of {count} draws", progress))
-    _show("", progress)
+    counter = Counter(label, shown=progress)
+    found = over_draws(problem.bound, name, per_draw, problem.draws, key, show=counter, parts=problem.kept(label))
+    counter.close()
     return found
-
-
-def _show(text: str, progress: bool) -> None:
-    if progress:
-        print(f"\r{text:<70}\r", end="", file=sys.stderr, flush=True)
 
 
 def _scouted(problem: PosteriorDraws) -> list[Any]:

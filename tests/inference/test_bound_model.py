@@ -199,7 +199,8 @@ def test_a_step_is_that_of_numpyros_nuts(bound):
     assert moved >= 3
 
 
-def test_thinning_and_blocks_keep_the_last_step_of_each_draw(capfd):
+def test_thinning_and_blocks_keep_the_last_step_of_each_draw(capfd, monkeypatch):
+    monkeypatch.setattr("lfm_ppl.inference.progress.EVERY_S", 0.0)
     bound = lfm.bind(model, TIMES, Y)
     kernel = lfm.RAM(model, initial_scale=0.1)
     starts = np.stack([bound.unconstrain(VALUES)] * 2)

@@ -177,14 +177,18 @@ class ParticleMarginalRAM(RAM):
         assert self.estimate is not None and self.tuned is not None, "init must be called first."
         return self.estimate.settings._replace(particles=self.tuned.particles)
 
-    def prepare(self, bound: BoundModel, start: Any) -> None:
+    def prepare(self, bound: BoundModel, start: Any, tuned: Tuned | None = None) -> None:
         """Check the filter and choose the number of particles: with numbers, since it decides what is compiled.
 
         Args:
             bound: the model and its data.
             start: (d,), where the number is chosen unless ``tune_at`` says otherwise.
+            tuned: what was chosen before; None: choose.
         """
         self.estimate = ParticlePotential(bound, self._settings, self.particle_steps)
+        if tuned is not None:
+            self.tuned = tuned
+            return
         if checks.traced(bound.y):
             # Data that are arguments of a compiled program: there is nothing to choose the number by.
             if self._particles is None:

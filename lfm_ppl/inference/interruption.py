@@ -1,0 +1,50 @@
+"""Ctrl-C while chains run: the block of draws that is under way ends first."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from types import FrameType
+from typing import Any
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class Interruption:
+    """Within this context Ctrl-C is a request, once `defer` was called; a second one raises KeyboardInterrupt.
+
+    It takes the place of Python's own handler alone (``signal.default_int_handler``), in the main thread: whoever has
+    set another one wants something else. The command line sets Python's handler for SIGTERM, too.
+
+    Attributes:
+        requests: how often somebody has asked to stop. Counted also where KeyboardInterrupt is raised, because that may
+            be lost: Python ignores what is raised within a callback of the garbage collector, of which JAX has one.
+    """
+
+    def __init__(self) -> None:
+        self.requests = 0
+        self._deferring = False
+        self._replaced: list[int] = []
+
+    def __enter__(self) -> Interruption:
+        if threading.current_thread() is threading.main_thread():
+            for number in _SIGNALS:
+                if signal.getsignal(number) is signal.default_int_handler:
+                    signal.signal(number, self._handle)
+                    self._replaced.append(number)
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        for number in self._replaced:
+            signal.signal(number, signal.default_int_handler)
+
+    def defer(self) -> None:
+        """From now on there is something to lose: let the present block end before all stops."""
+        self._deferring = True
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        self.requests += 1
+        if self.requests > 1 or not self._deferring:
+            raise KeyboardInterrupt
+        print("\nstopping after this block of draws; once more to stop at once", file=sys.stderr, flush=True)

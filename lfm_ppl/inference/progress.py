@@ -1,0 +1,128 @@
+"""How far a computation is: a bar on a terminal, a line now and then elsewhere."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+EVERY_S = 30.0
+"""Between two lines, where no terminal redraws one."""
+
+
+def on_terminal() -> bool:
+    """Whether a line on standard error can be redrawn: a terminal or a notebook."""
+    return sys.stderr.isatty() or "ipykernel" in sys.modules
+
+
+class Stage(NamedTuple):
+    """How far chains are.
+
+    Attributes:
+        draws: of each chain, so far.
+        samples: of each chain, in the end.
+        divergences: of all chains.
+        words: of the sampler.
+    """
+
+    draws: int
+    samples: int
+    divergences: int
+    words: str
+
+
+class Progress:
+    """Shows steps of chains.
+
+    Args:
+        total: number of steps.
+        done: those of an earlier run.
+        shown: whether anything is shown.
+    """
+
+    def __init__(self, total: int, done: int, shown: bool) -> None:
+        self._total, self._done, self._shown = total, done, shown
+        self._bar: Any = None
+        self._first: tuple[float, int] | None = None
+        self._said = time.perf_counter()
+
+    def __enter__(self) -> Progress:
+        if self._shown and on_terminal():
+            from tqdm.auto import tqdm
+
+            self._bar = tqdm(total=self._total, initial=self._done, file=sys.stderr)
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        if self._bar is not None:
+            self._bar.close()
+
+    def advance(self, done: int, stage: Callable[[], Stage]) -> None:
+        """Show that so many steps are done; ``stage`` is asked only where it is shown."""
+        now = time.perf_counter()
+        if self._bar is not None:
+            what = stage()
+            self._bar.set_postfix_str(_divergences(what, ", ") + what.words, refresh=False)
+            self._bar.update(done - self._done)
+        elif self._shown and now - self._said >= EVERY_S:
+            self._said = now
+            what = stage()
+            print(f"sampling {done:,} of {self._total:,} steps, {what.draws:,} of {what.samples:,} draws a chain, "
+                  f"{_divergences(what, ', ')}{what.words}{self._left(now, done)}", file=sys.stderr, flush=True)
+        self._done = done
+        if self._first is None:  # the steps before it came with the compilation
+            self._first = now, done
+
+    def _left(self, now: float, done: int) -> str:
+        if self._first is None or done <= self._first[1]:
+            return ""
+        return f"; about {_duration((now - self._first[0]) / (done - self._first[1]) * (self._total - done))} left"
+
+
+class Counter:
+    """Shows how many of a number of things are done: ``counter(done, count)``.
+
+    Args:
+        label: what is computed.
+        things: what is counted.
+        shown: whether anything is shown.
+    """
+
+    def __init__(self, label: str, things: str = "draws", shown: bool = True) -> None:
+        self._label, self._things, self._shown = label, things, shown
+        self._said = time.perf_counter()
+
+    def __call__(self, done: int, count: int) -> None:
+        """Show that ``done`` of ``count`` are done."""
+        if not self._shown:
+            return
+        text = f"{self._label}: {done:,} of {count:,} {self._things}"
+        if on_terminal():
+            print(f"\r{text:<70}\r", end="", file=sys.stderr, flush=True)
+        elif time.perf_counter() - self._said >= EVERY_S:
+            self._said = time.perf_counter()
+            print(text, file=sys.stderr, flush=True)
+
+    def close(self) -> None:
+        """Leave an empty line on a terminal."""
+        if self._shown and on_terminal():
+            print(f"\r{'':<70}\r", end="", file=sys.stderr, flush=True)
+
+
+def _divergences(stage: Stage, end: str) -> str:
+    if not stage.divergences:
+        return ""
+    return f"{stage.divergences:,} divergence{'s' * (stage.divergences > 1)}{end}"
+
+
+def _duration(seconds: float) -> str:
+    """Return a time in the unit in which it is read best.
+
+    Example:
+        >>> _duration(42.0), _duration(600.0), _duration(9000.0)
+        ('42 s', '10 min', '2.5 h')
+    """
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

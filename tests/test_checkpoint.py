@@ -1,0 +1,442 @@
+"""Runs that are stopped, killed and gone on with give the draws of runs that are not."""
+
+import functools
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import warnings
+from pathlib import Path
+
+import jax
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
+import systems
+import xarray as xr
+
+import lfm_ppl as lfm
+from lfm_ppl.cli import main
+from lfm_ppl.inference import progress, sampling
+from lfm_ppl.results import arviz_data
+from lfm_ppl.results import checkpoint as checkpoints
+from lfm_ppl.results.checkpoint import Checkpoint
+from tests.processes import ROOT
+
+TIMES = np.arange(4.0)
+Y = np.array([[0.3], [0.9], [np.nan], [-0.8]])
+SIZES = {"chains": 2, "warmup": 8, "samples": 6, "trajectory_draws": 4, "at": [0.5, 4.0], "chain_method": "vectorized"}
+OPTIONS = {"pmmh": {"particles": 10}}
+SAMPLERS = ("nuts", "ram", "pmmh", "map")
+
+
+def well(times, y=None, width=0.3):
+    """A double well whose noise is unknown."""
+    noise = numpyro.sample("noise", dist.LogNormal(-0.5, width))
+    system = systems.double_well(dispersion=noise, noise=0.1)
+    numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=1), obs=y)
+
+
+def fit(sampler, **changes):
+    settings = {"sampler_options": OPTIONS.get(sampler), **SIZES, **changes}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return lfm.fit(settings.pop("model", well), settings.pop("times", TIMES), settings.pop("y", Y),
+                       sampler=sampler, progress=False, **settings)
+
+
+def assert_same(result, expected):
+    """All groups are equal to the last bit, and so is what is said of them, but for times."""
+    assert set(arviz_data.groups(result)) == set(arviz_data.groups(expected))
+    for name in arviz_data.groups(expected):
+        xr.testing.assert_identical(arviz_data.group(result, name), arviz_data.group(expected, name))
+    ours, theirs = arviz_data.attributes(result), arviz_data.attributes(expected)
+    for attrs in (ours, theirs):
+        for name in ("wall_time_s", "created_at", "run"):
+            attrs.pop(name, None)
+    assert ours == theirs
+
+
+@pytest.fixture(autouse=True)
+def many_small_blocks(monkeypatch):
+    """Blocks of a step, each of them on disk."""
+    monkeypatch.setattr(sampling, "BLOCK_S", 0.0)
+    monkeypatch.setattr(checkpoints, "_EVERY_S", 0.0)
+
+
+@pytest.fixture
+def stop_after(monkeypatch):
+    """Send SIGINT when so many draws are on disk; the handler is Python's, as in a program."""
+    monkeypatch.setattr(signal, "default_int_handler", signal.getsignal(signal.SIGINT))
+
+    def set_up(draws, steps=0):
+        save = Checkpoint.save
+
+        def stopping(self, saved, count):
+            save(self, saved, count)
+            if count >= draws and saved.done >= steps:
+                monkeypatch.setattr(Checkpoint, "save", save)
+                signal.raise_signal(signal.SIGINT)
+
+        monkeypatch.setattr(Checkpoint, "save", stopping)
+
+    return set_up
+
+
+@pytest.fixture(scope="module")
+def whole():
+    """Results of runs that nobody stops and nothing keeps, in blocks as long as they like."""
+    return functools.cache(fit)
+
+
+@pytest.mark.parametrize("sampler", ["nuts", "ram", "pmmh"])
+def test_a_run_that_is_stopped_goes_on_to_the_same_draws(sampler, whole, tmp_path, stop_after):
+    expected = whole(sampler)
+    stop_after(0, steps=3)
+    with pytest.raises(KeyboardInterrupt, match=r"stopped in the warm-up, after \d+ of \d+ steps; there are no draws"):
+        fit(sampler, checkpoint=tmp_path / "run")
+    stop_after(3)
+    partial = fit(sampler, checkpoint=tmp_path / "run", resume=True)
+    said = arviz_data.attributes(partial)["partial"]
+    count = arviz_data.group(partial, "posterior").sizes["draw"]
+    assert 3 <= count < 6 and said == f"{count} of 6 draws a chain, without scores and trajectories"
+    for name in ("posterior", "sample_stats"):
+        xr.testing.assert_identical(arviz_data.group(partial, name),
+                                    arviz_data.group(expected, name).isel(draw=slice(count)))
+    assert_same(lfm.load(tmp_path / "run"), partial)
+    assert (arviz_data.summary(partial)["partial"] == f"{count} of 6 draws a chain").all()
+    assert_same(fit(sampler, checkpoint=tmp_path / "run", resume=True), expected)
+    assert [path.name for path in (tmp_path / "run").iterdir()] == ["posterior.nc"]
+    assert "partial" not in arviz_data.summary(expected)
+
+
+@pytest.mark.parametrize("sampler", ["ram", "map"])
+def test_a_stop_after_sampling_costs_no_draw(sampler, whole, tmp_path, monkeypatch):
+    def stop(*arguments, **keywords):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("lfm_ppl.fitting.trajectories", stop)
+        partial = fit(sampler, checkpoint=tmp_path)
+    said = arviz_data.attributes(partial)["partial"]
+    assert said == "all draws and their scores, without trajectories"
+    assert "log_likelihood" in arviz_data.groups(partial) and "trajectories" not in arviz_data.groups(partial)
+    xr.testing.assert_identical(arviz_data.group(partial, "posterior"), arviz_data.group(whole(sampler), "posterior"))
+    monkeypatch.setattr("lfm_ppl.inference.map.mode_of", stop)  # nothing is searched or sampled again
+    monkeypatch.setattr("lfm_ppl.fitting.mode_of", stop)
+    assert_same(fit(sampler, checkpoint=tmp_path, resume=True), whole(sampler))
+
+
+def test_a_run_that_nothing_keeps_gives_what_it_has(whole, monkeypatch):
+    monkeypatch.setattr(signal, "default_int_handler", signal.getsignal(signal.SIGINT))
+    took = sampling._Pace.took
+    calls = []
+
+    def stopping(self, seconds):
+        took(self, seconds)
+        calls.append(seconds)
+        if len(calls) == 11:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(sampling._Pace, "took", stopping)
+    with warnings.catch_warnings(), pytest.warns(UserWarning, match="partial: 3 of 6 draws a chain"):
+        warnings.simplefilter("ignore", lfm.ConvergenceWarning)
+        partial = lfm.fit(well, TIMES, Y, sampler="nuts", progress=False, **SIZES)
+    np.testing.assert_array_equal(arviz_data.group(partial, "posterior")["noise"],
+                                  arviz_data.group(whole("nuts"), "posterior")["noise"][:, :3])
+
+
+def test_a_second_request_ends_at_once(monkeypatch):
+    monkeypatch.setattr(signal, "default_int_handler", signal.getsignal(signal.SIGINT))
+
+    def twice(self, seconds):
+        if self._compiled:
+            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
+        self._compiled = True
+
+    monkeypatch.setattr(sampling._Pace, "took", twice)
+    with pytest.raises(KeyboardInterrupt):
+        fit("ram")
+
+
+# Refusals
+
+
+@pytest.fixture(scope="module")
+def unfinished(tmp_path_factory):
+    """A folder with a run that was stopped."""
+    folder = tmp_path_factory.mktemp("unfinished") / "run"
+    checkpoint_save = Checkpoint.save
+
+    def stop(self, saved, draws):
+        checkpoint_save(self, saved, draws)
+        raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Checkpoint, "save", stop)
+        with pytest.raises(KeyboardInterrupt):
+            fit("ram", checkpoint=folder)
+    assert (folder / "checkpoint" / "state.npz").is_file()
+    return folder
+
+
+def wider(times, y=None):
+    well(times, y, width=0.4)
+
+
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"seed": 3}, "seed was 0 and is 3"),
+    ({"samples": 7, "thin": 2}, "samples was 6 and is 7; thin was 5 and is 2"),
+    ({"y": Y + 1.0}, "another one: data differ"),
+    ({"times": TIMES + 0.5}, "times differ"),
+    ({"model": wider}, "another one: model differs"),
+    ({"at": [0.5, 4.5]}, "another one: times of the trajectories differ"),
+    ({"sampler_options": {"target_accept_prob": 0.5}}, "sampler_options target_accept_prob was not given and is 0.5"),
+    ({"chain_method": "sequential"}, "chain_method was vectorized and is sequential"),
+    ({"init": "map"}, "init was not given and is map"),
+])
+def test_another_run_is_not_gone_on_with(unfinished, changes, message):
+    before = {path: path.read_bytes() for path in unfinished.rglob("*") if path.is_file()}
+    with pytest.raises(ValueError, match="cannot go on with the run in .*run, which was another one: ") as raised:
+        fit("ram", checkpoint=unfinished, resume=True, **changes)
+    assert message in str(raised.value) and "Repeat what it was begun with" in str(raised.value)
+    assert {path: path.read_bytes() for path in unfinished.rglob("*") if path.is_file()} == before
+
+
+def test_other_versions_do_not_go_on(unfinished, monkeypatch):
+    versions = checkpoints.versions() | {"jax": "0.1"}
+    monkeypatch.setattr(checkpoints, "versions", lambda: versions)
+    with pytest.raises(ValueError, match=r"versions jax was \S+ and is 0.1\."):
+        fit("ram", checkpoint=unfinished, resume=True)
+
+
+def test_one_process_at_a_time(unfinished):
+    first = Checkpoint.resume(unfinished, json.loads((unfinished / "checkpoint" / "run.json").read_text()))
+    with pytest.raises(RuntimeError, match="another process is at work on the run in"):
+        fit("ram", checkpoint=unfinished, resume=True)
+    first.close()
+
+
+def test_a_finished_run_is_read(whole, tmp_path, monkeypatch):
+    fit("ram", checkpoint=tmp_path)
+    before = (tmp_path / "posterior.nc").stat()
+    monkeypatch.setattr(sampling, "sample", lambda *arguments, **keywords: pytest.fail("it was sampled"))
+    assert_same(fit("ram", checkpoint=tmp_path, resume=True), whole("ram"))
+    assert (tmp_path / "posterior.nc").stat().st_mtime_ns == before.st_mtime_ns
+    with pytest.raises(ValueError, match="seed was 0 and is 1"):
+        fit("ram", checkpoint=tmp_path, resume=True, seed=1)
+    with pytest.raises(FileExistsError, match="holds a result, which is kept. Name another folder, or replace it with"):
+        fit("ram", checkpoint=tmp_path)
+
+
+def test_folders_that_cannot_be_used(unfinished, tmp_path):
+    with pytest.raises(ValueError, match="resume goes on with a run that a folder keeps; name the folder, checkpoint="):
+        fit("ram", resume=True)
+    with pytest.raises(FileExistsError, match="holds an unfinished run, which is kept. Go on with it with resume=True"):
+        fit("ram", checkpoint=unfinished)
+    (tmp_path / "mine.txt").write_text("keep")
+    with pytest.raises(FileNotFoundError, match="holds files, but no run to go on with"):
+        fit("ram", checkpoint=tmp_path, resume=True)
+    with pytest.raises(FileExistsError, match="mine.txt is a file; expected the name of a folder"):
+        fit("ram", checkpoint=tmp_path / "mine.txt")
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_nothing_is_left_where_nothing_was_sampled(tmp_path, monkeypatch):
+    def stop(*arguments, **keywords):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("lfm_ppl.fitting.mode_of", stop)
+    with pytest.raises(KeyboardInterrupt):
+        fit("ram", checkpoint=tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+# Accuracy
+
+
+def test_a_check_goes_on_where_it_was_stopped(whole, tmp_path, monkeypatch):
+    result = whole("map")
+    monkeypatch.setattr("lfm_ppl.inference.posterior._BATCH", 2)
+    check = lambda **more: lfm.check_accuracy(  # noqa: E731
+        result, well, reference="particles", particles=20, draws=6, progress=False, **more).dataset
+    expected = check()
+
+    def stopping(self, done, count):
+        if done >= 4:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(progress.Counter, "__call__", stopping)
+        with pytest.raises(KeyboardInterrupt):
+            check(checkpoint=tmp_path)
+    assert {path.name for path in (tmp_path / "checkpoint").iterdir() if path.is_dir()} == {
+        "log-likelihoods", "log-likelihoods-with-finer-steps", "particle-filter-20-particles"}
+    put = checkpoints.Parts.put
+    again = []
+    monkeypatch.setattr(checkpoints.Parts, "put", lambda self, at, part: again.append(at) or put(self, at, part))
+    xr.testing.assert_identical(check(checkpoint=tmp_path, resume=True), expected)
+    assert again == [4], "the first draws were not worked again"
+
+
+# Progress
+
+
+def test_where_there_is_no_terminal_lines_say_how_far_it_is(capfd, monkeypatch):
+    monkeypatch.setattr(progress, "EVERY_S", 0.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        lfm.fit(well, TIMES, Y, sampler="nuts", **SIZES)
+    lines = [line for line in capfd.readouterr().err.splitlines() if line.startswith("sampling")]
+    assert lines[0].startswith("sampling 1 of 14 steps, 0 of 6 draws a chain, ")
+    assert lines[-1].startswith("sampling 14 of 14 steps, 6 of 6 draws a chain, ") and lines[-1].endswith(" left")
+    assert "acceptance" in lines[-1] and "step size" in lines[-1]
+
+
+# The command line
+
+MODEL = '''"""A double well."""
+
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+
+import lfm_ppl as lfm
+
+OUTPUTS = ("x",)
+
+
+def model(times, y=None):
+    noise = numpyro.sample("noise", dist.LogNormal(-0.5, 0.3))
+    system = lfm.LatentForceModel(
+        lambda x, u, t: x - x**3, {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        lfm.Gaussian(jnp.array([0.5]), jnp.array([[0.2]])), process_noise=noise * jnp.eye(1))
+    numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=1), obs=y)
+
+
+def simulate(seed=0):
+    return lfm.Data(np.arange(4.0), np.array([[0.3], [0.9], [np.nan], [-0.8]]), OUTPUTS)
+'''
+
+
+def start(folder, *words):
+    """Begin `lfm-ppl fit` in a process of its own."""
+    (folder / "well.py").write_text(MODEL)
+    # Shells start what is in the background deaf to Ctrl-C, and so the tests, if they are.
+    code = ("import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+            "from lfm_ppl.cli import main; sys.exit(main(sys.argv[1:]))")
+    command = [sys.executable, "-c", code, "fit", "well.py", "--quiet", "--chains", "2", "--out", "run", *words]
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+    if (cache := jax.config.jax_compilation_cache_dir) is not None:
+        environment["JAX_COMPILATION_CACHE_DIR"] = cache
+    return subprocess.Popen(command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+                            text=True)
+
+
+def drawn(folder):
+    """Return how many draws are on disk."""
+    try:
+        with np.load(folder / "run" / "checkpoint" / "state.npz") as file:
+            return int(file["draws"])
+    except OSError:
+        return 0
+
+
+def test_ctrl_c_leaves_a_usable_result_within_ten_seconds(tmp_path, monkeypatch, capsys):
+    process = start(tmp_path, "--sampler", "ram", "--warmup", "10", "--samples", "1000000")
+    until = time.monotonic() + 200
+    while not drawn(tmp_path) and process.poll() is None and time.monotonic() < until:
+        time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    sent = time.monotonic()
+    out, _ = process.communicate(timeout=60)
+    assert time.monotonic() - sent < 10 and process.returncode == 130, out
+    assert "stopping after this block of draws" in out
+    assert "resume   lfm-ppl fit well.py --quiet --chains 2 --out run --sampler ram" in out
+    result = lfm.load(tmp_path / "run")
+    count = arviz_data.group(result, "posterior").sizes["draw"]
+    assert 0 < count < 1000000
+    assert arviz_data.attributes(result)["partial"].startswith(f"{count} of 1000000 draws a chain")
+    assert f"partial  {count} of 1000000 draws a chain" in out
+    assert f"{count} of 1000000 draws a chain" in (tmp_path / "run" / "summary.csv").read_text()
+    monkeypatch.chdir(tmp_path)
+    assert main(["plot", "run"]) == 0
+    assert "wrote run/trace.png" in capsys.readouterr().out
+
+
+def test_the_process_ends_though_compiled_code_runs_on():
+    code = """
+import hashlib, signal, threading, os, time
+from lfm_ppl.cli import interruption
+interruption._PATIENCE_S = 0.3
+threading.Timer(0.3, lambda: os.kill(os.getpid(), signal.SIGTERM)).start()
+with interruption.watched(lambda: "it is safe"):
+    hashlib.pbkdf2_hmac("sha256", b"", b"", 10**9)  # ten minutes of C, in which no handler runs
+"""
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=60)
+    assert ended.returncode == 130 and "lfm-ppl: stopped; it is safe" in ended.stderr, ended.stderr
+
+
+def test_a_finished_run_says_so(tmp_path, monkeypatch, capsys):
+    (tmp_path / "well.py").write_text(MODEL)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("lfm_ppl.results.plots.save_figures", lambda *arguments, **keywords: [])
+    line = ["fit", "well.py", "--sampler", "map", "--samples", "8", "--quiet", "--out", "run"]
+    assert main(line) == 0
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "run").iterdir()}
+    assert main([*line, "--resume"]) == 0
+    assert "the run in run is finished; nothing was changed" in capsys.readouterr().out
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "run").iterdir()} == before
+    assert main([*line, "--resume", "--seed", "2"]) == 2
+    assert "cannot go on with the run in run, which was another one: seed was 0 and is 2" in capsys.readouterr().err
+    for words, message in ((["--resume", "--overwrite"], "choose one"), ([], "the folder run exists and holds files")):
+        assert main([*line, *words]) == 2
+        assert message in capsys.readouterr().err
+    assert main([*line[:-2], "--resume"]) == 2
+    assert "name the folder with --out" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sampler", SAMPLERS)
+def test_killed_at_any_moment_it_goes_on_to_the_same_draws(sampler, tmp_path):
+    words = ["--sampler", sampler, "--warmup", "200", "--samples", "400", "--thin", "60" if sampler == "ram" else "4"]
+    if sampler == "map":
+        words = ["--sampler", "map", "--samples", "4000"]
+    if sampler == "pmmh":
+        words += ["--particles", "100"]
+    process = start(tmp_path, *words)
+    began = time.monotonic()
+    out, _ = process.communicate(timeout=600)
+    took = time.monotonic() - began
+    assert process.returncode == 0, out
+    expected = lfm.load(tmp_path / "run")
+    kills = int(os.environ.get("LFM_PPL_KILLS", "100")) // len(SAMPLERS)
+    chance = random.Random(SAMPLERS.index(sampler))
+    while kills > 0:
+        shutil.rmtree(tmp_path / "run", ignore_errors=True)
+        resume = []
+        while True:
+            process = start(tmp_path, *words, *resume)
+            try:
+                out, _ = process.communicate(timeout=chance.uniform(0.0, 1.1 * took) if kills > 0 else 600)
+            except subprocess.TimeoutExpired:
+                before = drawn(tmp_path)
+                process.kill()
+                process.communicate()
+                kills -= 1
+                assert drawn(tmp_path) >= before
+                for path in Path(tmp_path / "run").glob("posterior.nc"):
+                    lfm.load(path)  # it is whole, whenever the process was killed
+                resume = ["--resume"]
+                continue
+            assert process.returncode == 0, out
+            break
+        assert_same(lfm.load(tmp_path / "run"), expected)
+        assert not (tmp_path / "run" / "checkpoint").exists()
