@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from lfm_ppl import forces as forces
     from lfm_ppl import orbits as orbits
+    from lfm_ppl.backtesting import Backtest as Backtest
+    from lfm_ppl.backtesting import backtest as backtest
     from lfm_ppl.compilation import fast_loops as fast_loops
     from lfm_ppl.data import Data as Data
     from lfm_ppl.data import read_csv as read_csv
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
     from lfm_ppl.filtering.smoother import smooth as smooth
     from lfm_ppl.fitting import ConvergenceWarning as ConvergenceWarning
     from lfm_ppl.fitting import fit as fit
+    from lfm_ppl.forecasting import forecast as forecast
     from lfm_ppl.fokker_planck_grid.fokker_planck import fokker_planck as fokker_planck
     from lfm_ppl.forces import ApproximationWarning as ApproximationWarning
     from lfm_ppl.forces import Constant as Constant
@@ -61,6 +64,7 @@ if TYPE_CHECKING:
     from lfm_ppl.results.arviz_data import load as load
     from lfm_ppl.results.arviz_data import save as save
     from lfm_ppl.results.correction import correct_posterior as correct_posterior
+    from lfm_ppl.results.scoring import score as score
     from lfm_ppl.switching.rao_blackwellised import rao_blackwellised as rao_blackwellised
     from lfm_ppl.switching.rule import SwitchingRule as SwitchingRule
     from lfm_ppl.switching.rule import Thermostat as Thermostat
@@ -81,6 +85,7 @@ _NAMES = {
     "results.accuracy": ("check_accuracy",),
     "results.arviz_data": ("load", "save"),
     "results.correction": ("correct_posterior",),
+    "results.scoring": ("score",),
     "inference.kernels.elliptical_slice": ("EllipticalSlice",),
     "fokker_planck_grid.fokker_planck": ("fokker_planck",),
     "latent_grid.laplace": ("laplace",),
@@ -99,7 +104,9 @@ _NAMES = {
         "SquaredExponential", "WienerVelocity",
     ),
     "inference.bound_model": ("BoundModel", "bind"),
+    "backtesting": ("Backtest", "backtest"),
     "fitting": ("ConvergenceWarning", "fit"),
+    "forecasting": ("forecast",),
     "inference.handlers.fixing": ("fix",),
     "inference.map": ("map_estimate",),
     "inference.marginal_likelihood": ("MarginalLikelihood", "panel"),

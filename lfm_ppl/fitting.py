@@ -30,6 +30,7 @@ from lfm_ppl.inference.marginal_likelihood import Panel
 from lfm_ppl.inference.posterior import scores, trajectories
 from lfm_ppl.inference.sampling import Transition
 from lfm_ppl.results import arviz_data
+from lfm_ppl.results.predictions import GROUP, NOISE_FREE, predictions
 from lfm_ppl.results.scalars import units_attribute
 
 SAMPLERS = ("nuts", "ram", "pmmh", "map")
@@ -83,7 +84,8 @@ def fit(
         thin: steps of the chain that make one draw, in the warm-up too. By default 1 for NUTS, 5 for each parameter
             for RAM, whose steps are cheap and short, and 1 for each parameter for particle-marginal RAM.
         seed: of everything random.
-        at: times of the trajectories; by default a grid over the data. Times after the last are forecasts.
+        at: times of the trajectories, and of new observations; by default a grid over the data. Times after the last
+            observation are forecasts, see `forecast`.
         trajectory_draws: number of posterior draws, spread over the chains, for which trajectories are drawn; 0: none.
         model_kwargs: keyword arguments of the model.
         fixed: parameters that are not learnt: name -> value, ``{"decay": 0.8}`` or ``{"decay[CDKN1A]": 0.8}``.
@@ -109,6 +111,7 @@ def fit(
           and for "pmmh" from the particle smoother;
         - ``posterior_predictive``: replicated data along these trajectories. (``numpyro.infer.Predictive`` with the
           same draws simulates NEW forces instead.)
+        - ``predictions``: with ``at``, new observations at these times, with their noise; see `forecast`;
         - ``observed_data``, and ``truth`` where known.
 
     Raises:
@@ -169,6 +172,8 @@ def fit(
         "trajectories", lambda: _paths(keys[3], bound, flat, at, trajectory_draws, chains, samples, **particles),
         (None, None, None))
     groups = _groups(bound, draws, stats, rated, paths, chosen, grid, truth)
+    if at is not None and paths is not None and "prediction" in paths:
+        groups[GROUP] = predictions(bound, paths, chosen, grid)
     example = bound.site.example
     attrs = {
         "model": name or getattr(numpyro_model, "__name__", "model"), "rule": example.rule.name,
@@ -375,6 +380,7 @@ def _groups(bound: BoundModel, draws: dict, stats: dict, rated: dict | None, pat
         groups["trajectories"] = xr.Dataset(
             {f"{kind}s": variable((*place, kind), paths[kind], named[kind]) for kind in named if paths[kind].shape[-1]},
             {**thinned, **at, **{kind: named[kind] for kind in named if named[kind]}})
+        groups["trajectories"]["outputs"].attrs["long_name"] = NOISE_FREE
     if truth:
         groups["truth"] = _truth(truth, named, units, draws)
     return groups

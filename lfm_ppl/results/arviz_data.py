@@ -32,6 +32,7 @@ _HOW_TO_GET = {
     "one_step_ahead": "lfm.fit",
     "posterior_predictive": "lfm.fit with trajectory_draws above zero",
     "trajectories": "lfm.fit with trajectory_draws above zero",
+    "predictions": "lfm.forecast(result, model, times), or lfm.fit with `at`",
     "observed_data": "lfm.fit",
     "accuracy": "lfm.check_accuracy, or `lfm-ppl check`",
     "truth": "lfm.fit on data that were simulated and carry their truth (lfm.Data.truth)",
