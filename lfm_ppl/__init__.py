@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from lfm_ppl.filtering.smoother import smooth as smooth
     from lfm_ppl.fitting import ConvergenceWarning as ConvergenceWarning
     from lfm_ppl.fitting import fit as fit
-    from lfm_ppl.forecasting import forecast as forecast
     from lfm_ppl.fokker_planck_grid.fokker_planck import fokker_planck as fokker_planck
     from lfm_ppl.forces import ApproximationWarning as ApproximationWarning
     from lfm_ppl.forces import Constant as Constant
@@ -32,6 +31,7 @@ if TYPE_CHECKING:
     from lfm_ppl.forces import Resonator as Resonator
     from lfm_ppl.forces import SquaredExponential as SquaredExponential
     from lfm_ppl.forces import WienerVelocity as WienerVelocity
+    from lfm_ppl.forecasting import forecast as forecast
     from lfm_ppl.inference.bound_model import BoundModel as BoundModel
     from lfm_ppl.inference.bound_model import bind as bind
     from lfm_ppl.inference.handlers.fixing import fix as fix

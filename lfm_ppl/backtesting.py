@@ -32,8 +32,8 @@ class Backtest(NamedTuple):
     """What `backtest` found.
 
     Attributes:
-        scores: dataset with dimensions forecaster ("model" and the reference), origin (the time of the last row that was
-            known), horizon (1, 2, ... rows after it) and output: ``mean``, ``error``, ``crps``, ``log_score``,
+        scores: dataset with dimensions forecaster ("model" and the reference), origin (the time of the last row that
+            was known), horizon (1, 2, ... rows after it) and output: ``mean``, ``error``, ``crps``, ``log_score``,
             ``covered``; and ``time`` (origin, horizon), the times that were predicted. NaN where y is.
         table: mean scores by forecaster and output, and of "all" outputs; columns as in `lfm_ppl.score`.
     """
@@ -82,8 +82,8 @@ def backtest(numpyro_model: Callable, times: Any, y: Any, *, horizon: int, every
         every: rows from one origin to the next.
         first: rows that the first fit knows; by default half of them.
         season: rows of a season, for the seasonal-naive reference; None: persistence.
-        sampler: as in `lfm_ppl.fit`. The default takes the Laplace approximation at the posterior mode, in a fraction of
-            the time; "nuts" is the honest choice where the posterior is wide or skew.
+        sampler: as in `lfm_ppl.fit`. The default takes the Laplace approximation at the posterior mode, in a fraction
+            of the time; "nuts" is the better choice where the posterior is wide or skew.
         draws: number of posterior draws that are propagated.
         level: of the intervals whose coverage is counted.
         seed: of everything random.
@@ -176,8 +176,8 @@ def _origins(rows: int, horizon: int, every: int, first: int | None) -> list[int
     checks.positive_integer("first", first)
     found = list(range(first - 1, rows - horizon, every))
     if first < _LEAST_ROWS or not found:
-        raise ValueError(f"there is no origin: of {rows} rows the first fit is to know {first} (at least {_LEAST_ROWS}) "
-                         f"and {horizon} more are to be predicted. Take a smaller first or horizon.")
+        raise ValueError(f"there is no origin: of {rows} rows the first fit is to know {first} (at least "
+                         f"{_LEAST_ROWS}) and {horizon} more are to be predicted. Take a smaller first or horizon.")
     return found
 
 
@@ -232,6 +232,7 @@ def _table(dataset: xr.Dataset, level: float) -> pd.DataFrame:
     for index, forecaster in enumerate(dataset["forecaster"].values):
         picked = dataset.isel(forecaster=index)
         for name in [*outputs, ALL]:
-            rows[(str(forecaster), name)] = summary(_scores_of(picked if name == ALL else picked.sel(output=name)), level)
+            chosen = picked if name == ALL else picked.sel(output=name)
+            rows[(str(forecaster), name)] = summary(_scores_of(chosen), level)
     found = pd.DataFrame.from_dict(rows, orient="index")
     return found.set_index(pd.MultiIndex.from_tuples(rows, names=["forecaster", "output"]))

@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 
 from lfm_ppl import data, loading
-from lfm_ppl.cli import choices, results, session
+from lfm_ppl.cli import choices, forecast, results, session
 
 SETTINGS = ("rule", "steps", "max_step", "iterations", "tolerance")
 """Flags of the approximation; None where the user leaves one to the model."""
 
 _GRID = 241
-"""Times of the trajectories with --until, besides those of the data: enough for a smooth line."""
+"""Times of the trajectories with --until or --at, besides those of the data: enough for a smooth line."""
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -30,7 +30,7 @@ def run(arguments: argparse.Namespace) -> int:
     options = choices.options(model, arguments.option)
     observed = _observed(arguments, model, options)
     fixed = choices.fixed(arguments.set, model.anchors(observed))
-    at = _requested(observed.times, arguments.until)
+    at = _requested(observed.times, arguments.until, arguments.at)
     if arguments.target_accept is not None and arguments.sampler == "map":
         raise ValueError("--target-accept is for the samplers nuts, ram and pmmh; map accepts and rejects nothing.")
     if arguments.particles is not None and arguments.sampler != "pmmh":
@@ -67,13 +67,12 @@ def _observed(arguments: argparse.Namespace, model: loading.ModelFile, options: 
     return model.prepare(observed)
 
 
-def _requested(times: np.ndarray, until: float | None) -> np.ndarray | None:
-    """Return the times of the trajectories where they go beyond the data; None: the library's own grid."""
-    if until is None:
+def _requested(times: np.ndarray, until: float | None, at: np.ndarray | None) -> np.ndarray | None:
+    """Return the times of the trajectories where some are asked for; None: the library's own grid."""
+    if until is None and at is None:
         return None
-    if not (np.isfinite(until) and until > times[-1]):
-        raise ValueError(f"--until takes a time after the last observation, at {times[-1]:g}, got {until:g}.")
-    return np.union1d(np.linspace(times[0], until, _GRID), times)
+    wanted = forecast.requested(times, until, at, 2, times)
+    return np.union1d(np.linspace(times[0], max(wanted[-1], times[-1]), _GRID), wanted)
 
 
 def _print_task(

@@ -69,8 +69,8 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
         particle_steps: integration steps of the particles between two observations; None: the model's.
 
     Returns:
-        ``state`` (S, ..., K, M), ``force`` (S, ..., K, R), ``output`` (S, ..., K, D) free of noise; ``y`` (S, ..., T, D),
-        the posterior predictive at the observation times; ``prediction`` (S, ..., K, D), new observations at the times
+        ``state`` (S, ..., K, M), ``force`` (S, ..., K, R), ``output`` (S, ..., K, D) free of noise; ``y``
+        (S, ..., T, D), the posterior predictive at the observation times; ``prediction`` (S, ..., K, D), new observations at the times
         of the trajectories, with ``predictive_mean`` and ``predictive_sd`` (S, ..., K, D), the normal distribution of
         each given the parameters (where the model is linear) or given the path, so that the mixture over the draws is
         the predictive density; the last three are left out where the covariance of the noise belongs to the rows of
@@ -201,7 +201,7 @@ def noise_of_rows(distribution: MarginalLikelihood) -> bool:
 
 
 def _gaussian_outputs(ssm: StateSpaceModel) -> bool:
-    """Whether y is normal given the parameters: linear dynamics and observation, and noise that does not follow them."""
+    """Whether y is normal given the parameters: all is linear, and the noise does not depend on the state."""
     observation = ssm.model.observation
     return not (ssm.drift_structure.points or ssm.observation_structure.points or observation.varies_with_state
                 or observation.angular)

@@ -4,26 +4,32 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 import xarray as xr
+from scipy import stats
 
-from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.marginal_likelihood import Panel
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.scalars import units_attribute
+
+if TYPE_CHECKING:  # figures, which read predictions, need no JAX
+    from lfm_ppl.inference.bound_model import BoundModel
 
 GROUP = "predictions"
 
 NOISE_FREE = "noise-free output"
 """What is said of ``outputs`` wherever they are stored."""
 
+_INTERVAL = (0.025, 0.975)
+
 MEAN, SD = "y_mean", "y_sd"
 """Moments of the normal distribution that y has at each draw."""
 
 
-def predictions(bound: BoundModel, paths: Mapping[str, np.ndarray], chosen: np.ndarray, times: np.ndarray) -> xr.Dataset:
+def predictions(bound: BoundModel, paths: Mapping[str, np.ndarray], chosen: np.ndarray,
+                times: np.ndarray) -> xr.Dataset:
     """Lay out new observations, and the paths that they were drawn along.
 
     Args:
@@ -39,7 +45,7 @@ def predictions(bound: BoundModel, paths: Mapping[str, np.ndarray], chosen: np.n
     """
     site = bound.site
     model = site.example.ssm.model
-    panel = ("series",) if isinstance(site.distribution, Panel) else ()
+    panel = ("series",) if np.ndim(bound.y) == 3 else ()
     named = {"output": list(model.output_names), "state": list(model.state_names), "force": list(model.force_names)}
     place = ("chain", "draw", *panel, "time")
 
@@ -70,8 +76,8 @@ def observed_variable(dataset: xr.Dataset) -> xr.DataArray:
     """Return the new observations of a dataset of predictions."""
     name = dataset.attrs.get("observed", "y")
     if name not in dataset:
-        raise ValueError(f"the group {GROUP} has no variable {name!r}; it has {', '.join(map(str, dataset.data_vars))}. "
-                         "Expected what lfm.forecast made.")
+        raise ValueError(f"the group {GROUP} has no variable {name!r}; it has "
+                         f"{', '.join(map(str, dataset.data_vars))}. Expected what lfm.forecast made.")
     return dataset[name]
 
 
@@ -82,3 +88,52 @@ def of_result(result: Any) -> xr.Dataset:
         ValueError: the result has none; the message says how to get them.
     """
     return result if isinstance(result, xr.Dataset) else arviz_data.group(result, GROUP)
+
+
+def summary(dataset: xr.Dataset) -> pd.DataFrame:
+    """Return a row for each time and output: mean, sd and 95% interval of new data, and of the noise-free output.
+
+    Args:
+        dataset: the group `predictions` of one series.
+
+    Returns:
+        Indexed by time; columns output, mean, sd, q2.5, q97.5, noise_free_mean, noise_free_q2.5, noise_free_q97.5.
+    """
+    rows = []
+    new, free = (_flat(dataset[name]) for name in (observed_variable(dataset).name, "outputs"))
+    if MEAN in dataset and SD in dataset:
+        mean, sd = _flat(dataset[MEAN]), _flat(dataset[SD])
+        low, high = mixture_quantiles(mean, sd, _INTERVAL)
+        spread = np.sqrt(np.mean(sd**2, axis=0) + mean.var(axis=0))
+    else:
+        mean, (low, high), spread = new, np.quantile(new, _INTERVAL, axis=0), new.std(axis=0)
+    below, above = np.quantile(free, _INTERVAL, axis=0)
+    for k, time in enumerate(dataset["time"].values):
+        for d, name in enumerate(dataset["output"].values):
+            rows.append({"time": time, "output": str(name), "mean": mean[:, k, d].mean(), "sd": spread[k, d],
+                         "q2.5": low[k, d], "q97.5": high[k, d], "noise_free_mean": free[:, k, d].mean(),
+                         "noise_free_q2.5": below[k, d], "noise_free_q97.5": above[k, d]})
+    return pd.DataFrame(rows).set_index("time")
+
+
+def _flat(variable: xr.DataArray) -> np.ndarray:
+    variable = variable.transpose("chain", "draw", "time", "output")
+    return np.asarray(variable.values, float).reshape(-1, *variable.shape[2:])
+
+
+def mixture_quantiles(mean: np.ndarray, sd: np.ndarray, p: Any) -> np.ndarray:
+    """Return quantiles (Q, ...) of the mixture of normal distributions (S, ...), by bisection."""
+    p = np.atleast_1d(np.asarray(p, float))
+    found = []
+    for one in p:
+        ends = mean + sd * stats.norm.ppf(one)  # the quantile of the mixture lies between those of its parts
+        low, high = ends.min(axis=0), ends.max(axis=0)
+        for _ in range(60):
+            middle = 0.5 * (low + high)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                share = np.where(sd > 0, stats.norm.cdf((middle - mean) / sd), middle >= mean).mean(axis=0)
+            low, high = np.where(share < one, middle, low), np.where(share < one, high, middle)
+            if np.all(high - low <= 1e-9 * (1e-300 + np.abs(high))):
+                break
+        found.append(0.5 * (low + high))
+    return np.array(found)

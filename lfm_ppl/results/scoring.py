@@ -150,32 +150,16 @@ def crps(draws: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def gaussian_scores(mean: np.ndarray, sd: np.ndarray, y: np.ndarray, level: float = 0.95) -> Scores:
-    r"""Return the scores of normal distributions, in closed form.
+    r"""Return the scores (...) of normal distributions with mean (...) and sd (...), in closed form.
 
-        crps = sd (z (2 Phi(z) - 1) + 2 phi(z) - 1 / sqrt(pi)),   z = (y - mean) / sd.
+    With z = (y - mean) / sd,
+
+        crps = sd (z (2 Phi(z) - 1) + 2 phi(z) - 1 / sqrt(pi)).
     """
     z = (y - mean) / sd
     ranked = sd * (z * (2 * stats.norm.cdf(z) - 1) + 2 * stats.norm.pdf(z) - 1 / np.sqrt(np.pi))
     inside = np.where(np.isfinite(z), np.abs(z) <= stats.norm.ppf(0.5 + 0.5 * level), np.nan)
     return Scores(y - mean, ranked, stats.norm.logpdf(z) - np.log(sd), inside)
-
-
-def mixture_quantiles(mean: np.ndarray, sd: np.ndarray, p: Any) -> np.ndarray:
-    """Return quantiles (Q, ...) of the mixture of normal distributions (S, ...), by bisection."""
-    p = np.atleast_1d(np.asarray(p, float))
-    found = []
-    for one in p:
-        ends = mean + sd * stats.norm.ppf(one)  # the quantile of the mixture lies between those of its parts
-        low, high = ends.min(axis=0), ends.max(axis=0)
-        for _ in range(60):
-            middle = 0.5 * (low + high)
-            with np.errstate(divide="ignore", invalid="ignore"):
-                share = np.where(sd > 0, stats.norm.cdf((middle - mean) / sd), middle >= mean).mean(axis=0)
-            low, high = np.where(share < one, middle, low), np.where(share < one, high, middle)
-            if np.all(high - low <= 1e-9 * (1e-300 + np.abs(high))):
-                break
-        found.append(0.5 * (low + high))
-    return np.array(found)
 
 
 def table(found: Scores, outputs: list[str], level: float = 0.95) -> pd.DataFrame:
@@ -214,8 +198,8 @@ def aligned(predicted: xr.Dataset, variable: xr.DataArray, held_out: Any,
         expected = (*(variable.sizes[dim] for dim in series), variable.sizes["time"], len(outputs))
         if y.shape != expected:
             raise ValueError(f"held_out must have shape {expected}, one row for each time of the predictions and one "
-                             f"column for each of {', '.join(outputs)}; got {y.shape}. Give an lfm.Data for some of the "
-                             "times.")
+                             f"column for each of {', '.join(outputs)}; got {y.shape}. Give an lfm.Data for some of "
+                             "the times.")
     if np.isinf(y).any():
         raise ValueError("held_out has infinite entries; use NaN for a missing entry.")
     if not np.isfinite(y).any():

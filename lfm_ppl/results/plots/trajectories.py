@@ -16,11 +16,14 @@ from matplotlib.patches import Patch
 from lfm_ppl.checks import unknown
 from lfm_ppl.results.arviz_data import group, has_group
 from lfm_ppl.results.plots import style
+from lfm_ppl.results.predictions import GROUP, MEAN, SD, mixture_quantiles, observed_variable
 from lfm_ppl.results.scalars import unit_of
 
 MAX_PANELS = 12
 _MANY = 150  # measurements
 _INTERVAL = (0.025, 0.975)
+_BARS = 12  # forecasts from which they are drawn as bands
+_END: dict[str, Any] = {"color": style.GREY, "lw": 0.8, "ls": (0, (1, 2)), "zorder": 0.5}
 _NOISE_FREE, _PREDICTIVE, _FORCE = "#8FBFDE", "#D3E4F1", "#9AD3C1"  # tints of the line colours
 
 
@@ -28,15 +31,17 @@ _NOISE_FREE, _PREDICTIVE, _FORCE = "#8FBFDE", "#D3E4F1", "#9AD3C1"  # tints of t
 def plot_fit(
     result: Any, outputs: Sequence[str] | None = None, *, width: str | float = "column"
 ) -> Figure:
-    """Draw the data of each output with the posterior of what was measured.
+    """Draw the data of each output with the posterior of what was measured, and forecasts of it.
 
-    The inner band holds 95% of the noise-free output, the outer one 95% of new measurements. The
-    outer band is exact at the measurement times; between them it is the inner band widened by the
+    The inner band holds 95% of the noise-free output, the outer one 95% of new measurements. Where the
+    result has predictions, both go on after the last observation, which a dotted line marks, and the outer
+    band is theirs; forecasts at fewer than 12 times are drawn as bars. Without them the outer band ends with
+    the data. It is exact at the measurement times; between them it is the inner band widened by the
     difference of the two, interpolated linearly. Replicates are pooled.
 
     Args:
-        result: with the groups observed_data and trajectories, and posterior_predictive for the
-            outer band.
+        result: with the groups observed_data and trajectories; posterior_predictive for the outer band, and
+            predictions for forecasts.
         outputs: names; None for all, up to 12.
         width: "column" (3.4 in), "full" (7 in), or inches.
 
@@ -61,16 +66,25 @@ def plot_fit(
     observed = group(result, "observed_data")["y"].transpose("time", "output")
     noise_free = _trajectories(result, "output")
     predictive = _predictive(result)
+    predicted = _predicted(result)
+    forecast = False
     names, note = style.first_of(pick(observed, "output", outputs), outputs, MAX_PANELS, "outputs")
     figure, panels = style.small_multiples(width, len(names), 1.35)
     for axes, name in zip(panels, names, strict=True):
         data = observed.sel(output=name)
         time, mean, low, high = _band(noise_free.sel(output=name))
-        if predictive is not None:
+        if predicted is not None and _covers(predicted["time"].values, time):
+            axes.fill_between(*_noisy_band(predicted.sel(output=name)), color=_PREDICTIVE, lw=0, zorder=1)
+        elif predictive is not None:
             outer = _widened(predictive.sel(output=name), time, low, high)
             axes.fill_between(*outer, color=_PREDICTIVE, lw=0, zorder=1)
         axes.fill_between(time, low, high, color=_NOISE_FREE, lw=0, zorder=2)
         axes.plot(time, mean, color=style.BLUE, zorder=3)
+        if predicted is not None:
+            after = predicted.sel(output=name).isel(time=predicted["time"].values > time[-1])
+            _draw_forecast(axes, after)
+            if forecast := _ends_before(predicted):
+                axes.axvline(predicted.attrs["last_observation"], **_END)
         _draw_data(axes, data)
         style.label_values(axes, name, unit_of(observed, name))
     style.label_time(panels, time_unit(result))
@@ -78,8 +92,10 @@ def plot_fit(
     handles: list[Artist] = [Line2D([], [], label="data", **_data_style(observed.sizes["time"]))]
     handles += [Line2D([], [], color=style.BLUE, label="posterior mean")]
     handles += [Patch(color=_NOISE_FREE, label="95%, noise-free")]
-    if predictive is not None:
+    if predictive is not None or predicted is not None:
         handles += [Patch(color=_PREDICTIVE, label="95%, new data")]
+    if forecast:
+        handles += [Line2D([], [], label="last observation", **_END)]
     if np.isnan(observed.sel(output=names)).any():
         handles += [Line2D([], [], label="missing", **_missing_style(observed.sizes["time"]))]
     style.legend_above(figure, handles)
@@ -223,6 +239,51 @@ def _predictive(result: Any) -> xr.DataArray | None:
     if not has_group(result, "posterior_predictive"):
         return None
     return group(result, "posterior_predictive")["y"].transpose("chain", "draw", "time", "output")
+
+
+def _predicted(result: Any) -> xr.Dataset | None:
+    """Return the predictions of one series; None where there are none."""
+    if not has_group(result, GROUP):
+        return None
+    dataset = group(result, GROUP)
+    return None if "series" in dataset.dims else dataset.transpose("chain", "draw", "time", ...)
+
+
+def _ends_before(predicted: xr.Dataset) -> bool:
+    """Whether the last observation comes before the last prediction."""
+    return bool(predicted.attrs.get("last_observation", np.inf) < predicted["time"].values.max())
+
+
+def _covers(times: np.ndarray, at: np.ndarray) -> bool:
+    """Whether there are predictions all along the trajectories."""
+    return bool(set(at.tolist()) <= set(times.tolist()))
+
+
+def _noisy_band(predicted: xr.Dataset) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return times and the ends of the 95% interval of new data of one output; of their density where it is known."""
+    times, order = np.unique(predicted["time"].values, return_index=True)
+    if MEAN in predicted and SD in predicted:
+        mean, sd = (predicted[name].values.reshape(-1, predicted.sizes["time"])[:, order] for name in (MEAN, SD))
+        return times, *mixture_quantiles(mean, sd, _INTERVAL)
+    draws = observed_variable(predicted).values.reshape(-1, predicted.sizes["time"])[:, order]
+    return times, *np.quantile(draws, _INTERVAL, axis=0)
+
+
+def _draw_forecast(axes: Axes, predicted: xr.Dataset) -> None:
+    """Draw noise-free and new data of one output at times after the trajectories."""
+    if predicted.sizes["time"] == 0:
+        return
+    times, lower, upper = _noisy_band(predicted)
+    outputs = predicted["outputs"].rename(time="at").drop_duplicates("at")
+    time, mean, low, high = _band(outputs)
+    if len(times) >= _BARS:
+        axes.fill_between(times, lower, upper, color=_PREDICTIVE, lw=0, zorder=1)
+        axes.fill_between(time, low, high, color=_NOISE_FREE, lw=0, zorder=2)
+        axes.plot(time, mean, color=style.BLUE, zorder=3)
+        return
+    axes.vlines(times, lower, upper, color=_PREDICTIVE, lw=5, zorder=1)
+    axes.vlines(time, low, high, color=_NOISE_FREE, lw=3, zorder=2)
+    axes.plot(time, mean, color=style.BLUE, ls="", marker="_", ms=5, zorder=3)
 
 
 def _band(draws: xr.DataArray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
