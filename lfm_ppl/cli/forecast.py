@@ -87,8 +87,8 @@ def _held_out(arguments: argparse.Namespace, task: stored.StoredModel) -> data.D
     taken = task.file.prepare(read)
     if not np.array_equal(taken.y, read.y, equal_nan=True):
         raise ValueError(f"{task.file.path} changes the numbers of a data file (`prepare`), perhaps by the file's own, "
-                         "so that held-out numbers cannot be compared with a fit to others. Score them in Python, on the "
-                         "model's scale: lfm.score(forecast, held_out).")
+                         "so that held-out numbers cannot be compared with a fit to others. Score them in Python, "
+                         "on the model's scale: lfm.score(forecast, held_out).")
     return read
 
 

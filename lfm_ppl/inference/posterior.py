@@ -70,11 +70,12 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
 
     Returns:
         ``state`` (S, ..., K, M), ``force`` (S, ..., K, R), ``output`` (S, ..., K, D) free of noise; ``y``
-        (S, ..., T, D), the posterior predictive at the observation times; ``prediction`` (S, ..., K, D), new observations at the times
-        of the trajectories, with ``predictive_mean`` and ``predictive_sd`` (S, ..., K, D), the normal distribution of
-        each given the parameters (where the model is linear) or given the path, so that the mixture over the draws is
-        the predictive density; the last three are left out where the covariance of the noise belongs to the rows of
-        the data. ``log_likelihood`` (S, ...) of the Gaussian filter, unless there are particles.
+        (S, ..., T, D), the posterior predictive at the observation times; ``prediction`` (S, ..., K, D), new
+        observations at the times of the trajectories, with ``predictive_mean`` and ``predictive_sd`` (S, ..., K, D),
+        the normal distribution of each given the parameters (where the model is linear) or given the path, so that the
+        mixture over the draws is the predictive density, and ``output_sd`` (S, ..., K, D), the sd without the noise;
+        the last four are left out where the covariance of the noise belongs to the rows of the data. ``log_likelihood``
+        (S, ...) of the Gaussian filter, unless there are particles.
     """
     at = None if at is None else np.asarray(at, float)
     if at is not None and bound.times.ndim == 1 and np.array_equal(at, bound.times):
@@ -111,14 +112,16 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
         if at is not None:
             covariance = jax.vmap(ssm.obs_cov)(w[there], when[there], jnp.zeros(len(there), int))
             prediction = _noisy(jax.random.fold_in(noise_key, 1), output[there], covariance)
-        mean, variance = output[there], jnp.diagonal(covariance, axis1=1, axis2=2)
+        mean, noise = output[there], jnp.diagonal(covariance, axis1=1, axis2=2)
+        variance = jnp.zeros_like(noise)
         if smoothed is not None and _gaussian_outputs(ssm):
             # The normal distribution of y given the parameters, instead of given a path: sharper by a lot.
             matrix = jax.vmap(jax.jacfwd(ssm.observe))(smoothed.input_mean[there], when[there])
             mean = jax.vmap(ssm.observe)(smoothed.input_mean[there], when[there])
-            state = jnp.einsum("kdi,kij,kdj->kd", matrix, smoothed.input_covariance[there], matrix)
-            variance = variance + jnp.maximum(state, 0.0)
-        return found | {"prediction": prediction, "predictive_mean": mean, "predictive_sd": jnp.sqrt(variance)}
+            variance = jnp.einsum("kdi,kij,kdj->kd", matrix, smoothed.input_covariance[there], matrix)
+            variance = jnp.maximum(variance, 0.0)
+        return found | {"prediction": prediction, "predictive_mean": mean, "predictive_sd": jnp.sqrt(variance + noise),
+                        "output_sd": jnp.sqrt(variance)}
 
     def per_draw(values: Any, key: jax.Array, y: Any) -> dict[str, jax.Array]:
         distribution = bound.likelihood(values, y)

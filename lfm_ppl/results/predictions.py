@@ -24,8 +24,8 @@ NOISE_FREE = "noise-free output"
 
 _INTERVAL = (0.025, 0.975)
 
-MEAN, SD = "y_mean", "y_sd"
-"""Moments of the normal distribution that y has at each draw."""
+MEAN, SD, FREE_SD = "y_mean", "y_sd", "outputs_sd"
+"""Mean of the normal distribution that y has at each draw, its sd, and its sd without the noise."""
 
 
 def predictions(bound: BoundModel, paths: Mapping[str, np.ndarray], chosen: np.ndarray,
@@ -41,7 +41,8 @@ def predictions(bound: BoundModel, paths: Mapping[str, np.ndarray], chosen: np.n
     Returns:
         Variables with dimensions chain, draw, (series,) time and one more: the site's name (new observations, with
         noise), ``y_mean`` and ``y_sd`` (normal distribution of one at each draw; the predictive density is their
-        mixture), ``outputs`` (noise-free), ``forces`` and ``states``.
+        mixture), ``outputs_sd`` (its sd without the noise, zero where it is that given a path), ``outputs``
+        (noise-free), ``forces`` and ``states``.
     """
     site = bound.site
     model = site.example.ssm.model
@@ -54,7 +55,8 @@ def predictions(bound: BoundModel, paths: Mapping[str, np.ndarray], chosen: np.n
 
     variables = {site.name: variable("output", paths["prediction"], "new observation, with noise"),
                  MEAN: variable("output", paths["predictive_mean"], "mean of the new observation at this draw"),
-                 SD: variable("output", paths["predictive_sd"], "sd of the new observation at this draw")}
+                 SD: variable("output", paths["predictive_sd"], "sd of the new observation at this draw"),
+                 FREE_SD: variable("output", paths["output_sd"], f"sd of the {NOISE_FREE} at this draw")}
     angles = [named["output"][index] for index in model.observation.angular]
     variables[site.name][2].update({"angular": json.dumps(angles)} if angles else {})
     words = {"output": NOISE_FREE, "state": "state", "force": "force"}
@@ -100,20 +102,35 @@ def summary(dataset: xr.Dataset) -> pd.DataFrame:
         Indexed by time; columns output, mean, sd, q2.5, q97.5, noise_free_mean, noise_free_q2.5, noise_free_q97.5.
     """
     rows = []
-    new, free = (_flat(dataset[name]) for name in (observed_variable(dataset).name, "outputs"))
+    new = _flat(observed_variable(dataset))
     if MEAN in dataset and SD in dataset:
-        mean, sd = _flat(dataset[MEAN]), _flat(dataset[SD])
-        low, high = mixture_quantiles(mean, sd, _INTERVAL)
-        spread = np.sqrt(np.mean(sd**2, axis=0) + mean.var(axis=0))
+        mean = _flat(dataset[MEAN])
+        spread = np.sqrt(np.mean(_flat(dataset[SD]) ** 2, axis=0) + mean.var(axis=0))
     else:
-        mean, (low, high), spread = new, np.quantile(new, _INTERVAL, axis=0), new.std(axis=0)
-    below, above = np.quantile(free, _INTERVAL, axis=0)
+        mean, spread = new, new.std(axis=0)
+    low, high = interval(dataset)
+    below, above = noise_free_interval(dataset)
+    free = mean.mean(axis=0) if MEAN in dataset else _flat(dataset["outputs"]).mean(axis=0)
     for k, time in enumerate(dataset["time"].values):
         for d, name in enumerate(dataset["output"].values):
             rows.append({"time": time, "output": str(name), "mean": mean[:, k, d].mean(), "sd": spread[k, d],
-                         "q2.5": low[k, d], "q97.5": high[k, d], "noise_free_mean": free[:, k, d].mean(),
+                         "q2.5": low[k, d], "q97.5": high[k, d], "noise_free_mean": free[k, d],
                          "noise_free_q2.5": below[k, d], "noise_free_q97.5": above[k, d]})
     return pd.DataFrame(rows).set_index("time")
+
+
+def interval(dataset: xr.Dataset) -> np.ndarray:
+    """Return the ends (2, K, D) of the 95% interval of new data, by their density where it is known."""
+    if MEAN in dataset and SD in dataset:
+        return mixture_quantiles(_flat(dataset[MEAN]), _flat(dataset[SD]), _INTERVAL)
+    return np.quantile(_flat(observed_variable(dataset)), _INTERVAL, axis=0)
+
+
+def noise_free_interval(dataset: xr.Dataset) -> np.ndarray:
+    """Return the ends (2, K, D) of the 95% interval of the noise-free outputs, by their density where it is known."""
+    if MEAN in dataset and FREE_SD in dataset and bool((dataset[FREE_SD] > 0).any()):
+        return mixture_quantiles(_flat(dataset[MEAN]), _flat(dataset[FREE_SD]), _INTERVAL)
+    return np.quantile(_flat(dataset["outputs"]), _INTERVAL, axis=0)
 
 
 def _flat(variable: xr.DataArray) -> np.ndarray:

@@ -16,7 +16,7 @@ from matplotlib.patches import Patch
 from lfm_ppl.checks import unknown
 from lfm_ppl.results.arviz_data import group, has_group
 from lfm_ppl.results.plots import style
-from lfm_ppl.results.predictions import GROUP, MEAN, SD, mixture_quantiles, observed_variable
+from lfm_ppl.results.predictions import GROUP, MEAN, interval, noise_free_interval
 from lfm_ppl.results.scalars import unit_of
 
 MAX_PANELS = 12
@@ -74,15 +74,16 @@ def plot_fit(
         data = observed.sel(output=name)
         time, mean, low, high = _band(noise_free.sel(output=name))
         if predicted is not None and _covers(predicted["time"].values, time):
-            axes.fill_between(*_noisy_band(predicted.sel(output=name)), color=_PREDICTIVE, lw=0, zorder=1)
-        elif predictive is not None:
-            outer = _widened(predictive.sel(output=name), time, low, high)
-            axes.fill_between(*outer, color=_PREDICTIVE, lw=0, zorder=1)
-        axes.fill_between(time, low, high, color=_NOISE_FREE, lw=0, zorder=2)
-        axes.plot(time, mean, color=style.BLUE, zorder=3)
+            _draw_forecast(axes, predicted.sel(output=[name]))
+        else:
+            if predictive is not None:
+                outer = _widened(predictive.sel(output=name), time, low, high)
+                axes.fill_between(*outer, color=_PREDICTIVE, lw=0, zorder=1)
+            axes.fill_between(time, low, high, color=_NOISE_FREE, lw=0, zorder=2)
+            axes.plot(time, mean, color=style.BLUE, zorder=3)
+            if predicted is not None:
+                _draw_forecast(axes, predicted.sel(output=[name]).isel(time=predicted["time"].values >= time[-1]))
         if predicted is not None:
-            after = predicted.sel(output=name).isel(time=predicted["time"].values > time[-1])
-            _draw_forecast(axes, after)
             if forecast := _ends_before(predicted):
                 axes.axvline(predicted.attrs["last_observation"], **_END)
         _draw_data(axes, data)
@@ -246,7 +247,7 @@ def _predicted(result: Any) -> xr.Dataset | None:
     if not has_group(result, GROUP):
         return None
     dataset = group(result, GROUP)
-    return None if "series" in dataset.dims else dataset.transpose("chain", "draw", "time", ...)
+    return None if "series" in dataset.dims else dataset.drop_duplicates("time")
 
 
 def _ends_before(predicted: xr.Dataset) -> bool:
@@ -256,32 +257,27 @@ def _ends_before(predicted: xr.Dataset) -> bool:
 
 def _covers(times: np.ndarray, at: np.ndarray) -> bool:
     """Whether there are predictions all along the trajectories."""
-    return bool(set(at.tolist()) <= set(times.tolist()))
+    return len(times) >= _BARS and bool(set(at.tolist()) <= set(times.tolist()))
 
 
 def _noisy_band(predicted: xr.Dataset) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return times and the ends of the 95% interval of new data of one output; of their density where it is known."""
-    times, order = np.unique(predicted["time"].values, return_index=True)
-    if MEAN in predicted and SD in predicted:
-        mean, sd = (predicted[name].values.reshape(-1, predicted.sizes["time"])[:, order] for name in (MEAN, SD))
-        return times, *mixture_quantiles(mean, sd, _INTERVAL)
-    draws = observed_variable(predicted).values.reshape(-1, predicted.sizes["time"])[:, order]
-    return times, *np.quantile(draws, _INTERVAL, axis=0)
+    """Return times and the ends of the 95% interval of new data of one output."""
+    return predicted["time"].values, *interval(predicted)[..., 0]
 
 
 def _draw_forecast(axes: Axes, predicted: xr.Dataset) -> None:
-    """Draw noise-free and new data of one output at times after the trajectories."""
+    """Draw predictions of one output, noise-free and new data."""
     if predicted.sizes["time"] == 0:
         return
-    times, lower, upper = _noisy_band(predicted)
-    outputs = predicted["outputs"].rename(time="at").drop_duplicates("at")
-    time, mean, low, high = _band(outputs)
-    if len(times) >= _BARS:
-        axes.fill_between(times, lower, upper, color=_PREDICTIVE, lw=0, zorder=1)
+    time, lower, upper = _noisy_band(predicted)
+    low, high = noise_free_interval(predicted)[..., 0]
+    mean = predicted[MEAN if MEAN in predicted else "outputs"].mean(["chain", "draw"]).values[:, 0]
+    if len(time) >= _BARS:
+        axes.fill_between(time, lower, upper, color=_PREDICTIVE, lw=0, zorder=1)
         axes.fill_between(time, low, high, color=_NOISE_FREE, lw=0, zorder=2)
         axes.plot(time, mean, color=style.BLUE, zorder=3)
         return
-    axes.vlines(times, lower, upper, color=_PREDICTIVE, lw=5, zorder=1)
+    axes.vlines(time, lower, upper, color=_PREDICTIVE, lw=5, zorder=1)
     axes.vlines(time, low, high, color=_NOISE_FREE, lw=3, zorder=2)
     axes.plot(time, mean, color=style.BLUE, ls="", marker="_", ms=5, zorder=3)
 
