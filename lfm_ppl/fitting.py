@@ -14,7 +14,6 @@ from typing import Any
 
 import jax
 import numpy as np
-import xarray as xr
 from numpyro.infer import init_to_median, init_to_value
 
 from lfm_ppl import checks
@@ -30,8 +29,7 @@ from lfm_ppl.inference.marginal_likelihood import Panel
 from lfm_ppl.inference.posterior import scores, trajectories
 from lfm_ppl.inference.sampling import Transition
 from lfm_ppl.results import arviz_data
-from lfm_ppl.results.predictions import GROUP, NOISE_FREE, predictions
-from lfm_ppl.results.scalars import units_attribute
+from lfm_ppl.results.layout import Labels, lay_out
 
 SAMPLERS = ("nuts", "ram", "pmmh", "map")
 
@@ -67,6 +65,8 @@ def fit(
     progress: bool = True,
     truth: Mapping[str, Any] | None = None,
     name: str | None = None,
+    dims: Mapping[str, Sequence[str]] | None = None,
+    coords: Mapping[str, Sequence[Any]] | None = None,
 ) -> Any:
     """Fit a latent force model: sample its parameters, then its forces given them.
 
@@ -98,11 +98,16 @@ def fit(
         progress: show a progress bar.
         truth: of simulated data (``lfm.Data.truth``), stored beside the results for plots.
         name: of the model, for the record.
+        dims: parameter -> names of its dimensions, ``{"decay": ["gene"]}``. By default the plates that it stands in,
+            ``event_dims`` of NumPyro's ``infer``, "output" for a vector with an entry for each output.
+        coords: dimension -> labels, ``{"gene": ["CDKN1A", "SESN1"]}``; of "output", the names of the columns of y, and
+            of "series", those of a panel, too. By default columns of a data frame keep their names.
 
     Returns:
         An ArviZ object (``InferenceData`` on ArviZ 0.23, ``xarray.DataTree`` on 1.x) with the groups
 
-        - ``posterior``: parameters, with coordinates;
+        - ``posterior``: parameters, with coordinates; what ``numpyro.deterministic`` computes of them has the attribute
+          ``derived``;
         - ``sample_stats``;
         - ``log_likelihood``: the Gaussian filter's leave-one-out conditionals log p(y_k | y_-k, theta), which make
           ``az.loo`` right for dependent data;
@@ -149,7 +154,8 @@ def fit(
         checks.positive_integer("trajectory_draws", trajectory_draws)
     keys = jax.random.split(jax.random.key(seed), 5)
     bound = bind(numpyro_model, times, y, **dict(model_kwargs or {}))
-    _check_requested(bound, at)
+    check_requested(bound, at)
+    labels = Labels.of(bound, dims, coords, y)
     bound = bound.fix(fixed)
     remarks: dict[str, Any]
     if sampler == "map":
@@ -166,14 +172,12 @@ def fit(
         draws, stats = bound.constrain_draws(collected.z), _statistics(collected.statistics)
         remarks["thin"] = thin
     flat = {site: draws[site].reshape(-1, *draws[site].shape[2:]) for site in bound.sites}
-    rated = _kept("scores of the observations", lambda: scores(bound, flat), None)
+    rated = kept("scores of the observations", lambda: scores(bound, flat), None)
     particles = {name: remarks.pop(name, None) for name in ("particle_settings", "particle_steps")}
-    chosen, paths, grid = _kept(
-        "trajectories", lambda: _paths(keys[3], bound, flat, at, trajectory_draws, chains, samples, **particles),
+    chosen, paths, grid = kept(
+        "trajectories", lambda: draw_paths(keys[3], bound, flat, at, trajectory_draws, chains, samples, **particles),
         (None, None, None))
-    groups = _groups(bound, draws, stats, rated, paths, chosen, grid, truth)
-    if at is not None and paths is not None and "prediction" in paths:
-        groups[GROUP] = predictions(bound, paths, chosen, grid)
+    groups = lay_out(bound, draws, stats, rated, paths, chosen, grid, truth, labels)
     example = bound.site.example
     attrs = {
         "model": name or getattr(numpyro_model, "__name__", "model"), "rule": example.rule.name,
@@ -181,14 +185,20 @@ def fit(
         "tolerance": example.tolerance,
         "sampler": sampler, "seed": seed, "chains": chains, "warmup": warmup,
         "samples": samples, "fixed": json.dumps({k: np.asarray(v).tolist() for k, v in (fixed or {}).items()}),
-        "wall_time_s": round(time.perf_counter() - started, 3), "versions": json.dumps(_versions()),
+        "wall_time_s": round(time.perf_counter() - started, 3), "versions": json.dumps(versions()),
         "created_at": datetime.now(UTC).isoformat(timespec="seconds"), **remarks,
     }
     result = arviz_data.build(groups, {k: v for k, v in attrs.items() if v is not None})
-    if sampler != "map":
-        for message in arviz_data.convergence_warnings(result):
-            warnings.warn(message, ConvergenceWarning, stacklevel=2)
+    warn_of_convergence(result)
     return result
+
+
+def warn_of_convergence(result: Any) -> None:
+    """Store in a result what is wrong with its draws, in its attribute ``warnings``, and warn of it."""
+    found = arviz_data.convergence_warnings(result)
+    result.attrs["warnings"] = json.dumps(found)
+    for message in found:
+        checks.warn(message, ConvergenceWarning)
 
 
 @contextlib.contextmanager
@@ -198,7 +208,7 @@ def _start_explained(bound: BoundModel) -> Iterator[None]:
         yield
     except ValueError as error:
         if "finite density" in str(error):
-            _kept("reason why there is nowhere to start", lambda: _explain_start(bound), None)
+            kept("reason why there is nowhere to start", lambda: _explain_start(bound), None)
         raise
 
 
@@ -215,7 +225,7 @@ def _explain_start(bound: BoundModel) -> None:
             return
 
 
-def _kept(what: str, compute: Callable[[], Any], otherwise: Any) -> Any:
+def kept(what: str, compute: Callable[[], Any], otherwise: Any) -> Any:
     """Compute something from the draws; a failure must not lose the draws, which took the time."""
     try:
         return compute()
@@ -225,7 +235,7 @@ def _kept(what: str, compute: Callable[[], Any], otherwise: Any) -> Any:
         return otherwise
 
 
-def _check_requested(bound: BoundModel, at: Any) -> None:
+def check_requested(bound: BoundModel, at: Any) -> None:
     """Raise before sampling what would stop the trajectories after it."""
     if at is None:
         return
@@ -318,7 +328,7 @@ def _mode(bound: BoundModel, key: jax.Array, samples: int, seed: int, init: Any)
     return draws, {}, remarks
 
 
-def _paths(key: jax.Array, bound: BoundModel, draws: dict, at: Any, count: int, chains: int, samples: int,
+def draw_paths(key: jax.Array, bound: BoundModel, draws: dict, at: Any, count: int, chains: int, samples: int,
            particle_settings: Any, particle_steps: int | None) -> tuple[np.ndarray, dict | None, np.ndarray | None]:
     """Draw trajectories for draws that are spread evenly over each chain."""
     per_chain = min(samples, -(-count // chains))
@@ -334,101 +344,13 @@ def _paths(key: jax.Array, bound: BoundModel, draws: dict, at: Any, count: int, 
                 else np.atleast_1d(np.asarray(at, float)))
     subset = {site: value[rows] for site, value in draws.items()}
     paths = trajectories(key, bound, subset, grid, particle_settings, particle_steps)
+    if at is None:
+        paths.pop("prediction", None)  # stored where they were asked for
     return chosen, {k: v.reshape(chains, len(chosen), *v.shape[1:]) for k, v in paths.items()}, grid
 
 
-def _groups(bound: BoundModel, draws: dict, stats: dict, rated: dict | None, paths: dict | None, chosen: Any,
-            grid: np.ndarray | None, truth: Mapping[str, Any] | None) -> dict[str, xr.Dataset]:
-    site, times, y = bound.site, bound.times, np.asarray(bound.y)
-    chains, samples = next(iter(draws.values())).shape[:2]
-    model = site.example.ssm.model
-    units = model.units
-    panel = ("series",) if isinstance(site.distribution, Panel) else ()
-    per_series = times.ndim == 2
-    along = ("series", "time") if panel else ("time",)
-    coords: dict[str, Any] = {"chain": np.arange(chains), "draw": np.arange(samples)}
-    clock: dict[str, Any] = {} if per_series else {"time": ("time", times, units_attribute(["time"], units))}
-    named = {"output": list(model.output_names), "state": list(model.state_names), "force": list(model.force_names)}
-
-    def variable(dims: Sequence[str], values: Any, names: Sequence[str] = ()) -> tuple:
-        return tuple(dims), np.asarray(values), units_attribute(names, units)
-
-    # A time at which nothing was observed has no predictive density to compare.
-    seen = np.flatnonzero(np.isfinite(np.asarray(y)).any(axis=-1).reshape(-1, np.shape(y)[-2]).any(axis=0))
-    sample = ("chain", "draw", *along)
-    observed_coords = {**clock, "output": named["output"]}
-    groups = {
-        "posterior": _posterior(draws, coords, named["output"]),
-        "sample_stats": xr.Dataset({k: (("chain", "draw"), v) for k, v in stats.items()}, coords),
-        "observed_data": xr.Dataset({site.name: variable((*along, "output"), y, named["output"])}, observed_coords),
-    }
-    if per_series:
-        groups["observed_data"] = groups["observed_data"].assign(times=(along, times))
-    if rated is not None:
-        split = {label: value.reshape(chains, samples, *value.shape[1:]) for label, value in rated.items()}
-        left_out = xr.Dataset({site.name: variable(sample, split["leave_one_out"])}, {**coords, **clock})
-        groups["log_likelihood"] = left_out.isel(time=seen)
-        groups["one_step_ahead"] = xr.Dataset(
-            {"log_density": variable(sample, split["one_step_ahead"]),
-             "residual": variable((*sample, "output"), split["residual"])}, {**coords, **observed_coords})
-    if paths is not None:
-        thinned = {"chain": np.arange(chains), "draw": chosen}
-        groups["posterior_predictive"] = xr.Dataset(
-            {site.name: variable((*sample, "output"), paths["y"], named["output"])}, {**thinned, **observed_coords})
-        place = ("chain", "draw", *panel, "at")
-        at = {} if grid is None else {"at": ("at", grid, units_attribute(["time"], units))}
-        groups["trajectories"] = xr.Dataset(
-            {f"{kind}s": variable((*place, kind), paths[kind], named[kind]) for kind in named if paths[kind].shape[-1]},
-            {**thinned, **at, **{kind: named[kind] for kind in named if named[kind]}})
-        groups["trajectories"]["outputs"].attrs["long_name"] = NOISE_FREE
-    if truth:
-        groups["truth"] = _truth(truth, named, units, draws)
-    return groups
-
-
-def _posterior(draws: dict, coords: dict, outputs: list[str]) -> xr.Dataset:
-    variables: dict[str, Any] = {}
-    extra: dict[str, Any] = {}
-    for label, value in draws.items():
-        dims = []
-        for axis, size in enumerate(value.shape[2:]):
-            if size == len(outputs) and axis == 0 and value.ndim == 3 and size > 1:
-                dims.append("output")
-                extra["output"] = outputs
-            else:
-                dims.append(f"{label}_dim_{axis}")
-                extra[dims[-1]] = np.arange(size)
-        variables[label] = (("chain", "draw", *dims), value)
-    return xr.Dataset(variables, {**coords, **extra})
-
-
-def _truth(truth: Mapping[str, Any], named: dict, units: Mapping[str, str], draws: dict) -> xr.Dataset:
-    variables: dict[str, Any] = {}
-    coords: dict[str, Any] = {}
-    if truth.get("times") is not None:
-        coords["at_truth"] = ("at_truth", np.asarray(truth["times"], float), units_attribute(["time"], units))
-    forces = truth.get("forces") or {}
-    known = [label for label in named["force"] if label in forces]
-    if known:
-        coords["force"] = known
-        variables["forces"] = (("at_truth", "force"), np.stack([np.asarray(forces[n]) for n in known], axis=1),
-                               units_attribute(known, units))
-    if truth.get("state") is not None and np.ndim(truth["state"]) == 2:
-        coords["state"] = named["state"]
-        variables["states"] = (("at_truth", "state"), np.asarray(truth["state"]),
-                               units_attribute(named["state"], units))
-    for label, value in (truth.get("parameters") or {}).items():
-        value = np.asarray(value, float)
-        dims = ["output"] if value.shape == (len(named["output"]),) and value.size > 1 else \
-            [f"{label}_dim_{axis}" for axis in range(value.ndim)]
-        if dims == ["output"]:
-            coords["output"] = named["output"]
-        if label in draws:
-            variables[label] = (tuple(dims), value)
-    return xr.Dataset(variables, coords)
-
-
-def _versions() -> dict[str, str]:
+def versions() -> dict[str, str]:
+    """Return the versions of what a result was made with."""
     names = ("lfm_ppl", "jax", "jaxlib", "numpyro", "arviz", "numpy", "equinox")
     found = {"python": sys.version.split()[0]}
     for name in names:

@@ -96,7 +96,9 @@ def forecast(result: Any, numpyro_model: Callable, times: Any, *, inputs: Mappin
         rebuilding.check_likelihood(result, total, chosen)
     groups = {name: arviz_data.group(result, name) for name in arviz_data.groups(result)}
     labels = posterior["draw"].values[chosen] if "draw" in posterior.coords else chosen
-    groups[GROUP] = predictions(bound, split, labels, times)
+    observed = groups["observed_data"]
+    names = {name: observed[name].values.tolist() for name in ("output", "series") if name in observed.coords}
+    groups[GROUP] = predictions(bound, split, labels, times, names)
     return arviz_data.build(groups, attrs)
 
 

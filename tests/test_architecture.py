@@ -27,7 +27,7 @@ LAYERS = (
     ("inference",),
     ("results",),
     ("fitting", "forecasting"),
-    ("backtesting",),
+    ("backtesting", "conversion"),
     ("loading",),
     ("experiments",),
     ("cli", "__main__"),

@@ -9,10 +9,12 @@ import shlex
 import sys
 import time
 import warnings
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from lfm_ppl.cli import fit, results, session, stored
+from lfm_ppl import data, loading
+from lfm_ppl.cli import choices, fit, results, session
 
 TABLE = "accuracy.csv"
 FIGURE = "accuracy.png"
@@ -22,6 +24,17 @@ _CHAINS, _WARMUP, _SAMPLES = 4, 500, 500
 """Of the chains that correct a result from the posterior mode, which has none itself."""
 
 _RECORD = ("model_file", "settings", "options", "data", "note")
+
+
+class Check(NamedTuple):
+    """What is checked: the result, its model and the keyword arguments of that; the data, and the model's file."""
+
+    posterior: Any
+    name: str
+    model: Callable
+    keywords: dict[str, Any]
+    observed: data.Data
+    file: loading.ModelFile
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -39,7 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
     results.writable(path.parent)
     posterior = arviz_data.load(path)
     session.start(int(arviz_data.attributes(posterior).get("chains", 1)), not arguments.no_cache)
-    task = stored.model_of(posterior, arguments.model)
+    task = rebuilt(posterior, arguments.model)
     with contextlib.ExitStack() as stack:
         folder = None
         if arguments.correct:
@@ -58,7 +71,45 @@ def run(arguments: argparse.Namespace) -> int:
         return max(status, _correct(task, report, arguments, folder))
 
 
-def _checked(task: stored.StoredModel, arguments: argparse.Namespace) -> Any:
+def rebuilt(posterior: Any, model_file: str | None) -> Check:
+    """Rebuild the model from what the result remembers of it."""
+    from lfm_ppl.inference.handlers.settings import approximate
+    from lfm_ppl.results import arviz_data, rebuilding
+    from lfm_ppl.results.scalars import unit_of
+
+    attrs = arviz_data.attributes(posterior)
+    chosen = model_file or attrs.get("model_file")
+    if not chosen:
+        raise ValueError(f"the result does not say which file its model {attrs.get('model', '')!r} comes from, as of "
+                         "one that lfm.fit made. Name the file with --model FILE, or call lfm.check_accuracy(result, "
+                         "model) in Python.")
+    try:
+        model = loading.load(chosen)
+    except ValueError as error:
+        remedy = "" if model_file else " The result was made with this file; if it has moved, name it with --model."
+        raise ValueError(f"{error}{remedy}") from error
+    times, y = rebuilding.observations(posterior)
+    if y.ndim != 2 or times.ndim != 1:
+        raise ValueError("the result is of a panel of series; check it with lfm.check_accuracy in Python.")
+    group = arviz_data.group(posterior, "observed_data")
+    outputs = tuple(str(name) for name in group["output"].values)
+    if model.outputs is not None and model.outputs != outputs:
+        raise ValueError(f"the result is of the outputs {', '.join(outputs)}; {model.path} has "
+                         f"{', '.join(model.outputs)}. Give the file that it was made with.")
+    (variable,) = (group[name] for name in group.data_vars)
+    units = {name: unit for name in outputs if (unit := unit_of(variable, name))}
+    observed = data.Data(times, y, outputs, units={**model.units, **units})
+    options = json.loads(attrs.get("options") or "{}")
+    unknown = sorted(set(options) - set(model.options))
+    if unknown:
+        raise ValueError(f"the result was made with the option {unknown[0]!r}, which {model.path} no longer has.")
+    settings = json.loads(attrs.get("settings") or "{}")
+    settings["rule"] = choices.rule(settings.get("rule"))
+    numpyro_model = approximate(model.model, **settings)
+    return Check(posterior, model.name, numpyro_model, model.keywords(observed, options), observed, model)
+
+
+def _checked(task: Check, arguments: argparse.Namespace) -> Any:
     from lfm_ppl.results.accuracy import check_accuracy
 
     return check_accuracy(
@@ -94,7 +145,7 @@ def _write(report: Any, posterior: Any, path: Path) -> int:
     return 0
 
 
-def _correct(task: stored.StoredModel, report: Any, arguments: argparse.Namespace, folder: Path) -> int:
+def _correct(task: Check, report: Any, arguments: argparse.Namespace, folder: Path) -> int:
     """Write the corrected result: by resampling where the weights are reliable, else by new chains."""
     from lfm_ppl.results.correction import correct_posterior
 
@@ -108,7 +159,7 @@ def _correct(task: stored.StoredModel, report: Any, arguments: argparse.Namespac
     return fit.report(corrected, folder, time.perf_counter() - started, arguments.overwrite)
 
 
-def _exact_chains(task: stored.StoredModel, arguments: argparse.Namespace) -> Any:
+def _exact_chains(task: Check, arguments: argparse.Namespace) -> Any:
     """Sample the exact posterior by particle-marginal RAM.
 
     Where the weights fail, the filter's likelihood is too small in a part of the posterior, and delayed acceptance,

@@ -152,6 +152,7 @@ def sample(
         },
         model_kwargs=model.keywords(observed, options),
         fixed=fixed,
+        coords={"output": observed.outputs},
         truth=observed.truth,
         progress=not arguments.quiet and sys.stderr.isatty(),  # in a log file a bar is noise
         name=model.name,
@@ -173,7 +174,7 @@ def report(posterior: Any, folder: Path, seconds: float, overwrite: bool) -> int
 
     written = [arviz_data.save(posterior, folder / files.POSTERIOR, overwrite)]
     table = arviz_data.summary(posterior)
-    written.append(tables.write_csv(table, folder / results.SUMMARY, overwrite))
+    written.append(tables.write_csv(tables.annotated(table, posterior), folder / results.SUMMARY, overwrite))
     print(f"\n{tables.text_table(table, width=shutil.get_terminal_size().columns)}\n")
     status = 0
     try:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from lfm_ppl import data
-from lfm_ppl.cli import results, session, stored
+from lfm_ppl.cli import check, results, session
 
 TABLE = "forecast.csv"
 FIGURE = "forecast.png"
@@ -44,12 +44,12 @@ def run(arguments: argparse.Namespace) -> int:
                               "replace them with --overwrite.")
     results.writable(folder)
     session.start(1, not arguments.no_cache)
-    task = stored.model_of(posterior, arguments.model)
+    task = check.rebuilt(posterior, arguments.model)
     held_out = None if arguments.held_out is None else _held_out(arguments, task)
     return _write(_forecast(arguments, task, held_out), held_out, path, folder, arguments)
 
 
-def _forecast(arguments: argparse.Namespace, task: stored.StoredModel, held_out: data.Data | None) -> Any:
+def _forecast(arguments: argparse.Namespace, task: check.Check, held_out: data.Data | None) -> Any:
     import lfm_ppl
 
     times = requested(task.observed.times, arguments.until, arguments.at, _GRID, np.array([]))
@@ -74,7 +74,7 @@ def requested(times: np.ndarray, until: float | None, at: np.ndarray | None, gri
     return np.unique(np.concatenate(wanted))
 
 
-def _held_out(arguments: argparse.Namespace, task: stored.StoredModel) -> data.Data:
+def _held_out(arguments: argparse.Namespace, task: check.Check) -> data.Data:
     outputs = task.observed.outputs
     columns = outputs
     if arguments.outputs is not None:

@@ -28,8 +28,8 @@ MEAN, SD, FREE_SD = "y_mean", "y_sd", "outputs_sd"
 """Mean of the normal distribution that y has at each draw, its sd, and its sd without the noise."""
 
 
-def predictions(bound: BoundModel, paths: Mapping[str, np.ndarray], chosen: np.ndarray,
-                times: np.ndarray) -> xr.Dataset:
+def predictions(bound: BoundModel, paths: Mapping[str, np.ndarray], chosen: np.ndarray, times: np.ndarray,
+                labels: Mapping[str, Any] | None = None) -> xr.Dataset:
     """Lay out new observations, and the paths that they were drawn along.
 
     Args:
@@ -37,6 +37,7 @@ def predictions(bound: BoundModel, paths: Mapping[str, np.ndarray], chosen: np.n
         paths: what `lfm_ppl.inference.posterior.trajectories` drew, each (C, S, ..., K, size).
         chosen: (S,) which draws of each chain.
         times: (K,).
+        labels: dimension -> names of "output" and "series", where they are not the model's.
 
     Returns:
         Variables with dimensions chain, draw, (series,) time and one more: the site's name (new observations, with
@@ -47,11 +48,15 @@ def predictions(bound: BoundModel, paths: Mapping[str, np.ndarray], chosen: np.n
     site = bound.site
     model = site.example.ssm.model
     panel = ("series",) if np.ndim(bound.y) == 3 else ()
-    named = {"output": list(model.output_names), "state": list(model.state_names), "force": list(model.force_names)}
+    labels = labels or {}
+    outputs = list(labels.get("output", model.output_names))
+    units = {new: model.units[old] for old, new in zip(model.output_names, outputs, strict=True) if old in model.units}
+    units = {**model.units, **units}
+    named = {"output": outputs, "state": list(model.state_names), "force": list(model.force_names)}
     place = ("chain", "draw", *panel, "time")
 
     def variable(kind: str, values: np.ndarray, what: str) -> tuple:
-        return (*place, kind), values, {"long_name": what, **units_attribute(named[kind], model.units)}
+        return (*place, kind), values, {"long_name": what, **units_attribute(named[kind], units)}
 
     variables = {site.name: variable("output", paths["prediction"], "new observation, with noise"),
                  MEAN: variable("output", paths["predictive_mean"], "mean of the new observation at this draw"),
@@ -62,8 +67,9 @@ def predictions(bound: BoundModel, paths: Mapping[str, np.ndarray], chosen: np.n
     words = {"output": NOISE_FREE, "state": "state", "force": "force"}
     variables |= {f"{kind}s": variable(kind, paths[kind], word) for kind, word in words.items()
                   if paths[kind].shape[-1]}
-    clock = {"time": ("time", times, units_attribute(["time"], model.units))}
+    clock = {"time": ("time", times, units_attribute(["time"], units))}
     coords = {"chain": np.arange(paths["prediction"].shape[0]), "draw": chosen, **clock}
+    coords |= {"series": labels["series"]} if panel and "series" in labels else {}
     attrs = {"observed": site.name, "last_observation": float(last_observation(bound.times, np.asarray(bound.y)))}
     return xr.Dataset(variables, {**coords, **{kind: names for kind, names in named.items() if names}}, attrs)
 
