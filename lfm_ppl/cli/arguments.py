@@ -11,7 +11,7 @@ import numpy as np
 
 import lfm_ppl
 from lfm_ppl import checks
-from lfm_ppl.cli import check, compare, fit, forecast, models, plot, simulate, version
+from lfm_ppl.cli import check, compare, fit, forecast, models, new, plot, simulate, version
 from lfm_ppl.cli.choices import REFERENCES, RULES, SAMPLERS
 
 MODEL_HELP = "a shipped model (see `lfm-ppl models`) or the path of a Python file"
@@ -38,7 +38,8 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--version", action="version", version=f"lfm_ppl {lfm_ppl.__version__}",
                      help="print the version of lfm_ppl; `lfm-ppl version` prints those of what it stands on, too")
     commands = top.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    for add in (_add_models, _add_simulate, _add_fit, _add_forecast, _add_check, _add_compare, _add_plot, _add_version):
+    for add in (_add_models, _add_new, _add_simulate, _add_fit, _add_forecast, _add_check, _add_compare, _add_plot,
+                _add_version):
         add(commands)
     return top
 
@@ -62,9 +63,16 @@ def _command(commands: Any, name: str, run: Callable[..., int], help_: str, exam
 
 
 def _add_models(commands: Any) -> None:
-    examples = "  lfm-ppl models\n  lfm-ppl models transcription"
-    command = _command(commands, "models", models.run, "list the models, or describe one", examples)
+    examples = "  lfm-ppl models\n  lfm-ppl models transcription\n  lfm-ppl models my_model.py"
+    help_ = "list the models, or describe one: its parameters and their priors, forces, outputs"
+    command = _command(commands, "models", models.run, help_, examples)
     command.add_argument("model", nargs="?", metavar="MODEL", help=MODEL_HELP)
+
+
+def _add_new(commands: Any) -> None:
+    help_ = "write a commented model file to start from, which runs as it is"
+    command = _command(commands, "new", new.run, help_, "  lfm-ppl new my_model.py && lfm-ppl fit my_model.py")
+    command.add_argument("file", metavar="FILE", help="Python file to write; one that exists is kept")
 
 
 def _add_simulate(commands: Any) -> None:
