@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import shutil
 import sys
@@ -33,20 +34,23 @@ def run(arguments: argparse.Namespace) -> int:
         if getattr(arguments, flag) is not None and arguments.held_out is None:
             raise ValueError(f"--{flag.replace('_', '-')} says how to read a data file; give one with --held-out.")
     path = files.locate(arguments.result)
-    folder = Path(arguments.out) if arguments.out else path.parent
-    for name in (TABLE, FIGURE, *([SCORES] if arguments.held_out else [])):
-        files.refuse_existing(folder / name, arguments.overwrite)
-    if arguments.out:
-        files.refuse_existing(folder / files.POSTERIOR, arguments.overwrite)
+    if not arguments.out:
+        for name in (TABLE, FIGURE, *([SCORES] if arguments.held_out else [])):
+            files.refuse_existing(path.parent / name, arguments.overwrite)
     posterior = arviz_data.load(path)
     if not arguments.out and not arguments.overwrite and arviz_data.has_group(posterior, GROUP):
         raise FileExistsError(f"{path} holds predictions already, which are kept. Write elsewhere with --out, or "
                               "replace them with --overwrite.")
-    results.writable(folder)
-    session.start(1, not arguments.no_cache)
-    task = check.rebuilt(posterior, arguments.model)
-    held_out = None if arguments.held_out is None else _held_out(arguments, task)
-    return _write(_forecast(arguments, task, held_out), held_out, path, folder, arguments)
+    with contextlib.ExitStack() as stack:
+        folder = path.parent
+        if not arguments.out:
+            results.writable(folder)
+        else:
+            folder = stack.enter_context(results.folder("forecast", arguments.out, arguments.overwrite))
+        session.start(1, not arguments.no_cache)
+        task = check.rebuilt(posterior, arguments.model)
+        held_out = None if arguments.held_out is None else _held_out(arguments, task)
+        return _write(_forecast(arguments, task, held_out), held_out, path, folder, arguments)
 
 
 def _forecast(arguments: argparse.Namespace, task: check.Check, held_out: data.Data | None) -> Any:
