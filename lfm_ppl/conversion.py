@@ -82,7 +82,8 @@ def to_arviz(mcmc: Any, numpyro_model: Callable, times: Any, y: Any, *, at: Any 
     if trajectory_draws != 0:
         checks.positive_integer("trajectory_draws", trajectory_draws)
     draws, stats = _collected(mcmc)
-    bound = bind(numpyro_model, times, y, **dict(model_kwargs or {}))
+    values = y.to_numpy(float) if hasattr(y, "to_numpy") else y  # a data frame
+    bound = bind(numpyro_model, times, values, **dict(model_kwargs or {}))
     check_requested(bound, at)
     draws = _checked(bound, draws)
     labels = Labels.of(bound, dims, coords, y)

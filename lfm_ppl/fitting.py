@@ -153,7 +153,8 @@ def fit(
     if trajectory_draws != 0:
         checks.positive_integer("trajectory_draws", trajectory_draws)
     keys = jax.random.split(jax.random.key(seed), 5)
-    bound = bind(numpyro_model, times, y, **dict(model_kwargs or {}))
+    values = y.to_numpy(float) if hasattr(y, "to_numpy") else y  # a data frame
+    bound = bind(numpyro_model, times, values, **dict(model_kwargs or {}))
     check_requested(bound, at)
     labels = Labels.of(bound, dims, coords, y)
     bound = bound.fix(fixed)

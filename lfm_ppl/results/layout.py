@@ -53,8 +53,8 @@ class Labels(NamedTuple):
         """
         trace = bound.trace()
         site = bound.site
-        panel = [frame.name for frame in trace[site.name].get("cond_indep_stack", ())]
-        renamed = {name: SERIES for name in panel} if np.ndim(bound.y) == 3 else {}
+        plates = [frame.name for frame in trace[site.name].get("cond_indep_stack", ())]
+        renamed = {plates[0]: SERIES} if np.ndim(bound.y) == 3 and len(plates) == 1 else {}
         found: dict[str, tuple[str | None, ...]] = {}
         derived = set()
         for name, one in trace.items():
@@ -62,9 +62,8 @@ class Labels(NamedTuple):
                 continue
             derived |= {name} if one["type"] == "deterministic" else set()
             found[name] = _axes(one, renamed)
-        given = {name: [text] if isinstance(text := dims[name], str) else list(text) for name in dims or ()} if dims \
-            else {}
-        for name, names in given.items():
+        for name, given in (dims or {}).items():
+            names = [given] if isinstance(given, str) else list(given)
             if name not in found:
                 raise ValueError(f"dims: {checks.unknown('parameter', name, found)}")
             if len(names) != len(found[name]):
@@ -216,9 +215,9 @@ def _truth(truth: Mapping[str, Any], named: dict, units: Mapping[str, str],
         if label not in posterior:
             continue
         dims = posterior[label].dims[2:]
-        if value.ndim == len(dims):
+        if value.shape == posterior[label].shape[2:]:
             variables[label] = (dims, value)
-            coords |= {name: posterior[name].values for name in dims if value.shape == posterior[label].shape[2:]}
+            coords |= {name: posterior[name].values for name in dims}
         else:
             variables[label] = ([f"{label}_true_{axis}" for axis in range(value.ndim)], value)
     return xr.Dataset(variables, coords)
