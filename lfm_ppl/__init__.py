@@ -10,7 +10,10 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from lfm_ppl import forces as forces
     from lfm_ppl import orbits as orbits
+    from lfm_ppl.backtesting import Backtest as Backtest
+    from lfm_ppl.backtesting import backtest as backtest
     from lfm_ppl.compilation import fast_loops as fast_loops
+    from lfm_ppl.conversion import to_arviz as to_arviz
     from lfm_ppl.data import Data as Data
     from lfm_ppl.data import read_csv as read_csv
     from lfm_ppl.data import read_table as read_table
@@ -31,6 +34,7 @@ if TYPE_CHECKING:
     from lfm_ppl.forces import Resonator as Resonator
     from lfm_ppl.forces import SquaredExponential as SquaredExponential
     from lfm_ppl.forces import WienerVelocity as WienerVelocity
+    from lfm_ppl.forecasting import forecast as forecast
     from lfm_ppl.inference.bound_model import BoundModel as BoundModel
     from lfm_ppl.inference.bound_model import bind as bind
     from lfm_ppl.inference.handlers.fixing import fix as fix
@@ -72,6 +76,15 @@ if TYPE_CHECKING:
     from lfm_ppl.results.arviz_data import load as load
     from lfm_ppl.results.arviz_data import save as save
     from lfm_ppl.results.correction import correct_posterior as correct_posterior
+    from lfm_ppl.results.plots import plot_accuracy as plot_accuracy
+    from lfm_ppl.results.plots import plot_calibration as plot_calibration
+    from lfm_ppl.results.plots import plot_fit as plot_fit
+    from lfm_ppl.results.plots import plot_forces as plot_forces
+    from lfm_ppl.results.plots import plot_pairs as plot_pairs
+    from lfm_ppl.results.plots import plot_residuals as plot_residuals
+    from lfm_ppl.results.plots import plot_states as plot_states
+    from lfm_ppl.results.plots import plot_trace as plot_trace
+    from lfm_ppl.results.scoring import score as score
     from lfm_ppl.switching.rao_blackwellised import rao_blackwellised as rao_blackwellised
     from lfm_ppl.switching.rule import SwitchingRule as SwitchingRule
     from lfm_ppl.switching.rule import Thermostat as Thermostat
@@ -92,6 +105,11 @@ _NAMES = {
     "results.accuracy": ("check_accuracy",),
     "results.arviz_data": ("load", "save"),
     "results.correction": ("correct_posterior",),
+    "results.plots": (
+        "plot_accuracy", "plot_calibration", "plot_fit", "plot_forces", "plot_pairs", "plot_residuals", "plot_states",
+        "plot_trace",
+    ),
+    "results.scoring": ("score",),
     "inference.kernels.elliptical_slice": ("EllipticalSlice",),
     "fokker_planck_grid.fokker_planck": ("fokker_planck",),
     "latent_grid.laplace": ("laplace",),
@@ -101,6 +119,7 @@ _NAMES = {
     "switching.rao_blackwellised": ("rao_blackwellised",),
     "switching.switched_simulation": ("simulate_switched",),
     "compilation": ("fast_loops",),
+    "conversion": ("to_arviz",),
     "data": ("Data", "read_csv", "read_table"),
     "filtering.breakdown": ("FilterWarning",),
     "filtering.filter": ("FilterState", "filter"),
@@ -111,7 +130,9 @@ _NAMES = {
         "SquaredExponential", "WienerVelocity",
     ),
     "inference.bound_model": ("BoundModel", "bind"),
+    "backtesting": ("Backtest", "backtest"),
     "fitting": ("ConvergenceWarning", "fit"),
+    "forecasting": ("forecast",),
     "inference.handlers.fixing": ("fix",),
     "inference.map": ("map_estimate",),
     "inference.marginal_likelihood": ("MarginalLikelihood", "panel"),

@@ -11,7 +11,7 @@ import csv
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -194,6 +194,26 @@ def as_data(data: Any) -> Data:
         return read_table(data)
     raise TypeError("without y the data must be lfm.Data, a DataFrame or an xarray Dataset, got "
                     f"{type(data).__name__}. Pass times and y.")
+
+
+def on_clock_of(data: Data, other: Data) -> Data:
+    """Return data with their times counted from the origin of other data, in their unit.
+
+    Raises:
+        ValueError: the times of one are dates and of the other plain numbers, or only one has an offset from UTC.
+    """
+    if data.origin is None and other.origin is None:
+        return data
+    if data.origin is None or other.origin is None:
+        dated, plain = ("first", "others") if data.origin else ("others", "first")
+        raise ValueError(f"the times of two tables cannot be compared: those of the {dated} are dates, those of the "
+                         f"{plain} plain numbers.")
+    unit, own = other.units["time"], data.units["time"]
+    ratio = calendar_time.SECONDS[own] / calendar_time.SECONDS[unit]
+    shift = calendar_time.position(data.origin, other.origin, unit)
+    return replace(data, times=data.times * ratio + shift, origin=other.origin, units={**data.units, "time": unit},
+                   inputs={name: table._replace(times=table.times * ratio + shift)
+                           for name, table in data.inputs.items()})
 
 
 def write_csv(data: Data, path: str | Path) -> None:

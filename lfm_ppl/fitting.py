@@ -14,7 +14,6 @@ from typing import Any
 
 import jax
 import numpy as np
-import xarray as xr
 from numpyro.infer import init_to_median, init_to_value
 
 from lfm_ppl import checks
@@ -36,7 +35,7 @@ from lfm_ppl.results import checkpoint as checkpoints
 from lfm_ppl.results.checkpoint import Checkpoint
 from lfm_ppl.results.files import POSTERIOR
 from lfm_ppl.results.inputs import remember
-from lfm_ppl.results.scalars import units_attribute
+from lfm_ppl.results.layout import Labels, lay_out
 
 SAMPLERS = ("nuts", "ram", "pmmh", "map")
 
@@ -76,6 +75,8 @@ def fit(
     resume: bool = False,
     overwrite: bool = False,
     attributes: Mapping[str, Any] | None = None,
+    dims: Mapping[str, Sequence[str]] | None = None,
+    coords: Mapping[str, Sequence[Any]] | None = None,
 ) -> Any:
     """Fit a latent force model: sample its parameters, then its forces given them.
 
@@ -94,7 +95,8 @@ def fit(
         thin: steps of the chain that make one draw, in the warm-up too. By default 1 for NUTS, 5 for each parameter
             for RAM, whose steps are cheap and short, and 1 for each parameter for particle-marginal RAM.
         seed: of everything random.
-        at: times of the trajectories; by default a grid over the data. Times after the last are forecasts.
+        at: times of the trajectories, and of new observations; by default a grid over the data. Times after the last
+            observation are forecasts, see `forecast`.
         trajectory_draws: number of posterior draws, spread over the chains, for which trajectories are drawn; 0: none.
         model_kwargs: keyword arguments of the model.
         fixed: parameters that are not learnt: name -> value, ``{"decay": 0.8}`` or ``{"decay[CDKN1A]": 0.8}``.
@@ -115,6 +117,10 @@ def fit(
             that is empty or does not exist a new one begins.
         overwrite: replace a result or an unfinished run in ``checkpoint``.
         attributes: further attributes of the result.
+        dims: parameter -> names of its dimensions, ``{"decay": ["gene"]}``. By default the plates that it stands in,
+            ``event_dims`` of NumPyro's ``infer``, "output" for a vector with an entry for each output.
+        coords: dimension -> labels, ``{"gene": ["CDKN1A", "SESN1"]}``; of "output", the names of the columns of y, and
+            of "series", those of a panel, too. By default columns of a data frame keep their names.
 
     Ctrl-C ends the sampling after the present block of steps, some two seconds, and the draws so far are returned, with
     an attribute ``partial`` and a warning. Another one raises KeyboardInterrupt.
@@ -122,7 +128,8 @@ def fit(
     Returns:
         An ArviZ object (``InferenceData`` on ArviZ 0.23, ``xarray.DataTree`` on 1.x) with the groups
 
-        - ``posterior``: parameters, with coordinates;
+        - ``posterior``: parameters, with coordinates; what ``numpyro.deterministic`` computes of them has the attribute
+          ``derived``;
         - ``sample_stats``;
         - ``log_likelihood``: the Gaussian filter's leave-one-out conditionals log p(y_k | y_-k, theta), which make
           ``az.loo`` right for dependent data;
@@ -131,6 +138,7 @@ def fit(
           and for "pmmh" from the particle smoother;
         - ``posterior_predictive``: replicated data along these trajectories. (``numpyro.infer.Predictive`` with the
           same draws simulates NEW forces instead.)
+        - ``predictions``: with ``at``, new observations at these times, with their noise; see `forecast`;
         - ``observed_data``, and ``truth`` and ``constant_data`` (known inputs) where there are any.
 
     Raises:
@@ -179,9 +187,12 @@ def fit(
     if y is None:
         data = as_data(times)
         times, y, truth = data.times, data.y, data.truth if truth is None else truth
+        coords = {"output": data.outputs, **(coords or {})}
         model_kwargs = {**({"inputs": data.known_inputs()} if data.inputs else {}), **(model_kwargs or {})}
-    bound = bind(numpyro_model, times, y, **dict(model_kwargs or {}))
-    _check_requested(bound, at)
+    values = y.to_numpy(float) if hasattr(y, "to_numpy") else y  # a data frame
+    bound = bind(numpyro_model, times, values, **dict(model_kwargs or {}))
+    check_requested(bound, at)
+    labels = Labels.of(bound, dims, coords, y)
     fingerprint = bound.fingerprint
     bound = bound.fix(fixed)
     if sampler == "map":
@@ -216,11 +227,11 @@ def fit(
         attrs = {
             "model": name or getattr(numpyro_model, "__name__", "model"), **described,
             "wall_time_s": round(seconds, 3),
-            "versions": json.dumps(checkpoints.versions() | {"arviz": metadata.version("arviz")}),
+            "versions": json.dumps(versions()),
             "created_at": datetime.now(UTC).isoformat(timespec="seconds"), **remarks, "partial": partial,
             "run": None if run is None else run.record, **dict(attributes or {}),
         }
-        groups = _groups(bound, draws, stats, rated, paths, chosen, grid, truth)
+        groups = lay_out(bound, draws, stats, rated, paths, chosen, grid, truth, labels)
         attrs |= {} if data is None else remember(groups, data)
         return arviz_data.build(groups, {k: v for k, v in attrs.items() if v is not None})
 
@@ -244,7 +255,7 @@ def fit(
                 remarks["thin"] = thin
                 shown = {key: value for key, value in remarks.items() if key not in _OF_PARTICLES}
                 if run is not None:
-                    run.look = lambda rows: _kept("partial result", lambda: stored(built(
+                    run.look = lambda rows: kept("partial result", lambda: stored(built(
                         *_draws(bound, rows, samples), shown, partial=_some(rows["z"].shape[1], samples))), None)
                 collected = sampling.sample(keys[1], bound, transition, starts, warmup=warmup * thin, samples=samples,
                                             thin=thin, chain_method=method, progress=progress, keeper=run)
@@ -262,21 +273,21 @@ def fit(
             if run is not None:  # the draws are safe, whatever comes
                 stored(built(draws, stats, remarks, partial=_BARE))
             try:
-                rated = _kept("scores of the observations", lambda: scores(
+                rated = kept("scores of the observations", lambda: scores(
                     bound, flat, show=Counter("scores", shown=progress), parts=run and run.parts("scores")), None)
-                drawn = _kept("trajectories", lambda: _paths(
+                drawn = kept("trajectories", lambda: draw_paths(
                     keys[3], bound, flat, at, trajectory_draws, chains, samples, **particles,
                     show=Counter("trajectories", shown=progress), parts=run and run.parts("trajectories")), drawn)
             except KeyboardInterrupt:
                 partial = _BARE if rated is None else "all draws and their scores, without trajectories"
-        result = stored(built(draws, stats, remarks, rated, drawn, partial))
+        result = built(draws, stats, remarks, rated, drawn, partial)
+        note_warnings(result)
+        stored(result)
         if run is not None and partial is None:
             run.finish()
     if partial is not None:
         warnings.warn(f"the run was stopped, and its result is partial: {partial}.", stacklevel=2)
-    if sampler != "map":
-        for message in arviz_data.convergence_warnings(result):
-            warnings.warn(message, ConvergenceWarning, stacklevel=2)
+    warn_of_convergence(result)
     return result
 
 
@@ -300,6 +311,19 @@ def _draws(bound: BoundModel, rows: Mapping[str, np.ndarray], samples: int) -> t
     return draws, _statistics({name: values for name, values in rows.items() if name != "z"})
 
 
+def note_warnings(result: Any) -> list[str]:
+    """Store in a result what is wrong with its draws, in its attribute ``warnings``, and return it."""
+    found = arviz_data.convergence_warnings(result)
+    result.attrs["warnings"] = json.dumps(found)
+    return found
+
+
+def warn_of_convergence(result: Any) -> None:
+    """Store in a result what is wrong with its draws, and warn of it."""
+    for message in note_warnings(result):
+        checks.warn(message, ConvergenceWarning)
+
+
 @contextlib.contextmanager
 def _start_explained(bound: BoundModel) -> Iterator[None]:
     """Where no point to start from is found, say how the filter breaks down at the prior median."""
@@ -307,7 +331,7 @@ def _start_explained(bound: BoundModel) -> Iterator[None]:
         yield
     except ValueError as error:
         if "finite density" in str(error):
-            _kept("reason why there is nowhere to start", lambda: _explain_start(bound), None)
+            kept("reason why there is nowhere to start", lambda: _explain_start(bound), None)
         raise
 
 
@@ -324,7 +348,7 @@ def _explain_start(bound: BoundModel) -> None:
             return
 
 
-def _kept(what: str, compute: Callable[[], Any], otherwise: Any) -> Any:
+def kept(what: str, compute: Callable[[], Any], otherwise: Any) -> Any:
     """Compute something from the draws; a failure must not lose the draws, which took the time."""
     try:
         return compute()
@@ -334,7 +358,7 @@ def _kept(what: str, compute: Callable[[], Any], otherwise: Any) -> Any:
         return otherwise
 
 
-def _check_requested(bound: BoundModel, at: Any) -> None:
+def check_requested(bound: BoundModel, at: Any) -> None:
     """Raise before sampling what would stop the trajectories after it."""
     if at is None:
         return
@@ -447,9 +471,9 @@ def _mode(bound: BoundModel, key: jax.Array, samples: int, seed: int, init: Any,
     return {label: np.asarray(value)[None] for label, value in found.items()}, {}, remarks
 
 
-def _paths(key: jax.Array, bound: BoundModel, draws: dict, at: Any, count: int, chains: int, samples: int,
-           particle_settings: Any, particle_steps: int | None,
-           **more: Any) -> tuple[np.ndarray, dict | None, np.ndarray | None]:
+def draw_paths(key: jax.Array, bound: BoundModel, draws: dict, at: Any, count: int, chains: int, samples: int,
+               particle_settings: Any, particle_steps: int | None,
+               **more: Any) -> tuple[np.ndarray, dict | None, np.ndarray | None]:
     """Draw trajectories for draws that are spread evenly over each chain."""
     per_chain = min(samples, -(-count // chains))
     if per_chain == 0:
@@ -464,94 +488,11 @@ def _paths(key: jax.Array, bound: BoundModel, draws: dict, at: Any, count: int, 
                 else np.atleast_1d(np.asarray(at, float)))
     subset = {site: value[rows] for site, value in draws.items()}
     paths = trajectories(key, bound, subset, grid, particle_settings, particle_steps, **more)
+    if at is None:
+        paths.pop("prediction", None)  # stored where they were asked for
     return chosen, {k: v.reshape(chains, len(chosen), *v.shape[1:]) for k, v in paths.items()}, grid
 
 
-def _groups(bound: BoundModel, draws: dict, stats: dict, rated: dict | None, paths: dict | None, chosen: Any,
-            grid: np.ndarray | None, truth: Mapping[str, Any] | None) -> dict[str, xr.Dataset]:
-    site, times, y = bound.site, bound.times, np.asarray(bound.y)
-    chains, samples = next(iter(draws.values())).shape[:2]
-    model = site.example.ssm.model
-    units = model.units
-    panel = ("series",) if isinstance(site.distribution, Panel) else ()
-    per_series = times.ndim == 2
-    along = ("series", "time") if panel else ("time",)
-    coords: dict[str, Any] = {"chain": np.arange(chains), "draw": np.arange(samples)}
-    clock: dict[str, Any] = {} if per_series else {"time": ("time", times, units_attribute(["time"], units))}
-    named = {"output": list(model.output_names), "state": list(model.state_names), "force": list(model.force_names)}
-
-    def variable(dims: Sequence[str], values: Any, names: Sequence[str] = ()) -> tuple:
-        return tuple(dims), np.asarray(values), units_attribute(names, units)
-
-    # A time at which nothing was observed has no predictive density to compare.
-    seen = np.flatnonzero(np.isfinite(np.asarray(y)).any(axis=-1).reshape(-1, np.shape(y)[-2]).any(axis=0))
-    sample = ("chain", "draw", *along)
-    observed_coords = {**clock, "output": named["output"]}
-    groups = {
-        "posterior": _posterior(draws, coords, named["output"]),
-        "sample_stats": xr.Dataset({k: (("chain", "draw"), v) for k, v in stats.items()}, coords),
-        "observed_data": xr.Dataset({site.name: variable((*along, "output"), y, named["output"])}, observed_coords),
-    }
-    if per_series:
-        groups["observed_data"] = groups["observed_data"].assign(times=(along, times))
-    if rated is not None:
-        split = {label: value.reshape(chains, samples, *value.shape[1:]) for label, value in rated.items()}
-        left_out = xr.Dataset({site.name: variable(sample, split["leave_one_out"])}, {**coords, **clock})
-        groups["log_likelihood"] = left_out.isel(time=seen)
-        groups["one_step_ahead"] = xr.Dataset(
-            {"log_density": variable(sample, split["one_step_ahead"]),
-             "residual": variable((*sample, "output"), split["residual"])}, {**coords, **observed_coords})
-    if paths is not None:
-        thinned = {"chain": np.arange(chains), "draw": chosen}
-        groups["posterior_predictive"] = xr.Dataset(
-            {site.name: variable((*sample, "output"), paths["y"], named["output"])}, {**thinned, **observed_coords})
-        place = ("chain", "draw", *panel, "at")
-        at = {} if grid is None else {"at": ("at", grid, units_attribute(["time"], units))}
-        groups["trajectories"] = xr.Dataset(
-            {f"{kind}s": variable((*place, kind), paths[kind], named[kind]) for kind in named if paths[kind].shape[-1]},
-            {**thinned, **at, **{kind: named[kind] for kind in named if named[kind]}})
-    if truth:
-        groups["truth"] = _truth(truth, named, units, draws)
-    return groups
-
-
-def _posterior(draws: dict, coords: dict, outputs: list[str]) -> xr.Dataset:
-    variables: dict[str, Any] = {}
-    extra: dict[str, Any] = {}
-    for label, value in draws.items():
-        dims = []
-        for axis, size in enumerate(value.shape[2:]):
-            if size == len(outputs) and axis == 0 and value.ndim == 3 and size > 1:
-                dims.append("output")
-                extra["output"] = outputs
-            else:
-                dims.append(f"{label}_dim_{axis}")
-                extra[dims[-1]] = np.arange(size)
-        variables[label] = (("chain", "draw", *dims), value)
-    return xr.Dataset(variables, {**coords, **extra})
-
-
-def _truth(truth: Mapping[str, Any], named: dict, units: Mapping[str, str], draws: dict) -> xr.Dataset:
-    variables: dict[str, Any] = {}
-    coords: dict[str, Any] = {}
-    if truth.get("times") is not None:
-        coords["at_truth"] = ("at_truth", np.asarray(truth["times"], float), units_attribute(["time"], units))
-    forces = truth.get("forces") or {}
-    known = [label for label in named["force"] if label in forces]
-    if known:
-        coords["force"] = known
-        variables["forces"] = (("at_truth", "force"), np.stack([np.asarray(forces[n]) for n in known], axis=1),
-                               units_attribute(known, units))
-    if truth.get("state") is not None and np.ndim(truth["state"]) == 2:
-        coords["state"] = named["state"]
-        variables["states"] = (("at_truth", "state"), np.asarray(truth["state"]),
-                               units_attribute(named["state"], units))
-    for label, value in (truth.get("parameters") or {}).items():
-        value = np.asarray(value, float)
-        dims = ["output"] if value.shape == (len(named["output"]),) and value.size > 1 else \
-            [f"{label}_dim_{axis}" for axis in range(value.ndim)]
-        if dims == ["output"]:
-            coords["output"] = named["output"]
-        if label in draws:
-            variables[label] = (tuple(dims), value)
-    return xr.Dataset(variables, coords)
+def versions() -> dict[str, str]:
+    """Return the versions of what a result was made with."""
+    return checkpoints.versions() | {"arviz": metadata.version("arviz")}

@@ -71,6 +71,11 @@ class ModelFile:
     _prepare: Callable[[Data], Data] | None = None
     _anchors: Callable[[Data], Mapping[str, float]] | None = None
 
+    @property
+    def can_simulate(self) -> bool:
+        """Whether the file has data of its own."""
+        return self._simulate is not None
+
     def simulate(self, seed: int | None = None, **options: Any) -> Data:
         """Return simulated data with its truth; the model's default data where seed is None.
 

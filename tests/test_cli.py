@@ -324,7 +324,8 @@ def test_debug_shows_where(motif):
         main(["fit", motif, "--set", "dacay=1", "--debug"])
 
 
-@pytest.mark.parametrize("command", ["", "models", "simulate", "fit", "check", "compare", "plot", "version"])
+@pytest.mark.parametrize("command", ["", "models", "new", "simulate", "fit", "forecast", "check", "compare", "plot",
+                                     "version"])
 def test_help_has_examples(run, command):
     code, out, _ = run(f"{command} --help")
     assert code == 0

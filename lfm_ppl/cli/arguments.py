@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 
 import lfm_ppl
 from lfm_ppl import calendar_time, checks
-from lfm_ppl.cli import check, compare, fit, models, plot, simulate, version
+from lfm_ppl.cli import check, compare, fit, forecast, models, new, plot, simulate, version
 from lfm_ppl.cli.choices import REFERENCES, RULES, SAMPLERS
 
 MODEL_HELP = "a shipped model (see `lfm-ppl models`) or the path of a Python file"
@@ -36,7 +36,8 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--version", action="version", version=f"lfm_ppl {lfm_ppl.__version__}",
                      help="print the version of lfm_ppl; `lfm-ppl version` prints those of what it stands on, too")
     commands = top.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    for add in (_add_models, _add_simulate, _add_fit, _add_check, _add_compare, _add_plot, _add_version):
+    for add in (_add_models, _add_new, _add_simulate, _add_fit, _add_forecast, _add_check, _add_compare, _add_plot,
+                _add_version):
         add(commands)
     return top
 
@@ -60,9 +61,16 @@ def _command(commands: Any, name: str, run: Callable[..., int], help_: str, exam
 
 
 def _add_models(commands: Any) -> None:
-    examples = "  lfm-ppl models\n  lfm-ppl models transcription"
-    command = _command(commands, "models", models.run, "list the models, or describe one", examples)
+    examples = "  lfm-ppl models\n  lfm-ppl models transcription\n  lfm-ppl models my_model.py"
+    help_ = "list the models, or describe one: its parameters and their priors, forces, outputs"
+    command = _command(commands, "models", models.run, help_, examples)
     command.add_argument("model", nargs="?", metavar="MODEL", help=MODEL_HELP)
+
+
+def _add_new(commands: Any) -> None:
+    help_ = "write a commented model file to start from, which runs as it is"
+    command = _command(commands, "new", new.run, help_, "  lfm-ppl new my_model.py && lfm-ppl fit my_model.py")
+    command.add_argument("file", metavar="FILE", help="Python file to write; one that exists is kept")
 
 
 def _add_simulate(commands: Any) -> None:
@@ -208,12 +216,43 @@ def _add_fit(commands: Any) -> None:
     _add_approximation(command.add_argument_group("approximation (default: the model's own)"))
     out = command.add_argument_group("results")
     out.add_argument("--out", metavar="DIR", help="folder to write (default: lfm-results/MODEL-001, -002, ...)")
-    out.add_argument("--until", metavar="TIME", help="forecast to this time, a number or a date (default: none)")
+    _add_times(out)
     out.add_argument("--overwrite", action="store_true", help="write into a folder with files")
     out.add_argument("--resume", action="store_true",
                      help="go on with the run in --out that was stopped or killed, to the very same draws")
     out.add_argument("--quiet", action="store_true",
                      help="no progress (a bar, or a line every 30 s where there is no terminal)")
+
+
+def _add_times(group: Any) -> None:
+    group.add_argument("--until", metavar="TIME",
+                       help="forecast new data, with their noise, to this time, a number or a date (default: none)")
+    group.add_argument("--at", metavar="T1,T2,...",
+                       help="times, or dates, at which new data are predicted, between or after the observations")
+
+
+def _add_forecast(commands: Any) -> None:
+    examples = (
+        "  lfm-ppl forecast lfm-results/spring-001 --until 40\n"
+        "  lfm-ppl forecast lfm-results/my-model-001 --held-out next_week.csv --out next-week"
+    )
+    help_ = "forecast new data, with their noise, from a saved result, and score it"
+    command = _command(commands, "forecast", forecast.run, help_, examples, computes=True)
+    command.add_argument("result", metavar="RESULT", help="a results folder or a posterior.nc")
+    _add_times(command)
+    command.add_argument("--held-out", metavar="FILE",
+                         help="CSV of data that the fit has not seen, to be predicted and compared with")
+    command.add_argument("--time-column", metavar="NAME", help="its time column (default: time, t or time_h)")
+    command.add_argument("--outputs", metavar="A,B,...", help="its columns (default: the outputs of the result)")
+    command.add_argument("--inputs", metavar="A,B,...",
+                         help="its columns of known inputs, as far as the forecast goes (default: as in the model)")
+    command.add_argument("--draws", type=_whole(1), default=400, metavar="N",
+                         help="posterior draws that are propagated (default: 400)")
+    command.add_argument("--seed", type=_whole(0), default=0, help="random seed of paths and noise (default: 0)")
+    command.add_argument("--model", metavar="FILE", help="the model file, where the result does not know it")
+    command.add_argument("--out", metavar="DIR",
+                         help="folder for the result with its predictions, table and figure (default: RESULT's)")
+    command.add_argument("--overwrite", action="store_true", help="replace an earlier forecast")
 
 
 def _add_data(group: Any) -> None:

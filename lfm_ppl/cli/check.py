@@ -31,12 +31,14 @@ _RECORD = ("model_file", "settings", "options", "data", "note", "time_origin")
 
 
 class Check(NamedTuple):
-    """What is checked: the result, its model and the keyword arguments of that."""
+    """What is checked: the result, its model and the keyword arguments of that; the data, and the model's file."""
 
     posterior: Any
     name: str
     model: Callable
     keywords: dict[str, Any]
+    observed: data.Data
+    file: loading.ModelFile
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -56,7 +58,7 @@ def run(arguments: argparse.Namespace) -> int:
     results.writable(path.parent)
     posterior = arviz_data.load(path)
     session.start(int(arviz_data.attributes(posterior).get("chains", 1)), not arguments.no_cache)
-    task = _task(posterior, arguments.model)
+    task = rebuilt(posterior, arguments.model)
     with contextlib.ExitStack() as stack:
         folder = None
         if arguments.correct:
@@ -91,11 +93,11 @@ def _again(arguments: argparse.Namespace) -> str:
                        "--resume"])
 
 
-def _task(posterior: Any, model_file: str | None) -> Check:
+def rebuilt(posterior: Any, model_file: str | None) -> Check:
     """Rebuild the model from what the result remembers of it."""
     from lfm_ppl.inference.handlers.settings import approximate
     from lfm_ppl.results import arviz_data, rebuilding
-    from lfm_ppl.results.inputs import inputs_of
+    from lfm_ppl.results.inputs import ORIGIN, inputs_of
     from lfm_ppl.results.scalars import unit_of
 
     attrs = arviz_data.attributes(posterior)
@@ -119,7 +121,10 @@ def _task(posterior: Any, model_file: str | None) -> Check:
                          f"{', '.join(model.outputs)}. Give the file that it was made with.")
     (variable,) = (group[name] for name in group.data_vars)
     units = {name: unit for name in outputs if (unit := unit_of(variable, name))}
-    observed = data.Data(times, y, outputs, units={**model.units, **units}, inputs=inputs_of(posterior))
+    if clock := unit_of(group["time"]):
+        units["time"] = clock
+    observed = data.Data(times, y, outputs, units={**model.units, **units}, inputs=inputs_of(posterior),
+                         origin=attrs.get(ORIGIN))
     options = json.loads(attrs.get("options") or "{}")
     unknown = sorted(set(options) - set(model.options))
     if unknown:
@@ -127,7 +132,7 @@ def _task(posterior: Any, model_file: str | None) -> Check:
     settings = json.loads(attrs.get("settings") or "{}")
     settings["rule"] = choices.rule(settings.get("rule"))
     numpyro_model = approximate(model.model, **settings)
-    return Check(posterior, model.name, numpyro_model, model.keywords(observed, options))
+    return Check(posterior, model.name, numpyro_model, model.keywords(observed, options), observed, model)
 
 
 def _checked(task: Check, arguments: argparse.Namespace, folder: Path) -> Any:

@@ -55,6 +55,25 @@ def fixed(given: Sequence[str], anchors: Mapping[str, float]) -> dict[str, Any]:
     return chosen
 
 
+def inputs(given: str | None, model: ModelFile) -> dict[str, tuple[str, str]]:
+    """Return the known inputs to read: name -> column of the file, interpolation.
+
+    Args:
+        given: ``A,B:linear``, columns in the order of the model's inputs; None: columns of these names.
+        model: what takes them.
+    """
+    if given is None:
+        return {name: (name, way) for name, way in model.inputs.items()}
+    columns = [tuple(part.strip() for part in text.partition(":")[::2]) for text in given.split(",")]
+    names = list(model.inputs) or [column for column, _ in columns]
+    if len(names) != len(columns) or len(set(columns)) < len(columns):
+        known = ", ".join(names)
+        raise ValueError(f"{model.name} takes {len(names)} known inputs ({known}); --inputs names {len(columns)} "
+                         "columns, which must be as many, each of them once.")
+    return {name: (column, way or model.inputs.get(name, "previous"))
+            for name, (column, way) in zip(names, columns, strict=True)}
+
+
 def rule(word: str | None) -> Any:
     """Return the linearisation rule that a word stands for; None: the model's own."""
     import lfm_ppl

@@ -15,15 +15,15 @@ from typing import Any
 
 import numpy as np
 
-from lfm_ppl import calendar_time, data, loading
-from lfm_ppl.cli import choices, results, session
+from lfm_ppl import data, loading
+from lfm_ppl.cli import choices, forecast, results, session
 from lfm_ppl.cli.interruption import INTERRUPTED, watched
 
 SETTINGS = ("rule", "steps", "max_step", "iterations", "tolerance")
 """Flags of the approximation; None where the user leaves one to the model."""
 
 _GRID = 241
-"""Times of the trajectories with --until, besides those of the data: enough for a smooth line."""
+"""Times of the trajectories with --until or --at, besides those of the data: enough for a smooth line."""
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -35,7 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
     options = choices.options(model, arguments.option)
     observed = _observed(arguments, model, options)
     fixed = choices.fixed(arguments.set, model.anchors(observed))
-    at = _requested(observed, arguments.until)
+    at = _requested(observed, arguments.until, arguments.at)
     if arguments.target_accept is not None and arguments.sampler == "map":
         raise ValueError("--target-accept is for the samplers nuts, ram and pmmh; map accepts and rejects nothing.")
     if arguments.particles is not None and arguments.sampler != "pmmh":
@@ -101,7 +101,7 @@ def _observed(arguments: argparse.Namespace, model: loading.ModelFile, options: 
                 f"{model.name} has {len(model.outputs)} outputs ({', '.join(model.outputs)}); "
                 f"--outputs names {len(columns)} columns."
             )
-    inputs = _inputs(arguments.inputs, model)
+    inputs = choices.inputs(arguments.inputs, model)
     observed = data.read_csv(arguments.data, columns, arguments.time_column, dict(inputs.values()), arguments.time_unit)
     observed = dataclasses.replace(observed, outputs=model.outputs or observed.outputs,
                                    inputs={name: observed.inputs[column] for name, (column, _) in inputs.items()})
@@ -110,37 +110,13 @@ def _observed(arguments: argparse.Namespace, model: loading.ModelFile, options: 
     return model.prepare(observed)
 
 
-def _inputs(given: str | None, model: loading.ModelFile) -> dict[str, tuple[str, str]]:
-    """Return the known inputs to read: name -> column of the file, interpolation.
-
-    Args:
-        given: ``A,B:linear``, columns in the order of the model's inputs; None: columns of these names.
-        model: what takes them.
-    """
-    if given is None:
-        return {name: (name, way) for name, way in model.inputs.items()}
-    columns = [tuple(part.strip() for part in text.partition(":")[::2]) for text in given.split(",")]
-    names = list(model.inputs) or [column for column, _ in columns]
-    if len(names) != len(columns) or len(set(columns)) < len(columns):
-        known = ", ".join(names)
-        raise ValueError(f"{model.name} takes {len(names)} known inputs ({known}); --inputs names {len(columns)} "
-                         "columns, which must be as many, each of them once.")
-    return {name: (column, way or model.inputs.get(name, "previous"))
-            for name, (column, way) in zip(names, columns, strict=True)}
-
-
-def _requested(observed: data.Data, until: str | None) -> np.ndarray | None:
-    """Return the times of the trajectories where they go beyond the data; None: the library's own grid."""
-    if until is None:
+def _requested(observed: data.Data, until: str | None, at: str | None) -> np.ndarray | None:
+    """Return the times of the trajectories where some are asked for; None: the library's own grid."""
+    if until is None and at is None:
         return None
     times = observed.times
-    try:
-        end = calendar_time.position(until, observed.origin, observed.units.get("time", ""))
-    except ValueError as error:
-        raise ValueError(f"--until: {error}") from None
-    if not (np.isfinite(end) and end > times[-1]):
-        raise ValueError(f"--until takes a time after the last observation, at {times[-1]:g}, got {until}.")
-    return np.union1d(np.linspace(times[0], end, _GRID), times)
+    wanted = forecast.requested(observed, until, at, 2, times)
+    return np.union1d(np.linspace(times[0], max(wanted[-1], times[-1]), _GRID), wanted)
 
 
 def _print_task(
@@ -250,7 +226,7 @@ def report(posterior: Any, folder: Path, seconds: float, overwrite: bool) -> int
     # A run that was kept on its way has left a partial result, or the whole one, under this name.
     written = [arviz_data.save(posterior, folder / files.POSTERIOR, overwrite=True)]
     table = arviz_data.summary(posterior)
-    written.append(tables.write_csv(table, folder / results.SUMMARY, overwrite))
+    written.append(tables.write_csv(tables.annotated(table, posterior), folder / results.SUMMARY, overwrite))
     print(f"\n{tables.text_table(table, width=shutil.get_terminal_size().columns)}\n")
     status = 0
     attrs = arviz_data.attributes(posterior)

@@ -6,6 +6,7 @@ import argparse
 from typing import Any
 
 from lfm_ppl import loading
+from lfm_ppl.cli import description
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -27,11 +28,34 @@ def _list() -> None:
 
 def _describe(model: loading.ModelFile) -> None:
     print(f"{model.name}  ({model.path})\n\n{model.description}\n")
+    from lfm_ppl.cli import session
+
+    session.start(1)
     print(f"outputs: {_outputs(model)}\n")
-    rows = [(name, help_) for name, help_ in model.parameters.items()]
-    _table("parameters (fix one with --set NAME=VALUE)", rows)
+    try:
+        found = description.describe(model)
+    except Exception as error:  # a model that does not run can still be described by what its file says
+        _table("parameters (fix one with --set NAME=VALUE)", list(model.parameters.items()))
+        print(f"The model itself could not be run: {type(error).__name__}: {' '.join(str(error).split())}\n")
+    else:
+        _print_parameters(found)
+        for title, entries in (("forces", found.forces), ("states", found.states)):
+            _table(title, [(name, text) for name, text in entries.items()])
+        print(f"likelihood: {found.approximation}\n")
     rows = [(name, _option(*entry)) for name, entry in model.options.items()]
     _table("options (choose with --option NAME=VALUE)", rows)
+
+
+def _print_parameters(found: description.Description) -> None:
+    print("parameters (fix one with --set NAME=VALUE):")
+    rows = [("name", "shape", "prior", "support", ""), *found.parameters]
+    widths = [max(len(row[column]) for row in rows) for column in range(4)]
+    for row in rows:
+        cells = [f"{cell:<{width}}" for cell, width in zip(row[:4], widths, strict=True)]
+        print("  " + "  ".join([*cells, row[4]]).rstrip())
+    print()
+    if found.derived:
+        _table("derived from them", found.derived)
 
 
 def _outputs(model: loading.ModelFile) -> str:

@@ -42,7 +42,7 @@ from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.resolution import check_resolution
 from lfm_ppl.model.state_space import StateSpaceModel, state_space
 
-_LONGEST_FORECAST = 10_000
+LONGEST_FORECAST = 10_000
 """Most intervals of a forecast; a longer one gets a long last interval (or `max_step`)."""
 
 class Marginal(NamedTuple):
@@ -145,15 +145,26 @@ class SmootherResult(eqx.Module):
         checks.positive_integer("draws", draws)
         return _sample(self, key, draws)
 
+    def sample_joint(self, key: jax.Array, draws: int = 1) -> jax.Array:
+        """Draw trajectories of the joint state, the forces' own states included: (draws, K, n); see `sample`."""
+        checks.positive_integer("draws", draws)
+        return jnp.moveaxis(_joint_draws(self, key, draws), -1, 0)
+
 
 @eqx.filter_jit
-def _sample(result: SmootherResult, key: jax.Array, draws: int) -> Trajectories:
+def _joint_draws(result: SmootherResult, key: jax.Array, draws: int) -> jax.Array:
+    """Return draws (K, n, draws) of the joint state."""
     start, passed, requested, covariance = result._joint
     errors = smoothing_errors(key, passed, start, draws)[requested]
     if covariance is not None:
         errors = jax.vmap(_recoloured)(errors, covariance, result.covariance)
+    return result.mean[..., None] + errors
+
+
+@eqx.filter_jit
+def _sample(result: SmootherResult, key: jax.Array, draws: int) -> Trajectories:
     matrix, offset = result._input_map
-    inputs = jnp.moveaxis(matmul(matrix, result.mean[..., None] + errors) + offset[..., None], -1, 0)
+    inputs = jnp.moveaxis(matmul(matrix, _joint_draws(result, key, draws)) + offset[..., None], -1, 0)
     size = len(result.state_names)
     forces = {name: inputs[:, :, size + index] for index, name in enumerate(result.force_names)}
     return Trajectories(result.times, inputs[:, :, :size], forces)
@@ -260,7 +271,7 @@ def smoothing_grids(ssm: StateSpaceModel, times: Any, steps: int, max_step: floa
         gaps = np.diff(known)
         gap = np.median(gaps[gaps > 0]) if np.any(gaps > 0) else joint.requested_times.max() - known[-1]
         count = int(np.ceil((joint.requested_times.max() - known[-1]) / gap * (1 - 1e-12)))
-        beyond = known[-1] + gap * np.arange(1, min(count, _LONGEST_FORECAST) + 1)
+        beyond = known[-1] + gap * np.arange(1, min(count, LONGEST_FORECAST) + 1)
         beyond[-1] = max(beyond[-1], joint.requested_times.max())
     base = build_time_grid(ssm, times, steps, max_step, np.append(known[-1:], beyond), tolerance=tolerance)
     by_step = iterations or (isinstance(ssm.model.observation, ObservationFamily) and not is_linear(ssm))

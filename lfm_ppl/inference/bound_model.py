@@ -170,6 +170,10 @@ class _Program:
         """The likelihood site at the prior's medians."""
         return _only(self._likelihoods)
 
+    def trace(self, y: Any) -> dict[str, Any]:
+        """Return NumPyro's trace of the model at the prior's medians."""
+        return self._trace(y, self.key, init_to_median)
+
     def record(self, y: Any) -> Recording:
         """Return what a run of the model with all its parameters and data traced leaves."""
         with jax.ensure_compile_time_eval():  # compiled code may be the first to ask
@@ -510,6 +514,10 @@ class BoundModel:
                 return z
         raise ValueError(f"found no point of finite density to start from in {attempts} attempts. Give a starting "
                          "point, or check the model: its log density is -inf or NaN.")
+
+    def trace(self) -> dict[str, Any]:
+        """Return NumPyro's trace of the model at the prior medians: its sites with their priors, plates and values."""
+        return self._program.trace(self.y)
 
     # --- the filter and the smoother
 

@@ -44,7 +44,7 @@ from lfm_ppl.model.resolution import check_resolution
 from lfm_ppl.model.simulate import simulate_on
 from lfm_ppl.model.state_space import StateSpaceModel, check_times, state_space
 
-_SIMULATION_STEPS = 5
+SIMULATION_STEPS = 5
 """Steps of the simulator for one integration step of the filter: its paths are rougher than moments."""
 
 
@@ -203,7 +203,7 @@ class MarginalLikelihood(dist.Distribution):
         """Simulate the real model: (*sample_shape, T, D)."""
         start = jnp.asarray(self.time_grid.initial_time, float)
         run = lambda k: simulate_on(self.ssm, k, jnp.asarray(self.times, float), start,  # noqa: E731
-                                    _SIMULATION_STEPS * self.steps).y
+                                    SIMULATION_STEPS * self.steps).y
         return repeated(run, key, sample_shape)
 
     def filter(self, y: Any) -> FilterResult:

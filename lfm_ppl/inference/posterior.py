@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import checks
+from lfm_ppl.filtering.smoother import LONGEST_FORECAST
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.fingerprint import signature
-from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
+from lfm_ppl.inference.marginal_likelihood import SIMULATION_STEPS, MarginalLikelihood, Panel
+from lfm_ppl.linalg import matmul, semidefinite_root
 from lfm_ppl.model.observation_noise import expected_observation, noisy_observation
+from lfm_ppl.model.observations.family import ObservationFamily
+from lfm_ppl.model.simulate import simulate_onwards
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.particles.particle_filter import ParticleSettings
 from lfm_ppl.particles.particle_smoother import TRACING, draw_trajectories
@@ -24,6 +28,9 @@ _FILTERS = 4
 
 _BATCH = 8
 """Draws in a batch of those that go one after another."""
+
+_TRIED = 5
+"""How many times as many steps a model may take whose steps follow a tolerance."""
 
 _BATCH_NUMBERS = 2_000_000
 """Numbers that the smoother may hold for one batch of draws; more draws go one batch after another."""
@@ -66,7 +73,10 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
                  particles: ParticleSettings | None = None, particle_steps: int | None = None, *,
                  show: Callable[[int, int], None] = lambda done, count: None,
                  parts: Parts | None = None) -> dict[str, np.ndarray]:
-    """Draw one trajectory for each draw of the parameters, given the data, and replicate the data along it.
+    """Draw one trajectory for each draw of the parameters, given the data, and new data along it.
+
+    Up to the last observation the path is a draw of the smoother. After it, dynamics that are not linear are simulated
+    from there on: see `lfm_ppl.forecast` for why.
 
     Args:
         key: a JAX random key.
@@ -79,29 +89,62 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
         parts: keeps batches.
 
     Returns:
-        ``state`` (S, ..., K, M), ``force`` (S, ..., K, R), ``output`` (S, ..., K, D) free of noise (what is
-        expected of a family), and ``y``
-        (S, ..., T, D), the posterior predictive at the observation times.
+        ``state`` (S, ..., K, M), ``force`` (S, ..., K, R), ``output`` (S, ..., K, D) free of noise (what is expected of
+        a family); ``y`` (S, ..., T, D), the posterior predictive at the observation times; ``prediction``
+        (S, ..., K, D), new observations at the times of the trajectories. For Gaussian observations
+        ``predictive_mean`` and ``predictive_sd`` (S, ..., K, D), the normal distribution of each given the parameters
+        (where the model is linear) or given the path, so that the mixture over the draws is the predictive density, and
+        ``output_sd`` (S, ..., K, D), the sd without the noise. The last four are left out where the covariance of the
+        noise belongs to the rows of the data. ``log_likelihood`` (S, ...) of the Gaussian filter, unless there are
+        particles.
     """
     at = None if at is None else np.asarray(at, float)
-    count = 0 if at is None else len(at)
+    if at is not None and bound.times.ndim == 1 and np.array_equal(at, bound.times):
+        at = None
+    example = bound.site.example
+    after = None if particles is not None or not example.ssm.drift_structure.points else _after(bound, at)
+    plan = _plan(bound, at, particles is not None or after is not None)
 
     def one(distribution: MarginalLikelihood, y: jax.Array, key: jax.Array) -> dict[str, jax.Array]:
         ssm = distribution.ssm
-        times = jnp.asarray(distribution.times, float)
-        both = None if at is None else np.concatenate([at, np.asarray(distribution.times, float)])
         path_key, noise_key = jax.random.split(key)
         if particles is None:
-            w, when = _smoothed_path(distribution, y, both, path_key)
+            smoothed = distribution.smooth(y, plan.times)
+            when = smoothed.times
+            states = smoothed.sample_joint(path_key, 1)[0]
+            if after:
+                states = _onwards(distribution, y, states, when, plan, jax.random.fold_in(path_key, 1))
+            w = jax.vmap(ssm.inputs)(states, when)
         else:
-            w, when = _particle_path(distribution, y, both, path_key, particles, particle_steps or distribution.steps)
-        output = jax.vmap(lambda w, t: expected_observation(ssm, w, t))(w, when)
-        rows = jnp.arange(times.shape[0])
-        replicated = jax.vmap(lambda w, t, key, row: noisy_observation(ssm, w, t, key, row))(
-            w[count:], times, jax.random.split(noise_key, times.shape[0]), rows)
-        stop = count or None
+            smoothed = None
+            w, when = _particle_path(distribution, y, plan.times, path_key, particles,
+                                     particle_steps or distribution.steps)
+        there, data = plan.there, plan.data
+        if isinstance(ssm.model.observation, ObservationFamily):
+            return _of_family(ssm, noise_key, w, when, plan)
+        output = jax.vmap(ssm.observe)(w, when)
+        covariance = jax.vmap(ssm.obs_cov)(w[data], when[data], jnp.arange(len(data)))
+        replicated = _noisy(noise_key, output[data], covariance)
         size = ssm.physical_dim
-        return {"state": w[:stop, :size], "force": w[:stop, size:], "output": output[:stop], "y": replicated}
+        found = {"state": w[there, :size], "force": w[there, size:], "output": output[there], "y": replicated}
+        if smoothed is not None:
+            found["log_likelihood"] = smoothed.log_likelihood.sum()
+        if at is not None and noise_of_rows(distribution):
+            return found
+        prediction = replicated
+        if at is not None:
+            covariance = jax.vmap(ssm.obs_cov)(w[there], when[there], jnp.zeros(len(there), int))
+            prediction = _noisy(jax.random.fold_in(noise_key, 1), output[there], covariance)
+        mean, noise = output[there], jnp.diagonal(covariance, axis1=1, axis2=2)
+        variance = jnp.zeros_like(noise)
+        if smoothed is not None and _gaussian_outputs(ssm):
+            # The normal distribution of y given the parameters, instead of given a path: sharper by a lot.
+            matrix = jax.vmap(jax.jacfwd(ssm.observe))(smoothed.input_mean[there], when[there])
+            mean = jax.vmap(ssm.observe)(smoothed.input_mean[there], when[there])
+            variance = jnp.einsum("kdi,kij,kdj->kd", matrix, smoothed.input_covariance[there], matrix)
+            variance = jnp.maximum(variance, 0.0)
+        return found | {"prediction": prediction, "predictive_mean": mean, "predictive_sd": jnp.sqrt(variance + noise),
+                        "output_sd": jnp.sqrt(variance)}
 
     def per_draw(values: Any, key: jax.Array, y: Any) -> dict[str, jax.Array]:
         distribution = bound.likelihood(values, y)
@@ -109,19 +152,106 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
         keys = jax.random.split(key, y.shape[0]) if isinstance(distribution, Panel) else key
         return each(distribution, one, y, keys)
 
-    rows = count + bound.times.size
+    rows = plan.rows
     width = 1 if particles is None else particles.particles
-    name = ("trajectories", signature(at), particles, particle_steps)
+    name = ("trajectories", signature(at), particles, particle_steps, after)
     return over_draws(bound, name, per_draw, draws, key, rows * width, show, parts)
 
 
-def _smoothed_path(distribution: MarginalLikelihood, y: jax.Array, at: Any,
-                   key: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Draw the inputs (x, u) at times ``at`` (K,) from the Gaussian smoother: (K, M + R), and the times."""
-    result = distribution.smooth(y, at)
-    path = result.sample(key, 1)
-    forces = [path.forces[name][0][:, None] for name in distribution.ssm.model.force_names]
-    return jnp.concatenate([path.state[0], *forces], axis=1), result.times
+def _of_family(ssm: StateSpaceModel, key: jax.Array, w: jax.Array, when: jax.Array,
+               plan: _Plan) -> dict[str, jax.Array]:
+    """Return what `trajectories` draws along one path (L, M + R) where the observation is of a family."""
+    size, there, data = ssm.physical_dim, plan.there, plan.data
+    output = jax.vmap(lambda w, t: expected_observation(ssm, w, t))(w[there], when[there])
+    replicated = jax.vmap(lambda w, t, key, row: noisy_observation(ssm, w, t, key, row))(
+        w[data], when[data], jax.random.split(key, len(data)), jnp.arange(len(data)))
+    prediction = replicated
+    if plan.times is not None:
+        prediction = jax.vmap(lambda w, t, key: noisy_observation(ssm, w, t, key, None))(
+            w[there], when[there], jax.random.split(jax.random.fold_in(key, 1), len(there)))
+    return {"state": w[there, :size], "force": w[there, size:], "output": output, "y": replicated,
+            "prediction": prediction}
+
+
+class _Plan(NamedTuple):
+    """At which times paths are drawn.
+
+    Attributes:
+        times: (L,) the requested ones, those between, and those of the data; None: those of the data.
+        there: (K,) rows of the requested times.
+        data: (T,) rows of the data.
+        steps: of the simulation, in each row.
+    """
+
+    times: np.ndarray | None
+    there: np.ndarray
+    data: np.ndarray
+    steps: int
+
+    @property
+    def rows(self) -> int:
+        """How many there are."""
+        return len(self.data) if self.times is None else len(self.times)
+
+
+def _plan(bound: BoundModel, at: np.ndarray | None, simulated: bool) -> _Plan:
+    """Lay out the rows; those of a simulation after the data are no longer than the usual distance of the data."""
+    example = bound.site.example
+    known = bound.times
+    gaps = np.diff(known, axis=-1)
+    base = example.steps
+    if example.max_step is not None:
+        base = max(base, int(np.ceil(gaps.max(initial=0.0) / example.max_step)))
+    fine = SIMULATION_STEPS * base * (1 if example.tolerance is None else _TRIED)
+    rows = np.arange(known.shape[-1])
+    if at is None:
+        return _Plan(None, rows, rows, fine)
+    beyond = np.array([])
+    if simulated and at.max() > known[-1] and (gaps > 0).any():
+        gap = np.median(gaps[gaps > 0])
+        count = min(int(np.ceil((at.max() - known[-1]) / gap * (1 - 1e-12))), LONGEST_FORECAST)
+        beyond = np.linspace(known[-1], at.max(), count + 1)[1:-1]
+    everywhere = np.concatenate([at, beyond])
+    steps = _steps_in_a_row(example.ssm, known, everywhere, fine) if simulated else fine
+    first = len(everywhere)
+    return _Plan(np.concatenate([everywhere, known]), np.arange(len(at)), first + rows, steps)
+
+
+def _after(bound: BoundModel, at: np.ndarray | None) -> bool:
+    """Whether a time of the trajectories lies after the last observation of a series."""
+    seen = np.isfinite(np.asarray(bound.y)).any(axis=-1)
+    return not bool(np.all(seen[..., -1])) or (at is not None and bool(at.max() > bound.times.max()))
+
+
+def _onwards(distribution: MarginalLikelihood, y: jax.Array, states: jax.Array, when: jax.Array, plan: _Plan,
+             key: jax.Array) -> jax.Array:
+    """Return the joint states (L, n) with those after the last observation simulated from the one at it."""
+    order = np.arange(plan.rows) if plan.times is None else np.argsort(plan.times, kind="stable")
+    seen = jnp.isfinite(y).any(axis=-1)
+    last = jnp.max(jnp.where(seen, when[plan.data], -jnp.inf))
+    known = when[order] <= last
+    # Where nothing was observed, everything is simulated from the first row on.
+    path = simulate_onwards(distribution.ssm, key, states[order], when[order], known, plan.steps)
+    return jnp.zeros_like(states).at[order].set(path)
+
+
+def noise_of_rows(distribution: MarginalLikelihood) -> bool:
+    """Whether the covariance of the noise is given for each row of the data, so that no other row has one."""
+    observation = distribution.ssm.model.observation
+    return not observation.varies_with_state and np.ndim(observation.covariance) == 3
+
+
+def _gaussian_outputs(ssm: StateSpaceModel) -> bool:
+    """Whether y is normal given the parameters: all is linear, and the noise does not depend on the state."""
+    observation = ssm.model.observation
+    return not (ssm.drift_structure.points or ssm.observation_structure.points or observation.varies_with_state
+                or observation.angular)
+
+
+def _noisy(key: jax.Array, output: jax.Array, covariance: jax.Array) -> jax.Array:
+    """Return outputs (K, D) with noise of covariance (K, D, D)."""
+    noise = jax.random.normal(key, (*output.shape, 1))
+    return output + matmul(jax.vmap(semidefinite_root)(covariance), noise)[..., 0]
 
 
 def _particle_path(distribution: MarginalLikelihood, y: jax.Array, at: Any, key: jax.Array,

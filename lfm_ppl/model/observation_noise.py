@@ -53,10 +53,10 @@ def entry_log_prob(ssm: StateSpaceModel, w: jax.Array, t: jax.Array, row: Any, y
 
 
 def noisy_observation(ssm: StateSpaceModel, w: jax.Array, t: jax.Array, key: jax.Array, row: Any) -> jax.Array:
-    """Draw the observation (D,) of a row at the inputs w (M + R,) and time t."""
+    """Draw the observation (D,) of a row (None: of none of the data) at the inputs w (M + R,) and time t."""
     family, predictor = ssm.model.observation, ssm.observe(w, t)
     if isinstance(family, ObservationFamily):
-        return family.at(row).sample(key, predictor)
+        return (family.typical() if row is None else family.at(row)).sample(key, predictor)
     covariance = ssm.obs_cov(w, t, row)
     draw = jax.random.normal(key, (covariance.shape[0], 1))
     return predictor + matmul(semidefinite_root(covariance), draw)[:, 0]

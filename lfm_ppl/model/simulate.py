@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -81,10 +82,53 @@ def simulate_on(ssm: StateSpaceModel, key: jax.Array, times: jax.Array, start: j
     mean, covariance = ssm.initial()
     first = mean + matmul(semidefinite_root(covariance), jax.random.normal(initial, (ssm.state_dim, 1)))[:, 0]
     starts = jnp.concatenate([jnp.reshape(start, (1,)), times[:-1]])
-    jumps = ssm.stack.jump_roots()
+    advance = _interval(ssm, steps)
 
     def row(state: jax.Array, inputs: tuple) -> tuple[jax.Array, jax.Array]:
-        begin, end, row_key = inputs
+        state = advance(state, *inputs)
+        return state, state
+
+    _, states = jax.lax.scan(row, first, (starts, times, jax.random.split(path, times.shape[0])))
+    inputs = jax.vmap(ssm.inputs)(states, times)
+    y = jax.vmap(lambda w, t, k, index: noisy_observation(ssm, w, t, k, index))(
+        inputs, times, jax.random.split(noise, times.shape[0]), jnp.arange(times.shape[0]))
+    size = ssm.physical_dim
+    forces = {name: inputs[:, size + index] for index, name in enumerate(ssm.model.force_names)}
+    return Simulation(times, inputs[:, :size], forces, y)
+
+
+def simulate_onwards(ssm: StateSpaceModel, key: jax.Array, states: jax.Array, times: jax.Array, known: jax.Array,
+                     steps: int) -> jax.Array:
+    """Simulate the joint state on from where it is known; for compiled code.
+
+    Args:
+        ssm: the state-space model.
+        key: a JAX random key.
+        states: (K, n) joint states, of which those that are known are used.
+        times: (K,), non-decreasing.
+        known: (K,) Booleans; the first state counts as known.
+        steps: integration steps between two consecutive times.
+
+    Returns:
+        (K, n): the known states, and each of the others simulated from the one before it.
+    """
+    advance = _interval(ssm, steps)
+
+    def row(state: jax.Array, inputs: tuple) -> tuple[jax.Array, jax.Array]:
+        begin, end, row_key, given, is_known = inputs
+        state = jnp.where(is_known, given, advance(state, begin, end, row_key))
+        return state, state
+
+    keys = jax.random.split(key, times.shape[0] - 1)
+    _, rest = jax.lax.scan(row, states[0], (times[:-1], times[1:], keys, states[1:], known[1:]))
+    return jnp.concatenate([states[:1], rest])
+
+
+def _interval(ssm: StateSpaceModel, steps: int) -> Callable[..., jax.Array]:
+    """Return the map of a joint state, the interval's begin and end, and a key, to the state at the end."""
+    jumps = ssm.stack.jump_roots()
+
+    def advance(state: jax.Array, begin: jax.Array, end: jax.Array, row_key: jax.Array) -> jax.Array:
         h = (end - begin) / steps
         transition, covariance = ssm.stack.discretise(h)
         root = semidefinite_root(covariance)
@@ -96,16 +140,9 @@ def simulate_on(ssm: StateSpaceModel, key: jax.Array, times: jax.Array, start: j
             until = jnp.where(index == steps - 1, end, begin + (index + 1) * h)
             return _cross_jumps(ssm, jumps, state, begin + index * h, until, keys), None
 
-        state, _ = jax.lax.scan(step, state, jnp.arange(steps))
-        return state, state
+        return jax.lax.scan(step, state, jnp.arange(steps))[0]
 
-    _, states = jax.lax.scan(row, first, (starts, times, jax.random.split(path, times.shape[0])))
-    inputs = jax.vmap(ssm.inputs)(states, times)
-    y = jax.vmap(lambda w, t, k, index: noisy_observation(ssm, w, t, k, index))(
-        inputs, times, jax.random.split(noise, times.shape[0]), jnp.arange(times.shape[0]))
-    size = ssm.physical_dim
-    forces = {name: inputs[:, size + index] for index, name in enumerate(ssm.model.force_names)}
-    return Simulation(times, inputs[:, :size], forces, y)
+    return advance
 
 
 def _simulation_step(ssm: StateSpaceModel, state: jax.Array, t: jax.Array, h: jax.Array, transition: jax.Array,

@@ -32,6 +32,7 @@ _HOW_TO_GET = {
     "one_step_ahead": "lfm.fit",
     "posterior_predictive": "lfm.fit with trajectory_draws above zero",
     "trajectories": "lfm.fit with trajectory_draws above zero",
+    "predictions": "lfm.forecast(result, model, times), or lfm.fit with `at`",
     "observed_data": "lfm.fit",
     "accuracy": "lfm.check_accuracy, or `lfm-ppl check`",
     "truth": "lfm.fit on data that were simulated and carry their truth (lfm.Data.truth)",
@@ -254,7 +255,7 @@ def summary(result: Any) -> pd.DataFrame:
     return table
 
 
-def convergence_warnings(result: Any) -> list[str]:
+def convergence_warnings(result: Any, table: pd.DataFrame | None = None) -> list[str]:
     """Return what is wrong with the draws of ``result``, one message per finding.
 
     R-hat above 1.01, bulk or tail effective sample size below 100 per chain, divergences. Draws
@@ -262,6 +263,7 @@ def convergence_warnings(result: Any) -> list[str]:
 
     Args:
         result: an ArviZ object with a posterior, and sample_stats where there are any.
+        table: the rows of its `summary` to judge; None: all.
 
     Returns:
         Messages that name the parameters, their values, and what to do; empty if all is well.
@@ -271,7 +273,7 @@ def convergence_warnings(result: Any) -> list[str]:
     sizes = group(result, "posterior").sizes
     stats = group(result, "sample_stats") if has_group(result, "sample_stats") else {}
     divergences = int(stats["diverging"].sum()) if "diverging" in stats else 0
-    return convergence.messages(summary(result), sizes["chain"], sizes["draw"], divergences)
+    return convergence.messages(summary(result) if table is None else table, sizes["chain"], sizes["draw"], divergences)
 
 
 def mcse_mean(values: np.ndarray) -> float:

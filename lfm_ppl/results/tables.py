@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from lfm_ppl.results import arviz_data
 from lfm_ppl.results.files import writing
 
 # How a column of the summary table reads best; others get significant digits.
@@ -112,6 +113,27 @@ def markdown_table(frame: pd.DataFrame, digits: int = 3) -> str:
             ]
             lines.append(f"| {' | '.join(rules)} |")
     return "\n".join(lines)
+
+
+def annotated(table: pd.DataFrame, result: Any) -> pd.DataFrame:
+    """Return a summary with two more columns: what a parameter is, and what is wrong with its draws.
+
+    Args:
+        table: `lfm_ppl.results.arviz_data.summary` of the result.
+        result: an ArviZ object.
+
+    Returns:
+        The table with ``kind`` ("sampled", "derived" from sampled ones, or "fixed") and ``warnings`` (text, empty where
+        there are none; what concerns all parameters, such as divergences, stands in each row).
+    """
+    posterior = arviz_data.group(result, "posterior")
+    derived = {str(name) for name, variable in posterior.data_vars.items() if variable.attrs.get("derived")}
+    kinds, found = [], []
+    for label in table.index:
+        fixed = "fixed" if table.loc[label, "sd"] == 0.0 else "sampled"
+        kinds.append("derived" if label.partition("[")[0] in derived else fixed)
+        found.append(" ".join(arviz_data.convergence_warnings(result, table.loc[[label]])))
+    return table.assign(kind=kinds, warnings=found)
 
 
 def write_csv(

@@ -17,11 +17,14 @@ from lfm_ppl.checks import unknown
 from lfm_ppl.results.arviz_data import attributes, group, has_group
 from lfm_ppl.results.inputs import ORIGIN
 from lfm_ppl.results.plots import style
+from lfm_ppl.results.predictions import GROUP, MEAN, interval, noise_free_interval
 from lfm_ppl.results.scalars import unit_of
 
 MAX_PANELS = 12
 _MANY = 150  # measurements
 _INTERVAL = (0.025, 0.975)
+_BARS = 12  # forecasts from which they are drawn as bands
+_END: dict[str, Any] = {"color": style.GREY, "lw": 0.8, "ls": (0, (1, 2)), "zorder": 0.5}
 _NOISE_FREE, _PREDICTIVE, _FORCE = "#8FBFDE", "#D3E4F1", "#9AD3C1"  # tints of the line colours
 
 
@@ -29,15 +32,17 @@ _NOISE_FREE, _PREDICTIVE, _FORCE = "#8FBFDE", "#D3E4F1", "#9AD3C1"  # tints of t
 def plot_fit(
     result: Any, outputs: Sequence[str] | None = None, *, width: str | float = "column"
 ) -> Figure:
-    """Draw the data of each output with the posterior of what was measured.
+    """Draw the data of each output with the posterior of what was measured, and forecasts of it.
 
-    The inner band holds 95% of the noise-free output, the outer one 95% of new measurements. The
-    outer band is exact at the measurement times; between them it is the inner band widened by the
+    The inner band holds 95% of the noise-free output, the outer one 95% of new measurements. Where the
+    result has predictions, both go on after the last observation, which a dotted line marks, and the outer
+    band is theirs; forecasts at fewer than 12 times are drawn as bars. Without them the outer band ends with
+    the data. It is exact at the measurement times; between them it is the inner band widened by the
     difference of the two, interpolated linearly. Replicates are pooled.
 
     Args:
-        result: with the groups observed_data and trajectories, and posterior_predictive for the
-            outer band.
+        result: with the groups observed_data and trajectories; posterior_predictive for the outer band, and
+            predictions for forecasts.
         outputs: names; None for all, up to 12.
         width: "column" (3.4 in), "full" (7 in), or inches.
 
@@ -62,16 +67,26 @@ def plot_fit(
     observed = group(result, "observed_data")["y"].transpose("time", "output")
     noise_free = _trajectories(result, "output")
     predictive = _predictive(result)
+    predicted = _predicted(result)
+    forecast = False
     names, note = style.first_of(pick(observed, "output", outputs), outputs, MAX_PANELS, "outputs")
     figure, panels = style.small_multiples(width, len(names), 1.35)
     for axes, name in zip(panels, names, strict=True):
         data = observed.sel(output=name)
         time, mean, low, high = _band(noise_free.sel(output=name))
-        if predictive is not None:
-            outer = _widened(predictive.sel(output=name), time, low, high)
-            axes.fill_between(*outer, color=_PREDICTIVE, lw=0, zorder=1)
-        axes.fill_between(time, low, high, color=_NOISE_FREE, lw=0, zorder=2)
-        axes.plot(time, mean, color=style.BLUE, zorder=3)
+        if predicted is not None and _covers(predicted["time"].values, time):
+            _draw_forecast(axes, predicted.sel(output=[name]))
+        else:
+            if predictive is not None:
+                outer = _widened(predictive.sel(output=name), time, low, high)
+                axes.fill_between(*outer, color=_PREDICTIVE, lw=0, zorder=1)
+            axes.fill_between(time, low, high, color=_NOISE_FREE, lw=0, zorder=2)
+            axes.plot(time, mean, color=style.BLUE, zorder=3)
+            if predicted is not None:
+                _draw_forecast(axes, predicted.sel(output=[name]).isel(time=predicted["time"].values >= time[-1]))
+        if predicted is not None:
+            if forecast := _ends_before(predicted):
+                axes.axvline(predicted.attrs["last_observation"], **_END)
         _draw_data(axes, data)
         style.label_values(axes, name, unit_of(observed, name))
     style.label_time(panels, time_unit(result), time_origin(result))
@@ -79,8 +94,10 @@ def plot_fit(
     handles: list[Artist] = [Line2D([], [], label="data", **_data_style(observed.sizes["time"]))]
     handles += [Line2D([], [], color=style.BLUE, label="posterior mean")]
     handles += [Patch(color=_NOISE_FREE, label="95%, noise-free")]
-    if predictive is not None:
+    if predictive is not None or predicted is not None:
         handles += [Patch(color=_PREDICTIVE, label="95%, new data")]
+    if forecast:
+        handles += [Line2D([], [], label="last observation", **_END)]
     if np.isnan(observed.sel(output=names)).any():
         handles += [Line2D([], [], label="missing", **_missing_style(observed.sizes["time"]))]
     style.legend_above(figure, handles)
@@ -229,6 +246,46 @@ def _predictive(result: Any) -> xr.DataArray | None:
     if not has_group(result, "posterior_predictive"):
         return None
     return group(result, "posterior_predictive")["y"].transpose("chain", "draw", "time", "output")
+
+
+def _predicted(result: Any) -> xr.Dataset | None:
+    """Return the predictions of one series; None where there are none."""
+    if not has_group(result, GROUP):
+        return None
+    dataset = group(result, GROUP)
+    return None if "series" in dataset.dims else dataset.drop_duplicates("time")
+
+
+def _ends_before(predicted: xr.Dataset) -> bool:
+    """Whether the last observation comes before the last prediction."""
+    return bool(predicted.attrs.get("last_observation", np.inf) < predicted["time"].values.max())
+
+
+def _covers(times: np.ndarray, at: np.ndarray) -> bool:
+    """Whether there are predictions all along the trajectories."""
+    return len(times) >= _BARS and bool(set(at.tolist()) <= set(times.tolist()))
+
+
+def _noisy_band(predicted: xr.Dataset) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return times and the ends of the 95% interval of new data of one output."""
+    return predicted["time"].values, *interval(predicted)[..., 0]
+
+
+def _draw_forecast(axes: Axes, predicted: xr.Dataset) -> None:
+    """Draw predictions of one output, noise-free and new data."""
+    if predicted.sizes["time"] == 0:
+        return
+    time, lower, upper = _noisy_band(predicted)
+    low, high = noise_free_interval(predicted)[..., 0]
+    mean = predicted[MEAN if MEAN in predicted else "outputs"].mean(["chain", "draw"]).values[:, 0]
+    if len(time) >= _BARS:
+        axes.fill_between(time, lower, upper, color=_PREDICTIVE, lw=0, zorder=1)
+        axes.fill_between(time, low, high, color=_NOISE_FREE, lw=0, zorder=2)
+        axes.plot(time, mean, color=style.BLUE, zorder=3)
+        return
+    axes.vlines(time, lower, upper, color=_PREDICTIVE, lw=5, zorder=1)
+    axes.vlines(time, low, high, color=_NOISE_FREE, lw=3, zorder=2)
+    axes.plot(time, mean, color=style.BLUE, ls="", marker="_", ms=5, zorder=3)
 
 
 def _band(draws: xr.DataArray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -1,0 +1,238 @@
+"""Forecasts from rolling origins: what would have been predicted, had one known the data up to there only."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from lfm_ppl import checks
+from lfm_ppl.fitting import ConvergenceWarning, fit
+from lfm_ppl.forecasting import check_possible
+from lfm_ppl.inference.bound_model import bind
+from lfm_ppl.linalg import wrapped
+from lfm_ppl.results import arviz_data
+from lfm_ppl.results.predictions import GROUP, MEAN, SD, observed_variable
+from lfm_ppl.results.scoring import ALL, Scores, gaussian_scores, scores, summary
+
+MODEL = "model"
+"""The forecaster that is not the reference."""
+
+_LEAST_ROWS = 3
+"""Fewest rows that a model is learnt from."""
+
+_SCORES = ("rmse", "crps", "log_score")
+
+
+class Backtest(NamedTuple):
+    """What `backtest` found.
+
+    Attributes:
+        scores: dataset with dimensions forecaster ("model" and the reference), origin (the time of the last row that
+            was known), horizon (1, 2, ... rows after it) and output: ``mean``, ``error``, ``crps``, ``log_score``,
+            ``covered``; and ``time`` (origin, horizon), the times that were predicted. NaN where y is.
+        table: mean scores by forecaster and output, and of "all" outputs; columns as in `lfm_ppl.score`.
+    """
+
+    scores: xr.Dataset
+    table: pd.DataFrame
+
+    def wins(self) -> pd.DataFrame:
+        """Return at how many origins the forecast has the better RMSE, CRPS and log score than the reference.
+
+        Returns:
+            Rows: outputs and "all"; columns ``origins``, ``rmse``, ``crps``, ``log_score``.
+        """
+        own, reference = (self.scores.isel(forecaster=index) for index in (0, 1))
+        rows = {}
+        for name in [*(str(one) for one in self.scores["output"].values), ALL]:
+            ours, theirs = (_by_origin(one if name == ALL else one.sel(output=name)) for one in (own, reference))
+            both = np.isfinite(ours["rmse"]) & np.isfinite(theirs["rmse"])
+            better = {label: (ours[label] > theirs[label]) if label == "log_score" else ours[label] < theirs[label]
+                      for label in _SCORES}
+            rows[name] = {"origins": int(both.sum()), **{label: int(hit[both].sum()) for label, hit in better.items()}}
+        return pd.DataFrame.from_dict(rows, orient="index")
+
+
+def backtest(numpyro_model: Callable, times: Any, y: Any, *, horizon: int, every: int = 1, first: int | None = None,
+             season: int | None = None, sampler: str = "map", draws: int = 400, level: float = 0.95, seed: int = 0,
+             progress: bool = False, **options: Any) -> Backtest:
+    """Fit to the data up to an origin, predict what follows, move the origin on, and score it all.
+
+    Each fit has the shape of the whole data, with NaN in the place of what is not known yet, so that everything is
+    compiled once. New observations are predicted as `lfm_ppl.forecast` does: dynamics that are not linear are simulated
+    on from the last row that is known.
+
+    Beside the model stands a reference that knows no mechanism: at h rows after the origin k it predicts the value of
+    as many whole seasons before (of the row k itself for persistence), with the spread of such differences so far,
+
+        y*_k+h ~ N(y_k+h-l, s_l^2),   l = season ceil(h / season),   s_l^2 = mean of (y_i - y_i-l)^2 over i <= k.
+
+    Where the value is missing, one more season before is taken.
+
+    Args:
+        numpyro_model: as in `lfm_ppl.fit`.
+        times: (T,), increasing; in rows of one each, since horizon and season count rows.
+        y: (T, D), NaN where missing.
+        horizon: how many rows after each origin are predicted.
+        every: rows from one origin to the next.
+        first: rows that the first fit knows; by default half of them.
+        season: rows of a season, for the seasonal-naive reference; None: persistence.
+        sampler: as in `lfm_ppl.fit`. The default takes the Laplace approximation at the posterior mode, in a fraction
+            of the time; "nuts" is the better choice where the posterior is wide or skew.
+        draws: number of posterior draws that are propagated.
+        level: of the intervals whose coverage is counted.
+        seed: of everything random.
+        progress: print a line for each origin.
+        **options: further arguments of `lfm_ppl.fit`, such as ``warmup``, ``samples``, ``model_kwargs``, ``fixed``.
+
+    Returns:
+        Scores by origin, horizon and output, and their means; see `Backtest`.
+
+    Raises:
+        ValueError: no origin with a whole horizon after it; replicates (equal times); a panel; whatever `fit` says,
+            with the origin.
+
+    Warns:
+        ConvergenceWarning: chains of some origins have not converged.
+
+    Example:
+        >>> import jax.numpy as jnp, numpyro, numpyro.distributions as dist, lfm_ppl as lfm
+        >>> def model(times, y=None):
+        ...     rate = numpyro.sample("rate", dist.LogNormal(0.0, 0.5))
+        ...     lfmodel = lfm.LatentForceModel(
+        ...         lambda x, u, t: u - rate * x, {"u": lfm.Matern(1.0, 1.0)},
+        ...         lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        ...         lfm.Gaussian(jnp.zeros(1), jnp.eye(1)), output_names=["x"])
+        ...     numpyro.sample("y", lfm.MarginalLikelihood(lfmodel, times), obs=y)
+        >>> times = np.arange(12.0)
+        >>> found = lfm.backtest(model, times, np.sin(times)[:, None], horizon=2, every=2, draws=50)
+        >>> dict(found.scores["crps"].sizes)
+        {'forecaster': 2, 'origin': 3, 'horizon': 2, 'output': 1}
+        >>> found.table.index.tolist()[:2]
+        [('model', 'x'), ('model', 'all')]
+
+    Source: Hyndman and Athanasopoulos (2021), Forecasting: Principles and Practice, sections 5.2, 5.8 and 5.10.
+    """
+    for label, count in (("horizon", horizon), ("every", every), ("draws", draws)):
+        checks.positive_integer(label, count)
+    if season is not None:
+        checks.positive_integer("season", season)
+    if not 0 < level < 1:
+        raise ValueError(f"level must lie between 0 and 1, got {level}.")
+    times, y = np.asarray(times, float), np.asarray(y, float)
+    y = y[:, None] if y.ndim == times.ndim == 1 else y
+    if times.ndim != 1 or y.ndim != 2:
+        raise ValueError(f"backtest takes one series, times (T,) and y (T, D), got shapes {times.shape} and {y.shape}; "
+                         "of a panel, one series after another.")
+    again = np.flatnonzero(np.diff(times) == 0)
+    if again.size:
+        raise ValueError(f"rows {again[0]} and {again[0] + 1} have the same time {times[again[0]]:g}, but horizon and "
+                         "season count rows; put replicates into columns, or take their means.")
+    origins = _origins(len(times), horizon, every, first)
+    options = {"samples": draws if sampler == "map" else 1000, **options}
+    bound = bind(numpyro_model, times, y, **dict(options.get("model_kwargs") or {}))
+    check_possible(bound, times)
+    model = bound.site.example.ssm.model
+    angular = np.isin(np.arange(y.shape[1]), model.observation.angular)
+    reference = "persistence" if season is None else "seasonal-naive"
+    forecasts, naive, messages = [], [], []
+    for origin in origins:
+        known = np.where(np.arange(len(times))[:, None] <= origin, y, np.nan)
+        ahead = slice(origin + 1, origin + 1 + horizon)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            try:
+                result = fit(numpyro_model, times, known, sampler=sampler, seed=seed, at=times, trajectory_draws=draws,
+                             progress=False, **options)
+                predicted = arviz_data.group(result, GROUP).isel(time=ahead)
+            except Exception as error:
+                raise type(error)(f"at the origin {times[origin]:g} (row {origin}): {error}") from error
+            found = scores(_flat(observed_variable(predicted)), y[ahead], _flat(predicted[MEAN]), _flat(predicted[SD]),
+                           level, angular)
+        messages += [f"origin {times[origin]:g}: {one.message}" for one in caught]
+        forecasts.append((_flat(predicted[MEAN]).mean(axis=0), found))
+        mean, sd = _naive(known[:origin + 1], horizon, season or 1, angular)
+        target = np.where(angular, mean + np.asarray(wrapped(y[ahead] - mean)), y[ahead])
+        naive.append((mean, gaussian_scores(mean, sd, target, level)))
+        if progress:
+            print(f"origin {times[origin]:g}: RMSE {summary(found, level)['rmse']:.4g}, {reference} "
+                  f"{summary(naive[-1][1], level)['rmse']:.4g}", flush=True)
+    if messages:
+        checks.warn(f"{len(messages)} warnings at the origins, the first of them at {messages[0]}", ConvergenceWarning)
+    dataset = _dataset((forecasts, naive), reference, times, origins, horizon, model)
+    dataset.attrs.update(sampler=sampler, season=season or 1, level=level, seed=seed, warnings="\n".join(messages))
+    return Backtest(dataset, _table(dataset, level))
+
+
+def _origins(rows: int, horizon: int, every: int, first: int | None) -> list[int]:
+    """Return the last known row of each fit."""
+    if first is None:
+        first = max(rows // 2, _LEAST_ROWS)
+    checks.positive_integer("first", first)
+    found = list(range(first - 1, rows - horizon, every))
+    if first < _LEAST_ROWS or not found:
+        raise ValueError(f"there is no origin: of {rows} rows the first fit is to know {first} (at least "
+                         f"{_LEAST_ROWS}) and {horizon} more are to be predicted. Take a smaller first or horizon.")
+    return found
+
+
+def _naive(y: np.ndarray, horizon: int, season: int, angular: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and sd (H, D) of the reference given the rows (k + 1, D) so far; see `backtest`."""
+    known, outputs = y.shape
+    mean, sd = np.full((2, horizon, outputs), np.nan)
+    for lead in range(1, horizon + 1):
+        for output in range(outputs):
+            lag = season * -(-lead // season)
+            while lag - lead < known and not np.isfinite(y[known - 1 + lead - lag, output]):
+                lag += season
+            if lag - lead >= known:
+                continue
+            mean[lead - 1, output] = y[known - 1 + lead - lag, output]
+            change = y[lag:, output] - y[:-lag, output]
+            change = np.asarray(wrapped(change)) if angular[output] else change
+            change = change[np.isfinite(change)]
+            if change.size > 1 and np.any(change):
+                sd[lead - 1, output] = np.sqrt(np.mean(change**2))
+    return mean, sd
+
+
+def _flat(variable: xr.DataArray) -> np.ndarray:
+    variable = variable.transpose("chain", "draw", "time", "output")
+    return np.asarray(variable.values, float).reshape(-1, *variable.shape[2:])
+
+
+def _dataset(forecasters: tuple, reference: str, times: np.ndarray, origins: list[int], horizon: int,
+             model: Any) -> xr.Dataset:
+    dims = ("forecaster", "origin", "horizon", "output")
+    ahead = np.array(origins)[:, None] + np.arange(1, horizon + 1)
+    variables: dict[str, Any] = {"mean": (dims, np.array([[mean for mean, _ in one] for one in forecasters]))}
+    for name in Scores._fields:
+        variables[name] = (dims, np.array([[getattr(found, name) for _, found in one] for one in forecasters]))
+    coords = {"forecaster": [MODEL, reference], "origin": times[origins], "horizon": np.arange(1, horizon + 1),
+              "output": list(model.output_names), "time": (("origin", "horizon"), times[ahead])}
+    return xr.Dataset(variables, coords)
+
+
+def _scores_of(dataset: xr.Dataset) -> Scores:
+    return Scores(*(dataset[name].values for name in Scores._fields))
+
+
+def _by_origin(dataset: xr.Dataset) -> pd.DataFrame:
+    return pd.DataFrame([summary(_scores_of(dataset.isel(origin=index))) for index in range(dataset.sizes["origin"])])
+
+
+def _table(dataset: xr.Dataset, level: float) -> pd.DataFrame:
+    outputs = [str(name) for name in dataset["output"].values]
+    rows = {}
+    for index, forecaster in enumerate(dataset["forecaster"].values):
+        picked = dataset.isel(forecaster=index)
+        for name in [*outputs, ALL]:
+            chosen = picked if name == ALL else picked.sel(output=name)
+            rows[(str(forecaster), name)] = summary(_scores_of(chosen), level)
+    found = pd.DataFrame.from_dict(rows, orient="index")
+    return found.set_index(pd.MultiIndex.from_tuples(rows, names=["forecaster", "output"]))

@@ -1,0 +1,151 @@
+"""``lfm-ppl forecast``: new observations, with their noise, from a saved result."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import dataclasses
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lfm_ppl import calendar_time, data
+from lfm_ppl.cli import check, choices, results, session
+
+TABLE = "forecast.csv"
+FIGURE = "forecast.png"
+SCORES = "scores.csv"
+
+_GRID = 121
+"""Times of a forecast with --until: enough for smooth bands."""
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Write the forecast into the result, as a table and as a figure, and its scores where held-out data are given."""
+    from lfm_ppl.results import arviz_data, files
+    from lfm_ppl.results.predictions import GROUP
+
+    if arguments.held_out is None and arguments.until is None and arguments.at is None:
+        raise ValueError("say what to forecast: --until TIME, --at T1,T2,... or --held-out FILE (at its times).")
+    for flag in ("outputs", "inputs", "time_column"):
+        if getattr(arguments, flag) is not None and arguments.held_out is None:
+            raise ValueError(f"--{flag.replace('_', '-')} says how to read a data file; give one with --held-out.")
+    path = files.locate(arguments.result)
+    if not arguments.out:
+        for name in (TABLE, FIGURE, *([SCORES] if arguments.held_out else [])):
+            files.refuse_existing(path.parent / name, arguments.overwrite)
+    posterior = arviz_data.load(path)
+    if not arguments.out and not arguments.overwrite and arviz_data.has_group(posterior, GROUP):
+        raise FileExistsError(f"{path} holds predictions already, which are kept. Write elsewhere with --out, or "
+                              "replace them with --overwrite.")
+    with contextlib.ExitStack() as stack:
+        folder = path.parent
+        if not arguments.out:
+            results.writable(folder)
+        else:
+            folder = stack.enter_context(results.folder("forecast", arguments.out, arguments.overwrite))
+        session.start(1, not arguments.no_cache)
+        task = check.rebuilt(posterior, arguments.model)
+        held_out = None if arguments.held_out is None else _held_out(arguments, task)
+        return _write(_forecast(arguments, task, held_out), held_out, path, folder, arguments)
+
+
+def _forecast(arguments: argparse.Namespace, task: check.Check, held_out: data.Data | None) -> Any:
+    import lfm_ppl
+    from lfm_ppl.model.inputs import Input
+
+    times = requested(task.observed, arguments.until, arguments.at, _GRID, np.array([]))
+    inputs = {}
+    if held_out is not None:
+        times = np.union1d(times, held_out.times)
+        inputs = {name: Input(*joined(task.observed.inputs[name], later)) for name, later in held_out.inputs.items()}
+    return lfm_ppl.forecast(task.posterior, task.model, times, inputs=inputs, model_kwargs=task.keywords,
+                            draws=arguments.draws, seed=arguments.seed)
+
+
+def joined(before: data.InputTable, later: data.InputTable) -> data.InputTable:
+    """Return a known input that goes on with later values."""
+    kept = before.times < later.times[0]
+    return data.InputTable(np.append(before.times[kept], later.times), np.append(before.values[kept], later.values),
+                           before.interpolation)
+
+
+def requested(observed: data.Data, until: str | None, at: str | None, grid: int, always: np.ndarray) -> np.ndarray:
+    """Return the times that --until and --at ask for, numbers or dates, in order, and those of ``always``.
+
+    Raises:
+        ValueError: neither a number nor a date; --until is not after the last observation.
+    """
+    last = observed.times[-1]
+    wanted = [always, np.array([_time("--at", text, observed) for text in at.split(",")] if at is not None else [])]
+    if until is not None:
+        end = _time("--until", until, observed)
+        if end <= last:
+            raise ValueError(f"--until takes a time after the last observation, at {last:g}, got {until}.")
+        wanted.append(np.linspace(last, end, grid))
+    return np.unique(np.concatenate(wanted))
+
+
+def _time(flag: str, text: str, observed: data.Data) -> float:
+    try:
+        time = calendar_time.position(text, observed.origin, observed.units.get("time", ""))
+    except ValueError as error:
+        raise ValueError(f"{flag}: {error}") from None
+    if not np.isfinite(time):
+        raise ValueError(f"{flag} takes finite times, got {text}.")
+    return time
+
+
+def _held_out(arguments: argparse.Namespace, task: check.Check) -> data.Data:
+    outputs = task.observed.outputs
+    columns = outputs
+    if arguments.outputs is not None:
+        columns = tuple(name.strip() for name in arguments.outputs.split(","))
+        if len(columns) != len(outputs):
+            raise ValueError(f"the result has {len(outputs)} outputs ({', '.join(outputs)}); --outputs names "
+                             f"{len(columns)} columns.")
+    inputs = choices.inputs(arguments.inputs, task.file) if task.observed.inputs else {}
+    read = data.read_csv(arguments.held_out, columns, arguments.time_column, dict(inputs.values()),
+                         task.observed.units.get("time") if task.observed.origin is not None else None)
+    read = data.on_clock_of(dataclasses.replace(
+        read, outputs=outputs, inputs={name: read.inputs[column] for name, (column, _) in inputs.items()}),
+        task.observed)
+    taken = task.file.prepare(read)
+    if not np.array_equal(taken.y, read.y, equal_nan=True):
+        raise ValueError(f"{task.file.path} changes the numbers of a data file (`prepare`), perhaps by the file's own, "
+                         "so that held-out numbers cannot be compared with a fit to others. Score them in Python, "
+                         "on the model's scale: lfm.score(forecast, held_out).")
+    return read
+
+
+def _write(forecast: Any, held_out: data.Data | None, path: Path, folder: Path, arguments: argparse.Namespace) -> int:
+    import lfm_ppl
+    from lfm_ppl.results import arviz_data, files, tables
+    from lfm_ppl.results.plots import plot_fit
+    from lfm_ppl.results.predictions import GROUP, summary
+
+    group = arviz_data.group(forecast, GROUP)
+    target = folder / files.POSTERIOR if arguments.out else path
+    whole = forecast
+    if not arguments.out:
+        # The file again, not what was read before the computation: somebody may have added to it.
+        whole = arviz_data.add_group(arviz_data.load(path), GROUP, group)
+    print(f"wrote    {arviz_data.save(whole, target, arguments.overwrite or not arguments.out)} (group {GROUP})")
+    table = summary(group)
+    print(f"wrote    {tables.write_csv(table, folder / TABLE, arguments.overwrite, index_label='time')}")
+    if held_out is not None:
+        scores = lfm_ppl.score(forecast, held_out)
+        print(f"\n{tables.text_table(scores, width=shutil.get_terminal_size().columns)}\n")
+        print(f"wrote    {tables.write_csv(scores, folder / SCORES, arguments.overwrite, index_label='output')}")
+    try:
+        figure = plot_fit(forecast, width="full")
+        with files.writing(folder / FIGURE, arguments.overwrite) as temporary:
+            figure.savefig(temporary, format="png")
+    except Exception as error:  # the numbers are safe
+        print(f"lfm-ppl: the figure could not be drawn: {error}", file=sys.stderr)
+        return 1
+    print(f"wrote    {folder / FIGURE}")
+    return 0

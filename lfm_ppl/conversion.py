@@ -1,0 +1,160 @@
+"""From draws that a user made with NumPyro alone to the result that `fit` would have given."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from datetime import UTC, datetime
+from typing import Any
+
+import jax
+import numpy as np
+
+from lfm_ppl import checks
+from lfm_ppl.fitting import check_requested, draw_paths, kept, versions, warn_of_convergence
+from lfm_ppl.inference.bound_model import BoundModel, bind
+from lfm_ppl.inference.posterior import scores
+from lfm_ppl.results import arviz_data
+from lfm_ppl.results.layout import Labels, lay_out
+
+_STATISTICS = {"diverging": "diverging", "accept_prob": "acceptance_rate", "num_steps": "n_steps", "energy": "energy",
+               "adapt_state.step_size": "step_size", "potential_energy": "lp"}
+"""Field of a kernel's state -> its name in ArviZ."""
+
+
+def to_arviz(mcmc: Any, numpyro_model: Callable, times: Any, y: Any, *, at: Any = None, trajectory_draws: int = 400,
+             seed: int = 0, model_kwargs: Mapping[str, Any] | None = None,
+             dims: Mapping[str, Sequence[str]] | None = None, coords: Mapping[str, Sequence[Any]] | None = None,
+             truth: Mapping[str, Any] | None = None, name: str | None = None) -> Any:
+    """Turn the draws of a plain NumPyro run into a result, with everything that `lfm_ppl.fit` stores.
+
+    ArviZ's own converter sees a likelihood with a single observation, the whole sequence, so that ``az.loo`` of it says
+    nothing. Here each row of the data has its leave-one-out conditional log p(y_k | y_-k, theta), and forces, states
+    and replicated data are drawn along the smoothed trajectories.
+
+    Args:
+        mcmc: a ``numpyro.infer.MCMC`` that has run, with any kernel; or site name -> draws (chains, draws, ...).
+        numpyro_model: its model, ``model(times, y=None, **model_kwargs)``; with the handlers that it was run with, such
+            as `lfm_ppl.fix`.
+        times: (T,), as it was run with.
+        y: (T, D), as it was run with.
+        at: times of the trajectories and of new observations, as in `lfm_ppl.fit`.
+        trajectory_draws: number of draws for which trajectories are drawn; 0: none.
+        seed: of the trajectories.
+        model_kwargs: keyword arguments of the model.
+        dims: parameter -> names of its dimensions, as in `lfm_ppl.fit`.
+        coords: dimension -> labels, as in `lfm_ppl.fit`.
+        truth: of simulated data.
+        name: of the model, for the record.
+
+    Returns:
+        An ArviZ object with the groups of `lfm_ppl.fit`; `lfm_ppl.save`, `lfm_ppl.forecast`, `lfm_ppl.check_accuracy`
+        and the figures take it.
+
+    Raises:
+        TypeError: ``mcmc`` is neither.
+        ValueError: it has not run, or its draws are not those of the model's parameters.
+
+    Warns:
+        ConvergenceWarning: as `lfm_ppl.fit`.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, numpyro, numpyro.distributions as dist, lfm_ppl as lfm
+        >>> def model(times, y=None):
+        ...     rate = numpyro.sample("rate", dist.LogNormal(0.0, 0.5))
+        ...     lfmodel = lfm.LatentForceModel(
+        ...         lambda x, u, t: u - rate * x, {"u": lfm.Matern(1.0, 1.0)},
+        ...         lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        ...         lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
+        ...     numpyro.sample("y", lfm.MarginalLikelihood(lfmodel, times), obs=y)
+        >>> times, y = jnp.arange(5.0), jnp.sin(jnp.arange(5.0))[:, None]
+        >>> kernel = numpyro.infer.NUTS(model)
+        >>> mcmc = numpyro.infer.MCMC(kernel, num_warmup=50, num_samples=50, num_chains=2, chain_method="vectorized",
+        ...                           progress_bar=False)
+        >>> mcmc.run(jax.random.key(0), times, y)
+        >>> import warnings
+        >>> with warnings.catch_warnings():  # so few draws have not converged
+        ...     warnings.simplefilter("ignore")
+        ...     result = lfm.to_arviz(mcmc, model, times, y)
+        >>> result["log_likelihood"]["y"].dims, result["log_likelihood"]["y"].shape
+        (('chain', 'draw', 'time'), (2, 50, 5))
+    """
+    if trajectory_draws != 0:
+        checks.positive_integer("trajectory_draws", trajectory_draws)
+    draws, stats = _collected(mcmc)
+    values = y.to_numpy(float) if hasattr(y, "to_numpy") else y  # a data frame
+    bound = bind(numpyro_model, times, values, **dict(model_kwargs or {}))
+    check_requested(bound, at)
+    draws = _checked(bound, draws)
+    labels = Labels.of(bound, dims, coords, y)
+    chains, samples = next(iter(draws.values())).shape[:2]
+    flat = {site: draws[site].reshape(-1, *draws[site].shape[2:]) for site in bound.sites}
+    rated = kept("scores of the observations", lambda: scores(bound, flat), None)
+    chosen, paths, grid = kept("trajectories", lambda: draw_paths(
+        jax.random.key(seed), bound, flat, at, trajectory_draws, chains, samples, None, None), (None, None, None))
+    groups = lay_out(bound, draws, stats, rated, paths, chosen, grid, truth, labels)
+    example = bound.site.example
+    kernel = getattr(mcmc, "sampler", None)
+    attrs = {
+        "model": name or getattr(numpyro_model, "__name__", "model"), "rule": example.rule.name,
+        "steps": example.steps, "max_step": example.max_step, "iterations": example.iterations,
+        "tolerance": example.tolerance, "sampler": "draws" if kernel is None else type(kernel).__name__.lower(),
+        "chains": chains, "samples": samples, "fixed": "{}", "versions": json.dumps(versions()),
+        "created_at": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+    if kernel is not None:
+        attrs |= {"warmup": int(mcmc.num_warmup), "thin": int(mcmc.thinning)}
+    result = arviz_data.build(groups, {label: value for label, value in attrs.items() if value is not None})
+    warn_of_convergence(result)
+    return result
+
+
+def _collected(mcmc: Any) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Return site -> draws (C, N, ...) and statistic -> (C, N)."""
+    if isinstance(mcmc, Mapping):
+        return {str(name): np.asarray(value) for name, value in mcmc.items()}, {}
+    if not (hasattr(mcmc, "get_samples") and hasattr(mcmc, "get_extra_fields")):
+        raise TypeError("mcmc must be a numpyro.infer.MCMC that has run, or a dict of draws (chains, draws, ...), got "
+                        f"{type(mcmc).__name__}.")
+    try:
+        samples = mcmc.get_samples(group_by_chain=True)
+        fields = mcmc.get_extra_fields(group_by_chain=True)
+    except (AttributeError, TypeError, KeyError):  # what an MCMC raises that was never run
+        samples = None
+    if not samples:
+        raise ValueError("this MCMC has no draws; call mcmc.run(key, times, y) first.")
+    draws = {name: np.asarray(value) for name, value in samples.items()}
+    shape = next(iter(draws.values())).shape[:2]
+    stats = {_STATISTICS.get(name, name.replace(".", "_")): np.asarray(value) for name, value in fields.items()
+             if np.shape(value) == shape}
+    if "lp" in stats:
+        stats["lp"] = -stats["lp"]
+    return draws, stats
+
+
+def _checked(bound: BoundModel, draws: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the draws of the model's sites, those that it computes included; what is missing of these is computed.
+
+    Raises:
+        ValueError: a parameter has no draws, or draws of another shape.
+    """
+    shapes = {name: np.shape(value) for name, value in bound.constrain(np.zeros(bound.size)).items()}
+    lead = {value.shape[:2] for value in draws.values()}
+    if len(lead) != 1 or any(len(one) != 2 for one in lead):
+        raise ValueError("every parameter needs as many draws, (chains, draws, ...), as the others; got "
+                         f"{', '.join(f'{name} {value.shape}' for name, value in draws.items()) or 'none'}.")
+    for name in bound.sites:
+        if name not in draws:
+            raise ValueError(f"the model samples {name!r}, of which there are no draws (there are: "
+                             f"{', '.join(draws)}); give the model that was run, with its handlers.")
+        if draws[name].shape[2:] != shapes[name]:
+            raise ValueError(f"{name!r} has shape {shapes[name]} in the model, and draws of shape "
+                             f"{draws[name].shape[2:]}; give the model that was run, with its arguments.")
+    found = {name: draws[name] for name in shapes if name in draws}
+    if len(found) < len(shapes):
+        points = {name: draws[name].reshape(-1, *draws[name].shape[2:]) for name in bound.sites}
+        (count,) = lead
+        z = jax.vmap(bound.unconstrain)(points)
+        computed = bound.constrain_draws(np.asarray(z).reshape(*count, -1))
+        found = {name: found.get(name, computed[name]) for name in shapes}
+    return found

@@ -1,0 +1,137 @@
+"""From a posterior to new observations: forecasts with their noise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+from lfm_ppl import checks
+from lfm_ppl.filtering.time_grid import build_time_grid
+from lfm_ppl.inference.posterior import noise_of_rows, trajectories
+from lfm_ppl.particles.particle_filter import ParticleSettings
+from lfm_ppl.results import arviz_data, rebuilding
+from lfm_ppl.results import inputs as stored_inputs
+from lfm_ppl.results.accuracy import evenly_spaced
+from lfm_ppl.results.predictions import GROUP, predictions
+
+
+def forecast(result: Any, numpyro_model: Callable, times: Any, *, inputs: Mapping[str, Any] | None = None,
+             model_kwargs: Mapping[str, Any] | None = None, draws: int = 400, seed: int = 0) -> Any:
+    """Predict new observations, with their noise, between the data and after them.
+
+        p(y* | y) = int p(y* | s*, theta) p(s* | s_T, theta) p(s_T | y, theta) p(theta | y) ds* ds_T dtheta
+
+    is sampled in that order: parameters theta from the posterior, for each of them ONE path of state and forces given
+    the data, and noise along it.
+
+    Up to the last observation, at T, the path is a draw of the Gaussian smoother (of the particle smoother where the
+    result was sampled by "pmmh"). After it there is nothing to condition on, so that no approximation is needed but
+    that of the state at T: where the dynamics are not linear, the path is SIMULATED on from its own state at T, by the
+    steps of `lfm_ppl.simulate`. The Gaussian moments that a filter would carry on keep mean and variance roughly right
+    and the shape wrong: a state in a double well would be put between the wells, and a force with a softplus would push
+    below zero. Errors of the shape grow with the horizon, where a filter is never corrected by data. For linear
+    dynamics the moments are exact, and the path is drawn from them; there, with a linear observation, y* given theta is
+    normal with moments that are stored, so that scores and bands need no draws of the noise.
+
+    Args:
+        result: of `lfm_ppl.fit`, or read by `lfm_ppl.load`.
+        numpyro_model: the model that was fitted. A result holds draws and data, but no code.
+        times: (K,) times of the forecast, non-decreasing, from the initial time on.
+        inputs: known inputs (`lfm_ppl.Input`) that reach as far as ``times``, and are the same as before at the data:
+            those that the result holds, by name, or keyword arguments of the model that replace those of the fit.
+        model_kwargs: keyword arguments of the model, as in the fit.
+        draws: number of posterior draws, spread over the chains, each with a path of its own.
+        seed: of the paths and the noise.
+
+    Returns:
+        A new ArviZ object: the groups of ``result`` and a group ``predictions`` with dimensions chain, draw, time and
+        output: new observations under the name of the likelihood's site (``y``), with noise; ``y_mean`` and ``y_sd``,
+        their normal distribution at each draw; and ``outputs``, which are noise-free, ``forces`` and ``states`` along
+        the same paths. `lfm_ppl.score` compares them with data, `lfm_ppl.plot_fit` draws them.
+
+    Raises:
+        ValueError: times that go back or lie before the initial time; another model than that of the result, seen by
+            its settings, its parameters or its log likelihood at the draws; a known input that ends before ``times``; a
+            panel whose series have times of their own; noise whose covariance is given row by row.
+        TypeError: ``result`` is no ArviZ object.
+
+    Example:
+        >>> import jax.numpy as jnp, numpyro, numpyro.distributions as dist, lfm_ppl as lfm
+        >>> def model(times, y=None):
+        ...     rate = numpyro.sample("rate", dist.LogNormal(0.0, 0.5))
+        ...     lfmodel = lfm.LatentForceModel(
+        ...         lambda x, u, t: u - rate * x, {"u": lfm.Matern(1.0, 1.0)},
+        ...         lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        ...         lfm.Gaussian(jnp.zeros(1), jnp.eye(1)), output_names=["x"])
+        ...     numpyro.sample("y", lfm.MarginalLikelihood(lfmodel, times), obs=y)
+        >>> times = np.arange(5.0)
+        >>> result = lfm.fit(model, times, np.sin(times)[:, None], sampler="map", samples=50, progress=False)
+        >>> ahead = lfm.forecast(result, model, [5.0, 6.0])
+        >>> ahead["predictions"]["y"].dims, ahead["predictions"]["y"].shape
+        (('chain', 'draw', 'time', 'output'), (1, 50, 2, 1))
+        >>> lfm.score(ahead, [[-0.9], [-0.3]]).columns.tolist()
+        ['n', 'rmse', 'crps', 'log_score', 'coverage_95']
+
+    Source: Gelman et al. (2013), Bayesian Data Analysis, section 1.3, for the composition of draws; Särkkä and Solin
+    (2019), Applied Stochastic Differential Equations, chapter 9, for Gaussian moments and what they miss.
+    """
+    checks.positive_integer("draws", draws)
+    times = _checked_times(times)
+    keywords = stored_inputs.keywords(result, model_kwargs)
+    stored = stored_inputs.inputs_of(result)
+    for name, later in (inputs or {}).items():
+        keywords |= {"inputs": {**keywords["inputs"], name: later}} if name in stored else {name: later}
+    problem = rebuilding.problem(result, numpyro_model, model_kwargs=keywords)
+    bound = problem.bound
+    check_possible(bound, times)
+    posterior = arviz_data.group(result, "posterior")
+    chains = posterior.sizes["chain"]
+    chosen, rows = evenly_spaced(chains, posterior.sizes["draw"], draws)
+    attrs = arviz_data.attributes(result)
+    settings = None
+    if str(attrs.get("sampler", "")).startswith("pmmh") and "particles" in attrs:
+        settings = ParticleSettings(int(attrs["particles"]))
+    paths = trajectories(jax.random.key(seed), bound, problem.at(rows).draws, times, settings)
+    split = {name: value.reshape(chains, len(chosen), *value.shape[1:]) for name, value in paths.items()}
+    if "log_likelihood" in split:
+        total = split["log_likelihood"].reshape(chains, len(chosen), -1).sum(axis=-1)
+        rebuilding.check_likelihood(result, total, chosen)
+    groups = {name: arviz_data.group(result, name) for name in arviz_data.groups(result)}
+    labels = posterior["draw"].values[chosen] if "draw" in posterior.coords else chosen
+    observed = groups["observed_data"]
+    names = {name: observed[name].values.tolist() for name in ("output", "series") if name in observed.coords}
+    groups[GROUP] = predictions(bound, split, labels, times, names)
+    return arviz_data.build(groups, attrs)
+
+
+def check_possible(bound: Any, times: np.ndarray) -> None:
+    """Raise where new observations at these times have no distribution.
+
+    Raises:
+        ValueError: see `forecast`.
+    """
+    if bound.times.ndim != 1:
+        raise ValueError("a forecast needs one vector of times for all series; this panel has times of its own for "
+                         "each.")
+    example = bound.site.example
+    if noise_of_rows(example):
+        raise ValueError("the covariance of the observation is given for each row of the data, (T, D, D), so that "
+                         "there is none at other times; give a function (x, u, t) for a forecast.")
+    build_time_grid(example.ssm, bound.times, example.steps, example.max_step, times, tolerance=example.tolerance)
+    model = example.ssm.model
+    model.check_span(float(bound.times[0]), float(max(times.max(), bound.times[-1])))
+
+
+def _checked_times(times: Any) -> np.ndarray:
+    times = np.atleast_1d(np.asarray(times, float))
+    if times.ndim != 1 or times.size == 0:
+        raise ValueError(f"times must be a vector (K,) with at least one time, got shape {times.shape}.")
+    checks.finite("times", times)
+    back = np.flatnonzero(np.diff(times) < 0)
+    if back.size:
+        row = int(back[0]) + 1
+        raise ValueError(f"times must not go back: entry {row} is {times[row]:g} after {times[row - 1]:g}. Sort them.")
+    return times

@@ -1,0 +1,223 @@
+"""Draws, trajectories and scores of a bound model as the groups of a result, with names for every axis."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+
+from lfm_ppl import checks
+from lfm_ppl.results.predictions import GROUP, NOISE_FREE, predictions
+from lfm_ppl.results.scalars import units_attribute
+
+if TYPE_CHECKING:
+    from lfm_ppl.inference.bound_model import BoundModel
+
+SERIES, OUTPUT = "series", "output"
+
+DERIVED = "derived"
+"""Attribute of a variable of the posterior that is computed from the sampled ones."""
+
+
+class Labels(NamedTuple):
+    """Names of dimensions, and of what stands along them.
+
+    Attributes:
+        dims: site -> a name, or None where there is none, for each axis of its value.
+        coords: dimension -> labels.
+        derived: names of the deterministic sites.
+    """
+
+    dims: Mapping[str, tuple[str | None, ...]]
+    coords: Mapping[str, list]
+    derived: frozenset[str] = frozenset()
+
+    @classmethod
+    def of(cls, bound: BoundModel, dims: Mapping[str, Sequence[str]] | None = None,
+           coords: Mapping[str, Sequence[Any]] | None = None, y: Any = None) -> Labels:
+        """Return the names that a model and its user give.
+
+        A site's own dimensions come from ``dims``, else from ``event_dims`` of its ``infer`` and from the plates that
+        it stands in. The plate of a panel is called "series", as in the other groups.
+
+        Args:
+            bound: the model.
+            dims: site -> names of the axes of its value.
+            coords: dimension -> labels.
+            y: the data as they were given, whose column names are kept.
+
+        Raises:
+            ValueError: a site that the model has not; a number of names or labels that does not fit.
+        """
+        trace = bound.trace()
+        site = bound.site
+        plates = [frame.name for frame in trace[site.name].get("cond_indep_stack", ())]
+        renamed = {plates[0]: SERIES} if np.ndim(bound.y) == 3 and len(plates) == 1 else {}
+        found: dict[str, tuple[str | None, ...]] = {}
+        derived = set()
+        for name, one in trace.items():
+            if name == site.name or one["type"] not in ("sample", "deterministic"):
+                continue
+            derived |= {name} if one["type"] == "deterministic" else set()
+            found[name] = _axes(one, renamed)
+        for name, given in (dims or {}).items():
+            names = [given] if isinstance(given, str) else list(given)
+            if name not in found:
+                raise ValueError(f"dims: {checks.unknown('parameter', name, found)}")
+            if len(names) != len(found[name]):
+                raise ValueError(f"dims: {name!r} has {len(found[name])} dimensions, of shape "
+                                 f"{np.shape(trace[name]['value'])}, and {len(names)} names: {', '.join(names)}.")
+            found[name] = tuple(str(text) for text in names)
+        sizes = {OUTPUT: len(site.example.ssm.model.output_names)}
+        sizes |= {SERIES: np.shape(bound.y)[0]} if np.ndim(bound.y) == 3 else {}
+        for name, names in found.items():
+            for text, size in zip(names, np.shape(trace[name]["value"]), strict=True):
+                if text is not None and sizes.setdefault(text, size) != size:
+                    raise ValueError(f"the dimension {text!r} has {sizes[text]} entries elsewhere and {size} in "
+                                     f"{name!r}; give them different names.")
+        labels = {renamed.get(text, text): list(values) for text, values in (coords or {}).items()}
+        if OUTPUT not in labels and hasattr(y, "columns"):
+            labels[OUTPUT] = [str(column) for column in y.columns]
+        for text, values in labels.items():
+            if text not in sizes:
+                raise ValueError(f"coords: {checks.unknown('dimension', text, sizes)}")
+            if len(values) != sizes[text] or len(set(values)) < len(values):
+                raise ValueError(f"coords: the dimension {text!r} needs {sizes[text]} labels, each of them once; got "
+                                 f"{len(values)}: {', '.join(map(str, values))}.")
+        return cls(found, labels, frozenset(derived))
+
+
+def _axes(site: Mapping[str, Any], renamed: Mapping[str, str]) -> tuple[str | None, ...]:
+    """Return a name for each axis of the value of a site in a trace."""
+    ndim = np.ndim(site["value"])
+    events = site["fn"].event_dim if site["type"] == "sample" else 0
+    names: list[str | None] = [None] * ndim
+    given = tuple((site.get("infer") or {}).get("event_dims", ()))
+    if given:
+        names[ndim - len(given):] = [str(text) for text in given]
+    frames = site.get("cond_indep_stack") or ()
+    if site["type"] == "sample" or len(frames) == ndim:
+        for frame in frames:
+            axis = ndim - events + frame.dim
+            if 0 <= axis < ndim:
+                names[axis] = renamed.get(frame.name, frame.name)
+    return tuple(names)
+
+
+def lay_out(bound: BoundModel, draws: dict, stats: dict, rated: dict | None, paths: dict | None, chosen: Any,
+            grid: np.ndarray | None, truth: Mapping[str, Any] | None,
+            labels: Labels | None = None) -> dict[str, xr.Dataset]:
+    """Return the groups of a result.
+
+    Args:
+        bound: the model and its data.
+        draws: site -> (C, N, ...).
+        stats: statistic of the sampler -> (C, N).
+        rated: `lfm_ppl.inference.posterior.scores` of all draws, one chain after another; None: without.
+        paths: `lfm_ppl.inference.posterior.trajectories`, (C, S, ...); None: without.
+        chosen: (S,) which draws of each chain have trajectories.
+        grid: (K,) times of the trajectories; None: those of the data.
+        truth: of simulated data.
+        labels: names of axes; None: those of the model.
+    """
+    labels = labels or Labels.of(bound)
+    site, times, y = bound.site, bound.times, np.asarray(bound.y)
+    chains, samples = next(iter(draws.values())).shape[:2]
+    model = site.example.ssm.model
+    units = model.units
+    panel = (SERIES,) if y.ndim == 3 else ()
+    per_series = times.ndim == 2
+    along = (SERIES, "time") if panel else ("time",)
+    coords: dict[str, Any] = {"chain": np.arange(chains), "draw": np.arange(samples)}
+    clock: dict[str, Any] = {} if per_series else {"time": ("time", times, units_attribute(["time"], units))}
+    outputs = labels.coords.get(OUTPUT, list(model.output_names))
+    units = units | {new: units[old] for old, new in zip(model.output_names, outputs, strict=True) if old in units}
+    named = {"output": outputs, "state": list(model.state_names), "force": list(model.force_names)}
+
+    def variable(dims: Sequence[str], values: Any, names: Sequence[str] = ()) -> tuple:
+        return tuple(dims), np.asarray(values), units_attribute(names, units)
+
+    # A time at which nothing was observed has no predictive density to compare.
+    seen = np.flatnonzero(np.isfinite(np.asarray(y)).any(axis=-1).reshape(-1, np.shape(y)[-2]).any(axis=0))
+    sample = ("chain", "draw", *along)
+    which = {SERIES: labels.coords[SERIES]} if panel and SERIES in labels.coords else {}
+    observed_coords = {**clock, **which, "output": named["output"]}
+    groups = {
+        "posterior": _posterior(draws, coords, named, labels),
+        "sample_stats": xr.Dataset({k: (("chain", "draw"), v) for k, v in stats.items()}, coords),
+        "observed_data": xr.Dataset({site.name: variable((*along, "output"), y, named["output"])}, observed_coords),
+    }
+    if per_series:
+        groups["observed_data"] = groups["observed_data"].assign(times=(along, times))
+    if rated is not None:
+        split = {label: value.reshape(chains, samples, *value.shape[1:]) for label, value in rated.items()}
+        left_out = xr.Dataset({site.name: variable(sample, split["leave_one_out"])}, {**coords, **clock, **which})
+        groups["log_likelihood"] = left_out.isel(time=seen)
+        groups["one_step_ahead"] = xr.Dataset(
+            {"log_density": variable(sample, split["one_step_ahead"]),
+             "residual": variable((*sample, "output"), split["residual"])}, {**coords, **observed_coords})
+    if paths is not None:
+        thinned = {"chain": np.arange(chains), "draw": chosen}
+        groups["posterior_predictive"] = xr.Dataset(
+            {site.name: variable((*sample, "output"), paths["y"], named["output"])}, {**thinned, **observed_coords})
+        place = ("chain", "draw", *panel, "at")
+        at = {} if grid is None else {"at": ("at", grid, units_attribute(["time"], units))}
+        groups["trajectories"] = xr.Dataset(
+            {f"{kind}s": variable((*place, kind), paths[kind], named[kind]) for kind in named if paths[kind].shape[-1]},
+            {**thinned, **at, **which, **{kind: named[kind] for kind in named if named[kind]}})
+        groups["trajectories"]["outputs"].attrs["long_name"] = NOISE_FREE
+        if "prediction" in paths and grid is not None:
+            groups[GROUP] = predictions(bound, paths, chosen, grid, labels.coords)
+    if truth:
+        groups["truth"] = _truth(truth, named, units, groups["posterior"])
+    return groups
+
+
+def _posterior(draws: dict, coords: dict, named: Mapping[str, list], labels: Labels) -> xr.Dataset:
+    variables: dict[str, Any] = {}
+    extra: dict[str, Any] = {}
+    for label, value in draws.items():
+        shape = value.shape[2:]
+        known = labels.dims.get(label, (None,) * len(shape))
+        known = known if len(known) == len(shape) else (None,) * len(shape)
+        if known == (None,) and shape[0] == len(named[OUTPUT]) > 1:
+            known = (OUTPUT,)
+        dims = [name or f"{label}_dim_{axis}" for axis, name in enumerate(known)]
+        for name, size in zip(dims, shape, strict=True):
+            ticks = labels.coords.get(name, named.get(name, ()))
+            if not len(ticks) and known == (name,) and size > 1:
+                ticks = named[OUTPUT]  # of a plate with an entry for each output
+            extra[name] = list(ticks) if len(ticks) == size else np.arange(size)
+        variables[label] = (("chain", "draw", *dims), value, {DERIVED: 1} if label in labels.derived else {})
+    return xr.Dataset(variables, {**coords, **extra})
+
+
+def _truth(truth: Mapping[str, Any], named: dict, units: Mapping[str, str],
+           posterior: xr.Dataset) -> xr.Dataset:
+    variables: dict[str, Any] = {}
+    coords: dict[str, Any] = {}
+    if truth.get("times") is not None:
+        coords["at_truth"] = ("at_truth", np.asarray(truth["times"], float), units_attribute(["time"], units))
+    forces = truth.get("forces") or {}
+    known = [label for label in named["force"] if label in forces]
+    if known:
+        coords["force"] = known
+        variables["forces"] = (("at_truth", "force"), np.stack([np.asarray(forces[n]) for n in known], axis=1),
+                               units_attribute(known, units))
+    if truth.get("state") is not None and np.ndim(truth["state"]) == 2:
+        coords["state"] = named["state"]
+        variables["states"] = (("at_truth", "state"), np.asarray(truth["state"]),
+                               units_attribute(named["state"], units))
+    for label, value in (truth.get("parameters") or {}).items():
+        value = np.asarray(value, float)
+        if label not in posterior:
+            continue
+        dims = posterior[label].dims[2:]
+        if value.shape == posterior[label].shape[2:]:
+            variables[label] = (dims, value)
+            coords |= {name: posterior[name].values for name in dims}
+        else:
+            variables[label] = ([f"{label}_true_{axis}" for axis in range(value.ndim)], value)
+    return xr.Dataset(variables, coords)

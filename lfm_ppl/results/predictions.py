@@ -1,0 +1,163 @@
+"""The group ``predictions`` of a result: new observations, with their noise, at times that were asked for."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from scipy import stats
+
+from lfm_ppl.results import arviz_data
+from lfm_ppl.results.scalars import units_attribute
+
+if TYPE_CHECKING:  # figures, which read predictions, need no JAX
+    from lfm_ppl.inference.bound_model import BoundModel
+
+GROUP = "predictions"
+
+NOISE_FREE = "noise-free output"
+"""What is said of ``outputs`` wherever they are stored."""
+
+_INTERVAL = (0.025, 0.975)
+
+MEAN, SD, FREE_SD = "y_mean", "y_sd", "outputs_sd"
+"""Mean of the normal distribution that y has at each draw, its sd, and its sd without the noise."""
+
+
+def predictions(bound: BoundModel, paths: Mapping[str, np.ndarray], chosen: np.ndarray, times: np.ndarray,
+                labels: Mapping[str, Any] | None = None) -> xr.Dataset:
+    """Lay out new observations, and the paths that they were drawn along.
+
+    Args:
+        bound: the model and its data.
+        paths: what `lfm_ppl.inference.posterior.trajectories` drew, each (C, S, ..., K, size).
+        chosen: (S,) which draws of each chain.
+        times: (K,).
+        labels: dimension -> names of "output" and "series", where they are not the model's.
+
+    Returns:
+        Variables with dimensions chain, draw, (series,) time and one more: the site's name (new observations, with
+        noise); for Gaussian observations ``y_mean`` and ``y_sd`` (normal distribution of one at each draw; the
+        predictive density is their mixture) and ``outputs_sd`` (its sd without the noise, zero where it is that given a
+        path); ``outputs`` (noise-free), ``forces`` and ``states``.
+    """
+    site = bound.site
+    model = site.example.ssm.model
+    panel = ("series",) if np.ndim(bound.y) == 3 else ()
+    labels = labels or {}
+    outputs = list(labels.get("output", model.output_names))
+    units = {new: model.units[old] for old, new in zip(model.output_names, outputs, strict=True) if old in model.units}
+    units = {**model.units, **units}
+    named = {"output": outputs, "state": list(model.state_names), "force": list(model.force_names)}
+    place = ("chain", "draw", *panel, "time")
+
+    def variable(kind: str, values: np.ndarray, what: str) -> tuple:
+        return (*place, kind), values, {"long_name": what, **units_attribute(named[kind], units)}
+
+    variables = {site.name: variable("output", paths["prediction"], "new observation, with noise")}
+    if "predictive_mean" in paths:  # not of an observation family, whose law is not normal
+        variables |= {MEAN: variable("output", paths["predictive_mean"], "mean of the new observation at this draw"),
+                      SD: variable("output", paths["predictive_sd"], "sd of the new observation at this draw"),
+                      FREE_SD: variable("output", paths["output_sd"], f"sd of the {NOISE_FREE} at this draw")}
+    angles = [named["output"][index] for index in model.observation.angular]
+    variables[site.name][2].update({"angular": json.dumps(angles)} if angles else {})
+    words = {"output": NOISE_FREE, "state": "state", "force": "force"}
+    variables |= {f"{kind}s": variable(kind, paths[kind], word) for kind, word in words.items()
+                  if paths[kind].shape[-1]}
+    clock = {"time": ("time", times, units_attribute(["time"], units))}
+    coords = {"chain": np.arange(paths["prediction"].shape[0]), "draw": chosen, **clock}
+    coords |= {"series": labels["series"]} if panel and "series" in labels else {}
+    attrs = {"observed": site.name, "last_observation": float(last_observation(bound.times, np.asarray(bound.y)))}
+    return xr.Dataset(variables, {**coords, **{kind: names for kind, names in named.items() if names}}, attrs)
+
+
+def last_observation(times: np.ndarray, y: np.ndarray) -> float:
+    """Return the time of the last observation that is not missing."""
+    seen = np.isfinite(y).any(axis=-1)
+    return float(np.max(np.broadcast_to(times, seen.shape)[seen], initial=-np.inf))
+
+
+def observed_variable(dataset: xr.Dataset) -> xr.DataArray:
+    """Return the new observations of a dataset of predictions."""
+    name = dataset.attrs.get("observed", "y")
+    if name not in dataset:
+        raise ValueError(f"the group {GROUP} has no variable {name!r}; it has "
+                         f"{', '.join(map(str, dataset.data_vars))}. Expected what lfm.forecast made.")
+    return dataset[name]
+
+
+def of_result(result: Any) -> xr.Dataset:
+    """Return the predictions of a result, or the dataset itself where it is one.
+
+    Raises:
+        ValueError: the result has none; the message says how to get them.
+    """
+    return result if isinstance(result, xr.Dataset) else arviz_data.group(result, GROUP)
+
+
+def summary(dataset: xr.Dataset) -> pd.DataFrame:
+    """Return a row for each time and output: mean, sd and 95% interval of new data, and of the noise-free output.
+
+    Args:
+        dataset: the group `predictions` of one series.
+
+    Returns:
+        Indexed by time; columns output, mean, sd, q2.5, q97.5, noise_free_mean, noise_free_q2.5, noise_free_q97.5.
+    """
+    rows = []
+    new = _flat(observed_variable(dataset))
+    if MEAN in dataset and SD in dataset:
+        mean = _flat(dataset[MEAN])
+        spread = np.sqrt(np.mean(_flat(dataset[SD]) ** 2, axis=0) + mean.var(axis=0))
+    else:
+        mean, spread = new, new.std(axis=0)
+    low, high = interval(dataset)
+    below, above = noise_free_interval(dataset)
+    free = mean.mean(axis=0) if MEAN in dataset else _flat(dataset["outputs"]).mean(axis=0)
+    for k, time in enumerate(dataset["time"].values):
+        for d, name in enumerate(dataset["output"].values):
+            rows.append({"time": time, "output": str(name), "mean": mean[:, k, d].mean(), "sd": spread[k, d],
+                         "q2.5": low[k, d], "q97.5": high[k, d], "noise_free_mean": free[k, d],
+                         "noise_free_q2.5": below[k, d], "noise_free_q97.5": above[k, d]})
+    return pd.DataFrame(rows).set_index("time")
+
+
+def interval(dataset: xr.Dataset) -> np.ndarray:
+    """Return the ends (2, K, D) of the 95% interval of new data, by their density where it is known."""
+    if MEAN in dataset and SD in dataset:
+        return mixture_quantiles(_flat(dataset[MEAN]), _flat(dataset[SD]), _INTERVAL)
+    return np.quantile(_flat(observed_variable(dataset)), _INTERVAL, axis=0)
+
+
+def noise_free_interval(dataset: xr.Dataset) -> np.ndarray:
+    """Return the ends (2, K, D) of the 95% interval of the noise-free outputs, by their density where it is known."""
+    if MEAN in dataset and FREE_SD in dataset and bool((dataset[FREE_SD] > 0).any()):
+        return mixture_quantiles(_flat(dataset[MEAN]), _flat(dataset[FREE_SD]), _INTERVAL)
+    return np.quantile(_flat(dataset["outputs"]), _INTERVAL, axis=0)
+
+
+def _flat(variable: xr.DataArray) -> np.ndarray:
+    variable = variable.transpose("chain", "draw", "time", "output")
+    return np.asarray(variable.values, float).reshape(-1, *variable.shape[2:])
+
+
+def mixture_quantiles(mean: np.ndarray, sd: np.ndarray, p: Any) -> np.ndarray:
+    """Return quantiles (Q, ...) of the mixture of normal distributions (S, ...), by bisection."""
+    p = np.atleast_1d(np.asarray(p, float))
+    found = []
+    for one in p:
+        ends = mean + sd * stats.norm.ppf(one)  # the quantile of the mixture lies between those of its parts
+        low, high = ends.min(axis=0), ends.max(axis=0)
+        for _ in range(60):
+            middle = 0.5 * (low + high)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                share = np.where(sd > 0, stats.norm.cdf((middle - mean) / sd), middle >= mean).mean(axis=0)
+            low, high = np.where(share < one, middle, low), np.where(share < one, high, middle)
+            if np.all(high - low <= 1e-9 * (1e-300 + np.abs(high))):
+                break
+        found.append(0.5 * (low + high))
+    return np.array(found)

@@ -1,0 +1,256 @@
+"""How good predictions of data turned out to be: proper scores, errors, coverage."""
+
+from __future__ import annotations
+
+import json
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from scipy import stats
+from scipy.special import logsumexp
+
+from lfm_ppl import checks
+from lfm_ppl.data import Data
+from lfm_ppl.results.predictions import MEAN, SD, observed_variable, of_result
+
+ALL = "all"
+"""The row of a table of scores for all outputs together."""
+
+_FEW = 10.0
+"""Draws that carry a log score; with fewer it is told more by chance than by the forecast."""
+
+_SAME_TIME = 1e-9
+"""Relative difference of times that is rounding."""
+
+
+class Scores(NamedTuple):
+    """Scores of single predictions, arrays of the shape of what was predicted; NaN where nothing was measured.
+
+    Attributes:
+        error: y minus the predictive mean.
+        crps: continuous ranked probability score, in units of y; smaller is better.
+        log_score: log predictive density; larger is better. NaN where there is no density.
+        covered: 1 where the central interval holds y, 0 where not.
+    """
+
+    error: np.ndarray
+    crps: np.ndarray
+    log_score: np.ndarray
+    covered: np.ndarray
+
+
+def score(result: Any, held_out: Any, level: float = 0.95) -> pd.DataFrame:
+    r"""Compare predictions with what was measured after all.
+
+        rmse     root of the mean of (y - E y*)^2
+        crps     mean of  E|y* - y| - E|y* - y*'| / 2  =  mean of  int (F(v) - 1{v >= y})^2 dv
+        log      mean of  log p(y),   p = mean over the draws of N(y_mean, y_sd^2)
+        coverage share of y in the central interval, between the quantiles (1 - level)/2 and (1 + level)/2 of p
+
+    CRPS takes the draws y*_1..S of each prediction, with the unbiased ("fair") estimator
+
+        1/S sum_s |y*_s - y| - 1/(2 S (S - 1)) sum_s,r |y*_s - y*_r|.
+
+    The other scores take the mixture of normal densities that `forecast` stores. CRPS and the log score are proper: on
+    average the true predictive distribution has the best of them.
+
+    Args:
+        result: what `lfm_ppl.forecast`, or `lfm_ppl.fit` with ``at``, returned; or its dataset ``predictions``.
+        held_out: (K, D) (or (K,) for one output; (B, K, D) for a panel), one row for each time of the predictions; or a
+            `lfm_ppl.Data` or a DataArray with coordinates time and output, whose times must be among those predicted.
+            NaN entries are left out.
+        level: of the interval, between 0 and 1.
+
+    Returns:
+        A table with a row for each output and a row "all" for all entries: ``n`` (how many were compared), ``rmse``,
+        ``crps`` (both in the outputs' units, so that "all" means little where these differ), ``log_score`` (mean log
+        density of an entry) and ``coverage_95`` (after ``level``).
+
+    Raises:
+        ValueError: the result has no predictions; a wrong shape; a time or an output that was not predicted; nothing
+            to compare with.
+
+    Warns:
+        UserWarning: the log score of some entries rests on few draws, because the noise is small beside the differences
+            between paths that were simulated; take more draws, or CRPS.
+
+    Example:
+        >>> draws = np.random.default_rng(0).normal(size=(1, 4000, 1, 1))
+        >>> dims = ("chain", "draw", "time", "output")
+        >>> predicted = xr.Dataset({"y": (dims, draws)}, {"time": [1.0], "output": ["x"]})
+        >>> score(predicted, [[0.0]]).loc["x", "crps"].round(2)  # (sqrt(2) - 1) / sqrt(pi) = 0.234 in expectation
+        np.float64(0.23)
+
+    Source: Gneiting and Raftery (2007), JASA 102; Ferro (2014), QJRMS 140, for the fair estimator.
+    """
+    _check_level(level)
+    predicted = of_result(result)
+    variable = observed_variable(predicted)
+    series = [dim for dim in variable.dims if dim not in ("chain", "draw", "time", "output")]
+    predicted, y = aligned(predicted, variable, held_out, series)
+    variable = observed_variable(predicted)
+    order = ("chain", "draw", *series, "time", "output")
+
+    def flat(name: str) -> np.ndarray | None:
+        return None if name not in predicted else _stacked(predicted[name].transpose(*order))
+
+    found = scores(_stacked(variable.transpose(*order)), y, flat(MEAN), flat(SD), level,
+                   _angles(variable, predicted))
+    return table(found, [str(name) for name in predicted["output"].values], level)
+
+
+def scores(draws: np.ndarray, y: np.ndarray, mean: np.ndarray | None = None, sd: np.ndarray | None = None,
+           level: float = 0.95, angular: Any = False) -> Scores:
+    """Return the scores of single predictions.
+
+    Args:
+        draws: (S, ...) of each prediction.
+        y: (...), NaN where missing.
+        mean: (S, ...) of the normal distribution of each draw; None: there is no density.
+        sd: (S, ...), its standard deviation.
+        level: of the central interval.
+        angular: (...), which are angles: differences are taken on the circle.
+    """
+    mean, sd = (None, None) if mean is None or sd is None else (mean, sd)
+    if np.any(angular):
+        # Everything on the branch that has the mean direction in its middle.
+        centre = np.angle(np.exp(1j * draws).mean(axis=0))
+        unwrap = lambda value: np.where(angular, centre + np.angle(np.exp(1j * (value - centre))), value)  # noqa: E731
+        draws, y, mean = unwrap(draws), unwrap(y), None if mean is None else unwrap(mean)
+    present = np.isfinite(y)
+    below = 0.5 * (1.0 - level)
+    if mean is None or sd is None:
+        error = y - draws.mean(axis=0)
+        low, high = np.quantile(draws, (below, 1.0 - below), axis=0)
+        covered = np.where(present, (low <= y) & (y <= high), np.nan)
+        return Scores(error, crps(draws, y), np.full(y.shape, np.nan), covered)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        z = np.where(sd > 0, (y - mean) / sd, np.where(y == mean, 0.0, np.sign(y - mean) * np.inf))
+        terms = np.where(sd > 0, stats.norm.logpdf(z) - np.log(sd), np.nan)
+    log_score = np.where(present, logsumexp(np.where(present, terms, 0.0), axis=0) - np.log(len(mean)), np.nan)
+    distribution = stats.norm.cdf(z).mean(axis=0)
+    covered = np.where(present, (below <= distribution) & (distribution <= 1.0 - below), np.nan)
+    _say_where_few(np.where(present, terms, 0.0), present)
+    return Scores(y - mean.mean(axis=0), crps(draws, y), log_score, covered)
+
+
+def crps(draws: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return the fair CRPS (...) of draws (S, ...) at y (...), by sorting; NaN where y is, and for a single draw.
+
+    sum_s,r |y_s - y_r| = 2 sum_i (2 i - S - 1) y_(i) over the sorted draws.
+    """
+    count = len(draws)
+    if count < 2:
+        return np.full(np.shape(y), np.nan)
+    ordered = np.sort(draws, axis=0)
+    weight = (2.0 * np.arange(1, count + 1) - count - 1).reshape(-1, *(1,) * np.ndim(y))
+    return np.abs(draws - y).mean(axis=0) - (weight * ordered).sum(axis=0) / (count * (count - 1))
+
+
+def gaussian_scores(mean: np.ndarray, sd: np.ndarray, y: np.ndarray, level: float = 0.95) -> Scores:
+    r"""Return the scores (...) of normal distributions with mean (...) and sd (...), in closed form.
+
+    With z = (y - mean) / sd,
+
+        crps = sd (z (2 Phi(z) - 1) + 2 phi(z) - 1 / sqrt(pi)).
+    """
+    z = (y - mean) / sd
+    ranked = sd * (z * (2 * stats.norm.cdf(z) - 1) + 2 * stats.norm.pdf(z) - 1 / np.sqrt(np.pi))
+    inside = np.where(np.isfinite(z), np.abs(z) <= stats.norm.ppf(0.5 + 0.5 * level), np.nan)
+    return Scores(y - mean, ranked, stats.norm.logpdf(z) - np.log(sd), inside)
+
+
+def table(found: Scores, outputs: list[str], level: float = 0.95) -> pd.DataFrame:
+    """Return the mean scores by output (the last axis) and of all; see `score`."""
+    rows = {}
+    for index, name in [*enumerate(outputs), (slice(None), ALL)]:
+        rows[name] = summary(Scores(*(value[..., index] for value in found)), level)
+    return pd.DataFrame.from_dict(rows, orient="index")
+
+
+def summary(found: Scores, level: float = 0.95) -> dict[str, float]:
+    """Return the mean scores of the entries that were measured."""
+    present = np.isfinite(found.error)
+    mean = lambda values: float(np.mean(values[present])) if present.any() else np.nan  # noqa: E731
+    return {"n": int(present.sum()), "rmse": float(np.sqrt(mean(found.error**2))), "crps": mean(found.crps),
+            "log_score": mean(found.log_score), f"coverage_{100 * level:g}": mean(found.covered)}
+
+
+def aligned(predicted: xr.Dataset, variable: xr.DataArray, held_out: Any,
+            series: list[str]) -> tuple[xr.Dataset, np.ndarray]:
+    """Return the predictions of what was held out, and that as an array (..., K, D).
+
+    Raises:
+        ValueError: see `score`.
+    """
+    outputs = [str(name) for name in variable["output"].values]
+    if isinstance(held_out, (Data, xr.DataArray)):
+        times, y, names = _labelled(held_out)
+        for name in names:
+            if name not in outputs:
+                raise ValueError(f"held_out: {checks.unknown('output', name, outputs)}")
+        predicted = predicted.isel(time=_rows(predicted["time"].values, times)).sel(output=names)
+    else:
+        y = np.asarray(held_out, float)
+        y = y[..., None] if len(outputs) == 1 and y.ndim == 1 + len(series) else y
+        expected = (*(variable.sizes[dim] for dim in series), variable.sizes["time"], len(outputs))
+        if y.shape != expected:
+            raise ValueError(f"held_out must have shape {expected}, one row for each time of the predictions and one "
+                             f"column for each of {', '.join(outputs)}; got {y.shape}. Give an lfm.Data for some of "
+                             "the times.")
+    if np.isinf(y).any():
+        raise ValueError("held_out has infinite entries; use NaN for a missing entry.")
+    if not np.isfinite(y).any():
+        raise ValueError("held_out has no value to compare with: every entry is missing.")
+    return predicted, y
+
+
+def _labelled(held_out: Data | xr.DataArray) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    if isinstance(held_out, Data):
+        return held_out.times, held_out.y, list(held_out.outputs)
+    for name in ("time", "output"):
+        if name not in held_out.coords or name not in held_out.dims:
+            raise ValueError(f"held_out needs the dimensions and coordinates time and output, got "
+                             f"{tuple(held_out.dims)}; or pass an array.")
+    held_out = held_out.transpose(..., "time", "output")
+    return (np.asarray(held_out["time"].values, float), np.asarray(held_out.values, float),
+            [str(name) for name in held_out["output"].values])
+
+
+def _rows(predicted: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Return which predicted time each time is."""
+    nearest = np.abs(predicted[:, None] - times).argmin(axis=0)
+    far = np.abs(predicted[nearest] - times) > _SAME_TIME * (np.ptp(predicted) + np.abs(times))
+    if far.any():
+        raise ValueError(f"held_out has the time {times[far][0]:g}, which was not predicted (the predictions are at "
+                         f"{len(predicted)} times from {predicted.min():g} to {predicted.max():g}). Forecast at the "
+                         "times of the held-out data: lfm.forecast(result, model, held_out.times).")
+    return nearest
+
+
+def _stacked(variable: xr.DataArray) -> np.ndarray:
+    return np.asarray(variable.values, float).reshape(-1, *variable.shape[2:])
+
+
+def _angles(variable: xr.DataArray, predicted: xr.Dataset) -> np.ndarray:
+    names = json.loads(variable.attrs.get("angular") or "[]")
+    return np.isin(predicted["output"].values.astype(str), names)
+
+
+def _say_where_few(terms: np.ndarray, present: np.ndarray) -> None:
+    """Warn where a mixture density at y is that of a few of its parts."""
+    weights = np.exp(terms - terms.max(axis=0))
+    carried = weights.sum(axis=0) ** 2 / (weights**2).sum(axis=0)
+    few = present & (carried < min(_FEW, 0.5 * len(terms)))
+    if few.sum() > 0.05 * present.sum():
+        checks.warn(f"the log score of {int(few.sum())} of {int(present.sum())} entries rests on fewer than "
+                    f"{min(_FEW, 0.5 * len(terms)):g} draws: they lie between the simulated paths, or far from all. "
+                    "Take more draws in lfm.forecast, or compare by CRPS.")
+
+
+def _check_level(level: float) -> None:
+    if not 0 < level < 1:
+        raise ValueError(f"level must lie between 0 and 1, got {level}.")
+

@@ -1,0 +1,123 @@
+"""Scores against closed forms and integrals, and what is refused."""
+
+import numpy as np
+import pytest
+import xarray as xr
+from scipy import integrate, stats
+
+import lfm_ppl as lfm
+from lfm_ppl.results import scoring
+from lfm_ppl.results.predictions import mixture_quantiles
+
+RNG = np.random.default_rng(4)
+TIMES = np.array([1.0, 2.0, 4.0])
+
+
+def predicted(mean, sd, draws=None, names=("a", "b"), **attributes):
+    """A dataset of predictions from moments (S, K, D) of each draw."""
+    mean, sd = np.broadcast_arrays(np.asarray(mean, float), np.asarray(sd, float))
+    draws = mean + sd * RNG.normal(size=mean.shape) if draws is None else draws
+    dims = ("chain", "draw", "time", "output")
+    variables = {"y": (dims, draws[None], attributes), "y_mean": (dims, mean[None]), "y_sd": (dims, sd[None])}
+    return xr.Dataset(variables, {"time": TIMES, "output": list(names)})
+
+
+def test_crps_is_the_integral_of_the_squared_distance_of_distributions():
+    """The fair estimator is the integral over the empirical distribution plus a known correction for S draws."""
+    draws, y = RNG.normal(size=40), 0.7
+    ordered = np.sort(np.append(draws, y))
+    middle = 0.5 * (ordered[1:] + ordered[:-1])
+    empirical = (draws[:, None] <= middle).mean(axis=0)
+    integral = np.sum(np.diff(ordered) * (empirical - (middle >= y)) ** 2)
+    pairs = np.abs(draws[:, None] - draws).sum()
+    expected = integral + pairs / (2 * 40**2) - pairs / (2 * 40 * 39)
+    np.testing.assert_allclose(scoring.crps(draws[:, None], np.array([y])), expected, rtol=1e-12)
+
+
+def test_crps_of_draws_is_unbiased_for_that_of_the_normal_distribution():
+    y = np.array([-1.0, 0.2, 3.0])
+    exact = [integrate.quad(lambda v, at=at: (stats.norm.cdf(v) - (v >= at)) ** 2, -12, 12, points=[at], limit=200)[0]
+             for at in y]
+    closed = scoring.gaussian_scores(np.zeros(3), np.ones(3), y)
+    np.testing.assert_allclose(closed.crps, exact, rtol=1e-6)
+    np.testing.assert_allclose(closed.log_score, stats.norm.logpdf(y))
+    np.testing.assert_array_equal(closed.covered, [1, 1, 0])
+    many = np.array([scoring.crps(RNG.normal(size=(4, 3)), y) for _ in range(20_000)])  # four draws: bias would show
+    error = many.std(axis=0) / np.sqrt(len(many))
+    assert (np.abs(many.mean(axis=0) - exact) < 4.5 * error).all()
+
+
+def test_scores_of_a_mixture():
+    mean, sd = RNG.normal(size=(5, 3, 2)), RNG.uniform(0.5, 1.5, size=(5, 3, 2))
+    y = RNG.normal(size=(3, 2))
+    y[1, 0] = np.nan
+    dataset = predicted(mean, sd)
+    found = lfm.score(dataset, y)
+    density = stats.norm.pdf(y, mean, sd).mean(axis=0)
+    error = y - mean.mean(axis=0)
+    assert found.index.tolist() == ["a", "b", "all"]
+    assert found.columns.tolist() == ["n", "rmse", "crps", "log_score", "coverage_95"]
+    assert found["n"].tolist() == [2, 3, 5]
+    np.testing.assert_allclose(found["log_score"], [np.nanmean(np.log(density[:, 0])), np.log(density[:, 1]).mean(),
+                                                    np.nanmean(np.log(density))])
+    np.testing.assert_allclose(found["rmse"], [np.sqrt(np.nanmean(error[:, 0] ** 2)),
+                                               np.sqrt(np.mean(error[:, 1] ** 2)), np.sqrt(np.nanmean(error**2))])
+    ranked = scoring.crps(dataset["y"].values[0], y)
+    np.testing.assert_allclose(found.loc["a", "crps"], np.nanmean(ranked[:, 0]))
+    low, high = mixture_quantiles(mean, sd, [0.25, 0.75])
+    for ends, p in ((low, 0.25), (high, 0.75)):
+        np.testing.assert_allclose(stats.norm.cdf(ends, mean, sd).mean(axis=0), p, atol=1e-8)
+    inside = np.where(np.isnan(y), np.nan, (low <= y) & (y <= high))
+    np.testing.assert_allclose(lfm.score(dataset, y, level=0.5)["coverage_50"],
+                               [np.nanmean(inside[:, 0]), inside[:, 1].mean(), np.nanmean(inside)])
+
+
+def test_draws_alone_have_no_log_score():
+    dataset = predicted(np.zeros((2000, 3, 2)), 1.0)[["y"]]
+    found = lfm.score(dataset, np.zeros((3, 2)))
+    assert np.isnan(found["log_score"]).all()
+    assert (found["coverage_95"] == 1).all()
+
+
+def test_held_out_data_are_found_by_time_and_name():
+    mean, sd = RNG.normal(size=(50, 3, 2)), np.ones((50, 3, 2))
+    dataset, y = predicted(mean, sd), RNG.normal(size=(3, 2))
+    some = lfm.Data(TIMES[1:], y[1:, 1:], ("b",))
+    expected = lfm.score(dataset, np.where([[False, False], [False, True], [False, True]], y, np.nan)).loc["b"]
+    np.testing.assert_allclose(lfm.score(dataset, some).loc["b"], expected)
+    array = xr.DataArray(y[1:, 1:], dims=("time", "output"), coords={"time": TIMES[1:], "output": ["b"]})
+    np.testing.assert_allclose(lfm.score(dataset, array).loc["b"], expected)
+
+
+def test_angles_are_compared_on_the_circle():
+    mean = np.full((200, 3, 2), np.pi)
+    draws = (mean + 0.1 * RNG.normal(size=mean.shape) + np.pi) % (2 * np.pi) - np.pi  # on both sides of the cut
+    dataset = predicted(mean, 0.1, draws, angular='["a"]')
+    found = lfm.score(dataset, np.array([[-np.pi + 0.05, np.pi]] * 3))
+    np.testing.assert_allclose(found.loc["a", "rmse"], 0.05)
+    assert found.loc["a", "crps"] < 0.06 < 0.5 < found.loc["b", "crps"]  # b is no angle
+
+
+@pytest.mark.parametrize(("held_out", "message"), [
+    (np.zeros((2, 2)), r"must have shape \(3, 2\).*got \(2, 2\)"),
+    (np.full((3, 2), np.nan), "every entry is missing"),
+    (np.full((3, 2), np.inf), "infinite"),
+    (lfm.Data([2.0, 3.0], np.zeros((2, 1)), ("a",)), "time 3, which was not predicted"),
+    (lfm.Data([2.0], np.zeros((1, 1)), ("c",)), "unknown output 'c'"),
+])
+def test_what_cannot_be_compared(held_out, message):
+    with pytest.raises(ValueError, match=message):
+        lfm.score(predicted(np.zeros((4, 3, 2)), 1.0), held_out)
+
+
+def test_a_result_without_predictions_says_how_to_get_them(result):
+    with pytest.raises(ValueError, match=r"comes from lfm\.forecast"):
+        lfm.score(result, np.zeros((3, 2)))
+    with pytest.raises(ValueError, match="level must lie between 0 and 1"):
+        lfm.score(predicted(np.zeros((4, 3, 2)), 1.0), np.zeros((3, 2)), level=95)
+
+
+def test_a_log_score_of_few_draws_is_a_warning():
+    dataset = predicted(RNG.normal(size=(400, 3, 2)), 1e-4)
+    with pytest.warns(UserWarning, match="rests on fewer than 10 draws"):
+        lfm.score(dataset, np.zeros((3, 2)))

@@ -1,0 +1,163 @@
+"""Plain NumPyro runs as results, and the names of their dimensions."""
+
+import json
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pandas as pd
+import pytest
+from numpyro.infer import MCMC, NUTS
+
+import lfm_ppl as lfm
+from lfm_ppl.results import arviz_data, tables
+from tests.inference import linear_motif as motif
+
+QUIET = {"progress_bar": False, "chain_method": "vectorized"}
+
+
+def model(times, y=None, spread=0.4):
+    """The linear motif, with what follows from its parameters."""
+    decay = numpyro.sample("decay", dist.LogNormal(jnp.log(motif.THETA["decay"]), spread).to_event(1),
+                           infer={"event_dims": ["gene"]})
+    lengthscale = numpyro.sample("lengthscale", dist.LogNormal(jnp.log(1.5), spread))
+    noise_sd = numpyro.sample("noise_sd", dist.LogNormal(jnp.log(0.2), spread))
+    numpyro.deterministic("half_life", jnp.log(2.0) / decay)
+    numpyro.sample("y", lfm.MarginalLikelihood(motif.build(decay, lengthscale, noise_sd), times), obs=y)
+
+
+def group(result, name):
+    return arviz_data.group(result, name)
+
+
+@pytest.fixture(scope="module")
+def mcmc():
+    run = MCMC(NUTS(model, forward_mode_differentiation=True), num_warmup=30, num_samples=20, num_chains=2, **QUIET)
+    run.run(jax.random.key(0), motif.TIMES, jnp.asarray(motif.data()), extra_fields=("energy", "potential_energy"))
+    return run
+
+
+@pytest.fixture(scope="module")
+def converted(mcmc):
+    y = pd.DataFrame(motif.data(), columns=["CDKN1A", "SESN1"])
+    with pytest.warns(lfm.ConvergenceWarning):
+        return lfm.to_arviz(mcmc, model, motif.TIMES, y, trajectory_draws=8, at=[0.0, 6.0],
+                            dims={"half_life": ["gene"]}, coords={"gene": ["p21", "sestrin"]})
+
+
+def test_a_plain_run_has_the_groups_of_a_fit(mcmc, converted):
+    assert set(arviz_data.groups(converted)) == {
+        "posterior", "sample_stats", "log_likelihood", "one_step_ahead", "trajectories", "posterior_predictive",
+        "predictions", "observed_data"}
+    draws = mcmc.get_samples(group_by_chain=True)
+    for name in ("decay", "lengthscale", "noise_sd", "half_life"):
+        np.testing.assert_array_equal(group(converted, "posterior")[name], draws[name])
+    stats = group(converted, "sample_stats")
+    assert {"diverging", "energy", "lp"} <= set(stats.data_vars)
+    np.testing.assert_allclose(stats["lp"], -mcmc.get_extra_fields(group_by_chain=True)["potential_energy"])
+    assert arviz_data.attributes(converted)["sampler"] == "nuts"
+
+
+def test_one_step_ahead_densities_are_those_of_the_exact_likelihood(converted):
+    posterior = group(converted, "posterior").isel(chain=1, draw=7)
+    theta = {"decay": posterior["decay"].values, "lengthscale": float(posterior["lengthscale"]),
+             "noise_sd": float(posterior["noise_sd"])}
+    found = group(converted, "one_step_ahead")["log_density"].isel(chain=1, draw=7).sum()
+    np.testing.assert_allclose(found, motif.log_density(motif.data(), **theta), rtol=1e-7)
+
+
+def test_loo_sees_every_row_of_the_data(converted):
+    import arviz
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of few draws
+        loo = arviz.loo(converted)
+    assert loo.n_data_points == len(motif.TIMES)
+
+
+def test_dimensions_and_columns_have_names(converted):
+    posterior = group(converted, "posterior")
+    assert list(arviz_data.summary(converted).index) == [
+        "decay[p21]", "decay[sestrin]", "half_life[p21]", "half_life[sestrin]", "lengthscale", "noise_sd"]
+    assert posterior["decay"].dims == posterior["half_life"].dims == ("chain", "draw", "gene")
+    for name in ("observed_data", "predictions", "posterior_predictive", "trajectories"):
+        assert group(converted, name)["output"].values.tolist() == ["CDKN1A", "SESN1"]
+    assert group(converted, "observed_data")["y"].attrs["units"] == "nM"  # of the model's outputs a and b
+    again = lfm.forecast(converted, model, [5.0], draws=4)
+    assert group(again, "predictions")["output"].values.tolist() == ["CDKN1A", "SESN1"]
+
+
+def test_derived_parameters_and_warnings_are_marked(converted):
+    posterior = group(converted, "posterior")
+    assert posterior["half_life"].attrs["derived"] == 1
+    assert "derived" not in posterior["decay"].attrs
+    said = json.loads(arviz_data.attributes(converted)["warnings"])
+    assert any("effective sample size" in text for text in said)
+    table = tables.annotated(arviz_data.summary(converted), converted)
+    assert table.loc["half_life[p21]", "kind"] == "derived"
+    assert table.loc["noise_sd", "kind"] == "sampled"
+    assert "effective sample size" in table.loc["noise_sd", "warnings"]
+    assert "lengthscale (" not in table.loc["noise_sd", "warnings"]
+
+
+def test_names_survive_a_file(converted, tmp_path):
+    again = lfm.load(lfm.save(converted, tmp_path / "posterior.nc"))
+    assert arviz_data.attributes(again)["warnings"] == arviz_data.attributes(converted)["warnings"]
+    assert group(again, "posterior")["half_life"].attrs["derived"] == 1
+    assert group(again, "posterior")["gene"].values.tolist() == ["p21", "sestrin"]
+
+
+def test_draws_without_an_mcmc_and_without_derived_ones(mcmc, converted):
+    draws = {name: value for name, value in mcmc.get_samples(group_by_chain=True).items() if name != "half_life"}
+    with pytest.warns(lfm.ConvergenceWarning):
+        result = lfm.to_arviz(draws, model, motif.TIMES, motif.data(), trajectory_draws=0)
+    np.testing.assert_allclose(group(result, "posterior")["half_life"], group(converted, "posterior")["half_life"])
+    assert "sample_stats" not in arviz_data.groups(result)
+    assert group(result, "posterior")["decay"].dims == ("chain", "draw", "gene")  # of `event_dims`
+
+
+def panel_model(times, y=None):
+    with numpyro.plate("patient", 3):
+        decay = numpyro.sample("decay", dist.LogNormal(0.0, 0.3))
+        build = lambda p: motif.build(p["decay"][None], 1.5, 0.2)  # noqa: E731
+        numpyro.sample("y", lfm.panel(build, {"decay": decay}, times), obs=y)
+
+
+def test_the_series_of_a_panel_have_one_name_everywhere():
+    draws, times = {"decay": np.full((1, 4, 3), 0.5)}, np.arange(3.0)
+    y = np.zeros((3, 3, 1))
+    labels = ["Ann", "Bo", "Cy"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        result = lfm.to_arviz(draws, panel_model, times, y, coords={"series": labels}, trajectory_draws=2)
+        same = lfm.to_arviz(draws, panel_model, times, y, coords={"patient": labels}, trajectory_draws=0)
+    assert list(arviz_data.summary(result).index) == ["decay[Ann]", "decay[Bo]", "decay[Cy]"]
+    for name in ("observed_data", "log_likelihood", "trajectories", "posterior_predictive"):
+        assert group(result, name)["series"].values.tolist() == labels
+    assert group(same, "observed_data")["series"].values.tolist() == labels
+
+
+@pytest.mark.parametrize(("keywords", "message"), [
+    ({"dims": {"deca": ["gene"]}}, "unknown parameter 'deca'"),
+    ({"dims": {"decay": ["gene", "tissue"]}}, "'decay' has 1 dimensions"),
+    ({"coords": {"gen": ["a", "b"]}}, "unknown dimension 'gen'"),
+    ({"coords": {"gene": ["a"]}}, "needs 2 labels, each of them once; got 1"),
+    ({"coords": {"output": ["a", "a"]}}, "needs 2 labels, each of them once; got 2"),
+])
+def test_names_that_do_not_fit(mcmc, keywords, message):
+    with pytest.raises(ValueError, match=message):
+        lfm.to_arviz(mcmc, model, motif.TIMES, motif.data(), **keywords)
+
+
+def test_runs_that_are_none_or_of_another_model(mcmc):
+    with pytest.raises(ValueError, match="call mcmc.run"):
+        lfm.to_arviz(MCMC(NUTS(model), num_warmup=1, num_samples=1), model, motif.TIMES, motif.data())
+    with pytest.raises(TypeError, match="must be a numpyro.infer.MCMC"):
+        lfm.to_arviz("mcmc", model, motif.TIMES, motif.data())
+    with pytest.raises(ValueError, match="samples 'decay', of which there are no draws"):
+        lfm.to_arviz({"rate": np.ones((1, 3))}, model, motif.TIMES, motif.data())
+    with pytest.raises(ValueError, match="'decay' has shape"):
+        lfm.to_arviz({"decay": np.ones((1, 3))}, model, motif.TIMES, motif.data())

@@ -1,0 +1,261 @@
+"""Forecasts against dense Gaussian process algebra, the Fokker-Planck equation, and data that were simulated."""
+
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
+import systems
+from scipy import stats
+
+import lfm_ppl as lfm
+from lfm_ppl.results import arviz_data
+from lfm_ppl.results.predictions import noise_free_interval, summary
+from tests.inference import linear_motif as motif
+
+NEAR = 1e-7
+"""Relative width of priors that make the parameters all but known."""
+
+AT = np.array([0.7, 4.6, 5.1, 7.0])
+DRAWS = 2000
+
+
+def well(times, y=None, noise=0.0025):
+    a = numpyro.sample("a", dist.LogNormal(0.0, NEAR))
+    numpyro.sample("y", lfm.MarginalLikelihood(systems.double_well(a=-a, noise=noise), times), obs=y)
+
+
+def predictions(result):
+    return arviz_data.group(result, "predictions")
+
+
+@pytest.fixture(scope="module")
+def known():
+    """Many draws of parameters that are all but known, and no trajectories."""
+    return lfm.fit(motif.model, motif.TIMES, motif.data(), sampler="map", samples=DRAWS, trajectory_draws=0, seed=3,
+                   model_kwargs={"spread": NEAR}, progress=False)
+
+
+@pytest.fixture(scope="module")
+def ahead(known):
+    return lfm.forecast(known, motif.model, AT, model_kwargs={"spread": NEAR}, draws=DRAWS, seed=5)
+
+
+@pytest.fixture(scope="module")
+def exact():
+    """Exact mean and covariance of x(AT) given the data."""
+    mean, covariance = motif.posterior(motif.data(), AT, **motif.THETA)
+    start = 2 * len(motif.TIMES) + len(AT)
+    return mean[start:], covariance[start:, start:]
+
+
+def test_moments_of_a_linear_model_are_exact(ahead, exact):
+    mean, covariance = exact
+    found = predictions(ahead)
+    free = np.sqrt(np.diag(covariance)).reshape(-1, 2)
+    np.testing.assert_allclose(found["y_mean"].values[0], np.tile(mean.reshape(-1, 2), (DRAWS, 1, 1)), atol=2e-6)
+    np.testing.assert_allclose(found["y_sd"][0, 0], np.hypot(free, motif.THETA["noise_sd"]), rtol=2e-6)
+    np.testing.assert_allclose(found["outputs_sd"][0, 0], free, rtol=2e-6)
+    low, high = noise_free_interval(found)
+    np.testing.assert_allclose(high - low, 2 * stats.norm.ppf(0.975) * free, rtol=1e-5)
+
+
+def test_new_data_of_a_linear_model_are_exact_jointly_in_time(ahead, exact):
+    mean, covariance = exact
+    found = predictions(ahead)
+    for name, noise in (("outputs", 0.0), ("y", motif.THETA["noise_sd"] ** 2)):
+        draws = found[name].values[0].reshape(DRAWS, -1)
+        root = np.linalg.cholesky(covariance + (noise + 1e-12) * np.eye(len(mean)))
+        white = np.linalg.solve(root, (draws - mean).T)
+        assert np.abs(white.mean(axis=1)).max() < 4.5 / np.sqrt(DRAWS)
+        assert np.abs(white @ white.T / DRAWS - np.eye(len(mean))).max() < 4.5 * np.sqrt(2 / DRAWS)
+
+
+def test_groups_coordinates_and_words(ahead, known):
+    found = predictions(ahead)
+    assert "predictions" not in arviz_data.groups(known)  # a new object
+    assert set(arviz_data.groups(ahead)) == {*arviz_data.groups(known), "predictions"}
+    assert found["y"].dims == ("chain", "draw", "time", "output")
+    assert found["forces"].dims == ("chain", "draw", "time", "force")
+    np.testing.assert_array_equal(found["time"], AT)
+    assert found["output"].values.tolist() == ["a", "b"]
+    assert found["y"].attrs == {"long_name": "new observation, with noise", "units": "nM"}
+    assert found["outputs"].attrs["long_name"] == "noise-free output"
+    assert found.attrs["last_observation"] == motif.TIMES[-1]
+    table = summary(found)
+    assert table.index.tolist() == np.repeat(AT, 2).tolist()
+    wide, narrow = table["q97.5"] - table["q2.5"], table["noise_free_q97.5"] - table["noise_free_q2.5"]
+    assert (wide > narrow).all()
+
+
+def test_fit_at_times_gives_the_same_predictions_and_says_noise_free():
+    result = lfm.fit(motif.model, motif.TIMES, motif.data(), sampler="map", samples=DRAWS, trajectory_draws=DRAWS,
+                     at=AT, model_kwargs={"spread": NEAR}, progress=False)
+    mean, _ = motif.posterior(motif.data(), AT, **motif.THETA)
+    found = predictions(result)
+    np.testing.assert_allclose(found["y_mean"].values[0, 0].ravel(), mean[2 * len(motif.TIMES) + len(AT):], atol=2e-6)
+    paths = arviz_data.group(result, "trajectories")
+    np.testing.assert_array_equal(found["outputs"].values, paths["outputs"].values)
+    assert paths["outputs"].attrs["long_name"] == "noise-free output"
+
+
+@pytest.fixture(scope="module")
+def between_the_wells():
+    """A double well that was last seen on its way from one well to the other, with its draws."""
+    times, y = np.array([0.0, 0.5, 1.0]), np.array([[-0.8], [-0.4], [0.05]])
+    result = lfm.fit(well, times, y, sampler="map", samples=DRAWS, trajectory_draws=0, progress=False)
+    return times, y, result
+
+
+def test_after_the_data_a_nonlinear_model_has_its_own_distribution(between_the_wells):
+    """Two wells, as the Fokker-Planck equation has them; Gaussian moments would fill the gap between."""
+    times, y, result = between_the_wells
+    later = np.array([2.0, 4.0])
+    found = predictions(lfm.forecast(result, well, later, draws=DRAWS))
+    model = systems.double_well(noise=0.0025)
+    grid = lfm.fokker_planck(model, np.concatenate([times, later]), np.concatenate([y, np.full((2, 1), np.nan)]))
+    gaussian = lfm.smooth(model, times, y, at=later)
+    edges = np.append(grid.x - 0.5 * grid.grid.width, grid.x[-1] + 0.5 * grid.grid.width)
+    for k in range(2):
+        mass = np.asarray(grid.filtered[3 + k])
+        below = np.concatenate([[0.0], np.cumsum(mass) / mass.sum()])
+        distance = stats.kstest(found["states"].values[0, :, k, 0], lambda x, below=below: np.interp(x, edges, below))
+        # Critical value at 0.1%, and 0.01 for the Gaussian at the last observation.
+        assert distance.statistic < 1.95 / np.sqrt(DRAWS) + 0.01
+        moments = stats.norm.cdf(edges, gaussian.mean[k, 0], np.sqrt(gaussian.covariance[k, 0, 0]))
+        assert np.abs(moments - below).max() > 0.06
+        np.testing.assert_allclose(found["y_sd"], 0.05)
+        np.testing.assert_array_equal(found["y_mean"], found["outputs"])
+
+
+def test_one_path_goes_through_the_last_observation(between_the_wells):
+    """The simulated path starts where the smoothed one ends: neighbouring times stay near each other."""
+    times, _, result = between_the_wells
+    near = times[-1] + np.array([-1e-6, 0.0, 1e-6])
+    states = predictions(lfm.forecast(result, well, near, draws=100))["states"].values[0, :, :, 0]
+    assert np.abs(np.diff(states, axis=1)).max() < 5 * 0.7 * np.sqrt(1e-6)
+    assert states.std(axis=0).min() > 0.03
+
+
+def test_a_far_forecast_alone_is_that_of_many_times(between_the_wells):
+    """Steps are as short as between the data, however long the way to the first time that was asked for."""
+    _, _, result = between_the_wells
+    alone = predictions(lfm.forecast(result, well, [11.0], draws=DRAWS))["states"].values[0, :, 0, 0]
+    # The stationary density exp(-2 V / g^2), with V = x^4/4 - x^2/2 and g = 0.7.
+    x = np.linspace(-2.5, 2.5, 2001)
+    density = np.exp(-2 * (x**4 / 4 - x**2 / 2) / 0.49)
+    below = np.cumsum(density) / density.sum()
+    # By symmetry, the distance from the middle does not remember which well it started from.
+    distance = stats.kstest(np.abs(alone), lambda v: np.interp(v, x, below) - np.interp(-v, x, below))
+    assert distance.statistic < 1.95 / np.sqrt(DRAWS) + 0.01
+
+
+def test_forecast_refuses_another_model_and_impossible_times(known):
+    keywords = {"model_kwargs": {"spread": NEAR}}
+    for times, message in (([5.0, 4.0], "must not go back: entry 1"), ([-1.0], "initial time"), ([], "at least one"),
+                           ([np.nan], "finite")):
+        with pytest.raises(ValueError, match=message):
+            lfm.forecast(known, motif.model, times, **keywords)
+    with pytest.raises(ValueError, match="has no draws"):
+        lfm.forecast(known, well, AT)
+
+    def louder(times, y=None):
+        decay = numpyro.sample("decay", dist.LogNormal(jnp.zeros(2), 1.0).to_event(1))
+        lengthscale = numpyro.sample("lengthscale", dist.LogNormal(0.0, 1.0))
+        noise_sd = numpyro.sample("noise_sd", dist.LogNormal(0.0, 1.0))
+        numpyro.sample("y", lfm.MarginalLikelihood(motif.build(decay, lengthscale, 2 * noise_sd), times), obs=y)
+
+    with pytest.raises(ValueError, match="other log likelihoods than the result records"):
+        lfm.forecast(known, louder, AT, draws=2)
+
+
+def test_a_known_input_must_reach_the_forecast():
+    def driven(times, y=None, heat=None):
+        gain = numpyro.sample("gain", dist.LogNormal(0.0, NEAR))
+        system = lfm.LatentForceModel(
+            lambda x, u, t: gain * heat(t) - x, {}, lfm.GaussianObservation(systems.whole_state, jnp.array([0.01])),
+            lfm.Gaussian(jnp.zeros(1), jnp.eye(1)), process_noise=jnp.array([[0.1]]))
+        numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
+
+    times = np.arange(4.0)
+    short = lfm.Input(times, np.ones(4), interpolation="previous", outside="error")
+    result = lfm.fit(driven, times, np.ones((4, 1)), sampler="map", samples=20, trajectory_draws=0, progress=False,
+                     model_kwargs={"heat": short})
+    with pytest.raises(ValueError, match="input"):
+        lfm.forecast(result, driven, [30.0], model_kwargs={"heat": short})
+    longer = lfm.Input([*times, 4.0, 30.0], [1.0, 1.0, 1.0, 1.0, 7.0, 7.0], interpolation="previous", outside="error")
+    found = predictions(lfm.forecast(result, driven, [30.0], inputs={"heat": longer}))
+    np.testing.assert_allclose(found["y_mean"], 7.0, atol=1e-4)
+
+
+def test_a_panel_is_forecast_series_by_series():
+    def model(times, y=None):
+        decay = numpyro.sample("decay", dist.LogNormal(jnp.log(jnp.array([0.5, 1.2])), NEAR).to_event(1))
+        with numpyro.plate("series", 2):
+            build = lambda p: motif.build(p["decay"][None], 1.5, 0.2)  # noqa: E731
+            numpyro.sample("y", lfm.panel(build, {"decay": decay}, times), obs=y)
+
+    times, y = np.array([0.0, 1.0, 2.0]), np.random.default_rng(0).normal(size=(2, 3, 1))
+    result = lfm.fit(model, times, y, sampler="map", samples=30, trajectory_draws=0, progress=False)
+    ahead = lfm.forecast(result, model, [3.0, 5.0])
+    found = predictions(ahead)
+    assert found["y"].dims == ("chain", "draw", "series", "time", "output")
+    for series, decay in enumerate((0.5, 1.2)):
+        system = motif.build(jnp.array([decay]), 1.5, 0.2)
+        smoothed = lfm.smooth(system, times, y[series], at=np.array([3.0, 5.0]))
+        np.testing.assert_allclose(found["y_mean"].values[0, 0, series], smoothed.mean[:, :1], atol=1e-5)
+    assert lfm.score(ahead, np.zeros((2, 2, 1))).loc["a", "n"] == 4
+
+
+def softplus_motif(times, y=None):
+    """One gene, unknown decay and noise, and a force that acts through a softplus."""
+    decay = numpyro.sample("decay", dist.LogNormal(jnp.log(0.8), 0.3))
+    noise_sd = numpyro.sample("noise_sd", dist.LogNormal(jnp.log(0.1), 0.3))
+    system = systems.motif(decay=decay, noise_sd=noise_sd, genes=1, variance=0.1)
+    numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=5), obs=y)
+
+
+def one_motif(times, y=None):
+    """The same, linear."""
+    decay = numpyro.sample("decay", dist.LogNormal(jnp.log(0.8), 0.3))
+    noise_sd = numpyro.sample("noise_sd", dist.LogNormal(jnp.log(0.1), 0.3))
+    system = systems.motif(systems.identity, decay, noise_sd=noise_sd, genes=1, variance=0.1)
+    numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=5), obs=y)
+
+
+def wells(times, y=None):
+    """A double well of unknown depth and noise."""
+    a = numpyro.sample("a", dist.LogNormal(0.0, 0.3))
+    noise = numpyro.sample("noise", dist.LogNormal(jnp.log(0.05), 0.3))
+    system = systems.double_well(a=-a, b=a, noise=noise)
+    numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=5), obs=y)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", [one_motif, softplus_motif, wells], ids=lambda model: model.__name__)
+def test_bands_cover_new_data_over_200_runs(model):
+    """Parameters, force, state and data from the prior; fit to 25 rows, predict the 10 after them."""
+    times, known, runs = np.linspace(0.0, 14.0, 35), 25, 200
+    prior = numpyro.infer.Predictive(model, num_samples=runs)(jax.random.key(1), times)["y"]
+    covered, pit = [], []
+    for index, y in enumerate(np.asarray(prior)):
+        past = np.where(np.arange(35)[:, None] < known, y, np.nan)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", lfm.ConvergenceWarning)
+            result = lfm.fit(model, times, past, sampler="nuts", chains=1, warmup=200, samples=400,
+                             trajectory_draws=400, at=times, seed=index, progress=False)
+        found = predictions(result).isel(time=slice(known, None))
+        mean, sd = (found[name].values.reshape(-1, 10) for name in ("y_mean", "y_sd"))
+        share = stats.norm.cdf((y[known:, 0] - mean) / sd).mean(axis=0)
+        pit.append(share)
+        covered.append((share > 0.025) & (share < 0.975))
+    covered = np.array(covered)
+    rate, error = covered.mean(), covered.mean(axis=1).std() / np.sqrt(runs)
+    half = (np.abs(np.array(pit) - 0.5) < 0.25).mean()
+    print(f"\n{model.__name__}: 95% bands cover {100 * rate:.1f}% (se {100 * error:.1f}), "
+          f"first row {100 * covered[:, 0].mean():.1f}%, last row {100 * covered[:, -1].mean():.1f}%; 50% bands "
+          f"{100 * half:.1f}%")
+    assert abs(rate - 0.95) < 0.03
