@@ -15,7 +15,7 @@ and the log evidence, with I the integral of all sites that the filter gives,
     Laplace       log I + sum_i [log p_i - log t_i](mean of q).
 
 The first two are stationary in the sites and in the cavities where these do not change, so that a gradient holds both
-fixed and costs that of one filter.
+fixed and costs that of one filter. That of Laplace's goes through one more step to the mode.
 
 What is not Gaussian enters by `EntryTerms`: a colleague of `FamilyTerms` needs ``tilted`` alone, in closed form if it
 has one, to be refined by EP.
@@ -440,16 +440,33 @@ def _until_converged(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, settings:
         at = cavities(predictor, sites, terms.present, settings.power)
         # Two sites that answer each other overshoot; taking less of each new one ends that.
         sites, change = new_sites(terms, sites, at, settings, damping)
+        # Where the filter breaks down no sweep helps.
+        whole = jnp.isfinite(predictor.mean).all() & jnp.isfinite(predictor.covariance).all()
+        change = jnp.where(whole, change, jnp.nan)
         damping = jnp.where(change > last, jnp.maximum(0.5 * damping, 0.05), damping)
         return sites, at, change, damping, count + 1
 
     def going(carry: tuple) -> jax.Array:
         change, count = carry[2], carry[4]
-        return ~(change < _TOLERANCE) & (count < settings.sweeps)
+        return (change >= _TOLERANCE) & (count < settings.sweeps)
 
     carry = sweep((first, None, jnp.asarray(jnp.inf), jnp.asarray(settings.damping), jnp.asarray(0)))
     sites, at, change, _, count = jax.lax.while_loop(going, sweep, carry)
     return Converged(sites, at, change, count, (change < _TOLERANCE) & at.valid.all())
+
+
+def _newton_step(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, terms: EntryTerms,
+                 settings: SiteSettings, start: Moments, refined: Refined) -> tuple[Sites, Cavity]:
+    """Make one more step to the mode, whose derivative is the mode's.
+
+    Laplace's evidence is not stationary in its sites. A Newton step from the mode leads back to it, and does not depend
+    on where it starts, to first order: what it depends on otherwise the mode depends on.
+    """
+    found = refined.found
+    sites, _ = new_sites(terms, found.sites, found.cavity, settings, 1.0)
+    predictor = _smoothed(ssm, rule, grid, y, start, sites, refined.points, "all")[2]
+    at = cavities(predictor, sites, terms.present, 1.0)
+    return new_sites(terms, sites, at, settings, 1.0)[0], at
 
 
 class Prequential(NamedTuple):
@@ -529,8 +546,10 @@ def evidence(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, ter
     start = Moments(*ssm.initial()) if start is None else start
     refined = refine(ssm, rule, grid, y, terms, settings, start, first)
     found = refined.found
-    passed = forward(ssm, rule, grid, y, start=start, linearization_point=refined.points, keep=keep,
-                     sites=found.sites)
-    entries = log_evidence_terms(terms, found.sites, found.cavity, settings)
+    sites, at = found.sites, found.cavity
+    if settings.method == "laplace":
+        sites, at = _newton_step(ssm, rule, grid, y, terms, settings, start, refined)
+    passed = forward(ssm, rule, grid, y, start=start, linearization_point=refined.points, keep=keep, sites=sites)
+    entries = log_evidence_terms(terms, sites, at, settings)
     total = passed.log_likelihood.sum() + entries.sum()
     return Evidence(jnp.where(found.converged, total, -jnp.inf), entries, passed, refined)

@@ -13,6 +13,7 @@ import lfm_ppl as lfm
 from lfm_ppl.filtering.filter import as_rule, forward
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.rts import backward
+from lfm_ppl.filtering.site_importance import importance_weights
 from lfm_ppl.filtering.sites import (
     FamilyTerms,
     SiteSettings,
@@ -114,8 +115,8 @@ def differences(value, theta, h=1e-3):
 
 
 @pytest.mark.parametrize("name", FAMILIES)
-@pytest.mark.parametrize("sites", [None, SiteSettings(power=0.5), SiteSettings("variational")],
-                         ids=["EP", "power EP", "variational"])
+@pytest.mark.parametrize("sites", [None, SiteSettings(power=0.5), SiteSettings("variational"), SiteSettings("laplace")],
+                         ids=["EP", "power EP", "variational", "Laplace"])
 def test_gradient_is_that_of_the_value(name, sites):
     """By differences of fourth order; the sites are held fixed, and what the family's parameters do is not."""
     if name != "Poisson" and sites is not None:
@@ -268,3 +269,20 @@ def test_non_linear_dynamics_against_particles_and_differences():
     runs = [float(lfm.particle_filter(jax.random.key(k), pushed(theta), TIMES, y, particles=20_000, steps=8
                                       ).log_likelihood.sum()) for k in range(8)]
     assert abs(float(log_prob(theta)) - np.mean(runs)) < 0.2 + 4 * np.std(runs) / np.sqrt(8)
+
+
+@pytest.mark.parametrize("name", ["Poisson", "Student-t"])
+def test_weighted_draws_of_the_smoother_estimate_the_evidence(name):
+    """Against importance sampling by dense algebra, to five standard errors of both; also with negative precisions."""
+    y = data(name)
+    distribution = likelihood(name, THETA)
+    run = jax.jit(lambda key: importance_weights(distribution.ssm, distribution.rule, distribution.time_grid,
+                                                 jnp.asarray(y), key, 20_000, SiteSettings()))
+    log_weights = np.asarray(run(jax.random.key(0)))
+    result = distribution.smooth(y)
+    cov = np.cov(np.asarray(result.sample(jax.random.key(0), 4000).forces["u"]).T) * 1.1
+    log_z, error, *_ = importance(name, y, np.asarray(result.force("u").mean), cov)
+    weight = np.exp(log_weights - log_weights.max())
+    own = weight.std() / weight.mean() / np.sqrt(weight.size)
+    assert own < 0.02
+    assert abs(log_weights.max() + np.log(weight.mean()) - log_z) < 5 * np.hypot(own, error)
