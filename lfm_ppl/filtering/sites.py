@@ -313,8 +313,7 @@ def assumed_density(family: ObservationFamily) -> Callable[..., Sites]:
 
 def assumed_tilted(log_prob: Callable, mean: jax.Array, variance: jax.Array) -> tuple[Marginal, Tilted]:
     """Return a prediction of a row's predictor (D,), and the moments of it tilted by log p."""
-    # A predictor that is known has a variance of zero, or of rounding errors.
-    cavity = Marginal(mean, jnp.maximum(variance, 1e-20 * (1e-6 + mean**2)))
+    cavity = _known(mean, variance)
     near = _mode(log_prob, cavity)
     for _ in range(2):
         found = tilted_moments(jax.vmap(log_prob), cavity, near)
@@ -375,7 +374,8 @@ def refine(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, terms
         terms: what the sites stand for.
         settings: how they are refined.
         start: moments at the initial time.
-        first: sites to begin with; None: by `assumed_density`, of a model with an observation family.
+        first: sites to begin with; None, of a model with an observation family: from the prior's marginals in a linear
+            model, by `assumed_density` in another.
     """
     points = None
     if first is None:
@@ -406,14 +406,42 @@ def _stop(leaf: Any) -> Any:
 
 def _first(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments,
            family: ObservationFamily) -> Sites:
+    if is_linear(ssm):
+        return _from_prior(ssm, rule, grid, y, start, family)
     passed = forward(ssm, rule, grid, y, start=start, keep="moments", sites=assumed_density(family))
     return Sites(*(at_rows(a, grid.observed) for a in passed.site_terms.sites))
+
+
+def _from_prior(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments,
+                family: ObservationFamily) -> Sites:
+    """Return sites with the modes and curvatures of the prior's marginals times the data's factors.
+
+    All at once, which is faster than one after the other in the scan; in a model that is not linear the prior may run
+    away from the data.
+    """
+    nothing = jnp.zeros_like(y)
+    passed = forward(ssm, rule, grid, jnp.full(y.shape, jnp.nan), start=start, keep="moments",
+                     sites=Sites(nothing, nothing, nothing))
+    at = passed.site_terms
+    mean, variance = at_rows(at.value, grid.observed), at_rows(diagonal(at.variance), grid.observed)
+    cavity = _known(mean, variance)
+    found = _mode(FamilyTerms(family, y).log_prob, cavity)
+    tau = jnp.where(jnp.isfinite(y), 1.0 / found.variance - 1.0 / cavity.variance, 0.0)
+    # The mode of the product is where the slopes cancel.
+    nu = jnp.where(jnp.isfinite(y), (found.mean - mean) / cavity.variance, 0.0)
+    return Sites(found.mean, nu, jnp.maximum(tau, 0.0))
+
+
+def _known(mean: jax.Array, variance: jax.Array) -> Marginal:
+    """Return a marginal whose variance is above zero: a predictor that is known has one of rounding errors."""
+    return Marginal(mean, jnp.maximum(variance, 1e-20 * (1e-6 + mean**2)))
 
 
 def _smoothed(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments, sites: Sites,
               points: Points | None, keep: str) -> tuple[Pass, Smoothed, Predictor]:
     passed = forward(ssm, rule, grid, y, start=start, linearization_point=points, keep=keep, sites=sites)
-    smoothed = backward(passed, start, grid)
+    smoothed = backward(passed, start, grid, moments=keep == "inside")
+    assert smoothed.predictor is not None
     predictor = Predictor(*(at_rows(a, grid.observed) for a in smoothed.predictor))
     return passed, smoothed, predictor
 

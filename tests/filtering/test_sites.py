@@ -90,7 +90,8 @@ def importance(name, y, mean, cov):
     return log_weight.max() + np.log(weight.mean()), error, first, np.sqrt(share @ (f - first) ** 2)
 
 
-@pytest.mark.parametrize("name", FAMILIES)
+@pytest.mark.parametrize("name", [name if name == "Student-t" else pytest.param(name, marks=pytest.mark.slow)
+                                  for name in FAMILIES])
 def test_evidence_and_posterior_against_importance_sampling(name):
     """The proposal is dense algebra with the smoothed marginals' own precisions; its weights correct it."""
     y, k = data(name), covariance(np.asarray(THETA))
@@ -115,8 +116,10 @@ def differences(value, theta, h=1e-3):
 
 
 @pytest.mark.parametrize("name, sites", [
-    *((name, None) for name in FAMILIES),
-    *(("Poisson", sites) for sites in (SiteSettings(power=0.5), SiteSettings("variational"), SiteSettings("laplace"))),
+    ("Student-t", None),
+    *(pytest.param(name, None, marks=pytest.mark.slow) for name in ("Poisson", "negative binomial", "Bernoulli")),
+    *(pytest.param("Poisson", sites, marks=pytest.mark.slow)
+      for sites in (SiteSettings(power=0.5), SiteSettings("variational"), SiteSettings("laplace"))),
 ])
 def test_gradient_is_that_of_the_value(name, sites):
     """By differences of fourth order; the sites are held fixed, and what the family's parameters do is not."""
@@ -126,6 +129,7 @@ def test_gradient_is_that_of_the_value(name, sites):
     np.testing.assert_allclose(gradient, differences(value, THETA), atol=2e-7)
 
 
+@pytest.mark.slow
 def test_gradient_is_that_of_all_sweeps():
     """Differentiate through 25 sweeps, cavities and all, with nothing held fixed."""
     y = jnp.asarray(data("Poisson"))
@@ -213,6 +217,7 @@ def test_leave_one_out_terms_are_differences_of_evidences():
     assert distribution.log_prob_per_observation(y).sum() == pytest.approx(float(log_prob(y)), abs=0.2)
 
 
+@pytest.mark.slow
 def test_draws_are_those_of_the_smoothed_moments_where_precisions_are_negative():
     y = data("Student-t")
     result = likelihood("Student-t", THETA).smooth(y, np.linspace(0.0, 9.0, 5))
@@ -222,6 +227,7 @@ def test_draws_are_those_of_the_smoothed_moments_where_precisions_are_negative()
     assert np.abs(draws.std(0) / sd - 1).max() < 5 / np.sqrt(2 * 20_000)
 
 
+@pytest.mark.slow
 def test_what_is_missing_changes_nothing():
     """Times without an observation, and rows of which one entry is missing."""
     y = data("Poisson")
@@ -270,6 +276,7 @@ def test_non_linear_dynamics_against_particles_and_differences():
     assert abs(float(log_prob(theta)) - np.mean(runs)) < 0.2 + 4 * np.std(runs) / np.sqrt(8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["Poisson", "Student-t"])
 def test_weighted_draws_of_the_smoother_estimate_the_evidence(name):
     """Against importance sampling by dense algebra, to five standard errors of both; also with negative precisions."""
