@@ -17,8 +17,11 @@ and the log evidence, with I the integral of all sites that the filter gives,
 The first two are stationary in the sites and in the cavities where these do not change, so that a gradient holds both
 fixed and costs that of one filter. That of Laplace's goes through one more step to the mode.
 
-What is not Gaussian enters by `EntryTerms`: a colleague of `FamilyTerms` needs ``tilted`` alone, in closed form if it
-has one, to be refined by EP.
+What is not Gaussian enters by `EntryTerms`: to be refined by EP it needs ``tilted`` and ``present`` alone, with moments
+in closed form where there are any.
+
+Source: Minka (2001), A family of algorithms for approximate Bayesian inference; Nickisch, Solin and Grigorevskiy
+(2018), ICML; Wilkinson, Särkkä and Solin (2023), Journal of Machine Learning Research 24; Khan and Lin (2017), AISTATS.
 """
 
 from __future__ import annotations
@@ -381,11 +384,8 @@ def refine(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, terms
     if first is None:
         family = ssm.model.observation
         assert isinstance(family, ObservationFamily)
-        if is_linear(ssm):
-            held = _held(lambda y, start: _first(ssm, rule, grid, y, start, family), y, start)
-        else:
-            held = _first(ssm, rule, grid, y, start, family)
-        first = held
+        begin = lambda y, start: _first(ssm, rule, grid, y, start, family)  # noqa: E731
+        first = _held(begin, y, start) if is_linear(ssm) else begin(y, start)
     if not is_linear(ssm):
         first, points = _joint_sweeps(ssm, rule, grid, y, terms, settings, start, first)
     # The terms hold functions, so that they are closed over, and no argument.
