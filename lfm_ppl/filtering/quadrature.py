@@ -54,20 +54,22 @@ def tilted_moments(log_function: Callable[[jax.Array], jax.Array], cavity: Margi
 
     Source: Mori and Sugihara (2001), Journal of Computational and Applied Mathematics 127.
     """
-    nodes, log_weights = _rule()
     lead = (_NODES,) + (1,) * jnp.ndim(cavity.mean)
-    x, log_weights = jnp.asarray(nodes).reshape(lead), jnp.asarray(log_weights).reshape(lead)
+    x, log_weights = (jnp.asarray(part).reshape(lead) for part in _rule())
     sd = jnp.sqrt(near.variance)
     f = near.mean + sd * x
-    log_prior = -0.5 * ((f - cavity.mean) ** 2 / cavity.variance + jnp.log(cavity.variance) + _LOG_2PI)
-    log_mass = log_weights + jnp.log(sd) + log_prior + log_function(f)
+    log_mass = log_weights - 0.5 * (f - cavity.mean) ** 2 / cavity.variance + log_function(f)
     # Not a number is no mass: a link that overflows far out.
     log_mass = jnp.where(jnp.isnan(log_mass), -jnp.inf, log_mass)
-    log_partition = jax.scipy.special.logsumexp(log_mass, axis=0)
-    finite = jnp.where(jnp.isfinite(log_partition), log_partition, 0.0)
-    mass = jnp.exp(log_mass - finite)
-    middle = (mass * x).sum(0)
-    return Tilted(log_partition, near.mean + sd * middle, near.variance * (mass * (x - middle) ** 2).sum(0))
+    largest = jax.lax.stop_gradient(log_mass.max(0))
+    mass = jnp.exp(log_mass - jnp.where(jnp.isfinite(largest), largest, 0.0))
+    total = mass.sum(0)
+    possible = total > 0
+    total = jnp.where(possible, total, 1.0)
+    log_partition = jnp.where(possible, largest + jnp.log(total), -jnp.inf) + 0.5 * (
+        jnp.log(near.variance / cavity.variance) - _LOG_2PI)
+    middle = (mass * x).sum(0) / total
+    return Tilted(log_partition, near.mean + sd * middle, near.variance * (mass * (x - middle) ** 2).sum(0) / total)
 
 
 def expectations(function: Callable[[jax.Array], jax.Array], about: Marginal) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -76,9 +78,9 @@ def expectations(function: Callable[[jax.Array], jax.Array], about: Marginal) ->
     The derivatives are those of the quadrature itself.
     """
     nodes, log_weights = _rule()
-    weights = np.exp(log_weights - 0.5 * nodes**2 - 0.5 * _LOG_2PI)
+    shares = np.exp(log_weights - 0.5 * nodes**2)
     lead = (_NODES,) + (1,) * jnp.ndim(about.mean)
-    x, weights = jnp.asarray(nodes).reshape(lead), jnp.asarray(weights / weights.sum()).reshape(lead)
+    x, weights = (jnp.asarray(part).reshape(lead) for part in (nodes, shares / shares.sum()))
 
     def mean(m: jax.Array, v: jax.Array) -> jax.Array:
         value = function(m + jnp.sqrt(v) * x)

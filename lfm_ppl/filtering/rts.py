@@ -11,7 +11,7 @@ from lfm_ppl.filtering.filter import Pass
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.smoothing_kernel import smoothed_moments, smoothing_kernel
 from lfm_ppl.filtering.time_grid import TimeGrid
-from lfm_ppl.linalg import cholesky, congruence, diagonal, log_density, matmul, outer_square, solve_lower
+from lfm_ppl.linalg import cholesky, congruence, diagonal, log_density, matmul, outer_square, solve_lower, symmetric
 
 
 class Predictor(NamedTuple):
@@ -52,13 +52,19 @@ def at_start(filtered: Moments, start: Moments) -> Moments:
     return jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a[None], b[:-1]]), start, filtered)
 
 
-def backward(passed: Pass, start: Moments, grid: TimeGrid) -> Smoothed:
+def backward(passed: Pass, start: Moments, grid: TimeGrid, moments: bool = True) -> Smoothed:
     """Run the one backward scan.
 
     Moments follow Rauch, Tung and Striebel, with the gain from a semi-definite solve and the covariance as a sum of
     squares, or the adjoint of Bryson and Frazier, r and Lambda, which needs no inverse of a covariance
     (`smoothed_moments` says when). With u = S^-1 v - K' r and C = S^-1 + K' Lambda K, an observation given all the
     others is N(y - C^-1 u, C^-1).
+
+    Args:
+        passed: the forward scan, with what the smoother needs.
+        start: moments at the initial time.
+        grid: the time grid.
+        moments: whether those of the state are wanted; without them only the adjoint is run, and they stay as filtered.
     """
     length = jnp.asarray(grid.intervals.length)
     still = (length == 0) & (jnp.asarray(grid.intervals.jump) < 0)
@@ -68,14 +74,16 @@ def backward(passed: Pass, start: Moments, grid: TimeGrid) -> Smoothed:
     def step(carry: tuple, row: tuple) -> tuple[tuple, tuple]:
         later, r, adjoint = carry
         at, one, at_rest = row
-        gain, conditional = smoothing_kernel(at, one.predicted, one.phi, one.process_cov)
         if one.site_terms is None:
             left_out, r, adjoint = _leave_one_out(one, r, adjoint)
             predictor = None
         else:
             left_out = jnp.zeros(())
-            predictor, r, adjoint = _predictor(one, later, r, adjoint)
+            predictor, r, adjoint = _predictor(one, r, adjoint)
         back = matmul(one.phi.T, r[:, None])[:, 0], congruence(one.phi.T, adjoint)
+        if not moments:
+            return (at, *back), (later, left_out, (r, adjoint), predictor)
+        gain, conditional = smoothing_kernel(at, one.predicted, one.phi, one.process_cov)
         smoothed = smoothed_moments(at, one.predicted, later, gain, conditional, *back)
         # Nothing happens in an interval without length but for the observation at its end.
         smoothed = jax.tree_util.tree_map(lambda a, b: jnp.where(at_rest, a, b), later, smoothed)
@@ -85,29 +93,23 @@ def backward(passed: Pass, start: Moments, grid: TimeGrid) -> Smoothed:
     carry = (last, jnp.zeros(size), jnp.zeros((size, size)))
     (first, _, _), (ends, left_out, adjoint, predictor) = jax.lax.scan(
         step, carry, (before, passed._replace(steps=None), still), reverse=True)
-    moments = jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a[None], b]), first, ends)
-    return Smoothed(moments, left_out, adjoint, predictor)
+    every = jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a[None], b]), first, ends)
+    return Smoothed(every, left_out, adjoint, predictor)
 
 
-def _predictor(one: Pass, later: Moments, r: jax.Array,
-               adjoint: jax.Array) -> tuple[Predictor, jax.Array, jax.Array]:
+def _predictor(one: Pass, r: jax.Array, adjoint: jax.Array) -> tuple[Predictor, jax.Array, jax.Array]:
     """The predictor at an interval's end given all sites, and the adjoint there with the sites at it.
 
-    ``later`` holds the smoothed moments at the interval's end, r and Lambda what comes after it.
+    With M = (I + T F)^-1 and r and Lambda of what comes later, the predictor has the mean f + F S^-1 v + M' H P r and
+    the covariance F M - M' H P Lambda P H' M: no difference of variances that are larger than the site leaves them.
     """
     terms, jacobian = one.site_terms, one.jacobian
     u = terms.score - matmul(one.gain.T, r[:, None])[:, 0]
     precision = terms.precision + congruence(one.gain.T, adjoint)
-    # f = value + H (s - m_p) + e: of e the adjoint says what it does of s.
-    residual_cov = terms.residual_cov
-    mean = (terms.value + matmul(jacobian, (later.mean - one.predicted.mean)[:, None])[:, 0]
-            + matmul(residual_cov, u[:, None])[:, 0])
+    through = matmul(terms.shrinkage.T, matmul(jacobian, one.predicted.covariance))
+    mean = (terms.value + matmul(terms.variance, terms.score[:, None])[:, 0] + matmul(through, r[:, None])[:, 0])
+    covariance = symmetric(matmul(terms.variance, terms.shrinkage)) - congruence(through, adjoint)
     kept = jnp.eye(r.shape[0]) - matmul(one.gain, jacobian)
-    shared = matmul(matmul(jacobian, one.predicted.covariance),
-                    matmul(kept.T, matmul(adjoint, one.gain)) - matmul(jacobian.T, terms.precision))
-    shared = matmul(shared, residual_cov)
-    covariance = (congruence(jacobian, later.covariance) + residual_cov - congruence(residual_cov, precision)
-                  + shared + shared.T)
     r = matmul(jacobian.T, terms.score[:, None])[:, 0] + matmul(kept.T, r[:, None])[:, 0]
     adjoint = congruence(jacobian.T, terms.precision) + congruence(kept.T, adjoint)
     return Predictor(mean, covariance, u, precision), r, adjoint

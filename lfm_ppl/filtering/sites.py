@@ -15,10 +15,13 @@ and the log evidence, with I the integral of all sites that the filter gives,
     Laplace       log I + sum_i [log p_i - log t_i](mean of q).
 
 The first two are stationary in the sites and in the cavities where these do not change, so that a gradient holds both
-fixed and costs that of one filter.
+fixed and costs that of one filter. That of Laplace's goes through one more step to the mode.
 
-What is not Gaussian enters by `EntryTerms`: a colleague of `FamilyTerms` needs ``tilted`` alone, in closed form if it
-has one, to be refined by EP.
+What is not Gaussian enters by `EntryTerms`: to be refined by EP it needs ``tilted`` and ``present`` alone, with moments
+in closed form where there are any.
+
+Source: Minka (2001), A family of algorithms for approximate Bayesian inference; Nickisch, Solin and Grigorevskiy
+(2018), ICML; Wilkinson, Särkkä and Solin (2023), Journal of Machine Learning Research 24; Khan and Lin (2017), AISTATS.
 """
 
 from __future__ import annotations
@@ -313,8 +316,7 @@ def assumed_density(family: ObservationFamily) -> Callable[..., Sites]:
 
 def assumed_tilted(log_prob: Callable, mean: jax.Array, variance: jax.Array) -> tuple[Marginal, Tilted]:
     """Return a prediction of a row's predictor (D,), and the moments of it tilted by log p."""
-    # A predictor that is known has a variance of zero, or of rounding errors.
-    cavity = Marginal(mean, jnp.maximum(variance, 1e-20 * (1e-6 + mean**2)))
+    cavity = _known(mean, variance)
     near = _mode(log_prob, cavity)
     for _ in range(2):
         found = tilted_moments(jax.vmap(log_prob), cavity, near)
@@ -375,17 +377,15 @@ def refine(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, terms
         terms: what the sites stand for.
         settings: how they are refined.
         start: moments at the initial time.
-        first: sites to begin with; None: by `assumed_density`, of a model with an observation family.
+        first: sites to begin with; None, of a model with an observation family: from the prior's marginals in a linear
+            model, by `assumed_density` in another.
     """
     points = None
     if first is None:
         family = ssm.model.observation
         assert isinstance(family, ObservationFamily)
-        if is_linear(ssm):
-            held = _held(lambda y, start: _first(ssm, rule, grid, y, start, family), y, start)
-        else:
-            held = _first(ssm, rule, grid, y, start, family)
-        first = held
+        begin = lambda y, start: _first(ssm, rule, grid, y, start, family)  # noqa: E731
+        first = _held(begin, y, start) if is_linear(ssm) else begin(y, start)
     if not is_linear(ssm):
         first, points = _joint_sweeps(ssm, rule, grid, y, terms, settings, start, first)
     # The terms hold functions, so that they are closed over, and no argument.
@@ -406,14 +406,42 @@ def _stop(leaf: Any) -> Any:
 
 def _first(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments,
            family: ObservationFamily) -> Sites:
+    if is_linear(ssm):
+        return _from_prior(ssm, rule, grid, y, start, family)
     passed = forward(ssm, rule, grid, y, start=start, keep="moments", sites=assumed_density(family))
     return Sites(*(at_rows(a, grid.observed) for a in passed.site_terms.sites))
+
+
+def _from_prior(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments,
+                family: ObservationFamily) -> Sites:
+    """Return sites with the modes and curvatures of the prior's marginals times the data's factors.
+
+    All at once, which is faster than one after the other in the scan; in a model that is not linear the prior may run
+    away from the data.
+    """
+    nothing = jnp.zeros_like(y)
+    passed = forward(ssm, rule, grid, jnp.full(y.shape, jnp.nan), start=start, keep="moments",
+                     sites=Sites(nothing, nothing, nothing))
+    at = passed.site_terms
+    mean, variance = at_rows(at.value, grid.observed), at_rows(diagonal(at.variance), grid.observed)
+    cavity = _known(mean, variance)
+    found = _mode(FamilyTerms(family, y).log_prob, cavity)
+    tau = jnp.where(jnp.isfinite(y), 1.0 / found.variance - 1.0 / cavity.variance, 0.0)
+    # The mode of the product is where the slopes cancel.
+    nu = jnp.where(jnp.isfinite(y), (found.mean - mean) / cavity.variance, 0.0)
+    return Sites(found.mean, nu, jnp.maximum(tau, 0.0))
+
+
+def _known(mean: jax.Array, variance: jax.Array) -> Marginal:
+    """Return a marginal whose variance is above zero: a predictor that is known has one of rounding errors."""
+    return Marginal(mean, jnp.maximum(variance, 1e-20 * (1e-6 + mean**2)))
 
 
 def _smoothed(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments, sites: Sites,
               points: Points | None, keep: str) -> tuple[Pass, Smoothed, Predictor]:
     passed = forward(ssm, rule, grid, y, start=start, linearization_point=points, keep=keep, sites=sites)
-    smoothed = backward(passed, start, grid)
+    smoothed = backward(passed, start, grid, moments=keep == "inside")
+    assert smoothed.predictor is not None
     predictor = Predictor(*(at_rows(a, grid.observed) for a in smoothed.predictor))
     return passed, smoothed, predictor
 
@@ -440,16 +468,33 @@ def _until_converged(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, settings:
         at = cavities(predictor, sites, terms.present, settings.power)
         # Two sites that answer each other overshoot; taking less of each new one ends that.
         sites, change = new_sites(terms, sites, at, settings, damping)
+        # Where the filter breaks down no sweep helps.
+        whole = jnp.isfinite(predictor.mean).all() & jnp.isfinite(predictor.covariance).all()
+        change = jnp.where(whole, change, jnp.nan)
         damping = jnp.where(change > last, jnp.maximum(0.5 * damping, 0.05), damping)
         return sites, at, change, damping, count + 1
 
     def going(carry: tuple) -> jax.Array:
         change, count = carry[2], carry[4]
-        return ~(change < _TOLERANCE) & (count < settings.sweeps)
+        return (change >= _TOLERANCE) & (count < settings.sweeps)
 
     carry = sweep((first, None, jnp.asarray(jnp.inf), jnp.asarray(settings.damping), jnp.asarray(0)))
     sites, at, change, _, count = jax.lax.while_loop(going, sweep, carry)
     return Converged(sites, at, change, count, (change < _TOLERANCE) & at.valid.all())
+
+
+def _newton_step(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, terms: EntryTerms,
+                 settings: SiteSettings, start: Moments, refined: Refined) -> tuple[Sites, Cavity]:
+    """Make one more step to the mode, whose derivative is the mode's.
+
+    Laplace's evidence is not stationary in its sites. A Newton step from the mode leads back to it, and does not depend
+    on where it starts, to first order: what it depends on otherwise the mode depends on.
+    """
+    found = refined.found
+    sites, _ = new_sites(terms, found.sites, found.cavity, settings, 1.0)
+    predictor = _smoothed(ssm, rule, grid, y, start, sites, refined.points, "all")[2]
+    at = cavities(predictor, sites, terms.present, 1.0)
+    return new_sites(terms, sites, at, settings, 1.0)[0], at
 
 
 class Prequential(NamedTuple):
@@ -529,8 +574,10 @@ def evidence(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, ter
     start = Moments(*ssm.initial()) if start is None else start
     refined = refine(ssm, rule, grid, y, terms, settings, start, first)
     found = refined.found
-    passed = forward(ssm, rule, grid, y, start=start, linearization_point=refined.points, keep=keep,
-                     sites=found.sites)
-    entries = log_evidence_terms(terms, found.sites, found.cavity, settings)
+    sites, at = found.sites, found.cavity
+    if settings.method == "laplace":
+        sites, at = _newton_step(ssm, rule, grid, y, terms, settings, start, refined)
+    passed = forward(ssm, rule, grid, y, start=start, linearization_point=refined.points, keep=keep, sites=sites)
+    entries = log_evidence_terms(terms, sites, at, settings)
     total = passed.log_likelihood.sum() + entries.sum()
     return Evidence(jnp.where(found.converged, total, -jnp.inf), entries, passed, refined)

@@ -681,7 +681,7 @@ def bind(model: Callable, times: Any, y: Any, **keywords: Any) -> BoundModel:
     if isinstance(distribution, Panel):
         distribution.checked(given)
     else:
-        check_observations(given, *distribution.event_shape, model=distribution.model)
+        check_observations(given, *distribution.event_shape, False, distribution.model)
     return bound
 
 

@@ -13,6 +13,7 @@ import numpy as np
 import xarray as xr
 
 from lfm_ppl import checks
+from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.results import arviz_data, importance, likelihoods, rebuilding
 from lfm_ppl.results import checkpoint as checkpoints
@@ -233,7 +234,11 @@ def _check_sampler(result: Any) -> None:
 
 def _kind(reference: str, ssm: StateSpaceModel) -> str:
     """Return "grid", "particles" or "none"."""
-    one_state = ssm.state_dim == 1
+    family = isinstance(ssm.model.observation, ObservationFamily)
+    if reference == "grid" and family:
+        raise ValueError("reference='grid' takes Gaussian observations, and this model has an observation family. Use "
+                         "reference='particles'.")
+    one_state = ssm.state_dim == 1 and not family
     if reference == "grid" and not one_state:
         names = (*ssm.model.state_names, *ssm.model.force_names)
         raise ValueError(f"reference='grid' takes models of one state; this one has {ssm.state_dim}, of "

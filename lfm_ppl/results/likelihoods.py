@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lfm_ppl.filtering import site_importance
+from lfm_ppl.filtering.sites import as_settings, is_linear
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.fokker_planck_grid import fokker_planck
 from lfm_ppl.inference.bound_model import BoundModel
@@ -144,9 +146,14 @@ def on_grid(problem: PosteriorDraws, steps: int | None, progress: bool) -> Refer
     return Reference(found[:, None], f"Fokker-Planck equation on a grid of {layout.cells} cells")
 
 
+def takes_smoother_draws(ssm: StateSpaceModel) -> bool:
+    """Whether draws of the smoother, weighted, estimate the likelihood: linear, with an observation family."""
+    return isinstance(ssm.model.observation, ObservationFamily) and is_linear(ssm)
+
+
 def by_particles(problem: PosteriorDraws, particles: int | None, replicates: int, steps: int | None, key: jax.Array,
                  progress: bool, noise: Callable[[np.ndarray], float], target: float, most_work: float) -> Reference:
-    """Return replicates of the particle filter's estimates.
+    """Return replicates of the particle filter's estimates, or of importance sampling where `takes_smoother_draws`.
 
     Without a number of particles, a pilot run at a few draws, spread over all, finds the number at which the noise of
     a draw's averaged estimate is below ``target``, for the variance falls in proportion to it.
@@ -181,8 +188,9 @@ def by_particles(problem: PosteriorDraws, particles: int | None, replicates: int
         if wanted > chosen and most > chosen:
             chosen = int(np.ceil(min(wanted, most) / 500) * 500)
             run = _particle_run(problem, chosen, replicates, steps, progress)
-    return Reference(run(problem, key), f"particle filter, {replicates} runs of {chosen:,} particles a draw", chosen,
-                     limited)
+    method = (f"importance sampling, {replicates} runs of {chosen:,} draws of the smoother" if takes_smoother_draws(
+        example.ssm) else f"particle filter, {replicates} runs of {chosen:,} particles")
+    return Reference(run(problem, key), f"{method} a draw", chosen, limited)
 
 
 _FIRST_PARTICLES = 1000
@@ -199,6 +207,9 @@ def _particle_run(problem: PosteriorDraws, particles: int, replicates: int, step
     def one(distribution: MarginalLikelihood, y: jax.Array, key: jax.Array) -> jax.Array:
         time_grid = build_time_grid(distribution.ssm, distribution.times, steps or distribution.steps,
                                     distribution.max_step)
+        if takes_smoother_draws(distribution.ssm):
+            return site_importance.log_likelihood(distribution.ssm, distribution.rule, time_grid, y, key, particles,
+                                                  as_settings(distribution.sites))
         return particle_filter.log_likelihood(distribution.ssm, time_grid, y, key, settings)
 
     bound, series = problem.bound, problem.series

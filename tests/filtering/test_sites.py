@@ -13,6 +13,7 @@ import lfm_ppl as lfm
 from lfm_ppl.filtering.filter import as_rule, forward
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.rts import backward
+from lfm_ppl.filtering.site_importance import importance_weights
 from lfm_ppl.filtering.sites import (
     FamilyTerms,
     SiteSettings,
@@ -89,7 +90,8 @@ def importance(name, y, mean, cov):
     return log_weight.max() + np.log(weight.mean()), error, first, np.sqrt(share @ (f - first) ** 2)
 
 
-@pytest.mark.parametrize("name", FAMILIES)
+@pytest.mark.parametrize("name", [name if name == "Student-t" else pytest.param(name, marks=pytest.mark.slow)
+                                  for name in FAMILIES])
 def test_evidence_and_posterior_against_importance_sampling(name):
     """The proposal is dense algebra with the smoothed marginals' own precisions; its weights correct it."""
     y, k = data(name), covariance(np.asarray(THETA))
@@ -113,19 +115,21 @@ def differences(value, theta, h=1e-3):
             / (12 * h) for e in np.eye(theta.size)]
 
 
-@pytest.mark.parametrize("name", FAMILIES)
-@pytest.mark.parametrize("sites", [None, SiteSettings(power=0.5), SiteSettings("variational")],
-                         ids=["EP", "power EP", "variational"])
+@pytest.mark.parametrize("name, sites", [
+    ("Student-t", None),
+    *(pytest.param(name, None, marks=pytest.mark.slow) for name in ("Poisson", "negative binomial", "Bernoulli")),
+    *(pytest.param("Poisson", sites, marks=pytest.mark.slow)
+      for sites in (SiteSettings(power=0.5), SiteSettings("variational"), SiteSettings("laplace"))),
+])
 def test_gradient_is_that_of_the_value(name, sites):
     """By differences of fourth order; the sites are held fixed, and what the family's parameters do is not."""
-    if name != "Poisson" and sites is not None:
-        pytest.skip("one family for each method")
     y = data(name)
     value = jax.jit(lambda theta: likelihood(name, theta, sites).log_prob(y))
     gradient = np.asarray(jax.jit(jax.grad(lambda theta: likelihood(name, theta, sites).log_prob(y)))(THETA))
     np.testing.assert_allclose(gradient, differences(value, THETA), atol=2e-7)
 
 
+@pytest.mark.slow
 def test_gradient_is_that_of_all_sweeps():
     """Differentiate through 25 sweeps, cavities and all, with nothing held fixed."""
     y = jnp.asarray(data("Poisson"))
@@ -213,6 +217,7 @@ def test_leave_one_out_terms_are_differences_of_evidences():
     assert distribution.log_prob_per_observation(y).sum() == pytest.approx(float(log_prob(y)), abs=0.2)
 
 
+@pytest.mark.slow
 def test_draws_are_those_of_the_smoothed_moments_where_precisions_are_negative():
     y = data("Student-t")
     result = likelihood("Student-t", THETA).smooth(y, np.linspace(0.0, 9.0, 5))
@@ -222,6 +227,7 @@ def test_draws_are_those_of_the_smoothed_moments_where_precisions_are_negative()
     assert np.abs(draws.std(0) / sd - 1).max() < 5 / np.sqrt(2 * 20_000)
 
 
+@pytest.mark.slow
 def test_what_is_missing_changes_nothing():
     """Times without an observation, and rows of which one entry is missing."""
     y = data("Poisson")
@@ -268,3 +274,21 @@ def test_non_linear_dynamics_against_particles_and_differences():
     runs = [float(lfm.particle_filter(jax.random.key(k), pushed(theta), TIMES, y, particles=20_000, steps=8
                                       ).log_likelihood.sum()) for k in range(8)]
     assert abs(float(log_prob(theta)) - np.mean(runs)) < 0.2 + 4 * np.std(runs) / np.sqrt(8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["Poisson", "Student-t"])
+def test_weighted_draws_of_the_smoother_estimate_the_evidence(name):
+    """Against importance sampling by dense algebra, to five standard errors of both; also with negative precisions."""
+    y = data(name)
+    distribution = likelihood(name, THETA)
+    run = jax.jit(lambda key: importance_weights(distribution.ssm, distribution.rule, distribution.time_grid,
+                                                 jnp.asarray(y), key, 20_000, SiteSettings()))
+    log_weights = np.asarray(run(jax.random.key(0)))
+    result = distribution.smooth(y)
+    cov = np.cov(np.asarray(result.sample(jax.random.key(0), 4000).forces["u"]).T) * 1.1
+    log_z, error, *_ = importance(name, y, np.asarray(result.force("u").mean), cov)
+    weight = np.exp(log_weights - log_weights.max())
+    own = weight.std() / weight.mean() / np.sqrt(weight.size)
+    assert own < 0.02
+    assert abs(log_weights.max() + np.log(weight.mean()) - log_z) < 5 * np.hypot(own, error)

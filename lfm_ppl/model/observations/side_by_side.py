@@ -117,7 +117,9 @@ class Observations(ObservationFamily):
     def check_data(self, y: Any, first_column: int = 0) -> None:
         """Check the columns of each part."""
         known = checks.concrete(y)
-        for part, columns in self._each() if known is not None else ():
+        if known is None:
+            return
+        for part, columns in self._each():
             part.check_data(known[:, columns], first_column + columns.start)
 
 
