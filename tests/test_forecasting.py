@@ -37,7 +37,7 @@ def predictions(result):
 def known():
     """Many draws of parameters that are all but known, and no trajectories."""
     return lfm.fit(motif.model, motif.TIMES, motif.data(), sampler="map", samples=DRAWS, trajectory_draws=0, seed=3,
-                   model_kwargs={"spread": NEAR}, progress=False)
+                   model_kwargs={"spread": NEAR}, progress=False, coords={"output": ["left", "right"]})
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +82,7 @@ def test_groups_coordinates_and_words(ahead, known):
     assert found["y"].dims == ("chain", "draw", "time", "output")
     assert found["forces"].dims == ("chain", "draw", "time", "force")
     np.testing.assert_array_equal(found["time"], AT)
-    assert found["output"].values.tolist() == ["a", "b"]
+    assert found["output"].values.tolist() == ["left", "right"]
     assert found["y"].attrs == {"long_name": "new observation, with noise", "units": "nM"}
     assert found["outputs"].attrs["long_name"] == "noise-free output"
     assert found.attrs["last_observation"] == motif.TIMES[-1]
@@ -183,6 +183,7 @@ def test_forecast_refuses_another_model_and_impossible_times(known):
         lfm.forecast(known, louder, AT, draws=2)
 
 
+@pytest.mark.slow
 def test_a_known_input_must_reach_the_forecast():
     def driven(times, y=None, heat=None):
         gain = numpyro.sample("gain", dist.LogNormal(0.0, NEAR))
@@ -202,6 +203,7 @@ def test_a_known_input_must_reach_the_forecast():
     np.testing.assert_allclose(found["y_mean"], 7.0, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_panel_is_forecast_series_by_series():
     def model(times, y=None):
         decay = numpyro.sample("decay", dist.LogNormal(jnp.log(jnp.array([0.5, 1.2])), NEAR).to_event(1))
