@@ -119,7 +119,7 @@ def _collected(mcmc: Any) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]
     try:
         samples = mcmc.get_samples(group_by_chain=True)
         fields = mcmc.get_extra_fields(group_by_chain=True)
-    except (AttributeError, TypeError, KeyError):  # what an MCMC raises that was never run
+    except (AssertionError, AttributeError, TypeError, KeyError):  # what an MCMC raises that was never run
         samples = None
     if not samples:
         raise ValueError("this MCMC has no draws; call mcmc.run(key, times, y) first.")

@@ -52,7 +52,7 @@ def test_forecasts_are_those_of_the_data_up_to_the_origin(linear):
 
 
 def test_further_origins_compile_nothing(linear):
-    """Linear and non-linear: every fit has the shape of the whole data."""
+    """Every fit has the shape of the whole data."""
     with compilations() as compiled:
         lfm.backtest(motif.model, TIMES, data() + 0.1, horizon=1, every=2, first=3, model_kwargs={"spread": NEAR})
     assert compiled == []
@@ -63,6 +63,7 @@ def well(times, y=None):
     numpyro.sample("y", lfm.MarginalLikelihood(systems.double_well(a=-a), times), obs=y)
 
 
+@pytest.mark.slow
 def test_a_nonlinear_model_is_simulated_from_each_origin():
     times, y = np.arange(5.0), np.array([[-0.9], [0.0], [0.1], [0.9], [1.1]])
     first = lfm.backtest(well, times, y, horizon=2, first=3, draws=1000)

@@ -35,8 +35,9 @@ def group(result, name):
 
 @pytest.fixture(scope="module")
 def mcmc():
-    run = MCMC(NUTS(model, forward_mode_differentiation=True), num_warmup=30, num_samples=20, num_chains=2, **QUIET)
-    run.run(jax.random.key(0), motif.TIMES, jnp.asarray(motif.data()), extra_fields=("energy", "potential_energy"))
+    # A walk compiles in less than NUTS, which the docstring's example runs.
+    run = MCMC(lfm.RAM(model), num_warmup=30, num_samples=20, num_chains=2, **QUIET)
+    run.run(jax.random.key(0), motif.TIMES, jnp.asarray(motif.data()), extra_fields=("accept_prob", "potential_energy"))
     return run
 
 
@@ -56,9 +57,9 @@ def test_a_plain_run_has_the_groups_of_a_fit(mcmc, converted):
     for name in ("decay", "lengthscale", "noise_sd", "half_life"):
         np.testing.assert_array_equal(group(converted, "posterior")[name], draws[name])
     stats = group(converted, "sample_stats")
-    assert {"diverging", "energy", "lp"} <= set(stats.data_vars)
+    assert {"acceptance_rate", "lp"} <= set(stats.data_vars)
     np.testing.assert_allclose(stats["lp"], -mcmc.get_extra_fields(group_by_chain=True)["potential_energy"])
-    assert arviz_data.attributes(converted)["sampler"] == "nuts"
+    assert arviz_data.attributes(converted)["sampler"] == "ram"
 
 
 def test_one_step_ahead_densities_are_those_of_the_exact_likelihood(converted):
@@ -86,8 +87,6 @@ def test_dimensions_and_columns_have_names(converted):
     for name in ("observed_data", "predictions", "posterior_predictive", "trajectories"):
         assert group(converted, name)["output"].values.tolist() == ["CDKN1A", "SESN1"]
     assert group(converted, "observed_data")["y"].attrs["units"] == "nM"  # of the model's outputs a and b
-    again = lfm.forecast(converted, model, [5.0], draws=4)
-    assert group(again, "predictions")["output"].values.tolist() == ["CDKN1A", "SESN1"]
 
 
 def test_derived_parameters_and_warnings_are_marked(converted):

@@ -15,8 +15,8 @@ MODULES = sorted(
 
 
 COSTLY = tuple(f"lfm_ppl.{name}" for name in (
-    "inference.handlers.settings", "inference.kernels.particle_marginal", "latent_grid.laplace", "results.accuracy",
-    "results.calibration"))
+    "backtesting", "conversion", "forecasting", "inference.handlers.settings", "inference.kernels.particle_marginal",
+    "latent_grid.laplace", "results.accuracy", "results.calibration"))
 """Modules whose examples take several seconds to compile; these are run with -m slow."""
 
 

@@ -64,6 +64,10 @@ def test_groups_and_dimensions(nuts):
         "posterior_predictive": {"y": ("chain", "draw", "time", "output")},
         "trajectories": {"forces": ("chain", "draw", "at", "force"), "states": ("chain", "draw", "at", "state"),
                          "outputs": ("chain", "draw", "at", "output")},
+        "predictions": {"y": ("chain", "draw", "time", "output"), "y_mean": ("chain", "draw", "time", "output"),
+                        "y_sd": ("chain", "draw", "time", "output"), "outputs_sd": ("chain", "draw", "time", "output"),
+                        "outputs": ("chain", "draw", "time", "output"), "forces": ("chain", "draw", "time", "force"),
+                        "states": ("chain", "draw", "time", "state")},
         "observed_data": {"y": ("time", "output")},
         "truth": {"forces": ("at_truth", "force"), "states": ("at_truth", "state"), "decay": ("output",),
                   "lengthscale": (), "noise_sd": ()},
@@ -318,7 +322,7 @@ def test_panel(tmp_path):
     result = quiet_fit(shared, times, y, sampler="ram", chains=2, warmup=20, samples=10, trajectory_draws=4,
                        at=[0.0, 2.0], chain_method="vectorized", sampler_options={"adapt": "throughout"})
     sizes = {name: dict(group(result, name).sizes) for name in arviz_data.groups(result)}
-    assert sizes["posterior"] == {"chain": 2, "draw": 10, "decay_dim_0": 2}
+    assert sizes["posterior"] == {"chain": 2, "draw": 10, "series": 2}
     assert sizes["log_likelihood"] == {"chain": 2, "draw": 10, "series": 2, "time": 4}
     assert sizes["one_step_ahead"] == {"chain": 2, "draw": 10, "series": 2, "time": 4, "output": 1}
     assert sizes["posterior_predictive"] == {"chain": 2, "draw": 2, "series": 2, "time": 4, "output": 1}

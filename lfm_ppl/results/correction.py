@@ -64,9 +64,8 @@ def correct_posterior(result: Any, numpyro_model: Callable, times: Any = None, y
         groups |= _paths(result, numpyro_model, times, y, model_kwargs, picked, trajectory_draws, seed)
     attrs = arviz_data.attributes(result)
     attrs |= {"sampler": f"{attrs.get('sampler', 'unknown')} + importance resampling", "chains": chains,
-              "samples": size, "reference": report.reference, "pareto_k": report.k,
-              "effective_draws": report.ess, "warnings": "[]",
-              "created_at": datetime.now(UTC).isoformat(timespec="seconds")}
+              "samples": size, "reference": report.reference, "pareto_k": report.k, "effective_draws": report.ess,
+              "warnings": "[]", "created_at": datetime.now(UTC).isoformat(timespec="seconds")}
     return arviz_data.build(groups, attrs)
 
 
