@@ -113,8 +113,9 @@ def fit(
         overwrite: replace a result or an unfinished run in ``checkpoint``.
         attributes: further attributes of the result.
 
-    Ctrl-C ends the sampling after the present block of steps, some two seconds, and the draws so far are returned, with
-    an attribute ``partial`` and a warning. Another one raises KeyboardInterrupt.
+    Ctrl-C ends the sampling after the present block of steps, some two seconds. With a ``checkpoint`` the draws so far
+    are returned, with an attribute ``partial`` and a warning; without one they are the attribute ``result`` of the
+    KeyboardInterrupt that is raised. A second Ctrl-C ends it at once.
 
     Returns:
         An ArviZ object (``InferenceData`` on ArviZ 0.23, ``xarray.DataTree`` on 1.x) with the groups
@@ -134,7 +135,7 @@ def fit(
         ValueError, TypeError: unknown sampler, wrong shapes, parameters to fix that do not exist, and so on; a run to
             go on with that was of something else.
         FileExistsError, FileNotFoundError: the folder holds a result or a run; no run to go on with.
-        KeyboardInterrupt: Ctrl-C before there was a draw, or a second one.
+        KeyboardInterrupt: Ctrl-C before there was a draw, without a checkpoint, or for the second time.
 
     Warns:
         UserWarning: the result is partial.
@@ -252,23 +253,37 @@ def fit(
         if partial is None:
             if run is not None:  # the draws are safe, whatever comes
                 stored(built(draws, stats, remarks, partial=_BARE))
+
+            def watched(what: str) -> dict[str, Any]:
+                return {"show": Counter(what, shown=progress), "parts": None if run is None else run.parts(what)}
+
             try:
-                rated = _kept("scores of the observations", lambda: scores(
-                    bound, flat, show=Counter("scores", shown=progress), parts=run and run.parts("scores")), None)
-                drawn = _kept("trajectories", lambda: _paths(
-                    keys[3], bound, flat, at, trajectory_draws, chains, samples, **particles,
-                    show=Counter("trajectories", shown=progress), parts=run and run.parts("trajectories")), drawn)
+                rated = _kept("scores of the observations", lambda: scores(bound, flat, **watched("scores")), None)
+                drawn = _kept("trajectories", lambda: _paths(keys[3], bound, flat, at, trajectory_draws, chains,
+                                                             samples, **particles, **watched("trajectories")), drawn)
             except KeyboardInterrupt:
                 partial = _BARE if rated is None else "all draws and their scores, without trajectories"
         result = stored(built(draws, stats, remarks, rated, drawn, partial))
         if run is not None and partial is None:
             run.finish()
     if partial is not None:
+        if run is None:
+            # Who runs one fit after another wants them all to end, and takes none for whole that is not.
+            raise _Stopped(result, f"stopped with {partial}; they are in the attribute `result` of this exception "
+                                   "(sys.last_value.result). With a folder, checkpoint=..., fit returns them")
         warnings.warn(f"the run was stopped, and its result is partial: {partial}.", stacklevel=2)
     if sampler != "map":
         for message in arviz_data.convergence_warnings(result):
             warnings.warn(message, ConvergenceWarning, stacklevel=2)
     return result
+
+
+class _Stopped(KeyboardInterrupt):
+    """Ctrl-C, with what there is: ``result``."""
+
+    def __init__(self, result: Any, message: str) -> None:
+        super().__init__(message)
+        self.result = result
 
 
 _OF_PARTICLES = ("particle_settings", "particle_steps")

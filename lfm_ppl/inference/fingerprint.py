@@ -53,18 +53,19 @@ def record(energy: Callable[[jax.Array, Any], Any], size: int, y: Any) -> Record
 def portable(energy: Callable[[jax.Array, Any], Any], size: int, y: Any) -> str:
     """Return a digest that is equal in all processes for models that compute the same; arguments as in `record`.
 
-    The order of the constants of a jaxpr, and with it the names of its variables, differ from process to process. Here
-    variables are numbered in the order of their use, and a constant stands where it is first used.
+    The order of the constants of a jaxpr, and with it the names of its variables, differ from process to process, and
+    so does that of its outputs, among which are the fields of a NumPyro distribution. Here variables are numbered in
+    the order of their use, a constant stands where it is first used, and outputs are sorted.
     """
     traced, _, settings = _traced(energy, size, y)
     found = hashlib.sha256()
-    for word in (*_words(traced.jaxpr, traced.consts), *settings):
+    for word in (*_words(traced.jaxpr, traced.consts, sort=True), *settings):
         found.update(_without_addresses(word).encode() if isinstance(word, str) else word)
     return found.hexdigest()
 
 
-def _words(jaxpr: Any, constants: Any) -> Iterator[str | bytes]:
-    """Yield what a jaxpr does, in the order in which it does it."""
+def _words(jaxpr: Any, constants: Any, sort: bool = False) -> Iterator[str | bytes]:
+    """Yield what a jaxpr does, in the order in which it does it; its outputs in any order, if they may be sorted."""
     values, numbers = dict(zip(jaxpr.constvars, constants, strict=True)), {v: i for i, v in enumerate(jaxpr.invars)}
 
     def named(variables: Any) -> Iterator[str | bytes]:
@@ -85,7 +86,11 @@ def _words(jaxpr: Any, constants: Any) -> Iterator[str | bytes]:
             yield from _parameter(value)
         yield from named(equation.outvars)
     yield "return "
-    yield from named(jaxpr.outvars)
+    if not sort:
+        yield from named(jaxpr.outvars)
+        return
+    yield from sorted(f"{numbers[v]}" if not hasattr(v, "val") and v in numbers
+                      else f"{v.aval}{_bytes(v.val if hasattr(v, 'val') else values[v])!r}" for v in jaxpr.outvars)
 
 
 def _parameter(value: Any) -> Iterator[str | bytes]:
@@ -96,6 +101,8 @@ def _parameter(value: Any) -> Iterator[str | bytes]:
     elif isinstance(value, (tuple, list)):
         for inner in value:
             yield from _parameter(inner)
+    elif isinstance(value, (np.ndarray, jax.Array)):
+        yield _bytes(value)
     elif isinstance(value, (set, frozenset)):
         yield from sorted(map(repr, value))
     elif not callable(value):  # of functions the jaxprs are there, too
