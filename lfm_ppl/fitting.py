@@ -254,13 +254,16 @@ def fit(
             if run is not None:  # the draws are safe, whatever comes
                 stored(built(draws, stats, remarks, partial=_BARE))
 
+            counter = Counter(shown=progress)
+
             def watched(what: str) -> dict[str, Any]:
-                return {"show": Counter(what, shown=progress), "parts": None if run is None else run.parts(what)}
+                return {"show": counter.of(what), "parts": None if run is None else run.parts(what)}
 
             try:
                 rated = _kept("scores of the observations", lambda: scores(bound, flat, **watched("scores")), None)
                 drawn = _kept("trajectories", lambda: _paths(keys[3], bound, flat, at, trajectory_draws, chains,
                                                              samples, **particles, **watched("trajectories")), drawn)
+                counter.close()
             except KeyboardInterrupt:
                 partial = _BARE if rated is None else "all draws and their scores, without trajectories"
         result = stored(built(draws, stats, remarks, rated, drawn, partial))
