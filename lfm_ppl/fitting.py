@@ -122,8 +122,9 @@ def fit(
         coords: dimension -> labels, ``{"gene": ["CDKN1A", "SESN1"]}``; of "output", the names of the columns of y, and
             of "series", those of a panel, too. By default columns of a data frame keep their names.
 
-    Ctrl-C ends the sampling after the present block of steps, some two seconds, and the draws so far are returned, with
-    an attribute ``partial`` and a warning. Another one raises KeyboardInterrupt.
+    Ctrl-C ends the sampling after the present block of steps, some two seconds. With a ``checkpoint`` the draws so far
+    are returned, with an attribute ``partial`` and a warning; without one they are the attribute ``result`` of the
+    KeyboardInterrupt that is raised. A second Ctrl-C ends it at once.
 
     Returns:
         An ArviZ object (``InferenceData`` on ArviZ 0.23, ``xarray.DataTree`` on 1.x) with the groups
@@ -145,7 +146,7 @@ def fit(
         ValueError, TypeError: unknown sampler, wrong shapes, parameters to fix that do not exist, and so on; a run to
             go on with that was of something else.
         FileExistsError, FileNotFoundError: the folder holds a result or a run; no run to go on with.
-        KeyboardInterrupt: Ctrl-C before there was a draw, or a second one.
+        KeyboardInterrupt: Ctrl-C before there was a draw, without a checkpoint, or for the second time.
 
     Warns:
         UserWarning: the result is partial.
@@ -272,12 +273,17 @@ def fit(
         if partial is None:
             if run is not None:  # the draws are safe, whatever comes
                 stored(built(draws, stats, remarks, partial=_BARE))
+
+            counter = Counter(shown=progress)
+
+            def watched(what: str) -> dict[str, Any]:
+                return {"show": counter.of(what), "parts": None if run is None else run.parts(what)}
+
             try:
-                rated = kept("scores of the observations", lambda: scores(
-                    bound, flat, show=Counter("scores", shown=progress), parts=run and run.parts("scores")), None)
-                drawn = kept("trajectories", lambda: draw_paths(
-                    keys[3], bound, flat, at, trajectory_draws, chains, samples, **particles,
-                    show=Counter("trajectories", shown=progress), parts=run and run.parts("trajectories")), drawn)
+                rated = kept("scores of the observations", lambda: scores(bound, flat, **watched("scores")), None)
+                drawn = kept("trajectories", lambda: draw_paths(keys[3], bound, flat, at, trajectory_draws, chains,
+                                                                samples, **particles, **watched("trajectories")), drawn)
+                counter.close()
             except KeyboardInterrupt:
                 partial = _BARE if rated is None else "all draws and their scores, without trajectories"
         result = built(draws, stats, remarks, rated, drawn, partial)
@@ -286,9 +292,21 @@ def fit(
         if run is not None and partial is None:
             run.finish()
     if partial is not None:
+        if run is None:
+            # Who runs one fit after another wants them all to end, and takes none for whole that is not.
+            raise _Stopped(result, f"stopped with {partial}; they are in the attribute `result` of this exception "
+                                   "(sys.last_value.result). With a folder, checkpoint=..., fit returns them")
         warnings.warn(f"the run was stopped, and its result is partial: {partial}.", stacklevel=2)
     warn_of_convergence(result)
     return result
+
+
+class _Stopped(KeyboardInterrupt):
+    """Ctrl-C, with what there is: ``result``."""
+
+    def __init__(self, result: Any, message: str) -> None:
+        super().__init__(message)
+        self.result = result
 
 
 _OF_PARTICLES = ("particle_settings", "particle_steps")

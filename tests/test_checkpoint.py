@@ -144,10 +144,10 @@ def test_a_run_that_nothing_keeps_gives_what_it_has(whole, monkeypatch):
             signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(sampling._Pace, "took", stopping)
-    with warnings.catch_warnings(), pytest.warns(UserWarning, match="partial: 3 of 6 draws a chain"):
-        warnings.simplefilter("ignore", lfm.ConvergenceWarning)
-        partial = lfm.fit(well, TIMES, Y, sampler="nuts", progress=False, **SIZES)
-    np.testing.assert_array_equal(arviz_data.group(partial, "posterior")["noise"],
+    with pytest.raises(KeyboardInterrupt, match="stopped with 3 of 6 draws a chain.*sys.last_value.result") as raised:
+        fit("nuts")
+    assert arviz_data.attributes(raised.value.result)["partial"].startswith("3 of 6 draws a chain")
+    np.testing.assert_array_equal(arviz_data.group(raised.value.result, "posterior")["noise"],
                                   arviz_data.group(whole("nuts"), "posterior")["noise"][:, :3])
 
 

@@ -391,7 +391,7 @@ def test_times_are_known_to_everything_after_sampling(y, keywords):
 
 
 def test_what_fails_after_sampling_does_not_cost_the_draws(y, monkeypatch):
-    def broken(*arguments):
+    def broken(*arguments, **keywords):
         raise TypeError("no such thing")
 
     monkeypatch.setattr("lfm_ppl.fitting.scores", broken)

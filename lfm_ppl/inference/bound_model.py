@@ -22,7 +22,7 @@ from numpyro.infer.util import log_density as constrained_log_density
 from lfm_ppl import checks
 from lfm_ppl.filtering.filter import FilterResult, check_observations
 from lfm_ppl.filtering.smoother import SmootherResult
-from lfm_ppl.inference.fingerprint import Recording, record, signature
+from lfm_ppl.inference.fingerprint import Recording, portable, record, signature
 from lfm_ppl.inference.handlers.fixing import fix
 from lfm_ppl.inference.handlers.likelihood_handler import LikelihoodHandler
 from lfm_ppl.inference.handlers.settings import approximate
@@ -180,6 +180,11 @@ class _Program:
             return record(lambda z, y: potential_energy(self._seeded, self.call(y), self.keywords, self.unravel(z)),
                           self.size, y)
 
+    def portable(self, y: Any) -> str:
+        """Return a digest of what the model computes."""
+        return portable(lambda z, y: potential_energy(self._seeded, self.call(y), self.keywords, self.unravel(z)),
+                        self.size, y)
+
     def draw_sites(self, y: Any, key: jax.Array, strategy: Callable) -> dict[str, jax.Array]:
         """Return unconstrained values of the latent sites by a NumPyro strategy."""
         return _unconstrained(latent_sites(self._trace(y, key, strategy)))
@@ -267,9 +272,12 @@ class BoundModel:
         return self._program.model
 
     @property
-    def fingerprint(self) -> Hashable:
-        """Equal for models that compute the same; None where the model asks its data for values."""
-        return self._program.fingerprint
+    def fingerprint(self) -> str | None:
+        """Equal for models that compute the same, in every process; None where it cannot be told.
+
+        That is where the model asks its data for values.
+        """
+        return self._program.portable(self.y) if self._program.place is not None else None
 
     @property
     def forward_mode(self) -> bool:

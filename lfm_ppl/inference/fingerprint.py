@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterator
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -45,6 +46,72 @@ def record(energy: Callable[[jax.Array, Any], Any], size: int, y: Any) -> Record
         TypeError, ValueError, ...: whatever the model raises; JAX's errors for one that asks parameters or data for
             values.
     """
+    traced, shape, settings = _traced(energy, size, y)
+    times = len(jax.tree_util.tree_leaves(shape[2]))
+    return Recording(_fingerprint(traced, settings), _follow(traced.jaxpr, times))
+
+
+def portable(energy: Callable[[jax.Array, Any], Any], size: int, y: Any) -> str:
+    """Return a digest that is equal in all processes for models that compute the same; arguments as in `record`.
+
+    The order of the constants of a jaxpr, and with it the names of its variables, differ from process to process, and
+    so does that of its outputs, among which are the fields of a NumPyro distribution. Here variables are numbered in
+    the order of their use, a constant stands where it is first used, and outputs are sorted.
+    """
+    traced, _, settings = _traced(energy, size, y)
+    found = hashlib.sha256()
+    for word in (*_words(traced.jaxpr, traced.consts, sort=True), *settings):
+        found.update(_without_addresses(word).encode() if isinstance(word, str) else word)
+    return found.hexdigest()
+
+
+def _words(jaxpr: Any, constants: Any, sort: bool = False) -> Iterator[str | bytes]:
+    """Yield what a jaxpr does, in the order in which it does it; its outputs in any order, if they may be sorted."""
+    values, numbers = dict(zip(jaxpr.constvars, constants, strict=True)), {v: i for i, v in enumerate(jaxpr.invars)}
+
+    def named(variables: Any) -> Iterator[str | bytes]:
+        for variable in variables:
+            if hasattr(variable, "val"):
+                yield f"{np.asarray(variable.val).tolist()}:{variable.aval} "
+                continue
+            if variable in values and variable not in numbers:
+                yield _bytes(values[variable])
+            yield f"{numbers.setdefault(variable, len(numbers))}:{variable.aval} "
+
+    yield from named(jaxpr.invars)
+    for equation in jaxpr.eqns:
+        yield f"{equation.primitive}"
+        yield from named(equation.invars)
+        for name, value in sorted(equation.params.items()):
+            yield f"{name}="
+            yield from _parameter(value)
+        yield from named(equation.outvars)
+    yield "return "
+    if not sort:
+        yield from named(jaxpr.outvars)
+        return
+    yield from sorted(f"{numbers[v]}" if not hasattr(v, "val") and v in numbers
+                      else f"{v.aval}{_bytes(v.val if hasattr(v, 'val') else values[v])!r}" for v in jaxpr.outvars)
+
+
+def _parameter(value: Any) -> Iterator[str | bytes]:
+    if hasattr(value, "jaxpr") and hasattr(value, "consts"):
+        yield from _words(value.jaxpr, value.consts)
+    elif hasattr(value, "eqns"):
+        yield from _words(value, [()] * len(value.constvars))
+    elif isinstance(value, (tuple, list)):
+        for inner in value:
+            yield from _parameter(inner)
+    elif isinstance(value, (np.ndarray, jax.Array)):
+        yield _bytes(value)
+    elif isinstance(value, (set, frozenset)):
+        yield from sorted(map(repr, value))
+    elif not callable(value):  # of functions the jaxprs are there, too
+        yield repr(value)
+
+
+def _traced(energy: Callable[[jax.Array, Any], Any], size: int, y: Any) -> tuple[Any, Any, list[str]]:
+    """Return the jaxpr of a run of a model without its filter, the shapes of what it gives, and the settings."""
     runs = []
 
     def run(z: jax.Array, y: Any, at: jax.Array, t: jax.Array) -> Any:
@@ -54,8 +121,7 @@ def record(energy: Callable[[jax.Array, Any], Any], size: int, y: Any) -> Record
         return value, [part for part in runs[-1].values if part is not None], runs[-1].times
 
     traced, shape = jax.make_jaxpr(run, return_shape=True)(jnp.zeros(size), y, jnp.zeros(()), jnp.zeros(()))
-    times = len(jax.tree_util.tree_leaves(shape[2]))
-    return Recording(_fingerprint(traced, runs[-1].settings), _follow(traced.jaxpr, times))
+    return traced, shape, runs[-1].settings
 
 
 def signature(value: Any) -> Hashable:
@@ -107,8 +173,12 @@ def _fingerprint(traced: Any, settings: list[str]) -> Hashable:
     if checks.traced(constants):
         return None
     parts = tuple((np.shape(one), _bytes(one)) for one in constants)
-    # What is left of functions in a jaxpr is their address.
-    return re.sub(r"0x[0-9a-f]+", "", str(traced.jaxpr)), parts, tuple(settings)
+    return _without_addresses(str(traced.jaxpr)), parts, tuple(settings)
+
+
+def _without_addresses(text: str) -> str:
+    """Return a text without what is left of functions in it."""
+    return re.sub(r"0x[0-9a-f]+", "", text)
 
 
 def _follow(jaxpr: Any, times: int) -> bool:

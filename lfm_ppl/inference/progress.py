@@ -81,23 +81,27 @@ class Progress:
 
 
 class Counter:
-    """Shows how many of a number of things are done: ``counter(done, count)``.
+    """Shows how many draws are done: ``counter(done, count)``.
 
     Args:
-        label: what is computed.
-        things: what is counted.
+        label: what is computed at them.
         shown: whether anything is shown.
     """
 
-    def __init__(self, label: str, things: str = "draws", shown: bool = True) -> None:
-        self._label, self._things, self._shown = label, things, shown
+    def __init__(self, label: str = "", shown: bool = True) -> None:
+        self._label, self._shown = label, shown
         self._said = time.perf_counter()
+
+    def of(self, label: str) -> Counter:
+        """Return the counter, for something else."""
+        self._label = label
+        return self
 
     def __call__(self, done: int, count: int) -> None:
         """Show that ``done`` of ``count`` are done."""
         if not self._shown:
             return
-        text = f"{self._label}: {done:,} of {count:,} {self._things}"
+        text = f"{self._label}: {done:,} of {count:,} draws"
         if on_terminal():
             print(f"\r{text:<70}\r", end="", file=sys.stderr, flush=True)
         elif time.perf_counter() - self._said >= EVERY_S:

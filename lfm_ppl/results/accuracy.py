@@ -108,8 +108,8 @@ def check_accuracy(result: Any, numpyro_model: Callable, times: Any = None, y: A
             "draws of the result": checkpoints.digest(*whole.draws.values()), "versions": checkpoints.versions(),
         }, resume)  # fmt: skip
     with checkpoints.closing(kept):
-        report = _report(result, whole.at(rows)._replace(parts=kept and kept.parts), chosen, kind, particles,
-                         replicates, steps, seed, progress)
+        problem = whole.at(rows)._replace(parts=None if kept is None else kept.parts)
+        report = _report(result, problem, chosen, kind, particles, replicates, steps, seed, progress)
     arviz_data.add_group(result, GROUP, report.to_dataset())
     return report
 
