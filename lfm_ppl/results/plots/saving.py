@@ -98,7 +98,9 @@ def _pages(result: Any, width: str | float) -> Iterator[tuple[str, Draw, list[st
             # Pages would miss most pairs; the figure itself says how to choose others.
             yield "pairs", pairs.plot_pairs, None
     if has_group(result, "one_step_ahead"):
-        names = [str(name) for name in group(result, "one_step_ahead")["output"].values]
+        residual = group(result, "one_step_ahead")["residual"]
+        # An observation family has no standardised residuals.
+        names = [str(name) for name in residual["output"].values if residual.sel(output=name).notnull().any()]
         yield from _numbered("residuals", residuals.plot_residuals, names, residuals.MAX_OUTPUTS)
     if has_group(result, "accuracy"):
         yield "accuracy", accuracy.plot_accuracy, None
