@@ -14,7 +14,6 @@ from lfm_ppl import checks
 from lfm_ppl.fitting import ConvergenceWarning, fit
 from lfm_ppl.forecasting import check_possible
 from lfm_ppl.inference.bound_model import bind
-from lfm_ppl.linalg import wrapped
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.predictions import GROUP, MEAN, SD, observed_variable
 from lfm_ppl.results.scoring import ALL, Scores, gaussian_scores, scores, summary
@@ -157,7 +156,7 @@ def backtest(numpyro_model: Callable, times: Any, y: Any, *, horizon: int, every
         messages += [f"origin {times[origin]:g}: {one.message}" for one in caught]
         forecasts.append((_flat(predicted[MEAN]).mean(axis=0), found))
         mean, sd = _naive(known[:origin + 1], horizon, season or 1, angular)
-        target = np.where(angular, mean + np.asarray(wrapped(y[ahead] - mean)), y[ahead])
+        target = np.where(angular, mean + _wrapped(y[ahead] - mean), y[ahead])
         naive.append((mean, gaussian_scores(mean, sd, target, level)))
         if progress:
             print(f"origin {times[origin]:g}: RMSE {summary(found, level)['rmse']:.4g}, {reference} "
@@ -194,11 +193,16 @@ def _naive(y: np.ndarray, horizon: int, season: int, angular: np.ndarray) -> tup
                 continue
             mean[lead - 1, output] = y[known - 1 + lead - lag, output]
             change = y[lag:, output] - y[:-lag, output]
-            change = np.asarray(wrapped(change)) if angular[output] else change
+            change = _wrapped(change) if angular[output] else change
             change = change[np.isfinite(change)]
             if change.size > 1 and np.any(change):
                 sd[lead - 1, output] = np.sqrt(np.mean(change**2))
     return mean, sd
+
+
+def _wrapped(angle: np.ndarray) -> np.ndarray:
+    """Return differences of angles on the circle; in NumPy, since each shape would be compiled otherwise."""
+    return np.angle(np.exp(1j * angle))
 
 
 def _flat(variable: xr.DataArray) -> np.ndarray:

@@ -170,8 +170,8 @@ def test_forecast_refuses_another_model_and_impossible_times(known):
                            ([np.nan], "finite")):
         with pytest.raises(ValueError, match=message):
             lfm.forecast(known, motif.model, times, **keywords)
-    with pytest.raises(ValueError, match="has no draws"):
-        lfm.forecast(known, well, AT)
+    with pytest.raises(ValueError, match="y must have one row for each"):
+        lfm.forecast(known, well, AT)  # of one output
 
     def louder(times, y=None):
         decay = numpyro.sample("decay", dist.LogNormal(jnp.zeros(2), 1.0).to_event(1))
