@@ -25,7 +25,7 @@ LAYERS = (
     ("particles", "fokker_planck_grid", "latent_grid"),
     ("switching",),
     ("inference",),
-    ("results",),
+    ("results", "engine"),
     ("fitting",),
     ("loading",),
     ("experiments",),
@@ -187,7 +187,7 @@ def test_a_model_and_its_filter_import_no_satellites_figures_or_experiments():
     )
     found = run(code)
     assert found.endswith("False False") and "lfm_ppl.filtering" in found
-    for part in ("orbits", "particles", "fokker_planck_grid", "results", "experiments", "switching", "cli"):
+    for part in ("orbits", "particles", "fokker_planck_grid", "results", "engine", "experiments", "switching", "cli"):
         assert f"lfm_ppl.{part}" not in found
 
 

@@ -178,10 +178,22 @@ def _add_compare(commands: Any) -> None:
         help="folder to write; what it holds already is kept and used (default: lfm-results/compare/EXPERIMENT)",
     )
     command.add_argument("--overwrite", action="store_true", help="replace results that were made with other settings")
-    command.add_argument(
-        "--jobs", type=_whole(1), metavar="N", help="processes that compute (default: one for each core, at most 4)"
+    _add_workers(command)
+    command.add_argument("--quiet", action="store_true", help="no progress")
+
+
+def _add_workers(group: Any) -> None:
+    group.add_argument(
+        "--jobs",
+        type=_whole(1),
+        metavar="N",
+        help="processes that compute (default: one for each core, at most 4; one without Dask)",
     )
-    command.add_argument("--quiet", action="store_true", help="no lines of progress")
+    group.add_argument(
+        "--scheduler",
+        metavar="tcp://HOST:PORT",
+        help="compute with the workers of this scheduler of Dask, on other machines, too",
+    )
 
 
 def _add_version(commands: Any) -> None:
