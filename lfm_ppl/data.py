@@ -102,7 +102,12 @@ def read_csv(
         (('a', 'b'), {'time': 'h'}, [0.0, 0.0, 2.0])
     """
     path = Path(path)
-    header, rows = _read_table(path)
+    return _data_of(path, *_read_table(path), outputs, time_column)
+
+
+def _data_of(path: Path, header: list[str], rows: list[tuple[int, list[str]]], outputs: Sequence[str] | None,
+             time_column: str | None, where: str = "") -> Data:
+    """Return the observations in rows of a file."""
     time_name = _find_time(path, header, time_column)
     names = _find_outputs(path, header, time_name, outputs)
     columns = {name: header.index(name) for name in (time_name, *names)}
@@ -112,9 +117,48 @@ def read_csv(
         [[_value(path, line, name, row[columns[name]]) for name in names] for line, row in rows]
     )
     if np.all(np.isnan(y)):
-        raise ValueError(f"{path}: every value of {', '.join(names)} is missing.")
+        raise ValueError(f"{path}: every value of {', '.join(names)}{where} is missing.")
     unit = _unit_of(time_name)
     return Data(times, y, tuple(names), units={"time": unit} if unit else {})
+
+
+def read_series(path: str | Path, column: str, outputs: Sequence[str] | None = None,
+                time_column: str | None = None) -> dict[str, Data]:
+    r"""Read several series from one comma-separated file, in which a column says which series a row belongs to.
+
+    Args:
+        path: the file, as for :func:`read_csv`.
+        column: the column of identifiers, such as ``patient``; its cells are taken as text.
+        outputs: as for :func:`read_csv`; None leaves out ``column``, too.
+        time_column: as for :func:`read_csv`.
+
+    Returns:
+        Identifier -> observations, in the order in which the file has them. Rows of a series need not stand together,
+        but their times must not go back.
+
+    Raises:
+        ValueError: as :func:`read_csv`, with the row; a row without an identifier; a series without any value.
+
+    Example:
+        >>> import pathlib, tempfile
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "patients.csv"
+        >>> _ = path.write_text("patient,time,dose\nA,0,1.5\nB,0,2.5\nA,1,1.0\n")
+        >>> {name: one.y.ravel().tolist() for name, one in read_series(path, "patient").items()}
+        {'A': [1.5, 1.0], 'B': [2.5]}
+    """
+    path = Path(path)
+    header, rows = _read_table(path)
+    if column not in header:
+        raise ValueError(f"{path}: {checks.unknown('column of series', column, header)}")
+    place = header.index(column)
+    parts: dict[str, list[tuple[int, list[str]]]] = {}
+    for line, row in rows:
+        if not row[place]:
+            raise ValueError(f"{path}, row {line}, column {column!r}: the identifier of the series is missing.")
+        parts.setdefault(row[place], []).append((line, row[:place] + row[place + 1:]))
+    names = header[:place] + header[place + 1:]
+    return {name: _data_of(path, names, own, outputs, time_column, f" of series {name!r}")
+            for name, own in parts.items()}
 
 
 def write_csv(data: Data, path: str | Path) -> None:

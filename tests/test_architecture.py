@@ -27,6 +27,7 @@ LAYERS = (
     ("inference",),
     ("results", "engine"),
     ("fitting",),
+    ("fitting_many",),
     ("loading",),
     ("experiments",),
     ("cli", "__main__"),

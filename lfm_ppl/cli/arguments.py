@@ -207,6 +207,7 @@ def _add_fit(commands: Any) -> None:
         "  lfm-ppl fit transcription --data genes.csv --option link=saturation\n"
         "  lfm-ppl fit transcription --data p53.csv --set 'decay[CDKN1A]=0.8'\n"
         "  lfm-ppl fit spring --until 40 --target-accept 0.95\n"
+        "  lfm-ppl fit my_model.py --data 'patients/*.csv' --each --sampler map --jobs 2\n"
         "  lfm-ppl fit my_model.py --data mine.csv --rule gauss-hermite --steps 20 --out result"
     )
     help_ = "infer parameters and forces, and write posterior, summary and figures"
@@ -216,10 +217,12 @@ def _add_fit(commands: Any) -> None:
     _add_inference(command.add_argument_group("inference"))
     _add_approximation(command.add_argument_group("approximation (default: the model's own)"))
     out = command.add_argument_group("results")
-    out.add_argument("--out", metavar="DIR", help="folder to write (default: lfm-results/MODEL-001, -002, ...)")
+    out.add_argument("--out", metavar="DIR", help="folder to write (default: lfm-results/MODEL-001, -002, ...; with "
+                     "--each or --series lfm-results/MODEL-many, and what it holds already is kept and used)")
     out.add_argument("--until", type=float, metavar="TIME", help="forecast to this time (default: none)")
     out.add_argument("--overwrite", action="store_true", help="write into a folder with files")
     out.add_argument("--quiet", action="store_true", help="no progress bar (there is none without a terminal)")
+    _add_workers(command.add_argument_group("many data sets (--each, --series)"))
 
 
 def _add_data(group: Any) -> None:
@@ -227,8 +230,12 @@ def _add_data(group: Any) -> None:
         "--data",
         metavar="FILE",
         help="CSV: a time column, one column per output, empty cells missing, repeated times for "
-        "replicates (default: the model's simulated data)",
+        "replicates (default: the model's simulated data); with --each a pattern in quotes",
     )
+    many = group.add_mutually_exclusive_group()
+    many.add_argument("--each", action="store_true", help="fit each of the files that --data matches by itself")
+    many.add_argument("--series", metavar="NAME", help="fit each series by itself: the rows that share a value of this "
+                      "column")
     group.add_argument("--time-column", metavar="NAME", help="the time column (default: time, t or time_h)")
     group.add_argument("--outputs", metavar="A,B,...", help="the columns to use (default: those of the model)")
     group.add_argument("--truth", metavar="FILE", help="the truth that `simulate` wrote, to be drawn in figures")

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from lfm_ppl import data, loading
-from lfm_ppl.cli import choices, results, session
+from lfm_ppl.cli import choices, fit_many, results, session
 
 SETTINGS = ("rule", "steps", "max_step", "iterations", "tolerance")
 """Flags of the approximation; None where the user leaves one to the model."""
@@ -25,22 +25,31 @@ _GRID = 241
 
 def run(arguments: argparse.Namespace) -> int:
     """Fit, print the summary, and write the results; the posterior is on disk before any figure."""
+    if arguments.each or arguments.series is not None:
+        return fit_many.run(arguments)
+    if arguments.jobs is not None or arguments.scheduler is not None:
+        raise ValueError("--jobs and --scheduler are for many data sets; give them with --each or --series.")
     session.start(arguments.chains, not arguments.no_cache)
     model = loading.load(arguments.model)
     options = choices.options(model, arguments.option)
     observed = _observed(arguments, model, options)
     fixed = choices.fixed(arguments.set, model.anchors(observed))
-    at = _requested(observed.times, arguments.until)
-    if arguments.target_accept is not None and arguments.sampler == "map":
-        raise ValueError("--target-accept is for the samplers nuts, ram and pmmh; map accepts and rejects nothing.")
-    if arguments.particles is not None and arguments.sampler != "pmmh":
-        raise ValueError(f"--particles is for the sampler pmmh; {arguments.sampler} uses none.")
+    at = requested(observed.times, arguments.until)
+    check_sampler(arguments)
     with results.folder(model.name, arguments.out, arguments.overwrite) as folder:
         _print_task(arguments, model, observed, options, fixed)
         started = time.perf_counter()
         posterior = sample(arguments, model, observed, options, fixed, at)
         seconds = time.perf_counter() - started
         return report(posterior, folder, seconds, arguments.overwrite)
+
+
+def check_sampler(arguments: argparse.Namespace) -> None:
+    """Raise ValueError for a setting of another sampler."""
+    if arguments.target_accept is not None and arguments.sampler == "map":
+        raise ValueError("--target-accept is for the samplers nuts, ram and pmmh; map accepts and rejects nothing.")
+    if arguments.particles is not None and arguments.sampler != "pmmh":
+        raise ValueError(f"--particles is for the sampler pmmh; {arguments.sampler} uses none.")
 
 
 def _observed(arguments: argparse.Namespace, model: loading.ModelFile, options: dict[str, Any]) -> data.Data:
@@ -51,6 +60,14 @@ def _observed(arguments: argparse.Namespace, model: loading.ModelFile, options: 
                 flag = flag.replace("_", "-")
                 raise ValueError(f"--{flag} says how to read a data file; give one with --data.")
         return model.simulate(**options)
+    observed = taken(model, data.read_csv(arguments.data, columns(arguments, model), arguments.time_column))
+    if arguments.truth is not None:
+        observed = dataclasses.replace(observed, truth=data.read_truth(arguments.truth))
+    return model.prepare(observed)
+
+
+def columns(arguments: argparse.Namespace, model: loading.ModelFile) -> tuple[str, ...] | None:
+    """Return the columns of a file that are outputs; None: all but the time."""
     columns = model.outputs
     if arguments.outputs is not None:
         columns = tuple(name.strip() for name in arguments.outputs.split(","))
@@ -59,15 +76,15 @@ def _observed(arguments: argparse.Namespace, model: loading.ModelFile, options: 
                 f"{model.name} has {len(model.outputs)} outputs ({', '.join(model.outputs)}); "
                 f"--outputs names {len(columns)} columns."
             )
-    observed = data.read_csv(arguments.data, columns, arguments.time_column)
-    if model.outputs is not None:
-        observed = dataclasses.replace(observed, outputs=model.outputs)
-    if arguments.truth is not None:
-        observed = dataclasses.replace(observed, truth=data.read_truth(arguments.truth))
-    return model.prepare(observed)
+    return columns
 
 
-def _requested(times: np.ndarray, until: float | None) -> np.ndarray | None:
+def taken(model: loading.ModelFile, observed: data.Data) -> data.Data:
+    """Return observations under the model's names of its outputs."""
+    return observed if model.outputs is None else dataclasses.replace(observed, outputs=model.outputs)
+
+
+def requested(times: np.ndarray, until: float | None) -> np.ndarray | None:
     """Return the times of the trajectories where they go beyond the data; None: the library's own grid."""
     if until is None:
         return None
@@ -122,40 +139,19 @@ def sample(
         at: times of the trajectories; None: a grid over the data.
     """
     import lfm_ppl
-    from lfm_ppl.inference.handlers.settings import approximate
 
-    target_accept = arguments.target_accept
-    if target_accept is None and arguments.sampler == "nuts":
-        target_accept = model.target_accept
-    numpyro_model = approximate(
-        model.model,
-        rule=choices.rule(arguments.rule),
-        steps=arguments.steps,
-        max_step=arguments.max_step,
-        iterations=arguments.iterations,
-        tolerance=arguments.tolerance,
-    )
     posterior = lfm_ppl.fit(
-        numpyro_model,
+        approximated(arguments, model),
         observed.times,
         observed.y,
-        sampler=arguments.sampler,
-        chains=arguments.chains,
-        warmup=arguments.warmup,
-        samples=arguments.samples,
-        thin=arguments.thin,
         seed=arguments.seed,
         at=at,
-        sampler_options={
-            name: value
-            for name, value in (("target_accept_prob", target_accept), ("particles", arguments.particles))
-            if value is not None
-        },
         model_kwargs=model.keywords(observed, options),
         fixed=fixed,
         truth=observed.truth,
         progress=not arguments.quiet and sys.stderr.isatty(),  # in a log file a bar is noise
         name=model.name,
+        **sampling(arguments, model),
     )
     # What `lfm-ppl check` rebuilds the model from, in the words of the command line.
     posterior.attrs["model_file"] = model.name if loading.available().get(model.name) == model.path else str(model.path)
@@ -165,6 +161,36 @@ def sample(
     if observed.note:
         posterior.attrs["note"] = observed.note
     return posterior
+
+
+def approximated(arguments: argparse.Namespace, model: loading.ModelFile) -> Any:
+    """Return the NumPyro model with the user's settings of the approximation."""
+    from lfm_ppl.inference.handlers.settings import approximate
+
+    return approximate(
+        model.model,
+        rule=choices.rule(arguments.rule),
+        steps=arguments.steps,
+        max_step=arguments.max_step,
+        iterations=arguments.iterations,
+        tolerance=arguments.tolerance,
+    )
+
+
+def sampling(arguments: argparse.Namespace, model: loading.ModelFile) -> dict[str, Any]:
+    """Return the arguments of `lfm_ppl.fit` that say how to sample."""
+    target_accept = arguments.target_accept
+    if target_accept is None and arguments.sampler == "nuts":
+        target_accept = model.target_accept
+    given = (("target_accept_prob", target_accept), ("particles", arguments.particles))
+    return {
+        "sampler": arguments.sampler,
+        "chains": arguments.chains,
+        "warmup": arguments.warmup,
+        "samples": arguments.samples,
+        "thin": arguments.thin,
+        "sampler_options": {name: value for name, value in given if value is not None},
+    }
 
 
 def report(posterior: Any, folder: Path, seconds: float, overwrite: bool) -> int:

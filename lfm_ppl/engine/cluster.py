@@ -165,10 +165,10 @@ def started(workers: Workers, most: int | None = None) -> Iterator[Cluster | Non
         with _connected(workers) as client:
             setup = worker.Setup.here(None)
             check_fit(client, setup)
-            yield Cluster(client, setup, client.dashboard_link if _has_dashboard() else None)
+            yield Cluster(client, setup, _dashboard(client))
     else:
         with _embedded(workers if most is None else min(workers, most)) as client:
-            yield Cluster(client, worker.Setup.here(programs_folder()), client.dashboard_link if _has_dashboard() else None)
+            yield Cluster(client, worker.Setup.here(programs_folder()), _dashboard(client))
 
 
 @contextlib.contextmanager
@@ -219,13 +219,17 @@ def check_fit(client: Any, setup: worker.Setup) -> None:
     threads = {address: count for address, count in client.nthreads().items() if count != 1}
     if threads:
         address, count = next(iter(threads.items()))
-        raise ClusterError(f"the worker {address} has {count} threads, but models are traced by one at a time. Start it "
-                           "with `dask worker ... --nthreads 1 --nworkers N`.")
+        raise ClusterError(f"the worker {address} has {count} threads, but models are traced by one at a time. Start "
+                           "it with `dask worker ... --nthreads 1 --nworkers N`.")
     for address, found in client.run(worker.versions, on_error="return").items():
         if isinstance(found, BaseException):
             raise ClusterError(f"the worker {address} cannot run lfm_ppl {setup.versions['lfm_ppl']} "
                                f"({type(found).__name__}: {found}). Install the same versions on all machines.")
         worker.check_versions(found, setup.versions, address)
+
+
+def _dashboard(client: Any) -> str | None:
+    return client.dashboard_link if _has_dashboard() else None
 
 
 def _has_dashboard() -> bool:

@@ -14,7 +14,7 @@ from lfm_ppl.engine.progress import Console, Progress
 from lfm_ppl.engine.task import Result, Task, check_distinct
 from lfm_ppl.engine.worker import computed
 
-Report = Callable[[str], None] | Console
+Reporter = Callable[[str], None] | Console
 """What to do with a line of progress: `Console` draws a bar in a terminal."""
 
 
@@ -40,7 +40,7 @@ class Outcome(NamedTuple):
 
 
 def run_tasks(tasks: Iterable[Task], compute: Callable[[Task], Mapping[str, Any]], folder: str | Path | None, *,
-              overwrite: bool = False, report: Report | None = None, workers: Workers = 1) -> dict[str, Result]:
+              overwrite: bool = False, report: Reporter | None = None, workers: Workers = 1) -> dict[str, Result]:
     """Compute every task that ``folder`` does not hold yet, each into a file of its own, and return all results.
 
     A file is there whole or not at all, and a random key depends on its task alone. A run that is killed and started
@@ -55,8 +55,8 @@ def run_tasks(tasks: Iterable[Task], compute: Callable[[Task], Mapping[str, Any]
         folder: of the files; made where it does not exist, and held by one run at a time. None: nothing is stored.
         overwrite: compute again what was stored with other settings, which is an error otherwise.
         report: what to do with a line of progress, such as ``print`` or `Console`; None: nothing.
-        workers: what computes: 1, this process; more, so many others of this machine; ``"tcp://host:port"``, the workers
-            of that scheduler of Dask; workers that were `started`. A task whose worker dies is given to another.
+        workers: what computes: 1, this process; more, so many others of this machine; ``"tcp://host:port"``, those of
+            that scheduler of Dask; workers that were `started`. A task whose worker dies is given to another.
 
     Returns:
         Name of a task -> its result, in the order of the tasks.
@@ -94,7 +94,7 @@ def run_tasks(tasks: Iterable[Task], compute: Callable[[Task], Mapping[str, Any]
 
 
 def outcomes(tasks: Iterable[Task], compute: Callable[[Task], Mapping[str, Any]], folder: str | Path | None, *,
-             overwrite: bool = False, report: Report | None = None, workers: Workers = 1) -> Iterator[Outcome]:
+             overwrite: bool = False, report: Reporter | None = None, workers: Workers = 1) -> Iterator[Outcome]:
     """Yield how each task ended, one by one as they end, those first that were stored; arguments as in `run_tasks`.
 
     The folder is held, and workers are kept, until the last one was taken or the iterator is closed.

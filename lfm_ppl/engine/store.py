@@ -43,7 +43,8 @@ def held(folder: str | Path) -> Iterator[Path]:
         holder = "another run"
         with contextlib.suppress(OSError):
             holder += f" ({(folder / _HOLDER).read_text(encoding='utf-8').strip()})"
-        raise FolderInUseError(f"{folder} is in use by {holder}. Wait until that ends, or choose another folder.") from None
+        raise FolderInUseError(f"{folder} is in use by {holder}. Wait until that ends, or choose another "
+                               "folder.") from None
     try:
         (folder / _HOLDER).write_text(f"process {os.getpid()} on {socket.gethostname()}\n", encoding="utf-8")
         yield folder

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import functools
 import os
 import pickle
 import platform
@@ -60,8 +61,8 @@ def check_versions(found: Mapping[str, str], wanted: Mapping[str, str], where: s
     other = [f"{name} {found.get(name, 'missing')} (here {version})" for name, version in wanted.items()
              if found.get(name) != version]
     if other:
-        raise ClusterError(f"the worker {where or platform.node()} has {', '.join(other)}; its numbers would be others. "
-                           "Install the same versions on all machines.")
+        raise ClusterError(f"the worker {where or platform.node()} has {', '.join(other)}; its numbers would be "
+                           "others. Install the same versions on all machines.")
 
 
 _prepared: list[Setup] = []
@@ -87,7 +88,13 @@ def prepare(setup: Setup) -> None:
 def work(setup: Setup, program: bytes, task: bytes) -> dict[str, np.ndarray]:
     """Compute a task in a worker; both are pickled, so that nothing of them is imported before the preparation."""
     prepare(setup)
-    return computed(pickle.loads(program), pickle.loads(task))
+    return computed(_loaded(program), pickle.loads(task))
+
+
+@functools.lru_cache(maxsize=4)
+def _loaded(program: bytes) -> Callable[[Task], Mapping[str, Any]]:
+    """Return the function of a run, the same one for all its tasks: what was compiled for it is found by it."""
+    return pickle.loads(program)
 
 
 def computed(compute: Callable[[Task], Mapping[str, Any]], task: Task) -> dict[str, np.ndarray]:

@@ -11,7 +11,7 @@ import pandas as pd
 
 from lfm_ppl import checks
 from lfm_ppl.engine.cluster import Workers
-from lfm_ppl.engine.run import Report as Reporter
+from lfm_ppl.engine.run import Reporter
 
 _MODULES = {"ginzburg-landau": "lfm_ppl.experiments.ginzburg_landau.report",
             "gps": "lfm_ppl.experiments.gps.report",

@@ -22,7 +22,7 @@ from numpyro.infer.util import log_density as constrained_log_density
 from lfm_ppl import checks
 from lfm_ppl.filtering.filter import FilterResult, check_observations
 from lfm_ppl.filtering.smoother import SmootherResult
-from lfm_ppl.inference.fingerprint import Recording, record, signature
+from lfm_ppl.inference.fingerprint import Recording, digest, record, signature
 from lfm_ppl.inference.handlers.fixing import fix
 from lfm_ppl.inference.handlers.likelihood_handler import LikelihoodHandler
 from lfm_ppl.inference.handlers.settings import approximate
@@ -176,6 +176,13 @@ class _Program:
             return record(lambda z, y: potential_energy(self._seeded, self.call(y), self.keywords, self.unravel(z)),
                           self.size, y)
 
+    def digest(self, y: Any) -> str:
+        """Return a short text that tells the model from others."""
+        # At data of zeros, so that data sets share it.
+        zeros = jax.tree_util.tree_map(lambda leaf: jnp.zeros_like(leaf) if self.place is not None else leaf, y)
+        return digest(lambda z, y: potential_energy(self._seeded, self.call(y), self.keywords, self.unravel(z)),
+                      self.size, zeros)
+
     def draw_sites(self, y: Any, key: jax.Array, strategy: Callable) -> dict[str, jax.Array]:
         """Return unconstrained values of the latent sites by a NumPyro strategy."""
         return _unconstrained(latent_sites(self._trace(y, key, strategy)))
@@ -261,6 +268,11 @@ class BoundModel:
     def model(self) -> Callable:
         """The NumPyro model."""
         return self._program.model
+
+    @property
+    def digest(self) -> str:
+        """A short text that is equal for models that compute the same, in other processes, too."""
+        return self._program.once("digest", lambda: self._program.digest(self.y))
 
     @property
     def forward_mode(self) -> bool:

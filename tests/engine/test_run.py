@@ -190,6 +190,12 @@ def until(true, seconds=120.0):
         time.sleep(0.02)
 
 
+def gone(pids):
+    """Wait until none of these processes exists."""
+    pids = list(pids)
+    until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in pids))
+
+
 @pytest.mark.slow
 def test_fifty_workers_killed_at_random_moments_and_the_client_too(tmp_path):
     """Nothing is lost, no task is computed again that was stored, and the numbers are the same."""
@@ -204,10 +210,10 @@ def test_fifty_workers_killed_at_random_moments_and_the_client_too(tmp_path):
             if kills % 17 == 0:
                 running.kill()
                 running.wait()
-                until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in alive))
+                gone(alive)
                 kept, before = {path.name for path in (tmp_path / "out").glob("*.npz")}, len(begun(tmp_path))
                 running, clients = client(tmp_path, count, 0.4), clients + 1
-                until(lambda: len(begun(tmp_path)) > before)
+                until(lambda before=before: len(begun(tmp_path)) > before)
                 again = {name.replace("/", "-") + ".npz" for _, name in begun(tmp_path)[before:]}
                 assert not again & kept
     assert running.returncode == 0 and kills == 50 and clients == 2
@@ -225,7 +231,7 @@ def test_workers_end_with_the_one_that_started_them(tmp_path):
     until(lambda: len(begun(tmp_path)) >= 4)
     running.kill()
     running.wait()
-    until(lambda: not any(Path(f"/proc/{pid}").exists() for pid, _ in begun(tmp_path)))
+    gone(pid for pid, _ in begun(tmp_path))
     assert len(list((tmp_path / "out").glob("*.npz"))) == 2
     running = client(tmp_path, 4, 0.0)  # the folder is free again; other settings are refused
     assert running.wait() != 0

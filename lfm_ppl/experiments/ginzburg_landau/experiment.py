@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -11,7 +10,7 @@ import pandas as pd
 
 from lfm_ppl import checks
 from lfm_ppl.engine.cluster import Workers
-from lfm_ppl.engine.run import Report, run_tasks
+from lfm_ppl.engine.run import Reporter, run_tasks
 from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import output
 from lfm_ppl.experiments.ginzburg_landau import conditional, figures, problem, sampling, state, tables
@@ -118,7 +117,7 @@ def compute(task: Task) -> Result:
 
 
 def run(settings: Settings, folder: str | Path, *, overwrite: bool = False,
-        report: Report | None = None, workers: Workers = 1) -> Comparison:
+        report: Reporter | None = None, workers: Workers = 1) -> Comparison:
     """Compute what is not stored yet in ``folder``, and tabulate everything.
 
     Args:

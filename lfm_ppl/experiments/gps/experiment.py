@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,9 +12,9 @@ import numpy as np
 import pandas as pd
 
 from lfm_ppl import checks, orbits
-from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.engine.cluster import Workers, started
-from lfm_ppl.engine.run import Report, run_tasks
+from lfm_ppl.engine.run import Reporter, run_tasks
+from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import output
 from lfm_ppl.experiments.gps import figures, learning, magnitudes, prediction, problem, ways
 from lfm_ppl.experiments.gps.figures import METRE, rms
@@ -193,7 +193,7 @@ def _online(one: problem.Arc, orbit: orbits.Orbit, logarithms: np.ndarray, asked
 
 
 def run(settings: Settings, folder: str | Path, *, overwrite: bool = False,
-        report: Report | None = None, workers: Workers = 1) -> Found:
+        report: Reporter | None = None, workers: Workers = 1) -> Found:
     """Run the comparison, or what is missing of it.
 
     Args:

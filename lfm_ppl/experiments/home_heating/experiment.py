@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,7 +16,7 @@ from jax.scipy.stats import norm
 
 from lfm_ppl import checks
 from lfm_ppl.engine.cluster import Workers
-from lfm_ppl.engine.run import Report, run_tasks
+from lfm_ppl.engine.run import Reporter, run_tasks
 from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import output, scores
 from lfm_ppl.experiments.home_heating import figures, learning, prediction, problem, tables
@@ -205,7 +204,7 @@ def _stacked(rows: list[Result]) -> Result:
 
 
 def run(settings: Settings, folder: str | Path, *, overwrite: bool = False,
-        report: Report | None = None, workers: Workers = 1) -> Comparison:
+        report: Reporter | None = None, workers: Workers = 1) -> Comparison:
     """Compute what is not stored yet in ``folder``, and tabulate everything.
 
     Args:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,7 +14,7 @@ from scipy.stats import norm
 
 from lfm_ppl import checks
 from lfm_ppl.engine.cluster import Workers
-from lfm_ppl.engine.run import Report, run_tasks
+from lfm_ppl.engine.run import Reporter, run_tasks
 from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import output, scores
 from lfm_ppl.experiments.transcription import figures, laplace_modes, problem, slices, smoothers, tables
@@ -131,7 +130,7 @@ def judged(found: Result, truth: np.ndarray) -> Result:
 
 
 def run(settings: Settings, folder: str | Path, *, overwrite: bool = False,
-        report: Report | None = None, workers: Workers = 1) -> Comparison:
+        report: Reporter | None = None, workers: Workers = 1) -> Comparison:
     """Compute what is not stored yet in ``folder``, and tabulate everything.
 
     Args:
