@@ -292,7 +292,7 @@ def _fingerprint(model: Callable, times: np.ndarray, y: np.ndarray, keywords: An
         try:
             digests[key] = bind(model, times, y, **dict(keywords or {})).digest
         except Exception:  # what is wrong with this data set is told when its turn comes
-            digests[key] = "none"
+            return "none"
     return digests[key]
 
 

@@ -68,7 +68,8 @@ def test_one_table_and_one_file_over_all(folder):
     assert list(fits.summary.index.unique("data set")) == ["plant 0", "plant 2"]
     assert list(fits.summary.loc["plant 0"].index) == ["decay[a]", "decay[b]", "lengthscale", "noise_sd"]
     assert fits.overview.loc["noise_sd", "data sets"] == 2
-    np.testing.assert_allclose(fits.overview["mean"], fits.summary.groupby(level="parameter", sort=False)["mean"].mean())
+    means = fits.summary["mean"].groupby(level="parameter", sort=False)
+    np.testing.assert_allclose(fits.overview["mean"], means.mean())
     assert len(pd.read_csv(out / "summary.csv")) == 8
     posterior = arviz_data.group(lfm.load(out / "posteriors.nc"), "posterior")
     assert posterior["decay"].dims == ("chain", "draw", "data_set", "output")

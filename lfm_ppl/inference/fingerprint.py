@@ -73,7 +73,7 @@ def digest(energy: Callable[[jax.Array, Any], Any], size: int, y: Any) -> str:
         return value, [part for part in recorded.values if part is not None], recorded.times
 
     found = jax.jit(run)(jnp.linspace(-0.3, 0.4, size), y, jnp.asarray(0.23), jnp.asarray(0.41))
-    numbers = [[f"{number:.7e}" for number in np.asarray(one, float).ravel()]
+    numbers = [[f"{number:.7e}" for number in np.asarray(_number(one), float).ravel()]
                for one in jax.tree_util.tree_leaves(found)]
     text = re.sub(r"0x[0-9a-f]+", "", repr((numbers, settings)))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
@@ -151,5 +151,10 @@ def _constants(traced: Any) -> list[Any]:
 
 
 def _bytes(constant: Any) -> bytes:
+    return np.asarray(_number(constant)).tobytes()
+
+
+def _number(constant: Any) -> Any:
+    """Return the numbers of a random key, and anything else as it is."""
     is_key = jax.dtypes.issubdtype(getattr(constant, "dtype", float), jax.dtypes.prng_key)
-    return np.asarray(jax.random.key_data(constant) if is_key else constant).tobytes()
+    return jax.random.key_data(constant) if is_key else constant
