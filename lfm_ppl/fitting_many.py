@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import inspect
 import json
@@ -322,7 +323,8 @@ def _named(names: list[str]) -> xr.DataArray:
     return xr.DataArray(np.array(names, str), dims="data_set", name="data_set")
 
 
-class _Fit(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class _Fit:
     """From a task, a data set, to the result of its fit, as arrays."""
 
     model: Callable

@@ -1,7 +1,12 @@
 """Many data sets, each fitted by itself: the numbers of single fits, whatever fails and however often it is stopped."""
 
+import functools
 import json
+import os
+import subprocess
+import sys
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -13,6 +18,7 @@ from lfm_ppl.cli import main
 from lfm_ppl.results import arviz_data
 from tests.inference import linear_motif as motif
 
+ROOT = Path(__file__).resolve().parents[1]
 TIMES = motif.TIMES
 OPTIONS = {"sampler": "map", "samples": 20, "trajectory_draws": 4}
 
@@ -80,8 +86,8 @@ def test_one_table_and_one_file_over_all(folder):
 
 def test_what_is_stored_is_not_fitted_again(folder, monkeypatch):
     out, _, yielded = folder
-    fitted = []
-    monkeypatch.setattr(fitting_many, "fit", lambda *args, **keywords: fitted.append(1) or lfm.fit(*args, **keywords))
+    fitted, own = [], fitting_many._Fit.__call__
+    monkeypatch.setattr(fitting_many._Fit, "__call__", lambda self, task: fitted.append(task.name) or own(self, task))
     again = list(lfm.fit_many(motif.model, data_sets(), out=out, **OPTIONS))
     assert [one.stored for one in again] == [True, True, False] and again[2].name == "plant 1" and len(fitted) == 1
     for name, values in draws(yielded[2].result).items():
@@ -107,8 +113,10 @@ def test_results_of_something_else_are_refused(folder, change, message):
 def test_data_and_arguments_of_one_data_set():
     pairs = [("a", lfm.Data(TIMES, motif.data(0), ("a", "b"), truth={"parameters": {"noise_sd": 0.2}})),
              ("b", data_sets()["plant 1"])]
-    fits = lfm.fit_many(motif.model, pairs, each={"b": {"fixed": {"noise_sd": 0.2}}}, **OPTIONS).run()
-    assert "noise_sd" not in fits.summary.loc["b"].index and "noise_sd" in fits.summary.loc["a"].index
+    fits = lfm.fit_many(motif.model, pairs, each={"b": {"samples": 10}}, **OPTIONS).run()
+    noise = arviz_data.group(fits.combined(), "posterior")["noise_sd"].sel(chain=0)
+    assert np.isfinite(noise.sel(data_set="a")).all()
+    np.testing.assert_array_equal(np.isfinite(noise.sel(data_set="b")), np.arange(20) < 10)
     assert arviz_data.group(fits.combined(), "truth").sizes["data_set"] == 1
 
 
@@ -150,14 +158,21 @@ def model(times, y=None):
 
 
 @pytest.fixture
-def line(tmp_path, monkeypatch, capsys):
+def line(tmp_path, monkeypatch, capsys, folder):
+    """Run the command in an empty folder, where a fit takes no time; return (exit code, output, errors)."""
+    _, _, (one, *_) = folder
+    monkeypatch.setattr(fitting_many, "fit", functools.wraps(lfm.fit)(lambda *given, **named: one.result))
+    return command(tmp_path, monkeypatch, capsys)
+
+
+def command(tmp_path, monkeypatch, capsys, jobs=1):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "motif.py").write_text(MODEL)
 
     def run(text):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            code = main(["fit", "motif.py", "--sampler", "map", "--samples", "20", "--jobs", "1", *text.split()])
+            code = main(["fit", "motif.py", "--sampler", "map", "--samples", "20", "--jobs", str(jobs), *text.split()])
         captured = capsys.readouterr()
         return code, captured.out, captured.err
 
@@ -185,6 +200,23 @@ def test_each_of_many_files_and_one_that_cannot_be_read(line, tmp_path):
     csv(tmp_path / "patients" / "bad.csv", rows(5))
     code, out, err = line("--data patients/*.csv --each --out many")
     assert code == 0 and "2 of 3 tasks are stored already" in err
+
+
+@pytest.mark.slow
+def test_several_processes_get_a_model_file(tmp_path, monkeypatch, capsys):
+    """The same numbers as one process, and a run in another process goes on from it."""
+    monkeypatch.syspath_prepend(ROOT)
+    for k in range(3):
+        csv(tmp_path / "patients" / f"{k}.csv", rows(k))
+    for jobs in (1, 2):
+        code, _, _ = command(tmp_path, monkeypatch, capsys, jobs)(f"--data patients/*.csv --each --out jobs-{jobs}")
+        assert code == 0
+    one, other = (pd.read_csv(tmp_path / f"jobs-{jobs}" / "summary.csv") for jobs in (1, 2))
+    pd.testing.assert_frame_equal(one, other, rtol=1e-12)
+    found = subprocess.run([sys.executable, "-m", "lfm_ppl", *"fit motif.py --sampler map --samples 20 --jobs 1 --data "
+                            "patients/*.csv --each --out jobs-2".split()], capture_output=True, text=True,
+                           env=os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests'}"})
+    assert found.returncode == 0 and "3 of 3 tasks are stored already" in found.stderr, found.stderr
 
 
 def test_series_in_one_file(line, tmp_path):
