@@ -33,6 +33,9 @@ _WORKER_S = 60
 _COUNT_S = 1.0
 """Seconds after which workers are counted again."""
 
+_RESTART_S = 20.0
+"""Seconds in which Dask must have started a dead worker again, or another takes its place."""
+
 _DEATHS = 4
 """Workers that may die over a task before it has failed; with one thread each, only the task itself can be why."""
 
@@ -47,8 +50,11 @@ class Cluster:
         dashboard: address of Dask's dashboard; None where there is none.
     """
 
-    def __init__(self, client: Any, setup: worker.Setup, dashboard: str | None) -> None:
+    def __init__(self, client: Any, setup: worker.Setup, dashboard: str | None, local: Any = None,
+                 wanted: int = 1) -> None:
         self._client, self._setup, self.dashboard = client, setup, dashboard
+        # Dask starts a dead worker again, but gives up one that dies while it starts.
+        self._local, self._wanted, self._complete = local, wanted, time.monotonic()
 
     def computed(self, tasks: Iterable[Task], compute: Callable[[Task], Mapping[str, Any]]
                  ) -> Iterator[tuple[Task, dict[str, np.ndarray] | Exception]]:
@@ -61,36 +67,51 @@ class Cluster:
             ClusterError: the scheduler is lost, or a worker has other versions.
         """
         import cloudpickle
-        from distributed import as_completed
+        from distributed import CancelledError, wait
 
         program, waiting = cloudpickle.dumps(compute), iter(tasks)
         running: dict[Any, Task] = {}
-        done = as_completed()
         counted, workers = -np.inf, 1
 
         def submit() -> None:
             nonlocal counted, workers
             if time.monotonic() - counted > _COUNT_S:
-                counted, workers = time.monotonic(), max(len(self._client.nthreads()), 1)
+                counted, workers = time.monotonic(), max(self._count(), 1)
             for task in itertools.islice(waiting, max(workers - len(running), 0 if running else 1)):
                 future = self._client.submit(worker.work, self._setup, program, pickle.dumps(task), pure=False,
                                              key=f"{task.name}-{uuid.uuid4().hex}")
                 running[future] = task
-                done.add(future)
 
         try:
             submit()
-            for future in done:
-                task = running.pop(future)
-                found = self._outcome(future)
-                del future  # its result need not stay with the worker
-                submit()
-                yield task, found
-        except (OSError, TimeoutError) as error:  # of Dask's own communication
+            while running:
+                try:
+                    ended = wait(list(running), timeout=_COUNT_S, return_when="FIRST_COMPLETED").done
+                except TimeoutError:
+                    submit()
+                    continue
+                for future in ended:
+                    task = running.pop(future)
+                    found = self._outcome(future)
+                    submit()
+                    yield task, found
+                del future, ended  # results need not stay with the workers
+        except (OSError, TimeoutError, CancelledError) as error:  # of Dask's own communication
             raise ClusterError(self._lost()) from error
         finally:
             with contextlib.suppress(Exception):
                 self._client.cancel(list(running), asynchronous=False)
+
+    def _count(self) -> int:
+        """Return the number of workers; where one was started here and stays away, start another in its place."""
+        found = len(self._client.nthreads())
+        if self._local is not None and found < self._wanted:
+            if time.monotonic() - self._complete > _RESTART_S:
+                self._local.scale(len(self._local.worker_spec) + self._wanted - found)
+                self._complete = time.monotonic()
+        else:
+            self._complete = time.monotonic()
+        return found
 
     def _outcome(self, future: Any) -> dict[str, np.ndarray] | Exception:
         from distributed import KilledWorker
@@ -167,8 +188,9 @@ def started(workers: Workers, most: int | None = None) -> Iterator[Cluster | Non
             check_fit(client, setup)
             yield Cluster(client, setup, _dashboard(client))
     else:
-        with _embedded(workers if most is None else min(workers, most)) as client:
-            yield Cluster(client, worker.Setup.here(programs_folder()), _dashboard(client))
+        wanted = workers if most is None else min(workers, most)
+        with _embedded(wanted) as client:
+            yield Cluster(client, worker.Setup.here(programs_folder()), _dashboard(client), client.cluster, wanted)
 
 
 @contextlib.contextmanager
