@@ -29,7 +29,7 @@ class TasksFailedError(EngineError):
 
     def __init__(self, failed: Mapping[str, str], total: int, stored: bool = True) -> None:
         self.failed, self.total, self.stored = dict(failed), total, stored
-        shown = "; ".join(f"{name}: {reason}" for name, reason in list(failed.items())[:_SHOWN])
+        shown = "; ".join(f"{name}: {reason.rstrip('.')}" for name, reason in list(failed.items())[:_SHOWN])
         more = f"; and {len(failed) - _SHOWN} more" if len(failed) > _SHOWN else ""
         left = (" The results of the others are stored; the same call or command computes only what failed."
                 if stored and len(failed) < total else "")
