@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from lfm_ppl.filtering.smoother import smooth as smooth
     from lfm_ppl.fitting import ConvergenceWarning as ConvergenceWarning
     from lfm_ppl.fitting import fit as fit
+    from lfm_ppl.fitting_many import fit_many as fit_many
     from lfm_ppl.fokker_planck_grid.fokker_planck import fokker_planck as fokker_planck
     from lfm_ppl.forces import ApproximationWarning as ApproximationWarning
     from lfm_ppl.forces import Constant as Constant
@@ -132,6 +133,7 @@ _NAMES = {
     "inference.bound_model": ("BoundModel", "bind"),
     "backtesting": ("Backtest", "backtest"),
     "fitting": ("ConvergenceWarning", "fit"),
+    "fitting_many": ("fit_many",),
     "forecasting": ("forecast",),
     "inference.handlers.fixing": ("fix",),
     "inference.map": ("map_estimate",),

@@ -8,6 +8,12 @@ _OPTION = "xla_cpu_small_while_loop_byte_threshold"
 _BYTES = 1_000_000
 _FLAG = "--xla_backend_extra_options="
 
+ONE_THREAD = {"PJRT_NPROC": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+"""Environment in which a process computes with one thread: JAX reads it at its first computation, NumPy when imported.
+
+Processes side by side would otherwise have as many threads each as there are CPUs, which hand small operations to one
+another: two Hamiltonian chains on two CPUs took over four times as long as one by itself."""
+
 
 def fast_loops() -> None:
     """Let XLA compile a loop over small matrices as one function, which its CPU runtime calls once.

@@ -216,6 +216,44 @@ def on_clock_of(data: Data, other: Data) -> Data:
                            for name, table in data.inputs.items()})
 
 
+def read_series(path: str | Path, column: str, outputs: Sequence[str] | None = None, time_column: str | None = None,
+                inputs: Sequence[str] | Mapping[str, str] = (), time_unit: str | None = None) -> dict[str, Data]:
+    r"""Read several series from one comma-separated file, in which a column says which series a row belongs to.
+
+    Args:
+        path: the file, as for :func:`read_csv`.
+        column: the column of identifiers, such as ``patient``; its cells are taken as text.
+        outputs: as for :func:`read_csv`; None leaves out ``column``, too.
+        time_column: as for :func:`read_csv`, and so are the others.
+        inputs: columns of known inputs.
+        time_unit: unit of times that are dates.
+
+    Returns:
+        Identifier -> observations, in the order in which the file has them. Rows of a series need not stand together,
+        but their times must not go back.
+
+    Raises:
+        ValueError: as :func:`read_csv`, with the row; a row without an identifier; a series without any value.
+
+    Example:
+        >>> import pathlib, tempfile
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "patients.csv"
+        >>> _ = path.write_text("patient,time,dose\nA,0,1.5\nB,0,2.5\nA,1,1.0\n")
+        >>> {name: one.y.ravel().tolist() for name, one in read_series(path, "patient").items()}
+        {'A': [1.5, 1.0], 'B': [2.5]}
+    """
+    source = table.from_csv(path)
+    if column not in source.columns:
+        raise ValueError(f"{source.label}: {checks.unknown('column of series', column, source.columns)}")
+    parts: dict[str, list[int]] = {}
+    for row, name in enumerate(source.columns[column]):
+        if not name:
+            raise ValueError(f"{source.place(row, column)}: the identifier of the series is missing.")
+        parts.setdefault(name, []).append(row)
+    return {name: _read(source.part(rows, without=column), outputs, time_column, inputs, time_unit,
+                        f" of series {name!r}") for name, rows in parts.items()}
+
+
 def write_csv(data: Data, path: str | Path) -> None:
     """Write observations so that :func:`read_csv` reads the same numbers back.
 
@@ -258,8 +296,8 @@ def read_truth(path: str | Path) -> dict[str, Any]:
 
 
 def _read(source: Table, outputs: Sequence[str] | None, time_column: str | None,
-          inputs: Sequence[str] | Mapping[str, str], time_unit: str | None) -> Data:
-    """Return the observations in a table; arguments as for `read_csv`."""
+          inputs: Sequence[str] | Mapping[str, str], time_unit: str | None, part: str = "") -> Data:
+    """Return the observations in a table; arguments as for `read_csv`, and what a part of a file is called."""
     if time_unit is not None:
         checks.one_of("time_unit", time_unit, calendar_time.SECONDS)
     if isinstance(inputs, str):
@@ -276,7 +314,7 @@ def _read(source: Table, outputs: Sequence[str] | None, time_column: str | None,
     times, unit, origin = _times(source, time_name, time_unit)
     y = np.array([[_value(source, row, name) for name in names] for row in range(len(times))])
     if np.all(np.isnan(y)):
-        raise ValueError(f"{source.label}: every value of {', '.join(names)} is missing.")
+        raise ValueError(f"{source.label}: every value of {', '.join(names)}{part} is missing.")
     return Data(times, y, tuple(names), units={"time": unit} if unit else {}, origin=origin,
                 inputs={name: _input(source, name, way, times) for name, way in wanted.items()})
 

@@ -19,17 +19,20 @@ class Table:
         label: the file, or the kind of table.
         columns: name -> cells: text, numbers, dates, or None.
         rows: what the user calls each row.
-        header: what the user calls the row of names; empty where there is none.
     """
 
     label: str
     columns: Mapping[str, Sequence[Any]]
     rows: Sequence[Any]
-    header: str = ""
 
     def place(self, row: int, column: str) -> str:
         """Return where a cell is."""
         return f"{self.label}, row {self.rows[row]}, column {column!r}"
+
+    def part(self, rows: Sequence[int], without: str) -> Table:
+        """Return some of the rows, without a column."""
+        columns = {name: [cells[row] for row in rows] for name, cells in self.columns.items() if name != without}
+        return Table(self.label, columns, [self.rows[row] for row in rows])
 
 
 def from_csv(path: str | Path) -> Table:

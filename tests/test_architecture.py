@@ -25,9 +25,9 @@ LAYERS = (
     ("particles", "fokker_planck_grid", "latent_grid"),
     ("switching",),
     ("inference",),
-    ("results",),
+    ("results", "engine"),
     ("fitting", "forecasting"),
-    ("backtesting", "conversion"),
+    ("backtesting", "conversion", "fitting_many"),
     ("loading",),
     ("experiments",),
     ("cli", "__main__"),
@@ -188,7 +188,7 @@ def test_a_model_and_its_filter_import_no_satellites_figures_or_experiments():
     )
     found = run(code)
     assert found.endswith("False False") and "lfm_ppl.filtering" in found
-    for part in ("orbits", "particles", "fokker_planck_grid", "results", "experiments", "switching", "cli"):
+    for part in ("orbits", "particles", "fokker_planck_grid", "results", "engine", "experiments", "switching", "cli"):
         assert f"lfm_ppl.{part}" not in found
 
 

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 from lfm_ppl.cli.arguments import parser
 from lfm_ppl.cli.interruption import INTERRUPTED
+from lfm_ppl.engine.errors import EngineError
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -42,7 +43,7 @@ def _one_line(error: Exception) -> str:
     text = " ".join(str(error).split()) or type(error).__name__
     if isinstance(error, FileNotFoundError) and error.filename:
         return f"there is no file {error.filename}."
-    if isinstance(error, (ValueError, TypeError, OSError)):
+    if isinstance(error, (ValueError, TypeError, OSError, EngineError)):
         return text
     return f"{type(error).__name__}: {text} (--debug shows where)"
 

@@ -188,10 +188,22 @@ def _add_compare(commands: Any) -> None:
         help="folder to write; what it holds already is kept and used (default: lfm-results/compare/EXPERIMENT)",
     )
     command.add_argument("--overwrite", action="store_true", help="replace results that were made with other settings")
-    command.add_argument(
-        "--jobs", type=_whole(1), metavar="N", help="processes that compute (default: one for each core, at most 4)"
+    _add_workers(command)
+    command.add_argument("--quiet", action="store_true", help="no progress")
+
+
+def _add_workers(group: Any) -> None:
+    group.add_argument(
+        "--jobs",
+        type=_whole(1),
+        metavar="N",
+        help="processes that compute (default: one for each core, at most 4; one without Dask)",
     )
-    command.add_argument("--quiet", action="store_true", help="no lines of progress")
+    group.add_argument(
+        "--scheduler",
+        metavar="tcp://HOST:PORT",
+        help="compute with the workers of this scheduler of Dask, on other machines, too",
+    )
 
 
 def _add_version(commands: Any) -> None:
@@ -206,6 +218,7 @@ def _add_fit(commands: Any) -> None:
         "  lfm-ppl fit transcription --data p53.csv --set 'decay[CDKN1A]=0.8'\n"
         "  lfm-ppl fit spring --until 40 --target-accept 0.95\n"
         "  lfm-ppl fit spring --out result --resume\n"
+        "  lfm-ppl fit my_model.py --data 'patients/*.csv' --each --sampler map --jobs 2\n"
         "  lfm-ppl fit my_model.py --data mine.csv --rule gauss-hermite --steps 20 --out result"
     )
     help_ = "infer parameters and forces, and write posterior, summary and figures"
@@ -215,13 +228,15 @@ def _add_fit(commands: Any) -> None:
     _add_inference(command.add_argument_group("inference"))
     _add_approximation(command.add_argument_group("approximation (default: the model's own)"))
     out = command.add_argument_group("results")
-    out.add_argument("--out", metavar="DIR", help="folder to write (default: lfm-results/MODEL-001, -002, ...)")
+    out.add_argument("--out", metavar="DIR", help="folder to write (default: lfm-results/MODEL-001, -002, ...; with "
+                     "--each or --series lfm-results/MODEL-many, and what it holds already is kept and used)")
     _add_times(out)
     out.add_argument("--overwrite", action="store_true", help="write into a folder with files")
     out.add_argument("--resume", action="store_true",
                      help="go on with the run in --out that was stopped or killed, to the very same draws")
     out.add_argument("--quiet", action="store_true",
                      help="no progress (a bar, or a line every 30 s where there is no terminal)")
+    _add_workers(command.add_argument_group("many data sets (--each, --series)"))
 
 
 def _add_times(group: Any) -> None:
@@ -260,8 +275,12 @@ def _add_data(group: Any) -> None:
         "--data",
         metavar="FILE",
         help="CSV: a time column, one column per output, empty cells missing, repeated times for "
-        "replicates (default: the model's simulated data)",
+        "replicates (default: the model's simulated data); with --each a pattern in quotes",
     )
+    many = group.add_mutually_exclusive_group()
+    many.add_argument("--each", action="store_true", help="fit each of the files that --data matches by itself")
+    many.add_argument("--series", metavar="NAME", help="fit each series by itself: the rows that share a value of this "
+                      "column")
     group.add_argument("--time-column", metavar="NAME",
                        help="the time column, of numbers or dates (default: time, t or time_h, else one of dates)")
     group.add_argument("--time-unit", type=_one_of("unit of time", calendar_time.SECONDS), metavar="UNIT",

@@ -22,6 +22,8 @@ RULES = {
 SAMPLERS = ("nuts", "ram", "pmmh", "map")
 REFERENCES = ("auto", "grid", "particles")
 FREE = "free"
+MOST_JOBS = 4
+"""Processes that compute where nothing else is asked for; each takes one or two GiB."""
 
 
 def options(model: ModelFile, given: Sequence[str]) -> dict[str, Any]:
@@ -97,3 +99,20 @@ def _number(name: str, text: str) -> Any:
         ) from None
     checks.finite(f"--set {name}", np.array(values))
     return values[0] if len(values) == 1 else values
+
+
+def workers(jobs: int | None, scheduler: str | None) -> int | str:
+    """Return what computes, as `lfm_ppl.engine.run.run_tasks` takes it, for ``--jobs`` and ``--scheduler``.
+
+    Raises:
+        ValueError: both are given.
+    """
+    from lfm_ppl.engine.cluster import available, check_workers
+
+    if scheduler is None:
+        return jobs or min(available(), MOST_JOBS)
+    if jobs is not None:
+        raise ValueError("--jobs is the number of processes on this machine; a scheduler has workers of its own. Give "
+                         "one of --jobs and --scheduler.")
+    check_workers(scheduler)
+    return scheduler

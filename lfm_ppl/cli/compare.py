@@ -4,22 +4,18 @@ from __future__ import annotations
 
 import argparse
 import shutil
-import sys
 import textwrap
 import time
 from pathlib import Path
 
-from lfm_ppl.cli import results, session
-
-_MOST_JOBS = 4
-"""Processes that compute where nothing else is asked for; each takes one or two GiB."""
+from lfm_ppl.cli import choices, results, session
 
 
 def run(arguments: argparse.Namespace) -> int:
     """List the experiments, or run one: what its folder holds already is not computed again."""
-    session.start(1, not arguments.no_cache)
+    session.start(1, not arguments.no_cache, one_thread=True)  # so that one process finds the numbers of several
+    from lfm_ppl.engine.progress import Console, duration
     from lfm_ppl.experiments import catalogue
-    from lfm_ppl.experiments.tasks import available_cpus, duration
     from lfm_ppl.results import tables
 
     if arguments.experiment is None:
@@ -30,8 +26,7 @@ def run(arguments: argparse.Namespace) -> int:
     started = time.perf_counter()
     found = chosen.run(catalogue.Wanted(
         folder, arguments.realisations, arguments.conditional, arguments.seed, arguments.quick, arguments.overwrite,
-        None if arguments.quiet else lambda line: print(line, file=sys.stderr, flush=True),
-        arguments.jobs or min(available_cpus(), _MOST_JOBS), arguments.data,
+        None if arguments.quiet else Console(), choices.workers(arguments.jobs, arguments.scheduler), arguments.data,
         tuple(arguments.satellites) if arguments.satellites else None, arguments.train_days, arguments.axes))
     width = shutil.get_terminal_size().columns
     for title, table in found.tables.items():

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from lfm_ppl import data, loading
-from lfm_ppl.cli import choices, forecast, results, session
+from lfm_ppl.cli import choices, fit_many, forecast, results, session
 from lfm_ppl.cli.interruption import INTERRUPTED, watched
 
 SETTINGS = ("rule", "steps", "max_step", "iterations", "tolerance")
@@ -30,16 +30,17 @@ def run(arguments: argparse.Namespace) -> int:
     """Fit, print the summary, and write the results; the posterior is on disk before any figure."""
     from lfm_ppl.results import arviz_data, checkpoint
 
+    if arguments.each or arguments.series is not None:
+        return fit_many.run(arguments)
+    if arguments.jobs is not None or arguments.scheduler is not None:
+        raise ValueError("--jobs and --scheduler are for many data sets; give them with --each or --series.")
     session.start(arguments.chains, not arguments.no_cache)
     model = loading.load(arguments.model)
     options = choices.options(model, arguments.option)
     observed = _observed(arguments, model, options)
     fixed = choices.fixed(arguments.set, model.anchors(observed))
-    at = _requested(observed, arguments.until, arguments.at)
-    if arguments.target_accept is not None and arguments.sampler == "map":
-        raise ValueError("--target-accept is for the samplers nuts, ram and pmmh; map accepts and rejects nothing.")
-    if arguments.particles is not None and arguments.sampler != "pmmh":
-        raise ValueError(f"--particles is for the sampler pmmh; {arguments.sampler} uses none.")
+    at = requested(observed, arguments.until, arguments.at)
+    check_sampler(arguments)
     if arguments.resume and arguments.out is None:
         raise ValueError("--resume goes on with the run in a folder; name the folder with --out.")
     if arguments.resume and arguments.overwrite:
@@ -85,6 +86,14 @@ def _nothing_left(folder: Path) -> str:
     return "nothing was sampled yet"
 
 
+def check_sampler(arguments: argparse.Namespace) -> None:
+    """Raise ValueError for a setting of another sampler."""
+    if arguments.target_accept is not None and arguments.sampler == "map":
+        raise ValueError("--target-accept is for the samplers nuts, ram and pmmh; map accepts and rejects nothing.")
+    if arguments.particles is not None and arguments.sampler != "pmmh":
+        raise ValueError(f"--particles is for the sampler pmmh; {arguments.sampler} uses none.")
+
+
 def _observed(arguments: argparse.Namespace, model: loading.ModelFile, options: dict[str, Any]) -> data.Data:
     """Return the data to fit: the user's file as the model takes it, or the model's own."""
     if arguments.data is None:
@@ -93,6 +102,14 @@ def _observed(arguments: argparse.Namespace, model: loading.ModelFile, options: 
                 flag = flag.replace("_", "-")
                 raise ValueError(f"--{flag} says how to read a data file; give one with --data.")
         return model.simulate(**options)
+    observed = read(arguments.data, model, arguments)
+    if arguments.truth is not None:
+        observed = dataclasses.replace(observed, truth=data.read_truth(arguments.truth))
+    return model.prepare(observed)
+
+
+def columns(arguments: argparse.Namespace, model: loading.ModelFile) -> tuple[str, ...] | None:
+    """Return the columns of a file that are outputs; None: all but the time."""
     columns = model.outputs
     if arguments.outputs is not None:
         columns = tuple(name.strip() for name in arguments.outputs.split(","))
@@ -101,16 +118,29 @@ def _observed(arguments: argparse.Namespace, model: loading.ModelFile, options: 
                 f"{model.name} has {len(model.outputs)} outputs ({', '.join(model.outputs)}); "
                 f"--outputs names {len(columns)} columns."
             )
+    return columns
+
+
+def read(path: str, model: loading.ModelFile, arguments: argparse.Namespace) -> data.Data:
+    """Return the observations in a file, under the model's names of its outputs and inputs."""
     inputs = choices.inputs(arguments.inputs, model)
-    observed = data.read_csv(arguments.data, columns, arguments.time_column, dict(inputs.values()), arguments.time_unit)
-    observed = dataclasses.replace(observed, outputs=model.outputs or observed.outputs,
-                                   inputs={name: observed.inputs[column] for name, (column, _) in inputs.items()})
-    if arguments.truth is not None:
-        observed = dataclasses.replace(observed, truth=data.read_truth(arguments.truth))
-    return model.prepare(observed)
+    return taken(model, inputs, data.read_csv(path, columns(arguments, model), arguments.time_column,
+                                              dict(inputs.values()), arguments.time_unit))
 
 
-def _requested(observed: data.Data, until: str | None, at: str | None) -> np.ndarray | None:
+def taken(model: loading.ModelFile, inputs: dict[str, tuple[str, str]], observed: data.Data) -> data.Data:
+    """Return observations under the model's names of its outputs and inputs.
+
+    Args:
+        model: what takes them.
+        inputs: name -> column, interpolation, see `choices.inputs`.
+        observed: as read.
+    """
+    return dataclasses.replace(observed, outputs=model.outputs or observed.outputs,
+                               inputs={name: observed.inputs[column] for name, (column, _) in inputs.items()})
+
+
+def requested(observed: data.Data, until: str | None, at: str | None) -> np.ndarray | None:
     """Return the times of the trajectories where some are asked for; None: the library's own grid."""
     if until is None and at is None:
         return None
@@ -171,19 +201,7 @@ def sample(
         at: times of the trajectories; None: a grid over the data.
     """
     import lfm_ppl
-    from lfm_ppl.inference.handlers.settings import approximate
 
-    target_accept = arguments.target_accept
-    if target_accept is None and arguments.sampler == "nuts":
-        target_accept = model.target_accept
-    numpyro_model = approximate(
-        model.model,
-        rule=choices.rule(arguments.rule),
-        steps=arguments.steps,
-        max_step=arguments.max_step,
-        iterations=arguments.iterations,
-        tolerance=arguments.tolerance,
-    )
     # What `lfm-ppl check` rebuilds the model from, in the words of the command line.
     attributes = {
         "model_file": model.name if loading.available().get(model.name) == model.path else str(model.path),
@@ -193,20 +211,10 @@ def sample(
     if observed.note:
         attributes["note"] = observed.note
     return lfm_ppl.fit(
-        numpyro_model,
+        approximated(arguments, model),
         observed,
-        sampler=arguments.sampler,
-        chains=arguments.chains,
-        warmup=arguments.warmup,
-        samples=arguments.samples,
-        thin=arguments.thin,
         seed=arguments.seed,
         at=at,
-        sampler_options={
-            name: value
-            for name, value in (("target_accept_prob", target_accept), ("particles", arguments.particles))
-            if value is not None
-        },
         model_kwargs=model.keywords(observed, options),
         fixed=fixed,
         progress=not arguments.quiet,
@@ -215,7 +223,38 @@ def sample(
         resume=arguments.resume,
         overwrite=arguments.overwrite,
         attributes=attributes,
+        **sampling(arguments, model),
     )
+
+
+def approximated(arguments: argparse.Namespace, model: loading.ModelFile) -> Any:
+    """Return the NumPyro model with the user's settings of the approximation."""
+    from lfm_ppl.inference.handlers.settings import approximate
+
+    return approximate(
+        model.model,
+        rule=choices.rule(arguments.rule),
+        steps=arguments.steps,
+        max_step=arguments.max_step,
+        iterations=arguments.iterations,
+        tolerance=arguments.tolerance,
+    )
+
+
+def sampling(arguments: argparse.Namespace, model: loading.ModelFile) -> dict[str, Any]:
+    """Return the arguments of `lfm_ppl.fit` that say how to sample."""
+    target_accept = arguments.target_accept
+    if target_accept is None and arguments.sampler == "nuts":
+        target_accept = model.target_accept
+    given = (("target_accept_prob", target_accept), ("particles", arguments.particles))
+    return {
+        "sampler": arguments.sampler,
+        "chains": arguments.chains,
+        "warmup": arguments.warmup,
+        "samples": arguments.samples,
+        "thin": arguments.thin,
+        "sampler_options": {name: value for name, value in given if value is not None},
+    }
 
 
 def report(posterior: Any, folder: Path, seconds: float, overwrite: bool) -> int:

@@ -9,6 +9,8 @@ import platform
 import warnings
 from pathlib import Path
 
+from lfm_ppl.compilation import ONE_THREAD, fast_loops
+
 _MOST_DEVICES = 64
 
 SWITCH = "LFM_PPL_CACHE"
@@ -21,7 +23,7 @@ _LARGEST = 2**30
 """Bytes that the kept programs may take; a fit makes one to five million of them."""
 
 
-def start(chains: int, keep_programs: bool = True) -> None:
+def start(chains: int, keep_programs: bool = True, one_thread: bool = False) -> None:
     """Enable float64 and fast loops, make one device for each chain, and keep compiled programs for the next run.
 
     JAX counts its devices once, when the first array is made; after that the number is fixed. With
@@ -30,11 +32,12 @@ def start(chains: int, keep_programs: bool = True) -> None:
     Args:
         chains: that are to run side by side.
         keep_programs: see `cache_folder`.
+        one_thread: compute with one, as the workers of a cluster do.
     """
+    if one_thread:
+        os.environ.update(ONE_THREAD)
     import jax
     import numpyro
-
-    from lfm_ppl.compilation import fast_loops
 
     jax.config.update("jax_enable_x64", True)
     fast_loops()

@@ -10,6 +10,8 @@ from typing import Any, NamedTuple
 import pandas as pd
 
 from lfm_ppl import checks
+from lfm_ppl.engine.cluster import Workers
+from lfm_ppl.engine.run import Reporter
 
 _MODULES = {"ginzburg-landau": "lfm_ppl.experiments.ginzburg_landau.report",
             "gps": "lfm_ppl.experiments.gps.report",
@@ -32,7 +34,7 @@ class Wanted(NamedTuple):
         quick: a small version that shows that everything runs.
         overwrite: compute again what was stored with other settings.
         report: what to do with a line of progress; None: nothing.
-        workers: processes that compute.
+        workers: what computes; see `run_tasks`.
         data: a folder of files, where the experiment reads some; None: it makes its own data.
         satellites: names, where the experiment has satellites; None: all.
         train_days: days to learn from, where the experiment predicts those after them; None: its own.
@@ -45,8 +47,8 @@ class Wanted(NamedTuple):
     seed: int = 0
     quick: bool = False
     overwrite: bool = False
-    report: Callable[[str], None] | None = None
-    workers: int = 1
+    report: Reporter | None = None
+    workers: Workers = 1
     data: str | None = None
     satellites: tuple[str, ...] | None = None
     train_days: float | None = None

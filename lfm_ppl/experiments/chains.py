@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from numpyro.infer import MCMC, NUTS
 
+from lfm_ppl.engine.task import Result
 from lfm_ppl.experiments import scores
-from lfm_ppl.experiments.tasks import Result
 from lfm_ppl.experiments.timing import timed
 
 APART = 0.3

@@ -277,7 +277,9 @@ class BoundModel:
 
         That is where the model asks its data for values.
         """
-        return self._program.portable(self.y) if self._program.place is not None else None
+        if self._program.place is None:
+            return None
+        return self._program.once("fingerprint", lambda: self._program.portable(self.y))
 
     @property
     def forward_mode(self) -> bool:

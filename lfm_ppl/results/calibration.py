@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,11 +14,16 @@ import numpy as np
 from numpyro import handlers
 
 from lfm_ppl import checks
+from lfm_ppl.engine.cluster import Workers
+from lfm_ppl.engine.run import Reporter, run_tasks
+from lfm_ppl.engine.task import Task
 from lfm_ppl.inference.bound_model import bind, likelihood_site
 from lfm_ppl.results.files import writing
 
 LOG_LIKELIHOOD = "log likelihood"
 _SIMULATIONS = 20_000
+_BATCH = 25
+"""Data sets of a task where there are several."""
 
 
 class Calibration(NamedTuple):
@@ -32,7 +39,8 @@ class Calibration(NamedTuple):
 
 
 def calibrate(key: jax.Array, model: Callable, times: Any, kernel: Callable, *, data_sets: int = 200, draws: int = 63,
-              thin: int = 10, warmup: int = 500, batch: int | None = None) -> Calibration:
+              thin: int = 10, warmup: int = 500, batch: int | None = None, folder: str | Path | None = None,
+              overwrite: bool = False, report: Reporter | None = None, workers: Workers = 1) -> Calibration:
     """Rank true parameters among posterior draws, for many data sets that the model itself generates.
 
     For parameters theta* drawn from the prior and data drawn from the model at theta*, theta* is one more draw from
@@ -49,14 +57,21 @@ def calibrate(key: jax.Array, model: Callable, times: Any, kernel: Callable, *, 
         draws: L. With 63 the 64 possible ranks fall into 2, 4, 8, 16 or 32 bins of equal width.
         thin: steps of the chain between two of these; the draws must be nearly independent.
         warmup: steps before the first.
-        batch: data sets that run side by side; all by default. (NUTS side by side takes as long as its longest tree.)
+        batch: data sets that run side by side and make one task; by default all of them in this process, and 25 where
+            there is a folder or there are several workers. (NUTS side by side takes as long as its longest tree.)
+        folder: where the ranks of each task are stored, so that a run that was stopped goes on; None: nowhere.
+        overwrite: compute again what was stored with other settings.
+        report: what to do with a line of progress; None: nothing.
+        workers: what computes; see `lfm_ppl.engine.run.run_tasks`.
 
     Returns:
         The ranks.
 
     Raises:
         TypeError: ``key`` is no random key.
-        ValueError: the model has no likelihood site, or a count is not a positive number.
+        ValueError: the model has no likelihood site, a count is not a positive number, or the folder holds ranks that
+            were made with other settings.
+        TasksFailedError: some tasks failed; the others are stored.
 
     Example:
         >>> import jax.numpy as jnp, numpyro, numpyro.distributions as dist, lfm_ppl as lfm
@@ -75,24 +90,67 @@ def calibrate(key: jax.Array, model: Callable, times: Any, kernel: Callable, *, 
     checks.random_key(key)
     for name, value in (("data_sets", data_sets), ("draws", draws), ("thin", thin), ("warmup", warmup)):
         checks.positive_integer(name, value)
-    times = np.asarray(times, float)
-    site = likelihood_site(model, (times,), {}, key)
-    bound = bind(model, times, jnp.zeros_like(site.observed))
-    truth_keys, chain_keys = jax.random.split(key)
+    if batch is None:
+        batch = data_sets if folder is None and isinstance(workers, int) and workers == 1 else min(_BATCH, data_sets)
+    checks.positive_integer("batch", batch)
+    compute = _Ranks(model, np.asarray(times, float), kernel, draws, thin, warmup, batch)
+    compute.check()
+    truth_keys, chain_keys = (np.asarray(jax.random.key_data(jax.random.split(one, data_sets)))
+                              for one in jax.random.split(key))
+    settings = {"key": np.asarray(jax.random.key_data(key)).ravel().tolist(), "times": compute.times.tolist(),
+                "model": _name(model), "kernel": _name(kernel), "draws": draws, "thin": thin, "warmup": warmup}
+    tasks = [Task(f"data-sets/{first:05d}-{min(first + batch, data_sets) - 1:05d}", 0, settings,
+                  (truth_keys[first:first + batch], chain_keys[first:first + batch], str(jax.random.key_impl(key))))
+             for first in range(0, data_sets, batch)]
+    found = run_tasks(tasks, compute, folder, overwrite=overwrite, report=report, workers=workers)
+    parts = [found[task.name] for task in tasks]
+    return Calibration({name: np.concatenate([part[name] for part in parts]) for name in parts[0]}, draws)
 
-    def one(keys: tuple[jax.Array, jax.Array]) -> dict[str, jax.Array]:
-        trace = handlers.trace(handlers.seed(model, keys[0])).get_trace(times)
-        y = trace[site.name]["value"]
-        truth = {name: trace[name]["value"] for name in bound.sites}
-        posterior = _chain(kernel(model), (times, y), keys[1], draws, thin, warmup)
-        score = lambda theta: bound.likelihood(theta, y).log_prob(y).sum()  # noqa: E731
-        truth[LOG_LIKELIHOOD] = score(truth)
-        posterior[LOG_LIKELIHOOD] = jax.lax.map(score, posterior)
-        return {n: (posterior[n] < truth[n]).sum(0) for n in truth}
 
-    keys = (jax.random.split(truth_keys, data_sets), jax.random.split(chain_keys, data_sets))
-    found = jax.jit(lambda k: jax.lax.map(one, k, batch_size=batch or data_sets))(keys)
-    return Calibration(_scalars({name: np.asarray(value) for name, value in found.items()}), draws)
+@dataclasses.dataclass(eq=False)
+class _Ranks:
+    """From a task, the keys of some data sets, to the ranks of the true values in them."""
+
+    model: Callable
+    times: np.ndarray
+    kernel: Callable
+    draws: int
+    thin: int
+    warmup: int
+    batch: int
+
+    def check(self) -> None:
+        """Raise where the model has no likelihood site, before anything is computed."""
+        likelihood_site(self.model, (self.times,), {}, jax.random.key(0))
+
+    @functools.cached_property
+    def program(self) -> Callable:
+        """The compiled function of the keys."""
+        model, times = self.model, self.times
+        site = likelihood_site(model, (times,), {}, jax.random.key(0))
+        bound = bind(model, times, jnp.zeros_like(site.observed))
+
+        def one(keys: tuple[jax.Array, jax.Array]) -> dict[str, jax.Array]:
+            trace = handlers.trace(handlers.seed(model, keys[0])).get_trace(times)
+            y = trace[site.name]["value"]
+            truth = {name: trace[name]["value"] for name in bound.sites}
+            posterior = _chain(self.kernel(model), (times, y), keys[1], self.draws, self.thin, self.warmup)
+            score = lambda theta: bound.likelihood(theta, y).log_prob(y).sum()  # noqa: E731
+            truth[LOG_LIKELIHOOD] = score(truth)
+            posterior[LOG_LIKELIHOOD] = jax.lax.map(score, posterior)
+            return {n: (posterior[n] < truth[n]).sum(0) for n in truth}
+
+        return jax.jit(lambda keys: jax.lax.map(one, keys, batch_size=self.batch))
+
+    def __call__(self, task: Task) -> dict[str, np.ndarray]:
+        """Return name of a scalar -> ranks."""
+        *keys, kind = task.data
+        found = self.program(tuple(jax.random.wrap_key_data(jnp.asarray(one), impl=kind) for one in keys))
+        return _scalars({name: np.asarray(value) for name, value in found.items()})
+
+
+def _name(function: Callable) -> str:
+    return f"{getattr(function, '__module__', '')}.{getattr(function, '__qualname__', type(function).__name__)}"
 
 
 def _chain(kernel: Any, arguments: tuple, key: jax.Array, draws: int, thin: int, warmup: int) -> dict[str, jax.Array]:

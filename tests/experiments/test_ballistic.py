@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from lfm_ppl.engine.store import write
 from lfm_ppl.experiments import catalogue, scores
 from lfm_ppl.experiments.ballistic import (
     chains,
@@ -20,7 +21,6 @@ from lfm_ppl.experiments.ballistic import (
     tables,
     tracking,
 )
-from lfm_ppl.experiments.tasks import write
 
 SMALL = experiment.Settings(
     runs=2, particle_runs=1, particles=(2_000,), chain_runs=1, drawn_runs=1, draws=200, paths=5, nuts=(2, 10, 10, 1),

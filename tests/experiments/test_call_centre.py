@@ -12,9 +12,9 @@ import pytest
 from scipy import integrate, special, stats
 
 import lfm_ppl as lfm
+from lfm_ppl.engine.store import write
 from lfm_ppl.experiments import catalogue, scores, weighting
 from lfm_ppl.experiments.call_centre import counts, experiment, figures, posterior, problem, report, tables, tracking
-from lfm_ppl.experiments.tasks import write
 from lfm_ppl.inference.optimise import Objective
 
 DATA = Path(os.environ.get("LFM_DATA", "../shared/data")) / "calls"

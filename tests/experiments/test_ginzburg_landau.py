@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from lfm_ppl.engine.store import write
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.ginzburg_landau import conditional, experiment, figures, grid, problem, sampling, state, tables
-from lfm_ppl.experiments.tasks import write
 
 SMALL = experiment.Settings(
     realisations=1, conditional=2, particles=200, smoother_particles=50, smoother_draws=20, conditional_particles=50,

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import catalogue
 from lfm_ppl.experiments.periodic_kernels import covariance, experiment, figures, problem, regression
-from lfm_ppl.experiments.tasks import Task
 
 SMALL = experiment.Settings(runs=20, functions=(5, 22), draws=20, points=(20, 200))
 

@@ -10,8 +10,9 @@ import pandas as pd
 import pytest
 from scipy.integrate import solve_ivp
 
+from lfm_ppl.engine.store import write
+from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import catalogue, scores
-from lfm_ppl.experiments.tasks import Task, write
 from lfm_ppl.experiments.transcription import ellipses, experiment, figures, problem, report, slices, tables, verdict
 from lfm_ppl.latent_grid.laplace import laplace
 

@@ -9,8 +9,8 @@ import numpy as np
 import numpyro
 import pytest
 
+from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import catalogue
-from lfm_ppl.experiments.tasks import Task
 from lfm_ppl.experiments.transcription import parameters, parameters_report, problem
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.results import arviz_data

@@ -36,38 +36,42 @@ def test_p_values_are_those_of_pearson_and_kolmogorov():
     assert abs(found["ecdf"] - stats.kstest((rank + 0.5) / 1024, "uniform").pvalue) < 0.05
 
 
+def level(times, y=None, noise=1.0):
+    mean = numpyro.sample("level", dist.Normal(jnp.zeros(2), 1.0).to_event(1))
+    system = lfm.LatentForceModel(
+        lambda x, u, t: jnp.zeros(2), {}, lfm.GaussianObservation(lambda x, u, t: x, noise * jnp.ones(2)),
+        lfm.Gaussian(mean, jnp.zeros((2, 2))))
+    numpyro.sample("data", lfm.MarginalLikelihood(system, times), obs=y)
+
+
+class Exact:
+    """A kernel that draws independently from the posterior of `level`, or from a wider Gaussian."""
+
+    def __init__(self, widen):
+        self.widen = widen
+
+    def init(self, key, warmup, init_params, arguments, keywords):
+        return self.sample(State({"level": jnp.zeros(2)}, key), arguments, keywords)
+
+    def sample(self, state, arguments, keywords):
+        key, now = jax.random.split(state.key)
+        y = arguments[1]
+        precision = 1.0 + y.shape[0]
+        noise = self.widen * jax.random.normal(now, (2,)) / jnp.sqrt(precision)
+        return State({"level": y.sum(0) / precision + noise}, key)
+
+    def postprocess_fn(self, arguments, keywords):
+        return lambda z: z
+
+
+def run(widen, **options):
+    return calibration.calibrate(jax.random.key(5), level, np.arange(3.0), lambda model: Exact(widen), data_sets=400,
+                                 thin=1, warmup=1, **options)
+
+
 @pytest.fixture(scope="module")
 def conjugate():
     """Ranks of a level with a known posterior, from a sampler that is exact, and from one that is told lies."""
-
-    def level(times, y=None, noise=1.0):
-        mean = numpyro.sample("level", dist.Normal(jnp.zeros(2), 1.0).to_event(1))
-        system = lfm.LatentForceModel(
-            lambda x, u, t: jnp.zeros(2), {}, lfm.GaussianObservation(lambda x, u, t: x, noise * jnp.ones(2)),
-            lfm.Gaussian(mean, jnp.zeros((2, 2))))
-        numpyro.sample("data", lfm.MarginalLikelihood(system, times), obs=y)
-
-    class Exact:
-        """A kernel that draws independently from the posterior of `level`, or from a wider Gaussian."""
-
-        def __init__(self, widen):
-            self.widen = widen
-
-        def init(self, key, warmup, init_params, arguments, keywords):
-            return self.sample(State({"level": jnp.zeros(2)}, key), arguments, keywords)
-
-        def sample(self, state, arguments, keywords):
-            key, now = jax.random.split(state.key)
-            y = arguments[1]
-            precision = 1.0 + y.shape[0]
-            noise = self.widen * jax.random.normal(now, (2,)) / jnp.sqrt(precision)
-            return State({"level": y.sum(0) / precision + noise}, key)
-
-        def postprocess_fn(self, arguments, keywords):
-            return lambda z: z
-
-    run = lambda widen: calibration.calibrate(  # noqa: E731
-        jax.random.key(5), level, np.arange(3.0), lambda model: Exact(widen), data_sets=400, thin=1, warmup=1)
     return run(1.0), run(1.6)
 
 
@@ -91,6 +95,21 @@ def test_exact_draws_are_calibrated_and_wide_ones_are_not(conjugate):
     for name, rank in exact.ranks.items():
         assert min(calibration.p_values(rank, 63).values()) > 0.001, name
         assert calibration.p_values(wide.ranks[name], 63)["ecdf"] < 0.001, name
+
+
+def test_tasks_in_a_folder_find_the_same_ranks_and_go_on(conjugate, tmp_path):
+    lines = []
+    for count in (2, 1, 0):
+        found = run(1.0, batch=200, folder=tmp_path, report=lines.append)
+        for name, rank in conjugate[0].ranks.items():
+            np.testing.assert_array_equal(found.ranks[name], rank)
+        assert sum("data-sets/" in line for line in lines) == count
+        lines.clear()
+        if count == 2:
+            (tmp_path / "data-sets-00200-00399.npz").unlink()
+    with pytest.raises(ValueError, match="other settings: key is"):
+        calibration.calibrate(jax.random.key(6), level, np.arange(3.0), lambda model: Exact(1.0), data_sets=400, thin=1,
+                              warmup=1, batch=200, folder=tmp_path)
 
 
 def test_ranks_survive_a_file_and_are_not_overwritten(tmp_path):

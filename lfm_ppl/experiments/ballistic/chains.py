@@ -6,9 +6,9 @@ from typing import Any
 
 from numpyro.infer import MCMC, init_to_uniform
 
+from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import chains
 from lfm_ppl.experiments.ballistic import problem
-from lfm_ppl.experiments.tasks import Result, Task
 from lfm_ppl.inference.kernels.ram import RAM
 
 SAMPLERS = ("NUTS", "RAM")

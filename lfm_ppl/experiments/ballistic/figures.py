@@ -10,9 +10,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from scipy import stats
 
+from lfm_ppl.engine.task import Result
 from lfm_ppl.experiments.ballistic import chains, parameters, particles, problem, tables, tracking
 from lfm_ppl.experiments.scores import Z, mean_of, rate_of
-from lfm_ppl.experiments.tasks import Result
 from lfm_ppl.results.plots import style
 
 COLOURS = {"altitude": style.BLUE, "speed": style.VERMILLION, "u": style.GREEN}

@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments.ballistic import problem
 from lfm_ppl.experiments.ballistic.tracking import judged, rmse
-from lfm_ppl.experiments.tasks import Result, Task
 from lfm_ppl.experiments.timing import timed
 from lfm_ppl.particles.particle_filter import particle_filter
 from lfm_ppl.particles.particle_smoother import TRACING, particle_smoother

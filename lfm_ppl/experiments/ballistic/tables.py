@@ -8,11 +8,11 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
+from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments.ballistic import chains, known, problem, tracking
 from lfm_ppl.experiments.ballistic import parameters as estimates
 from lfm_ppl.experiments.ballistic import particles as by_particles
 from lfm_ppl.experiments.scores import Estimate, mean_of, pair, rate_of, relative_errors_of_sd
-from lfm_ppl.experiments.tasks import Result, Task
 
 UNITS = {"altitude": "m", "speed": "m/s", "u": "m/s^2"}
 UNKNOWN = {"most likely parameters": "likely", "parameters integrated out": "posterior"}

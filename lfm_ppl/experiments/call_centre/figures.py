@@ -10,11 +10,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from lfm_ppl.engine.task import Result
 from lfm_ppl.experiments.call_centre import counts, posterior, problem, tables, tracking
 from lfm_ppl.experiments.call_centre.problem import BIN, DAY, GRID, OPEN, TESTED, TRAIN
 from lfm_ppl.experiments.call_centre.tracking import Tracked
 from lfm_ppl.experiments.scores import Z, mean_of
-from lfm_ppl.experiments.tasks import Result
 from lfm_ppl.results.plots import style
 
 _TRUTH, _ESTIMATE, _READING = style.BLACK, style.BLUE, style.VERMILLION

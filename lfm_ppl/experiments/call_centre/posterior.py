@@ -15,11 +15,11 @@ import numpy as np
 from numpyro.infer import MCMC
 from scipy import special, stats
 
+from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import chains, scores
 from lfm_ppl.experiments.call_centre import problem, tracking
 from lfm_ppl.experiments.call_centre.problem import FIRST, TESTED, Method, Window
 from lfm_ppl.experiments.call_centre.tracking import Tracked
-from lfm_ppl.experiments.tasks import Result, Task
 from lfm_ppl.experiments.weighting import Weighted, weighted
 from lfm_ppl.inference.optimise import Minimum
 from lfm_ppl.results import importance

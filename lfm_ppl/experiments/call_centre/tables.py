@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from lfm_ppl.engine.task import Result
 from lfm_ppl.experiments.call_centre import posterior, tracking
 from lfm_ppl.experiments.scores import mean_of, pair
-from lfm_ppl.experiments.tasks import Result
 
 PUBLISHED = {
     "constant": {"SQM": (4.6, 2.2, -146, 22), "CQM": (4.4, 1.3, -142, 15), "WQM": (1.8, 0.2, -139, 20),

@@ -19,10 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
+from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.call_centre import counts, problem
 from lfm_ppl.experiments.call_centre.problem import FIRST, GRID, TESTED, Method, Window
-from lfm_ppl.experiments.tasks import Result, Task
 from lfm_ppl.filtering.filter import filter
 from lfm_ppl.filtering.smoother import smooth
 from lfm_ppl.inference.optimise import quasi_newton

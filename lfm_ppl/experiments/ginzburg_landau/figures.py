@@ -12,8 +12,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from scipy import stats
 
+from lfm_ppl.engine.task import Result
 from lfm_ppl.experiments.ginzburg_landau import conditional, problem, sampling, tables
-from lfm_ppl.experiments.tasks import Result
 from lfm_ppl.results.plots import style
 
 COLOURS = {"EKF": style.VERMILLION, "CKF": style.BLUE, "GHKF(7)": style.GREEN, problem.PARTICLES: style.ORANGE,

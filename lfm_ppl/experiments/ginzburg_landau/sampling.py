@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from numpyro.infer import NUTS
 
+from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.ginzburg_landau import grid, problem, state
-from lfm_ppl.experiments.tasks import Result, Task
 from lfm_ppl.experiments.timing import timed
 from lfm_ppl.filtering.smoother import smooth
 from lfm_ppl.inference.handlers.settings import approximate

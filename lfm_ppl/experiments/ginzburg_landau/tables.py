@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from lfm_ppl.engine.task import Result
 from lfm_ppl.experiments.ginzburg_landau import conditional, problem, sampling
 from lfm_ppl.experiments.scores import SE, Estimate, mean_of, pair, rate_of
-from lfm_ppl.experiments.tasks import Result
 
 PUBLISHED = {"RAM, EKF": 0.895, "RAM, CKF": 0.935}
 """RMSE of the smoothed state in the source's figure 2.5, for its one realisation."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,12 +12,14 @@ import numpy as np
 import pandas as pd
 
 from lfm_ppl import checks, orbits
-from lfm_ppl.experiments import output, tasks
+from lfm_ppl.engine.cluster import Workers, started
+from lfm_ppl.engine.run import Reporter, run_tasks
+from lfm_ppl.engine.task import Result, Task
+from lfm_ppl.experiments import output
 from lfm_ppl.experiments.gps import figures, learning, magnitudes, prediction, problem, ways
 from lfm_ppl.experiments.gps.figures import METRE, rms
 from lfm_ppl.experiments.gps.training import Training
 from lfm_ppl.experiments.scores import mean_of, pair
-from lfm_ppl.experiments.tasks import Result, Task
 
 _REFUSED = "refused"
 _WINDOW = 0.25
@@ -191,7 +193,7 @@ def _online(one: problem.Arc, orbit: orbits.Orbit, logarithms: np.ndarray, asked
 
 
 def run(settings: Settings, folder: str | Path, *, overwrite: bool = False,
-        report: Callable[[str], None] | None = None, workers: int = 1) -> Found:
+        report: Reporter | None = None, workers: Workers = 1) -> Found:
     """Run the comparison, or what is missing of it.
 
     Args:
@@ -199,24 +201,25 @@ def run(settings: Settings, folder: str | Path, *, overwrite: bool = False,
         folder: of the tasks.
         overwrite: compute again what was stored with other settings.
         report: what to do with a line of progress; None: nothing.
-        workers: processes that compute.
+        workers: what computes; see `run_tasks`.
 
     Raises:
         ValueError: data that cannot be used, an unknown satellite, no satellite that can be predicted, or stored
             results of other settings.
         FileNotFoundError: there are no files.
     """
-    def done(planned: list[Task]) -> dict[str, Result]:
-        return tasks.run_tasks(planned, compute, Path(folder) / "tasks", overwrite=overwrite, report=report,
-                               workers=workers)
-
     first = plan(settings)
     refused: dict[str, str] = {}
-    learnt = _kept(first, done(first), "learn/", refused)
-    if not learnt:
-        raise ValueError("no satellite can be predicted. " + " ".join(refused.values()))
-    second = plan_predictions(settings, learnt, first)
-    results = done(second)
+    with started(workers) as running:  # once, for both rounds
+        def done(planned: list[Task]) -> dict[str, Result]:
+            return run_tasks(planned, compute, Path(folder) / "tasks", overwrite=overwrite, report=report,
+                             workers=running or 1)
+
+        learnt = _kept(first, done(first), "learn/", refused)
+        if not learnt:
+            raise ValueError("no satellite can be predicted. " + " ".join(refused.values()))
+        second = plan_predictions(settings, learnt, first)
+        results = done(second)
     predicted = _kept(second, results, "predict/", refused)
     compared, online = (_kept(second, results, kind, {}) for kind in ("ways/", "online/"))
     if not predicted:

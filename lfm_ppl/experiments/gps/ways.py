@@ -14,6 +14,7 @@ import pandas as pd
 from numpyro.infer import MCMC, init_to_value
 
 from lfm_ppl import orbits
+from lfm_ppl.engine.task import Result
 from lfm_ppl.experiments.gps import learning, magnitudes, prediction, problem, training
 from lfm_ppl.experiments.gps.figures import METRE
 from lfm_ppl.experiments.gps.learning import DRAWS, Target
@@ -21,7 +22,6 @@ from lfm_ppl.experiments.gps.magnitudes import Prior
 from lfm_ppl.experiments.gps.problem import NOISE, Arc
 from lfm_ppl.experiments.gps.training import Regression, Training, steps_of
 from lfm_ppl.experiments.scores import mean_of, pair
-from lfm_ppl.experiments.tasks import Result
 from lfm_ppl.filtering.filter import filter
 from lfm_ppl.filtering.smoother import smooth
 from lfm_ppl.forces import Matern

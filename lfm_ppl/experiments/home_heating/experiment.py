@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,9 +15,11 @@ from jax.scipy.special import logsumexp
 from jax.scipy.stats import norm
 
 from lfm_ppl import checks
+from lfm_ppl.engine.cluster import Workers
+from lfm_ppl.engine.run import Reporter, run_tasks
+from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import output, scores
 from lfm_ppl.experiments.home_heating import figures, learning, prediction, problem, tables
-from lfm_ppl.experiments.tasks import Result, Task, run_tasks
 
 QUANTILES = (0.025, 0.25, 0.5, 0.75, 0.975)
 RESIDUALS = ("SQM", "matern")
@@ -203,7 +204,7 @@ def _stacked(rows: list[Result]) -> Result:
 
 
 def run(settings: Settings, folder: str | Path, *, overwrite: bool = False,
-        report: Callable[[str], None] | None = None, workers: int = 1) -> Comparison:
+        report: Reporter | None = None, workers: Workers = 1) -> Comparison:
     """Compute what is not stored yet in ``folder``, and tabulate everything.
 
     Args:
@@ -211,7 +212,7 @@ def run(settings: Settings, folder: str | Path, *, overwrite: bool = False,
         folder: of the experiment; its subfolder ``tasks`` holds a file for each task.
         overwrite: compute again what was stored with other settings.
         report: what to do with a line of progress; None: nothing.
-        workers: processes that compute.
+        workers: what computes; see `run_tasks`.
 
     Raises:
         ValueError: the folder holds results made with other settings; a file of the house that cannot be used.

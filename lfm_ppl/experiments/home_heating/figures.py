@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from lfm_ppl.engine.task import Result
 from lfm_ppl.experiments.home_heating import prediction, problem, tables
 from lfm_ppl.experiments.scores import Z, mean_of
-from lfm_ppl.experiments.tasks import Result
 from lfm_ppl.results.plots import style
 
 LABELS = {"none": "no residual", "matern": "Matern", **{name: name for name in ("SQM", "CQM", "WQM", "periodic",

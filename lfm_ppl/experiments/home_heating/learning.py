@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from numpyro.infer import MCMC
 
+from lfm_ppl.engine.task import Result
 from lfm_ppl.experiments import chains
 from lfm_ppl.experiments.home_heating import problem
 from lfm_ppl.experiments.posteriors import LogPosterior
-from lfm_ppl.experiments.tasks import Result
 from lfm_ppl.inference.bound_model import bind_arguments
 from lfm_ppl.inference.handlers.fixing import fix
 from lfm_ppl.inference.kernels.ram import RAM

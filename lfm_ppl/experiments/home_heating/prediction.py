@@ -12,8 +12,8 @@ import numpy as np
 from jax.scipy.special import ndtr
 from scipy.stats import norm
 
+from lfm_ppl.engine.task import Result
 from lfm_ppl.experiments.home_heating import learning, problem
-from lfm_ppl.experiments.tasks import Result
 from lfm_ppl.filtering.filter import FilterState
 from lfm_ppl.filtering.filter import filter as gaussian_filter
 from lfm_ppl.filtering.smoother import smooth

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from lfm_ppl.engine.task import Result
 from lfm_ppl.experiments.home_heating import learning
 from lfm_ppl.experiments.scores import Estimate, mean_of, pair, rate_of
-from lfm_ppl.experiments.tasks import Result
 
 PUBLISHED: dict[str, dict[str, tuple[float, float, float, float]]] = {
     "table 5": {"SQM": (0.67, 0.13, -116, 15), "CQM": (0.87, 0.11, -157, 13), "WQM": (1.06, 0.11, -227, 18),

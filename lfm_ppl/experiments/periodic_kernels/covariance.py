@@ -7,8 +7,8 @@ from typing import Any
 import jax
 import numpy as np
 
+from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments.periodic_kernels import problem
-from lfm_ppl.experiments.tasks import Result, Task
 from lfm_ppl.forces import Force, Periodic, SparseSpectrum, random_frequencies, resonators, significant_functions
 from lfm_ppl.forces.periodic_kernels import Kernel
 

@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from lfm_ppl.engine.task import Result
 from lfm_ppl.experiments.periodic_kernels import covariance, problem, regression
 from lfm_ppl.experiments.scores import Z
-from lfm_ppl.experiments.tasks import Result
 from lfm_ppl.forces import (
     CQM,
     SQM,

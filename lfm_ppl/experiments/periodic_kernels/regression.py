@@ -9,10 +9,10 @@ import jax
 import numpy as np
 from scipy.stats import norm
 
+from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.periodic_kernels import problem
 from lfm_ppl.experiments.periodic_kernels.covariance import eigenfunctions
-from lfm_ppl.experiments.tasks import Result, Task
 from lfm_ppl.forces import SparseSpectrum, random_frequencies
 
 EXACT, KPCA, COARSE = "exact", "22 eigenfunctions", "20 eigenfunctions on 20 points"

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from lfm_ppl.engine.task import Result
 from lfm_ppl.experiments.periodic_kernels import covariance, regression
 from lfm_ppl.experiments.scores import Estimate, mean_of, pair
-from lfm_ppl.experiments.tasks import Result
 
 PUBLISHED = {regression.SPARSE: (0.36, 3.03, -6.9e4), regression.SPARSE_4: (0.23, 2.74, -1.2e4),
              regression.KPCA: (9.6e-5, 2.49, 75.0)}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,8 +13,10 @@ import pandas as pd
 from scipy.stats import norm
 
 from lfm_ppl import checks
+from lfm_ppl.engine.cluster import Workers
+from lfm_ppl.engine.run import Reporter, run_tasks
+from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import output, scores
-from lfm_ppl.experiments.tasks import Result, Task, run_tasks
 from lfm_ppl.experiments.transcription import figures, laplace_modes, problem, slices, smoothers, tables
 
 TASKS = "tasks"
@@ -129,7 +130,7 @@ def judged(found: Result, truth: np.ndarray) -> Result:
 
 
 def run(settings: Settings, folder: str | Path, *, overwrite: bool = False,
-        report: Callable[[str], None] | None = None, workers: int = 1) -> Comparison:
+        report: Reporter | None = None, workers: Workers = 1) -> Comparison:
     """Compute what is not stored yet in ``folder``, and tabulate everything.
 
     Args:
@@ -137,7 +138,7 @@ def run(settings: Settings, folder: str | Path, *, overwrite: bool = False,
         folder: of the experiment; its subfolder ``tasks`` holds a file for each task.
         overwrite: compute again what was stored with other settings.
         report: what to do with a line of progress; None: nothing.
-        workers: processes that compute.
+        workers: what computes; see `run_tasks`.
 
     Raises:
         ValueError: the folder holds results made with other settings.

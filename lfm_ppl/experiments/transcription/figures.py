@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from lfm_ppl.engine.task import Result
 from lfm_ppl.experiments.scores import Z
-from lfm_ppl.experiments.tasks import Result
 from lfm_ppl.experiments.transcription import problem
 from lfm_ppl.results.plots import style
 

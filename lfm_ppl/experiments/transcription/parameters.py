@@ -12,8 +12,8 @@ import numpyro
 import numpyro.distributions as dist
 from numpyro.infer import MCMC, NUTS, init_to_uniform
 
+from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import scores
-from lfm_ppl.experiments.tasks import Result, Task
 from lfm_ppl.experiments.timing import timed
 from lfm_ppl.experiments.transcription import problem
 from lfm_ppl.filtering.smoother import smooth

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -13,10 +13,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from lfm_ppl import checks
+from lfm_ppl.engine.cluster import Workers
+from lfm_ppl.engine.run import Reporter, run_tasks
+from lfm_ppl.engine.task import Result
 from lfm_ppl.experiments import output, scores
 from lfm_ppl.experiments.catalogue import Report, Wanted
 from lfm_ppl.experiments.scores import Estimate, Z, mean_of, pair, readable
-from lfm_ppl.experiments.tasks import Result, run_tasks
 from lfm_ppl.experiments.transcription import parameters, problem
 from lfm_ppl.results.plots import style
 
@@ -96,7 +98,7 @@ def run(wanted: Wanted) -> Report:
 
 
 def compute(settings: Settings, folder: str | Path, *, overwrite: bool = False,
-            report: Callable[[str], None] | None = None, workers: int = 1) -> Comparison:
+            report: Reporter | None = None, workers: Workers = 1) -> Comparison:
     """Compute what is not stored yet in ``folder``, and tabulate everything; arguments as in `run_tasks`."""
     results = run_tasks(parameters.tasks(settings), parameters.compute, Path(folder) / TASKS, overwrite=overwrite,
                         report=report, workers=workers)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import checks
-from lfm_ppl.experiments.tasks import Result, Task
+from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.forces import Matern
 from lfm_ppl.model.gaussian import Gaussian
 from lfm_ppl.model.latent_force_model import LatentForceModel

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 import pandas as pd
 
+from lfm_ppl.engine.task import Result
 from lfm_ppl.experiments.scores import mean_of, pair
-from lfm_ppl.experiments.tasks import Result
 from lfm_ppl.experiments.transcription import problem, slices
 from lfm_ppl.experiments.transcription.verdict import Verdict
 

@@ -1,0 +1,140 @@
+"""Results of tasks in a folder: a file for each, whole or not at all, written by one run at a time."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import socket
+import warnings
+import zipfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import filelock
+import numpy as np
+
+from lfm_ppl.engine.errors import FolderInUseError
+from lfm_ppl.engine.task import Result, Task
+from lfm_ppl.results.files import writing
+
+_TASK = "__task__"
+_LOCK, _HOLDER = ".lock", ".held-by"
+
+
+class OtherSettingsError(ValueError):
+    """A stored result was made with other settings."""
+
+
+@contextlib.contextmanager
+def held(folder: str | Path) -> Iterator[Path]:
+    """Make the folder and keep other runs out of it; the system frees it when this process ends, however it ends.
+
+    Raises:
+        FolderInUseError: another run holds it.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = filelock.FileLock(folder / _LOCK, thread_local=False)
+    try:
+        lock.acquire(timeout=0)
+    except filelock.Timeout:
+        holder = "another run"
+        with contextlib.suppress(OSError):
+            holder += f" ({(folder / _HOLDER).read_text(encoding='utf-8').strip()})"
+        raise FolderInUseError(f"{folder} is in use by {holder}. Wait until that ends, or choose another "
+                               "folder.") from None
+    try:
+        (folder / _HOLDER).write_text(f"process {os.getpid()} on {socket.gethostname()}\n", encoding="utf-8")
+        yield folder
+    finally:
+        with contextlib.suppress(OSError):
+            (folder / _HOLDER).unlink(missing_ok=True)
+        lock.release()
+
+
+def arrays(task: Task, result: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Return a result as NumPy arrays.
+
+    Raises:
+        TypeError: the result is no mapping.
+        ValueError: an entry is not a number, an array of numbers or text.
+    """
+    if not isinstance(result, Mapping):
+        raise TypeError(f"the result of task {task.name} must be a dictionary of numbers, arrays and text, got "
+                        f"{type(result).__name__}.")
+    found = {name: np.asarray(value) for name, value in result.items()}
+    for name, value in found.items():
+        if value.dtype.kind not in "biufU" or name == _TASK:
+            raise ValueError(f"the result of task {task.name} has an entry {name!r} that is not a number, an array of "
+                             f"numbers or text, but {type(result[name]).__name__}.")
+    return found
+
+
+def values(found: Mapping[str, np.ndarray]) -> Result:
+    """Return a result with plain numbers and text in the place of arrays without dimensions."""
+    return {name: value.item() if value.ndim == 0 else value for name, value in found.items()}
+
+
+def write(task: Task, result: Mapping[str, Any], folder: str | Path, overwrite: bool = False) -> Path:
+    """Write the result of a task to its file in ``folder``, whole or not at all.
+
+    Raises:
+        ValueError: an entry of the result is not a number, an array or text.
+    """
+    found = arrays(task, result)
+    path = Path(folder) / task.file
+    with writing(path, overwrite) as temporary:
+        np.savez(temporary, **{_TASK: np.asarray(json.dumps(task.record()))}, **found)  # type: ignore[arg-type]
+    return path
+
+
+def read(task: Task, folder: str | Path) -> Result:
+    """Read the result of a task.
+
+    Raises:
+        FileNotFoundError: it is not stored.
+        OtherSettingsError: it was made with other settings.
+        OSError, KeyError, zipfile.BadZipFile: the file is damaged.
+    """
+    path = Path(folder) / task.file
+    with np.load(path) as kept:
+        found = {name: kept[name] for name in kept.files}
+    record, wanted = json.loads(str(found.pop(_TASK))), task.record()
+    if record != wanted:
+        raise OtherSettingsError(
+            f"{path} holds a result that was made with other settings: {_difference(record, wanted)}. Choose another "
+            "folder, or replace it with overwrite=True (--overwrite on the command line).")
+    return values(found)
+
+
+def stored(task: Task, folder: str | Path, overwrite: bool) -> Result | None:
+    """Return the result of a task; None where there is none, or one that is to be replaced.
+
+    Raises:
+        OtherSettingsError: it was made with other settings, and ``overwrite`` is False.
+
+    Warns:
+        UserWarning: the file cannot be read.
+    """
+    try:
+        return read(task, folder)
+    except FileNotFoundError:
+        return None
+    except OtherSettingsError:
+        if overwrite:
+            return None
+        raise
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        warnings.warn(f"{Path(folder) / task.file} cannot be read ({type(error).__name__}: {error}); its task runs "
+                      "again.", stacklevel=3)
+        return None
+
+
+def _difference(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
+    """Name the first few settings that differ, as ``name stored -> wanted``."""
+    flat = [{"name": record.get("name"), "seed": record.get("seed"), **record.get("settings", {})}
+            for record in (found, wanted)]
+    names = [name for name in {**flat[0], **flat[1]} if flat[0].get(name) != flat[1].get(name)]
+    return ", ".join(f"{name} is {flat[0].get(name)!r} there and {flat[1].get(name)!r} now" for name in names[:3])
