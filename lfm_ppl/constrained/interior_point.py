@@ -1,0 +1,216 @@
+r"""A primal-dual interior point whose Newton step is one smoother pass.
+
+The MAP trajectory under constraints minimises J, minus the log density of states and data, subject to c(x, u, t) >= 0
+on some rows. With slacks s and multipliers lambda the optimality conditions, the last one relaxed by mu, are
+
+    grad J = C' lambda,    c = s,    s lambda = mu,    s, lambda > 0.
+
+Newton's step for them minimises J + sum (lambda / 2 s) (c - z)^2: a smoother pass with the pseudo-observations
+
+    z = s + mu / lambda    of variance    V = s / lambda,
+
+after which lambda+ = mu / s - (lambda / s) (c - s) and s+ = c. Both are taken from the adjoint of the smoother and not
+from its mean: lambda+ = S^-1 v - K' r is the smoothed pseudo-noise (z - c) / V, and s+ = z - V lambda+, so that a slack
+of 1e-15 has all its digits.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from lfm_ppl.constrained.augmented import Rows, with_rows
+from lfm_ppl.filtering.filter import Pass, forward
+from lfm_ppl.filtering.predict import Moments
+from lfm_ppl.filtering.rts import Smoothed, backward
+from lfm_ppl.filtering.time_grid import TimeGrid
+from lfm_ppl.linalg import congruence, diagonal, matmul, safe_sqrt, solve_lower, solve_upper
+from lfm_ppl.linearisation.taylor import Taylor
+from lfm_ppl.model.state_space import StateSpaceModel
+
+CENTRING = 0.1
+"""mu as a share of the mean of s lambda."""
+BOUNDARY = 0.99
+"""Share of the way to the boundary that a step goes at most."""
+KNOWN = 1e-12
+"""Variance, as a share of the constraint's largest over the rows, below which it is known and no pass can move it."""
+VIOLATED = 1e-9
+"""Share of the constraint's largest standard deviation by which a known value must be negative to violate it."""
+
+
+class Problem(NamedTuple):
+    """What a pass needs besides the pseudo-observations.
+
+    Attributes:
+        ssm: the model with the constraints as further outputs.
+        grid: the time grid over the rows.
+        rows: which rows hold observations, and which constraints.
+        y: (T, D), NaN where missing.
+    """
+
+    ssm: StateSpaceModel
+    grid: TimeGrid
+    rows: Rows
+    y: jax.Array
+
+    @property
+    def count(self) -> int:
+        """C, the number of constraints at a time."""
+        return self.ssm.output_dim - self.y.shape[1]
+
+    def with_targets(self, targets: jax.Array, variances: jax.Array) -> tuple[StateSpaceModel, jax.Array]:
+        """Return model and observations with pseudo-observations (G, C), NaN for none, of these variances (G, C)."""
+        whole = jnp.ones((len(self.rows.times), self.count)).at[self.rows.grid].set(variances)
+        ssm = eqx.tree_at(lambda m: m.model.observation.variances, self.ssm, whole)
+        return ssm, with_rows(self.y, targets, self.rows)
+
+    def at_grid(self, a: jax.Array) -> jax.Array:
+        """Return the entries at the grid's rows of what has one for each interval of the scan."""
+        return a[jnp.asarray(self.grid.observed)[jnp.asarray(self.rows.grid)]]
+
+
+class Scan(NamedTuple):
+    """Both scans with given pseudo-observations.
+
+    Attributes:
+        passed: the forward scan.
+        smoothed: the backward scan.
+        noise: (G, C), smoothed pseudo-noise over its variance, (z - c) / V; zero without a pseudo-observation.
+    """
+
+    passed: Pass
+    smoothed: Smoothed
+    noise: jax.Array
+
+
+def scan(problem: Problem, targets: jax.Array, variances: jax.Array) -> Scan:
+    """Run a smoother pass with pseudo-observations (G, C) of the constraints, NaN for none."""
+    ssm, y = problem.with_targets(targets, variances)
+    start = Moments(*ssm.initial())
+    passed = forward(ssm, Taylor(), problem.grid, y, start=start, keep="all")
+    smoothed = backward(passed, start, problem.grid)
+    return Scan(passed, smoothed, problem.at_grid(weighted_noise(passed, smoothed))[:, -problem.count:])
+
+
+def weighted_noise(passed: Pass, smoothed: Smoothed) -> jax.Array:
+    """Return (N, D): R^-1 E[noise | all observations] = S^-1 v - K' r, with r of the later observations alone."""
+    r = smoothed.adjoint[0]
+    later = jnp.concatenate([matmul(jnp.swapaxes(passed.phi[1:], 1, 2), r[1:, :, None])[..., 0], jnp.zeros_like(r[:1])])
+    white = jax.vmap(lambda chol, v: solve_upper(chol, solve_lower(chol, v)))(passed.chol, passed.innovation)
+    return white - matmul(jnp.swapaxes(passed.gain, 1, 2), later[..., None])[..., 0]
+
+
+class Margins(NamedTuple):
+    """The constraints (G, C) along the smoothed trajectory, and their standard deviations (G, C)."""
+
+    value: jax.Array
+    sd: jax.Array
+
+
+def margins(problem: Problem, smoothed: Smoothed) -> Margins:
+    """Return the constraints at the smoothed means, and by how much they are uncertain to first order."""
+    ssm, first = problem.ssm, problem.y.shape[1]
+
+    def one(mean: jax.Array, covariance: jax.Array, t: jax.Array) -> tuple[jax.Array, jax.Array]:
+        function = lambda s: ssm.observe(ssm.inputs(s, t), t)[first:]  # noqa: E731
+        return function(mean), safe_sqrt(diagonal(congruence(jax.jacfwd(function)(mean), covariance)))
+
+    at = [problem.at_grid(a[1:]) for a in smoothed.moments]
+    return Margins(*jax.vmap(one)(*at, jnp.asarray(problem.rows.times)[jnp.asarray(problem.rows.grid)]))
+
+
+class Solution(NamedTuple):
+    """Where the iterations ended.
+
+    Attributes:
+        mean: (N + 1, n), the trajectory at the scan's nodes.
+        slack, multiplier: (G, C); infinity and zero where a constraint is not met by any pass (``known``).
+        gap: sum of s lambda, in units of the log density.
+        residual: largest |c - s| over the constraints, in standard deviations.
+        violation: (G, C), how far a constraint is from where its slack is, in standard deviations.
+        known: (G, C), whether the constraint's value has no variance.
+        violated: (G, C), whether such a value is negative.
+        passes: number of smoother passes.
+        converged: whether gap and residual are below their tolerances.
+    """
+
+    mean: jax.Array
+    slack: jax.Array
+    multiplier: jax.Array
+    gap: jax.Array
+    residual: jax.Array
+    violation: jax.Array
+    known: jax.Array
+    violated: jax.Array
+    passes: jax.Array
+    converged: jax.Array
+
+
+class _Iterate(NamedTuple):
+    mean: jax.Array
+    slack: jax.Array
+    multiplier: jax.Array
+    gap: jax.Array
+    residual: jax.Array
+    passes: jax.Array
+    done: jax.Array
+
+
+def longest_step(value: jax.Array, change: jax.Array) -> jax.Array:
+    """Return the share of ``change`` after which the first entry of ``value`` > 0 has gone 0.99 of the way to zero."""
+    ratio = jnp.where(change < 0, -value / jnp.where(change < 0, change, 1.0), jnp.inf)
+    return jnp.minimum(1.0, BOUNDARY * jnp.min(ratio, initial=jnp.inf))
+
+
+def solve_linear(problem: Problem, tolerance: float, most: int) -> Solution:
+    """Solve the problem of a model that is linear in states and forces, with linear constraints.
+
+    Args:
+        problem: what is to be solved.
+        tolerance: of the duality gap, in units of the log density.
+        most: number of passes, at most.
+    """
+    nothing = jnp.full((len(problem.rows.grid), problem.count), jnp.nan)
+    free = scan(problem, nothing, jnp.ones_like(nothing))
+    at = margins(problem, free.smoothed)
+    largest = jnp.max(at.sd, axis=0, initial=0.0)
+    known = at.sd <= jnp.sqrt(KNOWN) * largest
+    violated = known & (at.value < -VIOLATED * largest)
+    sd = jnp.where(known, 1.0, at.sd)
+    slack = jnp.where(known, 1.0, jnp.maximum(at.value, sd))
+    multiplier = jnp.where(known, 0.0, 1.0 / slack)
+    count = jnp.maximum(jnp.sum(~known), 1)
+    feasible = (known | (at.value >= 0)).all()
+
+    def step(now: _Iterate) -> _Iterate:
+        s, multiplier = now.slack, now.multiplier
+        mu = CENTRING * now.gap / count
+        safe = jnp.where(known, 1.0, multiplier)
+        target = jnp.where(known, jnp.nan, s + mu / safe)
+        one = scan(problem, target, s / safe)
+        ds = jnp.where(known, 0.0, (mu - s * one.noise) / safe)
+        dm = jnp.where(known, 0.0, one.noise - multiplier)
+        share = jnp.minimum(longest_step(s, ds), longest_step(safe, dm))
+        slack, multiplier = s + share * ds, multiplier + share * dm
+        gap = jnp.sum(jnp.where(known, 0.0, slack * multiplier))
+        residual = jnp.max(jnp.abs((1.0 - share) * ds) / sd, initial=0.0)
+        done = (gap <= tolerance) & (residual <= jnp.sqrt(tolerance)) | ~jnp.isfinite(gap)
+        return _Iterate(one.smoothed.moments.mean, slack, multiplier, gap, residual, now.passes + 1, done)
+
+    first = _Iterate(
+        free.smoothed.moments.mean, slack, multiplier, jnp.sum(slack * multiplier), jnp.asarray(jnp.inf),
+        jnp.asarray(1), feasible)
+    last = jax.lax.while_loop(lambda now: ~now.done & (now.passes < most), step, first)
+    # Where nothing is active the smoother's own trajectory is the solution.
+    slack = jnp.where(feasible, at.value, last.slack)
+    slack = jnp.where(known, jnp.maximum(at.value, 0.0), slack)
+    final = jax.vmap(lambda s, t: problem.ssm.observe(problem.ssm.inputs(s, t), t)[problem.y.shape[1]:])(
+        problem.at_grid(last.mean[1:]), jnp.asarray(problem.rows.times)[jnp.asarray(problem.rows.grid)])
+    violation = jnp.where(known, 0.0, jnp.abs(final - slack) / sd)
+    return Solution(
+        last.mean, slack, jnp.where(feasible | known, 0.0, last.multiplier),
+        jnp.where(feasible, 0.0, last.gap), jnp.where(feasible, 0.0, last.residual), violation, known, violated,
+        last.passes, (last.done & jnp.isfinite(last.gap)) & ~violated.any())
