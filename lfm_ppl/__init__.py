@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from lfm_ppl import forces as forces
     from lfm_ppl import orbits as orbits
     from lfm_ppl.compilation import fast_loops as fast_loops
+    from lfm_ppl.constrained.full_information import full_information as full_information
     from lfm_ppl.data import Data as Data
     from lfm_ppl.data import read_csv as read_csv
     from lfm_ppl.filtering.breakdown import FilterWarning as FilterWarning
@@ -107,6 +108,7 @@ _NAMES = {
         "ApproximationWarning", "Constant", "Force", "Matern", "Periodic", "QuasiPeriodic", "Resonator",
         "SquaredExponential", "WienerVelocity",
     ),
+    "constrained.full_information": ("full_information",),
     "inference.bound_model": ("BoundModel", "bind"),
     "fitting": ("ConvergenceWarning", "fit"),
     "inference.handlers.fixing": ("fix",),

@@ -16,7 +16,7 @@ of 1e-15 has all its digits.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -35,6 +35,8 @@ CENTRING = 0.1
 """mu as a share of the mean of s lambda."""
 BOUNDARY = 0.99
 """Share of the way to the boundary that a step goes at most."""
+START = 0.1
+"""Product s lambda of the first iterate."""
 KNOWN = 1e-12
 """Variance, as a share of the constraint's largest over the rows, below which it is known and no pass can move it."""
 VIOLATED = 1e-9
@@ -49,12 +51,14 @@ class Problem(NamedTuple):
         grid: the time grid over the rows.
         rows: which rows hold observations, and which constraints.
         y: (T, D), NaN where missing.
+        start: moments at the initial time.
     """
 
     ssm: StateSpaceModel
     grid: TimeGrid
     rows: Rows
     y: jax.Array
+    start: Moments
 
     @property
     def count(self) -> int:
@@ -89,10 +93,9 @@ class Scan(NamedTuple):
 def scan(problem: Problem, targets: jax.Array, variances: jax.Array) -> Scan:
     """Run a smoother pass with pseudo-observations (G, C) of the constraints, NaN for none."""
     ssm, y = problem.with_targets(targets, variances)
-    start = Moments(*ssm.initial())
-    passed = forward(ssm, Taylor(), problem.grid, y, start=start, keep="all")
-    smoothed = backward(passed, start, problem.grid)
-    return Scan(passed, smoothed, problem.at_grid(weighted_noise(passed, smoothed))[:, -problem.count:])
+    passed = forward(ssm, Taylor(), problem.grid, y, start=problem.start, keep="all")
+    smoothed = backward(passed, problem.start, problem.grid)
+    return Scan(passed, smoothed, problem.at_grid(weighted_noise(passed, smoothed))[:, problem.y.shape[1]:])
 
 
 def weighted_noise(passed: Pass, smoothed: Smoothed) -> jax.Array:
@@ -101,6 +104,18 @@ def weighted_noise(passed: Pass, smoothed: Smoothed) -> jax.Array:
     later = jnp.concatenate([matmul(jnp.swapaxes(passed.phi[1:], 1, 2), r[1:, :, None])[..., 0], jnp.zeros_like(r[:1])])
     white = jax.vmap(lambda chol, v: solve_upper(chol, solve_lower(chol, v)))(passed.chol, passed.innovation)
     return white - matmul(jnp.swapaxes(passed.gain, 1, 2), later[..., None])[..., 0]
+
+
+def start_adjoint(passed: Pass, smoothed: Smoothed) -> jax.Array:
+    """Return r_0 (n,), with which the smoothed state at the initial time is m_0 + P_0 r_0."""
+    return matmul(passed.phi[0].T, smoothed.adjoint[0][0][:, None])[:, 0]
+
+
+def constraint_values(problem: Problem, nodes: jax.Array) -> jax.Array:
+    """Return the constraints (G, C) along a trajectory (N + 1, n)."""
+    ssm, first = problem.ssm, problem.y.shape[1]
+    times = jnp.asarray(problem.rows.times)[jnp.asarray(problem.rows.grid)]
+    return jax.vmap(lambda s, t: ssm.observe(ssm.inputs(s, t), t)[first:])(problem.at_grid(nodes[1:]), times)
 
 
 class Margins(NamedTuple):
@@ -133,6 +148,7 @@ class Solution(NamedTuple):
         violation: (G, C), how far a constraint is from where its slack is, in standard deviations.
         known: (G, C), whether the constraint's value has no variance.
         violated: (G, C), whether such a value is negative.
+        objective: minus the log density of the trajectory and the data up to a constant, J.
         passes: number of smoother passes.
         converged: whether gap and residual are below their tolerances.
     """
@@ -145,18 +161,33 @@ class Solution(NamedTuple):
     violation: jax.Array
     known: jax.Array
     violated: jax.Array
+    objective: jax.Array
     passes: jax.Array
     converged: jax.Array
 
 
 class _Iterate(NamedTuple):
     mean: jax.Array
+    objective: jax.Array
     slack: jax.Array
     multiplier: jax.Array
     gap: jax.Array
     residual: jax.Array
     passes: jax.Array
     done: jax.Array
+
+
+def objective(problem: Problem, one: Scan) -> jax.Array:
+    """Return J at the smoothed trajectory of a linear model: half the squares of what the noises are smoothed to.
+
+    With the adjoint r these are Q r, P_0 r_0 and R (R^-1 E[noise]), so that nothing is inverted.
+    """
+    passed, r = one.passed, one.smoothed.adjoint[0]
+    r0 = start_adjoint(passed, one.smoothed)
+    noise = weighted_noise(passed, one.smoothed)[:, : problem.y.shape[1]]
+    obs_cov = passed.obs_cov[:, : problem.y.shape[1], : problem.y.shape[1]]
+    terms = ((r, passed.process_cov), (r0, problem.start.covariance), (noise, obs_cov))
+    return jnp.asarray(0.5 * sum((v * matmul(p, v[..., None])[..., 0]).sum() for v, p in terms))
 
 
 def longest_step(value: jax.Array, change: jax.Array) -> jax.Array:
@@ -177,11 +208,11 @@ def solve_linear(problem: Problem, tolerance: float, most: int) -> Solution:
     free = scan(problem, nothing, jnp.ones_like(nothing))
     at = margins(problem, free.smoothed)
     largest = jnp.max(at.sd, axis=0, initial=0.0)
-    known = at.sd <= jnp.sqrt(KNOWN) * largest
+    known = ~(at.sd > jnp.sqrt(KNOWN) * largest)
     violated = known & (at.value < -VIOLATED * largest)
     sd = jnp.where(known, 1.0, at.sd)
     slack = jnp.where(known, 1.0, jnp.maximum(at.value, sd))
-    multiplier = jnp.where(known, 0.0, 1.0 / slack)
+    multiplier = jnp.where(known, 0.0, START / slack)
     count = jnp.maximum(jnp.sum(~known), 1)
     feasible = (known | (at.value >= 0)).all()
 
@@ -193,24 +224,23 @@ def solve_linear(problem: Problem, tolerance: float, most: int) -> Solution:
         one = scan(problem, target, s / safe)
         ds = jnp.where(known, 0.0, (mu - s * one.noise) / safe)
         dm = jnp.where(known, 0.0, one.noise - multiplier)
-        share = jnp.minimum(longest_step(s, ds), longest_step(safe, dm))
-        slack, multiplier = s + share * ds, multiplier + share * dm
+        # A pass starts from s and lambda alone, so that they may go different ways.
+        share, dual = longest_step(s, ds), longest_step(safe, dm)
+        slack, multiplier = s + share * ds, multiplier + dual * dm
         gap = jnp.sum(jnp.where(known, 0.0, slack * multiplier))
         residual = jnp.max(jnp.abs((1.0 - share) * ds) / sd, initial=0.0)
         done = (gap <= tolerance) & (residual <= jnp.sqrt(tolerance)) | ~jnp.isfinite(gap)
-        return _Iterate(one.smoothed.moments.mean, slack, multiplier, gap, residual, now.passes + 1, done)
+        return _Iterate(one.smoothed.moments.mean, objective(problem, one), slack, multiplier, gap, residual,
+                        now.passes + 1, done)
 
-    first = _Iterate(
-        free.smoothed.moments.mean, slack, multiplier, jnp.sum(slack * multiplier), jnp.asarray(jnp.inf),
-        jnp.asarray(1), feasible)
+    first = _Iterate(free.smoothed.moments.mean, objective(problem, free), slack, multiplier,
+                     jnp.sum(slack * multiplier), jnp.asarray(jnp.inf), jnp.asarray(1), feasible)
     last = jax.lax.while_loop(lambda now: ~now.done & (now.passes < most), step, first)
     # Where nothing is active the smoother's own trajectory is the solution.
     slack = jnp.where(feasible, at.value, last.slack)
     slack = jnp.where(known, jnp.maximum(at.value, 0.0), slack)
-    final = jax.vmap(lambda s, t: problem.ssm.observe(problem.ssm.inputs(s, t), t)[problem.y.shape[1]:])(
-        problem.at_grid(last.mean[1:]), jnp.asarray(problem.rows.times)[jnp.asarray(problem.rows.grid)])
-    violation = jnp.where(known, 0.0, jnp.abs(final - slack) / sd)
+    violation = jnp.where(known, 0.0, jnp.abs(constraint_values(problem, last.mean) - slack) / sd)
     return Solution(
         last.mean, slack, jnp.where(feasible | known, 0.0, last.multiplier),
         jnp.where(feasible, 0.0, last.gap), jnp.where(feasible, 0.0, last.residual), violation, known, violated,
-        last.passes, (last.done & jnp.isfinite(last.gap)) & ~violated.any())
+        last.objective, last.passes, (last.done & jnp.isfinite(last.gap)) & ~violated.any())
