@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from lfm_ppl import orbits as orbits
     from lfm_ppl.compilation import fast_loops as fast_loops
     from lfm_ppl.constrained.full_information import full_information as full_information
+    from lfm_ppl.constrained.moving_horizon import MovingHorizon as MovingHorizon
+    from lfm_ppl.constrained.moving_horizon import moving_horizon as moving_horizon
     from lfm_ppl.data import Data as Data
     from lfm_ppl.data import read_csv as read_csv
     from lfm_ppl.filtering.breakdown import FilterWarning as FilterWarning
@@ -109,6 +111,7 @@ _NAMES = {
         "SquaredExponential", "WienerVelocity",
     ),
     "constrained.full_information": ("full_information",),
+    "constrained.moving_horizon": ("MovingHorizon", "moving_horizon"),
     "inference.bound_model": ("BoundModel", "bind"),
     "fitting": ("ConvergenceWarning", "fit"),
     "inference.handlers.fixing": ("fix",),

@@ -11,15 +11,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import checks
-from lfm_ppl.constrained.augmented import Rows, augmented, rows
+from lfm_ppl.constrained.augmented import augmented, rows
 from lfm_ppl.constrained.constraints import Constraints, build_constraints
 from lfm_ppl.constrained.gauss_newton import solve_nonlinear
 from lfm_ppl.constrained.interior_point import Problem, Solution, solve_linear
 from lfm_ppl.filtering.filter import check_observations, warn_single_precision
 from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.filtering.time_grid import TimeGrid, build_time_grid
+from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.linalg import matmul
 from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.observation import GaussianObservation
 from lfm_ppl.model.observation_noise import check_noise
 from lfm_ppl.model.state_space import StateSpaceModel
 
@@ -141,8 +142,7 @@ def full_information(model: LatentForceModel, times: Any, y: Any, lower: Mapping
     3.2; Rao, Wright and Rawlings (1998), Journal of Optimization Theory and Applications 99(3), for interior points by
     Riccati recursions.
     """
-    checks.positive("tolerance", tolerance, "It is in units of the log density.")
-    checks.positive_integer("max_passes", max_passes)
+    check_settings(model, tolerance, max_passes)
     found = build_constraints(model, lower, upper, constraints)
     laid_out = rows(model, times, grid)
     ssm = augmented(model, found, laid_out)
@@ -153,9 +153,19 @@ def full_information(model: LatentForceModel, times: Any, y: Any, lower: Mapping
     linear = is_linear(ssm)
     if not linear:
         check_noise(ssm, scan_grid.initial_time)
-    result, solution = _run(ssm, found, scan_grid, laid_out, y, None, float(tolerance), max_passes, linear)
+    problem = Problem(ssm, scan_grid, laid_out, y, Moments(*ssm.initial()))
+    result, solution = _run(ssm, found, problem, float(tolerance), max_passes, linear)
     report(result, solution)
     return result
+
+
+def check_settings(model: LatentForceModel, tolerance: float, max_passes: int) -> None:
+    """Raise where the model's observation is not Gaussian, or a setting is out of range."""
+    if not isinstance(model.observation, GaussianObservation):
+        raise TypeError("estimation under constraints takes an lfm.GaussianObservation; the observation is "
+                        f"{type(model.observation).__name__}.")
+    checks.positive("tolerance", tolerance, "It is in units of the log density.")
+    checks.positive_integer("max_passes", max_passes)
 
 
 def is_linear(ssm: StateSpaceModel) -> bool:
@@ -164,13 +174,11 @@ def is_linear(ssm: StateSpaceModel) -> bool:
             and not ssm.model.observation.varies_with_state)
 
 
-def estimate_on(ssm: StateSpaceModel, constraints: Constraints, grid: TimeGrid, laid_out: Rows, y: jax.Array,
-                start: Moments | None, tolerance: float, most: int,
+def estimate_on(ssm: StateSpaceModel, constraints: Constraints, problem: Problem, tolerance: float, most: int,
                 linear: bool) -> tuple[ConstrainedEstimate, Solution]:
-    """Solve on given rows from given moments at the initial time, without checks; for compiled code."""
-    problem = Problem(ssm, grid, laid_out, y, Moments(*ssm.initial()) if start is None else start)
+    """Solve a problem without checks; for compiled code."""
     solution = (solve_linear if linear else solve_nonlinear)(problem, tolerance, most)
-    times = jnp.asarray(laid_out.times)[jnp.asarray(laid_out.grid)]
+    times = jnp.asarray(problem.rows.times)[jnp.asarray(problem.rows.grid)]
     matrix, offset = jax.vmap(ssm.input_map)(times)
     inputs = matmul(matrix, problem.at_grid(solution.mean[1:])[..., None])[..., 0] + offset
     inputs = constraints.respected(inputs, solution.slack)

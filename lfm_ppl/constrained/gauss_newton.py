@@ -30,9 +30,7 @@ import jax.numpy as jnp
 
 from lfm_ppl.constrained.interior_point import (
     CENTRING,
-    KNOWN,
     START,
-    VIOLATED,
     Problem,
     Solution,
     constraint_values,
@@ -164,10 +162,7 @@ def solve_nonlinear(problem: Problem, tolerance: float, most: int) -> Solution:
     nothing = jnp.full((len(problem.rows.grid), problem.count), jnp.nan)
     free = scan(problem, nothing, jnp.ones_like(nothing))
     at = margins(problem, free.smoothed)
-    largest = jnp.max(at.sd, axis=0, initial=0.0)
-    known = ~(at.sd > jnp.sqrt(KNOWN) * largest)
-    sd = jnp.where(known, 1.0, at.sd)
-    count = jnp.maximum(jnp.sum(~known), 1)
+    known, sd, count = at.known, at.sd, at.count
 
     def step(now: _Iterate) -> _Iterate:
         process_cov = dynamics.linearised(now.path.nodes).process_cov
@@ -231,7 +226,7 @@ def solve_nonlinear(problem: Problem, tolerance: float, most: int) -> Solution:
                      ~jnp.isfinite(path.nodes).all())
     last = jax.lax.while_loop(lambda now: ~now.done & (now.passes < most), step, first)
     value = constraint_values(problem, last.path.nodes)
-    violated = known & (value < -VIOLATED * largest)
+    violated = at.violated(problem, value)
     slack = jnp.where(known, jnp.maximum(value, 0.0), last.slack)
     finite = jnp.isfinite(last.gap) & jnp.isfinite(last.path.nodes).all()
     objective = _objective(problem, last.path, last.process_cov, _noise_factors(problem, last.path.nodes))

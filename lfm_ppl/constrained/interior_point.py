@@ -16,14 +16,14 @@ of 1e-15 has all its digits.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 from lfm_ppl.constrained.augmented import Rows, with_rows
-from lfm_ppl.filtering.filter import Pass, forward
+from lfm_ppl.filtering.filter import Pass, Transitions, forward
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.rts import Smoothed, backward
 from lfm_ppl.filtering.time_grid import TimeGrid
@@ -52,6 +52,8 @@ class Problem(NamedTuple):
         rows: which rows hold observations, and which constraints.
         y: (T, D), NaN where missing.
         start: moments at the initial time.
+        held: (G,), at which times of the grid the constraints hold; all by default.
+        transitions: of a linear model's intervals, where they are known ahead of all passes.
     """
 
     ssm: StateSpaceModel
@@ -59,6 +61,8 @@ class Problem(NamedTuple):
     rows: Rows
     y: jax.Array
     start: Moments
+    held: Any = None
+    transitions: Transitions | None = None
 
     @property
     def count(self) -> int:
@@ -93,7 +97,8 @@ class Scan(NamedTuple):
 def scan(problem: Problem, targets: jax.Array, variances: jax.Array) -> Scan:
     """Run a smoother pass with pseudo-observations (G, C) of the constraints, NaN for none."""
     ssm, y = problem.with_targets(targets, variances)
-    passed = forward(ssm, Taylor(), problem.grid, y, start=problem.start, keep="all")
+    passed = forward(ssm, Taylor(), problem.grid, y, start=problem.start, keep="all",
+                     transitions=problem.transitions)
     smoothed = backward(passed, problem.start, problem.grid)
     return Scan(passed, smoothed, problem.at_grid(weighted_noise(passed, smoothed))[:, problem.y.shape[1]:])
 
@@ -119,10 +124,26 @@ def constraint_values(problem: Problem, nodes: jax.Array) -> jax.Array:
 
 
 class Margins(NamedTuple):
-    """The constraints (G, C) along the smoothed trajectory, and their standard deviations (G, C)."""
+    """The constraints along the smoothed trajectory of a pass without them.
+
+    Attributes:
+        value: (G, C).
+        sd: (G, C), standard deviations to first order; 1 where a value is known.
+        largest: (C,), the largest of each constraint.
+        known: (G, C), whether no pass can move the constraint, or it is not held.
+        count: of the constraints that are not known, at least 1.
+    """
 
     value: jax.Array
     sd: jax.Array
+    largest: jax.Array
+    known: jax.Array
+    count: jax.Array
+
+    def violated(self, problem: Problem, value: jax.Array) -> jax.Array:
+        """Return (G, C), whether a value is known, and negative."""
+        held = True if problem.held is None else problem.held[:, None]
+        return self.known & (value < -VIOLATED * self.largest) & held
 
 
 def margins(problem: Problem, smoothed: Smoothed) -> Margins:
@@ -134,7 +155,12 @@ def margins(problem: Problem, smoothed: Smoothed) -> Margins:
         return function(mean), safe_sqrt(diagonal(congruence(jax.jacfwd(function)(mean), covariance)))
 
     at = [problem.at_grid(a[1:]) for a in smoothed.moments]
-    return Margins(*jax.vmap(one)(*at, jnp.asarray(problem.rows.times)[jnp.asarray(problem.rows.grid)]))
+    value, sd = jax.vmap(one)(*at, jnp.asarray(problem.rows.times)[jnp.asarray(problem.rows.grid)])
+    largest = jnp.max(sd, axis=0, initial=0.0)
+    known = ~(sd > jnp.sqrt(KNOWN) * largest)
+    if problem.held is not None:
+        known = known | ~problem.held[:, None]
+    return Margins(value, jnp.where(known, 1.0, sd), largest, known, jnp.maximum(jnp.sum(~known), 1))
 
 
 class Solution(NamedTuple):
@@ -207,13 +233,10 @@ def solve_linear(problem: Problem, tolerance: float, most: int) -> Solution:
     nothing = jnp.full((len(problem.rows.grid), problem.count), jnp.nan)
     free = scan(problem, nothing, jnp.ones_like(nothing))
     at = margins(problem, free.smoothed)
-    largest = jnp.max(at.sd, axis=0, initial=0.0)
-    known = ~(at.sd > jnp.sqrt(KNOWN) * largest)
-    violated = known & (at.value < -VIOLATED * largest)
-    sd = jnp.where(known, 1.0, at.sd)
+    known, sd, count = at.known, at.sd, at.count
+    violated = at.violated(problem, at.value)
     slack = jnp.where(known, 1.0, jnp.maximum(at.value, sd))
     multiplier = jnp.where(known, 0.0, START / slack)
-    count = jnp.maximum(jnp.sum(~known), 1)
     feasible = (known | (at.value >= 0)).all()
 
     def step(now: _Iterate) -> _Iterate:
