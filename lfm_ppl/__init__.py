@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from lfm_ppl.constrained.full_information import full_information as full_information
     from lfm_ppl.constrained.moving_horizon import MovingHorizon as MovingHorizon
     from lfm_ppl.constrained.moving_horizon import moving_horizon as moving_horizon
+    from lfm_ppl.constrained.posterior import constrained_posterior as constrained_posterior
     from lfm_ppl.data import Data as Data
     from lfm_ppl.data import read_csv as read_csv
     from lfm_ppl.filtering.breakdown import FilterWarning as FilterWarning
@@ -112,6 +113,7 @@ _NAMES = {
     ),
     "constrained.full_information": ("full_information",),
     "constrained.moving_horizon": ("MovingHorizon", "moving_horizon"),
+    "constrained.posterior": ("constrained_posterior",),
     "inference.bound_model": ("BoundModel", "bind"),
     "fitting": ("ConvergenceWarning", "fit"),
     "inference.handlers.fixing": ("fix",),

@@ -132,7 +132,18 @@ def _checked_grid(grid: Any, origin: float) -> np.ndarray:
 
 def augmented(model: LatentForceModel, constraints: Constraints, laid_out: Rows) -> StateSpaceModel:
     """Return the state-space model whose observation has the constraints as further outputs."""
-    observation = AugmentedObservation(model.observation, constraints, laid_out.data_rows)
+    return _observed_by(model, AugmentedObservation(model.observation, constraints, laid_out.data_rows), constraints)
+
+
+def stacked_model(model: LatentForceModel, constraints: Constraints) -> StateSpaceModel:
+    """Return the same with outputs (h, c) without noise, which sites observe."""
+    noise = jnp.zeros(len(model.output_names) + constraints.count)
+    function = _Stacked(model.observation.function, constraints)
+    return _observed_by(model, GaussianObservation(function, noise), constraints)
+
+
+def _observed_by(model: LatentForceModel, observation: GaussianObservation,
+                 constraints: Constraints) -> StateSpaceModel:
     return state_space(LatentForceModel(
         model.dynamics, tuple(model.forces.items()), observation, model.initial_state, model.process_noise,
         model.initial_time, model.nonlinear_inputs, model.state_names, (*model.output_names, *constraints.labels),
