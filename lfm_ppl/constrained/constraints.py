@@ -26,7 +26,7 @@ class Constraints(eqx.Module):
         functions: further constraints.
         lower_indices, upper_indices: of the bounded quantities in (x, u, y).
         inputs: M + R, the number of entries of (x, u).
-        labels: C labels such as "factor >= 0".
+        labels: C labels such as "factor >= lower".
     """
 
     observe: Callable[..., jax.Array]
@@ -102,8 +102,8 @@ def build_constraints(model: LatentForceModel, lower: Mapping[str, Any] | None, 
     if callable(functions):
         functions = (functions,)
     functions = tuple(functions or ())
-    labels = [f"{name} {sign} {_text(bound)}" for given, sign in zip(bounds, (">=", "<="), strict=True)
-              for name, bound in given.items()]
+    # Without the bounds' values, which are arguments of a compiled program.
+    labels = [*(f"{name} >= lower" for name in bounds[0]), *(f"{name} <= upper" for name in bounds[1])]
     for number, function in enumerate(functions):
         size = _size(model, number, function)
         name = getattr(function, "__name__", "<lambda>")
@@ -130,11 +130,6 @@ def _checked(kind: str, given: Mapping[str, Any] | None, names: Sequence[str]) -
                              "changes with time give a function: constraints=lambda x, u, t: x[0] - bound(t).")
         checks.finite(f"{kind}[{name!r}]", bound, "Leave a quantity without a bound out.")
     return dict(given)
-
-
-def _text(bound: Any) -> str:
-    value = checks.concrete(bound)
-    return "its bound" if value is None else f"{float(value):g}"
 
 
 def _check_initial_state(model: LatentForceModel, lower: dict[str, Any], upper: dict[str, Any]) -> None:

@@ -45,7 +45,7 @@ class ConstrainedEstimate(eqx.Module):
         converged: whether the gap is below the tolerance, and the constraints equal their slacks.
         violation: (K, C), distance of each constraint from its slack in standard deviations; large where the problem is
             infeasible.
-        labels: of the C constraints, such as "factor >= 0".
+        labels: of the C constraints, such as "factor >= lower".
     """
 
     times: jax.Array

@@ -252,13 +252,18 @@ def solve_linear(problem: Problem, tolerance: float, most: int) -> Solution:
         slack, multiplier = s + share * ds, multiplier + dual * dm
         gap = jnp.sum(jnp.where(known, 0.0, slack * multiplier))
         residual = jnp.max(jnp.abs((1.0 - share) * ds) / sd, initial=0.0)
-        done = (gap <= tolerance) & (residual <= jnp.sqrt(tolerance)) | ~jnp.isfinite(gap)
-        return _Iterate(one.smoothed.moments.mean, objective(problem, one), slack, multiplier, gap, residual,
-                        now.passes + 1, done)
+        done = (gap <= tolerance) & (residual <= jnp.sqrt(tolerance))
+        new = _Iterate(one.smoothed.moments.mean, objective(problem, one), slack, multiplier, gap, residual,
+                       now.passes + 1, done)
+        # Multipliers of an infeasible problem grow without bound; the last finite iterate tells the rows.
+        good = jnp.isfinite(gap) & jnp.isfinite(one.noise).all()
+        stopped = now._replace(done=jnp.asarray(True))
+        return jax.tree_util.tree_map(lambda a, b: jnp.where(good, a, b), new, stopped)
 
     first = _Iterate(free.smoothed.moments.mean, objective(problem, free), slack, multiplier,
                      jnp.sum(slack * multiplier), jnp.asarray(jnp.inf), jnp.asarray(1), feasible)
     last = jax.lax.while_loop(lambda now: ~now.done & (now.passes < most), step, first)
+    solved = feasible | (last.gap <= tolerance) & (last.residual <= jnp.sqrt(tolerance))
     # Where nothing is active the smoother's own trajectory is the solution.
     slack = jnp.where(feasible, at.value, last.slack)
     slack = jnp.where(known, jnp.maximum(at.value, 0.0), slack)
@@ -266,4 +271,4 @@ def solve_linear(problem: Problem, tolerance: float, most: int) -> Solution:
     return Solution(
         last.mean, slack, jnp.where(feasible | known, 0.0, last.multiplier),
         jnp.where(feasible, 0.0, last.gap), jnp.where(feasible, 0.0, last.residual), violation, known, violated,
-        last.objective, last.passes, (last.done & jnp.isfinite(last.gap)) & ~violated.any())
+        last.objective, last.passes, solved & ~violated.any())

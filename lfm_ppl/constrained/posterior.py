@@ -92,10 +92,8 @@ class ConstrainedPosterior(eqx.Module):
         times: (K,), at which the constraints hold.
         state_mean, state_sd: (K, M), of the physical state.
         force_mean, force_sd: (K, R), of the forces.
-        log_evidence: log p(y | c), the evidence Z(y, c) / Z(c) of the data in the prior that respects the constraints.
-        log_prior_probability: log Z(c), how probable the prior without them holds the constraints to be.
         sweeps: passes of expectation propagation.
-        converged: whether the sites of posterior and prior have converged.
+        converged: whether the sites have converged.
     """
 
     times: jax.Array
@@ -103,8 +101,6 @@ class ConstrainedPosterior(eqx.Module):
     state_sd: jax.Array
     force_mean: jax.Array
     force_sd: jax.Array
-    log_evidence: jax.Array
-    log_prior_probability: jax.Array
     sweeps: jax.Array
     converged: jax.Array
     _cavity: Marginal
@@ -162,13 +158,7 @@ def constrained_posterior(model: LatentForceModel, times: Any, y: Any, lower: Ma
     r"""Approximate the posterior of state and forces under constraints by expectation propagation.
 
     On every row of the grid the factor 1(c >= 0) is a site, a Gaussian that gives the marginal of c the mean and the
-    variance of the truncated normal N(c; cavity) 1(c >= 0). The evidence is that of the prior conditioned on the
-    constraints,
-
-        p(y | c) = Z(y, c) / Z(c),    Z(y, c) = int p(w) p(y | w) 1(c(w) >= 0) dw;
-
-    without the denominator, which has an expectation propagation of its own, parameters under which the constraints are
-    improbable would be punished.
+    variance of the truncated normal N(c; cavity) 1(c >= 0).
 
     Args:
         model: the latent force model, with independent observation noise of the outputs.
@@ -183,7 +173,7 @@ def constrained_posterior(model: LatentForceModel, times: Any, y: Any, lower: Ma
         sweeps: passes, at most.
 
     Returns:
-        Means, standard deviations and intervals that respect the bounds; the evidence.
+        Means, standard deviations, and intervals that respect the bounds.
 
     Raises:
         ValueError, TypeError: as `lfm_ppl.full_information`; outputs whose noise is correlated, zero, or a function.
@@ -245,16 +235,12 @@ def _run(ssm: StateSpaceModel, constraints: Constraints, rule: Rule, grid: TimeG
     noise = jnp.ones((count, outputs)).at[laid_out.data].set(variance)
     start = Moments(*ssm.initial())
 
-    def sited(y: jax.Array, keep: str) -> Any:
-        whole = with_rows(y, jnp.zeros((len(laid_out.grid), constraints.count)), laid_out)
-        measured = whole[:, :outputs]
-        present = jnp.isfinite(measured)
-        nothing = jnp.zeros((count, constraints.count))
-        first = Sites(jnp.concatenate([jnp.where(present, measured, 0.0), nothing], axis=1), jnp.zeros_like(whole),
-                      jnp.concatenate([jnp.where(present, 1.0 / noise, 0.0), nothing], axis=1))
-        return evidence(ssm, rule, grid, whole, BoundedTerms(measured, noise, held), settings, start, first, keep)
-
-    prior, posterior = sited(jnp.full_like(y, jnp.nan), "likelihood"), sited(y, "all")
+    whole = with_rows(y, jnp.zeros((len(laid_out.grid), constraints.count)), laid_out)
+    measured = whole[:, :outputs]
+    present, nothing = jnp.isfinite(measured), jnp.zeros((count, constraints.count))
+    first = Sites(jnp.concatenate([jnp.where(present, measured, 0.0), nothing], axis=1), jnp.zeros_like(whole),
+                  jnp.concatenate([jnp.where(present, 1.0 / noise, 0.0), nothing], axis=1))
+    posterior = evidence(ssm, rule, grid, whole, BoundedTerms(measured, noise, held), settings, start, first, "all")
     smoothed = backward(posterior.passed, start, grid)
     at = jnp.asarray(grid.observed)[jnp.asarray(laid_out.grid)]
     times = jnp.asarray(laid_out.times)[jnp.asarray(laid_out.grid)]
@@ -267,6 +253,4 @@ def _run(ssm: StateSpaceModel, constraints: Constraints, rule: Rule, grid: TimeG
     cavity = Marginal(*(a[jnp.asarray(laid_out.grid), outputs:] for a in found.cavity.cavity))
     return ConstrainedPosterior(
         times, mean[:, :size], sd[:, :size], mean[:, size:], sd[:, size:],
-        posterior.log_evidence - prior.log_evidence, prior.log_evidence, found.sweeps,
-        found.converged & prior.refined.found.converged, cavity, constraints, ssm.model.state_names,
-        ssm.model.force_names)
+        found.sweeps, found.converged, cavity, constraints, ssm.model.state_names, ssm.model.force_names)

@@ -30,27 +30,24 @@ def model(noise_sd=0.08):
 def dense():
     process = LinearLFM(np.array([[-0.6]]), np.array([[0.25]]), [matern(1.0, 1.0, 1)], 0.0, np.zeros(1),
                         np.array([[0.01]]), dispersion=np.array([[0.05]]))
-    return process, Regression(process, np.array([[1.0, 0.0]]), np.array([0.08**2]))
+    return Regression(process, np.array([[1.0, 0.0]]), np.array([0.08**2]))
 
 
 def accepted(mean, covariance, low, high):
-    """Draws (N, 2 T) of (x, u) at all rows that respect ``low <= u <= high``, and their share."""
+    """Draws (N, 2 T) of (x, u) at all rows that respect ``low <= u <= high``."""
     covariance = covariance.transpose(0, 2, 1, 3).reshape(mean.size, mean.size)
     values, vectors = np.linalg.eigh(covariance)
     noise = np.random.default_rng(0).normal(size=(DRAWS, mean.size))
     draws = mean.ravel() + noise @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
-    good = ((draws[:, 1::2] >= low) & (draws[:, 1::2] <= high)).all(axis=1)
-    return draws[good], good.mean()
+    return draws[((draws[:, 1::2] >= low) & (draws[:, 1::2] <= high)).all(axis=1)]
 
 
 @pytest.mark.parametrize("upper", [{}, {"factor": 1.2}], ids=["one bound", "two bounds"])
-def test_moments_bands_and_evidence(dense, upper):
-    process, regression = dense
+def test_moments_and_bands(dense, upper):
     found = lfm.constrained_posterior(model(), TIMES, Y, lower={"factor": 0.0}, upper=upper, grid=TIMES)
     assert found.converged
     high = upper.get("factor", np.inf)
-    draws, share = accepted(*regression.posterior(TIMES, Y, TIMES), 0.0, high)
-    _, prior_share = accepted(*process.moments(TIMES), 0.0, high)
+    draws = accepted(*dense.posterior(TIMES, Y, TIMES), 0.0, high)
     u, x = draws[:, 1::2], draws[:, 0::2]
     assert len(u) > 1000
     # Monte Carlo error, plus what expectation propagation is off by.
@@ -63,9 +60,6 @@ def test_moments_bands_and_evidence(dense, upper):
     if not upper:
         covered = ((u >= np.asarray(low)) & (u <= np.asarray(top))).mean(axis=0)
         np.testing.assert_allclose(covered, 0.9, atol=0.02 + error)
-    exact = regression.log_likelihood(TIMES, Y) + np.log(share) - np.log(prior_share)
-    assert np.isclose(found.log_evidence, exact, atol=0.05)
-    assert np.isclose(found.log_prior_probability, np.log(prior_share), atol=0.05)
 
 
 def test_without_active_constraints_it_is_the_smoother():
@@ -73,7 +67,6 @@ def test_without_active_constraints_it_is_the_smoother():
     smoothed = lfm.smooth(model(), TIMES, Y)
     np.testing.assert_allclose(found.force_mean[:, 0], smoothed.force("factor").mean, atol=1e-8)
     np.testing.assert_allclose(found.force_sd[:, 0], smoothed.force("factor").sd, atol=1e-8)
-    assert np.isclose(found.log_evidence, smoothed.log_likelihood.sum(), atol=1e-8)
     low, high = found.interval("x0")
     sd = smoothed.state("x0").sd
     np.testing.assert_allclose(low, smoothed.state("x0").mean + norm.ppf(0.025) * sd, atol=1e-8)
@@ -84,7 +77,7 @@ def test_moments_of_a_truncated_normal():
     """From far above the bound to far below it, where one minus nearly one loses all digits."""
     mean = np.array([8.0, 1.0, 0.0, -3.0, -12.0, -29.9, -30.1, -200.0])
     found = truncated_moments(Marginal(jnp.asarray(2.0 * mean), jnp.full(8, 4.0)))
-    np.testing.assert_allclose(found.log_partition, norm.logcdf(mean), rtol=1e-12)
+    np.testing.assert_allclose(found.log_partition, norm.logcdf(mean), rtol=1e-12, atol=1e-15)
     expected = truncnorm(-mean[:5], np.inf, 2.0 * mean[:5], 2.0)
     np.testing.assert_allclose(found.mean[:5], expected.mean(), rtol=1e-8)
     np.testing.assert_allclose(found.variance[:5], expected.var(), rtol=1e-6)
