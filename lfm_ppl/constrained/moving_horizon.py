@@ -134,8 +134,9 @@ class MovingHorizon(eqx.Module):
         """Return the state before the first observation."""
         window, outputs = self.setting.window, len(self.setting.plain.model.output_names)
         origin = jnp.asarray(self.setting.plain.model.initial_time, float)
-        return HorizonState(jnp.full(window, origin), jnp.full((window, outputs), jnp.nan), jnp.asarray(0), origin,
-                            *self.setting.plain.initial())
+        # Types as after an update, for one program: a Python number would be a weaker one.
+        return HorizonState(jnp.full(window, origin), jnp.full((window, outputs), jnp.nan, float),
+                            jnp.asarray(0, int), origin, *self.setting.plain.initial())
 
     def update(self, state: HorizonState, t: Any, y: Any) -> tuple[HorizonState, HorizonEstimate]:
         """Take one observation.

@@ -28,9 +28,10 @@ from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.state_space import StateSpaceModel
 
-_FAR = -30.0
-"""Standard deviations below the bound from which the moments are taken from their asymptotic series."""
-
+_BELOW, _TERMS = 5.0, 60
+"""Standard deviations below the bound from which the mean is a continued fraction, and its terms."""
+_FAR = 100.0
+"""The same, from which the variance is an asymptotic series."""
 _UNDERFLOW = -600.0
 """Logarithm of a probability from which its exponential is not used."""
 
@@ -76,12 +77,16 @@ def truncated_moments(cavity: Marginal) -> Tilted:
     sd = jnp.sqrt(cavity.variance)
     a = cavity.mean / sd
     log_share = norm.logcdf(a)
-    near = jnp.maximum(a, _FAR)
-    h = jnp.exp(norm.logpdf(near) - norm.logcdf(near))
-    far = jnp.minimum(a, _FAR)
-    square = 1.0 / far**2
-    mean = jnp.where(a < _FAR, -(1.0 - square * (2.0 - 10.0 * square)) / far, near + h)
-    share = jnp.where(a < _FAR, square * (1.0 - square * (6.0 - 50.0 * square)), 1.0 - h * (h + near))
+    near = jnp.maximum(a, -_BELOW)
+    above = near + jnp.exp(norm.logpdf(near) - norm.logcdf(near))
+    # Far below the bound a and h cancel; h = z + 1 / (z + 2 / (z + 3 / ...)) with z = -a.
+    z = jnp.maximum(-a, _BELOW)
+    below = jnp.zeros_like(z)
+    for term in range(_TERMS, 0, -1):
+        below = term / (z + below)
+    mean = jnp.where(a < -_BELOW, below, above)
+    square = 1.0 / jnp.maximum(-a, _FAR) ** 2
+    share = jnp.where(a < -_FAR, square * (1.0 - square * (6.0 - 50.0 * square)), 1.0 - (mean - a) * mean)
     return Tilted(log_share, sd * mean, cavity.variance * share)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from reference_map import Transcribed, quadratic_program
 from references import LinearLFM, Regression, matern
-from systems import Linear, Motif, whole_state
+from systems import Linear, whole_state
 
 import lfm_ppl as lfm
 
@@ -171,10 +171,6 @@ def ballistic():
         process_noise=jnp.diag(jnp.sqrt(jnp.array([50e-6, 10e-6]))), initial_time=0.0)
 
 
-def exponential(x, u):
-    return [0.3 + casadi.exp(u) - 0.8 * x[0], 0.3 + 0.6 * casadi.exp(u) - 1.2 * x[1]]
-
-
 @pytest.mark.slow
 def test_ballistic_target_against_ipopt():
     model, times = ballistic(), np.linspace(0.0, 25.0, 26)
@@ -192,30 +188,6 @@ def test_ballistic_target_against_ipopt():
         assert np.isclose(found.objective, objective, atol=1e-4)
         np.testing.assert_allclose(found.force("u"), nodes[:, 2], atol=1e-5)
         np.testing.assert_allclose(found.state_mean, nodes[:, :2], atol=1e-4)
-
-
-def motif(noise=0.01):
-    decay = jnp.array([0.8, 1.2])
-    return lfm.LatentForceModel(
-        Motif(decay, jnp.array([1.0, 0.6]), 0.3, jnp.exp), {"u": lfm.Matern(1.0, 1.3)},
-        lfm.GaussianObservation(whole_state, noise * jnp.ones(2)), lfm.Gaussian(0.3 / decay, jnp.zeros((2, 2))),
-        initial_time=0.0)
-
-
-@pytest.mark.slow
-def test_exponential_transcription_against_ipopt():
-    """A known start, no noise on the states: the process covariance is all but singular."""
-    model, times = motif(), np.linspace(0.0, 8.0, 17)
-    y = lfm.simulate(jax.random.key(1), model, times).y
-    found = lfm.full_information(model, times, y, lower={"u": -0.3}, upper={"x0": 2.0}, grid=times, steps=8)
-    assert found.converged and np.asarray(found.active).any(axis=0).all()
-    reference = Transcribed(exponential, lambda x: [x[0], x[1]], (1.0, 1.3, 1), np.zeros((2, 2)),
-                            np.array([0.3 / 0.8, 0.3 / 1.2]), np.zeros((2, 2)), [0.01, 0.01],
-                            [(2, 1.0, -0.3), (0, -1.0, 2.0)])
-    guess = np.concatenate([found.state_mean, found.force_mean, np.zeros((17, 1))], axis=1)
-    nodes, objective = reference.solve(times, np.asarray(y), guess)
-    assert np.isclose(found.objective, objective, atol=1e-4)
-    np.testing.assert_allclose(found.force("u"), nodes[:, 2], atol=1e-4)
 
 
 # --- errors
