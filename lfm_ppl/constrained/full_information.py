@@ -14,7 +14,7 @@ from lfm_ppl import checks
 from lfm_ppl.constrained.augmented import augmented, rows
 from lfm_ppl.constrained.constraints import Constraints, build_constraints
 from lfm_ppl.constrained.gauss_newton import solve_nonlinear
-from lfm_ppl.constrained.interior_point import Problem, Solution, solve_linear
+from lfm_ppl.constrained.interior_point import RESPECTED, Problem, Solution, solve_linear
 from lfm_ppl.filtering.filter import check_observations, warn_single_precision
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.time_grid import build_time_grid
@@ -23,9 +23,6 @@ from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation import GaussianObservation
 from lfm_ppl.model.observation_noise import check_noise
 from lfm_ppl.model.state_space import StateSpaceModel
-
-_INFEASIBLE = 1e-6
-"""Distance of a constraint from its slack, in standard deviations, from which it is said to be violated."""
 
 
 class ConstrainedEstimate(eqx.Module):
@@ -207,7 +204,7 @@ def report(result: ConstrainedEstimate, solution: Solution) -> None:
     if bool(result.converged):
         return
     times = np.asarray(result.times)
-    apart = np.asarray(result.violation) > _INFEASIBLE
+    apart = np.asarray(result.violation) > RESPECTED
     text = [f"{label!r} at {_where(violated, times)}" for label, violated in
             zip(result.labels, np.asarray(solution.violated).T, strict=True) if violated.any()]
     if text:

@@ -39,6 +39,9 @@ START = 0.1
 """Product s lambda of the first iterate."""
 KNOWN = 1e-12
 """Variance, as a share of the constraint's largest over the rows, below which it is known and no pass can move it."""
+RESPECTED = 1e-6
+"""Distance of a constraint from its slack, in standard deviations, up to which it is respected. Slacks follow the
+adjoint; where no trajectory is feasible they vanish, and only the trajectory tells."""
 VIOLATED = 1e-9
 """Share of the constraint's largest standard deviation by which a known value must be negative to violate it."""
 
@@ -271,4 +274,4 @@ def solve_linear(problem: Problem, tolerance: float, most: int) -> Solution:
     return Solution(
         last.mean, slack, jnp.where(feasible | known, 0.0, last.multiplier),
         jnp.where(feasible, 0.0, last.gap), jnp.where(feasible, 0.0, last.residual), violation, known, violated,
-        last.objective, last.passes, solved & ~violated.any())
+        last.objective, last.passes, solved & ~violated.any() & (violation <= RESPECTED).all())
