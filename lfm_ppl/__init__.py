@@ -13,6 +13,10 @@ if TYPE_CHECKING:
     from lfm_ppl.backtesting import Backtest as Backtest
     from lfm_ppl.backtesting import backtest as backtest
     from lfm_ppl.compilation import fast_loops as fast_loops
+    from lfm_ppl.constrained.full_information import full_information as full_information
+    from lfm_ppl.constrained.moving_horizon import MovingHorizon as MovingHorizon
+    from lfm_ppl.constrained.moving_horizon import moving_horizon as moving_horizon
+    from lfm_ppl.constrained.posterior import constrained_posterior as constrained_posterior
     from lfm_ppl.conversion import to_arviz as to_arviz
     from lfm_ppl.data import Data as Data
     from lfm_ppl.data import read_csv as read_csv
@@ -130,6 +134,9 @@ _NAMES = {
         "ApproximationWarning", "Constant", "Force", "Matern", "Periodic", "QuasiPeriodic", "Resonator",
         "SquaredExponential", "WienerVelocity",
     ),
+    "constrained.full_information": ("full_information",),
+    "constrained.moving_horizon": ("MovingHorizon", "moving_horizon"),
+    "constrained.posterior": ("constrained_posterior",),
     "inference.bound_model": ("BoundModel", "bind"),
     "backtesting": ("Backtest", "backtest"),
     "fitting": ("ConvergenceWarning", "fit"),

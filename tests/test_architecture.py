@@ -22,7 +22,7 @@ LAYERS = (
     ("model",),
     ("orbits", "data"),
     ("filtering",),
-    ("particles", "fokker_planck_grid", "latent_grid"),
+    ("particles", "fokker_planck_grid", "latent_grid", "constrained"),
     ("switching",),
     ("inference",),
     ("results", "engine"),

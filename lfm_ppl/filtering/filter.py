@@ -101,6 +101,27 @@ class Points(NamedTuple):
     ends: Moments
 
 
+class Transitions(NamedTuple):
+    """Maps of the intervals that are known ahead of a pass: s -> mean + phi (s - point) + N(0, process_cov).
+
+    Attributes:
+        point: (N, n), states at the intervals' starts about which the dynamics is linearised.
+        mean: (N, n), where it takes them; a jump at the end included.
+        phi, process_cov: (N, n, n).
+    """
+
+    point: jax.Array
+    mean: jax.Array
+    phi: jax.Array
+    process_cov: jax.Array
+
+    def predict(self, moments: Moments) -> Prediction:
+        """Return the prediction over one interval."""
+        moved_by = matmul(self.phi, (moments.mean - self.point)[:, None])[:, 0]
+        covariance = congruence(self.phi, moments.covariance) + self.process_cov
+        return Prediction(Moments(self.mean + moved_by, covariance), self.phi, self.process_cov)
+
+
 def needed(ssm: StateSpaceModel, rule: Rule) -> np.ndarray:
     """Return (k,), the joint states whose moments a linearisation of the dynamics needs."""
     if isinstance(rule, SigmaPointRule) and rule.full_state:
@@ -258,7 +279,7 @@ def integrate(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, linear: LinearPa
 
 def forward(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, *, start: Moments | None = None,
             linearization_point: Points | None = None, keep: str = "likelihood",
-            sites: Sites | Callable[..., Sites] | None = None) -> Pass:
+            sites: Sites | Callable[..., Sites] | None = None, transitions: Transitions | None = None) -> Pass:
     """Run the one forward scan.
 
     Args:
@@ -273,6 +294,7 @@ def forward(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, *, s
         sites: (T, D) each, of an observation family: pseudo-observations in the place of ``y``, whose log likelihoods
             are then integrals of the sites. Or what makes those of a row from the mean (D,) and the covariance (D, D)
             of the predictor as predicted, the row's index, and its entries of y.
+        transitions: of the intervals, where they are known; of ``linearization_point`` only the ends are used then.
     """
     prepared = preparation(ssm, rule, grid)
     with_map = keep in ("all", "steps", "inside")
@@ -284,10 +306,13 @@ def forward(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, *, s
         each = lambda one: (_columns(one.moments.mean, used), _columns(one.moments.covariance, used).T,  # noqa: E731
                             one.phi)
 
-    def step(moments: Moments, inputs: tuple[Intervals, jax.Array, Points | None, Any]) -> tuple[Moments, Pass]:
-        interval, observed, point, given = inputs
-        nodes = None if point is None else completed(ssm, rule, point.nodes)
-        one = predict(ssm, rule, grid, prepared, interval, moments, nodes, with_map, each)
+    def step(moments: Moments, inputs: tuple) -> tuple[Moments, Pass]:
+        interval, observed, point, given, transition = inputs
+        if transition is None:
+            nodes = None if point is None else completed(ssm, rule, point.nodes)
+            one = predict(ssm, rule, grid, prepared, interval, moments, nodes, with_map, each)
+        else:
+            one = transition.predict(moments)
         centre = one.moments if point is None else point.ends
         affine = linearise_observation(ssm, rule, prepared.jacobian, interval.start + interval.length,
                                        jnp.maximum(interval.observation, 0), centre)
@@ -317,7 +342,8 @@ def forward(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, *, s
     if sites is not None and not callable(sites):
         padded = with_observations(grid.intervals, jnp.stack(sites, axis=1))[1]
         by_row = jnp.moveaxis(jnp.where(jnp.isnan(padded), 0.0, padded), 1, 0)
-    inputs = (*with_observations(grid.intervals, y), linearization_point, by_row if by_row is None else tuple(by_row))
+    inputs = (*with_observations(grid.intervals, y), linearization_point,
+              by_row if by_row is None else tuple(by_row), transitions)
     return jax.lax.scan(jax.checkpoint(step, prevent_cse=False, policy=_KEPT), first, inputs)[1]
 
 

@@ -1,0 +1,163 @@
+"""The observation with the constraints as further outputs, and the rows of the scan at which each is met."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lfm_ppl import checks
+from lfm_ppl.constrained.constraints import Constraints
+from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.observation import GaussianObservation
+from lfm_ppl.model.state_space import StateSpaceModel, check_times, state_space
+
+_FEWEST_ROWS = 200
+"""Rows of the default grid: wider gaps between observations are cut into pieces of 1/200 of the record."""
+
+
+class _Stacked(eqx.Module):
+    """h(x, u, t) (D,), then c(x, u, t) (C,)."""
+
+    observe: Any
+    constraints: Constraints
+
+    def __call__(self, x: jax.Array, u: jax.Array, t: jax.Array) -> jax.Array:
+        return jnp.concatenate([jnp.asarray(self.observe(x, u, t), float), self.constraints(x, u, t)])
+
+
+class AugmentedObservation(GaussianObservation):
+    """Measurements h and pseudo-observations of the constraints c, whose variances differ from row to row.
+
+    Attributes:
+        inner: the model's own observation.
+        variances: (K, C), of the pseudo-observations.
+        data_rows: (K,), row of the data whose noise covariance a row of the scan has.
+    """
+
+    inner: GaussianObservation
+    variances: Any
+    data_rows: Any
+
+    def __init__(self, inner: GaussianObservation, constraints: Constraints, data_rows: Any):
+        self.function = _Stacked(inner.function, constraints)
+        self.covariance, self.angular, self.inner = inner.covariance, inner.angular, inner
+        self.variances, self.data_rows = jnp.ones((len(data_rows), constraints.count)), data_rows
+
+    def covariance_at(self, x: jax.Array, u: jax.Array, t: jax.Array, row: jax.Array) -> jax.Array:
+        """Return the covariance (D + C, D + C): that of the measurements, and a diagonal."""
+        own = self.inner.covariance_at(x, u, t, jnp.asarray(self.data_rows)[row])
+        return jax.scipy.linalg.block_diag(own, jnp.diag(self.variances[row]))
+
+
+class Rows(NamedTuple):
+    """The rows of the scan: times of observations and of the grid.
+
+    Attributes:
+        times: (K,), non-decreasing.
+        data: (T,), row of each observation.
+        grid: (G,), rows at which the constraints hold.
+        data_rows: (K,), observation of each row, 0 where it has none.
+    """
+
+    times: np.ndarray
+    data: np.ndarray
+    grid: np.ndarray
+    data_rows: np.ndarray
+
+
+def rows(model: LatentForceModel, times: Any, grid: Any = None) -> Rows:
+    """Lay out the rows of the scan.
+
+    Args:
+        model: the latent force model.
+        times: (T,) observation times.
+        grid: (G,) times at which the constraints hold. By default the initial time, the times of the observations, and
+            between those that are further apart than 1/200 of the record times at equal distances.
+
+    Raises:
+        ValueError: times that are not known before compilation, a grid that is not an increasing vector of finite times
+            at or after the initial time.
+    """
+    known = check_times(times, model.initial_time)
+    origin = model.initial_time if model.initial_time is not None or known is None else known[0]
+    origin = None if origin is None else checks.concrete(origin)
+    if known is None or origin is None:
+        raise ValueError("times and the model's initial_time must be known before compilation; pass NumPy arrays.")
+    wanted = _default_grid(known, float(origin)) if grid is None else _checked_grid(grid, float(origin))
+    extra = np.setdiff1d(wanted, known)
+    every = np.concatenate([known, extra])
+    order = np.argsort(every, kind="stable")
+    position = np.empty(len(every), int)
+    position[order] = np.arange(len(every))
+    every = every[order]
+    data = position[: len(known)]
+    # Of several observations at one time the last has the constraint.
+    held = np.searchsorted(every, wanted, side="right") - 1
+    data_rows = np.zeros(len(every), int)
+    data_rows[data] = np.arange(len(known))
+    return Rows(every, data, held, data_rows)
+
+
+def _default_grid(times: np.ndarray, origin: float) -> np.ndarray:
+    nodes = np.unique(np.append(times, origin))
+    longest = (nodes[-1] - nodes[0]) / _FEWEST_ROWS
+    if longest == 0:
+        return nodes
+    pieces = np.maximum(1, np.ceil(np.diff(nodes) / longest * (1 - 1e-9))).astype(int)
+    inside = [begin + (end - begin) * np.arange(count) / count
+              for begin, end, count in zip(nodes[:-1], nodes[1:], pieces, strict=True)]
+    return np.concatenate([*inside, nodes[-1:]])
+
+
+def _checked_grid(grid: Any, origin: float) -> np.ndarray:
+    known = checks.concrete(grid)
+    if known is None:
+        raise ValueError("grid must be known before compilation; pass a NumPy array.")
+    known = np.atleast_1d(known).astype(float)
+    checks.finite("grid", known)
+    if known.ndim != 1 or known.size == 0:
+        raise ValueError(f"grid must be a vector of at least one time, got shape {known.shape}.")
+    back = np.flatnonzero(np.diff(known) <= 0)
+    if back.size:
+        raise ValueError(f"grid must increase: entry {back[0] + 1} is {known[back[0] + 1]:g} after "
+                         f"{known[back[0]]:g}.")
+    if known[0] < origin:
+        raise ValueError(f"grid[0] = {known[0]:g} lies before the initial time {origin:g}.")
+    return known
+
+
+def augmented(model: LatentForceModel, constraints: Constraints, laid_out: Rows) -> StateSpaceModel:
+    """Return the state-space model whose observation has the constraints as further outputs."""
+    return _observed_by(model, AugmentedObservation(model.observation, constraints, laid_out.data_rows), constraints)
+
+
+def stacked_model(model: LatentForceModel, constraints: Constraints) -> StateSpaceModel:
+    """Return the same with outputs (h, c) without noise, which sites observe."""
+    noise = jnp.zeros(len(model.output_names) + constraints.count)
+    function = _Stacked(model.observation.function, constraints)
+    return _observed_by(model, GaussianObservation(function, noise), constraints)
+
+
+def _observed_by(model: LatentForceModel, observation: GaussianObservation,
+                 constraints: Constraints) -> StateSpaceModel:
+    return state_space(LatentForceModel(
+        model.dynamics, tuple(model.forces.items()), observation, model.initial_state, model.process_noise,
+        model.initial_time, model.nonlinear_inputs, model.state_names, (*model.output_names, *constraints.labels),
+        model.units))
+
+
+def with_rows(y: jax.Array, targets: jax.Array, laid_out: Rows) -> jax.Array:
+    """Return the augmented observations (K, D + C), NaN where a row has none.
+
+    Args:
+        y: (T, D).
+        targets: (G, C), of the constraints.
+        laid_out: the rows.
+    """
+    count = len(laid_out.times)
+    measured = jnp.full((count, y.shape[1]), jnp.nan).at[laid_out.data].set(y)
+    return jnp.concatenate([measured, jnp.full((count, targets.shape[1]), jnp.nan).at[laid_out.grid].set(targets)], 1)

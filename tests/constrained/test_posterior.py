@@ -1,0 +1,102 @@
+"""Expectation propagation under constraints against draws from the exact truncated normal distribution."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from references import LinearLFM, Regression, matern
+from scipy.integrate import quad
+from scipy.stats import norm, truncnorm
+from systems import Linear, whole_state
+
+import lfm_ppl as lfm
+from lfm_ppl.constrained.posterior import truncated_moments
+from lfm_ppl.filtering.quadrature import Marginal
+
+TIMES = np.linspace(0.0, 5.0, 8)
+Y = np.array([[0.0], [0.25], [0.13], [-0.03], [0.02], [-0.05], [0.21], [0.05]])
+DRAWS = 400_000
+
+
+def model(noise_sd=0.08):
+    return lfm.LatentForceModel(
+        Linear(jnp.array([[-0.6]]), jnp.array([[0.25]])), {"factor": lfm.Matern(1.0, 1.0)},
+        lfm.GaussianObservation(whole_state, jnp.array([noise_sd**2])), lfm.Gaussian(jnp.zeros(1), 0.01 * jnp.eye(1)),
+        process_noise=0.05 * jnp.eye(1), initial_time=0.0)
+
+
+@pytest.fixture(scope="module")
+def dense():
+    process = LinearLFM(np.array([[-0.6]]), np.array([[0.25]]), [matern(1.0, 1.0, 1)], 0.0, np.zeros(1),
+                        np.array([[0.01]]), dispersion=np.array([[0.05]]))
+    return Regression(process, np.array([[1.0, 0.0]]), np.array([0.08**2]))
+
+
+def accepted(mean, covariance, low, high):
+    """Draws (N, 2 T) of (x, u) at all rows that respect ``low <= u <= high``."""
+    covariance = covariance.transpose(0, 2, 1, 3).reshape(mean.size, mean.size)
+    values, vectors = np.linalg.eigh(covariance)
+    noise = np.random.default_rng(0).normal(size=(DRAWS, mean.size))
+    draws = mean.ravel() + noise @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
+    return draws[((draws[:, 1::2] >= low) & (draws[:, 1::2] <= high)).all(axis=1)]
+
+
+@pytest.mark.parametrize("upper", [{}, {"factor": 1.2}], ids=["one bound", "two bounds"])
+def test_moments_and_bands(dense, upper):
+    found = lfm.constrained_posterior(model(), TIMES, Y, lower={"factor": 0.0}, upper=upper, grid=TIMES)
+    assert found.converged
+    high = upper.get("factor", np.inf)
+    draws = accepted(*dense.posterior(TIMES, Y, TIMES), 0.0, high)
+    u, x = draws[:, 1::2], draws[:, 0::2]
+    assert len(u) > 1000
+    # Monte Carlo error, plus what expectation propagation is off by.
+    error = 4.0 / np.sqrt(len(u))
+    np.testing.assert_allclose(found.force_mean[:, 0], u.mean(axis=0), atol=(0.03 + error) * u.std(axis=0).max())
+    np.testing.assert_allclose(found.state_mean[:, 0], x.mean(axis=0), atol=(0.03 + error) * x.std(axis=0).max())
+    np.testing.assert_allclose(found.force_sd[:, 0], u.std(axis=0), rtol=0.05 + error)
+    low, top = found.interval("factor", 0.9)
+    assert (low >= 0.0).all() and (top <= high).all()
+    if not upper:
+        covered = ((u >= np.asarray(low)) & (u <= np.asarray(top))).mean(axis=0)
+        np.testing.assert_allclose(covered, 0.9, atol=0.02 + error)
+
+
+def test_without_active_constraints_it_is_the_smoother():
+    found = lfm.constrained_posterior(model(), TIMES, Y, lower={"factor": -30.0}, grid=TIMES)
+    smoothed = lfm.smooth(model(), TIMES, Y)
+    np.testing.assert_allclose(found.force_mean[:, 0], smoothed.force("factor").mean, atol=1e-8)
+    np.testing.assert_allclose(found.force_sd[:, 0], smoothed.force("factor").sd, atol=1e-8)
+    low, high = found.interval("x0")
+    sd = smoothed.state("x0").sd
+    np.testing.assert_allclose(low, smoothed.state("x0").mean + norm.ppf(0.025) * sd, atol=1e-8)
+    np.testing.assert_allclose(high - low, 2 * norm.ppf(0.975) * sd, atol=1e-8)
+
+
+def test_moments_of_a_truncated_normal():
+    """From far above the bound to far below it, where one minus nearly one loses all digits."""
+    mean = np.array([8.0, 1.0, 0.0, -3.0, -12.0, -29.9, -30.1, -200.0])
+    found = truncated_moments(Marginal(jnp.asarray(2.0 * mean), jnp.full(8, 4.0)))
+    np.testing.assert_allclose(found.log_partition, norm.logcdf(mean), rtol=1e-12, atol=1e-15)
+    expected = truncnorm(-mean[:5], np.inf, 2.0 * mean[:5], 2.0)
+    np.testing.assert_allclose(found.mean[:5], expected.mean(), rtol=1e-8)
+    np.testing.assert_allclose(found.variance[:5], expected.var(), rtol=1e-6)
+    for index in (5, 6, 7):
+        a = -mean[index]
+        # f = 2 s / a with density exp(-s - s^2 / (2 a^2)).
+        moments = [quad(lambda s, k=k, a=a: s**k * np.exp(-s - 0.5 * (s / a) ** 2), 0.0, 60.0, epsabs=1e-14)[0]
+                   for k in range(3)]
+        first, second = moments[1] / moments[0], moments[2] / moments[0]
+        np.testing.assert_allclose(found.mean[index], 2.0 * first / a, rtol=1e-7)
+        np.testing.assert_allclose(found.variance[index], 4.0 * (second - first**2) / a**2, rtol=1e-6)
+
+
+def test_bad_observations_say_what_to_do():
+    base = model()
+    for covariance, message in ((jnp.zeros(1), "Sites need observations with noise"),
+                                (lambda x, u, t: jnp.ones(1), "a function of")):
+        other = lfm.LatentForceModel(
+            base.dynamics, base.forces, lfm.GaussianObservation(whole_state, covariance), base.initial_state,
+            initial_time=0.0)
+        with pytest.raises(ValueError, match=message):
+            lfm.constrained_posterior(other, TIMES, Y, lower={"factor": 0.0})
