@@ -16,7 +16,9 @@ MODULES = sorted(
 
 COSTLY = tuple(f"lfm_ppl.{name}" for name in (
     "inference.handlers.settings", "inference.kernels.particle_marginal", "latent_grid.laplace", "results.accuracy",
-    "results.calibration"))
+    "results.calibration", "fitting", "fokker_planck_grid.fokker_planck", "inference.bound_model", "orbits.deviations",
+    "inference.handlers.on_latent_grid", "inference.kernels.elliptical_slice", "latent_grid.latent_grid",
+    "switching.rao_blackwellised", "switching.switched_simulation"))
 """Modules whose examples take several seconds to compile; these are run with -m slow."""
 
 
