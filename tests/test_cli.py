@@ -85,11 +85,16 @@ def run(capsys, monkeypatch, tmp_path):
     return run_line
 
 
+@pytest.fixture(scope="module", params=["ram", pytest.param("nuts", marks=pytest.mark.slow)])
+def sampler(request):
+    return request.param
+
+
 @pytest.fixture(scope="module")
-def short_run(motif, tmp_path_factory):
-    """The folder that a short run with NUTS wrote, and what it printed."""
+def short_run(motif, sampler, tmp_path_factory):
+    """The folder that a short run wrote, and what it printed."""
     folder = tmp_path_factory.mktemp("fit") / "result"
-    line = f"fit {motif} --chains 2 --warmup 60 --samples 60 --seed 1 --quiet --out {folder}"
+    line = f"fit {motif} --sampler {sampler} --chains 2 --warmup 60 --samples 60 --seed 1 --quiet --out {folder}"
     with contextlib.redirect_stdout(io.StringIO()) as out:
         assert main(shlex.split(line)) == 0
     return folder, out.getvalue()
@@ -97,7 +102,7 @@ def short_run(motif, tmp_path_factory):
 
 @pytest.fixture
 def fitted(short_run):
-    """The folder that a short run with NUTS wrote."""
+    """The folder that a short run wrote."""
     return short_run[0]
 
 
@@ -123,13 +128,13 @@ def test_models_describes_one(run):
     assert "default: softplus" in out and "any number, the columns of the data file" in out
 
 
-def test_fit_writes_posterior_summary_and_figures(fitted):
+def test_fit_writes_posterior_summary_and_figures(fitted, sampler):
     assert {path.name for path in fitted.iterdir()} == {"posterior.nc", "summary.csv", *FIGURES}
     posterior = arviz_data.load(fitted / "posterior.nc")
     draws = arviz_data.group(posterior, "posterior")
     assert draws["decay"].shape == (2, 60, 2)
     attributes = arviz_data.attributes(posterior)
-    assert (attributes["model"], attributes["sampler"], attributes["seed"]) == ("motif", "nuts", 1)
+    assert (attributes["model"], attributes["sampler"], attributes["seed"]) == ("motif", sampler, 1)
     assert arviz_data.has_group(posterior, "truth"), "simulated data carries its truth along"
     table = pd.read_csv(fitted / "summary.csv", index_col="parameter")
     assert list(table.index) == ["decay[a]", "decay[b]", "noise_sd"]

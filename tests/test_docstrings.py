@@ -15,8 +15,10 @@ MODULES = sorted(
 
 
 COSTLY = tuple(f"lfm_ppl.{name}" for name in (
-    "backtesting", "conversion", "forecasting", "inference.handlers.settings", "inference.kernels.particle_marginal",
-    "latent_grid.laplace", "results.accuracy", "results.calibration"))
+    "backtesting", "conversion", "fokker_planck_grid.fokker_planck", "forecasting", "inference.bound_model",
+    "inference.handlers.on_latent_grid", "inference.handlers.settings", "inference.kernels.elliptical_slice",
+    "inference.kernels.particle_marginal", "latent_grid.laplace", "latent_grid.latent_grid", "orbits.deviations",
+    "results.accuracy", "results.calibration", "switching.rao_blackwellised", "switching.switched_simulation"))
 """Modules whose examples take several seconds to compile; these are run with -m slow."""
 
 

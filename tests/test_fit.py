@@ -375,10 +375,12 @@ def converted(times, y=None, start=None, max_step=None):
     numpyro.sample("y", lfm.MarginalLikelihood(system, times, max_step=max_step), obs=y)
 
 
-@pytest.mark.parametrize("keywords", [pytest.param({}, marks=pytest.mark.slow), {"start": -1.0, "max_step": 0.1}],
-                         ids=["times as JAX array", "initial time"])
-def test_times_are_known_to_everything_after_sampling(y, keywords):
-    result = quiet_fit(converted, TIMES, y[:, :1], sampler="nuts", chains=1, warmup=5, samples=4, trajectory_draws=2,
+@pytest.mark.parametrize("keywords, sampler", [
+    pytest.param({}, "nuts", id="times as JAX array", marks=pytest.mark.slow),
+    pytest.param({"start": -1.0, "max_step": 0.1}, "nuts", id="initial time", marks=pytest.mark.slow),
+    pytest.param({"start": -1.0, "max_step": 0.1}, "map", id="initial time, from the mode")])
+def test_times_are_known_to_everything_after_sampling(y, keywords, sampler):
+    result = quiet_fit(converted, TIMES, y[:, :1], sampler=sampler, chains=1, warmup=5, samples=4, trajectory_draws=2,
                        at=[0.5, 9.0], model_kwargs=keywords)
     assert set(arviz_data.groups(result)) >= {"trajectories", "log_likelihood", "posterior_predictive"}
     assert group(result, "trajectories")["forces"].sizes["at"] == 2
@@ -464,7 +466,7 @@ def steep(times, y=None):
     numpyro.sample("y", lfm.MarginalLikelihood(model, times), obs=y)
 
 
-@pytest.mark.parametrize("sampler", ["nuts", pytest.param("map", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("sampler", [pytest.param("nuts", marks=pytest.mark.slow), "map"])
 def test_nowhere_to_start_from_is_explained(sampler):
     times = np.array([0.0, 1.0, 2.0])
     with pytest.warns(lfm.FilterWarning, match=r"at the prior median, the filter breaks down at row 1 \(time 1\)"):

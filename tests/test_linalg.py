@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -94,6 +96,23 @@ def by_columns(p, floor, keep):
     return chol, solve_lower(chol, jnp.eye(len(p)))
 
 
+def at_once(p, floor, keep):
+    factor = cholesky(p, floor, keep)
+    return factor.chol, factor.inverse
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def derivatives(factorise, keep, root, live, weights, floor):
+    def value(z):
+        scaled = root * (1.0 + z[0] * jnp.arange(5.0)) + 0.3 * z[1] * live[:, None]
+        found = factorise(outer_square(scaled), floor * (1.0 + z[2]), keep)
+        return sum((weight * jnp.tril(matrix)).sum() for weight, matrix in zip(weights, found, strict=True))
+
+    z = jnp.array([0.1, 0.2, 0.3])
+    grad = jax.grad(value)
+    return value(z), grad(z), jax.jacfwd(value)(z), jax.hessian(value)(z), jax.vmap(grad)(jnp.stack([z, -z]))
+
+
 @pytest.mark.parametrize("keep", [True, False])
 @pytest.mark.parametrize("floor", [[0.0, 0.0, 0.0, 0.0], [0.0, 0.5, 0.0, 2.0], [0.3, 0.3, 0.3, 0.3]])
 @pytest.mark.parametrize("dead", [(), (0,), (1, 3), (2,)])
@@ -103,21 +122,8 @@ def test_derivatives_of_a_factor_are_those_of_its_operations(keep, floor, dead):
     root = np.random.default_rng(0).normal(size=(4, 5)) * live[:, None]
     weights = np.random.default_rng(1).normal(size=(2, 4, 4))
 
-    def of(factorise):
-        def value(z):
-            scaled = jnp.asarray(root) * (1.0 + z[0] * jnp.arange(5.0)) + 0.3 * z[1] * live[:, None]
-            found = factorise(outer_square(scaled), jnp.asarray(floor) * (1.0 + z[2]))
-            return sum((weight * jnp.tril(matrix)).sum() for weight, matrix in zip(weights, found, strict=True))
-
-        z = jnp.array([0.1, 0.2, 0.3])
-        grad = jax.grad(value)
-        return value(z), grad(z), jax.jacfwd(value)(z), jax.hessian(value)(z), jax.vmap(grad)(jnp.stack([z, -z]))
-
-    def factorise(p, floor):
-        factor = cholesky(p, floor, keep)
-        return factor.chol, factor.inverse
-
-    for found, expected in zip(of(factorise), of(lambda p, floor: by_columns(p, floor, keep)), strict=True):
+    both = (derivatives(f, keep, root, live, weights, np.array(floor)) for f in (at_once, by_columns))
+    for found, expected in zip(*both, strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-12 * np.abs(expected).max())
 
 

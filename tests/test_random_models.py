@@ -139,7 +139,7 @@ def _of_known_numbers(one: Structure, drawn: Series, found: dict) -> list[str]:
     return [] if difference <= 1e-6 * max(1.0, abs(float(eager))) else [f"known numbers and traced: {difference:.1e}"]
 
 
-@pytest.mark.parametrize("seed", [285, 16])
+@pytest.mark.parametrize("seed", [pytest.param(285, marks=pytest.mark.slow), 16])
 def test_a_few_structures(seed):
     """One with a force that jumps and a curved output, and one that is linear."""
     assert not complaints(seed, FEW)

@@ -27,6 +27,7 @@ SMALL = experiment.Settings(
     ram=(2, 10, 10, 2))
 
 
+@pytest.mark.slow
 def test_the_targets_are_those_of_the_model_file():
     data = problem.model_file().simulate(seed=problem.MOST + 3)
     target = problem.target(3, seed=1)

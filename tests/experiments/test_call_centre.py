@@ -174,6 +174,7 @@ def searched(monkeypatch, value_and_gradient):
     monkeypatch.setattr(problem, "posterior", lambda method: Posterior())
 
 
+@pytest.mark.slow
 def test_searches_from_several_starts_find_several_modes(monkeypatch):
     """Three wells, one of them far higher than the others."""
     method = problem.Method("sqm")

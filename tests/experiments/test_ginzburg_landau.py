@@ -170,6 +170,7 @@ def test_the_figures_are_drawn_and_labelled():
             assert axes.get_xlabel() or not place.is_last_row()
 
 
+@pytest.mark.slow
 def test_what_is_stored_is_tabulated_and_drawn_without_computing(tmp_path):
     results = made_up(MADE)
     for one in experiment.all_tasks(MADE):

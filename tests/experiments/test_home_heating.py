@@ -22,6 +22,7 @@ def window():
     return problem.home(0, "one store")
 
 
+@pytest.mark.slow
 def test_a_simulated_home_is_under_its_thermostat(window):
     assert window.y.shape == (120, 3) and window.fine.shape == (149, 3) and problem.FINE.shape == (149,)
     points = window.set_points[problem.FINE.astype(int)]

@@ -50,7 +50,7 @@ def test_the_densities_are_those_of_the_model_in_the_order_asked_for(bound, name
     np.testing.assert_allclose([part[0] for part in several], [expected, prior], rtol=1e-10)
 
 
-@pytest.mark.parametrize("forward_mode", [True, False])
+@pytest.mark.parametrize("forward_mode", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_the_weight_of_the_prior_and_the_data_are_arguments_of_one_program(bound, forward_mode):
     posterior, runs = LogPosterior(bound, ("decay", "amount"), forward_mode), []
     z, step = np.array([-0.2, 0.4]), 1e-5 * np.eye(2)

@@ -44,6 +44,7 @@ def test_the_data_solve_the_equation():
     assert abs(noise.mean()) < 4 / np.sqrt(noise.size) and abs(noise.std() - 1) < 4 / np.sqrt(2 * noise.size)
 
 
+@pytest.mark.slow
 def test_force_and_rates_are_shared_by_the_configurations_and_have_their_distribution():
     first, second = problem.data_set(SATURATION, 0), problem.data_set(EXPONENTIAL, 0)
     assert np.array_equal(first.u, second.u) and np.array_equal(first.rates.decay, second.rates.decay)
@@ -273,6 +274,7 @@ def test_what_is_not_finite_has_diverged():
     assert found["diverged"].tolist() == [True, True, False] and found["rmse"][0] == np.inf
 
 
+@pytest.mark.slow
 def test_what_is_stored_is_tabulated_and_drawn_without_computing(tmp_path):
     results = made_up(FEW)
     for one in experiment.all_tasks(FEW):

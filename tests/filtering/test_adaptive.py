@@ -68,7 +68,7 @@ def test_a_rejected_step_does_not_spoil_the_derivative():
 
 
 @pytest.mark.parametrize("start, link", [
-    pytest.param(0.0, jax.nn.softplus, id="softplus-known"),
+    pytest.param(0.0, jax.nn.softplus, id="softplus-known", marks=pytest.mark.slow),
     pytest.param(1.0, jnp.exp, id="exp-diffuse"),
     pytest.param(1.0, jax.nn.softplus, id="softplus-diffuse", marks=pytest.mark.slow),
     pytest.param(0.0, jnp.exp, id="exp-known", marks=pytest.mark.slow),
@@ -105,8 +105,9 @@ WITHIN = lfm.Input(jnp.array([0.0, 1.3, 4.7]), jnp.array([1.0, -2.0, 3.0]))
 
 
 @pytest.mark.parametrize("keywords", [
-    {}, {"input_": STEPPED}, {"input_": WITHIN}, {"force": lfm.Matern(1.0, 2.0, mean=lambda t: jnp.cos(t))},
-    {"force": systems.Kicked(0.3, (3.0, 5.0), 1.0, 2.0)},
+    {}, pytest.param({"input_": STEPPED}, marks=pytest.mark.slow), {"input_": WITHIN},
+    pytest.param({"force": lfm.Matern(1.0, 2.0, mean=lambda t: jnp.cos(t))}, marks=pytest.mark.slow),
+    pytest.param({"force": systems.Kicked(0.3, (3.0, 5.0), 1.0, 2.0)}, marks=pytest.mark.slow),
     {"dispersion": lambda x, u, t: (1.0 + 0.2 * jnp.sin(t) + 0.1 * jnp.tanh(x))[:, None]},
 ], ids=["time", "input", "input within rows", "mean function", "jumps", "state-dependent noise"])
 def test_dynamics_that_depend_on_time(keywords):
@@ -120,6 +121,7 @@ def test_an_input_that_jumps_between_rows_takes_few_steps():
     np.testing.assert_allclose(found, explicit(STEPPED).log_prob(Y), atol=1e-3)
 
 
+@pytest.mark.slow
 def test_derivatives_with_respect_to_times():
     def log_prob(t, tolerance, steps):
         return explicit(initial_time=t, tolerance=tolerance, steps=steps).log_prob(Y)
@@ -152,7 +154,9 @@ class Last(eqx.Module):
         return x[-1:] / self.units[-1]
 
 
-@pytest.mark.parametrize("units", [np.ones(4), np.array([1e-3, 1e3, 1.0, 30.0])], ids=["alike", "mixed units"])
+@pytest.mark.parametrize("units", [
+    pytest.param(np.ones(4), id="alike", marks=pytest.mark.slow),
+    pytest.param(np.array([1e-3, 1e3, 1.0, 30.0]), id="mixed units")])
 def test_a_cascade_from_a_known_zero_in_any_units(units):
     def log_prob(tolerance, steps):
         model = lfm.LatentForceModel(
@@ -166,6 +170,15 @@ def test_a_cascade_from_a_known_zero_in_any_units(units):
     np.testing.assert_allclose(log_prob(1e-5, 100), exact, rtol=1e-3)
 
 
+def test_smoothed_moments_at_requested_times():
+    at = np.array([0.7, 5.1, 9.5])
+    exact, found = (lfm.smooth(double_well(SLOW_TO_STIFF[0]).model, TIMES, Y, at=at, **settings)
+                    for settings in ({"steps": 2000}, {"steps": 300, "tolerance": 1e-7}))
+    np.testing.assert_allclose(found.mean, exact.mean, atol=1e-4)
+    np.testing.assert_allclose(found.covariance, exact.covariance, atol=1e-4)
+
+
+@pytest.mark.slow
 def test_smoother_draws_and_requested_times():
     y = np.array([[0.2, 0.4], [0.9, 1.0], [np.nan, 1.3], [0.8, 0.9], [0.7, np.nan]])
     at = np.array([0.0, 0.7, 2.0, 5.1, 9.5])

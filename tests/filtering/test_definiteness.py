@@ -71,7 +71,7 @@ def test_smallest_eigenvalue(build, order, linear):
 
 
 @pytest.mark.parametrize("steps", [pytest.param(1, marks=pytest.mark.slow), 7])
-@pytest.mark.parametrize("link", [identity, softplus])
+@pytest.mark.parametrize("link", [identity, pytest.param(softplus, marks=pytest.mark.slow)])
 def test_the_force_keeps_its_stationary_distribution(link, steps):
     """Nothing is learnt from the observation of an output that the force does not reach."""
     model = motif(link, order=2)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from systems import Motif, Oscillator, first_state, identity, softplus
+from systems import DoubleWell, Motif, Oscillator, first_state, identity, softplus
 
 import lfm_ppl as lfm
 
@@ -32,7 +32,14 @@ def oscillator(theta):
         lfm.Gaussian(jnp.array([0.4, 0.0]), theta[5] * jnp.eye(2)), initial_time=0.0)
 
 
-BUILDERS = {"linear": single(identity), "softplus": single(softplus), "oscillator": oscillator}
+def well(theta):
+    """theta: linear and cubic coefficient of the drift, initial variance."""
+    return lfm.LatentForceModel(
+        DoubleWell(theta[0], theta[1]), {}, lfm.GaussianObservation(first_state, 0.01 * jnp.ones(1)),
+        lfm.Gaussian(jnp.array([0.4]), theta[2] * jnp.eye(1)), process_noise=jnp.eye(1), initial_time=0.0)
+
+
+BUILDERS = {"linear": single(identity), "softplus": single(softplus), "oscillator": oscillator, "well": well}
 
 
 @pytest.fixture(scope="module")
@@ -107,14 +114,18 @@ def test_one_observation():
         assert abs(gradient[index] - difference) < 1e-5 * max(1.0, abs(difference))
 
 
-def test_blow_up_is_minus_infinity_with_zero_gradient(compiled):
+@pytest.mark.parametrize("name, theta, regular", [
+    ("well", [1.0, -1e6, 0.5], [1.0, 0.7, 0.5]),
+    pytest.param("oscillator", [1.0, 0.5, -1e6, 1.3, 0.1, 0.5], [1.0, 0.5, 0.7, 1.3, 0.1, 0.5], marks=pytest.mark.slow),
+])
+def test_blow_up_is_minus_infinity_with_zero_gradient(compiled, name, theta, regular):
     """A negative cubic stiffness sends the state to infinity in finite time."""
-    value, gradient = compiled("oscillator")
-    theta = jnp.array([1.0, 0.5, -1e6, 1.3, 0.1, 0.5])
+    value, gradient = compiled(name)
+    theta = jnp.array(theta)
     assert value(theta, jnp.asarray(Y)) == -np.inf
     for found in gradient(theta, jnp.asarray(Y)):
-        assert np.array_equal(found, np.zeros(6))
-    both = jnp.stack([theta, jnp.array([1.0, 0.5, 0.7, 1.3, 0.1, 0.5])])
+        assert np.array_equal(found, np.zeros(len(theta)))
+    both = jnp.stack([theta, jnp.array(regular)])
     values, gradients = jax.jit(jax.vmap(jax.value_and_grad(lambda p: value(p, jnp.asarray(Y)))))(both)
     assert np.isneginf(values[0]) and np.isfinite(values[1])
     assert not gradients[0].any() and np.isfinite(gradients[1]).all() and gradients[1].any()

@@ -54,8 +54,10 @@ class Polynomial(eqx.Module):
                           -x[1] + 0.3 * x[0] ** 2 * u[0] - 0.1 * x[1] ** 3 + 0.2 * t])
 
 
-@pytest.mark.parametrize("dynamics", [Polynomial(), Motif(jnp.array([0.8, 1.2]), jnp.array([1.0, 0.5]), 0.2,
-                                                          jnp.square)], ids=["polynomial", "quadratic motif"])
+@pytest.mark.parametrize("dynamics", [
+    pytest.param(Polynomial(), id="polynomial"),
+    pytest.param(Motif(jnp.array([0.8, 1.2]), jnp.array([1.0, 0.5]), 0.2, jnp.square), id="quadratic motif",
+                 marks=pytest.mark.slow)])
 def test_projected_points_equal_points_in_the_whole_state_within_their_degree(dynamics):
     model = lfm.LatentForceModel(
         dynamics, {"u": lfm.Matern(0.7, 1.0, 0)}, lfm.GaussianObservation(whole_state, 0.1 * jnp.ones(2)),

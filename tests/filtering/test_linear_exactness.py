@@ -256,7 +256,8 @@ def derivatives():
     return derivative
 
 
-@pytest.mark.parametrize("name", GRADIENTS)
+@pytest.mark.parametrize("name", [
+    pytest.param(name, marks=pytest.mark.slow if name.startswith("spring") else ()) for name in GRADIENTS])
 def test_gradient(derivatives, name):
     build, dense, theta = GRADIENTS[name]
     value, reverse, forward = derivatives(build)(jnp.asarray(theta))

@@ -100,7 +100,7 @@ def joint_diffusion(s, t):
 
 
 @pytest.mark.parametrize("name, rule, points", [
-    ("Taylor", lfm.Taylor(), None),
+    pytest.param("Taylor", lfm.Taylor(), None, marks=pytest.mark.slow),
     ("Cubature", lfm.Cubature(full_state=True), cubature(4)),
 ])
 def test_pendulum_with_force_and_state_dependent_noise(name, rule, points):
@@ -138,7 +138,9 @@ class TimeVarying(eqx.Module):
         return -self.rate * (1.0 + 0.5 * jnp.sin(3.0 * t)) * x + jnp.cos(2.0 * t) * u
 
 
-@pytest.mark.parametrize("rule", [lfm.Taylor(), lfm.Cubature(), lfm.Cubature(full_state=True)], ids=lambda r: r.name)
+@pytest.mark.parametrize("rule", [
+    lfm.Taylor(), pytest.param(lfm.Cubature(), marks=pytest.mark.slow), lfm.Cubature(full_state=True)],
+    ids=lambda r: r.name)
 def test_linear_with_coefficients_that_depend_on_time(rule):
     lam = 1.0 / 0.7
     matrix = lambda t: np.array([[-(1.0 + 0.5 * np.sin(3 * t)), np.cos(2 * t)], [0.0, -lam]])  # noqa: E731
@@ -156,6 +158,7 @@ def test_linear_with_coefficients_that_depend_on_time(rule):
     assert 3.7 < np.log2(errors[0] / errors[1]) < 4.7, errors
 
 
+@pytest.mark.slow
 def test_random_points_with_a_known_state():
     """A regression on random points would divide their sampling error by a standard deviation of zero."""
     model = lfm.LatentForceModel(

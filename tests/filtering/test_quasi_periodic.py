@@ -115,6 +115,7 @@ def test_asking_for_times_changes_nothing():
     np.testing.assert_allclose(np.asarray(asked.mean)[len(AT):], plain.mean, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_panel_is_a_loop():
     def build(p):
         return model(lfm.QuasiPeriodic(kernel(p["lengthscale"], p["period"]), forces.SQM(2.0, POINTS), functions=3))
@@ -140,6 +141,7 @@ def test_gradients_of_the_likelihood_are_finite_differences():
     np.testing.assert_allclose(jax.jit(jax.grad(value))(point), difference, rtol=1e-6, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_resonator_with_a_bias_is_that_of_dense_algebra():
     """Noise, damping and a mean; and the same for the sum that carries a kernel."""
     for force in (lfm.Resonator(3.0, 0.8, 0.3, 0.1, mean=1.5),

@@ -90,7 +90,8 @@ def log_likelihood(name, units):
     return float(passed.log_likelihood.sum() + np.isfinite(y).sum() * np.log(units.distance))
 
 
-@pytest.mark.parametrize("name", RULES)
+@pytest.mark.parametrize("name", [
+    pytest.param(name, marks=pytest.mark.slow if name == "GaussHermite(5)" else ()) for name in RULES])
 @pytest.mark.parametrize("units", OTHERS.values(), ids=OTHERS)
 def test_the_likelihood_is_the_same_density(name, units):
     assert abs(log_likelihood(name, units) - log_likelihood(name, METRIC)) < 1e-8

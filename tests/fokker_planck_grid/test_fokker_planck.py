@@ -80,7 +80,8 @@ LINEAR = {
 }
 
 
-@pytest.mark.parametrize("name", LINEAR)
+@pytest.mark.parametrize("name", [
+    pytest.param(name, marks=pytest.mark.slow if name in ("drift of time", "force") else ()) for name in LINEAR])
 def test_it_equals_the_kalman_filter_and_smoother(name):
     model, options = LINEAR[name]
     y = data(model)
@@ -117,6 +118,7 @@ WELL_TIMES = np.array([0.0, 0.5, 1.0, 1.5, 2.0, 2.5])
 WELL_Y = np.array([0.7, 1.1, np.nan, -0.2, -0.9, -0.6])[:, None]
 
 
+@pytest.mark.slow
 def test_second_order_in_the_width_of_a_cell():
     ssm = lfm.state_space(WELL)
     time_grid = build_time_grid(ssm, WELL_TIMES, 1)
@@ -162,6 +164,7 @@ def rising(x, u, t):
     return jnp.reshape(0.5 + t, (1, 1)) + 0.0 * x
 
 
+@pytest.mark.slow
 def test_dispersion_that_depends_on_time():
     model = lfm.LatentForceModel(still, {}, lfm.GaussianObservation(whole_state, jnp.array([0.1])),
                                  lfm.Gaussian([0.2], [0.1]), process_noise=rising, initial_time=0.0)
@@ -230,7 +233,9 @@ def parameters(theta):
     return double_well(mean=0.9, variance=0.05, dispersion=theta[1], noise=0.04, b=theta[0])
 
 
-@pytest.mark.parametrize("times", [WELL_TIMES, WELL_TIMES**1.1], ids=["equal intervals", "any intervals"])
+@pytest.mark.parametrize("times", [
+    pytest.param(WELL_TIMES, id="equal intervals", marks=pytest.mark.slow),
+    pytest.param(WELL_TIMES**1.1, id="any intervals")])
 def test_batches_and_vmap_equal_loops(times):
     ssm, grid = lfm.state_space(WELL), Grid(-3.0, 3.0, 60)
     time_grid = build_time_grid(ssm, times, 1)

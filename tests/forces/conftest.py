@@ -111,7 +111,14 @@ def build_exact(request):
     return FORCES[request.param]
 
 
-@pytest.fixture(params=[name for name in FORCES if FORCES[name](1.0, 1.0).stationary])
+def pytest_generate_tests(metafunc):
+    """Ask at collection which forces are stationary: at import XLA would not have the switches of the tests yet."""
+    if "build_stationary" in metafunc.fixturenames:
+        names = [name for name in FORCES if FORCES[name](1.0, 1.0).stationary]
+        metafunc.parametrize("build_stationary", names, indirect=True)
+
+
+@pytest.fixture
 def build_stationary(request):
     return FORCES[request.param]
 

@@ -76,7 +76,9 @@ def test_the_error_is_the_spectral_mass_left_out(order, functions):
     assert error[0] == pytest.approx(1.0 - float(force.eigenvalues().sum()), abs=1e-13)
 
 
-@pytest.mark.parametrize(("order", "largest"), [("se", 0.01), (2, 0.01), (1, 0.015), (0, 0.064)])
+@pytest.mark.parametrize(("order", "largest"), [
+    ("se", 0.01), pytest.param(2, 0.01, marks=pytest.mark.slow), pytest.param(1, 0.015, marks=pytest.mark.slow),
+    (0, 0.064)])
 def test_the_default_is_as_good_as_documented(order, largest):
     """At all lengthscales; the largest errors are where a pair is only just left out."""
     errors = []

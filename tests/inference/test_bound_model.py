@@ -33,6 +33,12 @@ def model(times, y=None, order=1):
     numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=2), obs=y)
 
 
+def small(times, y=None):
+    """Linear, with one parameter: little to compile."""
+    decay = numpyro.sample("decay", dist.LogNormal(0.0, 0.3))
+    numpyro.sample("y", lfm.MarginalLikelihood(systems.motif(systems.identity, decay=decay), times, steps=2), obs=y)
+
+
 @pytest.fixture(scope="module")
 def bound():
     return lfm.bind(model, TIMES, Y)
@@ -140,8 +146,8 @@ def test_what_decides_the_program_is_never_mixed_up(bound, change):
     def sized(times, y=None, order=1):
         count = 2 if y is None else y.shape[1]
         rate = numpyro.sample("decay", dist.LogNormal(0.0, 0.3))
-        numpyro.sample("y", lfm.MarginalLikelihood(systems.motif(decay=rate, order=order, genes=count), times, steps=2),
-                       obs=y)
+        system = systems.motif(systems.identity, decay=rate, order=order, genes=count)
+        numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=2), obs=y)
 
     given = {"times": TIMES, "y": Y, **change}
     times, y = given.pop("times"), given.pop("y")
@@ -151,10 +157,14 @@ def test_what_decides_the_program_is_never_mixed_up(bound, change):
     assert float(found.log_density(np.zeros(1))) == pytest.approx(float(expected), rel=1e-12)
 
 
-@pytest.mark.parametrize("sampler", ["nuts", "ram", "map"])
-def test_a_second_data_set_compiles_nothing_in_fit(sampler):
+@pytest.mark.parametrize("sampler, model, fixed", [
+    pytest.param("nuts", small, {}, id="nuts, one parameter"),
+    pytest.param("nuts", model, {"lengthscale": 1.3}, id="nuts", marks=pytest.mark.slow),
+    pytest.param("ram", model, {"lengthscale": 1.3}, id="ram"),
+    pytest.param("map", model, {"lengthscale": 1.3}, id="map")])
+def test_a_second_data_set_compiles_nothing_in_fit(sampler, model, fixed):
     settings = {"sampler": sampler, "chains": 2, "warmup": 20, "samples": 20, "trajectory_draws": 8, "progress": False,
-                "chain_method": "vectorized", "fixed": {"lengthscale": 1.3}}
+                "chain_method": "vectorized", "fixed": fixed}
     with pytest.warns() if sampler != "map" else contextlib.nullcontext():
         lfm.fit(model, TIMES, Y, **settings)
     with compilations() as compiled, pytest.warns() if sampler != "map" else contextlib.nullcontext():
@@ -175,8 +185,10 @@ def test_a_second_data_set_compiles_nothing_in_map_and_check():
     assert compiled == []
 
 
-def test_a_step_is_that_of_numpyros_nuts(bound):
-    z = bound.unconstrain(VALUES)
+@pytest.mark.parametrize("model", [small, pytest.param(model, marks=pytest.mark.slow)], ids=["small", "non-linear"])
+def test_a_step_is_that_of_numpyros_nuts(model):
+    bound = lfm.bind(model, TIMES, Y)
+    z = bound.unconstrain({"decay": VALUES["decay"]} if model is small else VALUES)
     value, gradient = bound.log_density_gradient(z)
     point = ParamInfo(bound.unravel(z), -value, bound.unravel(-gradient))
     transition = sampling.nuts(bound, 30, {})
@@ -201,9 +213,9 @@ def test_a_step_is_that_of_numpyros_nuts(bound):
 
 def test_thinning_and_blocks_keep_the_last_step_of_each_draw(capfd, monkeypatch):
     monkeypatch.setattr("lfm_ppl.inference.progress.EVERY_S", 0.0)
-    bound = lfm.bind(model, TIMES, Y)
-    kernel = lfm.RAM(model, initial_scale=0.1)
-    starts = np.stack([bound.unconstrain(VALUES)] * 2)
+    bound = lfm.bind(small, TIMES, Y)
+    kernel = lfm.RAM(small, initial_scale=0.1)
+    starts = np.stack([bound.unconstrain({"decay": 0.8})] * 2)
     run = lambda **more: sampling.sample(  # noqa: E731
         jax.random.key(0), bound, sampling.random_walk(bound, kernel, 7), starts, warmup=7, **more).z
     every = run(samples=30, chain_method="sequential")
@@ -226,7 +238,7 @@ def test_a_model_that_asks_its_data_for_values():
     def looks(times, y=None):
         shift = float(np.nanmean(y))
         rate = numpyro.sample("decay", dist.LogNormal(shift, 0.3))
-        numpyro.sample("y", lfm.MarginalLikelihood(systems.motif(decay=rate), times, steps=2), obs=y)
+        numpyro.sample("y", lfm.MarginalLikelihood(systems.motif(systems.identity, decay=rate), times, steps=2), obs=y)
 
     found = lfm.bind(looks, TIMES, Y)
     expected = -float(potential_energy(looks, (TIMES, Y), {}, {"decay": jnp.array(0.1)}))
@@ -243,11 +255,11 @@ def test_a_model_that_asks_its_data_for_values():
 def test_times_that_a_model_computes_with_stay_known():
     def hours(times, y=None):
         rate = numpyro.sample("decay", dist.LogNormal(0.0, 0.3))
-        system = systems.motif(decay=rate)
+        system = systems.motif(systems.identity, decay=rate)
         numpyro.sample("y", lfm.MarginalLikelihood(system, jnp.asarray(times) * 2.0, steps=2), obs=y)
 
     found = lfm.bind(hours, TIMES, Y).smooth({"decay": 1.2}, at=[0.5, 7.0])  # requested times need known ones
-    expected = lfm.smooth(systems.motif(decay=1.2), TIMES * 2.0, Y, steps=2, at=[0.5, 7.0])
+    expected = lfm.smooth(systems.motif(systems.identity, decay=1.2), TIMES * 2.0, Y, steps=2, at=[0.5, 7.0])
     np.testing.assert_allclose(found.force("u").mean, expected.force("u").mean, atol=1e-10)
 
 
@@ -286,8 +298,9 @@ def _density_of(change, **start):
     return z, found
 
 
-@pytest.mark.parametrize("change", [{"power": 2.0}, {"noise": 0.2}, {"prior": 0.5}, {"steps": 3},
-                                    {"table": np.array([1.0, 2.1])}], ids=str)
+@pytest.mark.parametrize("change", [
+    {"power": 2.0}, {"prior": 0.5}, {"table": np.array([1.0, 2.1])},
+    *(pytest.param(change, marks=pytest.mark.slow) for change in ({"noise": 0.2}, {"steps": 3}))], ids=str)
 def test_a_variable_that_a_model_reads_may_change(change):
     z, ((first, before), (second, after)) = _density_of(change)
     assert second._program is not first._program and before != after
@@ -316,7 +329,7 @@ def test_a_table_that_is_read_later_may_change():
 def test_times_may_follow_from_parameters_or_data():
     def warped(times, y=None):
         speed = numpyro.sample("speed", dist.LogNormal(0.0, 0.5))
-        system = systems.motif(initial_time=0.0)
+        system = systems.motif(systems.identity)
         numpyro.sample("y", lfm.MarginalLikelihood(system, jnp.asarray(times) * speed, steps=2), obs=y)
 
     bound = lfm.bind(warped, TIMES, Y)
@@ -326,7 +339,7 @@ def test_times_may_follow_from_parameters_or_data():
 
     def packed(data):
         decay = numpyro.sample("decay", dist.LogNormal(0.0, 0.3))
-        system = systems.motif(decay=decay)
+        system = systems.motif(systems.identity, decay=decay)
         numpyro.sample("y", lfm.MarginalLikelihood(system, data["times"], steps=2), obs=data["y"])
 
     for times in (TIMES, 2.0 * TIMES):

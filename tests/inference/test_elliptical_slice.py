@@ -234,9 +234,12 @@ PRIORS = {
     "nested plates": (nested_plates, np.full(3, -2.0), np.eye(3)),
     "scaled": (scaled, LOC, 2 * COVARIANCE),
 }  # fmt: skip
+COSTLY = ("Normal", "sample_shape", "scale_tril", "precision", "low rank", "nested plates")
+"""Priors that other ones resemble; these are run with -m slow."""
 
 
-@pytest.mark.parametrize("name", PRIORS)
+@pytest.mark.parametrize("name", [
+    pytest.param(name, marks=pytest.mark.slow if name in COSTLY else ()) for name in PRIORS])
 def test_linear_gaussian_posterior(name):
     prior, mean, covariance = PRIORS[name]
 
@@ -277,6 +280,7 @@ def counts(y):
     numpyro.sample("y", dist.Poisson(jnp.exp(f)).to_event(1), obs=y)
 
 
+@pytest.mark.slow
 def test_agreement_with_blackjax():
     chains, warmup, draws = 4, 500, 10_000
     ours = np.asarray(run(EllipticalSlice(counts), 2, COUNTS, samples=draws).get_samples(group_by_chain=True)["f"])
@@ -348,6 +352,7 @@ def test_without_observations_the_draws_come_from_the_prior():
     assert_expectation((x - 3.0) ** 2, 0.25)
 
 
+@pytest.mark.slow
 def test_priors_written_with_standard_normals():
     """LocScaleReparam and TransformReparam, which the messages advise."""
     from numpyro.infer.reparam import LocScaleReparam, TransformReparam
@@ -481,6 +486,7 @@ def test_new_arguments_reach_a_compiled_kernel():
     assert np.diff(counts).tolist() == [traced, traced]
 
 
+@pytest.mark.slow
 def test_data_sets_can_be_mapped_over():
     def draws(y):
         return run(EllipticalSlice(regression), 0, X, y=y, warmup=10, samples=20, chains=2).get_samples()["weights"]

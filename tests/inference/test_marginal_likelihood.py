@@ -166,6 +166,7 @@ def test_expanded_and_masked_batches(y):
     np.testing.assert_allclose(event, plain.sum(), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_prior_predictive_has_the_exact_moments():
     draws = 4000
     known = handlers.condition(motif.model, THETA)
@@ -225,7 +226,7 @@ class CountedDrift:
         return dynamics
 
 
-@pytest.mark.parametrize("kernel", [NUTS, lfm.RAM])
+@pytest.mark.parametrize("kernel", [pytest.param(NUTS, marks=pytest.mark.slow), lfm.RAM])
 def test_samplers_compile_once_for_all_draws(y, kernel):
     drift = CountedDrift()
 

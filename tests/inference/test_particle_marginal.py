@@ -63,7 +63,8 @@ def assert_posterior(log_rate, mean, sd):
     assert abs(log_rate.std() - sd) < 4.0 * spread_error
 
 
-@pytest.mark.parametrize("delayed", [pytest.param(False, marks=pytest.mark.slow), True], ids=["plain", "delayed"])
+@pytest.mark.slow
+@pytest.mark.parametrize("delayed", [False, True], ids=["plain", "delayed"])
 def test_it_reproduces_the_exact_posterior_of_a_linear_model(delayed):
     """Twenty particles give a noisy likelihood; the posterior is the Kalman filter's all the same."""
     kernel = lfm.ParticleMarginalRAM(relaxing, particles=20, delayed=delayed)

@@ -24,9 +24,9 @@ MOST_FAILURES = {"ginzburg-landau": {DRAWS: 44, FEW: 7}}
 
 @pytest.fixture(
     scope="module",
-    params=[("ginzburg-landau", FEW), ("spring", DRAWS), ("transcription", DRAWS),
+    params=[("transcription", DRAWS), pytest.param(("ginzburg-landau", FEW), marks=pytest.mark.slow),
             *(pytest.param((name, DRAWS), marks=pytest.mark.slow)
-              for name in ("ginzburg-landau", *(f"transcription {link}" for link in OTHER_LINKS)))],
+              for name in ("ginzburg-landau", "spring", *(f"transcription {link}" for link in OTHER_LINKS)))],
     ids=lambda case: case[0] if case[1] == DRAWS else f"{case[0]} {case[1]}",
 )
 def drawn(request):

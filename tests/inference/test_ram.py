@@ -256,6 +256,7 @@ print("same")
 """
 
 
+@pytest.mark.slow
 def test_chain_methods_give_the_same_draws():
     result = on_two_devices(CHAIN_METHODS)
     assert result.stdout.strip() == "same", result.stderr

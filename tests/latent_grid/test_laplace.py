@@ -28,16 +28,16 @@ def observed(model, seed=0):
     return y
 
 
-@pytest.mark.parametrize("variance", [0.0, 0.3])
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method, variance", [
+    *((method, 0.0) for method in METHODS), *(pytest.param(method, 0.3, marks=pytest.mark.slow) for method in METHODS)])
 def test_it_is_exact_for_a_linear_model(method, variance):
     """Dense algebra on the same grid: mean, covariance and marginal likelihood, in one step."""
     model = genes(lambda u: u, variance)
     y = observed(model)
     latent = LatentGrid(model, TIMES, 61)
     found = laplace(latent, y, method)
-    by_force, by_start = (np.asarray(part).reshape(y.size, -1) for part in jax.jacobian(
-        latent.state, argnums=(0, 1))(latent.mean, jnp.zeros(2)))
+    by_force, by_start = (np.asarray(part).reshape(y.size, -1) for part in jax.jit(jax.jacobian(
+        latent.state, argnums=(0, 1)))(latent.mean, jnp.zeros(2)))
     present = np.isfinite(y).ravel()
     a, b = by_force[present], by_start[present]
     prior = np.asarray(latent.root)[0] @ np.asarray(latent.root)[0].T
@@ -60,7 +60,7 @@ def test_it_is_exact_for_a_linear_model(method, variance):
 @pytest.mark.parametrize("link", [
     pytest.param(jax.nn.softplus, id="softplus"),
     pytest.param(jnp.exp, id="exponential", marks=pytest.mark.slow),
-    pytest.param(lambda u: 1 / (0.5 + jnp.exp(u)), id="repression")])
+    pytest.param(lambda u: 1 / (0.5 + jnp.exp(u)), id="repression", marks=pytest.mark.slow)])
 def test_the_mode_is_that_of_a_general_optimiser(link):
     """BFGS on the same density finds nothing higher; the covariance is the inverse of its numerical Hessian."""
     model = genes(link)

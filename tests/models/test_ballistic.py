@@ -39,6 +39,7 @@ def test_one_step_between_measurements_is_exact():
     np.testing.assert_allclose(one[possible], eight[possible], rtol=0, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_rare_measurements_get_more_steps():
     data = loading.load("ballistic").simulate()
     grids = [likelihood_site(loading.load("ballistic").model, (times,), {}, jax.random.key(0)).example.time_grid

@@ -27,8 +27,10 @@ def choices(name):
     return [dict(zip(listed, values, strict=True)) for values in itertools.product(*listed.values())]
 
 
-COSTLY = ("gps", "home-heating")
+COSTLY = ("gps", "home-heating", "ballistic-3d")
 """Models whose other variants take long to compile; these are run with -m slow."""
+
+ALL_BUT_GPS = [pytest.param(name, marks=[pytest.mark.slow] if name == "gps" else []) for name in MODELS]
 
 CASES = [
     pytest.param(name, options, id="-".join([name, *map(str, options.values())]),
@@ -78,8 +80,7 @@ def test_default_data_fit_the_model_and_carry_their_truth(name, options):
     assert set(data.times) <= set(np.asarray(truth["times"])), "the truth is known at the data"
 
 
-@pytest.mark.parametrize("name", [
-    pytest.param(name, marks=[pytest.mark.slow] if name == "gps" else []) for name in MODELS])
+@pytest.mark.parametrize("name", ALL_BUT_GPS)
 def test_default_data_depend_on_the_seed_alone(name):
     file = loading.load(name)
     first = file.simulate(seed=123)
@@ -130,7 +131,7 @@ def test_prior_predictive_has_the_shape_of_the_data(name):
     assert np.all(np.isfinite(draws["y"]))
 
 
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", ALL_BUT_GPS)
 def test_default_data_survive_a_file(name, tmp_path):
     file = loading.load(name)
     data = simulated(name)
@@ -142,7 +143,7 @@ def test_default_data_survive_a_file(name, tmp_path):
         np.testing.assert_array_equal(prepared.y, data.y)
 
 
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", ALL_BUT_GPS)
 def test_units_of_the_data_reach_the_model(name):
     file = loading.load(name)
     data = replace(simulated(name), units={**file.units, "time": "fortnight"})

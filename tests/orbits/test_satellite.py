@@ -51,6 +51,7 @@ def test_the_two_body_limit_is_an_ellipse():
     assert np.abs(energy / energy[0] - 1).max() < 1e-12
 
 
+@pytest.mark.slow
 def test_energy_in_the_turning_field_is_conserved():
     """Jacobi's integral v^2/2 - U - omega . (r x v), for a field that turns evenly about a fixed axis."""
     field = orbits.Environment.over(EPOCH, 24.0, bodies=False)

@@ -56,7 +56,8 @@ def assert_unbiased(found, exact):
 
 
 @pytest.mark.parametrize("resampling, threshold", [
-    ("systematic", 0.5), ("stratified", 1.0), ("multinomial", 1.0), ("systematic", 0.0)])
+    ("systematic", 0.5), ("stratified", 1.0), ("multinomial", 1.0),
+    pytest.param("systematic", 0.0, marks=pytest.mark.slow)])
 def test_the_likelihood_is_unbiased(resampling, threshold):
     """Over 1,000 runs against the Kalman filter, which is exact; a start before the data, a replicate, a gap."""
     model = relaxing()
@@ -66,7 +67,7 @@ def test_the_likelihood_is_unbiased(resampling, threshold):
 
 
 @pytest.mark.parametrize("model, scheme, steps", [
-    (driven(), "exact", 1), (driven(order=0), "srk", 40),
+    (driven(), "exact", 1), pytest.param(driven(order=0), "srk", 40, marks=pytest.mark.slow),
     pytest.param(driven(), "srk", 20, marks=pytest.mark.slow),
     pytest.param(relaxing(), "srk", 20, marks=pytest.mark.slow),
 ], ids=["exact", "rough force", "smooth force", "no force"])
@@ -99,6 +100,7 @@ def test_filtering_moments_agree_with_the_kalman_filter():
     assert np.all(np.abs(found.covariance - exact.filtered_covariance) < 5.0 * error)
 
 
+@pytest.mark.slow
 def test_the_double_well_agrees_with_the_grid():
     """Non-linear dynamics, bimodal filtering densities: the Fokker-Planck grid is the reference."""
     from lfm_ppl.fokker_planck_grid.fokker_planck import fokker_planck

@@ -54,6 +54,7 @@ def test_unknown_format(tmp_path, result):
     assert not os.listdir(tmp_path)
 
 
+@pytest.mark.slow
 def test_long_lists_go_to_numbered_pages(tmp_path, crowded, monkeypatch):
     saving = import_module("lfm_ppl.results.plots.saving")
     trajectories = arviz_data.group(crowded, "trajectories")

@@ -83,6 +83,7 @@ def test_simulated_paths_have_the_same_distribution(predicted):
     assert residual.var() == pytest.approx(NOISE, rel=0.02)
 
 
+@pytest.mark.slow
 def test_an_input_that_changes_a_rate_has_covariances_of_its_own():
     assert only_adds(house) and not only_adds(leaky)
     found = lfm.rao_blackwellised(jax.random.key(3), leaky, THERMOSTAT, TIMES, particles=1000)
@@ -91,6 +92,7 @@ def test_an_input_that_changes_a_rate_has_covariances_of_its_own():
     agree(found, np.asarray(drawn.state[:, :, 0]), np.asarray(drawn.inputs))
 
 
+@pytest.mark.slow
 def test_between_decisions_nothing_is_drawn():
     """With one decision at the start, later moments are those of two Gaussians, and vary less than plain particles."""
     found = lfm.rao_blackwellised(jax.random.key(5), house, THERMOSTAT, TIMES, particles=400, decisions=TIMES[:1])
