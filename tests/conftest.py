@@ -1,6 +1,7 @@
 """Settings that every test needs: double precision, compiled programs kept between runs, and processes to run in."""
 
 import contextlib
+import ctypes
 import gc
 import os
 import re
@@ -58,7 +59,7 @@ def _keep_to_one_cpu(worker: str) -> None:
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """A worker per core up to four, each needs 2 GiB; one process where speed is measured."""
+    """A worker per core up to four, each needs 2 GiB or more; one process where speed is measured."""
     return 0 if _asked_for(config, "performance") else min(os.cpu_count() or 1, 4)
 
 
@@ -66,13 +67,29 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 def release_compiled_programs():
     """Forget compiled programs after a file where they have become many; until then later files use them too.
 
-    Linux allows a process 65,530 memory mappings, of which each program takes some, and a worker has 2 GiB.
+    Linux allows a process 65,530 memory mappings, of which each program takes some, and a worker has 2 to 4 GiB. Memory
+    that is free, but still the process's, is given back first: it would look like programs for ever.
     """
     yield
-    with contextlib.suppress(OSError):  # /proc is Linux's
+    if _crowded():
+        _give_back_free_memory()
+        if _crowded():
+            jax.clear_caches()
+            gc.collect()
+            _give_back_free_memory()
+
+
+def _crowded() -> bool:
+    with contextlib.suppress(AttributeError, OSError, ValueError):  # /proc is Linux's
+        page = os.sysconf("SC_PAGE_SIZE")
+        workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+        share = os.sysconf("SC_PHYS_PAGES") * page // (2 * workers)
         mappings = Path("/proc/self/maps").read_bytes().count(b"\n")
-        resident = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-        if mappings < 30_000 and resident < 2 * 2**30:
-            return
-    jax.clear_caches()
-    gc.collect()
+        resident = int(Path("/proc/self/statm").read_text().split()[1]) * page
+        return mappings > 30_000 or resident > min(max(share, 2 * 2**30), 4 * 2**30)
+    return True
+
+
+def _give_back_free_memory() -> None:
+    with contextlib.suppress(AttributeError, OSError, TypeError):  # glibc's
+        ctypes.CDLL(None).malloc_trim(0)
