@@ -2,7 +2,7 @@
 
 The number of events in a bin of width w about the time t_k is
 
-    y_k ~ Poisson(w exp(level + u(t_k))),
+    rate(t) = exp(level + u(t)),    y_k ~ Poisson(w rate(t_k)),
 
 with u a Gaussian process of mean zero, Matern-5/2 covariance, standard deviation `scale` and lengthscale `lengthscale`.
 Nothing is integrated: the forces are what is observed. The likelihood is that of expectation propagation, whose sites
