@@ -247,6 +247,7 @@ def fit(
             with _start_explained(bound):
                 draws, stats, remarks = _mode(bound, keys[1], samples, seed, init, run)
         else:
+            assert thin is not None
             with _start_explained(bound):
                 setup = run.setup if run is not None and run.started else None
                 transition, starts, remarks = _transition(sampler, bound, sampler_options, init, keys[2], seed, chains,

@@ -151,7 +151,7 @@ class Checkpoint:
                 kept = np.load(path, mmap_mode="r+")
                 kept[:, self._written : draws] = values[:, self._written : draws]
                 kept.flush()
-        arrays = {f"leaf{index}": leaf for index, leaf in enumerate(saved.leaves)}
+        arrays: dict[str, Any] = {f"leaf{index}": leaf for index, leaf in enumerate(saved.leaves)}
         with writing(self._own / _STATE, overwrite=True) as temporary, temporary.open("wb") as file:
             np.savez(file, done=saved.done, draws=draws, leaves=len(saved.leaves), names=list(saved.rows),
                      seconds=self.seconds, **arrays)
@@ -167,7 +167,7 @@ class Checkpoint:
         path = self._own / f"{name}.npz"
         if not path.is_file():
             with writing(path, overwrite=True) as temporary, temporary.open("wb") as file:
-                np.savez(file, **{key: np.asarray(value) for key, value in compute().items()})
+                np.savez(file, **dict[str, Any](compute()))
         with np.load(path) as file:
             return {key: file[key] for key in file.files}
 
@@ -265,7 +265,7 @@ class Parts:
     def flush(self) -> None:
         """Write what was not yet."""
         if self._waiting:
-            arrays = {}
+            arrays: dict[str, Any] = {}
             for start, part in self._waiting.items():
                 named = part if isinstance(part, Mapping) else {"": part}
                 arrays |= {f"{start}/{name}".rstrip("/"): np.asarray(value) for name, value in named.items()}

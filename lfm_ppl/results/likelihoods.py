@@ -176,9 +176,9 @@ def by_particles(problem: PosteriorDraws, particles: int | None, replicates: int
     run = _particle_run(problem, chosen, replicates, steps, progress)
     if particles is None:
         rows = np.unique(np.linspace(0, problem.size - 1, _PILOT).round().astype(int))
-        few = problem.at(rows)
-        sd = noise(run(few._replace(parts=lambda name: problem.parts(f"pilot {name}")) if problem.parts else few,
-                       pilot_key))
+        keep = problem.parts
+        pilot = None if keep is None else lambda name: keep(f"pilot {name}")
+        sd = noise(run(problem.at(rows)._replace(parts=pilot), pilot_key))
         wanted = chosen * (sd / target) ** 2 * _SAFETY if np.isfinite(sd) else np.inf
         time_grid = build_time_grid(example.ssm, example.times, steps or example.steps, example.max_step)
         steps_made = np.shape(time_grid.intervals.length)[0] * time_grid.steps
