@@ -138,7 +138,7 @@ def test_after_the_data_a_nonlinear_model_has_its_own_distribution(between_the_w
         bound = 1.95 / np.sqrt(DRAWS) + 0.01
         assert distance.statistic < bound
         moments = stats.norm.cdf(edges, gaussian.mean[k, 0], np.sqrt(gaussian.covariance[k, 0, 0]))
-        assert np.abs(moments - below).max() > 2 * bound
+        assert np.abs(moments - below).max() > bound  # which the Gaussian moments, without any Monte Carlo error, miss
         np.testing.assert_allclose(found["y_sd"], 0.05)
         np.testing.assert_array_equal(found["y_mean"], found["outputs"])
 
