@@ -73,7 +73,7 @@ class Data:
     units: Mapping[str, str] = field(default_factory=dict)
     truth: Mapping[str, Any] | None = None
     note: str = ""
-    inputs: Mapping[str, InputTable] = field(default_factory=dict)
+    inputs: Mapping[str, Any] = field(default_factory=dict)
     origin: str | None = None
 
     def __post_init__(self) -> None:
@@ -405,7 +405,7 @@ def _input(source: Table, name: str, interpolation: str, times: np.ndarray) -> I
     if not known.size or times[known[0]] > times[0]:
         raise ValueError(f"{source.place(0, name)}: the known input has no value at the first time; fill the cell.")
     kept, first = np.unique(times[known], return_index=True)
-    for row in known:
+    for row in map(int, known):
         before = values[known[first[np.searchsorted(kept, times[row])]]]
         if values[row] != before:
             raise ValueError(f"{source.place(row, name)}: the known input is {values[row]:g} here and {before:g} in "

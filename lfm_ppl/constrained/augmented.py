@@ -132,7 +132,9 @@ def _checked_grid(grid: Any, origin: float) -> np.ndarray:
 
 def augmented(model: LatentForceModel, constraints: Constraints, laid_out: Rows) -> StateSpaceModel:
     """Return the state-space model whose observation has the constraints as further outputs."""
-    return _observed_by(model, AugmentedObservation(model.observation, constraints, laid_out.data_rows), constraints)
+    own = model.observation
+    assert isinstance(own, GaussianObservation)
+    return _observed_by(model, AugmentedObservation(own, constraints, laid_out.data_rows), constraints)
 
 
 def stacked_model(model: LatentForceModel, constraints: Constraints) -> StateSpaceModel:

@@ -110,11 +110,10 @@ def build_constraints(model: LatentForceModel, lower: Mapping[str, Any] | None, 
         if name == "<lambda>" or any(label.startswith((f"{name} ", f"{name}[")) for label in labels):
             name = f"constraints[{number}]"
         labels += [f"{name} >= 0"] if size == 1 else [f"{name}[{i}] >= 0" for i in range(size)]
-    low, high = ([jnp.asarray(bound, float) for bound in given.values()] for given in bounds)
-    return Constraints(
-        model.observation.function, jnp.stack(low) if low else jnp.zeros(0), jnp.stack(high) if high else jnp.zeros(0),
-        functions, *(tuple(names.index(name) for name in given) for given in bounds),
-        len(model.state_names) + len(model.force_names), tuple(labels))
+    values = [jnp.asarray([jnp.asarray(bound, float) for bound in given.values()], float) for given in bounds]
+    below, above = (tuple(names.index(name) for name in given) for given in bounds)
+    return Constraints(model.observation.function, values[0], values[1], functions, below, above,
+                       len(model.state_names) + len(model.force_names), tuple(labels))
 
 
 def _checked(kind: str, given: Mapping[str, Any] | None, names: Sequence[str]) -> dict[str, Any]:

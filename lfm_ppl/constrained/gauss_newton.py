@@ -28,6 +28,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from lfm_ppl.constrained.augmented import AugmentedObservation
 from lfm_ppl.constrained.interior_point import (
     CENTRING,
     START,
@@ -128,6 +129,7 @@ def _rows_of_data(problem: Problem, nodes: jax.Array) -> tuple[jax.Array, jax.Ar
 def _noise_factors(problem: Problem, nodes: jax.Array) -> jax.Array:
     """Return the Cholesky factors (T, D, D) of the observations' noise along a trajectory."""
     ssm, outputs = problem.ssm, problem.y.shape[1]
+    assert isinstance(ssm.model.observation, AugmentedObservation)
     inner = ssm.model.observation.inner
 
     def one(state: jax.Array, t: jax.Array, row: jax.Array, y: jax.Array) -> jax.Array:
@@ -159,10 +161,10 @@ def _square(r: jax.Array, p: jax.Array) -> jax.Array:
 def solve_nonlinear(problem: Problem, tolerance: float, most: int) -> Solution:
     """Solve the problem of any model; arguments as in `lfm_ppl.constrained.interior_point.solve_linear`."""
     dynamics, start = Dynamics(problem), problem.start
-    nothing = jnp.full((len(problem.rows.grid), problem.count), jnp.nan)
+    nothing = jnp.full((len(problem.rows.grid), problem.width), jnp.nan)
     free = scan(problem, nothing, jnp.ones_like(nothing))
     at = margins(problem, free.smoothed)
-    known, sd, count = at.known, at.sd, at.count
+    known, sd, count = at.known, at.sd, at.free
 
     def step(now: _Iterate) -> _Iterate:
         process_cov = dynamics.linearised(now.path.nodes).process_cov

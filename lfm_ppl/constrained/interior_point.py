@@ -68,13 +68,13 @@ class Problem(NamedTuple):
     transitions: Transitions | None = None
 
     @property
-    def count(self) -> int:
+    def width(self) -> int:
         """C, the number of constraints at a time."""
         return self.ssm.output_dim - self.y.shape[1]
 
     def with_targets(self, targets: jax.Array, variances: jax.Array) -> tuple[StateSpaceModel, jax.Array]:
         """Return model and observations with pseudo-observations (G, C), NaN for none, of these variances (G, C)."""
-        whole = jnp.ones((len(self.rows.times), self.count)).at[self.rows.grid].set(variances)
+        whole = jnp.ones((len(self.rows.times), self.width)).at[self.rows.grid].set(variances)
         ssm = eqx.tree_at(lambda m: m.model.observation.variances, self.ssm, whole)
         return ssm, with_rows(self.y, targets, self.rows)
 
@@ -134,14 +134,14 @@ class Margins(NamedTuple):
         sd: (G, C), standard deviations to first order; 1 where a value is known.
         largest: (C,), the largest of each constraint.
         known: (G, C), whether no pass can move the constraint, or it is not held.
-        count: of the constraints that are not known, at least 1.
+        free: the number of those that are not known, at least 1.
     """
 
     value: jax.Array
     sd: jax.Array
     largest: jax.Array
     known: jax.Array
-    count: jax.Array
+    free: jax.Array
 
     def violated(self, problem: Problem, value: jax.Array) -> jax.Array:
         """Return (G, C), whether a value is known, and negative."""
@@ -157,8 +157,8 @@ def margins(problem: Problem, smoothed: Smoothed) -> Margins:
         function = lambda s: ssm.observe(ssm.inputs(s, t), t)[first:]  # noqa: E731
         return function(mean), safe_sqrt(diagonal(congruence(jax.jacfwd(function)(mean), covariance)))
 
-    at = [problem.at_grid(a[1:]) for a in smoothed.moments]
-    value, sd = jax.vmap(one)(*at, jnp.asarray(problem.rows.times)[jnp.asarray(problem.rows.grid)])
+    mean, covariance = (problem.at_grid(a[1:]) for a in smoothed.moments)
+    value, sd = jax.vmap(one)(mean, covariance, jnp.asarray(problem.rows.times)[jnp.asarray(problem.rows.grid)])
     largest = jnp.max(sd, axis=0, initial=0.0)
     known = ~(sd > jnp.sqrt(KNOWN) * largest)
     if problem.held is not None:
@@ -233,10 +233,10 @@ def solve_linear(problem: Problem, tolerance: float, most: int) -> Solution:
         tolerance: of the duality gap, in units of the log density.
         most: number of passes, at most.
     """
-    nothing = jnp.full((len(problem.rows.grid), problem.count), jnp.nan)
+    nothing = jnp.full((len(problem.rows.grid), problem.width), jnp.nan)
     free = scan(problem, nothing, jnp.ones_like(nothing))
     at = margins(problem, free.smoothed)
-    known, sd, count = at.known, at.sd, at.count
+    known, sd, count = at.known, at.sd, at.free
     violated = at.violated(problem, at.value)
     slack = jnp.where(known, 1.0, jnp.maximum(at.value, sd))
     multiplier = jnp.where(known, 0.0, START / slack)

@@ -31,14 +31,14 @@ class HorizonState(NamedTuple):
     Attributes:
         times: (W,), of the observations in the window; the initial time where there is none yet.
         y: (W, D), these, NaN where there is none.
-        count: of the observations so far.
+        seen: number of observations so far.
         arrival_time: when the moments below hold.
         mean, covariance: (n,), (n, n), of the joint state given all observations before the window.
     """
 
     times: jax.Array
     y: jax.Array
-    count: jax.Array
+    seen: jax.Array
     arrival_time: jax.Array
     mean: jax.Array
     covariance: jax.Array
@@ -282,12 +282,12 @@ def _update(setting: _Setting, state: HorizonState, t: jax.Array, y: jax.Array) 
     arrival = Moments(state.mean, state.covariance)
     passed = jax.tree_util.tree_map(
         lambda a: a[0], _filtered(setting, state.times[:1], state.y[:1], state.arrival_time, arrival))
-    full = state.count >= setting.window
+    full = state.seen >= setting.window
     arrival = jax.tree_util.tree_map(lambda new, old: jnp.where(full, new, old), passed, arrival)
     new = HorizonState(
-        jnp.append(state.times[1:], t), jnp.concatenate([state.y[1:], y[None]]), state.count + 1,
+        jnp.append(state.times[1:], t), jnp.concatenate([state.y[1:], y[None]]), state.seen + 1,
         jnp.where(full, state.times[0], state.arrival_time), *arrival)
-    held = jnp.arange(setting.window) >= setting.window - new.count
+    held = jnp.arange(setting.window) >= setting.window - new.seen
     found = _solved(setting, new.times, new.y, held, new.arrival_time, arrival)
     row = setting.window - 1 - setting.delay
     time = jnp.where(held[row], new.times[row], jnp.nan)

@@ -691,7 +691,8 @@ def bind(model: Callable, times: Any, y: Any, **keywords: Any) -> BoundModel:
     if isinstance(distribution, Panel):
         distribution.checked(given)
     else:
-        check_observations(given, *distribution.event_shape, False, distribution.model)
+        rows, outputs = distribution.event_shape
+        check_observations(given, rows, outputs, model=distribution.model)
     return bound
 
 

@@ -143,7 +143,7 @@ class MarginalLikelihood(dist.Distribution):
 
     def log_prob_per_observation(self, value: Any) -> jax.Array:
         """Return (T,): log p(y_k | y_1:k-1) of the present entries of each observation."""
-        y = check_observations(value, *self.event_shape, False, self.model)
+        y = self._checked(value)
         return self._said(y, finite_or_minus_infinity(self._one_step_ahead, y), alone=True)
 
     def log_prob(self, value: Any) -> jax.Array:
@@ -153,16 +153,21 @@ class MarginalLikelihood(dist.Distribution):
             return jax.vmap(self.log_prob)(value)
         check_resolution(self.model, self.times, value)
         # One failure makes the sum -inf, and with it the derivatives of the other terms zero.
-        y = check_observations(value, *self.event_shape, False, self.model)
+        y = self._checked(value)
         if isinstance(self.model.observation, ObservationFamily):
             return self._said(y, finite_or_minus_infinity(self._evidence, y))
         return self._said(y, finite_or_minus_infinity(lambda y: self._one_step_ahead(y).sum(), y))
+
+    def _checked(self, y: Any) -> jax.Array:
+        rows, outputs = self.event_shape
+        return check_observations(y, rows, outputs, model=self.model)
 
     @property
     def _site_settings(self) -> SiteSettings:
         return as_settings(self.sites, self.iterations)
 
     def _evidence(self, y: jax.Array) -> jax.Array:
+        assert isinstance(self.model.observation, ObservationFamily)
         terms = FamilyTerms(self.model.observation, y)
         return evidence(self.ssm, self.rule, self.time_grid, y, terms, self._site_settings).log_evidence
 
@@ -208,14 +213,14 @@ class MarginalLikelihood(dist.Distribution):
 
     def filter(self, y: Any) -> FilterResult:
         """Filter with this distribution's rule and steps; see `lfm_ppl.filter`."""
-        y = check_observations(y, *self.event_shape, False, self.model)
+        y = self._checked(y)
         return filter_on(self.ssm, self.rule, self.time_grid, y, jnp.asarray(self.times, float))
 
     def smooth(self, y: Any, at: Any = None) -> SmootherResult:
         """Smooth with this distribution's settings; see `lfm_ppl.smooth`."""
         grids = smoothing_grids(self.ssm, self.times, self.steps, self.max_step, at, self.iterations,
                                 self.tolerance)
-        y = check_observations(y, *self.event_shape, False, self.model)
+        y = self._checked(y)
         return smooth_on(self.ssm, self.rule, grids, y, self.iterations, self.damping, self._site_settings)
 
 

@@ -63,7 +63,7 @@ class Labels(NamedTuple):
             derived |= {name} if one["type"] == "deterministic" else set()
             found[name] = _axes(one, renamed)
         for name, given in (dims or {}).items():
-            names = [given] if isinstance(given, str) else list(given)
+            names: list[str] = [given] if isinstance(given, str) else list(given)
             if name not in found:
                 raise ValueError(f"dims: {checks.unknown('parameter', name, found)}")
             if len(names) != len(found[name]):
@@ -72,8 +72,8 @@ class Labels(NamedTuple):
             found[name] = tuple(str(text) for text in names)
         sizes = {OUTPUT: len(site.example.ssm.model.output_names)}
         sizes |= {SERIES: np.shape(bound.y)[0]} if np.ndim(bound.y) == 3 else {}
-        for name, names in found.items():
-            for text, size in zip(names, np.shape(trace[name]["value"]), strict=True):
+        for name, axes in found.items():
+            for text, size in zip(axes, np.shape(trace[name]["value"]), strict=True):
                 if text is not None and sizes.setdefault(text, size) != size:
                     raise ValueError(f"the dimension {text!r} has {sizes[text]} entries elsewhere and {size} in "
                                      f"{name!r}; give them different names.")

@@ -88,7 +88,7 @@ def score(result: Any, held_out: Any, level: float = 0.95) -> pd.DataFrame:
     _check_level(level)
     predicted = of_result(result)
     variable = observed_variable(predicted)
-    series = [dim for dim in variable.dims if dim not in ("chain", "draw", "time", "output")]
+    series = [str(dim) for dim in variable.dims if dim not in ("chain", "draw", "time", "output")]
     predicted, y = aligned(predicted, variable, held_out, series)
     variable = observed_variable(predicted)
     order = ("chain", "draw", *series, "time", "output")
@@ -165,7 +165,8 @@ def gaussian_scores(mean: np.ndarray, sd: np.ndarray, y: np.ndarray, level: floa
 def table(found: Scores, outputs: list[str], level: float = 0.95) -> pd.DataFrame:
     """Return the mean scores by output (the last axis) and of all; see `score`."""
     rows = {}
-    for index, name in [*enumerate(outputs), (slice(None), ALL)]:
+    entries: list[tuple[Any, str]] = [*enumerate(outputs), (slice(None), ALL)]
+    for index, name in entries:
         rows[name] = summary(Scores(*(value[..., index] for value in found)), level)
     return pd.DataFrame.from_dict(rows, orient="index")
 

@@ -90,7 +90,7 @@ class ObservationFamily(eqx.Module):
         return ()
 
     @property
-    def covariance(self) -> None:
+    def covariance(self) -> Any:
         """There is no covariance: sites have precisions of their own."""
         return None
 

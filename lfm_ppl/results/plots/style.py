@@ -231,12 +231,12 @@ class DateTicks(Locator):
         self.dates = dates
         self.inner = AutoDateLocator(minticks=3, maxticks=ticks)
 
-    def __call__(self) -> np.ndarray:
+    def __call__(self) -> Any:
         """Return the ticks of the interval that the axis shows."""
         assert self.axis is not None
         return self.tick_values(*self.axis.get_view_interval())
 
-    def tick_values(self, vmin: float, vmax: float) -> np.ndarray:
+    def tick_values(self, vmin: float, vmax: float) -> Any:
         """Return the ticks of an interval."""
         start, end = self.dates.days((vmin, vmax))
         days = np.asarray(self.inner.tick_values(num2date(start), num2date(end)))
