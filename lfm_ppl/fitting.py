@@ -324,8 +324,9 @@ def _draws(bound: BoundModel, rows: Mapping[str, np.ndarray], samples: int) -> t
     """Return site name -> draws, and the statistics, of rows that the chains left."""
     z = rows["z"]
     count = z.shape[1]
-    # As many rows as there will be in the end: compiled once.
-    whole = z if count == samples else np.concatenate([z, np.repeat(z[:, -1:], samples - count, axis=1)], axis=1)
+    # A power of two of rows: compiled a few times, whatever their number.
+    rows_there = min(1 << max(count - 1, 0).bit_length(), samples)
+    whole = np.concatenate([z, np.repeat(z[:, -1:], rows_there - count, axis=1)], axis=1)
     draws = {site: values[:, :count] for site, values in bound.constrain_draws(whole).items()}
     return draws, _statistics({name: values for name, values in rows.items() if name != "z"})
 

@@ -10,6 +10,8 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 
+from lfm_ppl.inference.interruption import LISTENERS
+
 INTERRUPTED = 130
 """Exit status of a program that a signal has ended (128 + SIGINT)."""
 
@@ -95,9 +97,11 @@ def watched(last_words: Callable[[], str]) -> Iterator[Watch | None]:
         signal.signal(signal.SIGTERM, signal.default_int_handler)
     before = signal.set_wakeup_fd(watch.wakeup, warn_on_full_buffer=False)
     watch.start()
+    LISTENERS.append(watch.answered)
     try:
         yield watch
     finally:
+        LISTENERS.remove(watch.answered)
         signal.set_wakeup_fd(before)
         signal.signal(signal.SIGTERM, terminate)
         watch.stop()

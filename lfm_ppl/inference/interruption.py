@@ -5,10 +5,14 @@ from __future__ import annotations
 import signal
 import sys
 import threading
+from collections.abc import Callable
 from types import FrameType
 from typing import Any
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+LISTENERS: list[Callable[[], None]] = []
+"""Called when a request is taken: the main thread runs, and will end by itself."""
 
 
 class Interruption:
@@ -47,4 +51,6 @@ class Interruption:
         self.requests += 1
         if self.requests > 1 or not self._deferring:
             raise KeyboardInterrupt
+        for heard in LISTENERS:
+            heard()
         print("\nstopping after this block of draws; once more to stop at once", file=sys.stderr, flush=True)
