@@ -44,7 +44,8 @@ class Backtest(NamedTuple):
         """Return at how many origins the forecast has the better RMSE, CRPS and log score than the reference.
 
         Returns:
-            Rows: outputs and "all"; columns ``origins``, ``rmse``, ``crps``, ``log_score``.
+            Rows: outputs and "all"; columns ``origins``, ``rmse``, ``crps``, ``log_score``; NaN where one of the two has
+            no such score.
         """
         own, reference = (self.scores.isel(forecaster=index) for index in (0, 1))
         rows = {}
@@ -53,7 +54,9 @@ class Backtest(NamedTuple):
             both = np.isfinite(ours["rmse"]) & np.isfinite(theirs["rmse"])
             better = {label: (ours[label] > theirs[label]) if label == "log_score" else ours[label] < theirs[label]
                       for label in _SCORES}
-            rows[name] = {"origins": int(both.sum()), **{label: int(hit[both].sum()) for label, hit in better.items()}}
+            known = {label: bool((np.isfinite(ours[label]) & np.isfinite(theirs[label])).any()) for label in _SCORES}
+            rows[name] = {"origins": int(both.sum()), **{
+                label: int(hit[both].sum()) if known[label] else np.nan for label, hit in better.items()}}
         return pd.DataFrame.from_dict(rows, orient="index")
 
 
@@ -151,10 +154,12 @@ def backtest(numpyro_model: Callable, times: Any, y: Any, *, horizon: int, every
                 predicted = arviz_data.group(result, GROUP).isel(time=ahead)
             except Exception as error:
                 raise type(error)(f"at the origin {times[origin]:g} (row {origin}): {error}") from error
-            found = scores(_flat(observed_variable(predicted)), y[ahead], _flat(predicted[MEAN]), _flat(predicted[SD]),
-                           level, angular)
+            drawn = _flat(observed_variable(predicted))
+            # An observation family has no normal distribution at each draw.
+            mean, sd = (_flat(predicted[name]) if name in predicted else None for name in (MEAN, SD))
+            found = scores(drawn, y[ahead], mean, sd, level, angular)
         messages += [f"origin {times[origin]:g}: {one.message}" for one in caught]
-        forecasts.append((_flat(predicted[MEAN]).mean(axis=0), found))
+        forecasts.append(((drawn if mean is None else mean).mean(axis=0), found))
         mean, sd = _naive(known[:origin + 1], horizon, season or 1, angular)
         target = np.where(angular, mean + _wrapped(y[ahead] - mean), y[ahead])
         naive.append((mean, gaussian_scores(mean, sd, target, level)))

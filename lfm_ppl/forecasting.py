@@ -118,8 +118,10 @@ def check_possible(bound: Any, times: np.ndarray) -> None:
                          "each.")
     example = bound.site.example
     if noise_of_rows(example):
-        raise ValueError("the covariance of the observation is given for each row of the data, (T, D, D), so that "
-                         "there is none at other times; give a function (x, u, t) for a forecast.")
+        raise ValueError("the covariance of the observation, (T, D, D), or a parameter of its family, (T, D), is given "
+                         "for each row of the data, so that there is none at other times. For a forecast give a "
+                         "function (x, u, t) as covariance, or one number for all rows; what differs from row to row, "
+                         "such as an exposure, can be a known input of the predictor.")
     build_time_grid(example.ssm, bound.times, example.steps, example.max_step, times, tolerance=example.tolerance)
     model = example.ssm.model
     model.check_span(float(bound.times[0]), float(max(times.max(), bound.times[-1])))

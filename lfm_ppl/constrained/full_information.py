@@ -42,6 +42,7 @@ class ConstrainedEstimate(eqx.Module):
         converged: whether the gap is below the tolerance, and the constraints equal their slacks.
         violation: (K, C), distance of each constraint from its slack in standard deviations; large where the problem is
             infeasible.
+        scale: (K, C), standard deviation of each constraint given the data alone; 1 where it is known.
         labels: of the C constraints, such as "factor >= lower".
     """
 
@@ -55,15 +56,15 @@ class ConstrainedEstimate(eqx.Module):
     passes: jax.Array
     converged: jax.Array
     violation: jax.Array
+    scale: jax.Array
     labels: tuple[str, ...] = eqx.field(static=True)
     state_names: tuple[str, ...] = eqx.field(static=True)
     force_names: tuple[str, ...] = eqx.field(static=True)
 
     @property
     def active(self) -> jax.Array:
-        """(K, C), whether a constraint binds: its multiplier outweighs its slack, each relative to its largest."""
-        slack = self.slack / jnp.max(self.slack, axis=0)
-        return self.multiplier > slack * jnp.max(self.multiplier, axis=0)
+        """(K, C), whether a constraint binds: its multiplier outweighs its slack, both in standard deviations."""
+        return self.multiplier * self.scale > self.slack / self.scale
 
     def state(self, name: str) -> jax.Array:
         """Return (K,), the trajectory of a physical state.
@@ -182,7 +183,7 @@ def estimate_on(ssm: StateSpaceModel, constraints: Constraints, problem: Problem
     size = ssm.physical_dim
     return ConstrainedEstimate(
         times, inputs[:, :size], inputs[:, size:], solution.slack, solution.multiplier, solution.gap,
-        solution.objective, solution.passes, solution.converged, solution.violation, constraints.labels,
+        solution.objective, solution.passes, solution.converged, solution.violation, solution.sd, constraints.labels,
         ssm.model.state_names, ssm.model.force_names), solution
 
 

@@ -230,10 +230,10 @@ def solve_nonlinear(problem: Problem, tolerance: float, most: int) -> Solution:
     value = constraint_values(problem, last.path.nodes)
     violated = at.violated(problem, value)
     slack = jnp.where(known, jnp.maximum(value, 0.0), last.slack)
-    finite = jnp.isfinite(last.gap) & jnp.isfinite(last.path.nodes).all()
+    finite = jnp.isfinite(last.gap + last.decrement) & jnp.isfinite(last.path.nodes).all()
     objective = _objective(problem, last.path, last.process_cov, _noise_factors(problem, last.path.nodes))
     return Solution(last.path.nodes, slack, jnp.where(known, 0.0, last.multiplier), last.gap, last.residual,
-                    jnp.where(known, 0.0, jnp.abs(value - slack) / sd), known, violated, objective, last.passes,
+                    jnp.where(known, 0.0, jnp.abs(value - slack) / sd), sd, known, violated, objective, last.passes,
                     last.done & finite & ~violated.any())
 
 

@@ -175,6 +175,7 @@ class Solution(NamedTuple):
         gap: sum of s lambda, in units of the log density.
         residual: largest |c - s| over the constraints, in standard deviations.
         violation: (G, C), how far a constraint is from where its slack is, in standard deviations.
+        sd: (G, C), standard deviations of the constraints without them; 1 where a value is known.
         known: (G, C), whether the constraint's value has no variance.
         violated: (G, C), whether such a value is negative.
         objective: minus the log density of the trajectory and the data up to a constant, J.
@@ -188,6 +189,7 @@ class Solution(NamedTuple):
     gap: jax.Array
     residual: jax.Array
     violation: jax.Array
+    sd: jax.Array
     known: jax.Array
     violated: jax.Array
     objective: jax.Array
@@ -273,5 +275,5 @@ def solve_linear(problem: Problem, tolerance: float, most: int) -> Solution:
     violation = jnp.where(known, 0.0, jnp.abs(constraint_values(problem, last.mean) - slack) / sd)
     return Solution(
         last.mean, slack, jnp.where(feasible | known, 0.0, last.multiplier),
-        jnp.where(feasible, 0.0, last.gap), jnp.where(feasible, 0.0, last.residual), violation, known, violated,
+        jnp.where(feasible, 0.0, last.gap), jnp.where(feasible, 0.0, last.residual), violation, sd, known, violated,
         last.objective, last.passes, solved & ~violated.any() & (violation <= RESPECTED).all())

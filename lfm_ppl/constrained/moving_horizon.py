@@ -323,4 +323,4 @@ def _run(setting: _Setting, times: jax.Array, y: jax.Array, origin: jax.Array) -
         labels=last.labels, state_names=last.state_names, force_names=last.force_names)
 
 
-_BY_ROW = ("times", "state_mean", "force_mean", "slack", "multiplier", "violation")
+_BY_ROW = ("times", "state_mean", "force_mean", "slack", "multiplier", "violation", "scale")

@@ -200,6 +200,9 @@ def constrained_posterior(model: LatentForceModel, times: Any, y: Any, lower: Ma
     Lacoste-Julien (2011), Gaussian probabilities and expectation propagation.
     """
     check_settings(model, 1.0, sweeps)
+    if model.observation.angular:
+        raise ValueError("the posterior under constraints takes no angular outputs; observe their sine and cosine, or "
+                         "take lfm.full_information.")
     found = build_constraints(model, lower, upper, constraints)
     laid_out = rows(model, times, grid)
     ssm = stacked_model(model, found)

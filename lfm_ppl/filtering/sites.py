@@ -150,7 +150,7 @@ def row_log_prob(family: ObservationFamily, row: Any, f: jax.Array, y: jax.Array
     """Return log p(y_d | f_d) (D,) of a row, zero where missing."""
     present = jnp.isfinite(y)
     # A missing entry must not put NaN into a derivative.
-    return jnp.where(present, family.at(row).log_prob(f, jnp.where(present, y, 1.0)), 0.0)
+    return jnp.where(present, family.at(row).log_prob(f, jnp.where(present, y, family.possible(f))), 0.0)
 
 
 class Cavity(NamedTuple):
@@ -160,11 +160,13 @@ class Cavity(NamedTuple):
         cavity: without the site (to its power).
         marginal: with it.
         valid: whether both have a positive variance.
+        known: whether the predictor has no variance: it needs no site, and adds log p at its mean.
     """
 
     cavity: Marginal
     marginal: Marginal
     valid: jax.Array
+    known: jax.Array
 
 
 class Converged(NamedTuple):
@@ -215,17 +217,21 @@ def cavities(predictor: Predictor, sites: Sites, present: jax.Array, power: floa
     """
     m, v = predictor.mean - sites.centre, diagonal(predictor.covariance)
     nu, tau = sites.nu, sites.tau
-    share = power * tau * v
+    least = _known(predictor.mean, jnp.zeros_like(v)).variance
+    known = jnp.abs(v) <= least
+    v = jnp.where(known, least, v)
+    share = jnp.where(known, 0.0, power * tau * v)
     whole = (share > _WHOLE) & (power == 1.0)
     safe_tau = jnp.where(whole, tau, 1.0)
     left = jnp.where(whole, diagonal(predictor.precision) / safe_tau, 1.0 - share)
     valid = (left > 0) & (v > 0) & jnp.isfinite(m)
     left = jnp.where(valid, left, 1.0)
     mean = jnp.where(whole, (nu - predictor.score / left) / safe_tau, (m - power * v * nu) / left)
+    mean = jnp.where(known, m, mean)
     v = jnp.where(valid, v, 1.0)
     marginal = Marginal(jnp.where(valid, predictor.mean, 0.0), v)
     cavity = Marginal(jnp.where(valid, sites.centre + mean, 0.0), v / left)
-    return Cavity(cavity, marginal, valid | ~present)
+    return Cavity(cavity, marginal, valid | ~present, known)
 
 
 def _ep(terms: EntryTerms, sites: Sites, at: Cavity, power: float) -> tuple[jax.Array, jax.Array]:
@@ -255,6 +261,7 @@ def new_sites(terms: EntryTerms, sites: Sites, at: Cavity, settings: SiteSetting
               damping: Any) -> tuple[Sites, jax.Array]:
     """Return damped new sites, and the largest change of one; where a cavity is not valid its site is kept."""
     nu, tau = _NEW_SITES[settings.method](terms, sites, at, settings.power)
+    nu, tau = (jnp.where(at.known, 0.0, new) for new in (nu, tau))
     usable = terms.present & at.valid & jnp.isfinite(nu) & jnp.isfinite(tau)
     nu, tau = (jnp.where(usable, new, old) for new, old in ((nu, sites.nu), (tau, sites.tau)))
     v = at.marginal.variance
@@ -476,11 +483,16 @@ def _until_converged(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, settings:
 
     def going(carry: tuple) -> jax.Array:
         change, count = carry[2], carry[4]
-        return (change >= _TOLERANCE) & (count < settings.sweeps)
+        return (change >= _tolerance(change)) & (count < settings.sweeps)
 
     carry = sweep((first, None, jnp.asarray(jnp.inf), jnp.asarray(settings.damping), jnp.asarray(0)))
     sites, at, change, _, count = jax.lax.while_loop(going, sweep, carry)
-    return Converged(sites, at, change, count, (change < _TOLERANCE) & at.valid.all())
+    return Converged(sites, at, change, count, (change < _tolerance(change)) & at.valid.all())
+
+
+def _tolerance(change: jax.Array) -> float:
+    """Return the largest change of converged sites; in single precision none is as small as 1e-8."""
+    return max(_TOLERANCE, 32 * float(jnp.finfo(change.dtype).eps))
 
 
 def _newton_step(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, terms: EntryTerms,

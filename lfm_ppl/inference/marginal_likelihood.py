@@ -322,6 +322,15 @@ class Panel(dist.Distribution):
         known = checks.concrete(value)
         if known is not None and np.isinf(known).any():
             raise ValueError("y has infinite entries; use NaN for a missing entry.")
+        if known is not None:
+            for index, rows in enumerate(known):
+                family = self.series(index).model.observation if self._series_times else self.first.model.observation
+                if not isinstance(family, ObservationFamily):
+                    break
+                try:
+                    family.check_data(rows)
+                except ValueError as error:
+                    raise ValueError(f"series {index}: {error}") from None
         return jnp.asarray(value, float)
 
 

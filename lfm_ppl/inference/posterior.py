@@ -121,7 +121,10 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
                                      particle_steps or distribution.steps)
         there, data = plan.there, plan.data
         if isinstance(ssm.model.observation, ObservationFamily):
-            return _of_family(ssm, noise_key, w, when, plan)
+            found = _of_family(ssm, noise_key, w, when, plan)
+            if at is not None and noise_of_rows(distribution):
+                del found["prediction"]
+            return found
         output = jax.vmap(ssm.observe)(w, when)
         covariance = jax.vmap(ssm.obs_cov)(w[data], when[data], jnp.arange(len(data)))
         replicated = _noisy(noise_key, output[data], covariance)
@@ -236,8 +239,10 @@ def _onwards(distribution: MarginalLikelihood, y: jax.Array, states: jax.Array, 
 
 
 def noise_of_rows(distribution: MarginalLikelihood) -> bool:
-    """Whether the covariance of the noise is given for each row of the data, so that no other row has one."""
+    """Whether the law of the noise is given for each row of the data, so that no other row has one."""
     observation = distribution.ssm.model.observation
+    if isinstance(observation, ObservationFamily):
+        return observation.of_rows()
     return not observation.varies_with_state and np.ndim(observation.covariance) == 3
 
 

@@ -48,7 +48,7 @@ def entry_log_prob(ssm: StateSpaceModel, w: jax.Array, t: jax.Array, row: Any, y
     assert isinstance(family, ObservationFamily)
     predictor = ssm.observe(w, t)
     # A missing entry must not put NaN into a derivative; any value in the support does.
-    value = family.at(row).log_prob(predictor, jnp.where(present, y, 1.0))
+    value = family.at(row).log_prob(predictor, jnp.where(present, y, family.possible(predictor)))
     return jnp.where(present, value, 0.0)
 
 

@@ -69,7 +69,11 @@ class CensoredObservation(ObservationFamily):
         error = (y - predictor) / s
         seen = jnp.where(self.width > 0, _log_probability_between(error - half / s, error + half / s),
                          norm.logpdf(error) - jnp.log(s))
-        below, above = norm.logcdf((finite_left - predictor) / s), norm.logcdf((predictor - finite_right) / s)
+        # Of values in bins those are reported as a limit whose bin's middle lies at it or beyond.
+        width = jnp.where(self.width > 0, self.width, 1.0)
+        low = jnp.where(self.width > 0, (jnp.floor(finite_left / width) + 0.5) * width, finite_left)
+        high = jnp.where(self.width > 0, (jnp.ceil(finite_right / width) - 0.5) * width, finite_right)
+        below, above = norm.logcdf((low - predictor) / s), norm.logcdf((predictor - high) / s)
         return jnp.where(y <= self.left, below, jnp.where(y >= self.right, above, seen))
 
     def sample(self, key: jax.Array, predictor: jax.Array) -> jax.Array:

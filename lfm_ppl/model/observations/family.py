@@ -58,6 +58,10 @@ class ObservationFamily(eqx.Module):
         """Return what the entries (D,) are on average under ``predictor``, for plots: here the predictor itself."""
         return predictor
 
+    def possible(self, predictor: jax.Array) -> jax.Array:
+        """Return entries (D,) inside the support, to stand where one is missing."""
+        return jnp.ones_like(predictor)
+
     def problem(self, y: np.ndarray) -> tuple[np.ndarray, str] | None:
         """Say what data (T, D) cannot be: where (T, D), and what they must be. Of missing entries nothing is asked."""
         return None
@@ -77,6 +81,11 @@ class ObservationFamily(eqx.Module):
             return self
         names = list(rows)
         return eqx.tree_at(lambda family: [getattr(family, name) for name in names], self, list(rows.values()))
+
+    def of_rows(self) -> bool:
+        """Whether a parameter differs from row to row of the data, so that no other row has a law."""
+        given = (getattr(self, name) for name in self.per_entry if np.ndim(getattr(self, name)) == 2)
+        return any((known := checks.concrete(one)) is None or bool((known != known[:1]).any()) for one in given)
 
     def typical(self) -> ObservationFamily:
         """Return the family with parameters (T, D) averaged over the rows, for times that are no row of the data."""

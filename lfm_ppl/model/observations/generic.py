@@ -64,6 +64,11 @@ class Observation(ObservationFamily):
         """Draw entries (D,)."""
         return self.make(predictor).sample(key).astype(predictor.dtype)
 
+    def possible(self, predictor: jax.Array) -> jax.Array:
+        """Return entries (D,) inside the distribution's support."""
+        value = self.make(jax.lax.stop_gradient(predictor)).support.feasible_like(predictor)
+        return jax.lax.stop_gradient(jnp.asarray(value, predictor.dtype))
+
     def mean(self, predictor: jax.Array) -> jax.Array:
         """Return the distribution's mean (D,)."""
         return jnp.asarray(self.make(predictor).mean, float)
@@ -74,7 +79,10 @@ class Observation(ObservationFamily):
         if known is None:
             return
         support = self.make(jnp.zeros(known.shape[1])).support
-        inside = np.broadcast_to(np.asarray(support(jnp.asarray(known))), known.shape)
+        found = checks.concrete(support(jnp.asarray(known)))
+        if found is None:  # within compiled code
+            return
+        inside = np.broadcast_to(found, known.shape)
         wrong = ~inside & np.isfinite(known)
         if wrong.any():
             row, column = np.argwhere(wrong)[0]

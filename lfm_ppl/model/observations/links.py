@@ -38,6 +38,11 @@ def _log_positive(f: jax.Array) -> jax.Array:
     return jnp.where(f > 0, jnp.log(jnp.where(f > 0, f, 1.0)), -jnp.inf)
 
 
+def _log_share(f: jax.Array) -> jax.Array:
+    """Return log f, -inf with a zero gradient where f is no probability."""
+    return _log_positive(jnp.where(f < 1, f, -1.0))
+
+
 RATES = {
     "exp": RateLink(jnp.exp, lambda f: f),
     "softplus": RateLink(jax.nn.softplus, _log_softplus),
@@ -46,7 +51,7 @@ RATES = {
 PROBABILITIES = {
     "logit": ProbabilityLink(jax.nn.log_sigmoid, lambda f: jax.nn.log_sigmoid(-f)),
     "probit": ProbabilityLink(jax.scipy.stats.norm.logcdf, lambda f: jax.scipy.stats.norm.logcdf(-f)),
-    "identity": ProbabilityLink(_log_positive, lambda f: _log_positive(1.0 - f)),
+    "identity": ProbabilityLink(_log_share, lambda f: _log_share(1.0 - f)),
 }
 
 

@@ -50,9 +50,15 @@ class NegativeBinomialObservation(ObservationFamily):
     def log_prob(self, predictor: jax.Array, y: jax.Array) -> jax.Array:
         """Return the log probabilities (D,) of counts."""
         c, log_mean = self.concentration, RATES[self.link].log_rate(predictor) + jnp.log(self.exposure)
-        total = jnp.logaddexp(jnp.log(c), log_mean)
-        value = (gammaln(y + c) - gammaln(c) - gammaln(y + 1.0) + c * (jnp.log(c) - total)
-                 + y * (log_mean - total))
+        log_odds = log_mean - jnp.log(c)
+        total = jax.nn.softplus(log_odds)  # log(1 + mu / c)
+        # Gamma(y + c) / (Gamma(c) c^y): differences of large numbers where c is large; Stirling's series there.
+        large = c > 1e3
+        small_c, large_c = jnp.where(large, 1.0, c), jnp.where(large, c, 1e3)
+        rising = jnp.where(
+            large, (y + large_c - 0.5) * jnp.log1p(y / large_c) - y - y / (12.0 * large_c * (y + large_c)),
+            gammaln(y + small_c) - gammaln(small_c) - y * jnp.log(small_c))
+        value = rising - gammaln(y + 1.0) - c * total + y * (log_mean - total)
         return jnp.where(jnp.isneginf(log_mean), -jnp.inf, value) if self.link == "identity" else value
 
     def sample(self, key: jax.Array, predictor: jax.Array) -> jax.Array:

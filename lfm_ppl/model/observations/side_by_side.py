@@ -88,9 +88,17 @@ class Observations(ObservationFamily):
         return jnp.concatenate([part.sample(one, predictor[columns])
                                 for one, (part, columns) in zip(keys, self._each(), strict=True)])
 
+    def possible(self, predictor: jax.Array) -> jax.Array:
+        """Return entries (D,) inside the supports."""
+        return jnp.concatenate([part.possible(predictor[columns]) for part, columns in self._each()])
+
     def mean(self, predictor: jax.Array) -> jax.Array:
         """Return what the entries are on average (D,)."""
         return jnp.concatenate([part.mean(predictor[columns]) for part, columns in self._each()])
+
+    def of_rows(self) -> bool:
+        """Whether a parameter of a part differs from row to row of the data."""
+        return any(part.of_rows() for part in self.parts)
 
     def typical(self) -> Observations:
         """Return the families with parameters averaged over the rows."""
