@@ -44,8 +44,8 @@ class Backtest(NamedTuple):
         """Return at how many origins the forecast has the better RMSE, CRPS and log score than the reference.
 
         Returns:
-            Rows: outputs and "all"; columns ``origins``, ``rmse``, ``crps``, ``log_score``; NaN where one of the two has
-            no such score.
+            Rows: outputs and "all"; columns ``origins``, ``rmse``, ``crps``, ``log_score``, NaN where there is no such
+            score.
         """
         own, reference = (self.scores.isel(forecaster=index) for index in (0, 1))
         rows = {}

@@ -8,7 +8,7 @@ that a change to summer time leaves out or repeats is counted right.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from datetime import UTC, date, datetime, time, timedelta
+from datetime import UTC, date, datetime, time, timedelta, timezone
 from typing import Any
 
 import numpy as np
@@ -72,6 +72,10 @@ def since_midnight(stamps: Sequence[datetime], unit: str | None = None) -> tuple
     """
     first = min(stamps)
     origin = datetime.combine(first.date(), time(), first.tzinfo)
+    offset = origin.utcoffset()
+    if offset is not None:  # times that share a time zone are subtracted as its clocks show them, change of hour or not
+        origin = origin.replace(tzinfo=timezone(offset))
+        stamps = [stamp.astimezone(UTC) for stamp in stamps]
     seconds = np.array([(stamp - origin).total_seconds() for stamp in stamps])
     if unit is None:
         gaps = np.diff(seconds)
@@ -97,9 +101,13 @@ def position(text: str, origin: str | None, unit: str) -> float:
         (36.0, 3.5)
     """
     try:
-        return float(text)
+        number = float(text)
     except ValueError:
         pass
+    else:
+        if origin is not None and len(text) == 8 and text.isdigit():
+            raise ValueError(f"is {text} a number or a date? Write a date as 2026-03-31, and a number as {text}.0.")
+        return number
     try:
         stamp = parse(text)
     except ValueError:

@@ -110,6 +110,9 @@ def read_csv(
     time_column: str | None = None,
     inputs: Sequence[str] | Mapping[str, str] = (),
     time_unit: str | None = None,
+    *,
+    usual_unit: str | None = None,
+    observed: bool = True,
 ) -> Data:
     r"""Read observations and known inputs from a comma-separated file.
 
@@ -123,6 +126,8 @@ def read_csv(
         inputs: columns of known inputs; or a mapping column -> "previous" (a value holds until the next, the default)
             or "linear". Empty cells are left out: the input is interpolated over them.
         time_unit: unit of times that are dates (ms, s, min, h, d, weeks, years). None: that of the time between rows.
+        usual_unit: what None means instead, the unit of a model.
+        observed: whether a file without any value of the outputs is an error; known inputs of the future have none.
 
     Returns:
         The observations; empty cells (and NA, NaN) are NaN. Dates (ISO 8601, with an offset from UTC in each row, or in
@@ -146,7 +151,7 @@ def read_csv(
         >>> data.times.tolist(), data.units, data.origin, float(data.known_inputs()["heater"](7.5))
         ([6.0, 7.0], {'time': 'h'}, '2026-01-05T00:00:00', 1.0)
     """
-    return _read(table.from_csv(path), outputs, time_column, inputs, time_unit)
+    return _read(table.from_csv(path), outputs, time_column, inputs, time_unit, usual_unit, observed=observed)
 
 
 def read_table(
@@ -217,7 +222,8 @@ def on_clock_of(data: Data, other: Data) -> Data:
 
 
 def read_series(path: str | Path, column: str, outputs: Sequence[str] | None = None, time_column: str | None = None,
-                inputs: Sequence[str] | Mapping[str, str] = (), time_unit: str | None = None) -> dict[str, Data]:
+                inputs: Sequence[str] | Mapping[str, str] = (), time_unit: str | None = None,
+                usual_unit: str | None = None) -> dict[str, Data]:
     r"""Read several series from one comma-separated file, in which a column says which series a row belongs to.
 
     Args:
@@ -227,6 +233,7 @@ def read_series(path: str | Path, column: str, outputs: Sequence[str] | None = N
         time_column: as for :func:`read_csv`, and so are the others.
         inputs: columns of known inputs.
         time_unit: unit of times that are dates.
+        usual_unit: what None means instead.
 
     Returns:
         Identifier -> observations, in the order in which the file has them. Rows of a series need not stand together,
@@ -251,7 +258,7 @@ def read_series(path: str | Path, column: str, outputs: Sequence[str] | None = N
             raise ValueError(f"{source.place(row, column)}: the identifier of the series is missing.")
         parts.setdefault(name, []).append(row)
     return {name: _read(source.part(rows, without=column), outputs, time_column, inputs, time_unit,
-                        f" of series {name!r}") for name, rows in parts.items()}
+                        usual_unit, f" of series {name!r}") for name, rows in parts.items()}
 
 
 def write_csv(data: Data, path: str | Path) -> None:
@@ -296,7 +303,8 @@ def read_truth(path: str | Path) -> dict[str, Any]:
 
 
 def _read(source: Table, outputs: Sequence[str] | None, time_column: str | None,
-          inputs: Sequence[str] | Mapping[str, str], time_unit: str | None, part: str = "") -> Data:
+          inputs: Sequence[str] | Mapping[str, str], time_unit: str | None, usual_unit: str | None = None,
+          part: str = "", observed: bool = True) -> Data:
     """Return the observations in a table; arguments as for `read_csv`, and what a part of a file is called."""
     if time_unit is not None:
         checks.one_of("time_unit", time_unit, calendar_time.SECONDS)
@@ -311,9 +319,9 @@ def _read(source: Table, outputs: Sequence[str] | None, time_column: str | None,
     names = _find_outputs(source, [name for name in others if name not in wanted], time_name, outputs)
     if both := sorted(set(names) & set(wanted)):
         raise ValueError(f"the column {both[0]!r} is named as an output and as an input; it can be one of them.")
-    times, unit, origin = _times(source, time_name, time_unit)
+    times, unit, origin = _times(source, time_name, time_unit, usual_unit)
     y = np.array([[_value(source, row, name) for name in names] for row in range(len(times))])
-    if np.all(np.isnan(y)):
+    if observed and np.all(np.isnan(y)):
         raise ValueError(f"{source.label}: every value of {', '.join(names)}{part} is missing.")
     return Data(times, y, tuple(names), units={"time": unit} if unit else {}, origin=origin,
                 inputs={name: _input(source, name, way, times) for name, way in wanted.items()})
@@ -364,7 +372,7 @@ def _unit_of(time_name: str) -> str | None:
     return unit if stem.lower() == "time" and unit in calendar_time.SECONDS else None
 
 
-def _times(source: Table, name: str, unit: str | None) -> tuple[np.ndarray, str | None, str | None]:
+def _times(source: Table, name: str, unit: str | None, usual: str | None) -> tuple[np.ndarray, str | None, str | None]:
     """Return times (T,), their unit and their origin, None where the table does not say."""
     cells = source.columns[name]
     if missing := [row for row, cell in enumerate(cells) if _missing(cell)]:
@@ -388,7 +396,7 @@ def _times(source: Table, name: str, unit: str | None) -> tuple[np.ndarray, str 
             raise ValueError(f"{source.place(row, name)}: some dates have an offset from UTC and others have none: "
                              f"{cells[0]!s} and {cell!s}.")
     back = " A clock that is set back for winter needs offsets from UTC." if stamps[0].tzinfo is None else ""
-    times, origin, unit = calendar_time.since_midnight(stamps, unit or _unit_of(name))
+    times, origin, unit = calendar_time.since_midnight(stamps, unit or _unit_of(name) or usual)
     _check_order(source, times, [str(cell) for cell in cells], back)
     return times, unit, origin
 

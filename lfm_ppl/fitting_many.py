@@ -32,7 +32,7 @@ FITS, SUMMARY, POSTERIORS, FAILED = "fits", "summary.csv", "posteriors.nc", "fai
 WARNINGS = "warnings"
 """Attribute of a result: what `fit` warned of, as a list in JSON."""
 
-_OWN = ("numpyro_model", "times", "y", "seed", "progress", "truth", "name")
+_OWN = ("numpyro_model", "times", "y", "seed", "progress", "truth", "name", "checkpoint", "resume", "overwrite")
 """Arguments of `fit` that a data set has of its own, or none of."""
 
 _STRUCTURE = "structure"
@@ -285,6 +285,8 @@ def _task(model: Callable, name: str, value: Any, options: dict[str, Any], seed:
     named = {key: one for key, one in options.items() if key not in ("truth", "name", "seed", "model_kwargs")}
     settings = {"data": digest, "model": _fingerprint(model, times, y, keywords, digests),
                 "options": _plain({**named, "model_kwargs": keywords})}
+    if isinstance(value, Data):
+        settings["named"] = _plain({"outputs": value.outputs, "units": dict(value.units), "origin": value.origin})
     data = (value, None) if isinstance(value, Data) else (times, y)
     return Task(_file_name(name), seed, settings, (*data, options))
 

@@ -257,10 +257,12 @@ def _add_forecast(commands: Any) -> None:
     _add_times(command)
     command.add_argument("--held-out", metavar="FILE",
                          help="CSV of data that the fit has not seen, to be predicted and compared with")
-    command.add_argument("--time-column", metavar="NAME", help="its time column (default: time, t or time_h)")
+    command.add_argument("--time-column", metavar="NAME",
+                         help="its time column, of numbers or dates (default: time, t or time_h, else one of dates)")
     command.add_argument("--outputs", metavar="A,B,...", help="its columns (default: the outputs of the result)")
     command.add_argument("--inputs", metavar="A,B,...",
-                         help="its columns of known inputs, as far as the forecast goes (default: as in the model)")
+                         help="its columns of known inputs, in the result's order (default: of their names); its "
+                         "outputs may then all be empty")
     command.add_argument("--draws", type=_whole(1), default=400, metavar="N",
                          help="posterior draws that are propagated (default: 400)")
     command.add_argument("--seed", type=_whole(0), default=0, help="random seed of paths and noise (default: 0)")

@@ -202,10 +202,9 @@ def _exact_chains(task: Check, arguments: argparse.Namespace, folder: Path) -> A
     which screens proposals with it, mixes worse than it saves; so it is left to the user.
     """
     import lfm_ppl
-    from lfm_ppl.results import arviz_data, rebuilding
+    from lfm_ppl.results import arviz_data
 
     attrs = arviz_data.attributes(task.posterior)
-    times, y = rebuilding.observations(task.posterior)
     mode = attrs.get("sampler") == "map"
     chains, warmup, samples = ((_CHAINS, _WARMUP, _SAMPLES) if mode else
                                (int(attrs[name]) for name in ("chains", "warmup", "samples")))
@@ -219,14 +218,13 @@ def _exact_chains(task: Check, arguments: argparse.Namespace, folder: Path) -> A
     if arguments.particles is not None:
         options["particles"] = arguments.particles
     corrected = lfm_ppl.fit(
-        task.model, times, y, sampler="pmmh", sampler_options=options, chains=chains, warmup=warmup, samples=samples,
-        seed=arguments.seed, at=at, trajectory_draws=0 if at is None else 400, model_kwargs=task.keywords,
+        task.model, task.observed, sampler="pmmh", sampler_options=options, chains=chains, warmup=warmup,
+        samples=samples, seed=arguments.seed, at=at, trajectory_draws=0 if at is None else 400, model_kwargs=task.keywords,
         fixed=json.loads(attrs.get("fixed") or "{}"), name=task.name, progress=not arguments.quiet,
         checkpoint=folder, resume=arguments.resume, overwrite=arguments.overwrite,
         attributes={name: attrs[name] for name in _RECORD if name in attrs},
     )  # fmt: skip
-    for group in ("truth", "constant_data"):
-        if arviz_data.has_group(task.posterior, group):
-            arviz_data.add_group(corrected, group, arviz_data.group(task.posterior, group))
+    if arviz_data.has_group(task.posterior, "truth"):
+        arviz_data.add_group(corrected, "truth", arviz_data.group(task.posterior, "truth"))
     return corrected
 

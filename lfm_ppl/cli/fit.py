@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from lfm_ppl import data, loading
+from lfm_ppl import calendar_time, data, loading
 from lfm_ppl.cli import choices, fit_many, forecast, results, session
 from lfm_ppl.cli.interruption import INTERRUPTED, watched
 
@@ -45,8 +45,9 @@ def run(arguments: argparse.Namespace) -> int:
         raise ValueError("--resume goes on with the run in a folder; name the folder with --out.")
     if arguments.resume and arguments.overwrite:
         raise ValueError("--resume goes on with the run in a folder, --overwrite begins another one; choose one.")
+    if arguments.out is not None:  # first, because it knows of runs that can be gone on with
+        checkpoint.check_folder(arguments.out, arguments.resume, arguments.overwrite)
     with results.folder(model.name, arguments.out, arguments.overwrite, arguments.resume) as folder:
-        checkpoint.check_folder(folder, arguments.resume, arguments.overwrite)
         finished = arguments.resume and checkpoint.is_finished(folder)
         _print_task(arguments, model, observed, options, fixed)
         started = time.perf_counter()
@@ -61,7 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
             partial = arviz_data.attributes(posterior).get("partial")
             if watch is not None and partial is not None:
                 watch.answered()
-            if finished and partial is None:
+            if finished and partial is None and (folder / results.SUMMARY).is_file():
                 print(f"\nthe run in {folder} is finished; nothing was changed")
                 return 0
             seconds = time.perf_counter() - started
@@ -81,6 +82,10 @@ def _again(arguments: argparse.Namespace, folder: Path) -> str:
 
 
 def _nothing_left(folder: Path) -> str:
+    from lfm_ppl.results.files import POSTERIOR
+
+    if (folder / POSTERIOR).is_file():
+        return f"the result is whole; draw its figures with: lfm-ppl plot {folder} --overwrite"
     with contextlib.suppress(OSError):  # raised where it is not empty
         folder.rmdir()
     return "nothing was sampled yet"
@@ -125,7 +130,14 @@ def read(path: str, model: loading.ModelFile, arguments: argparse.Namespace) -> 
     """Return the observations in a file, under the model's names of its outputs and inputs."""
     inputs = choices.inputs(arguments.inputs, model)
     return taken(model, inputs, data.read_csv(path, columns(arguments, model), arguments.time_column,
-                                              dict(inputs.values()), arguments.time_unit))
+                                              dict(inputs.values()), arguments.time_unit,
+                                              usual_unit=usual_unit(model)))
+
+
+def usual_unit(model: loading.ModelFile) -> str | None:
+    """Return the unit in which a model counts time, where it says so: that of dates in a file."""
+    unit = model.units.get("time")
+    return unit if unit in calendar_time.SECONDS else None
 
 
 def taken(model: loading.ModelFile, inputs: dict[str, tuple[str, str]], observed: data.Data) -> data.Data:

@@ -34,6 +34,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.data is None:
         raise ValueError("--each and --series fit data of your own: give a pattern of files, --data 'patients/*.csv' "
                          "--each, or a file with a column of identifiers, --data all.csv --series patient.")
+    if arguments.resume and arguments.overwrite:
+        raise ValueError("--resume goes on with what a folder holds, --overwrite begins anew; choose one.")
     if arguments.truth is not None:
         raise ValueError("--truth is for one data set; leave it out with --each and --series.")
     found, failed = _each(arguments, model) if arguments.each else (_series(arguments, model), {})
@@ -103,6 +105,7 @@ def _each(arguments: argparse.Namespace, model: loading.ModelFile) -> tuple[dict
         if found[name].outputs != found[first].outputs:
             raise ValueError(f"{path} has the columns {', '.join(found[name].outputs)}, but {first} has "
                              f"{', '.join(found[first].outputs)}. Name those to use with --outputs.")
+    _check_units(found)
     return found, failed
 
 
@@ -124,8 +127,19 @@ def _series(arguments: argparse.Namespace, model: loading.ModelFile) -> dict[str
 
     inputs = choices.inputs(arguments.inputs, model)
     read = data.read_series(arguments.data, arguments.series, fit.columns(arguments, model), arguments.time_column,
-                            dict(inputs.values()), arguments.time_unit)
+                            dict(inputs.values()), arguments.time_unit, fit.usual_unit(model))
+    _check_units(read)
     return {name: fit.taken(model, inputs, one) for name, one in read.items()}
+
+
+def _check_units(found: dict[str, data.Data]) -> None:
+    """Raise ValueError where dates of data sets are counted in different units, of which a table would say nothing."""
+    first = next(iter(found), "")
+    for name, one in found.items():
+        unit, other = (each.units.get("time", "no unit") for each in (one, found[first]))
+        if unit != other:
+            raise ValueError(f"the times of {name} are in {unit}, and those of {first} in {other}. Give one unit for "
+                             "all of them, with --time-unit for dates.")
 
 
 def _folder(arguments: argparse.Namespace, name: str) -> Path:

@@ -107,13 +107,16 @@ def _held_out(arguments: argparse.Namespace, task: check.Check) -> data.Data:
         if len(columns) != len(outputs):
             raise ValueError(f"the result has {len(outputs)} outputs ({', '.join(outputs)}); --outputs names "
                              f"{len(columns)} columns.")
-    inputs = choices.inputs(arguments.inputs, task.file) if task.observed.inputs else {}
+    known = {name: one.interpolation for name, one in task.observed.inputs.items()}
+    inputs = choices.inputs(arguments.inputs, dataclasses.replace(task.file, inputs=known)) if known else {}
     read = data.read_csv(arguments.held_out, columns, arguments.time_column, dict(inputs.values()),
-                         task.observed.units.get("time") if task.observed.origin is not None else None)
+                         task.observed.units.get("time") if task.observed.origin is not None else None,
+                         observed=not inputs)
     read = data.on_clock_of(dataclasses.replace(
         read, outputs=outputs, inputs={name: read.inputs[column] for name, (column, _) in inputs.items()}),
         task.observed)
-    taken = task.file.prepare(read)
+    taken = task.file.prepare(dataclasses.replace(read, inputs={
+        name: joined(task.observed.inputs[name], later) for name, later in read.inputs.items()}))
     if not np.array_equal(taken.y, read.y, equal_nan=True):
         raise ValueError(f"{task.file.path} changes the numbers of a data file (`prepare`), perhaps by the file's own, "
                          "so that held-out numbers cannot be compared with a fit to others. Score them in Python, "
@@ -136,7 +139,7 @@ def _write(forecast: Any, held_out: data.Data | None, path: Path, folder: Path, 
     print(f"wrote    {arviz_data.save(whole, target, arguments.overwrite or not arguments.out)} (group {GROUP})")
     table = summary(group)
     print(f"wrote    {tables.write_csv(table, folder / TABLE, arguments.overwrite, index_label='time')}")
-    if held_out is not None:
+    if held_out is not None and np.isfinite(held_out.y).any():
         scores = lfm_ppl.score(forecast, held_out)
         print(f"\n{tables.text_table(scores, width=shutil.get_terminal_size().columns)}\n")
         print(f"wrote    {tables.write_csv(scores, folder / SCORES, arguments.overwrite, index_label='output')}")

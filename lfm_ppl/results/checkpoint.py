@@ -30,6 +30,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lfm_ppl.engine.errors import FolderInUseError
 from lfm_ppl.inference.sampling import Saved
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.files import POSTERIOR, writing
@@ -87,7 +88,7 @@ class Checkpoint:
         Raises:
             FileNotFoundError: no run is kept here.
             ValueError: it is a run of something else; the message says in what it differs.
-            RuntimeError: another process goes on with it.
+            FolderInUseError: another process goes on with it.
         """
         checkpoint = cls(Path(folder))
         path = checkpoint._own / _RUN
@@ -145,7 +146,7 @@ class Checkpoint:
         """Write the draws that are new, and then the state that counts them."""
         for name, values in saved.rows.items():
             path = self._rows(name)
-            if not path.exists():
+            if not path.exists() or not self.started:  # before the first state a file may be cut off
                 np.lib.format.open_memmap(path, "w+", values.dtype, values.shape).flush()
             if draws > self._written:
                 kept = np.load(path, mmap_mode="r+")
@@ -218,7 +219,7 @@ class Checkpoint:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             self._lock.close()
-            raise RuntimeError(f"another process is at work on the run in {self.folder}; wait for it, or end it "
+            raise FolderInUseError(f"another process is at work on the run in {self.folder}; wait for it, or end it "
                                "first.") from None
         except OSError:  # a file system without locks
             pass
