@@ -68,3 +68,18 @@ def test_figures_show_round_dates(hours, labels, common):
     assert common in axes.get_xlabel()
     assert set(labels) <= set(shown), shown
     assert len(shown) <= 7
+
+
+@pytest.mark.parametrize("start", ["2026-03-28 22:00", "2026-10-24 22:00"])
+def test_a_time_zone_with_summer_time_counts_elapsed_hours(start):
+    # datetime subtracts times of one zone as its clocks show them.
+    hours = pd.date_range(start, periods=8, freq="h", tz="Europe/Berlin")
+    times, _, unit = calendar_time.since_midnight([hour.to_pydatetime() for hour in hours])
+    np.testing.assert_array_equal(times, np.arange(22.0, 30.0))
+    assert unit == "h"
+
+
+def test_a_date_without_marks_is_asked_about():
+    with pytest.raises(ValueError, match="a number or a date"):
+        calendar_time.position("20260107", "2026-01-05T00:00:00", "h")
+    assert calendar_time.position("20260107", None, "h") == 20260107.0

@@ -252,7 +252,7 @@ def test_folders_are_numbered_and_not_left_empty(monkeypatch, tmp_path):
     "fit spring --out taken/result", "simulate spring --out taken/data.csv", "compare gps --out taken/result",
 ])
 def test_a_path_that_cannot_be_written_is_told_first(run, tmp_path, monkeypatch, line):
-    monkeypatch.setattr("lfm_ppl.cli.session.start", lambda *asked: None)
+    monkeypatch.setattr("lfm_ppl.cli.session.start", lambda *asked, **more: None)
     monkeypatch.setattr("lfm_ppl.cli.fit.sample", lambda *task: pytest.fail("it was computed"))
     (tmp_path / "taken").write_text("keep")
     code, out, err = run(line)

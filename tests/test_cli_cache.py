@@ -59,7 +59,7 @@ def test_every_command_that_computes_keeps_them_and_has_the_flag(line, capsys, t
              tmp_path / "result" / "posterior.nc")
     asked = []
 
-    def start(chains, keep_programs=True):
+    def start(chains, keep_programs=True, **more):
         asked.append(keep_programs)
         raise ValueError("that is far enough")
 

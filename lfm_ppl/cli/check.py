@@ -219,7 +219,8 @@ def _exact_chains(task: Check, arguments: argparse.Namespace, folder: Path) -> A
         options["particles"] = arguments.particles
     corrected = lfm_ppl.fit(
         task.model, task.observed, sampler="pmmh", sampler_options=options, chains=chains, warmup=warmup,
-        samples=samples, seed=arguments.seed, at=at, trajectory_draws=0 if at is None else 400, model_kwargs=task.keywords,
+        samples=samples, seed=arguments.seed, at=at, trajectory_draws=0 if at is None else 400,
+        model_kwargs=task.keywords,
         fixed=json.loads(attrs.get("fixed") or "{}"), name=task.name, progress=not arguments.quiet,
         checkpoint=folder, resume=arguments.resume, overwrite=arguments.overwrite,
         attributes={name: attrs[name] for name in _RECORD if name in attrs},

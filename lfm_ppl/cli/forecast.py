@@ -80,23 +80,23 @@ def requested(observed: data.Data, until: str | None, at: str | None, grid: int,
         ValueError: neither a number nor a date; --until is not after the last observation.
     """
     last = observed.times[-1]
-    wanted = [always, np.array([_time("--at", text, observed) for text in at.split(",")] if at is not None else [])]
+    asked = [_time("--at", text, observed, ". Separate times by commas.") for text in (at or "").split(",") if at]
+    if not np.isfinite(asked).all():
+        raise ValueError(f"--at takes finite times, separated by commas, got {at}.")
+    wanted = [always, np.array(asked)]
     if until is not None:
         end = _time("--until", until, observed)
-        if end <= last:
+        if not (np.isfinite(end) and end > last):
             raise ValueError(f"--until takes a time after the last observation, at {last:g}, got {until}.")
         wanted.append(np.linspace(last, end, grid))
     return np.unique(np.concatenate(wanted))
 
 
-def _time(flag: str, text: str, observed: data.Data) -> float:
+def _time(flag: str, text: str, observed: data.Data, more: str = "") -> float:
     try:
-        time = calendar_time.position(text, observed.origin, observed.units.get("time", ""))
+        return calendar_time.position(text, observed.origin, observed.units.get("time", ""))
     except ValueError as error:
-        raise ValueError(f"{flag}: {error}") from None
-    if not np.isfinite(time):
-        raise ValueError(f"{flag} takes finite times, got {text}.")
-    return time
+        raise ValueError(f"{flag}: {str(error).rstrip('.')}{more or '.'}") from None
 
 
 def _held_out(arguments: argparse.Namespace, task: check.Check) -> data.Data:

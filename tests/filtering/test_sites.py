@@ -5,6 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpyro.distributions as dist
 import pytest
 from references import matern
 from scipy import stats
@@ -292,3 +293,30 @@ def test_weighted_draws_of_the_smoother_estimate_the_evidence(name):
     own = weight.std() / weight.mean() / np.sqrt(weight.size)
     assert own < 0.02
     assert abs(log_weights.max() + np.log(weight.mean()) - log_z) < 5 * np.hypot(own, error)
+
+
+def test_a_known_start_is_the_limit_of_a_nearly_known_one():
+    times, y = np.arange(5.0), np.array([[1.0], [2.0], [np.nan], [0.0], [1.0]])
+
+    def evidence(variance):
+        model = lfm.LatentForceModel(
+            lambda x, u, t: u - 0.5 * x, {"u": lfm.Matern(1.0, 1.3)}, lfm.PoissonObservation(lambda x, u, t: x),
+            lfm.Gaussian(0.2 * jnp.ones(1), variance * jnp.eye(1)))
+        return lfm.MarginalLikelihood(model, times).log_prob(y)
+
+    known, nearly = jax.jit(lambda: (evidence(0.0), evidence(1e-14)))()
+    assert float(known) == pytest.approx(float(nearly), abs=1e-10)
+
+
+def test_a_gap_leaves_the_gradient_of_a_bounded_law_alone():
+    times, y = np.arange(4.0), np.array([[0.4], [np.nan], [0.7], [0.2]])
+
+    def evidence(level):
+        observation = lfm.Observation(lambda x, u, t: u + level, lambda f: dist.TransformedDistribution(
+            dist.Normal(f, 0.7), dist.transforms.SigmoidTransform()))  # no density at 1
+        return lfm.MarginalLikelihood(process(observation), times).log_prob(y)
+
+    both = jax.jit(jax.value_and_grad(evidence))
+    step = 1e-5
+    slope = (both(step)[0] - both(-step)[0]) / (2 * step)
+    assert float(both(0.0)[1]) == pytest.approx(float(slope), rel=1e-6)

@@ -149,3 +149,36 @@ def test_a_particle_filter_weighs_with_the_family():
     assert found.log_likelihood[0] == pytest.approx(stats.poisson.logpmf(3, np.exp(0.7)), abs=1e-12)
     filtered = lfm.filter(known, [0.0], [[3.0]]).log_likelihood[0]
     assert filtered == pytest.approx(float(found.log_likelihood[0]), abs=1e-7)
+
+
+def test_probabilities_outside_of_the_unit_interval_have_no_density():
+    family = lfm.BernoulliObservation(lambda x, u, t: x, link="identity")
+    found = family.log_prob(jnp.array([-3.0, 0.25, 1.5]), jnp.array([0.0, 1.0, 1.0]))
+    np.testing.assert_allclose(found, [-np.inf, np.log(0.25), -np.inf])
+
+
+def test_limits_of_rounded_values_leave_nothing_out():
+    family = lfm.CensoredObservation(lambda x, u, t: x, scale=1.0, left=0.0, width=1.0)
+    values = jnp.arange(0.0, 12.0)
+    total = jax.vmap(lambda y: family.log_prob(jnp.array([0.3]), y[None])[0])(values)
+    assert float(jnp.exp(total).sum()) == pytest.approx(1.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("concentration", [3.0, 1e4, 1e12, 1e15])
+def test_a_large_concentration_is_a_poisson(concentration):
+    family = lfm.NegativeBinomialObservation(lambda x, u, t: x, concentration)
+    found = float(family.log_prob(jnp.array([0.5]), jnp.array([3.0]))[0])
+    mean = np.exp(0.5)
+    expected = stats.nbinom.logpmf(3, concentration, concentration / (concentration + mean)) \
+        if concentration < 1e6 else stats.poisson.logpmf(3, mean)
+    assert found == pytest.approx(expected, abs=1e-8)
+
+
+def test_a_panel_checks_the_data_of_a_family():
+    def build(rate):
+        return lfm.LatentForceModel(lambda x, u, t: u - rate * x, {"u": lfm.Matern(1.0, 1.0)},
+                                    lfm.PoissonObservation(lambda x, u, t: x), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
+
+    panel = lfm.panel(build, jnp.array([1.0, 2.0]), np.arange(3.0))
+    with pytest.raises(ValueError, match=r"series 1: y\[2, 0\] is -2.5"):
+        panel.checked(np.array([[[1.0], [0.0], [2.0]], [[1.0], [np.nan], [-2.5]]]))

@@ -136,7 +136,7 @@ def test_default_data_survive_a_file(name, tmp_path):
     file = loading.load(name)
     data = simulated(name)
     write_csv(data, tmp_path / "data.csv")
-    prepared = file.prepare(read_csv(tmp_path / "data.csv", file.outputs))
+    prepared = file.prepare(read_csv(tmp_path / "data.csv", file.outputs, inputs=file.inputs))
     assert prepared.outputs == data.outputs
     assert np.all(np.isnan(prepared.y) == np.isnan(data.y))
     if not prepared.note:
