@@ -350,7 +350,7 @@ def drawn(folder):
 
 
 def test_ctrl_c_leaves_a_usable_result_within_ten_seconds(tmp_path, monkeypatch, capsys):
-    process = start(tmp_path, "--sampler", "ram", "--warmup", "10", "--samples", "1000000", "--thin", "1")
+    process = start(tmp_path, "--sampler", "ram", "--warmup", "10", "--samples", "1000000", "--thin", "50")
     until = time.monotonic() + 200
     while not drawn(tmp_path) and process.poll() is None and time.monotonic() < until:
         time.sleep(0.1)
@@ -405,7 +405,7 @@ def test_a_finished_run_says_so(tmp_path, monkeypatch, capsys):
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "run").iterdir()} == before
     assert main([*line, "--resume", "--seed", "2"]) == 2
     assert "cannot go on with the run in run, which was another one: seed was 0 and is 2" in capsys.readouterr().err
-    for words, message in ((["--resume", "--overwrite"], "choose one"), ([], "the folder run exists and holds files")):
+    for words, message in ((["--resume", "--overwrite"], "choose one"), ([], "run holds a result, which is kept")):
         assert main([*line, *words]) == 2
         assert message in capsys.readouterr().err
     assert main([*line[:-2], "--resume"]) == 2
