@@ -57,9 +57,10 @@ tbody th { font-weight: 600; white-space: nowrap; }
 .n { text-align: right; white-space: nowrap; }
 .warning { background: var(--warn-box); color: var(--warn); border-radius: 6px; padding: .6rem .9rem; margin: .6rem 0; }
 .warning ul { margin: 0; padding-left: 1.2rem; }
-figure { margin: 1rem 0; }
+figure { margin: 1rem 0; overflow-x: auto; }
 figure img { display: block; max-width: 100%; height: auto; background: #ffffff; border-radius: 6px; padding: 4px; }
-@media (max-width: 34rem) { dl { grid-template-columns: minmax(0, 1fr); gap: 0; } dd { margin-bottom: .4rem; } }
+@media (max-width: 34rem) { dl { grid-template-columns: minmax(0, 1fr); gap: 0; } dd { margin-bottom: .4rem; }
+  figure img { max-width: none; width: 36rem; } }
 @media print { nav { display: none; } .scroll { overflow: visible; } figure { break-inside: avoid; } }
 </style>
 """
