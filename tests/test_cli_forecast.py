@@ -54,7 +54,8 @@ def test_forecast_of_a_stored_result_writes_table_figure_group_and_scores(result
                          capsys)
     assert code == 0, err
     ahead = tmp_path / "ahead"
-    assert {path.name for path in ahead.iterdir()} == {"posterior.nc", "forecast.csv", "forecast.png", "scores.csv"}
+    assert {path.name for path in ahead.iterdir()} == {
+        "posterior.nc", "forecast.csv", "forecast.png", "scores.csv", "report.html"}
     for path in ahead.iterdir():
         assert f"wrote    {path}" in out
     table = pd.read_csv(ahead / "forecast.csv")
