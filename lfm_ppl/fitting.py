@@ -216,10 +216,10 @@ def fit(
         "times of the trajectories": None if at is None else checkpoints.digest(np.asarray(at, float)),
         "versions": checkpoints.versions(),
     }  # fmt: skip
-    call = _call(name or getattr(numpyro_model, "__name__", "model"), "times, y" if data is None else "data", {
+    call = _call(str(name or getattr(numpyro_model, "__name__", "model")), "times, y" if data is None else "data", {
         **{label: record[label] for label in ("sampler", "chains", "warmup", "samples", "thin", "seed",
                                               "trajectory_draws", "chain_method", "init", "sampler_options")},
-        "fixed": json.loads(described["fixed"])}, at=at, model_kwargs=model_kwargs)
+        "fixed": json.loads(str(described["fixed"]))}, at=at, model_kwargs=model_kwargs)
     run = None
     if checkpoint is not None:
         if resume and (finished := checkpoints.finished(checkpoint, record)) is not None:
