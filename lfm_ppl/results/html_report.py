@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import re
+import shlex
 from collections.abc import Mapping, Sequence
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -16,6 +17,7 @@ import xarray as xr
 
 from lfm_ppl import calendar_time
 from lfm_ppl.results import arviz_data, predictions, report, tables, web_page
+from lfm_ppl.results.files import POSTERIOR
 from lfm_ppl.results.inputs import ORIGIN, inputs_of
 from lfm_ppl.results.plots import saving, style
 from lfm_ppl.results.plots.trajectories import time_origin, time_unit
@@ -30,7 +32,7 @@ COMMAND = "command_line"
 CALL, DESCRIPTION = "call", "description"
 """Attributes of a result: the call in Python that made it, and the docstring of the model."""
 
-_MOST_TIMES = 40
+_MOST_TIMES = 20
 """Times of a forecast that are listed; more are thinned evenly."""
 
 _MOST_SERIES = 5
@@ -47,12 +49,12 @@ _SETTINGS = {
     "thin": "steps a draw", "seed": "seed", "rule": "rule", "steps": "integration steps", "max_step": "longest step",
     "tolerance": "tolerance of a step (sd)", "iterations": "iterations", "fixed": "fixed", "options": "options",
     "particles": "particles", "log_likelihood_sd": "sd of the log likelihood", "delayed": "delayed acceptance",
-    "effective_draws": "effective draws", "map_converged": "optimiser converged", "map_message": "optimiser",
+    "effective_draws": "effective draws", "map_message": "optimiser",
     "map_log_density": "log density at the mode", "log_evidence": "log evidence (Laplace)",
     "wall_time_s": "time (s)", "created_at": "made at",
 }
 _ELSEWHERE = ("model", "model_file", DESCRIPTION, "data", "note", "versions", "warnings", "partial", "settings", "run",
-              COMMAND, CALL, ORIGIN, "inference_library")
+              "map_converged", COMMAND, CALL, ORIGIN, "inference_library")
 """Attributes that stand in other sections, or that nobody needs to read."""
 
 _FILES = re.compile(r"(.*\.nc|(summary|accuracy|forecast|scores)\.csv"
@@ -132,9 +134,10 @@ def _state(result: Any, attrs: Mapping[str, Any]) -> str:
 
 def _model(attrs: Mapping[str, Any], description: str) -> str:
     file = str(attrs.get("model_file", ""))
-    shown = web_page.facts([("name", str(attrs.get("model", "model"))), *([("file", file)] if file else [])])
+    name = str(attrs.get("model", "model"))
+    shown = web_page.facts([("name", name), *([("file", file)] if file not in ("", name) else [])])
     if description:
-        return shown + web_page.preformatted(description)
+        return shown + web_page.prose(description)
     return shown + web_page.paragraph("The model has no docstring; what stands in one would be shown here.", "note")
 
 
@@ -181,7 +184,7 @@ def _span(times: np.ndarray, result: Any) -> str:
     times, unit = times[np.isfinite(times)], time_unit(result)
     if not times.size:
         return "none"
-    text = f"{times.min():g} to {times.max():g}" + (f" {unit}" if unit else "")
+    text = f"{times.min():.10g} to {times.max():.10g}" + (f" {unit}" if unit else "")
     if origin := time_origin(result):
         text += f" ({_clock(float(times.min()), origin, unit)} to {_clock(float(times.max()), origin, unit)})"
     return text
@@ -199,10 +202,11 @@ def _summary(result: Any) -> str:
         return web_page.paragraph("The model has no parameters that are sampled.", "note")
     kind = tables.annotated(table, result)["kind"]
     found = {label: arviz_data.convergence_warnings(result, table.loc[[label]]) for label in table.index}
-    # What concerns all of them stands at the top of the page.
+    # What concerns all of them, and what to do about it, stands at the top of the page.
     shared = set.intersection(*map(set, found.values()))
-    own = [" ".join(message for message in found[label] if message not in shared) for label in table.index]
-    table = table.assign(kind=kind, **({"warnings": own} if any(own) else {}))
+    own = ["; ".join(message.partition(": ")[0] for message in found[label] if message not in shared)
+           for label in table.index]
+    table = table.drop(columns="partial", errors="ignore").assign(kind=kind, **({"warnings": own} if any(own) else {}))
     return tables.html_table(table, index_label="parameter")
 
 
@@ -214,7 +218,8 @@ def _accuracy(result: Any, folder: Path) -> str:
     word, reason, command = checked.verdict
     lines = [("verdict", f"{word}: {reason}")]
     if command:
-        lines.append(("next", command.replace("RESULT", str(folder))))
+        there = shlex.quote(str(folder)) if (folder / POSTERIOR).is_file() else "RESULT"
+        lines.append(("next", command.replace("RESULT", there)))
     return web_page.facts([*lines, *checked.numbers()]) + tables.html_table(
         checked.table[list(report.SHOWN)], index_label="parameter")
 
@@ -243,7 +248,7 @@ def _forecast_of(dataset: xr.Dataset, result: Any) -> str:
     thinned = chosen[np.unique(np.linspace(0, chosen.size - 1, _MOST_TIMES).round().astype(int))]
     table = predictions.summary(dataset.isel(time=thinned))
     unit, origin = time_unit(result), time_origin(result)
-    labels = [_clock(float(time), origin, unit) if origin else f"{time:g}" for time in table.index]
+    labels = [_clock(float(time), origin, unit) if origin else f"{time:.10g}" for time in table.index]
     shown = tables.html_table(table.set_axis(labels), index_label=f"time ({unit})" if unit and not origin else "time")
     what = "after the last observation" if later.size else "of the prediction"
     some = f"{thinned.size} of {chosen.size} times" if thinned.size < chosen.size else "All times"

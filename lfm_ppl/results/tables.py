@@ -17,6 +17,9 @@ from lfm_ppl.results.files import writing
 _FORMATS = {"r_hat": "{:.3f}", "ess_bulk": "{:.0f}", "ess_tail": "{:.0f}"}
 _DIGITS = {"mcse_mean": 2}
 
+_LONG_TEXT = 50
+"""Characters of a cell from which on it is broken into lines."""
+
 
 def format_number(value: Any, digits: int = 3) -> str:
     """Return ``value`` with ``digits`` significant digits, in plain notation where that is short.
@@ -121,7 +124,7 @@ def html_table(frame: pd.DataFrame, digits: int = 3, index_label: str = "") -> s
 
     Args:
         frame: the table.
-        digits: significant digits of numbers, which get the class ``n``.
+        digits: significant digits of numbers, which get the class ``n``; text of more than a few words gets ``t``.
         index_label: header of the first column, which holds the row names.
 
     Example:
@@ -134,8 +137,11 @@ def html_table(frame: pd.DataFrame, digits: int = 3, index_label: str = "") -> s
         </table></div>
     """
     body = _formatted(frame, digits)
-    kind = {name: ' class="n"' if pd.api.types.is_numeric_dtype(frame[name]) else "" for name in body}
-    header = "".join(f'<th scope="col"{kind[name]}>{html.escape(str(name))}</th>' for name in body)
+    kind = {}
+    for name, column in body.items():
+        wide = ' class="t"' if max(map(len, column), default=0) > _LONG_TEXT else ""
+        kind[name] = ' class="n"' if pd.api.types.is_numeric_dtype(frame[name]) else wide
+    header = "".join(f'<th scope="col"{kind[name]}>{_breakable(str(name))}</th>' for name in body)
     lines = ['<div class="scroll"><table>',
              f'<thead><tr><th scope="col">{html.escape(index_label)}</th>{header}</tr></thead>', "<tbody>"]
     for row, label in enumerate(frame.index):
@@ -234,6 +240,11 @@ def _blocks(widths: dict[Any, int], room: int) -> list[list[Any]]:
         blocks[-1].append(name)
         used += size
     return blocks
+
+
+def _breakable(header: str) -> str:
+    """Return a header as HTML that may be broken at its underscores."""
+    return html.escape(header).replace("_", "_<wbr>")
 
 
 def _escaped(cell: str) -> str:

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import base64
 import contextlib
+import re
+import textwrap
 from collections.abc import Iterable, Sequence
 from html import escape
 from pathlib import Path
@@ -45,16 +47,18 @@ nav { display: flex; flex-wrap: wrap; gap: .25rem 1rem; margin: .8rem 0; font-si
 a { color: var(--link); }
 pre { background: var(--box); border: 1px solid var(--line); border-radius: 6px; padding: .7rem .9rem;
   white-space: pre-wrap; overflow-wrap: anywhere; font: .85rem/1.45 ui-monospace, monospace; margin: .6rem 0; }
+pre.equation { white-space: pre; overflow-x: auto; overflow-wrap: normal; }
 dl { display: grid; grid-template-columns: minmax(7rem, max-content) minmax(0, 1fr); gap: .2rem 1rem; margin: .6rem 0; }
 dt { color: var(--soft); }
 dd { margin: 0; overflow-wrap: anywhere; }
 .scroll { overflow-x: auto; margin: .6rem 0; }
 table { border-collapse: collapse; font-size: .88rem; font-variant-numeric: tabular-nums; }
 th, td { padding: .25rem .7rem; text-align: left; vertical-align: top; border-bottom: 1px solid var(--line); }
-td { min-width: 3rem; }
-thead th { color: var(--soft); font-weight: 600; white-space: nowrap; }
+td { white-space: nowrap; }
+td.t { white-space: normal; min-width: 18rem; }
+thead th { color: var(--soft); font-weight: 600; vertical-align: bottom; overflow-wrap: normal; }
 tbody th { font-weight: 600; white-space: nowrap; }
-.n { text-align: right; white-space: nowrap; }
+.n { text-align: right; }
 .warning { background: var(--warn-box); color: var(--warn); border-radius: 6px; padding: .6rem .9rem; margin: .6rem 0; }
 .warning ul { margin: 0; padding-left: 1.2rem; }
 figure { margin: 1rem 0; overflow-x: auto; }
@@ -129,8 +133,25 @@ def heading(text: str) -> str:
 
 
 def preformatted(text: str) -> str:
-    """Return text with its own line breaks, such as a docstring with equations, or a command."""
+    """Return text with its own line breaks, such as a command; long lines are broken."""
     return f"<pre>{escape(text)}</pre>"
+
+
+def prose(text: str) -> str:
+    r"""Return a docstring: its paragraphs, and what is indented in it, such as equations, as it stands.
+
+    Example:
+        >>> print(prose("A spring\nand a mass.\n\n    dx/dt = v"))
+        <p>A spring and a mass.</p>
+        <pre class="equation">dx/dt = v</pre>
+    """
+    blocks = []
+    for block in re.split(r"\n(?:[ \t]*\n)+", text.strip("\n")):
+        if any(line[:1].isspace() for line in block.splitlines()):
+            blocks.append(f'<pre class="equation">{escape(textwrap.dedent(block).rstrip())}</pre>')
+        else:
+            blocks.append(paragraph(" ".join(block.split())))
+    return "\n".join(blocks)
 
 
 def warnings(messages: Iterable[str]) -> str:
