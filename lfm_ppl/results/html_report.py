@@ -154,7 +154,7 @@ def _data(result: Any, attrs: Mapping[str, Any]) -> str:
     missing = int(variable.isnull().sum())
     lines += [("rows", str(variable.sizes["time"])), ("missing", f"{missing} of {variable.size} values"),
               ("times", _span(times, result))]
-    if origin := time_origin(result):
+    if origin := _origin(result):
         lines.append(("time 0", _clock(0.0, origin, time_unit(result))))
     if attrs.get("note"):
         lines.append(("note", str(attrs["note"])))
@@ -185,9 +185,14 @@ def _span(times: np.ndarray, result: Any) -> str:
     if not times.size:
         return "none"
     text = f"{times.min():.10g} to {times.max():.10g}" + (f" {unit}" if unit else "")
-    if origin := time_origin(result):
+    if origin := _origin(result):
         text += f" ({_clock(float(times.min()), origin, unit)} to {_clock(float(times.max()), origin, unit)})"
     return text
+
+
+def _origin(result: Any) -> str:
+    """Return the calendar time of t = 0; empty where it, or the unit that times count, is not known."""
+    return time_origin(result) if time_unit(result) in calendar_time.SECONDS else ""
 
 
 def _clock(time: float, origin: str, unit: str) -> str:
@@ -247,7 +252,7 @@ def _forecast_of(dataset: xr.Dataset, result: Any) -> str:
     chosen = later if later.size else np.arange(times.size)
     thinned = chosen[np.unique(np.linspace(0, chosen.size - 1, _MOST_TIMES).round().astype(int))]
     table = predictions.summary(dataset.isel(time=thinned))
-    unit, origin = time_unit(result), time_origin(result)
+    unit, origin = time_unit(result), _origin(result)
     labels = [_clock(float(time), origin, unit) if origin else f"{time:.10g}" for time in table.index]
     shown = tables.html_table(table.set_axis(labels), index_label=f"time ({unit})" if unit and not origin else "time")
     what = "after the last observation" if later.size else "of the prediction"

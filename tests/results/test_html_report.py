@@ -177,6 +177,12 @@ def test_a_posterior_alone_and_a_call_in_python(groups, tmp_path):
     assert "has not been measured" in page.texts["accuracy"] and "no docstring" in page.texts["model"]
 
 
+def test_dates_need_a_unit_of_time(groups, attrs, tmp_path):
+    del groups["observed_data"]["time"].attrs["units"]
+    page = read(save(groups, attrs, tmp_path / "a.html"))
+    assert "0 to 5" in page.texts["data"] and "2024" not in page.texts["data"] + page.texts["forecast"]
+
+
 def test_a_partial_result_says_so_first(groups, attrs, tmp_path):
     page = read(save(groups, {**attrs, "partial": "50 of 1000 draws a chain"}, tmp_path / "a.html"))
     assert page.texts["result"].strip().startswith("Result\nThis result is partial: 50 of 1000 draws a chain.")
