@@ -81,6 +81,7 @@ if TYPE_CHECKING:
     from lfm_ppl.results.arviz_data import load as load
     from lfm_ppl.results.arviz_data import save as save
     from lfm_ppl.results.correction import correct_posterior as correct_posterior
+    from lfm_ppl.results.html_report import save_report as save_report
     from lfm_ppl.results.plots import plot_accuracy as plot_accuracy
     from lfm_ppl.results.plots import plot_calibration as plot_calibration
     from lfm_ppl.results.plots import plot_fit as plot_fit
@@ -110,6 +111,7 @@ _NAMES = {
     "results.accuracy": ("check_accuracy",),
     "results.arviz_data": ("load", "save"),
     "results.correction": ("correct_posterior",),
+    "results.html_report": ("save_report",),
     "results.plots": (
         "plot_accuracy", "plot_calibration", "plot_fit", "plot_forces", "plot_pairs", "plot_residuals", "plot_states",
         "plot_trace",

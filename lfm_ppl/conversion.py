@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from lfm_ppl import checks
-from lfm_ppl.fitting import check_requested, draw_paths, kept, versions, warn_of_convergence
+from lfm_ppl.fitting import check_requested, described_by, draw_paths, kept, versions, warn_of_convergence
 from lfm_ppl.inference.bound_model import BoundModel, bind
 from lfm_ppl.inference.posterior import scores
 from lfm_ppl.results import arviz_data
@@ -96,7 +96,8 @@ def to_arviz(mcmc: Any, numpyro_model: Callable, times: Any, y: Any, *, at: Any 
     example = bound.site.example
     kernel = getattr(mcmc, "sampler", None)
     attrs = {
-        "model": name or getattr(numpyro_model, "__name__", "model"), "rule": example.rule.name,
+        "model": name or getattr(numpyro_model, "__name__", "model"), "description": described_by(numpyro_model),
+        "rule": example.rule.name,
         "steps": example.steps, "max_step": example.max_step, "iterations": example.iterations,
         "tolerance": example.tolerance, "sampler": "draws" if kernel is None else type(kernel).__name__.lower(),
         "chains": chains, "samples": samples, "fixed": "{}", "versions": json.dumps(versions()),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import inspect
 import json
 import time
 import warnings
@@ -215,6 +216,10 @@ def fit(
         "times of the trajectories": None if at is None else checkpoints.digest(np.asarray(at, float)),
         "versions": checkpoints.versions(),
     }  # fmt: skip
+    call = _call(str(name or getattr(numpyro_model, "__name__", "model")), "times, y" if data is None else "data", {
+        **{label: record[label] for label in ("sampler", "chains", "warmup", "samples", "thin", "seed",
+                                              "trajectory_draws", "chain_method", "init", "sampler_options")},
+        "fixed": json.loads(str(described["fixed"]))}, at=at, model_kwargs=model_kwargs)
     run = None
     if checkpoint is not None:
         if resume and (finished := checkpoints.finished(checkpoint, record)) is not None:
@@ -226,7 +231,8 @@ def fit(
         chosen, paths, grid = drawn
         seconds = time.perf_counter() - started if run is None else run.seconds
         attrs = {
-            "model": name or getattr(numpyro_model, "__name__", "model"), **described,
+            "model": name or getattr(numpyro_model, "__name__", "model"), "description": described_by(numpyro_model),
+            "call": call, **described,
             "wall_time_s": round(seconds, 3),
             "versions": json.dumps(versions()),
             "created_at": datetime.now(UTC).isoformat(timespec="seconds"), **remarks, "partial": partial,
@@ -511,6 +517,20 @@ def draw_paths(key: jax.Array, bound: BoundModel, draws: dict, at: Any, count: i
     if at is None:
         paths.pop("prediction", None)  # stored where they were asked for
     return chosen, {k: v.reshape(chains, len(chosen), *v.shape[1:]) for k, v in paths.items()}, grid
+
+
+def described_by(numpyro_model: Any) -> str | None:
+    """Return the docstring of a model, under handlers and partial applications; None where there is none."""
+    while (inner := getattr(numpyro_model, "fn", getattr(numpyro_model, "func", None))) is not None:
+        numpyro_model = inner
+    return inspect.getdoc(numpyro_model) if inspect.isroutine(numpyro_model) else None
+
+
+def _call(model: str, data: str, arguments: Mapping[str, Any], **objects: Any) -> str:
+    """Return the call of `fit` as text; ``objects`` are named where they were given, since text cannot hold them."""
+    given = [f"{label}={value!r}" if isinstance(value, (str, int, float, dict)) else f"{label}={label}"
+             for label, value in arguments.items() if value is not None and value != {}]
+    return f"lfm.fit({', '.join([model, data, *given, *(f'{k}={k}' for k, v in objects.items() if v is not None)])})"
 
 
 def versions() -> dict[str, str]:

@@ -129,7 +129,7 @@ def test_models_describes_one(run):
 
 
 def test_fit_writes_posterior_summary_and_figures(fitted, sampler):
-    assert {path.name for path in fitted.iterdir()} == {"posterior.nc", "summary.csv", *FIGURES}
+    assert {path.name for path in fitted.iterdir()} == {"posterior.nc", "summary.csv", "report.html", *FIGURES}
     posterior = arviz_data.load(fitted / "posterior.nc")
     draws = arviz_data.group(posterior, "posterior")
     assert draws["decay"].shape == (2, 60, 2)
@@ -142,11 +142,31 @@ def test_fit_writes_posterior_summary_and_figures(fitted, sampler):
     np.testing.assert_allclose(table.loc["noise_sd", "mean"], float(draws["noise_sd"].mean()))
 
 
+def test_fit_writes_a_page_that_says_how_to_repeat_it(fitted, sampler):
+    page = (fitted / "report.html").read_text()
+    said = f"--sampler {sampler} --chains 2 --warmup 60 --samples 60 --seed 1 --quiet --out {fitted}</pre>"
+    assert "Two genes, one factor." in page and "<pre>lfm-ppl fit " in page and said in page
+    assert page.count("data:image/png;base64,") == len(FIGURES)
+    for name in ("posterior.nc", "summary.csv", *FIGURES):
+        assert f'<a href="./{name}">' in page
+
+
+@pytest.mark.usefixtures("without_sampling")
+def test_a_page_that_fails_does_not_cost_the_result(run, motif, tmp_path, monkeypatch):
+    def fail(*args, **kwargs):
+        raise RuntimeError("no paper")
+
+    monkeypatch.setattr("lfm_ppl.results.html_report.save_report", fail)
+    code, out, err = run(f"fit {motif} --out r")
+    assert code == 1 and "lfm-ppl: the page could not be written: no paper" in err
+    assert {path.name for path in (tmp_path / "r").iterdir()} == {"posterior.nc", "summary.csv", *FIGURES}
+
+
 def test_fit_prints_summary_time_and_paths(short_run):
     folder, out = short_run
     for words in ("motif: Two genes, one factor.", "8 rows of a, b", "r_hat", "ess", "decay[a]"):
         assert words in out
-    for name in ("posterior.nc", "summary.csv", *FIGURES):
+    for name in ("posterior.nc", "summary.csv", "report.html", *FIGURES):
         assert f"wrote    {folder / name}\n" in out
     assert "\ntime " in out
 
@@ -219,7 +239,8 @@ def test_a_figure_that_fails_does_not_cost_the_draws(run, motif, tmp_path, monke
     code, out, err = run(f"fit {motif} --out r")
     assert code == 1
     assert "no ink" in err and "lfm-ppl plot r --overwrite" in err
-    assert {path.name for path in (tmp_path / "r").iterdir()} == {"posterior.nc", "summary.csv"}
+    assert {path.name for path in (tmp_path / "r").iterdir()} == {"posterior.nc", "summary.csv", "report.html"}
+    assert "No figures were drawn" in (tmp_path / "r" / "report.html").read_text()
 
 
 @pytest.mark.usefixtures("without_sampling")

@@ -76,8 +76,10 @@ def test_check_prints_stores_and_draws(run, fitted):
     assert code == 0, err
     for words in ("grid", "Pareto k", "depth", "verdict", "doubled", "sd over the draws"):
         assert words in out
-    for name in ("posterior.nc (group accuracy)", "accuracy.csv", "accuracy.png"):
+    for name in ("posterior.nc (group accuracy)", "accuracy.csv", "accuracy.png", "report.html"):
         assert f"wrote    {fitted / name}" in out
+    page = (fitted / "report.html").read_text()
+    assert "What the exact likelihood would change" in page and f"lfm-ppl check {fitted} --draws 40</pre>" in page
     after = arviz_data.load(fitted / "posterior.nc")
     assert set(arviz_data.groups(after)) == {*arviz_data.groups(before), "accuracy"}
     for name in arviz_data.groups(before):
@@ -114,6 +116,8 @@ def test_correct_writes_a_result_of_its_own(run, fitted):
     assert attributes["model_file"].endswith("well.py")
     assert arviz_data.has_group(corrected, "truth")
     assert (fitted / "better" / "summary.csv").is_file() and (fitted / "better" / "trace.png").is_file()
+    page = (fitted / "better" / "report.html").read_text()
+    assert "<pre>lfm-ppl fit " in page and "check" in page.partition("<pre>lfm-ppl fit ")[2].partition("</pre>")[0]
     code, _, err = run(f"check {fitted / 'better'}")
     assert code == 2 and "samples the exact posterior already" in err
     assert (fitted / "corrected" / "mine.txt").read_text() == "keep"

@@ -76,6 +76,33 @@ def test_it_prints_tables_progress_and_files(run, wanted, tmp_path):
     assert (one.realisations, one.conditional, one.seed, one.quick, one.overwrite) == (3, 7, 5, False, False)
 
 
+def test_it_writes_an_index_of_tables_and_figures(run, wanted, tmp_path):
+    (tmp_path / "here").mkdir()
+    (tmp_path / "here" / "rates.csv").write_text("")
+    index = tmp_path / "here" / "index.html"
+    for _ in range(2):  # our own page is brought up to date
+        code, out, _ = run("compare gps --seed 5 --out here --overwrite --quiet")
+        assert code == 0 and "wrote    here/index.html" in out
+    page = index.read_text()
+    for words in ("<h1>gps</h1>", "<h3>Rates</h3>", '<th scope="row">EKF</th><td class="n">0.500</td>',
+                  "<p>1 of 1 cell is consistent.</p>", "<pre>lfm-ppl compare gps --seed 5 --out here --quiet</pre>",
+                  '<a href="./rates.csv">rates.csv</a>'):
+        assert words in page
+    index.write_text("my own notes")
+    code, _, err = run("compare gps --out here --quiet")
+    assert code == 2 and "index.html exists already and is kept" in err and len(wanted) == 2
+    assert index.read_text() == "my own notes"
+
+
+def test_an_index_that_fails_does_not_cost_the_tables(run, wanted, monkeypatch):
+    def fail(*args, **kwargs):
+        raise OSError("no space left")
+
+    monkeypatch.setattr("lfm_ppl.results.web_page.write", fail)
+    code, out, err = run("compare gps --out here --quiet")
+    assert code == 1 and "EKF  0.500" in out and "the page could not be written: no space left" in err
+
+
 def test_the_same_command_has_the_same_folder(run, wanted):
     for line in ("", "--quiet", "--quick --overwrite --quiet"):
         assert run(f"compare ginzburg-landau {line}")[0] == 0

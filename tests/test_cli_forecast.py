@@ -54,9 +54,13 @@ def test_forecast_of_a_stored_result_writes_table_figure_group_and_scores(result
                          capsys)
     assert code == 0, err
     ahead = tmp_path / "ahead"
-    assert {path.name for path in ahead.iterdir()} == {"posterior.nc", "forecast.csv", "forecast.png", "scores.csv"}
+    assert {path.name for path in ahead.iterdir()} == {
+        "posterior.nc", "forecast.csv", "forecast.png", "scores.csv", "report.html"}
     for path in ahead.iterdir():
         assert f"wrote    {path}" in out
+    page = (ahead / "report.html").read_text()
+    assert "<h3>Scores on the held-out data</h3>" in page and f"\nlfm-ppl forecast {result} --held-out" in page
+    assert "after the last observation" in page and page.count("data:image/png;base64,") == 1
     table = pd.read_csv(ahead / "forecast.csv")
     assert set(table["output"]) == {"x"}
     assert table["time"].tolist() == [6.0, 7.0, 7.5]

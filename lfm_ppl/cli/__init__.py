@@ -18,7 +18,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: the arguments without the program's name; None: those of the process.
 
     Returns:
-        0 after success, 1 where results were saved and a figure could not be drawn, 2 after an
+        0 after success, 1 where results were saved and a figure or the page could not be made, 2 after an
         error, which is one line on standard error unless ``--debug`` is given, 130 after Ctrl-C.
     """
     arguments = parser().parse_args(argv)

@@ -221,7 +221,7 @@ def _add_fit(commands: Any) -> None:
         "  lfm-ppl fit my_model.py --data 'patients/*.csv' --each --sampler map --jobs 2\n"
         "  lfm-ppl fit my_model.py --data mine.csv --rule gauss-hermite --steps 20 --out result"
     )
-    help_ = "infer parameters and forces, and write posterior, summary and figures"
+    help_ = "infer parameters and forces, and write posterior, summary, figures and a page of them all"
     command = _command(commands, "fit", fit.run, help_, examples, computes=True)
     command.add_argument("model", metavar="MODEL", help=MODEL_HELP)
     _add_data(command.add_argument_group("data"))

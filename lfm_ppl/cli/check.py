@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from lfm_ppl import data, loading
-from lfm_ppl.cli import choices, fit, results, session
+from lfm_ppl.cli import choices, fit, page, results, session
 from lfm_ppl.cli.interruption import INTERRUPTED, Watch, watched
 
 TABLE = "accuracy.csv"
@@ -27,7 +27,7 @@ _DRAWS, _DRAWS_TO_CORRECT = 200, 1000
 _CHAINS, _WARMUP, _SAMPLES = 4, 500, 500
 """Of the chains that correct a result from the posterior mode, which has none itself."""
 
-_RECORD = ("model_file", "settings", "options", "data", "note", "time_origin")
+_RECORD = ("model_file", "settings", "options", "data", "note", "time_origin", "description")
 
 
 class Check(NamedTuple):
@@ -55,6 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
     path = files.locate(arguments.result)
     for name in (TABLE, FIGURE):
         files.refuse_existing(path.parent / name, arguments.overwrite or arguments.resume)
+    page.refuse_foreign(path.parent, arguments.overwrite)
     results.writable(path.parent)
     posterior = arviz_data.load(path)
     session.start(int(arviz_data.attributes(posterior).get("chains", 1)), not arguments.no_cache)
@@ -72,11 +73,13 @@ def run(arguments: argparse.Namespace) -> int:
             for message in arviz_data.convergence_warnings(posterior):
                 warnings.warn(f"the draws that are checked: {message}", stacklevel=1)
             print(f"\n{report.text(result=shlex.quote(arguments.result))}\n")
-            status = _write(report, task.posterior, path)
+            status = _write(report, task.posterior, path, page.command_line(arguments))
             if folder is not None and report.exact:
                 print("the filter is exact: there is nothing to correct")
             elif folder is not None:
                 status = max(status, _correct(task, report, arguments, folder, watch))
+                # Again, with a link to the corrected result.
+                status = max(status, page.update(arviz_data.load(path), path.parent))
         except KeyboardInterrupt as error:
             print(f"\nlfm-ppl: {str(error) or 'stopped'}; {go_on}", file=sys.stderr)
             return INTERRUPTED
@@ -152,14 +155,15 @@ def _checked(task: Check, arguments: argparse.Namespace, folder: Path) -> Any:
     )
 
 
-def _write(report: Any, posterior: Any, path: Path) -> int:
-    """Store the report in the result and beside it; return 1 where the figure could not be drawn."""
+def _write(report: Any, posterior: Any, path: Path, command_line: str) -> int:
+    """Store the report in the result and beside it; return 1 where figure or page could not be made."""
     from lfm_ppl.results import arviz_data, files, tables
     from lfm_ppl.results.plots import plot_accuracy
     from lfm_ppl.results.report import GROUP
 
     # The file again, not what was read before the computation: somebody may have added to it.
-    stored = arviz_data.add_group(arviz_data.load(path), GROUP, report.to_dataset())
+    made = report.to_dataset().assign_attrs(command_line=command_line)
+    stored = arviz_data.add_group(arviz_data.load(path), GROUP, made)
     print(f"wrote    {arviz_data.save(stored, path, overwrite=True)} (group {GROUP})")
     print(f"wrote    {tables.write_csv(report.table, path.parent / TABLE, overwrite=True)}")
     try:
@@ -170,7 +174,7 @@ def _write(report: Any, posterior: Any, path: Path) -> int:
         print(f"lfm-ppl: the figure could not be drawn: {error}", file=sys.stderr)
         return 1
     print(f"wrote    {path.parent / FIGURE}")
-    return 0
+    return page.update(stored, path.parent)
 
 
 def _correct(task: Check, report: Any, arguments: argparse.Namespace, folder: Path, watch: Watch | None) -> int:
@@ -188,6 +192,8 @@ def _correct(task: Check, report: Any, arguments: argparse.Namespace, folder: Pa
     partial = arviz_data.attributes(corrected).get("partial")
     if partial is not None and watch is not None:
         watch.answered()
+    first = arviz_data.attributes(task.posterior).get("command_line")
+    corrected.attrs["command_line"] = "\n".join([*([first] if first else []), page.command_line(arguments)])
     status = fit.report(corrected, folder, time.perf_counter() - started, arguments.overwrite or arguments.resume)
     if partial is None:
         return status

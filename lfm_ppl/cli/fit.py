@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from lfm_ppl import calendar_time, data, loading
-from lfm_ppl.cli import choices, fit_many, forecast, results, session
+from lfm_ppl.cli import choices, fit_many, forecast, page, results, session
 from lfm_ppl.cli.interruption import INTERRUPTED, watched
 
 SETTINGS = ("rule", "steps", "max_step", "iterations", "tolerance")
@@ -219,6 +219,7 @@ def sample(
         "model_file": model.name if loading.available().get(model.name) == model.path else str(model.path),
         "settings": json.dumps({name: getattr(arguments, name) for name in SETTINGS}),
         "options": json.dumps(options), "data": arguments.data or "simulated",
+        "description": model.description, "command_line": page.command_line(arguments),
     }  # fmt: skip
     if observed.note:
         attributes["note"] = observed.note
@@ -270,7 +271,7 @@ def sampling(arguments: argparse.Namespace, model: loading.ModelFile) -> dict[st
 
 
 def report(posterior: Any, folder: Path, seconds: float, overwrite: bool) -> int:
-    """Write and print everything, of a partial result all but figures; return 1 where a figure could not be drawn."""
+    """Write and print everything, of a partial result all but figures; return 1 where figures or page failed."""
     from lfm_ppl.results import arviz_data, files, tables
     from lfm_ppl.results.plots import save_figures
 
@@ -281,9 +282,11 @@ def report(posterior: Any, folder: Path, seconds: float, overwrite: bool) -> int
     print(f"\n{tables.text_table(table, width=shutil.get_terminal_size().columns)}\n")
     status = 0
     attrs = arviz_data.attributes(posterior)
+    figures: list[Path] = []
     try:
         if "partial" not in attrs:
-            written += save_figures(posterior, folder, overwrite=overwrite)
+            figures = save_figures(posterior, folder, overwrite=overwrite)
+            written += figures
     except Exception as error:  # the draws are safe; a figure is no reason to end with an error
         print(f"lfm-ppl: the figures could not be drawn: {error}", file=sys.stderr)
         print(f"         try again with: lfm-ppl plot {folder} --overwrite", file=sys.stderr)
@@ -294,4 +297,4 @@ def report(posterior: Any, folder: Path, seconds: float, overwrite: bool) -> int
     print(f"time     {seconds:.0f} s")
     for path in written:
         print(f"wrote    {path}")
-    return status
+    return max(status, page.save(posterior, folder, overwrite, figures))

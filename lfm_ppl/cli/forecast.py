@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from lfm_ppl import calendar_time, data
-from lfm_ppl.cli import check, choices, results, session
+from lfm_ppl.cli import check, choices, page, results, session
 
 TABLE = "forecast.csv"
 FIGURE = "forecast.png"
@@ -37,6 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
     if not arguments.out:
         for name in (TABLE, FIGURE, *([SCORES] if arguments.held_out else [])):
             files.refuse_existing(path.parent / name, arguments.overwrite)
+        page.refuse_foreign(path.parent, arguments.overwrite)
     posterior = arviz_data.load(path)
     if not arguments.out and not arguments.overwrite and arviz_data.has_group(posterior, GROUP):
         raise FileExistsError(f"{path} holds predictions already, which are kept. Write elsewhere with --out, or "
@@ -130,7 +132,8 @@ def _write(forecast: Any, held_out: data.Data | None, path: Path, folder: Path, 
     from lfm_ppl.results.plots import plot_fit
     from lfm_ppl.results.predictions import GROUP, summary
 
-    group = arviz_data.group(forecast, GROUP)
+    group = arviz_data.group(forecast, GROUP).assign_attrs(command_line=page.command_line(arguments))
+    forecast = arviz_data.add_group(forecast, GROUP, group)
     target = folder / files.POSTERIOR if arguments.out else path
     whole = forecast
     if not arguments.out:
@@ -139,10 +142,12 @@ def _write(forecast: Any, held_out: data.Data | None, path: Path, folder: Path, 
     print(f"wrote    {arviz_data.save(whole, target, arguments.overwrite or not arguments.out)} (group {GROUP})")
     table = summary(group)
     print(f"wrote    {tables.write_csv(table, folder / TABLE, arguments.overwrite, index_label='time')}")
+    more: dict[str, pd.DataFrame] = {}
     if held_out is not None and np.isfinite(held_out.y).any():
         scores = lfm_ppl.score(forecast, held_out)
         print(f"\n{tables.text_table(scores, width=shutil.get_terminal_size().columns)}\n")
         print(f"wrote    {tables.write_csv(scores, folder / SCORES, arguments.overwrite, index_label='output')}")
+        more = {"Scores on the held-out data": scores}
     try:
         figure = plot_fit(forecast, width="full")
         with files.writing(folder / FIGURE, arguments.overwrite) as temporary:
@@ -151,4 +156,4 @@ def _write(forecast: Any, held_out: data.Data | None, path: Path, folder: Path, 
         print(f"lfm-ppl: the figure could not be drawn: {error}", file=sys.stderr)
         return 1
     print(f"wrote    {folder / FIGURE}")
-    return 0
+    return page.update(whole, folder, (folder / FIGURE,), more)

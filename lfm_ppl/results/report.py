@@ -128,13 +128,14 @@ class AccuracyReport:
         after = [("verdict", f"{word}: {reason}")]
         if command:
             after.append(("next", command.replace("RESULT", result)))
-        return f"{_labelled(self._numbers(), width)}\n\n{table}\n\n{_labelled(after, width)}"
+        return f"{_labelled(self.numbers(), width)}\n\n{table}\n\n{_labelled(after, width)}"
 
     def __str__(self) -> str:
         """Return the report as text."""
         return self.text()
 
-    def _numbers(self) -> list[tuple[str, str]]:
+    def numbers(self) -> list[tuple[str, str]]:
+        """Return what was compared with what, and the numbers that the verdict rests on, as (label, text)."""
         attrs, number = self.dataset.attrs, tables.format_number
         count = self.log_ratio.size
         mean, sd = self.step_change

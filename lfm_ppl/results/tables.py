@@ -1,7 +1,8 @@
-"""Tables for the terminal, for Markdown and for other programs (CSV)."""
+"""Tables for the terminal, for Markdown, for a page in a browser (HTML) and for other programs (CSV)."""
 
 from __future__ import annotations
 
+import html
 import math
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,9 @@ from lfm_ppl.results.files import writing
 # How a column of the summary table reads best; others get significant digits.
 _FORMATS = {"r_hat": "{:.3f}", "ess_bulk": "{:.0f}", "ess_tail": "{:.0f}"}
 _DIGITS = {"mcse_mean": 2}
+
+_LONG_TEXT = 50
+"""Characters of a cell from which on it is broken into lines."""
 
 
 def format_number(value: Any, digits: int = 3) -> str:
@@ -115,6 +119,37 @@ def markdown_table(frame: pd.DataFrame, digits: int = 3) -> str:
     return "\n".join(lines)
 
 
+def html_table(frame: pd.DataFrame, digits: int = 3, index_label: str = "") -> str:
+    """Return ``frame`` as an HTML table, in a box that scrolls where the page is narrower; all text is escaped.
+
+    Args:
+        frame: the table.
+        digits: significant digits of numbers, which get the class ``n``; text of more than a few words gets ``t``.
+        index_label: header of the first column, which holds the row names.
+
+    Example:
+        >>> print(html_table(pd.DataFrame({"mean": [0.5]}, index=["k<1"])))
+        <div class="scroll"><table>
+        <thead><tr><th scope="col"></th><th scope="col" class="n">mean</th></tr></thead>
+        <tbody>
+        <tr><th scope="row">k&lt;1</th><td class="n">0.500</td></tr>
+        </tbody>
+        </table></div>
+    """
+    body = _formatted(frame, digits)
+    kind = {}
+    for name, column in body.items():
+        wide = ' class="t"' if max(map(len, column), default=0) > _LONG_TEXT else ""
+        kind[name] = ' class="n"' if pd.api.types.is_numeric_dtype(frame[name]) else wide
+    header = "".join(f'<th scope="col"{kind[name]}>{_breakable(str(name))}</th>' for name in body)
+    lines = ['<div class="scroll"><table>',
+             f'<thead><tr><th scope="col">{html.escape(index_label)}</th>{header}</tr></thead>', "<tbody>"]
+    for row, label in enumerate(frame.index):
+        cells = "".join(f"<td{kind[name]}>{html.escape(column[row])}</td>" for name, column in body.items())
+        lines.append(f'<tr><th scope="row">{html.escape(str(label))}</th>{cells}</tr>')
+    return "\n".join([*lines, "</tbody>", "</table></div>"])
+
+
 def annotated(table: pd.DataFrame, result: Any) -> pd.DataFrame:
     """Return a summary with two more columns: what a parameter is, and what is wrong with its draws.
 
@@ -205,6 +240,11 @@ def _blocks(widths: dict[Any, int], room: int) -> list[list[Any]]:
         blocks[-1].append(name)
         used += size
     return blocks
+
+
+def _breakable(header: str) -> str:
+    """Return a header as HTML that may be broken at its underscores."""
+    return html.escape(header).replace("_", "_<wbr>")
 
 
 def _escaped(cell: str) -> str:

@@ -65,7 +65,7 @@ def save_figures(
     for ending in formats:
         if ending not in known:
             raise ValueError(f"unknown figure format {ending!r}; known: {', '.join(known)}.")
-    pages = list(_pages(result, width))
+    pages = list(pages_of(result, width))
     paths = [Path(folder) / f"{name}.{ending}" for name, _, _ in pages for ending in formats]
     for path in paths:
         refuse_existing(path, overwrite)
@@ -79,7 +79,7 @@ def save_figures(
     return paths
 
 
-def _pages(result: Any, width: str | float) -> Iterator[tuple[str, Draw, list[str] | None]]:
+def pages_of(result: Any, width: str | float) -> Iterator[tuple[str, Draw, list[str] | None]]:
     """Yield file name, function and the names to draw, for each page of each figure."""
     for kind, draw in (
         ("output", trajectories.plot_fit),
