@@ -13,6 +13,7 @@ import xarray as xr
 
 import lfm_ppl as lfm
 from lfm_ppl import loading
+from lfm_ppl.cli import description
 from lfm_ppl.cli import fit as command
 from lfm_ppl.data import Data, InputTable, write_csv
 from lfm_ppl.results import arviz_data, rebuilding
@@ -74,6 +75,13 @@ def test_dates_are_counted_in_the_model_s_unit_of_time_unless_the_user_says_anot
     assert data.units["time"] == "h"
     said = command._observed(arguments(folder, time_unit="min"), model, {})
     assert said.times.tolist() == [360.0, 390.0, 420.0] and said.units["time"] == "min"
+
+
+def test_a_model_of_known_inputs_is_described_without_data():
+    room = loading.load(str(pathlib.Path(__file__).parent.parent / "docs" / "examples" / "room.py"))
+    found = description.describe(room)
+    assert [parameter.name for parameter in found.parameters] == list(room.parameters)
+    assert found.forces == {"heat": "Matern (K/h)"} and found.approximation == "exact: the model is linear"
 
 
 @pytest.mark.parametrize(("changed", "message"), [
