@@ -37,6 +37,8 @@ def test_every_public_name_stands_in_the_reference_once():
     wanted = {*lfm.__all__, *of_modules} - {"forces", "orbits"}
     assert wanted - set(REFERENCE) == set()
     assert len(REFERENCE) == len(set(REFERENCE))
+    overview = (DOCS / "api" / "index.md").read_text("utf-8")
+    assert sorted(re.findall(r"\.md#lfm_ppl\.([\w.]+)\)", overview)) == sorted(REFERENCE)
 
 
 @pytest.mark.parametrize("name", [name for name in REFERENCE if name not in lfm.__all__])
