@@ -83,3 +83,11 @@ def test_a_date_without_marks_is_asked_about():
     with pytest.raises(ValueError, match="a number or a date"):
         calendar_time.position("20260107", "2026-01-05T00:00:00", "h")
     assert calendar_time.position("20260107", None, "h") == 20260107.0
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("last", [59.0, 179.0, 3595.0, 9300.0, 10790.0, 36e3, 216600.0, 259000.0, 6e6, 79e6, 94e6])
+def test_every_span_has_a_few_dates_and_no_complaint(last):
+    ticks = style.DateTicks(style.Dates("2026-01-05T00:00:00", "s"), 6)
+    shown = [tick for tick in ticks.tick_values(0.0, last) if 0.0 <= tick <= last]
+    assert 2 <= len(shown) <= 7, shown

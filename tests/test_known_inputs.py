@@ -13,6 +13,7 @@ import xarray as xr
 
 import lfm_ppl as lfm
 from lfm_ppl import loading
+from lfm_ppl.cli import description
 from lfm_ppl.cli import fit as command
 from lfm_ppl.data import Data, InputTable, write_csv
 from lfm_ppl.results import arviz_data, rebuilding
@@ -24,6 +25,7 @@ HOUSE = """date,indoor,heater,outside
 2026-01-05 08:00,19.5,2,4
 2026-01-05 09:00,20.1,0,6
 """
+HALF_HOURS = HOUSE.replace("07:00", "06:30").replace("08:00", "07:00").rpartition("2026-")[0]
 MODEL = '''"""A house."""
 import jax.numpy as jnp, numpyro, numpyro.distributions as dist, lfm_ppl as lfm
 OUTPUTS = ("T",)
@@ -61,6 +63,25 @@ def test_the_command_line_maps_columns_to_the_model_s_names(folder):
     assert {name: table.interpolation for name, table in data.inputs.items()} == {
         "power": "previous", "weather": "linear"}
     assert isinstance(model.keywords(data, {})["inputs"]["weather"], lfm.Input)
+
+
+def test_dates_are_counted_in_the_model_s_unit_of_time_unless_the_user_says_another(folder):
+    (folder / "house.csv").write_text(HALF_HOURS)
+    (folder / "house.py").write_text('UNITS = {"time": "h"}\n' + MODEL)
+    model = loading.load(str(folder / "house.py"))
+    data = command._observed(arguments(folder), model, {})
+    np.testing.assert_allclose(data.times, [6.0, 6.5, 7.0], rtol=1e-15)
+    np.testing.assert_array_equal(data.inputs["power"].times, data.times)
+    assert data.units["time"] == "h"
+    said = command._observed(arguments(folder, time_unit="min"), model, {})
+    assert said.times.tolist() == [360.0, 390.0, 420.0] and said.units["time"] == "min"
+
+
+def test_a_model_of_known_inputs_is_described_without_data():
+    room = loading.load(str(pathlib.Path(__file__).parent.parent / "docs" / "examples" / "room.py"))
+    found = description.describe(room)
+    assert [parameter.name for parameter in found.parameters] == list(room.parameters)
+    assert found.forces == {"heat": "Matern (K/h)"} and found.approximation == "exact: the model is linear"
 
 
 @pytest.mark.parametrize(("changed", "message"), [

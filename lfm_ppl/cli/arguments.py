@@ -286,7 +286,8 @@ def _add_data(group: Any) -> None:
     group.add_argument("--time-column", metavar="NAME",
                        help="the time column, of numbers or dates (default: time, t or time_h, else one of dates)")
     group.add_argument("--time-unit", type=_one_of("unit of time", calendar_time.SECONDS), metavar="UNIT",
-                       help=f"unit of times that are dates: {', '.join(calendar_time.SECONDS)} (default: by the gaps)")
+                       help=f"unit of times that are dates: {', '.join(calendar_time.SECONDS)} (default: the "
+                       "model's, else by the gaps)")
     group.add_argument("--outputs", metavar="A,B,...", help="the columns to use (default: those of the model)")
     group.add_argument("--inputs", metavar="A,B:linear,...",
                        help="columns of known inputs, in the model's order; a value holds until the next row, or with "

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lfm_ppl import loading
-from lfm_ppl.data import Data
+from lfm_ppl.data import Data, InputTable
 
 _MOST_NUMBERS = 4
 """Numbers of a vector that are printed."""
@@ -77,7 +77,9 @@ def describe(model: loading.ModelFile) -> Description:
 def _made_up(model: loading.ModelFile) -> Data:
     """Return data of the right shape, where the file has none."""
     outputs = model.outputs or ("y",)
-    return Data(np.arange(3.0), np.zeros((3, len(outputs))), outputs, units=model.units)
+    times = np.arange(3.0)
+    inputs = {name: InputTable(times, np.ones(3), way) for name, way in model.inputs.items()}
+    return Data(times, np.zeros((3, len(outputs))), outputs, units=model.units, inputs=inputs)
 
 
 def prior(distribution: Any) -> str:

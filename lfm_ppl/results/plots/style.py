@@ -15,7 +15,7 @@ import matplotlib.style
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
-from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, num2date
+from matplotlib.dates import HOURLY, MINUTELY, MONTHLY, SECONDLY, AutoDateLocator, ConciseDateFormatter, num2date
 from matplotlib.figure import Figure
 from matplotlib.ticker import Formatter, Locator, MaxNLocator
 
@@ -230,6 +230,10 @@ class DateTicks(Locator):
     def __init__(self, dates: Dates, ticks: int) -> None:
         self.dates = dates
         self.inner = AutoDateLocator(minticks=3, maxticks=ticks)
+        # Less than three of a unit, and so many of the next smaller one that none of its intervals keeps to the number
+        # of ticks, is two and a half days, say, at 12 hours: ticks then stand at the larger unit after all.
+        for frequency, whole in ((MONTHLY, 12), (HOURLY, 24), (MINUTELY, 60), (SECONDLY, 60)):
+            self.inner.intervald[frequency] = [*self.inner.intervald[frequency], whole]
 
     def __call__(self) -> Any:
         """Return the ticks of the interval that the axis shows."""
