@@ -17,11 +17,11 @@ TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
 
 def test_models_and_extras_that_it_names_exist():
     models = set(re.findall(r"lfm-ppl fit ([a-z][a-z-]*)(?=[\s`])", TEXT))
-    assert models == {"ginzburg-landau"} and models <= set(loading.available())
+    assert "ginzburg-landau" in models and models <= set(loading.available())
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     assert set(re.findall(r'"\.\[(\w+)\]"', TEXT)) <= set(extras)
     for name in re.findall(r"^ {4,6}([\w./]+/?) {2,}", TEXT, re.MULTILINE):
-        folder = ROOT if name.startswith((".", "lfm_ppl", "models", "notebooks", "tests")) else None
+        folder = ROOT if name.startswith((".", "lfm_ppl", "models", "notebooks", "docs", "tests")) else None
         assert ((folder or ROOT / "lfm_ppl") / name).exists(), name
 
 
