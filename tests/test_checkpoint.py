@@ -4,6 +4,7 @@ import functools
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -224,10 +225,11 @@ def test_one_process_at_a_time(unfinished):
 
 
 def test_a_finished_run_is_read(whole, tmp_path, monkeypatch):
+    expected = whole("ram")
     fit("ram", checkpoint=tmp_path)
     before = (tmp_path / "posterior.nc").stat()
     monkeypatch.setattr(sampling, "sample", lambda *arguments, **keywords: pytest.fail("it was sampled"))
-    assert_same(fit("ram", checkpoint=tmp_path, resume=True), whole("ram"))
+    assert_same(fit("ram", checkpoint=tmp_path, resume=True), expected)
     assert (tmp_path / "posterior.nc").stat().st_mtime_ns == before.st_mtime_ns
     with pytest.raises(ValueError, match="seed was 0 and is 1"):
         fit("ram", checkpoint=tmp_path, resume=True, seed=1)
@@ -377,7 +379,8 @@ def test_ctrl_c_leaves_a_usable_result_within_ten_seconds(tmp_path, monkeypatch,
     monkeypatch.setattr(sampling, "sample", gone_on_with)
     monkeypatch.setattr(sampling, "available_method", lambda *asked: "parallel")  # as with the devices there
     assert main([*process.args[3:], "--resume"]) == 130
-    assert f"{count + 10} steps are known" in capsys.readouterr().err
+    known = re.search(r"(\d+) steps are known", capsys.readouterr().err)
+    assert known is not None and int(known[1]) // 50 == count + 10
 
 
 def test_the_process_ends_though_compiled_code_runs_on():
