@@ -83,10 +83,10 @@ class MovingHorizon(eqx.Module):
 
         minimise  (s - m)' P^-1 (s - m) / 2 + (the costs of `lfm_ppl.full_information` within the window)
 
-    subject to the constraints at the observations' times, and gives the estimate ``delay`` observations before the
-    last: 0 is the present, W // 2 the middle of the window. The arrival cost, m and P, is the filter's: the Gaussian of
-    the state given all observations before the window, constraints aside. Without active constraints the estimates of a
-    linear model are those of the Kalman filter (delay 0) and of the fixed-lag smoother.
+    subject to the constraints at the observations' times (not at the initial time), and gives the estimate ``delay``
+    observations before the last: 0 is the present, W // 2 the middle of the window. The arrival cost, m and P, is the
+    filter's: the Gaussian of the state given all observations before the window, constraints aside. Without active
+    constraints the estimates of a linear model are those of the Kalman filter (delay 0) and of the fixed-lag smoother.
 
     Args:
         model: the latent force model, with an ``initial_time``.
@@ -170,7 +170,7 @@ def moving_horizon(model: LatentForceModel, times: Any, y: Any, window: int, del
 
     Row k is estimated from the window that ends ``delay`` observations later; the first rows come from the first whole
     window, and the last from the last one. See `lfm_ppl.MovingHorizon`, which does the same one observation at a time.
-    A window as long as the record is `lfm_ppl.full_information`.
+    A window as long as the record is `lfm_ppl.full_information` with ``grid=times``.
 
     Args:
         model: the latent force model.

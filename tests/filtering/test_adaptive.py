@@ -121,7 +121,6 @@ def test_an_input_that_jumps_between_rows_takes_few_steps():
     np.testing.assert_allclose(found, explicit(STEPPED).log_prob(Y), atol=1e-3)
 
 
-@pytest.mark.slow
 def test_derivatives_with_respect_to_times():
     def log_prob(t, tolerance, steps):
         return explicit(initial_time=t, tolerance=tolerance, steps=steps).log_prob(Y)

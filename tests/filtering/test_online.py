@@ -92,8 +92,7 @@ def repeating(period_decay, lengthscale):
         lfm.Gaussian(jnp.zeros(1), jnp.eye(1)), initial_time=0.0)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("cut", [3, 12])
+@pytest.mark.parametrize("cut", [pytest.param(3, marks=pytest.mark.slow), 12])
 def test_forces_that_jump_go_on_in_compiled_code(cut):
     """The times are known; the state comes from the same compiled function, or from outside of it as an argument."""
     times = TIMES[:18]
