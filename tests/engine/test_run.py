@@ -230,8 +230,8 @@ def test_fifty_workers_killed_at_random_moments_and_the_client_too(tmp_path):
     own = slow_tasks(count, 0.4, tmp_path / "log")
     same(run_tasks([Task(task.name, task.seed, {"size": 3}) for task in own], noise, None),
          {task.name: read(task, tmp_path / "out") for task in own})
-    # A task is begun again only where it, its worker or the client was killed.
-    assert len(begun(tmp_path)) <= count + kills + 2 * (clients + 1)
+    # A worker that dies takes with it what it computes, and at most one result that the client has not fetched yet.
+    assert len(begun(tmp_path)) <= count + 2 * kills + 2 * (clients + 1)
 
 
 @pytest.mark.slow
