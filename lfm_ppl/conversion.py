@@ -11,7 +11,15 @@ import jax
 import numpy as np
 
 from lfm_ppl import checks
-from lfm_ppl.fitting import check_requested, described_by, draw_paths, kept, versions, warn_of_convergence
+from lfm_ppl.fitting import (
+    check_requested,
+    described_by,
+    draw_paths,
+    kept,
+    note_warnings,
+    versions,
+    warn_of_convergence,
+)
 from lfm_ppl.inference.bound_model import BoundModel, bind
 from lfm_ppl.inference.posterior import scores
 from lfm_ppl.results import arviz_data
@@ -106,7 +114,7 @@ def to_arviz(mcmc: Any, numpyro_model: Callable, times: Any, y: Any, *, at: Any 
     if kernel is not None:
         attrs |= {"warmup": int(mcmc.num_warmup), "thin": int(mcmc.thinning)}
     result = arviz_data.build(groups, {label: value for label, value in attrs.items() if value is not None})
-    warn_of_convergence(result)
+    warn_of_convergence(note_warnings(result))
     return result
 
 

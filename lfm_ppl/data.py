@@ -98,10 +98,7 @@ class Data:
 
     def known_inputs(self) -> dict[str, Input]:
         """Return the known inputs as functions of time, for the ``inputs`` argument of a model."""
-        # Here and not before: arrays made before float64 is enabled stay in float32.
-        from lfm_ppl.model.inputs import Input
-
-        return {name: Input(*table) for name, table in self.inputs.items()}
+        return as_inputs(self.inputs)
 
 
 def read_csv(
@@ -185,6 +182,19 @@ def read_table(
         array([18.1,  nan, 18.4])
     """
     return _read(table.from_frame(frame), outputs, time_column, inputs, time_unit)
+
+
+def as_inputs(tables: Mapping[str, InputTable]) -> dict[str, Input]:
+    """Return known inputs as functions of time."""
+    # Here and not before: arrays made before float64 is enabled stay in float32.
+    from lfm_ppl.model.inputs import Input
+
+    return {name: Input(*table) for name, table in tables.items()}
+
+
+def model_keywords(tables: Mapping[str, InputTable], given: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Return the keyword arguments of a model: those given, and ``inputs`` where there are known inputs."""
+    return {**({"inputs": as_inputs(tables)} if tables else {}), **(given or {})}
 
 
 def as_data(data: Any) -> Data:

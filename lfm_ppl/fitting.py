@@ -18,7 +18,7 @@ import numpy as np
 from numpyro.infer import init_to_median, init_to_value
 
 from lfm_ppl import checks
-from lfm_ppl.data import as_data
+from lfm_ppl.data import as_data, model_keywords
 from lfm_ppl.filtering.breakdown import FilterWarning, breakdown
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference import sampling
@@ -190,12 +190,13 @@ def fit(
         data = as_data(times)
         times, y, truth = data.times, data.y, data.truth if truth is None else truth
         coords = {"output": data.outputs, **(coords or {})}
-        model_kwargs = {**({"inputs": data.known_inputs()} if data.inputs else {}), **(model_kwargs or {})}
+        model_kwargs = model_keywords(data.inputs, model_kwargs)
     values = y.to_numpy(float) if hasattr(y, "to_numpy") else y  # a data frame
     bound = bind(numpyro_model, times, values, **dict(model_kwargs or {}))
     check_requested(bound, at)
     labels = Labels.of(bound, dims, coords, y)
-    fingerprint = bound.fingerprint
+    # Traces the model once more, for the record of a run that is kept.
+    fingerprint = None if checkpoint is None else bound.fingerprint
     bound = bound.fix(fixed)
     if sampler == "map":
         chains, warmup, thin, method = 1, 0, None, None
@@ -294,7 +295,7 @@ def fit(
             except KeyboardInterrupt:
                 partial = _BARE if rated is None else "all draws and their scores, without trajectories"
         result = built(draws, stats, remarks, rated, drawn, partial)
-        note_warnings(result)
+        found = note_warnings(result)
         stored(result)
         if run is not None and partial is None:
             run.finish()
@@ -304,7 +305,7 @@ def fit(
             raise _Stopped(result, f"stopped with {partial}; they are in the attribute `result` of this exception "
                                    "(sys.last_value.result). With a folder, checkpoint=..., fit returns them")
         warnings.warn(f"the run was stopped, and its result is partial: {partial}.", stacklevel=2)
-    warn_of_convergence(result)
+    warn_of_convergence(found)
     return result
 
 
@@ -344,9 +345,9 @@ def note_warnings(result: Any) -> list[str]:
     return found
 
 
-def warn_of_convergence(result: Any) -> None:
-    """Store in a result what is wrong with its draws, and warn of it."""
-    for message in note_warnings(result):
+def warn_of_convergence(found: Sequence[str]) -> None:
+    """Warn of what `note_warnings` found."""
+    for message in found:
         checks.warn(message, ConvergenceWarning)
 
 

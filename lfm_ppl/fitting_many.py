@@ -18,7 +18,7 @@ import pandas as pd
 import xarray as xr
 
 from lfm_ppl import checks
-from lfm_ppl.data import Data
+from lfm_ppl.data import Data, model_keywords
 from lfm_ppl.engine.cluster import Workers, check_workers
 from lfm_ppl.engine.run import Reporter, outcomes
 from lfm_ppl.engine.task import Task, check_distinct
@@ -274,7 +274,7 @@ def _task(model: Callable, name: str, value: Any, options: dict[str, Any], seed:
     keywords = options.get("model_kwargs") or {}
     if isinstance(value, Data):
         times, y = value.times, value.y
-        keywords = {**({"inputs": value.known_inputs()} if value.inputs else {}), **keywords}
+        keywords = model_keywords(value.inputs, keywords)
     else:
         try:
             times, y = (np.asarray(part, float) for part in value)

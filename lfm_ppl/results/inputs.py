@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from lfm_ppl.data import Data, InputTable
-from lfm_ppl.model.inputs import Input
+from lfm_ppl.data import Data, InputTable, model_keywords
 from lfm_ppl.results import arviz_data
 
 GROUP = "constant_data"
@@ -39,9 +38,7 @@ def inputs_of(result: Any) -> dict[str, InputTable]:
 
 def keywords(result: Any, given: Mapping[str, Any] | None) -> dict[str, Any]:
     """Return the keyword arguments of the model of a result: those given, and its known inputs."""
-    stored = inputs_of(result)
-    known = {"inputs": {name: Input(*table) for name, table in stored.items()}} if stored else {}
-    return {**known, **(given or {})}
+    return model_keywords(inputs_of(result), given)
 
 
 def remember(groups: dict[str, xr.Dataset], data: Data) -> dict[str, Any]:
