@@ -427,27 +427,45 @@ def test_a_finished_run_says_so(tmp_path, monkeypatch, capsys):
     assert "name the folder with --out" in capsys.readouterr().err
 
 
+KILLS = 25
+"""Of each sampler, in pieces, so that they can be run one after another or by several processes."""
+
+PIECES = 5
+TO_KILL = {
+    "nuts": ["--warmup", "200", "--samples", "400", "--thin", "4"],
+    "ram": ["--warmup", "200", "--samples", "400", "--thin", "60"],
+    "pmmh": ["--warmup", "200", "--samples", "400", "--thin", "4", "--particles", "100"],
+    "map": ["--samples", "4000"],
+}
+
+
+@pytest.fixture(scope="module")
+def unkilled(tmp_path_factory):
+    """Sampler -> the result of a run that nobody kills, and the seconds that it takes."""
+
+    def run(sampler):
+        folder = tmp_path_factory.mktemp(sampler)
+        began = time.monotonic()
+        process = start(folder, "--sampler", sampler, *TO_KILL[sampler])
+        out, _ = process.communicate(timeout=600)
+        assert process.returncode == 0, out
+        return lfm.load(folder / "run"), time.monotonic() - began
+
+    return functools.cache(run)
+
+
 @pytest.mark.slow
+@pytest.mark.parametrize("piece", range(PIECES))
 @pytest.mark.parametrize("sampler", SAMPLERS)
-def test_killed_at_any_moment_it_goes_on_to_the_same_draws(sampler, tmp_path):
-    words = ["--sampler", sampler, "--warmup", "200", "--samples", "400", "--thin", "60" if sampler == "ram" else "4"]
-    if sampler == "map":
-        words = ["--sampler", "map", "--samples", "4000"]
-    if sampler == "pmmh":
-        words += ["--particles", "100"]
-    process = start(tmp_path, *words)
-    began = time.monotonic()
-    out, _ = process.communicate(timeout=600)
-    took = time.monotonic() - began
-    assert process.returncode == 0, out
-    expected = lfm.load(tmp_path / "run")
-    kills = int(os.environ.get("LFM_PPL_KILLS", "100")) // len(SAMPLERS)
-    chance = random.Random(SAMPLERS.index(sampler))
+def test_killed_at_any_moment_it_goes_on_to_the_same_draws(sampler, piece, unkilled, tmp_path):
+    expected, took = unkilled(sampler)
+    kills = KILLS // PIECES
+    chance = random.Random(f"{sampler} {piece}")
     while kills > 0:
         shutil.rmtree(tmp_path / "run", ignore_errors=True)
         resume = []
         while True:
-            process = start(tmp_path, *words, *resume)
+            process = start(tmp_path, "--sampler", sampler, *TO_KILL[sampler], *resume)
             try:
                 out, _ = process.communicate(timeout=chance.uniform(0.0, 1.1 * took) if kills > 0 else 600)
             except subprocess.TimeoutExpired:
