@@ -11,7 +11,6 @@ import subprocess
 import sys
 import time
 import warnings
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -441,7 +440,7 @@ TO_KILL = {
 
 @pytest.fixture(scope="module")
 def unkilled(tmp_path_factory):
-    """Sampler -> the result of a run that nobody kills, and the seconds that it takes."""
+    """Sampler -> a folder, the result there of a run that nobody kills, and the seconds that it takes."""
 
     def run(sampler):
         folder = tmp_path_factory.mktemp(sampler)
@@ -449,7 +448,7 @@ def unkilled(tmp_path_factory):
         process = start(folder, "--sampler", sampler, *TO_KILL[sampler])
         out, _ = process.communicate(timeout=600)
         assert process.returncode == 0, out
-        return lfm.load(folder / "run"), time.monotonic() - began
+        return folder, lfm.load(folder / "run"), time.monotonic() - began
 
     return functools.cache(run)
 
@@ -457,28 +456,28 @@ def unkilled(tmp_path_factory):
 @pytest.mark.slow
 @pytest.mark.parametrize("piece", range(PIECES))
 @pytest.mark.parametrize("sampler", SAMPLERS)
-def test_killed_at_any_moment_it_goes_on_to_the_same_draws(sampler, piece, unkilled, tmp_path):
-    expected, took = unkilled(sampler)
+def test_killed_at_any_moment_it_goes_on_to_the_same_draws(sampler, piece, unkilled):
+    folder, expected, took = unkilled(sampler)
     kills = KILLS // PIECES
     chance = random.Random(f"{sampler} {piece}")
     while kills > 0:
-        shutil.rmtree(tmp_path / "run", ignore_errors=True)
+        shutil.rmtree(folder / "run", ignore_errors=True)
         resume = []
         while True:
-            process = start(tmp_path, "--sampler", sampler, *TO_KILL[sampler], *resume)
+            process = start(folder, "--sampler", sampler, *TO_KILL[sampler], *resume)
             try:
                 out, _ = process.communicate(timeout=chance.uniform(0.0, 1.1 * took) if kills > 0 else 600)
             except subprocess.TimeoutExpired:
-                before = drawn(tmp_path)
+                before = drawn(folder)
                 process.kill()
                 process.communicate()
                 kills -= 1
-                assert drawn(tmp_path) >= before
-                for path in Path(tmp_path / "run").glob("posterior.nc"):
+                assert drawn(folder) >= before
+                for path in (folder / "run").glob("posterior.nc"):
                     lfm.load(path)  # it is whole, whenever the process was killed
                 resume = ["--resume"]
                 continue
             assert process.returncode == 0, out
             break
-        assert_same(lfm.load(tmp_path / "run"), expected)
-        assert not (tmp_path / "run" / "checkpoint").exists()
+        assert_same(lfm.load(folder / "run"), expected)
+        assert not (folder / "run" / "checkpoint").exists()
