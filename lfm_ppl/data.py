@@ -303,13 +303,13 @@ def read_truth(path: str | Path) -> dict[str, Any]:
     """Read what :func:`write_truth` wrote: the truth in the form of :attr:`Data.truth`."""
     try:
         raw = json.loads(Path(path).read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is not a truth file written by `simulate`: {error}") from None
-    truth: dict[str, Any] = {}
-    for key, value in raw.items():
-        nested = isinstance(value, dict)
-        truth[key] = {k: np.array(v) for k, v in value.items()} if nested else np.array(value)
-    return truth
+        if not isinstance(raw, dict):
+            raise ValueError(f"it holds a {type(raw).__name__}, not a mapping of names to values")
+        return {key: {k: np.array(v) for k, v in value.items()} if isinstance(value, dict) else np.array(value)
+                for key, value in raw.items()}
+    except ValueError as error:  # of JSON, of UTF-8, or of rows of different lengths
+        reason = str(error).rstrip(".")
+        raise ValueError(f"{path} is not a truth file written by `lfm-ppl simulate`: {reason}.") from None
 
 
 def _read(source: Table, outputs: Sequence[str] | None, time_column: str | None,
@@ -325,14 +325,16 @@ def _read(source: Table, outputs: Sequence[str] | None, time_column: str | None,
     others = [name for name in source.columns if name != time_name]
     for name in wanted:
         if name not in others:
-            raise ValueError(f"{source.label}: {checks.unknown('input column', name, others)}")
+            raise ValueError(f"{source.label}: {checks.unknown('input column', name, others)} Name the column "
+                             "with --inputs (inputs=).")
     names = _find_outputs(source, [name for name in others if name not in wanted], time_name, outputs)
     if both := sorted(set(names) & set(wanted)):
         raise ValueError(f"the column {both[0]!r} is named as an output and as an input; it can be one of them.")
     times, unit, origin = _times(source, time_name, time_unit, usual_unit)
     y = np.array([[_value(source, row, name) for name in names] for row in range(len(times))])
     if observed and np.all(np.isnan(y)):
-        raise ValueError(f"{source.label}: every value of {', '.join(names)}{part} is missing.")
+        raise ValueError(f"{source.label}: every value of {', '.join(names)}{part} is missing; expected at least one "
+                         "number.")
     return Data(times, y, tuple(names), units={"time": unit} if unit else {}, origin=origin,
                 inputs={name: _input(source, name, way, times) for name, way in wanted.items()})
 
@@ -372,7 +374,8 @@ def _find_outputs(source: Table, others: Sequence[str], time_name: str, outputs:
     known = [name for name in source.columns if name != time_name]
     for name in outputs:
         if name not in known:
-            raise ValueError(f"{source.label}: {checks.unknown('output column', name, known)}")
+            raise ValueError(f"{source.label}: {checks.unknown('output column', name, known)} Name the columns "
+                             "with --outputs (outputs=).")
     return list(outputs)
 
 
@@ -388,7 +391,8 @@ def _times(source: Table, name: str, unit: str | None, usual: str | None) -> tup
     if missing := [row for row, cell in enumerate(cells) if _missing(cell)]:
         raise ValueError(f"{source.place(missing[0], name)}: the time is missing.")
     if not calendar_time.is_date(cells[0]):
-        times = np.array([_value(source, row, name) for row in range(len(cells))])
+        times = np.array([_value(source, row, name, "a number, or a date such as 2026-03-31 in every row", "")
+                          for row in range(len(cells))])
         _check_order(source, times, [f"{time:g}" for time in times])
         own = _unit_of(name)
         if own is not None and unit not in (None, own):
@@ -404,7 +408,7 @@ def _times(source: Table, name: str, unit: str | None, usual: str | None) -> tup
                              f"{cell!r}.") from None
         if (stamps[-1].tzinfo is None) != (stamps[0].tzinfo is None):
             raise ValueError(f"{source.place(row, name)}: some dates have an offset from UTC and others have none: "
-                             f"{cells[0]!s} and {cell!s}.")
+                             f"{cells[0]!s} and {cell!s}. Write it in all of them, or in none.")
     back = " A clock that is set back for winter needs offsets from UTC." if stamps[0].tzinfo is None else ""
     times, origin, unit = calendar_time.since_midnight(stamps, unit or _unit_of(name) or usual)
     _check_order(source, times, [str(cell) for cell in cells], back)
@@ -452,7 +456,8 @@ def _missing(cell: Any) -> bool:
     return bool(cell != cell)  # NaN, and pandas' NaT
 
 
-def _value(source: Table, row: int, name: str) -> float:
+def _value(source: Table, row: int, name: str, expected: str = "a number or an empty cell",
+           remedy: str = " If the column is not an output, name the outputs.") -> float:
     cell = source.columns[name][row]
     try:
         if _missing(cell):
@@ -461,11 +466,17 @@ def _value(source: Table, row: int, name: str) -> float:
     except (TypeError, ValueError):  # a TypeError is pandas' NA, or a cell that is no scalar
         if type(cell).__name__ == "NAType":
             return math.nan
-        raise ValueError(f"{source.place(row, name)}: expected a number or an empty cell, got {cell!r}. If the column "
-                         "is not an output, name the outputs.") from None
+        raise ValueError(f"{source.place(row, name)}: expected {expected}, got {_shown(cell)}.{remedy}") from None
     if not math.isfinite(value):
-        raise ValueError(f"{source.place(row, name)}: expected a finite number, got {cell!r}.")
+        raise ValueError(f"{source.place(row, name)}: expected a finite number, got {_shown(cell)}. Leave the cell of "
+                         "a missing value empty.")
     return value
+
+
+def _shown(cell: Any) -> str:
+    """Return a cell as messages show it."""
+    text = repr(cell)
+    return text if len(text) <= 60 else f"{text[:50]}... ({len(text)} characters)"
 
 
 def _check_order(source: Table, times: np.ndarray, said: Sequence[str], more: str = "") -> None:

@@ -32,10 +32,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 from lfm_ppl import checks
 from lfm_ppl.data import INTERPOLATIONS, Data
+
+_MODULE = "_lfm_ppl_model_"
+"""Begins the names of the modules that model files become."""
 
 
 @dataclass(frozen=True)
@@ -88,22 +91,31 @@ class ModelFile:
                 "own. Give a data file with --data FILE, or add the function."
             )
         seeded = {} if seed is None else {"seed": seed}
+        _check_call(self.path, "simulate", self._simulate, "seed and the names in OPTIONS", **seeded, **options)
         data = self._simulate(**seeded, **options)
         if not isinstance(data, Data):
             raise TypeError(f"simulate in {self.path} must return lfm.Data, got {_type(data)}.")
-        return self._with_units(data)
+        return self._completed("simulate", data)
 
     def prepare(self, data: Data) -> Data:
         """Return a user's data in the form that the model takes; ``note`` says what was done."""
         if self._prepare is not None:
+            _check_call(self.path, "prepare", self._prepare, "the data", data)
             data = self._prepare(data)
             if not isinstance(data, Data):
                 raise TypeError(f"prepare in {self.path} must return lfm.Data, got {_type(data)}.")
-        return self._with_units(data)
+        return self._completed("prepare", data)
 
     def anchors(self, data: Data) -> dict[str, float]:
         """Return the parameters that are fixed for this data unless the user frees them."""
-        return dict(self._anchors(data)) if self._anchors is not None else {}
+        if self._anchors is None:
+            return {}
+        _check_call(self.path, "anchors", self._anchors, "the data", data)
+        found = self._anchors(data)
+        if not isinstance(found, Mapping):
+            raise TypeError(f"anchors in {self.path} must return a mapping of names of parameters to values, got "
+                            f"{_type(found)}.")
+        return dict(found)
 
     def keywords(self, data: Data, options: Mapping[str, Any]) -> dict[str, Any]:
         """Return the keyword arguments of ``model`` for this data and these options."""
@@ -139,7 +151,11 @@ class ModelFile:
                 f"got {text!r}."
             ) from None
 
-    def _with_units(self, data: Data) -> Data:
+    def _completed(self, function: str, data: Data) -> Data:
+        """Return data with the units of the model."""
+        if self.outputs is not None and data.outputs != self.outputs:
+            raise ValueError(f"{function} in {self.path} returns data of {', '.join(data.outputs)}, but the file has "
+                             f"OUTPUTS = {self.outputs}; make them the same.")
         return replace(data, units={**self.units, **data.units})
 
 
@@ -189,7 +205,7 @@ def load(name: str) -> ModelFile:
 
 def _execute(path: Path) -> ModuleType:
     """Run a file as a module of its own, named so that it cannot hide another module."""
-    name = f"_lfm_ppl_model_{path.stem}"
+    name = f"{_MODULE}{path.stem}"
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
         raise ValueError(f"{path} is not a Python file.")
@@ -197,7 +213,7 @@ def _execute(path: Path) -> ModuleType:
     sys.modules[name] = module  # a dataclass or an equinox Module looks itself up there
     try:
         spec.loader.exec_module(module)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         del sys.modules[name]
         raise ValueError(f"{path} does not run: {_where(error, path)}") from error
     return module
@@ -219,12 +235,17 @@ def _checked(path: Path, module: ModuleType) -> ModelFile:
             raise ValueError(f"{path}: {name} must be a function, got {getattr(module, name)!r}.")
     description = (module.__doc__ or "").strip()
     outputs = getattr(module, "OUTPUTS", None)
-    if isinstance(outputs, str):
-        raise ValueError(f'{path}: OUTPUTS must be a tuple of names, as in ("{outputs}",).')
+    named = isinstance(outputs, (tuple, list)) and all(isinstance(name, str) for name in outputs)
+    if outputs is not None and not (named and outputs):
+        example = outputs if isinstance(outputs, str) else "x"
+        raise ValueError(f'{path}: OUTPUTS must be a tuple of names, as in ("{example}",), got {outputs!r}.')
+    for name in ("UNITS", "PARAMETERS", "OPTIONS"):
+        if not isinstance(getattr(module, name, {}), Mapping):
+            raise ValueError(f"{path}: {name} must be a mapping, a dict, got {getattr(module, name)!r}.")
     target_accept = getattr(module, "TARGET_ACCEPT", None)
     if target_accept is not None and not (isinstance(target_accept, int | float) and 0 < target_accept < 1):
         raise ValueError(f"{path}: TARGET_ACCEPT must lie between 0 and 1, got {target_accept!r}.")
-    return ModelFile(
+    loaded = ModelFile(
         name=_name(path),
         path=path,
         summary=description.partition("\n")[0],
@@ -240,6 +261,19 @@ def _checked(path: Path, module: ModuleType) -> ModelFile:
         _prepare=getattr(module, "prepare", None),
         _anchors=getattr(module, "anchors", None),
     )
+    taken = inspect.signature(loaded.model).parameters
+    told = {name: None for name in ("outputs", "units", "inputs") if name in taken}
+    _check_call(path, "model", loaded.model, "(times, y=None) and the names in OPTIONS", None, None,
+                **{name: None for name in loaded.options}, **told)
+    return loaded
+
+
+def _check_call(path: Path, name: str, function: Callable, form: str, *arguments: Any, **keywords: Any) -> None:
+    """Raise ValueError unless a function of a model file takes these arguments; ``form`` says which it must take."""
+    try:
+        inspect.signature(function).bind(*arguments, **keywords)
+    except TypeError as error:
+        raise ValueError(f"{path}: {name} must take {form}: {error}.") from None
 
 
 def _checked_options(path: Path, options: Mapping[str, Any]) -> dict[str, tuple[Any, Any, str]]:
@@ -250,6 +284,9 @@ def _checked_options(path: Path, options: Mapping[str, Any]) -> dict[str, tuple[
                 f"{path}: OPTIONS[{name!r}] must be (default, tuple of choices or a type, help), "
                 f"got {entry!r}."
             )
+        if isinstance(entry[1], tuple) and entry[0] not in entry[1]:
+            raise ValueError(f"{path}: the default of OPTIONS[{name!r}] must be one of its choices {entry[1]!r}, got "
+                             f"{entry[0]!r}.")
     return dict(options)
 
 
@@ -270,7 +307,37 @@ def _convert(kind: type, text: str) -> Any:
     return kind(text)
 
 
-def _where(error: Exception, path: Path) -> str:
+class Place(NamedTuple):
+    """A line of a model file.
+
+    Attributes:
+        file: its path.
+        line: counted from 1.
+        shipped: whether the file comes with the library.
+    """
+
+    file: str
+    line: int
+    shipped: bool
+
+
+def place_in_model(error: BaseException) -> Place | None:
+    """Return the last line of a model file that led to an error, or to its cause; None where none did."""
+    found = None
+    cause: BaseException | None = error
+    while cause is not None:
+        for frame, line in traceback.walk_tb(cause.__traceback__):
+            module = str(frame.f_globals.get("__name__", ""))
+            if module.startswith(_MODULE):
+                file = frame.f_code.co_filename
+                found = Place(file, line, Path(file).parent == models_folder())
+            elif module.startswith("lfm_ppl.inference.handlers."):  # what a user asks of a site is not the file's fault
+                found = None
+        cause = cause.__cause__
+    return found
+
+
+def _where(error: BaseException, path: Path) -> str:
     """Return the error in one line, with the last line of ``path`` that led to it."""
     lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == str(path)]
     line = error.lineno if isinstance(error, SyntaxError) else (lines[-1] if lines else None)

@@ -42,6 +42,8 @@ def from_csv(path: str | Path) -> Table:
         ValueError: it is empty, not comma-separated text, has rows of different lengths or repeated names.
         FileNotFoundError: there is no such file.
     """
+    if not str(path).strip():
+        raise ValueError("the name of the data file is empty.")
     path = Path(path)
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
@@ -58,10 +60,16 @@ def from_csv(path: str | Path) -> Table:
     if not lines:
         raise ValueError(f"{path} is empty; expected a header row and one row per time.")
     first, header = lines[0]
-    for separator, name in ((";", "semicolons"), ("\t", "tabs")):
+    if header[0].startswith("<"):
+        raise ValueError(f"{path} is HTML or XML, beginning with {header[0][:40]!r}; expected comma-separated text. "
+                         "Export it as CSV.")
+    for separator, name in ((";", "semicolons"), ("\t", "tabs"), ("|", "bars"), (" ", "spaces")):
         if len(header) == 1 and separator in header[0]:
             raise ValueError(f"{path} is separated by {name}; expected commas between columns and a point in decimals. "
                              "Export it as comma-separated CSV.")
+    if all(_is_number(cell) for cell in header):
+        raise ValueError(f"{path}, row {first}: expected a header with the name of each column, got the numbers "
+                         f"{', '.join(header[:3])}{', ...' if len(header) > 3 else ''}. Write one above them.")
     _check_names(f"{path}, row {first}", header)
     if len(lines) == 1:
         raise ValueError(f"{path} has a header and no rows; expected one row per time.")
@@ -122,6 +130,14 @@ def _kind(value: Any) -> str | None:
     library = type(value).__module__.partition(".")[0]
     expected = {"pandas": "iloc", "polars": "columns", "xarray": "to_dataframe"}
     return library if library in expected and hasattr(value, expected[library]) else None
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
 
 
 def _check_names(where: str, header: Sequence[str]) -> None:

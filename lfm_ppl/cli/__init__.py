@@ -6,7 +6,8 @@ import sys
 import warnings
 from collections.abc import Sequence
 
-from lfm_ppl.cli.arguments import parser
+from lfm_ppl import loading
+from lfm_ppl.cli.arguments import parsed
 from lfm_ppl.cli.interruption import INTERRUPTED
 from lfm_ppl.engine.errors import EngineError
 
@@ -21,7 +22,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         0 after success, 1 where results were saved and a figure or the page could not be made, 2 after an
         error, which is one line on standard error unless ``--debug`` is given, 130 after Ctrl-C.
     """
-    arguments = parser().parse_args(argv)
+    arguments = parsed(argv)
     arguments.line = list(sys.argv[1:] if argv is None else argv)
     warnings.showwarning = _show_warning
     try:
@@ -40,9 +41,16 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _one_line(error: Exception) -> str:
+    """Return what is wrong, and where, if it comes from a model file."""
     text = " ".join(str(error).split()) or type(error).__name__
+    place = loading.place_in_model(error)
+    if place is not None and place.file not in text and not (isinstance(error, ValueError) and place.shipped):
+        kind = "" if isinstance(error, (ValueError, TypeError)) else f"{type(error).__name__}: "
+        return f"{place.file}, line {place.line}: {kind}{text}" + (" (--debug shows more)" if kind else "")
     if isinstance(error, FileNotFoundError) and error.filename:
         return f"there is no file {error.filename}."
+    if isinstance(error, OSError) and error.filename and error.strerror:
+        return f"{error.filename}: {error.strerror}."
     if isinstance(error, (ValueError, TypeError, OSError, EngineError)):
         return text
     return f"{type(error).__name__}: {text} (--debug shows where)"

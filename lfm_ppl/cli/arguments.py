@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import difflib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
 import lfm_ppl
@@ -23,6 +24,25 @@ class Parser(argparse.ArgumentParser):
         """Print the complaint and end the process."""
         print(f"lfm-ppl: error: {message} (see `{self.prog} --help`)", file=sys.stderr)
         raise SystemExit(2)
+
+
+def parsed(argv: Sequence[str] | None = None) -> argparse.Namespace:
+    """Return the arguments; of an unknown one, or an empty one, the command complains, and names what may be meant."""
+    top = parser()
+    arguments, unknown = top.parse_known_args(argv)
+    (commands,) = (action for action in top._actions if isinstance(action, argparse._SubParsersAction))
+    command = commands.choices[arguments.command]
+    if unknown:
+        flag = unknown[0].partition("=")[0]
+        near = difflib.get_close_matches(flag, command._option_string_actions, n=2) if flag.startswith("-") else []
+        hint = f". Did you mean {' or '.join(near)}?" if near else ""
+        command.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
+    for action in command._actions:
+        value = getattr(arguments, action.dest, None)
+        if isinstance(value, str) and not value.strip():
+            name = "/".join(action.option_strings) or action.metavar
+            command.error(f"{name}: expected {action.metavar}, got {value!r}")
+    return arguments
 
 
 def parser() -> argparse.ArgumentParser:

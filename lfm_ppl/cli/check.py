@@ -13,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lfm_ppl import data, loading
+from lfm_ppl import checks, data, loading
 from lfm_ppl.cli import choices, fit, page, results, session
 from lfm_ppl.cli.interruption import INTERRUPTED, Watch, watched
 
@@ -59,7 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
     results.writable(path.parent)
     posterior = arviz_data.load(path)
     session.start(int(arviz_data.attributes(posterior).get("chains", 1)), not arguments.no_cache)
-    task = rebuilt(posterior, arguments.model)
+    task = rebuilt(posterior, arguments.model, path)
     with contextlib.ExitStack() as stack:
         folder = None
         if arguments.correct:
@@ -96,8 +96,8 @@ def _again(arguments: argparse.Namespace) -> str:
                        "--resume"])
 
 
-def rebuilt(posterior: Any, model_file: str | None) -> Check:
-    """Rebuild the model from what the result remembers of it."""
+def rebuilt(posterior: Any, model_file: str | None, path: Path) -> Check:
+    """Rebuild the model from what the result in a file remembers of it."""
     from lfm_ppl.inference.handlers.settings import approximate
     from lfm_ppl.results import arviz_data, rebuilding
     from lfm_ppl.results.inputs import ORIGIN, inputs_of
@@ -106,21 +106,24 @@ def rebuilt(posterior: Any, model_file: str | None) -> Check:
     attrs = arviz_data.attributes(posterior)
     chosen = model_file or attrs.get("model_file")
     if not chosen:
-        raise ValueError(f"the result does not say which file its model {attrs.get('model', '')!r} comes from, as of "
-                         "one that lfm.fit made. Name the file with --model FILE, or call lfm.check_accuracy(result, "
+        raise ValueError(f"{path} does not say which file its model {attrs.get('model', '')!r} comes from, as of one "
+                         "that lfm.fit made. Name the file with --model FILE, or call lfm.check_accuracy(result, "
                          "model) in Python.")
     try:
         model = loading.load(chosen)
     except ValueError as error:
         remedy = "" if model_file else " The result was made with this file; if it has moved, name it with --model."
         raise ValueError(f"{error}{remedy}") from error
-    times, y = rebuilding.observations(posterior)
+    try:
+        times, y = rebuilding.observations(posterior)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
     if y.ndim != 2 or times.ndim != 1:
-        raise ValueError("the result is of a panel of series; check it with lfm.check_accuracy in Python.")
+        raise ValueError(f"{path} is of a panel of series; use lfm.check_accuracy or lfm.forecast in Python.")
     group = arviz_data.group(posterior, "observed_data")
     outputs = tuple(str(name) for name in group["output"].values)
     if model.outputs is not None and model.outputs != outputs:
-        raise ValueError(f"the result is of the outputs {', '.join(outputs)}; {model.path} has "
+        raise ValueError(f"{path} is of the outputs {', '.join(outputs)}; {model.path} has "
                          f"{', '.join(model.outputs)}. Give the file that it was made with.")
     (variable,) = (group[name] for name in group.data_vars)
     units = {name: unit for name in outputs if (unit := unit_of(variable, name))}
@@ -128,14 +131,30 @@ def rebuilt(posterior: Any, model_file: str | None) -> Check:
         units["time"] = clock
     observed = data.Data(times, y, outputs, units={**model.units, **units}, inputs=inputs_of(posterior),
                          origin=attrs.get(ORIGIN))
-    options = json.loads(attrs.get("options") or "{}")
+    options = _stored(attrs, "options", path)
     unknown = sorted(set(options) - set(model.options))
     if unknown:
-        raise ValueError(f"the result was made with the option {unknown[0]!r}, which {model.path} no longer has.")
-    settings = json.loads(attrs.get("settings") or "{}")
+        raise ValueError(f"{path} was made with the option {unknown[0]!r}, which {model.path} no longer has. Give the "
+                         "file as it was then, with --model.")
+    settings = _stored(attrs, "settings", path)
+    if settings.get("rule") not in (None, *choices.RULES):
+        raise ValueError(f"{path}, attribute settings: {checks.unknown('rule', settings['rule'], choices.RULES)}")
     settings["rule"] = choices.rule(settings.get("rule"))
     numpyro_model = approximate(model.model, **settings)
     return Check(posterior, model.name, numpyro_model, model.keywords(observed, options), observed, model)
+
+
+def _stored(attrs: dict[str, Any], name: str, path: Path) -> dict[str, Any]:
+    """Return what an attribute of a result holds as JSON."""
+    try:
+        found = json.loads(attrs.get(name) or "{}")
+    except ValueError as error:
+        raise ValueError(f"{path}: its attribute {name} cannot be read ({error}); the file was changed since `lfm-ppl "
+                         "fit` wrote it.") from None
+    if not isinstance(found, dict):
+        raise ValueError(f"{path}: its attribute {name} is no mapping; the file was changed since `lfm-ppl fit` wrote "
+                         "it.")
+    return found
 
 
 def _checked(task: Check, arguments: argparse.Namespace, folder: Path) -> Any:

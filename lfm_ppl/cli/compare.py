@@ -28,13 +28,15 @@ def run(arguments: argparse.Namespace) -> int:
         _list()
         return 0
     chosen = catalogue.experiment(arguments.experiment)
-    folder = _folder(arguments, chosen.name)
-    web_page.refuse_foreign(folder / PAGE, arguments.overwrite)
-    started = time.perf_counter()
-    found = chosen.run(catalogue.Wanted(
-        folder, arguments.realisations, arguments.conditional, arguments.seed, arguments.quick, arguments.overwrite,
-        None if arguments.quiet else Console(), choices.workers(arguments.jobs, arguments.scheduler), arguments.data,
-        tuple(arguments.satellites) if arguments.satellites else None, arguments.train_days, arguments.axes))
+    workers = choices.workers(arguments.jobs, arguments.scheduler)
+    default = Path("lfm-results") / "compare" / (f"{chosen.name}-quick" if arguments.quick else chosen.name)
+    with results.lasting(default, arguments.out) as folder:
+        web_page.refuse_foreign(folder / PAGE, arguments.overwrite)
+        started = time.perf_counter()
+        found = chosen.run(catalogue.Wanted(
+            folder, arguments.realisations, arguments.conditional, arguments.seed, arguments.quick, arguments.overwrite,
+            None if arguments.quiet else Console(), workers, arguments.data,
+            tuple(arguments.satellites) if arguments.satellites else None, arguments.train_days, arguments.axes))
     width = shutil.get_terminal_size().columns
     for title, table in found.tables.items():
         print(f"\n{title}\n{tables.text_table(table, width=width)}")
@@ -74,13 +76,3 @@ def _list() -> None:
     for one in shown:
         print(f"{one.name:<{width}}  {one.summary}")
     print("\n`lfm-ppl compare NAME` runs one; `--quick` shows in a few minutes that it runs.")
-
-
-def _folder(arguments: argparse.Namespace, name: str) -> Path:
-    """Return the folder of the experiment: always the same one, so that the same command goes on where it stopped."""
-    kind = f"{name}-quick" if arguments.quick else name
-    folder = Path("lfm-results") / "compare" / kind if arguments.out is None else Path(arguments.out)
-    if folder.exists() and not folder.is_dir():
-        raise FileExistsError(f"{folder} is a file; expected the name of a folder for the results.")
-    results.writable(folder)
-    return folder

@@ -53,8 +53,8 @@ def run(arguments: argparse.Namespace) -> int:
     if not data_sets:
         name, reason = next(iter(failed.items()))
         raise ValueError(f"none of the {len(failed)} data sets can be used. {name}: {reason}")
-    folder = _folder(arguments, model.name)
-    with _sent_as_code(model, workers):
+    default = Path("lfm-results") / f"{model.name}-many"
+    with results.lasting(default, arguments.out) as folder, _sent_as_code(model, workers):
         fits = fit_many(fit.approximated(arguments, model), data_sets, out=folder, workers=workers, each=own,
                         seed=arguments.seed, overwrite=arguments.overwrite,
                         report=None if arguments.quiet else Console(),
@@ -140,15 +140,6 @@ def _check_units(found: dict[str, data.Data]) -> None:
         if unit != other:
             raise ValueError(f"the times of {name} are in {unit}, and those of {first} in {other}. Give one unit for "
                              "all of them, with --time-unit for dates.")
-
-
-def _folder(arguments: argparse.Namespace, name: str) -> Path:
-    """Return the folder of the results: the same one again, so that the same command goes on where it stopped."""
-    folder = Path("lfm-results") / f"{name}-many" if arguments.out is None else Path(arguments.out)
-    if folder.exists() and not folder.is_dir():
-        raise FileExistsError(f"{folder} is a file; expected the name of a folder for the results.")
-    results.writable(folder)
-    return folder
 
 
 @contextlib.contextmanager

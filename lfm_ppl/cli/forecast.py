@@ -50,7 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
         else:
             folder = stack.enter_context(results.folder("forecast", arguments.out, arguments.overwrite))
         session.start(1, not arguments.no_cache)
-        task = check.rebuilt(posterior, arguments.model)
+        task = check.rebuilt(posterior, arguments.model, path)
         held_out = None if arguments.held_out is None else _held_out(arguments, task)
         return _write(_forecast(arguments, task, held_out), held_out, path, folder, arguments)
 
@@ -110,13 +110,19 @@ def _held_out(arguments: argparse.Namespace, task: check.Check) -> data.Data:
             raise ValueError(f"the result has {len(outputs)} outputs ({', '.join(outputs)}); --outputs names "
                              f"{len(columns)} columns.")
     known = {name: one.interpolation for name, one in task.observed.inputs.items()}
+    if arguments.inputs is not None and not known:
+        raise ValueError("--inputs names columns of known inputs, and the result has no known inputs; leave it out.")
     inputs = choices.inputs(arguments.inputs, dataclasses.replace(task.file, inputs=known)) if known else {}
     read = data.read_csv(arguments.held_out, columns, arguments.time_column, dict(inputs.values()),
                          task.observed.units.get("time") if task.observed.origin is not None else None,
                          observed=not inputs)
-    read = data.on_clock_of(dataclasses.replace(
-        read, outputs=outputs, inputs={name: read.inputs[column] for name, (column, _) in inputs.items()}),
-        task.observed)
+    read = dataclasses.replace(read, outputs=outputs,
+                               inputs={name: read.inputs[column] for name, (column, _) in inputs.items()})
+    if (read.origin is None) != (task.observed.origin is None):
+        kinds = ("plain numbers", "dates") if read.origin is None else ("dates", "plain numbers")
+        raise ValueError(f"{arguments.held_out}: its times are {kinds[0]}, and those of the result {kinds[1]}; give "
+                         "both in one form.")
+    read = data.on_clock_of(read, task.observed)
     taken = task.file.prepare(dataclasses.replace(read, inputs={
         name: joined(task.observed.inputs[name], later) for name, later in read.inputs.items()}))
     if not np.array_equal(taken.y, read.y, equal_nan=True):

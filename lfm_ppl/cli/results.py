@@ -15,7 +15,7 @@ _REMEDY = "Nothing was computed; name a folder that you may write with --out."
 
 @contextlib.contextmanager
 def folder(name: str, out: str | None, overwrite: bool, resume: bool = False) -> Iterator[Path]:
-    """Make the folder for the results, and remove it again where nothing was put into it.
+    """Make the folder for the results, and remove it again where it is new and nothing was put into it.
 
     Args:
         name: of the model.
@@ -30,13 +30,47 @@ def folder(name: str, out: str | None, overwrite: bool, resume: bool = False) ->
         FileExistsError: if ``out`` holds files and ``overwrite`` is False.
         OSError: the folder cannot be made or written.
     """
-    chosen = _fresh(name) if out is None else _named(Path(out), overwrite or resume)
-    try:
+    with _emptied(FOLDER if out is None else Path(out)) as new:
+        chosen = _fresh(name) if out is None else _named(Path(out), overwrite or resume)
+        if out is None:
+            new.insert(0, chosen)
         writable(chosen)
         yield chosen
+
+
+@contextlib.contextmanager
+def lasting(default: Path, out: str | None) -> Iterator[Path]:
+    """Make the folder of what can go on: the same one for the same command; it may hold results already.
+
+    Args:
+        default: the folder where none is named.
+        out: the folder that the user wants.
+
+    Yields:
+        The folder, which exists; it is removed again where it is new and nothing was put into it.
+
+    Raises:
+        FileExistsError: a file has its name.
+        OSError: it cannot be made or written.
+    """
+    folder = default if out is None else Path(out)
+    if folder.exists() and not folder.is_dir():
+        raise FileExistsError(f"{folder} is a file; expected the name of a folder for the results.")
+    with _emptied(folder):
+        writable(folder)
+        yield folder
+
+
+@contextlib.contextmanager
+def _emptied(folder: Path) -> Iterator[list[Path]]:
+    """Remove what did not exist before, a folder and those above it, as far as they are empty afterwards."""
+    new = [path for path in (folder, *folder.parents) if not path.exists()]
+    try:
+        yield new
     finally:
-        with contextlib.suppress(OSError):  # raised where it is not empty
-            chosen.rmdir()
+        with contextlib.suppress(OSError):  # raised by the first that is not empty
+            for path in new:
+                path.rmdir()
 
 
 def writable(folder: Path) -> None:

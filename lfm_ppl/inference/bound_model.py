@@ -687,6 +687,9 @@ def bind(model: Callable, times: Any, y: Any, **keywords: Any) -> BoundModel:
     given = jnp.asarray(y, float)
     y = given[:, None] if given.ndim == times.ndim == 1 else given
     bound = bind_arguments(model, (times, y), keywords)
+    if bound.site.name in bound.sites:
+        raise ValueError(f"the model does not use the data: its likelihood site {bound.site.name!r} is not observed. "
+                         f"Write numpyro.sample({bound.site.name!r}, ..., obs=y), with the argument y of the model.")
     distribution = bound.site.distribution
     if isinstance(distribution, Panel):
         distribution.checked(given)

@@ -21,6 +21,7 @@ import re
 import shutil
 import sys
 import time
+import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from importlib import metadata
 from pathlib import Path
@@ -37,6 +38,9 @@ from lfm_ppl.results.files import POSTERIOR, writing
 
 FOLDER = "checkpoint"
 _RUN, _SETUP, _STATE, _LOCK = "run.json", "setup.json", "state.npz", "lock"
+
+_SHOWN = 6
+"""Differences between two runs that a message names; the others are counted."""
 
 _EVERY_S = 1.0
 """Shortest time between two states on disk."""
@@ -95,14 +99,10 @@ class Checkpoint:
         if not path.is_file():
             raise FileNotFoundError(f"{folder} holds no run to go on with; expected a folder in which a run was begun "
                                     "and not finished.")
-        checkpoint._hold()
-        checkpoint.record = json.loads(path.read_text(encoding="utf-8"))
-        try:
-            check_same(folder, checkpoint.record, record)
-        except ValueError:
-            checkpoint._release()
-            raise
+        checkpoint.record = _record(path)
+        check_same(folder, checkpoint.record, record)
         checkpoint._earlier_s = float(checkpoint._state_seconds())
+        checkpoint._hold()
         for left in Path(folder).glob(".*.part*"):  # by a process that was killed
             left.unlink(missing_ok=True)
         return checkpoint
@@ -132,11 +132,15 @@ class Checkpoint:
         path = self._own / _STATE
         if not path.is_file():
             return None
-        with np.load(path) as file:
+        with _readable(path), np.load(path) as file:
             leaves = [file[f"leaf{index}"] for index in range(int(file["leaves"]))]
             done, names = int(file["done"]), [str(name) for name in file["names"]]
             self._written = int(file["draws"])
-        return Saved(done, leaves, {name: np.load(self._rows(name)) for name in names})
+        rows = {}
+        for name in names:
+            with _readable(self._rows(name)):
+                rows[name] = np.load(self._rows(name))
+        return Saved(done, leaves, rows)
 
     def due(self) -> bool:
         """Whether the last state on disk is older than a second."""
@@ -194,7 +198,7 @@ class Checkpoint:
         path = self._own / _STATE
         if not path.is_file():
             return 0.0
-        with np.load(path) as file:
+        with _readable(path), np.load(path) as file:
             return float(file["seconds"])
 
     def _write(self, name: str, content: Mapping[str, Any]) -> None:
@@ -313,8 +317,36 @@ def check_same(folder: str | Path, kept: Mapping[str, Any], record: Mapping[str,
     record = _plain(record)
     differences = list(_differences(kept, record))
     if differences:
-        raise ValueError(f"cannot go on with the run in {folder}, which was another one: {'; '.join(differences)}. "
-                         "Repeat what it was begun with, or begin a new run in another folder.")
+        more = [f"and {len(differences) - _SHOWN} more"] if len(differences) > _SHOWN else []
+        raise ValueError(f"cannot go on with the run in {folder}, which was another one: "
+                         f"{'; '.join(differences[:_SHOWN] + more)}. Repeat what it was begun with, or begin a new run "
+                         "in another folder.")
+
+
+def _record(path: Path) -> dict[str, Any]:
+    """Return what a run is of.
+
+    Raises:
+        ValueError: the file does not say.
+    """
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(record, dict):
+            raise ValueError(f"it holds {record!r:.20}, not a mapping")
+    except ValueError as error:  # of JSON, or of UTF-8
+        raise ValueError(f"{path} is not the record of a run ({error}), which cannot go on without it. Begin anew with "
+                         "overwrite=True (--overwrite), or in another folder.") from None
+    return record
+
+
+@contextlib.contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    """Raise ValueError where a file of arrays is damaged, which no kill can do."""
+    try:
+        yield
+    except (OSError, KeyError, EOFError, ValueError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path} is damaged ({type(error).__name__}: {error}), and its run cannot go on. Begin anew "
+                         "with overwrite=True (--overwrite), or in another folder.") from None
 
 
 def _differences(kept: Mapping[str, Any], record: Mapping[str, Any]) -> Iterator[str]:

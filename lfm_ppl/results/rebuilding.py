@@ -93,7 +93,7 @@ def _latent(bound: BoundModel, posterior: xr.Dataset) -> dict:
         if stored not in posterior:
             known = ", ".join(map(str, posterior.data_vars))
             raise ValueError(f"the model samples {name!r}, of which the result has no draws (it has {known}); it is "
-                             "not the model that the result was made with.")
+                             "not the model that the result was made with. Give the one that was.")
         values = posterior[stored].transpose("chain", "draw", ...).values
         if values.shape[2:] != shapes[name]:
             raise ValueError(f"{name!r} has shape {shapes[name]} in the model and {values.shape[2:]} in the "
