@@ -78,6 +78,39 @@ def finite(name: str, value: Any, remedy: str = "") -> None:
         raise ValueError(_message(name, f"finite{where}", array, remedy))
 
 
+def time_vector(name: str, value: Any, earliest: float | None = None, order: str = "", remedy: str = "") -> np.ndarray:
+    """Return times (K,) as float64, K >= 1; a number is one time.
+
+    Args:
+        name: of the argument, for messages.
+        value: the times, which must be known, not traced.
+        earliest: the initial time, before which there is nothing.
+        order: "non-decreasing" or "increasing"; empty: any.
+        remedy: what to do about a time before ``earliest``.
+
+    Raises:
+        ValueError: they are traced, not a vector, empty, not finite, too early or not in order.
+    """
+    known = concrete(value)
+    if known is None:
+        raise ValueError(f"{name} must be known before compilation; pass a NumPy array.")
+    known = np.atleast_1d(known).astype(float)
+    if known.ndim != 1 or known.size == 0:
+        raise ValueError(f"{name} must be a vector (K,) of at least one time, got shape {known.shape}.")
+    finite(name, known)
+    if order:
+        gaps = np.diff(known)
+        wrong = np.flatnonzero(gaps < 0 if order == "non-decreasing" else gaps <= 0)
+        if wrong.size:
+            row = int(wrong[0]) + 1
+            rule = "must not go back" if order == "non-decreasing" else "must increase"
+            raise ValueError(f"{name} {rule}: entry {row} is {known[row]:g} after {known[row - 1]:g}. Sort them.")
+    if earliest is not None and known.min() < earliest:
+        raise ValueError(f"{name}[{int(known.argmin())}] = {known.min():g} lies before the initial time {earliest:g}"
+                         f"{remedy}.")
+    return known
+
+
 def one_of(name: str, value: str, choices: Iterable[str]) -> None:
     """Raise ValueError unless ``value`` is among ``choices``; name the nearest ones."""
     choices = list(choices)

@@ -25,6 +25,7 @@ from lfm_ppl.engine.task import Task, check_distinct
 from lfm_ppl.fitting import fit
 from lfm_ppl.inference.bound_model import bind
 from lfm_ppl.results import arviz_data, tables
+from lfm_ppl.results.checkpoint import digest
 
 FITS, SUMMARY, POSTERIORS, FAILED = "fits", "summary.csv", "posteriors.nc", "failed.csv"
 """What a folder of results holds: a file for each data set, and over all of them a table, draws, and what failed."""
@@ -281,9 +282,8 @@ def _task(model: Callable, name: str, value: Any, options: dict[str, Any], seed:
         except (TypeError, ValueError):
             raise TypeError(f"data set {name!r} must be (times, y) or lfm.Data, got {type(value).__name__}.") from None
     options = {"name": getattr(model, "__name__", "model"), "seed": seed_of(name, seed), **options}
-    digest = hashlib.sha256(repr((times.shape, y.shape)).encode() + times.tobytes() + y.tobytes()).hexdigest()[:16]
     named = {key: one for key, one in options.items() if key not in ("truth", "name", "seed", "model_kwargs")}
-    settings = {"data": digest, "model": _fingerprint(model, times, y, keywords, digests),
+    settings = {"data": digest(times, y), "model": _fingerprint(model, times, y, keywords, digests),
                 "options": _plain({**named, "model_kwargs": keywords})}
     if isinstance(value, Data):
         settings["named"] = _plain({"outputs": value.outputs, "units": dict(value.units), "origin": value.origin})

@@ -79,7 +79,7 @@ def forecast(result: Any, numpyro_model: Callable, times: Any, *, inputs: Mappin
     (2019), Applied Stochastic Differential Equations, chapter 9, for Gaussian moments and what they miss.
     """
     checks.positive_integer("draws", draws)
-    times = _checked_times(times)
+    times = checks.time_vector("times", times, order="non-decreasing")
     keywords = stored_inputs.keywords(result, model_kwargs)
     stored = stored_inputs.inputs_of(result)
     for name, later in (inputs or {}).items():
@@ -125,15 +125,3 @@ def check_possible(bound: Any, times: np.ndarray) -> None:
     build_time_grid(example.ssm, bound.times, example.steps, example.max_step, times, tolerance=example.tolerance)
     model = example.ssm.model
     model.check_span(float(bound.times[0]), float(max(times.max(), bound.times[-1])))
-
-
-def _checked_times(times: Any) -> np.ndarray:
-    times = np.atleast_1d(np.asarray(times, float))
-    if times.ndim != 1 or times.size == 0:
-        raise ValueError(f"times must be a vector (K,) with at least one time, got shape {times.shape}.")
-    checks.finite("times", times)
-    back = np.flatnonzero(np.diff(times) < 0)
-    if back.size:
-        row = int(back[0]) + 1
-        raise ValueError(f"times must not go back: entry {row} is {times[row]:g} after {times[row - 1]:g}. Sort them.")
-    return times

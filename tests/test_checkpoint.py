@@ -218,7 +218,7 @@ def test_other_versions_do_not_go_on(unfinished, monkeypatch):
 
 def test_one_process_at_a_time(unfinished):
     first = Checkpoint.resume(unfinished, json.loads((unfinished / "checkpoint" / "run.json").read_text()))
-    with pytest.raises(RuntimeError, match="another process is at work on the run in"):
+    with pytest.raises(RuntimeError, match="the run in .* is in use by another run"):
         fit("ram", checkpoint=unfinished, resume=True)
     first.close()
 
@@ -290,7 +290,7 @@ def test_a_check_goes_on_where_it_was_stopped(whole, tmp_path, monkeypatch):
 
 
 def test_where_there_is_no_terminal_lines_say_how_far_it_is(capfd, monkeypatch):
-    monkeypatch.setattr(progress, "EVERY_S", 0.0)
+    monkeypatch.setattr("lfm_ppl.progress.EVERY_S", 0.0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         lfm.fit(well, TIMES, Y, sampler="nuts", **SIZES)

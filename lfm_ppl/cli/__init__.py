@@ -24,7 +24,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     arguments = parsed(argv)
     arguments.line = list(sys.argv[1:] if argv is None else argv)
-    warnings.showwarning = _show_warning
+    warnings.showwarning = _Warnings()
     try:
         return int(arguments.run(arguments))
     except KeyboardInterrupt:
@@ -56,5 +56,15 @@ def _one_line(error: Exception) -> str:
     return f"{type(error).__name__}: {text} (--debug shows where)"
 
 
-def _show_warning(message, category, filename, lineno, file=None, line=None) -> None:
-    print(f"lfm-ppl: warning: {' '.join(str(message).split())}", file=sys.stderr)
+class _Warnings:
+    """Shows each warning once: Python forgets those it has shown where a library changes its filters."""
+
+    def __init__(self) -> None:
+        self._said: set[str] = set()
+
+    def __call__(self, message, category, filename, lineno, file=None, line=None) -> None:
+        """Print a warning in one line."""
+        text = " ".join(str(message).split())
+        if text not in self._said:
+            self._said.add(text)
+            print(f"lfm-ppl: warning: {text}", file=sys.stderr)

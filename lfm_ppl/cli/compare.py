@@ -20,8 +20,9 @@ PAGE = "index.html"
 def run(arguments: argparse.Namespace) -> int:
     """List the experiments, or run one: what its folder holds already is not computed again."""
     session.start(1, not arguments.no_cache, one_thread=True)  # so that one process finds the numbers of several
-    from lfm_ppl.engine.progress import Console, duration
+    from lfm_ppl.engine.progress import Console
     from lfm_ppl.experiments import catalogue
+    from lfm_ppl.progress import duration
     from lfm_ppl.results import tables, web_page
 
     if arguments.experiment is None:

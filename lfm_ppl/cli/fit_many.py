@@ -23,7 +23,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Fit every data set that the folder does not hold yet; return 1 where some failed."""
     from lfm_ppl import fit_many
     from lfm_ppl.cli import fit
-    from lfm_ppl.engine.progress import Console, duration
+    from lfm_ppl.engine.progress import Console
+    from lfm_ppl.progress import duration
     from lfm_ppl.results import tables
 
     workers = choices.workers(arguments.jobs, arguments.scheduler)

@@ -87,7 +87,8 @@ def rows(model: LatentForceModel, times: Any, grid: Any = None) -> Rows:
     origin = None if origin is None else checks.concrete(origin)
     if known is None or origin is None:
         raise ValueError("times and the model's initial_time must be known before compilation; pass NumPy arrays.")
-    wanted = _default_grid(known, float(origin)) if grid is None else _checked_grid(grid, float(origin))
+    wanted = (_default_grid(known, float(origin)) if grid is None else
+              checks.time_vector("grid", grid, float(origin), "increasing"))
     extra = np.setdiff1d(wanted, known)
     every = np.concatenate([known, extra])
     order = np.argsort(every, kind="stable")
@@ -111,23 +112,6 @@ def _default_grid(times: np.ndarray, origin: float) -> np.ndarray:
     inside = [begin + (end - begin) * np.arange(count) / count
               for begin, end, count in zip(nodes[:-1], nodes[1:], pieces, strict=True)]
     return np.concatenate([*inside, nodes[-1:]])
-
-
-def _checked_grid(grid: Any, origin: float) -> np.ndarray:
-    known = checks.concrete(grid)
-    if known is None:
-        raise ValueError("grid must be known before compilation; pass a NumPy array.")
-    known = np.atleast_1d(known).astype(float)
-    checks.finite("grid", known)
-    if known.ndim != 1 or known.size == 0:
-        raise ValueError(f"grid must be a vector of at least one time, got shape {known.shape}.")
-    back = np.flatnonzero(np.diff(known) <= 0)
-    if back.size:
-        raise ValueError(f"grid must increase: entry {back[0] + 1} is {known[back[0] + 1]:g} after "
-                         f"{known[back[0]]:g}.")
-    if known[0] < origin:
-        raise ValueError(f"grid[0] = {known[0]:g} lies before the initial time {origin:g}.")
-    return known
 
 
 def augmented(model: LatentForceModel, constraints: Constraints, laid_out: Rows) -> StateSpaceModel:

@@ -5,12 +5,9 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
-from typing import Any, TextIO
+from typing import TextIO
 
-from lfm_ppl import checks
-
-EVERY_S = 30.0
-"""Seconds between two lines of progress."""
+from lfm_ppl.progress import Clock, bar, duration, on_terminal
 
 
 class Console:
@@ -30,7 +27,7 @@ class Console:
     def begin(self, total: int, stored: int) -> Progress:
         """Return the progress of a run."""
         file = self.file or sys.stderr
-        return Bar(total, stored, file) if file.isatty() and stored < total else Progress(total, stored, self)
+        return Bar(total, stored, file) if on_terminal(file) and stored < total else Progress(total, stored, self)
 
 
 class Progress:
@@ -44,7 +41,7 @@ class Progress:
 
     def __init__(self, total: int, stored: int, report: Callable[[str], None] | None) -> None:
         self.total, self.missing, self.report = total, total - stored, report
-        self.finished, self.started, self.last = 0, time.perf_counter(), -float("inf")
+        self.finished, self.started, self._clock = 0, time.perf_counter(), Clock(at_once=True)
         if stored:
             self.say(f"{stored} of {total} tasks are stored already")
 
@@ -60,11 +57,9 @@ class Progress:
     def done(self, name: str) -> None:
         """Count a task that ended."""
         self.finished += 1
-        now = time.perf_counter()
-        if now - self.last < EVERY_S and self.finished < self.missing:
+        if not self._clock.due() and self.finished < self.missing:
             return
-        self.last = now
-        left = (now - self.started) / self.finished * (self.missing - self.finished)
+        left = (time.perf_counter() - self.started) / self.finished * (self.missing - self.finished)
         count = self.total - self.missing + self.finished
         self.say(f"{count}/{self.total} {name}" + (f", {duration(left)} left" if self.finished < self.missing else ""))
 
@@ -76,9 +71,7 @@ class Bar(Progress):
     """The same as a bar of tqdm."""
 
     def __init__(self, total: int, stored: int, file: TextIO) -> None:
-        from tqdm import tqdm
-
-        self.bar: Any = tqdm(total=total, initial=stored, file=file, unit="task", dynamic_ncols=True)
+        self.bar = bar(total, stored, file, unit="task", dynamic_ncols=True)
         super().__init__(total, stored, lambda line: self.bar.write(line, file=file))
 
     def begin(self) -> None:
@@ -93,18 +86,3 @@ class Bar(Progress):
     def close(self) -> None:
         """Leave the bar where it is."""
         self.bar.close()
-
-
-def duration(seconds: float) -> str:
-    """Return a length of time in the words of a person.
-
-    Example:
-        >>> [duration(s) for s in (0.4, 42.0, 400.0, 8000.0)]
-        ['0.4 s', '42 s', '7 min', '2.2 h']
-    """
-    checks.finite("seconds", seconds)
-    if seconds < 10:
-        return f"{seconds:.1f} s"
-    if seconds < 100:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"

@@ -4,23 +4,19 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
-import socket
 import warnings
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import filelock
 import numpy as np
 
-from lfm_ppl.engine.errors import FolderInUseError
+from lfm_ppl.engine.lock import FolderLock
 from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.results.files import writing
 
 _TASK = "__task__"
-_LOCK, _HOLDER = ".lock", ".held-by"
 
 
 class OtherSettingsError(ValueError):
@@ -36,21 +32,10 @@ def held(folder: str | Path) -> Iterator[Path]:
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    lock = filelock.FileLock(folder / _LOCK, thread_local=False)
+    lock = FolderLock(folder)
     try:
-        lock.acquire(timeout=0)
-    except filelock.Timeout:
-        holder = "another run"
-        with contextlib.suppress(OSError):
-            holder += f" ({(folder / _HOLDER).read_text(encoding='utf-8').strip()})"
-        raise FolderInUseError(f"{folder} is in use by {holder}. Wait until that ends, or choose another "
-                               "folder.") from None
-    try:
-        (folder / _HOLDER).write_text(f"process {os.getpid()} on {socket.gethostname()}\n", encoding="utf-8")
         yield folder
     finally:
-        with contextlib.suppress(OSError):
-            (folder / _HOLDER).unlink(missing_ok=True)
         lock.release()
 
 

@@ -195,17 +195,7 @@ def _concrete(times: np.ndarray, origin: float, jumps: tuple[float, ...], steps:
 
 
 def _requested(at: Any, origin: float) -> np.ndarray:
-    known = checks.concrete(at)
-    if known is None:
-        raise ValueError("the requested times `at` must be known before compilation; pass a NumPy array.")
-    known = np.atleast_1d(known).astype(float)
-    checks.finite("at", known)
-    if known.ndim != 1 or known.size == 0:
-        raise ValueError(f"at must be a vector of at least one time, got shape {known.shape}.")
-    if known.min() < origin:
-        raise ValueError(f"at[{int(known.argmin())}] = {known.min():g} lies before the initial time {origin:g}; set "
-                         "the model's initial_time earlier to look further back.")
-    return known
+    return checks.time_vector("at", at, origin, remedy="; set the model's initial_time earlier to look further back")
 
 
 def _distinct(length: np.ndarray, scale: float) -> tuple[np.ndarray | None, np.ndarray]:

@@ -15,8 +15,7 @@ from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.fingerprint import signature
 from lfm_ppl.inference.marginal_likelihood import SIMULATION_STEPS, MarginalLikelihood, Panel
-from lfm_ppl.linalg import matmul, semidefinite_root
-from lfm_ppl.model.observation_noise import expected_observation, noisy_observation
+from lfm_ppl.model.observation_noise import expected_observation, noisy_observation, with_noise
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.simulate import simulate_onwards
 from lfm_ppl.model.state_space import StateSpaceModel
@@ -127,7 +126,7 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
             return found
         output = jax.vmap(ssm.observe)(w, when)
         covariance = jax.vmap(ssm.obs_cov)(w[data], when[data], jnp.arange(len(data)))
-        replicated = _noisy(noise_key, output[data], covariance)
+        replicated = with_noise(noise_key, output[data], covariance)
         size = ssm.physical_dim
         found = {"state": w[there, :size], "force": w[there, size:], "output": output[there], "y": replicated}
         if smoothed is not None:
@@ -137,7 +136,7 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
         prediction = replicated
         if at is not None:
             covariance = jax.vmap(ssm.obs_cov)(w[there], when[there], jnp.zeros(len(there), int))
-            prediction = _noisy(jax.random.fold_in(noise_key, 1), output[there], covariance)
+            prediction = with_noise(jax.random.fold_in(noise_key, 1), output[there], covariance)
         mean, noise = output[there], jnp.diagonal(covariance, axis1=1, axis2=2)
         variance = jnp.zeros_like(noise)
         if smoothed is not None and _gaussian_outputs(ssm):
@@ -251,12 +250,6 @@ def _gaussian_outputs(ssm: StateSpaceModel) -> bool:
     observation = ssm.model.observation
     return not (ssm.drift_structure.points or ssm.observation_structure.points or observation.varies_with_state
                 or observation.angular)
-
-
-def _noisy(key: jax.Array, output: jax.Array, covariance: jax.Array) -> jax.Array:
-    """Return outputs (K, D) with noise of covariance (K, D, D)."""
-    noise = jax.random.normal(key, (*output.shape, 1))
-    return output + matmul(jax.vmap(semidefinite_root)(covariance), noise)[..., 0]
 
 
 def _particle_path(distribution: MarginalLikelihood, y: jax.Array, at: Any, key: jax.Array,

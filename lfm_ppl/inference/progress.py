@@ -1,4 +1,4 @@
-"""How far a computation is: a bar on a terminal, a line now and then elsewhere."""
+"""How far chains are, and what is computed at their draws."""
 
 from __future__ import annotations
 
@@ -7,13 +7,7 @@ import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-EVERY_S = 30.0
-"""Between two lines, where no terminal redraws one."""
-
-
-def on_terminal() -> bool:
-    """Whether a line on standard error can be redrawn: a terminal or a notebook."""
-    return sys.stderr.isatty() or "ipykernel" in sys.modules
+from lfm_ppl.progress import Clock, bar, duration, on_terminal
 
 
 class Stage(NamedTuple):
@@ -45,13 +39,11 @@ class Progress:
         self._total, self._done, self._shown = total, done, shown
         self._bar: Any = None
         self._first: tuple[float, int] | None = None
-        self._said = time.perf_counter()
+        self._clock = Clock()
 
     def __enter__(self) -> Progress:
         if self._shown and on_terminal():
-            from tqdm.auto import tqdm
-
-            self._bar = tqdm(total=self._total, initial=self._done, file=sys.stderr)
+            self._bar = bar(self._total, self._done)
         return self
 
     def __exit__(self, *error: Any) -> None:
@@ -65,8 +57,7 @@ class Progress:
             what = stage()
             self._bar.set_postfix_str(_divergences(what, ", ") + what.words, refresh=False)
             self._bar.update(done - self._done)
-        elif self._shown and now - self._said >= EVERY_S:
-            self._said = now
+        elif self._shown and self._clock.due():
             what = stage()
             print(f"sampling {done:,} of {self._total:,} steps, {what.draws:,} of {what.samples:,} draws a chain, "
                   f"{_divergences(what, ', ')}{what.words}{self._left(now, done)}", file=sys.stderr, flush=True)
@@ -77,7 +68,7 @@ class Progress:
     def _left(self, now: float, done: int) -> str:
         if self._first is None or done <= self._first[1]:
             return ""
-        return f"; about {_duration((now - self._first[0]) / (done - self._first[1]) * (self._total - done))} left"
+        return f"; about {duration((now - self._first[0]) / (done - self._first[1]) * (self._total - done))} left"
 
 
 class Counter:
@@ -90,7 +81,7 @@ class Counter:
 
     def __init__(self, label: str = "", shown: bool = True) -> None:
         self._label, self._shown = label, shown
-        self._said = time.perf_counter()
+        self._clock = Clock()
 
     def of(self, label: str) -> Counter:
         """Return the counter, for something else."""
@@ -104,8 +95,7 @@ class Counter:
         text = f"{self._label}: {done:,} of {count:,} draws"
         if on_terminal():
             print(f"\r{text:<70}\r", end="", file=sys.stderr, flush=True)
-        elif time.perf_counter() - self._said >= EVERY_S:
-            self._said = time.perf_counter()
+        elif self._clock.due():
             print(text, file=sys.stderr, flush=True)
 
     def close(self) -> None:
@@ -118,15 +108,3 @@ def _divergences(stage: Stage, end: str) -> str:
     if not stage.divergences:
         return ""
     return f"{stage.divergences:,} divergence{'s' * (stage.divergences > 1)}{end}"
-
-
-def _duration(seconds: float) -> str:
-    """Return a time in the unit in which it is read best.
-
-    Example:
-        >>> _duration(42.0), _duration(600.0), _duration(9000.0)
-        ('42 s', '10 min', '2.5 h')
-    """
-    if seconds < 120:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

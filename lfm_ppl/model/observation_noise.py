@@ -57,9 +57,14 @@ def noisy_observation(ssm: StateSpaceModel, w: jax.Array, t: jax.Array, key: jax
     family, predictor = ssm.model.observation, ssm.observe(w, t)
     if isinstance(family, ObservationFamily):
         return (family.typical() if row is None else family.at(row)).sample(key, predictor)
-    covariance = ssm.obs_cov(w, t, row)
-    draw = jax.random.normal(key, (covariance.shape[0], 1))
-    return predictor + matmul(semidefinite_root(covariance), draw)[:, 0]
+    return with_noise(key, predictor, ssm.obs_cov(w, t, row))
+
+
+def with_noise(key: jax.Array, mean: jax.Array, covariance: jax.Array) -> jax.Array:
+    """Return a draw of N(mean, covariance): (D,) and (D, D), or (K, D) and (K, D, D)."""
+    root = semidefinite_root if covariance.ndim == 2 else jax.vmap(semidefinite_root)
+    noise = jax.random.normal(key, (*mean.shape, 1))
+    return mean + matmul(root(covariance), noise)[..., 0]
 
 
 def expected_observation(ssm: StateSpaceModel, w: jax.Array, t: jax.Array) -> jax.Array:

@@ -31,13 +31,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.engine.errors import FolderInUseError
+from lfm_ppl.engine import lock
+from lfm_ppl.engine.lock import FolderLock
 from lfm_ppl.inference.sampling import Saved
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.files import POSTERIOR, writing
 
 FOLDER = "checkpoint"
-_RUN, _SETUP, _STATE, _LOCK = "run.json", "setup.json", "state.npz", "lock"
+_RUN, _SETUP, _STATE = "run.json", "setup.json", "state.npz"
 
 _SHOWN = 6
 """Differences between two runs that a message names; the others are counted."""
@@ -63,7 +64,7 @@ class Checkpoint:
         self.record: dict[str, Any] = {}
         self.look = _no_look
         self._own = folder / FOLDER
-        self._lock: Any = None
+        self._lock: FolderLock | None = None
         self._written = 0
         self._saved = self._looked = time.perf_counter()
         self._look_took = 0.0
@@ -209,30 +210,17 @@ class Checkpoint:
         for path in self._own.iterdir():
             if path.is_dir():
                 shutil.rmtree(path)
-            elif path.name != _LOCK:
+            elif path.name not in (lock.FILE, lock.HOLDER):
                 path.unlink()
 
     def _hold(self) -> None:
-        """Keep other processes from going on with the same run; the system lets go when this one ends."""
-        try:
-            import fcntl
-        except ImportError:  # not a POSIX system
-            return
-        self._lock = (self._own / _LOCK).open("w")
-        try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            self._lock.close()
-            raise FolderInUseError(f"another process is at work on the run in {self.folder}; wait for it, or end it "
-                               "first.") from None
-        except OSError:  # a file system without locks
-            pass
+        """Keep other processes from going on with the same run."""
+        self._lock = FolderLock(self._own, f"the run in {self.folder}")
 
     def _release(self) -> None:
         if self._lock is not None:
-            self._lock.close()
+            self._lock.release()
             self._lock = None
-
 
 
 class Parts:

@@ -16,11 +16,11 @@ import pytest
 from lfm_ppl.engine import cluster, progress
 from lfm_ppl.engine.cluster import Cluster, started
 from lfm_ppl.engine.errors import ClusterError, FolderInUseError, TasksFailedError
-from lfm_ppl.engine.progress import duration
 from lfm_ppl.engine.run import outcomes, run_tasks
 from lfm_ppl.engine.store import read, write
 from lfm_ppl.engine.task import Task
 from lfm_ppl.engine.worker import return_memory
+from lfm_ppl.progress import duration
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -212,7 +212,7 @@ def test_a_step_is_that_of_numpyros_nuts(model):
 
 
 def test_thinning_and_blocks_keep_the_last_step_of_each_draw(capfd, monkeypatch):
-    monkeypatch.setattr("lfm_ppl.inference.progress.EVERY_S", 0.0)
+    monkeypatch.setattr("lfm_ppl.progress.EVERY_S", 0.0)
     bound = lfm.bind(small, TIMES, Y)
     kernel = lfm.RAM(small, initial_scale=0.1)
     starts = np.stack([bound.unconstrain({"decay": 0.8})] * 2)

@@ -41,8 +41,8 @@ def plot_fit(
     difference of the two, interpolated linearly. Replicates are pooled.
 
     Args:
-        result: with the groups observed_data and trajectories; posterior_predictive for the outer band, and
-            predictions for forecasts.
+        result: with the groups observed_data and trajectories, posterior_predictive for the outer band, and
+            predictions for forecasts, which alone are drawn of a result without trajectories, such as a partial one.
         outputs: names; None for all, up to 12.
         width: "column" (3.4 in), "full" (7 in), or inches.
 
@@ -65,18 +65,20 @@ def plot_fit(
         'mRNA (nM)'
     """
     observed = group(result, "observed_data")["y"].transpose("time", "output")
-    noise_free = _trajectories(result, "output")
     predictive = _predictive(result)
     predicted = _predicted(result)
+    alone = predicted is not None and not has_group(result, "trajectories")
+    noise_free = None if alone else _trajectories(result, "output")
     forecast = False
     names, note = style.first_of(pick(observed, "output", outputs), outputs, MAX_PANELS, "outputs")
     figure, panels = style.small_multiples(width, len(names), 1.35)
     for axes, name in zip(panels, names, strict=True):
         data = observed.sel(output=name)
-        time, mean, low, high = _band(noise_free.sel(output=name))
-        if predicted is not None and _covers(predicted["time"].values, time):
+        if noise_free is None or (predicted is not None and
+                                  _covers(predicted["time"].values, noise_free["at"].values)):
             _draw_forecast(axes, predicted.sel(output=[name]))
         else:
+            time, mean, low, high = _band(noise_free.sel(output=name))
             if predictive is not None:
                 outer = _widened(predictive.sel(output=name), time, low, high)
                 axes.fill_between(*outer, color=_PREDICTIVE, lw=0, zorder=1)
