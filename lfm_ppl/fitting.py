@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import inspect
 import json
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from numpyro.infer import init_to_median, init_to_value
 
 from lfm_ppl import checks
-from lfm_ppl.data import as_data, model_keywords
+from lfm_ppl.data import Data, as_data, model_keywords
 from lfm_ppl.filtering.breakdown import FilterWarning, breakdown
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference import sampling
@@ -170,21 +172,12 @@ def fit(
         (1, 50)
     """
     started = time.perf_counter()
-    checks.one_of("sampler", sampler, SAMPLERS)
+    _check_sizes(sampler, chains, warmup, samples, thin, trajectory_draws)
     check_options(sampler, sampler_options)
-    for label, value in (("chains", chains), ("samples", samples)):
-        checks.positive_integer(label, value)
-    if warmup != 0:
-        checks.positive_integer("warmup", warmup)
-    if thin is not None:
-        checks.positive_integer("thin", thin)
-    if trajectory_draws != 0:
-        checks.positive_integer("trajectory_draws", trajectory_draws)
     if checkpoint is None and resume:
         raise ValueError("resume goes on with a run that a folder keeps; name the folder, checkpoint=...")
     if checkpoint is not None:
         checkpoints.check_folder(checkpoint, resume, overwrite)
-    keys = jax.random.split(jax.random.key(seed), 5)
     data = None
     if y is None:
         data = as_data(times)
@@ -203,110 +196,221 @@ def fit(
     else:
         thin = thin or _STEPS_A_DRAW.get(sampler, 0) * bound.size or 1
         method = sampling.available_method(chain_method, chains)
-    example = bound.site.example
-    described = {
-        "rule": example.rule.name, "steps": example.steps, "max_step": example.max_step,
-        "iterations": example.iterations, "tolerance": example.tolerance, "sampler": sampler, "seed": seed,
-        "chains": chains, "warmup": warmup, "samples": samples,
-        "fixed": json.dumps({k: np.asarray(v).tolist() for k, v in (fixed or {}).items()}),
-    }
-    record = {
-        **described, "thin": thin, "chain_method": method, "init": init, "sampler_options": dict(sampler_options or {}),
-        "trajectory_draws": trajectory_draws, "parameters": bound.names, "model": checkpoints.digest(fingerprint),
-        "times": checkpoints.digest(bound.times), "data": checkpoints.digest(bound.y),
-        "times of the trajectories": None if at is None else checkpoints.digest(np.asarray(at, float)),
-        "versions": checkpoints.versions(),
-    }  # fmt: skip
-    call = _call(str(name or getattr(numpyro_model, "__name__", "model")), "times, y" if data is None else "data", {
-        **{label: record[label] for label in ("sampler", "chains", "warmup", "samples", "thin", "seed",
-                                              "trajectory_draws", "chain_method", "init", "sampler_options")},
-        "fixed": json.loads(str(described["fixed"]))}, at=at, model_kwargs=model_kwargs)
-    run = None
+    asked = _Asked(sampler, chains, warmup, samples, thin, seed, dict(fixed or {}), at, trajectory_draws, init,
+                   dict(sampler_options or {}), method)
+    title = str(name or getattr(numpyro_model, "__name__", "model"))
+    call = _call(title, "times, y" if data is None else "data", asked, model_kwargs)
+    run = _Run(bound, asked, labels, data, truth, progress, started, {
+        "model": title, "description": described_by(numpyro_model), "call": call, **asked.described(bound)},
+        dict(attributes or {}))
     if checkpoint is not None:
+        record = asked.record(bound, fingerprint)
         if resume and (finished := checkpoints.finished(checkpoint, record)) is not None:
             return finished
-        run = checkpoints.begin_or_resume(checkpoint, record, resume)
-
-    def built(draws: dict, stats: dict, remarks: dict, rated: Any = None, drawn: tuple = (None, None, None),
-              partial: str | None = None) -> Any:
-        chosen, paths, grid = drawn
-        seconds = time.perf_counter() - started if run is None else run.seconds
-        attrs = {
-            "model": name or getattr(numpyro_model, "__name__", "model"), "description": described_by(numpyro_model),
-            "call": call, **described,
-            "wall_time_s": round(seconds, 3),
-            "versions": json.dumps(versions()),
-            "created_at": datetime.now(UTC).isoformat(timespec="seconds"), **remarks, "partial": partial,
-            "run": None if run is None else run.record, **dict(attributes or {}),
-        }
-        groups = lay_out(bound, draws, stats, rated, paths, chosen, grid, truth, labels)
-        attrs |= {} if data is None else remember(groups, data)
-        return arviz_data.build(groups, {k: v for k, v in attrs.items() if v is not None})
-
-    def stored(result: Any) -> Any:
-        if run is not None:
-            arviz_data.save(result, run.folder / POSTERIOR, overwrite=True)
-        return result
-
-    partial = None
-    with checkpoints.closing(run):
-        if sampler == "map":
-            with _start_explained(bound):
-                draws, stats, remarks = _mode(bound, keys[1], samples, seed, init, run)
-        else:
-            assert thin is not None
-            with _start_explained(bound):
-                setup = run.setup if run is not None and run.started else None
-                transition, starts, remarks = _transition(sampler, bound, sampler_options, init, keys[2], seed, chains,
-                                                          warmup * thin, setup)
-                if run is not None and setup is None:
-                    run.setup = {key: remarks[key] for key in ("particles", "log_likelihood_sd") if key in remarks}
-                remarks["thin"] = thin
-                shown = {key: value for key, value in remarks.items() if key not in _OF_PARTICLES}
-                if run is not None:
-                    run.look = lambda rows: kept("partial result", lambda: stored(built(
-                        *_draws(bound, rows, samples), shown, partial=_some(rows["z"].shape[1], samples))), None)
-                collected = sampling.sample(keys[1], bound, transition, starts, warmup=warmup * thin, samples=samples,
-                                            thin=thin, chain_method=method, progress=progress, keeper=run)
-            if collected.z.shape[1] == 0:
-                raise KeyboardInterrupt(f"stopped in the warm-up, after {collected.done:,} of {collected.total:,} "
-                                        "steps; there are no draws yet")
-            if collected.done < collected.total:
-                partial = _some(collected.z.shape[1], samples)
-            draws, stats = _draws(bound, {"z": collected.z, **collected.statistics}, samples)
-        particles = {label: remarks.pop(label, None) for label in _OF_PARTICLES}
-        flat = {site: draws[site].reshape(-1, *draws[site].shape[2:]) for site in bound.sites}
-        rated: Any = None
-        drawn: tuple = (None, None, None)
-        if partial is None:
-            if run is not None:  # the draws are safe, whatever comes
-                stored(built(draws, stats, remarks, partial=_BARE))
-
-            counter = Counter(shown=progress)
-
-            def watched(what: str) -> dict[str, Any]:
-                return {"show": counter.of(what), "parts": None if run is None else run.parts(what)}
-
-            try:
-                rated = kept("scores of the observations", lambda: scores(bound, flat, **watched("scores")), None)
-                drawn = kept("trajectories", lambda: draw_paths(keys[3], bound, flat, at, trajectory_draws, chains,
-                                                                samples, **particles, **watched("trajectories")), drawn)
-                counter.close()
-            except KeyboardInterrupt:
-                partial = _BARE if rated is None else "all draws and their scores, without trajectories"
-        result = built(draws, stats, remarks, rated, drawn, partial)
+        run.keeper = checkpoints.begin_or_resume(checkpoint, record, resume)
+    with checkpoints.closing(run.keeper):
+        with _start_explained(bound):
+            run.sample()
+        run.follow()
+        result = run.result()
         found = note_warnings(result)
-        stored(result)
-        if run is not None and partial is None:
-            run.finish()
-    if partial is not None:
-        if run is None:
+        run.store(result)
+        if run.keeper is not None and run.partial is None:
+            run.keeper.finish()
+    if run.partial is not None:
+        if run.keeper is None:
             # Who runs one fit after another wants them all to end, and takes none for whole that is not.
-            raise _Stopped(result, f"stopped with {partial}; they are in the attribute `result` of this exception "
+            raise _Stopped(result, f"stopped with {run.partial}; they are in the attribute `result` of this exception "
                                    "(sys.last_value.result). With a folder, checkpoint=..., fit returns them")
-        warnings.warn(f"the run was stopped, and its result is partial: {partial}.", stacklevel=2)
+        warnings.warn(f"the run was stopped, and its result is partial: {run.partial}.", stacklevel=2)
     warn_of_convergence(found)
     return result
+
+
+def _check_sizes(sampler: str, chains: int, warmup: int, samples: int, thin: int | None, paths: int) -> None:
+    checks.one_of("sampler", sampler, SAMPLERS)
+    for label, value, none in (("chains", chains, ()), ("samples", samples, ()), ("warmup", warmup, (0,)),
+                               ("thin", thin, (None,)), ("trajectory_draws", paths, (0,))):
+        if value not in none:
+            checks.positive_integer(label, value)
+
+
+class _Asked(NamedTuple):
+    """How to sample, as `fit` was asked; its arguments are described there.
+
+    Attributes:
+        thin: steps of a draw; None for "map".
+        method: how the chains run side by side.
+    """
+
+    sampler: str
+    chains: int
+    warmup: int
+    samples: int
+    thin: int | None
+    seed: int
+    fixed: dict[str, Any]
+    at: Any
+    trajectory_draws: int
+    init: Any
+    options: dict[str, Any]
+    method: str | None
+
+    @property
+    def keys(self) -> jax.Array:
+        """Random keys: of the chains, their starts, and the trajectories, among others."""
+        return jax.random.split(jax.random.key(self.seed), 5)
+
+    def described(self, bound: BoundModel) -> dict[str, Any]:
+        """Return what the attributes of the result say of the approximation and the sampler."""
+        example = bound.site.example
+        return {
+            "rule": example.rule.name, "steps": example.steps, "max_step": example.max_step,
+            "iterations": example.iterations, "tolerance": example.tolerance, "sampler": self.sampler,
+            "seed": self.seed, "chains": self.chains, "warmup": self.warmup, "samples": self.samples,
+            "fixed": json.dumps({k: np.asarray(v).tolist() for k, v in self.fixed.items()}),
+        }  # fmt: skip
+
+    def record(self, bound: BoundModel, fingerprint: Any) -> dict[str, Any]:
+        """Return all that a run must share with one that it goes on with."""
+        return {
+            **self.described(bound), "thin": self.thin, "chain_method": self.method, "init": self.init,
+            "sampler_options": self.options, "trajectory_draws": self.trajectory_draws, "parameters": bound.names,
+            "model": checkpoints.digest(fingerprint), "times": checkpoints.digest(bound.times),
+            "data": checkpoints.digest(bound.y),
+            "times of the trajectories": None if self.at is None else checkpoints.digest(np.asarray(self.at, float)),
+            "versions": checkpoints.versions(),
+        }  # fmt: skip
+
+
+@dataclass
+class _Run:
+    """A run of `fit`: what it is of, how far it is, and where it is kept.
+
+    Attributes:
+        bound: the model with its data, without the parameters that are fixed.
+        asked: how to sample.
+        labels: names of dimensions and entries.
+        data: as they were given, with known inputs; None where times and y were.
+        truth: of simulated data.
+        progress: whether to show how far it is.
+        started: when it began.
+        described: attributes of the result, but for those that come of sampling.
+        attributes: those that the user wants besides.
+        keeper: what keeps it in a folder; None: nothing does.
+        draws: site -> (C, N, ...), so far.
+        stats: statistics of the sampler, (C, N) each.
+        remarks: attributes that come of sampling.
+        particles: what trajectories of "pmmh" need to know of its particles.
+        rated: scores of the observations; None where there are none yet.
+        drawn: chosen draws, their trajectories, and the times of these.
+        partial: what a result that was stopped lacks; None: nothing.
+    """
+
+    bound: BoundModel
+    asked: _Asked
+    labels: Labels
+    data: Data | None
+    truth: Mapping[str, Any] | None
+    progress: bool
+    started: float
+    described: dict[str, Any]
+    attributes: dict[str, Any]
+    keeper: Checkpoint | None = None
+    draws: dict[str, np.ndarray] = field(default_factory=dict)
+    stats: dict[str, np.ndarray] = field(default_factory=dict)
+    remarks: dict[str, Any] = field(default_factory=dict)
+    particles: dict[str, Any] = field(default_factory=dict)
+    rated: Any = None
+    drawn: tuple = (None, None, None)
+    partial: str | None = None
+
+    def sample(self) -> None:
+        """Draw parameters, or find the mode; after Ctrl-C, as far as it came.
+
+        Raises:
+            KeyboardInterrupt: there are no draws.
+        """
+        asked, keeper = self.asked, self.keeper
+        key = asked.keys[1]
+        if asked.sampler == "map":
+            self.draws, self.stats, self.remarks = _mode(self.bound, key, asked.samples, asked.seed, asked.init, keeper)
+            return
+        assert asked.thin is not None
+        warmup = asked.warmup * asked.thin
+        setup = keeper.setup if keeper is not None and keeper.started else None
+        transition, starts, remarks = _transition(asked.sampler, self.bound, asked.options, asked.init, asked.keys[2],
+                                                  asked.seed, asked.chains, warmup, setup)
+        if keeper is not None:
+            if setup is None:
+                keeper.setup = {name: remarks[name] for name in ("particles", "log_likelihood_sd") if name in remarks}
+            keeper.look = self._look
+        self.particles = {label: remarks.pop(label, None) for label in _OF_PARTICLES}
+        self.remarks = {**remarks, "thin": asked.thin}
+        collected = sampling.sample(key, self.bound, transition, starts, warmup=warmup, samples=asked.samples,
+                                    thin=asked.thin, chain_method=asked.method, progress=self.progress, keeper=keeper)
+        count = collected.z.shape[1]
+        if count == 0:
+            raise KeyboardInterrupt(f"stopped in the warm-up, after {collected.done:,} of {collected.total:,} steps; "
+                                    "there are no draws yet")
+        if collected.done < collected.total:
+            self.partial = _some(count, asked.samples)
+        self.draws, self.stats = _draws(self.bound, {"z": collected.z, **collected.statistics}, asked.samples)
+
+    def follow(self) -> None:
+        """Compute what follows from the draws, scores of the observations and trajectories; after Ctrl-C, less."""
+        if self.partial is not None:
+            return
+        asked, keeper = self.asked, self.keeper
+        if keeper is not None:  # the draws are safe, whatever comes
+            self.store(self.result(_BARE))
+        flat = {site: self.draws[site].reshape(-1, *self.draws[site].shape[2:]) for site in self.bound.sites}
+        counter = Counter(shown=self.progress)
+
+        def watched(what: str) -> dict[str, Any]:
+            return {"show": counter.of(what), "parts": None if keeper is None else keeper.parts(what)}
+
+        try:
+            self.rated = kept("scores of the observations",
+                              lambda: scores(self.bound, flat, **watched("scores")), None)
+            self.drawn = kept("trajectories", lambda: draw_paths(
+                asked.keys[3], self.bound, flat, asked.at, asked.trajectory_draws, asked.chains, asked.samples,
+                **{label: self.particles.get(label) for label in _OF_PARTICLES}, **watched("trajectories")), self.drawn)
+            counter.close()
+        except KeyboardInterrupt:
+            self.partial = _BARE if self.rated is None else "all draws and their scores, without trajectories"
+
+    def result(self, partial: str | None = None) -> Any:
+        """Return an ArviZ object of what there is.
+
+        Args:
+            partial: what it lacks; None: what the run says.
+        """
+        seconds = time.perf_counter() - self.started if self.keeper is None else self.keeper.seconds
+        attrs = {
+            **self.described, "wall_time_s": round(seconds, 3), "versions": json.dumps(versions()),
+            "created_at": datetime.now(UTC).isoformat(timespec="seconds"), **self.remarks,
+            "partial": partial or self.partial, "run": None if self.keeper is None else self.keeper.record,
+            **self.attributes,
+        }  # fmt: skip
+        chosen, paths, grid = self.drawn
+        groups = lay_out(self.bound, self.draws, self.stats, self.rated, paths, chosen, grid, self.truth, self.labels)
+        attrs |= {} if self.data is None else remember(groups, self.data)
+        return arviz_data.build(groups, {k: v for k, v in attrs.items() if v is not None})
+
+    def store(self, result: Any) -> None:
+        """Write a result into the folder, where there is one."""
+        if self.keeper is not None:
+            arviz_data.save(result, self.keeper.folder / POSTERIOR, overwrite=True)
+
+    def _look(self, rows: Mapping[str, np.ndarray]) -> None:
+        """Write a partial result of rows that the chains have left so far."""
+        def write() -> None:
+            draws, stats = _draws(self.bound, rows, self.asked.samples)
+            so_far = dataclasses.replace(self, draws=draws, stats=stats)
+            self.store(so_far.result(_some(rows["z"].shape[1], self.asked.samples)))
+
+        kept("partial result", write, None)
 
 
 class _Stopped(KeyboardInterrupt):
@@ -527,11 +631,19 @@ def described_by(numpyro_model: Any) -> str | None:
     return inspect.getdoc(numpyro_model) if inspect.isroutine(numpyro_model) else None
 
 
-def _call(model: str, data: str, arguments: Mapping[str, Any], **objects: Any) -> str:
-    """Return the call of `fit` as text; ``objects`` are named where they were given, since text cannot hold them."""
+def _call(model: str, data: str, asked: _Asked, model_kwargs: Mapping[str, Any] | None) -> str:
+    """Return the call of `fit` as text, in which objects that text cannot hold are named where they were given."""
+    arguments = {
+        "sampler": asked.sampler, "chains": asked.chains, "warmup": asked.warmup, "samples": asked.samples,
+        "thin": asked.thin, "seed": asked.seed, "trajectory_draws": asked.trajectory_draws,
+        "chain_method": asked.method, "init": asked.init, "sampler_options": asked.options,
+        "fixed": {name: np.asarray(value).tolist() for name, value in asked.fixed.items()},
+    }  # fmt: skip
     given = [f"{label}={value!r}" if isinstance(value, (str, int, float, dict)) else f"{label}={label}"
              for label, value in arguments.items() if value is not None and value != {}]
-    return f"lfm.fit({', '.join([model, data, *given, *(f'{k}={k}' for k, v in objects.items() if v is not None)])})"
+    named = [f"{label}={label}" for label, value in (("at", asked.at), ("model_kwargs", model_kwargs))
+             if value is not None]
+    return f"lfm.fit({', '.join([model, data, *given, *named])})"
 
 
 def versions() -> dict[str, str]:

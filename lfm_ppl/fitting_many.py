@@ -288,7 +288,7 @@ def _task(model: Callable, name: str, value: Any, options: dict[str, Any], seed:
     if isinstance(value, Data):
         settings["named"] = _plain({"outputs": value.outputs, "units": dict(value.units), "origin": value.origin})
     data = (value, None) if isinstance(value, Data) else (times, y)
-    return Task(_file_name(name), seed, settings, (*data, options))
+    return Task(file_name(name), seed, settings, (*data, options))
 
 
 def _fingerprint(model: Callable, times: np.ndarray, y: np.ndarray, keywords: Any, digests: dict[Any, str]) -> str:
@@ -320,7 +320,7 @@ def _plain(value: Any) -> Any:
     return re.sub(r" at 0x[0-9a-f]+", "", getattr(value, "__qualname__", repr(value)))
 
 
-def _file_name(name: str) -> str:
+def file_name(name: str) -> str:
     """Return the name as a file may have it; what had to be changed gets a digest, so that no two become one."""
     safe = re.sub(r"[^A-Za-z0-9_.()-]", "_", name)[:80]
     safe = safe if safe.strip(".") else f"_{safe}"

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from lfm_ppl import loading
+from lfm_ppl import cli, loading
 from lfm_ppl.cli import choices, main, results
 from lfm_ppl.results import arviz_data
 
@@ -383,3 +383,10 @@ ANCHORS = {"sensitivity[C]": 1.0, "decay[C]": 0.8}
 )
 def test_what_the_user_fixes_wins_over_the_anchors(given, expected):
     assert choices.fixed(given, ANCHORS) == expected
+
+
+def test_a_warning_is_shown_once(capsys):
+    show = cli._Warnings()
+    for text in ("the input\n ends", "the input ends", "another"):
+        show(UserWarning(text), UserWarning, "file", 1)
+    assert capsys.readouterr().err == "lfm-ppl: warning: the input ends\nlfm-ppl: warning: another\n"

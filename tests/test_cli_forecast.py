@@ -73,6 +73,15 @@ def test_forecast_of_a_stored_result_writes_table_figure_group_and_scores(result
     assert len(arviz_data.group(arviz_data.load(result), "predictions")["time"]) > 200  # what was there is kept
 
 
+def test_a_forecast_of_a_partial_result_has_its_figure(result, capsys):
+    whole = arviz_data.load(result)
+    partial = arviz_data.build({name: arviz_data.group(whole, name) for name in ("posterior", "observed_data")},
+                               {**arviz_data.attributes(whole), "partial": "60 of 90 draws a chain"})
+    arviz_data.save(partial, result / "posterior.nc", overwrite=True)
+    code, out, err = run(f"forecast {result} --until 8", capsys)
+    assert code == 0 and f"wrote    {result / 'forecast.png'}" in out, err
+
+
 def test_predictions_that_exist_are_replaced_only_if_asked(result, capsys):
     before = arviz_data.group(arviz_data.load(result), "predictions")
     code, _, err = run(f"forecast {result} --at 9", capsys)

@@ -197,9 +197,28 @@ def test_each_of_many_files_and_one_that_cannot_be_read(line, tmp_path):
     assert code == 1 and "3 data sets" in out and "noise_sd" in out and "1/2 0" in err
     assert "failed: bad: patients/bad.csv, row 3, column 'a': expected a number" in err and "1 of 3 data sets" in err
     assert list(pd.read_csv(tmp_path / "many" / "failed.csv")["data set"]) == ["bad"]
+    written = tmp_path / "many" / "results"
+    assert sorted(path.relative_to(written).as_posix() for path in written.rglob("*.*")) == sorted(
+        f"{k}/{name}" for k in range(2) for name in ("posterior.nc", "report.html", "summary.csv"))
+    attrs = lfm.load(written / "1").attrs
+    assert attrs["model_file"] == str(tmp_path / "motif.py") and attrs["data"] == "patients/*.csv"
+    before = (written / "0" / "posterior.nc").stat().st_mtime_ns
     csv(tmp_path / "patients" / "bad.csv", rows(5))
     code, out, err = line("--data patients/*.csv --each --out many")
     assert code == 0 and "2 of 3 tasks are stored already" in err
+    assert (written / "0" / "posterior.nc").stat().st_mtime_ns == before and (written / "bad" / "report.html").is_file()
+
+
+@pytest.mark.slow
+def test_a_result_of_many_is_checked_forecast_and_drawn(tmp_path, monkeypatch, capsys):
+    csv(tmp_path / "patients" / "0.csv", rows(0))
+    code, out, _ = command(tmp_path, monkeypatch, capsys)("--data patients/*.csv --each --out many")
+    assert code == 0 and "lfm-ppl plot RESULT" in out
+    for words in ("check many/results/0 --draws 10", f"forecast many/results/0 --until {TIMES[-1] + 2}",
+                  "plot many/results/0"):
+        assert main(words.split()) == 0, capsys.readouterr().err
+    assert {"accuracy.csv", "forecast.csv", "forecast.png", "fit.png"} <= {
+        path.name for path in (tmp_path / "many" / "results" / "0").iterdir()}
 
 
 @pytest.mark.slow

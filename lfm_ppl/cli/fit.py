@@ -62,7 +62,8 @@ def run(arguments: argparse.Namespace) -> int:
             partial = arviz_data.attributes(posterior).get("partial")
             if watch is not None and partial is not None:
                 watch.answered()
-            if finished and partial is None and (folder / results.SUMMARY).is_file():
+            # The page is written last, so that a run that was killed at its figures draws them now.
+            if finished and partial is None and page.exists(folder):
                 print(f"\nthe run in {folder} is finished; nothing was changed")
                 return 0
             seconds = time.perf_counter() - started
@@ -214,15 +215,6 @@ def sample(
     """
     import lfm_ppl
 
-    # What `lfm-ppl check` rebuilds the model from, in the words of the command line.
-    attributes = {
-        "model_file": model.name if loading.available().get(model.name) == model.path else str(model.path),
-        "settings": json.dumps({name: getattr(arguments, name) for name in SETTINGS}),
-        "options": json.dumps(options), "data": arguments.data or "simulated",
-        "description": model.description, "command_line": page.command_line(arguments),
-    }  # fmt: skip
-    if observed.note:
-        attributes["note"] = observed.note
     return lfm_ppl.fit(
         approximated(arguments, model),
         observed,
@@ -235,9 +227,21 @@ def sample(
         checkpoint=folder,
         resume=arguments.resume,
         overwrite=arguments.overwrite,
-        attributes=attributes,
+        attributes=attributes(arguments, model, observed, options),
         **sampling(arguments, model),
     )
+
+
+def attributes(arguments: argparse.Namespace, model: loading.ModelFile, observed: data.Data,
+               options: dict[str, Any]) -> dict[str, Any]:
+    """Return what a result must remember for `lfm-ppl check` and `forecast`, in the words of the command line."""
+    return {
+        "model_file": model.name if loading.available().get(model.name) == model.path else str(model.path),
+        "settings": json.dumps({name: getattr(arguments, name) for name in SETTINGS}),
+        "options": json.dumps(options), "data": arguments.data or "simulated",
+        "description": model.description, "command_line": page.command_line(arguments),
+        **({"note": observed.note} if observed.note else {}),
+    }  # fmt: skip
 
 
 def approximated(arguments: argparse.Namespace, model: loading.ModelFile) -> Any:

@@ -15,6 +15,9 @@ from typing import Any
 from lfm_ppl import data, loading
 from lfm_ppl.cli import choices, results, session
 
+RESULTS = "results"
+"""Folder with a folder for each data set, as `lfm-ppl fit` writes one: ``lfm-ppl check OUT/results/NAME``."""
+
 _SHOWN = 10
 """Data sets that failed whose reasons are printed; ``failed.csv`` has them all."""
 
@@ -64,15 +67,35 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"model    {model.name}: {model.summary}" if model.summary else f"model    {model.name}")
         print(f"data     {arguments.data}: {len(fits)} data sets", flush=True)
         started = time.perf_counter()
-        fits.run()
+        for one in fits:
+            if one.result is not None:
+                _write(one, folder / RESULTS, fit.attributes(arguments, model, data_sets[one.name], options))
     return _report(fits, folder, duration(time.perf_counter() - started), tables)
+
+
+def _write(one: Any, folder: Path, attributes: dict[str, Any]) -> None:
+    """Write the result of a data set as that of a single fit, but for its figures, which `lfm-ppl plot` draws."""
+    from lfm_ppl.fitting_many import file_name
+    from lfm_ppl.results import arviz_data, files, html_report, tables
+
+    target = folder / file_name(one.name)
+    if one.stored and (target / html_report.NAME).is_file():
+        return
+    one.result.attrs.update(attributes)
+    arviz_data.save(one.result, target / files.POSTERIOR, overwrite=True)
+    summary = tables.annotated(arviz_data.summary(one.result), one.result)
+    tables.write_csv(summary, target / results.SUMMARY, overwrite=True)
+    try:
+        html_report.save_report(one.result, target / html_report.NAME, overwrite=True, figures=[])
+    except Exception as error:  # the result is safe
+        print(f"lfm-ppl: the page of {one.name} could not be written: {error}", file=sys.stderr)
 
 
 def _report(fits: Any, folder: Path, spent: str, tables: Any) -> int:
     if not fits.overview.empty:
         print(f"\n{tables.text_table(fits.overview, width=shutil.get_terminal_size().columns)}\n")
     print(f"time     {spent}")
-    print(f"wrote    {folder}")
+    print(f"wrote    {folder} (a result of each in {folder / RESULTS}; figures: lfm-ppl plot RESULT)")
     for name, reason in list(fits.failed.items())[:_SHOWN]:
         print(f"lfm-ppl: failed: {name}: {reason}", file=sys.stderr)
     if fits.failed:

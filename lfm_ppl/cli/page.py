@@ -24,6 +24,13 @@ def refuse_foreign(folder: Path, overwrite: bool) -> None:
     web_page.refuse_foreign(folder / html_report.NAME, overwrite)
 
 
+def exists(folder: Path) -> bool:
+    """Whether a folder has a page."""
+    from lfm_ppl.results import html_report
+
+    return (folder / html_report.NAME).is_file()
+
+
 def save(result: Any, folder: Path, overwrite: bool, figures: Sequence[Path],
          more: Mapping[str, pd.DataFrame] | None = None) -> int:
     """Write the page and say so; return 1 where it could not be written.
