@@ -407,6 +407,23 @@ with interruption.watched(lambda: "it is safe"):
     assert ended.returncode == 130 and "lfm-ppl: stopped; it is safe" in ended.stderr, ended.stderr
 
 
+def test_the_process_ends_though_the_interruption_is_swallowed():
+    code = """
+import contextlib, signal, sys, time
+from lfm_ppl.cli import interruption, main, version
+interruption._PATIENCE_S = 0.3
+def run(arguments):
+    with contextlib.suppress(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
+    time.sleep(60)
+version.run = run
+signal.signal(signal.SIGINT, signal.default_int_handler)
+sys.exit(main(["version"]))
+"""
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=50)
+    assert ended.returncode == 130 and "lfm-ppl: stopped; what was written before is kept" in ended.stderr, ended.stderr
+
+
 def test_a_finished_run_says_so(tmp_path, monkeypatch, capsys):
     (tmp_path / "well.py").write_text(MODEL)
     monkeypatch.chdir(tmp_path)

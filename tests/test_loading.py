@@ -143,7 +143,7 @@ def test_files_that_cannot_be_used(model_file, text, message):
 
 
 def test_simulate_must_return_data(model_file):
-    text = "def model(times): ...\ndef simulate(seed=0):\n    return [1]\n"
+    text = "def model(times, y=None): ...\ndef simulate(seed=0):\n    return [1]\n"
     with pytest.raises(TypeError, match=r"simulate in .* must return lfm.Data, got list"):
         loading.load(model_file(text)).simulate()
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import warnings
 from collections.abc import Sequence
 
 from lfm_ppl import loading
 from lfm_ppl.cli.arguments import parsed
-from lfm_ppl.cli.interruption import INTERRUPTED
+from lfm_ppl.cli.interruption import INTERRUPTED, watched
 from lfm_ppl.engine.errors import EngineError
 
 
@@ -26,7 +27,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments.line = list(sys.argv[1:] if argv is None else argv)
     warnings.showwarning = _Warnings()
     try:
-        return int(arguments.run(arguments))
+        # A library that swallows KeyboardInterrupt, as some do while they are imported, does not keep us. Runs of many
+        # tasks end their workers first, which may take longer.
+        many = arguments.command == "compare" or getattr(arguments, "each", False) or getattr(arguments, "series", None)
+        with contextlib.nullcontext() if many else watched(lambda: "what was written before is kept"):
+            return int(arguments.run(arguments))
     except KeyboardInterrupt:
         print("lfm-ppl: interrupted", file=sys.stderr)
         return INTERRUPTED
