@@ -391,8 +391,8 @@ def _times(source: Table, name: str, unit: str | None, usual: str | None) -> tup
     if missing := [row for row, cell in enumerate(cells) if _missing(cell)]:
         raise ValueError(f"{source.place(missing[0], name)}: the time is missing.")
     if not calendar_time.is_date(cells[0]):
-        times = np.array([_value(source, row, name, "a number, or a date such as 2026-03-31 in every row", "")
-                          for row in range(len(cells))])
+        wanted = "expected a number, or a date such as 2026-03-31 in every row, got {}."
+        times = np.array([_value(source, row, name, wanted) for row in range(len(cells))])
         _check_order(source, times, [f"{time:g}" for time in times])
         own = _unit_of(name)
         if own is not None and unit not in (None, own):
@@ -456,8 +456,11 @@ def _missing(cell: Any) -> bool:
     return bool(cell != cell)  # NaN, and pandas' NaT
 
 
-def _value(source: Table, row: int, name: str, expected: str = "a number or an empty cell",
-           remedy: str = " If the column is not an output, name the outputs.") -> float:
+_WANTED = "expected a number or an empty cell, got {}. If the column is not an output, name the outputs."
+
+
+def _value(source: Table, row: int, name: str, wanted: str = _WANTED) -> float:
+    """Return the number in a cell; ``wanted`` is what to say, with the place of the cell, of one that holds none."""
     cell = source.columns[name][row]
     try:
         if _missing(cell):
@@ -466,7 +469,7 @@ def _value(source: Table, row: int, name: str, expected: str = "a number or an e
     except (TypeError, ValueError):  # a TypeError is pandas' NA, or a cell that is no scalar
         if type(cell).__name__ == "NAType":
             return math.nan
-        raise ValueError(f"{source.place(row, name)}: expected {expected}, got {_shown(cell)}.{remedy}") from None
+        raise ValueError(f"{source.place(row, name)}: {wanted.format(_shown(cell))}") from None
     if not math.isfinite(value):
         raise ValueError(f"{source.place(row, name)}: expected a finite number, got {_shown(cell)}. Leave the cell of "
                          "a missing value empty.")
