@@ -74,10 +74,11 @@ def plot_fit(
     figure, panels = style.small_multiples(width, len(names), 1.35)
     for axes, name in zip(panels, names, strict=True):
         data = observed.sel(output=name)
-        if noise_free is None or (predicted is not None and
-                                  _covers(predicted["time"].values, noise_free["at"].values)):
+        if predicted is not None and (noise_free is None or
+                                      _covers(predicted["time"].values, noise_free["at"].values)):
             _draw_forecast(axes, predicted.sel(output=[name]))
         else:
+            assert noise_free is not None
             time, mean, low, high = _band(noise_free.sel(output=name))
             if predictive is not None:
                 outer = _widened(predictive.sel(output=name), time, low, high)
