@@ -11,6 +11,7 @@ import pandas as pd
 import xarray as xr
 
 from lfm_ppl import checks
+from lfm_ppl.data import as_data, model_keywords
 from lfm_ppl.fitting import ConvergenceWarning, fit
 from lfm_ppl.forecasting import check_possible
 from lfm_ppl.inference.bound_model import bind
@@ -60,7 +61,7 @@ class Backtest(NamedTuple):
         return pd.DataFrame.from_dict(rows, orient="index")
 
 
-def backtest(numpyro_model: Callable, times: Any, y: Any, *, horizon: int, every: int = 1, first: int | None = None,
+def backtest(numpyro_model: Callable, times: Any, y: Any = None, *, horizon: int, every: int = 1, first: int | None = None,
              season: int | None = None, sampler: str = "map", draws: int = 400, level: float = 0.95, seed: int = 0,
              progress: bool = False, **options: Any) -> Backtest:
     """Fit to the data up to an origin, predict what follows, move the origin on, and score it all.
@@ -78,8 +79,9 @@ def backtest(numpyro_model: Callable, times: Any, y: Any, *, horizon: int, every
 
     Args:
         numpyro_model: as in `lfm_ppl.fit`.
-        times: (T,), increasing; in rows of one each, since horizon and season count rows.
-        y: (T, D), NaN where missing.
+        times: (T,), increasing; in rows of one each, since horizon and season count rows. Or data, as in `lfm_ppl.fit`:
+            `lfm_ppl.Data`, whose known inputs the model is given over the whole span, or a DataFrame.
+        y: (T, D), NaN where missing; None where the first argument is the data.
         horizon: how many rows after each origin are predicted.
         every: rows from one origin to the next.
         first: rows that the first fit knows; by default half of them.
@@ -126,6 +128,10 @@ def backtest(numpyro_model: Callable, times: Any, y: Any, *, horizon: int, every
         checks.positive_integer("season", season)
     if not 0 < level < 1:
         raise ValueError(f"level must lie between 0 and 1, got {level}.")
+    if y is None:
+        data = as_data(times)
+        times, y = data.times, data.y
+        options["model_kwargs"] = model_keywords(data.inputs, options.get("model_kwargs"))
     times, y = np.asarray(times, float), np.asarray(y, float)
     y = y[:, None] if y.ndim == times.ndim == 1 else y
     if times.ndim != 1 or y.ndim != 2:
