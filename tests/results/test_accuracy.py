@@ -131,7 +131,7 @@ def findings(**changes):
         ({"sd_ratio": 0.8, "sd_ratio_se": 0.05}, "corrected", "the sd of rate (to 1.25 times", "--correct"),
         ({"k": 0.6}, "re-run", "with 200 draws", "--draws 634"),
         ({"k": 0.6, "available": 200}, "re-run", "too far from the exact one", "check RESULT --correct"),
-        ({"k": 0.9}, "re-run", "sampler pmmh", "check RESULT --correct"),
+        ({"k": 0.9}, "re-run", "the likelihood of a particle filter", "check RESULT --correct"),
         ({"k": 0.9, "noise_share": 0.8, "particles": 500}, "re-run", "80% of the variance", "--particles 2000"),
         ({"k": np.inf, "checked": 10}, "re-run", "10 draws are too few", "--draws 200"),
         ({"step_change_sd": 0.2}, "re-run", "vary by 0.2", "lfm-ppl fit well --steps 20"),
