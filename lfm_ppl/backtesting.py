@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,6 +11,7 @@ import pandas as pd
 import xarray as xr
 
 from lfm_ppl import checks
+from lfm_ppl.data import as_data, model_keywords
 from lfm_ppl.fitting import ConvergenceWarning, fit
 from lfm_ppl.forecasting import check_possible
 from lfm_ppl.inference.bound_model import bind
@@ -60,9 +61,9 @@ class Backtest(NamedTuple):
         return pd.DataFrame.from_dict(rows, orient="index")
 
 
-def backtest(numpyro_model: Callable, times: Any, y: Any, *, horizon: int, every: int = 1, first: int | None = None,
-             season: int | None = None, sampler: str = "map", draws: int = 400, level: float = 0.95, seed: int = 0,
-             progress: bool = False, **options: Any) -> Backtest:
+def backtest(numpyro_model: Callable, times: Any, y: Any = None, *, horizon: int, every: int = 1,
+             first: int | None = None, season: int | None = None, sampler: str = "map", draws: int = 400,
+             level: float = 0.95, seed: int = 0, progress: bool = False, **options: Any) -> Backtest:
     """Fit to the data up to an origin, predict what follows, move the origin on, and score it all.
 
     Each fit has the shape of the whole data, with NaN in the place of what is not known yet, so that everything is
@@ -78,8 +79,9 @@ def backtest(numpyro_model: Callable, times: Any, y: Any, *, horizon: int, every
 
     Args:
         numpyro_model: as in `lfm_ppl.fit`.
-        times: (T,), increasing; in rows of one each, since horizon and season count rows.
-        y: (T, D), NaN where missing.
+        times: (T,), increasing; in rows of one each, since horizon and season count rows. Or data, as in `lfm_ppl.fit`:
+            `lfm_ppl.Data`, whose known inputs the model is given over the whole span, or a DataFrame.
+        y: (T, D), NaN where missing; None where the first argument is the data.
         horizon: how many rows after each origin are predicted.
         every: rows from one origin to the next.
         first: rows that the first fit knows; by default half of them.
@@ -126,6 +128,11 @@ def backtest(numpyro_model: Callable, times: Any, y: Any, *, horizon: int, every
         checks.positive_integer("season", season)
     if not 0 < level < 1:
         raise ValueError(f"level must lie between 0 and 1, got {level}.")
+    names = None
+    if y is None:
+        data = as_data(times)
+        times, y, names = data.times, data.y, data.outputs
+        options["model_kwargs"] = model_keywords(data.inputs, options.get("model_kwargs"))
     times, y = np.asarray(times, float), np.asarray(y, float)
     y = y[:, None] if y.ndim == times.ndim == 1 else y
     if times.ndim != 1 or y.ndim != 2:
@@ -168,7 +175,7 @@ def backtest(numpyro_model: Callable, times: Any, y: Any, *, horizon: int, every
                   f"{summary(naive[-1][1], level)['rmse']:.4g}", flush=True)
     if messages:
         checks.warn(f"{len(messages)} warnings at the origins, the first of them at {messages[0]}", ConvergenceWarning)
-    dataset = _dataset((forecasts, naive), reference, times, origins, horizon, model)
+    dataset = _dataset((forecasts, naive), reference, times, origins, horizon, names or model.output_names)
     dataset.attrs.update(sampler=sampler, season=season or 1, level=level, seed=seed, warnings="\n".join(messages))
     return Backtest(dataset, _table(dataset, level))
 
@@ -216,14 +223,14 @@ def _flat(variable: xr.DataArray) -> np.ndarray:
 
 
 def _dataset(forecasters: tuple, reference: str, times: np.ndarray, origins: list[int], horizon: int,
-             model: Any) -> xr.Dataset:
+             outputs: Sequence[str]) -> xr.Dataset:
     dims = ("forecaster", "origin", "horizon", "output")
     ahead = np.array(origins)[:, None] + np.arange(1, horizon + 1)
     variables: dict[str, Any] = {"mean": (dims, np.array([[mean for mean, _ in one] for one in forecasters]))}
     for name in Scores._fields:
         variables[name] = (dims, np.array([[getattr(found, name) for _, found in one] for one in forecasters]))
     coords = {"forecaster": [MODEL, reference], "origin": times[origins], "horizon": np.arange(1, horizon + 1),
-              "output": list(model.output_names), "time": (("origin", "horizon"), times[ahead])}
+              "output": list(outputs), "time": (("origin", "horizon"), times[ahead])}
     return xr.Dataset(variables, coords)
 
 

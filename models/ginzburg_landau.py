@@ -46,7 +46,7 @@ PARAMETERS = {
 }
 TRUTH = {"alpha": -1.0, "beta": 0.1, "sigma": 2.0}
 GRID = np.linspace(0.0, 50.0, 501)
-TARGET_ACCEPT = 0.9  # of fast diffusions in deep wells the Gaussian filter's likelihood falls off as from a cliff
+TARGET_ACCEPT = 0.95  # of fast diffusions in deep wells the Gaussian filter's likelihood falls off as from a cliff
 TOLERANCE = 5e-3  # of an integration step, in sds: the posterior holds slow diffusions and very fast, stiff ones
 STEPS = 60  # equal ones, where steps cannot follow a tolerance: simulation, particles, iterations
 

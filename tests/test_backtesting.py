@@ -51,6 +51,13 @@ def test_forecasts_are_those_of_the_data_up_to_the_origin(linear):
     assert (wins[["rmse", "crps", "log_score"]] <= 3).all(axis=None)
 
 
+def test_data_with_their_names_are_one_argument(linear):
+    data_set = lfm.Data(TIMES, data(), ("left", "right"))
+    again = lfm.backtest(motif.model, data_set, horizon=2, every=1, first=4, model_kwargs={"spread": NEAR})
+    assert again.scores["output"].values.tolist() == ["left", "right"]
+    np.testing.assert_array_equal(again.scores["crps"], linear.scores["crps"])
+
+
 def test_further_origins_compile_nothing(linear):
     """Every fit has the shape of the whole data."""
     with compilations() as compiled:

@@ -78,6 +78,9 @@ def test_check_prints_stores_and_draws(run, fitted):
         assert words in out
     for name in ("posterior.nc (group accuracy)", "accuracy.csv", "accuracy.png", "report.html"):
         assert f"wrote    {fitted / name}" in out
+    following = AccuracyReport.of(arviz_data.load(fitted / "posterior.nc")).verdict.command
+    last = f"next     {following.replace('RESULT', str(fitted))}" if following else f"wrote    {fitted / 'report.html'}"
+    assert out.splitlines()[-1] == last
     page = (fitted / "report.html").read_text()
     assert "What the exact likelihood would change" in page and f"lfm-ppl check {fitted} --draws 40</pre>" in page
     after = arviz_data.load(fitted / "posterior.nc")
@@ -130,6 +133,8 @@ def test_exact_chains_where_the_weights_are_not_reliable(run, fitted, monkeypatc
     code, out, err = run(f"check {fitted} --draws 20 --correct --particles 100 --reference particles{flag}")
     assert code == 0, err
     assert f"particle-marginal RAM{name}, 2 chains of 100 warm-up and 100 kept draws" in out
+    assert out.splitlines()[-1] == ("done     the corrected posterior (particle-marginal RAM) is in "
+                                    f"{fitted / 'corrected'}")
     corrected = arviz_data.load(fitted / "corrected" / "posterior.nc")
     attributes = arviz_data.attributes(corrected)
     assert attributes["sampler"] == "pmmh" and attributes["particles"] == 100

@@ -70,7 +70,7 @@ def test_groups_and_dimensions(nuts):
                         "states": ("chain", "draw", "time", "state")},
         "observed_data": {"y": ("time", "output")},
         "truth": {"forces": ("at_truth", "force"), "states": ("at_truth", "state"), "decay": ("output",),
-                  "lengthscale": (), "noise_sd": ()},
+                  "lengthscale": (), "noise_sd": (), "outputs": ("at_truth", "output")},
     }
     assert set(arviz_data.groups(nuts)) == {*expected, "sample_stats"}
     for name, variables in expected.items():
@@ -96,6 +96,9 @@ def test_coordinates_carry_names_times_and_units(nuts, y):
     assert paths["at"].attrs["units"] == "h"
     assert paths["forces"].attrs["units"] == "1/h"
     assert observed["y"].attrs["units"] == "nM"
+    truth = group(nuts, "truth")["outputs"]  # the states themselves
+    np.testing.assert_array_equal(truth, np.ones((len(TIMES), 2)))
+    assert truth.attrs["units"] == "nM" and truth["output"].values.tolist() == ["a", "b"]
 
 
 def test_attributes_say_how_it_was_made(nuts):

@@ -72,7 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
             report = _checked(task, arguments, path.parent / UNFINISHED)
             for message in arviz_data.convergence_warnings(posterior):
                 warnings.warn(f"the draws that are checked: {message}", stacklevel=1)
-            print(f"\n{report.text(result=shlex.quote(arguments.result))}\n")
+            print(f"\n{report.text(command=False)}\n")
             status = _write(report, task.posterior, path, page.command_line(arguments))
             if folder is not None and report.exact:
                 print("the filter is exact: there is nothing to correct")
@@ -80,6 +80,12 @@ def run(arguments: argparse.Namespace) -> int:
                 status = max(status, _correct(task, report, arguments, folder, watch))
                 # Again, with a link to the corrected result.
                 status = max(status, page.update(arviz_data.load(path), path.parent))
+                if status != INTERRUPTED:
+                    way = "draws weighted by the exact likelihood" if report.reliable else "particle-marginal RAM"
+                    print(f"done     the corrected posterior ({way}) is in {folder}")
+            if folder is None and (command := report.verdict.command):
+                # Last, where it is seen.
+                print(f"next     {command.replace('RESULT', shlex.quote(arguments.result))}")
         except KeyboardInterrupt as error:
             print(f"\nlfm-ppl: {str(error) or 'stopped'}; {go_on}", file=sys.stderr)
             return INTERRUPTED

@@ -218,7 +218,7 @@ def _summary(result: Any) -> str:
 def _accuracy(result: Any, folder: Path) -> str:
     if not arviz_data.has_group(result, report.GROUP):
         return web_page.paragraph("What the approximation of the likelihood does to this posterior has not been "
-                                  "measured yet; `lfm-ppl check`, or lfm.check_accuracy, does it.", "note")
+                                  "measured yet; lfm-ppl check, or lfm.check_accuracy, measures it.", "note")
     checked = report.AccuracyReport.of(result)
     word, reason, command = checked.verdict
     lines = [("verdict", f"{word}: {reason}")]

@@ -5,21 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import jax
 import numpy as np
 import xarray as xr
 
 from lfm_ppl import checks
+from lfm_ppl.model.observation_noise import expected_observation
 from lfm_ppl.results.predictions import GROUP, NOISE_FREE, predictions
-from lfm_ppl.results.scalars import units_attribute
+from lfm_ppl.results.scalars import DERIVED, units_attribute
 
 if TYPE_CHECKING:
     from lfm_ppl.inference.bound_model import BoundModel
 
 SERIES, OUTPUT = "series", "output"
-
-DERIVED = "derived"
-"""Attribute of a variable of the posterior that is computed from the sampled ones."""
-
 
 class Labels(NamedTuple):
     """Names of dimensions, and of what stands along them.
@@ -172,13 +170,18 @@ def lay_out(bound: BoundModel, draws: dict, stats: dict, rated: dict | None, pat
             groups[GROUP] = predictions(bound, paths, chosen, grid, labels.coords)
     if truth:
         groups["truth"] = _truth(truth, named, units, groups["posterior"])
+        outputs = _true_outputs(bound, truth)
+        if outputs is not None:
+            groups["truth"] = groups["truth"].assign(outputs=variable(("at_truth", OUTPUT), outputs, named[OUTPUT]))
+            groups["truth"] = groups["truth"].assign_coords({OUTPUT: named[OUTPUT]})
     return groups
 
 
 def _posterior(draws: dict, coords: dict, named: Mapping[str, list], labels: Labels) -> xr.Dataset:
     variables: dict[str, Any] = {}
     extra: dict[str, Any] = {}
-    for label, value in draws.items():
+    # What is sampled comes before what is derived from it.
+    for label, value in sorted(draws.items(), key=lambda item: item[0] in labels.derived):
         shape = value.shape[2:]
         known = labels.dims.get(label, (None,) * len(shape))
         known = known if len(known) == len(shape) else (None,) * len(shape)
@@ -192,6 +195,28 @@ def _posterior(draws: dict, coords: dict, named: Mapping[str, list], labels: Lab
             extra[name] = list(ticks) if len(ticks) == size else np.arange(size)
         variables[label] = (("chain", "draw", *dims), value, {DERIVED: 1} if label in labels.derived else {})
     return xr.Dataset(variables, {**coords, **extra})
+
+
+def _true_outputs(bound: BoundModel, truth: Mapping[str, Any]) -> np.ndarray | None:
+    """Return the noise-free outputs (K, D) along the true path; None where not all of the truth is known."""
+    parameters, forces = truth.get("parameters") or {}, truth.get("forces") or {}
+    model = bound.site.example.ssm.model
+    if (np.ndim(bound.y) != 2 or truth.get("times") is None or truth.get("state") is None
+            or not set(bound.sites) <= set(parameters) or not set(model.force_names) <= set(forces)):
+        return None
+    times = np.asarray(truth["times"], float)
+    parts = [np.asarray(truth["state"], float), *(np.asarray(forces[name], float) for name in model.force_names)]
+    size = len(model.state_names)
+    if [part.shape for part in parts] != [(len(times), size), *[(len(times),)] * len(model.force_names)]:
+        return None
+    shapes = {name: np.shape(one["value"]) for name, one in bound.trace().items()}
+    values = {name: np.asarray(parameters[name], float) for name in bound.sites}
+    if any(value.shape not in ((), shapes[name]) for name, value in values.items()):
+        return None
+    values = {name: np.broadcast_to(value, shapes[name]) for name, value in values.items()}
+    ssm = bound.likelihood(values).ssm
+    w = np.column_stack(parts)
+    return np.asarray(jax.vmap(lambda one, t: expected_observation(ssm, one, t))(w, times))
 
 
 def _truth(truth: Mapping[str, Any], named: dict, units: Mapping[str, str],

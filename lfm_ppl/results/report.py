@@ -115,19 +115,20 @@ class AccuracyReport:
         """The word (trust, corrected, re-run), the reason, and the next command."""
         return Verdict(*(str(self.dataset.attrs[name]) for name in ("verdict", "reason", "command")))
 
-    def text(self, width: int | None = None, result: str = "RESULT") -> str:
+    def text(self, width: int | None = None, result: str = "RESULT", command: bool = True) -> str:
         """Return the report as text for a terminal.
 
         Args:
             width: characters per line; None: the terminal's.
             result: path of the result, for the command.
+            command: whether to name the next command.
         """
         width = width or shutil.get_terminal_size().columns
         table = tables.text_table(self.table[list(SHOWN)], width=width)
-        word, reason, command = self.verdict
+        word, reason, following = self.verdict
         after = [("verdict", f"{word}: {reason}")]
-        if command:
-            after.append(("next", command.replace("RESULT", result)))
+        if command and following:
+            after.append(("next", following.replace("RESULT", result)))
         return f"{_labelled(self.numbers(), width)}\n\n{table}\n\n{_labelled(after, width)}"
 
     def __str__(self) -> str:

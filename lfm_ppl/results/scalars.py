@@ -12,6 +12,9 @@ from lfm_ppl.checks import unknown
 
 SAMPLE_DIMS = ("chain", "draw")
 
+DERIVED = "derived"
+"""Attribute of a variable of the posterior that is computed from the sampled ones."""
+
 
 def scalar_draws(dataset: xr.Dataset) -> dict[str, np.ndarray]:
     """Return every scalar of ``dataset`` by name: vector entries as ``decay[CDKN1A]``.
@@ -57,6 +60,12 @@ def choose(draws: Mapping[str, np.ndarray], names: str | Sequence[str] | None) -
             raise ValueError(unknown("parameter", name, [*sites, *(d for d in draws if "[" in d)]))
         chosen.update(dict.fromkeys(found))
     return list(chosen)
+
+
+def sampled(posterior: xr.Dataset) -> list[str]:
+    """Return the labels of what was sampled and varies; of all that varies where a result does not tell them apart."""
+    free = posterior[[name for name, variable in posterior.data_vars.items() if not variable.attrs.get(DERIVED)]]
+    return choose(scalar_draws(free), None) or choose(scalar_draws(posterior), None)
 
 
 def scalar_truth(posterior: xr.Dataset, truth: xr.Dataset) -> dict[str, float]:

@@ -137,8 +137,8 @@ def _unreliable(found: Findings) -> tuple[str, str]:
     if found.checked < needed <= found.available:
         more = min(2 * int(needed), found.available)  # a margin, because k itself is an estimate
         return f"{start} with {found.checked} draws.", f"lfm-ppl check RESULT --draws {more} --overwrite"
-    return (f"{start}: the posterior of the Gaussian filter is too far from the exact one. Delayed acceptance, or "
-            "`lfm-ppl fit` with --sampler pmmh, samples the exact one.", "lfm-ppl check RESULT --correct --overwrite")
+    return (f"{start}: the posterior of the Gaussian filter is too far from the exact one. One command samples the "
+            "exact one, with the likelihood of a particle filter.", "lfm-ppl check RESULT --correct --overwrite")
 
 
 def _changed(table: pd.DataFrame) -> list[str]:

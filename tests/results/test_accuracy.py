@@ -7,6 +7,7 @@ import numpyro
 import numpyro.distributions as dist
 import pytest
 import xarray as xr
+from scipy import stats
 
 import lfm_ppl as lfm
 from lfm_ppl.results import accuracy, arviz_data, importance, likelihoods, rebuilding
@@ -130,7 +131,7 @@ def findings(**changes):
         ({"sd_ratio": 0.8, "sd_ratio_se": 0.05}, "corrected", "the sd of rate (to 1.25 times", "--correct"),
         ({"k": 0.6}, "re-run", "with 200 draws", "--draws 634"),
         ({"k": 0.6, "available": 200}, "re-run", "too far from the exact one", "check RESULT --correct"),
-        ({"k": 0.9}, "re-run", "sampler pmmh", "check RESULT --correct"),
+        ({"k": 0.9}, "re-run", "the likelihood of a particle filter", "check RESULT --correct"),
         ({"k": 0.9, "noise_share": 0.8, "particles": 500}, "re-run", "80% of the variance", "--particles 2000"),
         ({"k": np.inf, "checked": 10}, "re-run", "10 draws are too few", "--draws 200"),
         ({"step_change_sd": 0.2}, "re-run", "vary by 0.2", "lfm-ppl fit well --steps 20"),
@@ -280,6 +281,27 @@ def test_the_figure_is_readable(checked, readable):
         readable(figure)
         assert [axes.get_xlabel() for axes in figure.axes] == ["log likelihood, relative", "depth"]
     assert "k = " in figure.axes[0].get_title(loc="left")
+
+
+def test_densities_keep_to_the_support_and_their_mass_and_are_dashed_where_unreliable(checked):
+    result, report = checked
+    draws = np.abs(np.random.default_rng(0).normal(size=(1, 6000)))  # half a normal: densest at the end of its support
+    chosen = np.arange(0, 6000, 6000 // report.log_weight.size)[:report.log_weight.size]
+    for k, dashed in ((0.1, False), (2.0, True)):
+        stored = report.to_dataset().assign_attrs(pareto_k=k).assign_coords(draw=chosen)
+        posterior = xr.Dataset({"depth": (("chain", "draw"), draws)}, {"chain": [0], "draw": np.arange(6000)})
+        axes = plot_accuracy(arviz_data.build({"posterior": posterior, "accuracy": stored})).axes[1]
+        (band,) = axes.collections
+        x, y = band.get_paths()[0].vertices.T
+        assert x.min() >= 0.0
+        top = {at: y[x == at].max() for at in np.unique(x)}
+        grid, density = np.array(list(top)), np.array(list(top.values()))
+        np.testing.assert_allclose(np.trapezoid(density, grid), 1.0, atol=0.02)
+        near = np.searchsorted(grid, 0.1)
+        np.testing.assert_allclose(density[near], 2 * stats.norm.pdf(0.1), rtol=0.1)
+        (corrected,) = [one for one in axes.lines if one.get_linestyle() != "None" and len(one.get_xdata()) > 2]
+        assert corrected.is_dashed() is dashed
+        assert corrected.get_xdata().min() >= 0.0
 
 
 def test_correction_keeps_data_truth_and_the_layout_of_trajectories(checked):

@@ -5,7 +5,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import xarray as xr
-from matplotlib.collections import PolyCollection
+from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_hex
 from scipy import stats
 
@@ -127,6 +127,21 @@ def test_fit_draws_predictive_quantiles_of_pooled_replicates(result, datasets):
         for time in np.unique(predictive["time"].values):
             draws = predictive.values[:, :, predictive["time"].values == time, index]
             np.testing.assert_allclose(outer[time], np.quantile(draws, [0.025, 0.975]))
+
+
+def test_fit_draws_the_noise_free_truth(datasets):
+    truth = datasets["truth"]
+    outputs = np.sin(truth["at_truth"].values)[:, None] * [1.0, 2.0]
+    datasets["truth"] = truth.assign(outputs=(("at_truth", "output"), outputs)).assign_coords(
+        output=["CDKN1A", "TNFRSF10b"])
+    figure = plot_fit(arviz_data.build(datasets))
+    assert "truth" in legend_texts(figure)
+    first, second, third = figure.axes
+    for axes, column in ((first, 0), (third, 1)):
+        true = line(axes, style.BLACK, dashed=True)
+        np.testing.assert_array_equal(true.get_xdata(), truth["at_truth"].values)
+        np.testing.assert_array_equal(true.get_ydata(), outputs[:, column])
+    assert not [one for one in second.lines if one.is_dashed() and to_hex(one.get_color()) == style.BLACK]
 
 
 def test_fit_of_chosen_outputs_and_without_predictive_draws(datasets):
@@ -312,6 +327,28 @@ def test_residuals(result, datasets):
     assert quantiles.get_title(loc="left") == f"KS p = {p:.2g}"
     assert lags.get_title(loc="left").startswith("Ljung-Box p = 0.")
     assert (over_time.get_xlabel(), lags.get_xlabel()) == ("time (h)", "lag (observations)")
+
+
+def test_bars_of_residuals_are_drawn_whole(datasets):
+    residual = datasets["one_step_ahead"]["residual"]
+    seen = int(np.flatnonzero(residual.notnull().all(["chain", "draw"])[:, 0])[0])
+    residual[:, ::2, seen, 0] = -9.0  # of half of the draws
+    (bars,) = [one for one in plot_residuals(arviz_data.build(datasets)).axes[0].collections
+               if isinstance(one, LineCollection)]
+    ends = np.concatenate([segment[:, 1] for segment in bars.get_segments() if len(segment)])  # none where missing
+    low, high = bars.axes.get_ylim()
+    assert ends.min() == -9.0
+    assert low < ends.min() and high == -low
+
+
+def test_derived_parameters_are_drawn_where_they_are_named(datasets):
+    posterior = datasets["posterior"]
+    square = posterior["noise_sd"] ** 2
+    square.attrs["derived"] = 1
+    result = arviz_data.build({**datasets, "posterior": posterior.assign(variance=square)})
+    assert "variance" not in [axes.get_title(loc="left") for axes in plot_trace(result).axes]
+    assert "variance" not in [axes.get_xlabel() for axes in plot_pairs(result).axes]
+    assert plot_trace(result, ["variance"]).axes[0].get_title(loc="left") == "variance"
 
 
 def test_residuals_of_few_or_no_observations(datasets, readable, recwarn):

@@ -33,7 +33,8 @@ def plot_accuracy(
     filter, both relative to their mean: a level cloud leaves the posterior as it is, a slope or a
     curve moves it. Then, for each scalar parameter, the density of the Gaussian filter's posterior
     (all draws) and that of the corrected one (weighted draws), the means of both, and the true
-    value where it is known.
+    value where it is known. The corrected one is dashed, and its mean left out, where the weights
+    cannot be relied on.
 
     Args:
         result: with the groups posterior and accuracy, and truth where there is one.
@@ -62,20 +63,25 @@ def plot_accuracy(
     at = np.searchsorted(group(result, "posterior")["draw"].values, report.dataset["draw"].values)
     weight = np.exp(report.log_weight).ravel()
     for axes, label in zip(panels[1:], labels, strict=False):
-        _draw_densities(axes, draws[label], draws[label][:, at].ravel(), weight)
+        _draw_densities(axes, draws[label], draws[label][:, at].ravel(), weight, _line(report))
         if label in table.index and report.reliable:
             _mark_means(axes, table.loc[label, "mean"], table.loc[label, "corrected_mean"])
         if label in truth:
             axes.axvline(truth[label], **_TRUTH)
         unit = f"{style.scale(axes.xaxis)} {units.get(label, '')}".strip()
         axes.set_xlabel(style.with_unit(label, unit, 24))
-    _legend(figure, any(label in truth for label in labels), report.reliable)
+    _legend(figure, any(label in truth for label in labels), report)
     if note:
         style.note_below(figure, note)
     return figure
 
 
 _TRUTH: dict[str, Any] = {"color": style.BLACK, "lw": 0.9, "ls": (0, (4, 2))}
+
+
+def _line(report: AccuracyReport) -> dict[str, Any]:
+    """Return how to draw the corrected density."""
+    return {"color": style.VERMILLION, "lw": 1.1, "ls": "-" if report.reliable else (0, (2.5, 1.2))}
 
 
 def _draw_ratios(axes: Axes, report: AccuracyReport) -> None:
@@ -97,28 +103,30 @@ def _draw_ratios(axes: Axes, report: AccuracyReport) -> None:
 
 
 def _draw_densities(
-    axes: Axes, values: np.ndarray, subset: np.ndarray, weight: np.ndarray
+    axes: Axes, values: np.ndarray, subset: np.ndarray, weight: np.ndarray, line: dict[str, Any]
 ) -> None:
     flat = values.ravel()
     grid = np.linspace(*_range(flat, subset, weight), 200)
-    before = _density(grid, flat, np.full(flat.size, 1.0 / flat.size))
+    ends = flat.min(), flat.max()
+    before = _density(grid, flat, np.full(flat.size, 1.0 / flat.size), ends)
     width = _bandwidth(subset, weight, grid)
     # What the weights change on the subset, as for the moments: the subset's own chance cancels.
     equal = np.full(subset.size, 1.0 / subset.size)
-    change = _density(grid, subset, weight, width) - _density(grid, subset, equal, width)
+    change = _density(grid, subset, weight, ends, width) - _density(grid, subset, equal, ends, width)
     axes.fill_between(grid, before, color=style.SKY, alpha=0.5, lw=0)
-    axes.plot(grid, np.maximum(before + change, 0.0), color=style.VERMILLION, lw=1.1)
+    axes.plot(grid, np.maximum(before + change, 0.0), **line)
     axes.set_ylim(0.0, None)
     axes.set_yticks([])
     axes.spines["left"].set_visible(False)
 
 
 def _range(values: np.ndarray, subset: np.ndarray, weight: np.ndarray) -> tuple[float, float]:
+    """Return the interval to draw: within the draws, which keep to the support of the parameter."""
     low, high = np.quantile(values, (0.005, 0.995))
     used = subset[weight > weight.max() * np.exp(_BELOW)]
     low, high = min(low, np.quantile(used, 0.005)), max(high, np.quantile(used, 0.995))
     room = 0.12 * (high - low)
-    return low - room, high + room
+    return max(low - room, values.min()), min(high + room, values.max())
 
 
 def _bandwidth(values: np.ndarray, weight: np.ndarray, grid: np.ndarray) -> float:
@@ -128,12 +136,18 @@ def _bandwidth(values: np.ndarray, weight: np.ndarray, grid: np.ndarray) -> floa
 
 
 def _density(
-    grid: np.ndarray, values: np.ndarray, weight: np.ndarray, bandwidth: float | None = None
+    grid: np.ndarray, values: np.ndarray, weight: np.ndarray, ends: tuple[float, float],
+    bandwidth: float | None = None
 ) -> np.ndarray:
-    """Return a Gaussian kernel density estimate."""
+    """Return a Gaussian kernel density estimate that is reflected at both ends, so that it keeps its mass in between.
+
+    Source: Silverman (1986), Density Estimation, section 2.10.
+    """
     bandwidth = bandwidth or _bandwidth(values, weight, grid)
-    kernel = np.exp(-0.5 * ((grid[:, None] - values) / bandwidth) ** 2)
-    return kernel @ weight / (bandwidth * np.sqrt(2.0 * np.pi))
+    total = np.zeros_like(grid)
+    for points in (grid, 2.0 * ends[0] - grid, 2.0 * ends[1] - grid):
+        total += np.exp(-0.5 * ((points[:, None] - values) / bandwidth) ** 2) @ weight
+    return total / (bandwidth * np.sqrt(2.0 * np.pi))
 
 
 def _mark_means(axes: Axes, before: float, after: float) -> None:
@@ -143,12 +157,12 @@ def _mark_means(axes: Axes, before: float, after: float) -> None:
         axes.plot(mean, 0.04, color=colour, marker="^", ms=4, mew=0, ls="", transform=where, zorder=4)
 
 
-def _legend(figure: Figure, truth: bool, means: bool) -> None:
+def _legend(figure: Figure, truth: bool, report: AccuracyReport) -> None:
     handles: list[Any] = [
         Patch(color=style.SKY, alpha=0.5, label="Gaussian filter"),
-        Line2D([], [], color=style.VERMILLION, lw=1.1, label="corrected"),
+        Line2D([], [], label="corrected" if report.reliable else "corrected, not reliable", **_line(report)),
     ]
-    if means:
+    if report.reliable:
         handles.append(Line2D([], [], color=style.GREY, marker="^", ms=4, mew=0, ls="", label="mean"))
     if truth:
         handles.append(Line2D([], [], label="truth", **_TRUTH))

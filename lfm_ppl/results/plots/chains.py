@@ -13,7 +13,7 @@ from scipy import stats
 
 from lfm_ppl.results.arviz_data import group, has_group
 from lfm_ppl.results.plots import style
-from lfm_ppl.results.scalars import choose, scalar_draws, scalar_truth, unit_of
+from lfm_ppl.results.scalars import choose, sampled, scalar_draws, scalar_truth, unit_of
 
 MAX_ROWS = 8
 
@@ -31,7 +31,7 @@ def plot_trace(
 
     Args:
         result: with the group posterior; sample_stats and truth where there are any.
-        parameters: names such as ``decay`` or ``decay[CDKN1A]``; None for all that vary, up to 8.
+        parameters: names such as ``decay`` or ``decay[CDKN1A]``; None for all that were sampled and vary, up to 8.
         width: "column" (3.4 in), "full" (7 in), or inches.
 
     Returns:
@@ -82,8 +82,9 @@ def parameters_to_draw(
     result: Any, wanted: Sequence[str] | None, limit: int
 ) -> tuple[dict[str, np.ndarray], list[str], str]:
     """Return all scalar draws, the labels to draw, and a remark where some are left out."""
-    draws = scalar_draws(group(result, "posterior"))
-    chosen = choose(draws, wanted)
+    posterior = group(result, "posterior")
+    draws = scalar_draws(posterior)
+    chosen = sampled(posterior) if wanted is None else choose(draws, wanted)
     if not chosen:
         raise ValueError(
             "no parameter varies in the posterior, so there is nothing to draw; "

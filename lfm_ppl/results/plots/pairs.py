@@ -35,8 +35,8 @@ def plot_pairs(
 
     Args:
         result: with the group posterior; sample_stats and truth where there are any.
-        parameters: names such as ``decay`` or ``decay[CDKN1A]``; None for the first that vary, as
-            many as the width holds (8, or 3 in a column).
+        parameters: names such as ``decay`` or ``decay[CDKN1A]``; None for the first that were
+            sampled and vary, as many as the width holds (8, or 3 in a column).
         width: "column" (3.4 in), "full" (7 in), or inches.
 
     Returns:

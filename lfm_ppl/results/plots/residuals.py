@@ -109,14 +109,15 @@ def _draw_over_time(axes: Axes, series: xr.DataArray, draws: xr.DataArray) -> No
     times = series["time"].values
     axes.axhspan(-1.96, 1.96, color=_ENVELOPE, lw=0, zorder=0)
     axes.axhline(0.0, color=style.GREY, lw=0.6, zorder=1)
+    reach = max(3.0, 1.1 * np.nanmax(np.abs(series.values), initial=0.0))
     if len(times) <= 200:
-        low, high = np.quantile(draws.values, (0.025, 0.975), axis=(0, 1))
-        axes.vlines(times, low, high, color=style.SKY, lw=0.8, zorder=2)
+        ends = np.quantile(draws.values, (0.025, 0.975), axis=(0, 1))
+        axes.vlines(times, *ends, color=style.SKY, lw=0.8, zorder=2)
+        reach = max(reach, 1.05 * np.nanmax(np.abs(ends), initial=0.0))
     size = 2.6 if len(times) <= 150 else 1.2
     axes.plot(times, series, color=style.BLUE, ls="", marker="o", ms=size, mew=0, zorder=3)
     pad = 0.03 * (times[-1] - times[0]) or 0.5
     axes.set_xlim(times[0] - pad, times[-1] + pad)  # the same for all outputs, missing or not
-    reach = max(3.0, 1.1 * np.nanmax(np.abs(series.values), initial=0.0))
     axes.set_ylim(-reach, reach)
 
 

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from lfm_ppl.results.arviz_data import group, has_group
 from lfm_ppl.results.files import refuse_existing, writing
 from lfm_ppl.results.plots import accuracy, chains, pairs, residuals, style, trajectories
-from lfm_ppl.results.scalars import choose, scalar_draws
+from lfm_ppl.results.scalars import sampled
 
 MAX_PAGES = 5
 Draw = Callable[..., Figure]
@@ -92,7 +92,7 @@ def pages_of(result: Any, width: str | float) -> Iterator[tuple[str, Draw, list[
         title = "fit" if kind == "output" else f"{kind}s"
         yield from _numbered(title, draw, names, trajectories.MAX_PANELS)
     if has_group(result, "posterior"):
-        labels = choose(scalar_draws(group(result, "posterior")), None)
+        labels = sampled(group(result, "posterior"))
         yield from _numbered("trace", chains.plot_trace, labels, chains.MAX_ROWS)
         if labels:
             # Pages would miss most pairs; the figure itself says how to choose others.

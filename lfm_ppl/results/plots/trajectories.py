@@ -25,6 +25,7 @@ _MANY = 150  # measurements
 _INTERVAL = (0.025, 0.975)
 _BARS = 12  # forecasts from which they are drawn as bands
 _END: dict[str, Any] = {"color": style.GREY, "lw": 0.8, "ls": (0, (1, 2)), "zorder": 0.5}
+_TRUTH: dict[str, Any] = {"color": style.BLACK, "lw": 0.9, "ls": (0, (4, 2)), "zorder": 3.5}
 _NOISE_FREE, _PREDICTIVE, _FORCE = "#8FBFDE", "#D3E4F1", "#9AD3C1"  # tints of the line colours
 
 
@@ -38,11 +39,13 @@ def plot_fit(
     result has predictions, both go on after the last observation, which a dotted line marks, and the outer
     band is theirs; forecasts at fewer than 12 times are drawn as bars. Without them the outer band ends with
     the data. It is exact at the measurement times; between them it is the inner band widened by the
-    difference of the two, interpolated linearly. Replicates are pooled.
+    difference of the two, interpolated linearly. Replicates are pooled. Of simulated data the noise-free truth is
+    drawn, too.
 
     Args:
-        result: with the groups observed_data and trajectories, posterior_predictive for the outer band, and
-            predictions for forecasts, which alone are drawn of a result without trajectories, such as a partial one.
+        result: with the groups observed_data and trajectories, posterior_predictive for the outer band, predictions for
+            forecasts, which alone are drawn of a result without trajectories, such as a partial one, and truth where
+            it is known.
         outputs: names; None for all, up to 12.
         width: "column" (3.4 in), "full" (7 in), or inches.
 
@@ -69,7 +72,8 @@ def plot_fit(
     predicted = _predicted(result)
     alone = predicted is not None and not has_group(result, "trajectories")
     noise_free = None if alone else _trajectories(result, "output")
-    forecast = False
+    truth = _true(result, "output")
+    forecast = known = False
     names, note = style.first_of(pick(observed, "output", outputs), outputs, MAX_PANELS, "outputs")
     figure, panels = style.small_multiples(width, len(names), 1.35)
     for axes, name in zip(panels, names, strict=True):
@@ -90,6 +94,7 @@ def plot_fit(
         if predicted is not None:
             if forecast := _ends_before(predicted):
                 axes.axvline(predicted.attrs["last_observation"], **_END)
+        known |= _draw_truth(axes, truth, "output", name)
         _draw_data(axes, data)
         style.label_values(axes, name, unit_of(observed, name))
     style.label_time(panels, time_unit(result), time_origin(result))
@@ -99,6 +104,8 @@ def plot_fit(
     handles += [Patch(color=_NOISE_FREE, label="95%, noise-free")]
     if predictive is not None or predicted is not None:
         handles += [Patch(color=_PREDICTIVE, label="95%, new data")]
+    if known:
+        handles += [Line2D([], [], label="truth", **_TRUTH)]
     if forecast:
         handles += [Line2D([], [], label="last observation", **_END)]
     if np.isnan(observed.sel(output=names)).any():
@@ -209,7 +216,7 @@ def _panels(
     colours: tuple[str, str],
 ) -> Figure:
     draws = _trajectories(result, kind)
-    truth = group(result, "truth").get(f"{kind}s") if has_group(result, "truth") else None
+    truth = _true(result, kind)
     names, note = style.first_of(pick(draws, kind, wanted), wanted, MAX_PANELS, f"{kind}s")
     figure, panels = style.small_multiples(width, len(names), 1.25)
     line, tint = colours
@@ -218,16 +225,13 @@ def _panels(
         time, mean, low, high = _band(draws.sel({kind: name}))
         axes.fill_between(time, low, high, color=tint, lw=0, zorder=1)
         axes.plot(time, mean, color=line, zorder=2)
-        if truth is not None and name in truth[kind].values:
-            true = truth.sel({kind: name})
-            axes.plot(true["at_truth"], true, color=style.BLACK, lw=0.9, ls=(0, (4, 2)), zorder=3)
-            known = True
+        known |= _draw_truth(axes, truth, kind, name)
         style.label_values(axes, name, unit_of(draws, name))
     style.label_time(panels, time_unit(result), time_origin(result))
     figure.align_ylabels(panels)
     handles = [Line2D([], [], color=line, label="posterior mean"), Patch(color=tint, label="95%")]
     if known:
-        handles += [Line2D([], [], color=style.BLACK, lw=0.9, ls=(0, (4, 2)), label="truth")]
+        handles += [Line2D([], [], label="truth", **_TRUTH)]
     style.legend_above(figure, handles)
     if note:
         style.note_below(figure, note)
@@ -243,6 +247,19 @@ def _trajectories(result: Any, kind: str) -> xr.DataArray:
             f"trajectory_draws above zero, for a model that has {kind}s."
         )
     return dataset[f"{kind}s"].transpose("chain", "draw", "at", kind)
+
+
+def _true(result: Any, kind: str) -> xr.DataArray | None:
+    """Return the true trajectories of a kind; None where they are not known."""
+    return group(result, "truth").get(f"{kind}s") if has_group(result, "truth") else None
+
+
+def _draw_truth(axes: Axes, truth: xr.DataArray | None, kind: str, name: str) -> bool:
+    """Draw the true trajectory where it is known, and return whether it is."""
+    if truth is None or kind not in truth.dims or name not in truth[kind].values:
+        return False
+    axes.plot(truth["at_truth"], truth.sel({kind: name}), **_TRUTH)
+    return True
 
 
 def _predictive(result: Any) -> xr.DataArray | None:
