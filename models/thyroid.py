@@ -59,7 +59,8 @@ PARAMETERS = {
     "lengthscale": "lengthscale of TRH (h)",
     "variation": "coefficient of variation of the assays (1)",
 }
-TRUTH = {"level": 6.9, "scale": 3.5, "lengthscale": 2.0, "variation": 0.03}
+# TRH of the default data is no draw of a Gaussian process; scale and lengthscale are those that suit it.
+TRUTH = {"level": 6.9, "scale": 3.5, "lengthscale": 1.0, "variation": 0.03}
 
 # mol, mU, l and s; the states are in nmol/l and mU/l, and times in hours.
 HOUR, NANO, PICO = 3600.0, 1e-9, 1e-12
@@ -144,7 +145,7 @@ def model(times, y=None, units=None) -> None:
     """
     level = numpyro.sample("level", dist.LogNormal(jnp.log(7.0), 0.3))
     scale = numpyro.sample("scale", dist.LogNormal(jnp.log(3.0), 0.5))
-    lengthscale = numpyro.sample("lengthscale", dist.LogNormal(jnp.log(2.0), 0.5))
+    lengthscale = numpyro.sample("lengthscale", dist.LogNormal(jnp.log(1.5), 0.5))
     variation = numpyro.sample("variation", dist.LogNormal(jnp.log(0.04), 0.5))
     system = build(level, scale, lengthscale, variation, units=units)
     numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=4), obs=y)
@@ -175,7 +176,8 @@ def _simulator() -> Callable[[jax.Array], tuple[jax.Array, lfm.Simulation]]:
 
         def trh(t):
             circadian = 1.0 + 0.6 * jnp.cos(2.0 * np.pi * t / 24.0 - 5.0 * np.pi / 12.0)
-            return TRUTH["level"] * circadian * (0.7 + 0.3 * (height * jnp.exp(-0.5 * ((t - place) / WIDTH) ** 2)).sum())
+            pulses = (height * jnp.exp(-0.5 * ((t - place) / WIDTH) ** 2)).sum()
+            return TRUTH["level"] * circadian * (0.7 + 0.3 * pulses)
 
         return jax.vmap(trh)(jnp.asarray(GRID)), lfm.simulate(keys[2], build(**TRUTH, trh=trh), GRID, steps=2)
 
