@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.stats import norm
 
 from lfm_ppl.constrained.full_information import full_information
 from lfm_ppl.constrained.posterior import ConstrainedPosterior, constrained_posterior
@@ -23,6 +24,9 @@ EARLY, HORIZON, SMOOTHER, FULL, BANDS, LINK = (
 METHODS = {EARLY: "early", HORIZON: "early", SMOOTHER: "all", FULL: "all", BANDS: "all", LINK: "softplus"}
 """Estimator -> its hyperparameters, a kind of `problem.learning`."""
 
+ROWS = dict.fromkeys(METHODS, 1) | {BANDS: 10}
+"""Estimator -> of how many samples one has an estimate."""
+
 _BELOW = np.linspace(0.0, 0.045, 10)
 """Shares below a 95% band among which the shortest one is sought."""
 
@@ -33,15 +37,18 @@ def shortest(found: ConstrainedPosterior, name: str) -> tuple[jax.Array, jax.Arr
     A central interval would leave out a truth at the bound, however probable it is.
     """
     low = [jnp.zeros_like(found.times), *(found.interval(name, 1.0 - 2.0 * share)[0] for share in _BELOW[1:])]
-    high = [found.interval(name, 0.9 + 2.0 * share)[1] for share in _BELOW]
-    low, high = jnp.stack(low), jnp.stack(high)
+    return _narrowest(jnp.stack(low), jnp.stack([found.interval(name, 0.9 + 2.0 * share)[1] for share in _BELOW]))
+
+
+def _narrowest(low: jax.Array, high: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return the ends (K,) of the narrowest of several bands (S, K)."""
     best = jnp.argmin(high - low, axis=0)[None]
     return jnp.take_along_axis(low, best, 0)[0], jnp.take_along_axis(high, best, 0)[0]
 
 
 @functools.cache
 def transcription(method: str) -> Callable[[Any, Any], tuple[jax.Array, jax.Array, jax.Array]]:
-    """Return estimates and ends of bands (N, T) of hyperparameters (N, P) and records (N, T, 1)."""
+    """Return estimates and ends of bands (N, K) of hyperparameters (N, P) and records (N, T, 1)."""
     one = {EARLY: _smoother, SMOOTHER: _smoother, HORIZON: _horizon, FULL: _full, BANDS: _bands, LINK: _link}[method]
     return jax.jit(jax.vmap(one))
 
@@ -57,11 +64,12 @@ def _smoother(values: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
 
 
 def _link(values: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
-    """Mean of softplus(u) by quadrature; its band is that of u, through the link."""
+    """Mean of softplus(u) by quadrature, and its shortest 95% interval."""
     force = smooth(_model(values, True), TIMES, y, rule=GaussHermite(5), steps=1).force(FACTOR)
     nodes, weights = np.polynomial.hermite_e.hermegauss(15)
     mean = (weights / weights.sum() * jax.nn.softplus(force.mean[:, None] + force.sd[:, None] * nodes)).sum(axis=1)
-    return mean, jax.nn.softplus(force.mean - Z * force.sd), jax.nn.softplus(force.mean + Z * force.sd)
+    below, above = (norm.ppf(jnp.asarray(shares))[:, None] for shares in (_BELOW, _BELOW + 0.95))
+    return mean, *_narrowest(*(jax.nn.softplus(force.mean + force.sd * z) for z in (below, above)))
 
 
 def _full(values: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
@@ -71,13 +79,21 @@ def _full(values: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
 
 
 def _bands(values: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
-    found = constrained_posterior(_model(values), TIMES, y, lower={FACTOR: 0.0}, grid=TIMES)
+    """On every tenth row: a prior that is truncated on ever more rows keeps the force ever further from its bound."""
+    found = constrained_posterior(_model(values), TIMES, y, lower={FACTOR: 0.0}, grid=TIMES[:: ROWS[BANDS]])
     low, high = shortest(found, FACTOR)
     return found.force_mean[:, 0], low, high
 
 
 def _horizon(values: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
-    """The source's delayed estimator: the arrival mean of the window from t - M is the earlier estimate at t - M.
+    nothing = jnp.full(len(TIMES), jnp.nan)
+    return horizon(values, y)[:, 1], nothing, nothing
+
+
+def horizon(values: jax.Array, y: jax.Array) -> jax.Array:
+    """Return (x, l, l') (T, 3) by the source's delayed estimator, with the lengthscale ``values[0]``.
+
+    The arrival mean of the window from t - M is the earlier estimate at t - M.
 
     Row k is the middle of its window, from which a later window starts (equations 13 to 16); the first and the last
     half windows are from the end windows. The estimate before the first window is zero.
@@ -96,9 +112,7 @@ def _horizon(values: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
     last = len(TIMES) - 1 - WINDOW
     estimate = jnp.zeros((len(TIMES), 3)).at[: half + 1].set(window(0, jnp.zeros(3))[: half + 1])
     estimate, _ = jax.lax.scan(step, estimate, jnp.arange(1, last))
-    estimate = jax.lax.dynamic_update_slice(estimate, window(last, estimate[last])[half:], (last + half, 0))
-    nothing = jnp.full(len(TIMES), jnp.nan)
-    return estimate[:, 1], nothing, nothing
+    return jax.lax.dynamic_update_slice(estimate, window(last, estimate[last])[half:], (last + half, 0))
 
 
 @functools.cache

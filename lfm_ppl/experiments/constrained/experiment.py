@@ -19,6 +19,8 @@ from lfm_ppl.inference.optimise import quasi_newton
 
 TASKS = "tasks"
 _SEARCH = {"ftol": 1e-10, "gtol": 1e-4}
+_FURTHEST = 4.0
+"""Largest logarithm of a parameter, in its units: 60 samples may not have a most likely lengthscale."""
 
 
 @dataclass(frozen=True)
@@ -92,26 +94,30 @@ def compute(task: Task) -> Result:
         task, indices)
 
 
-def _found(posterior: Any, y: np.ndarray) -> np.ndarray:
+def _found(posterior: Any, y: np.ndarray, prior: float = 1.0) -> np.ndarray:
     """Return the logarithms of parameters at the mode, where the density is that of the logarithms."""
-    return quasi_newton(posterior.objective(y), np.zeros(len(posterior.names)), options=_SEARCH).point
+    start = np.zeros(len(posterior.names))
+    bounds = np.stack([start - _FURTHEST, start + _FURTHEST], axis=1)
+    return quasi_newton(posterior.objective(y, prior), start, bounds=bounds, options=_SEARCH).point
 
 
 def _transcription(task: Task, indices: range) -> Result:
     """Return by estimator, ``{method}/``: ``mse``, ``minimum``, ``coverage`` (N,), and the ``first`` record's paths."""
     records = [problem.record(task.settings["shape"], index, task.seed) for index in indices]
     y, truth = (np.stack([getattr(one, name) for one in records]) for name in ("y", "force"))
-    after = slice(problem.WINDOW, None)
     values: dict[str, np.ndarray] = {}
     for kind in set(estimators.METHODS.values()):
         posterior = problem.learning(kind)
         count = len(posterior.bound.times)
-        values[kind] = np.exp([_found(posterior, one[:count]) for one in y])
+        # The source maximises the likelihood of the first samples.
+        values[kind] = np.exp([_found(posterior, one[:count], float(kind != "early")) for one in y])
     result: Result = {f"hyperparameters/{kind}": found for kind, found in values.items()} | {"truth": truth[0]}
     for method, kind in estimators.METHODS.items():
+        rows = estimators.ROWS[method]
         estimate, low, high = (np.asarray(a) for a in estimators.transcription(method)(values[kind], y))
-        covered = np.where(np.isfinite(low), (low <= truth) & (truth <= high), np.nan)
-        result |= {f"{method}/mse": ((estimate - truth)[:, after] ** 2).mean(axis=1),
+        exact, after = truth[:, ::rows], slice(problem.WINDOW // rows, None)
+        covered = np.where(np.isfinite(low), (low <= exact) & (exact <= high), np.nan)
+        result |= {f"{method}/mse": ((estimate - exact)[:, after] ** 2).mean(axis=1),
                    f"{method}/minimum": estimate.min(axis=1), f"{method}/coverage": covered[:, after].mean(axis=1),
                    f"{method}/first": np.stack([estimate[0], low[0], high[0]]),
                    f"{method}/failed": ~np.isfinite(estimate).all(axis=1) | np.isinf(low).any(axis=1)}

@@ -38,7 +38,7 @@ def plot_forces(settings: Any, results: dict[str, Result], *, width: str | float
     for axes, shape in zip(panels, settings.shapes, strict=True):
         found = results[f"transcription/{shape.replace(' ', '-')}/0000"]
         _, low, high = found[f"{estimators.BANDS}/first"]
-        axes.fill_between(problem.TIMES, low, high, color=_SHADE, lw=0)
+        axes.fill_between(problem.TIMES[:: estimators.ROWS[estimators.BANDS]], low, high, color=_SHADE, lw=0)
         axes.plot(problem.TIMES, found[f"{estimators.HORIZON}/first"][0], color=style.ORANGE, lw=0.8)
         axes.plot(problem.TIMES, found[f"{estimators.FULL}/first"][0], color=style.BLUE)
         axes.plot(problem.TIMES, found["truth"], color=style.BLACK, lw=0.8, ls="--")
