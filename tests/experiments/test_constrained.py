@@ -102,6 +102,8 @@ def test_tables_and_figures_from_stored_results(tmp_path):
 def test_settings_say_what_is_wrong():
     with pytest.raises(ValueError, match="shapes"):
         experiment.Settings(shapes=("sine",))
+    with pytest.raises(ValueError, match="Did you mean 'EP'"):
+        experiment.Settings(methods=("EPP",))
     with pytest.raises(ValueError, match="10000 records"):
         experiment.Settings(runs=10_001)
     assert catalogue.experiment("constrained").run is report.run

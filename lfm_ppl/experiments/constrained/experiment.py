@@ -19,8 +19,8 @@ from lfm_ppl.inference.optimise import quasi_newton
 
 TASKS = "tasks"
 _SEARCH = {"ftol": 1e-10, "gtol": 1e-4}
-_FURTHEST = 4.0
-"""Largest logarithm of a parameter, in its units: 60 samples may not have a most likely lengthscale."""
+_FURTHEST = float(np.log(problem.TIMES[-1] / 2.0))
+"""Largest logarithm of the lengthscale that is learnt from 60 samples, whose likelihood often has no maximum."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,7 @@ class Settings:
         patients: simulated days of TSH, FT3 and FT4.
         targets: on reentry.
         shapes: of the force, names of `problem.SHAPES`.
+        methods: names of `estimators.METHODS`, with full information and EP among them.
         block: records that are computed in one go, and stored in one file.
     """
 
@@ -41,6 +42,7 @@ class Settings:
     patients: int = 50
     targets: int = 20
     shapes: tuple[str, ...] = problem.SHAPES
+    methods: tuple[str, ...] = tuple(estimators.METHODS)
     block: int = 25
 
     def __post_init__(self) -> None:
@@ -49,13 +51,16 @@ class Settings:
             checks.positive_integer(name, getattr(self, name))
         for shape in self.shapes:
             checks.one_of("shapes", shape, problem.SHAPES)
+        for method in self.methods:
+            checks.one_of("methods", method, estimators.METHODS)
         if max(self.runs, self.patients, self.targets) > problem.MOST:
             raise ValueError(f"one seed has {problem.MOST} records of a kind; use several seeds for more.")
 
 
 def quick(runs: int = 2, seed: int = 0) -> Settings:
     """Return settings that show in minutes that everything runs, and no more."""
-    return Settings(runs, seed, patients=2, targets=2, shapes=problem.SHAPES[:1])
+    return Settings(runs, seed, patients=2, targets=2, shapes=problem.SHAPES[:1], methods=(
+        estimators.SMOOTHER, estimators.FULL, estimators.BANDS))
 
 
 class Comparison(NamedTuple):
@@ -78,12 +83,13 @@ class Comparison(NamedTuple):
 
 def all_tasks(settings: Settings) -> list[Task]:
     """Return a task for each block of records of a shape, of targets and of patients."""
-    kinds = [("transcription", shape, settings.runs) for shape in settings.shapes]
-    kinds += [("ballistic", "", settings.targets), ("thyroid", "", settings.patients)]
+    kinds = [("ballistic", "", settings.targets), ("thyroid", "", settings.patients)]
+    kinds += [("transcription", shape, settings.runs) for shape in settings.shapes]
     return [
         Task("/".join([what, *filter(None, [shape.replace(" ", "-")]), f"{first:04d}"]), settings.seed,
              {"experiment": "constrained", "what": what, "shape": shape, "first": first,
-              "count": min(settings.block, count - first)})
+              "count": min(settings.block, count - first),
+              "methods": list(settings.methods) if what == "transcription" else []})
         for what, shape, count in kinds for first in range(0, count, settings.block)]
 
 
@@ -94,10 +100,10 @@ def compute(task: Task) -> Result:
         task, indices)
 
 
-def _found(posterior: Any, y: np.ndarray, prior: float = 1.0) -> np.ndarray:
+def _found(posterior: Any, y: np.ndarray, prior: float = 1.0, furthest: float = np.inf) -> np.ndarray:
     """Return the logarithms of parameters at the mode, where the density is that of the logarithms."""
     start = np.zeros(len(posterior.names))
-    bounds = np.stack([start - _FURTHEST, start + _FURTHEST], axis=1)
+    bounds = np.stack([start - furthest, start + furthest], axis=1)
     return quasi_newton(posterior.objective(y, prior), start, bounds=bounds, options=_SEARCH).point
 
 
@@ -106,13 +112,15 @@ def _transcription(task: Task, indices: range) -> Result:
     records = [problem.record(task.settings["shape"], index, task.seed) for index in indices]
     y, truth = (np.stack([getattr(one, name) for one in records]) for name in ("y", "force"))
     values: dict[str, np.ndarray] = {}
-    for kind in set(estimators.METHODS.values()):
+    methods = {method: estimators.METHODS[method] for method in task.settings["methods"]}
+    for kind in set(methods.values()):
         posterior = problem.learning(kind)
         count = len(posterior.bound.times)
         # The source maximises the likelihood of the first samples.
-        values[kind] = np.exp([_found(posterior, one[:count], float(kind != "early")) for one in y])
+        how = {"prior": 0.0, "furthest": _FURTHEST} if kind == "early" else {}
+        values[kind] = np.exp([_found(posterior, one[:count], **how) for one in y])
     result: Result = {f"hyperparameters/{kind}": found for kind, found in values.items()} | {"truth": truth[0]}
-    for method, kind in estimators.METHODS.items():
+    for method, kind in methods.items():
         rows = estimators.ROWS[method]
         estimate, low, high = (np.asarray(a) for a in estimators.transcription(method)(values[kind], y))
         exact, after = truth[:, ::rows], slice(problem.WINDOW // rows, None)
@@ -141,8 +149,8 @@ def _thyroid(task: Task, indices: range) -> Result:
     patients = [problem.patient(index, task.seed) for index in indices]
     posterior = problem.thyroid_learning()
     z = np.stack([_found(posterior, one.y) for one in patients])
-    found = {name: np.asarray(value) for name, value in
-             estimators.thyroid()(z, np.stack([one.y for one in patients])).items()}
+    y = np.stack([one.y for one in patients])
+    found = {name: np.asarray(value) for one in estimators.thyroid() for name, value in one(z, y).items()}
     times = found.pop("times")[0]
     truth = np.stack([np.interp(times, one.truth["times"], one.truth["forces"][problem.HORMONE]) for one in patients])
     held = (found["low"] <= truth) & (truth <= found["high"])
@@ -150,7 +158,7 @@ def _thyroid(task: Task, indices: range) -> Result:
         acrophase(times, found["mode"]), acrophase(times, truth))], axis=1)
     return found | {"times": times, "truth": truth, "z": z, "coverage": held.mean(axis=1), "peak": errors,
                     "rmse": np.sqrt(((found["mode"] - truth) ** 2).mean(axis=1)),
-                    "y": patients[0].y, "measured": patients[0].times}
+                    "y": y[0], "measured": patients[0].times}
 
 
 def peak(times: np.ndarray, paths: np.ndarray) -> np.ndarray:

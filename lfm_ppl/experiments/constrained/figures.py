@@ -39,7 +39,8 @@ def plot_forces(settings: Any, results: dict[str, Result], *, width: str | float
         found = results[f"transcription/{shape.replace(' ', '-')}/0000"]
         _, low, high = found[f"{estimators.BANDS}/first"]
         axes.fill_between(problem.TIMES[:: estimators.ROWS[estimators.BANDS]], low, high, color=_SHADE, lw=0)
-        axes.plot(problem.TIMES, found[f"{estimators.HORIZON}/first"][0], color=style.ORANGE, lw=0.8)
+        if estimators.HORIZON in settings.methods:
+            axes.plot(problem.TIMES, found[f"{estimators.HORIZON}/first"][0], color=style.ORANGE, lw=0.8)
         axes.plot(problem.TIMES, found[f"{estimators.FULL}/first"][0], color=style.BLUE)
         axes.plot(problem.TIMES, found["truth"], color=style.BLACK, lw=0.8, ls="--")
         axes.set_title(shape)
@@ -64,7 +65,7 @@ def plot_errors(settings: Any, results: dict[str, Result], *, width: str | float
     """
     figure = style.new_figure(width, 2.6)
     axes = figure.subplots()
-    errors = [tables.gathered(results, "transcription", f"{method}/mse") for method in estimators.METHODS]
+    errors = [tables.gathered(results, "transcription", f"{method}/mse") for method in settings.methods]
     drawn = axes.boxplot(errors, orientation="horizontal", whis=(0, 100), widths=0.6, patch_artist=True)
     for box in drawn["boxes"]:
         box.set_facecolor(_SHADE)
@@ -73,7 +74,7 @@ def plot_errors(settings: Any, results: dict[str, Result], *, width: str | float
     for colour, line, published in ((style.BLACK, ":", "smoother"), (style.ORANGE, "--", "delayed MHE")):
         axes.axvline(problem.PUBLISHED[published], color=colour, ls=line, lw=1.0)
     axes.set_xscale("log")
-    axes.set_yticks(range(1, len(errors) + 1), list(estimators.METHODS))
+    axes.set_yticks(range(1, len(errors) + 1), list(settings.methods))
     axes.invert_yaxis()
     axes.set_xlabel("mean squared error of the force")
     style.tidy(axes)

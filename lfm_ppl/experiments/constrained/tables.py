@@ -31,7 +31,7 @@ def transcription(settings: Any, results: dict[str, Result]) -> pd.DataFrame:
         estimate.
     """
     rows = {}
-    for method in estimators.METHODS:
+    for method in settings.methods:
         mse, least, covered, failed = (gathered(results, "transcription", f"{method}/{name}")
                                        for name in ("mse", "minimum", "coverage", "failed"))
         rows[method] = {"median MSE": np.median(mse), "largest MSE": mse.max(),
@@ -44,7 +44,7 @@ def transcription(settings: Any, results: dict[str, Result]) -> pd.DataFrame:
 def shapes(settings: Any, results: dict[str, Result]) -> pd.DataFrame:
     """Return one row an estimator: median MSE and coverage of each shape of the force."""
     rows = {}
-    for method in estimators.METHODS:
+    for method in settings.methods:
         rows[method] = {}
         for shape in settings.shapes:
             begins = f"transcription/{shape.replace(' ', '-')}"
