@@ -83,7 +83,8 @@ def stored(folder, settings):
             paths = np.abs(random.normal(size=(count, 51)))
             found = {"times": times, "truth": paths, "mode": paths, "low": 0.5 * paths, "high": 2 * paths,
                      "coverage": np.ones(count), "peak": random.uniform(0.0, 2.0, (count, 2)), "rmse": np.ones(count),
-                     "converged": np.ones(count, bool), "y": random.normal(size=(25, 3)), "measured": hours}
+                     "converged": np.ones(count, bool), "bands_converged": np.ones(count, bool),
+                     "y": random.normal(size=(25, 3)), "measured": hours}
         write(task, found, Path(folder) / experiment.TASKS, overwrite=False)
 
 

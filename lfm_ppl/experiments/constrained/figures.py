@@ -66,22 +66,22 @@ def plot_errors(settings: Any, results: dict[str, Result], *, width: str | float
     figure = style.new_figure(width, 2.6)
     axes = figure.subplots()
     errors = [tables.gathered(results, "transcription", f"{method}/mse") for method in settings.methods]
-    drawn = axes.boxplot(errors, orientation="horizontal", whis=(0, 100), widths=0.6, patch_artist=True)
-    for box in drawn["boxes"]:
-        box.set_facecolor(_SHADE)
-    for line in (*drawn["medians"], *drawn["boxes"], *drawn["whiskers"], *drawn["caps"]):
-        line.set_color(style.BLUE)
+    for row, mse in enumerate(errors):
+        least, low, median, high, largest = np.quantile(mse, [0.0, 0.25, 0.5, 0.75, 1.0])
+        axes.hlines(row, least, largest, color=style.BLUE, lw=0.8)
+        axes.hlines(row, low, high, color=style.BLUE, lw=4.0)
+        axes.plot(median, row, color=style.BLACK, marker="|", ms=7.0, ls="")
     for colour, line, published in ((style.BLACK, ":", "smoother"), (style.ORANGE, "--", "delayed MHE")):
         axes.axvline(problem.PUBLISHED[published], color=colour, ls=line, lw=1.0)
     axes.set_xscale("log")
-    axes.set_yticks(range(1, len(errors) + 1), list(settings.methods))
+    axes.set_yticks(range(len(errors)), list(settings.methods))
     axes.invert_yaxis()
     axes.set_xlabel("mean squared error of the force")
     style.tidy(axes)
     style.legend_above(figure, [
         Line2D([], [], color=style.BLACK, ls=":", label="published, smoother"),
         Line2D([], [], color=style.ORANGE, ls="--", label="published, delayed MHE")])
-    style.note_below(figure, f"{len(errors[0])} records: quartiles, and least and largest error.")
+    style.note_below(figure, f"{len(errors[0])} records: quartiles, median, and least and largest error.")
     return figure
 
 

@@ -64,6 +64,6 @@ def others(settings: Any, results: dict[str, Result]) -> pd.DataFrame:
              "patients, coverage of TRH": mean_of(gathered(results, "thyroid", "coverage")),
              "patients, greatest TRH within 1 h": rate_of(peaks[:, 0] <= NEAR),
              "patients, peak of the day's wave of TRH within 1 h": rate_of(peaks[:, 1] <= NEAR),
-             "patients, converged": rate_of(gathered(results, "thyroid", "converged"))}
-    table = pd.DataFrame.from_dict({name: pair("value", found) for name, found in rows.items()}, orient="index")
-    return table
+             "patients, converged": rate_of(gathered(results, "thyroid", "converged")),
+             "patients, bands converged": rate_of(gathered(results, "thyroid", "bands_converged"))}
+    return pd.DataFrame.from_dict({name: pair("value", found) for name, found in rows.items()}, orient="index")
