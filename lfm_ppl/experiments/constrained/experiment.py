@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 import pandas as pd
 
@@ -102,7 +103,8 @@ def compute(task: Task) -> Result:
 
 def _found(posterior: Any, y: np.ndarray, prior: float = 1.0, furthest: float = np.inf) -> np.ndarray:
     """Return the logarithms of parameters at the mode, where the density is that of the logarithms."""
-    start = np.zeros(len(posterior.names))
+    medians = dict(zip(posterior.bound.names, posterior.bound.draw(jax.random.key(0)), strict=True))
+    start = np.array([medians[name] for name in posterior.names])
     bounds = np.stack([start - furthest, start + furthest], axis=1)
     return quasi_newton(posterior.objective(y, prior), start, bounds=bounds, options=_SEARCH).point
 
