@@ -1,0 +1,151 @@
+"""The estimators, each compiled once for blocks of records: estimate and ends of the 95% band of the force."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.stats import norm
+
+from lfm_ppl.constrained.full_information import full_information
+from lfm_ppl.constrained.posterior import ConstrainedPosterior, constrained_posterior
+from lfm_ppl.experiments.constrained import problem
+from lfm_ppl.experiments.constrained.problem import FACTOR, TIMES, WINDOW
+from lfm_ppl.experiments.scores import Z
+from lfm_ppl.filtering.smoother import smooth
+from lfm_ppl.linearisation.sigma_points import GaussHermite
+
+EARLY, HORIZON, SMOOTHER, FULL, BANDS, LINK = (
+    "smoother, 60 samples", "delayed MHE, 60 samples", "smoother", "full information", "EP", "softplus link")
+METHODS = {EARLY: "early", HORIZON: "early", SMOOTHER: "all", FULL: "all", BANDS: "all", LINK: "softplus"}
+"""Estimator -> its hyperparameters, a kind of `problem.learning`."""
+
+ROWS = dict.fromkeys(METHODS, 1) | {BANDS: 10}
+"""Estimator -> of how many samples one has an estimate."""
+
+_BELOW = np.array([0.0, 0.01, 0.025, 0.04])
+"""Shares below a 95% band, among which the shortest one is chosen."""
+
+
+def shortest(found: ConstrainedPosterior, name: str) -> tuple[jax.Array, jax.Array]:
+    """Return the ends (K,), (K,) of the shortest 95% interval of what has the lower bound zero.
+
+    A central interval would leave out a truth at the bound, however probable it is.
+    """
+    low = [jnp.zeros_like(found.times), *(found.interval(name, 1.0 - 2.0 * share)[0] for share in _BELOW[1:])]
+    return _narrowest(jnp.stack(low), jnp.stack([found.interval(name, 0.9 + 2.0 * share)[1] for share in _BELOW]))
+
+
+def _narrowest(low: jax.Array, high: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return the ends (K,) of the narrowest of several bands (S, K)."""
+    best = jnp.argmin(high - low, axis=0)[None]
+    return jnp.take_along_axis(low, best, 0)[0], jnp.take_along_axis(high, best, 0)[0]
+
+
+@functools.cache
+def transcription(method: str) -> Callable[[Any, Any], tuple[jax.Array, jax.Array, jax.Array]]:
+    """Return estimates and ends of bands (N, K) of hyperparameters (N, P) and records (N, T, 1)."""
+    one = {EARLY: _smoother, SMOOTHER: _smoother, HORIZON: _horizon, FULL: _full, BANDS: _bands, LINK: _link}[method]
+    return jax.jit(jax.vmap(one))
+
+
+def _model(values: jax.Array, softplus: bool = False) -> Any:
+    scale = values[1] if values.shape[0] > 1 else 1.0
+    return problem.transcription(scale, values[0], softplus=softplus)
+
+
+def _smoother(values: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
+    force = smooth(_model(values), TIMES, y).force(FACTOR)
+    return force.mean, force.mean - Z * force.sd, force.mean + Z * force.sd
+
+
+def _link(values: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
+    """Mean of softplus(u) by quadrature, and its shortest 95% interval."""
+    force = smooth(_model(values, True), TIMES, y, rule=GaussHermite(5), steps=1).force(FACTOR)
+    nodes, weights = np.polynomial.hermite_e.hermegauss(15)
+    mean = (weights / weights.sum() * jax.nn.softplus(force.mean[:, None] + force.sd[:, None] * nodes)).sum(axis=1)
+    below, above = (norm.ppf(jnp.asarray(shares))[:, None] for shares in (_BELOW, _BELOW + 0.95))
+    return mean, *_narrowest(*(jax.nn.softplus(force.mean + force.sd * z) for z in (below, above)))
+
+
+def _full(values: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
+    found = full_information(_model(values), TIMES, y, lower={FACTOR: 0.0}, grid=TIMES)
+    nothing = jnp.where(found.converged, jnp.nan, jnp.inf) * jnp.ones(len(TIMES))
+    return found.force(FACTOR), nothing, nothing
+
+
+def _bands(values: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
+    """On every tenth row: a prior that is truncated on ever more rows keeps the force ever further from its bound."""
+    found = constrained_posterior(_model(values), TIMES, y, lower={FACTOR: 0.0}, grid=TIMES[:: ROWS[BANDS]])
+    low, high = shortest(found, FACTOR)
+    return found.force_mean[:, 0], low, high
+
+
+def _horizon(values: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
+    nothing = jnp.full(len(TIMES), jnp.nan)
+    return horizon(values, y)[:, 1], nothing, nothing
+
+
+def horizon(values: jax.Array, y: jax.Array) -> jax.Array:
+    """Return (x, l, l') (T, 3) by the source's delayed estimator, with the lengthscale ``values[0]``.
+
+    The arrival mean of the window from t - M is the earlier estimate at t - M.
+
+    Row k is the middle of its window, from which a later window starts (equations 13 to 16); the first and the last
+    half windows are from the end windows. The estimate before the first window is zero.
+    """
+    inside, half = TIMES[: WINDOW + 1], WINDOW // 2
+
+    def window(begin: Any, mean: jax.Array) -> jax.Array:
+        part = jax.lax.dynamic_slice_in_dim(y, begin, WINDOW + 1)
+        return full_information(problem.companion(values[0], mean), inside, part, lower={FACTOR: 0.0}, grid=inside,
+                                tolerance=1e-8).state_mean
+
+    def step(estimate: jax.Array, begin: jax.Array) -> tuple[jax.Array, None]:
+        found = window(begin, estimate[begin])
+        return estimate.at[begin + half].set(found[half]), None
+
+    last = len(TIMES) - 1 - WINDOW
+    estimate = jnp.zeros((len(TIMES), 3)).at[: half + 1].set(window(0, jnp.zeros(3))[: half + 1])
+    estimate, _ = jax.lax.scan(step, estimate, jnp.arange(1, last))
+    return jax.lax.dynamic_update_slice(estimate, window(last, estimate[last])[half:], (last + half, 0))
+
+
+@functools.cache
+def ballistic() -> Callable[[Any], tuple]:
+    """Return paths (N, 3, T) of distances (N, T, 1), and whether the estimate has converged (N,)."""
+
+    def one(y: jax.Array) -> tuple:
+        # P = 1e-11 I and the cost 2 |x - guess|^2_P against |y - h|^2_R
+        model = problem.ballistic(problem.GUESS, 1.0 / 2e-11)
+        found = full_information(model, problem.TARGET_TIMES, y, lower={"altitude": 0.0, "speed": 0.0},
+                                 grid=problem.TARGET_TIMES, steps=4)
+        return jnp.concatenate([found.state_mean, found.force_mean], axis=1).T, found.converged
+
+    return jax.jit(jax.vmap(one))
+
+
+@functools.cache
+def thyroid() -> tuple[Callable[[Any, Any], dict[str, jax.Array]], Callable[[Any, Any], dict[str, jax.Array]]]:
+    """Return full information and bands of patients' logarithms of parameters (N, P) and concentrations (N, T, 3)."""
+    times = problem.patient(0).times
+
+    def full(z: jax.Array, y: jax.Array) -> dict[str, jax.Array]:
+        model = problem.thyroid_learning().likelihood(z, y).model
+        lower = dict.fromkeys((*model.state_names, problem.HORMONE), 0.0)
+        found = full_information(model, times, y, lower=lower, steps=2)
+        lowest = jnp.minimum(found.state_mean.min(), found.force_mean.min())
+        return {"times": found.times, "mode": found.force(problem.HORMONE), "lowest": lowest,
+                "converged": found.converged}
+
+    def bands(z: jax.Array, y: jax.Array) -> dict[str, jax.Array]:
+        model = problem.thyroid_learning().likelihood(z, y).model
+        found = constrained_posterior(model, times, y, lower={problem.HORMONE: 0.0}, steps=2)
+        low, high = shortest(found, problem.HORMONE)
+        return {"mean": found.force_mean[:, 0], "low": low, "high": high, "bands_converged": found.converged}
+
+    return jax.jit(jax.vmap(full)), jax.jit(jax.vmap(bands))

@@ -1,0 +1,207 @@
+"""The whole experiment: its settings, its tasks, its run, and what it leaves in a folder."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import pandas as pd
+
+from lfm_ppl import checks
+from lfm_ppl.engine.cluster import Workers
+from lfm_ppl.engine.run import Reporter, run_tasks
+from lfm_ppl.engine.task import Result, Task
+from lfm_ppl.experiments import output
+from lfm_ppl.experiments.constrained import estimators, figures, problem, tables
+from lfm_ppl.inference.optimise import quasi_newton
+
+TASKS = "tasks"
+_SEARCH = {"ftol": 1e-10, "gtol": 1e-4}
+_FURTHEST = float(np.log(problem.TIMES[-1] / 2.0))
+"""Largest logarithm of the lengthscale that is learnt from 60 samples, whose likelihood often has no maximum."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How much is computed.
+
+    Attributes:
+        runs: records of each shape of the transcription factor.
+        seed: of everything random.
+        patients: simulated days of TSH, FT3 and FT4.
+        targets: on reentry.
+        shapes: of the force, names of `problem.SHAPES`.
+        methods: names of `estimators.METHODS`, with full information and EP among them.
+        block: records that are computed in one go, and stored in one file.
+    """
+
+    runs: int = 100
+    seed: int = 0
+    patients: int = 50
+    targets: int = 20
+    shapes: tuple[str, ...] = problem.SHAPES
+    methods: tuple[str, ...] = tuple(estimators.METHODS)
+    block: int = 25
+
+    def __post_init__(self) -> None:
+        """Check what a user gives."""
+        for name in ("runs", "patients", "targets", "block"):
+            checks.positive_integer(name, getattr(self, name))
+        for shape in self.shapes:
+            checks.one_of("shapes", shape, problem.SHAPES)
+        for method in self.methods:
+            checks.one_of("methods", method, estimators.METHODS)
+        if max(self.runs, self.patients, self.targets) > problem.MOST:
+            raise ValueError(f"one seed has {problem.MOST} records of a kind; use several seeds for more.")
+
+
+def quick(runs: int = 2, seed: int = 0) -> Settings:
+    """Return settings that show in minutes that everything runs, and no more."""
+    return Settings(runs, seed, patients=2, targets=2, shapes=problem.SHAPES[:1], methods=(
+        estimators.SMOOTHER, estimators.FULL, estimators.BANDS))
+
+
+class Comparison(NamedTuple):
+    """What the experiment found.
+
+    Attributes:
+        settings: that it ran with.
+        results: of every task, by name.
+        transcription: errors, minima and coverage, one row an estimator.
+        shapes: median errors and coverage by the shape of the force.
+        others: the target's paths and the patients' TRH.
+    """
+
+    settings: Settings
+    results: dict[str, Result]
+    transcription: pd.DataFrame
+    shapes: pd.DataFrame
+    others: pd.DataFrame
+
+
+def all_tasks(settings: Settings) -> list[Task]:
+    """Return a task for each block of records of a shape, of targets and of patients."""
+    kinds = [("ballistic", "", settings.targets), ("thyroid", "", settings.patients)]
+    kinds += [("transcription", shape, settings.runs) for shape in settings.shapes]
+    return [
+        Task("/".join([what, *filter(None, [shape.replace(" ", "-")]), f"{first:04d}"]), settings.seed,
+             {"experiment": "constrained", "what": what, "shape": shape, "first": first,
+              "count": min(settings.block, count - first),
+              "methods": list(settings.methods) if what == "transcription" else []})
+        for what, shape, count in kinds for first in range(0, count, settings.block)]
+
+
+def compute(task: Task) -> Result:
+    """Compute one task."""
+    indices = range(task.settings["first"], task.settings["first"] + task.settings["count"])
+    return {"transcription": _transcription, "ballistic": _ballistic, "thyroid": _thyroid}[task.settings["what"]](
+        task, indices)
+
+
+def _found(posterior: Any, y: np.ndarray, prior: float = 1.0, furthest: float = np.inf) -> np.ndarray:
+    """Return the logarithms of parameters at the mode, where the density is that of the logarithms."""
+    medians = dict(zip(posterior.bound.names, posterior.bound.draw(jax.random.key(0)), strict=True))
+    start = np.array([medians[name] for name in posterior.names])
+    bounds = np.stack([start - furthest, start + furthest], axis=1)
+    return quasi_newton(posterior.objective(y, prior), start, bounds=bounds, options=_SEARCH).point
+
+
+def _transcription(task: Task, indices: range) -> Result:
+    """Return by estimator, ``{method}/``: ``mse``, ``minimum``, ``coverage`` (N,), and the ``first`` record's paths."""
+    records = [problem.record(task.settings["shape"], index, task.seed) for index in indices]
+    y, truth = (np.stack([getattr(one, name) for one in records]) for name in ("y", "force"))
+    values: dict[str, np.ndarray] = {}
+    methods = {method: estimators.METHODS[method] for method in task.settings["methods"]}
+    for kind in set(methods.values()):
+        posterior = problem.learning(kind)
+        count = len(posterior.bound.times)
+        # The source maximises the likelihood of the first samples.
+        how = {"prior": 0.0, "furthest": _FURTHEST} if kind == "early" else {}
+        values[kind] = np.exp([_found(posterior, one[:count], **how) for one in y])
+    result: Result = {f"hyperparameters/{kind}": found for kind, found in values.items()} | {"truth": truth[0]}
+    for method, kind in methods.items():
+        rows = estimators.ROWS[method]
+        estimate, low, high = (np.asarray(a) for a in estimators.transcription(method)(values[kind], y))
+        exact, after = truth[:, ::rows], slice(problem.WINDOW // rows, None)
+        covered = np.where(np.isfinite(low), (low <= exact) & (exact <= high), np.nan)
+        result |= {f"{method}/mse": ((estimate - exact)[:, after] ** 2).mean(axis=1),
+                   f"{method}/minimum": estimate.min(axis=1), f"{method}/coverage": covered[:, after].mean(axis=1),
+                   f"{method}/first": np.stack([estimate[0], low[0], high[0]]),
+                   f"{method}/failed": ~np.isfinite(estimate).all(axis=1) | np.isinf(low).any(axis=1)}
+    return result
+
+
+def _ballistic(task: Task, indices: range) -> Result:
+    """Return ``rmse`` (N, 3) and ``converged`` (N,), and the first target's ``estimate`` and ``truth`` (3, T)."""
+    pairs = [problem.target(index, task.seed) for index in indices]
+    y, truth = (np.stack(part) for part in zip(*pairs, strict=True))
+    paths, converged = (np.asarray(a) for a in estimators.ballistic()(y))
+    return {"rmse": np.sqrt(((paths - truth) ** 2).mean(axis=2)), "converged": converged, "estimate": paths[0],
+            "truth": truth[0]}
+
+
+def _thyroid(task: Task, indices: range) -> Result:
+    """Return what `estimators.thyroid` does, and ``rmse``, ``coverage`` (N,), ``peak`` (N, 2) in h, ``truth`` (N, K).
+
+    A peak is the greatest value and the maximum of the wave of 24 h that fits best; errors of both are returned.
+    """
+    patients = [problem.patient(index, task.seed) for index in indices]
+    posterior = problem.thyroid_learning()
+    z = np.stack([_found(posterior, one.y) for one in patients])
+    y = np.stack([one.y for one in patients])
+    found = {name: np.asarray(value) for one in estimators.thyroid() for name, value in one(z, y).items()}
+    times = found.pop("times")[0]
+    truth = np.stack([np.interp(times, one.truth["times"], one.truth["forces"][problem.HORMONE]) for one in patients])
+    held = (found["low"] <= truth) & (truth <= found["high"])
+    errors = np.stack([_apart(peak(times, found["mode"]), peak(times, truth)), _apart(
+        acrophase(times, found["mode"]), acrophase(times, truth))], axis=1)
+    return found | {"times": times, "truth": truth, "z": z, "coverage": held.mean(axis=1), "peak": errors,
+                    "rmse": np.sqrt(((found["mode"] - truth) ** 2).mean(axis=1)),
+                    "y": y[0], "measured": patients[0].times}
+
+
+def peak(times: np.ndarray, paths: np.ndarray) -> np.ndarray:
+    """Return when paths (N, K) are greatest."""
+    return times[paths.argmax(axis=1)]
+
+
+def acrophase(times: np.ndarray, paths: np.ndarray) -> np.ndarray:
+    """Return when the wave of 24 h that fits paths (N, K) best is greatest, in h."""
+    angle = 2.0 * np.pi * times / 24.0
+    wave = np.stack([np.ones_like(times), np.cos(angle), np.sin(angle)], axis=1)
+    _, cosine, sine = np.linalg.lstsq(wave, paths.T, rcond=None)[0]
+    return np.arctan2(sine, cosine) * 12.0 / np.pi % 24.0
+
+
+def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the distance of times of day."""
+    return np.abs((a - b + 12.0) % 24.0 - 12.0)
+
+
+def run(settings: Settings, folder: str | Path, *, overwrite: bool = False,
+        report: Reporter | None = None, workers: Workers = 1) -> Comparison:
+    """Compute what is not stored yet in ``folder``, and tabulate everything.
+
+    Args:
+        settings: how much.
+        folder: of the experiment; its subfolder ``tasks`` holds a file for each task.
+        overwrite: compute again what was stored with other settings.
+        report: what to do with a line of progress; None: nothing.
+        workers: what computes; see `run_tasks`.
+
+    Raises:
+        ValueError: the folder holds results made with other settings.
+    """
+    results = run_tasks(all_tasks(settings), compute, Path(folder) / TASKS, overwrite=overwrite, report=report,
+                        workers=workers)
+    return Comparison(settings, results, tables.transcription(settings, results), tables.shapes(settings, results),
+                      tables.others(settings, results))
+
+
+def save(found: Comparison, folder: str | Path) -> list[Path]:
+    """Write tables and figures, replacing older ones, and return their paths."""
+    shown = {"transcription": found.transcription, "shapes": found.shapes, "others": found.others}
+    return output.save(folder, shown, figures.draw(found.settings, found.results), "estimator")
