@@ -20,7 +20,8 @@ _MODULES = {"ginzburg-landau": "lfm_ppl.experiments.ginzburg_landau.report",
             "transcription-parameters": "lfm_ppl.experiments.transcription.parameters_report",
             "ballistic": "lfm_ppl.experiments.ballistic.report",
             "periodic-kernels": "lfm_ppl.experiments.periodic_kernels.report",
-            "call-centre": "lfm_ppl.experiments.call_centre.report"}
+            "call-centre": "lfm_ppl.experiments.call_centre.report",
+            "counts": "lfm_ppl.experiments.counts.report"}
 
 
 class Wanted(NamedTuple):
