@@ -57,10 +57,10 @@ def compute(task: Task) -> Result:
 
 
 def _sites(task: Task, one: Problem, theta: dict[str, float]) -> Result:
-    method = task.settings["method"]
+    settings = lfm.SiteSettings(task.settings["method"], damping=one.damping)
 
     def likelihood(values: dict[str, Any]) -> lfm.MarginalLikelihood:
-        return lfm.MarginalLikelihood(one.build(**values), one.times, sites=method)
+        return lfm.MarginalLikelihood(one.build(**values), one.times, sites=settings)
 
     evidence = jax.jit(jax.value_and_grad(lambda values, y: likelihood(values).log_prob(y)))
 
@@ -93,7 +93,7 @@ def _sites(task: Task, one: Problem, theta: dict[str, float]) -> Result:
 def _reference(task: Task, one: Problem, theta: dict[str, float]) -> Result:
     draws = task.settings["draws"]
     system = one.build(**theta)
-    reference = Reference(system, one.times)
+    reference = Reference(system, one.times, one.damping)
     key, fold_key = jax.random.split(task.key)
     seconds, found = timed(lambda: reference.sample(key, one.y, draws))
     weighed = reference.weigh(jax.random.fold_in(key, 1), one.y, draws)

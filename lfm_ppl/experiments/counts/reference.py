@@ -48,12 +48,13 @@ class Reference:
     Args:
         model: forces that are observed themselves, through a predictor that is linear in them.
         times: (T,).
+        damping: of the sites.
 
     Source: Nishihara, Murray and Adams (2014), Journal of Machine Learning Research 15.
     """
 
-    def __init__(self, model: LatentForceModel, times: np.ndarray) -> None:
-        self.ssm, self.times = state_space(model), times
+    def __init__(self, model: LatentForceModel, times: np.ndarray, damping: float = 1.0) -> None:
+        self.ssm, self.times, self.settings = state_space(model), times, SiteSettings(damping=damping)
         t = jnp.asarray(times)
         nothing = jnp.zeros(len(model.force_names))
         predictor = jax.vmap(lambda u, t: model.observation.function(jnp.zeros(0), u, t)[0], in_axes=(None, 0))
@@ -86,7 +87,7 @@ class Reference:
     def _proposal(self, y: jax.Array) -> _Proposal:
         rule, grid = as_rule(None), build_time_grid(self.ssm, self.times, 1)
         terms = FamilyTerms(self.ssm.model.observation, y)
-        sites = evidence(self.ssm, rule, grid, y, terms, SiteSettings()).refined.found.sites
+        sites = evidence(self.ssm, rule, grid, y, terms, self.settings).refined.found.sites
         nu, tau = (jnp.where(jnp.isfinite(y), a, 0.0)[:, 0] for a in (sites.nu, sites.tau))
         precision = jnp.eye(len(y)) + self.root.T @ (tau[:, None] * self.root)
         root = jnp.linalg.cholesky(precision)
