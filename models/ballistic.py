@@ -64,7 +64,7 @@ AIR, GRAVITY = 1.49e-4, 9.8
 START = (65_000.0, 3_000.0)
 START_SD = (500.0, 100.0)
 GRID = np.linspace(0.0, 30.0, 1191)  # ten cells between two of 120 measurements
-SITES = lfm.SiteSettings(damping=0.5)  # of Student's t; whole ones can run away from gross errors
+SITES = lfm.SiteSettings(damping=0.5, sweeps=1000)  # of Student's t: near gross errors whole sites run away
 LONGEST_STEP = 0.26  # seconds: one step between two of 120 measurements; likelihoods are exact to 0.1%
 
 

@@ -65,7 +65,7 @@ PARAMETERS = {
 }
 FACTOR = "transcription factor"
 START_SD = 0.1
-SITES = lfm.SiteSettings(damping=0.5)  # of Student's t; whole ones can run away from gross errors
+SITES = lfm.SiteSettings(damping=0.5, sweeps=1000)  # of Student's t: near gross errors whole sites run away
 STEPS = 6  # log likelihood within 0.02 of its limit over the posterior of the p53 data
 
 

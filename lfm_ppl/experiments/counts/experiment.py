@@ -45,7 +45,7 @@ class Settings:
 
 def quick(seed: int = 0, data: str | None = None) -> Settings:
     """Return settings that show in a minute that everything runs, and no more."""
-    return Settings(seed, data, (problem.COAL, "student-t"), problem.Size(40, 2, 40, 2), draws=500)
+    return Settings(seed, data, (problem.COAL,), problem.Size(bins=56, folds=2), draws=500)
 
 
 class Comparison(NamedTuple):

@@ -57,7 +57,7 @@ def compute(task: Task) -> Result:
 
 
 def _sites(task: Task, one: Problem, theta: dict[str, float]) -> Result:
-    settings = lfm.SiteSettings(task.settings["method"], damping=one.damping)
+    settings = one.sites._replace(method=task.settings["method"])
 
     def likelihood(values: dict[str, Any]) -> lfm.MarginalLikelihood:
         return lfm.MarginalLikelihood(one.build(**values), one.times, sites=settings)
@@ -93,7 +93,7 @@ def _sites(task: Task, one: Problem, theta: dict[str, float]) -> Result:
 def _reference(task: Task, one: Problem, theta: dict[str, float]) -> Result:
     draws = task.settings["draws"]
     system = one.build(**theta)
-    reference = Reference(system, one.times, one.damping)
+    reference = Reference(system, one.times, one.sites)
     key, fold_key = jax.random.split(task.key)
     seconds, found = timed(lambda: reference.sample(key, one.y, draws))
     weighed = reference.weigh(jax.random.fold_in(key, 1), one.y, draws)

@@ -54,7 +54,8 @@ class Problem(NamedTuple):
         priors: name -> prior of the parameters, in the order of the table.
         given: the parameters where they are known; None: they are learnt.
         truth: (T,) the predictor; None where nobody knows it.
-        damping: share of each new site that is taken. Near gross errors whole ones run away from where they converge.
+        sites: how they are refined, whatever the method. Near gross errors whole new ones run away from where they
+            converge.
     """
 
     times: np.ndarray
@@ -64,7 +65,7 @@ class Problem(NamedTuple):
     priors: Mapping[str, dist.Distribution]
     given: Mapping[str, float] | None = None
     truth: np.ndarray | None = None
-    damping: float = 1.0
+    sites: lfm.SiteSettings = lfm.SiteSettings()
 
     def model(self, times: Any, y: Any = None) -> None:
         """Sample the parameters, and score the data."""
@@ -187,4 +188,4 @@ def _simulated(name: str, size: Size, seed: int, generator: np.random.Generator)
               "noise": dist.LogNormal(-1.6, 0.5)}
     return Problem(times, y, _folds(size.rows, size.folds, 1, generator), build,
                    {key: priors[key] for key in given}, given, np.asarray(drawn.forces["u"]),
-                   0.5 if name == "student-t" else 1.0)
+                   lfm.SiteSettings(damping=0.5, sweeps=2000) if name == "student-t" else lfm.SiteSettings())

@@ -48,13 +48,13 @@ class Reference:
     Args:
         model: forces that are observed themselves, through a predictor that is linear in them.
         times: (T,).
-        damping: of the sites.
+        sites: how they are refined.
 
     Source: Nishihara, Murray and Adams (2014), Journal of Machine Learning Research 15.
     """
 
-    def __init__(self, model: LatentForceModel, times: np.ndarray, damping: float = 1.0) -> None:
-        self.ssm, self.times, self.settings = state_space(model), times, SiteSettings(damping=damping)
+    def __init__(self, model: LatentForceModel, times: np.ndarray, sites: SiteSettings) -> None:
+        self.ssm, self.times, self.settings = state_space(model), times, sites
         t = jnp.asarray(times)
         nothing = jnp.zeros(len(model.force_names))
         predictor = jax.vmap(lambda u, t: model.observation.function(jnp.zeros(0), u, t)[0], in_axes=(None, 0))
