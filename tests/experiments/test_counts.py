@@ -17,7 +17,8 @@ from lfm_ppl.experiments.counts.reference import Reference
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 DATA = Path(os.environ.get("LFM_DATA", ROOT.parent / "shared" / "data"))
-needs_data = pytest.mark.skipif(not (DATA / problem.EVENTS).is_file(), reason=f"{DATA} is not there; LFM_DATA says where")
+needs_data = pytest.mark.skipif(not (DATA / problem.EVENTS).is_file(),
+                                reason=f"{DATA} is not there; LFM_DATA says where")
 
 
 @needs_data

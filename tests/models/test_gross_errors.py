@@ -1,4 +1,4 @@
-"""Student's t errors as an option: 5% gross errors of 20 standard deviations move what Gaussian errors take at its word.
+"""Student's t errors as an option: 5% gross errors of 20 sds move parameters only where errors are Gaussian.
 
 A fit is the mode of the posterior of the unconstrained parameters, and its standard deviations are those of Laplace's
 approximation there. Its measure is the same model's fit in which the spoilt entries are missing.

@@ -184,8 +184,8 @@ def _simulated(name: str, size: Size, seed: int, generator: np.random.Generator)
     y = np.array(drawn.y)
     if name == "student-t":
         y[EVERY // 2::EVERY] += OUTLIER
-    priors = {"level": dist.Normal(0.0, 1.0), "scale": dist.LogNormal(0.0, 0.5), "lengthscale": dist.LogNormal(0.3, 0.5),
-              "noise": dist.LogNormal(-1.6, 0.5)}
+    priors = {"level": dist.Normal(0.0, 1.0), "scale": dist.LogNormal(0.0, 0.5),
+              "lengthscale": dist.LogNormal(0.3, 0.5), "noise": dist.LogNormal(-1.6, 0.5)}
     return Problem(times, y, _folds(size.rows, size.folds, 1, generator), build,
                    {key: priors[key] for key in given}, given, np.asarray(drawn.forces["u"]),
                    lfm.SiteSettings(damping=0.5, sweeps=2000) if name == "student-t" else lfm.SiteSettings())
