@@ -1,19 +1,13 @@
-"""Sites against exact draws as an experiment: its data, its reference against dense algebra, tables and figures."""
+"""Sites against exact draws as an experiment: its data, settings and tables."""
 
 import os
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from references import matern
-from scipy import stats
 
-import lfm_ppl as lfm
 from lfm_ppl.experiments import catalogue
 from lfm_ppl.experiments.counts import experiment, methods, problem, report, tables
-from lfm_ppl.experiments.counts.reference import Reference
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 DATA = Path(os.environ.get("LFM_DATA", ROOT.parent / "shared" / "data"))
@@ -61,43 +55,3 @@ def test_tables_measure_against_the_reference(monkeypatch):
     row = tables.prediction(settings, results).loc["student-t, EP"]
     assert row[["NLPD", "less reference", "covered"]].tolist() == pytest.approx([2.0, 0.5, 0.75])
     assert row["less reference se"] == pytest.approx(0.0)
-
-
-@pytest.mark.slow
-def test_the_reference_is_dense_algebra_where_that_is_exact():
-    """Gaussian data under a family: log evidence, means and sds in closed form; a missing entry."""
-    times, noise = np.linspace(0.0, 6.0, 25), 0.3
-    system = problem.process({"u": lfm.Matern(1.2, 1.5, order=1), "v": lfm.Matern(0.5, 0.4, order=1)},
-                             lambda h: lfm.Observations(lfm.GaussianObservation(h, noise**2 * jnp.ones(1))), 0.7)
-    y = 0.7 + np.random.default_rng(0).normal(size=(25, 1))
-    y[4] = np.nan
-    k = sum(matern(s, length, 1)(times[:, None], times) for s, length in ((1.2, 1.5), (0.5, 0.4)))
-    there = np.isfinite(y[:, 0])
-    own = k[np.ix_(there, there)] + noise**2 * np.eye(there.sum())
-    gain = np.linalg.solve(own, k[there]).T
-    mean, cov = 0.7 + gain @ (y[there, 0] - 0.7), k - gain @ k[there]
-    reference = Reference(system, times, lfm.SiteSettings())
-    weighed = reference.weigh(jax.random.key(0), y, 500)
-    log_z = stats.multivariate_normal.logpdf(y[there, 0], np.full(there.sum(), 0.7), own)
-    assert weighed.log_evidence == pytest.approx(log_z, abs=1e-6) and weighed.share == pytest.approx(1.0)
-    draws = reference.sample(jax.random.key(1), y, 2000)
-    sd = np.sqrt(np.diag(cov))
-    # 8,000 independent draws: 4.5 standard errors for 25 entries
-    assert np.abs((draws.mean((0, 1)) - mean) / sd).max() < 4.5 / np.sqrt(8000)
-    assert np.abs(draws.std((0, 1)) / sd - 1).max() < 4.5 / np.sqrt(16000)
-
-
-@pytest.mark.slow
-def test_a_small_one_runs_and_leaves_files(tmp_path):
-    settings = experiment.Settings(problems=("bernoulli", "student-t"), size=problem.Size(rows=30, folds=2), draws=2000)
-    found = experiment.run(settings, tmp_path)
-    accuracy = found.accuracy
-    for name in settings.problems:
-        assert abs(accuracy.loc[f"{name}, EP", "less reference"]) < 0.2
-        assert accuracy.loc[f"{name}, EP", "mean"] < 0.1
-    reference = tables.reference(settings, found.results)
-    assert reference["r_hat"].max() < 1.02 and reference["share"].min() > 0.2
-    written = {path.name for path in experiment.save(found, tmp_path)}
-    assert written == {"accuracy.csv", "accuracy.md", "prediction.csv", "prediction.md", "errors.png"}
-    again = experiment.run(settings, tmp_path)
-    np.testing.assert_array_equal(again.accuracy, found.accuracy)

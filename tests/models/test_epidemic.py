@@ -56,23 +56,6 @@ def test_known_rates_are_fixed_unless_freed(file):
 
 
 @pytest.mark.slow
-def test_settings_are_accurate_enough(functions, simulated):
-    """Log likelihoods at draws of the prior, with as many relinearisations and shorter steps, within 0.02."""
-    times = np.arange(60.0)
-    thetas = _prior_draws(12)
-
-    def value(theta, y, steps, sites):
-        system = functions["build"](*theta, 0.2, 0.5)
-        return lfm.MarginalLikelihood(system, times, steps=steps, sites=sites).log_prob(y)
-
-    rough = jax.jit(lambda theta, y: value(theta, y, functions["STEPS"], functions["SITES"]))
-    fine = jax.jit(lambda theta, y: value(theta, y, 4, lfm.SiteSettings(relinearisations=10)))
-    for index, theta in enumerate(thetas):
-        y = simulated(jax.random.key(index), theta, times).y
-        assert float(rough(theta, y)) == pytest.approx(float(fine(theta, y)), abs=0.02)
-
-
-@pytest.mark.slow
 def test_the_posterior_covers_the_truth(file, functions, simulated):
     """Epidemics with parameters of the prior: weighted draws about the mode of each posterior.
 
