@@ -194,8 +194,8 @@ def _add_compare(commands: Any) -> None:
     command.add_argument(
         "--data",
         metavar="FOLDER",
-        help="gps: SP3 files, call-centre: counts (default of both: simulated); home-heating: house_hourly.csv "
-        "(default: $LFM_DATA/house)",
+        help="gps: SP3 files, call-centre: counts, counts: folders coal and calls (default of these: simulated); "
+        "home-heating: house_hourly.csv (default: $LFM_DATA/house)",
     )
     command.add_argument("--satellites", nargs="+", metavar="NAME", help="gps: as in G05 G20 (default: all)")
     command.add_argument("--train-days", type=_positive, metavar="D", help="gps: days to learn from (default: 3)")

@@ -21,7 +21,8 @@ _MODULES = {"ginzburg-landau": "lfm_ppl.experiments.ginzburg_landau.report",
             "ballistic": "lfm_ppl.experiments.ballistic.report",
             "periodic-kernels": "lfm_ppl.experiments.periodic_kernels.report",
             "call-centre": "lfm_ppl.experiments.call_centre.report",
-            "constrained": "lfm_ppl.experiments.constrained.report"}
+            "constrained": "lfm_ppl.experiments.constrained.report",
+            "counts": "lfm_ppl.experiments.counts.report"}
 
 
 class Wanted(NamedTuple):

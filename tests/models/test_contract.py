@@ -27,7 +27,7 @@ def choices(name):
     return [dict(zip(listed, values, strict=True)) for values in itertools.product(*listed.values())]
 
 
-COSTLY = ("gps", "home-heating", "ballistic-3d")
+COSTLY = ("gps", "home-heating", "ballistic-3d", "epidemic")
 """Models whose other variants take long to compile; these are run with -m slow."""
 
 ALL_BUT_GPS = [pytest.param(name, marks=[pytest.mark.slow] if name == "gps" else []) for name in MODELS]

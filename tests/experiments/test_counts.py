@@ -1,0 +1,57 @@
+"""Sites against exact draws as an experiment: its data, settings and tables."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lfm_ppl.experiments import catalogue
+from lfm_ppl.experiments.counts import experiment, methods, problem, report, tables
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+DATA = Path(os.environ.get("LFM_DATA", ROOT.parent / "shared" / "data"))
+needs_data = pytest.mark.skipif(not (DATA / problem.EVENTS).is_file(),
+                                reason=f"{DATA} is not there; LFM_DATA says where")
+
+
+@needs_data
+def test_the_data_are_counted_as_they_are():
+    coal = problem.problem(problem.COAL, problem.Size(), 0, str(DATA))
+    assert coal.y.sum() == 191 and coal.y.shape == (333, 1)
+    assert np.bincount(coal.folds).tolist() == [34, 34, 34, 33, 33, 33, 33, 33, 33, 33]
+    calls = [problem.problem(name, problem.Size(), 0, str(DATA)) for name in problem.CALLS]
+    assert calls[0].y.shape == (8 * 42, 1) and calls[0].y[0, 0] == 111 + 113 + 76 + 82
+    for one in calls:
+        np.testing.assert_array_equal(one.folds, calls[0].folds)
+    # Whole blocks are held out, and each row once.
+    assert all(len(set(block)) == 1 for block in np.split(calls[0].folds, 56))
+
+
+def test_settings_are_checked_and_it_is_in_the_catalogue():
+    with pytest.raises(ValueError, match="Did you mean 'coal'"):
+        experiment.Settings(problems=("coals",))
+    with pytest.raises(ValueError, match="draws"):
+        experiment.Settings(draws=0)
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        problem.problem(problem.CALLS[0], problem.Size(), 0, "nowhere")
+    assert catalogue.experiment("counts").summary == report.SUMMARY
+    assert len(experiment.comparing(experiment.Settings(), dict.fromkeys(problem.NAMES, {}))) == 7 * 4
+
+
+def test_tables_measure_against_the_reference(monkeypatch):
+    """From results that are made up, and errors that are known."""
+    settings = experiment.Settings(problems=("student-t",), size=problem.Size(rows=4))
+    truth = np.array([0.0, 0.1, 5.0, 0.0])
+    one = problem.Problem(np.arange(4.0), truth[:, None], np.zeros(4, int), lambda: None, {}, {}, truth)
+    monkeypatch.setattr(problem, "problem", lambda *arguments: one)
+    exact = {"log evidence": -10.0, "log evidence error": 0.01, "mean": np.zeros(4), "sd": np.ones(4), "seconds": 3.0,
+             "log density": -np.arange(4.0), "low": -np.ones(4), "high": np.ones(4)}
+    rough = exact | {"log evidence": -10.5, "mean": np.array([0, 0, 0.2, 0]), "sd": np.full(4, 0.9),
+                     "log density": -np.arange(4.0) - 0.5}
+    results = {f"student-t/{method}": rough for method in methods.METHODS} | {"student-t/reference": exact}
+    row = tables.accuracy(settings, results).loc["student-t, EP"]
+    assert row[["less reference", "mean", "sd", "covered"]].tolist() == pytest.approx([-0.5, 0.2, 0.1, 0.75])
+    row = tables.prediction(settings, results).loc["student-t, EP"]
+    assert row[["NLPD", "less reference", "covered"]].tolist() == pytest.approx([2.0, 0.5, 0.75])
+    assert row["less reference se"] == pytest.approx(0.0)
