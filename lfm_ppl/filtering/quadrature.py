@@ -38,12 +38,17 @@ class Tilted(NamedTuple):
     variance: jax.Array
 
 
-def _rule() -> tuple[np.ndarray, np.ndarray]:
-    u = np.linspace(-_END, _END, _NODES)
+_ROUGH_NODES, _ROUGH_END = 16, 4.0
+"""Of a rule to some percent, to 7 standard deviations."""
+
+
+def _rule(count: int = _NODES, end: float = _END) -> tuple[np.ndarray, np.ndarray]:
+    u = np.linspace(-end, end, count)
     return np.sinh(_STRETCH * u) / _STRETCH, np.log((u[1] - u[0]) * np.cosh(_STRETCH * u))
 
 
-def tilted_moments(log_function: Callable[[jax.Array], jax.Array], cavity: Marginal, near: Marginal) -> Tilted:
+def tilted_moments(log_function: Callable[[jax.Array], jax.Array], cavity: Marginal, near: Marginal,
+                   rough: bool = False) -> Tilted:
     """Return log Z, mean and variance of N(f; m, v) p(f) by quadrature, about where the product is.
 
     The trapezoidal rule in u with f = near.mean + near.sd sinh(a u) / a: its nodes are dense in the middle and reach
@@ -53,17 +58,18 @@ def tilted_moments(log_function: Callable[[jax.Array], jax.Array], cavity: Margi
         log_function: log p, of nodes (J, ...), entry by entry.
         cavity: m and v.
         near: about where the product is, and how wide; its own moments are best.
+        rough: a third of the nodes.
 
     Source: Mori and Sugihara (2001), Journal of Computational and Applied Mathematics 127.
     """
-    nodes, log_weights = map(jnp.asarray, _rule())
-    lead = (_NODES,) + (1,) * jnp.ndim(cavity.mean)
-    f = near.mean + jnp.sqrt(near.variance) * nodes.reshape(lead)
-    log_mass = log_weights.reshape(lead) - 0.5 * (f - cavity.mean) ** 2 / cavity.variance + log_function(f)
+    nodes, log_weights = map(jnp.asarray, _rule(_ROUGH_NODES, _ROUGH_END) if rough else _rule())
+    lead = (len(nodes),) + (1,) * jnp.ndim(cavity.mean)
+    f, half = near.mean + jnp.sqrt(near.variance) * nodes.reshape(lead), -0.5 / cavity.variance
+    log_mass = log_weights.reshape(lead) + half * (f - cavity.mean) ** 2 + log_function(f)
     # Not a number is no mass: a link that overflows far out.
     log_mass = jnp.where(jnp.isnan(log_mass), -jnp.inf, log_mass)
     # The barriers keep XLA from computing the function again in each sum, 4 times slower; so does a table of 2 axes.
-    log_mass = _once(log_mass.reshape(_NODES, -1))
+    log_mass = _once(log_mass.reshape(len(nodes), -1))
     largest = _once(jax.lax.stop_gradient(log_mass.max(0)))
     mass = jnp.exp(log_mass - jnp.where(jnp.isfinite(largest), largest, 0.0))
     x = nodes[:, None]

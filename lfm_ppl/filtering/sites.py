@@ -50,7 +50,7 @@ from lfm_ppl.model.state_space import StateSpaceModel
 METHODS = ("ep", "variational", "laplace")
 
 _TOLERANCE = 1e-8
-"""Largest change of a site in a sweep, in units of the marginal (nu times its sd, tau times its variance)."""
+"""Largest change of a site that is left, in units of the marginal (nu times its sd, tau times its variance)."""
 
 _SEARCH = 12
 """Steps of the search for the mode of a tilted distribution."""
@@ -58,8 +58,14 @@ _SEARCH = 12
 _MEMORY = 3
 """Sweeps whose steps are remembered; more do not save sweeps."""
 
+_ROUGH, _ROUGH_SWEEPS = 0.05, 4
+"""Change above which the first sweeps are rough, and how many of them may be."""
+
 _NEAR = 0.5
 """Largest change from which on steps are those of a map that is nearly linear."""
+
+_HOPELESS = 3
+"""Sweeps without any cavities from which on the first sites count for nothing."""
 
 _STUCK = 1e-4
 """Share of a move below which there is no way on."""
@@ -150,9 +156,9 @@ class FamilyTerms(eqx.Module):
             return jax.vmap(self.log_prob)(f)
         return jax.vmap(lambda row, f, y: row_log_prob(self.family, row, f, y))(jnp.arange(len(f)), f, self.y)
 
-    def tilted(self, cavity: Marginal, near: Marginal, power: float) -> Tilted:
-        """Return the tilted moments by quadrature."""
-        return tilted_moments(lambda f: power * self.log_prob(f), cavity, near)
+    def tilted(self, cavity: Marginal, near: Marginal, power: float, rough: bool = False) -> Tilted:
+        """Return the tilted moments by quadrature; to some percent where ``rough``, in a third of the time."""
+        return tilted_moments(lambda f: power * self.log_prob(f), cavity, near, rough)
 
 
 def row_log_prob(family: ObservationFamily, row: Any, f: jax.Array, y: jax.Array) -> jax.Array:
@@ -184,9 +190,9 @@ class Converged(NamedTuple):
     Attributes:
         sites: (T, D) each.
         cavity: of the last sweep.
-        change: largest change of a site in it.
+        change: largest change of a site that is left, as the last two sweeps tell.
         sweeps: how many were made.
-        converged: whether the change is below 1e-8 and every cavity valid.
+        converged: whether that is below 1e-8 and every cavity valid.
     """
 
     sites: Sites
@@ -242,20 +248,24 @@ def cavities(predictor: Predictor, sites: Sites, present: jax.Array, power: floa
     return Cavity(cavity, marginal, valid | ~present, known)
 
 
-def _ep(terms: EntryTerms, sites: Sites, at: Cavity, power: float) -> tuple[jax.Array, jax.Array]:
-    found = terms.tilted(at.cavity, at.marginal, power)
+def _ep(terms: EntryTerms, sites: Sites, at: Cavity, power: float, rough: Any = None) -> tuple[jax.Array, jax.Array]:
+    if rough is None or not isinstance(terms, FamilyTerms):
+        found = terms.tilted(at.cavity, at.marginal, power)
+    else:
+        found = jax.lax.cond(rough, *(lambda at, how=how: terms.tilted(at.cavity, at.marginal, power, how)
+                                      for how in (True, False)), at)
     c, v = at.cavity.mean - sites.centre, at.cavity.variance
     nu = ((found.mean - sites.centre) / found.variance - c / v) / power
     return nu, (1.0 / found.variance - 1.0 / v) / power
 
 
-def _variational(terms: Any, sites: Sites, at: Cavity, power: float) -> tuple[jax.Array, jax.Array]:
+def _variational(terms: Any, sites: Sites, at: Cavity, power: float, rough: Any = None) -> tuple[jax.Array, jax.Array]:
     _, by_mean, by_variance = expectations(terms.log_prob, at.marginal)
     tau = -2.0 * by_variance
     return by_mean + tau * (at.marginal.mean - sites.centre), tau
 
 
-def _laplace(terms: Any, sites: Sites, at: Cavity, power: float) -> tuple[jax.Array, jax.Array]:
+def _laplace(terms: Any, sites: Sites, at: Cavity, power: float, rough: Any = None) -> tuple[jax.Array, jax.Array]:
     m = at.marginal.mean
     first = jax.grad(lambda f: terms.log_prob(f).sum())
     slope, curvature = jax.jvp(first, (m,), (jnp.ones_like(m),))
@@ -266,9 +276,12 @@ _NEW_SITES: dict[str, Callable] = {"ep": _ep, "variational": _variational, "lapl
 
 
 def new_sites(terms: EntryTerms, sites: Sites, at: Cavity, settings: SiteSettings,
-              damping: Any) -> tuple[Sites, jax.Array]:
-    """Return damped new sites, and the largest change of one; where a cavity is not valid its site is kept."""
-    nu, tau = _NEW_SITES[settings.method](terms, sites, at, settings.power)
+              damping: Any, rough: Any = None) -> tuple[Sites, jax.Array]:
+    """Return damped new sites, and the largest change of one; where a cavity is not valid its site is kept.
+
+    Those of expectation propagation may be ``rough``.
+    """
+    nu, tau = _NEW_SITES[settings.method](terms, sites, at, settings.power, rough)
     nu, tau = (jnp.where(at.known, 0.0, new) for new in (nu, tau))
     usable = terms.present & at.valid & jnp.isfinite(nu) & jnp.isfinite(tau)
     nu, tau = (jnp.where(usable, new, old) for new, old in ((nu, sites.nu), (tau, sites.tau)))
@@ -441,7 +454,7 @@ def _from_prior(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, 
     mean, variance = at_rows(at.value, grid.observed), at_rows(diagonal(at.variance), grid.observed)
     cavity = _known(mean, variance)
     terms = FamilyTerms(family, y)
-    found = terms.tilted(cavity, _mode(terms.log_prob, cavity), 1.0)
+    found = terms.tilted(cavity, _mode(terms.log_prob, cavity), 1.0, rough=True)
     usable = jnp.isfinite(y) & jnp.isfinite(found.log_partition) & (found.variance > 0) & ~_is_known(mean, variance)
     variance = jnp.where(usable, found.variance, 1.0)
     tau = jnp.where(usable, 1.0 / variance - 1.0 / cavity.variance, 0.0)
@@ -495,6 +508,7 @@ class _Loop(NamedTuple):
         change: largest change of a site in it; infinite where an entry had no cavity.
         last: that of ``base``.
         sweeps: how many were made.
+        fine: how many of them were not rough.
     """
 
     sites: Sites
@@ -507,6 +521,7 @@ class _Loop(NamedTuple):
     change: jax.Array
     last: jax.Array
     sweeps: jax.Array
+    fine: jax.Array
 
 
 def _until_converged(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, settings: SiteSettings, terms: EntryTerms,
@@ -520,39 +535,49 @@ def _until_converged(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, settings:
     """
 
     def sweep(loop: _Loop) -> _Loop:
-        sites = loop.sites
+        sites, rough = loop.sites, (loop.fine == 0) & (loop.last > _ROUGH) & (loop.sweeps < _ROUGH_SWEEPS)
         _, _, predictor = _smoothed(ssm, rule, grid, y, start, sites, points, "all")
         at = cavities(predictor, sites, terms.present, settings.power)
-        new, change = new_sites(terms, sites, at, settings, 1.0)
+        new, change = new_sites(terms, sites, at, settings, 1.0, rough)
         whole = jnp.isfinite(predictor.mean).all() & jnp.isfinite(predictor.covariance).all() & at.valid.all()
         change = jnp.where(whole, change, jnp.inf)
         good = jnp.isfinite(change)
         here = jnp.stack([sites.nu, sites.tau])
         move = jnp.stack([new.nu, new.tau]) - here
-        forget = ~good | (change > loop.last) | (loop.sweeps == 0)
-        share = jnp.where(good, jnp.where(change > loop.last, jnp.maximum(0.5 * loop.share, 0.05),
-                                          jnp.minimum(1.5 * loop.share, settings.damping)), 0.5 * loop.share)
+        grown = (change > loop.last) & (loop.fine > 0)
+        share = jnp.where(grown, jnp.maximum(0.5 * loop.share, 0.05), jnp.minimum(1.5 * loop.share, settings.damping))
+        share = jnp.where(good, share, 0.5 * loop.share)
+        # Rough sweeps tell nothing of fine ones.
+        forget = ~good | grown | (loop.fine == 0) | jnp.isinf(loop.last)
         slot = loop.sweeps % _MEMORY
         steps = jnp.where(forget, 0.0, loop.steps.at[slot].set(here - loop.base))
         changes = jnp.where(forget, 0.0, loop.changes.at[slot].set(move - loop.move))
         mixed = _mixed(move, steps, changes, share, at.marginal.variance)
         base, move = (jnp.where(good, a, b) for a, b in ((here, loop.base), (move, loop.move)))
-        nu, tau = base + jnp.where(good & (change < _NEAR), mixed, share * move)
-        return _Loop(sites._replace(nu=nu, tau=tau), base, move, share, steps, changes, at, change,
-                     jnp.where(good, change, loop.last), loop.sweeps + 1)
+        # First sites that are far off: those of a sweep from no sites at all instead.
+        anew = ~good & jnp.isinf(loop.last) & (loop.sweeps == _HOPELESS)
+        share = jnp.where(anew, settings.damping, share)
+        nu, tau = base + jnp.where(anew, 0.0, jnp.where(good & (change < _NEAR), mixed, share * move))
+        # What is left to go after this step, if it shortens the way as the last one did.
+        shortened = jnp.where(forget, 1.0, jnp.clip(change / loop.last, 0.1, 1.0))
+        return _Loop(sites._replace(nu=nu, tau=tau), base, move, share, steps, changes, at, shortened * change,
+                     jnp.where(good, change, loop.last), loop.sweeps + 1, loop.fine + ~rough)
 
     def going(loop: _Loop) -> jax.Array:
-        return (loop.change >= _tolerance(loop.change)) & (loop.sweeps < settings.sweeps) & (loop.share > _STUCK)
+        return ((loop.change >= _tolerance(loop.change)) | (loop.fine == 0)) & (loop.sweeps < settings.sweeps) & (
+            loop.share > _STUCK)
 
     move = jnp.stack([first.nu, first.tau])
     nothing = jnp.zeros((_MEMORY, *move.shape))
-    still, infinite = jnp.zeros_like(first.nu), jnp.full((), jnp.inf)
+    still, infinite, none = jnp.zeros_like(first.nu), jnp.full((), jnp.inf), jnp.zeros((), int)
     no_cavity = Cavity(Marginal(still, still), Marginal(still, still), still > 0, still > 0)
+    # Points of linearisation are known from sweeps of the same sites.
+    fine = none if points is None else none + 1
     loop = _Loop(first, jnp.zeros_like(move), move, jnp.asarray(settings.damping), nothing, nothing, no_cavity,
-                 infinite, infinite, jnp.asarray(0))
+                 infinite, infinite, none, fine)
     loop = jax.lax.while_loop(going, sweep, loop)
-    sites = loop.sites._replace(nu=loop.base[0] + loop.move[0], tau=loop.base[1] + loop.move[1])
-    return Converged(sites, loop.cavity, loop.change, loop.sweeps, loop.change < _tolerance(loop.change))
+    converged = (loop.change < _tolerance(loop.change)) & (loop.fine > 0)
+    return Converged(loop.sites, loop.cavity, loop.change, loop.sweeps, converged)
 
 
 def _mixed(move: jax.Array, steps: jax.Array, changes: jax.Array, share: jax.Array, variance: jax.Array) -> jax.Array:
