@@ -3,6 +3,7 @@
 import json
 
 import arviz as az
+import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro
@@ -110,3 +111,36 @@ def test_unconverged_sites_are_counted_and_named(result):
 def test_figures_of_counts(ahead):
     figure = lfm.plot_fit(ahead)
     assert any("events" in axes.get_ylabel() or "events" in axes.get_title() for axes in figure.axes)
+
+
+def test_a_panel_of_counts_is_a_loop_over_its_series():
+    """One of the series is all missing, the other has a gap."""
+    y = np.stack([COUNTS, np.full_like(COUNTS, np.nan)])
+    y[0, 3] = np.nan
+    panel = lfm.panel(lambda level: system(level, 0.6), jnp.array([0.3, 0.8]), TIMES)
+    found = panel.log_prob(y)
+    assert found[0] == pytest.approx(float(lfm.MarginalLikelihood(system(0.3, 0.6), TIMES).log_prob(y[0])), abs=1e-9)
+    assert found[1] == pytest.approx(0.0, abs=1e-12)
+
+
+def driven(times, y=None):
+    """Counts of a state that softplus of a force produces: no Gaussian moments are exact."""
+    level = numpyro.sample("level", dist.Normal(0.5, 0.5))
+    model = lfm.LatentForceModel(
+        lambda x, u, t: jax.nn.softplus(u) - 0.7 * x, {"u": lfm.Matern(1.0, 3.0)},
+        lfm.PoissonObservation(lambda x, u, t: level + x), lfm.Gaussian(jnp.ones(1), 0.1 * jnp.eye(1)))
+    numpyro.sample("y", lfm.MarginalLikelihood(model, times, steps=3), obs=y)
+
+
+@pytest.mark.slow
+def test_particles_check_and_correct_counts_of_dynamics_that_are_not_linear():
+    """pmmh draws from the exact posterior; NUTS with EP comes near, and the check says by how much."""
+    filtered, exact = (lfm.fit(driven, TIMES, COUNTS, sampler=sampler, chains=2, warmup=200, samples=300,
+                               trajectory_draws=20, progress=False) for sampler in ("nuts", "pmmh"))
+    report = lfm.check_accuracy(filtered, driven, draws=40, particles=2000, replicates=3, progress=False)
+    assert "particle filter" in report.reference and report.k < report.threshold
+    means = [float(arviz_data.group(one, "posterior")["level"].mean()) for one in (filtered, exact)]
+    sd = float(arviz_data.group(exact, "posterior")["level"].std())
+    assert abs(means[0] - means[1]) < 0.4 * sd
+    drawn = arviz_data.group(lfm.forecast(exact, driven, AHEAD, draws=20), "predictions")["y"].values
+    assert np.all(drawn == np.round(drawn))
