@@ -68,6 +68,7 @@ def test_nuts_with_expectation_propagation_is_calibrated(name):
     assert_uniform(found, bins=16)
 
 
+@pytest.mark.slow
 def test_random_walks_with_expectation_propagation_are_calibrated():
     """The same, small: 24 data sets of 6 rows, and random walks, whose program is a fraction of that of NUTS."""
     found = calibration.calibrate(jax.random.key(4), poisson, np.arange(6.0), lfm.RAM, data_sets=24, draws=15, thin=20,

@@ -1,6 +1,7 @@
 """Counts through what follows a fit: forecast, scores, intervals, checks, correction, comparison, figures."""
 
 import json
+import warnings
 
 import arviz as az
 import jax
@@ -37,8 +38,11 @@ def counts(times, y=None, sites=None):
 
 @pytest.fixture(scope="module")
 def result():
-    return lfm.fit(counts, TIMES, COUNTS, sampler="ram", chains=2, warmup=150, samples=150, thin=3, trajectory_draws=40,
-                   chain_method="vectorized", progress=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", lfm.ConvergenceWarning)  # it is short
+        return lfm.fit(counts, TIMES, COUNTS, sampler="ram", chains=2, warmup=50, samples=60, thin=3,
+                       trajectory_draws=40, chain_method="vectorized", progress=False,
+                       sampler_options={"initial_covariance": np.diag([0.15, 0.08])})
 
 
 @pytest.fixture(scope="module")
@@ -73,9 +77,10 @@ def test_log_score_is_that_of_the_family_along_the_paths(ahead):
         lfm.score(arviz_data.group(ahead, "predictions"), HELD_OUT, numpyro_model=counts)
 
 
+@pytest.mark.slow
 def test_check_by_importance_sampling_and_correction(result):
     """One state: draws of the smoother are exact but for their noise, and EP is within 0.15 of the log evidence."""
-    report = lfm.check_accuracy(result, counts, draws=20, particles=400, replicates=3, progress=False)
+    report = lfm.check_accuracy(result, counts, draws=120, particles=400, replicates=3, progress=False)
     assert "importance sampling, 3 runs of 400 draws" in report.reference
     ratio = (report.dataset["log_likelihood_reference"] - report.dataset["log_likelihood"]).values
     assert np.abs(ratio).max() < 0.15 + 5 * report.dataset["noise_sd"].values.max()
@@ -113,6 +118,7 @@ def test_figures_of_counts(ahead):
     assert any("events" in axes.get_ylabel() or "events" in axes.get_title() for axes in figure.axes)
 
 
+@pytest.mark.slow
 def test_a_panel_of_counts_is_a_loop_over_its_series():
     """One of the series is all missing, the other has a gap."""
     y = np.stack([COUNTS, np.full_like(COUNTS, np.nan)])
