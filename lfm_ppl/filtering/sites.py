@@ -252,8 +252,8 @@ def _ep(terms: EntryTerms, sites: Sites, at: Cavity, power: float, rough: Any = 
     if rough is None or not isinstance(terms, FamilyTerms):
         found = terms.tilted(at.cavity, at.marginal, power)
     else:
-        found = jax.lax.cond(rough, *(lambda at, how=how: terms.tilted(at.cavity, at.marginal, power, how)
-                                      for how in (True, False)), at)
+        found = jax.lax.cond(rough, lambda at: terms.tilted(at.cavity, at.marginal, power, True),
+                             lambda at: terms.tilted(at.cavity, at.marginal, power), at)
     c, v = at.cavity.mean - sites.centre, at.cavity.variance
     nu = ((found.mean - sites.centre) / found.variance - c / v) / power
     return nu, (1.0 / found.variance - 1.0 / v) / power
