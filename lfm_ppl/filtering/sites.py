@@ -505,8 +505,8 @@ class _Loop(NamedTuple):
         steps, changes: (_MEMORY, 2, T, D), the latest steps between such sites, and what they changed of ``move``;
             zero where there is none.
         cavity: of the last sweep.
-        change: largest change of a site in it; infinite where an entry had no cavity.
-        last: that of ``base``.
+        change: largest change of a site that is left after it; infinite where an entry had no cavity.
+        last: largest change of a site in the sweep from ``base``.
         sweeps: how many were made.
         fine: how many of them were not rough.
     """
