@@ -14,8 +14,9 @@ from lfm_ppl import checks
 from lfm_ppl.data import as_data, model_keywords
 from lfm_ppl.fitting import ConvergenceWarning, fit
 from lfm_ppl.forecasting import check_possible
-from lfm_ppl.inference.bound_model import bind
+from lfm_ppl.inference.bound_model import BoundModel, bind
 from lfm_ppl.results import arviz_data
+from lfm_ppl.results.family_scores import log_densities
 from lfm_ppl.results.predictions import GROUP, MEAN, SD, observed_variable
 from lfm_ppl.results.scoring import ALL, Scores, gaussian_scores, scores, summary
 
@@ -164,7 +165,8 @@ def backtest(numpyro_model: Callable, times: Any, y: Any = None, *, horizon: int
             drawn = _flat(observed_variable(predicted))
             # An observation family has no normal distribution at each draw.
             mean, sd = (_flat(predicted[name]) if name in predicted else None for name in (MEAN, SD))
-            found = scores(drawn, y[ahead], mean, sd, level, angular)
+            densities = None if mean is not None else _of_family(bound, result, predicted, y[ahead])
+            found = scores(drawn, y[ahead], mean, sd, level, angular, densities)
         messages += [f"origin {times[origin]:g}: {one.message}" for one in caught]
         forecasts.append(((drawn if mean is None else mean).mean(axis=0), found))
         mean, sd = _naive(known[:origin + 1], horizon, season or 1, angular)
@@ -178,6 +180,13 @@ def backtest(numpyro_model: Callable, times: Any, y: Any = None, *, horizon: int
     dataset = _dataset((forecasts, naive), reference, times, origins, horizon, names or model.output_names)
     dataset.attrs.update(sampler=sampler, season=season or 1, level=level, seed=seed, warnings="\n".join(messages))
     return Backtest(dataset, _table(dataset, level))
+
+
+def _of_family(bound: BoundModel, result: Any, predicted: xr.Dataset, y: np.ndarray) -> np.ndarray:
+    """Return the log densities (S, H, D) of an observation family along the predicted paths."""
+    posterior = arviz_data.group(result, "posterior").isel(draw=predicted["draw"].values)
+    draws = {site: posterior[site.replace("/", ".")].transpose("chain", "draw", ...).values for site in bound.sites}
+    return log_densities(bound, {site: one.reshape(-1, *one.shape[2:]) for site, one in draws.items()}, predicted, y)
 
 
 def _origins(rows: int, horizon: int, every: int, first: int | None) -> list[int]:

@@ -33,6 +33,7 @@ from lfm_ppl.inference.marginal_likelihood import Panel
 from lfm_ppl.inference.posterior import scores, trajectories
 from lfm_ppl.inference.progress import Counter
 from lfm_ppl.inference.sampling import Transition
+from lfm_ppl.inference.site_failures import site_failures
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results import checkpoint as checkpoints
 from lfm_ppl.results.checkpoint import Checkpoint
@@ -298,6 +299,7 @@ class _Run:
         described: attributes of the result, but for those that come of sampling.
         attributes: those that the user wants besides.
         keeper: what keeps it in a folder; None: nothing does.
+        z: (C, N, d), unconstrained draws of the chains; None for "map".
         draws: site -> (C, N, ...), so far.
         stats: statistics of the sampler, (C, N) each.
         remarks: attributes that come of sampling.
@@ -317,6 +319,7 @@ class _Run:
     described: dict[str, Any]
     attributes: dict[str, Any]
     keeper: Checkpoint | None = None
+    z: np.ndarray | None = None
     draws: dict[str, np.ndarray] = field(default_factory=dict)
     stats: dict[str, np.ndarray] = field(default_factory=dict)
     remarks: dict[str, Any] = field(default_factory=dict)
@@ -355,6 +358,7 @@ class _Run:
                                     "there are no draws yet")
         if collected.done < collected.total:
             self.partial = _some(count, asked.samples)
+        self.z = collected.z
         self.draws, self.stats = _draws(self.bound, {"z": collected.z, **collected.statistics}, asked.samples)
 
     def follow(self) -> None:
@@ -373,6 +377,9 @@ class _Run:
         try:
             self.rated = kept("scores of the observations",
                               lambda: scores(self.bound, flat, **watched("scores")), None)
+            if asked.sampler in ("nuts", "ram") and (z := self.z) is not None:
+                failures = kept("convergence of the sites", lambda: site_failures(self.bound, z, asked.seed), None)
+                self.remarks |= {} if failures is None else {arviz_data.SITES: json.dumps(failures)}
             self.drawn = kept("trajectories", lambda: draw_paths(
                 asked.keys[3], self.bound, flat, asked.at, asked.trajectory_draws, asked.chains, asked.samples,
                 **{label: self.particles.get(label) for label in _OF_PARTICLES}, **watched("trajectories")), self.drawn)

@@ -13,7 +13,6 @@ from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.posterior import noise_of_rows, trajectories
 from lfm_ppl.particles.particle_filter import ParticleSettings
 from lfm_ppl.results import arviz_data, rebuilding
-from lfm_ppl.results import inputs as stored_inputs
 from lfm_ppl.results.accuracy import evenly_spaced
 from lfm_ppl.results.predictions import GROUP, predictions
 
@@ -80,11 +79,8 @@ def forecast(result: Any, numpyro_model: Callable, times: Any, *, inputs: Mappin
     """
     checks.positive_integer("draws", draws)
     times = checks.time_vector("times", times, order="non-decreasing")
-    keywords = stored_inputs.keywords(result, model_kwargs)
-    stored = stored_inputs.inputs_of(result)
-    for name, later in (inputs or {}).items():
-        keywords |= {"inputs": {**keywords["inputs"], name: later}} if name in stored else {name: later}
-    problem = rebuilding.problem(result, numpyro_model, model_kwargs=keywords)
+    problem = rebuilding.problem(result, numpyro_model,
+                                 model_kwargs=rebuilding.keywords(result, inputs, model_kwargs))
     bound = problem.bound
     check_possible(bound, times)
     posterior = arviz_data.group(result, "posterior")

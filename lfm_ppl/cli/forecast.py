@@ -7,6 +7,7 @@ import contextlib
 import dataclasses
 import shutil
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -52,20 +53,28 @@ def run(arguments: argparse.Namespace) -> int:
         session.start(1, not arguments.no_cache)
         task = check.rebuilt(posterior, arguments.model, path)
         held_out = None if arguments.held_out is None else _held_out(arguments, task)
-        return _write(_forecast(arguments, task, held_out), held_out, path, folder, arguments)
+        forecast, score = _forecast(arguments, task, held_out)
+        return _write(forecast, score, held_out, path, folder, arguments)
 
 
-def _forecast(arguments: argparse.Namespace, task: check.Check, held_out: data.Data | None) -> Any:
+def _forecast(arguments: argparse.Namespace, task: check.Check, held_out: data.Data | None) -> tuple:
+    """Return the forecast, and what scores it."""
     import lfm_ppl
     from lfm_ppl.model.inputs import Input
+    from lfm_ppl.results import arviz_data
+    from lfm_ppl.results.predictions import GROUP, MEAN
 
     times = requested(task.observed, arguments.until, arguments.at, _GRID, np.array([]))
     inputs = {}
     if held_out is not None:
         times = np.union1d(times, held_out.times)
         inputs = {name: Input(*joined(task.observed.inputs[name], later)) for name, later in held_out.inputs.items()}
-    return lfm_ppl.forecast(task.posterior, task.model, times, inputs=inputs, model_kwargs=task.keywords,
-                            draws=arguments.draws, seed=arguments.seed)
+    more = {"inputs": inputs, "model_kwargs": task.keywords}
+    forecast = lfm_ppl.forecast(task.posterior, task.model, times, draws=arguments.draws, seed=arguments.seed, **more)
+    # An observation family has its own law, which is the model's.
+    of_family = MEAN not in arviz_data.group(forecast, GROUP)
+    own = {"numpyro_model": task.model, **more} if of_family else {}
+    return forecast, lambda: lfm_ppl.score(forecast, held_out, **own)
 
 
 def joined(before: data.InputTable, later: data.InputTable) -> data.InputTable:
@@ -132,8 +141,8 @@ def _held_out(arguments: argparse.Namespace, task: check.Check) -> data.Data:
     return read
 
 
-def _write(forecast: Any, held_out: data.Data | None, path: Path, folder: Path, arguments: argparse.Namespace) -> int:
-    import lfm_ppl
+def _write(forecast: Any, score: Callable, held_out: data.Data | None, path: Path, folder: Path,
+           arguments: argparse.Namespace) -> int:
     from lfm_ppl.results import arviz_data, files, tables
     from lfm_ppl.results.plots import plot_fit
     from lfm_ppl.results.predictions import GROUP, summary
@@ -150,7 +159,7 @@ def _write(forecast: Any, held_out: data.Data | None, path: Path, folder: Path, 
     print(f"wrote    {tables.write_csv(table, folder / TABLE, arguments.overwrite, index_label='time')}")
     more: dict[str, pd.DataFrame] = {}
     if held_out is not None and np.isfinite(held_out.y).any():
-        scores = lfm_ppl.score(forecast, held_out)
+        scores = score()
         print(f"\n{tables.text_table(scores, width=shutil.get_terminal_size().columns)}\n")
         print(f"wrote    {tables.write_csv(scores, folder / SCORES, arguments.overwrite, index_label='output')}")
         more = {"Scores on the held-out data": scores}

@@ -12,6 +12,8 @@ import numpy as np
 _NODES, _STRETCH, _END = 48, 0.5, 6.0
 """Of the rule: nodes x = sinh(a u) / a at equal steps of u in [-6, 6], to 20 standard deviations on either side."""
 
+_once = jax.lax.optimization_barrier
+
 _LOG_2PI = float(np.log(2.0 * np.pi))
 
 
@@ -36,12 +38,17 @@ class Tilted(NamedTuple):
     variance: jax.Array
 
 
-def _rule() -> tuple[np.ndarray, np.ndarray]:
-    u = np.linspace(-_END, _END, _NODES)
+_ROUGH_NODES, _ROUGH_END = 16, 4.0
+"""Of a rule to some percent, to 7 standard deviations."""
+
+
+def _rule(count: int = _NODES, end: float = _END) -> tuple[np.ndarray, np.ndarray]:
+    u = np.linspace(-end, end, count)
     return np.sinh(_STRETCH * u) / _STRETCH, np.log((u[1] - u[0]) * np.cosh(_STRETCH * u))
 
 
-def tilted_moments(log_function: Callable[[jax.Array], jax.Array], cavity: Marginal, near: Marginal) -> Tilted:
+def tilted_moments(log_function: Callable[[jax.Array], jax.Array], cavity: Marginal, near: Marginal,
+                   rough: bool = False) -> Tilted:
     """Return log Z, mean and variance of N(f; m, v) p(f) by quadrature, about where the product is.
 
     The trapezoidal rule in u with f = near.mean + near.sd sinh(a u) / a: its nodes are dense in the middle and reach
@@ -51,25 +58,29 @@ def tilted_moments(log_function: Callable[[jax.Array], jax.Array], cavity: Margi
         log_function: log p, of nodes (J, ...), entry by entry.
         cavity: m and v.
         near: about where the product is, and how wide; its own moments are best.
+        rough: a third of the nodes.
 
     Source: Mori and Sugihara (2001), Journal of Computational and Applied Mathematics 127.
     """
-    lead = (_NODES,) + (1,) * jnp.ndim(cavity.mean)
-    x, log_weights = (jnp.asarray(part).reshape(lead) for part in _rule())
-    sd = jnp.sqrt(near.variance)
-    f = near.mean + sd * x
-    log_mass = log_weights - 0.5 * (f - cavity.mean) ** 2 / cavity.variance + log_function(f)
+    nodes, log_weights = map(jnp.asarray, _rule(_ROUGH_NODES, _ROUGH_END) if rough else _rule())
+    lead = (len(nodes),) + (1,) * jnp.ndim(cavity.mean)
+    f, half = near.mean + jnp.sqrt(near.variance) * nodes.reshape(lead), -0.5 / cavity.variance
+    log_mass = log_weights.reshape(lead) + half * (f - cavity.mean) ** 2 + log_function(f)
     # Not a number is no mass: a link that overflows far out.
     log_mass = jnp.where(jnp.isnan(log_mass), -jnp.inf, log_mass)
-    largest = jax.lax.stop_gradient(log_mass.max(0))
+    # The barriers keep XLA from computing the function again in each sum, 4 times slower; so does a table of 2 axes.
+    log_mass = _once(log_mass.reshape(len(nodes), -1))
+    largest = _once(jax.lax.stop_gradient(log_mass.max(0)))
     mass = jnp.exp(log_mass - jnp.where(jnp.isfinite(largest), largest, 0.0))
-    total = mass.sum(0)
+    x = nodes[:, None]
+    total, first, second = mass.sum(0), (mass * x).sum(0), (mass * x**2).sum(0)
     possible = total > 0
     total = jnp.where(possible, total, 1.0)
-    log_partition = jnp.where(possible, largest + jnp.log(total), -jnp.inf) + 0.5 * (
-        jnp.log(near.variance / cavity.variance) - _LOG_2PI)
-    middle = (mass * x).sum(0) / total
-    return Tilted(log_partition, near.mean + sd * middle, near.variance * (mass * (x - middle) ** 2).sum(0) / total)
+    middle = first / total
+    log_total, middle, spread = (part.reshape(cavity.mean.shape) for part in (
+        jnp.where(possible, largest + jnp.log(total), -jnp.inf), middle, second / total - middle**2))
+    log_partition = log_total + 0.5 * (jnp.log(near.variance / cavity.variance) - _LOG_2PI)
+    return Tilted(log_partition, near.mean + jnp.sqrt(near.variance) * middle, near.variance * spread)
 
 
 def expectations(function: Callable[[jax.Array], jax.Array], about: Marginal) -> tuple[jax.Array, jax.Array, jax.Array]:

@@ -42,7 +42,7 @@ from lfm_ppl.filtering.quadrature import Marginal, Tilted, expectations, tilted_
 from lfm_ppl.filtering.rts import Predictor, Smoothed, backward
 from lfm_ppl.filtering.time_grid import TimeGrid
 from lfm_ppl.filtering.update import Sites
-from lfm_ppl.linalg import diagonal, inverse_and_log_det, matmul
+from lfm_ppl.linalg import diagonal, inverse_and_log_det, matmul, solve_semidefinite
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel
@@ -50,10 +50,25 @@ from lfm_ppl.model.state_space import StateSpaceModel
 METHODS = ("ep", "variational", "laplace")
 
 _TOLERANCE = 1e-8
-"""Largest change of a site in a sweep, in units of the marginal (nu times its sd, tau times its variance)."""
+"""Largest change of a site that is left, in units of the marginal (nu times its sd, tau times its variance)."""
 
 _SEARCH = 12
 """Steps of the search for the mode of a tilted distribution."""
+
+_MEMORY = 3
+"""Sweeps whose steps are remembered; more do not save sweeps."""
+
+_ROUGH, _ROUGH_SWEEPS = 0.05, 4
+"""Change above which the first sweeps are rough, and how many of them may be."""
+
+_NEAR = 0.5
+"""Largest change from which on steps are those of a map that is nearly linear."""
+
+_HOPELESS = 3
+"""Sweeps without any cavities from which on the first sites count for nothing."""
+
+_STUCK = 1e-4
+"""Share of a move below which there is no way on."""
 
 _WHOLE = 0.5
 """Share of the marginal's precision from its own site, from which the cavity is taken from leave-one-out terms."""
@@ -141,9 +156,9 @@ class FamilyTerms(eqx.Module):
             return jax.vmap(self.log_prob)(f)
         return jax.vmap(lambda row, f, y: row_log_prob(self.family, row, f, y))(jnp.arange(len(f)), f, self.y)
 
-    def tilted(self, cavity: Marginal, near: Marginal, power: float) -> Tilted:
-        """Return the tilted moments by quadrature."""
-        return tilted_moments(lambda f: power * self.log_prob(f), cavity, near)
+    def tilted(self, cavity: Marginal, near: Marginal, power: float, rough: bool = False) -> Tilted:
+        """Return the tilted moments by quadrature; to some percent where ``rough``, in a third of the time."""
+        return tilted_moments(lambda f: power * self.log_prob(f), cavity, near, rough)
 
 
 def row_log_prob(family: ObservationFamily, row: Any, f: jax.Array, y: jax.Array) -> jax.Array:
@@ -175,9 +190,9 @@ class Converged(NamedTuple):
     Attributes:
         sites: (T, D) each.
         cavity: of the last sweep.
-        change: largest change of a site in it.
+        change: largest change of a site that is left, as the last two sweeps tell.
         sweeps: how many were made.
-        converged: whether the change is below 1e-8 and every cavity valid.
+        converged: whether that is below 1e-8 and every cavity valid.
     """
 
     sites: Sites
@@ -217,9 +232,8 @@ def cavities(predictor: Predictor, sites: Sites, present: jax.Array, power: floa
     """
     m, v = predictor.mean - sites.centre, diagonal(predictor.covariance)
     nu, tau = sites.nu, sites.tau
-    least = _known(predictor.mean, jnp.zeros_like(v)).variance
-    known = jnp.abs(v) <= least
-    v = jnp.where(known, least, v)
+    known = _is_known(predictor.mean, v)
+    v = jnp.where(known, _known(predictor.mean, v).variance, v)
     share = jnp.where(known, 0.0, power * tau * v)
     whole = (share > _WHOLE) & (power == 1.0)
     safe_tau = jnp.where(whole, tau, 1.0)
@@ -234,20 +248,24 @@ def cavities(predictor: Predictor, sites: Sites, present: jax.Array, power: floa
     return Cavity(cavity, marginal, valid | ~present, known)
 
 
-def _ep(terms: EntryTerms, sites: Sites, at: Cavity, power: float) -> tuple[jax.Array, jax.Array]:
-    found = terms.tilted(at.cavity, at.marginal, power)
+def _ep(terms: EntryTerms, sites: Sites, at: Cavity, power: float, rough: Any = None) -> tuple[jax.Array, jax.Array]:
+    if rough is None or not isinstance(terms, FamilyTerms):
+        found = terms.tilted(at.cavity, at.marginal, power)
+    else:
+        found = jax.lax.cond(rough, lambda at: terms.tilted(at.cavity, at.marginal, power, True),
+                             lambda at: terms.tilted(at.cavity, at.marginal, power), at)
     c, v = at.cavity.mean - sites.centre, at.cavity.variance
     nu = ((found.mean - sites.centre) / found.variance - c / v) / power
     return nu, (1.0 / found.variance - 1.0 / v) / power
 
 
-def _variational(terms: Any, sites: Sites, at: Cavity, power: float) -> tuple[jax.Array, jax.Array]:
+def _variational(terms: Any, sites: Sites, at: Cavity, power: float, rough: Any = None) -> tuple[jax.Array, jax.Array]:
     _, by_mean, by_variance = expectations(terms.log_prob, at.marginal)
     tau = -2.0 * by_variance
     return by_mean + tau * (at.marginal.mean - sites.centre), tau
 
 
-def _laplace(terms: Any, sites: Sites, at: Cavity, power: float) -> tuple[jax.Array, jax.Array]:
+def _laplace(terms: Any, sites: Sites, at: Cavity, power: float, rough: Any = None) -> tuple[jax.Array, jax.Array]:
     m = at.marginal.mean
     first = jax.grad(lambda f: terms.log_prob(f).sum())
     slope, curvature = jax.jvp(first, (m,), (jnp.ones_like(m),))
@@ -258,9 +276,12 @@ _NEW_SITES: dict[str, Callable] = {"ep": _ep, "variational": _variational, "lapl
 
 
 def new_sites(terms: EntryTerms, sites: Sites, at: Cavity, settings: SiteSettings,
-              damping: Any) -> tuple[Sites, jax.Array]:
-    """Return damped new sites, and the largest change of one; where a cavity is not valid its site is kept."""
-    nu, tau = _NEW_SITES[settings.method](terms, sites, at, settings.power)
+              damping: Any, rough: Any = None) -> tuple[Sites, jax.Array]:
+    """Return damped new sites, and the largest change of one; where a cavity is not valid its site is kept.
+
+    Those of expectation propagation may be ``rough``.
+    """
+    nu, tau = _NEW_SITES[settings.method](terms, sites, at, settings.power, rough)
     nu, tau = (jnp.where(at.known, 0.0, new) for new in (nu, tau))
     usable = terms.present & at.valid & jnp.isfinite(nu) & jnp.isfinite(tau)
     nu, tau = (jnp.where(usable, new, old) for new, old in ((nu, sites.nu), (tau, sites.tau)))
@@ -421,7 +442,7 @@ def _first(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start
 
 def _from_prior(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments,
                 family: ObservationFamily) -> Sites:
-    """Return sites with the modes and curvatures of the prior's marginals times the data's factors.
+    """Return sites with the moments of the prior's marginals times the data's factors.
 
     All at once, which is faster than one after the other in the scan; in a model that is not linear the prior may run
     away from the data.
@@ -432,11 +453,17 @@ def _from_prior(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, 
     at = passed.site_terms
     mean, variance = at_rows(at.value, grid.observed), at_rows(diagonal(at.variance), grid.observed)
     cavity = _known(mean, variance)
-    found = _mode(FamilyTerms(family, y).log_prob, cavity)
-    tau = jnp.where(jnp.isfinite(y), 1.0 / found.variance - 1.0 / cavity.variance, 0.0)
-    # The mode of the product is where the slopes cancel.
-    nu = jnp.where(jnp.isfinite(y), (found.mean - mean) / cavity.variance, 0.0)
-    return Sites(found.mean, nu, jnp.maximum(tau, 0.0))
+    terms = FamilyTerms(family, y)
+    found = terms.tilted(cavity, _mode(terms.log_prob, cavity), 1.0, rough=True)
+    usable = jnp.isfinite(y) & jnp.isfinite(found.log_partition) & (found.variance > 0) & ~_is_known(mean, variance)
+    variance = jnp.where(usable, found.variance, 1.0)
+    tau = jnp.where(usable, 1.0 / variance - 1.0 / cavity.variance, 0.0)
+    return Sites(mean, jnp.where(usable, (found.mean - mean) / variance, 0.0), tau)
+
+
+def _is_known(mean: jax.Array, variance: jax.Array) -> jax.Array:
+    """Whether a variance is nothing but rounding errors."""
+    return jnp.abs(variance) <= _known(mean, jnp.zeros_like(variance)).variance
 
 
 def _known(mean: jax.Array, variance: jax.Array) -> Marginal:
@@ -467,27 +494,104 @@ def _joint_sweeps(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array
     return sites, points
 
 
+class _Loop(NamedTuple):
+    """Where the search for the fixed point stands.
+
+    Attributes:
+        sites: to be tried next.
+        base: nu and tau (2, T, D) of the last ones under which every entry had a cavity.
+        move: by how much a sweep moved those, undamped.
+        share: of a move that is taken.
+        steps, changes: (_MEMORY, 2, T, D), the latest steps between such sites, and what they changed of ``move``;
+            zero where there is none.
+        cavity: of the last sweep.
+        change: largest change of a site that is left after it; infinite where an entry had no cavity.
+        last: largest change of a site in the sweep from ``base``.
+        sweeps: how many were made.
+        fine: how many of them were not rough.
+    """
+
+    sites: Sites
+    base: jax.Array
+    move: jax.Array
+    share: jax.Array
+    steps: jax.Array
+    changes: jax.Array
+    cavity: Any
+    change: jax.Array
+    last: jax.Array
+    sweeps: jax.Array
+    fine: jax.Array
+
+
 def _until_converged(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, settings: SiteSettings, terms: EntryTerms,
                      y: jax.Array, start: Moments, first: Sites, points: Points | None) -> Converged:
-    def sweep(carry: tuple) -> tuple:
-        sites, _, last, damping, count = carry
+    """Sweep until the sites do not change, faster by what the last sweeps tell of the next (Anderson's mixing).
+
+    Sites that leave an entry without a cavity are halfway too far from the last good ones. Where changes grow, two
+    sites answer each other, and less of each new one is taken.
+
+    Source: Anderson (1965), Journal of the ACM 12; Walker and Ni (2011), SIAM Journal on Numerical Analysis 49.
+    """
+
+    def sweep(loop: _Loop) -> _Loop:
+        sites, rough = loop.sites, (loop.fine == 0) & (loop.last > _ROUGH) & (loop.sweeps < _ROUGH_SWEEPS)
         _, _, predictor = _smoothed(ssm, rule, grid, y, start, sites, points, "all")
         at = cavities(predictor, sites, terms.present, settings.power)
-        # Two sites that answer each other overshoot; taking less of each new one ends that.
-        sites, change = new_sites(terms, sites, at, settings, damping)
-        # Where the filter breaks down no sweep helps.
-        whole = jnp.isfinite(predictor.mean).all() & jnp.isfinite(predictor.covariance).all()
-        change = jnp.where(whole, change, jnp.nan)
-        damping = jnp.where(change > last, jnp.maximum(0.5 * damping, 0.05), damping)
-        return sites, at, change, damping, count + 1
+        new, change = new_sites(terms, sites, at, settings, 1.0, rough)
+        whole = jnp.isfinite(predictor.mean).all() & jnp.isfinite(predictor.covariance).all() & at.valid.all()
+        change = jnp.where(whole, change, jnp.inf)
+        good = jnp.isfinite(change)
+        here = jnp.stack([sites.nu, sites.tau])
+        move = jnp.stack([new.nu, new.tau]) - here
+        grown = (change > loop.last) & (loop.fine > 0)
+        share = jnp.where(grown, jnp.maximum(0.5 * loop.share, 0.05), jnp.minimum(1.5 * loop.share, settings.damping))
+        share = jnp.where(good, share, 0.5 * loop.share)
+        # Rough sweeps tell nothing of fine ones.
+        forget = ~good | grown | (loop.fine == 0) | jnp.isinf(loop.last)
+        slot = loop.sweeps % _MEMORY
+        steps = jnp.where(forget, 0.0, loop.steps.at[slot].set(here - loop.base))
+        changes = jnp.where(forget, 0.0, loop.changes.at[slot].set(move - loop.move))
+        mixed = _mixed(move, steps, changes, share, at.marginal.variance)
+        base, move = (jnp.where(good, a, b) for a, b in ((here, loop.base), (move, loop.move)))
+        # First sites that are far off: those of a sweep from no sites at all instead.
+        anew = ~good & jnp.isinf(loop.last) & (loop.sweeps == _HOPELESS)
+        share = jnp.where(anew, settings.damping, share)
+        nu, tau = base + jnp.where(anew, 0.0, jnp.where(good & (change < _NEAR), mixed, share * move))
+        # What is left to go after this step, if it shortens the way as the last one did.
+        shortened = jnp.where(forget, 1.0, jnp.clip(change / loop.last, 0.1, 1.0))
+        return _Loop(sites._replace(nu=nu, tau=tau), base, move, share, steps, changes, at, shortened * change,
+                     jnp.where(good, change, loop.last), loop.sweeps + 1, loop.fine + ~rough)
 
-    def going(carry: tuple) -> jax.Array:
-        change, count = carry[2], carry[4]
-        return (change >= _tolerance(change)) & (count < settings.sweeps)
+    def going(loop: _Loop) -> jax.Array:
+        return ((loop.change >= _tolerance(loop.change)) | (loop.fine == 0)) & (loop.sweeps < settings.sweeps) & (
+            loop.share > _STUCK)
 
-    carry = sweep((first, None, jnp.asarray(jnp.inf), jnp.asarray(settings.damping), jnp.asarray(0)))
-    sites, at, change, _, count = jax.lax.while_loop(going, sweep, carry)
-    return Converged(sites, at, change, count, (change < _tolerance(change)) & at.valid.all())
+    move = jnp.stack([first.nu, first.tau])
+    nothing = jnp.zeros((_MEMORY, *move.shape))
+    still, infinite, none = jnp.zeros_like(first.nu), jnp.full((), jnp.inf), jnp.zeros((), int)
+    no_cavity = Cavity(Marginal(still, still), Marginal(still, still), still > 0, still > 0)
+    # Points of linearisation are known from sweeps of the same sites.
+    fine = none if points is None else none + 1
+    loop = _Loop(first, jnp.zeros_like(move), move, jnp.asarray(settings.damping), nothing, nothing, no_cavity,
+                 infinite, infinite, none, fine)
+    loop = jax.lax.while_loop(going, sweep, loop)
+    converged = (loop.change < _tolerance(loop.change)) & (loop.fine > 0)
+    return Converged(loop.sites, loop.cavity, loop.change, loop.sweeps, converged)
+
+
+def _mixed(move: jax.Array, steps: jax.Array, changes: jax.Array, share: jax.Array, variance: jax.Array) -> jax.Array:
+    """Return the step (2, T, D) to where a linear map that agrees with the last sweeps would not move.
+
+    Least squares in units of the marginals, as changes are measured.
+    """
+    units = jnp.stack([jnp.sqrt(variance), variance])
+    flat = lambda a: a.reshape(*a.shape[:-3], -1)  # noqa: E731
+    weighted = flat(changes * units)
+    gram = matmul(weighted, weighted.T)
+    weights = solve_semidefinite(gram, matmul(weighted, flat(move * units)[:, None]), tolerance=1e-10)
+    along = (weights[:, :, None, None] * (steps + share * changes)).sum(0)
+    return share * move - along
 
 
 def _tolerance(change: jax.Array) -> float:

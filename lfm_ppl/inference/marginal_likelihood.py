@@ -28,7 +28,14 @@ from lfm_ppl.filtering.filter import (
 )
 from lfm_ppl.filtering.iterated import posterior_linearisation
 from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.filtering.sites import FamilyTerms, SiteSettings, as_settings, assumed_density_filter, evidence
+from lfm_ppl.filtering.sites import (
+    Evidence,
+    FamilyTerms,
+    SiteSettings,
+    as_settings,
+    assumed_density_filter,
+    evidence,
+)
 from lfm_ppl.filtering.smoother import (
     SmootherResult,
     check_iterations,
@@ -155,7 +162,7 @@ class MarginalLikelihood(dist.Distribution):
         # One failure makes the sum -inf, and with it the derivatives of the other terms zero.
         y = self._checked(value)
         if isinstance(self.model.observation, ObservationFamily):
-            return self._said(y, finite_or_minus_infinity(self._evidence, y))
+            return self._said(y, finite_or_minus_infinity(lambda y: self.evidence(y).log_evidence, y))
         return self._said(y, finite_or_minus_infinity(lambda y: self._one_step_ahead(y).sum(), y))
 
     def _checked(self, y: Any) -> jax.Array:
@@ -166,10 +173,11 @@ class MarginalLikelihood(dist.Distribution):
     def _site_settings(self) -> SiteSettings:
         return as_settings(self.sites, self.iterations)
 
-    def _evidence(self, y: jax.Array) -> jax.Array:
+    def evidence(self, y: jax.Array) -> Evidence:
+        """Return the log evidence of an observation family and what it is made of; ``y`` (T, D) is not checked."""
         assert isinstance(self.model.observation, ObservationFamily)
         terms = FamilyTerms(self.model.observation, y)
-        return evidence(self.ssm, self.rule, self.time_grid, y, terms, self._site_settings).log_evidence
+        return evidence(self.ssm, self.rule, self.time_grid, y, terms, self._site_settings)
 
     def _said(self, y: jax.Array, log_likelihood: jax.Array, alone: bool = False) -> jax.Array:
         """Return the log likelihood; outside of compiled code say what breaks down if something does.

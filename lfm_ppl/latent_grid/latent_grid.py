@@ -22,6 +22,7 @@ from lfm_ppl.forces.sde import Force
 from lfm_ppl.linalg import semidefinite_root
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation_noise import check_noise, log_density, noisy_observation
+from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel, check_times, state_space
 
 RULES = ("riemann", "trapezoid", "linear")
@@ -52,7 +53,8 @@ class LatentGrid(eqx.Module):
 
     Args:
         model: the latent force model: dynamics linear in the state with constant coefficients, any use of the forces,
-            no process noise. A Gaussian initial state is legal.
+            no process noise. A Gaussian initial state is legal; of an observation family there need be no state, where
+            the forces are what is observed: between the points they are interpolated, so put the observations on these.
         times: (T,) of the observations, non-decreasing.
         points: number of equally spaced points from the initial time to the last observation, or the grid itself (G,),
             increasing, which starts at the initial time.
@@ -254,7 +256,7 @@ def _check_factor(latent: LatentGrid) -> None:
 
 def _check_model(ssm: StateSpaceModel) -> None:
     model = ssm.model
-    if not model.state_names:
+    if not model.state_names and not isinstance(model.observation, ObservationFamily):
         raise ValueError("the model has no physical state; its forces are what is observed, so that lfm.filter and "
                          "lfm.smooth serve it.")
     if not model.force_names:
@@ -294,7 +296,7 @@ def _grid(points: Any, initial: float, times: np.ndarray) -> np.ndarray:
 
 def _diagonal(ssm: StateSpaceModel) -> bool:
     size = ssm.physical_dim
-    pattern = np.asarray(ssm.drift_structure.jacobian, bool)[:, :size]
+    pattern = np.asarray(ssm.drift_structure.jacobian, bool).reshape(size, ssm.input_dim)[:, :size]
     return not (pattern & ~np.eye(size, dtype=bool)).any()
 
 

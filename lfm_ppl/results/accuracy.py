@@ -119,7 +119,7 @@ def _report(result: Any, problem: PosteriorDraws, chosen: np.ndarray, kind: str,
     posterior = arviz_data.group(result, "posterior")
     shape = (posterior.sizes["chain"], len(chosen))
     filtered = likelihoods.gaussian(problem).reshape(shape)
-    rebuilding.check_likelihood(result, filtered, chosen)
+    rebuilding.check_likelihood(result, likelihoods.recorded(problem, filtered.ravel()).reshape(shape), chosen)
     doubled = likelihoods.gaussian_with_finer_steps(problem).reshape(shape)
     found = _reference(kind, problem, filtered, particles, replicates, steps, seed, progress)
     return assess(result, chosen, filtered, doubled, found, problem)

@@ -7,6 +7,7 @@ alone knows the difference; everything else asks for a group by name and gets an
 from __future__ import annotations
 
 import functools
+import json
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -21,6 +22,9 @@ from lfm_ppl.results import convergence, files, netcdf
 from lfm_ppl.results.scalars import scalar_draws
 
 LIBRARY = "lfm_ppl"
+
+SITES = "site_failures"
+"""Attribute of a result: counts of `lfm_ppl.inference.site_failures`, as JSON."""
 
 _SMALLEST_TAIL = 5
 """Fewest importance ratios that a Pareto distribution can be fitted to."""
@@ -258,8 +262,9 @@ def summary(result: Any) -> pd.DataFrame:
 def convergence_warnings(result: Any, table: pd.DataFrame | None = None) -> list[str]:
     """Return what is wrong with the draws of ``result``, one message per finding.
 
-    R-hat above 1.01, bulk or tail effective sample size below 100 per chain, divergences. Draws
-    from a Laplace approximation (sampler "map") are independent, and give none.
+    R-hat above 1.01, bulk or tail effective sample size below 100 per chain, divergences, sites of
+    an observation family that do not converge. Draws from a Laplace approximation (sampler "map")
+    are independent, and give none.
 
     Args:
         result: an ArviZ object with a posterior, and sample_stats where there are any.
@@ -273,7 +278,9 @@ def convergence_warnings(result: Any, table: pd.DataFrame | None = None) -> list
     sizes = group(result, "posterior").sizes
     stats = group(result, "sample_stats") if has_group(result, "sample_stats") else {}
     divergences = int(stats["diverging"].sum()) if "diverging" in stats else 0
-    return convergence.messages(summary(result) if table is None else table, sizes["chain"], sizes["draw"], divergences)
+    found = convergence.messages(summary(result) if table is None else table, sizes["chain"], sizes["draw"],
+                                 divergences)
+    return found + convergence.of_sites(*json.loads(attributes(result).get(SITES, "[0, 0, 0]")))
 
 
 def mcse_mean(values: np.ndarray) -> float:

@@ -62,6 +62,24 @@ def messages(summary: pd.DataFrame, chains: int, draws: int, divergences: int) -
     return found
 
 
+def of_sites(points: int, unconverged: int, impossible: int) -> list[str]:
+    """Return what to say where sites of an observation family do not converge near the draws; nothing where they do.
+
+    Args:
+        points: a step away from the draws, at which it was tried.
+        unconverged: of them, where sites do not converge.
+        impossible: of them, where the likelihood is zero, for that reason or another.
+    """
+    if not unconverged:
+        return []
+    return [
+        f"the sites of the observation family do not converge at {unconverged} of {points} points a step away from the "
+        f"draws ({100.0 * unconverged / points:.2g}%), and the likelihood counts as zero there (and at {impossible} "
+        "points in all): draws may miss these parameters. Take a smaller share of each new site, "
+        "sites=lfm.SiteSettings(damping=0.5), half powers, sites=lfm.SiteSettings(power=0.5), or a tighter prior."
+    ]
+
+
 def _low_ess(ess: pd.Series, kind: str, what: str, chains: int) -> list[str]:
     needed = MIN_ESS_PER_CHAIN * chains
     low = ess[ess < needed].sort_values()

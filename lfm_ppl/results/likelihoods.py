@@ -111,6 +111,22 @@ def gaussian(problem: PosteriorDraws, name: str = "log likelihoods") -> np.ndarr
                       parts=problem.kept(name))["total"]
 
 
+def recorded(problem: PosteriorDraws, log_likelihoods: np.ndarray) -> np.ndarray:
+    """Return (S,): what a result records of its log likelihoods, the sum of one-step-ahead terms.
+
+    Those of the Gaussian filter are the sum itself; of an observation family they are of assumed density filtering.
+    """
+    bound = problem.bound
+    if not isinstance(problem.example.ssm.model.observation, ObservationFamily):
+        return log_likelihoods
+
+    def per_draw(values: Any, key: jax.Array, y: jax.Array) -> jax.Array:
+        return bound.likelihood(values, y).log_prob_per_observation(bound.data(y)).sum()
+
+    return over_draws(bound, "one step ahead", per_draw, problem.draws, jax.random.key(0), bound.times.size,
+                      parts=problem.kept("one-step-ahead terms"))
+
+
 def finer_tolerance(tolerance: float) -> float:
     """Return the tolerance at which steps are half as long: their errors grow with the fourth power of the length."""
     return tolerance / 16

@@ -130,7 +130,18 @@ def interval(dataset: xr.Dataset) -> np.ndarray:
     """Return the ends (2, K, D) of the 95% interval of new data, by their density where it is known."""
     if MEAN in dataset and SD in dataset:
         return mixture_quantiles(_flat(dataset[MEAN]), _flat(dataset[SD]), _INTERVAL)
-    return np.quantile(_flat(observed_variable(dataset)), _INTERVAL, axis=0)
+    return quantiles(_flat(observed_variable(dataset)), _INTERVAL)
+
+
+def quantiles(draws: np.ndarray, p: Any) -> np.ndarray:
+    """Return quantiles (Q, ...) of draws (S, ...): whole numbers where all draws are, as those of counts.
+
+    Example:
+        >>> quantiles(np.array([0.0, 1.0, 1.0, 4.0]), 0.75), quantiles(np.array([0.0, 1.5]), 0.5)
+        (array(1.), array(0.75))
+    """
+    whole = bool(np.all(draws == np.round(draws)))
+    return np.quantile(draws, p, axis=0, method="inverted_cdf" if whole else "linear")
 
 
 def noise_free_interval(dataset: xr.Dataset) -> np.ndarray:

@@ -35,6 +35,14 @@ def observations(result: Any) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(times.values, float), np.asarray(data[names[0]].values, float)
 
 
+def keywords(result: Any, later: Mapping[str, Any] | None, given: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Return the keyword arguments of a result's model with known inputs that reach further; see `lfm_ppl.forecast`."""
+    found, stored = inputs.keywords(result, given), inputs.inputs_of(result)
+    for name, one in (later or {}).items():
+        found |= {"inputs": {**found["inputs"], name: one}} if name in stored else {name: one}
+    return found
+
+
 def problem(result: Any, numpyro_model: Callable, times: Any = None, y: Any = None,
             model_kwargs: Mapping[str, Any] | None = None) -> PosteriorDraws:
     """Return model, data and all draws (C * N, ...) of the sample sites, with the result's fixed parameters.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,7 +14,8 @@ from scipy.special import logsumexp
 
 from lfm_ppl import checks
 from lfm_ppl.data import Data
-from lfm_ppl.results.predictions import MEAN, SD, observed_variable, of_result
+from lfm_ppl.results import arviz_data
+from lfm_ppl.results.predictions import MEAN, SD, observed_variable, of_result, quantiles
 
 ALL = "all"
 """The row of a table of scores for all outputs together."""
@@ -41,7 +43,8 @@ class Scores(NamedTuple):
     covered: np.ndarray
 
 
-def score(result: Any, held_out: Any, level: float = 0.95) -> pd.DataFrame:
+def score(result: Any, held_out: Any, level: float = 0.95, *, numpyro_model: Callable | None = None,
+          inputs: Mapping[str, Any] | None = None, model_kwargs: Mapping[str, Any] | None = None) -> pd.DataFrame:
     r"""Compare predictions with what was measured after all.
 
         rmse     root of the mean of (y - E y*)^2
@@ -56,12 +59,18 @@ def score(result: Any, held_out: Any, level: float = 0.95) -> pd.DataFrame:
     The other scores take the mixture of normal densities that `forecast` stores. CRPS and the log score are proper: on
     average the true predictive distribution has the best of them.
 
+    Of an observation family p is the mixture over the draws of the family's own law along each path, which takes the
+    model; the other scores take the draws.
+
     Args:
         result: what `lfm_ppl.forecast`, or `lfm_ppl.fit` with ``at``, returned; or its dataset ``predictions``.
         held_out: (K, D) (or (K,) for one output; (B, K, D) for a panel), one row for each time of the predictions; or a
             `lfm_ppl.Data` or a DataArray with coordinates time and output, whose times must be among those predicted.
             NaN entries are left out.
         level: of the interval, between 0 and 1.
+        numpyro_model: of an observation family, the model that was fitted; without it there is no log score.
+        inputs: as in `lfm_ppl.forecast`, and so is the next.
+        model_kwargs: keyword arguments of the model.
 
     Returns:
         A table with a row for each output and a row "all" for all entries: ``n`` (how many were compared), ``rmse``,
@@ -96,13 +105,16 @@ def score(result: Any, held_out: Any, level: float = 0.95) -> pd.DataFrame:
     def flat(name: str) -> np.ndarray | None:
         return None if name not in predicted else _stacked(predicted[name].transpose(*order))
 
+    densities = None
+    if numpyro_model is not None:
+        densities = _family_densities(result, numpyro_model, predicted, y, inputs, model_kwargs)
     found = scores(_stacked(variable.transpose(*order)), y, flat(MEAN), flat(SD), level,
-                   _angles(variable, predicted))
+                   _angles(variable, predicted), densities)
     return table(found, [str(name) for name in predicted["output"].values], level)
 
 
 def scores(draws: np.ndarray, y: np.ndarray, mean: np.ndarray | None = None, sd: np.ndarray | None = None,
-           level: float = 0.95, angular: Any = False) -> Scores:
+           level: float = 0.95, angular: Any = False, densities: np.ndarray | None = None) -> Scores:
     """Return the scores of single predictions.
 
     Args:
@@ -112,6 +124,7 @@ def scores(draws: np.ndarray, y: np.ndarray, mean: np.ndarray | None = None, sd:
         sd: (S, ...), its standard deviation.
         level: of the central interval.
         angular: (...), which are angles: differences are taken on the circle.
+        densities: (S, ...), log densities of ``y`` at each draw, where these are not normal.
     """
     mean, sd = (None, None) if mean is None or sd is None else (mean, sd)
     if np.any(angular):
@@ -123,9 +136,14 @@ def scores(draws: np.ndarray, y: np.ndarray, mean: np.ndarray | None = None, sd:
     below = 0.5 * (1.0 - level)
     if mean is None or sd is None:
         error = y - draws.mean(axis=0)
-        low, high = np.quantile(draws, (below, 1.0 - below), axis=0)
+        low, high = quantiles(draws, (below, 1.0 - below))
         covered = np.where(present, (low <= y) & (y <= high), np.nan)
-        return Scores(error, crps(draws, y), np.full(y.shape, np.nan), covered)
+        log_score = np.full(y.shape, np.nan)
+        if densities is not None:
+            log_score = np.where(present, logsumexp(np.where(present, densities, 0.0), axis=0) - np.log(len(draws)),
+                                 np.nan)
+            _say_where_few(np.where(present, densities, 0.0), present)
+        return Scores(error, crps(draws, y), log_score, covered)
     with np.errstate(divide="ignore", invalid="ignore"):
         z = np.where(sd > 0, (y - mean) / sd, np.where(y == mean, 0.0, np.sign(y - mean) * np.inf))
         terms = np.where(sd > 0, stats.norm.logpdf(z) - np.log(sd), np.nan)
@@ -134,6 +152,23 @@ def scores(draws: np.ndarray, y: np.ndarray, mean: np.ndarray | None = None, sd:
     covered = np.where(present, (below <= distribution) & (distribution <= 1.0 - below), np.nan)
     _say_where_few(np.where(present, terms, 0.0), present)
     return Scores(y - mean.mean(axis=0), crps(draws, y), log_score, covered)
+
+
+def _family_densities(result: Any, numpyro_model: Callable, predicted: xr.Dataset, y: np.ndarray,
+                      inputs: Mapping[str, Any] | None, model_kwargs: Mapping[str, Any] | None) -> np.ndarray:
+    """Return the log densities (S, ...) of an observation family."""
+    from lfm_ppl.results import rebuilding  # figures and tables of scores need no JAX
+    from lfm_ppl.results.family_scores import log_densities
+
+    if isinstance(result, xr.Dataset):
+        raise ValueError("the log score of an observation family takes the parameters of each draw; pass what "
+                         "lfm.forecast returned, not its dataset.")
+    problem = rebuilding.problem(result, numpyro_model, model_kwargs=rebuilding.keywords(result, inputs, model_kwargs))
+    posterior = arviz_data.group(result, "posterior")
+    labels = posterior["draw"].values if "draw" in posterior.coords else np.arange(posterior.sizes["draw"])
+    chosen = np.searchsorted(labels, predicted["draw"].values)
+    rows = (np.arange(posterior.sizes["chain"])[:, None] * len(labels) + chosen).ravel()
+    return log_densities(problem.bound, problem.at(rows).draws, predicted, y)
 
 
 def crps(draws: np.ndarray, y: np.ndarray) -> np.ndarray:

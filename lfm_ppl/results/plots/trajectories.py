@@ -17,7 +17,7 @@ from lfm_ppl.checks import unknown
 from lfm_ppl.results.arviz_data import attributes, group, has_group
 from lfm_ppl.results.inputs import ORIGIN
 from lfm_ppl.results.plots import style
-from lfm_ppl.results.predictions import GROUP, MEAN, interval, noise_free_interval
+from lfm_ppl.results.predictions import GROUP, MEAN, interval, noise_free_interval, quantiles
 from lfm_ppl.results.scalars import unit_of
 
 MAX_PANELS = 12
@@ -321,7 +321,7 @@ def _widened(
     """Return times from the first to the last measurement and the predictive interval there."""
     measured, which = np.unique(predictive["time"].values, return_inverse=True)
     draws = predictive.values.reshape(-1, predictive.sizes["time"])
-    ends = np.array([np.quantile(draws[:, which == k], _INTERVAL) for k in range(len(measured))])
+    ends = np.array([quantiles(draws[:, which == k].ravel(), _INTERVAL) for k in range(len(measured))])
     below = ends[:, 0] - np.interp(measured, at, low)
     above = ends[:, 1] - np.interp(measured, at, high)
     grid = np.union1d(measured, at[(at >= measured[0]) & (at <= measured[-1])])

@@ -1,0 +1,152 @@
+"""Counts through what follows a fit: forecast, scores, intervals, checks, correction, comparison, figures."""
+
+import json
+import warnings
+
+import arviz as az
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
+from scipy import special, stats
+
+import lfm_ppl as lfm
+from lfm_ppl.filtering.sites import SiteSettings
+from lfm_ppl.inference.site_failures import site_failures
+from lfm_ppl.results import arviz_data
+from lfm_ppl.results.predictions import summary
+
+TIMES = np.arange(14.0)
+COUNTS = np.array([2, 0, 1, 3, 5, 4, 7, 3, 2, 1, 0, 0, 1, 2], float)[:, None]
+AHEAD, HELD_OUT = np.array([14.0, 16.0]), np.array([[1.0], [4.0]])
+
+
+def system(level, scale):
+    return lfm.LatentForceModel(
+        lambda x, u, t: jnp.zeros(0), {"u": lfm.Matern(scale, 3.0)},
+        lfm.PoissonObservation(lambda x, u, t: level + u, exposure=1.5), lfm.Gaussian(jnp.zeros(0), jnp.zeros((0, 0))),
+        output_names=("events",))
+
+
+def counts(times, y=None, sites=None):
+    level = numpyro.sample("level", dist.Normal(0.0, 1.0))
+    scale = numpyro.sample("scale", dist.LogNormal(-0.5, 0.3))
+    numpyro.sample("y", lfm.MarginalLikelihood(system(level, scale), times, sites=sites), obs=y)
+
+
+@pytest.fixture(scope="module")
+def result():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", lfm.ConvergenceWarning)  # it is short
+        return lfm.fit(counts, TIMES, COUNTS, sampler="ram", chains=2, warmup=50, samples=60, thin=3,
+                       trajectory_draws=40, chain_method="vectorized", progress=False,
+                       sampler_options={"initial_covariance": np.diag([0.15, 0.08])})
+
+
+@pytest.fixture(scope="module")
+def ahead(result):
+    return lfm.forecast(result, counts, AHEAD, draws=100)
+
+
+def test_new_counts_are_counts_and_so_are_their_intervals(result, ahead):
+    predicted = arviz_data.group(ahead, "predictions")
+    replicated = arviz_data.group(result, "posterior_predictive")["y"].values
+    for drawn in (predicted["y"].values, replicated):
+        assert np.all(drawn == np.round(drawn)) and np.all(drawn >= 0)
+    table = summary(predicted)
+    ends = table[["q2.5", "q97.5"]].to_numpy()
+    assert np.all(ends == np.round(ends)) and np.all(ends[:, 0] < ends[:, 1])
+
+
+def test_log_score_is_that_of_the_family_along_the_paths(ahead):
+    """Against SciPy: the mean over the draws of the Poisson probability at each path's own rate."""
+    predicted, posterior = (arviz_data.group(ahead, name) for name in ("predictions", "posterior"))
+    level = posterior["level"].values[:, predicted["draw"].values]
+    rate = 1.5 * np.exp(level[..., None] + predicted["forces"].values[..., 0]).reshape(-1, 2)
+    log_p = special.logsumexp(stats.poisson.logpmf(HELD_OUT[:, 0], rate), axis=0) - np.log(len(rate))
+    found = lfm.score(ahead, HELD_OUT, numpyro_model=counts).loc["events"]
+    assert found["log_score"] == pytest.approx(log_p.mean(), abs=1e-12)
+    drawn = predicted["y"].values.reshape(len(rate), 2)
+    far = np.abs(drawn - HELD_OUT[:, 0]).mean(0) - 0.5 * np.abs(drawn[:, None] - drawn).sum((0, 1)) / (
+        len(rate) * (len(rate) - 1))
+    assert found["crps"] == pytest.approx(far.mean(), rel=1e-12)
+    assert np.isnan(lfm.score(ahead, HELD_OUT).loc["events", "log_score"])
+    with pytest.raises(ValueError, match="pass what lfm.forecast returned"):
+        lfm.score(arviz_data.group(ahead, "predictions"), HELD_OUT, numpyro_model=counts)
+
+
+@pytest.mark.slow
+def test_check_by_importance_sampling_and_correction(result):
+    """One state: draws of the smoother are exact but for their noise, and EP is within 0.15 of the log evidence."""
+    report = lfm.check_accuracy(result, counts, draws=120, particles=400, replicates=3, progress=False)
+    assert "importance sampling, 3 runs of 400 draws" in report.reference
+    ratio = (report.dataset["log_likelihood_reference"] - report.dataset["log_likelihood"]).values
+    assert np.abs(ratio).max() < 0.15 + 5 * report.dataset["noise_sd"].values.max()
+    assert report.k < report.threshold
+    corrected = lfm.correct_posterior(result, counts, trajectory_draws=10)
+    drawn = arviz_data.group(corrected, "posterior_predictive")["y"].values
+    assert np.all(drawn == np.round(drawn))
+    with pytest.raises(ValueError, match="gives other log likelihoods than the result records"):
+        lfm.check_accuracy(result, lambda times, y=None: counts(times, y, SiteSettings()), TIMES, COUNTS + 1.0, draws=4,
+                           particles=10, replicates=2, progress=False)
+
+
+def test_leave_one_out_comparison(result):
+    found = az.loo(result)
+    total = getattr(found, "elpd_loo", None) or found.elpd
+    assert np.isfinite(total) and total < 0
+
+
+def test_unconverged_sites_are_counted_and_named(result):
+    """With few sweeps allowed they converge at some points and not at others."""
+    kept = json.loads(arviz_data.attributes(result)["site_failures"])
+    assert kept == [100, 0, 0] and not any("sites" in said for said in arviz_data.convergence_warnings(result))
+    bound = lfm.bind(counts, TIMES, COUNTS, sites=SiteSettings(sweeps=9))
+    found = site_failures(bound, 2.0 * np.random.default_rng(0).normal(size=(1, 50, 2)))
+    assert 0 < found.unconverged < found.points and found.unconverged <= found.impossible
+    result.attrs["site_failures"] = json.dumps([100, 7, 9])
+    said = arviz_data.convergence_warnings(result)[-1]
+    result.attrs["site_failures"] = json.dumps(kept)
+    assert "at 7 of 100 points a step away from the draws (7%)" in said and "(and at 9 points in all)" in said
+    assert "damping=0.5" in said
+
+
+def test_figures_of_counts(ahead):
+    figure = lfm.plot_fit(ahead)
+    assert any("events" in axes.get_ylabel() or "events" in axes.get_title() for axes in figure.axes)
+
+
+@pytest.mark.slow
+def test_a_panel_of_counts_is_a_loop_over_its_series():
+    """One of the series is all missing, the other has a gap."""
+    y = np.stack([COUNTS, np.full_like(COUNTS, np.nan)])
+    y[0, 3] = np.nan
+    panel = lfm.panel(lambda level: system(level, 0.6), jnp.array([0.3, 0.8]), TIMES)
+    found = panel.log_prob(y)
+    assert found[0] == pytest.approx(float(lfm.MarginalLikelihood(system(0.3, 0.6), TIMES).log_prob(y[0])), abs=1e-9)
+    assert found[1] == pytest.approx(0.0, abs=1e-12)
+
+
+def driven(times, y=None):
+    """Counts of a state that softplus of a force produces: no Gaussian moments are exact."""
+    level = numpyro.sample("level", dist.Normal(0.5, 0.5))
+    model = lfm.LatentForceModel(
+        lambda x, u, t: jax.nn.softplus(u) - 0.7 * x, {"u": lfm.Matern(1.0, 3.0)},
+        lfm.PoissonObservation(lambda x, u, t: level + x), lfm.Gaussian(jnp.ones(1), 0.1 * jnp.eye(1)))
+    numpyro.sample("y", lfm.MarginalLikelihood(model, times, steps=3), obs=y)
+
+
+@pytest.mark.slow
+def test_particles_check_and_correct_counts_of_dynamics_that_are_not_linear():
+    """pmmh draws from the exact posterior; NUTS with EP comes near, and the check says by how much."""
+    filtered, exact = (lfm.fit(driven, TIMES, COUNTS, sampler=sampler, chains=2, warmup=200, samples=300,
+                               trajectory_draws=20, progress=False) for sampler in ("nuts", "pmmh"))
+    report = lfm.check_accuracy(filtered, driven, draws=40, particles=2000, replicates=3, progress=False)
+    assert "particle filter" in report.reference and report.k < report.threshold
+    means = [float(arviz_data.group(one, "posterior")["level"].mean()) for one in (filtered, exact)]
+    sd = float(arviz_data.group(exact, "posterior")["level"].std())
+    assert abs(means[0] - means[1]) < 0.4 * sd
+    drawn = arviz_data.group(lfm.forecast(exact, driven, AHEAD, draws=20), "predictions")["y"].values
+    assert np.all(drawn == np.round(drawn))
