@@ -5,11 +5,11 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.scipy.stats import norm
 
 from lfm_ppl.constrained.constraints import Constraints
 from lfm_ppl.constrained.truncated import truncated_moments
 from lfm_ppl.filtering.quadrature import Marginal, Tilted
-from jax.scipy.stats import norm
 
 
 class Boxes(eqx.Module):

@@ -10,12 +10,14 @@ by importance sampling with trajectories that respect all constraints (`lfm_ppl.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from lfm_ppl.constrained.augmented import Rows, stacked_model, with_rows
+from lfm_ppl import checks
+from lfm_ppl.constrained.augmented import Rows, with_rows
 from lfm_ppl.constrained.boxes import BoundedTerms, Boxes
 from lfm_ppl.constrained.feasible_paths import Paths, feasible_paths
 from lfm_ppl.filtering.filter import Pass, forward
@@ -23,9 +25,11 @@ from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.sites import Evidence, SiteSettings, evidence
 from lfm_ppl.filtering.time_grid import TimeGrid
 from lfm_ppl.filtering.update import Sites
+from lfm_ppl.linalg import matmul
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.state_space import StateSpaceModel
+from lfm_ppl.model.structure import pattern
 
 _LOG_2PI = 1.8378770664093453
 
@@ -92,6 +96,27 @@ class Bounded(NamedTuple):
             self.held)
         return feasible_paths(key, passed, held, self.boxes.widths, count)
 
+    def chosen(self, key: jax.Array, passed: Pass, draws: int, candidates: int) -> jax.Array:
+        """Return trajectories (K, M + R, draws) of (x, u) at the rows, each one of some by their weights.
+
+        Bounded states and forces are what was drawn for them, and so feasible to the last bit.
+        """
+        keys = jax.random.split(key)
+        found = self.paths(keys[0], passed, draws * candidates)
+        # Trajectories with mirrored random numbers are not to stand beside each other.
+        order = jnp.arange(draws * candidates).reshape(candidates, draws).T
+        index = jax.random.categorical(keys[1], found.log_weights[order], axis=1)
+        picked = jnp.take_along_axis(order, index[:, None], axis=1)[:, 0]
+        at = jnp.asarray(self.grid.observed)
+        states, values = found.states[at][..., picked], found.values[at][..., picked]
+        matrix, offset = jax.vmap(self.ssm.input_map)(jnp.asarray(self.rows.times))
+        inputs = matmul(matrix, states) + offset[..., None]
+        # (K, S, ...): the bounded ones where the constraints hold.
+        inputs, values = (jnp.moveaxis(a, 1, -1) for a in (inputs, values))
+        exact = self.boxes.constraints.respected(inputs, self.boxes.slacks(values))
+        held = jnp.zeros(len(self.rows.times), bool).at[self.rows.grid].set(True)
+        return jnp.moveaxis(jnp.where(held[:, None, None], exact, inputs), -1, 1)
+
     def log_weights(self, key: jax.Array, y: jax.Array, count: int) -> jax.Array:
         """Return log weights (count,) whose exponentials have the evidence of data and constraints as their mean."""
         found = self.propagated(y)
@@ -115,7 +140,33 @@ class Bounded(NamedTuple):
         return self.log_evidence(y, draws, key) - self.log_evidence(jnp.full_like(y, jnp.nan), draws, key)
 
 
-def bounded(model: LatentForceModel, boxes: Boxes, rule: Rule, grid: TimeGrid, laid_out: Rows, variance: Any,
-            settings: SiteSettings) -> Bounded:
-    """Put a model under constraints together."""
-    return Bounded(stacked_model(model, boxes), rule, grid, laid_out, boxes, variance, settings)
+def check_variances(model: LatentForceModel, count: int) -> jax.Array:
+    """Return the noise variances (T, D), after checking that there is nothing else."""
+    if model.observation.angular:
+        raise ValueError("the posterior under constraints takes no angular outputs; observe their sine and cosine, or "
+                         "take lfm.full_information.")
+    covariance = model.observation.covariance
+    if callable(covariance):
+        raise ValueError("the posterior under constraints takes a fixed observation covariance; the model's is a "
+                         "function of (x, u, t).")
+    value = jnp.asarray(covariance, float)
+    if value.ndim > 1:
+        known = checks.concrete(value)
+        if known is not None and np.any(known * (1.0 - np.eye(known.shape[-1]))):
+            raise ValueError("the posterior under constraints takes outputs with independent noise; the observation "
+                             "covariance has entries off its diagonal.")
+        value = jnp.diagonal(value, axis1=-2, axis2=-1)
+    checks.positive("the observation covariance", value, "Sites need observations with noise.")
+    return jnp.broadcast_to(value, (count, value.shape[-1]))
+
+
+def check_linear(problem: Bounded, draws: int) -> None:
+    """Raise where constraints are not linear in states and forces, and trajectories are to be drawn."""
+    if not draws:
+        return
+    ssm, t = problem.ssm, jnp.asarray(problem.grid.initial_time, float)
+    first = ssm.output_dim - problem.boxes.count
+    for number, label in enumerate(problem.boxes.labels, first):
+        if pattern(lambda w, n=number: ssm.observe(w, t)[n : n + 1], ssm.input_dim).hessian.any():
+            raise ValueError(f"the constraint {label!r} is not linear in states and forces, and draws={draws} "
+                             "trajectories take linear ones. Set draws=0, for expectation propagation alone.")

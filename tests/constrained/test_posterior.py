@@ -11,7 +11,7 @@ from scipy.stats import norm, truncnorm
 from systems import Linear, whole_state
 
 import lfm_ppl as lfm
-from lfm_ppl.constrained.posterior import truncated_moments
+from lfm_ppl.constrained.truncated import truncated_moments
 from lfm_ppl.filtering.quadrature import Marginal
 
 TIMES = np.linspace(0.0, 5.0, 8)
