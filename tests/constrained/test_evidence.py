@@ -56,8 +56,6 @@ CASES = {
     "upper": (8, 5.0, {}, {"factor": 0.5}),
     "state": (8, 5.0, {"x": 0.05}, {}),
     "state and force": (6, 5.0, {"x": 0.0, "factor": 0.0}, {"factor": 1.2}),
-    "dense": (12, 1.0, {"factor": 0.0}, {}),
-    "denser": (12, 0.1, {"factor": 0.0}, {"factor": 1.0}),
 }
 
 
@@ -109,6 +107,7 @@ def test_the_derivative_is_that_of_differences():
         np.testing.assert_allclose(found[index], difference, rtol=0.02, atol=0.02)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_is_minus_infinity_with_finite_derivatives():
     log_prob, y = small()
     value, slope = jax.jit(jax.value_and_grad(log_prob, argnums=1))(y, jnp.nan, 0.0)

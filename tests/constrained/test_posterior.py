@@ -103,7 +103,8 @@ def test_bad_observations_say_what_to_do():
             lfm.constrained_posterior(other, TIMES, Y, lower={"factor": 0.0})
 
 
-@pytest.mark.parametrize("upper", [{}, {"factor": 1.2}], ids=["one bound", "two bounds"])
+@pytest.mark.parametrize("upper", [pytest.param({}, marks=pytest.mark.slow), {"factor": 1.2}],
+                         ids=["one bound", "two bounds"])
 def test_draws_are_feasible_and_from_the_truncated_distribution(dense, upper):
     found = lfm.constrained_posterior(model(), TIMES, Y, lower={"factor": 0.0}, upper=upper, grid=TIMES)
     high = upper.get("factor", np.inf)
@@ -138,5 +139,6 @@ def test_a_box_far_from_the_mean_and_a_narrow_one(mean, width):
     np.testing.assert_allclose(found.variance, second - first**2, rtol=1e-6)
     for share in (0.01, 0.5, 0.99):
         value = float(quantile(cavity, width, share))
-        # Beyond 35 standard deviations the tail is taken for an exponential one.
-        np.testing.assert_allclose(integral(0, value) / total, share, rtol=2e-3 if abs(mean) > 35 else 1e-8)
+        # Beyond 35 standard deviations the tail is taken for an exponential one. At 30 the first quantile is the
+        # difference, 3e-4, of two numbers near 30, one of them a normal quantile, right to 1e-13.
+        np.testing.assert_allclose(integral(0, value) / total, share, rtol=2e-3 if abs(mean) > 35 else 1e-7)
