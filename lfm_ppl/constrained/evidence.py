@@ -35,7 +35,7 @@ _LOG_2PI = 1.8378770664093453
 
 _TEMPER = 0.7
 """Share of the converged sites that draws look ahead by. On dense grids the sites of all rows together say more than
-their constraints do: a share of 1/2 to 4/5 has the smallest variance there, and on coarse grids any share will do."""
+their constraints do, and 1/2 to 4/5 has the smallest variance; on coarse grids 1 has, and less than 4/5 is worse."""
 
 
 class Bounded(NamedTuple):
