@@ -309,17 +309,17 @@ class MarginalLikelihood(dist.Distribution):
 
     def _constrained_sample(self, key: jax.Array) -> jax.Array:
         keys = jax.random.split(key)
-        w, when = self.feasible_path(jnp.full(self.event_shape, jnp.nan), None, keys[0])
+        w, when = self.feasible_path(keys[0], jnp.full(self.event_shape, jnp.nan))
         return jax.vmap(lambda w, t, key, row: noisy_observation(self.ssm, w, t, key, row))(
             w, when, jax.random.split(keys[1], len(when)), jnp.arange(len(when)))
 
-    def feasible_path(self, y: jax.Array, at: Any, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def feasible_path(self, key: jax.Array, y: jax.Array, at: Any = None) -> tuple[jax.Array, jax.Array]:
         """Draw a trajectory under the constraints, one of 64 by their weights.
 
         Args:
+            key: a JAX random key.
             y: (T, D), NaN where missing.
             at: (L,) times; those of the data where None.
-            key: a JAX random key.
 
         Returns:
             (x, u) (L, M + R), and the times (L,).

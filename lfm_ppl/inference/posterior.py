@@ -112,7 +112,7 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
         path_key, noise_key = jax.random.split(key)
         if distribution.constrained:
             smoothed = None
-            w, when = distribution.feasible_path(y, plan.times, path_key)
+            w, when = distribution.feasible_path(path_key, y, plan.times)
         elif particles is None:
             smoothed = distribution.smooth(y, plan.times)
             when = smoothed.times
