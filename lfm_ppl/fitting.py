@@ -270,6 +270,7 @@ class _Asked(NamedTuple):
             "iterations": example.iterations, "tolerance": example.tolerance, "sampler": self.sampler,
             "seed": self.seed, "chains": self.chains, "warmup": self.warmup, "samples": self.samples,
             "fixed": json.dumps({k: np.asarray(v).tolist() for k, v in self.fixed.items()}),
+            **({"constraints": ", ".join(example.bounds)} if example.constrained else {}),
         }  # fmt: skip
 
     def record(self, bound: BoundModel, fingerprint: Any) -> dict[str, Any]:

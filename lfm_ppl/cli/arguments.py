@@ -368,6 +368,9 @@ def _add_approximation(group: Any) -> None:
     group.add_argument("--tolerance", type=_positive, metavar="SD",
                        help="largest error of an integration step, in standard deviations; steps then follow it")
     group.add_argument("--iterations", type=_whole(0), metavar="N", help="of posterior linearisation")
+    group.add_argument("--lower", action="append", default=[], metavar="NAME=VALUE",
+                       help="lower bound of a state, force or output, `factor=0`; may be repeated")
+    group.add_argument("--upper", action="append", default=[], metavar="NAME=VALUE", help="upper bound")
 
 
 def _one_of(kind: str, choices: Any) -> Callable[[str], str]:

@@ -57,6 +57,20 @@ def fixed(given: Sequence[str], anchors: Mapping[str, float]) -> dict[str, Any]:
     return chosen
 
 
+def bounds(flag: str, given: Sequence[str]) -> dict[str, float] | None:
+    """Return the bounds ``NAME=VALUE`` of a flag, name -> bound; None without any."""
+    found: dict[str, float] = {}
+    for text in given:
+        name, value = _pair(flag, text)
+        if name in found:
+            raise ValueError(f"{flag} gives {name} two bounds, {found[name]:g} and {value}.")
+        try:
+            found[name] = float(value)
+        except ValueError:
+            raise ValueError(f"{flag} takes NAME=NUMBER, got {text!r}.") from None
+    return found or None
+
+
 def inputs(given: str | None, model: ModelFile) -> dict[str, tuple[str, str]]:
     """Return the known inputs to read: name -> column of the file, interpolation.
 

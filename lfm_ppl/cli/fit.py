@@ -178,6 +178,9 @@ def _print_task(
         print("inputs   " + ", ".join(f"{name} ({table.interpolation})" for name, table in observed.inputs.items()))
     if observed.origin is not None:
         print(f"time     in {observed.units['time']} since {observed.origin.replace('T', ' ')}")
+    for flag, sign, given in (("--lower", ">=", arguments.lower), ("--upper", "<=", arguments.upper)):
+        for name, value in (choices.bounds(flag, given) or {}).items():
+            print(f"bound    {name} {sign} {value:g}")
     if options:
         print("options  " + ", ".join(f"{name} = {value}" for name, value in options.items()))
     anchors = model.anchors(observed)
@@ -237,7 +240,7 @@ def attributes(arguments: argparse.Namespace, model: loading.ModelFile, observed
     """Return what a result must remember for `lfm-ppl check` and `forecast`, in the words of the command line."""
     return {
         "model_file": model.name if loading.available().get(model.name) == model.path else str(model.path),
-        "settings": json.dumps({name: getattr(arguments, name) for name in SETTINGS}),
+        "settings": json.dumps({name: getattr(arguments, name) for name in SETTINGS} | constraints(arguments)),
         "options": json.dumps(options), "data": arguments.data or "simulated",
         "description": model.description, "command_line": page.command_line(arguments),
         **({"note": observed.note} if observed.note else {}),
@@ -255,7 +258,19 @@ def approximated(arguments: argparse.Namespace, model: loading.ModelFile) -> Any
         max_step=arguments.max_step,
         iterations=arguments.iterations,
         tolerance=arguments.tolerance,
+        **constraints(arguments),
     )
+
+
+def constraints(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return the bounds that the user gives, and where they hold; nothing where there are none."""
+    given = {"lower": choices.bounds("--lower", arguments.lower), "upper": choices.bounds("--upper", arguments.upper)}
+    if given == {"lower": None, "upper": None}:
+        return {}
+    if arguments.sampler == "pmmh":
+        raise ValueError("--lower and --upper are for the samplers nuts, ram and map: the particle filter of pmmh "
+                         "knows no constraints.")
+    return {name: value for name, value in given.items() if value is not None}
 
 
 def sampling(arguments: argparse.Namespace, model: loading.ModelFile) -> dict[str, Any]:

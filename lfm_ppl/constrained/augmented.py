@@ -103,6 +103,19 @@ def rows(model: LatentForceModel, times: Any, grid: Any = None) -> Rows:
     return Rows(every, data, held, data_rows)
 
 
+def with_times(laid_out: Rows, at: np.ndarray) -> Rows:
+    """Return the rows with further ones at times (L,) that are not among them; nothing is observed or held there."""
+    extra = np.setdiff1d(at, laid_out.times)
+    every = np.concatenate([laid_out.times, extra])
+    order = np.argsort(every, kind="stable")
+    position = np.empty(len(every), int)
+    position[order] = np.arange(len(every))
+    data = position[laid_out.data]
+    data_rows = np.zeros(len(every), int)
+    data_rows[data] = np.arange(len(data))
+    return Rows(every[order], data, position[laid_out.grid], data_rows)
+
+
 def _default_grid(times: np.ndarray, origin: float) -> np.ndarray:
     nodes = np.unique(np.append(times, origin))
     longest = (nodes[-1] - nodes[0]) / _FEWEST_ROWS

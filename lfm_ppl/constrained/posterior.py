@@ -9,85 +9,31 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import ndtri
 from jax.scipy.stats import norm
 
 from lfm_ppl import checks
-from lfm_ppl.constrained.augmented import Rows, rows, stacked_model, with_rows
-from lfm_ppl.constrained.constraints import Constraints, build_constraints
+from lfm_ppl.constrained.augmented import rows, stacked_model
+from lfm_ppl.constrained.boxes import Boxes, boxes
+from lfm_ppl.constrained.constraints import build_constraints
+from lfm_ppl.constrained.evidence import Bounded, check_variances
 from lfm_ppl.constrained.full_information import check_settings
-from lfm_ppl.filtering.filter import as_rule, at_rows, check_observations, warn_single_precision
+from lfm_ppl.constrained.truncated import quantile
+from lfm_ppl.filtering.filter import Pass, as_rule, at_rows, check_observations, warn_single_precision
 from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.filtering.quadrature import Marginal, Tilted
+from lfm_ppl.filtering.quadrature import Marginal
 from lfm_ppl.filtering.rts import backward
-from lfm_ppl.filtering.sites import SiteSettings, evidence
-from lfm_ppl.filtering.time_grid import TimeGrid, build_time_grid
-from lfm_ppl.filtering.update import Sites
+from lfm_ppl.filtering.sites import SiteSettings
+from lfm_ppl.filtering.smoother import Trajectories
+from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.linalg import congruence, diagonal, matmul, safe_sqrt
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.latent_force_model import LatentForceModel
-from lfm_ppl.model.state_space import StateSpaceModel
 
-_BELOW, _TERMS = 5.0, 60
-"""Standard deviations below the bound from which the mean is a continued fraction, and its terms."""
-_FAR = 100.0
-"""The same, from which the variance is an asymptotic series."""
-_UNDERFLOW = -600.0
-"""Logarithm of a probability from which its exponential is not used."""
+_CANDIDATES = 32
+"""Trajectories of which one is chosen by its weight."""
 
-
-class BoundedTerms(eqx.Module):
-    """Factors N(y; f, R) of the data, and 1(f >= 0) of the constraints.
-
-    Attributes:
-        y: (K, D), NaN where missing.
-        variance: (K, D), R.
-        held: (K, C), whether the constraint holds at the row.
-    """
-
-    y: jax.Array
-    variance: jax.Array
-    held: jax.Array
-
-    @property
-    def present(self) -> jax.Array:
-        """(K, D + C), whether an entry has a factor."""
-        return jnp.concatenate([jnp.isfinite(self.y), self.held], axis=1)
-
-    def tilted(self, cavity: Marginal, near: Marginal, power: float) -> Tilted:
-        """Return the tilted moments in closed form; the power of an indicator is itself, that of the data must be 1."""
-        data = self.y.shape[1]
-        measured = _measured(Marginal(*(a[:, :data] for a in cavity)), self.y, self.variance)
-        truncated = truncated_moments(Marginal(*(a[:, data:] for a in cavity)))
-        return Tilted(*(jnp.concatenate(pair, axis=1) for pair in zip(measured, truncated, strict=True)))
-
-
-def _measured(cavity: Marginal, y: jax.Array, variance: jax.Array) -> Tilted:
-    y = jnp.where(jnp.isfinite(y), y, 0.0)
-    total = cavity.variance + variance
-    gain = cavity.variance / total
-    return Tilted(norm.logpdf(y, cavity.mean, jnp.sqrt(total)), cavity.mean + gain * (y - cavity.mean), gain * variance)
-
-
-def truncated_moments(cavity: Marginal) -> Tilted:
-    """Return log P(f >= 0), and mean and variance of f given f >= 0, for f ~ N(cavity).
-
-    With a = m / sd and h = phi(a) / Phi(a) these are log Phi(a), m + sd h and sd^2 (1 - h (h + a)).
-    """
-    sd = jnp.sqrt(cavity.variance)
-    a = cavity.mean / sd
-    log_share = norm.logcdf(a)
-    near = jnp.maximum(a, -_BELOW)
-    above = near + jnp.exp(norm.logpdf(near) - norm.logcdf(near))
-    # Far below the bound a and h cancel; h = z + 1 / (z + 2 / (z + 3 / ...)) with z = -a.
-    z = jnp.maximum(-a, _BELOW)
-    below = jnp.zeros_like(z)
-    for term in range(_TERMS, 0, -1):
-        below = term / (z + below)
-    mean = jnp.where(a < -_BELOW, below, above)
-    square = 1.0 / jnp.maximum(-a, _FAR) ** 2
-    share = jnp.where(a < -_FAR, square * (1.0 - square * (6.0 - 50.0 * square)), 1.0 - (mean - a) * mean)
-    return Tilted(log_share, sd * mean, cavity.variance * share)
+_BATCH = 64
+"""Draws side by side."""
 
 
 class ConstrainedPosterior(eqx.Module):
@@ -109,15 +55,16 @@ class ConstrainedPosterior(eqx.Module):
     sweeps: jax.Array
     converged: jax.Array
     _cavity: Marginal
-    _constraints: Constraints
+    _boxes: Boxes
+    _problem: Bounded
+    _proposal: Pass
     state_names: tuple[str, ...] = eqx.field(static=True)
     force_names: tuple[str, ...] = eqx.field(static=True)
 
     def interval(self, name: str, level: float = 0.95) -> tuple[jax.Array, jax.Array]:
         """Return the ends (K,), (K,) of the central interval of a state or force.
 
-        A bounded quantity has a truncated normal distribution, so that its interval respects the bound; of one with two
-        bounds the other one enters as a Gaussian, and the ends are kept within it.
+        A bounded quantity has a truncated normal distribution, so that its interval respects its bounds.
 
         Raises:
             ValueError: an unknown name, or a level outside of (0, 1).
@@ -126,34 +73,61 @@ class ConstrainedPosterior(eqx.Module):
         checks.one_of("name", name, names)
         if not 0 < level < 1:
             raise ValueError(f"level must lie between 0 and 1, got {level!r}.")
-        index, given = names.index(name), self._constraints
+        index = names.index(name)
         tails = 0.5 * (1.0 - level), 0.5 * (1.0 + level)
-        if index in given.lower_indices:
-            i = given.lower_indices.index(index)
-            low, high = (given.lower[i] + self._quantile(i, tail) for tail in tails)
-        elif index in given.upper_indices:
-            i = given.upper_indices.index(index)
-            low, high = (given.upper[i] - self._quantile(len(given.lower_indices) + i, 1.0 - tail) for tail in tails)
-        else:
+        box = self._boxes.box_of(index)
+        if box is None:
             mean, sd = (jnp.concatenate(pair, axis=1)[:, index] for pair in (
                 (self.state_mean, self.force_mean), (self.state_sd, self.force_sd)))
             low, high = (mean + sd * norm.ppf(tail) for tail in tails)
-        if index in given.upper_indices:
-            bound = given.upper[given.upper_indices.index(index)]
-            low, high = jnp.minimum(low, bound), jnp.minimum(high, bound)
-        return low, high
+            return low, high
+        entry, sign, bound = box
+        cavity = Marginal(*(a[:, entry] for a in self._cavity))
+        near, far = (quantile(cavity, self._boxes.widths[entry], tail) for tail in tails)
+        return (bound + near, bound + far) if sign > 0 else (bound - far, bound - near)
 
-    def _quantile(self, entry: int, share: float) -> jax.Array:
-        """Return a quantile (K,) of a constraint: Phi((m - q) / sd) = (1 - share) Phi(m / sd).
+    def sample(self, key: jax.Array, draws: int = 1) -> Trajectories:
+        """Draw trajectories that respect all constraints.
 
-        Where the mean lies so far below the bound that Phi underflows, the distribution is an exponential one.
+        Each is one of 32 of `lfm_ppl.constrained.feasible_paths`, chosen by their weights: for a linear model from the
+        posterior itself as far as 32 represent it (`effective_share` says how well), and not from a Gaussian one.
+
+        Args:
+            key: a JAX random key.
+            draws: number of trajectories.
+
+        Returns:
+            State (draws, K, M) and forces (draws, K) at the times of the grid.
         """
-        mean, sd = self._cavity.mean[:, entry], jnp.sqrt(self._cavity.variance[:, entry])
-        tail = jnp.log1p(-share) + norm.logcdf(mean / sd)
-        ordinary = tail > _UNDERFLOW
-        value = mean - sd * ndtri(jnp.exp(jnp.where(ordinary, tail, -1.0)))
-        exponential = -jnp.log1p(-share) * sd**2 / jnp.where(mean < 0, -mean, 1.0)
-        return jnp.maximum(jnp.where(ordinary, value, exponential), 0.0)
+        checks.positive_integer("draws", draws)
+        inputs = sampled(self._problem, self._proposal, key, draws)[:, jnp.asarray(self._problem.rows.grid)]
+        size = len(self.state_names)
+        forces = {name: inputs[:, :, size + i] for i, name in enumerate(self.force_names)}
+        return Trajectories(self.times, inputs[:, :, :size], forces)
+
+    def effective_share(self, key: jax.Array, draws: int = 1024) -> jax.Array:
+        """Return the share of trajectories that weighted ones are worth, between 1 / ``draws`` and 1."""
+        weights = _weights(self._problem, self._proposal, key, draws)
+        weights = jnp.exp(weights - weights.max())
+        return weights.sum() ** 2 / (weights**2).sum() / draws
+
+
+@eqx.filter_jit
+def _weights(problem: Bounded, passed: Pass, key: jax.Array, draws: int) -> jax.Array:
+    return problem.paths(key, passed, draws + draws % 2).log_weights[:draws]
+
+
+@eqx.filter_jit
+def sampled(problem: Bounded, passed: Pass, key: jax.Array, draws: int) -> jax.Array:
+    """Return trajectories (draws, K, M + R) of (x, u) at the rows of the scan."""
+    batch = min(draws, _BATCH)
+
+    def some(key: jax.Array) -> jax.Array:
+        return jnp.moveaxis(problem.chosen(key, passed, batch, _CANDIDATES), -1, 0)
+
+    keys = jax.random.split(key, -(-draws // batch))
+    found = jax.lax.map(some, keys)
+    return found.reshape(-1, *found.shape[2:])[:draws]
 
 
 def constrained_posterior(model: LatentForceModel, times: Any, y: Any, lower: Mapping[str, Any] | None = None,
@@ -200,57 +174,28 @@ def constrained_posterior(model: LatentForceModel, times: Any, y: Any, lower: Ma
     Lacoste-Julien (2011), Gaussian probabilities and expectation propagation.
     """
     check_settings(model, 1.0, sweeps)
-    if model.observation.angular:
-        raise ValueError("the posterior under constraints takes no angular outputs; observe their sine and cosine, or "
-                         "take lfm.full_information.")
-    found = build_constraints(model, lower, upper, constraints)
+    found = boxes(build_constraints(model, lower, upper, constraints))
     laid_out = rows(model, times, grid)
     ssm = stacked_model(model, found)
     scan_grid = build_time_grid(ssm, laid_out.times, steps)
     model.check_at(scan_grid.initial_time, np.shape(times)[0])
     y = check_observations(y, np.shape(times)[0], len(model.output_names))
-    variance = _variances(model, np.shape(times)[0])
+    variance = check_variances(model, np.shape(times)[0])
     warn_single_precision()
-    result = _run(ssm, found, as_rule(rule), scan_grid, laid_out, y, variance, SiteSettings(sweeps=sweeps))
-    if not checks.traced(result) and not bool(result.converged):
+    result = _run(Bounded(ssm, as_rule(rule), scan_grid, laid_out, found, variance, SiteSettings(sweeps=sweeps)), y)
+    if not checks.traced(result.converged) and not bool(result.converged):
         checks.warn(f"expectation propagation has not converged in {int(result.sweeps)} passes. Raise sweeps, take a "
                     "coarser grid, or see whether the constraints can be respected at all (lfm.full_information).")
     return result
 
 
-def _variances(model: LatentForceModel, count: int) -> jax.Array:
-    """Return the noise variances (T, D), after checking that there is nothing else."""
-    covariance = model.observation.covariance
-    if callable(covariance):
-        raise ValueError("the posterior under constraints takes a fixed observation covariance; the model's is a "
-                         "function of (x, u, t).")
-    value = jnp.asarray(covariance, float)
-    if value.ndim > 1:
-        known = checks.concrete(value)
-        if known is not None and np.any(known * (1.0 - np.eye(known.shape[-1]))):
-            raise ValueError("the posterior under constraints takes outputs with independent noise; the observation "
-                             "covariance has entries off its diagonal.")
-        value = jnp.diagonal(value, axis1=-2, axis2=-1)
-    checks.positive("the observation covariance", value, "Sites need observations with noise.")
-    return jnp.broadcast_to(value, (count, value.shape[-1]))
-
-
 @eqx.filter_jit
-def _run(ssm: StateSpaceModel, constraints: Constraints, rule: Rule, grid: TimeGrid, laid_out: Rows, y: jax.Array,
-         variance: jax.Array, settings: SiteSettings) -> ConstrainedPosterior:
-    count, outputs = len(laid_out.times), y.shape[1]
-    held = jnp.zeros((count, constraints.count), bool).at[laid_out.grid].set(True)
-    noise = jnp.ones((count, outputs)).at[laid_out.data].set(variance)
+def _parts(problem: Bounded, y: jax.Array) -> tuple:
+    ssm, laid_out, outputs = problem.ssm, problem.rows, y.shape[1]
     start = Moments(*ssm.initial())
-
-    whole = with_rows(y, jnp.zeros((len(laid_out.grid), constraints.count)), laid_out)
-    measured = whole[:, :outputs]
-    present, nothing = jnp.isfinite(measured), jnp.zeros((count, constraints.count))
-    first = Sites(jnp.concatenate([jnp.where(present, measured, 0.0), nothing], axis=1), jnp.zeros_like(whole),
-                  jnp.concatenate([jnp.where(present, 1.0 / noise, 0.0), nothing], axis=1))
-    posterior = evidence(ssm, rule, grid, whole, BoundedTerms(measured, noise, held), settings, start, first, "all")
-    smoothed = backward(posterior.passed, start, grid)
-    at = jnp.asarray(grid.observed)[jnp.asarray(laid_out.grid)]
+    posterior = problem.propagated(y, "all")
+    smoothed = backward(posterior.passed, start, problem.grid)
+    at = jnp.asarray(problem.grid.observed)[jnp.asarray(laid_out.grid)]
     times = jnp.asarray(laid_out.times)[jnp.asarray(laid_out.grid)]
     matrix, offset = jax.vmap(ssm.input_map)(times)
     mean, covariance = (at_rows(a[1:], at) for a in smoothed.moments)
@@ -259,6 +204,12 @@ def _run(ssm: StateSpaceModel, constraints: Constraints, rule: Rule, grid: TimeG
     size = ssm.physical_dim
     found = posterior.refined.found
     cavity = Marginal(*(a[jnp.asarray(laid_out.grid), outputs:] for a in found.cavity.cavity))
-    return ConstrainedPosterior(
-        times, mean[:, :size], sd[:, :size], mean[:, size:], sd[:, size:],
-        found.sweeps, found.converged, cavity, constraints, ssm.model.state_names, ssm.model.force_names)
+    proposal = problem.proposal(y, posterior)._replace(steps=None)
+    return (times, mean[:, :size], sd[:, :size], mean[:, size:], sd[:, size:], found.sweeps, found.converged,
+            cavity), proposal
+
+
+def _run(problem: Bounded, y: jax.Array) -> ConstrainedPosterior:
+    moments, proposal = _parts(problem, y)
+    return ConstrainedPosterior(*moments, problem.boxes, problem, proposal, problem.ssm.model.state_names,
+                                problem.ssm.model.force_names)

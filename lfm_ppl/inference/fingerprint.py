@@ -165,6 +165,10 @@ class _ingredients(LikelihoodHandler):  # noqa: N801 (an effect handler, named a
             one.rule, one.steps, one.max_step, one.iterations, one.damping, one.tolerance, one.sites, model.state_names,
             model.output_names, model.force_names, model.units, model.nonlinear_inputs, model.observation.angular,
             ssm.stack.jump_times, site["name"])))
+        if one.constrained:
+            problem = one.bounded()
+            self.values.append(problem.boxes(*ssm.split(w), t))
+            self.settings.append(str((problem.boxes.constraints.labels, one.grid, one.draws)))
         return super().replacement(likelihood, site)
 
 

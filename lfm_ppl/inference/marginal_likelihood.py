@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -16,6 +16,11 @@ from numpyro.distributions import constraints
 from numpyro.primitives import _PYRO_STACK
 
 from lfm_ppl import checks
+from lfm_ppl.constrained.augmented import rows, stacked_model, with_times
+from lfm_ppl.constrained.boxes import boxes
+from lfm_ppl.constrained.constraints import build_constraints
+from lfm_ppl.constrained.evidence import Bounded, check_linear, check_variances
+from lfm_ppl.constrained.full_information import check_settings
 from lfm_ppl.filtering.breakdown import warn_of_breakdown
 from lfm_ppl.filtering.filter import (
     FilterResult,
@@ -28,6 +33,7 @@ from lfm_ppl.filtering.filter import (
 )
 from lfm_ppl.filtering.iterated import posterior_linearisation
 from lfm_ppl.filtering.predict import Moments
+from lfm_ppl.filtering.rts import backward
 from lfm_ppl.filtering.sites import (
     Evidence,
     FamilyTerms,
@@ -35,6 +41,7 @@ from lfm_ppl.filtering.sites import (
     as_settings,
     assumed_density_filter,
     evidence,
+    leave_one_out,
 )
 from lfm_ppl.filtering.smoother import (
     SmootherResult,
@@ -43,9 +50,11 @@ from lfm_ppl.filtering.smoother import (
     smoothing_grids,
 )
 from lfm_ppl.filtering.time_grid import TimeGrid, build_time_grid
+from lfm_ppl.filtering.update import Sites
 from lfm_ppl.gradients import finite_or_minus_infinity
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.observation_noise import noisy_observation
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.resolution import check_resolution
 from lfm_ppl.model.simulate import simulate_on
@@ -53,6 +62,9 @@ from lfm_ppl.model.state_space import StateSpaceModel, check_times, state_space
 
 SIMULATION_STEPS = 5
 """Steps of the simulator for one integration step of the filter: its paths are rougher than moments."""
+
+_CANDIDATES = 64
+"""Trajectories under constraints of which one is chosen by its weight."""
 
 
 class MarginalLikelihood(dist.Distribution):
@@ -83,6 +95,17 @@ class MarginalLikelihood(dist.Distribution):
             "variational", "laplace", or `lfm_ppl.SiteSettings`. The log density is then the log evidence of the
             converged sites, and -inf where they do not converge. Where the model is not linear it is linearised about
             smoothed moments, ``iterations`` times (8 by default).
+        lower: name of a state, force or output -> its lower bound. Under constraints the log density is
+            log Z(y, c) - log Z(c), that of the data given that the constraints are respected: by expectation
+            propagation, made right with ``draws`` trajectories that respect them. It is -inf where that does not
+            converge. Not with an observation family, ``iterations``, ``max_step`` or ``tolerance``.
+        upper: the same for upper bounds.
+        constraints: functions c(x, u, t), feasible where >= 0; with ``draws``, linear in x and u.
+        grid: (K,) times at which the constraints hold; as in `lfm_ppl.full_information`. The cost is that of some tens
+            of smoother passes over it.
+        draws: number of trajectories, an even one; 0: by expectation propagation alone, which may be off by .1 on a
+            coarse grid, and by .5 on a dense one. They have the same random numbers for all parameters, so that the
+            log density has no noise but is off by a constant, nearly.
 
     Raises:
         ValueError, TypeError: as `lfm_ppl.filter`; also where it is used in a ``numpyro.plate``. In compiled code a
@@ -103,13 +126,16 @@ class MarginalLikelihood(dist.Distribution):
     """
 
     support = constraints.real_matrix
-    pytree_data_fields = ("model", "times")
-    pytree_aux_fields = ("rule", "steps", "max_step", "iterations", "damping", "tolerance", "sites")
+    pytree_data_fields = ("model", "times", "lower", "upper")
+    pytree_aux_fields = ("rule", "steps", "max_step", "iterations", "damping", "tolerance", "sites", "constraints",
+                         "grid", "draws")
 
     def __init__(self, model: LatentForceModel, times: Any, rule: Rule | None = None, steps: int = 10,
                  max_step: float | None = None, iterations: int = 0, damping: float = 0.7,
                  tolerance: float | None = None, sites: SiteSettings | str | None = None, *,
-                 validate_args: bool | None = None):
+                 lower: Mapping[str, Any] | None = None, upper: Mapping[str, Any] | None = None,
+                 constraints: Callable[..., Any] | Sequence[Callable[..., Any]] = (), grid: Any = None,
+                 draws: int = 256, validate_args: bool | None = None):
         if not isinstance(model, LatentForceModel):
             raise TypeError(f"model must be an lfm.LatentForceModel, got {type(model).__name__}.")
         check_iterations(iterations, damping, tolerance)
@@ -120,6 +146,11 @@ class MarginalLikelihood(dist.Distribution):
             checks.positive("tolerance", tolerance, "It is in standard deviations, 0.001 for example.")
         self.tolerance = None if tolerance is None else float(tolerance)
         self.sites = None if sites is None else as_settings(sites)
+        self.lower, self.upper = (None if bounds is None else dict(bounds) for bounds in (lower, upper))
+        self.constraints = (constraints,) if callable(constraints) else tuple(constraints or ())
+        self.grid, self.draws = None if grid is None else tuple(np.asarray(grid, float).tolist()), draws
+        if self.constrained:
+            self._check_constraints()
         if sites is not None and not isinstance(model.observation, ObservationFamily):
             raise ValueError("sites are for an observation family such as lfm.PoissonObservation; the observation of "
                              "this model is Gaussian, whose filter needs none. Leave out sites.")
@@ -141,6 +172,55 @@ class MarginalLikelihood(dist.Distribution):
         """The time grid of the scan."""
         return build_time_grid(self.ssm, self.times, self.steps, self.max_step, tolerance=self.tolerance)
 
+    @property
+    def constrained(self) -> bool:
+        """Whether there are constraints."""
+        return bool(self.lower or self.upper or self.constraints)
+
+    @property
+    def bounds(self) -> list[str]:
+        """Each constraint in words, ``factor >= 0``."""
+        words = [f"{name} {sign} {_shown(value)}" for given, sign in ((self.lower, ">="), (self.upper, "<="))
+                 for name, value in (given or {}).items()]
+        return words + [f"{getattr(one, '__name__', type(one).__name__)} >= 0" for one in self.constraints]
+
+    def refuse_constraints(self, what: str) -> None:
+        """Raise where there are constraints, which ``what`` would pass over."""
+        if self.constrained:
+            raise ValueError(f"{what} knows no constraints, and the likelihood has some: "
+                             f"{', '.join(self.bounds)}. Leave them out, or take NUTS, RAM "
+                             "or MAP.")
+
+    def _check_constraints(self) -> None:
+        check_settings(self.model, 1.0, 1)
+        for name in ("max_step", "tolerance"):
+            if getattr(self, name) is not None:
+                raise ValueError(f"{name} is not to be had under constraints, which hold at rows of their own; raise "
+                                 "steps.")
+        if self.iterations:
+            raise ValueError("iterations are made under constraints by themselves: a model that is not linear is "
+                             "linearised about smoothed moments. Leave iterations out.")
+        if self.draws != 0:
+            checks.positive_integer("draws", self.draws)
+            if self.draws % 2:
+                raise ValueError(f"draws must be even, half of them mirror the other half; got {self.draws}.")
+        if checks.concrete(self.times) is not None:
+            check_linear(self.bounded(), self.draws)
+
+    def bounded(self, at: Any = None) -> Bounded:
+        """Return what the log density under constraints is made of.
+
+        Args:
+            at: (K,) further times for trajectories, at which the constraints need not hold.
+        """
+        found = boxes(build_constraints(self.model, self.lower, self.upper, self.constraints))
+        laid_out = rows(self.model, self.times, None if self.grid is None else np.asarray(self.grid))
+        if at is not None:
+            laid_out = with_times(laid_out, np.asarray(at, float))
+        ssm = stacked_model(self.model, found)
+        return Bounded(ssm, self.rule, build_time_grid(ssm, laid_out.times, self.steps), laid_out, found,
+                       check_variances(self.model, np.shape(self.times)[0]), SiteSettings())
+
     def with_times(self, times: Any) -> MarginalLikelihood:
         """Return the same distribution for times that are known, where its own were traced."""
         other = copy.copy(self)
@@ -149,7 +229,10 @@ class MarginalLikelihood(dist.Distribution):
         return other
 
     def log_prob_per_observation(self, value: Any) -> jax.Array:
-        """Return (T,): log p(y_k | y_1:k-1) of the present entries of each observation."""
+        """Return (T,): log p(y_k | y_1:k-1) of the present entries of each observation.
+
+        Under constraints these are terms of the model without them, which do not sum to `log_prob`.
+        """
         y = self._checked(value)
         return self._said(y, finite_or_minus_infinity(self._one_step_ahead, y), alone=True)
 
@@ -161,13 +244,15 @@ class MarginalLikelihood(dist.Distribution):
         check_resolution(self.model, self.times, value)
         # One failure makes the sum -inf, and with it the derivatives of the other terms zero.
         y = self._checked(value)
+        if self.constrained:
+            return finite_or_minus_infinity(lambda y: self.bounded().log_likelihood(y, self.draws), y)
         if isinstance(self.model.observation, ObservationFamily):
             return self._said(y, finite_or_minus_infinity(lambda y: self.evidence(y).log_evidence, y))
         return self._said(y, finite_or_minus_infinity(lambda y: self._one_step_ahead(y).sum(), y))
 
     def _checked(self, y: Any) -> jax.Array:
-        rows, outputs = self.event_shape
-        return check_observations(y, rows, outputs, model=self.model)
+        count, outputs = self.event_shape
+        return check_observations(y, count, outputs, model=self.model)
 
     @property
     def _site_settings(self) -> SiteSettings:
@@ -213,23 +298,71 @@ class MarginalLikelihood(dist.Distribution):
         return at_rows(passed.log_likelihood, self.time_grid.observed)
 
     def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
-        """Simulate the real model: (*sample_shape, T, D)."""
+        """Simulate the real model: (*sample_shape, T, D).
+
+        Under constraints: along trajectories that respect them, drawn from the (linearised) model itself.
+        """
+        if self.constrained:
+            return repeated(self._constrained_sample, key, sample_shape)
         start = jnp.asarray(self.time_grid.initial_time, float)
         run = lambda k: simulate_on(self.ssm, k, jnp.asarray(self.times, float), start,  # noqa: E731
                                     SIMULATION_STEPS * self.steps).y
         return repeated(run, key, sample_shape)
 
+    def _constrained_sample(self, key: jax.Array) -> jax.Array:
+        keys = jax.random.split(key)
+        w, when = self.feasible_path(keys[0], jnp.full(self.event_shape, jnp.nan))
+        return jax.vmap(lambda w, t, key, row: noisy_observation(self.ssm, w, t, key, row))(
+            w, when, jax.random.split(keys[1], len(when)), jnp.arange(len(when)))
+
+    def feasible_path(self, key: jax.Array, y: jax.Array, at: Any = None) -> tuple[jax.Array, jax.Array]:
+        """Draw a trajectory under the constraints, one of 64 by their weights.
+
+        Args:
+            key: a JAX random key.
+            y: (T, D), NaN where missing.
+            at: (L,) times; those of the data where None.
+
+        Returns:
+            (x, u) (L, M + R), and the times (L,).
+        """
+        problem = self.bounded(at)
+        passed = problem.proposal(y, problem.propagated(y))._replace(steps=None)
+        path = problem.chosen(key, passed, 1, _CANDIDATES)[..., 0]
+        # The last row of a time is the one at which the constraint holds.
+        wanted = np.asarray(self.times if at is None else at, float)
+        index = np.searchsorted(problem.rows.times, wanted, side="right") - 1
+        return path[index], jnp.asarray(wanted)
+
+    def constrained_leave_one_out(self, y: jax.Array) -> jax.Array:
+        """Return (T,), log p(y_k | y_-k, c), by expectation propagation."""
+        problem = self.bounded()
+        found = problem.propagated(y, "all")
+        predictor = backward(found.passed, Moments(*problem.ssm.initial()), problem.grid).predictor
+        assert predictor is not None
+        data, outputs = jnp.asarray(problem.rows.data), y.shape[1]
+        at = jax.tree_util.tree_map(lambda a: at_rows(a, problem.grid.observed)[data], predictor)
+        at = at._replace(mean=at.mean[:, :outputs], covariance=at.covariance[:, :outputs, :outputs])
+        sites = Sites(*(a[data, :outputs] for a in found.refined.found.sites))
+        value = leave_one_out(at, sites, found.entries[data, :outputs])
+        return jnp.where(found.refined.found.converged, value, -jnp.inf)
+
     def filter(self, y: Any) -> FilterResult:
-        """Filter with this distribution's rule and steps; see `lfm_ppl.filter`."""
+        """Filter with this distribution's rule and steps; see `lfm_ppl.filter`. Constraints are of no account."""
         y = self._checked(y)
         return filter_on(self.ssm, self.rule, self.time_grid, y, jnp.asarray(self.times, float))
 
     def smooth(self, y: Any, at: Any = None) -> SmootherResult:
-        """Smooth with this distribution's settings; see `lfm_ppl.smooth`."""
+        """Smooth with this distribution's settings; see `lfm_ppl.smooth`. Constraints are of no account."""
         grids = smoothing_grids(self.ssm, self.times, self.steps, self.max_step, at, self.iterations,
                                 self.tolerance)
         y = self._checked(y)
         return smooth_on(self.ssm, self.rule, grids, y, self.iterations, self.damping, self._site_settings)
+
+
+def _shown(value: Any) -> str:
+    known = checks.concrete(value)
+    return "..." if known is None else f"{float(known):g}"
 
 
 class Panel(dist.Distribution):

@@ -97,6 +97,8 @@ class with_particles(LikelihoodHandler):  # noqa: N801 (an effect handler, named
 
     def replacement(self, likelihood: MarginalLikelihood | Panel, site: dict[str, Any]) -> Any:
         """Return the estimate."""
+        one = likelihood.first if isinstance(likelihood, Panel) else likelihood
+        one.refuse_constraints("a particle filter")
         return ParticleLikelihood(likelihood, self.key, self.settings, self.steps)
 
 

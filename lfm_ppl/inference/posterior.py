@@ -54,12 +54,13 @@ def scores(bound: BoundModel, draws: Mapping[str, Any], *, show: Callable[[int, 
 
     Returns:
         ``leave_one_out`` (S, ..., T), ``one_step_ahead`` (S, ..., T), ``residual`` (S, ..., T, D); the series of a
-        panel come after the draws.
+        panel come after the draws. Under constraints the last two are those of the filter, which knows none.
     """
 
     def one(distribution: MarginalLikelihood, y: jax.Array) -> dict[str, jax.Array]:
         result = distribution.smooth(y)
-        return {"leave_one_out": result.leave_one_out, "one_step_ahead": result.log_likelihood,
+        left_out = distribution.constrained_leave_one_out(y) if distribution.constrained else result.leave_one_out
+        return {"leave_one_out": left_out, "one_step_ahead": result.log_likelihood,
                 "residual": result.whitened_innovation}
 
     def per_draw(values: Any, key: jax.Array, y: Any) -> dict[str, jax.Array]:
@@ -101,13 +102,18 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
     if at is not None and bound.times.ndim == 1 and np.array_equal(at, bound.times):
         at = None
     example = bound.site.example
-    after = None if particles is not None or not example.ssm.drift_structure.points else _after(bound, at)
+    after = None
+    if particles is None and not example.constrained and example.ssm.drift_structure.points:
+        after = _after(bound, at)
     plan = _plan(bound, at, particles is not None or after is not None)
 
     def one(distribution: MarginalLikelihood, y: jax.Array, key: jax.Array) -> dict[str, jax.Array]:
         ssm = distribution.ssm
         path_key, noise_key = jax.random.split(key)
-        if particles is None:
+        if distribution.constrained:
+            smoothed = None
+            w, when = distribution.feasible_path(path_key, y, plan.times)
+        elif particles is None:
             smoothed = distribution.smooth(y, plan.times)
             when = smoothed.times
             states = smoothed.sample_joint(path_key, 1)[0]

@@ -96,6 +96,7 @@ def check_accuracy(result: Any, numpyro_model: Callable, times: Any = None, y: A
         raise ValueError("replicates must be at least 2: the noise of the particle filter is told from their spread.")
     _check_sampler(result)
     whole = rebuilding.problem(result, numpyro_model, times, y, model_kwargs)
+    whole.example.refuse_constraints("a check of the Gaussian filter's accuracy")
     ssm = whole.example.ssm
     kind = _kind(reference, ssm)
     posterior = arviz_data.group(result, "posterior")

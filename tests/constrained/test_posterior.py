@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from scipy.stats import norm, truncnorm
 from systems import Linear, whole_state
 
 import lfm_ppl as lfm
-from lfm_ppl.constrained.posterior import truncated_moments
+from lfm_ppl.constrained.truncated import quantile, truncated_moments
 from lfm_ppl.filtering.quadrature import Marginal
 
 TIMES = np.linspace(0.0, 5.0, 8)
@@ -100,3 +101,44 @@ def test_bad_observations_say_what_to_do():
             initial_time=0.0)
         with pytest.raises(ValueError, match=message):
             lfm.constrained_posterior(other, TIMES, Y, lower={"factor": 0.0})
+
+
+@pytest.mark.parametrize("upper", [pytest.param({}, marks=pytest.mark.slow), {"factor": 1.2}],
+                         ids=["one bound", "two bounds"])
+def test_draws_are_feasible_and_from_the_truncated_distribution(dense, upper):
+    found = lfm.constrained_posterior(model(), TIMES, Y, lower={"factor": 0.0}, upper=upper, grid=TIMES)
+    high = upper.get("factor", np.inf)
+    draws = found.sample(jax.random.key(0), 2000)
+    u, x = np.asarray(draws.forces["factor"]), np.asarray(draws.state[..., 0])
+    assert u.min() >= 0.0 and u.max() <= high and found.effective_share(jax.random.key(1)) > 0.3
+    exact = accepted(*dense.posterior(TIMES, Y, TIMES), 0.0, high)
+    error = 4.0 * np.sqrt(1 / 2000 + 1 / len(exact))
+    for ours, reference in ((u, exact[:, 1::2]), (x, exact[:, 0::2])):
+        assert (np.abs(ours.mean(axis=0) - reference.mean(axis=0)) < error * reference.std(axis=0)).all()
+        np.testing.assert_allclose(ours.std(axis=0), reference.std(axis=0), rtol=error)
+        np.testing.assert_allclose(np.corrcoef(ours.T), np.corrcoef(reference.T), atol=1.5 * error)
+
+
+@pytest.mark.parametrize("mean, width", [(-30.0, 0.5), (30.5, 0.5), (0.3, 1e-4), (-2.0, 3.0), (-50.0, np.inf)])
+def test_a_box_far_from_the_mean_and_a_narrow_one(mean, width):
+    """Against quadrature: nothing cancels."""
+    near = float(np.clip(mean, 0.0, width))
+    reach = min(width, 1.0 if abs(mean) > 10 else 12.0)
+    low, high = max(near - reach, 0.0), min(near + reach, width)
+
+    def integral(power, end):
+        return quad(lambda f: (f - near) ** power * np.exp(-0.5 * (f - near) * (f + near - 2 * mean)), low, end,
+                    epsabs=0, epsrel=1e-12, limit=200)[0]
+
+    total = integral(0, high)
+    first, second = integral(1, high) / total, integral(2, high) / total
+    cavity = Marginal(jnp.asarray(mean), jnp.asarray(1.0))
+    found = truncated_moments(cavity, width)
+    np.testing.assert_allclose(found.log_partition, np.log(total) + norm.logpdf(near, mean), rtol=1e-9)
+    np.testing.assert_allclose(found.mean, near + first, rtol=1e-9)
+    np.testing.assert_allclose(found.variance, second - first**2, rtol=1e-6)
+    for share in (0.01, 0.5, 0.99):
+        value = float(quantile(cavity, width, share))
+        # Beyond 35 standard deviations the tail is taken for an exponential one. At 30 the first quantile is the
+        # difference, 3e-4, of two numbers near 30, one of them a normal quantile, right to 1e-13.
+        np.testing.assert_allclose(integral(0, value) / total, share, rtol=2e-3 if abs(mean) > 35 else 1e-7)

@@ -89,6 +89,7 @@ class on_latent_grid(LikelihoodHandler):  # noqa: N801 (an effect handler, named
         """Sample the forces, and return the distribution of the observations given them."""
         if isinstance(likelihood, Panel):
             raise ValueError(f"the site {site['name']!r} is a panel; put one series at a time on a grid.")
+        likelihood.refuse_constraints("a grid of latent values")
         if checks.traced(likelihood.times):
             raise ValueError("times must be known when the grid is built, but they are traced; run with "
                              "jit_model_args=False.")

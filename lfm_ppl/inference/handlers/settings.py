@@ -8,7 +8,8 @@ from typing import Any
 from lfm_ppl.inference.handlers.likelihood_handler import LikelihoodHandler
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
 
-NAMES = ("rule", "steps", "max_step", "iterations", "damping", "tolerance", "sites")
+NAMES = ("rule", "steps", "max_step", "iterations", "damping", "tolerance", "sites", "lower", "upper", "constraints",
+         "grid", "draws")
 
 
 class approximate(LikelihoodHandler):  # noqa: N801 (an effect handler, named as NumPyro names its handlers)
@@ -16,9 +17,10 @@ class approximate(LikelihoodHandler):  # noqa: N801 (an effect handler, named as
 
     Args:
         fn: a NumPyro model with a site ``MarginalLikelihood`` or ``panel``.
-        **settings: any of ``rule``, ``steps``, ``max_step``, ``iterations``, ``damping``, ``tolerance`` and ``sites``;
-            what is None or left out stays as the model has it. But ``steps`` or ``iterations`` without a tolerance are
-            steps of equal length, also where the model has a tolerance.
+        **settings: any of ``rule``, ``steps``, ``max_step``, ``iterations``, ``damping``, ``tolerance``, ``sites``,
+            ``lower``, ``upper``, ``constraints``, ``grid`` and ``draws``; what is None or left out stays as the model
+            has it. But ``steps`` or ``iterations`` without a tolerance are steps of equal length, also where the model
+            has a tolerance.
 
     Raises:
         TypeError: for a setting of another name.
