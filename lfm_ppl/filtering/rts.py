@@ -94,7 +94,7 @@ def backward(passed: Pass, start: Moments, grid: TimeGrid, moments: bool = True)
     last = Moments(passed.filtered.mean[-1], passed.filtered.covariance[-1])
     carry = (last, jnp.zeros(size), jnp.zeros((size, size)))
     (first, _, _), (ends, left_out, adjoint, predictor) = jax.lax.scan(
-        step, carry, (before, passed._replace(steps=None), still), reverse=True)
+        jax.checkpoint(step, prevent_cse=False), carry, (before, passed._replace(steps=None), still), reverse=True)
     every = jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a[None], b]), first, ends)
     return Smoothed(every, left_out, adjoint, predictor)
 
