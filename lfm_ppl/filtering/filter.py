@@ -94,11 +94,11 @@ class Points(NamedTuple):
     Attributes:
         nodes: (N, J + 1, k), (N, J + 1, k, k) of the `needed` states at the ends of the steps of each interval, before
             a jump.
-        ends: (N, n), (N, n, n) at the intervals' ends, after it.
+        ends: (N, n), (N, n, n) at the intervals' ends, after it; None where no observation `bends`.
     """
 
     nodes: Moments
-    ends: Moments
+    ends: Moments | None
 
 
 class Transitions(NamedTuple):
@@ -120,6 +120,12 @@ class Transitions(NamedTuple):
         moved_by = matmul(self.phi, (moments.mean - self.point)[:, None])[:, 0]
         covariance = congruence(self.phi, moments.covariance) + self.process_cov
         return Prediction(Moments(self.mean + moved_by, covariance), self.phi, self.process_cov)
+
+
+def bends(ssm: StateSpaceModel) -> bool:
+    """Whether the linearisation of an observation depends on the moments about which it is made."""
+    observation = ssm.model.observation
+    return bool(not ssm.observation_structure.linear or observation.angular or observation.varies_with_state)
 
 
 def needed(ssm: StateSpaceModel, rule: Rule) -> np.ndarray:
@@ -145,9 +151,10 @@ def completed(ssm: StateSpaceModel, rule: Rule, nodes: Moments) -> Moments:
     return Moments(matmul(nodes.mean[..., None, :], pick)[..., 0, :], congruence(pick.T, nodes.covariance))
 
 
-def _inside(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, prepared: Preparation, interval: Intervals,
-            steps: Any) -> Inside:
-    """Return what the iterations need of an interval from (mean, covariance with all states, phi) of its steps."""
+def _inside(ssm: StateSpaceModel, rule: Rule, prepared: Preparation, interval: Intervals,
+            steps: Any) -> tuple[jax.Array, Inside]:
+    """Return an interval's phi and what the iterations need of it, from (mean, covariance with all states, phi) of its
+    steps."""
     mean, own, phi = steps
     to_end = jnp.eye(ssm.state_dim)
     if prepared.jumps is not None:
@@ -157,8 +164,8 @@ def _inside(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, prepared: Preparat
         own, phi = at
         return matmul(to_end, phi), matmul(own, to_end.T)
 
-    _, cross = jax.lax.scan(back, to_end, (own, phi), reverse=True)
-    return Inside(Moments(mean, _columns(own, needed(ssm, rule))), cross)
+    whole, cross = jax.lax.scan(back, to_end, (own, phi), reverse=True)
+    return whole, Inside(Moments(mean, columns(own, needed(ssm, rule))), cross)
 
 
 def at_rows(a: jax.Array, intervals: Any) -> jax.Array:
@@ -168,7 +175,7 @@ def at_rows(a: jax.Array, intervals: Any) -> jax.Array:
     return a[jnp.asarray(intervals)]
 
 
-def _columns(a: jax.Array, indices: np.ndarray) -> jax.Array:
+def columns(a: jax.Array, indices: np.ndarray) -> jax.Array:
     """Return the entries at ``indices`` along the last axis; XLA fuses a slice, not a gather."""
     if not _contiguous(indices):
         return a[..., indices]
@@ -290,20 +297,20 @@ def forward(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, *, s
         start: moments at the initial time; the model's by default.
         linearization_point: linearise about these moments; the filter's own by default.
         keep: "likelihood" (log likelihoods only), "moments" (and the moments), "all" (what the smoother needs),
-            "steps" (and the steps within the intervals), "inside" (instead of these, what the iterations need of them).
+            "steps" (and the steps within the intervals), "inside" (what the adjoint and the iterations need).
         sites: (T, D) each, of an observation family: pseudo-observations in the place of ``y``, whose log likelihoods
             are then integrals of the sites. Or what makes those of a row from the mean (D,) and the covariance (D, D)
             of the predictor as predicted, the row's index, and its entries of y.
         transitions: of the intervals, where they are known; of ``linearization_point`` only the ends are used then.
     """
     prepared = preparation(ssm, rule, grid)
-    with_map = keep in ("all", "steps", "inside")
+    with_map = keep in ("all", "steps") or (keep == "inside" and grid.tolerance is not None)
     each: Callable[[Prediction], Any] | None = None
     if keep == "steps":
         each = lambda one: one  # noqa: E731
     if keep == "inside" and not ssm.time_invariant:
         used = needed(ssm, rule)
-        each = lambda one: (_columns(one.moments.mean, used), _columns(one.moments.covariance, used).T,  # noqa: E731
+        each = lambda one: (columns(one.moments.mean, used), columns(one.moments.covariance, used).T,  # noqa: E731
                             one.phi)
 
     def step(moments: Moments, inputs: tuple) -> tuple[Moments, Pass]:
@@ -313,10 +320,10 @@ def forward(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, *, s
             one = predict(ssm, rule, grid, prepared, interval, moments, nodes, with_map, each)
         else:
             one = transition.predict(moments)
-        centre = one.moments if point is None else point.ends
+        centre = one.moments if point is None or point.ends is None else point.ends
         affine = linearise_observation(ssm, rule, prepared.jacobian, interval.start + interval.length,
                                        jnp.maximum(interval.observation, 0), centre)
-        if point is not None:
+        if centre is not one.moments:
             affine = affine.shifted(one.moments.mean - centre.mean)
         if sites is None:
             new = update(ssm, affine, observed, jnp.isfinite(observed), one.moments, scale)
@@ -328,12 +335,12 @@ def forward(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, *, s
         if keep != "likelihood":
             out = out._replace(predicted=one.moments, filtered=new.moments, innovation=new.innovation,
                                present=jnp.isfinite(observed), chol=new.chol, site_terms=new.site_terms)
-        if with_map:
-            steps = one.steps
+        if with_map or keep == "inside":
+            phi, steps = one.phi, one.steps
             if keep == "inside" and steps is not None:
-                steps = _inside(ssm, rule, grid, prepared, interval, steps)
-            out = out._replace(phi=one.phi, process_cov=one.process_cov, gain=new.gain, jacobian=new.jacobian,
-                               obs_cov=new.obs_cov, steps=steps)
+                phi, steps = _inside(ssm, rule, prepared, interval, steps)
+            out = out._replace(phi=phi, process_cov=one.process_cov if with_map else None, gain=new.gain,
+                               jacobian=new.jacobian, obs_cov=new.obs_cov, steps=steps)
         return new.moments, out
 
     first = Moments(*ssm.initial()) if start is None else start

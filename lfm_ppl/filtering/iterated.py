@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.filtering.dense_output import Branches
-from lfm_ppl.filtering.filter import Pass, Points, completed, forward, needed
+from lfm_ppl.filtering.filter import Pass, Points, bends, columns, completed, forward, needed
 from lfm_ppl.filtering.jumps import jump_map
 from lfm_ppl.filtering.predict import Moments, compose
 from lfm_ppl.filtering.rts import Smoothed, backward
@@ -49,24 +49,19 @@ def posterior_linearisation(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y:
     """
     def smoothed(linearization_point: Points | None) -> Points:
         passed = forward(ssm, rule, grid, y, start=start, linearization_point=linearization_point, keep="inside")
-        found = backward(passed, start, grid)
-        return smoothed_nodes(ssm, rule, grid, passed, found)
+        return smoothed_points(ssm, rule, grid, passed, backward(passed, start, grid, moments=False), start)
 
     def iterate(carry: tuple[Points, jax.Array], _: None) -> tuple[tuple[Points, jax.Array], None]:
         points = carry[0]
         new = smoothed(points)
-        change = jnp.maximum(_largest_change(points.nodes, new.nodes), _largest_change(points.ends, new.ends))
+        change = _largest_change(points.nodes, new.nodes)
+        if points.ends is not None:
+            change = jnp.maximum(change, _largest_change(points.ends, new.ends))
         return (jax.tree_util.tree_map(lambda a, b: a + damping * (b - a), points, new), change), None
 
     first = smoothed(None), jnp.asarray(jnp.nan)
     (points, change), _ = jax.lax.scan(iterate, first, None, length=iterations - 1)
     return Iterated(points, change)
-
-
-def smoothed_nodes(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, passed: Pass, smoothed: Smoothed) -> Points:
-    """Return the smoothed moments about which the next pass is linearised, of a pass that kept what is "inside"."""
-    ends = jax.tree_util.tree_map(lambda a: a[1:], smoothed.moments)
-    return Points(_nodes(ssm, rule, grid, passed, smoothed), ends)
 
 
 def _largest_change(old: Moments, new: Moments) -> jax.Array:
@@ -76,33 +71,47 @@ def _largest_change(old: Moments, new: Moments) -> jax.Array:
     return jnp.max(jnp.where(sd > 0, change, 0.0), initial=0.0)
 
 
-def _nodes(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, passed: Pass, smoothed: Smoothed) -> Moments:
-    """Return smoothed moments (N, J + 1, ...) of the needed states at the ends of the steps.
+def smoothed_points(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, passed: Pass, smoothed: Smoothed,
+                    start: Moments) -> Points:
+    """Return the smoothed moments about which the next pass is linearised, of a pass that kept what is "inside".
 
-    Between an interval's ends they are those of the adjoint at its end,
+    They are those of the adjoint at the end of the interval that a node lies in,
 
         m + W r,    P - W Lambda W',    W = Cov(node, state at the interval's end).
     """
     used = needed(ssm, rule)
-    pick = np.eye(ssm.state_dim)[used]
-    marginal = Moments(matmul(smoothed.moments.mean, pick.T), congruence(pick, smoothed.moments.covariance))
-    first, last = (jax.tree_util.tree_map(lambda a: a[part][:, None], marginal)  # noqa: B023
-                   for part in (slice(None, -1), slice(1, None)))
-    if passed.steps is None or not used.size:
-        return jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a, *(b for _ in range(grid.steps))], axis=1),
-                                      first, last)
+    r, adjoint = smoothed.adjoint
 
-    def row(at: tuple) -> Moments:
-        (moments, cross), r, adjoint = at
+    def row(moments: Moments, cross: jax.Array, r: jax.Array, adjoint: jax.Array) -> Moments:
         return Moments(moments.mean + matmul(cross, r[:, None])[..., 0],
                        moments.covariance - congruence(cross, adjoint))
 
-    # Interval by interval: XLA makes one small program of an interval, where it treats all intervals at once operation
-    # by operation.
-    inside = jax.lax.map(row, (passed.steps, *smoothed.adjoint))
-    if ssm.stack.jump_table() is None:
-        inside = jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a[:, :-1], b], axis=1), inside, last)
-    return jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a, b], axis=1), first, inside)
+    ends = None
+    if bends(ssm):
+        ends = jax.vmap(row)(passed.predicted, passed.predicted.covariance, r, adjoint)
+
+    def marginal(moments: Moments) -> tuple[Moments, jax.Array]:
+        cross = columns(moments.covariance, used).mT
+        return Moments(columns(moments.mean, used), columns(cross, used)), cross
+
+    back = matmul(passed.phi[0].T, r[0][:, None])[:, 0], congruence(passed.phi[0].T, adjoint[0])
+    first = row(*marginal(start), *back)
+    inside = passed.steps
+    if inside is None or not used.size or ssm.stack.jump_table() is not None:
+        after = jax.vmap(row)(*marginal(passed.predicted), r, adjoint)
+    if inside is None or not used.size:
+        inside = jax.tree_util.tree_map(lambda a: jnp.broadcast_to(a[:, None], (len(a), grid.steps, *a.shape[1:])),
+                                        after)
+    else:
+        # Interval by interval: XLA makes one small program of an interval, where it treats all intervals at once
+        # operation by operation.
+        inside = jax.lax.map(lambda at: row(*at), (*passed.steps, r, adjoint))
+        if ssm.stack.jump_table() is None:
+            after = jax.tree_util.tree_map(lambda a: a[:, -1], inside)
+    nodes = jax.tree_util.tree_map(
+        lambda first, after, inside: jnp.concatenate(
+            [jnp.concatenate([first[None], after[:-1]])[:, None], inside], axis=1), first, after, inside)
+    return Points(nodes, ends)
 
 
 def _to_end(ssm: StateSpaceModel, grid: TimeGrid, passed: Pass) -> tuple[jax.Array, jax.Array]:

@@ -64,7 +64,8 @@ def backward(passed: Pass, start: Moments, grid: TimeGrid, moments: bool = True)
         passed: the forward scan, with what the smoother needs.
         start: moments at the initial time.
         grid: the time grid.
-        moments: whether those of the state are wanted; without them only the adjoint is run, and they stay as filtered.
+        moments: whether those of the state are wanted, and the leave-one-out terms; without them only the adjoint is
+            run, moments stay as filtered and the terms are zero.
     """
     length = jnp.asarray(grid.intervals.length)
     still = (length == 0) & (jnp.asarray(grid.intervals.jump) < 0)
@@ -74,12 +75,13 @@ def backward(passed: Pass, start: Moments, grid: TimeGrid, moments: bool = True)
     def step(carry: tuple, row: tuple) -> tuple[tuple, tuple]:
         later, r, adjoint = carry
         at, one, at_rest = row
-        if one.site_terms is None:
-            left_out, r, adjoint = _leave_one_out(one, r, adjoint)
-            predictor = None
-        else:
-            left_out = jnp.zeros(())
+        left_out, predictor = jnp.zeros(()), None
+        if one.site_terms is not None:
             predictor, r, adjoint = _predictor(one, r, adjoint)
+        elif moments:
+            left_out, r, adjoint = _leave_one_out(one, r, adjoint)
+        else:
+            r, adjoint = _with_observation(one, *_whitened(one), r, adjoint)
         back = matmul(one.phi.T, r[:, None])[:, 0], congruence(one.phi.T, adjoint)
         if not moments:
             return (at, *back), (later, left_out, (r, adjoint), predictor)
@@ -92,7 +94,7 @@ def backward(passed: Pass, start: Moments, grid: TimeGrid, moments: bool = True)
     last = Moments(passed.filtered.mean[-1], passed.filtered.covariance[-1])
     carry = (last, jnp.zeros(size), jnp.zeros((size, size)))
     (first, _, _), (ends, left_out, adjoint, predictor) = jax.lax.scan(
-        step, carry, (before, passed._replace(steps=None), still), reverse=True)
+        jax.checkpoint(step, prevent_cse=False), carry, (before, passed._replace(steps=None), still), reverse=True)
     every = jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a[None], b]), first, ends)
     return Smoothed(every, left_out, adjoint, predictor)
 
@@ -115,19 +117,27 @@ def _predictor(one: Pass, r: jax.Array, adjoint: jax.Array) -> tuple[Predictor, 
     return Predictor(mean, covariance, u, precision), r, adjoint
 
 
+def _whitened(one: Pass) -> tuple[jax.Array, jax.Array]:
+    """Return S^-1 (D, D) and S^-1 v (D,) of an update."""
+    inverse = outer_square(solve_lower(one.chol, jnp.eye(one.innovation.shape[0])).T)
+    return inverse, matmul(inverse, one.innovation[:, None])[:, 0]
+
+
+def _with_observation(one: Pass, inverse: jax.Array, white: jax.Array, r: jax.Array,
+                      adjoint: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return the adjoint at an interval's end, its observation included."""
+    kept = jnp.eye(r.shape[0]) - matmul(one.gain, one.jacobian)
+    return (matmul(one.jacobian.T, white[:, None])[:, 0] + matmul(kept.T, r[:, None])[:, 0],
+            congruence(one.jacobian.T, inverse) + congruence(kept.T, adjoint))
+
+
 def _leave_one_out(one: Pass, r: jax.Array, adjoint: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Log density of an interval's observation given all others, and the adjoint at the interval's end with it."""
-    outputs = one.innovation.shape[0]
-    root = solve_lower(one.chol, jnp.eye(outputs))
-    inverse = outer_square(root.T)
-    white = matmul(inverse, one.innovation[:, None])[:, 0]
+    inverse, white = _whitened(one)
     u = white - matmul(one.gain.T, r[:, None])[:, 0]
     precision = inverse + congruence(one.gain.T, adjoint)
     factor = cholesky(precision)
     # A missing entry has unit precision and u = 0, and so contributes nothing.
     left_out = (log_density(solve_lower(factor.chol, u), factor.chol, one.present)
                 + 2.0 * jnp.log(diagonal(factor.chol)).sum())  # C is a precision
-    kept = jnp.eye(r.shape[0]) - matmul(one.gain, one.jacobian)
-    r = matmul(one.jacobian.T, white[:, None])[:, 0] + matmul(kept.T, r[:, None])[:, 0]
-    adjoint = congruence(one.jacobian.T, inverse) + congruence(kept.T, adjoint)
-    return left_out, r, adjoint
+    return left_out, *_with_observation(one, inverse, white, r, adjoint)

@@ -36,7 +36,7 @@ import numpy as np
 
 from lfm_ppl import checks
 from lfm_ppl.filtering.filter import Pass, Points, at_rows, forward
-from lfm_ppl.filtering.iterated import smoothed_nodes
+from lfm_ppl.filtering.iterated import smoothed_points
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.quadrature import Marginal, Tilted, expectations, tilted_moments
 from lfm_ppl.filtering.rts import Predictor, Smoothed, backward
@@ -474,7 +474,7 @@ def _known(mean: jax.Array, variance: jax.Array) -> Marginal:
 def _smoothed(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments, sites: Sites,
               points: Points | None, keep: str) -> tuple[Pass, Smoothed, Predictor]:
     passed = forward(ssm, rule, grid, y, start=start, linearization_point=points, keep=keep, sites=sites)
-    smoothed = backward(passed, start, grid, moments=keep == "inside")
+    smoothed = backward(passed, start, grid, moments=False)
     assert smoothed.predictor is not None
     predictor = Predictor(*(at_rows(a, grid.observed) for a in smoothed.predictor))
     return passed, smoothed, predictor
@@ -486,7 +486,7 @@ def _joint_sweeps(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array
         passed, smoothed, predictor = _smoothed(ssm, rule, grid, y, start, sites, points, "inside")
         at = cavities(predictor, sites, terms.present, settings.power)
         sites, _ = new_sites(terms, sites, at, settings, settings.damping)
-        return sites, smoothed_nodes(ssm, rule, grid, passed, smoothed)
+        return sites, smoothed_points(ssm, rule, grid, passed, smoothed, start)
 
     carry = sweep(first, None)
     (sites, points), _ = jax.lax.scan(lambda carry, _: (sweep(*carry), None), carry, None,
