@@ -67,9 +67,9 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"model    {model.name}: {model.summary}" if model.summary else f"model    {model.name}")
         print(f"data     {arguments.data}: {len(fits)} data sets", flush=True)
         started = time.perf_counter()
-        for one in fits:
-            if one.result is not None:
-                _write(one, folder / RESULTS, fit.attributes(arguments, model, data_sets[one.name], options))
+        for found in fits:
+            if found.result is not None:
+                _write(found, folder / RESULTS, fit.attributes(arguments, model, data_sets[found.name], options))
     return _report(fits, folder, duration(time.perf_counter() - started), tables)
 
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import checks
+from lfm_ppl.constrained.boxes import Boxes
 from lfm_ppl.constrained.constraints import Constraints
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation import GaussianObservation
@@ -23,7 +24,7 @@ class _Stacked(eqx.Module):
     """h(x, u, t) (D,), then c(x, u, t) (C,)."""
 
     observe: Any
-    constraints: Constraints
+    constraints: Constraints | Boxes
 
     def __call__(self, x: jax.Array, u: jax.Array, t: jax.Array) -> jax.Array:
         return jnp.concatenate([jnp.asarray(self.observe(x, u, t), float), self.constraints(x, u, t)])
@@ -134,7 +135,7 @@ def augmented(model: LatentForceModel, constraints: Constraints, laid_out: Rows)
     return _observed_by(model, AugmentedObservation(own, constraints, laid_out.data_rows), constraints)
 
 
-def stacked_model(model: LatentForceModel, constraints: Constraints) -> StateSpaceModel:
+def stacked_model(model: LatentForceModel, constraints: Constraints | Boxes) -> StateSpaceModel:
     """Return the same with outputs (h, c) without noise, which sites observe."""
     noise = jnp.zeros(len(model.output_names) + constraints.count)
     function = _Stacked(model.observation.function, constraints)
@@ -142,7 +143,7 @@ def stacked_model(model: LatentForceModel, constraints: Constraints) -> StateSpa
 
 
 def _observed_by(model: LatentForceModel, observation: GaussianObservation,
-                 constraints: Constraints) -> StateSpaceModel:
+                 constraints: Constraints | Boxes) -> StateSpaceModel:
     return state_space(LatentForceModel(
         model.dynamics, tuple(model.forces.items()), observation, model.initial_state, model.process_noise,
         model.initial_time, model.nonlinear_inputs, model.state_names, (*model.output_names, *constraints.labels),

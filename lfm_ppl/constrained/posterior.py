@@ -211,5 +211,5 @@ def _parts(problem: Bounded, y: jax.Array) -> tuple:
 
 def _run(problem: Bounded, y: jax.Array) -> ConstrainedPosterior:
     moments, proposal = _parts(problem, y)
-    return ConstrainedPosterior(*moments, problem.boxes, problem, proposal, problem.ssm.model.state_names,
-                                problem.ssm.model.force_names)
+    names = problem.ssm.model.state_names, problem.ssm.model.force_names
+    return ConstrainedPosterior(*(*moments, problem.boxes, problem, proposal, *names))

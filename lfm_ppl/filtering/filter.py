@@ -153,8 +153,7 @@ def completed(ssm: StateSpaceModel, rule: Rule, nodes: Moments) -> Moments:
 
 def _inside(ssm: StateSpaceModel, rule: Rule, prepared: Preparation, interval: Intervals,
             steps: Any) -> tuple[jax.Array, Inside]:
-    """Return an interval's phi and what the iterations need of it, from (mean, covariance with all states, phi) of its
-    steps."""
+    """Return phi of an interval and what the iterations need, from (mean, covariance with all, phi) of its steps."""
     mean, own, phi = steps
     to_end = jnp.eye(ssm.state_dim)
     if prepared.jumps is not None:

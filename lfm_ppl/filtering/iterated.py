@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from lfm_ppl.filtering.dense_output import Branches
 from lfm_ppl.filtering.filter import Pass, Points, bends, columns, completed, forward, needed
@@ -55,7 +54,7 @@ def posterior_linearisation(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y:
         points = carry[0]
         new = smoothed(points)
         change = _largest_change(points.nodes, new.nodes)
-        if points.ends is not None:
+        if points.ends is not None and new.ends is not None:
             change = jnp.maximum(change, _largest_change(points.ends, new.ends))
         return (jax.tree_util.tree_map(lambda a, b: a + damping * (b - a), points, new), change), None
 

@@ -170,9 +170,10 @@ def lay_out(bound: BoundModel, draws: dict, stats: dict, rated: dict | None, pat
             groups[GROUP] = predictions(bound, paths, chosen, grid, labels.coords)
     if truth:
         groups["truth"] = _truth(truth, named, units, groups["posterior"])
-        outputs = _true_outputs(bound, truth)
-        if outputs is not None:
-            groups["truth"] = groups["truth"].assign(outputs=variable(("at_truth", OUTPUT), outputs, named[OUTPUT]))
+        without_noise = _true_outputs(bound, truth)
+        if without_noise is not None:
+            groups["truth"] = groups["truth"].assign(
+                outputs=variable(("at_truth", OUTPUT), without_noise, named[OUTPUT]))
             groups["truth"] = groups["truth"].assign_coords({OUTPUT: named[OUTPUT]})
     return groups
 

@@ -18,7 +18,7 @@ from lfm_ppl.experiments.posteriors import LogPosterior
 from lfm_ppl.forces import Matern
 from lfm_ppl.inference.bound_model import bind, likelihood_site
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
-from lfm_ppl.linearisation.sigma_points import GaussHermite
+from lfm_ppl.linearisation.sigma_points import Cubature, GaussHermite
 from lfm_ppl.model.gaussian import Gaussian
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation import GaussianObservation
@@ -133,8 +133,8 @@ def _learnt(times: Any, y: Any = None, softplus: bool = False, alone: bool = Fal
     lengthscale = numpyro.sample("lengthscale", dist.LogNormal(0.0, 1.0))
     scale = 1.0 if alone else numpyro.sample("scale", dist.LogNormal(0.0, 1.0))
     model = transcription(scale, lengthscale, 0.0, softplus)
-    rule = GaussHermite(5) if softplus else None
-    numpyro.sample("y", MarginalLikelihood(model, times, steps=1, **({"rule": rule} if rule else {})), obs=y)
+    rule = GaussHermite(5) if softplus else Cubature()
+    numpyro.sample("y", MarginalLikelihood(model, times, rule, steps=1), obs=y)
 
 
 @functools.cache

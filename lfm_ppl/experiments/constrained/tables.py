@@ -43,7 +43,7 @@ def transcription(settings: Any, results: dict[str, Result]) -> pd.DataFrame:
 
 def shapes(settings: Any, results: dict[str, Result]) -> pd.DataFrame:
     """Return one row an estimator: median MSE and coverage of each shape of the force."""
-    rows = {}
+    rows: dict[str, dict[str, float]] = {}
     for method in settings.methods:
         rows[method] = {}
         for shape in settings.shapes:

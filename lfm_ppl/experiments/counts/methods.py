@@ -78,7 +78,7 @@ def _sites(task: Task, one: Problem, theta: dict[str, float]) -> Result:
     log_z = float(evidence(theta, one.y)[0])  # compiled here
     seconds, _ = timed(lambda: [evidence(theta, one.y) for _ in range(REPEATS)])
     mean, sd = _moments(smoothed(theta, one.y))
-    family = one.build(**theta).observation
+    family = _family(one.build(**theta))
 
     def predicted(y: np.ndarray, held: np.ndarray, key: jax.Array) -> tuple[np.ndarray, np.ndarray]:
         m, s = (a[held][:, None] for a in _moments(smoothed(theta, y)))
@@ -93,6 +93,7 @@ def _sites(task: Task, one: Problem, theta: dict[str, float]) -> Result:
 def _reference(task: Task, one: Problem, theta: dict[str, float]) -> Result:
     draws = task.settings["draws"]
     system = one.build(**theta)
+    family = _family(system)
     reference = Reference(system, one.times, one.sites)
     key, fold_key = jax.random.split(task.key)
     seconds, found = timed(lambda: reference.sample(key, one.y, draws))
@@ -101,12 +102,17 @@ def _reference(task: Task, one: Problem, theta: dict[str, float]) -> Result:
     def predicted(y: np.ndarray, held: np.ndarray, key: jax.Array) -> tuple[np.ndarray, np.ndarray]:
         f = reference.sample(jax.random.fold_in(fold_key, int(held.argmax())), y, max(draws // 5, 100))
         f = f.reshape(-1, f.shape[-1])[:, held].T
-        density = np.asarray(_densities(system.observation, jnp.asarray(f), jnp.asarray(one.y[held])))
+        density = np.asarray(_densities(family, jnp.asarray(f), jnp.asarray(one.y[held])))
         return np.log(density.mean(axis=1)), f[:, np.linspace(0, f.shape[1] - 1, DRAWN).astype(int)]
 
     return {"log evidence": weighed.log_evidence, "log evidence error": weighed.error, "share": weighed.share,
             "mean": found.mean(axis=(0, 1)), "sd": found.std(axis=(0, 1)), "seconds": seconds,
-            **scores_of_chains(found), **held_out(task, one, system.observation, predicted)}
+            **scores_of_chains(found), **held_out(task, one, family, predicted)}
+
+
+def _family(model: lfm.LatentForceModel) -> ObservationFamily:
+    assert isinstance(model.observation, ObservationFamily)
+    return model.observation
 
 
 def scores_of_chains(draws: np.ndarray) -> Result:

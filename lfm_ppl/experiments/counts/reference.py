@@ -15,6 +15,7 @@ from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.kernels.elliptical_slice import SliceState, elliptical_slice_step
 from lfm_ppl.latent_grid.latent_grid import JITTER
 from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import state_space
 
 CHAINS = 4
@@ -54,7 +55,8 @@ class Reference:
     """
 
     def __init__(self, model: LatentForceModel, times: np.ndarray, sites: SiteSettings) -> None:
-        self.ssm, self.times, self.settings = state_space(model), times, sites
+        assert isinstance(model.observation, ObservationFamily)
+        self.ssm, self.times, self.settings, self.family = state_space(model), times, sites, model.observation
         t = jnp.asarray(times)
         nothing = jnp.zeros(len(model.force_names))
         predictor = jax.vmap(lambda u, t: model.observation.function(jnp.zeros(0), u, t)[0], in_axes=(None, 0))
@@ -81,12 +83,12 @@ class Reference:
 
     def log_likelihood(self, w: jax.Array, y: jax.Array) -> jax.Array:
         """Return log p(y | w)."""
-        return FamilyTerms(self.ssm.model.observation, y).log_prob((self.mean + self.root @ w)[:, None]).sum()
+        return FamilyTerms(self.family, y).log_prob((self.mean + self.root @ w)[:, None]).sum()
 
     @partial(jax.jit, static_argnums=0)
     def _proposal(self, y: jax.Array) -> _Proposal:
         rule, grid = as_rule(None), build_time_grid(self.ssm, self.times, 1)
-        terms = FamilyTerms(self.ssm.model.observation, y)
+        terms = FamilyTerms(self.family, y)
         sites = evidence(self.ssm, rule, grid, y, terms, self.settings).refined.found.sites
         nu, tau = (jnp.where(jnp.isfinite(y), a, 0.0)[:, 0] for a in (sites.nu, sites.tau))
         precision = jnp.eye(len(y)) + self.root.T @ (tau[:, None] * self.root)
@@ -108,7 +110,7 @@ class Reference:
         # In coordinates z = R' (w - a) the proposal is standard normal; f = m + L a + L R^-T z.
         forward = jax.scipy.linalg.solve_triangular(proposal.root, self.root.T, lower=True).T
         middle = self.mean + self.root @ proposal.mean
-        terms = FamilyTerms(self.ssm.model.observation, y)
+        terms = FamilyTerms(self.family, y)
         back = jax.scipy.linalg.solve_triangular(proposal.root, jnp.eye(len(middle)), lower=True).T
 
         def log_ratio(z: jax.Array) -> jax.Array:
