@@ -136,7 +136,7 @@ def test_bad_arguments(sets, options, message):
 
 def test_names_become_files_that_differ():
     names = ["a/b", "a b", "a_b", "ä", "..", "x" * 200, "x" * 201]
-    files = [fitting_many._file_name(name) for name in names]
+    files = [fitting_many.file_name(name) for name in names]
     assert len(set(files)) == len(files) and files[2] == "a_b" and max(map(len, files)) < 100
 
 
