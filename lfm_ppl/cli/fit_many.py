@@ -67,9 +67,9 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"model    {model.name}: {model.summary}" if model.summary else f"model    {model.name}")
         print(f"data     {arguments.data}: {len(fits)} data sets", flush=True)
         started = time.perf_counter()
-        for found in fits:
-            if found.result is not None:
-                _write(found, folder / RESULTS, fit.attributes(arguments, model, data_sets[found.name], options))
+        for fitted in fits:
+            if fitted.result is not None:
+                _write(fitted, folder / RESULTS, fit.attributes(arguments, model, data_sets[fitted.name], options))
     return _report(fits, folder, duration(time.perf_counter() - started), tables)
 
 

@@ -167,7 +167,7 @@ def check_linear(problem: Bounded, draws: int) -> None:
     ssm, t = problem.ssm, jnp.asarray(problem.grid.initial_time, float)
     first = ssm.output_dim - problem.boxes.count
     for number, label in enumerate(problem.boxes.labels, first):
-        one = lambda w, n=number: ssm.observe(w, t)[n : n + 1]  # type: ignore[misc]  # noqa: E731
+        one = lambda w, n=number: ssm.observe(w, t)[n : n + 1]  # noqa: E731
         if pattern(one, ssm.input_dim).hessian.any():
             raise ValueError(f"the constraint {label!r} is not linear in states and forces, and draws={draws} "
                              "trajectories take linear ones. Set draws=0, for expectation propagation alone.")
