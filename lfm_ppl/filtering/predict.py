@@ -180,12 +180,13 @@ def unmoved(moments: Moments, with_map: bool, each: Callable[[Prediction], Any] 
             steps: int = 0) -> Prediction:
     """Predict over an interval of length zero; the same structure as what `predict_interval` returns."""
     size = moments.mean.shape[0]
-    still = (Prediction(moments, jnp.eye(size), jnp.zeros((size, size))) if with_map
-             else Prediction(moments, jnp.zeros(0), jnp.zeros(0)))
+    still = Prediction(moments, jnp.eye(size), jnp.zeros((size, size)))
+    within = None
     if each is not None:
-        still = still._replace(
-            steps=jax.tree_util.tree_map(lambda a: jnp.broadcast_to(a, (steps, *a.shape)), each(still)))
-    return still
+        within = jax.tree_util.tree_map(lambda a: jnp.broadcast_to(a, (steps, *a.shape)), each(still))
+    if not with_map:
+        still = still._replace(phi=jnp.zeros(0), process_cov=jnp.zeros(0))
+    return still._replace(steps=within)
 
 
 def minimum_sd(ssm: StateSpaceModel, rule: Rule, factor: IntegratingFactor, t: jax.Array, h: jax.Array,
