@@ -18,9 +18,10 @@ Measured, once an hour, are TSH and the free hormones FT3 = T3 / (1 + K30 TBG) a
 each with an error of the same percentage. TRH is a Gaussian process with a Matern-3/2 covariance about its level. A
 concentration cannot be negative: `lfm.full_information` and `lfm.constrained_posterior` take `lower={"TRH": 0.0}`.
 
-Constants are those of the sources. The production of T3 has GD1 = 22 nmol/s and GT3 = 394 fmol/s, with which the steady
-state at TRH = 6.9 nmol/l is the published one in all printed digits: T4 122.02, T3 3.1615, T3c 11.701 nmol/l, TSH
-1.8157 mU/l. The default data are a day of a simulated patient, who starts at midnight near that state, with TRH that
+Constants are those of Berberich et al. (2018) as public implementations have them. For the production of T3 these
+disagree: with GD1 = 22 nmol/s and GT3 = 394 fmol/s, taken here, the steady state at TRH = 6.9 nmol/l is the published
+one in all printed digits, T4 122.02, T3 3.1615, T3c 11.701 nmol/l, TSH 1.8157 mU/l; with GD1 = 23.527 nmol/s and GT3 =
+188.82 fmol/s, T3 is 3.0804 nmol/l. The table of the paper itself was not compared. The default data are a day of a simulated patient, who starts at midnight near that state, with TRH that
 is highest at 5 h and comes in pulses.
 
 Sources: J. Berberich, J. W. Dietrich, R. Hoermann and M. A. Mueller, Mathematical modeling of the pituitary-thyroid
