@@ -21,8 +21,8 @@ concentration cannot be negative: `lfm.full_information` and `lfm.constrained_po
 Constants are those of Berberich et al. (2018) as public implementations have them. For the production of T3 these
 disagree: with GD1 = 22 nmol/s and GT3 = 394 fmol/s, taken here, the steady state at TRH = 6.9 nmol/l is the published
 one in all printed digits, T4 122.02, T3 3.1615, T3c 11.701 nmol/l, TSH 1.8157 mU/l; with GD1 = 23.527 nmol/s and GT3 =
-188.82 fmol/s, T3 is 3.0804 nmol/l. The table of the paper itself was not compared. The default data are a day of a simulated patient, who starts at midnight near that state, with TRH that
-is highest at 5 h and comes in pulses.
+188.82 fmol/s, T3 is 3.0804 nmol/l. The table of the paper itself was not compared. The default data are a day of a
+simulated patient, who starts at midnight near that state, with TRH that is highest at 5 h and comes in pulses.
 
 Sources: J. Berberich, J. W. Dietrich, R. Hoermann and M. A. Mueller, Mathematical modeling of the pituitary-thyroid
 feedback loop: role of a TSH-T3-shunt and sensitivity analysis, Frontiers in Endocrinology 9 (2018); J. W. Dietrich,

@@ -18,7 +18,7 @@ from lfm_ppl.constrained.constraints import build_constraints
 from lfm_ppl.constrained.evidence import Bounded, check_variances
 from lfm_ppl.constrained.full_information import check_settings
 from lfm_ppl.constrained.truncated import quantile
-from lfm_ppl.filtering.filter import Pass, as_rule, at_rows, check_observations, warn_single_precision
+from lfm_ppl.filtering.filter import Pass, as_rule, at_intervals, check_observations, warn_single_precision
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.quadrature import Marginal
 from lfm_ppl.filtering.rts import backward
@@ -198,7 +198,7 @@ def _parts(problem: Bounded, y: jax.Array) -> tuple:
     at = jnp.asarray(problem.grid.observed)[jnp.asarray(laid_out.grid)]
     times = jnp.asarray(laid_out.times)[jnp.asarray(laid_out.grid)]
     matrix, offset = jax.vmap(ssm.input_map)(times)
-    mean, covariance = (at_rows(a[1:], at) for a in smoothed.moments)
+    mean, covariance = (at_intervals(a[1:], at) for a in smoothed.moments)
     mean = matmul(matrix, mean[..., None])[..., 0] + offset
     sd = safe_sqrt(jax.vmap(diagonal)(congruence(matrix, covariance)))
     size = ssm.physical_dim

@@ -17,9 +17,9 @@ from lfm_ppl.filtering.predict import (
     FLOOR,
     Moments,
     Prediction,
+    interval_factor,
     predict_exact,
     predict_interval,
-    row_factor,
     unmoved,
 )
 from lfm_ppl.filtering.time_grid import Intervals, TimeGrid, build_time_grid, by_length, with_observations
@@ -167,7 +167,7 @@ def _inside(ssm: StateSpaceModel, rule: Rule, prepared: Preparation, interval: I
     return whole, Inside(Moments(mean, columns(own, needed(ssm, rule))), cross)
 
 
-def at_rows(a: jax.Array, intervals: Any) -> jax.Array:
+def at_intervals(a: jax.Array, intervals: Any) -> jax.Array:
     """Return entries of ``a`` (N, ...) at some intervals; for all of them without a gather, a scatter in reverse."""
     if isinstance(intervals, np.ndarray) and np.array_equal(intervals, np.arange(a.shape[0])):
         return a
@@ -220,7 +220,7 @@ def step_transition(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, grid: 
         return exact(ssm, length, grid.steps, linear)
     if grid.tolerance is not None:
         return None
-    return row_factor(ssm, rule, linear, length, grid.steps, tabulated)
+    return interval_factor(ssm, rule, linear, length, grid.steps, tabulated)
 
 
 class FilterState(NamedTuple):
@@ -492,7 +492,7 @@ def filter_on(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, ti
         log_likelihood, passed = assumed_density_filter(ssm, rule, grid, y, begin)
     else:
         passed = forward(ssm, rule, grid, y, start=begin, keep="moments")
-    at = jax.tree_util.tree_map(lambda a: at_rows(a, grid.observed), passed)
+    at = jax.tree_util.tree_map(lambda a: at_intervals(a, grid.observed), passed)
     state = FilterState(times[-1], at.filtered.mean[-1], at.filtered.covariance[-1])
     return FilterResult(times, at.log_likelihood if log_likelihood is None else log_likelihood, at.predicted.mean,
                         at.predicted.covariance, at.filtered.mean, at.filtered.covariance,

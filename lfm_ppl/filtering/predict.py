@@ -331,8 +331,8 @@ def _stage(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, t: jax.Array, m
     return Stage(rest, affine.jacobian - linear.rows, affine.extra if isinstance(affine.extra, jax.Array) else None)
 
 
-def row_factor(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, length: jax.Array, steps: int,
-               tabulated: bool = False) -> IntegratingFactor:
+def interval_factor(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, length: jax.Array, steps: int,
+                    tabulated: bool = False) -> IntegratingFactor:
     """Return the integrating factor of an interval's steps; one ``tabulated`` for many intervals may cost more."""
     stages = not bent_by_forces_only(ssm, rule)
     nodes = not stages and tabulated and ssm.force_dim <= _LARGEST_TABULATED

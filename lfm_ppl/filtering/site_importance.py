@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from lfm_ppl.filtering.filter import at_rows
+from lfm_ppl.filtering.filter import at_intervals
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.rts import backward
 from lfm_ppl.filtering.simulation_smoother import smoothing_errors
@@ -41,9 +41,9 @@ def importance_weights(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.
     terms = FamilyTerms(family, y)
     found = evidence(ssm, rule, grid, y, terms, settings, start, keep="all")
     passed, sites = found.passed, found.refined.found.sites
-    mean = at_rows(backward(passed, start, grid).moments.mean[1:], grid.observed)
-    errors = at_rows(smoothing_errors(key, passed, start, draws), grid.observed)
-    ends = at_rows(jnp.asarray(grid.intervals.start) + jnp.asarray(grid.intervals.length), grid.observed)
+    mean = at_intervals(backward(passed, start, grid).moments.mean[1:], grid.observed)
+    errors = at_intervals(smoothing_errors(key, passed, start, draws), grid.observed)
+    ends = at_intervals(jnp.asarray(grid.intervals.start) + jnp.asarray(grid.intervals.length), grid.observed)
 
     def log_weight(errors: jax.Array) -> jax.Array:
         f = jax.vmap(lambda s, t: ssm.observe(ssm.inputs(s, t), t))(mean + errors, ends)

@@ -35,7 +35,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import checks
-from lfm_ppl.filtering.filter import Pass, Points, at_rows, forward
+from lfm_ppl.filtering.filter import Pass, Points, at_intervals, forward
 from lfm_ppl.filtering.iterated import smoothed_points
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.quadrature import Marginal, Tilted, expectations, tilted_moments
@@ -437,7 +437,7 @@ def _first(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start
     if is_linear(ssm):
         return _from_prior(ssm, rule, grid, y, start, family)
     passed = forward(ssm, rule, grid, y, start=start, keep="moments", sites=assumed_density(family))
-    return Sites(*(at_rows(a, grid.observed) for a in passed.site_terms.sites))
+    return Sites(*(at_intervals(a, grid.observed) for a in passed.site_terms.sites))
 
 
 def _from_prior(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments,
@@ -451,7 +451,7 @@ def _from_prior(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, 
     passed = forward(ssm, rule, grid, jnp.full(y.shape, jnp.nan), start=start, keep="moments",
                      sites=Sites(nothing, nothing, nothing))
     at = passed.site_terms
-    mean, variance = at_rows(at.value, grid.observed), at_rows(diagonal(at.variance), grid.observed)
+    mean, variance = at_intervals(at.value, grid.observed), at_intervals(diagonal(at.variance), grid.observed)
     cavity = _known(mean, variance)
     terms = FamilyTerms(family, y)
     found = terms.tilted(cavity, _mode(terms.log_prob, cavity), 1.0, rough=True)
@@ -476,7 +476,7 @@ def _smoothed(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, st
     passed = forward(ssm, rule, grid, y, start=start, linearization_point=points, keep=keep, sites=sites)
     smoothed = backward(passed, start, grid, moments=False)
     assert smoothed.predictor is not None
-    predictor = Predictor(*(at_rows(a, grid.observed) for a in smoothed.predictor))
+    predictor = Predictor(*(at_intervals(a, grid.observed) for a in smoothed.predictor))
     return passed, smoothed, predictor
 
 
@@ -634,14 +634,14 @@ def assumed_density_filter(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: 
     family = ssm.model.observation
     assert isinstance(family, ObservationFamily)
     passed = forward(ssm, rule, grid, y, start=start, keep="moments", sites=assumed_density(family))
-    at = jax.tree_util.tree_map(lambda a: at_rows(a, grid.observed), passed.site_terms)
+    at = jax.tree_util.tree_map(lambda a: at_intervals(a, grid.observed), passed.site_terms)
     variance = diagonal(at.variance)
     cavity, found = jax.vmap(lambda row, m, v, y: assumed_tilted(
         lambda f: row_log_prob(family, row, f, y), m, v))(jnp.arange(len(y)), at.value, variance, y)
     # An entry's own term stands in the place of its site; one entry a row: this is log Z of the tilted prediction.
     gaussian = gaussian_terms(at.sites, cavity, 1.0)
     entries = jnp.where(jnp.isfinite(y), found.log_partition - gaussian, 0.0).sum(1)
-    return Prequential(at_rows(passed.log_likelihood, grid.observed) + entries, passed)
+    return Prequential(at_intervals(passed.log_likelihood, grid.observed) + entries, passed)
 
 
 def leave_one_out(predictor: Predictor, sites: Sites, entries: jax.Array) -> jax.Array:

@@ -15,7 +15,7 @@ from lfm_ppl.filtering.dense_output import Branches, Places, dense_output, place
 from lfm_ppl.filtering.filter import (
     Pass,
     as_rule,
-    at_rows,
+    at_intervals,
     check_observations,
     forward,
     warn_single_precision,
@@ -284,14 +284,14 @@ def smooth_on(ssm: StateSpaceModel, rule: Rule, grids: SmoothingGrids, y: jax.Ar
     """The same on time grids, without checks; for compiled code."""
     grid = grids.marginals
     start = Moments(*ssm.initial())
-    passed, smoothed, found, scored = _smooth_rows(ssm, rule, grid, y, start, iterations, damping, settings)
+    passed, smoothed, found, scored = _smooth_intervals(ssm, rule, grid, y, start, iterations, damping, settings)
     times = jnp.asarray(grids.times, float)
     if grids.joint is None or grids.where is None:
         at = jnp.asarray(grid.requested)
         mean, covariance = (a[at + 1] for a in smoothed.moments)
         joint = Joint(start, passed._replace(steps=None), at, None)
     else:
-        drawn, pieces, *_ = _smooth_rows(ssm, rule, grids.joint, y, start, iterations, damping, settings)
+        drawn, pieces, *_ = _smooth_intervals(ssm, rule, grids.joint, y, start, iterations, damping, settings)
         at = jnp.asarray(grids.joint.requested)
         joint = Joint(start, drawn._replace(steps=None), at, pieces.moments.covariance[at + 1])
         branches = (Branches(grid, passed.filtered, smoothed.moments, smoothed.adjoint, None) if found is None
@@ -308,8 +308,8 @@ def smooth_on(ssm: StateSpaceModel, rule: Rule, grids: SmoothingGrids, y: jax.Ar
         ssm.model.state_names, ssm.model.force_names)
 
 
-def _smooth_rows(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments, iterations: int,
-                 damping: float, settings: SiteSettings) -> tuple[Pass, Smoothed, Iterated | None, tuple | None]:
+def _smooth_intervals(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments, iterations: int,
+                      damping: float, settings: SiteSettings) -> tuple[Pass, Smoothed, Iterated | None, tuple | None]:
     """Smooth on one time grid; of a family also its one-step-ahead and leave-one-out terms."""
     if isinstance(ssm.model.observation, ObservationFamily):
         return _smooth_family(ssm, rule, grid, y, start, settings, ssm.model.observation)
@@ -328,7 +328,7 @@ def _smooth_family(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Arra
     smoothed = backward(found.passed, start, grid)
     assert smoothed.predictor is not None
     refined_sites = found.refined.found
-    at = jax.tree_util.tree_map(lambda a: at_rows(a, grid.observed), smoothed.predictor)
+    at = jax.tree_util.tree_map(lambda a: at_intervals(a, grid.observed), smoothed.predictor)
     failed = lambda a: jnp.where(refined_sites.converged, a, -jnp.inf)  # noqa: E731
     scored = (failed(assumed_density_filter(ssm, rule, grid, y, start).log_likelihood),
               failed(leave_one_out(at, refined_sites.sites, found.entries)))

@@ -25,7 +25,7 @@ from lfm_ppl.filtering.breakdown import warn_of_breakdown
 from lfm_ppl.filtering.filter import (
     FilterResult,
     as_rule,
-    at_rows,
+    at_intervals,
     check_observations,
     filter_on,
     forward,
@@ -295,7 +295,7 @@ class MarginalLikelihood(dist.Distribution):
             point = posterior_linearisation(self.ssm, self.rule, self.time_grid, y, start, self.iterations,
                                             self.damping).points
         passed = forward(self.ssm, self.rule, self.time_grid, y, start=start, linearization_point=point)
-        return at_rows(passed.log_likelihood, self.time_grid.observed)
+        return at_intervals(passed.log_likelihood, self.time_grid.observed)
 
     def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
         """Simulate the real model: (*sample_shape, T, D).
@@ -341,7 +341,7 @@ class MarginalLikelihood(dist.Distribution):
         predictor = backward(found.passed, Moments(*problem.ssm.initial()), problem.grid).predictor
         assert predictor is not None
         data, outputs = jnp.asarray(problem.rows.data), y.shape[1]
-        at = jax.tree_util.tree_map(lambda a: at_rows(a, problem.grid.observed)[data], predictor)
+        at = jax.tree_util.tree_map(lambda a: at_intervals(a, problem.grid.observed)[data], predictor)
         at = at._replace(mean=at.mean[:, :outputs], covariance=at.covariance[:, :outputs, :outputs])
         sites = Sites(*(a[data, :outputs] for a in found.refined.found.sites))
         value = leave_one_out(at, sites, found.entries[data, :outputs])

@@ -220,7 +220,7 @@ def _plan(bound: BoundModel, at: np.ndarray | None, simulated: bool) -> _Plan:
         count = min(int(np.ceil((at.max() - known[-1]) / gap * (1 - 1e-12))), LONGEST_FORECAST)
         beyond = np.linspace(known[-1], at.max(), count + 1)[1:-1]
     everywhere = np.concatenate([at, beyond])
-    steps = _steps_in_a_row(example.ssm, known, everywhere, fine) if simulated else fine
+    steps = _steps_per_interval(example.ssm, known, everywhere, fine) if simulated else fine
     first = len(everywhere)
     return _Plan(np.concatenate([everywhere, known]), np.arange(len(at)), first + rows, steps)
 
@@ -266,7 +266,7 @@ def _particle_path(distribution: MarginalLikelihood, y: jax.Array, at: Any, key:
     to its estimate of the likelihood gives a path of the right one as the number of filters grows, too.
     """
     ssm, times = distribution.ssm, distribution.times
-    grid = build_time_grid(ssm, times, _steps_in_a_row(ssm, times, at, steps), distribution.max_step, at)
+    grid = build_time_grid(ssm, times, _steps_per_interval(ssm, times, at, steps), distribution.max_step, at)
     path_keys, choice = jax.random.split(key, _FILTERS + 1)[:-1], jax.random.fold_in(key, _FILTERS)
     states, _, total = jax.lax.map(lambda k: draw_trajectories(ssm, grid, y, k, particles, 1, TRACING), path_keys)
     best = jax.random.categorical(choice, jnp.where(jnp.isneginf(total).all(), 0.0, total))
@@ -274,7 +274,7 @@ def _particle_path(distribution: MarginalLikelihood, y: jax.Array, at: Any, key:
     return jax.vmap(ssm.inputs)(states[best][:, 0], when), when
 
 
-def _steps_in_a_row(ssm: StateSpaceModel, times: Any, at: Any, steps: int) -> int:
+def _steps_per_interval(ssm: StateSpaceModel, times: Any, at: Any, steps: int) -> int:
     """Return how many steps each row needs so that none is longer than those between two observations."""
     known = checks.concrete(times)
     if at is None or known is None:

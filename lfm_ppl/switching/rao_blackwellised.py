@@ -40,10 +40,10 @@ from lfm_ppl.switching.switched_model import (
     SwitchedMap,
     check_initial,
     check_linear,
+    decision_grid,
     first_moments,
+    interval_maps,
     only_adds,
-    plan_rows,
-    row_maps,
     switched,
 )
 
@@ -147,7 +147,7 @@ def rao_blackwellised(key: jax.Array, build: Build, rule: SwitchingRule, times: 
     ssms = switched(build, rule)
     for ssm in ssms:
         check_linear(ssm, rule)
-    grid, decides = plan_rows(ssms[0], times, decisions, start, steps, max_step)
+    grid, decides = decision_grid(ssms[0], times, decisions, start, steps, max_step)
     warn_single_precision()
     shape = (len(grid.observed), ssms[0].output_dim)
     y = jnp.full(shape, jnp.nan) if y is None else check_observations(y, *shape, empty=True)
@@ -161,7 +161,7 @@ def _run(ssms: tuple[StateSpaceModel, ...], rule: SwitchingRule, grid: TimeGrid,
          times: jax.Array, begin: Moments, initial: jax.Array, key: jax.Array,
          settings: _Settings) -> RaoBlackwellisedResult:
     size = settings.particles
-    maps = [row_maps(ssm, rule, grid) for ssm in ssms]
+    maps = [interval_maps(ssm, rule, grid) for ssm in ssms]
     equal = jnp.full(size, -np.log(size))
 
     def row(particles: _Particles,

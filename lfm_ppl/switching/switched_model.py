@@ -67,8 +67,8 @@ def switched(build: Build, rule: SwitchingRule) -> tuple[StateSpaceModel, ...]:
     return ssms
 
 
-def plan_rows(ssm: StateSpaceModel, times: Any, decisions: Any, start: FilterState | None, steps: int,
-              max_step: float | None) -> tuple[TimeGrid, np.ndarray]:
+def decision_grid(ssm: StateSpaceModel, times: Any, decisions: Any, start: FilterState | None, steps: int,
+                  max_step: float | None) -> tuple[TimeGrid, np.ndarray]:
     """Return the rows, and which of them (K,) end with a decision."""
     grid = build_time_grid(ssm, times, steps, max_step, at=times if decisions is None else decisions,
                            initial_time=None if start is None else start.time)
@@ -133,7 +133,7 @@ def only_adds(build: Build) -> bool:
         return False  # build asks in Python for the value of the input: it may do anything
 
 
-def row_maps(ssm: StateSpaceModel, rule: SwitchingRule, grid: TimeGrid) -> Callable[[Intervals], SwitchedMap]:
+def interval_maps(ssm: StateSpaceModel, rule: SwitchingRule, grid: TimeGrid) -> Callable[[Intervals], SwitchedMap]:
     """Return what makes the affine maps of a row, for a model that is linear; traceable."""
     total = ssm.state_dim
     nothing = Moments(jnp.zeros(total), jnp.zeros((total, total)))

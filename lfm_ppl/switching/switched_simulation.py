@@ -18,7 +18,7 @@ from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.particles.normals import normals
 from lfm_ppl.particles.stochastic_steps import Moves, choose_scheme, first_particles
 from lfm_ppl.switching.rule import SwitchingRule
-from lfm_ppl.switching.switched_model import Build, check_initial, first_moments, plan_rows, switched
+from lfm_ppl.switching.switched_model import Build, check_initial, decision_grid, first_moments, switched
 
 
 class SwitchedSimulation(NamedTuple):
@@ -81,7 +81,7 @@ def simulate_switched(key: jax.Array, build: Build, rule: SwitchingRule, times: 
     checks.positive_integer("paths", paths)
     ssms = switched(build, rule)
     schemes = tuple(choose_scheme(ssm, scheme) for ssm in ssms)
-    grid, decides = plan_rows(ssms[0], times, decisions, start, steps, max_step)
+    grid, decides = decision_grid(ssms[0], times, decisions, start, steps, max_step)
     return _run(ssms, schemes, rule, grid, jnp.asarray(decides), jnp.asarray(times, float),
                 first_moments(ssms[0], start), check_initial(initial, rule, paths), key)
 

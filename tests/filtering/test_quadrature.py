@@ -8,7 +8,7 @@ from systems import whole_state
 
 import lfm_ppl as lfm
 from lfm_ppl.filtering import predict
-from lfm_ppl.filtering.predict import Moments, predict_interval, row_factor
+from lfm_ppl.filtering.predict import Moments, interval_factor, predict_interval
 from lfm_ppl.filtering.transition import linear_part
 
 DECAY = jnp.array([0.4, 0.9, 0.6])
@@ -77,7 +77,7 @@ def nodes(ssm, steps):
 def predictions(ssm, rule, steps):
     """Of a row from all starts, about the filter's own moments and about given ones."""
     linear = linear_part(ssm, jnp.zeros(()))
-    factor = row_factor(ssm, rule, linear, jnp.asarray(1.5), steps, tabulated=steps != 3)
+    factor = interval_factor(ssm, rule, linear, jnp.asarray(1.5), steps, tabulated=steps != 3)
 
     def row(moments, about):
         return predict_interval(ssm, rule, linear, factor, steps, jnp.asarray(0.7), jnp.asarray(1.5), moments, about,
