@@ -145,7 +145,7 @@ def backtest(numpyro_model: Callable, times: Any, y: Any = None, *, horizon: int
                          "season count rows; put replicates into columns, or take their means.")
     origins = _origins(len(times), horizon, every, first)
     options = {"samples": draws if sampler == "map" else 1000, **options}
-    bound = bind(numpyro_model, times, y, **dict(options.get("model_kwargs") or {}))
+    bound = bind(numpyro_model, times, y, **dict(options.get("model_kwargs") or {})).fix(options.get("fixed"))
     check_possible(bound, times)
     model = bound.site.example.ssm.model
     angular = np.isin(np.arange(y.shape[1]), model.observation.angular)

@@ -65,6 +65,12 @@ def build(level, scale, lengthscale, width, units=None) -> lfm.LatentForceModel:
     )
 
 
+def _usual_distance(times) -> float:
+    """Return the median distance between two different times; 1 where there are none."""
+    gaps = np.diff(times)
+    return float(np.median(gaps[gaps > 0])) if (gaps > 0).any() else 1.0
+
+
 def model(times, y=None, width: float = 0.0, units=None) -> None:
     """Sample the parameters of the rate, and score the counts.
 
@@ -74,10 +80,12 @@ def model(times, y=None, width: float = 0.0, units=None) -> None:
         width: of the bins; 0: the median distance between two times.
         units: name -> unit, for plots.
     """
+    if width < 0:
+        raise ValueError(f"width must be zero or positive, got {width:g}.")
     level = numpyro.sample("level", dist.Normal(0.0, 1.5))
     scale = numpyro.sample("scale", dist.LogNormal(-0.3, 0.6))
     lengthscale = numpyro.sample("lengthscale", dist.LogNormal(3.0, 0.7))
-    system = build(level, scale, lengthscale, width or float(np.median(np.diff(times))), units)
+    system = build(level, scale, lengthscale, width or _usual_distance(times), units)
     numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
 
 

@@ -116,6 +116,18 @@ def parameters() -> dict[str, jax.Array]:
     return {name: numpyro.sample(name, prior) for name, prior in priors.items()}
 
 
+def _usual_distance(times) -> float:
+    """Return the median distance between two different times; 1 where there are none."""
+    gaps = np.diff(times)
+    return float(np.median(gaps[gaps > 0])) if (gaps > 0).any() else 1.0
+
+
+def _check(population: float, start: float, width: float) -> None:
+    if not 0 < start < population or width < 0:
+        raise ValueError("population must be larger than start, which is positive, and width zero or positive; got "
+                         f"population={population:g}, start={start:g}, width={width:g}.")
+
+
 def model(times, y=None, population: float = 100_000.0, start: float = 30.0, width: float = 0.0, units=None) -> None:
     """Sample the parameters of the epidemic, and score the reports.
 
@@ -127,7 +139,8 @@ def model(times, y=None, population: float = 100_000.0, start: float = 30.0, wid
         width: time that a report covers; 0: the median distance between two times.
         units: name -> unit, for plots.
     """
-    width = width or float(np.median(np.diff(times)))
+    _check(population, start, width)
+    width = width or _usual_distance(times)
     system = build(**parameters(), population=population, start=start, width=width, units=units)
     numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=STEPS, sites=SITES), obs=y)
 
@@ -146,6 +159,7 @@ def simulate(seed: int = 0, population: float = 100_000.0, start: float = 30.0, 
         start: persons who infect at the first time, to a factor of some three.
         width: time that a report covers (day); 0: one day.
     """
+    _check(population, start, width)
     width = width or 1.0
     times = width * np.arange(DAYS)
     drawn = _simulator(float(population), float(start), float(width))(jax.random.key(seed))

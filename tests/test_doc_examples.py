@@ -12,7 +12,7 @@ from lfm_ppl import loading
 
 ROOT = Path(__file__).resolve().parent.parent
 EXAMPLES = ROOT / "docs" / "examples"
-DATA = Path(os.environ.get("LFM_PPL_DATA", ROOT.parent / "shared" / "data"))
+DATA = Path(os.environ.get("LFM_DATA", ROOT.parent / "shared" / "data"))
 FILES = {"house": DATA / "house" / "house_hourly.csv", "calls": DATA / "calls" / "bank_calls.csv.gz"}
 
 

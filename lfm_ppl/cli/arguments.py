@@ -369,7 +369,8 @@ def _add_approximation(group: Any) -> None:
                        help="largest error of an integration step, in standard deviations; steps then follow it")
     group.add_argument("--iterations", type=_whole(0), metavar="N", help="of posterior linearisation")
     group.add_argument("--lower", action="append", default=[], metavar="NAME=VALUE",
-                       help="lower bound of a state, force or output, `factor=0`; may be repeated")
+                       help="lower bound of a state, force or output, such as \"transcription factor=0\"; may be "
+                            "repeated; each likelihood then costs some hundred times as much")
     group.add_argument("--upper", action="append", default=[], metavar="NAME=VALUE", help="upper bound")
 
 

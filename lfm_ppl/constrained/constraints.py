@@ -123,7 +123,7 @@ def _checked(kind: str, given: Mapping[str, Any] | None, names: Sequence[str]) -
         raise TypeError(f'{kind} must map names to bounds, for example {{"{names[0]}": 0.0}}; got '
                         f"{type(given).__name__}.")
     for name, bound in given.items():
-        checks.one_of(f"name in {kind}", name, names)
+        checks.one_of(f"name in {kind}", name, tuple(dict.fromkeys(names)))
         if np.ndim(bound):
             raise ValueError(f"{kind}[{name!r}] must be one number, got shape {np.shape(bound)}. For a bound that "
                              "changes with time give a function: constraints=lambda x, u, t: x[0] - bound(t).")

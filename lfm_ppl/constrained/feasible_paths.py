@@ -89,7 +89,9 @@ def feasible_paths(key: jax.Array, passed: Pass, held: jax.Array, widths: jax.Ar
                               jnp.broadcast_to(safe / left, now.shape))
             outside = jnp.maximum(-now, now - widths[index]) > _RESPECTED * jnp.sqrt(jnp.maximum(largest, 1e-300))
             term = log_share(cavity, widths[index]) - gaussian_terms(sites, cavity, 1.0)
-            term = jnp.where(known, jnp.where(outside, -jnp.inf, 0.0), term)
+            # What is determined already is as it is: its site, which the proposal holds, is divided out there.
+            away = now - sites.centre
+            term = jnp.where(known, jnp.where(outside, -jnp.inf, (0.5 * sites.tau * away - sites.nu) * away), term)
             drawn = jnp.where(known, jnp.clip(now, 0.0, widths[index]), quantile(cavity, widths[index], shares[index]))
             take = held[index] & ~known
             log_weights = log_weights + jnp.where(held[index], term, 0.0)

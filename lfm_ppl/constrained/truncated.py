@@ -71,7 +71,8 @@ def log_share(cavity: Marginal, width: jax.Array | float = np.inf) -> jax.Array:
     low, high, _, _ = _tails(cavity, width)
     none = low <= -1e9
     log_high = norm.logcdf(high)
-    below = norm.logcdf(jnp.where(none, high - 1.0, low)) - log_high
+    # Where there is no lower end, a number whose derivatives are finite however far the upper one is.
+    below = jnp.where(none, -1.0, norm.logcdf(jnp.where(none, -1.0, low)) - log_high)
     return log_high + jnp.where(none, 0.0, jnp.log(-jnp.expm1(below)))
 
 

@@ -254,6 +254,9 @@ def _ep(terms: EntryTerms, sites: Sites, at: Cavity, power: float, rough: Any = 
     else:
         found = jax.lax.cond(rough, lambda at: terms.tilted(at.cavity, at.marginal, power, True),
                              lambda at: terms.tilted(at.cavity, at.marginal, power), at)
+    # Where one node holds all the mass the variance is one of rounding errors, and no new site.
+    variance = jnp.where(found.variance > 1e-13 * at.marginal.variance, found.variance, jnp.nan)
+    found = found._replace(variance=variance)
     c, v = at.cavity.mean - sites.centre, at.cavity.variance
     nu = ((found.mean - sites.centre) / found.variance - c / v) / power
     return nu, (1.0 / found.variance - 1.0 / v) / power

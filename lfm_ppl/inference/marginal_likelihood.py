@@ -188,8 +188,8 @@ class MarginalLikelihood(dist.Distribution):
         """Raise where there are constraints, which ``what`` would pass over."""
         if self.constrained:
             raise ValueError(f"{what} knows no constraints, and the likelihood has some: "
-                             f"{', '.join(self.bounds)}. Leave them out, or take NUTS, RAM "
-                             "or MAP.")
+                             f"{', '.join(self.bounds)}. NUTS, RAM and MAP do; for anything else "
+                             "leave them out.")
 
     def _check_constraints(self) -> None:
         check_settings(self.model, 1.0, 1)

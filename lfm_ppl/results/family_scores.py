@@ -11,11 +11,11 @@ import numpy as np
 import xarray as xr
 
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
+from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
 from lfm_ppl.inference.posterior import each, over_draws
 from lfm_ppl.model.observations.family import ObservationFamily
 
-_PATH, _VALUES = "path of the inputs", "held-out values"
+_PATH, _VALUES, _TIMES = "path of the inputs", "held-out values", "times of the path"
 """Under these names they go with the draws; no site has such a name."""
 
 
@@ -35,11 +35,11 @@ def log_densities(bound: BoundModel, draws: Mapping[str, Any], predicted: xr.Dat
     if not isinstance(observation, ObservationFamily):
         raise ValueError("the observation of the model is Gaussian, whose densities the predictions hold already; "
                          "leave out numpyro_model.")
-    times = jnp.asarray(predicted["time"].values, float)
+    times = np.asarray(predicted["time"].values, float)
     w = _inputs(predicted, y.shape[:-1])
     count = len(w)
 
-    def one(distribution: MarginalLikelihood, w: jax.Array, y: jax.Array) -> jax.Array:
+    def one(distribution: MarginalLikelihood, w: jax.Array, y: jax.Array, times: jax.Array) -> jax.Array:
         ssm = distribution.ssm
         family = ssm.model.observation
         assert isinstance(family, ObservationFamily)
@@ -53,11 +53,15 @@ def log_densities(bound: BoundModel, draws: Mapping[str, Any], predicted: xr.Dat
 
     def per_draw(values: dict, key: jax.Array, data: Any) -> jax.Array:
         values = dict(values)
-        w, y = values.pop(_PATH), values.pop(_VALUES)
-        return each(bound.likelihood(values, data), one, w, y)
+        w, y, times = values.pop(_PATH), values.pop(_VALUES), values.pop(_TIMES)
+        distribution = bound.likelihood(values, data)
+        if isinstance(distribution, Panel):
+            times = jnp.broadcast_to(times, (y.shape[0], *times.shape))
+        return each(distribution, one, w, y, times)
 
     found = over_draws(bound, ("log densities", y.shape), per_draw,
-                       {**draws, _PATH: w, _VALUES: np.broadcast_to(y, (count, *y.shape))}, jax.random.key(0))
+                       {**draws, _PATH: w, _VALUES: np.broadcast_to(y, (count, *y.shape)),
+                        _TIMES: np.broadcast_to(times, (count, len(times)))}, jax.random.key(0))
     return np.where(np.isfinite(y), found, np.nan)
 
 

@@ -54,7 +54,8 @@ _SETTINGS = {
     "wall_time_s": "time (s)", "created_at": "made at",
 }
 _ELSEWHERE = ("model", "model_file", DESCRIPTION, "data", "note", "versions", "warnings", "partial", "settings", "run",
-              "map_converged", COMMAND, CALL, ORIGIN, "inference_library")
+              "map_converged", COMMAND, CALL, ORIGIN, "inference_library",
+              "site_failures")
 """Attributes that stand in other sections, or that nobody needs to read."""
 
 _FILES = re.compile(r"(.*\.nc|(summary|accuracy|forecast|scores)\.csv"
@@ -216,6 +217,9 @@ def _summary(result: Any) -> str:
 
 
 def _accuracy(result: Any, folder: Path) -> str:
+    if "constraints" in arviz_data.attributes(result):
+        return web_page.paragraph("What the approximation of the likelihood does to this posterior cannot be measured: "
+                                  "no reference knows constraints.", "note")
     if not arviz_data.has_group(result, report.GROUP):
         return web_page.paragraph("What the approximation of the likelihood does to this posterior has not been "
                                   "measured yet; lfm-ppl check, or lfm.check_accuracy, measures it.", "note")

@@ -170,7 +170,7 @@ def lay_out(bound: BoundModel, draws: dict, stats: dict, rated: dict | None, pat
             groups[GROUP] = predictions(bound, paths, chosen, grid, labels.coords)
     if truth:
         groups["truth"] = _truth(truth, named, units, groups["posterior"])
-        without_noise = _true_outputs(bound, truth)
+        without_noise = _true_outputs(bound, truth, draws)
         if without_noise is not None:
             groups["truth"] = groups["truth"].assign(
                 outputs=variable(("at_truth", OUTPUT), without_noise, named[OUTPUT]))
@@ -198,8 +198,12 @@ def _posterior(draws: dict, coords: dict, named: Mapping[str, list], labels: Lab
     return xr.Dataset(variables, {**coords, **extra})
 
 
-def _true_outputs(bound: BoundModel, truth: Mapping[str, Any]) -> np.ndarray | None:
-    """Return the noise-free outputs (K, D) along the true path; None where not all of the truth is known."""
+def _true_outputs(bound: BoundModel, truth: Mapping[str, Any], draws: Mapping[str, np.ndarray]) -> np.ndarray | None:
+    """Return the noise-free outputs (K, D) along the true path; None where not all of the truth is known.
+
+    None, too, where the model refuses the truth, or holds a parameter at another value: draws are worth more than a
+    line in a figure.
+    """
     parameters, forces = truth.get("parameters") or {}, truth.get("forces") or {}
     model = bound.site.example.ssm.model
     if (np.ndim(bound.y) != 2 or truth.get("times") is None or truth.get("state") is None
@@ -210,14 +214,25 @@ def _true_outputs(bound: BoundModel, truth: Mapping[str, Any]) -> np.ndarray | N
     size = len(model.state_names)
     if [part.shape for part in parts] != [(len(times), size), *[(len(times),)] * len(model.force_names)]:
         return None
-    shapes = {name: np.shape(one["value"]) for name, one in bound.trace().items()}
-    values = {name: np.asarray(parameters[name], float) for name in bound.sites}
-    if any(value.shape not in ((), shapes[name]) for name, value in values.items()):
+    if any(_held_elsewhere(draws[name], parameters[name]) for name in set(parameters) & set(draws)):
         return None
-    values = {name: np.broadcast_to(value, shapes[name]) for name, value in values.items()}
-    ssm = bound.likelihood(values).ssm
-    w = np.column_stack(parts)
-    return np.asarray(jax.vmap(lambda one, t: expected_observation(ssm, one, t))(w, times))
+    try:
+        values = {name: np.broadcast_to(np.asarray(parameters[name], float), draws[name].shape[2:])
+                  for name in bound.sites}
+        ssm = bound.likelihood(values).ssm
+        w = np.column_stack(parts)
+        return np.asarray(jax.vmap(lambda one, t: expected_observation(ssm, one, t))(w, times))
+    except Exception:
+        return None
+
+
+def _held_elsewhere(draws: np.ndarray, truth: Any) -> bool:
+    """Whether an element of draws (C, S, ...) is the same in all of them, and not the true one."""
+    try:
+        fixed = np.ptp(draws, axis=(0, 1)) == 0
+        return bool(np.any(fixed & ~np.isclose(draws[0, 0], np.broadcast_to(truth, fixed.shape))))
+    except ValueError:
+        return True
 
 
 def _truth(truth: Mapping[str, Any], named: dict, units: Mapping[str, str],

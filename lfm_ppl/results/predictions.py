@@ -134,14 +134,16 @@ def interval(dataset: xr.Dataset) -> np.ndarray:
 
 
 def quantiles(draws: np.ndarray, p: Any) -> np.ndarray:
-    """Return quantiles (Q, ...) of draws (S, ...): whole numbers where all draws are, as those of counts.
+    """Return quantiles (Q, ..., D) of draws (S, ..., D): whole numbers for an output whose draws are, as of counts.
 
     Example:
         >>> quantiles(np.array([0.0, 1.0, 1.0, 4.0]), 0.75), quantiles(np.array([0.0, 1.5]), 0.5)
         (array(1.), array(0.75))
     """
-    whole = bool(np.all(draws == np.round(draws)))
-    return np.quantile(draws, p, axis=0, method="inverted_cdf" if whole else "linear")
+    draws = np.asarray(draws)
+    whole = np.all(draws == np.round(draws), axis=tuple(range(draws.ndim - 1)) if draws.ndim > 1 else None)
+    linear = np.quantile(draws, p, axis=0)
+    return np.where(whole, np.quantile(draws, p, axis=0, method="inverted_cdf"), linear) if np.any(whole) else linear
 
 
 def noise_free_interval(dataset: xr.Dataset) -> np.ndarray:

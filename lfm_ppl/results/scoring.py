@@ -98,6 +98,7 @@ def score(result: Any, held_out: Any, level: float = 0.95, *, numpyro_model: Cal
     predicted = of_result(result)
     variable = observed_variable(predicted)
     series = [str(dim) for dim in variable.dims if dim not in ("chain", "draw", "time", "output")]
+    outputs = [str(name) for name in variable["output"].values]
     predicted, y = aligned(predicted, variable, held_out, series)
     variable = observed_variable(predicted)
     order = ("chain", "draw", *series, "time", "output")
@@ -107,7 +108,11 @@ def score(result: Any, held_out: Any, level: float = 0.95, *, numpyro_model: Cal
 
     densities = None
     if numpyro_model is not None:
-        densities = _family_densities(result, numpyro_model, predicted, y, inputs, model_kwargs)
+        # A family's law is that of all its outputs, in the model's order; those not held out are missing.
+        columns = [outputs.index(str(name)) for name in predicted["output"].values]
+        every = np.full((*y.shape[:-1], len(outputs)), np.nan)
+        every[..., columns] = y
+        densities = _family_densities(result, numpyro_model, predicted, every, inputs, model_kwargs)[..., columns]
     found = scores(_stacked(variable.transpose(*order)), y, flat(MEAN), flat(SD), level,
                    _angles(variable, predicted), densities)
     return table(found, [str(name) for name in predicted["output"].values], level)
@@ -277,8 +282,10 @@ def _angles(variable: xr.DataArray, predicted: xr.Dataset) -> np.ndarray:
 
 def _say_where_few(terms: np.ndarray, present: np.ndarray) -> None:
     """Warn where a mixture density at y is that of a few of its parts."""
-    weights = np.exp(terms - terms.max(axis=0))
-    carried = weights.sum(axis=0) ** 2 / (weights**2).sum(axis=0)
+    largest = terms.max(axis=0)
+    weights = np.exp(terms - np.where(np.isfinite(largest), largest, 0.0))
+    squares = (weights**2).sum(axis=0)
+    carried = np.where(squares > 0, weights.sum(axis=0) ** 2 / np.where(squares > 0, squares, 1.0), 0.0)
     few = present & (carried < min(_FEW, 0.5 * len(terms)))
     if few.sum() > 0.05 * present.sum():
         checks.warn(f"the log score of {int(few.sum())} of {int(present.sum())} entries rests on fewer than "
