@@ -82,7 +82,7 @@ def test_loo_sees_every_row_of_the_data(converted):
 def test_dimensions_and_columns_have_names(converted):
     posterior = group(converted, "posterior")
     assert list(arviz_data.summary(converted).index) == [
-        "decay[p21]", "decay[sestrin]", "half_life[p21]", "half_life[sestrin]", "lengthscale", "noise_sd"]
+        "decay[p21]", "decay[sestrin]", "lengthscale", "noise_sd", "half_life[p21]", "half_life[sestrin]"]
     assert posterior["decay"].dims == posterior["half_life"].dims == ("chain", "draw", "gene")
     for name in ("observed_data", "predictions", "posterior_predictive", "trajectories"):
         assert group(converted, name)["output"].values.tolist() == ["CDKN1A", "SESN1"]

@@ -81,6 +81,15 @@ def test_expectation_propagation_alone_serves_two_bounds_on_a_coarse_grid():
     assert abs(value - expected) < 0.002
 
 
+@pytest.mark.slow
+def test_a_constraint_that_says_nothing_new_changes_nothing():
+    times, y = data(4, 3.0)
+    values = [float(jax.jit(lfm.MarginalLikelihood(model(), times, lower={"factor": 0.0}, constraints=more, grid=times,
+                                                   draws=1024).log_prob)(y))
+              for more in ((), lambda x, u, t: u[0] + 0.5, lambda x, u, t: 2.0 * u[0])]
+    np.testing.assert_allclose(values[1:], values[0], atol=0.03)
+
+
 @functools.cache
 def small():
     times, y = data(5, 4.0)
@@ -98,6 +107,7 @@ def test_nothing_observed_has_probability_one():
     assert abs(float(log_prob(np.full_like(y, np.nan), 1.0, 0.0))) < 1e-12
 
 
+@pytest.mark.slow
 def test_the_derivative_is_that_of_differences():
     """Sites are held fixed in it; the random numbers' part of their dependence is all that is left out."""
     log_prob, y = small()

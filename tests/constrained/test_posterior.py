@@ -12,7 +12,7 @@ from scipy.stats import norm, truncnorm
 from systems import Linear, whole_state
 
 import lfm_ppl as lfm
-from lfm_ppl.constrained.truncated import quantile, truncated_moments
+from lfm_ppl.constrained.truncated import log_share, quantile, truncated_moments
 from lfm_ppl.filtering.quadrature import Marginal
 
 TIMES = np.linspace(0.0, 5.0, 8)
@@ -142,3 +142,9 @@ def test_a_box_far_from_the_mean_and_a_narrow_one(mean, width):
         # Beyond 35 standard deviations the tail is taken for an exponential one. At 30 the first quantile is the
         # difference, 3e-4, of two numbers near 30, one of them a normal quantile, right to 1e-13.
         np.testing.assert_allclose(integral(0, value) / total, share, rtol=2e-3 if abs(mean) > 35 else 1e-7)
+
+
+@pytest.mark.parametrize("mean", [0.5, 37.0, 39.0, 50.0])
+def test_the_probability_far_inside_a_bound_has_a_derivative(mean):
+    slope = jax.grad(lambda m: log_share(Marginal(m, jnp.asarray(1.0))))(mean)
+    np.testing.assert_allclose(slope, np.exp(norm.logpdf(mean) - norm.logcdf(mean)), atol=1e-300)

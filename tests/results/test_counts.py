@@ -10,12 +10,14 @@ import numpy as np
 import numpyro
 import numpyro.distributions as dist
 import pytest
+import xarray as xr
 from scipy import special, stats
 
 import lfm_ppl as lfm
 from lfm_ppl.filtering.sites import SiteSettings
 from lfm_ppl.inference.site_failures import site_failures
 from lfm_ppl.results import arviz_data
+from lfm_ppl.results.family_scores import log_densities
 from lfm_ppl.results.predictions import summary
 
 TIMES = np.arange(14.0)
@@ -75,6 +77,26 @@ def test_log_score_is_that_of_the_family_along_the_paths(ahead):
     assert np.isnan(lfm.score(ahead, HELD_OUT).loc["events", "log_score"])
     with pytest.raises(ValueError, match="pass what lfm.forecast returned"):
         lfm.score(arviz_data.group(ahead, "predictions"), HELD_OUT, numpyro_model=counts)
+
+
+def test_densities_are_those_of_the_times_that_are_asked_for():
+    """Two blocks of times with one shape, and a rate that grows with time."""
+
+    def growing(times, y=None):
+        level = numpyro.sample("level", dist.Normal(0.0, 1.0))
+        model = lfm.LatentForceModel(
+            lambda x, u, t: jnp.zeros(0), {"u": lfm.Matern(1.0, 3.0)},
+            lfm.PoissonObservation(lambda x, u, t: level + 0.1 * t + u), lfm.Gaussian(jnp.zeros(0), jnp.zeros((0, 0))))
+        numpyro.sample("y", lfm.MarginalLikelihood(model, times), obs=y)
+
+    bound = lfm.bind(growing, TIMES, COUNTS)
+    rng = np.random.default_rng(0)
+    level, force = rng.normal(size=3), rng.normal(size=(1, 3, 2, 1))
+    for times in (np.array([14.0, 16.0]), np.array([20.0, 29.0])):
+        predicted = xr.Dataset({"forces": (("chain", "draw", "time", "force"), force)}, {"time": times})
+        found = log_densities(bound, {"level": level}, predicted, HELD_OUT)
+        rate = np.exp(level[:, None] + 0.1 * times + force[0, ..., 0])
+        np.testing.assert_allclose(found[..., 0], stats.poisson.logpmf(HELD_OUT[:, 0], rate), rtol=1e-12)
 
 
 @pytest.mark.slow
