@@ -108,7 +108,8 @@ class Bounded(NamedTuple):
         index = jax.random.categorical(keys[1], found.log_weights[order], axis=1)
         picked = jnp.take_along_axis(order, index[:, None], axis=1)[:, 0]
         at = jnp.asarray(self.grid.observed)
-        states, values = found.states[at][..., picked], found.values[at][..., picked]
+        possible = jnp.isfinite(jnp.take_along_axis(found.log_weights, picked, axis=0))
+        states, values = (jnp.where(possible, a[at][..., picked], jnp.nan) for a in (found.states, found.values))
         matrix, offset = jax.vmap(self.ssm.input_map)(jnp.asarray(self.rows.times))
         inputs = matmul(matrix, states) + offset[..., None]
         # (K, S, ...): the bounded ones where the constraints hold.

@@ -105,7 +105,7 @@ class MarginalLikelihood(dist.Distribution):
             of smoother passes over it.
         draws: number of trajectories, an even one; 0: by expectation propagation alone, which may be off by .1 on a
             coarse grid, and by .5 on a dense one. They have the same random numbers for all parameters, so that the
-            log density has no noise but is off by a constant, nearly.
+            log density has no noise, but an error that varies slowly with the parameters.
 
     Raises:
         ValueError, TypeError: as `lfm_ppl.filter`; also where it is used in a ``numpyro.plate``. In compiled code a
@@ -300,7 +300,8 @@ class MarginalLikelihood(dist.Distribution):
     def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
         """Simulate the real model: (*sample_shape, T, D).
 
-        Under constraints: along trajectories that respect them, drawn from the (linearised) model itself.
+        Under constraints: along trajectories that respect them, from the (linearised) model as far as 64 candidates
+        represent it.
         """
         if self.constrained:
             return repeated(self._constrained_sample, key, sample_shape)

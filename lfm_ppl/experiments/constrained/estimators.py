@@ -82,7 +82,8 @@ def _bands(values: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
     """On every tenth row: a prior that is truncated on ever more rows keeps the force ever further from its bound."""
     found = constrained_posterior(_model(values), TIMES, y, lower={FACTOR: 0.0}, grid=TIMES[:: ROWS[BANDS]])
     low, high = shortest(found, FACTOR)
-    return found.force_mean[:, 0], low, high
+    # An end at infinity says that there is no estimate.
+    return found.force_mean[:, 0], jnp.where(found.converged, low, jnp.inf), high
 
 
 def _horizon(values: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
