@@ -137,8 +137,8 @@ def quantiles(draws: np.ndarray, p: Any) -> np.ndarray:
     """Return quantiles (Q, ..., D) of draws (S, ..., D): whole numbers for an output whose draws are, as of counts.
 
     Example:
-        >>> quantiles(np.array([0.0, 1.0, 1.0, 4.0]), 0.75), quantiles(np.array([0.0, 1.5]), 0.5)
-        (array(1.), array(0.75))
+        >>> float(quantiles(np.array([0.0, 1.0, 1.0, 4.0]), 0.75)), float(quantiles(np.array([0.0, 1.5]), 0.5))
+        (1.0, 0.75)
     """
     draws = np.asarray(draws)
     whole = np.all(draws == np.round(draws), axis=tuple(range(draws.ndim - 1)) if draws.ndim > 1 else None)
