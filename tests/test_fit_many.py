@@ -215,7 +215,7 @@ def test_a_result_of_many_is_checked_forecast_and_drawn(tmp_path, monkeypatch, c
     code, out, _ = command(tmp_path, monkeypatch, capsys)("--data patients/*.csv --each --out many")
     assert code == 0 and "lfm-ppl plot RESULT" in out
     for words in ("check many/results/0 --draws 10", f"forecast many/results/0 --until {TIMES[-1] + 2}",
-                  "plot many/results/0"):
+                  "plot many/results/0 --overwrite"):
         assert main(words.split()) == 0, capsys.readouterr().err
     assert {"accuracy.csv", "forecast.csv", "forecast.png", "fit.png"} <= {
         path.name for path in (tmp_path / "many" / "results" / "0").iterdir()}
