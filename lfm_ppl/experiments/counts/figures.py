@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.ticker import NullFormatter
 
 from lfm_ppl.engine.task import Result
 from lfm_ppl.experiments.counts import problem, tables
@@ -98,6 +99,10 @@ def plot_errors(settings: Any, results: dict[str, Result], *, width: str | float
                 value = abs(table.loc[f"{name}, {METHODS[method]}", column])
                 axes.plot(max(value, 1e-4), row + shift, marker, color=colour, ms=3.5)
         axes.set_xscale("log")
+        # Whole decades, so that two ticks have a number at least.
+        low, high = axes.get_xlim()
+        axes.set_xlim(10 ** np.floor(np.log10(low)), 10 ** np.ceil(np.log10(high)))
+        axes.xaxis.set_minor_formatter(NullFormatter())
         axes.set_xlabel(label)
         axes.tick_params(labelsize=style.SMALL)
     panels[0].set_yticks(range(len(settings.problems)), [name.replace("-", " ") for name in settings.problems])
