@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.ticker import NullFormatter
 
 from lfm_ppl.engine.task import Result
 from lfm_ppl.experiments.constrained import estimators, problem, tables
@@ -77,11 +78,12 @@ def plot_errors(settings: Any, results: dict[str, Result], *, width: str | float
     axes.set_yticks(range(len(errors)), list(settings.methods))
     axes.invert_yaxis()
     axes.set_xlabel("mean squared error of the force")
-    style.tidy(axes)
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.tick_params(labelsize=style.SMALL)
     style.legend_above(figure, [
         Line2D([], [], color=style.BLACK, ls=":", label="published, smoother"),
         Line2D([], [], color=style.ORANGE, ls="--", label="published, delayed MHE")])
-    style.note_below(figure, f"{len(errors[0])} records: quartiles, median, and least and largest error.")
+    style.note_below(figure, f"{len(errors[0])} records: median, quartiles, extremes")
     return figure
 
 
