@@ -11,6 +11,7 @@ import numpy as np
 from lfm_ppl import checks
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.posterior import noise_of_rows, trajectories
+from lfm_ppl.inference.progress import Counter
 from lfm_ppl.particles.particle_filter import ParticleSettings
 from lfm_ppl.results import arviz_data, rebuilding
 from lfm_ppl.results.accuracy import evenly_spaced
@@ -18,7 +19,8 @@ from lfm_ppl.results.predictions import GROUP, predictions
 
 
 def forecast(result: Any, numpyro_model: Callable, times: Any, *, inputs: Mapping[str, Any] | None = None,
-             model_kwargs: Mapping[str, Any] | None = None, draws: int = 400, seed: int = 0) -> Any:
+             model_kwargs: Mapping[str, Any] | None = None, draws: int = 400, seed: int = 0,
+             progress: bool = True) -> Any:
     """Predict new observations, with their noise, between the data and after them.
 
         p(y* | y) = int p(y* | s*, theta) p(s* | s_T, theta) p(s_T | y, theta) p(theta | y) ds* ds_T dtheta
@@ -44,6 +46,7 @@ def forecast(result: Any, numpyro_model: Callable, times: Any, *, inputs: Mappin
         model_kwargs: keyword arguments of the model, as in the fit.
         draws: number of posterior draws, spread over the chains, each with a path of its own.
         seed: of the paths and the noise.
+        progress: show on standard error how far it is.
 
     Returns:
         A new ArviZ object: the groups of ``result`` and a group ``predictions`` with dimensions chain, draw, time and
@@ -90,7 +93,10 @@ def forecast(result: Any, numpyro_model: Callable, times: Any, *, inputs: Mappin
     settings = None
     if str(attrs.get("sampler", "")).startswith("pmmh") and "particles" in attrs:
         settings = ParticleSettings(int(attrs["particles"]))
-    paths = trajectories(jax.random.key(seed), bound, problem.at(rows).draws, times, settings)
+    counter = Counter("forecast", shown=progress)
+    paths = trajectories(jax.random.key(seed), bound, problem.at(rows).draws, times, settings, log_likelihood=True,
+                         show=counter)
+    counter.close()
     split = {name: value.reshape(chains, len(chosen), *value.shape[1:]) for name, value in paths.items()}
     if "log_likelihood" in split:
         total = split["log_likelihood"].reshape(chains, len(chosen), -1).sum(axis=-1)

@@ -99,6 +99,21 @@ def test_check_prints_stores_and_draws(run, fitted):
     assert code == 0 and "accuracy.png" in out
 
 
+def test_new_chains_follow_a_check_that_asked_for_them(run, fitted, monkeypatch):
+    assert run(f"check {fitted} --draws 40 --quiet")[0] == 0
+    result = arviz_data.load(fitted / "posterior.nc")
+    report = arviz_data.group(result, "accuracy").assign_attrs(pareto_k=0.9, command="lfm-ppl check RESULT --correct")
+    arviz_data.save(arviz_data.add_group(result, "accuracy", report), fitted / "posterior.nc", overwrite=True)
+    table = (fitted / "accuracy.csv").stat().st_mtime_ns
+    asked = []
+    monkeypatch.setattr("lfm_ppl.cli.check._correct", lambda task, report, *rest: asked.append(report) or 0)
+    monkeypatch.setattr("lfm_ppl.cli.check._checked", lambda *rest: pytest.fail("checked again"))
+    code, out, err = run(f"check {fitted} --correct")
+    assert code == 0, err
+    assert "checked  before: k = 0.90 is not below" in out and asked[0].k == 0.9
+    assert (fitted / "accuracy.csv").stat().st_mtime_ns == table
+
+
 @pytest.mark.slow
 def test_correct_writes_a_result_of_its_own(run, fitted):
     (fitted / "corrected").mkdir()

@@ -63,7 +63,9 @@ def test_groups_and_dimensions(nuts):
         "one_step_ahead": {"log_density": ("chain", "draw", "time"), "residual": ("chain", "draw", "time", "output")},
         "posterior_predictive": {"y": ("chain", "draw", "time", "output")},
         "trajectories": {"forces": ("chain", "draw", "at", "force"), "states": ("chain", "draw", "at", "state"),
-                         "outputs": ("chain", "draw", "at", "output")},
+                         "outputs": ("chain", "draw", "at", "output"),
+                         "forces_summary": ("statistic", "at", "force"), "states_summary": ("statistic", "at", "state"),
+                         "outputs_summary": ("statistic", "at", "output"), "y_summary": ("statistic", "at", "output")},
         "predictions": {"y": ("chain", "draw", "time", "output"), "y_mean": ("chain", "draw", "time", "output"),
                         "y_sd": ("chain", "draw", "time", "output"), "outputs_sd": ("chain", "draw", "time", "output"),
                         "outputs": ("chain", "draw", "time", "output"), "forces": ("chain", "draw", "time", "force"),
@@ -295,6 +297,25 @@ def test_trajectories_agree_with_smooth(known, y):
     assert sd[-1] > sd[-2] > sd[-3]
 
 
+def test_bands_are_the_quantiles_of_the_mixture_over_the_draws(nuts, y):
+    """Against the exact posterior of the force at every draw of the parameters, by dense algebra."""
+    paths = group(nuts, "trajectories")
+    drawn = group(nuts, "posterior").sel(draw=paths["draw"])
+    means, sds = [], []
+    for chain in range(2):
+        for draw in range(paths.sizes["draw"]):
+            at = {name: value.isel(chain=chain, draw=draw).values for name, value in drawn.items()}
+            mean, covariance = motif.posterior(y, FORECAST, **{name: at[name] for name in motif.THETA})
+            start = 2 * len(TIMES)
+            means.append(mean[start:start + len(FORECAST)])
+            sds.append(np.sqrt(np.diag(covariance)[start:start + len(FORECAST)]))
+    found = paths["forces_summary"].sel(force="drive")
+    np.testing.assert_allclose(found.sel(statistic="mean"), np.mean(means, axis=0), rtol=1e-6, atol=1e-8)
+    for p, name in ((0.025, "q2.5"), (0.975, "q97.5")):
+        share = stats.norm.cdf(found.sel(statistic=name).values, means, sds).mean(axis=0)
+        np.testing.assert_allclose(share, p, atol=1e-4)
+
+
 def test_mode_of_known_parameters(known):
     attrs = arviz_data.attributes(known)
     assert (attrs["sampler"], attrs["chains"], attrs["warmup"]) == ("map", 1, 0)
@@ -329,7 +350,8 @@ def test_panel(tmp_path):
     assert sizes["log_likelihood"] == {"chain": 2, "draw": 10, "series": 2, "time": 4}
     assert sizes["one_step_ahead"] == {"chain": 2, "draw": 10, "series": 2, "time": 4, "output": 1}
     assert sizes["posterior_predictive"] == {"chain": 2, "draw": 2, "series": 2, "time": 4, "output": 1}
-    assert sizes["trajectories"] == {"chain": 2, "draw": 2, "series": 2, "at": 2, "force": 1, "state": 1, "output": 1}
+    assert sizes["trajectories"] == {"chain": 2, "draw": 2, "series": 2, "at": 2, "force": 1, "state": 1, "output": 1,
+                                     "statistic": 3}
     assert sizes["observed_data"] == {"series": 2, "time": 4, "output": 1}
     posterior, ahead = group(result, "posterior"), group(result, "one_step_ahead")["log_density"].values
     for series in range(2):

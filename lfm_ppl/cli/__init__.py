@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import sys
 import warnings
 from collections.abc import Sequence
@@ -27,10 +26,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments.line = list(sys.argv[1:] if argv is None else argv)
     warnings.showwarning = _Warnings()
     try:
-        # A library that swallows KeyboardInterrupt, as some do while they are imported, does not keep us. Runs of many
-        # tasks end their workers first, which may take longer.
-        many = arguments.command == "compare" or getattr(arguments, "each", False) or getattr(arguments, "series", None)
-        with contextlib.nullcontext() if many else watched(lambda: "what was written before is kept"):
+        # A library that swallows KeyboardInterrupt, as some do while they are imported, does not keep us; nor do
+        # workers that are slow to end, which end when this process is gone.
+        with watched(lambda: "what was written before is kept"):
             return int(arguments.run(arguments))
     except KeyboardInterrupt:
         print("lfm-ppl: interrupted", file=sys.stderr)

@@ -141,7 +141,8 @@ def _add_check(commands: Any) -> None:
         help="what gives the exact likelihood (default: auto, the grid for one state, else particles)",
     )
     command.add_argument(
-        "--draws", type=_whole(1), metavar="N", help="posterior draws to compare at (default: 200; to correct, 1000)"
+        "--draws", type=_whole(1), metavar="N", help="posterior draws to compare at (default: 200; to correct, 1000, unless an "
+        "earlier check says that new chains are needed)"
     )
     command.add_argument("--particles", type=_whole(1), metavar="N", help="default: as many as keep the noise low")
     command.add_argument("--seed", type=_whole(0), default=0, help="of the particle filter (default: 0)")
@@ -290,6 +291,7 @@ def _add_forecast(commands: Any) -> None:
     command.add_argument("--out", metavar="DIR",
                          help="folder for the result with its predictions, table and figure (default: RESULT's)")
     command.add_argument("--overwrite", action="store_true", help="replace an earlier forecast")
+    command.add_argument("--quiet", action="store_true", help="no progress")
 
 
 def _add_data(group: Any) -> None:

@@ -53,11 +53,13 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.resume and arguments.overwrite:
         raise ValueError("--resume goes on with a check that was stopped, --overwrite begins another one; choose one.")
     path = files.locate(arguments.result)
-    for name in (TABLE, FIGURE):
-        files.refuse_existing(path.parent / name, arguments.overwrite or arguments.resume)
+    posterior = arviz_data.load(path)
+    settled = _settled(posterior, arguments)
+    if settled is None:
+        for name in (TABLE, FIGURE):
+            files.refuse_existing(path.parent / name, arguments.overwrite or arguments.resume)
     page.refuse_foreign(path.parent, arguments.overwrite)
     results.writable(path.parent)
-    posterior = arviz_data.load(path)
     session.start(int(arviz_data.attributes(posterior).get("chains", 1)), not arguments.no_cache)
     task = rebuilt(posterior, arguments.model, path)
     with contextlib.ExitStack() as stack:
@@ -69,11 +71,16 @@ def run(arguments: argparse.Namespace) -> int:
         go_on = f"go on with: {_again(arguments)}"
         watch = stack.enter_context(watched(lambda: go_on))
         try:
-            report = _checked(task, arguments, path.parent / UNFINISHED)
+            report = settled or _checked(task, arguments, path.parent / UNFINISHED)
             for message in arviz_data.convergence_warnings(posterior):
                 warnings.warn(f"the draws that are checked: {message}", stacklevel=1)
-            print(f"\n{report.text(command=False)}\n")
-            status = _write(report, task.posterior, path, page.command_line(arguments))
+            if settled is None:
+                print(f"\n{report.text(command=False)}\n")
+                status = _write(report, task.posterior, path, page.command_line(arguments))
+            else:
+                print(f"checked  before: k = {report.k:.2f} is not below {report.threshold:.2f}, so that no weights of "
+                      "draws can correct this posterior (--draws N checks again)")
+                status = 0
             if folder is not None and report.exact:
                 print("the filter is exact: there is nothing to correct")
             elif folder is not None:
@@ -94,6 +101,19 @@ def run(arguments: argparse.Namespace) -> int:
         else:
             checkpoint.forget(path.parent / UNFINISHED)
         return status
+
+
+def _settled(posterior: Any, arguments: argparse.Namespace) -> Any:
+    """Return the stored report where it says that new chains are needed, so that more draws would be a waste."""
+    from lfm_ppl.results import arviz_data
+    from lfm_ppl.results.report import GROUP, AccuracyReport
+    from lfm_ppl.results.verdict import CORRECT
+
+    asked_anew = arguments.draws is not None or arguments.reference != "auto"
+    if not arguments.correct or asked_anew or not arviz_data.has_group(posterior, GROUP):
+        return None
+    report = AccuracyReport.of(posterior)
+    return report if not report.reliable and report.verdict.command == CORRECT else None
 
 
 def _again(arguments: argparse.Namespace) -> str:

@@ -70,7 +70,8 @@ def _forecast(arguments: argparse.Namespace, task: check.Check, held_out: data.D
         times = np.union1d(times, held_out.times)
         inputs = {name: Input(*joined(task.observed.inputs[name], later)) for name, later in held_out.inputs.items()}
     more: dict[str, Any] = {"inputs": inputs, "model_kwargs": task.keywords}
-    forecast = lfm_ppl.forecast(task.posterior, task.model, times, draws=arguments.draws, seed=arguments.seed, **more)
+    forecast = lfm_ppl.forecast(task.posterior, task.model, times, draws=arguments.draws, seed=arguments.seed,
+                                progress=not arguments.quiet, **more)
     # An observation family has its own law, which is the model's.
     of_family = MEAN not in arviz_data.group(forecast, GROUP)
     own: dict[str, Any] = {"numpyro_model": task.model, **more} if of_family else {}

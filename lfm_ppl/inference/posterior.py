@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import checks
-from lfm_ppl.filtering.smoother import LONGEST_FORECAST
+from lfm_ppl.filtering.smoother import LONGEST_FORECAST, SmootherResult
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.fingerprint import signature
@@ -71,7 +71,7 @@ def scores(bound: BoundModel, draws: Mapping[str, Any], *, show: Callable[[int, 
 
 def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at: Any,
                  particles: ParticleSettings | None = None, particle_steps: int | None = None, *,
-                 show: Callable[[int, int], None] = lambda done, count: None,
+                 log_likelihood: bool = False, show: Callable[[int, int], None] = lambda done, count: None,
                  parts: Parts | None = None) -> dict[str, np.ndarray]:
     """Draw one trajectory for each draw of the parameters, given the data, and new data along it.
 
@@ -85,6 +85,7 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
         at: (K,) times of the trajectories, or None for the observation times.
         particles: draw the trajectories with the particle smoother; None: with the Gaussian one.
         particle_steps: integration steps of the particles between two observations; None: the model's.
+        log_likelihood: whether to return that of the Gaussian filter, (S, ...), unless there are particles.
         show: as in `over_draws`, and so is the next.
         parts: keeps batches.
 
@@ -93,10 +94,11 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
         a family); ``y`` (S, ..., T, D), the posterior predictive at the observation times; ``prediction``
         (S, ..., K, D), new observations at the times of the trajectories. For Gaussian observations
         ``predictive_mean`` and ``predictive_sd`` (S, ..., K, D), the normal distribution of each given the parameters
-        (where the model is linear) or given the path, so that the mixture over the draws is the predictive density, and
-        ``output_sd`` (S, ..., K, D), the sd without the noise. The last four are left out where the covariance of the
-        noise belongs to the rows of the data. ``log_likelihood`` (S, ...) of the Gaussian filter, unless there are
-        particles.
+        (where the observation is linear, up to the last one) or given the path, so that the mixture over the draws is
+        the predictive density, and ``output_sd`` (S, ..., K, D), the sd without the noise. The last four are left out
+        where the covariance of the noise belongs to the rows of the data. From the Gaussian smoother ``state_mean``,
+        ``state_sd``, ``force_mean`` and ``force_sd``, the normal distribution that the path is drawn from, with the
+        path itself and zero where it is simulated.
     """
     at = None if at is None else np.asarray(at, float)
     if at is not None and bound.times.ndim == 1 and np.array_equal(at, bound.times):
@@ -110,6 +112,7 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
     def one(distribution: MarginalLikelihood, y: jax.Array, key: jax.Array) -> dict[str, jax.Array]:
         ssm = distribution.ssm
         path_key, noise_key = jax.random.split(key)
+        found: dict[str, jax.Array] = {}
         if distribution.constrained:
             smoothed = None
             w, when = distribution.feasible_path(path_key, y, plan.times)
@@ -117,16 +120,20 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
             smoothed = distribution.smooth(y, plan.times)
             when = smoothed.times
             states = smoothed.sample_joint(path_key, 1)[0]
+            drawn = jnp.ones((len(when), 1), bool)
             if after:
-                states = _onwards(distribution, y, states, when, plan, jax.random.fold_in(path_key, 1))
+                drawn = (when <= _last(y, when, plan))[:, None]
+                states = _onwards(distribution, states, when, drawn[:, 0], plan, jax.random.fold_in(path_key, 1))
             w = jax.vmap(ssm.inputs)(states, when)
+            found = _moments(ssm, smoothed, w, drawn, plan)
+            found |= {"log_likelihood": smoothed.log_likelihood.sum()} if log_likelihood else {}
         else:
             smoothed = None
             w, when = _particle_path(distribution, y, plan.times, path_key, particles,
                                      particle_steps or distribution.steps)
         there, data = plan.there, plan.data
         if isinstance(ssm.model.observation, ObservationFamily):
-            found = _of_family(ssm, noise_key, w, when, plan)
+            found |= _of_family(ssm, noise_key, w, when, plan)
             if at is not None and noise_of_rows(distribution):
                 del found["prediction"]
             return found
@@ -134,9 +141,7 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
         covariance = jax.vmap(ssm.obs_cov)(w[data], when[data], jnp.arange(len(data)))
         replicated = with_noise(noise_key, output[data], covariance)
         size = ssm.physical_dim
-        found = {"state": w[there, :size], "force": w[there, size:], "output": output[there], "y": replicated}
-        if smoothed is not None:
-            found["log_likelihood"] = smoothed.log_likelihood.sum()
+        found |= {"state": w[there, :size], "force": w[there, size:], "output": output[there], "y": replicated}
         if at is not None and noise_of_rows(distribution):
             return found
         prediction = replicated
@@ -145,12 +150,12 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
             prediction = with_noise(jax.random.fold_in(noise_key, 1), output[there], covariance)
         mean, noise = output[there], jnp.diagonal(covariance, axis1=1, axis2=2)
         variance = jnp.zeros_like(noise)
-        if smoothed is not None and _gaussian_outputs(ssm):
+        if smoothed is not None and _normal_outputs(ssm):
             # The normal distribution of y given the parameters, instead of given a path: sharper by a lot.
             matrix = jax.vmap(jax.jacfwd(ssm.observe))(smoothed.input_mean[there], when[there])
-            mean = jax.vmap(ssm.observe)(smoothed.input_mean[there], when[there])
-            variance = jnp.einsum("kdi,kij,kdj->kd", matrix, smoothed.input_covariance[there], matrix)
-            variance = jnp.maximum(variance, 0.0)
+            spread = jnp.einsum("kdi,kij,kdj->kd", matrix, smoothed.input_covariance[there], matrix)
+            mean = jnp.where(drawn[there], jax.vmap(ssm.observe)(smoothed.input_mean[there], when[there]), mean)
+            variance = jnp.where(drawn[there], jnp.maximum(spread, 0.0), 0.0)
         return found | {"prediction": prediction, "predictive_mean": mean, "predictive_sd": jnp.sqrt(variance + noise),
                         "output_sd": jnp.sqrt(variance)}
 
@@ -162,7 +167,7 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
 
     rows = plan.rows
     width = 1 if particles is None else particles.particles
-    name = ("trajectories", signature(at), particles, particle_steps, after)
+    name = ("trajectories", signature(at), particles, particle_steps, after, log_likelihood)
     return over_draws(bound, name, per_draw, draws, key, rows * width, show, parts)
 
 
@@ -231,16 +236,28 @@ def _after(bound: BoundModel, at: np.ndarray | None) -> bool:
     return not bool(np.all(seen[..., -1])) or (at is not None and bool(at.max() > bound.times.max()))
 
 
-def _onwards(distribution: MarginalLikelihood, y: jax.Array, states: jax.Array, when: jax.Array, plan: _Plan,
+def _last(y: jax.Array, when: jax.Array, plan: _Plan) -> jax.Array:
+    """Return the time of the last observation; where nothing was observed, everything is simulated."""
+    return jnp.max(jnp.where(jnp.isfinite(y).any(axis=-1), when[plan.data], -jnp.inf))
+
+
+def _onwards(distribution: MarginalLikelihood, states: jax.Array, when: jax.Array, known: jax.Array, plan: _Plan,
              key: jax.Array) -> jax.Array:
-    """Return the joint states (L, n) with those after the last observation simulated from the one at it."""
+    """Return the joint states (L, n) with those that are not ``known`` (L,) simulated from the last one that is."""
     order = np.arange(plan.rows) if plan.times is None else np.argsort(plan.times, kind="stable")
-    seen = jnp.isfinite(y).any(axis=-1)
-    last = jnp.max(jnp.where(seen, when[plan.data], -jnp.inf))
-    known = when[order] <= last
-    # Where nothing was observed, everything is simulated from the first row on.
-    path = simulate_onwards(distribution.ssm, key, states[order], when[order], known, plan.steps)
+    path = simulate_onwards(distribution.ssm, key, states[order], when[order], known[order], plan.steps)
     return jnp.zeros_like(states).at[order].set(path)
+
+
+def _moments(ssm: StateSpaceModel, smoothed: SmootherResult, w: jax.Array, drawn: jax.Array,
+             plan: _Plan) -> dict[str, jax.Array]:
+    """Return mean and sd of state and forces at the requested times: of a path (L, M + R) where it is simulated."""
+    size, there = ssm.physical_dim, plan.there
+    mean = jnp.where(drawn, smoothed.input_mean, w)[there]
+    variance = jnp.diagonal(smoothed.input_covariance, axis1=1, axis2=2)
+    sd = jnp.where(drawn, jnp.sqrt(jnp.maximum(variance, 0.0)), 0.0)[there]
+    return {"state_mean": mean[:, :size], "state_sd": sd[:, :size],
+            "force_mean": mean[:, size:], "force_sd": sd[:, size:]}
 
 
 def noise_of_rows(distribution: MarginalLikelihood) -> bool:
@@ -251,11 +268,10 @@ def noise_of_rows(distribution: MarginalLikelihood) -> bool:
     return not observation.varies_with_state and np.ndim(observation.covariance) == 3
 
 
-def _gaussian_outputs(ssm: StateSpaceModel) -> bool:
-    """Whether y is normal given the parameters: all is linear, and the noise does not depend on the state."""
+def _normal_outputs(ssm: StateSpaceModel) -> bool:
+    """Whether y is normal where the state is: a linear observation, with noise that does not depend on the state."""
     observation = ssm.model.observation
-    return not (ssm.drift_structure.points or ssm.observation_structure.points or observation.varies_with_state
-                or observation.angular)
+    return not (ssm.observation_structure.points or observation.varies_with_state or observation.angular)
 
 
 def _particle_path(distribution: MarginalLikelihood, y: jax.Array, at: Any, key: jax.Array,

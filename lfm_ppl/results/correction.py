@@ -14,6 +14,7 @@ from lfm_ppl import checks
 from lfm_ppl.inference.posterior import trajectories
 from lfm_ppl.results import arviz_data, importance, rebuilding
 from lfm_ppl.results.accuracy import evenly_spaced
+from lfm_ppl.results.layout import with_summaries
 from lfm_ppl.results.report import AccuracyReport
 
 _KEPT = ("observed_data", "truth")
@@ -87,14 +88,17 @@ def _paths(result: Any, numpyro_model: Callable, times: Any, y: Any, model_kwarg
     at = template["at"].values if "at" in template.coords else None
     chosen, rows = evenly_spaced(picked.shape[0], picked.shape[1], count)
     problem = rebuilding.problem(result, numpyro_model, times, y, model_kwargs).at(picked.ravel()[rows])
-    found = trajectories(jax.random.key(seed), problem.bound, problem.draws, at)
+    found = {label: values.reshape(picked.shape[0], len(chosen), *values.shape[1:]) for label, values in
+             trajectories(jax.random.key(seed), problem.bound, problem.draws, at).items()}
     groups = {}
     for name, old in templates.items():
         variables = {}
         for label, variable in old.data_vars.items():
+            if "draw" not in variable.dims:  # a summary, made anew below
+                continue
             kind = _KINDS[str(label)] if name == "trajectories" else "y"
-            values = found[kind].reshape(picked.shape[0], len(chosen), *found[kind].shape[1:])
-            variables[label] = (variable.transpose("chain", "draw", ...).dims, values, variable.attrs)
-        coords = {key: value for key, value in old.coords.items() if key not in ("chain", "draw")}
+            variables[label] = (variable.transpose("chain", "draw", ...).dims, found[kind], variable.attrs)
+        coords = {key: value for key, value in old.coords.items() if key not in ("chain", "draw", "statistic")}
         groups[name] = xr.Dataset(variables, coords | {"chain": np.arange(picked.shape[0]), "draw": chosen})
+    groups["trajectories"] = with_summaries(groups["trajectories"], found, problem.bound.site.name)
     return groups

@@ -11,7 +11,7 @@ import xarray as xr
 
 from lfm_ppl import checks
 from lfm_ppl.model.observation_noise import expected_observation
-from lfm_ppl.results.predictions import GROUP, NOISE_FREE, predictions
+from lfm_ppl.results.predictions import GROUP, INTERVAL, NOISE_FREE, mixture_quantiles, predictions
 from lfm_ppl.results.scalars import DERIVED, units_attribute
 
 if TYPE_CHECKING:
@@ -166,6 +166,7 @@ def lay_out(bound: BoundModel, draws: dict, stats: dict, rated: dict | None, pat
             {f"{kind}s": variable((*place, kind), paths[kind], named[kind]) for kind in named if paths[kind].shape[-1]},
             {**thinned, **at, **which, **{kind: named[kind] for kind in named if named[kind]}})
         groups["trajectories"]["outputs"].attrs["long_name"] = NOISE_FREE
+        groups["trajectories"] = with_summaries(groups["trajectories"], paths, site.name)
         if "prediction" in paths and grid is not None:
             groups[GROUP] = predictions(bound, paths, chosen, grid, labels.coords)
     if truth:
@@ -176,6 +177,43 @@ def lay_out(bound: BoundModel, draws: dict, stats: dict, rated: dict | None, pat
                 outputs=variable(("at_truth", OUTPUT), without_noise, named[OUTPUT]))
             groups["truth"] = groups["truth"].assign_coords({OUTPUT: named[OUTPUT]})
     return groups
+
+
+def with_summaries(trajectories: xr.Dataset, paths: Mapping[str, np.ndarray], observed: str) -> xr.Dataset:
+    """Return trajectories with the mean and the 95% interval at each time, where their density is known.
+
+    That is a mixture of normal distributions, one for each draw of the parameters. The quantiles of a mixture are
+    smooth in time and much nearer to the true ones than those of the draws: 400 draws leave an error of a seventh of
+    an sd.
+
+    Args:
+        trajectories: draws of states, forces and outputs, (chain, draw, ..., at, kind).
+        paths: `lfm_ppl.inference.posterior.trajectories`, (C, S, ..., K, size).
+        observed: name of the observed site.
+
+    Returns:
+        Variables ``states_summary``, ``forces_summary``, ``outputs_summary`` (noise-free), and one of new data with
+        their noise, named after the site, are added, with the dimension ``statistic``: mean, q2.5, q97.5.
+    """
+    moments = {"states": ("state_mean", "state_sd"), "forces": ("force_mean", "force_sd"),
+               "outputs": ("predictive_mean", "output_sd"), observed: ("predictive_mean", "predictive_sd")}
+    found = {}
+    for name, (mean, sd) in moments.items():
+        like = trajectories.get(name, trajectories["outputs"])
+        if mean not in paths or paths[mean].shape[-1] == 0 or not np.any(paths[sd] > 0):
+            continue
+        means, sds = (paths[label].reshape(-1, *paths[label].shape[2:]) for label in (mean, sd))
+        values = np.concatenate([means.mean(axis=0)[None], mixture_quantiles(means, sds, INTERVAL, _TOLERANCE)])
+        dims = [dim for dim in like.dims if dim not in ("chain", "draw")]
+        found[f"{name}_summary"] = (("statistic", *dims), values, like.attrs)
+    return trajectories.assign(found).assign_coords(statistic=list(STATISTICS)) if found else trajectories
+
+
+_TOLERANCE = 1e-4
+"""Of the ends of an interval, as a share of their range over the draws: far below what the draws leave open."""
+
+STATISTICS = ("mean", "q2.5", "q97.5")
+"""What a summary of trajectories has at each time."""
 
 
 def _posterior(draws: dict, coords: dict, named: Mapping[str, list], labels: Labels) -> xr.Dataset:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 import xarray as xr
-from scipy import stats
+from scipy import special
 
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.scalars import units_attribute
@@ -22,7 +23,7 @@ GROUP = "predictions"
 NOISE_FREE = "noise-free output"
 """What is said of ``outputs`` wherever they are stored."""
 
-_INTERVAL = (0.025, 0.975)
+INTERVAL = (0.025, 0.975)
 
 MEAN, SD, FREE_SD = "y_mean", "y_sd", "outputs_sd"
 """Mean of the normal distribution that y has at each draw, its sd, and its sd without the noise."""
@@ -129,8 +130,8 @@ def summary(dataset: xr.Dataset) -> pd.DataFrame:
 def interval(dataset: xr.Dataset) -> np.ndarray:
     """Return the ends (2, K, D) of the 95% interval of new data, by their density where it is known."""
     if MEAN in dataset and SD in dataset:
-        return mixture_quantiles(_flat(dataset[MEAN]), _flat(dataset[SD]), _INTERVAL)
-    return quantiles(_flat(observed_variable(dataset)), _INTERVAL)
+        return mixture_quantiles(_flat(dataset[MEAN]), _flat(dataset[SD]), INTERVAL)
+    return quantiles(_flat(observed_variable(dataset)), INTERVAL)
 
 
 def quantiles(draws: np.ndarray, p: Any) -> np.ndarray:
@@ -149,8 +150,8 @@ def quantiles(draws: np.ndarray, p: Any) -> np.ndarray:
 def noise_free_interval(dataset: xr.Dataset) -> np.ndarray:
     """Return the ends (2, K, D) of the 95% interval of the noise-free outputs, by their density where it is known."""
     if MEAN in dataset and FREE_SD in dataset and bool((dataset[FREE_SD] > 0).any()):
-        return mixture_quantiles(_flat(dataset[MEAN]), _flat(dataset[FREE_SD]), _INTERVAL)
-    return np.quantile(_flat(dataset["outputs"]), _INTERVAL, axis=0)
+        return mixture_quantiles(_flat(dataset[MEAN]), _flat(dataset[FREE_SD]), INTERVAL)
+    return np.quantile(_flat(dataset["outputs"]), INTERVAL, axis=0)
 
 
 def _flat(variable: xr.DataArray) -> np.ndarray:
@@ -158,19 +159,23 @@ def _flat(variable: xr.DataArray) -> np.ndarray:
     return np.asarray(variable.values, float).reshape(-1, *variable.shape[2:])
 
 
-def mixture_quantiles(mean: np.ndarray, sd: np.ndarray, p: Any) -> np.ndarray:
-    """Return quantiles (Q, ...) of the mixture of normal distributions (S, ...), by bisection."""
-    p = np.atleast_1d(np.asarray(p, float))
+def mixture_quantiles(mean: np.ndarray, sd: np.ndarray, p: Any, tolerance: float = 1e-9) -> np.ndarray:
+    """Return quantiles (Q, ...) of the mixture of normal distributions (S, ...), by bisection.
+
+    Args:
+        mean: of the parts.
+        sd: of the parts; those with zero are draws.
+        p: (Q,) probabilities.
+        tolerance: of a quantile, as a share of the distance between the lowest and the highest one of the parts.
+    """
     found = []
-    for one in p:
-        ends = mean + sd * stats.norm.ppf(one)  # the quantile of the mixture lies between those of its parts
-        low, high = ends.min(axis=0), ends.max(axis=0)
-        for _ in range(60):
-            middle = 0.5 * (low + high)
-            with np.errstate(divide="ignore", invalid="ignore"):
-                share = np.where(sd > 0, stats.norm.cdf((middle - mean) / sd), middle >= mean).mean(axis=0)
-            low, high = np.where(share < one, middle, low), np.where(share < one, high, middle)
-            if np.all(high - low <= 1e-9 * (1e-300 + np.abs(high))):
-                break
-        found.append(0.5 * (low + high))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for one in np.atleast_1d(np.asarray(p, float)):
+            ends = mean + sd * special.ndtri(one)  # the quantile of the mixture lies between those of its parts
+            low, high = ends.min(axis=0), ends.max(axis=0)
+            for _ in range(math.ceil(-math.log2(tolerance))):
+                middle = 0.5 * (low + high)
+                share = np.where(sd > 0, special.ndtr((middle - mean) / sd), middle >= mean).mean(axis=0)
+                low, high = np.where(share < one, middle, low), np.where(share < one, high, middle)
+            found.append(0.5 * (low + high))
     return np.array(found)

@@ -23,6 +23,9 @@ STEP_CHANGE = 0.1
 NOISE_SD = 0.3
 """Noise of a log ratio that does not matter."""
 
+CORRECT = "lfm-ppl check RESULT --correct"
+"""The command that samples the exact posterior, where no weights can be relied on."""
+
 LEAST_DRAWS = 40
 """Fewer draws have no tail to fit a Pareto distribution to."""
 
@@ -138,7 +141,7 @@ def _unreliable(found: Findings) -> tuple[str, str]:
         more = min(2 * int(needed), found.available)  # a margin, because k itself is an estimate
         return f"{start} with {found.checked} draws.", f"lfm-ppl check RESULT --draws {more} --overwrite"
     return (f"{start}: the posterior of the Gaussian filter is too far from the exact one. One command samples the "
-            "exact one, with the likelihood of a particle filter.", "lfm-ppl check RESULT --correct --overwrite")
+            "exact one, with the likelihood of a particle filter.", CORRECT)
 
 
 def _changed(table: pd.DataFrame) -> list[str]:

@@ -72,6 +72,7 @@ def plot_fit(
     predicted = _predicted(result)
     alone = predicted is not None and not has_group(result, "trajectories")
     noise_free = None if alone else _trajectories(result, "output")
+    new = None if noise_free is None else _summary(result, "y")
     truth = _true(result, "output")
     forecast = known = False
     names, note = style.first_of(pick(observed, "output", outputs), outputs, MAX_PANELS, "outputs")
@@ -83,9 +84,10 @@ def plot_fit(
             _draw_forecast(axes, predicted.sel(output=[name]))
         else:
             assert noise_free is not None
-            time, mean, low, high = _band(noise_free.sel(output=name))
-            if predictive is not None:
-                outer = _widened(predictive.sel(output=name), time, low, high)
+            time, mean, low, high = _band(result, "output", name)
+            if new is not None or predictive is not None:
+                outer = (_widened(predictive.sel(output=name), time, low, high) if new is None
+                         else (time, *new.sel(output=name).values[1:]))
                 axes.fill_between(*outer, color=_PREDICTIVE, lw=0, zorder=1)
             axes.fill_between(time, low, high, color=_NOISE_FREE, lw=0, zorder=2)
             axes.plot(time, mean, color=style.BLUE, zorder=3)
@@ -102,7 +104,7 @@ def plot_fit(
     handles: list[Artist] = [Line2D([], [], label="data", **_data_style(observed.sizes["time"]))]
     handles += [Line2D([], [], color=style.BLUE, label="posterior mean")]
     handles += [Patch(color=_NOISE_FREE, label="95%, noise-free")]
-    if predictive is not None or predicted is not None:
+    if new is not None or predictive is not None or predicted is not None:
         handles += [Patch(color=_PREDICTIVE, label="95%, new data")]
     if known:
         handles += [Line2D([], [], label="truth", **_TRUTH)]
@@ -222,7 +224,7 @@ def _panels(
     line, tint = colours
     known = False
     for axes, name in zip(panels, names, strict=True):
-        time, mean, low, high = _band(draws.sel({kind: name}))
+        time, mean, low, high = _band(result, kind, name)
         axes.fill_between(time, low, high, color=tint, lw=0, zorder=1)
         axes.plot(time, mean, color=line, zorder=2)
         known |= _draw_truth(axes, truth, kind, name)
@@ -308,11 +310,21 @@ def _draw_forecast(axes: Axes, predicted: xr.Dataset) -> None:
     axes.plot(time, mean, color=style.BLUE, ls="", marker="_", ms=5, zorder=3)
 
 
-def _band(draws: xr.DataArray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return times, mean and the ends of the 95% interval of draws (chain, draw, at)."""
+def _band(result: Any, kind: str, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return times, mean and the ends of the 95% interval of a state, force or output, by its density if known."""
+    draws = _trajectories(result, kind).sel({kind: name})
+    summary = _summary(result, f"{kind}s")
+    if summary is not None:
+        return draws["at"].values, *summary.sel({kind: name}).values
     flat = draws.values.reshape(-1, draws.sizes["at"])
     low, high = np.quantile(flat, _INTERVAL, axis=0)
     return draws["at"].values, flat.mean(axis=0), low, high
+
+
+def _summary(result: Any, name: str) -> xr.DataArray | None:
+    """Return the summary (statistic, at, ...) of trajectories; None where there are draws alone."""
+    found = group(result, "trajectories").get(f"{name}_summary")
+    return None if found is None or "series" in found.dims else found.transpose("statistic", "at", ...)
 
 
 def _widened(
