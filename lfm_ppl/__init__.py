@@ -84,6 +84,7 @@ if TYPE_CHECKING:
     from lfm_ppl.results.html_report import save_report as save_report
     from lfm_ppl.results.plots import plot_accuracy as plot_accuracy
     from lfm_ppl.results.plots import plot_calibration as plot_calibration
+    from lfm_ppl.results.plots import plot_deterministics as plot_deterministics
     from lfm_ppl.results.plots import plot_fit as plot_fit
     from lfm_ppl.results.plots import plot_forces as plot_forces
     from lfm_ppl.results.plots import plot_pairs as plot_pairs
@@ -113,8 +114,8 @@ _NAMES = {
     "results.correction": ("correct_posterior",),
     "results.html_report": ("save_report",),
     "results.plots": (
-        "plot_accuracy", "plot_calibration", "plot_fit", "plot_forces", "plot_pairs", "plot_residuals", "plot_states",
-        "plot_trace",
+        "plot_accuracy", "plot_calibration", "plot_deterministics", "plot_fit", "plot_forces", "plot_pairs",
+        "plot_residuals", "plot_states", "plot_trace",
     ),
     "results.scoring": ("score",),
     "inference.kernels.elliptical_slice": ("EllipticalSlice",),

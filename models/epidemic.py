@@ -100,6 +100,7 @@ def build(r0, scale, lengthscale, concentration, recovery, reporting, population
         state_names=("log susceptible", "log infectious"),
         output_names=OUTPUTS,
         units=units,
+        deterministics={"reproduction number": lambda x, u, t: r0 * jnp.exp(u[0] + x[0])},
     )
 
 

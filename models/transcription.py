@@ -122,6 +122,7 @@ def build(
         state_names=outputs,
         output_names=outputs,
         units=units,
+        deterministics={} if link == "linear" else {"activity": lambda x, u, t: activity(u[0], link, gamma)},
     )
 
 

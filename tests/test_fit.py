@@ -64,15 +64,19 @@ def test_groups_and_dimensions(nuts):
         "posterior_predictive": {"y": ("chain", "draw", "time", "output")},
         "trajectories": {"forces": ("chain", "draw", "at", "force"), "states": ("chain", "draw", "at", "state"),
                          "outputs": ("chain", "draw", "at", "output"),
+                         "deterministics": ("chain", "draw", "at", "deterministic"),
+                         "deterministics_summary": ("statistic", "at", "deterministic"),
                          "forces_summary": ("statistic", "at", "force"), "states_summary": ("statistic", "at", "state"),
                          "outputs_summary": ("statistic", "at", "output"), "y_summary": ("statistic", "at", "output")},
         "predictions": {"y": ("chain", "draw", "time", "output"), "y_mean": ("chain", "draw", "time", "output"),
                         "y_sd": ("chain", "draw", "time", "output"), "outputs_sd": ("chain", "draw", "time", "output"),
                         "outputs": ("chain", "draw", "time", "output"), "forces": ("chain", "draw", "time", "force"),
-                        "states": ("chain", "draw", "time", "state")},
+                        "states": ("chain", "draw", "time", "state"),
+                        "deterministics": ("chain", "draw", "time", "deterministic")},
         "observed_data": {"y": ("time", "output")},
         "truth": {"forces": ("at_truth", "force"), "states": ("at_truth", "state"), "decay": ("output",),
-                  "lengthscale": (), "noise_sd": (), "outputs": ("at_truth", "output")},
+                  "lengthscale": (), "noise_sd": (), "outputs": ("at_truth", "output"),
+                  "deterministics": ("at_truth", "deterministic")},
     }
     assert set(arviz_data.groups(nuts)) == {*expected, "sample_stats"}
     for name, variables in expected.items():
@@ -316,6 +320,23 @@ def test_bands_are_the_quantiles_of_the_mixture_over_the_draws(nuts, y):
         np.testing.assert_allclose(share, p, atol=1e-4)
 
 
+def test_deterministics_follow_the_path_and_have_its_bands(known, y):
+    paths = group(known, "trajectories")
+    rate = paths["deterministics"].sel(deterministic="rate")
+    np.testing.assert_allclose(rate, np.exp(paths["forces"].sel(force="drive")), rtol=1e-12)
+    assert rate.attrs["units"] == "1/h"
+    # Its distribution is log-normal: quantiles of the logarithm, with the error of 8 points a draw.
+    smoothed = lfm.smooth(motif.build(**motif.THETA), TIMES, y, at=FORECAST)
+    mean, sd = (np.asarray(part) for part in smoothed.force("drive"))
+    found = np.log(paths["deterministics_summary"].sel(deterministic="rate"))
+    error = np.sqrt(0.025 * 0.975 / (8 * paths.sizes["draw"])) / stats.norm.pdf(stats.norm.ppf(0.025))
+    for p, name in ((0.025, "q2.5"), (0.975, "q97.5")):
+        assert np.abs((found.sel(statistic=name) - mean) / sd - stats.norm.ppf(p)).max() < 4.5 * error
+    expected = np.exp(mean + sd**2 / 2)
+    error = expected * np.sqrt(np.expm1(sd**2) / (8 * paths.sizes["draw"]))
+    assert (np.abs(np.exp(found.sel(statistic="mean")) - expected) < 4.5 * error).all()
+
+
 def test_mode_of_known_parameters(known):
     attrs = arviz_data.attributes(known)
     assert (attrs["sampler"], attrs["chains"], attrs["warmup"]) == ("map", 1, 0)
@@ -351,7 +372,7 @@ def test_panel(tmp_path):
     assert sizes["one_step_ahead"] == {"chain": 2, "draw": 10, "series": 2, "time": 4, "output": 1}
     assert sizes["posterior_predictive"] == {"chain": 2, "draw": 2, "series": 2, "time": 4, "output": 1}
     assert sizes["trajectories"] == {"chain": 2, "draw": 2, "series": 2, "at": 2, "force": 1, "state": 1, "output": 1,
-                                     "statistic": 3}
+                                     "deterministic": 1, "statistic": 3}
     assert sizes["observed_data"] == {"series": 2, "time": 4, "output": 1}
     posterior, ahead = group(result, "posterior"), group(result, "one_step_ahead")["log_density"].values
     for series in range(2):

@@ -141,8 +141,8 @@ def _add_check(commands: Any) -> None:
         help="what gives the exact likelihood (default: auto, the grid for one state, else particles)",
     )
     command.add_argument(
-        "--draws", type=_whole(1), metavar="N", help="posterior draws to compare at (default: 200; to correct, 1000, unless an "
-        "earlier check says that new chains are needed)"
+        "--draws", type=_whole(1), metavar="N", help="posterior draws to compare at (default: 200; to correct, 1000, "
+        "or none where an earlier check says that new chains are needed)"
     )
     command.add_argument("--particles", type=_whole(1), metavar="N", help="default: as many as keep the noise low")
     command.add_argument("--seed", type=_whole(0), default=0, help="of the particle filter (default: 0)")

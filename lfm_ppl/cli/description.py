@@ -32,6 +32,7 @@ class Description(NamedTuple):
         derived: names of what is computed from them, with their shapes.
         forces: name -> kind and unit.
         states: name -> unit.
+        deterministics: name -> unit.
         approximation: the likelihood's settings.
     """
 
@@ -39,6 +40,7 @@ class Description(NamedTuple):
     derived: list[tuple[str, str]]
     forces: dict[str, str]
     states: dict[str, str]
+    deterministics: dict[str, str]
     approximation: str
 
 
@@ -71,7 +73,8 @@ def describe(model: loading.ModelFile) -> Description:
     return Description(
         parameters, derived, {name: " ".join([type(force).__name__, _bracketed(units.get(name))]).strip()
                               for name, force in system.forces.items()},
-        {name: _bracketed(units.get(name)) for name in system.state_names}, approximation)
+        {name: _bracketed(units.get(name)) for name in system.state_names},
+        {name: _bracketed(units.get(name)) for name in system.deterministic_names}, approximation)
 
 
 def _made_up(model: loading.ModelFile) -> Data:

@@ -39,7 +39,8 @@ def _describe(model: loading.ModelFile) -> None:
         print(f"The model itself could not be run: {type(error).__name__}: {' '.join(str(error).split())}\n")
     else:
         _print_parameters(found)
-        for title, entries in (("forces", found.forces), ("states", found.states)):
+        more = (("of states and forces (deterministics)", found.deterministics),) if found.deterministics else ()
+        for title, entries in (("forces", found.forces), ("states", found.states), *more):
             _table(title, [(name, text) for name, text in entries.items()])
         print(f"likelihood: {found.approximation}\n")
     rows = [(name, _option(*entry)) for name, entry in model.options.items()]

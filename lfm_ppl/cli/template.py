@@ -53,6 +53,8 @@ def build(loss, scale, lengthscale, noise_sd):
         state_names=("x",),
         output_names=OUTPUTS,
         units=UNITS,
+        # What follows from state and forces, drawn like them: a rate softplus(u) that the dynamics use, a flow, ...
+        # deterministics={"net heat": lambda x, u, t: u[0] - loss * (x[0] - OUTSIDE)},
     )
 
 

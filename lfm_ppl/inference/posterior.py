@@ -15,6 +15,7 @@ from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.fingerprint import signature
 from lfm_ppl.inference.marginal_likelihood import SIMULATION_STEPS, MarginalLikelihood, Panel
+from lfm_ppl.linalg import semidefinite_root
 from lfm_ppl.model.observation_noise import expected_observation, noisy_observation, with_noise
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.simulate import simulate_onwards
@@ -27,6 +28,9 @@ _FILTERS = 4
 
 _BATCH = 8
 """Draws in a batch of those that go one after another."""
+
+_POINTS = 8
+"""Points of the distribution of state and forces, for the bands of functions of them that are not linear."""
 
 _TRIED = 5
 """How many times as many steps a model may take whose steps follow a tolerance."""
@@ -90,15 +94,16 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
         parts: keeps batches.
 
     Returns:
-        ``state`` (S, ..., K, M), ``force`` (S, ..., K, R), ``output`` (S, ..., K, D) free of noise (what is expected of
-        a family); ``y`` (S, ..., T, D), the posterior predictive at the observation times; ``prediction``
-        (S, ..., K, D), new observations at the times of the trajectories. For Gaussian observations
-        ``predictive_mean`` and ``predictive_sd`` (S, ..., K, D), the normal distribution of each given the parameters
-        (where the observation is linear, up to the last one) or given the path, so that the mixture over the draws is
-        the predictive density, and ``output_sd`` (S, ..., K, D), the sd without the noise. The last four are left out
-        where the covariance of the noise belongs to the rows of the data. From the Gaussian smoother ``state_mean``,
-        ``state_sd``, ``force_mean`` and ``force_sd``, the normal distribution that the path is drawn from, with the
-        path itself and zero where it is simulated.
+        ``state`` (S, ..., K, M), ``force`` (S, ..., K, R), ``deterministic`` (S, ..., K, Q), ``output`` (S, ..., K, D)
+        free of noise (what is expected of a family); ``y`` (S, ..., T, D), the posterior predictive at the observation
+        times; ``prediction`` (S, ..., K, D), new observations at the times of the trajectories. For Gaussian
+        observations ``predictive_mean`` and ``predictive_sd`` (S, ..., K, D), the normal distribution of each given the
+        parameters (where the observation is linear, up to the last one) or given the path, so that the mixture over the
+        draws is the predictive density, and ``output_sd`` (S, ..., K, D), the sd without the noise. The last four are
+        left out where the covariance of the noise belongs to the rows of the data. From the Gaussian smoother
+        ``state_mean``, ``state_sd``, ``force_mean`` and ``force_sd``, the normal distribution that the path is drawn
+        from, with the path itself and zero where it is simulated; ``deterministic_points`` and ``output_points`` (S,
+        ..., P, K, size), where these functions are not linear, at points of that distribution.
     """
     at = None if at is None else np.asarray(at, float)
     if at is not None and bound.times.ndim == 1 and np.array_equal(at, bound.times):
@@ -126,12 +131,14 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
                 states = _onwards(distribution, states, when, drawn[:, 0], plan, jax.random.fold_in(path_key, 1))
             w = jax.vmap(ssm.inputs)(states, when)
             found = _moments(ssm, smoothed, w, drawn, plan)
+            found |= _points(ssm, smoothed, w, drawn, plan, jax.random.fold_in(path_key, 2))
             found |= {"log_likelihood": smoothed.log_likelihood.sum()} if log_likelihood else {}
         else:
             smoothed = None
             w, when = _particle_path(distribution, y, plan.times, path_key, particles,
                                      particle_steps or distribution.steps)
         there, data = plan.there, plan.data
+        found["deterministic"] = jax.vmap(ssm.deterministics)(w[there], when[there])
         if isinstance(ssm.model.observation, ObservationFamily):
             found |= _of_family(ssm, noise_key, w, when, plan)
             if at is not None and noise_of_rows(distribution):
@@ -258,6 +265,28 @@ def _moments(ssm: StateSpaceModel, smoothed: SmootherResult, w: jax.Array, drawn
     sd = jnp.where(drawn, jnp.sqrt(jnp.maximum(variance, 0.0)), 0.0)[there]
     return {"state_mean": mean[:, :size], "state_sd": sd[:, :size],
             "force_mean": mean[:, size:], "force_sd": sd[:, size:]}
+
+
+def _points(ssm: StateSpaceModel, smoothed: SmootherResult, w: jax.Array, drawn: jax.Array, plan: _Plan,
+            key: jax.Array) -> dict[str, jax.Array]:
+    """Return functions of state and forces that are not linear, (P, K, ...), at points of their normal distribution.
+
+    A point is the same one, in units of the distribution, at all times, so that it moves as smoothly as they do. Where
+    a path is simulated, all are the path.
+    """
+    nonlinear = isinstance(ssm.model.observation, ObservationFamily) or not _normal_outputs(ssm)
+    if not (nonlinear or ssm.model.deterministic_names):
+        return {}
+    there = plan.there
+    root = jax.vmap(semidefinite_root)(smoothed.input_covariance[there])
+    z = jax.random.normal(key, (_POINTS, w.shape[1]), w.dtype)
+    points = smoothed.input_mean[there] + jnp.einsum("kij,pj->pki", root, z)
+    points, times = jnp.where(drawn[there], points, w[there]), smoothed.times[there]
+    found = {"deterministic_points": jax.vmap(lambda w: jax.vmap(ssm.deterministics)(w, times))(points)}
+    if nonlinear:
+        expected = jax.vmap(lambda one, t: expected_observation(ssm, one, t))
+        found["output_points"] = jax.vmap(lambda w: expected(w, times))(points)
+    return found
 
 
 def noise_of_rows(distribution: MarginalLikelihood) -> bool:

@@ -35,7 +35,10 @@ class LatentForceModel(eqx.Module):
         nonlinear_inputs: names of the states and forces that enter f non-linearly. None: found from f itself.
         state_names: M names, for results and plots.
         output_names: D names of the components of y.
-        units: unit of "time", of states, outputs and forces, by name.
+        units: unit of "time", of states, outputs, forces and deterministics, by name.
+        deterministics: name -> ``(x, u, t) -> ()``, what follows from state and forces: a rate ``softplus(u)`` where
+            the dynamics use it, a flow, a reproduction number. Drawn along every trajectory, as
+            ``numpyro.deterministic`` is of the parameters, with a figure of its own; it changes no likelihood.
 
     Raises:
         ValueError, TypeError: f returns a wrong shape; a function takes an entry out of range, or is not made of JAX
@@ -65,6 +68,8 @@ class LatentForceModel(eqx.Module):
     process_noise: Any
     initial_time: Any
     force_names: tuple[str, ...] = eqx.field(static=True)
+    deterministics: dict[str, Callable[..., jax.Array]]
+    deterministic_names: tuple[str, ...] = eqx.field(static=True)
     nonlinear_inputs: tuple[str, ...] | None = eqx.field(static=True)
     state_names: tuple[str, ...] = eqx.field(static=True)
     output_names: tuple[str, ...] = eqx.field(static=True)
@@ -83,6 +88,7 @@ class LatentForceModel(eqx.Module):
         state_names: Sequence[str] | None = None,
         output_names: Sequence[str] | None = None,
         units: Mapping[str, str] | None = None,
+        deterministics: Mapping[str, Callable[..., jax.Array]] | None = None,
     ):
         _check_types(dynamics, observation, initial_state)
         self.force_names, self.forces = _named_forces(forces)
@@ -98,6 +104,8 @@ class LatentForceModel(eqx.Module):
         if overlap := set(self.state_names) & set(self.force_names):
             raise ValueError(f"the name {sorted(overlap)[0]!r} is used for a state and for a force; rename one.")
         self.process_noise = process_noise if callable(process_noise) else _dispersion(process_noise, size)
+        self.deterministics = _functions(deterministics, {*self.state_names, *self.force_names})
+        self.deterministic_names = tuple(self.deterministics)
         functions = self._traced()
         self.output_names = _names("output_names", output_names, functions["observation"].shape.shape[0], "y")
         if isinstance(self.observation, ObservationFamily):
@@ -154,6 +162,13 @@ class LatentForceModel(eqx.Module):
         if callable(self.observation.covariance):
             functions["covariance"] = trace("the observation covariance", "(x, u, t)", self.observation.covariance,
                                             *arguments)
+        for name, function in self.deterministics.items():
+            label = f"the deterministic {name!r}"
+            functions[label] = trace(label, "(x, u, t)", function, *arguments)
+            if getattr(functions[label].shape, "shape", None) != ():
+                found = getattr(functions[label].shape, "shape", functions[label].shape)
+                raise ValueError(f"{label} must return one number, shape (); it returned {found}. The entry of a "
+                                 "vector is x[0], u[0].")
         for function in functions.values():
             function.check_indices(("x", "u"))
         for name, force in self.forces.items():
@@ -251,6 +266,18 @@ class LatentForceModel(eqx.Module):
             noise = checks.concrete(self.observation.covariance_at(x, u, t, jnp.asarray(0)))
             if noise is not None:
                 checks.covariance_matrix(f"the observation covariance {where}", noise)
+
+
+def _functions(given: Mapping[str, Callable] | None, taken: set[str]) -> dict[str, Callable]:
+    """Return the deterministics, checked."""
+    if given is not None and not isinstance(given, Mapping):
+        raise TypeError(f"deterministics must be a mapping, name -> function (x, u, t), got {type(given).__name__}.")
+    for name, function in (given or {}).items():
+        if not callable(function):
+            raise TypeError(f"the deterministic {name!r} must be a function (x, u, t), got {type(function).__name__}.")
+        if name in taken:
+            raise ValueError(f"the name {name!r} of a deterministic is used for a state or a force; rename one.")
+    return {str(name): function for name, function in (given or {}).items()}
 
 
 def _check_types(dynamics: Any, observation: Any, initial_state: Any) -> None:

@@ -101,6 +101,13 @@ class StateSpaceModel(eqx.Module):
         x, u = self.split(w)
         return jnp.asarray(self.model.observation.function(x, u, t), float)
 
+    def deterministics(self, w: jax.Array, t: Any) -> jax.Array:
+        """Return the values (Q,) of the deterministics of the model."""
+        x, u = self.split(w)
+        model = self.model
+        found = [jnp.asarray(model.deterministics[name](x, u, t), float) for name in model.deterministic_names]
+        return jnp.stack(found) if found else jnp.zeros(0)
+
     def obs_cov(self, w: jax.Array, t: Any, row: Any) -> jax.Array:
         """Return R (D, D)."""
         x, u = self.split(w)

@@ -19,7 +19,7 @@ from lfm_ppl.results.report import AccuracyReport
 
 _KEPT = ("observed_data", "truth")
 _DRAWN = ("trajectories", "posterior_predictive")
-_KINDS = {"states": "state", "forces": "force", "outputs": "output"}
+_KINDS = {"states": "state", "forces": "force", "outputs": "output", "deterministics": "deterministic"}
 
 
 def correct_posterior(result: Any, numpyro_model: Callable, times: Any = None, y: Any = None, *,

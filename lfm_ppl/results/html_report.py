@@ -40,7 +40,8 @@ _MOST_SERIES = 5
 
 _CAPTIONS = {
     "fit": "Data and fit: posterior mean, 95% of the noise-free output and of new data", "forces": "Latent forces",
-    "states": "States", "trace": "Chains", "pairs": "Pairs of parameters", "residuals": "Residuals one step ahead",
+    "deterministics": "What follows from states and forces", "states": "States", "trace": "Chains",
+    "pairs": "Pairs of parameters", "residuals": "Residuals one step ahead",
     "accuracy": "What the exact likelihood would change", "forecast": "Forecast with its noise",
 }
 
@@ -59,7 +60,7 @@ _ELSEWHERE = ("model", "model_file", DESCRIPTION, "data", "note", "versions", "w
 """Attributes that stand in other sections, or that nobody needs to read."""
 
 _FILES = re.compile(r"(.*\.nc|(summary|accuracy|forecast|scores)\.csv"
-                    r"|(fit|forces|states|trace|pairs|residuals|accuracy|forecast)(-\d+)?\.(png|pdf|svg))")
+                    r"|(fit|forces|deterministics|states|trace|pairs|residuals|accuracy|forecast)(-\d+)?\.(png|pdf|svg))")
 """Files of a result; what else lies in a folder is nobody's business."""
 
 

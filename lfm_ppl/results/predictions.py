@@ -44,7 +44,7 @@ def predictions(bound: BoundModel, paths: Mapping[str, np.ndarray], chosen: np.n
         Variables with dimensions chain, draw, (series,) time and one more: the site's name (new observations, with
         noise); for Gaussian observations ``y_mean`` and ``y_sd`` (normal distribution of one at each draw; the
         predictive density is their mixture) and ``outputs_sd`` (its sd without the noise, zero where it is that given a
-        path); ``outputs`` (noise-free), ``forces`` and ``states``.
+        path); ``outputs`` (noise-free), ``forces``, ``states`` and ``deterministics``.
     """
     site = bound.site
     model = site.example.ssm.model
@@ -53,7 +53,8 @@ def predictions(bound: BoundModel, paths: Mapping[str, np.ndarray], chosen: np.n
     outputs = list(labels.get("output", model.output_names))
     units = {new: model.units[old] for old, new in zip(model.output_names, outputs, strict=True) if old in model.units}
     units = {**model.units, **units}
-    named = {"output": outputs, "state": list(model.state_names), "force": list(model.force_names)}
+    named = {"output": outputs, "state": list(model.state_names), "force": list(model.force_names),
+             "deterministic": list(model.deterministic_names)}
     place = ("chain", "draw", *panel, "time")
 
     def variable(kind: str, values: np.ndarray, what: str) -> tuple:
@@ -66,7 +67,7 @@ def predictions(bound: BoundModel, paths: Mapping[str, np.ndarray], chosen: np.n
                       FREE_SD: variable("output", paths["output_sd"], f"sd of the {NOISE_FREE} at this draw")}
     angles = [named["output"][index] for index in model.observation.angular]
     variables[site.name][2].update({"angular": json.dumps(angles)} if angles else {})
-    words = {"output": NOISE_FREE, "state": "state", "force": "force"}
+    words = {"output": NOISE_FREE, "state": "state", "force": "force", "deterministic": "of state and forces"}
     variables |= {f"{kind}s": variable(kind, paths[kind], word) for kind, word in words.items()
                   if paths[kind].shape[-1]}
     clock = {"time": ("time", times, units_attribute(["time"], units))}

@@ -33,7 +33,8 @@ def build(decay, lengthscale, noise_sd) -> lfm.LatentForceModel:
         observation=lfm.GaussianObservation(systems.whole_state, noise_sd**2 * jnp.ones(size)),
         initial_state=lfm.Gaussian(jnp.zeros(size), START_VARIANCE * jnp.eye(size)),
         output_names=("a", "b")[:size],
-        units={"time": "h", "a": "nM", "b": "nM", "drive": "1/h"},
+        units={"time": "h", "a": "nM", "b": "nM", "drive": "1/h", "rate": "1/h"},
+        deterministics={"rate": lambda x, u, t: jnp.exp(u[0])},
     )
 
 

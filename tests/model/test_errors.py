@@ -31,6 +31,9 @@ def make(dynamics=lambda x, u, t: -x, forces=FORCE, observation=OBSERVATION, ini
     ({"process_noise": jnp.ones(2)}, r"process_noise must be a dispersion matrix \(2, S\).*got shape \(2,\).*jnp.diag"),
     ({"process_noise": jnp.full((2, 1), jnp.nan)}, "process_noise must be finite"),
     ({"process_noise": lambda x, u, t: jnp.ones(3)}, r"process_noise must return a dispersion matrix.*got \(3,\)"),
+    ({"deterministics": {"rate": lambda x, u, t: u}}, "the deterministic 'rate' must return one number"),
+    ({"deterministics": {"rate": lambda x, u, t: u[3]}}, "the deterministic 'rate'"),
+    ({"deterministics": {"u": lambda x, u, t: u[0]}}, "name 'u' of a deterministic is used for a state or a force"),
     ({"initial_time": np.inf}, "initial_time must be finite"),
     ({"nonlinear_inputs": ("y",)}, "unknown name in nonlinear_inputs 'y'"),
     ({"observation": lfm.GaussianObservation(lambda x, u, t: x[0], jnp.ones(1))},
@@ -48,6 +51,8 @@ def test_model_values(options, message):
 
 
 @pytest.mark.parametrize("options, message", [
+    ({"deterministics": [1.0]}, "deterministics must be a mapping"),
+    ({"deterministics": {"rate": 1.0}}, "the deterministic 'rate' must be a function"),
     ({"dynamics": 3.0}, "dynamics must be callable as f\\(x, u, t\\), got float"),
     ({"observation": jnp.ones(2)}, "observation must be an lfm.GaussianObservation.*Wrap"),
     ({"initial_state": jnp.zeros(2)}, "initial_state must be an lfm.Gaussian"),

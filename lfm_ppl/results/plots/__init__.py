@@ -6,11 +6,12 @@ from lfm_ppl.results.plots.chains import plot_trace
 from lfm_ppl.results.plots.pairs import plot_pairs
 from lfm_ppl.results.plots.residuals import plot_residuals
 from lfm_ppl.results.plots.saving import save_figures
-from lfm_ppl.results.plots.trajectories import plot_fit, plot_forces, plot_states
+from lfm_ppl.results.plots.trajectories import plot_deterministics, plot_fit, plot_forces, plot_states
 
 __all__ = [
     "plot_accuracy",
     "plot_calibration",
+    "plot_deterministics",
     "plot_fit",
     "plot_forces",
     "plot_pairs",

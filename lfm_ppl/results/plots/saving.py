@@ -30,8 +30,8 @@ def save_figures(
 ) -> list[Path]:
     """Draw every figure that ``result`` has the groups for, and write it to ``folder``.
 
-    The figures are fit, forces, states, trace, pairs, residuals and accuracy. What does not fit on one page
-    goes to numbered ones, such as ``trace-1.png`` and ``trace-2.png``, five at most. Every file is
+    The figures are fit, forces, deterministics, states, trace, pairs, residuals and accuracy. What does not fit on
+    one page goes to numbered ones, such as ``trace-1.png`` and ``trace-2.png``, five at most. Every file is
     written under a temporary name and renamed.
 
     Args:
@@ -84,6 +84,7 @@ def pages_of(result: Any, width: str | float) -> Iterator[tuple[str, Draw, list[
     for kind, draw in (
         ("output", trajectories.plot_fit),
         ("force", trajectories.plot_forces),
+        ("deterministic", trajectories.plot_deterministics),
         ("state", trajectories.plot_states),
     ):
         names = trajectories.trajectory_names(result, kind)

@@ -26,7 +26,8 @@ _INTERVAL = (0.025, 0.975)
 _BARS = 12  # forecasts from which they are drawn as bands
 _END: dict[str, Any] = {"color": style.GREY, "lw": 0.8, "ls": (0, (1, 2)), "zorder": 0.5}
 _TRUTH: dict[str, Any] = {"color": style.BLACK, "lw": 0.9, "ls": (0, (4, 2)), "zorder": 3.5}
-_NOISE_FREE, _PREDICTIVE, _FORCE = "#8FBFDE", "#D3E4F1", "#9AD3C1"  # tints of the line colours
+_NOISE_FREE, _PREDICTIVE, _FORCE, _DETERMINISTIC = "#8FBFDE", "#D3E4F1", "#9AD3C1", "#F3CFA3"
+"""Tints of the line colours."""
 
 
 @style.styled
@@ -175,6 +176,34 @@ def plot_states(
     return _panels(result, "state", states, width, (style.BLUE, _NOISE_FREE))
 
 
+@style.styled
+def plot_deterministics(
+    result: Any, names: Sequence[str] | None = None, *, width: str | float = "column"
+) -> Figure:
+    """Draw the posterior mean of what follows from states and forces with a 95% band, and the truth where it is known.
+
+    Args:
+        result: with the group trajectories, of a model with ``deterministics``, and truth where it is known.
+        names: of the deterministics; None for all, up to 12.
+        width: "column" (3.4 in), "full" (7 in), or inches.
+
+    Returns:
+        A figure with one panel for each.
+
+    Raises:
+        ValueError: the result holds none, or a name is unknown.
+
+    Example:
+        >>> from lfm_ppl.results.arviz_data import build
+        >>> dims = ("chain", "draw", "at", "deterministic")
+        >>> draws = xr.Dataset({"deterministics": (dims, np.zeros((2, 5, 10, 1)))})
+        >>> draws = draws.assign_coords({"at": np.linspace(0.0, 9.0, 10), "deterministic": ["uptake"]})
+        >>> [axes.get_ylabel() for axes in plot_deterministics(build({"trajectories": draws})).axes]
+        ['uptake']
+    """
+    return _panels(result, "deterministic", names, width, (style.ORANGE, _DETERMINISTIC))
+
+
 def time_unit(result: Any) -> str:
     """Return the unit of time, empty where the result does not know it."""
     for name, coordinate in (("observed_data", "time"), ("trajectories", "at")):
@@ -190,7 +219,7 @@ def time_origin(result: Any) -> str:
 
 
 def trajectory_names(result: Any, kind: str) -> list[str]:
-    """Return the names of the forces, states or outputs that ``result`` has trajectories of."""
+    """Return the names of the forces, states, deterministics or outputs that ``result`` has trajectories of."""
     if not has_group(result, "trajectories") or kind not in group(result, "trajectories").dims:
         return []
     return [str(name) for name in group(result, "trajectories")[kind].values]
