@@ -16,7 +16,7 @@ from lfm_ppl import cli, loading
 from lfm_ppl.cli import choices, main, results
 from lfm_ppl.results import arviz_data
 
-FIGURES = {"fit.png", "forces.png", "states.png", "trace.png", "pairs.png", "residuals.png"}
+FIGURES = {"fit.png", "forces.png", "deterministics.png", "states.png", "trace.png", "pairs.png", "residuals.png"}
 
 MOTIF = '''"""Two genes, one factor.
 
@@ -42,6 +42,7 @@ def build(decay, noise_sd, order):
         observation=lfm.GaussianObservation(lambda x, u, t: x, noise_sd**2 * jnp.ones(2)),
         initial_state=lfm.Gaussian(jnp.zeros(2), jnp.eye(2)),
         output_names=OUTPUTS,
+        deterministics={"activity": lambda x, u, t: jax.nn.softplus(u[0])},
     )
 
 

@@ -11,6 +11,7 @@ from scipy import stats
 
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.plots import (
+    plot_deterministics,
     plot_fit,
     plot_forces,
     plot_pairs,
@@ -172,6 +173,38 @@ def test_forces_and_states_draw_means_bands_and_truth(result, datasets, plot, ki
         expected = np.quantile(draws, [0.025, 0.975], axis=0)
         for x, low, high in zip(variable["at"].values, *expected, strict=True):
             np.testing.assert_allclose(edges(band)[x], [low, high])
+
+
+def test_bands_are_those_of_the_summary_where_there_is_one(datasets):
+    paths = datasets["trajectories"]
+    ends = np.stack([np.full((paths.sizes["at"], 2), value) for value in (0.5, -1.0, 2.0)])
+    datasets["trajectories"] = paths.assign(forces_summary=(("statistic", "at", "force"), ends, paths["forces"].attrs))
+    axes = plot_forces(arviz_data.build(datasets)).axes[1]
+    np.testing.assert_array_equal(line(axes, style.GREEN).get_ydata(), np.full(paths.sizes["at"], 0.5))
+    (band,) = bands(axes)
+    assert set(map(tuple, map(sorted, edges(band).values()))) == {(-1.0, 2.0)}
+
+
+def test_new_data_have_their_band_at_all_times_where_their_density_is_known(datasets):
+    paths = datasets["trajectories"]
+    ends = np.stack([np.full((paths.sizes["at"], 3), value) for value in (0.5, -1.0, 2.0)])
+    datasets["trajectories"] = paths.assign(y_summary=(("statistic", "at", "output"), ends))
+    outer, _ = bands(plot_fit(arviz_data.build(datasets)).axes[0])
+    assert set(edges(outer)) == set(paths["at"].values)
+    assert set(map(tuple, map(sorted, edges(outer).values()))) == {(-1.0, 2.0)}
+
+
+def test_deterministics_have_a_figure(datasets):
+    renamed = datasets["trajectories"][["forces"]].rename(forces="deterministics", force="deterministic")
+    datasets["truth"] = datasets["truth"][["forces"]].rename(forces="deterministics", force="deterministic")
+    datasets["trajectories"] = datasets["trajectories"].merge(renamed)
+    figure = plot_deterministics(arviz_data.build(datasets), ["stress"])
+    (axes,) = figure.axes
+    assert axes.get_ylabel() == "stress (K)" and legend_texts(figure) == ["posterior mean", "95%", "truth"]
+    draws = renamed["deterministics"].values[..., 1].reshape(200, -1)
+    np.testing.assert_allclose(line(axes, style.ORANGE).get_ydata(), draws.mean(axis=0))
+    with pytest.raises(ValueError, match="unknown deterministic 'p35'.*p53"):
+        plot_deterministics(arviz_data.build(datasets), ["p35"])
 
 
 def test_units_on_force_and_state_axes(result):
