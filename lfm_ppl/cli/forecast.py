@@ -146,15 +146,21 @@ def _write(forecast: Any, score: Callable, held_out: data.Data | None, path: Pat
            arguments: argparse.Namespace) -> int:
     from lfm_ppl.results import arviz_data, files, tables
     from lfm_ppl.results.plots import plot_fit
-    from lfm_ppl.results.predictions import GROUP, summary
+    from lfm_ppl.results.predictions import GROUP, HELD_OUT, held_out_data, summary
 
     group = arviz_data.group(forecast, GROUP).assign_attrs(command_line=page.command_line(arguments))
     forecast = arviz_data.add_group(forecast, GROUP, group)
     target = folder / files.POSTERIOR if arguments.out else path
+    if held_out is not None and np.isfinite(held_out.y).any():
+        later = held_out_data(held_out.times, held_out.y, arviz_data.group(forecast, "observed_data"))
+        forecast = arviz_data.add_group(forecast, HELD_OUT, later)
     whole = forecast
     if not arguments.out:
         # The file again, not what was read before the computation: somebody may have added to it.
-        whole = arviz_data.add_group(arviz_data.load(path), GROUP, group)
+        whole = arviz_data.load(path)
+        for name in (GROUP, HELD_OUT):
+            if arviz_data.has_group(forecast, name):
+                whole = arviz_data.add_group(whole, name, arviz_data.group(forecast, name))
     print(f"wrote    {arviz_data.save(whole, target, arguments.overwrite or not arguments.out)} (group {GROUP})")
     table = summary(group)
     print(f"wrote    {tables.write_csv(table, folder / TABLE, arguments.overwrite, index_label='time')}")

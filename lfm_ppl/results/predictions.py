@@ -20,6 +20,9 @@ if TYPE_CHECKING:  # figures, which read predictions, need no JAX
 
 GROUP = "predictions"
 
+HELD_OUT = "held_out_data"
+"""Group of the data that predictions were compared with."""
+
 NOISE_FREE = "noise-free output"
 """What is said of ``outputs`` wherever they are stored."""
 
@@ -75,6 +78,12 @@ def predictions(bound: BoundModel, paths: Mapping[str, np.ndarray], chosen: np.n
     coords |= {"series": labels["series"]} if panel and "series" in labels else {}
     attrs = {"observed": site.name, "last_observation": float(last_observation(bound.times, np.asarray(bound.y)))}
     return xr.Dataset(variables, {**coords, **{kind: names for kind, names in named.items() if names}}, attrs)
+
+
+def held_out_data(times: np.ndarray, y: np.ndarray, observed: xr.Dataset) -> xr.Dataset:
+    """Return data (T, D) that were not fitted as a group, with the names and units of those that were."""
+    named = {"output": observed["output"].values, "time": ("time", times, observed["time"].attrs)}
+    return xr.Dataset({"y": (("time", "output"), y, observed["y"].attrs)}, named)
 
 
 def last_observation(times: np.ndarray, y: np.ndarray) -> float:

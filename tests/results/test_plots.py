@@ -194,6 +194,17 @@ def test_new_data_have_their_band_at_all_times_where_their_density_is_known(data
     assert set(map(tuple, map(sorted, edges(outer).values()))) == {(-1.0, 2.0)}
 
 
+def test_held_out_data_are_marked(datasets):
+    y = xr.DataArray([[1.0, 2.0, 3.0], [1.5, np.nan, 2.5]], dims=("time", "output"))
+    named = {"time": [13.0, 13.5], "output": datasets["observed_data"]["output"]}
+    datasets["held_out_data"] = xr.Dataset({"y": y}, named)
+    figure = plot_fit(arviz_data.build(datasets))
+    assert "held-out data" in legend_texts(figure)
+    (marks,) = [one for one in figure.axes[1].lines if to_hex(one.get_markerfacecolor()) == "#ffffff"]
+    np.testing.assert_array_equal(marks.get_ydata(), [2.0, np.nan])
+    np.testing.assert_array_equal(marks.get_xdata(), [13.0, 13.5])
+
+
 def test_deterministics_have_a_figure(datasets):
     renamed = datasets["trajectories"][["forces"]].rename(forces="deterministics", force="deterministic")
     datasets["truth"] = datasets["truth"][["forces"]].rename(forces="deterministics", force="deterministic")

@@ -17,7 +17,7 @@ from lfm_ppl.checks import unknown
 from lfm_ppl.results.arviz_data import attributes, group, has_group
 from lfm_ppl.results.inputs import ORIGIN
 from lfm_ppl.results.plots import style
-from lfm_ppl.results.predictions import GROUP, MEAN, interval, noise_free_interval, quantiles
+from lfm_ppl.results.predictions import GROUP, HELD_OUT, MEAN, interval, noise_free_interval, quantiles
 from lfm_ppl.results.scalars import unit_of
 
 MAX_PANELS = 12
@@ -26,6 +26,8 @@ _INTERVAL = (0.025, 0.975)
 _BARS = 12  # forecasts from which they are drawn as bands
 _END: dict[str, Any] = {"color": style.GREY, "lw": 0.8, "ls": (0, (1, 2)), "zorder": 0.5}
 _TRUTH: dict[str, Any] = {"color": style.BLACK, "lw": 0.9, "ls": (0, (4, 2)), "zorder": 3.5}
+_HELD_OUT: dict[str, Any] = {"color": style.BLACK, "ls": "", "marker": "o", "ms": 2.6, "mfc": "white", "mew": 0.6,
+                             "zorder": 4}
 _NOISE_FREE, _PREDICTIVE, _FORCE, _DETERMINISTIC = "#8FBFDE", "#D3E4F1", "#9AD3C1", "#F3CFA3"
 """Tints of the line colours."""
 
@@ -45,8 +47,8 @@ def plot_fit(
 
     Args:
         result: with the groups observed_data and trajectories, posterior_predictive for the outer band, predictions for
-            forecasts, which alone are drawn of a result without trajectories, such as a partial one, and truth where
-            it is known.
+            forecasts, which alone are drawn of a result without trajectories, such as a partial one, held_out_data that
+            these were compared with, and truth where it is known.
         outputs: names; None for all, up to 12.
         width: "column" (3.4 in), "full" (7 in), or inches.
 
@@ -74,6 +76,7 @@ def plot_fit(
     alone = predicted is not None and not has_group(result, "trajectories")
     noise_free = None if alone else _trajectories(result, "output")
     new = None if noise_free is None else _summary(result, "y")
+    later = group(result, HELD_OUT)["y"] if has_group(result, HELD_OUT) else None
     truth = _true(result, "output")
     forecast = known = False
     names, note = style.first_of(pick(observed, "output", outputs), outputs, MAX_PANELS, "outputs")
@@ -99,10 +102,13 @@ def plot_fit(
                 axes.axvline(predicted.attrs["last_observation"], **_END)
         known |= _draw_truth(axes, truth, "output", name)
         _draw_data(axes, data)
+        if later is not None:
+            axes.plot(later["time"], later.sel(output=name), **_HELD_OUT)
         style.label_values(axes, name, unit_of(observed, name))
     style.label_time(panels, time_unit(result), time_origin(result))
     figure.align_ylabels(panels)
     handles: list[Artist] = [Line2D([], [], label="data", **_data_style(observed.sizes["time"]))]
+    handles += [Line2D([], [], label="held-out data", **_HELD_OUT)] if later is not None else []
     handles += [Line2D([], [], color=style.BLUE, label="posterior mean")]
     handles += [Patch(color=_NOISE_FREE, label="95%, noise-free")]
     if new is not None or predictive is not None or predicted is not None:
