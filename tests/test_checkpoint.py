@@ -22,6 +22,7 @@ import xarray as xr
 
 import lfm_ppl as lfm
 from lfm_ppl.cli import main
+from lfm_ppl.cli.interruption import watched
 from lfm_ppl.inference import progress, sampling
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results import checkpoint as checkpoints
@@ -405,6 +406,14 @@ with interruption.watched(lambda: "it is safe"):
 """
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=60)
     assert ended.returncode == 130 and "lfm-ppl: stopped; it is safe" in ended.stderr, ended.stderr
+
+
+def test_an_error_that_a_library_makes_of_an_interruption_is_one():
+    with pytest.raises(KeyboardInterrupt, match="interrupted; it is safe"), watched(lambda: "it is safe"):
+        raise ValueError("Cache keys should be comparable using __eq__. Traceback: sharding.py, line 154, "
+                         "KeyboardInterrupt:")
+    with pytest.raises(ValueError, match="an error of its own"), watched(lambda: "it is safe"):
+        raise ValueError("an error of its own")
 
 
 def test_the_process_ends_though_the_interruption_is_swallowed():

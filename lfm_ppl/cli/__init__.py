@@ -30,8 +30,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         # workers that are slow to end, which end when this process is gone.
         with watched(lambda: "what was written before is kept"):
             return int(arguments.run(arguments))
-    except KeyboardInterrupt:
-        print("lfm-ppl: interrupted", file=sys.stderr)
+    except KeyboardInterrupt as error:
+        print(f"lfm-ppl: {str(error) or 'interrupted'}", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:  # the reader of a pipe, such as `head`, has seen enough
         sys.stderr.close()

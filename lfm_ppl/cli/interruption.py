@@ -76,11 +76,21 @@ class Watch:
             os._exit(INTERRUPTED)
 
 
+def _was_interrupt(error: BaseException | None) -> bool:
+    """Whether an error is what a library made of Ctrl-C, as JAX does where two keys of a cache are compared."""
+    while error is not None:
+        if isinstance(error, KeyboardInterrupt) or "KeyboardInterrupt" in str(error):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
 @contextlib.contextmanager
 def watched(last_words: Callable[[], str]) -> Iterator[Watch | None]:
     """Let Ctrl-C and SIGTERM end the process within seconds, whatever compiled code is running.
 
-    Both raise KeyboardInterrupt, unless `lfm_ppl.inference.interruption` takes them as a request.
+    Both raise KeyboardInterrupt, unless `lfm_ppl.inference.interruption` takes them as a request; so do errors that
+    libraries make of it.
 
     Args:
         last_words: what to say where the process has to be ended from outside.
@@ -100,6 +110,10 @@ def watched(last_words: Callable[[], str]) -> Iterator[Watch | None]:
     LISTENERS.append(watch.answered)
     try:
         yield watch
+    except Exception as error:
+        if _was_interrupt(error):
+            raise KeyboardInterrupt(f"interrupted; {last_words()}") from error
+        raise
     finally:
         LISTENERS.remove(watch.answered)
         signal.set_wakeup_fd(before)
