@@ -42,7 +42,9 @@ def test_fit_until_and_at_stores_predictions_with_their_noise(folder):
     times = found["time"].values
     assert {0.0, 5.0, 6.25, 8.0} <= set(times.tolist())
     assert found["y"].dims == ("chain", "draw", "time", "output")
-    np.testing.assert_allclose(found["y_sd"], 0.3)  # of the noise, along each path
+    np.testing.assert_allclose(found["y_sd"], np.hypot(0.3, found["outputs_sd"]))
+    assert (found["outputs_sd"].sel(time=2.0) > 0.05).all()  # of the smoother, given the parameters
+    assert (found["outputs_sd"].sel(time=[6.25, 8.0]) == 0).all()  # along each path, which is simulated there
     assert found["y"].values[0, :, -1].std() > found["outputs"].values[0, :, -1].std() > 0.3
     assert found.attrs["last_observation"] == 5.0
 
