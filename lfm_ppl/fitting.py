@@ -25,6 +25,7 @@ from lfm_ppl.filtering.breakdown import FilterWarning, breakdown
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference import sampling
 from lfm_ppl.inference.bound_model import BoundModel, bind
+from lfm_ppl.inference.interruption import was_interrupt
 from lfm_ppl.inference.kernels.options import check_options
 from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalRAM, Tuned
 from lfm_ppl.inference.kernels.ram import RAM
@@ -139,8 +140,9 @@ def fit(
         - ``log_likelihood``: the Gaussian filter's leave-one-out conditionals log p(y_k | y_-k, theta), which make
           ``az.loo`` right for dependent data;
         - ``one_step_ahead``: log p(y_k | y_1:k-1, theta) and standardised residuals;
-        - ``trajectories``: forces, states and noise-free outputs at ``at``, given the data; from the Gaussian smoother,
-          and for "pmmh" from the particle smoother;
+        - ``trajectories``: forces, states, deterministics of these and noise-free outputs at ``at``, given the data;
+          from the Gaussian smoother, and for "pmmh" from the particle smoother. Where densities are known, mean and 95%
+          interval of each, ``forces_summary`` and so on, and of new data, ``new_data_summary``;
         - ``posterior_predictive``: replicated data along these trajectories. (``numpyro.infer.Predictive`` with the
           same draws simulates NEW forces instead.)
         - ``predictions``: with ``at``, new observations at these times, with their noise; see `forecast`;
@@ -492,6 +494,8 @@ def kept(what: str, compute: Callable[[], Any], otherwise: Any) -> Any:
     try:
         return compute()
     except Exception as error:
+        if was_interrupt(error):
+            raise KeyboardInterrupt from error
         reason = f"{type(error).__name__}: {error}"
         warnings.warn(f"the {what} could not be computed and are left out of the result: {reason}", stacklevel=3)
         return otherwise

@@ -12,10 +12,11 @@ from lfm_ppl import checks
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.posterior import noise_of_rows, trajectories
 from lfm_ppl.inference.progress import Counter
+from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.particles.particle_filter import ParticleSettings
 from lfm_ppl.results import arviz_data, rebuilding
 from lfm_ppl.results.accuracy import evenly_spaced
-from lfm_ppl.results.predictions import GROUP, predictions
+from lfm_ppl.results.predictions import GROUP, HELD_OUT, predictions
 
 
 def forecast(result: Any, numpyro_model: Callable, times: Any, *, inputs: Mapping[str, Any] | None = None,
@@ -34,8 +35,9 @@ def forecast(result: Any, numpyro_model: Callable, times: Any, *, inputs: Mappin
     steps of `lfm_ppl.simulate`. The Gaussian moments that a filter would carry on keep mean and variance roughly right
     and the shape wrong: a state in a double well would be put between the wells, and a force with a softplus would push
     below zero. Errors of the shape grow with the horizon, where a filter is never corrected by data. For linear
-    dynamics the moments are exact, and the path is drawn from them; there, with a linear observation, y* given theta is
-    normal with moments that are stored, so that scores and bands need no draws of the noise.
+    dynamics the moments are exact, and the path is drawn from them. With a linear observation, y* given theta is normal
+    there, and up to the last observation of any model, with moments that are stored, so that scores and bands need no
+    draws of the noise.
 
     Args:
         result: of `lfm_ppl.fit`, or read by `lfm_ppl.load`.
@@ -51,8 +53,8 @@ def forecast(result: Any, numpyro_model: Callable, times: Any, *, inputs: Mappin
     Returns:
         A new ArviZ object: the groups of ``result`` and a group ``predictions`` with dimensions chain, draw, time and
         output: new observations under the name of the likelihood's site (``y``), with noise; ``y_mean`` and ``y_sd``,
-        their normal distribution at each draw; and ``outputs``, which are noise-free, ``forces`` and ``states`` along
-        the same paths. `lfm_ppl.score` compares them with data, `lfm_ppl.plot_fit` draws them.
+        their normal distribution at each draw; and ``outputs``, which are noise-free, ``forces``, ``states`` and
+        ``deterministics`` along the same paths. `lfm_ppl.score` compares them with data, `lfm_ppl.plot_fit` draws them.
 
     Raises:
         ValueError: times that go back or lie before the initial time; another model than that of the result, seen by
@@ -94,14 +96,19 @@ def forecast(result: Any, numpyro_model: Callable, times: Any, *, inputs: Mappin
     if str(attrs.get("sampler", "")).startswith("pmmh") and "particles" in attrs:
         settings = ParticleSettings(int(attrs["particles"]))
     counter = Counter("forecast", shown=progress)
-    paths = trajectories(jax.random.key(seed), bound, problem.at(rows).draws, times, settings, log_likelihood=True,
-                         show=counter)
-    counter.close()
+    # That of an observation family, by its sites, depends on the times of the forecast in its last digits.
+    known = not isinstance(bound.site.example.ssm.model.observation, ObservationFamily)
+    try:
+        paths = trajectories(jax.random.key(seed), bound, problem.at(rows).draws, times, settings,
+                             log_likelihood=known, show=counter)
+    finally:
+        counter.close()
     split = {name: value.reshape(chains, len(chosen), *value.shape[1:]) for name, value in paths.items()}
     if "log_likelihood" in split:
         total = split["log_likelihood"].reshape(chains, len(chosen), -1).sum(axis=-1)
         rebuilding.check_likelihood(result, total, chosen)
-    groups = {name: arviz_data.group(result, name) for name in arviz_data.groups(result)}
+    # Data that an earlier forecast was compared with are not those of this one.
+    groups = {name: arviz_data.group(result, name) for name in arviz_data.groups(result) if name != HELD_OUT}
     labels = posterior["draw"].values[chosen] if "draw" in posterior.coords else chosen
     observed = groups["observed_data"]
     names = {name: observed[name].values.tolist() for name in ("output", "series") if name in observed.coords}

@@ -412,8 +412,9 @@ def test_an_error_that_a_library_makes_of_an_interruption_is_one():
     with pytest.raises(KeyboardInterrupt, match="interrupted; it is safe"), watched(lambda: "it is safe"):
         raise ValueError("Cache keys should be comparable using __eq__. Traceback: sharding.py, line 154, "
                          "KeyboardInterrupt:")
+    own = ValueError("an error of its own")
     with pytest.raises(ValueError, match="an error of its own"), watched(lambda: "it is safe"):
-        raise ValueError("an error of its own")
+        raise own from own  # a ring
 
 
 def test_the_process_ends_though_the_interruption_is_swallowed():

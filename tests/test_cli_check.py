@@ -110,8 +110,12 @@ def test_new_chains_follow_a_check_that_asked_for_them(run, fitted, monkeypatch)
     monkeypatch.setattr("lfm_ppl.cli.check._checked", lambda *rest: pytest.fail("checked again"))
     code, out, err = run(f"check {fitted} --correct")
     assert code == 0, err
-    assert "checked  before: k = 0.90 is not below" in out and asked[0].k == 0.9
+    assert "checked  before: k = 0.9 is not below" in out and asked[0].k == 0.9
     assert (fitted / "accuracy.csv").stat().st_mtime_ns == table
+    other = fitted.parent / "other.py"
+    other.write_text(WELL.replace("depth * (x - x**3)", "depth * (x - 1.1 * x**3)"))
+    code, _, err = run(f"check {fitted} --correct --model {other} --overwrite")
+    assert code == 2 and "gives other log likelihoods than the result records" in err
 
 
 @pytest.mark.slow

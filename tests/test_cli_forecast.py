@@ -75,6 +75,8 @@ def test_forecast_of_a_stored_result_writes_table_figure_group_and_scores(result
     np.testing.assert_allclose(scores.to_numpy(float), expected.to_numpy(float))
     assert scores.loc["x", "n"] == 2
     assert len(arviz_data.group(arviz_data.load(result), "predictions")["time"]) > 200  # what was there is kept
+    assert run(f"forecast {ahead} --until 8 --draws 30 --overwrite", capsys)[0] == 0
+    assert "held_out_data" not in arviz_data.groups(arviz_data.load(ahead))
 
 
 def test_a_forecast_of_a_partial_result_has_its_figure(result, capsys):

@@ -78,7 +78,8 @@ def run(arguments: argparse.Namespace) -> int:
                 print(f"\n{report.text(command=False)}\n")
                 status = _write(report, task.posterior, path, page.command_line(arguments))
             else:
-                print(f"checked  before: k = {report.k:.2f} is not below {report.threshold:.2f}, so that no weights of "
+                _refuse_other(task)
+                print(f"checked  before: k = {report.k:.4g} is not below {report.threshold:.4g}, so that no weights of "
                       "draws can correct this posterior (--draws N checks again)")
                 status = 0
             if folder is not None and report.exact:
@@ -113,7 +114,20 @@ def _settled(posterior: Any, arguments: argparse.Namespace) -> Any:
     if not arguments.correct or asked_anew or not arviz_data.has_group(posterior, GROUP):
         return None
     report = AccuracyReport.of(posterior)
-    return report if not report.reliable and report.verdict.command == CORRECT else None
+    return report if not report.reliable and report.verdict.command.startswith(CORRECT) else None
+
+
+def _refuse_other(task: Check) -> None:
+    """Raise ValueError where the model gives other log likelihoods than the result records, at a draw of each chain."""
+    from lfm_ppl.results import arviz_data, likelihoods, rebuilding
+    from lfm_ppl.results.accuracy import evenly_spaced
+
+    posterior = arviz_data.group(task.posterior, "posterior")
+    chains = posterior.sizes["chain"]
+    chosen, rows = evenly_spaced(chains, posterior.sizes["draw"], 1)
+    problem = rebuilding.problem(task.posterior, task.model, model_kwargs=task.keywords).at(rows)
+    found = likelihoods.recorded(problem, likelihoods.gaussian(problem))
+    rebuilding.check_likelihood(task.posterior, found.reshape(chains, len(chosen)), chosen)
 
 
 def _again(arguments: argparse.Namespace) -> str:

@@ -158,9 +158,9 @@ def _write(forecast: Any, score: Callable, held_out: data.Data | None, path: Pat
     if not arguments.out:
         # The file again, not what was read before the computation: somebody may have added to it.
         whole = arviz_data.load(path)
-        for name in (GROUP, HELD_OUT):
-            if arviz_data.has_group(forecast, name):
-                whole = arviz_data.add_group(whole, name, arviz_data.group(forecast, name))
+        whole = arviz_data.remove_group(arviz_data.add_group(whole, GROUP, group), HELD_OUT)
+        if arviz_data.has_group(forecast, HELD_OUT):
+            whole = arviz_data.add_group(whole, HELD_OUT, arviz_data.group(forecast, HELD_OUT))
     print(f"wrote    {arviz_data.save(whole, target, arguments.overwrite or not arguments.out)} (group {GROUP})")
     table = summary(group)
     print(f"wrote    {tables.write_csv(table, folder / TABLE, arguments.overwrite, index_label='time')}")

@@ -10,7 +10,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 
-from lfm_ppl.inference.interruption import LISTENERS
+from lfm_ppl.inference.interruption import LISTENERS, was_interrupt
 
 INTERRUPTED = 130
 """Exit status of a program that a signal has ended (128 + SIGINT)."""
@@ -76,15 +76,6 @@ class Watch:
             os._exit(INTERRUPTED)
 
 
-def _was_interrupt(error: BaseException | None) -> bool:
-    """Whether an error is what a library made of Ctrl-C, as JAX does where two keys of a cache are compared."""
-    while error is not None:
-        if isinstance(error, KeyboardInterrupt) or "KeyboardInterrupt" in str(error):
-            return True
-        error = error.__cause__ or error.__context__
-    return False
-
-
 @contextlib.contextmanager
 def watched(last_words: Callable[[], str]) -> Iterator[Watch | None]:
     """Let Ctrl-C and SIGTERM end the process within seconds, whatever compiled code is running.
@@ -111,7 +102,7 @@ def watched(last_words: Callable[[], str]) -> Iterator[Watch | None]:
     try:
         yield watch
     except Exception as error:
-        if _was_interrupt(error):
+        if was_interrupt(error):
             raise KeyboardInterrupt(f"interrupted; {last_words()}") from error
         raise
     finally:

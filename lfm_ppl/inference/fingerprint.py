@@ -157,15 +157,17 @@ class _ingredients(LikelihoodHandler):  # noqa: N801 (an effect handler, named a
         self.times.append(likelihood.times)
         self.values += eqx.filter(jax.tree_util.tree_leaves((likelihood, one.rule)), eqx.is_array_like) + [
             ssm.drift(w, t), ssm.dispersion(w, t), ssm.observe(w, t), ssm.obs_cov(w, t, 0), ssm.input_map(t),
-            ssm.deterministics(w, t), ssm.initial(), ssm.stack.feedback(), ssm.stack.dispersion(),
-            ssm.stack.jump_table()]
+            ssm.initial(), ssm.stack.feedback(), ssm.stack.dispersion(), ssm.stack.jump_table()]
+        if model.deterministic_names:
+            self.values.append(ssm.deterministics(w, t))
+            self.settings.append(str(model.deterministic_names))
         if isinstance(model.observation, ObservationFamily):
             f = ssm.observe(w, t)
             self.values.append(model.observation.at(0).log_prob(f, f))
         self.settings.append(str((
             one.rule, one.steps, one.max_step, one.iterations, one.damping, one.tolerance, one.sites, model.state_names,
-            model.output_names, model.force_names, model.deterministic_names, model.units, model.nonlinear_inputs,
-            model.observation.angular, ssm.stack.jump_times, site["name"])))
+            model.output_names, model.force_names, model.units, model.nonlinear_inputs, model.observation.angular,
+            ssm.stack.jump_times, site["name"])))
         if one.constrained:
             problem = one.bounded()
             self.values.append(problem.boxes(*ssm.split(w), t))

@@ -54,3 +54,19 @@ class Interruption:
         for heard in LISTENERS:
             heard()
         print("\nstopping after this block of draws; once more to stop at once", file=sys.stderr, flush=True)
+
+
+def was_interrupt(error: BaseException | None) -> bool:
+    """Whether an error is Ctrl-C, or what a library made of it, as JAX does where two keys of a cache are compared.
+
+    Example:
+        >>> was_interrupt(KeyboardInterrupt()), was_interrupt(ValueError("x is negative"))
+        (True, False)
+    """
+    seen: set[int] = set()  # a chain of errors may be a ring
+    while error is not None and id(error) not in seen:
+        seen.add(id(error))
+        if isinstance(error, KeyboardInterrupt) or "KeyboardInterrupt" in str(error):
+            return True
+        error = error.__cause__ or error.__context__
+    return False

@@ -99,11 +99,12 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
         times; ``prediction`` (S, ..., K, D), new observations at the times of the trajectories. For Gaussian
         observations ``predictive_mean`` and ``predictive_sd`` (S, ..., K, D), the normal distribution of each given the
         parameters (where the observation is linear, up to the last one) or given the path, so that the mixture over the
-        draws is the predictive density, and ``output_sd`` (S, ..., K, D), the sd without the noise. The last four are
-        left out where the covariance of the noise belongs to the rows of the data. From the Gaussian smoother
-        ``state_mean``, ``state_sd``, ``force_mean`` and ``force_sd``, the normal distribution that the path is drawn
-        from, with the path itself and zero where it is simulated; ``deterministic_points`` and ``output_points`` (S,
-        ..., P, K, size), where these functions are not linear, at points of that distribution.
+        draws is the predictive density, and ``output_sd`` (S, ..., K, D), the sd without the noise. ``prediction`` and
+        ``predictive_sd`` are left out where the covariance of the noise belongs to the rows of the data. From the
+        Gaussian smoother ``state_mean``, ``state_sd``, ``force_mean`` and ``force_sd``, the normal distribution that
+        the path is drawn from, with the path itself and zero where it is simulated; ``deterministic_points``,
+        ``output_points`` and ``noise_sd_points`` (S, ..., P, K, size), where these functions are not linear, at points
+        of that distribution.
     """
     at = None if at is None else np.asarray(at, float)
     if at is not None and bound.times.ndim == 1 and np.array_equal(at, bound.times):
@@ -131,7 +132,8 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
                 states = _onwards(distribution, states, when, drawn[:, 0], plan, jax.random.fold_in(path_key, 1))
             w = jax.vmap(ssm.inputs)(states, when)
             found = _moments(ssm, smoothed, w, drawn, plan)
-            found |= _points(ssm, smoothed, w, drawn, plan, jax.random.fold_in(path_key, 2))
+            gaussian = not (isinstance(ssm.model.observation, ObservationFamily) or noise_of_rows(distribution))
+            found |= _points(ssm, smoothed, w, drawn, plan, jax.random.fold_in(path_key, 2), gaussian)
             found |= {"log_likelihood": smoothed.log_likelihood.sum()} if log_likelihood else {}
         else:
             smoothed = None
@@ -149,22 +151,23 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
         replicated = with_noise(noise_key, output[data], covariance)
         size = ssm.physical_dim
         found |= {"state": w[there, :size], "force": w[there, size:], "output": output[there], "y": replicated}
-        if at is not None and noise_of_rows(distribution):
-            return found
-        prediction = replicated
-        if at is not None:
-            covariance = jax.vmap(ssm.obs_cov)(w[there], when[there], jnp.zeros(len(there), int))
-            prediction = with_noise(jax.random.fold_in(noise_key, 1), output[there], covariance)
-        mean, noise = output[there], jnp.diagonal(covariance, axis1=1, axis2=2)
-        variance = jnp.zeros_like(noise)
+        mean = output[there]
+        variance = jnp.zeros_like(mean)
         if smoothed is not None and _normal_outputs(ssm):
             # The normal distribution of y given the parameters, instead of given a path: sharper by a lot.
             matrix = jax.vmap(jax.jacfwd(ssm.observe))(smoothed.input_mean[there], when[there])
             spread = jnp.einsum("kdi,kij,kdj->kd", matrix, smoothed.input_covariance[there], matrix)
             mean = jnp.where(drawn[there], jax.vmap(ssm.observe)(smoothed.input_mean[there], when[there]), mean)
             variance = jnp.where(drawn[there], jnp.maximum(spread, 0.0), 0.0)
-        return found | {"prediction": prediction, "predictive_mean": mean, "predictive_sd": jnp.sqrt(variance + noise),
-                        "output_sd": jnp.sqrt(variance)}
+        found |= {"predictive_mean": mean, "output_sd": jnp.sqrt(variance)}
+        if at is not None and noise_of_rows(distribution):
+            return found
+        prediction = replicated
+        if at is not None:
+            covariance = jax.vmap(ssm.obs_cov)(w[there], when[there], jnp.zeros(len(there), int))
+            prediction = with_noise(jax.random.fold_in(noise_key, 1), output[there], covariance)
+        noise = jnp.diagonal(covariance, axis1=1, axis2=2)
+        return found | {"prediction": prediction, "predictive_sd": jnp.sqrt(variance + noise)}
 
     def per_draw(values: Any, key: jax.Array, y: Any) -> dict[str, jax.Array]:
         distribution = bound.likelihood(values, y)
@@ -268,11 +271,11 @@ def _moments(ssm: StateSpaceModel, smoothed: SmootherResult, w: jax.Array, drawn
 
 
 def _points(ssm: StateSpaceModel, smoothed: SmootherResult, w: jax.Array, drawn: jax.Array, plan: _Plan,
-            key: jax.Array) -> dict[str, jax.Array]:
+            key: jax.Array, with_noise: bool) -> dict[str, jax.Array]:
     """Return functions of state and forces that are not linear, (P, K, ...), at points of their normal distribution.
 
     A point is the same one, in units of the distribution, at all times, so that it moves as smoothly as they do. Where
-    a path is simulated, all are the path.
+    a path is simulated, all are the path. ``with_noise`` asks for the sds of a Gaussian observation's noise, too.
     """
     nonlinear = isinstance(ssm.model.observation, ObservationFamily) or not _normal_outputs(ssm)
     if not (nonlinear or ssm.model.deterministic_names):
@@ -286,6 +289,9 @@ def _points(ssm: StateSpaceModel, smoothed: SmootherResult, w: jax.Array, drawn:
     if nonlinear:
         expected = jax.vmap(lambda one, t: expected_observation(ssm, one, t))
         found["output_points"] = jax.vmap(lambda w: expected(w, times))(points)
+    if nonlinear and with_noise:
+        noise = jax.vmap(lambda one, t: jnp.diagonal(ssm.obs_cov(one, t, 0)))
+        found["noise_sd_points"] = jnp.sqrt(jax.vmap(lambda w: noise(w, times))(points))
     return found
 
 

@@ -18,7 +18,7 @@ from numpyro.infer.util import ParamInfo
 from lfm_ppl import checks
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.fingerprint import signature
-from lfm_ppl.inference.interruption import Interruption
+from lfm_ppl.inference.interruption import Interruption, was_interrupt
 from lfm_ppl.inference.kernels import robust_metropolis
 from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalRAM, ParticleMarginalState
 from lfm_ppl.inference.kernels.ram import RAM
@@ -251,8 +251,8 @@ def sample(key: jax.Array, bound: BoundModel, transition: Transition, starts: np
                     on_disk = upper
                 shown.advance(upper, lambda: Stage(  # noqa: B023 (called at once)
                     drawn(upper), samples, _divergences(store, drawn(upper)), transition.describe(state)))  # noqa: B023
-        except KeyboardInterrupt:
-            if stop.requests > 1:
+        except (KeyboardInterrupt, Exception) as error:
+            if stop.requests > 1 or not was_interrupt(error):
                 raise
         if on_disk < now[-1]:
             keep(*now)

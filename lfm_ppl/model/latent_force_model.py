@@ -116,7 +116,8 @@ class LatentForceModel(eqx.Module):
             checks.one_of("name in nonlinear_inputs", name, (*self.state_names, *self.force_names))
         self._reads_inputs = any(reads_inputs(function) for function in functions.values())
         self._check_precision()
-        if self.initial_time is not None or not any(function.depends_on_time for function in functions.values()):
+        if self.initial_time is not None or not any(
+                function.depends_on_time for name, function in functions.items() if not name.startswith("determin")):
             self._check_finite(self.initial_time)
 
     @property
@@ -162,13 +163,7 @@ class LatentForceModel(eqx.Module):
         if callable(self.observation.covariance):
             functions["covariance"] = trace("the observation covariance", "(x, u, t)", self.observation.covariance,
                                             *arguments)
-        for name, function in self.deterministics.items():
-            label = f"the deterministic {name!r}"
-            functions[label] = trace(label, "(x, u, t)", function, *arguments)
-            if getattr(functions[label].shape, "shape", None) != ():
-                found = getattr(functions[label].shape, "shape", functions[label].shape)
-                raise ValueError(f"{label} must return one number, shape (); it returned {found}. The entry of a "
-                                 "vector is x[0], u[0].")
+        functions |= {f"deterministic {name}": found for name, found in self._traced_deterministics(arguments).items()}
         for function in functions.values():
             function.check_indices(("x", "u"))
         for name, force in self.forces.items():
@@ -176,6 +171,17 @@ class LatentForceModel(eqx.Module):
                 functions[f"mean of {name}"] = trace(f"the mean of the force {name!r}", "(t)", force.mean_at,
                                                      arguments[-1])
         return functions
+
+    def _traced_deterministics(self, arguments: tuple) -> dict[str, Traced]:
+        found = {}
+        for name, function in self.deterministics.items():
+            label = f"the deterministic {name!r}"
+            found[name] = trace(label, "(x, u, t)", function, *arguments)
+            shape = getattr(found[name].shape, "shape", found[name].shape)
+            if shape != ():
+                raise ValueError(f"{label} must return one number, shape (); it returned {shape}. The entry of a "
+                                 "vector is x[0], u[0].")
+        return found
 
     def _traced_observation(self, arguments: tuple) -> Traced:
         traced = trace("the observation function", "h(x, u, t)", self.observation.function, *arguments)

@@ -121,6 +121,13 @@ def add_group(result: Any, name: str, dataset: xr.Dataset) -> Any:
     return result
 
 
+def remove_group(result: Any, name: str) -> Any:
+    """Take the group ``name`` out of ``result``, which is changed in place, if it is there; return ``result``."""
+    if has_group(result, name):
+        del result[name]
+    return result
+
+
 def attributes(result: Any) -> dict[str, Any]:
     """Return the attributes of ``result`` as a whole: model, rule, seed, versions..."""
     return dict(result.attrs)

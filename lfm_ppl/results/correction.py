@@ -19,7 +19,7 @@ from lfm_ppl.results.report import AccuracyReport
 
 _KEPT = ("observed_data", "truth")
 _DRAWN = ("trajectories", "posterior_predictive")
-_KINDS = {"states": "state", "forces": "force", "outputs": "output", "deterministics": "deterministic"}
+_KINDS = {"states": "state", "forces": "force", "outputs": "output"}
 
 
 def correct_posterior(result: Any, numpyro_model: Callable, times: Any = None, y: Any = None, *,
@@ -94,11 +94,18 @@ def _paths(result: Any, numpyro_model: Callable, times: Any, y: Any, model_kwarg
     for name, old in templates.items():
         variables = {}
         for label, variable in old.data_vars.items():
-            if "draw" not in variable.dims:  # a summary, made anew below
+            if "draw" not in variable.dims or label == "deterministics":  # made anew below
                 continue
             kind = _KINDS[str(label)] if name == "trajectories" else "y"
             variables[label] = (variable.transpose("chain", "draw", ...).dims, found[kind], variable.attrs)
         coords = {key: value for key, value in old.coords.items() if key not in ("chain", "draw", "statistic")}
         groups[name] = xr.Dataset(variables, coords | {"chain": np.arange(picked.shape[0]), "draw": chosen})
-    groups["trajectories"] = with_summaries(groups["trajectories"], found, problem.bound.site.name)
+    # The model may have other deterministics than when it was fitted.
+    names, new = list(problem.bound.site.example.ssm.model.deterministic_names), groups["trajectories"]
+    new = new.drop_vars("deterministic", errors="ignore")
+    if names:
+        dims = [*new["outputs"].dims[:-1], "deterministic"]
+        attrs = template["deterministics"].attrs if "deterministics" in template else {}
+        new = new.assign(deterministics=(dims, found["deterministic"], attrs)).assign_coords(deterministic=names)
+    groups["trajectories"] = with_summaries(new, found)
     return groups

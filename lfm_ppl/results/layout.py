@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
@@ -167,7 +168,7 @@ def lay_out(bound: BoundModel, draws: dict, stats: dict, rated: dict | None, pat
             {f"{kind}s": variable((*place, kind), paths[kind], named[kind]) for kind in named if paths[kind].shape[-1]},
             {**thinned, **at, **which, **{kind: named[kind] for kind in named if named[kind]}})
         groups["trajectories"]["outputs"].attrs["long_name"] = NOISE_FREE
-        groups["trajectories"] = with_summaries(groups["trajectories"], paths, site.name)
+        groups["trajectories"] = with_summaries(groups["trajectories"], paths)
         if "prediction" in paths and grid is not None:
             groups[GROUP] = predictions(bound, paths, chosen, grid, labels.coords)
     if truth:
@@ -178,7 +179,7 @@ def lay_out(bound: BoundModel, draws: dict, stats: dict, rated: dict | None, pat
     return groups
 
 
-def with_summaries(trajectories: xr.Dataset, paths: Mapping[str, np.ndarray], observed: str) -> xr.Dataset:
+def with_summaries(trajectories: xr.Dataset, paths: Mapping[str, np.ndarray]) -> xr.Dataset:
     """Return trajectories with the mean and the 95% interval at each time, where their density is known.
 
     That is a mixture of normal distributions, one for each draw of the parameters. The quantiles of a mixture are
@@ -188,37 +189,39 @@ def with_summaries(trajectories: xr.Dataset, paths: Mapping[str, np.ndarray], ob
     Args:
         trajectories: draws of states, forces and outputs, (chain, draw, ..., at, kind).
         paths: `lfm_ppl.inference.posterior.trajectories`, (C, S, ..., K, size).
-        observed: name of the observed site.
 
     Returns:
         Variables ``states_summary``, ``forces_summary``, ``deterministics_summary``, ``outputs_summary``
-        (noise-free), and one of new data with their noise, named after the site, are added, with the dimension
-        ``statistic``: mean, q2.5, q97.5.
+        (noise-free) and ``new_data_summary`` (with the noise) are added, with the dimension ``statistic``: mean, q2.5,
+        q97.5. Those of which nothing but draws is known are left out.
     """
-    moments = {"states": ("state_mean", "state_sd"), "forces": ("force_mean", "force_sd"),
-               "outputs": ("predictive_mean", "output_sd"), observed: ("predictive_mean", "predictive_sd")}
     found = {}
-    for name, (mean, sd) in moments.items():
-        like = trajectories.get(name, trajectories["outputs"])
-        if mean not in paths or paths[mean].shape[-1] == 0 or not np.any(paths[sd] > 0):
+    for name, (mean, sd) in {"states": ("state_mean", "state_sd"), "forces": ("force_mean", "force_sd"),
+                             "deterministics": ("deterministic_points", None),
+                             "outputs": ("predictive_mean", "output_sd"),
+                             "new_data": ("predictive_mean", "predictive_sd")}.items():
+        if "output_points" in paths and mean == "predictive_mean":
+            mean, sd = "output_points", None if name == "outputs" else "noise_sd_points"
+        if mean not in paths or paths[mean].shape[-1] == 0 or (sd is not None and not np.any(paths.get(sd, 0.0) > 0)):
             continue
-        means, sds = (paths[label].reshape(-1, *paths[label].shape[2:]) for label in (mean, sd))
-        values = np.concatenate([means.mean(axis=0)[None], mixture_quantiles(means, sds, INTERVAL, _TOLERANCE)])
+        like = trajectories["outputs" if name == "new_data" else name]
         dims = [dim for dim in like.dims if dim not in ("chain", "draw")]
-        found[f"{name}_summary"] = (("statistic", *dims), values, like.attrs)
-    for kind in ("output", "deterministic"):
-        if f"{kind}_points" not in paths or (points := paths[f"{kind}_points"]).shape[-1] == 0:
-            continue
-        like = trajectories[f"{kind}s"]
-        dims = [dim for dim in like.dims if dim not in ("chain", "draw")]
-        flat = np.moveaxis(points, -3, 2).reshape(-1, *(like.sizes[dim] for dim in dims))
-        values = np.concatenate([flat.mean(axis=0)[None], np.quantile(flat, INTERVAL, axis=0)])
-        found[f"{kind}s_summary"] = (("statistic", *dims), values, like.attrs)
+        shape = tuple(like.sizes[dim] for dim in dims)
+
+        def flat(label: str, shape: tuple[int, ...] = shape) -> np.ndarray:
+            values = paths[label]  # the axis of the points, if there is one, beside those of the draws
+            return (np.moveaxis(values, -3, 2) if label.endswith("_points") else values).reshape(-1, *shape)
+
+        means = flat(mean)
+        ends = (np.quantile(means, INTERVAL, axis=0) if sd is None
+                else mixture_quantiles(means, flat(sd), INTERVAL, _TOLERANCE))
+        attrs = {"units": like.attrs["units"]} if "units" in like.attrs else {}
+        found[f"{name}_summary"] = (("statistic", *dims), np.concatenate([means.mean(axis=0)[None], ends]), attrs)
     return trajectories.assign(found).assign_coords(statistic=list(STATISTICS)) if found else trajectories
 
 
 _TOLERANCE = 1e-4
-"""Of the ends of an interval, as a share of their range over the draws: far below what the draws leave open."""
+"""Of the ends of an interval, as a share of the usual spread of a draw: far below what the draws leave open."""
 
 STATISTICS = ("mean", "q2.5", "q97.5")
 """What a summary of trajectories has at each time."""
@@ -267,13 +270,15 @@ def _true_functions(bound: BoundModel, truth: Mapping[str, Any],
         values = {name: np.broadcast_to(np.asarray(parameters[name], float), draws[name].shape[2:])
                   for name in bound.sites}
         ssm = bound.likelihood(values).ssm
-        w = np.column_stack(parts)
-        found = {OUTPUT: jax.vmap(lambda one, t: expected_observation(ssm, one, t))(w, times)}
-        if model.deterministic_names:
-            found["deterministic"] = jax.vmap(ssm.deterministics)(w, times)
-        return {kind: np.asarray(values) for kind, values in found.items()}
+        w = jnp.asarray(np.column_stack(parts))
+        found = {OUTPUT: np.asarray(jax.vmap(lambda one, t: expected_observation(ssm, one, t))(w, times))}
     except Exception:
         return {}
+    try:
+        more = {"deterministic": np.asarray(jax.vmap(ssm.deterministics)(w, times))}
+    except Exception:
+        return found
+    return found | (more if model.deterministic_names else {})
 
 
 def _held_elsewhere(draws: np.ndarray, truth: Any) -> bool:

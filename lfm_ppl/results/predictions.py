@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -176,16 +175,24 @@ def mixture_quantiles(mean: np.ndarray, sd: np.ndarray, p: Any, tolerance: float
         mean: of the parts.
         sd: of the parts; those with zero are draws.
         p: (Q,) probabilities.
-        tolerance: of a quantile, as a share of the distance between the lowest and the highest one of the parts.
+        tolerance: of a quantile, as a share of the usual spread, that of the median sd and of half of the means.
     """
     found = []
+    low, high = np.quantile(mean, (0.25, 0.75), axis=0)
+    spread = np.median(sd, axis=0) + high - low
     with np.errstate(divide="ignore", invalid="ignore"):
         for one in np.atleast_1d(np.asarray(p, float)):
             ends = mean + sd * special.ndtri(one)  # the quantile of the mixture lies between those of its parts
             low, high = ends.min(axis=0), ends.max(axis=0)
-            for _ in range(math.ceil(-math.log2(tolerance))):
+            limit = tolerance * np.where(spread > 0, spread, high - low)
+            for _ in range(_MOST_HALVINGS):
+                if not np.any(high - low > limit):
+                    break
                 middle = 0.5 * (low + high)
                 share = np.where(sd > 0, special.ndtr((middle - mean) / sd), middle >= mean).mean(axis=0)
                 low, high = np.where(share < one, middle, low), np.where(share < one, high, middle)
             found.append(0.5 * (low + high))
     return np.array(found)
+
+
+_MOST_HALVINGS = 100

@@ -313,6 +313,7 @@ def test_correction_keeps_data_truth_and_the_layout_of_trajectories(checked):
     np.testing.assert_array_equal(new["at"], old["at"])
     assert arviz_data.group(corrected, "posterior_predictive")["y"].shape == (1, 6, 6, 1)
     assert {"observed_data", "truth"} <= set(arviz_data.groups(corrected))
+    assert "states_summary" in new  # of the corrected draws, where the result has none
 
 
 @pytest.mark.slow

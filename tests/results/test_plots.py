@@ -188,7 +188,7 @@ def test_bands_are_those_of_the_summary_where_there_is_one(datasets):
 def test_new_data_have_their_band_at_all_times_where_their_density_is_known(datasets):
     paths = datasets["trajectories"]
     ends = np.stack([np.full((paths.sizes["at"], 3), value) for value in (0.5, -1.0, 2.0)])
-    datasets["trajectories"] = paths.assign(y_summary=(("statistic", "at", "output"), ends))
+    datasets["trajectories"] = paths.assign(new_data_summary=(("statistic", "at", "output"), ends))
     outer, _ = bands(plot_fit(arviz_data.build(datasets)).axes[0])
     assert set(edges(outer)) == set(paths["at"].values)
     assert set(map(tuple, map(sorted, edges(outer).values()))) == {(-1.0, 2.0)}

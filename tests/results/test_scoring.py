@@ -7,6 +7,7 @@ from scipy import integrate, stats
 
 import lfm_ppl as lfm
 from lfm_ppl.results import scoring
+from lfm_ppl.results.layout import with_summaries
 from lfm_ppl.results.predictions import mixture_quantiles
 
 RNG = np.random.default_rng(4)
@@ -70,6 +71,30 @@ def test_scores_of_a_mixture():
     inside = np.where(np.isnan(y), np.nan, (low <= y) & (y <= high))
     np.testing.assert_allclose(lfm.score(dataset, y, level=0.5)["coverage_50"],
                                [np.nanmean(inside[:, 0]), inside[:, 1].mean(), np.nanmean(inside)])
+
+
+def test_quantiles_of_a_mixture_with_one_part_far_away():
+    mean, sd = np.zeros((400, 1)), np.full((400, 1), 0.01)
+    sd[0] = 1000.0
+    (found,) = mixture_quantiles(mean, sd, 0.025, 1e-4)[0]
+    np.testing.assert_allclose(stats.norm.cdf(found, mean, sd).mean(), 0.025, atol=1e-5)
+
+
+def test_summaries_of_a_panel_with_normal_parts_and_with_points():
+    rng = np.random.default_rng(1)
+    lead, where = (2, 3, 4), (5,)  # chains, draws, series; times
+    mean, sd, points = rng.normal(size=(*lead, *where, 2)), rng.uniform(0.5, 1.0, (*lead, *where, 2)), rng.normal(
+        size=(*lead, 8, *where, 1))
+    dims = ("chain", "draw", "series", "at")
+    paths = xr.Dataset({"states": ((*dims, "state"), mean), "outputs": ((*dims, "output"), points[..., 0, :, :])})
+    found = with_summaries(paths, {"state_mean": mean, "state_sd": sd, "output_points": points})
+    assert found["states_summary"].dims == ("statistic", "series", "at", "state")
+    high = found["states_summary"].sel(statistic="q97.5").values
+    np.testing.assert_allclose(stats.norm.cdf(high, mean, sd).mean(axis=(0, 1)), 0.975, atol=1e-5)
+    low = np.quantile(points, 0.025, axis=(0, 1, 3))
+    np.testing.assert_allclose(found["outputs_summary"].sel(statistic="q2.5"), low, rtol=1e-12)
+    np.testing.assert_allclose(found["outputs_summary"].sel(statistic="mean"), points.mean(axis=(0, 1, 3)), rtol=1e-12)
+    assert "new_data_summary" not in found and "forces_summary" not in found
 
 
 def test_draws_alone_have_no_log_score():

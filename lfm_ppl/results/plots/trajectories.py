@@ -40,10 +40,10 @@ def plot_fit(
 
     The inner band holds 95% of the noise-free output, the outer one 95% of new measurements. Where the
     result has predictions, both go on after the last observation, which a dotted line marks, and the outer
-    band is theirs; forecasts at fewer than 12 times are drawn as bars. Without them the outer band ends with
-    the data. It is exact at the measurement times; between them it is the inner band widened by the
-    difference of the two, interpolated linearly. Replicates are pooled. Of simulated data the noise-free truth is
-    drawn, too.
+    band is theirs; forecasts at fewer than 12 times are drawn as bars. Bands are those of the summaries that the
+    trajectories hold; where they hold draws alone, they are quantiles of these, and the outer one ends with the data:
+    it is exact at the measurement times, and between them the inner one widened by the difference of the two,
+    interpolated linearly. Replicates are pooled. Of simulated data the noise-free truth is drawn, too.
 
     Args:
         result: with the groups observed_data and trajectories, posterior_predictive for the outer band, predictions for
@@ -75,7 +75,8 @@ def plot_fit(
     predicted = _predicted(result)
     alone = predicted is not None and not has_group(result, "trajectories")
     noise_free = None if alone else _trajectories(result, "output")
-    new = None if noise_free is None else _summary(result, "y")
+    inner = None if noise_free is None else _summary(result, "outputs")
+    new = None if noise_free is None else _summary(result, "new_data")
     later = group(result, HELD_OUT)["y"] if has_group(result, HELD_OUT) else None
     truth = _true(result, "output")
     forecast = known = False
@@ -83,19 +84,22 @@ def plot_fit(
     figure, panels = style.small_multiples(width, len(names), 1.35)
     for axes, name in zip(panels, names, strict=True):
         data = observed.sel(output=name)
-        if predicted is not None and (noise_free is None or
-                                      _covers(predicted["time"].values, noise_free["at"].values)):
+        covered = predicted is not None and (noise_free is None or
+                                             _covers(predicted["time"].values, noise_free["at"].values))
+        if predicted is not None and covered and inner is None:
             _draw_forecast(axes, predicted.sel(output=[name]))
         else:
-            assert noise_free is not None
             time, mean, low, high = _band(result, "output", name)
-            if new is not None or predictive is not None:
-                outer = (_widened(predictive.sel(output=name), time, low, high) if new is None
-                         else (time, *new.sel(output=name).values[1:]))
+            if new is not None:
+                axes.fill_between(time, *new.sel(output=name).values[1:], color=_PREDICTIVE, lw=0, zorder=1)
+            elif predicted is not None and covered:
+                axes.fill_between(*_noisy_band(predicted.sel(output=[name])), color=_PREDICTIVE, lw=0, zorder=1)
+            elif predictive is not None:
+                outer = _widened(predictive.sel(output=name), time, low, high)
                 axes.fill_between(*outer, color=_PREDICTIVE, lw=0, zorder=1)
             axes.fill_between(time, low, high, color=_NOISE_FREE, lw=0, zorder=2)
             axes.plot(time, mean, color=style.BLUE, zorder=3)
-            if predicted is not None:
+            if predicted is not None and not covered:
                 _draw_forecast(axes, predicted.sel(output=[name]).isel(time=predicted["time"].values >= time[-1]))
         if predicted is not None:
             if forecast := _ends_before(predicted):
