@@ -131,7 +131,7 @@ class Bounded(NamedTuple):
         """Return log Z(y, c); by expectation propagation alone where ``draws`` is 0."""
         if not draws:
             return self.propagated(y).log_evidence
-        weights = self.log_weights(jax.random.key(0) if key is None else key, y, draws)
+        weights = self.log_weights(_key(key), y, draws)
         largest = jax.lax.stop_gradient(jnp.max(weights))
         safe = jnp.where(jnp.isfinite(largest), largest, 0.0)
         return jax.scipy.special.logsumexp(weights - safe) + safe - jnp.log(draws)
@@ -139,6 +139,28 @@ class Bounded(NamedTuple):
     def log_likelihood(self, y: jax.Array, draws: int, key: jax.Array | None = None) -> jax.Array:
         """Return log Z(y, c) - log Z(c), with the same random numbers in both."""
         return self.log_evidence(y, draws, key) - self.log_evidence(jnp.full_like(y, jnp.nan), draws, key)
+
+    def converged(self, y: jax.Array) -> jax.Array:
+        """Whether the sites converge, with the data and without them."""
+        return (self.propagated(y).refined.found.converged
+                & self.propagated(jnp.full_like(y, jnp.nan)).refined.found.converged)
+
+    def worth(self, y: jax.Array, draws: int, key: jax.Array | None = None) -> jax.Array:
+        """Return how many of the weighted trajectories count, with the data or without them, whichever is fewer."""
+        return jnp.minimum(*(effective_number(self.log_weights(_key(key), one, draws))
+                             for one in (y, jnp.full_like(y, jnp.nan))))
+
+
+def _key(key: jax.Array | None) -> jax.Array:
+    return jax.random.key(0) if key is None else key
+
+
+def effective_number(log_weights: jax.Array) -> jax.Array:
+    """Return (sum w)^2 / sum w^2 of weights (N,), zero where all are."""
+    largest = log_weights.max()
+    possible = jnp.isfinite(largest)
+    weights = jnp.where(possible, jnp.exp(log_weights - jnp.where(possible, largest, 0.0)), 1.0)
+    return jnp.where(possible, weights.sum() ** 2 / (weights**2).sum(), 0.0)
 
 
 def check_variances(model: LatentForceModel, count: int) -> jax.Array:
