@@ -278,7 +278,8 @@ def convergence_warnings(result: Any, table: pd.DataFrame | None = None) -> list
     """
     attrs = attributes(result)
     constrained, from_mode = "constraints" in attrs, attrs.get("sampler") == "map"
-    of_sites = convergence.of_sites(*json.loads(attrs.get(SITES, "[0, 0, 0]")), constrained, from_mode)
+    of_sites = convergence.of_sites(*json.loads(attrs.get(SITES, "[0, 0, 0]")), constrained=constrained,
+                                    from_mode=from_mode)
     of_sites += convergence.of_weights(*json.loads(attrs.get(WEIGHTS, "[0, 0, 0]")))
     if from_mode or "effective_draws" in attrs:
         return of_sites if from_mode else []

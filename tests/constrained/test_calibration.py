@@ -30,7 +30,7 @@ def genes(decay, lengthscale):
 
 def bounded(decay, lengthscale):
     """The factor cannot be negative."""
-    return lfm.MarginalLikelihood(genes(decay, lengthscale), TIMES, lower={"factor": 0.0}, grid=TIMES, draws=64)
+    return lfm.MarginalLikelihood(genes(decay, lengthscale), TIMES, lower={"factor": 0.0}, grid=TIMES, draws=32)
 
 
 def transcription(times, y=None):
@@ -70,8 +70,8 @@ def test_data_are_simulated_from_the_constrained_prior():
 
 @pytest.mark.slow
 def test_nuts_is_calibrated_over_100_data_sets(tmp_path):
-    found = calibration.calibrate(jax.random.key(5), transcription, TIMES, NUTS, data_sets=100, draws=31, thin=3,
-                                  warmup=150, batch=1, folder=tmp_path)
+    found = calibration.calibrate(jax.random.key(5), transcription, TIMES, NUTS, data_sets=100, draws=15, thin=3,
+                                  warmup=100, batch=1, folder=tmp_path)
     assert set(found.ranks) == {"lengthscale", "decay", "log likelihood"}
     values = {name: calibration.p_values(rank, found.draws, bins=8) for name, rank in found.ranks.items()}
     print(values)
