@@ -10,6 +10,7 @@ by importance sampling with trajectories that respect all constraints (`lfm_ppl.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -138,17 +139,21 @@ class Bounded(NamedTuple):
 
     def log_likelihood(self, y: jax.Array, draws: int, key: jax.Array | None = None) -> jax.Array:
         """Return log Z(y, c) - log Z(c), with the same random numbers in both."""
-        return self.log_evidence(y, draws, key) - self.log_evidence(jnp.full_like(y, jnp.nan), draws, key)
+        both = _with_and_without(lambda one: self.log_evidence(one, draws, key), y)
+        return both[0] - both[1]
 
     def converged(self, y: jax.Array) -> jax.Array:
         """Whether the sites converge, with the data and without them."""
-        return (self.propagated(y).refined.found.converged
-                & self.propagated(jnp.full_like(y, jnp.nan)).refined.found.converged)
+        return _with_and_without(lambda one: self.propagated(one).refined.found.converged, y).all()
 
     def worth(self, y: jax.Array, draws: int, key: jax.Array | None = None) -> jax.Array:
         """Return how many of the weighted trajectories count, with the data or without them, whichever is fewer."""
-        return jnp.minimum(*(effective_number(self.log_weights(_key(key), one, draws))
-                             for one in (y, jnp.full_like(y, jnp.nan))))
+        return _with_and_without(lambda one: effective_number(self.log_weights(_key(key), one, draws)), y).min()
+
+
+def _with_and_without(function: Callable[[jax.Array], jax.Array], y: jax.Array) -> jax.Array:
+    """Return ``function`` of the data and of none, compiled once, (2,)."""
+    return jax.vmap(function)(jnp.stack([y, jnp.full_like(y, jnp.nan)]))
 
 
 def _key(key: jax.Array | None) -> jax.Array:
