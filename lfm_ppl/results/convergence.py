@@ -70,7 +70,7 @@ def messages(summary: pd.DataFrame, chains: int, draws: int, divergences: int) -
     return found
 
 
-def of_sites(points: int, unconverged: int, impossible: int, constrained: bool = False,
+def of_sites(points: int, unconverged: int, impossible: int, *, constrained: bool = False,
              from_mode: bool = False) -> list[str]:
     """Return what to say where sites do not converge near the draws; nothing where they do.
 
