@@ -34,7 +34,7 @@ from lfm_ppl.inference.marginal_likelihood import Panel
 from lfm_ppl.inference.posterior import scores, trajectories
 from lfm_ppl.inference.progress import Counter
 from lfm_ppl.inference.sampling import Transition
-from lfm_ppl.inference.site_failures import site_failures
+from lfm_ppl.inference.site_failures import failures_at, paths_worth, site_failures
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results import checkpoint as checkpoints
 from lfm_ppl.results.checkpoint import Checkpoint
@@ -272,7 +272,7 @@ class _Asked(NamedTuple):
             "iterations": example.iterations, "tolerance": example.tolerance, "sampler": self.sampler,
             "seed": self.seed, "chains": self.chains, "warmup": self.warmup, "samples": self.samples,
             "fixed": json.dumps({k: np.asarray(v).tolist() for k, v in self.fixed.items()}),
-            **({"constraints": ", ".join(example.bounds)} if example.constrained else {}),
+            **({"constraints": example.constraints_in_words} if example.constrained else {}),
         }  # fmt: skip
 
     def record(self, bound: BoundModel, fingerprint: Any) -> dict[str, Any]:
@@ -380,15 +380,24 @@ class _Run:
         try:
             self.rated = kept("scores of the observations",
                               lambda: scores(self.bound, flat, **watched("scores")), None)
-            if asked.sampler in ("nuts", "ram") and (z := self.z) is not None:
-                failures = kept("convergence of the sites", lambda: site_failures(self.bound, z, asked.seed), None)
-                self.remarks |= {} if failures is None else {arviz_data.SITES: json.dumps(failures)}
+            self.remarks |= self._found_of_sites(flat)
             self.drawn = kept("trajectories", lambda: draw_paths(
                 asked.keys[3], self.bound, flat, asked.at, asked.trajectory_draws, asked.chains, asked.samples,
                 **{label: self.particles.get(label) for label in _OF_PARTICLES}, **watched("trajectories")), self.drawn)
             counter.close()
         except KeyboardInterrupt:
             self.partial = _BARE if self.rated is None else "all draws and their scores, without trajectories"
+
+    def _found_of_sites(self, flat: Mapping[str, Any]) -> dict[str, str]:
+        """Return attributes that say where sites do not converge, and what the weights of trajectories are worth."""
+        asked, found, z = self.asked, {}, self.z
+        if asked.sampler in ("nuts", "ram") and z is not None:
+            found[arviz_data.SITES] = kept("convergence of the sites",
+                                           lambda: site_failures(self.bound, z, asked.seed), None)
+        elif asked.sampler == "map" and self.bound.site.example.constrained:
+            found[arviz_data.SITES] = kept("convergence of the sites", lambda: failures_at(self.bound, flat), None)
+        found[arviz_data.WEIGHTS] = kept("weights under the constraints", lambda: paths_worth(self.bound, flat), None)
+        return {name: json.dumps(value) for name, value in found.items() if value is not None}
 
     def result(self, partial: str | None = None) -> Any:
         """Return an ArviZ object of what there is.

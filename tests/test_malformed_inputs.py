@@ -278,6 +278,26 @@ OPTIONS = {
                            ("unknown value of option kind 'strange'", "even, odd")),
 }
 
+BOUNDS = {
+    "no bound": Case("fit model.py --lower x0", ("--lower takes NAME=VALUE, got 'x0'",)),
+    "no value": Case("fit model.py --upper x0=", ("--upper takes NAME=",)),
+    "words": Case("fit model.py --lower x0=none", ("--lower takes NAME=NUMBER, got 'x0=none'",)),
+    "NaN": Case("fit model.py --lower x0=nan", ("lower['x0'] must be finite",)),
+    "infinite": Case("fit model.py --upper x0=inf", ("upper['x0'] must be finite", "Leave a quantity")),
+    "twice": Case("fit model.py --lower x0=0 --lower x0=1", ("--lower gives x0 two bounds, 0 and 1",)),
+    "no such name": Case("fit model.py --lower depth=0", ("unknown name in lower 'depth'", "x0")),
+    "nothing between": Case("fit model.py --lower x0=1 --upper x0=0",
+                            ("leave nothing between them: lower=1, upper=0",)),
+    "iterations": Case("fit model.py --lower x0=-3 --iterations 2", ("Leave iterations out",)),
+    "a tolerance": Case("fit model.py --lower x0=-3 --tolerance 0.1", ("tolerance is not to be had", "raise steps")),
+    "particles": Case("fit model.py --lower x0=-3 --sampler pmmh", ("--lower and --upper are for the samplers",)),
+    "rows of nothing": Case("fit model.py --grid 20", ("--grid says at how many times --lower and --upper hold",)),
+    **{f"rows: {value}": Case(f"fit model.py --lower x0=-3 --grid {value}", (
+        "--grid: expected a whole number of at least 2", repr(value))) for value in ("1", "0", "2.5", "many", "1e3")},
+    "many fits": Case("fit model.py --each --data d.csv --grid 20", ("--grid says at how many times",),
+                      {"d.csv": GOOD}),
+}
+
 RUN = '{"sampler": "nuts", "seed": 5}'
 RESULTS_OF_FIT = {
     "a file": Case("fit model.py --out out", ("out is a file; expected the name of a folder",), {"out": "keep"}),
@@ -575,9 +595,8 @@ OTHERS = {
     "version: of what": Case("version jax", ("unrecognized arguments", "jax")),
 }
 
-GROUPS = {"files": FILES, "columns": COLUMNS, "times": TIMES, "options": OPTIONS, "folders": RESULTS_OF_FIT,
-          "many": MANY,
-          "models": MODELS, "results": RESULTS, "other commands": OTHERS}
+GROUPS = {"files": FILES, "columns": COLUMNS, "times": TIMES, "options": OPTIONS, "bounds": BOUNDS,
+          "folders": RESULTS_OF_FIT, "many": MANY, "models": MODELS, "results": RESULTS, "other commands": OTHERS}
 CASES = {f"{group}: {name}": case for group, cases in GROUPS.items() for name, case in cases.items()}
 
 
@@ -714,6 +733,12 @@ CALLS = {
     "table: two dimensions": (lambda: lfm.read_table(xr.DataArray(np.ones((2, 2)), dims=("time", "gene"))),
                               ("time alone", "to_dataset")),
     "file: none": (lambda: lfm.read_csv("gone.csv"), ("gone.csv",)),
+    **{f"bounds: {grid!r} rows": (lambda grid=grid: lfm.MarginalLikelihood(linear(), T, lower={"x0": 0.0}, grid=grid),
+                                  words) for grid, words in (
+        (1, ("grid must be at least 2 rows", "got 1")), (-3, ("grid must be at least 1", "-3")),
+        (True, ("grid must be a whole number", "True")), ((0.0, 9.0, 2.0), ("grid must increase",)))},
+    "bounds: one row of an estimate": (lambda: lfm.full_information(linear(), T, Y, lower={"x0": 0.0}, grid=1),
+                                       ("grid must be at least 2 rows",)),
     "file: no name": (lambda: lfm.read_csv(""), ("the name of the data file is empty",)),
     "load: none": (lambda: lfm.load("gone"), ("there is no result gone",)),
     "load: no result": (lambda: lfm.load("model.py"), ("could not be read as a netCDF file",)),

@@ -374,6 +374,10 @@ def _add_approximation(group: Any) -> None:
                        help="lower bound of a state, force or output, such as \"transcription factor=0\"; may be "
                             "repeated; each likelihood then costs some hundred times as much")
     group.add_argument("--upper", action="append", default=[], metavar="NAME=VALUE", help="upper bound")
+    group.add_argument("--grid", type=_whole(2), metavar="N",
+                       help="at how many times, at equal distances over the record, --lower and --upper hold; cost and "
+                            "error grow with them (default: the times of the data, and more where they are further "
+                            "apart than 1/20 of the record; 100 where the data have more)")
 
 
 def _one_of(kind: str, choices: Any) -> Callable[[str], str]:

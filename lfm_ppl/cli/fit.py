@@ -179,8 +179,9 @@ def _print_task(
     if observed.origin is not None:
         print(f"time     in {observed.units['time']} since {observed.origin.replace('T', ' ')}")
     for flag, sign, given in (("--lower", ">=", arguments.lower), ("--upper", "<=", arguments.upper)):
+        where = "" if arguments.grid is None else f" at {arguments.grid} times"
         for name, value in (choices.bounds(flag, given) or {}).items():
-            print(f"bound    {name} {sign} {value:g}")
+            print(f"bound    {name} {sign} {value:g}{where}")
     if options:
         print("options  " + ", ".join(f"{name} = {value}" for name, value in options.items()))
     anchors = model.anchors(observed)
@@ -266,11 +267,13 @@ def constraints(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the bounds that the user gives, and where they hold; nothing where there are none."""
     given = {"lower": choices.bounds("--lower", arguments.lower), "upper": choices.bounds("--upper", arguments.upper)}
     if given == {"lower": None, "upper": None}:
+        if arguments.grid is not None:
+            raise ValueError("--grid says at how many times --lower and --upper hold; give one of them with it.")
         return {}
     if arguments.sampler == "pmmh":
         raise ValueError("--lower and --upper are for the samplers nuts, ram and map: the particle filter of pmmh "
                          "knows no constraints.")
-    return {name: value for name, value in given.items() if value is not None}
+    return {name: value for name, value in (given | {"grid": arguments.grid}).items() if value is not None}
 
 
 def sampling(arguments: argparse.Namespace, model: loading.ModelFile) -> dict[str, Any]:

@@ -16,8 +16,8 @@ from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation import GaussianObservation
 from lfm_ppl.model.state_space import StateSpaceModel, check_times, state_space
 
-_FEWEST_ROWS = 200
-"""Rows of the default grid: wider gaps between observations are cut into pieces of 1/200 of the record."""
+_SMALLEST_SHARE = 1e-9
+"""Of the record: a row at equal distances that is nearer to an observation than this is at its time."""
 
 
 class _Stacked(eqx.Module):
@@ -54,6 +54,25 @@ class AugmentedObservation(GaussianObservation):
         return jax.scipy.linalg.block_diag(own, jnp.diag(self.variances[row]))
 
 
+class DefaultGrid(NamedTuple):
+    """Where constraints hold by default: at the initial time, at the observations, and in wide gaps between them.
+
+    Attributes:
+        pieces: gaps wider than 1 / pieces of the record are cut into equal parts that are not.
+        most: more times of observations than these are replaced by as many at equal distances.
+    """
+
+    pieces: int
+    most: float = np.inf
+
+
+FINE = DefaultGrid(200)
+"""Of a trajectory or a band, which is given at these rows."""
+
+COARSE = DefaultGrid(20, 100)
+"""Of an evidence, whose cost and error grow with the rows. Both numbers are chosen without knowing a lengthscale."""
+
+
 class Rows(NamedTuple):
     """The rows of the scan: times of observations and of the grid.
 
@@ -70,26 +89,31 @@ class Rows(NamedTuple):
     data_rows: np.ndarray
 
 
-def rows(model: LatentForceModel, times: Any, grid: Any = None) -> Rows:
+def rows(model: LatentForceModel, times: Any, grid: Any = None, default: DefaultGrid = FINE) -> Rows:
     """Lay out the rows of the scan.
 
     Args:
         model: the latent force model.
         times: (T,) observation times.
-        grid: (G,) times at which the constraints hold. By default the initial time, the times of the observations, and
-            between those that are further apart than 1/200 of the record times at equal distances.
+        grid: (G,) times at which the constraints hold, or how many at equal distances from the initial time to the last
+            observation.
+        default: what they are where no grid is given.
 
     Raises:
-        ValueError: times that are not known before compilation, a grid that is not an increasing vector of finite times
-            at or after the initial time.
+        ValueError, TypeError: times that are not known before compilation, a grid that is not an increasing vector of
+            finite times at or after the initial time, or fewer than two rows.
     """
     known = check_times(times, model.initial_time)
     origin = model.initial_time if model.initial_time is not None or known is None else known[0]
     origin = None if origin is None else checks.concrete(origin)
     if known is None or origin is None:
         raise ValueError("times and the model's initial_time must be known before compilation; pass NumPy arrays.")
-    wanted = (_default_grid(known, float(origin)) if grid is None else
-              checks.time_vector("grid", grid, float(origin), "increasing"))
+    if grid is None:
+        wanted = _default_grid(known, float(origin), default)
+    elif is_count(grid):
+        wanted = _spread(known, float(origin), int(grid))
+    else:
+        wanted = checks.time_vector("grid", grid, float(origin), "increasing")
     extra = np.setdiff1d(wanted, known)
     every = np.concatenate([known, extra])
     order = np.argsort(every, kind="stable")
@@ -117,9 +141,34 @@ def with_times(laid_out: Rows, at: np.ndarray) -> Rows:
     return Rows(every[order], data, position[laid_out.grid], data_rows)
 
 
-def _default_grid(times: np.ndarray, origin: float) -> np.ndarray:
+def is_count(grid: Any) -> bool:
+    """Whether a grid is given as a number of rows.
+
+    Raises:
+        ValueError, TypeError: they are fewer than two, or a truth value.
+    """
+    if np.ndim(grid) or not isinstance(grid, (bool, int, np.integer)):
+        return False
+    checks.positive_integer("grid", grid, "Give times, or a number of rows.")
+    if grid < 2:
+        raise ValueError("grid must be at least 2 rows, the first and the last of the record, or the times at which "
+                         f"the constraints hold; got {grid}.")
+    return True
+
+
+def _spread(times: np.ndarray, origin: float, count: int) -> np.ndarray:
+    """Return ``count`` times at equal distances; no time lies next to one of an observation."""
     nodes = np.unique(np.append(times, origin))
-    longest = (nodes[-1] - nodes[0]) / _FEWEST_ROWS
+    wanted = np.linspace(nodes[0], nodes[-1], count)
+    nearest = nodes[np.abs(wanted[:, None] - nodes).argmin(axis=1)]
+    return np.unique(np.where(np.abs(wanted - nearest) <= _SMALLEST_SHARE * (nodes[-1] - nodes[0]), nearest, wanted))
+
+
+def _default_grid(times: np.ndarray, origin: float, default: DefaultGrid) -> np.ndarray:
+    nodes = np.unique(np.append(times, origin))
+    if len(nodes) > default.most:
+        return _spread(times, origin, int(default.most))
+    longest = (nodes[-1] - nodes[0]) / default.pieces
     if longest == 0:
         return nodes
     pieces = np.maximum(1, np.ceil(np.diff(nodes) / longest * (1 - 1e-9))).astype(int)

@@ -10,6 +10,7 @@ by importance sampling with trajectories that respect all constraints (`lfm_ppl.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -131,14 +132,40 @@ class Bounded(NamedTuple):
         """Return log Z(y, c); by expectation propagation alone where ``draws`` is 0."""
         if not draws:
             return self.propagated(y).log_evidence
-        weights = self.log_weights(jax.random.key(0) if key is None else key, y, draws)
+        weights = self.log_weights(_key(key), y, draws)
         largest = jax.lax.stop_gradient(jnp.max(weights))
         safe = jnp.where(jnp.isfinite(largest), largest, 0.0)
         return jax.scipy.special.logsumexp(weights - safe) + safe - jnp.log(draws)
 
     def log_likelihood(self, y: jax.Array, draws: int, key: jax.Array | None = None) -> jax.Array:
         """Return log Z(y, c) - log Z(c), with the same random numbers in both."""
-        return self.log_evidence(y, draws, key) - self.log_evidence(jnp.full_like(y, jnp.nan), draws, key)
+        both = _with_and_without(lambda one: self.log_evidence(one, draws, key), y)
+        return both[0] - both[1]
+
+    def converged(self, y: jax.Array) -> jax.Array:
+        """Whether the sites converge, with the data and without them."""
+        return _with_and_without(lambda one: self.propagated(one).refined.found.converged, y).all()
+
+    def worth(self, y: jax.Array, draws: int, key: jax.Array | None = None) -> jax.Array:
+        """Return how many of the weighted trajectories count, with the data or without them, whichever is fewer."""
+        return _with_and_without(lambda one: effective_number(self.log_weights(_key(key), one, draws)), y).min()
+
+
+def _with_and_without(function: Callable[[jax.Array], jax.Array], y: jax.Array) -> jax.Array:
+    """Return ``function`` of the data and of none, compiled once, (2,)."""
+    return jax.vmap(function)(jnp.stack([y, jnp.full_like(y, jnp.nan)]))
+
+
+def _key(key: jax.Array | None) -> jax.Array:
+    return jax.random.key(0) if key is None else key
+
+
+def effective_number(log_weights: jax.Array) -> jax.Array:
+    """Return (sum w)^2 / sum w^2 of weights (N,), zero where all are."""
+    largest = log_weights.max()
+    possible = jnp.isfinite(largest)
+    weights = jnp.where(possible, jnp.exp(log_weights - jnp.where(possible, largest, 0.0)), 1.0)
+    return jnp.where(possible, weights.sum() ** 2 / (weights**2).sum(), 0.0)
 
 
 def check_variances(model: LatentForceModel, count: int) -> jax.Array:

@@ -109,7 +109,7 @@ def full_information(model: LatentForceModel, times: Any, y: Any, lower: Mapping
         constraints: a function c(x, u, t) or several, each returning a number or a vector, feasible where >= 0.
         grid: (K,) increasing times at which the constraints hold and the result is given. By default the initial time
             and the times of the observations, and between those that are further apart than 1/200 of the record times
-            at equal distances.
+            at equal distances. A whole number: as many at equal distances over the record.
         steps: integration steps between two times of the grid or the data; of no account for a linear model.
         tolerance: of the duality gap, in units of the log density; constraints equal their slacks to its square root,
             in standard deviations.

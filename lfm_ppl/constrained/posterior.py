@@ -15,7 +15,7 @@ from lfm_ppl import checks
 from lfm_ppl.constrained.augmented import rows, stacked_model
 from lfm_ppl.constrained.boxes import Boxes, boxes
 from lfm_ppl.constrained.constraints import build_constraints
-from lfm_ppl.constrained.evidence import Bounded, check_variances
+from lfm_ppl.constrained.evidence import Bounded, check_variances, effective_number
 from lfm_ppl.constrained.full_information import check_settings
 from lfm_ppl.constrained.truncated import quantile
 from lfm_ppl.filtering.filter import Pass, as_rule, at_intervals, check_observations, warn_single_precision
@@ -107,9 +107,7 @@ class ConstrainedPosterior(eqx.Module):
 
     def effective_share(self, key: jax.Array, draws: int = 1024) -> jax.Array:
         """Return the share of trajectories that weighted ones are worth, between 1 / ``draws`` and 1."""
-        weights = _weights(self._problem, self._proposal, key, draws)
-        weights = jnp.exp(weights - weights.max())
-        return weights.sum() ** 2 / (weights**2).sum() / draws
+        return effective_number(_weights(self._problem, self._proposal, key, draws)) / draws
 
 
 @eqx.filter_jit

@@ -16,7 +16,7 @@ from numpyro.distributions import constraints
 from numpyro.primitives import _PYRO_STACK
 
 from lfm_ppl import checks
-from lfm_ppl.constrained.augmented import rows, stacked_model, with_times
+from lfm_ppl.constrained.augmented import COARSE, is_count, rows, stacked_model, with_times
 from lfm_ppl.constrained.boxes import boxes
 from lfm_ppl.constrained.constraints import build_constraints
 from lfm_ppl.constrained.evidence import Bounded, check_linear, check_variances
@@ -101,8 +101,11 @@ class MarginalLikelihood(dist.Distribution):
             converge. Not with an observation family, ``iterations``, ``max_step`` or ``tolerance``.
         upper: the same for upper bounds.
         constraints: functions c(x, u, t), feasible where >= 0; with ``draws``, linear in x and u.
-        grid: (K,) times at which the constraints hold; as in `lfm_ppl.full_information`. The cost is that of some tens
-            of smoother passes over it.
+        grid: (K,) times at which the constraints hold, or how many at equal distances from the initial time to the last
+            observation. By default the initial time and the times of the observations, and between those that are
+            further apart than 1/20 of the record times at equal distances; 100 at equal distances where observations
+            have more times. The cost is that of some tens of smoother passes over it, and the error of the importance
+            sampling grows with the number of rows.
         draws: number of trajectories, an even one; 0: by expectation propagation alone, which may be off by .1 on a
             coarse grid, and by .5 on a dense one. They have the same random numbers for all parameters, so that the
             log density has no noise, but an error that varies slowly with the parameters.
@@ -148,7 +151,8 @@ class MarginalLikelihood(dist.Distribution):
         self.sites = None if sites is None else as_settings(sites)
         self.lower, self.upper = (None if bounds is None else dict(bounds) for bounds in (lower, upper))
         self.constraints = (constraints,) if callable(constraints) else tuple(constraints or ())
-        self.grid, self.draws = None if grid is None else tuple(np.asarray(grid, float).tolist()), draws
+        self.grid = grid if grid is None or is_count(grid) else tuple(np.atleast_1d(np.asarray(grid, float)).tolist())
+        self.draws = draws
         if self.constrained:
             self._check_constraints()
         if sites is not None and not isinstance(model.observation, ObservationFamily):
@@ -184,6 +188,11 @@ class MarginalLikelihood(dist.Distribution):
                  for name, value in (given or {}).items()]
         return words + [f"{getattr(one, '__name__', type(one).__name__)} >= 0" for one in self.constraints]
 
+    @property
+    def constraints_in_words(self) -> str:
+        """All constraints, and at how many times they hold."""
+        return f"{', '.join(self.bounds)} at {len(self.bounded().rows.grid)} times"
+
     def refuse_constraints(self, what: str) -> None:
         """Raise where there are constraints, which ``what`` would pass over."""
         if self.constrained:
@@ -214,7 +223,8 @@ class MarginalLikelihood(dist.Distribution):
             at: (K,) further times for trajectories, at which the constraints need not hold.
         """
         found = boxes(build_constraints(self.model, self.lower, self.upper, self.constraints))
-        laid_out = rows(self.model, self.times, None if self.grid is None else np.asarray(self.grid))
+        laid_out = rows(self.model, self.times, np.asarray(self.grid) if isinstance(self.grid, tuple) else self.grid,
+                        COARSE)
         if at is not None:
             laid_out = with_times(laid_out, np.asarray(at, float))
         ssm = stacked_model(self.model, found)

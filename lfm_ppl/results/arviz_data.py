@@ -26,6 +26,9 @@ LIBRARY = "lfm_ppl"
 SITES = "site_failures"
 """Attribute of a result: counts of `lfm_ppl.inference.site_failures`, as JSON."""
 
+WEIGHTS = "constraint_weights"
+"""Attribute of a result under constraints: what weighted trajectories are worth, `site_failures.PathsWorth` as JSON."""
+
 _SMALLEST_TAIL = 5
 """Fewest importance ratios that a Pareto distribution can be fitted to."""
 
@@ -270,8 +273,8 @@ def convergence_warnings(result: Any, table: pd.DataFrame | None = None) -> list
     """Return what is wrong with the draws of ``result``, one message per finding.
 
     R-hat above 1.01, bulk or tail effective sample size below 100 per chain, divergences, sites of
-    an observation family that do not converge. Draws from a Laplace approximation (sampler "map")
-    are independent, and give none.
+    an observation family or of constraints that do not converge, trajectories under constraints that are worth little.
+    Draws from a Laplace approximation (sampler "map") are independent, and give none but the last two.
 
     Args:
         result: an ArviZ object with a posterior, and sample_stats where there are any.
@@ -280,14 +283,19 @@ def convergence_warnings(result: Any, table: pd.DataFrame | None = None) -> list
     Returns:
         Messages that name the parameters, their values, and what to do; empty if all is well.
     """
-    if attributes(result).get("sampler") == "map" or "effective_draws" in attributes(result):
-        return []
+    attrs = attributes(result)
+    constrained, from_mode = "constraints" in attrs, attrs.get("sampler") == "map"
+    of_sites = convergence.of_sites(*json.loads(attrs.get(SITES, "[0, 0, 0]")), constrained=constrained,
+                                    from_mode=from_mode)
+    of_sites += convergence.of_weights(*json.loads(attrs.get(WEIGHTS, "[0, 0, 0]")))
+    if from_mode or "effective_draws" in attrs:
+        return of_sites if from_mode else []
     sizes = group(result, "posterior").sizes
     stats = group(result, "sample_stats") if has_group(result, "sample_stats") else {}
     divergences = int(stats["diverging"].sum()) if "diverging" in stats else 0
     found = convergence.messages(summary(result) if table is None else table, sizes["chain"], sizes["draw"],
                                  divergences)
-    return found + convergence.of_sites(*json.loads(attributes(result).get(SITES, "[0, 0, 0]")))
+    return found + of_sites
 
 
 def mcse_mean(values: np.ndarray) -> float:

@@ -154,16 +154,14 @@ def _name(function: Callable) -> str:
 
 
 def _chain(kernel: Any, arguments: tuple, key: jax.Array, draws: int, thin: int, warmup: int) -> dict[str, jax.Array]:
-    state = kernel.init(key, warmup, None, arguments, {})
-    advance = lambda count, state: jax.lax.fori_loop(  # noqa: E731
-        0, count, lambda _, s: kernel.sample(s, arguments, {}), state)
-    state = advance(warmup, state)
+    # The warm-up goes before the first draw in the same loop: a kernel takes long to compile, and is compiled once.
+    counts = jnp.full(draws, thin).at[0].add(warmup)
 
-    def step(state: Any, _: None) -> tuple[Any, Any]:
-        state = advance(thin, state)
+    def step(state: Any, count: jax.Array) -> tuple[Any, Any]:
+        state = jax.lax.fori_loop(0, count, lambda _, s: kernel.sample(s, arguments, {}), state)
         return state, state.z
 
-    _, collected = jax.lax.scan(step, state, length=draws)
+    _, collected = jax.lax.scan(step, kernel.init(key, warmup, None, arguments, {}), counts)
     return jax.vmap(kernel.postprocess_fn(arguments, {}))(collected)
 
 

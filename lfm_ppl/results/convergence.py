@@ -9,7 +9,15 @@ import pandas as pd
 
 MAX_R_HAT = 1.01
 MIN_ESS_PER_CHAIN = 100
+LEAST_TRAJECTORIES = 10
+"""Worth of weighted trajectories below which the error of a log likelihood, about .3, is said."""
+
 _NAMED = 5
+
+_OF_FAMILY = ("Take a smaller share of each new site, sites=lfm.SiteSettings(damping=0.5), half powers, "
+              "sites=lfm.SiteSettings(power=0.5), or a tighter prior.")
+_OF_CONSTRAINTS = ("Let the constraints hold at fewer times (grid, --grid), or see with lfm.full_information whether "
+                   "they can be respected at all.")
 
 
 def messages(summary: pd.DataFrame, chains: int, draws: int, divergences: int) -> list[str]:
@@ -62,21 +70,48 @@ def messages(summary: pd.DataFrame, chains: int, draws: int, divergences: int) -
     return found
 
 
-def of_sites(points: int, unconverged: int, impossible: int) -> list[str]:
-    """Return what to say where sites of an observation family do not converge near the draws; nothing where they do.
+def of_sites(points: int, unconverged: int, impossible: int, *, constrained: bool = False,
+             from_mode: bool = False) -> list[str]:
+    """Return what to say where sites do not converge near the draws; nothing where they do.
 
     Args:
         points: a step away from the draws, at which it was tried.
         unconverged: of them, where sites do not converge.
         impossible: of them, where the likelihood is zero, for that reason or another.
+        constrained: they are sites of constraints, and not of an observation family.
+        from_mode: the points are draws of a Laplace approximation.
     """
     if not unconverged:
         return []
+    which, remedy = (("constraints", _OF_CONSTRAINTS) if constrained else ("observation family", _OF_FAMILY))
+    where = "draws of the Laplace approximation" if from_mode else "points a step away from the draws"
     return [
-        f"the sites of the observation family do not converge at {unconverged} of {points} points a step away from the "
-        f"draws ({100.0 * unconverged / points:.2g}%), and the likelihood counts as zero there (and at {impossible} "
-        "points in all): draws may miss these parameters. Take a smaller share of each new site, "
-        "sites=lfm.SiteSettings(damping=0.5), half powers, sites=lfm.SiteSettings(power=0.5), or a tighter prior."
+        f"the sites of the {which} do not converge at {unconverged} of {points} {where} "
+        f"({100.0 * unconverged / points:.2g}%), and the likelihood counts as zero there (and at {impossible} "
+        f"points in all): draws may miss these parameters. {remedy}"
+    ]
+
+
+def of_weights(trajectories: int, median: float, least: float) -> list[str]:
+    """Return what to say of an evidence under constraints that rests on few of its trajectories.
+
+    The logarithm of a mean of weights that are worth n equal ones has a standard error of about 1 / sqrt(n).
+
+    Args:
+        trajectories: that are weighted; 0: none.
+        median: what they are worth at half of the draws.
+        least: at the worst.
+    """
+    if not trajectories or median >= LEAST_TRAJECTORIES:
+        return []
+    if median < 1.0:
+        return ["the likelihood under the constraints is zero at half of the draws or more: nothing holds of what is "
+                f"computed from them. {_OF_CONSTRAINTS}"]
+    return [
+        f"the {trajectories} weighted trajectories of the evidence under constraints are worth {median:.2g} at half of "
+        f"the draws, and {least:.2g} at the worst: the log likelihood is off by about {median**-0.5:.1f}, differently "
+        "at other parameters. Let the constraints hold at fewer times (grid, --grid), or weight more trajectories "
+        "(draws of lfm.MarginalLikelihood)."
     ]
 
 

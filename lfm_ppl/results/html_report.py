@@ -49,6 +49,7 @@ _SETTINGS = {
     "sampler": "sampler", "chains": "chains", "warmup": "warm-up steps", "samples": "draws a chain",
     "thin": "steps a draw", "seed": "seed", "rule": "rule", "steps": "integration steps", "max_step": "longest step",
     "tolerance": "tolerance of a step (sd)", "iterations": "iterations", "fixed": "fixed", "options": "options",
+    "constraints": "constraints",
     "particles": "particles", "log_likelihood_sd": "sd of the log likelihood", "delayed": "delayed acceptance",
     "effective_draws": "effective draws", "map_message": "optimiser",
     "map_log_density": "log density at the mode", "log_evidence": "log evidence (Laplace)",
@@ -56,7 +57,7 @@ _SETTINGS = {
 }
 _ELSEWHERE = ("model", "model_file", DESCRIPTION, "data", "note", "versions", "warnings", "partial", "settings", "run",
               "map_converged", COMMAND, CALL, ORIGIN, "inference_library",
-              "site_failures")
+              "site_failures", "constraint_weights")
 """Attributes that stand in other sections, or that nobody needs to read."""
 
 _FILES = re.compile(r"(.*\.nc|(summary|accuracy|forecast|scores)\.csv"

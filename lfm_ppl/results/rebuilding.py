@@ -83,7 +83,7 @@ def _check_settings(site: LikelihoodSite, attrs: Mapping[str, Any]) -> None:
     example = site.example
     own = {"rule": example.rule.name, "steps": example.steps, "max_step": example.max_step,
            "iterations": example.iterations, "tolerance": example.tolerance,
-           "constraints": ", ".join(example.bounds) if example.constrained else None}
+           "constraints": example.constraints_in_words if example.constrained else None}
     if not set(own) & set(attrs):
         return  # not made by `fit`
     for name in own:

@@ -190,6 +190,33 @@ def test_ballistic_target_against_ipopt():
         np.testing.assert_allclose(found.state_mean, nodes[:, :2], atol=1e-4)
 
 
+class Exponential(eqx.Module):
+    """A force that acts through the exponential function."""
+
+    def __call__(self, x, u, t):
+        return 0.5 * jnp.exp(u) - 0.6 * x
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lower", [{}, {"u": -0.3}], ids=["free", "bounded"])
+def test_an_exponential_link_against_ipopt(lower):
+    """Small noise of the state: eight steps of integration between rows leave 2e-3 in its covariance and J, 32 1e-5."""
+    model = lfm.LatentForceModel(
+        Exponential(), {"u": lfm.Matern(1.0, 1.0)}, lfm.GaussianObservation(whole_state, jnp.array([0.05**2])),
+        lfm.Gaussian(jnp.array([0.8]), jnp.array([[0.1]])), process_noise=0.03 * jnp.eye(1), initial_time=0.0)
+    y = lfm.simulate(jax.random.key(0), model, TIMES).y
+    found = lfm.full_information(model, TIMES, y, lower=lower, grid=TIMES, steps=32)
+    assert found.converged and bool(lower) == np.asarray(found.active).any()
+    reference = Transcribed(
+        lambda x, u: [0.5 * casadi.exp(u) - 0.6 * x[0]], lambda x: [x[0]], (1.0, 1.0, 1), np.array([[0.03**2]]),
+        np.array([0.8]), np.array([[0.1]]), [0.05**2], [(1, 1.0, -0.3)] if lower else [])
+    # From the prior mean, and not from our own solution.
+    nodes, objective = reference.solve(TIMES, np.asarray(y), np.tile([0.8, 0.0, 0.0], (25, 1)), rounds=8)
+    assert np.isclose(found.objective, objective, atol=1e-4)
+    np.testing.assert_allclose(found.force("u"), nodes[:, 1], atol=1e-5)
+    np.testing.assert_allclose(found.state("x0"), nodes[:, 0], atol=1e-5)
+
+
 # --- errors
 
 

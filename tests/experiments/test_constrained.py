@@ -52,6 +52,19 @@ def test_the_shortest_band_of_a_truncated_normal():
         assert exact.cdf(high) - exact.cdf(low) == pytest.approx(0.95, abs=1e-3)
         assert high - low == pytest.approx(widths.min(), rel=5e-3)
         assert (low == 0.0) == (y < 0)
+        # From 60 quantiles, the 57 nearest of which are 56 parts.
+        parts = estimators.quantiles(found, "u", 60)
+        np.testing.assert_allclose(np.sort(parts[:, 0]), exact.ppf((np.arange(60) + 0.5) / 60), rtol=1e-6)
+        ends = [float(a[0]) for a in estimators.shortest_of(parts)]
+        assert exact.cdf(ends[1]) - exact.cdf(ends[0]) == pytest.approx(56 / 60, abs=1e-6)
+
+
+def test_the_shortest_interval_of_a_mixture():
+    """Of two uniform distributions side by side, nine tenths in the narrow one: 95% reach into the wide one."""
+    values = jnp.concatenate([jnp.tile((jnp.arange(40) + 0.5) / 40, 9), 1.0 + 10.0 * (jnp.arange(40) + 0.5) / 40])
+    low, high = estimators.shortest_of(jnp.stack([values, -values], axis=1))
+    np.testing.assert_allclose([low[0], high[0]], [0.0, 6.0], atol=0.3)
+    np.testing.assert_allclose([low[1], high[1]], [-high[0], -low[0]], rtol=1e-12)
 
 
 def test_times_of_peaks():

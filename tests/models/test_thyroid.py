@@ -86,8 +86,8 @@ def test_full_information_against_ipopt():
     level, scale, lengthscale, variation = 7.0, 3.0, 1.5, 0.03
     model = own.build(level, scale, lengthscale, variation)
     names = (*model.state_names, "TRH")
-    bounds = dict.fromkeys(names, 0.0) | {"TRH": 5.0}
-    found = lfm.full_information(model, times, y, lower=bounds, grid=times, steps=8, tolerance=1e-10)
+    bounds = dict.fromkeys(names, 0.0) | {"TRH": 7.5}
+    found = lfm.full_information(model, times, y, lower=bounds, grid=times, steps=32, tolerance=1e-10)
     assert found.converged and np.asarray(found.active)[:, 4].any()
 
     def drift(x, u):
@@ -109,9 +109,9 @@ def test_full_information_against_ipopt():
     reference = Transcribed(
         drift, lambda x: [x[3] * own.STEADY[3], x[1] * own.FREE[1], x[0] * own.FREE[2]], (scale, lengthscale, 1),
         np.zeros((4, 4)), np.ones(4), np.diag((own.START_SD / own.STEADY) ** 2), (variation * own.FREE) ** 2,
-        [(4, 1.0, 5.0 - level), *((k, 1.0, 0.0) for k in range(4))])
+        [(4, 1.0, 7.5 - level), *((k, 1.0, 0.0) for k in range(4))])
     force = np.asarray(found.force("TRH")) - level
     guess = np.column_stack([np.asarray(found.state_mean) / own.STEADY, force, np.gradient(force, times)])
-    nodes, objective = reference.solve(times, np.asarray(y), guess + 0.01)
+    nodes, objective = reference.solve(times, np.asarray(y), guess + 0.01, rounds=8)
     assert float(found.objective) == pytest.approx(objective, abs=1e-4)
     np.testing.assert_allclose(force, nodes[:, 4], atol=1e-3)

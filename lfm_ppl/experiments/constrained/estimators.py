@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -132,7 +133,10 @@ def ballistic() -> Callable[[Any], tuple]:
 
 @functools.cache
 def thyroid() -> tuple[Callable[[Any, Any], dict[str, jax.Array]], Callable[[Any, Any], dict[str, jax.Array]]]:
-    """Return full information and bands of patients' logarithms of parameters (N, P) and concentrations (N, T, 3)."""
+    """Return full information of patients' logarithms of parameters (N, P) and concentrations (N, T, 3), and bands.
+
+    Bands take several logarithms of parameters of a patient, (N, K, P), and average over them.
+    """
     times = problem.patient(0).times
 
     def full(z: jax.Array, y: jax.Array) -> dict[str, jax.Array]:
@@ -143,10 +147,28 @@ def thyroid() -> tuple[Callable[[Any, Any], dict[str, jax.Array]], Callable[[Any
         return {"times": found.times, "mode": found.force(problem.HORMONE), "lowest": lowest,
                 "converged": found.converged}
 
-    def bands(z: jax.Array, y: jax.Array) -> dict[str, jax.Array]:
+    def given(z: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         model = problem.thyroid_learning().likelihood(z, y).model
         found = constrained_posterior(model, times, y, lower={problem.HORMONE: 0.0}, steps=2)
-        low, high = shortest(found, problem.HORMONE)
-        return {"mean": found.force_mean[:, 0], "low": low, "high": high, "bands_converged": found.converged}
+        return found.force_mean[:, 0], quantiles(found, problem.HORMONE), found.converged
+
+    def bands(draws: jax.Array, y: jax.Array) -> dict[str, jax.Array]:
+        means, each, converged = jax.vmap(given, in_axes=(0, None))(draws, y)
+        low, high = shortest_of(each.reshape(-1, each.shape[-1]))
+        return {"mean": means.mean(axis=0), "low": low, "high": high, "bands_converged": converged.all()}
 
     return jax.jit(jax.vmap(full)), jax.jit(jax.vmap(bands))
+
+
+def quantiles(found: ConstrainedPosterior, name: str, count: int = 40) -> jax.Array:
+    """Return as many quantiles (count, K), at equal distances in probability: a distribution as equal parts."""
+    ends = [found.interval(name, 1.0 - (2.0 * i + 1.0) / count) for i in range(count // 2)]
+    return jnp.stack([end for pair in ends for end in pair])
+
+
+def shortest_of(values: jax.Array, level: float = 0.95) -> tuple[jax.Array, jax.Array]:
+    """Return the ends (K,) of the shortest interval that has a share of equally probable values (S, K) in it."""
+    ordered = jnp.sort(values, axis=0)
+    inside = math.ceil(level * len(values))
+    last = len(values) - inside + 1
+    return _narrowest(ordered[:last], ordered[inside - 1:])

@@ -14,12 +14,14 @@ from lfm_ppl import checks
 from lfm_ppl.engine.cluster import Workers
 from lfm_ppl.engine.run import Reporter, run_tasks
 from lfm_ppl.engine.task import Result, Task
-from lfm_ppl.experiments import output
+from lfm_ppl.experiments import output, weighting
 from lfm_ppl.experiments.constrained import estimators, figures, problem, tables
-from lfm_ppl.inference.optimise import quasi_newton
+from lfm_ppl.inference.optimise import newton, quasi_newton
 
 TASKS = "tasks"
 _SEARCH = {"ftol": 1e-10, "gtol": 1e-4}
+_DRAWS, _WEIGHTED = 16, 150
+"""Draws of a patient's parameters over which bands are averaged, and weighted ones from which these are taken."""
 _FURTHEST = float(np.log(problem.TIMES[-1] / 2.0))
 """Largest logarithm of the lengthscale that is learnt from 60 samples, whose likelihood often has no maximum."""
 
@@ -109,6 +111,19 @@ def _found(posterior: Any, y: np.ndarray, prior: float = 1.0, furthest: float = 
     return quasi_newton(posterior.objective(y, prior), start, bounds=bounds, options=_SEARCH).point
 
 
+def drawn(posterior: Any, y: np.ndarray, mode: np.ndarray, seed: int) -> tuple[np.ndarray, float]:
+    """Return draws (16, P) of the logarithms of parameters from their posterior, and the Pareto index of the weights.
+
+    They are taken at equal distances from weighted draws about the mode.
+    """
+    minimum = newton(posterior.objective(y), mode)
+    found = weighting.weighted(lambda draws: np.sum(posterior.log_densities_of(draws, y), axis=0), [minimum],
+                               _WEIGHTED, seed)
+    share = np.cumsum(np.exp(found.weights.log_weight[0]))
+    chosen = np.searchsorted(share / share[-1], (np.arange(_DRAWS) + 0.5) / _DRAWS)
+    return found.draws[chosen], found.weights.k
+
+
 def _transcription(task: Task, indices: range) -> Result:
     """Return by estimator, ``{method}/``: ``mse``, ``minimum``, ``coverage`` (N,), and the ``first`` record's paths."""
     records = [problem.record(task.settings["shape"], index, task.seed) for index in indices]
@@ -152,15 +167,19 @@ def _thyroid(task: Task, indices: range) -> Result:
     posterior = problem.thyroid_learning()
     z = np.stack([_found(posterior, one.y) for one in patients])
     y = np.stack([one.y for one in patients])
-    found = {name: np.asarray(value) for one in estimators.thyroid() for name, value in one(z, y).items()}
+    seeds = [problem.MOST * task.seed + index for index in indices]
+    draws, k = zip(*(drawn(posterior, *one) for one in zip(y, z, seeds, strict=True)), strict=True)
+    full, bands = estimators.thyroid()
+    found = {name: np.asarray(value) for name, value in (full(z, y) | bands(np.stack(draws), y)).items()}
     times = found.pop("times")[0]
     truth = np.stack([np.interp(times, one.truth["times"], one.truth["forces"][problem.HORMONE]) for one in patients])
     held = (found["low"] <= truth) & (truth <= found["high"])
     errors = np.stack([_apart(peak(times, found["mode"]), peak(times, truth)), _apart(
         acrophase(times, found["mode"]), acrophase(times, truth))], axis=1)
-    return found | {"times": times, "truth": truth, "z": z, "coverage": held.mean(axis=1), "peak": errors,
-                    "rmse": np.sqrt(((found["mode"] - truth) ** 2).mean(axis=1)),
-                    "y": y[0], "measured": patients[0].times}
+    return found | {"times": times, "truth": truth, "z": z, "draws": np.stack(draws), "k": np.array(k),
+                    "coverage": held.mean(axis=1), "peak": errors,
+                    "rmse": np.sqrt(((found["mode"] - truth) ** 2).mean(axis=1)), "y": y[0],
+                    "measured": patients[0].times}
 
 
 def peak(times: np.ndarray, paths: np.ndarray) -> np.ndarray:

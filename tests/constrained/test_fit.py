@@ -1,0 +1,145 @@
+"""What a fit under constraints says of itself, and at which times they hold."""
+
+from __future__ import annotations
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pandas as pd
+import pytest
+import xarray as xr
+from systems import Linear, whole_state
+
+import lfm_ppl as lfm
+from lfm_ppl.cli import main
+from lfm_ppl.constrained.augmented import COARSE, rows
+from lfm_ppl.inference.site_failures import failures_at, paths_worth
+from lfm_ppl.results import arviz_data, tables
+
+TIMES = np.linspace(0.0, 3.0, 4)
+Y = np.array([[0.0], [0.1], [0.02], [0.1]])
+
+
+def system(lengthscale=1.0):
+    return lfm.LatentForceModel(
+        Linear(jnp.array([[-0.6]]), jnp.array([[0.25]])), {"factor": lfm.Matern(1.0, lengthscale)},
+        lfm.GaussianObservation(whole_state, jnp.array([0.08**2])), lfm.Gaussian(jnp.zeros(1), 0.01 * jnp.eye(1)),
+        initial_time=0.0)
+
+
+def bounded(times, y=None, draws=32, grid=None):
+    lengthscale = numpyro.sample("lengthscale", dist.LogNormal(0.0, 0.4))
+    numpyro.sample("y", lfm.MarginalLikelihood(system(lengthscale), times, lower={"factor": 0.0}, draws=draws,
+                                               grid=grid), obs=y)
+
+
+def held(times, grid=None, **more):
+    found = rows(system(), times, grid, **more)
+    return found.times[found.grid]
+
+
+def test_where_constraints_hold():
+    """By default at all observations and a little more where an evidence is asked for; as many times as are wanted."""
+    few, many = np.array([0.0, 1.0, 3.0]), np.linspace(0.0, 5.0, 501)
+    np.testing.assert_allclose(held(few, default=COARSE), [*np.linspace(0, 1, 8)[:-1], *np.linspace(1, 3, 15)])
+    assert np.isin(few, held(few, default=COARSE)).all() and len(held(few)) == 202
+    np.testing.assert_allclose(held(many, default=COARSE), np.linspace(0.0, 5.0, 100))
+    assert len(held(many)) == 501
+    np.testing.assert_allclose(held(few, 7), np.linspace(0.0, 3.0, 7))
+    # A row at equal distances that rounding puts beside an observation is at its time.
+    tenths = np.arange(31) * 0.1
+    assert len(rows(system(), tenths, 31).times) == 31
+    assert len(held(few[:1], 5)) == 1
+
+
+def result(**attrs):
+    chance = np.random.default_rng(0)
+    posterior = xr.Dataset({name: (("chain", "draw"), chance.normal(size=(4, 500))) for name in ("a", "b")})
+    return arviz_data.build({"posterior": posterior}, {"sampler": "nuts", **attrs})
+
+
+@pytest.mark.parametrize("sampler", ["nuts", "map"])
+def test_what_a_result_under_constraints_says(sampler):
+    """In its warnings, and in each row of the summary."""
+    base = {"sampler": sampler, "constraints": "factor >= 0 at 6 times"}
+    good = result(**base, site_failures="[100, 0, 1]", constraint_weights="[256, 40.0, 3.0]")
+    assert not arviz_data.convergence_warnings(good)
+    bad = result(**base, site_failures="[100, 7, 9]", constraint_weights="[256, 3.0, 1.2]")
+    sites, weights = arviz_data.convergence_warnings(bad)
+    where = "draws of the Laplace approximation" if sampler == "map" else "points a step away from the draws"
+    assert f"the sites of the constraints do not converge at 7 of 100 {where} (7%)" in sites and "--grid" in sites
+    assert "the 256 weighted trajectories" in weights
+    assert "worth 3 at half of the draws, and 1.2 at the worst" in weights
+    assert "off by about 0.6" in weights and "draws of lfm.MarginalLikelihood" in weights
+    for said in tables.annotated(arviz_data.summary(bad), bad)["warnings"]:
+        assert sites in said and weights in said
+    (nothing,) = arviz_data.convergence_warnings(result(**base, constraint_weights="[256, 0.0, 0.0]"))
+    assert "is zero at half of the draws or more" in nothing
+
+
+@pytest.mark.slow
+def test_unconverged_sites_and_light_weights_are_counted():
+    """The weights of 2 trajectories are worth at most 2; sites converge nowhere at a lengthscale that is no number."""
+    bound = lfm.bind(bounded, TIMES, Y, draws=2, grid=TIMES)
+    values = {"lengthscale": np.array([0.5, 1.0, np.nan, 2.0])}
+    assert failures_at(bound, values) == (4, 1, 1)
+    worth = paths_worth(bound, {"lengthscale": np.array([0.5, 1.0, 2.0])})
+    assert worth.trajectories == 2 and 1.0 <= worth.least <= worth.median <= 2.0
+    # Weights by hand, of the data and without them.
+    likelihood = lfm.MarginalLikelihood(system(), TIMES, lower={"factor": 0.0}, grid=TIMES, draws=64)
+    problem = likelihood.bounded()
+    by_hand = []
+    for y in (jnp.asarray(Y), jnp.full_like(Y, jnp.nan)):
+        weights = np.exp(problem.log_weights(jax.random.key(0), y, 64))
+        by_hand.append(weights.sum() ** 2 / (weights**2).sum())
+    assert float(problem.worth(jnp.asarray(Y), 64)) == pytest.approx(min(by_hand), rel=1e-10)
+
+
+@pytest.mark.slow
+def test_a_fit_stores_and_says_it(tmp_path):
+    with pytest.warns(lfm.ConvergenceWarning, match="the 2 weighted trajectories of the evidence"):
+        found = lfm.fit(lambda times, y=None: bounded(times, y, 2, TIMES), TIMES, Y, sampler="ram", chains=2, warmup=50,
+                        samples=50, trajectory_draws=0, progress=False)
+    attrs = arviz_data.attributes(found)
+    assert attrs["constraints"] == "factor >= 0 at 4 times" and json.loads(attrs["site_failures"])[0] == 100
+    assert any("weighted trajectories" in said for said in json.loads(attrs["warnings"]))
+
+
+MODEL = '''"""A gene."""
+import jax.numpy as jnp
+import numpyro
+import numpyro.distributions as dist
+
+import lfm_ppl as lfm
+
+OUTPUTS = ("x",)
+
+
+def model(times, y=None):
+    lengthscale = numpyro.sample("lengthscale", dist.LogNormal(0.0, 0.4))
+    system = lfm.LatentForceModel(
+        lambda x, u, t: 0.25 * u - 0.6 * x, {"factor": lfm.Matern(1.0, lengthscale)},
+        lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.08**2])), lfm.Gaussian(jnp.zeros(1), 0.01 * jnp.eye(1)))
+    numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=2), obs=y)
+'''
+
+
+@pytest.mark.slow
+def test_the_command_line_chooses_the_times(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "gene.py").write_text(MODEL)
+    pd.DataFrame({"time": TIMES, "x": Y[:, 0]}).to_csv("d.csv", index=False)
+    assert main(["fit", "gene.py", "--data", "d.csv", "--lower", "factor=0", "--grid", "7", "--sampler", "map",
+                 "--samples", "40", "--out", "out", "--quiet", "--no-cache"]) == 0
+    assert "bound    factor >= 0 at 7 times" in capsys.readouterr().out
+    found = lfm.load("out")
+    attrs = arviz_data.attributes(found)
+    assert attrs["constraints"] == "factor >= 0 at 7 times" and json.loads(attrs["site_failures"]) == [40, 0, 0]
+    trajectories, median, _ = json.loads(attrs["constraint_weights"])
+    assert trajectories == 256 and median > 10 and not arviz_data.convergence_warnings(found)
+    # The forecast goes on with the same times.
+    assert main(["forecast", "out", "--until", "4", "--no-cache"]) == 0
