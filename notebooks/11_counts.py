@@ -104,7 +104,7 @@ scores.readable(found.accuracy)
 # not the same for skew posteriors, and its log Z is the furthest off for yes or no and for gross errors.
 #
 # A run of the reference with 160,000 draws, good to 0.005, settles the largest errors of EP: standard deviations of
-# Student's t are within 0.021 of the exact ones, those of yes or no too small by up to 0.040, and means are within 0.013
+# Student's t are within 0.021 of the exact ones, those of yes or no too small by up to 0.040; means are within 0.013
 # posterior standard deviations in both.
 
 # %%
