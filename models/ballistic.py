@@ -16,7 +16,8 @@ noise_sd, are known in the source and fixed at its values unless they are freed,
     lfm-ppl fit ballistic --set noise_sd=free
 
 The target is at about 65 km at the first time and falls at about 3 km/s: r ~ N(65000, 500^2),
-v ~ N(3000, 100^2). The default data start at the means, and have 120 distances in 30 s.
+v ~ N(3000, 100^2). With the option `df` the errors e_k are noise_sd times Student's t of that many degrees of freedom,
+which the radar's gross errors do not move far. The default data start at the means, and have 120 distances in 30 s.
 
 Sources: J. Hartikainen, M. Seppanen and S. Sarkka, State-space inference for non-linear latent force
 models (ICML 2012), section 5.2; X. R. Li and V. P. Jilkov, Survey of maneuvering target tracking: II.
@@ -47,6 +48,7 @@ UNITS = {
 OPTIONS = {
     "aside": (30_000.0, float, "horizontal distance of the radar from the target's path (m)"),
     "height": (30.0, float, "height of the radar above the ground (m)"),
+    "df": (0.0, float, "degrees of freedom of Student's t errors, 4 for example; 0: Gaussian errors"),
 }
 PARAMETERS = {
     "alpha": "drag where the density of the air is that of the ground (1/m)",
@@ -54,7 +56,7 @@ PARAMETERS = {
     "lengthscale": "lengthscale of the unknown acceleration (s)",
     "q_r": "dispersion of the altitude (m/sqrt(s))",
     "q_v": "dispersion of the speed (m/s/sqrt(s))",
-    "noise_sd": "standard deviation of the radar's noise (m)",
+    "noise_sd": "standard deviation of the radar's noise, or scale of Student's t (m)",
 }
 KNOWN = {"q_r": 50.0, "q_v": 10.0, "noise_sd": 30.0}
 TRUTH = {"alpha": 4.49e-4, "scale": 50.0, "lengthscale": 5.0, **KNOWN}
@@ -66,7 +68,8 @@ LONGEST_STEP = 0.26  # seconds: one step between two of 120 measurements; likeli
 
 
 def build(
-    alpha, scale, lengthscale, q_r, q_v, noise_sd, aside=30_000.0, height=30.0, units=None, start_sd=START_SD
+    alpha, scale, lengthscale, q_r, q_v, noise_sd, aside=30_000.0, height=30.0, units=None, start_sd=START_SD,
+    df=0.0,
 ) -> lfm.LatentForceModel:
     """Return the target with these parameters.
 
@@ -81,6 +84,7 @@ def build(
         height: of the radar (m).
         units: name -> unit.
         start_sd: standard deviations of altitude and speed at the first time.
+        df: degrees of freedom of Student's t errors; 0: Gaussian errors.
     """
 
     def dynamics(x, u, t):
@@ -94,7 +98,8 @@ def build(
         dynamics=dynamics,
         forces={"u": lfm.Matern(scale=scale, lengthscale=lengthscale, order=2)},
         process_noise=jnp.diag(jnp.array([q_r, q_v], dtype=float)),
-        observation=lfm.GaussianObservation(distance, noise_sd**2 * jnp.ones(1)),
+        observation=(lfm.StudentTObservation(distance, df, noise_sd) if df
+                     else lfm.GaussianObservation(distance, noise_sd**2 * jnp.ones(1))),
         initial_state=lfm.Gaussian(jnp.array(START), jnp.diag(jnp.array(start_sd) ** 2)),
         state_names=("altitude", "speed"),
         output_names=OUTPUTS,
@@ -102,7 +107,7 @@ def build(
     )
 
 
-def model(times, y=None, aside: float = 30_000.0, height: float = 30.0, units=None) -> None:
+def model(times, y=None, aside: float = 30_000.0, height: float = 30.0, df: float = 0.0, units=None) -> None:
     """Sample the drag, the force's parameters and the noise, and score the distances.
 
     Args:
@@ -110,13 +115,14 @@ def model(times, y=None, aside: float = 30_000.0, height: float = 30.0, units=No
         y: distances (m), shape (T, 1); NaN is missing, None draws from the prior predictive.
         aside: horizontal distance of the radar from the target's path (m).
         height: of the radar (m).
+        df: degrees of freedom of Student's t errors; 0: Gaussian errors.
         units: name -> unit, for plots.
     """
     alpha = numpyro.sample("alpha", dist.LogNormal(jnp.log(5e-4), 1.0))
     scale = numpyro.sample("scale", dist.LogNormal(jnp.log(30.0), 1.0))
     lengthscale = numpyro.sample("lengthscale", dist.LogNormal(jnp.log(5.0), 0.7))
     q_r, q_v, noise_sd = (numpyro.sample(name, dist.LogNormal(jnp.log(value), 0.7)) for name, value in KNOWN.items())
-    system = build(alpha, scale, lengthscale, q_r, q_v, noise_sd, aside, height, units)
+    system = build(alpha, scale, lengthscale, q_r, q_v, noise_sd, aside, height, units, df=df)
     numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=1, max_step=LONGEST_STEP), obs=y)
 
 
@@ -125,15 +131,16 @@ def anchors(data: lfm.Data) -> dict[str, float]:
     return dict(KNOWN)
 
 
-def simulate(seed: int = 0, aside: float = 30_000.0, height: float = 30.0) -> lfm.Data:
+def simulate(seed: int = 0, aside: float = 30_000.0, height: float = 30.0, df: float = 0.0) -> lfm.Data:
     """Simulate 30 s of the source's target, measured 120 times.
 
     Args:
         seed: of force, path and noise.
         aside: horizontal distance of the radar (m).
         height: of the radar (m).
+        df: degrees of freedom of Student's t errors; 0: Gaussian errors.
     """
-    drawn = _simulator(float(aside), float(height))(jax.random.key(seed))
+    drawn = _simulator(float(aside), float(height), float(df))(jax.random.key(seed))
     observed = np.arange(0, len(GRID), 10)
     return lfm.Data(
         times=GRID[observed],
@@ -145,7 +152,7 @@ def simulate(seed: int = 0, aside: float = 30_000.0, height: float = 30.0) -> lf
 
 
 @functools.cache
-def _simulator(aside: float, height: float) -> Callable[[jax.Array], lfm.Simulation]:
+def _simulator(aside: float, height: float, df: float) -> Callable[[jax.Array], lfm.Simulation]:
     """Return the simulator, compiled once for all seeds."""
-    system = build(**TRUTH, aside=aside, height=height, start_sd=(0.0, 0.0))
+    system = build(**TRUTH, aside=aside, height=height, start_sd=(0.0, 0.0), df=df)
     return jax.jit(lambda key: lfm.simulate(key, system, GRID, steps=5))
