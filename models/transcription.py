@@ -14,8 +14,8 @@ covariance. The option `link` chooses g:
 
 Expression starts near the resting level, x_j(0) ~ N(basal_j / decay_j, 0.1^2).
 
-With the option `df` the errors e_jk are noise_sd_j times Student's t of that many degrees of freedom, and gross errors
-do not move the parameters far, as in
+With the option `df` the errors e_jk are noise_sd_j times Student's t of that many degrees of freedom, so that
+a few gross errors move the rates little; the noise_sd of their gene grows. As in
 
     lfm-ppl fit transcription --data p53.csv --option df=4
 

@@ -145,10 +145,13 @@ def is_count(grid: Any) -> bool:
     """Whether a grid is given as a number of rows.
 
     Raises:
-        ValueError, TypeError: they are fewer than two, or a truth value.
+        ValueError, TypeError: they are fewer than two, or a single number that is not whole.
     """
-    if np.ndim(grid) or not isinstance(grid, (bool, int, np.integer)):
+    if np.ndim(grid):
         return False
+    if not isinstance(grid, (bool, int, np.integer)):
+        raise TypeError(f"grid must be times, shape (G,), or a whole number of rows; got {grid!r}. One time is "
+                        f"[{grid}].")
     checks.positive_integer("grid", grid, "Give times, or a number of rows.")
     if grid < 2:
         raise ValueError("grid must be at least 2 rows, the first and the last of the record, or the times at which "
@@ -160,7 +163,9 @@ def _spread(times: np.ndarray, origin: float, count: int) -> np.ndarray:
     """Return ``count`` times at equal distances; no time lies next to one of an observation."""
     nodes = np.unique(np.append(times, origin))
     wanted = np.linspace(nodes[0], nodes[-1], count)
-    nearest = nodes[np.abs(wanted[:, None] - nodes).argmin(axis=1)]
+    after = np.clip(np.searchsorted(nodes, wanted), 1, len(nodes) - 1) if len(nodes) > 1 else np.zeros(count, int)
+    before = np.maximum(after - 1, 0)
+    nearest = np.where(wanted - nodes[before] <= nodes[after] - wanted, nodes[before], nodes[after])
     return np.unique(np.where(np.abs(wanted - nearest) <= _SMALLEST_SHARE * (nodes[-1] - nodes[0]), nearest, wanted))
 
 

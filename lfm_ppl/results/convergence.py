@@ -88,7 +88,7 @@ def of_sites(points: int, unconverged: int, impossible: int, *, constrained: boo
     return [
         f"the sites of the {which} do not converge at {unconverged} of {points} {where} "
         f"({100.0 * unconverged / points:.2g}%), and the likelihood counts as zero there (and at {impossible} "
-        f"points in all): draws may miss these parameters. {remedy}"
+        f"points in all){'' if from_mode else ': draws may miss these parameters'}. {remedy}"
     ]
 
 
@@ -105,8 +105,8 @@ def of_weights(trajectories: int, median: float, least: float) -> list[str]:
     if not trajectories or median >= LEAST_TRAJECTORIES:
         return []
     if median < 1.0:
-        return ["the likelihood under the constraints is zero at half of the draws or more: nothing holds of what is "
-                f"computed from them. {_OF_CONSTRAINTS}"]
+        return ["the likelihood under the constraints is zero at half of the draws or more: results that rest on them "
+                f"mean nothing. {_OF_CONSTRAINTS}"]
     return [
         f"the {trajectories} weighted trajectories of the evidence under constraints are worth {median:.2g} at half of "
         f"the draws, and {least:.2g} at the worst: the log likelihood is off by about {median**-0.5:.1f}, differently "

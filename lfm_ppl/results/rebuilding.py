@@ -86,6 +86,8 @@ def _check_settings(site: LikelihoodSite, attrs: Mapping[str, Any]) -> None:
            "constraints": example.constraints_in_words if example.constrained else None}
     if not set(own) & set(attrs):
         return  # not made by `fit`
+    if example.constrained and " at " not in str(attrs.get("constraints")):  # of a version that stored no number
+        own["constraints"] = ", ".join(example.bounds)
     for name in own:
         # What is None is not stored.
         if attrs.get(name) != own[name]:

