@@ -218,7 +218,11 @@ class _Plan(NamedTuple):
 
 
 def _plan(bound: BoundModel, at: np.ndarray | None, simulated: bool) -> _Plan:
-    """Lay out the rows; those of a simulation after the data are no longer than the usual distance of the data."""
+    """Lay out the rows.
+
+    Those after the data are no longer than the usual distance of the data where something is integrated on the way: a
+    simulation, or the known inputs of a linear model.
+    """
     example = bound.site.example
     known = bound.times
     gaps = np.diff(known, axis=-1)
@@ -230,7 +234,8 @@ def _plan(bound: BoundModel, at: np.ndarray | None, simulated: bool) -> _Plan:
     if at is None:
         return _Plan(None, rows, rows, fine)
     beyond = np.array([])
-    if simulated and at.max() > known[-1] and (gaps > 0).any():
+    integrated = simulated or not example.ssm.mean_invariant
+    if integrated and at.max() > known[-1] and (gaps > 0).any():
         gap = np.median(gaps[gaps > 0])
         count = min(int(np.ceil((at.max() - known[-1]) / gap * (1 - 1e-12))), LONGEST_FORECAST)
         beyond = np.linspace(known[-1], at.max(), count + 1)[1:-1]
