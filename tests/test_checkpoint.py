@@ -95,7 +95,7 @@ def whole():
     return functools.cache(fit)
 
 
-@pytest.mark.parametrize("sampler", ["nuts", "ram", "pmmh"])
+@pytest.mark.parametrize("sampler", ["nuts", *(pytest.param(name, marks=pytest.mark.slow) for name in ("ram", "pmmh"))])
 def test_a_run_that_is_stopped_goes_on_to_the_same_draws(sampler, whole, tmp_path, stop_after):
     expected = whole(sampler)
     stop_after(0, steps=3)

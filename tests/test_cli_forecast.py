@@ -79,6 +79,7 @@ def test_forecast_of_a_stored_result_writes_table_figure_group_and_scores(result
     assert "held_out_data" not in arviz_data.groups(arviz_data.load(ahead))
 
 
+@pytest.mark.slow
 def test_a_forecast_of_a_partial_result_has_its_figure(result, capsys):
     whole = arviz_data.load(result)
     partial = arviz_data.build({name: arviz_data.group(whole, name) for name in ("posterior", "observed_data")},

@@ -125,6 +125,7 @@ def panel_model(times, y=None):
         numpyro.sample("y", lfm.panel(build, {"decay": decay}, times), obs=y)
 
 
+@pytest.mark.slow
 def test_the_series_of_a_panel_have_one_name_everywhere():
     draws, times = {"decay": np.full((1, 4, 3), 0.5)}, np.arange(3.0)
     y = np.zeros((3, 3, 1))

@@ -361,6 +361,7 @@ def shared(times, y=None):
         numpyro.sample("y", lfm.panel(build, decay, times), obs=y)
 
 
+@pytest.mark.slow
 def test_panel(tmp_path):
     times = TIMES[:4]
     y = np.stack([motif.data(seed=s, missing=False)[:4, :1] for s in (1, 2)])

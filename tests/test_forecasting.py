@@ -121,6 +121,7 @@ def ahead_of_the_wells(between_the_wells):
     return predictions(lfm.forecast(between_the_wells[2], well, np.concatenate([AROUND, LATER]), draws=DRAWS))
 
 
+@pytest.mark.slow
 def test_after_the_data_a_nonlinear_model_has_its_own_distribution(between_the_wells, ahead_of_the_wells):
     """Two wells, as the Fokker-Planck equation has them; Gaussian moments would fill the gap between."""
     times, y, _ = between_the_wells

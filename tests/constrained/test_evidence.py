@@ -102,6 +102,7 @@ def small():
     return log_prob, y
 
 
+@pytest.mark.slow
 def test_nothing_observed_has_probability_one():
     log_prob, y = small()
     assert abs(float(log_prob(np.full_like(y, np.nan), 1.0, 0.0))) < 1e-12

@@ -35,6 +35,7 @@ def test_without_constraints_it_is_the_kalman_filter():
     np.testing.assert_allclose(found.force_mean[rows, 0], filtered.filtered_mean[rows, 1], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_with_a_delay_it_is_the_fixed_lag_smoother():
     found = lfm.moving_horizon(MODEL, TIMES, Y, window=WINDOW, delay=2)
     for last in (WINDOW - 1, 8, 11):
@@ -44,7 +45,7 @@ def test_with_a_delay_it_is_the_fixed_lag_smoother():
         np.testing.assert_allclose(found.force_mean[rows, 0], smoothed.force("factor").mean[rows], atol=1e-9)
 
 
-@pytest.mark.parametrize("delay", [0, 6])
+@pytest.mark.parametrize("delay", [0, pytest.param(6, marks=pytest.mark.slow)])
 def test_a_window_that_holds_everything_is_full_information(delay):
     whole = lfm.full_information(MODEL, TIMES, Y, lower={"factor": 0.0}, grid=np.unique(TIMES))
     found = lfm.moving_horizon(MODEL, TIMES, Y, window=12, delay=delay, lower={"factor": 0.0})

@@ -43,7 +43,8 @@ def accepted(mean, covariance, low, high):
     return draws[((draws[:, 1::2] >= low) & (draws[:, 1::2] <= high)).all(axis=1)]
 
 
-@pytest.mark.parametrize("upper", [{}, {"factor": 1.2}], ids=["one bound", "two bounds"])
+@pytest.mark.parametrize("upper", [
+    pytest.param({}, id="one bound", marks=pytest.mark.slow), pytest.param({"factor": 1.2}, id="two bounds")])
 def test_moments_and_bands(dense, upper):
     found = lfm.constrained_posterior(model(), TIMES, Y, lower={"factor": 0.0}, upper=upper, grid=TIMES)
     assert found.converged

@@ -312,6 +312,7 @@ def test_the_figures_are_drawn_and_labelled():
             assert axes.get_ylabel()
 
 
+@pytest.mark.slow
 def test_what_is_stored_is_tabulated_and_drawn_without_computing(tmp_path):
     results = made_up(MADE)
     for task in experiment.all_tasks(MADE):

@@ -59,6 +59,7 @@ def test_gradients_are_those_of_the_exact_integration_in_both_modes():
     np.testing.assert_allclose(reverse, exact, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_rejected_step_does_not_spoil_the_derivative():
     """A first step of an eighth of the interval would overflow."""
     at = jnp.array([-3.0, 40.0, 5.0])
@@ -73,6 +74,7 @@ def test_a_rejected_step_does_not_spoil_the_derivative():
     pytest.param(1.0, jax.nn.softplus, id="softplus-diffuse", marks=pytest.mark.slow),
     pytest.param(0.0, jnp.exp, id="exp-known", marks=pytest.mark.slow),
 ])
+@pytest.mark.slow
 def test_driven_models(link, start):
     y = np.array([[0.2, 0.4], [0.9, 1.0], [np.nan, 1.3], [0.8, 0.9], [0.7, np.nan]])
     exact = expression(start=start, link=link).log_prob(y)
@@ -121,6 +123,7 @@ def test_an_input_that_jumps_between_rows_takes_few_steps():
     np.testing.assert_allclose(found, explicit(STEPPED).log_prob(Y), atol=1e-3)
 
 
+@pytest.mark.slow
 def test_derivatives_with_respect_to_times():
     def log_prob(t, tolerance, steps):
         return explicit(initial_time=t, tolerance=tolerance, steps=steps).log_prob(Y)
@@ -169,6 +172,7 @@ def test_a_cascade_from_a_known_zero_in_any_units(units):
     np.testing.assert_allclose(log_prob(1e-5, 100), exact, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_smoothed_moments_at_requested_times():
     at = np.array([0.7, 5.1, 9.5])
     exact, found = (lfm.smooth(double_well(SLOW_TO_STIFF[0]).model, TIMES, Y, at=at, **settings)
@@ -191,6 +195,7 @@ def test_smoother_draws_and_requested_times():
     np.testing.assert_allclose(draws.forces["u"].std(0), found.force("u").sd, rtol=0.05)
 
 
+@pytest.mark.slow
 def test_requested_times_change_nothing():
     y = np.full((5, 2), 0.7)
     adaptive = expression(tolerance=1e-3, steps=60)
@@ -198,6 +203,7 @@ def test_requested_times_change_nothing():
                                rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_replicates_gaps_and_a_row_of_its_own_for_each_call():
     times = np.array([0.0, 0.0, 2.0, 2.0, 40.0])
     y = np.full((5, 2), 0.7)
@@ -209,6 +215,7 @@ def test_replicates_gaps_and_a_row_of_its_own_for_each_call():
     np.testing.assert_allclose(then.log_likelihood, whole.log_likelihood[3:], rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_side_by_side_as_one_by_one():
     alone = [double_well(p, tolerance=1e-3).log_prob(Y) for p in SLOW_TO_STIFF]
     together = jax.jit(jax.vmap(lambda p: double_well(p, tolerance=1e-3).log_prob(Y)))(SLOW_TO_STIFF)

@@ -131,6 +131,7 @@ def test_blow_up_is_minus_infinity_with_zero_gradient(compiled, name, theta, reg
     assert not gradients[0].any() and np.isfinite(gradients[1]).all() and gradients[1].any()
 
 
+@pytest.mark.slow
 def test_hessian_is_finite_and_symmetric(compiled):
     value, gradient = compiled("linear")
     theta = jnp.array([0.8, 1.3, 0.1, 0.0, 1.0])

@@ -91,6 +91,7 @@ def test_replicates_in_any_order(model):
     same(one.leave_one_out[jnp.array(order)], other.leave_one_out, 1e-9)
 
 
+@pytest.mark.slow
 def test_an_interval_in_two_pieces(model):
     """A row without observations in the middle of every interval, with half of the steps on each side."""
     times = np.array([0.0, 1.0, 2.5, 3.0])
@@ -171,6 +172,7 @@ def test_requested_times_come_in_the_order_that_was_asked(model):
     assert np.array_equal(one.times, shuffled)
 
 
+@pytest.mark.slow
 def test_a_long_gap_in_one_row_and_in_a_thousand():
     """Missing observations cut the gap; max_step does the same inside one row."""
     model = double_well(mean=0.3, variance=0.1, dispersion=0.6)

@@ -133,9 +133,12 @@ def _cases() -> dict[str, Any]:
 
 
 CASES = _cases()
+# Others of the same kind stay: orders 0 to 5, a mean and known inputs.
+SLOW = {"matern 0", "matern 2", "matern 4", "motif, uncertain start", "constant mean", "additive function"}
 
 
-@pytest.fixture(scope="module", params=CASES)
+@pytest.fixture(scope="module", params=[
+    pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in CASES])
 def case(request):
     return CASES[request.param]()
 

@@ -92,6 +92,7 @@ def repeating(period_decay, lengthscale):
         lfm.Gaussian(jnp.zeros(1), jnp.eye(1)), initial_time=0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cut", [pytest.param(3, marks=pytest.mark.slow), 12])
 def test_forces_that_jump_go_on_in_compiled_code(cut):
     """The times are known; the state comes from the same compiled function, or from outside of it as an argument."""
@@ -112,6 +113,7 @@ def test_forces_that_jump_go_on_in_compiled_code(cut):
     np.testing.assert_allclose(passed_in, expected, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_jump_is_not_repeated_where_the_filter_stands_at_it():
     """The first window ends exactly at the jump, which it has seen."""
     times = np.array([0.4, 1.1, 1.9, 2.6, 3.0])

@@ -57,7 +57,8 @@ def dense(evolution):
     return Regression(process, np.eye(1, 2), np.array([0.1]))
 
 
-@pytest.mark.parametrize("evolution", EVOLUTIONS)
+@pytest.mark.parametrize("evolution", [
+    pytest.param(name, marks=() if name == "SQM" else pytest.mark.slow) for name in EVOLUTIONS])
 def test_a_driven_state_is_that_of_dense_algebra(evolution):
     """All eigenfunctions above 1e-12; times asked for, one of them a change point; replicates; a missing entry."""
     force = lfm.QuasiPeriodic(kernel(), EVOLUTIONS[evolution], gamma=1e-12)
@@ -69,6 +70,7 @@ def test_a_driven_state_is_that_of_dense_algebra(evolution):
     np.testing.assert_allclose(found.input_covariance, covariance[np.arange(6), np.arange(6)], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_kernel_that_is_not_stationary_drives_a_state():
     """Its functions of time are integrated by Runge-Kutta steps; the reference has the same covariance."""
     moderated = forces.ModeratedPeriodicMatern(1.0, 1.0, PERIOD, 0.2, 2)
@@ -154,6 +156,7 @@ def test_a_resonator_with_a_bias_is_that_of_dense_algebra():
         assert abs(float(found.log_likelihood.sum()) - reference.log_likelihood(TIMES, Y)) < 1e-8
 
 
+@pytest.mark.slow
 def test_forces_on_a_grid_may_jump():
     """Their prior there is the product of the kernels."""
     latent = lfm.LatentGrid(model(lfm.QuasiPeriodic(kernel(), forces.SQM(1.5, POINTS), functions=5)), TIMES, 40)
@@ -167,6 +170,7 @@ def test_a_period_longer_than_the_data_is_an_error():
         lfm.MarginalLikelihood(late, TIMES)
 
 
+@pytest.mark.slow
 def test_a_sampled_period_may_be_longer_than_the_data():
     """A draw from its prior must not end a fit."""
     late = model(lfm.Periodic(kernel(period=jnp.asarray(24.0)), functions=3))

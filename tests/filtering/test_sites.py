@@ -206,6 +206,7 @@ def test_update_in_natural_parameters_against_dense_algebra():
     assert found.log_likelihood == pytest.approx(integral, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_leave_one_out_terms_are_differences_of_evidences():
     """EP's own approximation of both; and one-step-ahead terms add up to nearly the evidence."""
     y = data("Poisson")
@@ -295,6 +296,7 @@ def test_weighted_draws_of_the_smoother_estimate_the_evidence(name):
     assert abs(log_weights.max() + np.log(weight.mean()) - log_z) < 5 * np.hypot(own, error)
 
 
+@pytest.mark.slow
 def test_a_known_start_is_the_limit_of_a_nearly_known_one():
     times, y = np.arange(5.0), np.array([[1.0], [2.0], [np.nan], [0.0], [1.0]])
 

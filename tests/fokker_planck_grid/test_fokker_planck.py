@@ -81,7 +81,7 @@ LINEAR = {
 
 
 @pytest.mark.parametrize("name", [
-    pytest.param(name, marks=pytest.mark.slow if name in ("drift of time", "force") else ()) for name in LINEAR])
+    pytest.param(name, marks=() if name == "known start" else pytest.mark.slow) for name in LINEAR])
 def test_it_equals_the_kalman_filter_and_smoother(name):
     model, options = LINEAR[name]
     y = data(model)
@@ -103,6 +103,7 @@ def test_it_equals_the_kalman_filter_and_smoother(name):
         assert densities.min() >= 0.0
 
 
+@pytest.mark.slow
 def test_equal_intervals_use_the_matrix_and_agree():
     model, times = ornstein_uhlenbeck(), np.arange(12) * 0.4
     y = np.array(lfm.simulate(jax.random.key(2), model, times).y)
@@ -145,6 +146,7 @@ def proportional(x, u, t):
     return 0.5 * jnp.reshape(x, (1, 1))
 
 
+@pytest.mark.slow
 def test_state_dependent_dispersion_against_geometric_brownian_motion():
     model = lfm.LatentForceModel(growing, {}, lfm.GaussianObservation(whole_state, jnp.array([0.1])),
                                  lfm.Gaussian([1.0], [0.0]), process_noise=proportional, initial_time=0.0)
@@ -271,6 +273,7 @@ def test_failure_in_compiled_code_is_minus_infinity():
         assert run(*bad) == -np.inf
 
 
+@pytest.mark.slow
 def test_the_chosen_grid_is_as_accurate_as_asked():
     tolerance = 2e-3
     grid = choose_grid(WELL, WELL_TIMES, WELL_Y, tolerance=tolerance)
@@ -286,6 +289,7 @@ def test_the_chosen_grid_is_as_accurate_as_asked():
     assert filtered[:, :3].max() < 1e-10 and filtered[:, -3:].max() < 1e-10
 
 
+@pytest.mark.slow
 def test_one_grid_for_several_models_and_data_sets():
     models = [parameters(theta) for theta in ((1.5, 0.8), (0.5, 1.0))]
     sets = np.stack([WELL_Y, -WELL_Y])
@@ -370,6 +374,7 @@ def test_models_without_a_density(model, message):
             function(model, [0.0, 1.0], np.ones((2, 1)))
 
 
+@pytest.mark.slow
 def test_a_state_that_runs_away_has_no_bounds():
     model = simple(away, start=0.0, variance=1.0, process_noise=jnp.eye(1), noise=jnp.array([1e4]))
     with pytest.raises(ValueError, match="no bounds hold the density|not finite near|filter failed"):

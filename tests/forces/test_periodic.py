@@ -77,8 +77,7 @@ def test_the_error_is_the_spectral_mass_left_out(order, functions):
 
 
 @pytest.mark.parametrize(("order", "largest"), [
-    ("se", 0.01), pytest.param(2, 0.01, marks=pytest.mark.slow), pytest.param(1, 0.015, marks=pytest.mark.slow),
-    (0, 0.064)])
+    ("se", 0.01), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((2, 0.01), (1, 0.015), (0, 0.064)))])
 def test_the_default_is_as_good_as_documented(order, largest):
     """At all lengthscales; the largest errors are where a pair is only just left out."""
     errors = []
@@ -106,6 +105,7 @@ def test_the_error_goes_to_zero():
         assert errors[0] > errors[1] > errors[2] and errors[2] < last
 
 
+@pytest.mark.slow
 def test_nystrom_is_the_paper_s_formula():
     """Equation 30, orthonormal eigenfunctions, and a mean error of the eigenvalues left out."""
     kernel, count = forces.ModeratedPeriodicMatern(1.2, 0.8, 10.0, 0.2, 1), 7
@@ -136,6 +136,7 @@ def test_both_treatments_agree_where_both_apply():
     assert_allclose(three, one, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_published_comparison():
     """A squared exponential of scale 10 on a window of 130: 22 eigenfunctions against random frequencies."""
     window = np.linspace(0.0, 130.0, 131)[:-1]
@@ -213,6 +214,7 @@ def test_repeated_eigenvalues_have_finite_derivatives():
     assert_allclose(jax.grad(projector)(point), difference, atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("evolution", [forces.CQM(12.0), forces.SQM(1.5, POINTS), forces.WQM(0.4, POINTS)],
                          ids=["CQM", "SQM", "WQM"])
 def test_simulated_weights_have_the_published_covariance(evolution):

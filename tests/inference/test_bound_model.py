@@ -105,6 +105,7 @@ def test_many_data_sets_are_a_vmap(bound):
     np.testing.assert_allclose(both, [bound.log_density(z), bound.log_density(z, OTHER)], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_filter_and_smoother_at_a_draw_are_the_librarys(bound):
     system = systems.motif(decay=0.8, lengthscale=1.3, noise_sd=VALUES["noise_sd"])
     z = bound.unconstrain(VALUES)
@@ -141,7 +142,9 @@ def test_a_model_is_traced_once_whatever_the_data():
     assert float(second.log_density(z)) != float(first.log_density(z))
 
 
-@pytest.mark.parametrize("change", [{"times": TIMES + 1.0}, {"y": Y[:, :1]}, {"order": 2}], ids=str)
+@pytest.mark.parametrize("change", [
+    {"times": TIMES + 1.0},
+    *(pytest.param(change, marks=pytest.mark.slow) for change in ({"y": Y[:, :1]}, {"order": 2}))], ids=str)
 def test_what_decides_the_program_is_never_mixed_up(bound, change):
     def sized(times, y=None, order=1):
         count = 2 if y is None else y.shape[1]
@@ -158,9 +161,9 @@ def test_what_decides_the_program_is_never_mixed_up(bound, change):
 
 
 @pytest.mark.parametrize("sampler, model, fixed", [
-    pytest.param("nuts", small, {}, id="nuts, one parameter"),
+    pytest.param("nuts", small, {}, id="nuts, one parameter", marks=pytest.mark.slow),
     pytest.param("nuts", model, {"lengthscale": 1.3}, id="nuts", marks=pytest.mark.slow),
-    pytest.param("ram", model, {"lengthscale": 1.3}, id="ram"),
+    pytest.param("ram", model, {"lengthscale": 1.3}, id="ram", marks=pytest.mark.slow),
     pytest.param("map", model, {"lengthscale": 1.3}, id="map")])
 def test_a_second_data_set_compiles_nothing_in_fit(sampler, model, fixed):
     settings = {"sampler": sampler, "chains": 2, "warmup": 20, "samples": 20, "trajectory_draws": 8, "progress": False,
@@ -234,6 +237,7 @@ def test_fixed_parameters_and_settings(bound):
     assert bound.approximate(steps=9)._program is finer._program
 
 
+@pytest.mark.slow
 def test_a_model_that_asks_its_data_for_values():
     def looks(times, y=None):
         shift = float(np.nanmean(y))
@@ -299,8 +303,8 @@ def _density_of(change, **start):
 
 
 @pytest.mark.parametrize("change", [
-    {"power": 2.0}, {"prior": 0.5}, {"table": np.array([1.0, 2.1])},
-    *(pytest.param(change, marks=pytest.mark.slow) for change in ({"noise": 0.2}, {"steps": 3}))], ids=str)
+    {"power": 2.0}, *(pytest.param(change, marks=pytest.mark.slow) for change in (
+        {"prior": 0.5}, {"table": np.array([1.0, 2.1])}, {"noise": 0.2}, {"steps": 3}))], ids=str)
 def test_a_variable_that_a_model_reads_may_change(change):
     z, ((first, before), (second, after)) = _density_of(change)
     assert second._program is not first._program and before != after

@@ -53,6 +53,7 @@ def test_nuts_over_the_force_has_the_posterior_of_the_marginal_model():
     assert abs(found["std"] / sd - 1) < 4 / np.sqrt(2 * found["n_eff"]) + 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kernel", [pytest.param(NUTS, marks=pytest.mark.slow), lfm.RAM])
 def test_a_known_start_is_known_in_compiled_code_too(kernel):
     """Numbers that the model makes are tracers there, so that no site may depend on their values."""

@@ -216,6 +216,7 @@ def test_wrong_shapes_are_named():
         LatentGrid("model", TIMES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("build", [genes, pytest.param(oscillator, marks=pytest.mark.slow)])
 def test_many_observations_are_those_of_few(build, monkeypatch):
     """Above a number of observations the grid loops over them; with gaps, repeats, and one at the start."""

@@ -129,6 +129,7 @@ def test_a_nonlinear_link_agrees_with_importance_sampling_from_the_prior():
     assert abs(found.mean() - 1.0) < 4.0 * np.hypot(error, found.std() / np.sqrt(200))
 
 
+@pytest.mark.slow
 def test_jumps_of_a_force():
     force = Kicked(0.3, (0.6, 1.0), 1.0, 1.3, 1)
     model = eqx.tree_at(lambda m: m.forces["u"], driven(), force)
@@ -149,6 +150,7 @@ def test_angles_are_compared_on_the_circle():
     assert np.allclose(wrapped.log_likelihood, plain.log_likelihood, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_batches_bound_the_memory_and_nothing_else():
     """In batches, the last of which is not full, the estimate is as unbiased."""
     model = relaxing()
@@ -180,6 +182,7 @@ def test_some_exploding_particles_leave_the_others_alone():
     assert np.all(np.isfinite(result.log_likelihood)) and np.all(np.isfinite(result.mean))
 
 
+@pytest.mark.slow
 def test_lost_particles_count_wherever_they_are_lost():
     """A drift that explodes from some starts: rows within an interval do not forgive what one row would not."""
     model = lfm.LatentForceModel(lambda x, u, t: x**2, {}, lfm.GaussianObservation(first_state, jnp.array([1.0])),

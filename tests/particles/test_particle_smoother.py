@@ -31,6 +31,7 @@ def assert_close(found, mean, sd, draws, share=0.1):
     assert np.allclose(np.sqrt(np.asarray(found.covariance)[:, 0, 0]), sd[:, 0], rtol=share)
 
 
+@pytest.mark.slow
 def test_backward_simulation_of_a_linear_model():
     """Against the Rauch-Tung-Striebel smoother, before, between and after the observations."""
     exact = lfm.smooth(linear(), TIMES, Y, at=AT)
@@ -72,6 +73,7 @@ def test_the_double_well_agrees_with_the_grid():
         assert_close(found, np.asarray(exact.smoothed_mean)[:, None], np.asarray(exact.smoothed_sd)[:, None], count)
 
 
+@pytest.mark.slow
 def test_replicates_share_the_state():
     """Between observations at one time nothing moves: a trajectory has one value there."""
     found = lfm.particle_smoother(jax.random.key(0), double_well(), TIMES, Y, particles=200, draws=50, steps=5)
@@ -79,6 +81,7 @@ def test_replicates_share_the_state():
     assert np.array_equal(found.draws[:, 1], found.draws[:, 2])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model, reason", [
     (linear(lfm.Constant(1.0)), "not every state of this linear model"),
     (motif(softplus, genes=1), "not every physical state"),

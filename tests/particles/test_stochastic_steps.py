@@ -110,6 +110,7 @@ def observed_order(ssm, step, reference=None, factors=(8, 32)):
     return np.log(errors[1] / errors[0]) / np.log(factors[1] / factors[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ssm", [well(), varying(), pushed(0), pushed(1)],
                          ids=["double well", "time-varying noise", "rough force", "smooth force"])
 def test_the_runge_kutta_scheme_has_strong_order_one_and_a_half(ssm):

@@ -97,6 +97,7 @@ def test_exact_draws_are_calibrated_and_wide_ones_are_not(conjugate):
         assert calibration.p_values(wide.ranks[name], 63)["ecdf"] < 0.001, name
 
 
+@pytest.mark.slow
 def test_tasks_in_a_folder_find_the_same_ranks_and_go_on(conjugate, tmp_path):
     lines = []
     for count in (2, 1, 0):

@@ -52,6 +52,7 @@ def ahead(result):
     return lfm.forecast(result, counts, AHEAD, draws=100)
 
 
+@pytest.mark.slow
 def test_new_counts_are_counts_and_so_are_their_intervals(result, ahead):
     predicted = arviz_data.group(ahead, "predictions")
     replicated = arviz_data.group(result, "posterior_predictive")["y"].values

@@ -76,6 +76,7 @@ def test_the_prediction_is_that_of_a_hundred_times_the_plain_particles(predicted
     agree(predicted, *by_hand(np.random.default_rng(0), 100_000))
 
 
+@pytest.mark.slow
 def test_simulated_paths_have_the_same_distribution(predicted):
     drawn = lfm.simulate_switched(jax.random.key(2), house, THERMOSTAT, TIMES, paths=100_000)
     agree(predicted, np.asarray(drawn.state[:, :, 0]), np.asarray(drawn.inputs))
@@ -105,7 +106,8 @@ def test_between_decisions_nothing_is_drawn():
     assert heated.outputs.error()[-1, 0] < 0.3 * plain
 
 
-@pytest.mark.parametrize("build", [house, leaky], ids=["adds", "changes a rate"])
+@pytest.mark.parametrize("build", [
+    pytest.param(house, id="adds", marks=pytest.mark.slow), pytest.param(leaky, id="changes a rate")])
 def test_an_input_that_never_changes_is_the_filter(build):
     """Always on: moments, likelihood and state of the Gaussian filter of the heated house, whatever is drawn."""
     y = 17.0 + np.sin(3 * TIMES)[:, None]
@@ -139,6 +141,7 @@ def test_the_likelihood_is_that_of_weighted_paths():
     assert abs(float(found.mean[6, 0]) - mean) < 4 * spread * np.sqrt(1 / size + 3.0 / float(found.ess.min()))
 
 
+@pytest.mark.slow
 def test_forces_that_jump_are_followed():
     """A random jump of the force between two decisions: mean and variance of both kinds of particles."""
 
@@ -256,6 +259,7 @@ def two_rooms():
                                 lfm.Gaussian(jnp.zeros(2), jnp.eye(2)))
 
 
+@pytest.mark.slow
 def test_an_observation_comes_before_the_decision_at_its_time():
     """Of the input itself, which is switched on at the first time: the first reading is still of the heater off."""
 
