@@ -26,13 +26,13 @@ from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference import sampling
 from lfm_ppl.inference.bound_model import BoundModel, bind
 from lfm_ppl.inference.interruption import was_interrupt
-from lfm_ppl.inference.kernels.options import check_options
+from lfm_ppl.inference.kernels.options import KERNELS, check_options
 from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalRAM, Tuned
-from lfm_ppl.inference.kernels.ram import RAM
 from lfm_ppl.inference.map import MAPResult, mode_of
 from lfm_ppl.inference.marginal_likelihood import Panel
 from lfm_ppl.inference.posterior import scores, trajectories
 from lfm_ppl.inference.progress import Counter
+from lfm_ppl.inference.samplers import FILTERED, SAMPLERS
 from lfm_ppl.inference.sampling import Transition
 from lfm_ppl.inference.site_failures import failures_at, paths_worth, site_failures
 from lfm_ppl.results import arviz_data
@@ -41,12 +41,6 @@ from lfm_ppl.results.checkpoint import Checkpoint
 from lfm_ppl.results.files import POSTERIOR
 from lfm_ppl.results.inputs import remember
 from lfm_ppl.results.layout import Labels, lay_out
-
-SAMPLERS = ("nuts", "ram", "pmmh", "map")
-
-_STEPS_A_DRAW = {"ram": 5, "pmmh": 1}
-"""Steps for each parameter that make one draw: a random walk in d dimensions forgets in some multiple of d. A step of
-particle-marginal RAM takes some hundred times as long as one of RAM, so that it makes fewer."""
 
 _GRID = 200
 """Number of grid points of trajectories where no times are asked for."""
@@ -197,7 +191,7 @@ def fit(
     if sampler == "map":
         chains, warmup, thin, method = 1, 0, None, None
     else:
-        thin = thin or _STEPS_A_DRAW.get(sampler, 0) * bound.size or 1
+        thin = thin or SAMPLERS[sampler].steps_a_draw * bound.size or 1
         method = sampling.available_method(chain_method, chains)
     asked = _Asked(sampler, chains, warmup, samples, thin, seed, dict(fixed or {}), at, trajectory_draws, init,
                    dict(sampler_options or {}), method)
@@ -391,7 +385,7 @@ class _Run:
     def _found_of_sites(self, flat: Mapping[str, Any]) -> dict[str, str]:
         """Return attributes that say where sites do not converge, and what the weights of trajectories are worth."""
         asked, found, z = self.asked, {}, self.z
-        if asked.sampler in ("nuts", "ram") and z is not None:
+        if asked.sampler in FILTERED and z is not None:
             found[arviz_data.SITES] = kept("convergence of the sites",
                                            lambda: site_failures(self.bound, z, asked.seed), None)
         elif asked.sampler == "map" and self.bound.site.example.constrained:
@@ -542,11 +536,10 @@ def _transition(sampler: str, bound: BoundModel, options: Mapping[str, Any] | No
     Chains that go on start nowhere: all that their transition needs to know is in ``setup``.
     """
     options = dict(options or {})
-    walk = RAM if sampler == "ram" else ParticleMarginalRAM
     if setup is not None:
         if sampler == "nuts":
             return sampling.nuts(bound, warmup, options), None, {}
-        kernel = walk(bound.model, **options)
+        kernel = KERNELS[sampler](bound.model, **options)
         if not isinstance(kernel, ParticleMarginalRAM):
             return sampling.random_walk(bound, kernel, warmup), None, {}
         kernel.prepare(bound, None, Tuned(int(setup["particles"]), float(setup["log_likelihood_sd"])))
@@ -570,7 +563,7 @@ def _transition(sampler: str, bound: BoundModel, options: Mapping[str, Any] | No
         if sampler == "pmmh":
             # At the mode, because a chain's own start may be a poor place to judge the estimate by.
             options.setdefault("tune_at", bound.unravel(mode.mode))
-    kernel = walk(bound.model, **options)
+    kernel = KERNELS[sampler](bound.model, **options)
     starts = (_starts(key, bound, strategy, chains, bound.log_density) if mode is None or init is not None
               else _about(key, bound, mode, chains))
     if not isinstance(kernel, ParticleMarginalRAM):

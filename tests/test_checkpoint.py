@@ -24,6 +24,7 @@ import lfm_ppl as lfm
 from lfm_ppl.cli import main
 from lfm_ppl.cli.interruption import watched
 from lfm_ppl.inference import progress, sampling
+from lfm_ppl.inference.samplers import SAMPLERS
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results import checkpoint as checkpoints
 from lfm_ppl.results.checkpoint import Checkpoint
@@ -33,7 +34,6 @@ TIMES = np.arange(4.0)
 Y = np.array([[0.3], [0.9], [np.nan], [-0.8]])
 SIZES = {"chains": 2, "warmup": 8, "samples": 6, "trajectory_draws": 4, "at": [0.5, 4.0], "chain_method": "vectorized"}
 OPTIONS = {"pmmh": {"particles": 10}}
-SAMPLERS = ("nuts", "ram", "pmmh", "map")
 
 
 def well(times, y=None, width=0.3):

@@ -11,7 +11,8 @@ from typing import Any, NoReturn
 import lfm_ppl
 from lfm_ppl import calendar_time, checks
 from lfm_ppl.cli import check, compare, fit, forecast, models, new, plot, simulate, version
-from lfm_ppl.cli.choices import REFERENCES, RULES, SAMPLERS
+from lfm_ppl.cli.choices import REFERENCES, RULES
+from lfm_ppl.inference.samplers import SAMPLERS
 
 MODEL_HELP = "a shipped model (see `lfm-ppl models`) or the path of a Python file"
 OPTION_HELP = "a choice that the model offers, see `lfm-ppl models MODEL`; may be repeated"

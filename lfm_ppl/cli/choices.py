@@ -19,7 +19,6 @@ RULES = {
     "central-difference": "CentralDifference",
     "monte-carlo": "MonteCarlo",
 }
-SAMPLERS = ("nuts", "ram", "pmmh", "map")
 REFERENCES = ("auto", "grid", "particles")
 FREE = "free"
 MOST_JOBS = 4

@@ -13,6 +13,7 @@ import numpy as np
 import xarray as xr
 
 from lfm_ppl import checks
+from lfm_ppl.inference.samplers import FILTERED, SAMPLERS
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.results import arviz_data, importance, likelihoods, rebuilding
@@ -228,9 +229,11 @@ def _relative_efficiency(log_likelihood: np.ndarray) -> float:
 
 def _check_sampler(result: Any) -> None:
     sampler = str(arviz_data.attributes(result).get("sampler", ""))
-    if sampler not in ("", "nuts", "ram", "map"):
-        raise ValueError(f"the draws of this result come from {sampler}, which samples the exact posterior already; "
-                         "the check is for posteriors of the Gaussian filter (samplers nuts, ram and map).")
+    if sampler not in ("", *FILTERED):
+        exact = sampler in SAMPLERS or "+" in sampler  # after a "+": how the draws were corrected
+        which = ", which samples the exact posterior already" if exact else ""
+        raise ValueError(f"the draws of this result come from {sampler}{which}; the check is for posteriors of the "
+                         f"Gaussian filter (samplers {', '.join(FILTERED)}).")
 
 
 def _kind(reference: str, ssm: StateSpaceModel) -> str:

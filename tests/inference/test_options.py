@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 import lfm_ppl as lfm
-from lfm_ppl.inference.kernels.options import check_options
+from lfm_ppl.inference.kernels.options import KERNELS, check_options
+from lfm_ppl.inference.samplers import SAMPLERS
 
 
 def never(times, y=None):
@@ -25,6 +26,10 @@ def never(times, y=None):
 def test_unknown_options(sampler, options, message):
     with pytest.raises(ValueError, match=message):
         lfm.fit(never, [0.0, 1.0], [[0.0], [1.0]], sampler=sampler, sampler_options=options)
+
+
+def test_every_sampler_has_a_kernel_but_the_mode():
+    assert set(KERNELS) == set(SAMPLERS) - {"map"}
 
 
 def test_options_that_are_known():

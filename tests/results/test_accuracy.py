@@ -382,6 +382,8 @@ def test_mistakes_about_the_result(bent, linear):
         check_accuracy(bent, relaxation)
     with pytest.raises(ValueError, match="come from pmmh, which samples the exact posterior already"):
         check_accuracy(arviz_data.build({"posterior": posterior}, {"sampler": "pmmh"}), well)
+    with pytest.raises(ValueError, match=r"come from hmc; the check is for .* \(samplers nuts, ram, map\)"):
+        check_accuracy(arviz_data.build({"posterior": posterior}, {"sampler": "hmc"}), well)
     with pytest.raises(ValueError, match="no group 'accuracy'"):
         AccuracyReport.of(arviz_data.build({"posterior": posterior}))
 

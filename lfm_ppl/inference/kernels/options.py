@@ -12,7 +12,8 @@ from lfm_ppl import checks
 from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalRAM
 from lfm_ppl.inference.kernels.ram import RAM
 
-_KERNELS = {"nuts": NUTS, "ram": RAM, "pmmh": ParticleMarginalRAM}
+KERNELS: dict[str, Any] = {"nuts": NUTS, "ram": RAM, "pmmh": ParticleMarginalRAM}
+"""Sampler of `lfm_ppl.fit` -> the kernel whose arguments ``sampler_options`` are; "map" has none."""
 
 _ELSEWHERE = {
     "model": "the model is the first argument of fit",
@@ -27,7 +28,7 @@ def check_options(sampler: str, options: Mapping[str, Any] | None) -> None:
     """Check that a sampler's kernel takes the options.
 
     Args:
-        sampler: "nuts", "ram", "pmmh" or "map".
+        sampler: a name of `lfm_ppl.inference.samplers.SAMPLERS`.
         options: of the kernel; None for none.
 
     Raises:
@@ -39,11 +40,11 @@ def check_options(sampler: str, options: Mapping[str, Any] | None) -> None:
     if not isinstance(options, Mapping):
         raise TypeError('sampler_options must map names to values, for example {"target_accept_prob": 0.95}, got '
                         f"{options!r}.")
-    if options and sampler not in _KERNELS:
-        raise ValueError(f"sampler_options are for the samplers {', '.join(_KERNELS)}; {sampler!r} takes none, got "
+    if options and sampler not in KERNELS:
+        raise ValueError(f"sampler_options are for the samplers {', '.join(KERNELS)}; {sampler!r} takes none, got "
                          f"{', '.join(map(repr, options))}.")
     for name in options:
         if name in _ELSEWHERE:
             raise ValueError(f"sampler_options cannot hold {name!r}: {_ELSEWHERE[name]}.")
-        known = [option for option in inspect.signature(_KERNELS[sampler]).parameters if option not in _ELSEWHERE]
+        known = [option for option in inspect.signature(KERNELS[sampler]).parameters if option not in _ELSEWHERE]
         checks.one_of(f"option of the sampler {sampler!r} in sampler_options:", name, known)
