@@ -110,7 +110,8 @@ def test_type_checkers_see_the_names_that_are_imported_when_asked_for():
     typing, _ = (node for node in tree.body if isinstance(node, ast.If))
     seen = {alias.asname: (node.module, alias.name) for node in typing.body for alias in node.names}
     found = {name: (f"lfm_ppl.{module}", name) for name, module in lfm_ppl._MODULES.items()}
-    assert seen == found | {name: ("lfm_ppl", name) for name in lfm_ppl._PACKAGES}
+    found |= {name: ("lfm_ppl", name) for name in lfm_ppl._PACKAGES}
+    assert seen == found, "_NAMES and the imports under TYPE_CHECKING in lfm_ppl/__init__.py differ"
 
 
 def test_no_module_takes_the_place_of_a_public_name():

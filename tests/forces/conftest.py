@@ -25,6 +25,7 @@ from lfm_ppl.forces import (
     QuasiPeriodic,
     RandomWalk,
     Resonator,
+    SparseSpectrum,
     SquaredExponential,
     WienerVelocity,
 )
@@ -40,6 +41,7 @@ FORCES = {
     "random_walk": lambda s, ell: RandomWalk(s / jnp.sqrt(ell), 0.5 * s),
     "resonator": lambda s, ell: Resonator(10.0 * ell, s, s / jnp.sqrt(ell)),
     "damped_resonator": lambda s, ell: Resonator(12.0 * ell, s, s / jnp.sqrt(ell), 0.7 / ell),
+    "sparse_spectrum": lambda s, ell: SparseSpectrum(s, jnp.array([1.0, 2.3]) / ell),
     "constant": lambda s, ell: Constant(s),
     "sum": lambda s, ell: Matern(s, ell, order=1, mean=1.0) + Constant(2.0 * s),
     "nested_sum": lambda s, ell: Matern(s, ell, order=2) + (Matern(s, ell, 0) + Matern(s, ell, 0)),
@@ -98,6 +100,11 @@ class Oscillator(Force):
         if index >= len(self.jumps):
             return super().jump(index)
         return jnp.diag(jnp.array([1.0, -1.0])), jnp.diag(jnp.array([0.0, 0.1 * (index + 1.0)]))
+
+
+@pytest.fixture
+def every_force():
+    return FORCES
 
 
 @pytest.fixture(params=FORCES)

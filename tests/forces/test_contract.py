@@ -9,6 +9,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.linalg import expm
 
+from lfm_ppl import forces
+
 SCALE, LENGTHSCALE = 1.3, 0.7
 EXTREME_LENGTHSCALES = (1e-8, 1.0, 1e8)
 
@@ -29,6 +31,13 @@ def entrywise_error(noise, expected):
     sd = np.sqrt(np.diagonal(expected, axis1=-2, axis2=-1))
     sd = np.where(sd > 0, sd, 1.0)
     return np.abs((noise - expected) / sd[..., :, None] / sd[..., None, :]).max()
+
+
+def test_every_public_force_is_in_the_list(every_force):
+    public = [getattr(forces, name) for name in forces.__all__]
+    kinds = {one.__name__ for one in public if isinstance(one, type) and issubclass(one, forces.Force)} - {"Force"}
+    missing = kinds - {type(build(SCALE, LENGTHSCALE)).__name__ for build in every_force.values()}
+    assert not missing, f"add a line to FORCES in tests/forces/conftest.py for {missing}"
 
 
 def test_shapes(build):

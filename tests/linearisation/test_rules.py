@@ -9,6 +9,7 @@ import pytest
 from references import gauss_hermite
 
 import lfm_ppl as lfm
+from lfm_ppl.cli import choices
 from lfm_ppl.linearisation.rule import Inputs
 from lfm_ppl.linearisation.structure import InputStructure
 
@@ -19,6 +20,13 @@ MEAN = np.array([0.3, -0.5, 0.8, 0.1])
 ROOT = np.random.default_rng(0).normal(size=(4, 4)) * np.array([[0.5], [0.8], [0.3], [1.0]])
 COVARIANCE = ROOT @ ROOT.T
 DENSE = gauss_hermite(4, 9)
+
+
+def test_every_public_rule_is_in_the_list_and_has_a_word_on_the_command_line():
+    public = {name: getattr(lfm, name) for name in lfm.__all__}
+    kinds = {name for name, one in public.items() if isinstance(one, type) and issubclass(one, lfm.Rule)} - {"Rule"}
+    assert kinds == {type(rule).__name__ for rule in RULES}, "add it to RULES in this file"
+    assert kinds == set(choices.RULES.values()), "give it a word in RULES of lfm_ppl/cli/choices.py"
 
 
 def structure(points, averaged=(), constant=()):

@@ -47,6 +47,19 @@ CASES = {
                          lambda y, f: stats.geom.logpmf(y + 1, special.expit(f))),
 }
 
+VALUES = {
+    "censored": (np.linspace(0.0, 5.0, 100_001), np.r_[1.0, np.full(99_999, 5.0 / 100_000), 1.0]),
+}
+"""Where the density of a case is summed, and what each value counts for, unless its data are whole numbers."""
+WHOLE = np.arange(-10.0, 400.0), np.ones(410)
+
+
+def test_every_public_family_is_among_the_cases():
+    public = {name: getattr(lfm, name) for name in lfm.__all__}
+    kinds = {name for name, one in public.items() if isinstance(one, type) and issubclass(one, lfm.ObservationFamily)}
+    missing = kinds - {type(family).__name__ for family, *_ in CASES.values()} - {"ObservationFamily", "Observations"}
+    assert not missing, f"add a line to CASES in this file for {missing}"
+
 
 @pytest.mark.parametrize("name", CASES)
 def test_log_prob(name):
@@ -61,14 +74,9 @@ def test_draws_have_these_densities(name):
     family, _, log_prob = CASES[name]
     draws = np.asarray(jax.vmap(lambda key: family.sample(key, jnp.asarray(PREDICTOR)))(
         jax.random.split(jax.random.key(0), 20_000)))
-    if name == "censored":
-        values, weight = np.linspace(0.0, 5.0, 100_001), 5.0 / 100_000
-        probability = np.exp(log_prob(values[:, None], PREDICTOR)) * np.where((values == 0) | (values == 5), 1.0,
-                                                                              weight)[:, None]
-    else:
-        values = np.arange(-10.0, 400.0)
-        with np.errstate(divide="ignore"):
-            probability = np.nan_to_num(np.exp(log_prob(values[:, None], PREDICTOR)))
+    values, weight = VALUES.get(name, WHOLE)
+    with np.errstate(divide="ignore"):
+        probability = np.nan_to_num(np.exp(log_prob(values[:, None], PREDICTOR))) * weight[:, None]
     mean = (probability * values[:, None]).sum(0)
     if name not in ("censored", "binned"):
         np.testing.assert_allclose(family.mean(jnp.asarray(PREDICTOR)), mean, rtol=1e-6, atol=1e-9)
