@@ -10,7 +10,7 @@ import numpy as np
 from lfm_ppl import checks
 from lfm_ppl.loading import ModelFile
 
-# word on the command line -> name in lfm_ppl
+# word on the command line -> name in lfm_ppl; its defaults are what the word stands for
 RULES = {
     "cubature": "Cubature",
     "taylor": "Taylor",

@@ -1,4 +1,7 @@
-"""Forces: Gaussian process priors in state-space form."""
+"""Forces: Gaussian process priors in state-space form, one a module; `sde` says what a force has to be.
+
+All that is public is exported here, as `lfm_ppl.forces.NAME`; what most models take is also `lfm_ppl.NAME`.
+"""
 
 from lfm_ppl.forces.constant import Constant
 from lfm_ppl.forces.matern import Matern

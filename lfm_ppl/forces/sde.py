@@ -25,9 +25,10 @@ class Force(eqx.Module):
         u(t) = mean(t) + H(t) z(t),    dz = F z dt + L dbeta,    z(t0) ~ N(0, P0),
 
     with a standard Brownian motion ``beta``. A subclass says ``initial_covariance`` (P0),
-    ``feedback`` (F), ``dispersion`` (L, spectral density folded in) and its dimensions; everything
-    else has a default. It may replace ``discretise`` by a closed form, the measurement by one that
-    depends on time, and add jumps of the state at given times.
+    ``feedback`` (F), ``dispersion`` (L, spectral density folded in) and its dimensions, and has a
+    field ``mean``; everything else has a default. It says whether it is ``stationary`` (not, by
+    default), and may replace ``discretise`` by a closed form, the measurement by one that depends
+    on time, and add jumps of the state at given times. `lfm_ppl.forces.parameters` checks arguments.
 
     A force is a pytree: parameters are its array leaves, so that it passes through ``jax.jit``,
     ``jax.vmap`` and ``jax.grad``. Constructors check concrete parameters and let tracers pass.

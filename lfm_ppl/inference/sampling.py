@@ -1,4 +1,7 @@
-"""Markov chains on a bound model: started outside of compiled code, advanced by one program."""
+"""Markov chains on a bound model: started outside of compiled code, advanced by one program.
+
+One function for each sampler returns its `Transition`; `sample` runs any of them.
+"""
 
 from __future__ import annotations
 

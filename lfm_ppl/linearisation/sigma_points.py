@@ -21,7 +21,8 @@ class UnitPoints(NamedTuple):
 
     Attributes:
         nodes: (p, dim).
-        weights: (p,), for expectations and for the regression on the nodes; they integrate linear functions exactly.
+        weights: (p,), for expectations and for the regression on the nodes: their sum is 1, that of ``w xi`` is 0, that
+            of ``w xi xi'`` is I.
         residual_weights: (p, p), symmetric: the residual covariance is E' W E for residuals E (p, D).
     """
 
@@ -53,7 +54,10 @@ class SigmaPointRule(Rule):
     divides their sampling error by the standard deviation of the input, however small that is."""
 
     def points(self, dim: int) -> UnitPoints:
-        """Return nodes and weights for ``dim`` >= 1 dimensions."""
+        """Return nodes and weights for ``dim`` >= 1 dimensions.
+
+        Nodes whose third moments are not zero, such as those of a simplex, need ``regresses = False``.
+        """
         raise NotImplementedError
 
     def linearise(self, function: Function, inputs: Inputs, structure: InputStructure,
