@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import inspect
 import json
+import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -17,6 +18,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jax.stages import Lowered
 from numpyro.infer import init_to_median, init_to_value
 
 from lfm_ppl import checks
@@ -24,6 +26,7 @@ from lfm_ppl.data import Data, as_data, model_keywords
 from lfm_ppl.filtering.breakdown import FilterWarning, breakdown
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference import sampling
+from lfm_ppl.inference.ahead import Ahead, worthwhile
 from lfm_ppl.inference.bound_model import BoundModel, bind
 from lfm_ppl.inference.interruption import was_interrupt
 from lfm_ppl.inference.kernels.options import KERNELS, check_options
@@ -304,6 +307,7 @@ class _Run:
         rated: scores of the observations; None where there are none yet.
         drawn: chosen draws, their trajectories, and the times of these.
         partial: what a result that was stopped lacks; None: nothing.
+        ahead: the programs of `follow`, compiled while the chains run.
     """
 
     bound: BoundModel
@@ -324,6 +328,7 @@ class _Run:
     rated: Any = None
     drawn: tuple = (None, None, None)
     partial: str | None = None
+    ahead: Ahead | None = None
 
     def sample(self) -> None:
         """Draw parameters, or find the mode; after Ctrl-C, as far as it came.
@@ -334,6 +339,8 @@ class _Run:
         asked, keeper = self.asked, self.keeper
         key = asked.keys[1]
         if asked.sampler == "map":
+            if self.progress:
+                print("posterior mode: compiling and searching", file=sys.stderr, flush=True)
             self.draws, self.stats, self.remarks = _mode(self.bound, key, asked.samples, asked.seed, asked.init, keeper)
             return
         assert asked.thin is not None
@@ -347,6 +354,8 @@ class _Run:
             keeper.look = self._look
         self.particles = {label: remarks.pop(label, None) for label in _OF_PARTICLES}
         self.remarks = {**remarks, "thin": asked.thin}
+        if asked.sampler != "pmmh" and worthwhile():  # pmmh is told its particles by the warm-up
+            self.ahead = Ahead(self._programs)
         collected = sampling.sample(key, self.bound, transition, starts, warmup=warmup, samples=asked.samples,
                                     thin=asked.thin, chain_method=asked.method, progress=self.progress, keeper=keeper)
         count = collected.z.shape[1]
@@ -357,6 +366,19 @@ class _Run:
             self.partial = _some(count, asked.samples)
         self.z = collected.z
         self.draws, self.stats = _draws(self.bound, {"z": collected.z, **collected.statistics}, asked.samples)
+
+    def _programs(self) -> list[Lowered]:
+        """Return the programs of `follow`, for draws of any values."""
+        asked = self.asked
+        shapes = jax.eval_shape(self.bound.constrain, jax.ShapeDtypeStruct((self.bound.size,), float))
+        flat = {site: np.zeros((asked.chains * asked.samples, *shapes[site].shape), shapes[site].dtype)
+                for site in self.bound.sites}
+        _, rows, grid = _paths(self.bound, asked.at, asked.trajectory_draws, asked.chains, asked.samples)
+        found = [scores(self.bound, flat, lower=True)]
+        if len(rows):
+            subset = {site: value[rows] for site, value in flat.items()}
+            found.append(trajectories(asked.keys[3], self.bound, subset, grid, lower=True))
+        return found
 
     def follow(self) -> None:
         """Compute what follows from the draws, scores of the observations and trajectories; after Ctrl-C, less."""
@@ -372,6 +394,8 @@ class _Run:
             return {"show": counter.of(what), "parts": None if keeper is None else keeper.parts(what)}
 
         try:
+            if self.ahead is not None:
+                self.ahead.wait()
             self.rated = kept("scores of the observations",
                               lambda: scores(self.bound, flat, **watched("scores")), None)
             self.remarks |= self._found_of_sites(flat)
@@ -620,22 +644,29 @@ def draw_paths(key: jax.Array, bound: BoundModel, draws: dict, at: Any, count: i
                particle_settings: Any, particle_steps: int | None,
                **more: Any) -> tuple[np.ndarray, dict | None, np.ndarray | None]:
     """Draw trajectories for draws that are spread evenly over each chain."""
-    per_chain = min(samples, -(-count // chains))
-    if per_chain == 0:
-        return np.array([], int), None, None
-    chosen = np.unique(np.linspace(0, samples - 1, per_chain).round().astype(int))
-    rows = (np.arange(chains)[:, None] * samples + chosen).ravel()
-    times = bound.times
-    grid = None
-    if times.ndim == 1:
-        origin = float(bound.site.example.time_grid.initial_time)
-        grid = (np.union1d(np.linspace(min(origin, times[0]), times[-1], _GRID), times) if at is None
-                else np.atleast_1d(np.asarray(at, float)))
+    chosen, rows, grid = _paths(bound, at, count, chains, samples)
+    if not len(rows):
+        return chosen, None, None
     subset = {site: value[rows] for site, value in draws.items()}
     paths = trajectories(key, bound, subset, grid, particle_settings, particle_steps, **more)
     if at is None:
         paths.pop("prediction", None)  # stored where they were asked for
     return chosen, {k: v.reshape(chains, len(chosen), *v.shape[1:]) for k, v in paths.items()}, grid
+
+
+def _paths(bound: BoundModel, at: Any, count: int, chains: int,
+           samples: int) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Return which draws of each chain have a trajectory, their rows among all draws, and its times."""
+    per_chain = min(samples, -(-count // chains))
+    chosen = np.unique(np.linspace(0, samples - 1, per_chain).round().astype(int))
+    rows = (np.arange(chains)[:, None] * samples + chosen).ravel()
+    times = bound.times
+    if times.ndim > 1:
+        return chosen, rows, None
+    if at is not None:
+        return chosen, rows, np.atleast_1d(np.asarray(at, float))
+    origin = float(bound.site.example.time_grid.initial_time)
+    return chosen, rows, np.union1d(np.linspace(min(origin, times[0]), times[-1], _GRID), times)
 
 
 def described_by(numpyro_model: Any) -> str | None:

@@ -118,8 +118,10 @@ def test_a_run_that_is_stopped_goes_on_to_the_same_draws(sampler, whole, tmp_pat
 
 @pytest.mark.parametrize("sampler", ["ram", "map"])
 def test_a_stop_after_sampling_costs_no_draw(sampler, whole, tmp_path, monkeypatch):
-    def stop(*arguments, **keywords):
-        raise KeyboardInterrupt
+    def stop(*arguments, lower=False, **keywords):
+        if not lower:
+            raise KeyboardInterrupt
+        raise ValueError("what cannot be compiled ahead changes nothing")
 
     with monkeypatch.context() as patch:
         patch.setattr("lfm_ppl.fitting.trajectories", stop)

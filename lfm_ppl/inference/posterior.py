@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, cast
 
 import jax
 import jax.numpy as jnp
@@ -52,9 +52,9 @@ class Parts(Protocol):
         """Keep all that was put, now."""
 
 
-def scores(bound: BoundModel, draws: Mapping[str, Any], *, show: Callable[[int, int], None] = lambda done, count: None,
-           parts: Parts | None = None) -> dict[str, np.ndarray]:
-    """Score the observations under each draw, site name -> (S, ...); ``show`` and ``parts`` as in `over_draws`.
+def scores(bound: BoundModel, draws: Mapping[str, Any], *, lower: bool = False,
+           show: Callable[[int, int], None] = lambda done, count: None, parts: Parts | None = None) -> Any:
+    """Score the observations under each draw, site name -> (S, ...); the rest is as in `over_draws`.
 
     Returns:
         ``leave_one_out`` (S, ..., T), ``one_step_ahead`` (S, ..., T), ``residual`` (S, ..., T, D); the series of a
@@ -70,13 +70,13 @@ def scores(bound: BoundModel, draws: Mapping[str, Any], *, show: Callable[[int, 
     def per_draw(values: Any, key: jax.Array, y: Any) -> dict[str, jax.Array]:
         return each(bound.likelihood(values, y), one, bound.data(y))
 
-    return over_draws(bound, "scores", per_draw, draws, jax.random.key(0), bound.times.size, show, parts)
+    return over_draws(bound, "scores", per_draw, draws, jax.random.key(0), bound.times.size, show, parts, lower)
 
 
 def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at: Any,
                  particles: ParticleSettings | None = None, particle_steps: int | None = None, *,
-                 log_likelihood: bool = False, show: Callable[[int, int], None] = lambda done, count: None,
-                 parts: Parts | None = None) -> dict[str, np.ndarray]:
+                 log_likelihood: bool = False, lower: bool = False,
+                 show: Callable[[int, int], None] = lambda done, count: None, parts: Parts | None = None) -> Any:
     """Draw one trajectory for each draw of the parameters, given the data, and new data along it.
 
     Up to the last observation the path is a draw of the smoother. After it, dynamics that are not linear are simulated
@@ -90,7 +90,8 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
         particles: draw the trajectories with the particle smoother; None: with the Gaussian one.
         particle_steps: integration steps of the particles between two observations; None: the model's.
         log_likelihood: whether to return that of the Gaussian filter, (S, ...), unless there are particles.
-        show: as in `over_draws`, and so is the next.
+        lower: as in `over_draws`, and so are the next.
+        show: of the batches.
         parts: keeps batches.
 
     Returns:
@@ -178,7 +179,7 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
     rows = plan.rows
     width = 1 if particles is None else particles.particles
     name = ("trajectories", signature(at), particles, particle_steps, after, log_likelihood)
-    return over_draws(bound, name, per_draw, draws, key, rows * width, show, parts)
+    return over_draws(bound, name, per_draw, draws, key, rows * width, show, parts, lower)
 
 
 def _of_family(ssm: StateSpaceModel, key: jax.Array, w: jax.Array, when: jax.Array,
@@ -356,7 +357,7 @@ def each(distribution: MarginalLikelihood | Panel, function: Callable, *argument
 
 def over_draws(bound: BoundModel, name: Hashable, per_draw: Callable, draws: Mapping[str, Any], key: jax.Array,
                rows: int | None = None, show: Callable[[int, int], None] = lambda done, count: None,
-               parts: Parts | None = None) -> Any:
+               parts: Parts | None = None, lower: bool = False) -> Any:
     """Return ``per_draw(values, key, y)`` for all draws (S, ...), some at a time, with one compilation for any number.
 
     Args:
@@ -369,6 +370,8 @@ def over_draws(bound: BoundModel, name: Hashable, per_draw: Callable, draws: Map
             after another, as always with steps that follow a tolerance, of which each would make as many as are tried.
         show: is told before each batch how many draws of how many are done.
         parts: keeps the batches, and knows those of an earlier run.
+        lower: return the program of a batch (`jax.stages.Lowered`), whatever the draws' values. As long as it lives,
+            what it compiles to need not be compiled again.
     """
     draws = {site: jnp.asarray(value) for site, value in draws.items()}
     count = next(iter(draws.values())).shape[0]
@@ -382,6 +385,9 @@ def over_draws(bound: BoundModel, name: Hashable, per_draw: Callable, draws: Map
         return jax.jit(jax.vmap(per_draw, in_axes=(0, 0, None)) if several else one_by_one)
 
     run, keys = bound.compiled(("over draws", several, name), make), jax.random.split(key, count)
+    if lower:
+        one = {site: value[jnp.arange(batch)] for site, value in draws.items()}
+        return cast(Any, run).lower(one, keys[jnp.arange(batch)], bound.argument)
     found = []
     for start in range(0, count, batch):
         show(start, count)
