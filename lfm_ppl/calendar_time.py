@@ -122,6 +122,17 @@ def position(text: str, origin: str | None, unit: str) -> float:
     return (stamp - start).total_seconds() / SECONDS[unit]
 
 
+def clock(time: float, origin: str, unit: str, sep: str = " ", digits: int = 0) -> str:
+    """Return a time as a date, on the clock of the origin, to so many digits of a second.
+
+    Example:
+        >>> clock(36.0, "2019-12-23T00:00:00", "h")
+        '2019-12-24 12:00'
+    """
+    stamp = datetime.fromisoformat(origin) + timedelta(seconds=round(time * SECONDS[unit], digits))
+    return stamp.isoformat(sep=sep, timespec="auto" if stamp.second or stamp.microsecond else "minutes")
+
+
 def days_of(times: Any, origin: str, unit: str) -> np.ndarray:
     """Return times as days since 1970-01-01, on the clock of the origin: what Matplotlib draws dates by."""
     start = datetime.fromisoformat(origin).replace(tzinfo=UTC)

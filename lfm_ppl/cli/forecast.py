@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
         task = check.rebuilt(posterior, arguments.model, path)
         held_out = None if arguments.held_out is None else _held_out(arguments, task)
         forecast, score = _forecast(arguments, task, held_out)
-        return _write(forecast, score, held_out, path, folder, arguments)
+        return _write(forecast, score, held_out, task, path, folder, arguments)
 
 
 def _forecast(arguments: argparse.Namespace, task: check.Check, held_out: data.Data | None) -> tuple:
@@ -99,7 +99,10 @@ def requested(observed: data.Data, until: str | None, at: str | None, grid: int,
     if until is not None:
         end = _time("--until", until, observed)
         if not (np.isfinite(end) and end > last):
-            raise ValueError(f"--until takes a time after the last observation, at {last:g}, got {until}.")
+            shown = f"{last:g}"
+            if observed.origin is not None:
+                shown = calendar_time.clock(last, observed.origin, observed.units["time"], "T")
+            raise ValueError(f"--until takes a time after the last observation, at {shown}, got {until}.")
         wanted.append(np.linspace(last, end, grid))
     return np.unique(np.concatenate(wanted))
 
@@ -142,7 +145,7 @@ def _held_out(arguments: argparse.Namespace, task: check.Check) -> data.Data:
     return read
 
 
-def _write(forecast: Any, score: Callable, held_out: data.Data | None, path: Path, folder: Path,
+def _write(forecast: Any, score: Callable, held_out: data.Data | None, task: check.Check, path: Path, folder: Path,
            arguments: argparse.Namespace) -> int:
     from lfm_ppl.results import arviz_data, files, tables
     from lfm_ppl.results.plots import plot_fit
@@ -163,6 +166,10 @@ def _write(forecast: Any, score: Callable, held_out: data.Data | None, path: Pat
             whole = arviz_data.add_group(whole, HELD_OUT, arviz_data.group(forecast, HELD_OUT))
     print(f"wrote    {arviz_data.save(whole, target, arguments.overwrite or not arguments.out)} (group {GROUP})")
     table = summary(group)
+    seen = task.observed
+    if seen.origin is not None:  # as in the data
+        table.index = pd.Index([calendar_time.clock(float(time), seen.origin, seen.units["time"], "T", 3)
+                                for time in table.index], name="time")
     print(f"wrote    {tables.write_csv(table, folder / TABLE, arguments.overwrite, index_label='time')}")
     more: dict[str, pd.DataFrame] = {}
     if held_out is not None and np.isfinite(held_out.y).any():

@@ -7,7 +7,6 @@ import json
 import re
 import shlex
 from collections.abc import Mapping, Sequence
-from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +31,7 @@ COMMAND = "command_line"
 CALL, DESCRIPTION = "call", "description"
 """Attributes of a result: the call in Python that made it, and the docstring of the model."""
 
-_MOST_TIMES = 20
+_MOST_TIMES = 40
 """Times of a forecast that are listed; more are thinned evenly."""
 
 _MOST_SERIES = 5
@@ -158,7 +157,7 @@ def _data(result: Any, attrs: Mapping[str, Any]) -> str:
     lines += [("rows", str(variable.sizes["time"])), ("missing", f"{missing} of {variable.size} values"),
               ("times", _span(times, result))]
     if origin := _origin(result):
-        lines.append(("time 0", _clock(0.0, origin, time_unit(result))))
+        lines.append(("time 0", calendar_time.clock(0.0, origin, time_unit(result))))
     if attrs.get("note"):
         lines.append(("note", str(attrs["note"])))
     shown = web_page.facts(lines)
@@ -189,19 +188,14 @@ def _span(times: np.ndarray, result: Any) -> str:
         return "none"
     text = f"{times.min():.10g} to {times.max():.10g}" + (f" {unit}" if unit else "")
     if origin := _origin(result):
-        text += f" ({_clock(float(times.min()), origin, unit)} to {_clock(float(times.max()), origin, unit)})"
+        first, last = (calendar_time.clock(float(time), origin, unit) for time in (times.min(), times.max()))
+        text += f" ({first} to {last})"
     return text
 
 
 def _origin(result: Any) -> str:
     """Return the calendar time of t = 0; empty where it, or the unit that times count, is not known."""
     return time_origin(result) if time_unit(result) in calendar_time.SECONDS else ""
-
-
-def _clock(time: float, origin: str, unit: str) -> str:
-    """Return a time as a date on the clock of the data, to the second."""
-    stamp = datetime.fromisoformat(origin) + timedelta(seconds=round(time * calendar_time.SECONDS[unit]))
-    return stamp.isoformat(sep=" ", timespec="minutes" if stamp.second == 0 else "seconds")
 
 
 def _summary(result: Any) -> str:
@@ -259,7 +253,7 @@ def _forecast_of(dataset: xr.Dataset, result: Any) -> str:
     thinned = chosen[np.unique(np.linspace(0, chosen.size - 1, _MOST_TIMES).round().astype(int))]
     table = predictions.summary(dataset.isel(time=thinned))
     unit, origin = time_unit(result), _origin(result)
-    labels = [_clock(float(time), origin, unit) if origin else f"{time:.10g}" for time in table.index]
+    labels = [calendar_time.clock(float(time), origin, unit) if origin else f"{time:.10g}" for time in table.index]
     shown = tables.html_table(table.set_axis(labels), index_label=f"time ({unit})" if unit and not origin else "time")
     what = "after the last observation" if later.size else "of the prediction"
     some = f"{thinned.size} of {chosen.size} times" if thinned.size < chosen.size else "All times"
