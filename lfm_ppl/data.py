@@ -456,7 +456,8 @@ def _missing(cell: Any) -> bool:
     return bool(cell != cell)  # NaN, and pandas' NaT
 
 
-_WANTED = "expected a number or an empty cell, got {}. If the column is not an output, name the outputs."
+_WANTED = ("expected a number or an empty cell, got {}. If the model does not take this column, name those it takes: "
+           "outputs and inputs.")
 
 
 def _value(source: Table, row: int, name: str, wanted: str = _WANTED) -> float:

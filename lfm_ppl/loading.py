@@ -337,6 +337,16 @@ def place_in_model(error: BaseException) -> Place | None:
     return found
 
 
+def known_inputs(error: KeyError) -> tuple[str, ...] | None:
+    """Return the names of the known inputs where a model file asked for one that is not there; None elsewhere."""
+    for frame, _ in traceback.walk_tb(error.__traceback__):
+        inputs = frame.f_locals.get("inputs")
+        if (str(frame.f_globals.get("__name__", "")).startswith(_MODULE) and isinstance(inputs, Mapping)
+                and error.args and error.args[0] not in inputs):
+            return tuple(map(str, inputs))
+    return None
+
+
 def _where(error: BaseException, path: Path) -> str:
     """Return the error in one line, with the last line of ``path`` that led to it."""
     lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == str(path)]

@@ -47,6 +47,10 @@ def _one_line(error: Exception) -> str:
     """Return what is wrong, and where, if it comes from a model file."""
     text = " ".join(str(error).split()) or type(error).__name__
     place = loading.place_in_model(error)
+    if isinstance(error, KeyError) and place is not None and (known := loading.known_inputs(error)) is not None:
+        return (f"{place.file}, line {place.line}: the model reads the known input {text}, and "
+                + (f"has {', '.join(known)}. Correct the name, or add it to INPUTS." if known else
+                   "has none. Name it in INPUTS, with the way it is read between rows."))
     if place is not None and place.file not in text and not (isinstance(error, ValueError) and place.shipped):
         kind = "" if isinstance(error, (ValueError, TypeError)) else f"{type(error).__name__}: "
         return f"{place.file}, line {place.line}: {kind}{text}" + (" (--debug shows more)" if kind else "")

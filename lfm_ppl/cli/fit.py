@@ -170,10 +170,13 @@ def _print_task(
     fixed: dict[str, Any],
 ) -> None:
     source = arguments.data or "simulated by the model"
-    missing = int(np.isnan(observed.y).sum())
+    count = np.isnan(observed.y).reshape(-1, len(observed.outputs)).sum(axis=0)
+    missing = int(count.sum())
+    where = "" if len(count) == 1 else " (" + ", ".join(
+        f"{number} of {name}" for number, name in zip(count, observed.outputs, strict=True) if number) + ")"
     size = f"{len(observed.times)} rows of {', '.join(observed.outputs)}"
     print(f"model    {model.name}: {model.summary}" if model.summary else f"model    {model.name}")
-    print(f"data     {source}: {size}" + (f"; {missing} values missing" if missing else ""))
+    print(f"data     {source}: {size}" + (f"; {missing} values missing{where}" if missing else ""))
     if observed.inputs:
         print("inputs   " + ", ".join(f"{name} ({table.interpolation})" for name, table in observed.inputs.items()))
     if observed.origin is not None:

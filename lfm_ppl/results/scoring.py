@@ -290,7 +290,7 @@ def _say_where_few(terms: np.ndarray, present: np.ndarray) -> None:
     if few.sum() > 0.05 * present.sum():
         checks.warn(f"the log score of {int(few.sum())} of {int(present.sum())} entries rests on fewer than "
                     f"{min(_FEW, 0.5 * len(terms)):g} draws: they lie between the simulated paths, or far from all. "
-                    "Take more draws in lfm.forecast, or compare by CRPS.")
+                    "Take more draws in lfm.forecast (--draws), or compare by CRPS.")
 
 
 def _check_level(level: float) -> None:
