@@ -66,9 +66,14 @@ class Progress:
             self._first = now, done
 
     def _left(self, now: float, done: int) -> str:
-        if self._first is None or done <= self._first[1]:
-            return ""
-        return f"; about {duration((now - self._first[0]) / (done - self._first[1]) * (self._total - done))} left"
+        return _left(self._first, (now, done), self._total)
+
+
+def _left(first: tuple[float, int] | None, now: tuple[float, int], total: int) -> str:
+    """Return how long it will take from ``now``, where and when the ``first`` step after the compilation began."""
+    if first is None or now[1] <= first[1]:
+        return ""
+    return f"; about {duration((now[0] - first[0]) / (now[1] - first[1]) * (total - now[1]))} left"
 
 
 class Counter:
@@ -77,22 +82,27 @@ class Counter:
     Args:
         label: what is computed at them.
         shown: whether anything is shown.
+        at_once: whether to show at once that nothing is done yet, where compilation may take a while.
     """
 
-    def __init__(self, label: str = "", shown: bool = True) -> None:
+    def __init__(self, label: str = "", shown: bool = True, at_once: bool = False) -> None:
         self._label, self._shown = label, shown
-        self._clock = Clock()
+        self._clock = Clock(at_once)
+        self._first: tuple[float, int] | None = None
 
     def of(self, label: str) -> Counter:
         """Return the counter, for something else."""
-        self._label = label
+        self._label, self._first = label, None
         return self
 
     def __call__(self, done: int, count: int) -> None:
         """Show that ``done`` of ``count`` are done."""
         if not self._shown:
             return
-        text = f"{self._label}: {done:,} of {count:,} draws"
+        now = time.perf_counter(), done
+        text = f"{self._label}: {done:,} of {count:,} draws{_left(self._first, now, count)}"
+        if done and self._first is None:  # the first batch came with the compilation
+            self._first = now
         if on_terminal():
             print(f"\r{text:<70}\r", end="", file=sys.stderr, flush=True)
         elif self._clock.due():
