@@ -75,6 +75,7 @@ class LatentForceModel(eqx.Module):
     output_names: tuple[str, ...] = eqx.field(static=True)
     unit_items: tuple[tuple[str, str], ...] = eqx.field(static=True)
     _reads_inputs: bool = eqx.field(static=True)
+    _with_roots: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(
         self,
@@ -114,6 +115,7 @@ class LatentForceModel(eqx.Module):
         self.nonlinear_inputs = None if nonlinear_inputs is None else tuple(nonlinear_inputs)
         for name in self.nonlinear_inputs or ():
             checks.one_of("name in nonlinear_inputs", name, (*self.state_names, *self.force_names))
+        self._with_roots = tuple(name for name, function in functions.items() if function.takes_roots)
         self._reads_inputs = any(reads_inputs(function) for function in functions.values())
         self._check_precision()
         if self.initial_time is not None or not any(
@@ -261,6 +263,8 @@ class LatentForceModel(eqx.Module):
                 name = names[int(np.argmin(np.isfinite(value)))]
                 raise ValueError(f"the {label} returned {value} {where}: the entry for {name!r} is not finite. "
                                  "Change initial_state.mean, or guard the expression (for example jnp.maximum).")
+            if label.split()[0] in self._with_roots:
+                self._check_derivative(label, function, names, (x, u, t), where)
             if value is not None and function is self.observation.function and isinstance(self.observation,
                                                                                            ObservationFamily):
                 self.observation.check_predictor(value, where, names)
@@ -272,6 +276,18 @@ class LatentForceModel(eqx.Module):
             noise = checks.concrete(self.observation.covariance_at(x, u, t, jnp.asarray(0)))
             if noise is not None:
                 checks.covariance_matrix(f"the observation covariance {where}", noise)
+
+
+    @staticmethod
+    def _check_derivative(label: str, function: Callable, names: Sequence[str], at: tuple, where: str) -> None:
+        """Warn: a square root has a value at zero, but no derivative there, and none below."""
+        x, u, t = at
+        derivative = checks.concrete(jax.jacfwd(lambda w: function(w[:len(x)], w[len(x):], t))(jnp.concatenate([x, u])))
+        if derivative is not None and not np.all(np.isfinite(derivative)):
+            finite = np.isfinite(np.asarray(derivative)).reshape(len(names), -1).all(axis=1)
+            checks.warn(f"the derivative of the {label} is not finite {where}: that of the entry for "
+                        f"{names[int(np.argmin(finite))]!r}. Likelihood and gradient may not be finite either. Change "
+                        "initial_state.mean, or guard the expression (for example jnp.sqrt(jnp.maximum(x, 1e-6))).")
 
 
 def _functions(given: Mapping[str, Callable] | None, taken: set[str]) -> dict[str, Callable]:

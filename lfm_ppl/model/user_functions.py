@@ -58,6 +58,12 @@ class Traced(NamedTuple):
         used = {id(atom) for equation in jaxpr.eqns for atom in equation.invars} | {id(atom) for atom in jaxpr.outvars}
         return id(jaxpr.invars[-1]) in used
 
+    @property
+    def takes_roots(self) -> bool:
+        """Whether it holds a root or a power that is no whole number."""
+        scope = _Scope.of(self.closed, [None] * len(self.closed.jaxpr.invars))
+        return any(equation.primitive.name in ("sqrt", "rsqrt", "cbrt", "pow") for _, equation in scope.equations())
+
     def check_indices(self, names: Sequence[str]) -> None:
         """Check the indices that are numbers.
 
