@@ -34,6 +34,7 @@ from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalRAM, Tun
 from lfm_ppl.inference.map import MAPResult, mode_of
 from lfm_ppl.inference.marginal_likelihood import Panel
 from lfm_ppl.inference.posterior import scores, trajectories
+from lfm_ppl.inference.priors import prior
 from lfm_ppl.inference.progress import Counter
 from lfm_ppl.inference.samplers import FILTERED, SAMPLERS
 from lfm_ppl.inference.sampling import Transition
@@ -201,8 +202,8 @@ def fit(
     title = str(name or getattr(numpyro_model, "__name__", "model"))
     call = _call(title, "times, y" if data is None else "data", asked, model_kwargs)
     run = _Run(bound, asked, labels, data, truth, progress, started, {
-        "model": title, "description": described_by(numpyro_model), "call": call, **asked.described(bound)},
-        dict(attributes or {}))
+        "model": title, "description": described_by(numpyro_model), "call": call, **asked.described(bound),
+        "priors": kept("priors in words", lambda: _priors(bound), None)}, dict(attributes or {}))
     if checkpoint is not None:
         record = asked.record(bound, fingerprint)
         if resume and (finished := checkpoints.finished(checkpoint, record)) is not None:
@@ -667,6 +668,12 @@ def _paths(bound: BoundModel, at: Any, count: int, chains: int,
         return chosen, rows, np.atleast_1d(np.asarray(at, float))
     origin = float(bound.site.example.time_grid.initial_time)
     return chosen, rows, np.union1d(np.linspace(min(origin, times[0]), times[-1], _GRID), times)
+
+
+def _priors(bound: BoundModel) -> str:
+    """Return name -> prior in words, as JSON."""
+    trace = bound.trace()
+    return json.dumps({name: prior(trace[name]["fn"]) for name in bound.sites})
 
 
 def described_by(numpyro_model: Any) -> str | None:

@@ -246,7 +246,8 @@ def attributes(arguments: argparse.Namespace, model: loading.ModelFile, observed
         "model_file": model.name if loading.available().get(model.name) == model.path else str(model.path),
         "settings": json.dumps({name: getattr(arguments, name) for name in SETTINGS} | constraints(arguments)),
         "options": json.dumps(options), "data": arguments.data or "simulated",
-        "description": model.description, "command_line": page.command_line(arguments),
+        "description": model.description, "meanings": json.dumps(dict(model.parameters)),
+        "command_line": page.command_line(arguments),
         **({"note": observed.note} if observed.note else {}),
     }  # fmt: skip
 

@@ -31,6 +31,9 @@ COMMAND = "command_line"
 CALL, DESCRIPTION = "call", "description"
 """Attributes of a result: the call in Python that made it, and the docstring of the model."""
 
+PRIORS, MEANINGS = "priors", "meanings"
+"""Attributes of a result: name -> prior in words, and what the model file says of a parameter, as JSON."""
+
 _MOST_TIMES = 40
 """Times of a forecast that are listed; more are thinned evenly."""
 
@@ -55,7 +58,7 @@ _SETTINGS = {
     "wall_time_s": "time (s)", "created_at": "made at",
 }
 _ELSEWHERE = ("model", "model_file", DESCRIPTION, "data", "note", "versions", "warnings", "partial", "settings", "run",
-              "map_converged", COMMAND, CALL, ORIGIN, "inference_library",
+              "map_converged", COMMAND, CALL, ORIGIN, PRIORS, MEANINGS, "inference_library",
               "site_failures", "constraint_weights")
 """Attributes that stand in other sections, or that nobody needs to read."""
 
@@ -138,9 +141,17 @@ def _model(attrs: Mapping[str, Any], description: str) -> str:
     file = str(attrs.get("model_file", ""))
     name = str(attrs.get("model", "model"))
     shown = web_page.facts([("name", name), *([("file", file)] if file not in ("", name) else [])])
-    if description:
-        return shown + web_page.prose(description)
-    return shown + web_page.paragraph("The model has no docstring; what stands in one would be shown here.", "note")
+    shown += (web_page.prose(description) if description else web_page.paragraph(
+        "The model has no docstring; what stands in one would be shown here.", "note"))
+    priors = json.loads(str(attrs.get(PRIORS, "{}")))
+    if not priors:
+        return shown
+    meanings = json.loads(str(attrs.get(MEANINGS, "{}")))
+    table = pd.DataFrame({"prior": priors} | ({"meaning": {name: meanings.get(name, "") for name in priors}}
+                                               if any(meanings.get(name) for name in priors) else {}))
+    shown += web_page.heading("Priors") + web_page.paragraph(
+        "Where a prior depends on another parameter, its numbers are those at one value of it.", "note")
+    return shown + tables.html_table(table, index_label="parameter")
 
 
 def _data(result: Any, attrs: Mapping[str, Any]) -> str:
