@@ -188,6 +188,9 @@ COLUMNS = {
                         line="fit model.py --data d.csv --time-unit s"),
     "no such input": csv(WARM, "unknown input column 'heat'", "heater",
                          line="fit heated.py --data d.csv --inputs heat"),
+    "an input of another name": Case(
+        "fit heated3.py --data d.csv", ("heated3.py, line", "reads the known input 'heatr', and has heater"),
+        {"d.csv": WARM, "heated3.py": HEATED.replace('inputs["heater"]', 'inputs["heatr"]')}),
     "no such way": csv(WARM, "interpolation of heater", "cubic",
                        line="fit heated.py --data d.csv --inputs heater:cubic"),
     "too many inputs": csv(WARM, "takes 1 known inputs (heater)", "--inputs names 2",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -121,6 +123,15 @@ def test_functions_are_tried_at_the_prior_mean():
 def test_functions_are_tried_at_construction(options, message):
     with pytest.raises(ValueError, match=message):
         make(**options)
+
+
+def test_a_root_of_zero_has_no_derivative():
+    with pytest.warns(UserWarning, match="derivative of the dynamics is not finite at the prior mean .* 'x1'.*guard"):
+        make(dynamics=lambda x, u, t: jnp.stack([-x[0], jnp.sqrt(x[1])]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        make(dynamics=lambda x, u, t: jnp.sqrt(jnp.maximum(x, 1e-6)))
+        make(dynamics=lambda x, u, t: jnp.sqrt(x), initial_state=lfm.Gaussian(jnp.ones(2), jnp.eye(2)))
 
 
 def test_functions_of_time_wait_for_one_where_none_is_known():

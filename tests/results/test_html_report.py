@@ -71,6 +71,8 @@ def attrs():
         "sampler": "nuts", "chains": 4, "seed": 3, "rule": "Cubature", "options": json.dumps({"link": "softplus"}),
         "fixed": json.dumps({"decay[a]": 0.8}), "versions": json.dumps({"jax": "0.10"}), "data": "genes.csv",
         "command_line": "lfm-ppl fit gene.py --data genes.csv", "time_origin": "2024-03-01T00:00:00",
+        "priors": json.dumps({"decay": "LogNormal(0, 0.5)", "rate": "HalfNormal(1)"}),
+        "meanings": json.dumps({"decay": "how fast it goes"}),
     }
 
 
@@ -125,13 +127,13 @@ def test_every_section_says_what_it_is_for(groups, attrs, tmp_path):
     assert list(page.texts) == SECTIONS
     said = {
         "result": ["R-hat", "re-run"],
-        "model": ["gene.py", "switched on & off", "\ndx/dt = b - d x"],
+        "model": ["gene.py", "switched on & off", "\ndx/dt = b - d x", "LogNormal(0, 0.5)", "how fast it goes"],
         "data": ["genes.csv", "1 of 12 values", "0 to 5 h (2024-03-01 00:00 to 2024-03-01 05:00)", "nM", "heater",
                  "linear", "7.50"],
         "summary": ["decay", "rate", "r_hat", "sampled", "R-hat"],
         "accuracy": ["re-run: k is too large.", f"lfm-ppl check {tmp_path} --correct", "0.90 (reliable below 0.70)",
                      "0.125"],
-        "forecast": ["20 of 58 times after the last observation", "2024-03-01 06:00", "2024-03-03 15:00", "q97.5",
+        "forecast": ["40 of 58 times after the last observation", "2024-03-01 06:00", "2024-03-03 15:00", "q97.5",
                      "Scores", "0.250"],
         "figures": ["Chains, page 2"],
         "settings": ["nuts", "Cubature", "link softplus", "decay[a] 0.800", "jax 0.10"],
