@@ -37,10 +37,7 @@ ROWS = dict.fromkeys(METHODS, 1) | {BANDS: 10}
 _BELOW = np.array([0.0, 0.01, 0.025, 0.04])
 """Shares below a 95% band, among which the shortest one is chosen."""
 
-_PATHS = 8
-"""Trajectories of TRH for each draw of a patient's parameters."""
-
-_LENGTHSCALES = np.geomspace(0.02, 1000.0, 24)
+_LENGTHSCALES = np.geomspace(0.02, 1000.0, 12)
 """Among which a lengthscale that is a state of the cost is searched for first (s); the last is as good as infinity."""
 
 
@@ -139,7 +136,7 @@ def _least(kind: str, y: np.ndarray) -> np.ndarray:
     best = int(np.argmin(run(grid, y)))
     ends = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
     found = minimize_scalar(lambda z: float(run(np.array([z]), y)[0]), bounds=ends, method="bounded",
-                            options={"xatol": 1e-3})
+                            options={"xatol": 5e-3})
     lengthscale = np.exp(found.x)
     return np.array([lengthscale, lengthscale if kind == "weight" else problem.GUESSED])
 
@@ -202,11 +199,10 @@ def ballistic() -> Callable[[Any], tuple]:
 
 
 @functools.cache
-def thyroid() -> tuple[Callable[[Any, Any], dict[str, jax.Array]], Callable[[Any, Any, Any], dict[str, jax.Array]]]:
+def thyroid() -> tuple[Callable[[Any, Any], dict[str, jax.Array]], Callable[[Any, Any], dict[str, jax.Array]]]:
     """Return full information of patients' logarithms of parameters (N, P) and concentrations (N, T, 3), and bands.
 
-    Bands take several logarithms of parameters of a patient, (N, K, P), average over them, and take random keys (N,)
-    for trajectories, whose times of the greatest value are ``greatest`` (N, S).
+    Bands take several logarithms of parameters of a patient, (N, K, P), and average over them.
     """
     times = problem.patient(0).times
 
@@ -218,19 +214,15 @@ def thyroid() -> tuple[Callable[[Any, Any], dict[str, jax.Array]], Callable[[Any
         return {"times": found.times, "mode": found.force(problem.HORMONE), "lowest": lowest,
                 "converged": found.converged}
 
-    def given(z: jax.Array, y: jax.Array, key: jax.Array) -> tuple[jax.Array, ...]:
+    def given(z: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         model = problem.thyroid_learning().likelihood(z, y).model
         found = constrained_posterior(model, times, y, lower={problem.HORMONE: 0.0}, steps=2)
-        paths = found.sample(key, _PATHS).forces[problem.HORMONE]
-        return (found.force_mean[:, 0], quantiles(found, problem.HORMONE), found.converged,
-                found.times[paths.argmax(axis=1)])
+        return found.force_mean[:, 0], quantiles(found, problem.HORMONE), found.converged
 
-    def bands(draws: jax.Array, y: jax.Array, key: jax.Array) -> dict[str, jax.Array]:
-        keys = jax.random.split(key, len(draws))
-        means, each, converged, greatest = jax.vmap(given, in_axes=(0, None, 0))(draws, y, keys)
+    def bands(draws: jax.Array, y: jax.Array) -> dict[str, jax.Array]:
+        means, each, converged = jax.vmap(given, in_axes=(0, None))(draws, y)
         low, high = shortest_of(each.reshape(-1, each.shape[-1]), 0.0)
-        return {"mean": means.mean(axis=0), "low": low, "high": high, "bands_converged": converged.all(),
-                "greatest": greatest.ravel()}
+        return {"mean": means.mean(axis=0), "low": low, "high": high, "bands_converged": converged.all()}
 
     return jax.jit(jax.vmap(full)), jax.jit(jax.vmap(bands))
 

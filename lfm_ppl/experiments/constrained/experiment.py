@@ -106,7 +106,7 @@ def compute(task: Task) -> Result:
         task, indices)
 
 
-def _found(posterior: Any, y: np.ndarray, prior: float = 1.0, furthest: float = np.inf) -> np.ndarray:
+def posterior_mode(posterior: Any, y: np.ndarray, prior: float = 1.0, furthest: float = np.inf) -> np.ndarray:
     """Return the logarithms of parameters at the mode, where the density is that of the logarithms."""
     medians = dict(zip(posterior.bound.names, posterior.bound.draw(jax.random.key(0)), strict=True))
     start = np.array([medians[name] for name in posterior.names])
@@ -144,7 +144,7 @@ def _transcription(task: Task, indices: range) -> Result:
         count = len(posterior.bound.times)
         # The source maximises the likelihood of the first samples.
         how = {"prior": 0.0, "furthest": _FURTHEST} if kind == "early" else {}
-        values[kind] = np.exp([_found(posterior, one[:count], **how) for one in y])
+        values[kind] = np.exp([posterior_mode(posterior, one[:count], **how) for one in y])
     result: Result = {f"hyperparameters/{kind}": found for kind, found in values.items()} | {"truth": truth[0]}
     for method, kind in methods.items():
         rows = estimators.ROWS[method]
@@ -168,27 +168,24 @@ def _ballistic(task: Task, indices: range) -> Result:
 
 
 def _thyroid(task: Task, indices: range) -> Result:
-    """Return what `estimators.thyroid` does, and ``rmse``, ``coverage`` (N,), ``peak`` (N, 3) in h, ``truth`` (N, K).
+    """Return what `estimators.thyroid` does, and ``rmse``, ``coverage`` (N,), ``peak`` (N, 2) in h, ``truth`` (N, K).
 
-    The latter are the errors of three times: when the mode is greatest; when trajectories are, likeliest; and when the
-    wave of 24 h is that fits the mode best.
+    A peak is the greatest value and the maximum of the wave of 24 h that fits best; errors of both are returned.
     """
     patients = [problem.patient(index, task.seed) for index in indices]
     posterior = problem.thyroid_learning()
-    z = np.stack([_found(posterior, one.y) for one in patients])
+    z = np.stack([posterior_mode(posterior, one.y) for one in patients])
     y = np.stack([one.y for one in patients])
     seeds = [problem.MOST * task.seed + index for index in indices]
     counts = task.settings["draws"], task.settings["weighted"]
     draws, k = zip(*(drawn(posterior, *one, *counts) for one in zip(y, z, seeds, strict=True)), strict=True)
     full, bands = estimators.thyroid()
-    found = {name: np.asarray(value) for name, value in (
-        full(z, y) | bands(np.stack(draws), y, jax.vmap(jax.random.key)(np.array(seeds)))).items()}
+    found = {name: np.asarray(value) for name, value in (full(z, y) | bands(np.stack(draws), y)).items()}
     times = found.pop("times")[0]
     truth = np.stack([np.interp(times, one.truth["times"], one.truth["forces"][problem.HORMONE]) for one in patients])
     held = (found["low"] <= truth) & (truth <= found["high"])
-    errors = np.stack([np.abs(peak(times, found["mode"]) - peak(times, truth)),
-                       np.abs(likeliest(times, found.pop("greatest")) - peak(times, truth)),
-                       _apart(acrophase(times, found["mode"]), acrophase(times, truth))], axis=1)
+    errors = np.stack([_apart(peak(times, found["mode"]), peak(times, truth)), _apart(
+        acrophase(times, found["mode"]), acrophase(times, truth))], axis=1)
     return found | {"times": times, "truth": truth, "z": z, "draws": np.stack(draws), "k": np.array(k),
                     "coverage": held.mean(axis=1), "peak": errors,
                     "rmse": np.sqrt(((found["mode"] - truth) ** 2).mean(axis=1)), "y": y[0],
@@ -198,15 +195,6 @@ def _thyroid(task: Task, indices: range) -> Result:
 def peak(times: np.ndarray, paths: np.ndarray) -> np.ndarray:
     """Return when paths (N, K) are greatest."""
     return times[paths.argmax(axis=1)]
-
-
-def likeliest(times: np.ndarray, greatest: np.ndarray) -> np.ndarray:
-    """Return the time (N,) within an hour of which most of several times (N, S) are; of such times the middle one.
-
-    Where these are draws from a posterior, no other estimate has a larger probability to be off by an hour at most.
-    """
-    near = (np.abs(greatest[:, None, :] - times[:, None]) <= tables.NEAR).sum(axis=2)
-    return np.array([np.median(times[row == row.max()]) for row in near])
 
 
 def acrophase(times: np.ndarray, paths: np.ndarray) -> np.ndarray:
