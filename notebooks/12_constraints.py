@@ -77,17 +77,18 @@ print("least value of the draws:", draws.min())
 # %% [markdown]
 # ## Hyperparameters
 #
-# The source takes the rate $\lambda = \sqrt 3 / \text{lengthscale}$ as one more state, which does not change, and lets the
-# cost decide on it. With `learnt=True` the model below has the states $(x, \ell, \dot\ell, \lambda)$; it is not linear
-# any more, and `lfm.full_information` takes Gauss-Newton steps. With the weight $Q$ of the disturbance
-# $w = \ddot\ell + 2 \lambda \dot\ell + \lambda^2 \ell$ a constant, as in the source, the cost of a path is, but for the ends,
+# The source takes the rate $\lambda = \sqrt 3 / \text{lengthscale}$ as one more state, which does not change, and lets
+# the cost decide on it. With `learnt=True` the model below has the states $(x, \ell, \dot\ell, \lambda)$; it is not
+# linear any more, and `lfm.full_information` takes Gauss-Newton steps. With the weight $Q$ of the disturbance
+# $w = \ddot\ell + 2 \lambda \dot\ell + \lambda^2 \ell$ a constant, as in the source, the cost of a path is, but for
+# what happens at its ends,
 #
 # $$\int Q\,w^2\,dt = Q \int \ddot\ell^2 + 2 \lambda^2 \dot\ell^2 + \lambda^4 \ell^2\,dt,$$
 #
 # which is least at $\lambda = 0$ for every force: the lengthscale goes to infinity. With the weight that belongs to
-# $\lambda$, $Q = 1 / 4 \lambda^3$, there is a minimum, but at lengthscales that are too short, since nothing stands against
-# a large variance of the disturbances: the density of a path has the factor $Q^{1/2}$ for each sample, which the cost has
-# not. With that factor the density of a path without disturbances is infinite at $\lambda = 0$. The marginal likelihood
+# $\lambda$, $Q = 1 / 4 \lambda^3$, there is a minimum, but at lengthscales that are too short, since nothing stands
+# against large disturbances: the density of a path has the factor $Q^{1/2}$ for each sample, which the cost has not.
+# With that factor the density of a path without disturbances is infinite at $\lambda = 0$. The marginal likelihood
 # integrates the path out, and has neither fault.
 
 # %%
@@ -114,20 +115,21 @@ pd.Series({"a state, Q constant": np.sqrt(3.0) / states.state("rate")[0],
 # leave out a force that is exactly zero.
 
 # %%
-settings = experiment.quick() if quick else experiment.Settings()
+settings = experiment.Settings()
 # The folder of an earlier run of `lfm-ppl compare constrained`; without one everything is computed here.
 folder = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/constrained"))
-result = experiment.run(settings, folder)
-scores.readable(result.transcription)
+# Quick mode leaves the study out, which compiles for minutes; `lfm-ppl compare constrained --quick` is a little of it.
+result = None if quick else experiment.run(settings, folder)
+quick or scores.readable(result.transcription)
 
 # %%
-figures.plot_forces(settings, result.results)
+quick or figures.plot_forces(settings, result.results)
 
 # %%
-figures.plot_errors(settings, result.results)
+quick or figures.plot_errors(settings, result.results)
 
 # %%
-scores.readable(result.shapes)
+quick or scores.readable(result.shapes)
 
 # %% [markdown]
 # ## A target on reentry
@@ -136,7 +138,7 @@ scores.readable(result.shapes)
 # weight. Only distances are measured; dynamics and measurement are not linear.
 
 # %%
-figures.plot_target(settings, result.results)
+quick or figures.plot_target(settings, result.results)
 
 # %% [markdown]
 # ## Pituitary and thyroid
@@ -152,10 +154,10 @@ print(thyroid.summary)
 pd.Series(thyroid.parameters)
 
 # %%
-figures.plot_patient(settings, result.results)
+quick or figures.plot_patient(settings, result.results)
 
 # %%
-figures.plot_peaks(settings, result.results)
+quick or figures.plot_peaks(settings, result.results)
 
 # %%
-scores.readable(result.others)
+quick or scores.readable(result.others)
