@@ -188,6 +188,17 @@ def test_settings_say_what_is_wrong():
 
 
 @pytest.mark.slow
+def test_the_rate_of_the_first_window_is_where_the_dense_cost_is_least():
+    times, y = problem.TIMES[:61], problem.record("half sines", 303).y
+    rate = np.sqrt(3.0) / estimators.states("window", y[None])[0, 0]
+    cost = lambda other: dense_cost(other, other, np.sqrt(3.0), times, y[:61, 0])[0]  # noqa: E731
+    best = minimize_scalar(cost, bounds=(0.5 * rate, 2.0 * rate), method="bounded", options={"xatol": 1e-6})
+    assert rate == pytest.approx(best.x, rel=0.02) and cost(rate) == pytest.approx(best.fun, abs=1e-4)
+    found = estimators._costs("window")(np.log(np.sqrt(3.0) / np.array([rate])), y)
+    assert float(found[0]) == pytest.approx(cost(rate), abs=1e-5)
+
+
+@pytest.mark.slow
 def test_a_window_starts_from_the_earlier_estimate():
     """Rows of the source's estimator are those of windows solved one by one, from the printed arrival means."""
     y = problem.record("half sines", 0).y
