@@ -90,8 +90,9 @@ def all_tasks(settings: Settings) -> list[Task]:
     """Return a task for each block of records of a shape, of targets and of patients."""
     kinds = [("ballistic", "", settings.targets), ("thyroid", "", settings.patients)]
     kinds += [("transcription", shape, settings.runs) for shape in settings.shapes]
-    own = {"ballistic": {}, "thyroid": {"draws": settings.draws, "weighted": settings.weighted},
-           "transcription": {"methods": list(settings.methods)}}
+    own: dict[str, dict[str, Any]] = {
+        "ballistic": {}, "thyroid": {"draws": settings.draws, "weighted": settings.weighted},
+        "transcription": {"methods": list(settings.methods)}}
     return [
         Task("/".join([what, *filter(None, [shape.replace(" ", "-")]), f"{first:04d}"]), settings.seed,
              {"experiment": "constrained", "what": what, "shape": shape, "first": first,
