@@ -68,7 +68,7 @@ def plot_errors(settings: Any, results: dict[str, Result], *, width: str | float
     axes = figure.subplots()
     errors = [tables.gathered(results, "transcription", f"{method}/mse") for method in settings.methods]
     for row, mse in enumerate(errors):
-        least, low, median, high, largest = np.nanquantile(mse, [0.0, 0.25, 0.5, 0.75, 1.0])
+        least, low, median, high, largest = np.quantile(mse, [0.0, 0.25, 0.5, 0.75, 1.0])
         axes.hlines(row, least, largest, color=style.BLUE, lw=0.8)
         axes.hlines(row, low, high, color=style.BLUE, lw=4.0)
         axes.plot(median, row, color=style.BLACK, marker="|", ms=7.0, ls="")
