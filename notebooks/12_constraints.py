@@ -68,10 +68,10 @@ low, high = posterior.interval("factor")
 draws = posterior.sample(jax.random.key(0), 5).forces["factor"]
 figure, axes = plt.subplots(figsize=(7, 2.4), layout="constrained")
 axes.fill_between(posterior.times, low, high, color="#B3D5E9", lw=0, label="95% band")
-axes.plot(posterior.times, draws.T, color="#0072B2", lw=0.5)
+axes.plot(posterior.times, draws.T, color="#0072B2", lw=0.5, label=["draws", *[None] * 4])
 axes.plot(times, truth, color="black", lw=0.8, ls="--", label="truth")
-axes.set(xlabel="time (s)", ylabel="force", xlim=(0, 15))
-axes.legend(frameon=False)
+axes.set(xlabel="time (s)", ylabel="force", xlim=(0, 15), ylim=(0, 2))
+axes.legend(frameon=False, ncols=3)
 print("least value of the draws:", draws.min())
 
 # %% [markdown]
@@ -96,7 +96,7 @@ states = lfm.full_information(problem.companion(1.0, np.zeros(3), learnt=True), 
                               lower={"factor": 0.0, "rate": 0.0}, grid=times, tolerance=1e-8)
 learning = problem.learning("all")
 likeliest = experiment.posterior_mode(learning, record.y)
-pd.Series({"a state, Q constant": np.sqrt(3.0) / states.state("rate")[0],
+pd.Series({"a state, Q constant": float(np.sqrt(3.0) / states.state("rate")[0]),
            "a state, Q with it": estimators.states("weight", record.y[None])[0, 0],
            "marginal likelihood": np.exp(likeliest[0])}, name="lengthscale (s)").round(2)
 
@@ -131,7 +131,7 @@ quick or figures.plot_forces(settings, result.results)
 quick or figures.plot_errors(settings, result.results)
 
 # %%
-quick or scores.readable(result.shapes)
+quick or scores.readable(result.shapes).T
 
 # %% [markdown]
 # ## A target on reentry
