@@ -95,8 +95,6 @@ def of_sites(points: int, unconverged: int, impossible: int, *, constrained: boo
 def of_weights(trajectories: int, median: float, least: float) -> list[str]:
     """Return what to say of an evidence under constraints that rests on few of its trajectories.
 
-    The logarithm of a mean of weights that are worth n equal ones has a standard error of about 1 / sqrt(n).
-
     Args:
         trajectories: that are weighted; 0: none.
         median: what they are worth at half of the draws.
@@ -107,12 +105,27 @@ def of_weights(trajectories: int, median: float, least: float) -> list[str]:
     if median < 1.0:
         return ["the likelihood under the constraints is zero at half of the draws or more: results that rest on them "
                 f"mean nothing. {_OF_CONSTRAINTS}"]
+    few = trajectories < LEAST_TRAJECTORIES
+    off = "by more than so few can tell" if few else f"by about {log_mean_error(median, trajectories):.1f}"
     return [
         f"the {trajectories} weighted trajectories of the evidence under constraints are worth {median:.2g} at half of "
-        f"the draws, and {least:.2g} at the worst: the log likelihood is off by about {median**-0.5:.1f}, differently "
-        "at other parameters. Let the constraints hold at fewer times (grid, --grid), or weight more trajectories "
-        "(draws of lfm.MarginalLikelihood)."
+        f"the draws, and {least:.2g} at the worst: the log likelihood is off {off}, differently at other parameters. "
+        "Let the constraints hold at fewer times (grid, --grid), or weight more trajectories (draws of "
+        "lfm.MarginalLikelihood)."
     ]
+
+
+def log_mean_error(worth: float, count: int) -> float:
+    """Return the standard error of the logarithm of a mean of independent weights, to first order.
+
+    The coefficient of variation of N weights w that are worth n = (sum w)^2 / sum w^2 equal ones has the square
+    (N / n - 1) N / (N - 1), and that of their mean is 1 / N of it.
+
+    Args:
+        worth: n.
+        count: N; with fewer than two nothing is known.
+    """
+    return math.sqrt(max(count / worth - 1.0, 0.0) / (count - 1)) if count > 1 else math.nan
 
 
 def _low_ess(ess: pd.Series, kind: str, what: str, chains: int) -> list[str]:

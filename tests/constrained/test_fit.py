@@ -18,7 +18,7 @@ import lfm_ppl as lfm
 from lfm_ppl.cli import main
 from lfm_ppl.constrained.augmented import COARSE, rows
 from lfm_ppl.inference.site_failures import failures_at, paths_worth
-from lfm_ppl.results import arviz_data, tables
+from lfm_ppl.results import arviz_data, convergence, tables
 
 TIMES = np.linspace(0.0, 3.0, 4)
 Y = np.array([[0.0], [0.1], [0.02], [0.1]])
@@ -77,8 +77,21 @@ def test_what_a_result_under_constraints_says(sampler):
     assert "off by about 0.6" in weights and "draws of lfm.MarginalLikelihood" in weights
     for said in tables.annotated(arviz_data.summary(bad), bad)["warnings"]:
         assert sites in said and weights in said
+    (few,) = arviz_data.convergence_warnings(result(**base, constraint_weights="[2, 2.0, 2.0]"))
+    assert "off by more than so few can tell" in few
     (nothing,) = arviz_data.convergence_warnings(result(**base, constraint_weights="[256, 0.0, 0.0]"))
     assert "is zero at half of the draws or more" in nothing
+
+
+def test_the_error_of_an_evidence_is_that_of_its_logarithm_over_many_sets_of_weights():
+    """Of 32 log-normal weights, 5,000 times; the standard deviation of 5,000 has an error of 1%."""
+    weights = np.exp(0.6 * np.random.default_rng(0).normal(size=(5000, 32)))
+    worth = weights.sum(axis=1) ** 2 / (weights**2).sum(axis=1)
+    said = [convergence.log_mean_error(one, 32) for one in worth]
+    assert np.sqrt(np.mean(np.square(said))) == pytest.approx(np.log(weights.mean(axis=1)).std(), rel=0.04)
+    assert convergence.log_mean_error(32.0, 32) == 0.0
+    # Without the share of all: sqrt(1 / worth) would be more than twice as much.
+    assert np.mean(said) < 0.6 * np.mean(worth**-0.5)
 
 
 @pytest.mark.slow
@@ -101,11 +114,11 @@ def test_unconverged_sites_and_light_weights_are_counted():
 
 @pytest.mark.slow
 def test_a_fit_stores_and_says_it(tmp_path):
-    with pytest.warns(lfm.ConvergenceWarning, match="the 2 weighted trajectories of the evidence"):
-        found = lfm.fit(lambda times, y=None: bounded(times, y, 2, TIMES), TIMES, Y, sampler="ram", chains=2, warmup=50,
+    with pytest.warns(lfm.ConvergenceWarning, match="the 16 weighted trajectories .* off by about 0.[23]"):
+        found = lfm.fit(lambda times, y=None: bounded(times, y, 16, 31), TIMES, Y, sampler="ram", chains=2, warmup=50,
                         samples=50, trajectory_draws=0, progress=False)
     attrs = arviz_data.attributes(found)
-    assert attrs["constraints"] == "factor >= 0 at 4 times" and json.loads(attrs["site_failures"])[0] == 100
+    assert attrs["constraints"] == "factor >= 0 at 31 times" and json.loads(attrs["site_failures"])[0] == 100
     assert any("weighted trajectories" in said for said in json.loads(attrs["warnings"]))
 
 

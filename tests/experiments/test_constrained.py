@@ -5,12 +5,16 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from reference_map import quadratic_program
+from scipy.linalg import expm
+from scipy.optimize import minimize_scalar
 from scipy.stats import truncnorm
 
 import lfm_ppl as lfm
 from lfm_ppl.engine.store import write
 from lfm_ppl.experiments import catalogue
 from lfm_ppl.experiments.constrained import estimators, experiment, figures, problem, report, tables
+from lfm_ppl.inference.optimise import Objective
 
 
 @pytest.mark.parametrize("shape", problem.SHAPES)
@@ -52,19 +56,76 @@ def test_the_shortest_band_of_a_truncated_normal():
         assert exact.cdf(high) - exact.cdf(low) == pytest.approx(0.95, abs=1e-3)
         assert high - low == pytest.approx(widths.min(), rel=5e-3)
         assert (low == 0.0) == (y < 0)
-        # From 60 quantiles, the 57 nearest of which are 56 parts.
+        # From 60 quantiles; the bound is an end where the density falls from there on.
         parts = estimators.quantiles(found, "u", 60)
         np.testing.assert_allclose(np.sort(parts[:, 0]), exact.ppf((np.arange(60) + 0.5) / 60), rtol=1e-6)
-        ends = [float(a[0]) for a in estimators.shortest_of(parts)]
-        assert exact.cdf(ends[1]) - exact.cdf(ends[0]) == pytest.approx(56 / 60, abs=1e-6)
+        ends = [float(a[0]) for a in estimators.shortest_of(parts, 0.0)]
+        assert exact.cdf(ends[1]) - exact.cdf(ends[0]) == pytest.approx(0.95, abs=2e-3)
+        assert (ends[0] == 0.0) == (y < 0)
+        assert ends[1] - ends[0] == pytest.approx(widths.min(), rel=0.02)
 
 
 def test_the_shortest_interval_of_a_mixture():
     """Of two uniform distributions side by side, nine tenths in the narrow one: 95% reach into the wide one."""
     values = jnp.concatenate([jnp.tile((jnp.arange(40) + 0.5) / 40, 9), 1.0 + 10.0 * (jnp.arange(40) + 0.5) / 40])
     low, high = estimators.shortest_of(jnp.stack([values, -values], axis=1))
+    assert np.isfinite(low).all()
     np.testing.assert_allclose([low[0], high[0]], [0.0, 6.0], atol=0.3)
     np.testing.assert_allclose([low[1], high[1]], [-high[0], -low[0]], rtol=1e-12)
+
+
+def test_a_patient_without_curvature_has_its_mode():
+    """An infinite index says so; the others of its block are kept."""
+    class Flat:
+        def objective(self, y):
+            return Objective(lambda z: (jnp.sum(z**2), jnp.full_like(z, jnp.nan)))
+
+    draws, k = experiment.drawn(Flat(), np.zeros(1), np.array([0.3, -0.2]), 0, 16, 150)
+    np.testing.assert_array_equal(draws, np.tile([0.3, -0.2], (16, 1)))
+    assert k == np.inf
+
+
+def matrices(rate, weight, step):
+    """Transition and covariance of (x, l, l') over a step, by van Loan's matrix exponential."""
+    drift = np.array([[-0.6, 0.25, 0.0], [0.0, 0.0, 1.0], [0.0, -(rate**2), -2.0 * rate]])
+    found = expm(step * np.block([[-drift, np.diag([1e-6, 0.0, 4.0 * weight**3]) / 2.0], [np.zeros((3, 3)), drift.T]]))
+    return found[3:, 3:].T, found[3:, 3:].T @ found[:3, 3:]
+
+
+def dense_cost(rate, frozen, weight, times, y):
+    """The least cost at a rate, by Clarabel on dense algebra, with the covariances of another, and (l, rate) there."""
+    transition, _ = matrices(rate, weight, times[1])
+    _, noise = matrices(frozen, weight, times[1])
+    mean, blocks = np.zeros(3 * len(times)), [[50.0 * np.eye(3)]]
+    for _ in times[1:]:
+        new = [block @ transition.T for block in blocks[-1]]
+        blocks.append([*new, transition @ new[-1] + noise])
+    # blocks[k][j] = cov(s_j, s_k)
+    covariance = np.block([[blocks[max(j, k)][min(j, k)] if j <= k else blocks[j][k].T for k in range(len(times))]
+                           for j in range(len(times))])
+    observe = np.kron(np.eye(len(times)), [[1.0, 0.0, 0.0]])
+    total = observe @ covariance @ observe.T + 0.025**2 * np.eye(len(times))
+    gain = np.linalg.solve(total, observe @ covariance).T
+    free = 0.5 * y @ np.linalg.solve(total, y)
+    force = np.kron(np.eye(len(times)), [[0.0, 1.0, 0.0]])
+    path, _, excess = quadratic_program(mean + gain @ y, covariance - gain @ observe @ covariance, force,
+                                        np.zeros(len(times)))
+    return free + excess + 1e-2 * (rate - np.sqrt(3.0)) ** 2, force @ path
+
+
+def test_the_rate_as_a_constant_state_against_a_search_on_the_dense_cost():
+    """The printed cost with the rate among the states, and forces that cannot be negative."""
+    times = np.linspace(0.0, 6.0, 25)
+    y = problem.record("half sines", 1).y[:601:25]
+    found = lfm.full_information(problem.companion(1.0, jnp.zeros(3), learnt=True), times, y, grid=times, steps=16,
+                                 lower={"factor": 0.0, "rate": 0.0}, tolerance=1e-11)
+    rate = float(found.state("rate")[0])
+    assert found.converged and np.ptp(found.state("rate")) < 1e-9 and np.asarray(found.active)[:, 0].any()
+    best = minimize_scalar(lambda other: dense_cost(other, rate, np.sqrt(3.0), times, y[:, 0])[0],
+                           bounds=(1e-3, 3.0), method="bounded", options={"xatol": 1e-8})
+    cost, force = dense_cost(best.x, rate, np.sqrt(3.0), times, y[:, 0])
+    assert rate == pytest.approx(best.x, abs=2e-5) and float(found.objective) == pytest.approx(cost, abs=2e-6)
+    np.testing.assert_allclose(found.state("factor"), force, atol=2e-5)
 
 
 def test_times_of_peaks():
@@ -86,6 +147,7 @@ def stored(folder, settings):
             for method in estimators.METHODS:
                 found |= {f"{method}/mse": random.uniform(1e-3, 1e-2, count), f"{method}/minimum": np.zeros(count),
                           f"{method}/coverage": np.full(count, 0.95), f"{method}/failed": np.zeros(count, bool),
+                          f"hyperparameters/{estimators.METHODS[method]}": np.ones((count, 2)),
                           f"{method}/first": np.sort(path, axis=0)[[1, 0, 2], ::estimators.ROWS[method]]}
         elif what == "ballistic":
             paths = random.normal(size=(3, len(problem.TARGET_TIMES)))
@@ -96,6 +158,7 @@ def stored(folder, settings):
             paths = np.abs(random.normal(size=(count, 51)))
             found = {"times": times, "truth": paths, "mode": paths, "low": 0.5 * paths, "high": 2 * paths,
                      "coverage": np.ones(count), "peak": random.uniform(0.0, 2.0, (count, 2)), "rmse": np.ones(count),
+                     "k": np.where(np.arange(count) == 0, np.inf, 0.2),
                      "converged": np.ones(count, bool), "bands_converged": np.ones(count, bool),
                      "y": random.normal(size=(25, 3)), "measured": hours}
         write(task, found, Path(folder) / experiment.TASKS, overwrite=False)
@@ -106,6 +169,7 @@ def test_tables_and_figures_from_stored_results(tmp_path):
     stored(tmp_path, settings)
     found = experiment.run(settings, tmp_path)
     assert found.transcription.loc["delayed MHE, 60 samples", "published"] == 0.0103
+    assert found.others.loc["patients, Pareto k above 0.7", "value"] == 0.5  # the first of each block of two
     mse = tables.gathered(found.results, "transcription", "EP/mse")
     assert mse.shape == (12,) and found.transcription.loc["EP", "median MSE"] == np.median(mse)
     assert set(figures.draw(settings, found.results)) == {"forces", "errors", "target", "patient", "peaks"}
@@ -121,6 +185,17 @@ def test_settings_say_what_is_wrong():
     with pytest.raises(ValueError, match="10000 records"):
         experiment.Settings(runs=10_001)
     assert catalogue.experiment("constrained").run is report.run
+
+
+@pytest.mark.slow
+def test_the_rate_of_the_first_window_is_where_the_dense_cost_is_least():
+    times, y = problem.TIMES[:61], problem.record("half sines", 303).y
+    rate = np.sqrt(3.0) / estimators.states("window", y[None])[0, 0]
+    cost = lambda other: dense_cost(other, other, np.sqrt(3.0), times, y[:61, 0])[0]  # noqa: E731
+    best = minimize_scalar(cost, bounds=(0.5 * rate, 2.0 * rate), method="bounded", options={"xatol": 1e-6})
+    assert rate == pytest.approx(best.x, rel=0.02) and cost(rate) == pytest.approx(best.fun, abs=1e-4)
+    found = estimators._costs("window")(np.log(np.sqrt(3.0) / np.array([rate])), y)
+    assert float(found[0]) == pytest.approx(cost(rate), abs=1e-5)
 
 
 @pytest.mark.slow

@@ -11,8 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.stats import norm
+from scipy.optimize import minimize_scalar
 
-from lfm_ppl.constrained.full_information import full_information
+from lfm_ppl.constrained.full_information import ConstrainedEstimate, full_information
 from lfm_ppl.constrained.posterior import ConstrainedPosterior, constrained_posterior
 from lfm_ppl.experiments.constrained import problem
 from lfm_ppl.experiments.constrained.problem import FACTOR, TIMES, WINDOW
@@ -20,16 +21,24 @@ from lfm_ppl.experiments.scores import Z
 from lfm_ppl.filtering.smoother import smooth
 from lfm_ppl.linearisation.sigma_points import GaussHermite
 
-EARLY, HORIZON, SMOOTHER, FULL, BANDS, LINK = (
-    "smoother, 60 samples", "delayed MHE, 60 samples", "smoother", "full information", "EP", "softplus link")
-METHODS = {EARLY: "early", HORIZON: "early", SMOOTHER: "all", FULL: "all", BANDS: "all", LINK: "softplus"}
-"""Estimator -> its hyperparameters, a kind of `problem.learning`."""
+EARLY, HORIZON, HORIZON_RATE, RATE, RATE_IN_Q, SMOOTHER, FULL, BANDS, LINK = (
+    "smoother, 60 samples", "delayed MHE, 60 samples", "delayed MHE, rate a state", "full information, rate a state",
+    "full information, rate in Q", "smoother", "full information", "EP", "softplus link")
+METHODS = {EARLY: "early", HORIZON: "early", HORIZON_RATE: "window", RATE: "record", RATE_IN_Q: "weight",
+           SMOOTHER: "all", FULL: "all", BANDS: "all", LINK: "softplus"}
+"""Estimator -> its hyperparameters: a kind of `problem.learning`, or of `states`."""
+
+STATES = ("window", "record", "weight")
+"""Kinds of lengthscales that are constant states of the cost."""
 
 ROWS = dict.fromkeys(METHODS, 1) | {BANDS: 10}
 """Estimator -> of how many samples one has an estimate."""
 
 _BELOW = np.array([0.0, 0.01, 0.025, 0.04])
 """Shares below a 95% band, among which the shortest one is chosen."""
+
+_LENGTHSCALES = np.geomspace(0.02, 1000.0, 12)
+"""Among which a lengthscale that is a state of the cost is searched for first (s); the last is as good as infinity."""
 
 
 def shortest(found: ConstrainedPosterior, name: str) -> tuple[jax.Array, jax.Array]:
@@ -50,7 +59,8 @@ def _narrowest(low: jax.Array, high: jax.Array) -> tuple[jax.Array, jax.Array]:
 @functools.cache
 def transcription(method: str) -> Callable[[Any, Any], tuple[jax.Array, jax.Array, jax.Array]]:
     """Return estimates and ends of bands (N, K) of hyperparameters (N, P) and records (N, T, 1)."""
-    one = {EARLY: _smoother, SMOOTHER: _smoother, HORIZON: _horizon, FULL: _full, BANDS: _bands, LINK: _link}[method]
+    one = {EARLY: _smoother, SMOOTHER: _smoother, HORIZON: _horizon, HORIZON_RATE: _horizon, RATE: _cost,
+           RATE_IN_Q: _cost, FULL: _full, BANDS: _bands, LINK: _link}[method]
     return jax.jit(jax.vmap(one))
 
 
@@ -87,13 +97,70 @@ def _bands(values: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
     return found.force_mean[:, 0], jnp.where(found.converged, low, jnp.inf), high
 
 
+def _minimum(values: jax.Array, y: jax.Array, count: int = len(TIMES)) -> ConstrainedEstimate:
+    """Minimise the source's cost of the first samples, with the lengthscales (P,) of force and weights."""
+    return full_information(problem.companion(values[0], jnp.zeros(3), values[-1]), TIMES[:count], y[:count],
+                            lower={FACTOR: 0.0}, grid=TIMES[:count], tolerance=1e-8)
+
+
+def _cost(values: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
+    found = _minimum(values, y)
+    nothing = jnp.where(found.converged, jnp.nan, jnp.inf) * jnp.ones(len(TIMES))
+    return found.state(FACTOR), nothing, nothing
+
+
+def states(kind: str, y: np.ndarray) -> np.ndarray:
+    """Return lengthscales (N, 2) of force and weights from records (N, T, 1), learnt as section 3.4 of the source says.
+
+    The rate sqrt(3) / lengthscale is one more state, which does not change, and is found with the others: the cost
+    decides, and no likelihood. As Q is a constant in the source ("window", the first one, and "record", all of it),
+    only the dynamics depend on the rate, and but for boundary terms
+
+        integral of w^2 = integral of (l'' + 2 rate l' + rate^2 l)^2 = integral of l''^2 + 2 rate^2 l'^2 + rate^4 l^2
+
+    grows with it: a rate of zero is best, whatever the force is. With the Q of the rate that is found ("weight"), it is
+    divided by 4 rate^3 and has a minimum. The density of a path would also have its factor |Q|^(-1/2) = rate^(-3/2)
+    for each sample; without it a short lengthscale costs nothing, and with it a path without disturbances at a rate of
+    zero has an infinite density. The marginal likelihood, in which the path is integrated out, has neither fault.
+
+    The minimum is that over the rate of the cost's minimum over all else. Gauss-Newton steps of all states at once
+    (`lfm_ppl.full_information` of `problem.companion` with ``learnt``) have the same minimum for a constant Q, and find
+    it on short records; on whole ones, where the cost hardly depends on the rate, they take hundreds of passes.
+    """
+    return np.stack([_least(kind, one) for one in y])
+
+
+def _least(kind: str, y: np.ndarray) -> np.ndarray:
+    """Return the lengthscales (2,) of one record: the best of a grid, and a search between its neighbours."""
+    run, grid = _costs(kind), np.log(_LENGTHSCALES)
+    best = int(np.argmin(run(grid, y)))
+    ends = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
+    found = minimize_scalar(lambda z: float(run(np.array([z]), y)[0]), bounds=ends, method="bounded",
+                            options={"xatol": 5e-3})
+    lengthscale = np.exp(found.x)
+    return np.array([lengthscale, lengthscale if kind == "weight" else problem.GUESSED])
+
+
+@functools.cache
+def _costs(kind: str) -> Callable[[Any, Any], jax.Array]:
+    """Return the least cost (G,) at logarithms of lengthscales (G,), with the arrival cost of the rate."""
+    count = problem.WINDOW + 1 if kind == "window" else len(TIMES)
+
+    def one(z: jax.Array, y: jax.Array) -> jax.Array:
+        weighted = jnp.exp(z) if kind == "weight" else problem.GUESSED
+        arrival = problem.ARRIVAL * 3.0 * (jnp.exp(-z) - 1.0 / problem.GUESSED) ** 2
+        return _minimum(jnp.stack([jnp.exp(z), jnp.asarray(weighted)]), y, count).objective + arrival
+
+    return jax.jit(jax.vmap(one, in_axes=(0, None)))
+
+
 def _horizon(values: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
     nothing = jnp.full(len(TIMES), jnp.nan)
     return horizon(values, y)[:, 1], nothing, nothing
 
 
 def horizon(values: jax.Array, y: jax.Array) -> jax.Array:
-    """Return (x, l, l') (T, 3) by the source's delayed estimator, with the lengthscale ``values[0]``.
+    """Return (x, l, l') (T, 3) by the source's delayed estimator, with the lengthscales (P,) of force and weights.
 
     The arrival mean of the window from t - M is the earlier estimate at t - M.
 
@@ -104,8 +171,8 @@ def horizon(values: jax.Array, y: jax.Array) -> jax.Array:
 
     def window(begin: Any, mean: jax.Array) -> jax.Array:
         part = jax.lax.dynamic_slice_in_dim(y, begin, WINDOW + 1)
-        return full_information(problem.companion(values[0], mean), inside, part, lower={FACTOR: 0.0}, grid=inside,
-                                tolerance=1e-8).state_mean
+        model = problem.companion(values[0], mean, values[-1])
+        return full_information(model, inside, part, lower={FACTOR: 0.0}, grid=inside, tolerance=1e-8).state_mean
 
     def step(estimate: jax.Array, begin: jax.Array) -> tuple[jax.Array, None]:
         found = window(begin, estimate[begin])
@@ -154,7 +221,7 @@ def thyroid() -> tuple[Callable[[Any, Any], dict[str, jax.Array]], Callable[[Any
 
     def bands(draws: jax.Array, y: jax.Array) -> dict[str, jax.Array]:
         means, each, converged = jax.vmap(given, in_axes=(0, None))(draws, y)
-        low, high = shortest_of(each.reshape(-1, each.shape[-1]))
+        low, high = shortest_of(each.reshape(-1, each.shape[-1]), 0.0)
         return {"mean": means.mean(axis=0), "low": low, "high": high, "bands_converged": converged.all()}
 
     return jax.jit(jax.vmap(full)), jax.jit(jax.vmap(bands))
@@ -166,9 +233,16 @@ def quantiles(found: ConstrainedPosterior, name: str, count: int = 40) -> jax.Ar
     return jnp.stack([end for pair in ends for end in pair])
 
 
-def shortest_of(values: jax.Array, level: float = 0.95) -> tuple[jax.Array, jax.Array]:
-    """Return the ends (K,) of the shortest interval that has a share of equally probable values (S, K) in it."""
+def shortest_of(values: jax.Array, bound: float = -math.inf, level: float = 0.95) -> tuple[jax.Array, jax.Array]:
+    """Return the ends (K,) of the shortest interval with a share ``level``, or a little more, of a distribution.
+
+    Args:
+        values: (S, K), its quantiles (i + 1/2) / S, in any order.
+        bound: below which there is nothing, where the interval may begin.
+        level: the share.
+    """
     ordered = jnp.sort(values, axis=0)
-    inside = math.ceil(level * len(values))
-    last = len(values) - inside + 1
-    return _narrowest(ordered[:last], ordered[inside - 1:])
+    parts = math.ceil(level * len(values))
+    # From the bound, a half part below the first quantile, it is as many and a half less to the upper end.
+    low = jnp.concatenate([jnp.full_like(ordered[:1], bound), ordered[: len(values) - parts]])
+    return _narrowest(low, jnp.concatenate([0.5 * (ordered[parts - 1] + ordered[parts])[None], ordered[parts:]]))

@@ -20,8 +20,6 @@ from lfm_ppl.inference.optimise import newton, quasi_newton
 
 TASKS = "tasks"
 _SEARCH = {"ftol": 1e-10, "gtol": 1e-4}
-_DRAWS, _WEIGHTED = 16, 150
-"""Draws of a patient's parameters over which bands are averaged, and weighted ones from which these are taken."""
 _FURTHEST = float(np.log(problem.TIMES[-1] / 2.0))
 """Largest logarithm of the lengthscale that is learnt from 60 samples, whose likelihood often has no maximum."""
 
@@ -35,6 +33,8 @@ class Settings:
         seed: of everything random.
         patients: simulated days of TSH, FT3 and FT4.
         targets: on reentry.
+        draws: of a patient's parameters, over which bands are averaged.
+        weighted: draws from which these are taken.
         shapes: of the force, names of `problem.SHAPES`.
         methods: names of `estimators.METHODS`, with full information and EP among them.
         block: records that are computed in one go, and stored in one file.
@@ -44,13 +44,15 @@ class Settings:
     seed: int = 0
     patients: int = 50
     targets: int = 20
+    draws: int = 16
+    weighted: int = 150
     shapes: tuple[str, ...] = problem.SHAPES
     methods: tuple[str, ...] = tuple(estimators.METHODS)
     block: int = 25
 
     def __post_init__(self) -> None:
         """Check what a user gives."""
-        for name in ("runs", "patients", "targets", "block"):
+        for name in ("runs", "patients", "targets", "draws", "weighted", "block"):
             checks.positive_integer(name, getattr(self, name))
         for shape in self.shapes:
             checks.one_of("shapes", shape, problem.SHAPES)
@@ -88,11 +90,13 @@ def all_tasks(settings: Settings) -> list[Task]:
     """Return a task for each block of records of a shape, of targets and of patients."""
     kinds = [("ballistic", "", settings.targets), ("thyroid", "", settings.patients)]
     kinds += [("transcription", shape, settings.runs) for shape in settings.shapes]
+    own: dict[str, dict[str, Any]] = {
+        "ballistic": {}, "thyroid": {"draws": settings.draws, "weighted": settings.weighted},
+        "transcription": {"methods": list(settings.methods)}}
     return [
         Task("/".join([what, *filter(None, [shape.replace(" ", "-")]), f"{first:04d}"]), settings.seed,
              {"experiment": "constrained", "what": what, "shape": shape, "first": first,
-              "count": min(settings.block, count - first),
-              "methods": list(settings.methods) if what == "transcription" else []})
+              "count": min(settings.block, count - first), **own[what]})
         for what, shape, count in kinds for first in range(0, count, settings.block)]
 
 
@@ -103,7 +107,7 @@ def compute(task: Task) -> Result:
         task, indices)
 
 
-def _found(posterior: Any, y: np.ndarray, prior: float = 1.0, furthest: float = np.inf) -> np.ndarray:
+def posterior_mode(posterior: Any, y: np.ndarray, prior: float = 1.0, furthest: float = np.inf) -> np.ndarray:
     """Return the logarithms of parameters at the mode, where the density is that of the logarithms."""
     medians = dict(zip(posterior.bound.names, posterior.bound.draw(jax.random.key(0)), strict=True))
     start = np.array([medians[name] for name in posterior.names])
@@ -111,16 +115,19 @@ def _found(posterior: Any, y: np.ndarray, prior: float = 1.0, furthest: float = 
     return quasi_newton(posterior.objective(y, prior), start, bounds=bounds, options=_SEARCH).point
 
 
-def drawn(posterior: Any, y: np.ndarray, mode: np.ndarray, seed: int) -> tuple[np.ndarray, float]:
-    """Return draws (16, P) of the logarithms of parameters from their posterior, and the Pareto index of the weights.
+def drawn(posterior: Any, y: np.ndarray, mode: np.ndarray, seed: int, draws: int,
+          weighted: int) -> tuple[np.ndarray, float]:
+    """Return draws (draws, P) of the logarithms of parameters from their posterior, and the weights' Pareto index.
 
-    They are taken at equal distances from weighted draws about the mode.
+    They are taken at equal distances from weighted draws about the mode. Where there is no curvature, all are at the
+    mode, and the index is infinite.
     """
     minimum = newton(posterior.objective(y), mode)
-    found = weighting.weighted(lambda draws: np.sum(posterior.log_densities_of(draws, y), axis=0), [minimum],
-                               _WEIGHTED, seed)
+    if minimum.curvature is None:
+        return np.tile(mode, (draws, 1)), np.inf
+    found = weighting.weighted(lambda z: np.sum(posterior.log_densities_of(z, y), axis=0), [minimum], weighted, seed)
     share = np.cumsum(np.exp(found.weights.log_weight[0]))
-    chosen = np.searchsorted(share / share[-1], (np.arange(_DRAWS) + 0.5) / _DRAWS)
+    chosen = np.searchsorted(share / share[-1], (np.arange(draws) + 0.5) / draws)
     return found.draws[chosen], found.weights.k
 
 
@@ -130,12 +137,15 @@ def _transcription(task: Task, indices: range) -> Result:
     y, truth = (np.stack([getattr(one, name) for one in records]) for name in ("y", "force"))
     values: dict[str, np.ndarray] = {}
     methods = {method: estimators.METHODS[method] for method in task.settings["methods"]}
-    for kind in set(methods.values()):
+    for kind in dict.fromkeys(methods.values()):
+        if kind in estimators.STATES:
+            values[kind] = estimators.states(kind, y)
+            continue
         posterior = problem.learning(kind)
         count = len(posterior.bound.times)
         # The source maximises the likelihood of the first samples.
         how = {"prior": 0.0, "furthest": _FURTHEST} if kind == "early" else {}
-        values[kind] = np.exp([_found(posterior, one[:count], **how) for one in y])
+        values[kind] = np.exp([posterior_mode(posterior, one[:count], **how) for one in y])
     result: Result = {f"hyperparameters/{kind}": found for kind, found in values.items()} | {"truth": truth[0]}
     for method, kind in methods.items():
         rows = estimators.ROWS[method]
@@ -165,10 +175,11 @@ def _thyroid(task: Task, indices: range) -> Result:
     """
     patients = [problem.patient(index, task.seed) for index in indices]
     posterior = problem.thyroid_learning()
-    z = np.stack([_found(posterior, one.y) for one in patients])
+    z = np.stack([posterior_mode(posterior, one.y) for one in patients])
     y = np.stack([one.y for one in patients])
     seeds = [problem.MOST * task.seed + index for index in indices]
-    draws, k = zip(*(drawn(posterior, *one) for one in zip(y, z, seeds, strict=True)), strict=True)
+    counts = task.settings["draws"], task.settings["weighted"]
+    draws, k = zip(*(drawn(posterior, *one, *counts) for one in zip(y, z, seeds, strict=True)), strict=True)
     full, bands = estimators.thyroid()
     found = {name: np.asarray(value) for name, value in (full(z, y) | bands(np.stack(draws), y)).items()}
     times = found.pop("times")[0]

@@ -37,6 +37,10 @@ SHAPES = ("pulses", "half sines", "rectified GP", "softplus of a GP")
 """The source does not say what its force is; the largest value of these is about 2."""
 
 FACTOR = "factor"
+ARRIVAL = 1e-2
+"""P = 1e-2 I, the weight of the source's arrival cost."""
+GUESSED = 1.0
+"""Lengthscale (s) from which a search or an arrival cost of it starts; the source does not say."""
 PUBLISHED = {"smoother": 0.0192, "delayed MHE": 0.0103}
 """Mean squared errors of the force in the source, of one realisation."""
 
@@ -106,27 +110,41 @@ def transcription(scale: Any, lengthscale: Any, level: Any = 0.0, softplus: bool
 
 
 class Companion(eqx.Module):
-    """Dynamics of (x, l, l') in equation 7 of the source."""
+    """Dynamics of (x, l, l') in equation 7 of the source, or with a constant state more, the rate sqrt(3)/lengthscale.
+
+    Attributes:
+        rate: None: it is the last state.
+    """
 
     rate: Any
 
     def __call__(self, x: jax.Array, u: jax.Array, t: jax.Array) -> jax.Array:
-        """Return the rates (3,)."""
-        return jnp.stack([SENSITIVITY * x[1] - DECAY * x[0], x[2], -self.rate**2 * x[1] - 2.0 * self.rate * x[2]])
+        """Return the rates (3,) or (4,)."""
+        rate = x[3] if self.rate is None else self.rate
+        found = [SENSITIVITY * x[1] - DECAY * x[0], x[2], -(rate**2) * x[1] - 2.0 * rate * x[2]]
+        return jnp.stack(found if self.rate is not None else [*found, jnp.zeros_like(rate)])
 
 
-def companion(lengthscale: Any, mean: Any) -> LatentForceModel:
+def companion(lengthscale: Any, mean: Any, weighted: Any = None, learnt: bool = False) -> LatentForceModel:
     """Return the model of a window of the source: the force of scale 1 among the states, from an arrival mean (3,).
 
     Its cost 2 |chi - mean|^2_P + sum of 2 |w|^2_Q + |y - x|^2_R, with P = 1e-2 I and Q and R the inverses of the
     noises' variances, is twice that of an arrival covariance I / (2 P) and half the process covariance.
+
+    Args:
+        lengthscale: of the force. Where it is learnt, that of the arrival mean.
+        mean: (3,), of the arrival cost.
+        weighted: the lengthscale at which Q is taken; None: the force's.
+        learnt: whether the rate is a constant state of unknown value.
     """
     rate = np.sqrt(3.0) / lengthscale
-    noise = jnp.diag(jnp.stack([jnp.asarray(PROCESS_SD**2), jnp.asarray(0.0), 4.0 * rate**3]) / 2.0)
+    weight = rate if weighted is None else np.sqrt(3.0) / weighted
+    noise = [jnp.asarray(PROCESS_SD**2), jnp.asarray(0.0), jnp.asarray(4.0 * weight**3), *[jnp.asarray(0.0)] * learnt]
     return LatentForceModel(
-        Companion(rate), {}, GaussianObservation(_state, jnp.array([NOISE_SD**2])),
-        Gaussian(mean, 50.0 * jnp.eye(3)), process_noise=jnp.sqrt(noise), initial_time=0.0,
-        state_names=("x", FACTOR, "derivative"))
+        Companion(None if learnt else rate), {}, GaussianObservation(_state, jnp.array([NOISE_SD**2])),
+        Gaussian(jnp.append(mean, rate) if learnt else mean, 0.5 / ARRIVAL * jnp.eye(3 + learnt)),
+        process_noise=jnp.sqrt(jnp.diag(jnp.stack(noise)) / 2.0), initial_time=0.0,
+        state_names=("x", FACTOR, "derivative", *["rate"] * learnt))
 
 
 def _learnt(times: Any, y: Any = None, softplus: bool = False, alone: bool = False) -> None:
