@@ -150,7 +150,7 @@ def test_mistakes(conjugate):
         plot_calibration(conjugate[0], bins=10)
     with pytest.raises(ValueError, match="data_sets must be at least 1"):
         calibration.calibrate(jax.random.key(0), lambda times, y=None: None, [0.0], lfm.RAM, data_sets=0)
-    with pytest.raises(ValueError, match="unknown method 'parallel'; there are vectorized, sequential"):
+    with pytest.raises(ValueError, match="unknown method 'parallel'. Known: vectorized, sequential"):
         calibration.calibrate(jax.random.key(0), level, [0.0], lfm.RAM, method="parallel")
     with pytest.raises(ValueError, match="exactly one site"):
         calibration.calibrate(jax.random.key(0), lambda times, y=None: None, [0.0], lfm.RAM)
