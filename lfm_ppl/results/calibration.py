@@ -18,9 +18,12 @@ from lfm_ppl.engine.cluster import Workers
 from lfm_ppl.engine.run import Reporter, run_tasks
 from lfm_ppl.engine.task import Task
 from lfm_ppl.inference.bound_model import bind, likelihood_site
+from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
+from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.results.files import writing
 
 LOG_LIKELIHOOD = "log likelihood"
+METHODS = ("vectorized", "sequential")
 _SIMULATIONS = 20_000
 _BATCH = 25
 """Data sets of a task where there are several."""
@@ -39,8 +42,9 @@ class Calibration(NamedTuple):
 
 
 def calibrate(key: jax.Array, model: Callable, times: Any, kernel: Callable, *, data_sets: int = 200, draws: int = 63,
-              thin: int = 10, warmup: int = 500, batch: int | None = None, folder: str | Path | None = None,
-              overwrite: bool = False, report: Reporter | None = None, workers: Workers = 1) -> Calibration:
+              thin: int = 10, warmup: int = 500, batch: int | None = None, method: str | None = None,
+              folder: str | Path | None = None, overwrite: bool = False, report: Reporter | None = None,
+              workers: Workers = 1) -> Calibration:
     """Rank true parameters among posterior draws, for many data sets that the model itself generates.
 
     For parameters theta* drawn from the prior and data drawn from the model at theta*, theta* is one more draw from
@@ -57,8 +61,11 @@ def calibrate(key: jax.Array, model: Callable, times: Any, kernel: Callable, *, 
         draws: L. With 63 the 64 possible ranks fall into 2, 4, 8, 16 or 32 bins of equal width.
         thin: steps of the chain between two of these; the draws must be nearly independent.
         warmup: steps before the first.
-        batch: data sets that run side by side and make one task; by default all of them in this process, and 25 where
-            there is a folder or there are several workers. (NUTS side by side takes as long as its longest tree.)
+        batch: data sets that make one task; by default all of them in this process, and 25 where there is a folder or
+            there are several workers.
+        method: "vectorized", the data sets of a task side by side, or "sequential", one after the other. Side by side
+            all of them wait for whichever takes longest, at each step: for its tree with NUTS, and for its sites with
+            an observation family or constraints. None: sequential for the latter, vectorized otherwise.
         folder: where the ranks of each task are stored, so that a run that was stopped goes on; None: nowhere.
         overwrite: compute again what was stored with other settings.
         report: what to do with a line of progress; None: nothing.
@@ -69,8 +76,8 @@ def calibrate(key: jax.Array, model: Callable, times: Any, kernel: Callable, *, 
 
     Raises:
         TypeError: ``key`` is no random key.
-        ValueError: the model has no likelihood site, a count is not a positive number, or the folder holds ranks that
-            were made with other settings.
+        ValueError: the model has no likelihood site, a count is not a positive number, the method is unknown, or the
+            folder holds ranks that were made with other settings.
         TasksFailedError: some tasks failed; the others are stored.
 
     Example:
@@ -93,7 +100,9 @@ def calibrate(key: jax.Array, model: Callable, times: Any, kernel: Callable, *, 
     if batch is None:
         batch = data_sets if folder is None and isinstance(workers, int) and workers == 1 else min(_BATCH, data_sets)
     checks.positive_integer("batch", batch)
-    compute = _Ranks(model, np.asarray(times, float), kernel, draws, thin, warmup, batch)
+    if method is not None:
+        checks.one_of("method", method, METHODS)
+    compute = _Ranks(model, np.asarray(times, float), kernel, draws, thin, warmup, batch, method)
     compute.check()
     truth_keys, chain_keys = (np.asarray(jax.random.key_data(jax.random.split(one, data_sets)))
                               for one in jax.random.split(key))
@@ -118,6 +127,7 @@ class _Ranks:
     thin: int
     warmup: int
     batch: int
+    method: str | None = None
 
     def check(self) -> None:
         """Raise where the model has no likelihood site, before anything is computed."""
@@ -140,7 +150,14 @@ class _Ranks:
             posterior[LOG_LIKELIHOOD] = jax.lax.map(score, posterior)
             return {n: (posterior[n] < truth[n]).sum(0) for n in truth}
 
-        return jax.jit(lambda keys: jax.lax.map(one, keys, batch_size=self.batch))
+        # One data set in a batch of its own would take both branches of each condition.
+        side_by_side = self.batch > 1 and self._method(site.example) == "vectorized"
+        return jax.jit(lambda keys: jax.lax.map(one, keys, batch_size=self.batch if side_by_side else None))
+
+    def _method(self, likelihood: MarginalLikelihood) -> str:
+        """Return how the data sets of a task run: a search that ends when it has converged is one by one."""
+        searches = likelihood.constrained or isinstance(likelihood.model.observation, ObservationFamily)
+        return self.method or ("sequential" if searches else "vectorized")
 
     def __call__(self, task: Task) -> dict[str, np.ndarray]:
         """Return name of a scalar -> ranks."""

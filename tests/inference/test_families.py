@@ -1,4 +1,7 @@
-"""Observation families in a Bayesian workflow: calibration of a sampler with EP, and draws of the prior."""
+"""Observation families in a Bayesian workflow: calibration of samplers with EP, and draws of the prior."""
+
+import os
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +12,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 from numpyro import handlers
 from numpyro.distributions import biject_to
-from numpyro.infer import Predictive
+from numpyro.infer import NUTS, Predictive
 
 import lfm_ppl as lfm
 from lfm_ppl import loading
@@ -112,8 +115,24 @@ def test_random_walks_with_expectation_propagation_are_calibrated():
     assert_uniform(found, bins=4)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["Poisson", "Student-t"])
+def test_nuts_with_expectation_propagation_is_calibrated(name, tmp_path):
+    """200 data sets of 32 rows and all parameters; with LFM_SBC_OUT they are kept there, and the run goes on."""
+    folder = Path(os.environ.get("LFM_SBC_OUT", tmp_path)) / name
+    found = calibration.calibrate(jax.random.key(3), FAMILIES[name], 0.5 * np.arange(32.0),
+                                  lambda model: NUTS(model, max_tree_depth=6), data_sets=200, draws=31, thin=10,
+                                  warmup=200, batch=20, folder=folder, report=print)
+    assert {"scale", "lengthscale", "log likelihood"} < set(found.ranks)
+    assert all(len(rank) == 200 for rank in found.ranks.values())
+    assert_uniform(found, bins=16)
+
+
 def densities(model, times, y, count, keywords=None, known=None, seed=0):
-    """Return values and gradients of the log density at draws of the prior, in one program."""
+    """Return values and gradients of the log density at draws of the prior, in one program, one after the other.
+
+    Side by side all of them wait for the one whose sites take longest, with several times the memory.
+    """
     keywords = keywords or {}
     bound = bind(model, times, y, **keywords).fix(known or {})
     prior = Predictive(handlers.block(model, hide=["y"]), num_samples=count)(jax.random.key(seed), times, y, **keywords)
@@ -121,7 +140,7 @@ def densities(model, times, y, count, keywords=None, known=None, seed=0):
     draws = {name: biject_to(trace[name]["fn"].support).inv(prior[name]) for name in bound.sites}
     z = jax.vmap(lambda one: ravel_pytree(one)[0])(draws)
     assert z.shape == (count, bound.size)
-    run = jax.jit(lambda z: jax.lax.map(jax.value_and_grad(bound.log_density), z, batch_size=min(count, 500)))
+    run = jax.jit(lambda z: jax.lax.map(jax.value_and_grad(bound.log_density), z))
     return map(np.asarray, run(z))
 
 

@@ -87,6 +87,21 @@ def test_moments_are_those_of_elliptical_slices(name):
     assert np.all(away < 0.05 + 4 * of_mean) and np.all(wider < 0.03 + 4 * of_sd)
 
 
+@pytest.mark.slow
+def test_coal_has_the_evidence_of_bayesnewton():
+    """The same counts and hyperparameters in BayesNewton 1.3.4, an implementation of its own (111 bins)."""
+    model, times, y = problem("coal 111")
+    theirs = {"ep": -175.2304464105596, lfm.SiteSettings(power=0.5): -175.2314237700023,
+              "variational": -175.2324063924814}
+    for sites, expected in theirs.items():
+        found = float(jax.jit(lfm.MarginalLikelihood(model, times, sites=sites).log_prob)(jnp.asarray(y, float)))
+        print(sites, found)
+        assert found == pytest.approx(expected, abs=1e-7)
+    mean, sd = map(np.asarray, lfm.MarginalLikelihood(model, times).smooth(y).force(model.force_names[0]))
+    np.testing.assert_allclose(mean[[0, 50, 100]], [0.73549481, -0.3167189, -0.81036701], atol=5e-7)
+    np.testing.assert_allclose(sd[[0, 50, 100]], [0.24480603, 0.22654376, 0.27578656], atol=5e-7)
+
+
 def test_a_grid_without_states_is_the_process_itself():
     """Values on the grid have the prior's covariance, and the likelihood is the family's."""
     model, times, y = problem("Poisson")

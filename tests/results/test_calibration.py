@@ -97,6 +97,12 @@ def test_exact_draws_are_calibrated_and_wide_ones_are_not(conjugate):
         assert calibration.p_values(wide.ranks[name], 63)["ecdf"] < 0.001, name
 
 
+def test_one_by_one_finds_the_same_ranks(conjugate):
+    found = run(1.0, method="sequential")
+    for name, rank in conjugate[0].ranks.items():
+        np.testing.assert_array_equal(found.ranks[name], rank)
+
+
 @pytest.mark.slow
 def test_tasks_in_a_folder_find_the_same_ranks_and_go_on(conjugate, tmp_path):
     lines = []
@@ -145,5 +151,7 @@ def test_mistakes(conjugate):
         plot_calibration(conjugate[0], bins=10)
     with pytest.raises(ValueError, match="data_sets must be at least 1"):
         calibration.calibrate(jax.random.key(0), lambda times, y=None: None, [0.0], lfm.RAM, data_sets=0)
+    with pytest.raises(ValueError, match="unknown method 'parallel'. Known: vectorized, sequential"):
+        calibration.calibrate(jax.random.key(0), level, [0.0], lfm.RAM, method="parallel")
     with pytest.raises(ValueError, match="exactly one site"):
         calibration.calibrate(jax.random.key(0), lambda times, y=None: None, [0.0], lfm.RAM)
