@@ -33,7 +33,7 @@ from lfm_ppl.inference.kernels.options import KERNELS, check_options
 from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalRAM, Tuned
 from lfm_ppl.inference.map import MAPResult, mode_of
 from lfm_ppl.inference.marginal_likelihood import Panel
-from lfm_ppl.inference.posterior import scores, trajectories
+from lfm_ppl.inference.posterior import evenly_spaced, scores, trajectories
 from lfm_ppl.inference.priors import prior
 from lfm_ppl.inference.progress import Counter
 from lfm_ppl.inference.samplers import FILTERED, SAMPLERS
@@ -658,9 +658,7 @@ def draw_paths(key: jax.Array, bound: BoundModel, draws: dict, at: Any, count: i
 def _paths(bound: BoundModel, at: Any, count: int, chains: int,
            samples: int) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Return which draws of each chain have a trajectory, their rows among all draws, and its times."""
-    per_chain = min(samples, -(-count // chains))
-    chosen = np.unique(np.linspace(0, samples - 1, per_chain).round().astype(int))
-    rows = (np.arange(chains)[:, None] * samples + chosen).ravel()
+    chosen, rows = evenly_spaced(chains, samples, count)
     times = bound.times
     if times.ndim > 1:
         return chosen, rows, None

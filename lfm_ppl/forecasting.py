@@ -10,12 +10,11 @@ import numpy as np
 
 from lfm_ppl import checks
 from lfm_ppl.filtering.time_grid import build_time_grid
-from lfm_ppl.inference.posterior import noise_of_rows, trajectories
+from lfm_ppl.inference.posterior import evenly_spaced, noise_of_rows, trajectories
 from lfm_ppl.inference.progress import Counter
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.particles.particle_filter import ParticleSettings
 from lfm_ppl.results import arviz_data, rebuilding
-from lfm_ppl.results.accuracy import evenly_spaced
 from lfm_ppl.results.predictions import GROUP, HELD_OUT, predictions
 
 

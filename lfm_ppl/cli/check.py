@@ -119,8 +119,8 @@ def _settled(posterior: Any, arguments: argparse.Namespace) -> Any:
 
 def _refuse_other(task: Check) -> None:
     """Raise ValueError where the model gives other log likelihoods than the result records, at a draw of each chain."""
+    from lfm_ppl.inference.posterior import evenly_spaced
     from lfm_ppl.results import arviz_data, likelihoods, rebuilding
-    from lfm_ppl.results.accuracy import evenly_spaced
 
     posterior = arviz_data.group(task.posterior, "posterior")
     chains = posterior.sizes["chain"]

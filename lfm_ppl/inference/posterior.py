@@ -301,6 +301,18 @@ def _points(ssm: StateSpaceModel, smoothed: SmootherResult, w: jax.Array, drawn:
     return found
 
 
+def evenly_spaced(chains: int, samples: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return which draws of each chain (S,), and of all chains one after another (C * S,), are about ``count`` in all.
+
+    Example:
+        >>> evenly_spaced(2, 100, 4)[1].tolist()
+        [0, 99, 100, 199]
+    """
+    per_chain = min(samples, -(-count // chains))
+    chosen = np.unique(np.linspace(0, samples - 1, per_chain).round().astype(int))
+    return chosen, (np.arange(chains)[:, None] * samples + chosen).ravel()
+
+
 def noise_of_rows(distribution: MarginalLikelihood) -> bool:
     """Whether the law of the noise is given for each row of the data, so that no other row has one."""
     observation = distribution.ssm.model.observation

@@ -277,7 +277,6 @@ class LatentForceModel(eqx.Module):
             if noise is not None:
                 checks.covariance_matrix(f"the observation covariance {where}", noise)
 
-
     @staticmethod
     def _check_derivative(label: str, function: Callable, names: Sequence[str], at: tuple, where: str) -> None:
         """Warn: a square root has a value at zero, but no derivative there, and none below."""

@@ -13,6 +13,7 @@ import numpy as np
 import xarray as xr
 
 from lfm_ppl import checks
+from lfm_ppl.inference.posterior import evenly_spaced
 from lfm_ppl.inference.samplers import FILTERED, SAMPLERS
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel
@@ -125,18 +126,6 @@ def _report(result: Any, problem: PosteriorDraws, chosen: np.ndarray, kind: str,
     doubled = likelihoods.gaussian_with_finer_steps(problem).reshape(shape)
     found = _reference(kind, problem, filtered, particles, replicates, steps, seed, progress)
     return assess(result, chosen, filtered, doubled, found, problem)
-
-
-def evenly_spaced(chains: int, samples: int, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return which draws of each chain (S,), and of all chains one after another (C * S,), are about ``count`` in all.
-
-    Example:
-        >>> evenly_spaced(2, 100, 4)[1].tolist()
-        [0, 99, 100, 199]
-    """
-    per_chain = min(samples, -(-count // chains))
-    chosen = np.unique(np.linspace(0, samples - 1, per_chain).round().astype(int))
-    return chosen, (np.arange(chains)[:, None] * samples + chosen).ravel()
 
 
 def assess(result: Any, chosen: np.ndarray, filtered: np.ndarray, doubled: np.ndarray, reference: Reference,

@@ -11,9 +11,8 @@ import numpy as np
 import xarray as xr
 
 from lfm_ppl import checks
-from lfm_ppl.inference.posterior import trajectories
+from lfm_ppl.inference.posterior import evenly_spaced, trajectories
 from lfm_ppl.results import arviz_data, importance, rebuilding
-from lfm_ppl.results.accuracy import evenly_spaced
 from lfm_ppl.results.layout import with_summaries
 from lfm_ppl.results.report import AccuracyReport
 

@@ -17,12 +17,11 @@ from lfm_ppl.checks import unknown
 from lfm_ppl.results.arviz_data import attributes, group, has_group
 from lfm_ppl.results.inputs import ORIGIN
 from lfm_ppl.results.plots import style
-from lfm_ppl.results.predictions import GROUP, HELD_OUT, MEAN, interval, noise_free_interval, quantiles
+from lfm_ppl.results.predictions import GROUP, HELD_OUT, INTERVAL, MEAN, interval, noise_free_interval, quantiles
 from lfm_ppl.results.scalars import unit_of
 
 MAX_PANELS = 12
 _MANY = 150  # measurements
-_INTERVAL = (0.025, 0.975)
 _BARS = 12  # forecasts from which they are drawn as bands
 _END: dict[str, Any] = {"color": style.GREY, "lw": 0.8, "ls": (0, (1, 2)), "zorder": 0.5}
 _TRUTH: dict[str, Any] = {"color": style.BLACK, "lw": 0.9, "ls": (0, (4, 2)), "zorder": 3.5}
@@ -356,7 +355,7 @@ def _band(result: Any, kind: str, name: str) -> tuple[np.ndarray, np.ndarray, np
     if summary is not None:
         return draws["at"].values, *summary.sel({kind: name}).values
     flat = draws.values.reshape(-1, draws.sizes["at"])
-    low, high = np.quantile(flat, _INTERVAL, axis=0)
+    low, high = np.quantile(flat, INTERVAL, axis=0)
     return draws["at"].values, flat.mean(axis=0), low, high
 
 
@@ -372,7 +371,7 @@ def _widened(
     """Return times from the first to the last measurement and the predictive interval there."""
     measured, which = np.unique(predictive["time"].values, return_inverse=True)
     draws = predictive.values.reshape(-1, predictive.sizes["time"])
-    ends = np.array([quantiles(draws[:, which == k].ravel(), _INTERVAL) for k in range(len(measured))])
+    ends = np.array([quantiles(draws[:, which == k].ravel(), INTERVAL) for k in range(len(measured))])
     below = ends[:, 0] - np.interp(measured, at, low)
     above = ends[:, 1] - np.interp(measured, at, high)
     grid = np.union1d(measured, at[(at >= measured[0]) & (at <= measured[-1])])
