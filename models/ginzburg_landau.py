@@ -13,8 +13,10 @@ time, and jumps between the wells.
 What is sampled is sigma, linear = alpha / sigma^2 and cubic = beta / sigma^2; alpha and beta follow.
 The stationary density is proportional to exp(-linear x^2 - cubic x^4 / 2), so that linear and cubic
 are its shape and sigma the speed of time. Observations far apart are independent draws from this
-density: they tell its shape, and of the speed only that it is fast. The priors are for states of a
-few units; rescale data of another size.
+density: they tell its shape, and of the speed only that it is fast, so that it is the prior of sigma
+which ends the posterior there: 0.92 to 2.97 with probability 0.95. (Where the diffusion is fast, the
+Gaussian filter changes its mind about the wells from one parameter to the next, and NUTS diverges.)
+The priors are for states of a few units and observations a few units of time apart; rescale others.
 
 The prior of the state at the first observation is N(0, 10), the width of the stationary density.
 
@@ -84,8 +86,8 @@ def model(times, y=None, noise_sd: float = 0.1, units=None) -> None:
         noise_sd: standard deviation of the observation noise.
         units: name -> unit, for plots.
     """
-    sigma = numpyro.sample("sigma", dist.LogNormal(0.5, 0.5))
-    linear = numpyro.sample("linear", dist.Normal(0.0, 0.5))
+    sigma = numpyro.sample("sigma", dist.LogNormal(0.5, 0.3))
+    linear = numpyro.sample("linear", dist.Normal(0.0, 0.25))
     cubic = numpyro.sample("cubic", dist.LogNormal(-3.0, 1.0))
     alpha = numpyro.deterministic("alpha", linear * sigma**2)
     beta = numpyro.deterministic("beta", cubic * sigma**2)
