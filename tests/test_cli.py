@@ -129,6 +129,16 @@ def test_models_describes_one(run):
     assert "default: softplus" in out and "any number, the columns of the data file" in out
 
 
+@pytest.mark.slow
+def test_the_first_command_of_the_readme_does_not_diverge(run):
+    code, out, err = run("fit ginzburg-landau --out first")
+    assert code == 0 and "diverged" not in out + err
+    draws = arviz_data.load("first/posterior.nc")
+    assert int(arviz_data.group(draws, "sample_stats")["diverging"].sum()) == 0
+    summary = arviz_data.summary(draws)
+    assert summary["r_hat"].max() < 1.01 and summary["ess_bulk"].min() > 1000
+
+
 def test_fit_writes_posterior_summary_and_figures(fitted, sampler):
     assert {path.name for path in fitted.iterdir()} == {"posterior.nc", "summary.csv", "report.html", *FIGURES}
     posterior = arviz_data.load(fitted / "posterior.nc")

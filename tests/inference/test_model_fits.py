@@ -41,12 +41,6 @@ def test_double_well_in_a_few_draws():
 
 
 @pytest.mark.slow
-def test_the_first_fit_of_the_readme_does_not_diverge():
-    result = fitted("ginzburg-landau", sampler="nuts", chains=4, warmup=1000, samples=1000, trajectory_draws=10)
-    assert int(arviz_data.group(result, "sample_stats")["diverging"].sum()) == 0
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("sampler", ["nuts", "ram"])
 @pytest.mark.parametrize("name", ["ginzburg-landau", "transcription", "spring"])
 def test_posteriors_converge_and_hold_the_truth(name, sampler):
