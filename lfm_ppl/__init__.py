@@ -87,6 +87,7 @@ if TYPE_CHECKING:
     from lfm_ppl.results.plots import plot_deterministics as plot_deterministics
     from lfm_ppl.results.plots import plot_fit as plot_fit
     from lfm_ppl.results.plots import plot_forces as plot_forces
+    from lfm_ppl.results.plots import plot_inputs as plot_inputs
     from lfm_ppl.results.plots import plot_pairs as plot_pairs
     from lfm_ppl.results.plots import plot_residuals as plot_residuals
     from lfm_ppl.results.plots import plot_states as plot_states
@@ -114,8 +115,8 @@ _NAMES = {
     "results.correction": ("correct_posterior",),
     "results.html_report": ("save_report",),
     "results.plots": (
-        "plot_accuracy", "plot_calibration", "plot_deterministics", "plot_fit", "plot_forces", "plot_pairs",
-        "plot_residuals", "plot_states", "plot_trace",
+        "plot_accuracy", "plot_calibration", "plot_deterministics", "plot_fit", "plot_forces", "plot_inputs",
+        "plot_pairs", "plot_residuals", "plot_states", "plot_trace",
     ),
     "results.scoring": ("score",),
     "inference.kernels.elliptical_slice": ("EllipticalSlice",),

@@ -7,7 +7,9 @@ that a change to summer time leaves out or repeats is counted right.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
+from contextvars import ContextVar
 from datetime import UTC, date, datetime, time, timedelta, timezone
 from typing import Any
 
@@ -131,6 +133,38 @@ def clock(time: float, origin: str, unit: str, sep: str = " ", digits: int = 0) 
     """
     stamp = datetime.fromisoformat(origin) + timedelta(seconds=round(time * SECONDS[unit], digits))
     return stamp.isoformat(sep=sep, timespec="auto" if stamp.second or stamp.microsecond else "minutes")
+
+
+_CLOCK: ContextVar[tuple[str, str] | None] = ContextVar("clock", default=None)
+
+
+@contextlib.contextmanager
+def in_messages(origin: str | None, unit: str) -> Iterator[None]:
+    """Let messages name times as the data do: as dates, where their origin is known.
+
+    Args:
+        origin: None where the times are plain numbers.
+        unit: that they count.
+    """
+    token = _CLOCK.set((origin, unit) if origin and unit in SECONDS else None)
+    try:
+        yield
+    finally:
+        _CLOCK.reset(token)
+
+
+def named(time: float) -> str:
+    """Return a time for a message, see `in_messages`.
+
+    Example:
+        >>> with in_messages("2019-12-23T00:00:00", "h"):
+        ...     named(36.0)
+        '2019-12-24T12:00'
+        >>> named(36.0)
+        '36'
+    """
+    known = _CLOCK.get()
+    return f"{time:g}" if known is None else clock(time, *known, sep="T")
 
 
 def days_of(times: Any, origin: str, unit: str) -> np.ndarray:

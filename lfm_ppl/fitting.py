@@ -21,7 +21,7 @@ import numpy as np
 from jax.stages import Lowered
 from numpyro.infer import init_to_median, init_to_value
 
-from lfm_ppl import checks
+from lfm_ppl import calendar_time, checks
 from lfm_ppl.data import Data, as_data, model_keywords
 from lfm_ppl.filtering.breakdown import FilterWarning, breakdown
 from lfm_ppl.filtering.time_grid import build_time_grid
@@ -34,7 +34,7 @@ from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalRAM, Tun
 from lfm_ppl.inference.map import MAPResult, mode_of
 from lfm_ppl.inference.marginal_likelihood import Panel
 from lfm_ppl.inference.posterior import evenly_spaced, scores, trajectories
-from lfm_ppl.inference.priors import prior
+from lfm_ppl.inference.priors import assumptions, prior
 from lfm_ppl.inference.progress import Counter
 from lfm_ppl.inference.samplers import FILTERED, SAMPLERS
 from lfm_ppl.inference.sampling import Transition
@@ -186,8 +186,10 @@ def fit(
         coords = {"output": data.outputs, **(coords or {})}
         model_kwargs = model_keywords(data.inputs, model_kwargs)
     values = y.to_numpy(float) if hasattr(y, "to_numpy") else y  # a data frame
-    bound = bind(numpyro_model, times, values, **dict(model_kwargs or {}))
-    check_requested(bound, at)
+    clock = (None, "") if data is None else (data.origin, data.units.get("time", ""))
+    with calendar_time.in_messages(*clock):
+        bound = bind(numpyro_model, times, values, **dict(model_kwargs or {}))
+        check_requested(bound, at)
     labels = Labels.of(bound, dims, coords, y)
     # Traces the model once more, for the record of a run that is kept.
     fingerprint = None if checkpoint is None else bound.fingerprint
@@ -203,13 +205,14 @@ def fit(
     call = _call(title, "times, y" if data is None else "data", asked, model_kwargs)
     run = _Run(bound, asked, labels, data, truth, progress, started, {
         "model": title, "description": described_by(numpyro_model), "call": call, **asked.described(bound),
-        "priors": kept("priors in words", lambda: _priors(bound), None)}, dict(attributes or {}))
+        "priors": kept("priors in words", lambda: _priors(bound), None),
+        "assumptions": kept("the model in words", lambda: _assumptions(bound), None)}, dict(attributes or {}))
     if checkpoint is not None:
         record = asked.record(bound, fingerprint)
         if resume and (finished := checkpoints.finished(checkpoint, record)) is not None:
             return finished
         run.keeper = checkpoints.begin_or_resume(checkpoint, record, resume)
-    with checkpoints.closing(run.keeper):
+    with checkpoints.closing(run.keeper), calendar_time.in_messages(*clock):
         with _start_explained(bound):
             run.sample()
         run.follow()
@@ -672,6 +675,11 @@ def _priors(bound: BoundModel) -> str:
     """Return name -> prior in words, as JSON."""
     trace = bound.trace()
     return json.dumps({name: prior(trace[name]["fn"]) for name in bound.sites})
+
+
+def _assumptions(bound: BoundModel) -> str:
+    """Return what the model says of observations, forces and initial state at the prior medians, as JSON."""
+    return json.dumps(assumptions(bound.site.example.ssm.model))
 
 
 def described_by(numpyro_model: Any) -> str | None:

@@ -8,13 +8,16 @@ from typing import Any
 import jax
 import numpy as np
 
-from lfm_ppl import checks
+from lfm_ppl import calendar_time, checks
+from lfm_ppl.data import InputTable
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.posterior import evenly_spaced, noise_of_rows, trajectories
 from lfm_ppl.inference.progress import Counter
+from lfm_ppl.model.inputs import Input
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.particles.particle_filter import ParticleSettings
 from lfm_ppl.results import arviz_data, rebuilding
+from lfm_ppl.results import inputs as known_inputs
 from lfm_ppl.results.predictions import GROUP, HELD_OUT, predictions
 
 
@@ -53,7 +56,8 @@ def forecast(result: Any, numpyro_model: Callable, times: Any, *, inputs: Mappin
         A new ArviZ object: the groups of ``result`` and a group ``predictions`` with dimensions chain, draw, time and
         output: new observations under the name of the likelihood's site (``y``), with noise; ``y_mean`` and ``y_sd``,
         their normal distribution at each draw; and ``outputs``, which are noise-free, ``forces``, ``states`` and
-        ``deterministics`` along the same paths. `lfm_ppl.score` compares them with data, `lfm_ppl.plot_fit` draws them.
+        ``deterministics`` along the same paths. `lfm_ppl.score` compares them with data, `lfm_ppl.plot_fit` and
+        `lfm_ppl.plot_forces` draw them. Known ``inputs`` are a group ``predictions_constant_data``.
 
     Raises:
         ValueError: times that go back or lie before the initial time; another model than that of the result, seen by
@@ -83,6 +87,12 @@ def forecast(result: Any, numpyro_model: Callable, times: Any, *, inputs: Mappin
     """
     checks.positive_integer("draws", draws)
     times = checks.time_vector("times", times, order="non-decreasing")
+    with calendar_time.in_messages(*known_inputs.clock_of(result)):
+        return _forecast(result, numpyro_model, times, inputs, model_kwargs, draws, seed, progress)
+
+
+def _forecast(result: Any, numpyro_model: Callable, times: np.ndarray, inputs: Mapping[str, Any] | None,
+              model_kwargs: Mapping[str, Any] | None, draws: int, seed: int, progress: bool) -> Any:
     problem = rebuilding.problem(result, numpyro_model,
                                  model_kwargs=rebuilding.keywords(result, inputs, model_kwargs))
     bound = problem.bound
@@ -107,11 +117,15 @@ def forecast(result: Any, numpyro_model: Callable, times: Any, *, inputs: Mappin
         total = split["log_likelihood"].reshape(chains, len(chosen), -1).sum(axis=-1)
         rebuilding.check_likelihood(result, total, chosen)
     # Data that an earlier forecast was compared with are not those of this one.
-    groups = {name: arviz_data.group(result, name) for name in arviz_data.groups(result) if name != HELD_OUT}
+    groups = {name: arviz_data.group(result, name) for name in arviz_data.groups(result) if name not in (
+        HELD_OUT, known_inputs.FORECAST)}
     labels = posterior["draw"].values[chosen] if "draw" in posterior.coords else chosen
     observed = groups["observed_data"]
     names = {name: observed[name].values.tolist() for name in ("output", "series") if name in observed.coords}
     groups[GROUP] = predictions(bound, split, labels, times, names)
+    if continued := {name: InputTable(np.asarray(one.times), np.asarray(one.values), one.interpolation)
+                     for name, one in (inputs or {}).items() if isinstance(one, Input)}:
+        groups[known_inputs.FORECAST] = known_inputs.to_dataset(continued)
     return arviz_data.build(groups, attrs)
 
 

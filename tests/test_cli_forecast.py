@@ -57,14 +57,15 @@ def test_forecast_of_a_stored_result_writes_table_figure_group_and_scores(result
     assert code == 0, err
     ahead = tmp_path / "ahead"
     assert {path.name for path in ahead.iterdir()} == {
-        "posterior.nc", "forecast.csv", "forecast.png", "scores.csv", "report.html"}
+        "posterior.nc", "forecast.csv", "forecast.png", "forecast-states.png", "scores.csv", "report.html"}
     for path in ahead.iterdir():
         assert f"wrote    {path}" in out
     page = (ahead / "report.html").read_text()
     later = arviz_data.group(arviz_data.load(tmp_path / "ahead" / "posterior.nc"), "held_out_data")["y"]
     np.testing.assert_array_equal(later.sel(output="x"), [-0.9, np.nan, -1.2])
     assert "<h3>Scores on the held-out data</h3>" in page and f"\nlfm-ppl forecast {result} --held-out" in page
-    assert "after the last observation" in page and page.count("data:image/png;base64,") == 1
+    assert "after the last observation" in page and page.count("data:image/png;base64,") == 2
+    assert "Forecast of the states" in page
     table = pd.read_csv(ahead / "forecast.csv")
     assert set(table["output"]) == {"x"}
     assert table["time"].tolist() == [6.0, 7.0, 7.5]

@@ -17,7 +17,7 @@ from lfm_ppl.cli import description
 from lfm_ppl.cli import fit as command
 from lfm_ppl.data import Data, InputTable, write_csv
 from lfm_ppl.results import arviz_data, rebuilding
-from lfm_ppl.results.inputs import inputs_of
+from lfm_ppl.results.inputs import FORECAST, inputs_of
 
 HOUSE = """date,indoor,heater,outside
 2026-01-05 06:00,18.0,0,5
@@ -192,5 +192,12 @@ def test_a_fit_takes_a_table_and_its_result_remembers_inputs_and_dates(tmp_path)
     from lfm_ppl.results.plots import plot_fit
     figure = plot_fit(again)
     assert "Jan 2026" in figure.axes[0].get_xlabel()
+    # A forecast remembers the inputs that it goes on with, and a warning names times as the data do.
+    longer = lfm.Input(np.arange(12.0), 5.0 + 0.4 * np.arange(12.0), "linear")
+    ahead = lfm.forecast(again, heated, [8.0, 11.0], inputs={"outside": longer}, progress=False)
+    np.testing.assert_array_equal(inputs_of(ahead, FORECAST)["outside"].values, longer.values)
+    with pytest.warns(UserWarning, match="from 2026-01-05T00:00 to 2026-01-05T11:00, is read at time 2026-01-05T13:00"):
+        lfm.forecast(again, heated, [13.0], inputs={"outside": longer}, progress=False)
+    assert "Gaussian (sd 0.316)" in attributes["assumptions"]
     with pytest.raises(TypeError, match="without y the data must be"):
         lfm.fit(heated, np.arange(6.0))

@@ -7,7 +7,7 @@ import contextlib
 import dataclasses
 import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,10 @@ from lfm_ppl.cli import check, choices, page, results, session
 
 TABLE = "forecast.csv"
 FIGURE = "forecast.png"
+MORE_FIGURES = {"inputs": "forecast-inputs.png", "forces": "forecast-forces.png",
+                "deterministics": "forecast-deterministics.png", "states": "forecast-states.png"}
+"""Of what the result holds."""
+
 SCORES = "scores.csv"
 
 _GRID = 121
@@ -37,7 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
             raise ValueError(f"--{flag.replace('_', '-')} says how to read a data file; give one with --held-out.")
     path = files.locate(arguments.result)
     if not arguments.out:
-        for name in (TABLE, FIGURE, *([SCORES] if arguments.held_out else [])):
+        for name in (TABLE, FIGURE, *MORE_FIGURES.values(), *([SCORES] if arguments.held_out else [])):
             files.refuse_existing(path.parent / name, arguments.overwrite)
         page.refuse_foreign(path.parent, arguments.overwrite)
     posterior = arviz_data.load(path)
@@ -147,8 +151,7 @@ def _held_out(arguments: argparse.Namespace, task: check.Check) -> data.Data:
 
 def _write(forecast: Any, score: Callable, held_out: data.Data | None, task: check.Check, path: Path, folder: Path,
            arguments: argparse.Namespace) -> int:
-    from lfm_ppl.results import arviz_data, files, tables
-    from lfm_ppl.results.plots import plot_fit
+    from lfm_ppl.results import arviz_data, files, inputs, tables
     from lfm_ppl.results.predictions import GROUP, HELD_OUT, held_out_data, summary
 
     group = arviz_data.group(forecast, GROUP).assign_attrs(command_line=page.command_line(arguments))
@@ -161,9 +164,11 @@ def _write(forecast: Any, score: Callable, held_out: data.Data | None, task: che
     if not arguments.out:
         # The file again, not what was read before the computation: somebody may have added to it.
         whole = arviz_data.load(path)
-        whole = arviz_data.remove_group(arviz_data.add_group(whole, GROUP, group), HELD_OUT)
-        if arviz_data.has_group(forecast, HELD_OUT):
-            whole = arviz_data.add_group(whole, HELD_OUT, arviz_data.group(forecast, HELD_OUT))
+        whole = arviz_data.add_group(whole, GROUP, group)
+        for name in (HELD_OUT, inputs.FORECAST):
+            whole = arviz_data.remove_group(whole, name)
+            if arviz_data.has_group(forecast, name):
+                whole = arviz_data.add_group(whole, name, arviz_data.group(forecast, name))
     print(f"wrote    {arviz_data.save(whole, target, arguments.overwrite or not arguments.out)} (group {GROUP})")
     table = summary(group)
     seen = task.observed
@@ -177,12 +182,28 @@ def _write(forecast: Any, score: Callable, held_out: data.Data | None, task: che
         print(f"\n{tables.text_table(scores, width=shutil.get_terminal_size().columns)}\n")
         print(f"wrote    {tables.write_csv(scores, folder / SCORES, arguments.overwrite, index_label='output')}")
         more = {"Scores on the held-out data": scores}
+    drawn = []
     try:
-        figure = plot_fit(forecast, width="full")
-        with files.writing(folder / FIGURE, arguments.overwrite) as temporary:
-            figure.savefig(temporary, format="png")
+        for name, draw in _figures(forecast):
+            figure = draw(forecast, width="full")
+            with files.writing(folder / name, arguments.overwrite) as temporary:
+                figure.savefig(temporary, format="png")
+            drawn.append(folder / name)
+            print(f"wrote    {folder / name}")
     except Exception as error:  # the numbers are safe
         print(f"lfm-ppl: the figure could not be drawn: {error}", file=sys.stderr)
         return 1
-    print(f"wrote    {folder / FIGURE}")
-    return page.update(whole, folder, (folder / FIGURE,), more)
+    return page.update(whole, folder, tuple(drawn), more)
+
+
+def _figures(forecast: Any) -> Iterator[tuple[str, Callable]]:
+    """Yield file name and function of each figure that there are numbers for."""
+    from lfm_ppl.results import inputs, plots
+    from lfm_ppl.results.plots.trajectories import trajectory_names
+
+    yield FIGURE, plots.plot_fit
+    if inputs.inputs_of(forecast):
+        yield MORE_FIGURES["inputs"], plots.plot_inputs
+    for kind in ("force", "deterministic", "state"):
+        if trajectory_names(forecast, kind):
+            yield MORE_FIGURES[f"{kind}s"], getattr(plots, f"plot_{kind}s")

@@ -1,10 +1,13 @@
-"""Priors and supports in words."""
+"""Priors and supports in words, and what a model assumes beside them."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from lfm_ppl.model.latent_force_model import LatentForceModel
 
 _MOST_NUMBERS = 4
 """Numbers of a vector that are printed."""
@@ -43,6 +46,64 @@ def support(constraint: Any) -> str:
     if high is not None:
         return f"< {_number(high)}"
     return type(constraint).__name__.strip("_").lower()
+
+
+def assumptions(model: LatentForceModel) -> dict[str, str]:
+    """Return what a model says of its observations, forces and initial state, with the numbers that it holds.
+
+    Example:
+        >>> import jax.numpy as jnp, lfm_ppl as lfm
+        >>> noisy = lfm.LatentForceModel(lambda x, u, t: u - x, {"u": lfm.Matern(1.0, 2.0)},
+        ...     lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.01])), lfm.Gaussian(jnp.zeros(1), jnp.ones(1)))
+        >>> for what, said in assumptions(noisy).items():
+        ...     print(f"{what} | {said}")
+        observation | y0: Gaussian (sd 0.1)
+        forces | u: Matern (scale 1, lengthscale 2, order 1)
+        initial state | x0 = 0 (sd 1)
+    """
+    forces = [f"{name}: {_with_numbers(type(force).__name__, force, _OF_FORCES)}"
+              for name, force in model.forces.items()]
+    mean, sd = np.asarray(model.initial_state.mean), _sd(model.initial_state.covariance)
+    states = [f"{name} = {_number(one)} ({'known' if spread == 0 else f'sd {_number(spread)}'})"
+              for name, one, spread in zip(model.state_names, mean, sd, strict=True)]
+    return {"observation": "; ".join(_observation(model.observation, model.output_names)),
+            "forces": "; ".join(forces) or "none", "initial state": "; ".join(states) or "none"}
+
+
+_OF_FORCES = ("scale", "lengthscale", "period", "order")
+"""What a force is described by, where it has it."""
+
+
+def _observation(observation: Any, names: tuple[str, ...]) -> list[str]:
+    """Return the law of each output in words."""
+    if hasattr(observation, "parts"):
+        found, first = [], 0
+        for part, size in zip(observation.parts, observation.sizes, strict=True):
+            found += _observation(part, names[first:first + size])
+            first += size
+        return found
+    kind = type(observation).__name__.strip("_").removesuffix("Observation").removesuffix("Family") or "own law"
+    covariance = getattr(observation, "covariance", None)
+    if callable(covariance):
+        return [f"{name}: {kind} (sd a function of the state)" for name in names]
+    if covariance is not None:
+        if np.ndim(covariance) == 3:
+            return [f"{name}: {kind} (a covariance for each row)" for name in names]
+        return [f"{name}: {kind} (sd {_number(sd)})" for name, sd in zip(names, _sd(covariance), strict=True)]
+    said = _with_numbers(kind, observation, (*observation.per_entry, "link"))
+    return [f"{', '.join(names)}: {said}"]
+
+
+def _with_numbers(kind: str, part: Any, fields: tuple[str, ...]) -> str:
+    found = [(name, getattr(part, name, None)) for name in fields]
+    numbers = ", ".join(f"{name} {value if isinstance(value, str) else _number(value)}" for name, value in found
+                        if value is not None and not callable(value))
+    return f"{kind} ({numbers})" if numbers else kind
+
+
+def _sd(covariance: Any) -> np.ndarray:
+    covariance = np.asarray(covariance)
+    return np.sqrt(covariance if covariance.ndim == 1 else np.diagonal(covariance))
 
 
 def _number(value: Any) -> str:

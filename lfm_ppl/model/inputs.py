@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import checks
+from lfm_ppl.calendar_time import named
 from lfm_ppl.model.user_functions import Traced
 
 
@@ -79,12 +80,12 @@ def check_reads(functions: Sequence[Traced], first: float, last: float) -> None:
                 continue
             end = table[-1] + (table[-1] - table[-2] if interpolation == "previous" else 0.0)
             slack = 1e-9 * max(abs(table[0]), abs(end), abs(first), abs(last))
-            span = (f"the known input in {function.what}, whose table goes from {table[0]:g} to {table[-1]:g}, is read "
-                    "at")
+            span = (f"the known input in {function.what}, whose table goes from {named(table[0])} to "
+                    f"{named(table[-1])}, is read at")
             if np.min(when) < table[0] - slack:
-                beyond[outside].add(f"{span} time {np.min(when):g}, where its first value holds")
+                beyond[outside].add(f"{span} time {named(np.min(when))}, where its first value holds")
             if np.max(when) > end + slack:
-                beyond[outside].add(f"{span} time {np.max(when):g}, where its last value holds")
+                beyond[outside].add(f"{span} time {named(np.max(when))}, where its last value holds")
     remedy = 'Give it values for these times, or say with lfm.Input(..., outside="hold") that they hold.'
     if beyond["error"]:
         raise ValueError(f"{'; '.join(sorted(beyond['error']))}. {remedy}")

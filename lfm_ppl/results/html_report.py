@@ -17,9 +17,8 @@ import xarray as xr
 from lfm_ppl import calendar_time
 from lfm_ppl.results import arviz_data, predictions, report, tables, web_page
 from lfm_ppl.results.files import POSTERIOR
-from lfm_ppl.results.inputs import ORIGIN, inputs_of
+from lfm_ppl.results.inputs import ORIGIN, inputs_of, time_origin, time_unit
 from lfm_ppl.results.plots import saving, style
-from lfm_ppl.results.plots.trajectories import time_origin, time_unit
 from lfm_ppl.results.scalars import unit_of
 from lfm_ppl.results.web_page import Section
 
@@ -31,8 +30,9 @@ COMMAND = "command_line"
 CALL, DESCRIPTION = "call", "description"
 """Attributes of a result: the call in Python that made it, and the docstring of the model."""
 
-PRIORS, MEANINGS = "priors", "meanings"
-"""Attributes of a result: name -> prior in words, and what the model file says of a parameter, as JSON."""
+PRIORS, MEANINGS, ASSUMPTIONS = "priors", "meanings", "assumptions"
+"""Attributes of a result, as JSON: name -> prior in words; what the model file says of a parameter; and what the model
+says of its observations, forces and initial state."""
 
 _MOST_TIMES = 40
 """Times of a forecast that are listed; more are thinned evenly."""
@@ -41,10 +41,14 @@ _MOST_SERIES = 5
 """Series of a panel that a forecast is listed of."""
 
 _CAPTIONS = {
-    "fit": "Data and fit: posterior mean, 95% of the noise-free output and of new data", "forces": "Latent forces",
+    "fit": "Data and fit: posterior mean, 95% of the noise-free output and of new data", "inputs": "Known inputs",
+    "forces": "Latent forces",
     "deterministics": "What follows from states and forces", "states": "States", "trace": "Chains",
     "pairs": "Pairs of parameters", "residuals": "Residuals one step ahead",
     "accuracy": "What the exact likelihood would change", "forecast": "Forecast with its noise",
+    "forecast-inputs": "Known inputs of the forecast", "forecast-forces": "Forecast of the latent forces",
+    "forecast-deterministics": "Forecast of what follows from states and forces",
+    "forecast-states": "Forecast of the states",
 }
 
 _SETTINGS = {
@@ -58,12 +62,13 @@ _SETTINGS = {
     "wall_time_s": "time (s)", "created_at": "made at",
 }
 _ELSEWHERE = ("model", "model_file", DESCRIPTION, "data", "note", "versions", "warnings", "partial", "settings", "run",
-              "map_converged", COMMAND, CALL, ORIGIN, PRIORS, MEANINGS, "inference_library",
+              "map_converged", COMMAND, CALL, ORIGIN, PRIORS, MEANINGS, ASSUMPTIONS, "inference_library",
               "site_failures", "constraint_weights")
 """Attributes that stand in other sections, or that nobody needs to read."""
 
 _FILES = re.compile(r"(.*\.nc|(summary|accuracy|forecast|scores)\.csv"
-                    r"|(fit|forces|deterministics|states|trace|pairs|residuals|accuracy|forecast)(-\d+)?\.(png|pdf|svg))")
+                    r"|(forecast-)?(fit|inputs|forces|deterministics|states|trace|pairs|residuals|accuracy|forecast)"
+                    r"(-\d+)?\.(png|pdf|svg))")
 """Files of a result; what else lies in a folder is nobody's business."""
 
 
@@ -143,6 +148,9 @@ def _model(attrs: Mapping[str, Any], description: str) -> str:
     shown = web_page.facts([("name", name), *([("file", file)] if file not in ("", name) else [])])
     shown += (web_page.prose(description) if description else web_page.paragraph(
         "The model has no docstring; what stands in one would be shown here.", "note"))
+    if assumed := json.loads(str(attrs.get(ASSUMPTIONS, "{}"))):
+        shown += web_page.heading("Assumptions") + web_page.facts(list(assumed.items())) + web_page.paragraph(
+            "Numbers that depend on parameters are those at the prior medians.", "note")
     priors = json.loads(str(attrs.get(PRIORS, "{}")))
     if not priors:
         return shown
@@ -292,6 +300,8 @@ def _read(figures: Sequence[str | Path]) -> str:
 
 
 def _caption(name: str) -> str:
+    if name in _CAPTIONS:
+        return _CAPTIONS[name]
     kind, _, page = name.partition("-")
     return _CAPTIONS.get(kind, kind) + (f", page {page}" if page else "")
 

@@ -10,9 +10,13 @@ import xarray as xr
 
 from lfm_ppl.data import Data, InputTable, model_keywords
 from lfm_ppl.results import arviz_data
+from lfm_ppl.results.scalars import unit_of
 
 GROUP = "constant_data"
 """ArviZ's name for what a model is given beside the observations."""
+
+FORECAST = "predictions_constant_data"
+"""That of a forecast, of inputs that go on."""
 
 ORIGIN = "time_origin"
 """Attribute of a result: the calendar time of t = 0 as ISO 8601 text."""
@@ -26,11 +30,11 @@ def to_dataset(inputs: Mapping[str, InputTable]) -> xr.Dataset:
         {f"{name}_time": np.asarray(table.times) for name, table in inputs.items()})
 
 
-def inputs_of(result: Any) -> dict[str, InputTable]:
-    """Return the known inputs that a result was made with."""
-    if not arviz_data.has_group(result, GROUP):
+def inputs_of(result: Any, group: str = GROUP) -> dict[str, InputTable]:
+    """Return the known inputs that a result was made with, or its forecast."""
+    if not arviz_data.has_group(result, group):
         return {}
-    stored = arviz_data.group(result, GROUP)
+    stored = arviz_data.group(result, group)
     return {str(name): InputTable(np.asarray(stored[f"{name}_time"].values, float), np.asarray(one.values, float),
                                   str(one.attrs.get("interpolation", "previous")))
             for name, one in stored.data_vars.items()}
@@ -54,3 +58,22 @@ def remember(groups: dict[str, xr.Dataset], data: Data) -> dict[str, Any]:
             if data.units.get("time") and not dataset[name].attrs.get("units"):
                 dataset[name].attrs["units"] = data.units["time"]
     return {} if data.origin is None else {ORIGIN: data.origin}
+
+
+def time_unit(result: Any) -> str:
+    """Return the unit of time, empty where the result does not know it."""
+    for name, coordinate in (("observed_data", "time"), ("trajectories", "at")):
+        if arviz_data.has_group(result, name) and coordinate in (found := arviz_data.group(result, name)).coords:
+            if unit := unit_of(found[coordinate]):
+                return unit
+    return ""
+
+
+def time_origin(result: Any) -> str:
+    """Return the calendar time of t = 0, empty where times are plain numbers."""
+    return str(arviz_data.attributes(result).get(ORIGIN, ""))
+
+
+def clock_of(result: Any) -> tuple[str | None, str]:
+    """Return the calendar time of t = 0 and the unit that times count, for `calendar_time.in_messages`."""
+    return time_origin(result) or None, time_unit(result)

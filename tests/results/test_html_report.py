@@ -73,6 +73,7 @@ def attrs():
         "command_line": "lfm-ppl fit gene.py --data genes.csv", "time_origin": "2024-03-01T00:00:00",
         "priors": json.dumps({"decay": "LogNormal(0, 0.5)", "rate": "HalfNormal(1)"}),
         "meanings": json.dumps({"decay": "how fast it goes"}),
+        "assumptions": json.dumps({"observation": "x, z: StudentT (df 4)", "initial state": "x = 0 (known)"}),
     }
 
 
@@ -127,7 +128,8 @@ def test_every_section_says_what_it_is_for(groups, attrs, tmp_path):
     assert list(page.texts) == SECTIONS
     said = {
         "result": ["R-hat", "re-run"],
-        "model": ["gene.py", "switched on & off", "\ndx/dt = b - d x", "LogNormal(0, 0.5)", "how fast it goes"],
+        "model": ["gene.py", "switched on & off", "\ndx/dt = b - d x", "LogNormal(0, 0.5)", "how fast it goes",
+                  "x, z: StudentT (df 4)", "x = 0 (known)"],
         "data": ["genes.csv", "1 of 12 values", "0 to 5 h (2024-03-01 00:00 to 2024-03-01 05:00)", "nM", "heater",
                  "linear", "7.50"],
         "summary": ["decay", "rate", "r_hat", "sampled", "R-hat"],

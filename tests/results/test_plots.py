@@ -9,11 +9,14 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_hex
 from scipy import stats
 
+from lfm_ppl.data import InputTable
 from lfm_ppl.results import arviz_data
+from lfm_ppl.results.inputs import to_dataset
 from lfm_ppl.results.plots import (
     plot_deterministics,
     plot_fit,
     plot_forces,
+    plot_inputs,
     plot_pairs,
     plot_residuals,
     plot_states,
@@ -88,6 +91,46 @@ def test_the_readers_own_style_does_not_leak_in(result):
     figure.axes[0].set_yticks(np.linspace(0, 12, 25))
     figure.draw_without_rendering()
     assert max(text.get_fontsize() for text in figure.axes[0].get_yticklabels()) == 7.0
+
+
+def test_forces_go_on_with_their_forecast(datasets):
+    rng = np.random.default_rng(2)
+    place = ("chain", "draw", "time", "force")
+    ahead = rng.normal(size=(4, 25, 40, 2))
+    time = np.linspace(12.0, 30.0, 40)
+    predictions = xr.Dataset({"forces": (place, ahead)}, {"time": time, "force": datasets["trajectories"]["force"]},
+                             {"last_observation": 12.0})
+    figure = plot_forces(arviz_data.build({**datasets, "predictions": predictions}))
+    later = time >= datasets["trajectories"]["at"].values[-1]
+    for index, axes in enumerate(figure.axes):
+        drawn = edges(bands(axes)[-1])
+        low, high = np.quantile(ahead[..., index].reshape(-1, 40), (0.025, 0.975), axis=0)[:, later]
+        np.testing.assert_allclose([drawn[x] for x in time[later]], np.stack([low, high], axis=-1))
+        (end,) = [one for one in axes.lines if np.array_equal(one.get_xdata(), [12.0, 12.0])]
+        assert end.is_dashed()
+    assert legend_texts(figure)[-1] == "last observation"
+    few = arviz_data.build({**datasets, "predictions": predictions.isel(time=[0, -1])})
+    (bars,) = [one for one in plot_forces(few).axes[0].collections if isinstance(one, LineCollection)]
+    np.testing.assert_allclose(bars.get_segments()[0][:, 0], 30.0)
+
+
+def test_known_inputs_are_drawn_as_they_are_read(result, readable):
+    tables = {"heater": InputTable(np.array([0.0, 6.0, 22.0]), np.array([0.0, 1.0, 0.0]), "previous"),
+              "outside": InputTable(np.array([0.0, 24.0]), np.array([3.0, 5.0]), "linear")}
+    with pytest.raises(ValueError, match="holds no known inputs"):
+        plot_inputs(result)
+    known = arviz_data.add_group(result, "constant_data", to_dataset(tables))
+    figure = plot_inputs(known, width="full")
+    readable(figure)
+    assert [axes.get_ylabel() for axes in figure.axes] == ["heater", "outside"]
+    assert [axes.lines[0].get_drawstyle() for axes in figure.axes] == ["steps-post", "default"]
+    np.testing.assert_array_equal(figure.axes[0].lines[0].get_ydata(), [0.0, 1.0, 0.0])
+    longer = {"heater": InputTable(np.array([0.0, 30.0]), np.array([0.0, 2.0]), "previous")}
+    ahead = arviz_data.add_group(known, "predictions_constant_data", to_dataset(longer))
+    (axes,) = plot_inputs(ahead, "heater").axes
+    np.testing.assert_array_equal(axes.lines[0].get_xdata(), [0.0, 30.0])
+    with pytest.raises(ValueError, match="unknown input 'heatre'. Did you mean 'heater'"):
+        plot_inputs(known, "heatre")
 
 
 def test_shows_itself_in_a_notebook(result):

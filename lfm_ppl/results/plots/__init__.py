@@ -3,6 +3,7 @@
 from lfm_ppl.results.plots.accuracy import plot_accuracy
 from lfm_ppl.results.plots.calibration import plot_calibration
 from lfm_ppl.results.plots.chains import plot_trace
+from lfm_ppl.results.plots.inputs import plot_inputs
 from lfm_ppl.results.plots.pairs import plot_pairs
 from lfm_ppl.results.plots.residuals import plot_residuals
 from lfm_ppl.results.plots.saving import save_figures
@@ -14,6 +15,7 @@ __all__ = [
     "plot_deterministics",
     "plot_fit",
     "plot_forces",
+    "plot_inputs",
     "plot_pairs",
     "plot_residuals",
     "plot_states",

@@ -15,8 +15,9 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from lfm_ppl.results.arviz_data import group
+from lfm_ppl.results.inputs import time_origin, time_unit
 from lfm_ppl.results.plots import style
-from lfm_ppl.results.plots.trajectories import pick, time_origin, time_unit
+from lfm_ppl.results.plots.trajectories import pick
 from lfm_ppl.results.residuals import (
     autocorrelation,
     default_lags,

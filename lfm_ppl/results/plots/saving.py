@@ -13,7 +13,8 @@ from matplotlib.figure import Figure
 
 from lfm_ppl.results.arviz_data import group, has_group
 from lfm_ppl.results.files import refuse_existing, writing
-from lfm_ppl.results.plots import accuracy, chains, pairs, residuals, style, trajectories
+from lfm_ppl.results.inputs import inputs_of
+from lfm_ppl.results.plots import accuracy, chains, inputs, pairs, residuals, style, trajectories
 from lfm_ppl.results.scalars import sampled
 
 MAX_PAGES = 5
@@ -30,8 +31,8 @@ def save_figures(
 ) -> list[Path]:
     """Draw every figure that ``result`` has the groups for, and write it to ``folder``.
 
-    The figures are fit, forces, deterministics, states, trace, pairs, residuals and accuracy. What does not fit on
-    one page goes to numbered ones, such as ``trace-1.png`` and ``trace-2.png``, five at most. Every file is
+    The figures are fit, inputs, forces, deterministics, states, trace, pairs, residuals and accuracy. What does not fit
+    on one page goes to numbered ones, such as ``trace-1.png`` and ``trace-2.png``, five at most. Every file is
     written under a temporary name and renamed.
 
     Args:
@@ -92,6 +93,8 @@ def pages_of(result: Any, width: str | float) -> Iterator[tuple[str, Draw, list[
             continue
         title = "fit" if kind == "output" else f"{kind}s"
         yield from _numbered(title, draw, names, trajectories.MAX_PANELS)
+        if kind == "output" and (known := list(inputs_of(result))):
+            yield from _numbered("inputs", inputs.plot_inputs, known, trajectories.MAX_PANELS)
     if has_group(result, "posterior"):
         labels = sampled(group(result, "posterior"))
         yield from _numbered("trace", chains.plot_trace, labels, chains.MAX_ROWS)

@@ -14,8 +14,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from lfm_ppl.checks import unknown
-from lfm_ppl.results.arviz_data import attributes, group, has_group
-from lfm_ppl.results.inputs import ORIGIN
+from lfm_ppl.results.arviz_data import group, has_group
+from lfm_ppl.results.inputs import time_origin, time_unit
 from lfm_ppl.results.plots import style
 from lfm_ppl.results.predictions import GROUP, HELD_OUT, INTERVAL, MEAN, interval, noise_free_interval, quantiles
 from lfm_ppl.results.scalars import unit_of
@@ -132,10 +132,10 @@ def plot_fit(
 def plot_forces(
     result: Any, forces: Sequence[str] | None = None, *, width: str | float = "column"
 ) -> Figure:
-    """Draw the posterior mean of each force with a 95% band, and the truth where it is known.
+    """Draw the posterior mean of each force with a 95% band, the forecast of it, and the truth where they are known.
 
     Args:
-        result: with the group trajectories, and truth where it is known.
+        result: with the group trajectories, predictions of a forecast, and truth where it is known.
         forces: names; None for all, up to 12.
         width: "column" (3.4 in), "full" (7 in), or inches.
 
@@ -161,10 +161,10 @@ def plot_forces(
 def plot_states(
     result: Any, states: Sequence[str] | None = None, *, width: str | float = "column"
 ) -> Figure:
-    """Draw the posterior mean of each state with a 95% band, and the truth where it is known.
+    """Draw the posterior mean of each state with a 95% band, the forecast of it, and the truth where they are known.
 
     Args:
-        result: with the group trajectories, and truth where it is known.
+        result: with the group trajectories, predictions of a forecast, and truth where it is known.
         states: names; None for all, up to 12.
         width: "column" (3.4 in), "full" (7 in), or inches.
 
@@ -189,10 +189,10 @@ def plot_states(
 def plot_deterministics(
     result: Any, names: Sequence[str] | None = None, *, width: str | float = "column"
 ) -> Figure:
-    """Draw the posterior mean of what follows from states and forces with a 95% band, and the truth where it is known.
+    """Draw the posterior mean of what follows from states and forces with a 95% band, its forecast, and its truth.
 
     Args:
-        result: with the group trajectories, of a model with ``deterministics``, and truth where it is known.
+        result: with the group trajectories, of a model with ``deterministics``, predictions, and truth where known.
         names: of the deterministics; None for all, up to 12.
         width: "column" (3.4 in), "full" (7 in), or inches.
 
@@ -211,20 +211,6 @@ def plot_deterministics(
         ['uptake']
     """
     return _panels(result, "deterministic", names, width, (style.ORANGE, _DETERMINISTIC))
-
-
-def time_unit(result: Any) -> str:
-    """Return the unit of time, empty where the result does not know it."""
-    for name, coordinate in (("observed_data", "time"), ("trajectories", "at")):
-        if has_group(result, name) and coordinate in (found := group(result, name)).coords:
-            if unit := unit_of(found[coordinate]):
-                return unit
-    return ""
-
-
-def time_origin(result: Any) -> str:
-    """Return the calendar time of t = 0, empty where times are plain numbers."""
-    return str(attributes(result).get(ORIGIN, ""))
 
 
 def trajectory_names(result: Any, kind: str) -> list[str]:
@@ -261,10 +247,21 @@ def _panels(
     figure, panels = style.small_multiples(width, len(names), 1.25)
     line, tint = colours
     known = False
+    predicted = _predicted(result)
+    ahead = None if predicted is None else predicted.get(f"{kind}s")
+    last = np.inf if ahead is None or predicted is None else predicted.attrs.get("last_observation", np.inf)
+    later = ahead is not None and bool(ahead["time"].max() > last)
     for axes, name in zip(panels, names, strict=True):
         time, mean, low, high = _band(result, kind, name)
         axes.fill_between(time, low, high, color=tint, lw=0, zorder=1)
         axes.plot(time, mean, color=line, zorder=2)
+        if ahead is not None and later:
+            paths = ahead.sel({kind: name, "time": ahead["time"] >= time[-1]}).transpose("chain", "draw", "time")
+            if paths.sizes["time"]:
+                flat = paths.values.reshape(-1, paths.sizes["time"])
+                _draw_ahead(axes, paths["time"].values, flat.mean(axis=0), line,
+                            [(*np.quantile(flat, INTERVAL, axis=0), tint)])
+            axes.axvline(last, **_END)
         known |= _draw_truth(axes, truth, kind, name)
         style.label_values(axes, name, unit_of(draws, name))
     style.label_time(panels, time_unit(result), time_origin(result))
@@ -272,6 +269,8 @@ def _panels(
     handles = [Line2D([], [], color=line, label="posterior mean"), Patch(color=tint, label="95%")]
     if known:
         handles += [Line2D([], [], label="truth", **_TRUTH)]
+    if later:
+        handles += [Line2D([], [], label="last observation", **_END)]
     style.legend_above(figure, handles)
     if note:
         style.note_below(figure, note)
@@ -338,14 +337,20 @@ def _draw_forecast(axes: Axes, predicted: xr.Dataset) -> None:
     time, lower, upper = _noisy_band(predicted)
     low, high = noise_free_interval(predicted)[..., 0]
     mean = predicted[MEAN if MEAN in predicted else "outputs"].mean(["chain", "draw"]).values[:, 0]
-    if len(time) >= _BARS:
-        axes.fill_between(time, lower, upper, color=_PREDICTIVE, lw=0, zorder=1)
-        axes.fill_between(time, low, high, color=_NOISE_FREE, lw=0, zorder=2)
-        axes.plot(time, mean, color=style.BLUE, zorder=3)
-        return
-    axes.vlines(time, lower, upper, color=_PREDICTIVE, lw=5, zorder=1)
-    axes.vlines(time, low, high, color=_NOISE_FREE, lw=3, zorder=2)
-    axes.plot(time, mean, color=style.BLUE, ls="", marker="_", ms=5, zorder=3)
+    _draw_ahead(axes, time, mean, style.BLUE, ((lower, upper, _PREDICTIVE), (low, high, _NOISE_FREE)))
+
+
+def _draw_ahead(axes: Axes, time: np.ndarray, mean: np.ndarray, line: str,
+                bands: Sequence[tuple[np.ndarray, np.ndarray, str]]) -> None:
+    """Draw a mean and bands, the widest first: as bars where there are few times."""
+    filled = len(time) >= _BARS
+    for order, (low, high, tint) in enumerate(bands, start=1):
+        if filled:
+            axes.fill_between(time, low, high, color=tint, lw=0, zorder=order)
+        else:
+            axes.vlines(time, low, high, color=tint, lw=7 - 2 * order, zorder=order)
+    marks: dict[str, Any] = {} if filled else {"ls": "", "marker": "_", "ms": 5}
+    axes.plot(time, mean, color=line, zorder=3, **marks)
 
 
 def _band(result: Any, kind: str, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

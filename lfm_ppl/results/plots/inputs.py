@@ -1,0 +1,65 @@
+"""Figure of the known inputs that a result was made with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from lfm_ppl.checks import unknown
+from lfm_ppl.results.inputs import FORECAST, inputs_of, time_origin, time_unit
+from lfm_ppl.results.plots import style
+from lfm_ppl.results.plots.trajectories import MAX_PANELS
+
+_MANY = 150  # values, from which they have no marks
+
+
+@style.styled
+def plot_inputs(result: Any, inputs: Sequence[str] | None = None, *, width: str | float = "column") -> Figure:
+    """Draw the known inputs of a model as it reads them, steps or straight lines, as far as its forecast.
+
+    Args:
+        result: of a model with known inputs in a data file or `lfm_ppl.Data`.
+        inputs: names; None for all, up to 12.
+        width: "column" (3.4 in), "full" (7 in), or inches.
+
+    Returns:
+        A figure with one panel per input.
+
+    Raises:
+        ValueError: the result holds no known inputs, or an input is unknown.
+
+    Example:
+        >>> import numpy as np
+        >>> from lfm_ppl.data import InputTable
+        >>> from lfm_ppl.results.arviz_data import build
+        >>> from lfm_ppl.results.inputs import GROUP, to_dataset
+        >>> heater = InputTable(np.array([0.0, 6.0, 22.0]), np.array([0.0, 1.0, 0.0]), "previous")
+        >>> [axes.get_ylabel() for axes in plot_inputs(build({GROUP: to_dataset({"heater": heater})})).axes]
+        ['heater']
+    """
+    known = {**inputs_of(result), **inputs_of(result, FORECAST)}
+    if not known:
+        raise ValueError("the result holds no known inputs. Give those of a model as columns of its data file, or in "
+                         "lfm.Data(..., inputs=...).")
+    wanted = list(known) if inputs is None else [inputs] if isinstance(inputs, str) else list(inputs)
+    for name in wanted:
+        if name not in known:
+            raise ValueError(unknown("input", name, list(known)))
+    names, note = style.first_of(wanted, inputs, MAX_PANELS, "inputs")
+    figure, panels = style.small_multiples(width, len(names), 1.25)
+    line: dict[str, Any] = {"color": style.PURPLE, "mew": 0}
+    for axes, name in zip(panels, names, strict=True):
+        table = known[name]
+        drawn = "steps-post" if table.interpolation == "previous" else "default"
+        axes.plot(table.times, table.values, drawstyle=drawn, marker="o" if len(table.times) <= _MANY else "", ms=2.2,
+                  **line)
+        style.label_values(axes, name, "")
+    style.label_time(panels, time_unit(result), time_origin(result))
+    figure.align_ylabels(panels)
+    style.legend_above(figure, [Line2D([], [], label="known input", **line)])
+    if note:
+        style.note_below(figure, note)
+    return figure
