@@ -99,7 +99,9 @@ def plot_fit(
             axes.fill_between(time, low, high, color=_NOISE_FREE, lw=0, zorder=2)
             axes.plot(time, mean, color=style.BLUE, zorder=3)
             if predicted is not None and not covered:
-                _draw_forecast(axes, predicted.sel(output=[name]).isel(time=predicted["time"].values >= time[-1]))
+                wide = (low[-1], high[-1]) if new is None else new.sel(output=name).values[1:, -1]
+                _draw_forecast(axes, predicted.sel(output=[name]).isel(time=predicted["time"].values >= time[-1]),
+                               (time[-1], mean[-1], *wide, low[-1], high[-1]))
         if predicted is not None:
             if forecast := _ends_before(predicted):
                 axes.axvline(predicted.attrs["last_observation"], **_END)
@@ -259,8 +261,8 @@ def _panels(
             paths = ahead.sel({kind: name, "time": ahead["time"] >= time[-1]}).transpose("chain", "draw", "time")
             if paths.sizes["time"]:
                 flat = paths.values.reshape(-1, paths.sizes["time"])
-                _draw_ahead(axes, paths["time"].values, flat.mean(axis=0), line,
-                            [(*np.quantile(flat, INTERVAL, axis=0), tint)])
+                curves = (paths["time"].values, flat.mean(axis=0), *np.quantile(flat, INTERVAL, axis=0))
+                _draw_ahead(axes, curves, line, (tint,), (time[-1], mean[-1], low[-1], high[-1]))
             axes.axvline(last, **_END)
         known |= _draw_truth(axes, truth, kind, name)
         style.label_values(axes, name, unit_of(draws, name))
@@ -330,21 +332,32 @@ def _noisy_band(predicted: xr.Dataset) -> tuple[np.ndarray, np.ndarray, np.ndarr
     return predicted["time"].values, *interval(predicted)[..., 0]
 
 
-def _draw_forecast(axes: Axes, predicted: xr.Dataset) -> None:
-    """Draw predictions of one output, noise-free and new data."""
+def _draw_forecast(axes: Axes, predicted: xr.Dataset, start: tuple[float, ...] = ()) -> None:
+    """Draw predictions of one output, noise-free and new data; ``start`` is what they go on from."""
     if predicted.sizes["time"] == 0:
         return
     time, lower, upper = _noisy_band(predicted)
     low, high = noise_free_interval(predicted)[..., 0]
     mean = predicted[MEAN if MEAN in predicted else "outputs"].mean(["chain", "draw"]).values[:, 0]
-    _draw_ahead(axes, time, mean, style.BLUE, ((lower, upper, _PREDICTIVE), (low, high, _NOISE_FREE)))
+    _draw_ahead(axes, (time, mean, lower, upper, low, high), style.BLUE, (_PREDICTIVE, _NOISE_FREE), start)
 
 
-def _draw_ahead(axes: Axes, time: np.ndarray, mean: np.ndarray, line: str,
-                bands: Sequence[tuple[np.ndarray, np.ndarray, str]]) -> None:
-    """Draw a mean and bands, the widest first: as bars where there are few times."""
-    filled = len(time) >= _BARS
-    for order, (low, high, tint) in enumerate(bands, start=1):
+def _draw_ahead(axes: Axes, curves: Sequence[np.ndarray], line: str, tints: Sequence[str],
+                start: tuple[float, ...]) -> None:
+    """Draw a mean and bands, the widest first: as bars where there are few times.
+
+    Args:
+        axes: where to.
+        curves: times, mean, and the ends of each band.
+        line: colour of the mean.
+        tints: colours of the bands.
+        start: the same numbers where the curves go on from; empty where nothing comes before.
+    """
+    filled = len(curves[0]) >= _BARS
+    if filled and start and start[0] < curves[0][0]:
+        curves = [np.append(first, curve) for first, curve in zip(start, curves, strict=True)]
+    time, mean, *ends = curves
+    for order, (low, high, tint) in enumerate(zip(ends[::2], ends[1::2], tints, strict=True), start=1):
         if filled:
             axes.fill_between(time, low, high, color=tint, lw=0, zorder=order)
         else:
