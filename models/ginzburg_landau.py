@@ -87,7 +87,7 @@ def model(times, y=None, noise_sd: float = 0.1, units=None) -> None:
         units: name -> unit, for plots.
     """
     sigma = numpyro.sample("sigma", dist.LogNormal(0.5, 0.3))
-    linear = numpyro.sample("linear", dist.Normal(0.0, 0.25))
+    linear = numpyro.sample("linear", dist.Normal(0.0, 0.5))
     cubic = numpyro.sample("cubic", dist.LogNormal(-3.0, 1.0))
     alpha = numpyro.deterministic("alpha", linear * sigma**2)
     beta = numpyro.deterministic("beta", cubic * sigma**2)
