@@ -132,7 +132,12 @@ def remove_group(result: Any, name: str) -> Any:
 
 
 def attributes(result: Any) -> dict[str, Any]:
-    """Return the attributes of ``result`` as a whole: model, rule, seed, versions..."""
+    """Return the attributes of ``result`` as a whole: model, rule, seed, versions...
+
+    Raises:
+        TypeError: ``result`` is no ArviZ object.
+    """
+    groups(result)  # which says what it is instead
     return dict(result.attrs)
 
 
