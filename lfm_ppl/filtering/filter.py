@@ -240,7 +240,7 @@ class FilterResult(eqx.Module):
         predicted_mean, predicted_covariance: (T, n), (T, n, n) of the joint state, before each observation.
         filtered_mean, filtered_covariance: after it.
         whitened_innovation: (T, D), innovations whitened by their Cholesky factor: independent standard normals for a
-            true linear model; NaN where missing.
+            true linear model, and so are the randomised quantile residuals of an observation family; NaN where missing.
         state: time and moments after the last observation.
     """
 
@@ -484,25 +484,24 @@ def _check_start(start: Any, times: Any, size: int) -> None:
 def filter_on(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, times: jax.Array,
               begin: Moments | None = None) -> FilterResult:
     """Filter observations (T, D) at ``times`` on the intervals of a time grid; see `filter`."""
-    log_likelihood = None
+    log_likelihood, residual = None, None
     if isinstance(ssm.model.observation, ObservationFamily):
         # Sites are refined by passes of this filter, so that their module imports this one.
-        from lfm_ppl.filtering.sites import assumed_density_filter
+        from lfm_ppl.filtering.sites import assumed_density_filter, quantile_residuals
 
-        log_likelihood, passed = assumed_density_filter(ssm, rule, grid, y, begin)
+        log_likelihood, passed, prediction = assumed_density_filter(ssm, rule, grid, y, begin)
+        residual = quantile_residuals(ssm.model.observation, prediction, y)
     else:
         passed = forward(ssm, rule, grid, y, start=begin, keep="moments")
     at = jax.tree_util.tree_map(lambda a: at_intervals(a, grid.observed), passed)
     state = FilterState(times[-1], at.filtered.mean[-1], at.filtered.covariance[-1])
     return FilterResult(times, at.log_likelihood if log_likelihood is None else log_likelihood, at.predicted.mean,
                         at.predicted.covariance, at.filtered.mean, at.filtered.covariance,
-                        whitened_innovations(at, y), state)
+                        whitened_innovations(at, y) if residual is None else residual, state)
 
 
 def whitened_innovations(passed: Pass, y: jax.Array) -> jax.Array:
-    """Return innovations whitened by their Cholesky factor, (T, D), NaN where missing and for a family."""
-    if passed.chol is None:
-        return jnp.full(y.shape, jnp.nan)
+    """Return innovations whitened by their Cholesky factor, (T, D), NaN where missing."""
     return jnp.where(jnp.isfinite(y), jax.vmap(solve_lower)(passed.chol, passed.innovation), jnp.nan)
 
 

@@ -88,14 +88,15 @@ def expectations(function: Callable[[jax.Array], jax.Array], about: Marginal) ->
 
     The derivatives are those of the quadrature itself.
     """
+    value, back = jax.vjp(lambda m, v: expectation(function, Marginal(m, v)), *about)
+    return value, *back(jnp.ones_like(value))
+
+
+def expectation(function: Callable[[jax.Array], jax.Array], about: Marginal) -> jax.Array:
+    """Return E g under f ~ N(m, v), entry by entry; ``function`` takes nodes (J, ...)."""
     nodes, log_weights = _rule()
     shares = np.exp(log_weights - 0.5 * nodes**2)
     lead = (_NODES,) + (1,) * jnp.ndim(about.mean)
     x, weights = (jnp.asarray(part).reshape(lead) for part in (nodes, shares / shares.sum()))
-
-    def mean(m: jax.Array, v: jax.Array) -> jax.Array:
-        value = function(m + jnp.sqrt(v) * x)
-        return (weights * jnp.where(weights > 1e-30, value, 0.0)).sum(0)
-
-    value, back = jax.vjp(mean, *about)
-    return value, *back(jnp.ones_like(value))
+    value = function(about.mean + jnp.sqrt(about.variance) * x)
+    return (weights * jnp.where(weights > 1e-30, value, 0.0)).sum(0)

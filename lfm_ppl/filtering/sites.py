@@ -33,12 +33,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.special import ndtri
 
 from lfm_ppl import checks
 from lfm_ppl.filtering.filter import Pass, Points, at_intervals, forward
 from lfm_ppl.filtering.iterated import smoothed_points
 from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.filtering.quadrature import Marginal, Tilted, expectations, tilted_moments
+from lfm_ppl.filtering.quadrature import Marginal, Tilted, expectation, expectations, tilted_moments
 from lfm_ppl.filtering.rts import Predictor, Smoothed, backward
 from lfm_ppl.filtering.time_grid import TimeGrid
 from lfm_ppl.filtering.update import Sites
@@ -622,10 +623,12 @@ class Prequential(NamedTuple):
     Attributes:
         log_likelihood: (T,), log p(y_k | y_1:k-1).
         passed: the forward scan, (N, ...).
+        prediction: (T, D), of the predictor, given the rows before.
     """
 
     log_likelihood: jax.Array
     passed: Pass
+    prediction: Marginal
 
 
 def assumed_density_filter(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array,
@@ -644,7 +647,42 @@ def assumed_density_filter(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: 
     # An entry's own term stands in the place of its site; one entry a row: this is log Z of the tilted prediction.
     gaussian = gaussian_terms(at.sites, cavity, 1.0)
     entries = jnp.where(jnp.isfinite(y), found.log_partition - gaussian, 0.0).sum(1)
-    return Prequential(at_intervals(passed.log_likelihood, grid.observed) + entries, passed)
+    return Prequential(at_intervals(passed.log_likelihood, grid.observed) + entries, passed, cavity)
+
+
+def quantile_residuals(family: ObservationFamily, prediction: Marginal, y: jax.Array) -> jax.Array:
+    """Return randomised quantile residuals (T, D), NaN where an entry is missing or its family knows no probabilities.
+
+        e = Phi^-1(P(data < y) + v P(data = y)),    v ~ U(0, 1),
+
+    with the probabilities of one entry given all rows before: standard normal, and independent from row to row, where
+    the model holds. v is the same in every call, so that draws of the parameters do not differ by it.
+
+    Args:
+        family: of the rows of the data.
+        prediction: of the predictor, (T, D), given the rows before.
+        y: (T, D).
+
+    Source: Dunn and Smyth (1996), Journal of Computational and Graphical Statistics 5.
+    """
+
+    def row(index: jax.Array, about: Marginal, y: jax.Array, v: jax.Array) -> jax.Array:
+        at, present = family.at(index), jnp.isfinite(y)
+        filled = jnp.where(present, y, at.possible(about.mean))
+
+        def probability(f: jax.Array) -> jax.Array:
+            below, up_to = at.cumulative(f, filled)
+            return below + v * (up_to - below)
+
+        return jnp.where(present, ndtri(jnp.clip(expectation(jax.vmap(probability), about), _LEAST, 1.0 - _LEAST)),
+                         jnp.nan)
+
+    within = jax.random.uniform(jax.random.key(0), y.shape, y.dtype)
+    return jax.vmap(row)(jnp.arange(len(y)), prediction, y, within)
+
+
+_LEAST = 1e-15
+"""Least probability of a residual, which then is -7.9."""
 
 
 def leave_one_out(predictor: Predictor, sites: Sites, entries: jax.Array) -> jax.Array:

@@ -32,6 +32,7 @@ from lfm_ppl.filtering.sites import (
     assumed_density_filter,
     is_linear,
     leave_one_out,
+    quantile_residuals,
 )
 from lfm_ppl.filtering.sites import evidence as site_evidence
 from lfm_ppl.filtering.time_grid import TimeGrid, build_time_grid, per_step
@@ -92,7 +93,8 @@ class SmootherResult(eqx.Module):
         input_mean, input_covariance: (K, M + R), (K, M + R, M + R) of w = (x, u).
         log_likelihood: (T,), log p(y_k | y_1:k-1).
         leave_one_out: (T,), log p(y_k | y_-k).
-        whitened_innovation: (T, D), innovations whitened by their Cholesky factor, NaN where missing.
+        whitened_innovation: (T, D), innovations whitened by their Cholesky factor, or randomised quantile residuals
+            of an observation family, NaN where missing.
         change: largest change of a smoothed mean in the last iteration, in smoothed standard deviations; NaN
             with fewer than two iterations.
     """
@@ -300,17 +302,18 @@ def smooth_on(ssm: StateSpaceModel, rule: Rule, grids: SmoothingGrids, y: jax.Ar
     matrix, offset = jax.vmap(ssm.input_map)(times)
     observed = jnp.asarray(grid.observed)
     at_data = jax.tree_util.tree_map(lambda a: a[observed], passed._replace(steps=None))
-    one_step_ahead, left_out = scored or (at_data.log_likelihood, smoothed.leave_one_out[observed])
+    one_step_ahead, left_out, residual = scored or (
+        at_data.log_likelihood, smoothed.leave_one_out[observed], whitened_innovations(at_data, y))
     return SmootherResult(
         times, mean, covariance, matmul(matrix, mean[..., None])[..., 0] + offset, congruence(matrix, covariance),
-        one_step_ahead, left_out, whitened_innovations(at_data, y),
+        one_step_ahead, left_out, residual,
         jnp.asarray(jnp.nan) if found is None else found.change, joint, (matrix, offset),
         ssm.model.state_names, ssm.model.force_names)
 
 
 def _smooth_intervals(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments, iterations: int,
                       damping: float, settings: SiteSettings) -> tuple[Pass, Smoothed, Iterated | None, tuple | None]:
-    """Smooth on one time grid; of a family also its one-step-ahead and leave-one-out terms."""
+    """Smooth on one time grid; of a family also its one-step-ahead and leave-one-out terms, and its residuals."""
     if isinstance(ssm.model.observation, ObservationFamily):
         return _smooth_family(ssm, rule, grid, y, start, settings, ssm.model.observation)
     found = None
@@ -330,8 +333,9 @@ def _smooth_family(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Arra
     refined_sites = found.refined.found
     at = jax.tree_util.tree_map(lambda a: at_intervals(a, grid.observed), smoothed.predictor)
     failed = lambda a: jnp.where(refined_sites.converged, a, -jnp.inf)  # noqa: E731
-    scored = (failed(assumed_density_filter(ssm, rule, grid, y, start).log_likelihood),
-              failed(leave_one_out(at, refined_sites.sites, found.entries)))
+    ahead = assumed_density_filter(ssm, rule, grid, y, start)
+    scored = (failed(ahead.log_likelihood), failed(leave_one_out(at, refined_sites.sites, found.entries)),
+              quantile_residuals(family, ahead.prediction, y))
     points = found.refined.points
     iterated = None if points is None else Iterated(points, refined_sites.change)
     return found.passed, smoothed, iterated, scored

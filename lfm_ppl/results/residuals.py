@@ -18,7 +18,8 @@ def mean_residuals(result: Any) -> xr.DataArray:
     """Return the posterior mean of the standardised one-step-ahead residuals (time, output).
 
     A residual is e_k = L_k^-1 (y_k - E[y_k | y_1..k-1, theta]), with L_k L_k' the predictive
-    covariance. Where the model holds, e_k is independent N(0, 1). NaN stands for a missing value.
+    covariance, or the randomised quantile residual of an observation family. Where the model holds,
+    e_k is independent N(0, 1). NaN stands for a missing value.
 
     Args:
         result: with the group one_step_ahead.

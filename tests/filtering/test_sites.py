@@ -323,3 +323,27 @@ def test_a_gap_leaves_the_gradient_of_a_bounded_law_alone():
     step = 1e-5
     slope = (both(step)[0] - both(-step)[0]) / (2 * step)
     assert float(both(0.0)[1]) == pytest.approx(float(slope), rel=1e-6)
+
+
+def test_residuals_of_a_gaussian_part_are_whitened_innovations():
+    y = np.random.default_rng(0).normal(size=(20, 1))
+    y[3] = np.nan
+    noise = lfm.GaussianObservation(force, jnp.array([0.3]))
+    plain = lfm.filter(process(noise), TIMES, y)
+    family = process(lfm.Observations(noise))
+    for found in (lfm.filter(family, TIMES, y), lfm.smooth(family, TIMES, y)):
+        np.testing.assert_allclose(found.whitened_innovation, plain.whitened_innovation, atol=1e-7)
+
+
+@pytest.mark.parametrize("name", ["negative binomial", "Student-t"])
+def test_residuals_are_standard_normal_and_white_where_the_model_holds(name):
+    family = FAMILIES[name][0](THETA)
+    times = np.linspace(0.0, 300.0, 750)
+    scale, lengthscale = np.exp(THETA[:2]) * np.array([1.0, 1.3])
+    kernel = matern(scale, lengthscale, 1)(times[:, None], times)
+    f = np.linalg.cholesky(kernel + 1e-10 * np.eye(750)) @ np.random.default_rng(3).normal(size=750)
+    y = family.sample(jax.random.key(0), jnp.asarray(f))[:, None]
+    residual = np.asarray(lfm.filter(process(family, scale, lengthscale), times, y).whitened_innovation)[:, 0]
+    assert stats.kstest(residual, "norm").pvalue > 0.01
+    assert abs(residual.var() - 1) < 3 * np.sqrt(2 / residual.size)
+    assert abs(np.mean(residual[1:] * residual[:-1])) < 3 / np.sqrt(residual.size)

@@ -86,6 +86,34 @@ def test_draws_have_these_densities(name):
     assert np.all(np.abs(draws.var(0) - central[0]) < 5 * error + 1e-3 * central[0])
 
 
+@pytest.mark.parametrize("name", [name for name in CASES if name != "any distribution"])
+def test_cumulative_probabilities_are_sums_of_the_densities(name):
+    family, y, log_prob = CASES[name]
+    below, up_to = family.cumulative(jnp.asarray(PREDICTOR), jnp.asarray(y))
+    if name == "Student-t":
+        expected = stats.t.cdf(y, 4.0, PREDICTOR, 0.5)
+        np.testing.assert_allclose([below, up_to], [expected, expected], rtol=1e-10)
+        return
+    values, weight = VALUES.get(name, WHOLE)
+    with np.errstate(divide="ignore"):
+        probability = np.nan_to_num(np.exp(log_prob(values[:, None], PREDICTOR))) * weight[:, None]
+    inside = 1e-5 if name == "censored" else 1e-9  # of a Riemann sum
+    np.testing.assert_allclose(below, (probability * (values[:, None] < y - 1e-9)).sum(0), atol=inside)
+    np.testing.assert_allclose(up_to, (probability * (values[:, None] <= y + 1e-9)).sum(0), atol=inside)
+
+
+def test_a_family_without_cumulative_probabilities_has_none():
+    family = lfm.Observation(state, lambda f: dist.ZeroInflatedPoisson(0.5, jnp.exp(f)))
+    assert np.isnan(family.cumulative(jnp.zeros(2), jnp.ones(2))).all()
+    count = lfm.Observation(state, lambda f: dist.Poisson(jnp.exp(f))).cumulative(jnp.zeros(1), jnp.ones(1))
+    np.testing.assert_allclose(np.ravel(count), stats.poisson.cdf([0, 1], 1.0))
+    size = lfm.Observation(state, lambda f: dist.Gamma(2.0, jnp.exp(f))).cumulative(jnp.zeros(1), jnp.ones(1))
+    np.testing.assert_allclose(np.ravel(size), stats.gamma.cdf([1, 1], 2.0))
+    for concentration in (3e7, 3e8, 1e200):
+        limit = lfm.NegativeBinomialObservation(state, concentration).cumulative(jnp.zeros(1), jnp.ones(1))
+        np.testing.assert_allclose(np.ravel(limit), stats.poisson.cdf([0, 1], 1.0), rtol=1e-7)
+
+
 @pytest.mark.parametrize("f", [-800.0, -40.0, 0.0, 40.0])
 def test_links_neither_underflow_nor_lose_their_derivatives(f):
     for link in (RATES["softplus"], RATES["exp"]):

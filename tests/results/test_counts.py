@@ -18,6 +18,7 @@ from lfm_ppl.filtering.sites import SiteSettings
 from lfm_ppl.inference.site_failures import site_failures
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.family_scores import log_densities
+from lfm_ppl.results.plots.saving import pages_of
 from lfm_ppl.results.predictions import summary
 
 TIMES = np.arange(14.0)
@@ -61,6 +62,18 @@ def test_new_counts_are_counts_and_so_are_their_intervals(result, ahead):
     table = summary(predicted)
     ends = table[["q2.5", "q97.5"]].to_numpy()
     assert np.all(ends == np.round(ends)) and np.all(ends[:, 0] < ends[:, 1])
+
+
+def test_counts_have_residuals(result):
+    residual = arviz_data.group(result, "one_step_ahead")["residual"]
+    assert np.all(np.isfinite(residual))
+    # The first count, given nothing before it, at the first draw: by quadrature over the force's prior.
+    level, scale = (float(arviz_data.group(result, "posterior")[name][0, 0]) for name in ("level", "scale"))
+    nodes, weights = np.polynomial.hermite_e.hermegauss(80)
+    rate = 1.5 * np.exp(level + scale * nodes)
+    below, up_to = (weights @ stats.poisson.cdf(count, rate) / weights.sum() for count in (1.0, 2.0))
+    assert stats.norm.ppf(below) < float(residual[0, 0, 0, 0]) < stats.norm.ppf(up_to)
+    assert "residuals" in {name for name, *_ in pages_of(result, "column")}
 
 
 def test_log_score_is_that_of_the_family_along_the_paths(ahead):

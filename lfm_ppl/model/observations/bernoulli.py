@@ -49,6 +49,11 @@ class BernoulliObservation(ObservationFamily):
         probability = jnp.exp(PROBABILITIES[self.link].log_probability(predictor))
         return jax.random.bernoulli(key, probability, predictor.shape).astype(predictor.dtype)
 
+    def cumulative(self, predictor: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return P(data < y) and P(data <= y), (D,) each."""
+        no = jnp.exp(PROBABILITIES[self.link].log_complement(predictor))
+        return jnp.where(y > 0.5, no, 0.0), jnp.where(y > 0.5, 1.0, no)
+
     def mean(self, predictor: jax.Array) -> jax.Array:
         """Return the expected values, the probabilities of yes, (D,)."""
         return jnp.exp(PROBABILITIES[self.link].log_probability(predictor))

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import gammaln
+from jax.scipy.special import betainc, gammaln
 
 from lfm_ppl.model.observations.family import ObservationFamily, not_counts, parameter
 from lfm_ppl.model.observations.links import PROBABILITIES, checked
@@ -53,6 +53,12 @@ class BinomialObservation(ObservationFamily):
         """Draw counts (D,)."""
         probability = jnp.exp(PROBABILITIES[self.link].log_probability(predictor))
         return jax.random.binomial(key, self.total_count, probability, predictor.shape).astype(predictor.dtype)
+
+    def cumulative(self, predictor: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return P(data < y) and P(data <= y), (D,) each."""
+        n, share = self.total_count, jnp.exp(PROBABILITIES[self.link].log_complement(predictor))
+        below = jnp.where(y > 0, betainc(n - y + 1.0, jnp.where(y > 0, y, 1.0), share), 0.0)
+        return below, jnp.where(y < n, betainc(jnp.where(y < n, n - y, 1.0), y + 1.0, share), 1.0)
 
     def mean(self, predictor: jax.Array) -> jax.Array:
         """Return the expected counts (D,)."""

@@ -63,18 +63,30 @@ class CensoredObservation(ObservationFamily):
     def log_prob(self, predictor: jax.Array, y: jax.Array) -> jax.Array:
         """Return the log density of what is seen, the log probability of what is censored, (D,)."""
         s = self.scale
-        finite_left = jnp.where(jnp.isfinite(self.left), self.left, y)
-        finite_right = jnp.where(jnp.isfinite(self.right), self.right, y)
         half = 0.5 * jnp.where(self.width > 0, self.width, s)
         error = (y - predictor) / s
         seen = jnp.where(self.width > 0, _log_probability_between(error - half / s, error + half / s),
                          norm.logpdf(error) - jnp.log(s))
+        low, high = self._limits(y)
+        below, above = norm.logcdf((low - predictor) / s), norm.logcdf((predictor - high) / s)
+        return jnp.where(y <= self.left, below, jnp.where(y >= self.right, above, seen))
+
+    def _limits(self, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return below and above which values are reported as a limit; y where there is no limit."""
+        finite_left = jnp.where(jnp.isfinite(self.left), self.left, y)
+        finite_right = jnp.where(jnp.isfinite(self.right), self.right, y)
         # Of values in bins those are reported as a limit whose bin's middle lies at it or beyond.
         width = jnp.where(self.width > 0, self.width, 1.0)
         low = jnp.where(self.width > 0, (jnp.floor(finite_left / width) + 0.5) * width, finite_left)
-        high = jnp.where(self.width > 0, (jnp.ceil(finite_right / width) - 0.5) * width, finite_right)
-        below, above = norm.logcdf((low - predictor) / s), norm.logcdf((predictor - high) / s)
-        return jnp.where(y <= self.left, below, jnp.where(y >= self.right, above, seen))
+        return low, jnp.where(self.width > 0, (jnp.ceil(finite_right / width) - 0.5) * width, finite_right)
+
+    def cumulative(self, predictor: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return P(data < y) and P(data <= y), (D,) each: those of a limit, of a bin, or of a value."""
+        low, high = self._limits(y)
+        half = 0.5 * self.width
+        from_, to = jnp.where(y >= self.right, high, y - half), jnp.where(y <= self.left, low, y + half)
+        below, up_to = norm.cdf((from_ - predictor) / self.scale), norm.cdf((to - predictor) / self.scale)
+        return jnp.where(y <= self.left, 0.0, below), jnp.where(y >= self.right, 1.0, up_to)
 
     def sample(self, key: jax.Array, predictor: jax.Array) -> jax.Array:
         """Draw measurements (D,) and report them as the instrument does."""

@@ -54,6 +54,14 @@ class ObservationFamily(eqx.Module):
     def sample(self, key: jax.Array, predictor: jax.Array) -> jax.Array:
         """Draw entries (D,) under ``predictor`` (D,)."""
 
+    def cumulative(self, predictor: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return P(data < y) and P(data <= y), (D,) each, for residuals; NaN where they are not known: there are none.
+
+        The two are the same but where a single value has a probability, as counts and limits of detection have.
+        """
+        unknown = jnp.full(jnp.broadcast_shapes(predictor.shape, y.shape), jnp.nan)
+        return unknown, unknown
+
     def mean(self, predictor: jax.Array) -> jax.Array:
         """Return what the entries (D,) are on average under ``predictor``, for plots: here the predictor itself."""
         return predictor

@@ -64,6 +64,15 @@ class Observation(ObservationFamily):
         """Draw entries (D,)."""
         return self.make(predictor).sample(key).astype(predictor.dtype)
 
+    def cumulative(self, predictor: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return P(data < y) and P(data <= y), (D,) each, where NumPyro knows them."""
+        law = self.make(predictor)
+        try:
+            found = law.cdf(y)
+            return (law.cdf(y - 1.0) if law.is_discrete else found), found
+        except NotImplementedError:
+            return super().cumulative(predictor, y)
+
     def possible(self, predictor: jax.Array) -> jax.Array:
         """Return entries (D,) inside the distribution's support."""
         value = self.make(jax.lax.stop_gradient(predictor)).support.feasible_like(predictor)

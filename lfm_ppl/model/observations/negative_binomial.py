@@ -9,10 +9,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import gammaln
+from jax.scipy.special import betainc, gammaln
 
 from lfm_ppl.model.observations.family import ObservationFamily, not_counts, parameter
 from lfm_ppl.model.observations.links import RATES, checked
+from lfm_ppl.model.observations.poisson import poisson_cumulative
 
 
 class NegativeBinomialObservation(ObservationFamily):
@@ -68,6 +69,15 @@ class NegativeBinomialObservation(ObservationFamily):
         rate = self.exposure * RATES[self.link].rate(predictor) * jax.random.gamma(rate_key, c) / c
         return jax.random.poisson(count_key, rate, predictor.shape).astype(predictor.dtype)
 
+    def cumulative(self, predictor: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return P(data < y) and P(data <= y), (D,) each."""
+        mean, small = self.mean(predictor), self.concentration < _POISSON
+        c = jnp.where(small, self.concentration, 1.0)
+        share = c / (c + mean)
+        below = jnp.where(y > 0, betainc(c, jnp.where(y > 0, y, 1.0), share), 0.0)
+        limit = poisson_cumulative(mean, y)
+        return jnp.where(small, below, limit[0]), jnp.where(small, betainc(c, y + 1.0, share), limit[1])
+
     def mean(self, predictor: jax.Array) -> jax.Array:
         """Return the expected counts (D,)."""
         return self.exposure * RATES[self.link].rate(predictor)
@@ -80,3 +90,7 @@ class NegativeBinomialObservation(ObservationFamily):
         """Say where the mean is not finite, or not positive."""
         mean = np.asarray(self.exposure * RATES[self.link].rate(jnp.asarray(predictor, float)))
         return ~np.isfinite(mean) | ((mean <= 0) & (self.link == "identity"))
+
+
+_POISSON = 1e8
+"""Concentration from which on counts are those of a Poisson to eight digits."""

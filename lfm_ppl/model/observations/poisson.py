@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import gammaln
+from jax.scipy.special import gammaincc, gammaln
 
 from lfm_ppl.model.observations.family import ObservationFamily, not_counts, parameter
 from lfm_ppl.model.observations.links import RATES, checked
@@ -57,6 +57,10 @@ class PoissonObservation(ObservationFamily):
         rate = self.exposure * RATES[self.link].rate(predictor)
         return jax.random.poisson(key, rate, predictor.shape).astype(predictor.dtype)
 
+    def cumulative(self, predictor: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return P(data < y) and P(data <= y), (D,) each."""
+        return poisson_cumulative(self.mean(predictor), y)
+
     def mean(self, predictor: jax.Array) -> jax.Array:
         """Return the expected counts (D,)."""
         return self.exposure * RATES[self.link].rate(predictor)
@@ -69,3 +73,9 @@ class PoissonObservation(ObservationFamily):
         """Say where the rate is not finite, or not positive."""
         rate = np.asarray(self.exposure * RATES[self.link].rate(jnp.asarray(predictor, float)))
         return ~np.isfinite(rate) | ((rate <= 0) & (self.link == "identity"))
+
+
+def poisson_cumulative(rate: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return P(count < y) and P(count <= y) at a rate."""
+    below = jnp.where(y > 0, gammaincc(jnp.where(y > 0, y, 1.0), rate), 0.0)
+    return below, gammaincc(y + 1.0, rate)

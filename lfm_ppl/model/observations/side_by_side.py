@@ -25,6 +25,10 @@ class _GaussianFamily(ObservationFamily):
     def log_prob(self, predictor: jax.Array, y: jax.Array) -> jax.Array:
         return norm.logpdf(y, predictor, jnp.sqrt(self.variance))
 
+    def cumulative(self, predictor: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        found = norm.cdf(y, predictor, jnp.sqrt(self.variance))
+        return found, found
+
     def sample(self, key: jax.Array, predictor: jax.Array) -> jax.Array:
         return predictor + jnp.sqrt(self.variance) * jax.random.normal(key, predictor.shape)
 
@@ -87,6 +91,11 @@ class Observations(ObservationFamily):
         keys = jax.random.split(key, len(self.parts))
         return jnp.concatenate([part.sample(one, predictor[columns])
                                 for one, (part, columns) in zip(keys, self._each(), strict=True)])
+
+    def cumulative(self, predictor: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return P(data < y) and P(data <= y), (D,) each."""
+        found = [part.cumulative(predictor[columns], y[columns]) for part, columns in self._each()]
+        return jnp.concatenate([low for low, _ in found]), jnp.concatenate([high for _, high in found])
 
     def possible(self, predictor: jax.Array) -> jax.Array:
         """Return entries (D,) inside the supports."""

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
-from jax.scipy.special import gammaln
+from jax.scipy.special import betainc, gammaln
 
 from lfm_ppl.model.observations.family import ObservationFamily, parameter
 
@@ -47,6 +47,13 @@ class StudentTObservation(ObservationFamily):
         v, s = self.df, self.scale
         constant = gammaln(0.5 * (v + 1.0)) - gammaln(0.5 * v) - 0.5 * jnp.log(jnp.pi * v) - jnp.log(s)
         return constant - 0.5 * (v + 1.0) * jnp.log1p(((y - predictor) / s) ** 2 / v)
+
+    def cumulative(self, predictor: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return P(data <= y) twice, (D,) each: no single value has a probability."""
+        error = (y - predictor) / self.scale
+        tail = 0.5 * betainc(0.5 * self.df, 0.5, self.df / (self.df + error**2))
+        found = jnp.where(error < 0, tail, 1.0 - tail)
+        return found, found
 
     def sample(self, key: jax.Array, predictor: jax.Array) -> jax.Array:
         """Draw measurements (D,)."""

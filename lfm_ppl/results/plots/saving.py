@@ -103,7 +103,7 @@ def pages_of(result: Any, width: str | float) -> Iterator[tuple[str, Draw, list[
             yield "pairs", pairs.plot_pairs, None
     if has_group(result, "one_step_ahead"):
         residual = group(result, "one_step_ahead")["residual"]
-        # An observation family has no standardised residuals.
+        # An observation family may not know the probabilities that residuals are made of.
         names = [str(name) for name in residual["output"].values if residual.sel(output=name).notnull().any()]
         yield from _numbered("residuals", residuals.plot_residuals, names, residuals.MAX_OUTPUTS)
     if has_group(result, "accuracy"):
