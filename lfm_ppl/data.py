@@ -50,7 +50,7 @@ class Data:
         times: t_k, shape (T,), non-decreasing; equal times are replicates.
         y: observations, shape (T, D); NaN is a missing value.
         outputs: the names of the D outputs.
-        units: name -> unit, for ``time``, outputs, states and forces; incomplete is fine.
+        units: name -> unit, for ``time``, outputs, states, forces and known inputs; incomplete is fine.
         truth: for simulated data, a mapping with any of ``times`` (K,), ``forces`` (name -> (K,)),
             ``state`` (K, M) and ``parameters`` (name -> array).
         note: what was done to the numbers, to be printed with the results.

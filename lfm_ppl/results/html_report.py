@@ -17,7 +17,7 @@ import xarray as xr
 from lfm_ppl import calendar_time
 from lfm_ppl.results import arviz_data, predictions, report, tables, web_page
 from lfm_ppl.results.files import POSTERIOR
-from lfm_ppl.results.inputs import ORIGIN, inputs_of, time_origin, time_unit
+from lfm_ppl.results.inputs import ORIGIN, input_unit, inputs_of, time_origin, time_unit
 from lfm_ppl.results.plots import saving, style
 from lfm_ppl.results.scalars import unit_of
 from lfm_ppl.results.web_page import Section
@@ -187,9 +187,10 @@ def _data(result: Any, attrs: Mapping[str, Any]) -> str:
     inputs = inputs_of(result)
     if inputs:
         rows = [{"interpolation": table.interpolation, "times": _span(np.asarray(table.times), result),
-                 **_described(np.asarray(table.values, float), "")} for table in inputs.values()]
+                 **_described(np.asarray(table.values, float), input_unit(result, name))}
+                for name, table in inputs.items()]
         shown += web_page.heading("Known inputs") + tables.html_table(
-            pd.DataFrame(rows, list(inputs)).drop(columns="unit"), index_label="input")
+            pd.DataFrame(rows, list(inputs)), index_label="input")
     return shown
 
 

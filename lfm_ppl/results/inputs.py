@@ -10,7 +10,7 @@ import xarray as xr
 
 from lfm_ppl.data import Data, InputTable, model_keywords
 from lfm_ppl.results import arviz_data
-from lfm_ppl.results.scalars import unit_of
+from lfm_ppl.results.scalars import unit_of, units_attribute
 
 GROUP = "constant_data"
 """ArviZ's name for what a model is given beside the observations."""
@@ -22,10 +22,11 @@ ORIGIN = "time_origin"
 """Attribute of a result: the calendar time of t = 0 as ISO 8601 text."""
 
 
-def to_dataset(inputs: Mapping[str, InputTable]) -> xr.Dataset:
-    """Return known inputs, each over times of its own."""
+def to_dataset(inputs: Mapping[str, InputTable], units: Mapping[str, str] | None = None) -> xr.Dataset:
+    """Return known inputs, each over times of its own, with the units of those that have one."""
     return xr.Dataset(
-        {name: (f"{name}_time", np.asarray(table.values), {"interpolation": table.interpolation})
+        {name: (f"{name}_time", np.asarray(table.values),
+                {"interpolation": table.interpolation, **units_attribute([name], units)})
          for name, table in inputs.items()},
         {f"{name}_time": np.asarray(table.times) for name, table in inputs.items()})
 
@@ -40,6 +41,11 @@ def inputs_of(result: Any, group: str = GROUP) -> dict[str, InputTable]:
             for name, one in stored.data_vars.items()}
 
 
+def input_unit(result: Any, name: str) -> str:
+    """Return the unit of a known input, empty where the result does not know it."""
+    return unit_of(arviz_data.group(result, GROUP)[name]) if name in inputs_of(result) else ""
+
+
 def keywords(result: Any, given: Mapping[str, Any] | None) -> dict[str, Any]:
     """Return the keyword arguments of the model of a result: those given, and its known inputs."""
     return model_keywords(inputs_of(result), given)
@@ -52,7 +58,7 @@ def remember(groups: dict[str, xr.Dataset], data: Data) -> dict[str, Any]:
         Attributes of the result.
     """
     if data.inputs:
-        groups[GROUP] = to_dataset(data.inputs)
+        groups[GROUP] = to_dataset(data.inputs, data.units)
     for dataset in groups.values():
         for name in {"time", "at", "at_truth"} & set(dataset.coords):
             if data.units.get("time") and not dataset[name].attrs.get("units"):

@@ -119,10 +119,10 @@ def test_known_inputs_are_drawn_as_they_are_read(result, readable):
               "outside": InputTable(np.array([0.0, 24.0]), np.array([3.0, 5.0]), "linear")}
     with pytest.raises(ValueError, match="holds no known inputs"):
         plot_inputs(result)
-    known = arviz_data.add_group(result, "constant_data", to_dataset(tables))
+    known = arviz_data.add_group(result, "constant_data", to_dataset(tables, {"outside": "degC"}))
     figure = plot_inputs(known, width="full")
     readable(figure)
-    assert [axes.get_ylabel() for axes in figure.axes] == ["heater", "outside"]
+    assert [axes.get_ylabel() for axes in figure.axes] == ["heater", "outside (degC)"]
     assert [axes.lines[0].get_drawstyle() for axes in figure.axes] == ["steps-post", "default"]
     np.testing.assert_array_equal(figure.axes[0].lines[0].get_ydata(), [0.0, 1.0, 0.0])
     longer = {"heater": InputTable(np.array([0.0, 30.0]), np.array([0.0, 2.0]), "previous")}

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from lfm_ppl.checks import unknown
-from lfm_ppl.results.inputs import FORECAST, inputs_of, time_origin, time_unit
+from lfm_ppl.results.inputs import FORECAST, input_unit, inputs_of, time_origin, time_unit
 from lfm_ppl.results.plots import style
 from lfm_ppl.results.plots.trajectories import MAX_PANELS
 
@@ -56,7 +56,7 @@ def plot_inputs(result: Any, inputs: Sequence[str] | None = None, *, width: str 
         drawn = "steps-post" if table.interpolation == "previous" else "default"
         axes.plot(table.times, table.values, drawstyle=drawn, marker="o" if len(table.times) <= _MANY else "", ms=2.2,
                   **line)
-        style.label_values(axes, name, "")
+        style.label_values(axes, name, input_unit(result, name))
     style.label_time(panels, time_unit(result), time_origin(result))
     figure.align_ylabels(panels)
     style.legend_above(figure, [Line2D([], [], label="known input", **line)])
