@@ -15,10 +15,16 @@ from typing import Any
 
 import numpy as np
 
-SECONDS = {
-    "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "hr": 3600.0, "hours": 3600.0, "d": 86400.0, "days": 86400.0,
-    "weeks": 604800.0, "yr": 31557600.0, "years": 31557600.0,
+_LENGTHS = {
+    ("ms",): 1e-3, ("s", "sec", "second", "seconds"): 1.0, ("min", "minute", "minutes"): 60.0,
+    ("h", "hr", "hour", "hours"): 3600.0, ("d", "day", "days"): 86400.0, ("week", "weeks"): 604800.0,
+    ("yr", "year", "years"): 31557600.0,
 }
+
+USUAL = tuple(names[0] for names in _LENGTHS)
+"""Of several names of a unit the first one."""
+
+SECONDS = {name: length for names, length in _LENGTHS.items() for name in names}
 """Unit of time -> its length in seconds; a year is 365.25 days."""
 
 _INFERRED = (("years", 300 * 86400.0), ("d", 86400.0), ("h", 3600.0), ("min", 60.0), ("s", 1.0))
@@ -131,7 +137,7 @@ def clock(time: float, origin: str, unit: str, sep: str = " ", digits: int = 0) 
         >>> clock(36.0, "2019-12-23T00:00:00", "h")
         '2019-12-24 12:00'
     """
-    stamp = datetime.fromisoformat(origin) + timedelta(seconds=round(time * SECONDS[unit], digits))
+    stamp = datetime.fromisoformat(origin) + timedelta(seconds=round(float(time) * SECONDS[unit], digits))
     return stamp.isoformat(sep=sep, timespec="auto" if stamp.second or stamp.microsecond else "minutes")
 
 

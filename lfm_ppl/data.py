@@ -10,6 +10,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -189,7 +190,7 @@ def as_inputs(tables: Mapping[str, InputTable]) -> dict[str, Input]:
     # Here and not before: arrays made before float64 is enabled stay in float32.
     from lfm_ppl.model.inputs import Input
 
-    return {name: Input(*table) for name, table in tables.items()}
+    return {name: Input(*table, name=name) for name, table in tables.items()}
 
 
 def model_keywords(tables: Mapping[str, InputTable], given: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -335,8 +336,24 @@ def _read(source: Table, outputs: Sequence[str] | None, time_column: str | None,
     if observed and np.all(np.isnan(y)):
         raise ValueError(f"{source.label}: every value of {', '.join(names)}{part} is missing; expected at least one "
                          "number.")
+    _warn_of_codes(source, names, y)
     return Data(times, y, tuple(names), units={"time": unit} if unit else {}, origin=origin,
                 inputs={name: _input(source, name, way, times) for name, way in wanted.items()})
+
+
+_CODES = np.array([sign * (10.0**digits - 1.0) for digits in (2, 3, 4, 5) for sign in (1, -1)])
+"""Numbers that stand for a missing value in many files: 99, -999..."""
+
+
+def _warn_of_codes(source: Table, names: Sequence[str], y: np.ndarray) -> None:
+    """Warn of outputs (T, D) in which -999 or its like stands far from all other values."""
+    for name, column in zip(names, y.T, strict=True):
+        coded = np.isin(column, _CODES)
+        rest = column[np.isfinite(column) & ~coded]
+        if coded.any() and rest.size > 1 and np.abs(column[coded] - np.median(rest)).min() > 5.0 * np.ptp(rest) > 0:
+            checks.warn(f"{source.place(int(np.argmax(coded)), name)}: {column[coded][0]:g}, far from all other values "
+                        f"of the column, is taken as a measurement ({int(coded.sum())} of them). If it stands for a "
+                        "missing value, leave the cell empty.")
 
 
 def _find_time(source: Table, time_column: str | None) -> str:
@@ -375,7 +392,7 @@ def _find_outputs(source: Table, others: Sequence[str], time_name: str, outputs:
     for name in outputs:
         if name not in known:
             raise ValueError(f"{source.label}: {checks.unknown('output column', name, known)} Name the columns "
-                             "with --outputs (outputs=).")
+                             "with --outputs (outputs=); what was not measured is an empty column.")
     return list(outputs)
 
 
@@ -470,11 +487,22 @@ def _value(source: Table, row: int, name: str, wanted: str = _WANTED) -> float:
     except (TypeError, ValueError):  # a TypeError is pandas' NA, or a cell that is no scalar
         if type(cell).__name__ == "NAType":
             return math.nan
-        raise ValueError(f"{source.place(row, name)}: {wanted.format(_shown(cell))}") from None
+        raise ValueError(f"{source.place(row, name)}: {wanted.format(_shown(cell))}{_meant(cell)}") from None
     if not math.isfinite(value):
         raise ValueError(f"{source.place(row, name)}: expected a finite number, got {_shown(cell)}. Leave the cell of "
                          "a missing value empty.")
     return value
+
+
+def _meant(cell: Any) -> str:
+    """Return what to write in place of a number that is written otherwise."""
+    text = str(cell).strip()
+    if re.fullmatch(r"[+-]?\d+,\d+", text):
+        return f" A decimal point is a point: {text.replace(',', '.')}."
+    if re.fullmatch(r"[<>]=?\s*[\d.]+", text):
+        return (" A value beyond a limit is written as the limit, a number; lfm.CensoredObservation(left=, right=) "
+                "knows what it means.")
+    return ""
 
 
 def _shown(cell: Any) -> str:

@@ -104,7 +104,9 @@ def fit(
         model_kwargs: keyword arguments of the model.
         fixed: parameters that are not learnt: name -> value, ``{"decay": 0.8}`` or ``{"decay[CDKN1A]": 0.8}``.
         init: starting points: "map" for the posterior mode, "median" for the prior median, or a NumPyro strategy; by
-            default the prior median for NUTS, and draws from the Laplace approximation at the mode for the others.
+            default the prior median for NUTS, and draws from the Laplace approximation at the mode for the others. With
+            "map" NUTS begins its warm-up with the covariance at the mode as its (full) inverse mass matrix, which saves
+            most of the warm-up where parameters have narrow posteriors or strong correlations.
         sampler_options: further arguments of NUTS, `RAM` or `ParticleMarginalRAM`, for example
             ``{"target_accept_prob": 0.95}`` or ``{"particles": 500, "delayed": True}``.
         chain_method: "parallel", "vectorized" or "sequential"; by default parallel where there are as many devices as
@@ -188,7 +190,7 @@ def fit(
     values = y.to_numpy(float) if hasattr(y, "to_numpy") else y  # a data frame
     clock = (None, "") if data is None else (data.origin, data.units.get("time", ""))
     with calendar_time.in_messages(*clock):
-        bound = bind(numpyro_model, times, values, **dict(model_kwargs or {}))
+        bound = _bound(numpyro_model, times, values, dict(model_kwargs or {}))
         check_requested(bound, at)
     labels = Labels.of(bound, dims, coords, y)
     # Traces the model once more, for the record of a run that is kept.
@@ -564,6 +566,9 @@ def _transition(sampler: str, bound: BoundModel, options: Mapping[str, Any] | No
     Chains that go on start nowhere: all that their transition needs to know is in ``setup``.
     """
     options = dict(options or {})
+    at_mode = sampler == "nuts" and isinstance(init, str) and init == "map" and "inverse_mass_matrix" not in options
+    if at_mode:
+        options.setdefault("dense_mass", True)
     if setup is not None:
         if sampler == "nuts":
             return sampling.nuts(bound, warmup, options), None, {}
@@ -572,6 +577,11 @@ def _transition(sampler: str, bound: BoundModel, options: Mapping[str, Any] | No
             return sampling.random_walk(bound, kernel, warmup), None, {}
         kernel.prepare(bound, None, Tuned(int(setup["particles"]), float(setup["log_likelihood_sd"])))
         return sampling.particle_marginal(bound, kernel, warmup), None, _remarks(kernel)
+    if at_mode and options["dense_mass"] is True:
+        mode = mode_of(bound, seed=seed)
+        known = not mode.unidentified and np.all(np.isfinite(mode.covariance))
+        transition = sampling.nuts(bound, warmup, options, mode.covariance if known else np.eye(bound.size))
+        return transition, _starts(key, bound, init_to_value(values=mode.parameters), chains, transition.evaluate), {}
     strategy = _strategy(init, bound, seed)
     if sampler == "nuts":
         transition = sampling.nuts(bound, warmup, options)
@@ -671,6 +681,17 @@ def _paths(bound: BoundModel, at: Any, count: int, chains: int,
     return chosen, rows, np.union1d(np.linspace(min(origin, times[0]), times[-1], _GRID), times)
 
 
+def _bound(numpyro_model: Callable, times: Any, y: Any, model_kwargs: dict[str, Any]) -> BoundModel:
+    try:
+        return bind(numpyro_model, times, y, **model_kwargs)
+    except TypeError as error:
+        if "'NoneType'" not in str(error) or "inputs" in model_kwargs or (
+                "inputs" not in inspect.signature(numpyro_model).parameters):
+            raise
+        raise TypeError("the model has an argument `inputs`, and there are none. Name their columns, "
+                        "lfm.read_table(frame, inputs=[...]), or give lfm.Data(..., inputs={...}).") from error
+
+
 def _priors(bound: BoundModel) -> str:
     """Return name -> prior in words, as JSON."""
     trace = bound.trace()
@@ -678,7 +699,7 @@ def _priors(bound: BoundModel) -> str:
 
 
 def _assumptions(bound: BoundModel) -> str:
-    """Return what the model says of observations, forces and initial state at the prior medians, as JSON."""
+    """Return what the model says of observations, forces and initial state, with numbers typical of the prior."""
     return json.dumps(assumptions(bound.site.example.ssm.model))
 
 

@@ -235,7 +235,7 @@ def _scaled(truth, largest):
 
 def anchors(data: lfm.Data) -> dict[str, float]:
     """Return what the literature knows: the decay of CDKN1A per hour, its sensitivity as unit."""
-    hours = data.units.get("time") in ("h", "hr", "hours")
+    hours = data.units.get("time") in ("h", "hr", "hour", "hours")
     if "CDKN1A" in data.outputs and hours:
         return {"sensitivity[CDKN1A]": 1.0, "decay[CDKN1A]": 0.8}
     return {}

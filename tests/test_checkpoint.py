@@ -116,6 +116,13 @@ def test_a_run_that_is_stopped_goes_on_to_the_same_draws(sampler, whole, tmp_pat
     assert "partial" not in arviz_data.summary(expected)
 
 
+def test_chains_from_the_mode_go_on_to_the_same_draws(whole, tmp_path, stop_after):
+    expected = whole("nuts", init="map")
+    stop_after(3)
+    assert "partial" in arviz_data.attributes(fit("nuts", init="map", checkpoint=tmp_path / "run"))
+    assert_same(fit("nuts", init="map", checkpoint=tmp_path / "run", resume=True), expected)
+
+
 @pytest.mark.parametrize("sampler", ["ram", "map"])
 def test_a_stop_after_sampling_costs_no_draw(sampler, whole, tmp_path, monkeypatch):
     def stop(*arguments, lower=False, **keywords):

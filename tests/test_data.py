@@ -148,3 +148,11 @@ def test_data_checks_its_parts(times, y, message):
 def test_outputs_are_a_sequence_of_names(read):
     with pytest.raises(TypeError, match=r"sequence of column names, such as \['decay'\]"):
         read("time,decay\n0,1\n", outputs="decay")
+
+
+def test_codes_of_missing_values_are_told(tmp_path):
+    path = tmp_path / "d.csv"
+    path.write_text("time,x,z\n0,1.5,-99\n1,-999,-101\n2,2.5,-98\n3,-999,-100\n")
+    with pytest.warns(UserWarning, match=r"row 3, column 2 \(x\).*-999.*\(2 of them\).*leave the cell empty") as said:
+        read_csv(path)
+    assert len(said) == 1  # z has -99 among its like

@@ -183,7 +183,13 @@ COLUMNS = {
     "an output as the time": csv("time,x\n0,2\n1,1\n", "unknown output column 'x'", "Known: time",
                                  line="fit model.py --data d.csv "
                                  "--time-column x"),
-    "no such unit": csv(DATED, "unknown unit of time 'hour'", "h", line="fit model.py --data d.csv --time-unit hour"),
+    "no such unit": csv(DATED, "unknown unit of time 'fortnight'", "h",
+                        line="fit model.py --data d.csv --time-unit fortnight"),
+    "no such unit of the model": Case(
+        "fit weekly.py --data d.csv", ("weekly.py says that time is in 'fortnight'", "--time-unit", "d.csv"),
+        {"d.csv": DATED, "weekly.py": MODEL + '\nUNITS = {"time": "fortnight"}\n'}),
+    "a decimal comma": csv('time,x\n0,"7,77"\n1,2\n', "row 2", "a point: 7.77"),
+    "a limit": csv("time,x\n0,<5\n1,2\n", "row 2", "lfm.CensoredObservation"),
     "another unit": csv("time_h,x\n0,1\n1,2\n", "its unit is h", "--time-unit",
                         line="fit model.py --data d.csv --time-unit s"),
     "no such input": csv(WARM, "unknown input column 'heat'", "heater",
@@ -254,6 +260,7 @@ OPTIONS = {
        for flag, value in (("--chains", "-1"), ("--warmup", "-5"), ("--seed", "-1"), ("--tolerance", "-1"))},
     "no such sampler": Case("fit model.py --sampler nutz", ("unknown sampler 'nutz'", "nuts")),
     "no such rule": Case("fit model.py --rule cubatur", ("unknown rule 'cubatur'", "cubature")),
+    "the start of map": Case("fit model.py --sampler map --init map", ("--init says where chains start",)),
     "acceptance of map": Case("fit model.py --sampler map --target-accept 0.9",
                               ("--target-accept is for the samplers",)),
     "particles of nuts": Case("fit model.py --particles 50", ("--particles is for the sampler pmmh",)),
@@ -505,6 +512,8 @@ RESULTS = {
                                                {"cut.nc": f"without {group}"})
        for command, more in (("check", ""), ("forecast", " --until 9"))
        for group, said in (("posterior", "holds no posterior"), ("observed_data", "no group 'observed_data'"))},
+    "check: an unfinished run": Case("check begun", ("begun holds a run that is not finished", "--resume"),
+                                     {"begun/checkpoint/run.json": "{}"}),
     "plot: nothing to draw": Case("plot cut.nc", ("cut.nc holds no posterior",), {"cut.nc": "without posterior"}),
     **{f"{command}: its model has moved": Case(f"{command} moved.nc{more}", ("no model file", "name it with --model"),
                                                {"moved.nc": "with model_file=/gone/model.py"})
@@ -699,6 +708,11 @@ def well(times, y=None):
     numpyro.sample("y", lfm.MarginalLikelihood(systems.double_well(dispersion=noise, noise=0.1), times, steps=1), obs=y)
 
 
+def heated(times, y=None, inputs=None):
+    system = linear(dynamics=lambda x, u, t: inputs["heater"](t) - x)
+    numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
+
+
 def without_data(times, y=None):
     noise = numpyro.sample("noise", dist.LogNormal(-0.5, 0.3))
     numpyro.sample("y", lfm.MarginalLikelihood(systems.double_well(dispersion=noise, noise=0.1), times, steps=1))
@@ -767,6 +781,7 @@ CALLS = {
     "fit: beyond its support": (lambda: lfm.fit(well, T, Y, fixed={"noise": -1.0}), ("noise cannot be fixed at -1.0",)),
     "fit: a start": (lambda: lfm.fit(well, T, Y, init="mode"), ("unknown init 'mode'", "map")),
     "fit: no such method": (lambda: lfm.fit(well, T, Y, chain_method="threads"), ("'threads'", "vectorized")),
+    "fit: no inputs": (lambda: lfm.fit(heated, T, Y), ("argument `inputs`", "lfm.read_table(frame, inputs=[...])")),
     "fit: resume nothing": (lambda: lfm.fit(well, T, Y, resume=True), ("checkpoint=",)),
     "fit: a folder with a result": (lambda: lfm.fit(well, T, Y, checkpoint="result"),
                                     ("holds a result, which is kept",)),

@@ -309,7 +309,7 @@ def _add_data(group: Any) -> None:
     group.add_argument("--time-column", metavar="NAME",
                        help="the time column, of numbers or dates (default: time, t or time_h, else one of dates)")
     group.add_argument("--time-unit", type=_one_of("unit of time", calendar_time.SECONDS), metavar="UNIT",
-                       help=f"unit of times that are dates: {', '.join(calendar_time.SECONDS)} (default: the "
+                       help=f"unit of times that are dates: {', '.join(calendar_time.USUAL)} (default: the "
                        "model's, else by the gaps)")
     group.add_argument("--outputs", metavar="A,B,...", help="the columns to use (default: those of the model)")
     group.add_argument("--inputs", metavar="A,B:linear,...",
@@ -335,6 +335,10 @@ def _add_inference(group: Any) -> None:
         help="steps that make one draw (default: 1 for nuts, 5 per parameter for ram, 1 per parameter for pmmh)",
     )
     group.add_argument("--seed", type=_whole(0), default=0, help="random seed of the sampler (default: 0)")
+    group.add_argument("--init", type=_one_of("init", ("map", "median")), metavar="map|median",
+                       help="where chains start: at the posterior mode, nuts then with the covariance there, which "
+                       "helps where its first steps are slow; or at the prior median (default: median for nuts, about "
+                       "the mode for the others)")
     group.add_argument(
         "--target-accept",
         type=_fraction,

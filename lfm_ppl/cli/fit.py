@@ -49,6 +49,8 @@ def run(arguments: argparse.Namespace) -> int:
         checkpoint.check_folder(arguments.out, arguments.resume, arguments.overwrite)
     with results.folder(model.name, arguments.out, arguments.overwrite, arguments.resume) as folder:
         finished = arguments.resume and checkpoint.is_finished(folder)
+        if arguments.resume and not finished and not checkpoint.is_kept(folder):
+            print(f"resume   there is nothing to go on with in {folder}: this is a new run")
         _print_task(arguments, model, observed, options, fixed)
         started = time.perf_counter()
         go_on = f"go on with: {_again(arguments, folder)}"
@@ -96,6 +98,8 @@ def check_sampler(arguments: argparse.Namespace) -> None:
     """Raise ValueError for a setting of another sampler."""
     if arguments.target_accept is not None and arguments.sampler == "map":
         raise ValueError("--target-accept is for the samplers nuts, ram and pmmh; map accepts and rejects nothing.")
+    if arguments.init is not None and arguments.sampler == "map":
+        raise ValueError("--init says where chains start; the sampler map has none, and finds the mode itself.")
     if arguments.particles is not None and arguments.sampler != "pmmh":
         raise ValueError(f"--particles is for the sampler pmmh; {arguments.sampler} uses none.")
 
@@ -130,9 +134,13 @@ def columns(arguments: argparse.Namespace, model: loading.ModelFile) -> tuple[st
 def read(path: str, model: loading.ModelFile, arguments: argparse.Namespace) -> data.Data:
     """Return the observations in a file, under the model's names of its outputs and inputs."""
     inputs = choices.inputs(arguments.inputs, model)
-    return taken(model, inputs, data.read_csv(path, columns(arguments, model), arguments.time_column,
-                                              dict(inputs.values()), arguments.time_unit,
-                                              usual_unit=usual_unit(model)))
+    observed = data.read_csv(path, columns(arguments, model), arguments.time_column, dict(inputs.values()),
+                             arguments.time_unit, usual_unit=usual_unit(model))
+    unit = model.units.get("time")
+    if observed.origin is not None and unit and usual_unit(model) is None and not arguments.time_unit:
+        raise ValueError(f"UNITS of {model.path} says that time is in {unit!r}, in which the dates of {path} cannot be "
+                         f"counted. Write one of {', '.join(calendar_time.USUAL)}, or give --time-unit.")
+    return taken(model, inputs, observed)
 
 
 def usual_unit(model: loading.ModelFile) -> str | None:
@@ -171,12 +179,15 @@ def _print_task(
 ) -> None:
     source = arguments.data or "simulated by the model"
     count = np.isnan(observed.y).reshape(-1, len(observed.outputs)).sum(axis=0)
-    missing = int(count.sum())
+    missing, rows = int(count.sum()), observed.y[..., 0].size
     where = "" if len(count) == 1 else " (" + ", ".join(
-        f"{number} of {name}" for number, name in zip(count, observed.outputs, strict=True) if number) + ")"
+        f"{'all' if number == rows else number} of {name}"
+        for number, name in zip(count, observed.outputs, strict=True) if number) + ")"
     size = f"{len(observed.times)} rows of {', '.join(observed.outputs)}"
     print(f"model    {model.name}: {model.summary}" if model.summary else f"model    {model.name}")
     print(f"data     {source}: {size}" + (f"; {missing} values missing{where}" if missing else ""))
+    for name in np.array(observed.outputs)[count == rows]:
+        print(f"note     {name} has no value: the data say nothing of what it alone depends on")
     if observed.inputs:
         print("inputs   " + ", ".join(f"{name} ({table.interpolation})" for name, table in observed.inputs.items()))
     if observed.origin is not None:
@@ -292,6 +303,7 @@ def sampling(arguments: argparse.Namespace, model: loading.ModelFile) -> dict[st
         "warmup": arguments.warmup,
         "samples": arguments.samples,
         "thin": arguments.thin,
+        "init": arguments.init,
         "sampler_options": {name: value for name, value in given if value is not None},
     }
 

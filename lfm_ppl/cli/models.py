@@ -31,7 +31,12 @@ def _describe(model: loading.ModelFile) -> None:
     from lfm_ppl.cli import session
 
     session.start(1)
-    print(f"outputs: {_outputs(model)}\n")
+    print(f"outputs: {_outputs(model)}")
+    if model.inputs:
+        print("known inputs: " + ", ".join(f"{_with_unit(model, name)} ({way})" for name, way in model.inputs.items()))
+    if unit := model.units.get("time"):
+        print(f"time: in {unit}")
+    print()
     try:
         found = description.describe(model)
     except Exception as error:  # a model that does not run can still be described by what its file says
@@ -62,7 +67,11 @@ def _print_parameters(found: description.Description) -> None:
 def _outputs(model: loading.ModelFile) -> str:
     if model.outputs is None:
         return "any number, the columns of the data file"
-    return ", ".join(f"{name} ({unit})" if (unit := model.units.get(name)) else name for name in model.outputs)
+    return ", ".join(_with_unit(model, name) for name in model.outputs)
+
+
+def _with_unit(model: loading.ModelFile, name: str) -> str:
+    return f"{name} ({unit})" if (unit := model.units.get(name)) else name
 
 
 def _option(default: Any, accepted: tuple[Any, ...] | type, help_: str) -> str:

@@ -18,6 +18,10 @@ import lfm_ppl as lfm
 # What is measured: one column of the data file for each name, beside a column `time` (or `time_h`, with its unit).
 OUTPUTS = ("temperature",)
 
+# What is known at all times, as columns of the data file: name -> "previous" (a value holds to the next) or "linear".
+# Then `def model(times, y=None, inputs=None)`, and in the dynamics inputs["outside"](t) in place of OUTSIDE.
+# INPUTS = {"outside": "linear"}
+
 # Units of outputs, states, forces and time, for figures and tables; leave out what has none.
 UNITS = {"time": "h", "temperature": "degC", "x": "degC", "heat": "K/h"}
 

@@ -59,10 +59,17 @@ class Transition(NamedTuple):
     describe: Callable[[Any], str] = lambda state: ""
 
 
-def nuts(bound: BoundModel, warmup: int, options: Mapping[str, Any]) -> Transition:
+def nuts(bound: BoundModel, warmup: int, options: Mapping[str, Any],
+         covariance: np.ndarray | None = None) -> Transition:
     """Return the transition of NumPyro's NUTS with ``options``.
 
     A full mass matrix and forward-mode gradients are the default for up to ten parameters.
+
+    Args:
+        bound: the model.
+        warmup: steps of each chain.
+        options: of NUTS.
+        covariance: (d, d), the inverse mass matrix with which the warm-up begins; None: the identity.
     """
     options = {"forward_mode_differentiation": bound.forward_mode, "dense_mass": bound.forward_mode, **options}
     forward_mode = bool(options.pop("forward_mode_differentiation"))
@@ -71,7 +78,7 @@ def nuts(bound: BoundModel, warmup: int, options: Mapping[str, Any]) -> Transiti
         # In blocks of named sites, as NUTS itself has it where it knows their names.
         options["dense_mass"] = [tuple(sorted(bound.sites))] if options["dense_mass"] else []
 
-    def kernel(y: Any) -> NUTS:
+    def kernel(y: Any, **more: Any) -> NUTS:
         # Whichever way NUTS asks for it, the gradient is the one that was traced already, by the mode that is wanted.
         @jax.custom_jvp
         def log_density(z: jax.Array) -> jax.Array:
@@ -82,10 +89,11 @@ def nuts(bound: BoundModel, warmup: int, options: Mapping[str, Any]) -> Transiti
             value, gradient = both(primals[0], y)
             return value, gradient @ tangents[0]
 
-        return NUTS(potential_fn=lambda z: -log_density(ravel_pytree(z)[0]), **options)
+        return NUTS(potential_fn=lambda z: -log_density(ravel_pytree(z)[0]), **options, **more)
 
     def start(key: jax.Array, point: ParamInfo, y: Any, extra: Any) -> Any:
-        return kernel(y).init(key, warmup, point, (), {})
+        begun = {} if extra is None else {"inverse_mass_matrix": extra}
+        return kernel(y, **begun).init(key, warmup, point, (), {})
 
     def step(state: Any, y: Any) -> Any:
         own = kernel(y)
@@ -97,7 +105,8 @@ def nuts(bound: BoundModel, warmup: int, options: Mapping[str, Any]) -> Transiti
               "step_size": "adapt_state.step_size", "lp": "potential_energy"}
     return Transition(("nuts", warmup, forward_mode, signature(dict(options)) or object()), start, step, fields,
                       lambda z: both(jnp.asarray(z, float), bound.argument),
-                      describe=lambda state: _words(state, state.adapt_state.step_size))
+                      None if covariance is None else jnp.asarray(covariance),
+                      lambda state: _words(state, state.adapt_state.step_size))
 
 
 def random_walk(bound: BoundModel, kernel: RAM, warmup: int) -> Transition:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -26,6 +27,7 @@ class Input(eqx.Module):
         outside: what a model does whose times go beyond the table: "warn", "hold" (nothing) or "error". It is looked at
             where times and table are numbers, not in compiled code. The last value of "previous" may stand for an
             interval as long as the one before; a table of one row is a constant, and ends nowhere.
+        name: how messages call it; that of its column, where it comes from a table.
 
     Raises:
         ValueError: times not increasing or not finite, values of another length or not finite, unknown interpolation.
@@ -44,15 +46,17 @@ class Input(eqx.Module):
     values: jax.Array
     interpolation: str = eqx.field(static=True)
     outside: str = eqx.field(static=True)
+    name: str = eqx.field(static=True)
 
-    def __init__(self, times: Any, values: Any, interpolation: str = "previous", outside: str = "warn"):
+    def __init__(self, times: Any, values: Any, interpolation: str = "previous", outside: str = "warn",
+                 name: str = ""):
         checks.one_of("interpolation", interpolation, _INTERPOLATIONS)
         checks.one_of("outside", outside, _OUTSIDE)
         checks.finite("input times", times)
         checks.finite("input values", values)
         self.times = jnp.atleast_1d(jnp.asarray(times, float))
         self.values = jnp.asarray(values, float)
-        self.interpolation, self.outside = interpolation, outside
+        self.interpolation, self.outside, self.name = interpolation, outside, name
         if self.times.ndim != 1 or self.times.size == 0 or self.values.shape[:1] != self.times.shape:
             raise ValueError(f"input values must have one row a time, and at least one: {self.times.shape} times, "
                              f"values of shape {self.values.shape}.")
@@ -63,7 +67,7 @@ class Input(eqx.Module):
 
     def __call__(self, t: Any) -> jax.Array:
         """Return the input at time ``t``: a scalar, or (C,)."""
-        return _READERS[self.interpolation, self.outside](self.times, self.values, t)
+        return _reader(self.interpolation, self.outside, self.name)(self.times, self.values, t)
 
 
 def check_reads(functions: Sequence[Traced], first: float, last: float) -> None:
@@ -75,18 +79,19 @@ def check_reads(functions: Sequence[Traced], first: float, last: float) -> None:
     beyond: dict[str, set[str]] = {"warn": set(), "error": set()}
     for function in functions:
         for name, table, when in (read for t in (first, last) for read in function.table_reads(_MARK, t)):
-            interpolation, outside = name[name.index(_MARK) + len(_MARK):].split("_")[:2]
+            interpolation, outside, called = name[name.index(_MARK) + len(_MARK):].split("_", 2)
             if outside not in beyond or table.ndim != 1 or table.size < 2:
                 continue
             end = table[-1] + (table[-1] - table[-2] if interpolation == "previous" else 0.0)
             slack = 1e-9 * max(abs(table[0]), abs(end), abs(first), abs(last))
-            span = (f"the known input in {function.what}, whose table goes from {named(table[0])} to "
-                    f"{named(table[-1])}, is read at")
+            span = (f"the known input {f'{called!r} ' if called else ''}in {function.what}, whose table goes from "
+                    f"{named(table[0])} to {named(table[-1])}, is read at")
             if np.min(when) < table[0] - slack:
                 beyond[outside].add(f"{span} time {named(np.min(when))}, where its first value holds")
             if np.max(when) > end + slack:
                 beyond[outside].add(f"{span} time {named(np.max(when))}, where its last value holds")
-    remedy = 'Give it values for these times, or say with lfm.Input(..., outside="hold") that they hold.'
+    remedy = ('Give it values for these times, as rows of the data file or with --held-out, or say with '
+              'lfm.Input(..., outside="hold") that they hold.')
     if beyond["error"]:
         raise ValueError(f"{'; '.join(sorted(beyond['error']))}. {remedy}")
     if beyond["warn"]:
@@ -95,10 +100,12 @@ def check_reads(functions: Sequence[Traced], first: float, last: float) -> None:
 
 def reads_inputs(function: Traced) -> bool:
     """Whether a function reads a known input that does not simply hold beyond its table."""
-    return any(function.has(f"{_MARK}{way}_{outside}") for way, outside in _READERS if outside != "hold")
+    return any(function.has(f"{_MARK}{way}_{outside}_") for way in _INTERPOLATIONS for outside in _OUTSIDE
+               if outside != "hold")
 
 
-def _reader(interpolation: str, outside: str) -> Callable[..., jax.Array]:
+@functools.cache
+def _reader(interpolation: str, outside: str, name: str) -> Callable[..., jax.Array]:
     """Return the function that reads a table; its name stands in the jaxprs of what calls it."""
 
     def read(times: jax.Array, values: jax.Array, t: jax.Array) -> jax.Array:
@@ -111,11 +118,10 @@ def _reader(interpolation: str, outside: str) -> Callable[..., jax.Array]:
         fraction = jnp.clip((t - times[left]) / width, 0.0, 1.0)
         return values[left] + fraction * (values[left + 1] - values[left])
 
-    read.__name__ = read.__qualname__ = f"{_MARK}{interpolation}_{outside}"
+    read.__name__ = read.__qualname__ = f"{_MARK}{interpolation}_{outside}_{name}"
     return jax.jit(read)
 
 
 _MARK = "known_input_"
 _INTERPOLATIONS = ("previous", "linear")
 _OUTSIDE = ("warn", "hold", "error")
-_READERS = {(way, outside): _reader(way, outside) for way in _INTERPOLATIONS for outside in _OUTSIDE}

@@ -145,6 +145,15 @@ def trace(what: str, form: str, function: Callable, *arguments: Any) -> Traced:
         said = str(error).split("\n")[0]
         raise TypeError(f"{what} must be made of JAX operations, since it is compiled. {remedy} JAX says: "
                         f"{type(error).__name__}: {said}") from error
+    except (TypeError, IndexError) as error:
+        said = str(error).split("\n")[0]
+        if "'Input'" in said:
+            raise TypeError(f"{what} computes with a known input; call it with the time, inputs[...](t). Python says: "
+                            f"{said}") from error
+        if "array is 0-dimensional" in said:
+            raise TypeError(f"{what} takes an entry of a number. Its arguments are {form}, in this order, and t is a "
+                            f"number. JAX says: {said}") from error
+        raise
     return Traced(what, shape, closed)
 
 

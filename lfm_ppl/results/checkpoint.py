@@ -35,9 +35,8 @@ from lfm_ppl.engine import lock
 from lfm_ppl.engine.lock import FolderLock
 from lfm_ppl.inference.sampling import Saved
 from lfm_ppl.results import arviz_data
-from lfm_ppl.results.files import POSTERIOR, writing
+from lfm_ppl.results.files import CHECKPOINT, POSTERIOR, writing
 
-FOLDER = "checkpoint"
 _RUN, _SETUP, _STATE = "run.json", "setup.json", "state.npz"
 
 _SHOWN = 6
@@ -63,7 +62,7 @@ class Checkpoint:
         self.folder = folder
         self.record: dict[str, Any] = {}
         self.look = _no_look
-        self._own = folder / FOLDER
+        self._own = folder / CHECKPOINT
         self._lock: FolderLock | None = None
         self._written = 0
         self._saved = self._looked = time.perf_counter()
@@ -391,7 +390,7 @@ def check_folder(folder: str | Path, resume: bool, overwrite: bool) -> None:
 
 def is_kept(folder: str | Path) -> bool:
     """Whether there is an unfinished run in this folder."""
-    return (Path(folder) / FOLDER / _RUN).is_file()
+    return (Path(folder) / CHECKPOINT / _RUN).is_file()
 
 
 def is_finished(folder: str | Path) -> bool:
@@ -401,7 +400,7 @@ def is_finished(folder: str | Path) -> bool:
 
 def forget(folder: str | Path) -> None:
     """Remove what is kept in a folder, and the folder where it holds nothing else."""
-    shutil.rmtree(Path(folder) / FOLDER, ignore_errors=True)
+    shutil.rmtree(Path(folder) / CHECKPOINT, ignore_errors=True)
     with contextlib.suppress(OSError):  # raised where it is not empty
         Path(folder).rmdir()
 

@@ -11,6 +11,9 @@ from pathlib import Path
 POSTERIOR = "posterior.nc"
 """The result in a folder that `lfm-ppl fit` wrote."""
 
+CHECKPOINT = "checkpoint"
+"""Beside it, the folder of a run that is not finished: the state of the chains and their draws."""
+
 
 def locate(path: str | Path) -> Path:
     """Return the file of a result: ``path`` itself, or the ``posterior.nc`` in it where it is a folder.
@@ -21,6 +24,9 @@ def locate(path: str | Path) -> Path:
     path = Path(path)
     if path.is_dir():
         if not (path / POSTERIOR).is_file():
+            if (path / CHECKPOINT).is_dir():
+                raise FileNotFoundError(f"{path} holds a run that is not finished and has no draws yet; go on with it: "
+                                        "the command that began it, with --resume.")
             raise FileNotFoundError(f"{path} holds no {POSTERIOR}; expected a folder that `lfm-ppl fit` wrote, or a "
                                     "netCDF file.")
         return path / POSTERIOR

@@ -150,7 +150,8 @@ def _model(attrs: Mapping[str, Any], description: str) -> str:
         "The model has no docstring; what stands in one would be shown here.", "note"))
     if assumed := json.loads(str(attrs.get(ASSUMPTIONS, "{}"))):
         shown += web_page.heading("Assumptions") + web_page.facts(list(assumed.items())) + web_page.paragraph(
-            "Numbers that depend on parameters are those near the prior medians.", "note")
+            "Numbers that depend on parameters are those of one set of values typical of the prior, not of the "
+            "posterior.", "note")
     priors = json.loads(str(attrs.get(PRIORS, "{}")))
     if not priors:
         return shown

@@ -168,3 +168,10 @@ def test_compiled_code_says_what_is_known():
         jax.jit(traced)(LINE)
     with pytest.warns(UserWarning, match="is read at time 3"):
         jax.jit(lambda p: lfm.MarginalLikelihood(pushed(lambda x, u, t: LINE(t) - p * x), ROWS).event_shape[0] * p)(1.0)
+
+
+def test_a_warning_names_the_input():
+    heater = lfm.Input([0.0, 1.0, 2.0], [0.0, 5.0, 1.0], "linear", name="the_heater")
+    model = pushed(lambda x, u, t: heater(t) - x)
+    with pytest.warns(UserWarning, match="the known input 'the_heater' in dynamics, whose table goes from 0 to 2, is"):
+        lfm.filter(model, ROWS, np.full((4, 1), 0.3), steps=1)

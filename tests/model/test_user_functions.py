@@ -51,6 +51,15 @@ def test_indices_out_of_range(function, message):
         check(function)
 
 
+@pytest.mark.parametrize("dynamics, message", [
+    (lambda x, u, t: -x + lfm.Input([0.0, 1.0], [1.0, 2.0]), r"dynamics computes with a known input; call it with the"),
+    (lambda t, x, u: -x[0] * t[0] * jnp.ones(2) + u[0], r"Its arguments are .*x, u, t.*, in this order"),
+])
+def test_python_errors_say_what_to_write(dynamics, message):
+    with pytest.raises(TypeError, match=message):
+        make(dynamics)
+
+
 @pytest.mark.parametrize("function", [
     lambda x: x[0] + x[-1] + x[-3] + x[2] + x[1:9].sum() + x[5:].sum(),
     lambda x: x[jnp.array([0, -1, 2])] + x[np.array([1, -3])].sum(),

@@ -23,7 +23,7 @@ from lfm_ppl.results.scalars import unit_of
 MAX_PANELS = 12
 _MANY = 150  # measurements
 _BARS = 12  # forecasts from which they are drawn as bands
-_END: dict[str, Any] = {"color": style.GREY, "lw": 0.8, "ls": (0, (1, 2)), "zorder": 0.5}
+_END: dict[str, Any] = {"color": style.GREY, "lw": 0.8, "ls": (0, (1, 2)), "zorder": 2.5}
 _TRUTH: dict[str, Any] = {"color": style.BLACK, "lw": 0.9, "ls": (0, (4, 2)), "zorder": 3.5}
 _HELD_OUT: dict[str, Any] = {"color": style.BLACK, "ls": "", "marker": "o", "ms": 2.6, "mfc": "white", "mew": 0.6,
                              "zorder": 4}
