@@ -73,6 +73,9 @@ _NEAR = 0.5
 _HOPELESS = 3
 """Sweeps without any cavities from which on the first sites count for nothing."""
 
+_PATIENCE = 12
+"""Sweeps after which less and less of each new site is taken while changes are large."""
+
 _STUCK = 1e-4
 """Share of a move below which there is no way on."""
 
@@ -540,18 +543,32 @@ def _smoothed(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, st
 def _joint_sweeps(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, terms: EntryTerms,
                   settings: SiteSettings, start: Moments,
                   first: Sites | Callable[..., Sites]) -> tuple[Sites, Points]:
+    # A sweep in which an entry has no cavity tells nothing.
     def sweep(sites: Sites | Callable[..., Sites], points: Points | None) -> tuple[Sites, Points]:
         passed, smoothed, predictor = _smoothed(ssm, rule, grid, y, start, sites, points, "inside")
         used = Sites(*(at_intervals(a, grid.observed) for a in passed.site_terms.sites))
         at = cavities(predictor, used, terms.present, settings.power)
-        return (new_sites(terms, used, at, settings, settings.damping, rough=True)[0],
-                smoothed_points(ssm, rule, grid, passed, smoothed, start))
+        new = new_sites(terms, used, at, settings, settings.damping, rough=True)[0]
+        found = smoothed_points(ssm, rule, grid, passed, smoothed, start)
+        whole = _is_whole(predictor, at)
+        choose = lambda a, b: jax.tree_util.tree_map(functools.partial(jnp.where, whole), a, b)  # noqa: E731
+        return choose(new, _that_leave_cavities(used)), found if points is None else choose(found, points)
 
     carry, more = sweep(first, None), max(settings.relinearisations - 1, 0)
     if more == 1:
         # Of the last sites nothing needs the derivative, which a loop would take.
         return sweep(*carry)
     return jax.lax.scan(lambda carry, _: (sweep(*carry), None), carry, None, length=more)[0]
+
+
+def _is_whole(predictor: Predictor, at: Cavity) -> jax.Array:
+    """Whether a sweep has all that it should."""
+    return jnp.isfinite(predictor.mean).all() & jnp.isfinite(predictor.covariance).all() & at.valid.all()
+
+
+def _that_leave_cavities(sites: Sites) -> Sites:
+    """Return the sites of positive precision alone, under which every entry has a cavity."""
+    return sites._replace(nu=jnp.where(sites.tau > 0, sites.nu, 0.0), tau=jnp.maximum(sites.tau, 0.0))
 
 
 class _Loop(NamedTuple):
@@ -601,8 +618,7 @@ def _until_converged(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, settings:
         predictor = _smoothed(ssm, rule, grid, y, start, sites, points, "all", transitions)[2]
         at = cavities(predictor, sites, terms.present, settings.power)
         new, change, log_partition = new_sites(terms, sites, at, settings, 1.0, rough)
-        whole = jnp.isfinite(predictor.mean).all() & jnp.isfinite(predictor.covariance).all() & at.valid.all()
-        change = jnp.where(whole, change, jnp.inf)
+        change = jnp.where(_is_whole(predictor, at), change, jnp.inf)
         good = jnp.isfinite(change)
         here = jnp.stack([sites.nu, sites.tau])
         move = jnp.stack([new.nu, new.tau]) - here
@@ -610,6 +626,8 @@ def _until_converged(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, settings:
         grown = larger & ~switched & (loop.sweeps >= early)
         share = jnp.where(grown, jnp.maximum(0.5 * loop.share, 0.05), jnp.minimum(1.5 * loop.share, settings.damping))
         share = jnp.where(good, share, 0.5 * loop.share)
+        # Sites that go on answering each other are given less and less of a say.
+        share = jnp.where(change < _NEAR, share, jnp.minimum(share, _PATIENCE / (1 + loop.sweeps)))
         # Where that is more than was left, rough sweeps tell nothing of fine ones.
         forget = ~good | grown | (larger & switched) | jnp.isinf(loop.last)
         slot = loop.sweeps % _MEMORY
@@ -633,7 +651,8 @@ def _until_converged(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, settings:
         return ((loop.change >= _tolerance(loop.change)) | (loop.fine == 0)) & (loop.sweeps < settings.sweeps) & (
             loop.share > _STUCK)
 
-    move = jnp.stack([first.nu, first.tau])
+    safe = _that_leave_cavities(first)
+    move = jnp.stack([safe.nu, safe.tau])
     nothing = jnp.zeros((_MEMORY, *move.shape))
     still, infinite, none = jnp.zeros_like(first.nu), jnp.full((), jnp.inf), jnp.zeros((), int)
     no_cavity = Cavity(Marginal(still, still), Marginal(still, still), still > 0, still > 0)
