@@ -543,9 +543,14 @@ def _smoothed(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, st
 def _joint_sweeps(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, terms: EntryTerms,
                   settings: SiteSettings, start: Moments,
                   first: Sites | Callable[..., Sites]) -> tuple[Sites, Points]:
+    whole_intervals = grid.steps == 1 and ssm.stack.jump_table() is None
+
     # A sweep in which an entry has no cavity tells nothing.
     def sweep(sites: Sites | Callable[..., Sites], points: Points | None) -> tuple[Sites, Points]:
-        passed, smoothed, predictor = _smoothed(ssm, rule, grid, y, start, sites, points, "inside")
+        # Without nodes inside of an interval its map is all that is needed of it.
+        maps = transitions_about(ssm, rule, grid, points) if points is not None and whole_intervals else None
+        passed, smoothed, predictor = _smoothed(ssm, rule, grid, y, start, sites, points,
+                                                "inside" if maps is None else "all", maps)
         used = Sites(*(at_intervals(a, grid.observed) for a in passed.site_terms.sites))
         at = cavities(predictor, used, terms.present, settings.power)
         new = new_sites(terms, used, at, settings, settings.damping, rough=True)[0]
