@@ -333,8 +333,8 @@ def log_evidence_terms(terms: Any, sites: Sites, at: Cavity, settings: SiteSetti
     nu, tau = sites.nu, sites.tau
     if settings.method == "ep":
         a = settings.power
-        found = lambda: terms.tilted(at.cavity, at.marginal, a).log_partition  # noqa: E731
-        found = found() if log_partition is None else _of_known_value(found, log_partition)
+        integral = lambda: terms.tilted(at.cavity, at.marginal, a).log_partition  # noqa: E731
+        found = integral() if log_partition is None else _of_known_value(integral, log_partition)
         value = (found - gaussian_terms(sites, at.cavity, a)) / a
     else:
         m, v = at.marginal
@@ -470,21 +470,25 @@ def refine(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, terms
         first: sites to begin with; None, of a model with an observation family: from the prior's marginals in a linear
             model, by `assumed_density` in another.
     """
-    family = ssm.model.observation
-    assert first is not None or isinstance(family, ObservationFamily)
     points = transitions = None
     if is_linear(ssm):
         transitions = transitions_about(ssm, rule, grid, None)
         if first is None:
-            first = _held(lambda *a: _from_prior(ssm, rule, grid, family, *a), y, start, transitions)
+            first = _held(lambda *a: _from_prior(ssm, rule, grid, _family(ssm), *a), y, start, transitions)
     else:
         first, points = _joint_sweeps(ssm, rule, grid, y, terms, settings, start,
-                                      assumed_density(family) if first is None else first)
+                                      assumed_density(_family(ssm)) if first is None else first)
         transitions = transitions_about(ssm, rule, grid, points)
     # The terms hold functions, so that they are closed over, and no argument.
     found = _held(lambda *a: _until_converged(ssm, rule, grid, settings, terms, *a), y, start, first, points,
                   transitions)
     return Refined(found, points, transitions)
+
+
+def _family(ssm: StateSpaceModel) -> ObservationFamily:
+    family = ssm.model.observation
+    assert isinstance(family, ObservationFamily)
+    return family
 
 
 def _held(function: Callable, *arguments: Any) -> Any:
