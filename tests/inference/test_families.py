@@ -118,17 +118,6 @@ def test_random_walks_with_expectation_propagation_are_calibrated():
     assert_uniform(found, bins=4)
 
 
-def test_nuts_with_expectation_propagation_is_calibrated_on_few_data_sets():
-    """A small one: 40 data sets of 6 rows. The mean of 40 uniform ranks is within four of its standard errors."""
-    found = calibration.calibrate(
-        jax.random.key(4), counts, np.arange(6.0),
-        lambda model: NUTS(model, max_tree_depth=3), data_sets=40, draws=15, thin=3, warmup=80)
-    assert_uniform(found, bins=4)
-    for name, rank in found.ranks.items():
-        share = (rank + 0.5) / (found.draws + 1)
-        assert abs(share.mean() - 0.5) < 4 * np.sqrt((1 - 1 / 16**2) / 12 / 40), name
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["Poisson", "Student-t"])
 def test_nuts_with_expectation_propagation_is_calibrated(name, tmp_path):
