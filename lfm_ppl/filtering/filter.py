@@ -22,7 +22,7 @@ from lfm_ppl.filtering.predict import (
     predict_interval,
     unmoved,
 )
-from lfm_ppl.filtering.time_grid import Intervals, TimeGrid, build_time_grid, by_length, with_observations
+from lfm_ppl.filtering.time_grid import Intervals, TimeGrid, as_arrays, build_time_grid, by_length, with_observations
 from lfm_ppl.filtering.transition import IntegratingFactor, LinearPart, constant_jacobian, exact, linear_part
 from lfm_ppl.filtering.update import (
     FACTOR,
@@ -281,6 +281,36 @@ def integrate(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, linear: LinearPa
                                            with_map)
     assert factor is not None
     return predict_interval(ssm, rule, linear, factor, grid.steps, start, length, moments, nodes, with_map, each)
+
+
+def transitions_about(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, points: Points | None) -> Transitions | None:
+    """Return the maps of all intervals of a model that is linearised about fixed points.
+
+    Passes over the same points then integrate nothing.
+
+    Args:
+        ssm: the model.
+        rule: the linearisation rule.
+        grid: the time grid.
+        points: about which it is linearised; None: its dynamics is linear.
+
+    Returns:
+        None where a pass has its transitions at hand, or where the moments decide on its steps.
+    """
+    if ssm.time_invariant or grid.tolerance is not None:
+        return None
+    prepared = preparation(ssm, rule, grid)
+
+    def one(at: tuple[Intervals, Moments | None]) -> Transitions:
+        interval, nodes = at
+        nodes = None if nodes is None else completed(ssm, rule, nodes)
+        begin = jnp.zeros(ssm.state_dim) if nodes is None else nodes.mean[0]
+        found = predict(ssm, rule, grid, prepared, interval, Moments(begin, jnp.zeros((ssm.state_dim,) * 2)), nodes,
+                        with_map=True)
+        return Transitions(begin, found.moments.mean, found.phi, found.process_cov)
+
+    return jax.lax.map(jax.checkpoint(one, prevent_cse=False, policy=_KEPT),
+                       (as_arrays(grid.intervals), None if points is None else points.nodes))
 
 
 def forward(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, *, start: Moments | None = None,

@@ -26,6 +26,7 @@ Source: Minka (2001), A family of algorithms for approximate Bayesian inference;
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
@@ -33,10 +34,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
 from jax.scipy.special import ndtri
 
 from lfm_ppl import checks
-from lfm_ppl.filtering.filter import Pass, Points, at_intervals, forward
+from lfm_ppl.filtering.filter import Pass, Points, Transitions, at_intervals, forward, transitions_about
 from lfm_ppl.filtering.iterated import smoothed_points
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.quadrature import Marginal, Tilted, expectation, expectations, tilted_moments
@@ -53,20 +55,26 @@ METHODS = ("ep", "variational", "laplace")
 _TOLERANCE = 1e-8
 """Largest change of a site that is left, in units of the marginal (nu times its sd, tau times its variance)."""
 
-_SEARCH = 12
-"""Steps of the search for the mode of a tilted distribution."""
+_SEARCH, _ALWAYS, _FOUND = 12, 3, 0.1
+"""Most and least steps of the search for the mode of a tilted distribution, and its last one in standard deviations."""
 
 _MEMORY = 3
 """Sweeps whose steps are remembered; more do not save sweeps."""
 
-_ROUGH, _ROUGH_SWEEPS = 0.05, 4
-"""Change above which the first sweeps are rough, and how many of them may be."""
+_ROUGH, _ROUGH_SWEEPS = 5e-8, 12
+"""Change left above which the first sweeps are rough, and how many of them may be."""
+
+_EARLY = 4
+"""First sweeps of sites, in which changes may grow."""
 
 _NEAR = 0.5
 """Largest change from which on steps are those of a map that is nearly linear."""
 
 _HOPELESS = 3
 """Sweeps without any cavities from which on the first sites count for nothing."""
+
+_PATIENCE = 12
+"""Sweeps after which less and less of each new site is taken while changes are large."""
 
 _STUCK = 1e-4
 """Share of a move below which there is no way on."""
@@ -158,8 +166,9 @@ class FamilyTerms(eqx.Module):
         return jax.vmap(lambda row, f, y: row_log_prob(self.family, row, f, y))(jnp.arange(len(f)), f, self.y)
 
     def tilted(self, cavity: Marginal, near: Marginal, power: float, rough: bool = False) -> Tilted:
-        """Return the tilted moments by quadrature; to some percent where ``rough``, in a third of the time."""
-        return tilted_moments(lambda f: power * self.log_prob(f), cavity, near, rough)
+        """Return the tilted moments by quadrature, in half of the time where ``rough``."""
+        # The integral does not depend on where its nodes lie.
+        return tilted_moments(lambda f: power * self.log_prob(f), cavity, jax.lax.stop_gradient(near), rough)
 
 
 def row_log_prob(family: ObservationFamily, row: Any, f: jax.Array, y: jax.Array) -> jax.Array:
@@ -191,6 +200,7 @@ class Converged(NamedTuple):
     Attributes:
         sites: (T, D) each.
         cavity: of the last sweep.
+        log_partition: (T, D), log int q_-i p_i^a of expectation propagation with these cavities.
         change: largest change of a site that is left, as the last two sweeps tell.
         sweeps: how many were made.
         converged: whether that is below 1e-8 and every cavity valid.
@@ -198,6 +208,7 @@ class Converged(NamedTuple):
 
     sites: Sites
     cavity: Cavity
+    log_partition: jax.Array
     change: jax.Array
     sweeps: jax.Array
     converged: jax.Array
@@ -209,10 +220,12 @@ class Refined(NamedTuple):
     Attributes:
         found: where the sweeps ended; fixed numbers for a derivative.
         points: about which the model is linearised; None for a linear model.
+        transitions: of the intervals, linearised about them; None where a pass has its own.
     """
 
     found: Converged
     points: Points | None
+    transitions: Transitions | None
 
 
 # --- one sweep
@@ -249,9 +262,11 @@ def cavities(predictor: Predictor, sites: Sites, present: jax.Array, power: floa
     return Cavity(cavity, marginal, valid | ~present, known)
 
 
-def _ep(terms: EntryTerms, sites: Sites, at: Cavity, power: float, rough: Any = None) -> tuple[jax.Array, jax.Array]:
-    if rough is None or not isinstance(terms, FamilyTerms):
+def _ep(terms: EntryTerms, sites: Sites, at: Cavity, power: float, rough: Any = False) -> tuple:
+    if not isinstance(terms, FamilyTerms):
         found = terms.tilted(at.cavity, at.marginal, power)
+    elif isinstance(rough, bool):
+        found = terms.tilted(at.cavity, at.marginal, power, rough)
     else:
         found = jax.lax.cond(rough, lambda at: terms.tilted(at.cavity, at.marginal, power, True),
                              lambda at: terms.tilted(at.cavity, at.marginal, power), at)
@@ -260,32 +275,32 @@ def _ep(terms: EntryTerms, sites: Sites, at: Cavity, power: float, rough: Any = 
     found = found._replace(variance=variance)
     c, v = at.cavity.mean - sites.centre, at.cavity.variance
     nu = ((found.mean - sites.centre) / found.variance - c / v) / power
-    return nu, (1.0 / found.variance - 1.0 / v) / power
+    return nu, (1.0 / found.variance - 1.0 / v) / power, found.log_partition
 
 
-def _variational(terms: Any, sites: Sites, at: Cavity, power: float, rough: Any = None) -> tuple[jax.Array, jax.Array]:
+def _variational(terms: Any, sites: Sites, at: Cavity, power: float, rough: Any = False) -> tuple:
     _, by_mean, by_variance = expectations(terms.log_prob, at.marginal)
     tau = -2.0 * by_variance
-    return by_mean + tau * (at.marginal.mean - sites.centre), tau
+    return by_mean + tau * (at.marginal.mean - sites.centre), tau, jnp.zeros_like(tau)
 
 
-def _laplace(terms: Any, sites: Sites, at: Cavity, power: float, rough: Any = None) -> tuple[jax.Array, jax.Array]:
+def _laplace(terms: Any, sites: Sites, at: Cavity, power: float, rough: Any = False) -> tuple:
     m = at.marginal.mean
     first = jax.grad(lambda f: terms.log_prob(f).sum())
     slope, curvature = jax.jvp(first, (m,), (jnp.ones_like(m),))
-    return slope - curvature * (m - sites.centre), -curvature
+    return slope - curvature * (m - sites.centre), -curvature, jnp.zeros_like(m)
 
 
 _NEW_SITES: dict[str, Callable] = {"ep": _ep, "variational": _variational, "laplace": _laplace}
 
 
 def new_sites(terms: EntryTerms, sites: Sites, at: Cavity, settings: SiteSettings,
-              damping: Any, rough: Any = None) -> tuple[Sites, jax.Array]:
-    """Return damped new sites, and the largest change of one; where a cavity is not valid its site is kept.
+              damping: Any, rough: Any = False) -> tuple[Sites, jax.Array, jax.Array]:
+    """Return damped new sites, the largest change of one, and what EP has of log Z_i; without a cavity a site is kept.
 
     Those of expectation propagation may be ``rough``.
     """
-    nu, tau = _NEW_SITES[settings.method](terms, sites, at, settings.power, rough)
+    nu, tau, log_partition = _NEW_SITES[settings.method](terms, sites, at, settings.power, rough)
     nu, tau = (jnp.where(at.known, 0.0, new) for new in (nu, tau))
     usable = terms.present & at.valid & jnp.isfinite(nu) & jnp.isfinite(tau)
     nu, tau = (jnp.where(usable, new, old) for new, old in ((nu, sites.nu), (tau, sites.tau)))
@@ -293,7 +308,7 @@ def new_sites(terms: EntryTerms, sites: Sites, at: Cavity, settings: SiteSetting
     change = jnp.maximum(jnp.abs(nu - sites.nu) * jnp.sqrt(v), jnp.abs(tau - sites.tau) * v)
     change = jnp.max(jnp.where(usable | ~terms.present, change, jnp.inf), initial=0.0)
     mix = lambda old, new: old + damping * (new - old)  # noqa: E731
-    return sites._replace(nu=mix(sites.nu, nu), tau=mix(sites.tau, tau)), change
+    return sites._replace(nu=mix(sites.nu, nu), tau=mix(sites.tau, tau)), change, log_partition
 
 
 def gaussian_terms(sites: Sites, cavity: Marginal, power: float) -> jax.Array:
@@ -304,12 +319,23 @@ def gaussian_terms(sites: Sites, cavity: Marginal, power: float) -> jax.Array:
     return ((nu - 0.5 * tau * away) * away - 0.5 * jnp.log(grown) + 0.5 * (nu - tau * away) ** 2 * v / grown)
 
 
-def log_evidence_terms(terms: Any, sites: Sites, at: Cavity, settings: SiteSettings) -> jax.Array:
-    """Return what each entry (T, D) adds to the integral of all sites, zero where missing."""
+def log_evidence_terms(terms: Any, sites: Sites, at: Cavity, settings: SiteSettings,
+                       log_partition: jax.Array | None = None) -> jax.Array:
+    """Return what each entry (T, D) adds to the integral of all sites, zero where missing.
+
+    Args:
+        terms: what the sites stand for.
+        sites: (T, D) each.
+        at: their cavities, which have no derivative where ``log_partition`` is given.
+        settings: of the sites.
+        log_partition: (T, D), that of EP's cavities where it is known.
+    """
     nu, tau = sites.nu, sites.tau
     if settings.method == "ep":
         a = settings.power
-        value = (terms.tilted(at.cavity, at.marginal, a).log_partition - gaussian_terms(sites, at.cavity, a)) / a
+        integral = lambda: terms.tilted(at.cavity, at.marginal, a).log_partition  # noqa: E731
+        found = integral() if log_partition is None else _of_known_value(integral, log_partition)
+        value = (found - gaussian_terms(sites, at.cavity, a)) / a
     else:
         m, v = at.marginal
         away = m - sites.centre
@@ -319,6 +345,32 @@ def log_evidence_terms(terms: Any, sites: Sites, at: Cavity, settings: SiteSetti
         else:
             value = terms.log_prob(m) - gaussian
     return jnp.where(terms.present, value, 0.0)
+
+
+def _of_known_value(function: Callable[[], jax.Array], value: jax.Array) -> jax.Array:
+    """Return ``function()``, whose value is known: it is computed for a derivative only, and where it has one."""
+    converted, closed_over = jax.closure_convert(function)
+
+    @jax.custom_jvp
+    def known(value: jax.Array, *closed_over: Any) -> jax.Array:
+        return value
+
+    @functools.partial(known.defjvp, symbolic_zeros=True)
+    def _jvp(primals: tuple, tangents: tuple) -> tuple[jax.Array, jax.Array]:
+        moving = [i for i, tangent in enumerate(tangents[1:]) if not isinstance(tangent, SymbolicZero)]
+        if not moving:
+            return primals[0], jnp.zeros_like(primals[0])
+
+        def of_moving(*values: Any) -> jax.Array:
+            everything = list(primals[1:])
+            for i, one in zip(moving, values, strict=True):
+                everything[i] = one
+            return converted(*everything)
+
+        return primals[0], jax.jvp(of_moving, tuple(primals[1 + i] for i in moving),
+                                   tuple(tangents[1 + i] for i in moving))[1]
+
+    return known(value, *closed_over)
 
 
 # --- first sites
@@ -349,12 +401,15 @@ def assumed_density(family: ObservationFamily) -> Callable[..., Sites]:
 def assumed_tilted(log_prob: Callable, mean: jax.Array, variance: jax.Array) -> tuple[Marginal, Tilted]:
     """Return a prediction of a row's predictor (D,), and the moments of it tilted by log p."""
     cavity = _known(mean, variance)
-    near = _mode(log_prob, cavity)
-    for _ in range(2):
+
+    def about(cavity: Marginal) -> Marginal:
+        near = _mode(log_prob, cavity)
         found = tilted_moments(jax.vmap(log_prob), cavity, near)
         good = jnp.isfinite(found.log_partition) & (found.variance > 0)
-        near = Marginal(jnp.where(good, found.mean, near.mean), jnp.where(good, found.variance, near.variance))
-    return cavity, found
+        return Marginal(jnp.where(good, found.mean, near.mean), jnp.where(good, found.variance, near.variance))
+
+    # The integral does not depend on where its nodes lie.
+    return cavity, tilted_moments(jax.vmap(log_prob), cavity, _held(about, cavity))
 
 
 def _mode(log_prob: Callable, cavity: Marginal) -> Marginal:
@@ -369,18 +424,21 @@ def _mode(log_prob: Callable, cavity: Marginal) -> Marginal:
         curvature = jnp.where(jnp.isfinite(curvature), jnp.minimum(curvature, 0.0), 0.0)
         return slope, 1.0 / cavity.variance - curvature
 
-    def step(carry: tuple, _: None) -> tuple[tuple, None]:
-        f, value, radius = carry
+    def step(carry: tuple) -> tuple:
+        f, value, radius, _, count = carry
         slope, total = precision(f)
         move = (slope - (f - cavity.mean) / cavity.variance) / total
-        tried = f + jnp.clip(jnp.where(jnp.isfinite(move), move, 0.0), -radius, radius)
+        move = jnp.where(jnp.isfinite(move), move, 0.0)
+        tried = f + jnp.clip(move, -radius, radius)
         new = objective(tried)
         better = new > value
         return (jnp.where(better, tried, f), jnp.where(better, new, value),
-                jnp.where(better, 3.0 * radius, 0.25 * radius)), None
+                jnp.where(better, 3.0 * radius, 0.25 * radius), (move**2 * total > _FOUND**2).any(), count + 1)
 
-    start = cavity.mean, objective(cavity.mean), 4.0 * jnp.sqrt(cavity.variance)
-    (f, _, _), _ = jax.lax.scan(step, start, None, length=_SEARCH)
+    start = (cavity.mean, objective(cavity.mean), 4.0 * jnp.sqrt(cavity.variance), jnp.array(True),
+             jnp.zeros((), int))
+    carry = functools.reduce(lambda carry, _: step(carry), range(_ALWAYS), start)  # a loop costs more than its steps
+    f = jax.lax.while_loop(lambda carry: carry[3] & (carry[4] < _SEARCH), step, carry)[0]
     return Marginal(f, 1.0 / precision(f)[1])
 
 
@@ -412,17 +470,25 @@ def refine(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, terms
         first: sites to begin with; None, of a model with an observation family: from the prior's marginals in a linear
             model, by `assumed_density` in another.
     """
-    points = None
-    if first is None:
-        family = ssm.model.observation
-        assert isinstance(family, ObservationFamily)
-        begin = lambda y, start: _first(ssm, rule, grid, y, start, family)  # noqa: E731
-        first = _held(begin, y, start) if is_linear(ssm) else begin(y, start)
-    if not is_linear(ssm):
-        first, points = _joint_sweeps(ssm, rule, grid, y, terms, settings, start, first)
+    points = transitions = None
+    if is_linear(ssm):
+        transitions = transitions_about(ssm, rule, grid, None)
+        if first is None:
+            first = _held(lambda *a: _from_prior(ssm, rule, grid, _family(ssm), *a), y, start, transitions)
+    else:
+        first, points = _joint_sweeps(ssm, rule, grid, y, terms, settings, start,
+                                      assumed_density(_family(ssm)) if first is None else first)
+        transitions = transitions_about(ssm, rule, grid, points)
     # The terms hold functions, so that they are closed over, and no argument.
-    found = _held(lambda *a: _until_converged(ssm, rule, grid, settings, terms, *a), y, start, first, points)
-    return Refined(found, points)
+    found = _held(lambda *a: _until_converged(ssm, rule, grid, settings, terms, *a), y, start, first, points,
+                  transitions)
+    return Refined(found, points, transitions)
+
+
+def _family(ssm: StateSpaceModel) -> ObservationFamily:
+    family = ssm.model.observation
+    assert isinstance(family, ObservationFamily)
+    return family
 
 
 def _held(function: Callable, *arguments: Any) -> Any:
@@ -436,16 +502,8 @@ def _stop(leaf: Any) -> Any:
     return jax.lax.stop_gradient(leaf) if isinstance(leaf, (jax.Array, np.ndarray)) else leaf
 
 
-def _first(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments,
-           family: ObservationFamily) -> Sites:
-    if is_linear(ssm):
-        return _from_prior(ssm, rule, grid, y, start, family)
-    passed = forward(ssm, rule, grid, y, start=start, keep="moments", sites=assumed_density(family))
-    return Sites(*(at_intervals(a, grid.observed) for a in passed.site_terms.sites))
-
-
-def _from_prior(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments,
-                family: ObservationFamily) -> Sites:
+def _from_prior(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, family: ObservationFamily, y: jax.Array,
+                start: Moments, transitions: Transitions | None) -> Sites:
     """Return sites with the moments of the prior's marginals times the data's factors.
 
     All at once, which is faster than one after the other in the scan; in a model that is not linear the prior may run
@@ -453,7 +511,7 @@ def _from_prior(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, 
     """
     nothing = jnp.zeros_like(y)
     passed = forward(ssm, rule, grid, jnp.full(y.shape, jnp.nan), start=start, keep="moments",
-                     sites=Sites(nothing, nothing, nothing))
+                     sites=Sites(nothing, nothing, nothing), transitions=transitions)
     at = passed.site_terms
     mean, variance = at_intervals(at.value, grid.observed), at_intervals(diagonal(at.variance), grid.observed)
     cavity = _known(mean, variance)
@@ -475,9 +533,11 @@ def _known(mean: jax.Array, variance: jax.Array) -> Marginal:
     return Marginal(mean, jnp.maximum(variance, 1e-20 * (1e-6 + mean**2)))
 
 
-def _smoothed(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments, sites: Sites,
-              points: Points | None, keep: str) -> tuple[Pass, Smoothed, Predictor]:
-    passed = forward(ssm, rule, grid, y, start=start, linearization_point=points, keep=keep, sites=sites)
+def _smoothed(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments,
+              sites: Sites | Callable[..., Sites], points: Points | None, keep: str,
+              transitions: Transitions | None = None) -> tuple[Pass, Smoothed, Predictor]:
+    passed = forward(ssm, rule, grid, y, start=start, linearization_point=points, keep=keep, sites=sites,
+                     transitions=transitions)
     smoothed = backward(passed, start, grid, moments=False)
     assert smoothed.predictor is not None
     predictor = Predictor(*(at_intervals(a, grid.observed) for a in smoothed.predictor))
@@ -485,17 +545,39 @@ def _smoothed(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, st
 
 
 def _joint_sweeps(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, terms: EntryTerms,
-                  settings: SiteSettings, start: Moments, first: Sites) -> tuple[Sites, Points]:
-    def sweep(sites: Sites, points: Points | None) -> tuple[Sites, Points]:
-        passed, smoothed, predictor = _smoothed(ssm, rule, grid, y, start, sites, points, "inside")
-        at = cavities(predictor, sites, terms.present, settings.power)
-        sites, _ = new_sites(terms, sites, at, settings, settings.damping)
-        return sites, smoothed_points(ssm, rule, grid, passed, smoothed, start)
+                  settings: SiteSettings, start: Moments,
+                  first: Sites | Callable[..., Sites]) -> tuple[Sites, Points]:
+    whole_intervals = grid.steps == 1 and ssm.stack.jump_table() is None
 
-    carry = sweep(first, None)
-    (sites, points), _ = jax.lax.scan(lambda carry, _: (sweep(*carry), None), carry, None,
-                                      length=max(settings.relinearisations - 1, 0))
-    return sites, points
+    # A sweep in which an entry has no cavity tells nothing.
+    def sweep(sites: Sites | Callable[..., Sites], points: Points | None) -> tuple[Sites, Points]:
+        # Without nodes inside of an interval its map is all that is needed of it.
+        maps = transitions_about(ssm, rule, grid, points) if points is not None and whole_intervals else None
+        passed, smoothed, predictor = _smoothed(ssm, rule, grid, y, start, sites, points,
+                                                "inside" if maps is None else "all", maps)
+        used = Sites(*(at_intervals(a, grid.observed) for a in passed.site_terms.sites))
+        at = cavities(predictor, used, terms.present, settings.power)
+        new = new_sites(terms, used, at, settings, settings.damping, rough=True)[0]
+        found = smoothed_points(ssm, rule, grid, passed, smoothed, start)
+        whole = _is_whole(predictor, at)
+        choose = lambda a, b: jax.tree_util.tree_map(functools.partial(jnp.where, whole), a, b)  # noqa: E731
+        return choose(new, _that_leave_cavities(used)), found if points is None else choose(found, points)
+
+    carry, more = sweep(first, None), max(settings.relinearisations - 1, 0)
+    if more == 1:
+        # Of the last sites nothing needs the derivative, which a loop would take.
+        return sweep(*carry)
+    return jax.lax.scan(lambda carry, _: (sweep(*carry), None), carry, None, length=more)[0]
+
+
+def _is_whole(predictor: Predictor, at: Cavity) -> jax.Array:
+    """Whether a sweep has all that it should."""
+    return jnp.isfinite(predictor.mean).all() & jnp.isfinite(predictor.covariance).all() & at.valid.all()
+
+
+def _that_leave_cavities(sites: Sites) -> Sites:
+    """Return the sites of positive precision alone, under which every entry has a cavity."""
+    return sites._replace(nu=jnp.where(sites.tau > 0, sites.nu, 0.0), tau=jnp.maximum(sites.tau, 0.0))
 
 
 class _Loop(NamedTuple):
@@ -508,7 +590,7 @@ class _Loop(NamedTuple):
         share: of a move that is taken.
         steps, changes: (_MEMORY, 2, T, D), the latest steps between such sites, and what they changed of ``move``;
             zero where there is none.
-        cavity: of the last sweep.
+        cavity, log_partition: of the last sweep.
         change: largest change of a site that is left after it; infinite where an entry had no cavity.
         last: largest change of a site in the sweep from ``base``.
         sweeps: how many were made.
@@ -522,6 +604,7 @@ class _Loop(NamedTuple):
     steps: jax.Array
     changes: jax.Array
     cavity: Any
+    log_partition: jax.Array
     change: jax.Array
     last: jax.Array
     sweeps: jax.Array
@@ -529,7 +612,8 @@ class _Loop(NamedTuple):
 
 
 def _until_converged(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, settings: SiteSettings, terms: EntryTerms,
-                     y: jax.Array, start: Moments, first: Sites, points: Points | None) -> Converged:
+                     y: jax.Array, start: Moments, first: Sites, points: Points | None,
+                     transitions: Transitions | None) -> Converged:
     """Sweep until the sites do not change, faster by what the last sweeps tell of the next (Anderson's mixing).
 
     Sites that leave an entry without a cavity are halfway too far from the last good ones. Where changes grow, two
@@ -539,23 +623,27 @@ def _until_converged(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, settings:
     """
 
     def sweep(loop: _Loop) -> _Loop:
-        sites, rough = loop.sites, (loop.fine == 0) & (loop.last > _ROUGH) & (loop.sweeps < _ROUGH_SWEEPS)
-        _, _, predictor = _smoothed(ssm, rule, grid, y, start, sites, points, "all")
+        sites, rough = loop.sites, (loop.fine == 0) & (loop.change > _ROUGH) & (loop.sweeps < _ROUGH_SWEEPS)
+        predictor = _smoothed(ssm, rule, grid, y, start, sites, points, "all", transitions)[2]
         at = cavities(predictor, sites, terms.present, settings.power)
-        new, change = new_sites(terms, sites, at, settings, 1.0, rough)
-        whole = jnp.isfinite(predictor.mean).all() & jnp.isfinite(predictor.covariance).all() & at.valid.all()
-        change = jnp.where(whole, change, jnp.inf)
+        new, change, log_partition = new_sites(terms, sites, at, settings, 1.0, rough)
+        change = jnp.where(_is_whole(predictor, at), change, jnp.inf)
         good = jnp.isfinite(change)
         here = jnp.stack([sites.nu, sites.tau])
         move = jnp.stack([new.nu, new.tau]) - here
-        grown = (change > loop.last) & (loop.fine > 0)
+        larger, switched = change > loop.last, ~rough & (loop.fine == 0)
+        grown = larger & ~switched & (loop.sweeps >= early)
         share = jnp.where(grown, jnp.maximum(0.5 * loop.share, 0.05), jnp.minimum(1.5 * loop.share, settings.damping))
         share = jnp.where(good, share, 0.5 * loop.share)
-        # Rough sweeps tell nothing of fine ones.
-        forget = ~good | grown | (loop.fine == 0) | jnp.isinf(loop.last)
+        # Sites that go on answering each other are given less and less of a say.
+        share = jnp.where(change < _NEAR, share, jnp.minimum(share, _PATIENCE / (1 + loop.sweeps)))
+        # Where that is more than was left, rough sweeps tell nothing of fine ones.
+        forget = ~good | grown | (larger & switched) | jnp.isinf(loop.last)
         slot = loop.sweeps % _MEMORY
         steps = jnp.where(forget, 0.0, loop.steps.at[slot].set(here - loop.base))
         changes = jnp.where(forget, 0.0, loop.changes.at[slot].set(move - loop.move))
+        # The barrier keeps XLA from computing both again in each of their products.
+        steps, changes = jax.lax.optimization_barrier((steps, changes))
         mixed = _mixed(move, steps, changes, share, at.marginal.variance)
         base, move = (jnp.where(good, a, b) for a, b in ((here, loop.base), (move, loop.move)))
         # First sites that are far off: those of a sweep from no sites at all instead.
@@ -564,24 +652,26 @@ def _until_converged(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, settings:
         nu, tau = base + jnp.where(anew, 0.0, jnp.where(good & (change < _NEAR), mixed, share * move))
         # What is left to go after this step, if it shortens the way as the last one did.
         shortened = jnp.where(forget, 1.0, jnp.clip(change / loop.last, 0.1, 1.0))
-        return _Loop(sites._replace(nu=nu, tau=tau), base, move, share, steps, changes, at, shortened * change,
+        return _Loop(sites._replace(nu=nu, tau=tau), base, move, share, steps, changes, at, log_partition,
+                     shortened * change,
                      jnp.where(good, change, loop.last), loop.sweeps + 1, loop.fine + ~rough)
 
     def going(loop: _Loop) -> jax.Array:
         return ((loop.change >= _tolerance(loop.change)) | (loop.fine == 0)) & (loop.sweeps < settings.sweeps) & (
             loop.share > _STUCK)
 
-    move = jnp.stack([first.nu, first.tau])
+    safe = _that_leave_cavities(first)
+    move = jnp.stack([safe.nu, safe.tau])
     nothing = jnp.zeros((_MEMORY, *move.shape))
     still, infinite, none = jnp.zeros_like(first.nu), jnp.full((), jnp.inf), jnp.zeros((), int)
     no_cavity = Cavity(Marginal(still, still), Marginal(still, still), still > 0, still > 0)
     # Points of linearisation are known from sweeps of the same sites.
-    fine = none if points is None else none + 1
-    loop = _Loop(first, jnp.zeros_like(move), move, jnp.asarray(settings.damping), nothing, nothing, no_cavity,
-                 infinite, infinite, none, fine)
+    early = _EARLY if points is None else 1
+    loop = _Loop(first, jnp.zeros_like(move), move, jnp.asarray(settings.damping), nothing, nothing, no_cavity, still,
+                 infinite, infinite, none, none)
     loop = jax.lax.while_loop(going, sweep, loop)
     converged = (loop.change < _tolerance(loop.change)) & (loop.fine > 0)
-    return Converged(loop.sites, loop.cavity, loop.change, loop.sweeps, converged)
+    return Converged(loop.sites, loop.cavity, loop.log_partition, loop.change, loop.sweeps, converged)
 
 
 def _mixed(move: jax.Array, steps: jax.Array, changes: jax.Array, share: jax.Array, variance: jax.Array) -> jax.Array:
@@ -591,10 +681,11 @@ def _mixed(move: jax.Array, steps: jax.Array, changes: jax.Array, share: jax.Arr
     """
     units = jnp.stack([jnp.sqrt(variance), variance])
     flat = lambda a: a.reshape(*a.shape[:-3], -1)  # noqa: E731
-    weighted = flat(changes * units)
-    gram = matmul(weighted, weighted.T)
-    weights = solve_semidefinite(gram, matmul(weighted, flat(move * units)[:, None]), tolerance=1e-10)
-    along = (weights[:, :, None, None] * (steps + share * changes)).sum(0)
+    # The barrier keeps XLA from computing the rows again for each of their products.
+    rows = jax.lax.optimization_barrier(jnp.concatenate([flat(changes), flat(move)[None]]) * flat(units))
+    gram = jax.lax.dot_general(rows, rows, (((1,), (1,)), ((), ())))
+    weights = solve_semidefinite(gram[:-1, :-1], gram[:-1, -1:], tolerance=1e-10)
+    along = matmul(weights.T, flat(steps + share * changes)).reshape(move.shape)
     return share * move - along
 
 
@@ -611,8 +702,8 @@ def _newton_step(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array,
     on where it starts, to first order: what it depends on otherwise the mode depends on.
     """
     found = refined.found
-    sites, _ = new_sites(terms, found.sites, found.cavity, settings, 1.0)
-    predictor = _smoothed(ssm, rule, grid, y, start, sites, refined.points, "all")[2]
+    sites = new_sites(terms, found.sites, found.cavity, settings, 1.0)[0]
+    predictor = _smoothed(ssm, rule, grid, y, start, sites, refined.points, "all", refined.transitions)[2]
     at = cavities(predictor, sites, terms.present, 1.0)
     return new_sites(terms, sites, at, settings, 1.0)[0], at
 
@@ -734,7 +825,8 @@ def evidence(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, ter
     sites, at = found.sites, found.cavity
     if settings.method == "laplace":
         sites, at = _newton_step(ssm, rule, grid, y, terms, settings, start, refined)
-    passed = forward(ssm, rule, grid, y, start=start, linearization_point=refined.points, keep=keep, sites=sites)
-    entries = log_evidence_terms(terms, sites, at, settings)
+    passed = forward(ssm, rule, grid, y, start=start, linearization_point=refined.points, keep=keep, sites=sites,
+                     transitions=None if keep in ("steps", "inside") else refined.transitions)
+    entries = log_evidence_terms(terms, sites, at, settings, found.log_partition)
     total = passed.log_likelihood.sum() + entries.sum()
     return Evidence(jnp.where(found.converged, total, -jnp.inf), entries, passed, refined)
