@@ -19,7 +19,8 @@ import numpy as np
 from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.ballistic import problem
-from lfm_ppl.experiments.ballistic.tracking import blocks, judged
+from lfm_ppl.experiments.ballistic.tracking import judged
+from lfm_ppl.experiments.study import blocks
 from lfm_ppl.experiments.timing import timed
 from lfm_ppl.experiments.weighting import Weighted, moments, weighted
 from lfm_ppl.inference.optimise import Minimum, newton, quasi_newton

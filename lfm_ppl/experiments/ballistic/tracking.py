@@ -12,6 +12,7 @@ import numpy as np
 from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.ballistic import problem
+from lfm_ppl.experiments.study import blocks
 from lfm_ppl.experiments.timing import timed
 from lfm_ppl.filtering.filter import filter as gaussian_filter
 from lfm_ppl.filtering.smoother import smooth
@@ -33,16 +34,6 @@ def tasks(settings: Any) -> list[Task]:
     return [Task(f"tracking/{slug(rule)}/{first:04d}-{last:04d}", settings.seed,
                  {"experiment": "ballistic", "what": "tracking", "method": rule, "first": first, "last": last})
             for rule in settings.rules for first, last in blocks(settings.runs, BLOCK)]
-
-
-def blocks(count: int, size: int) -> list[tuple[int, int]]:
-    """Return first and last index of each block.
-
-    Example:
-        >>> blocks(5, 2)
-        [(0, 1), (2, 3), (4, 4)]
-    """
-    return [(first, min(first + size, count) - 1) for first in range(0, count, size)]
 
 
 def compute(task: Task) -> Result:
