@@ -13,8 +13,9 @@ from scipy.integrate import solve_ivp
 from lfm_ppl.engine.store import write
 from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import scores
+from lfm_ppl.experiments.published import Verdict, summary
 from lfm_ppl.experiments.study import TASKS
-from lfm_ppl.experiments.transcription import ellipses, experiment, figures, problem, slices, tables, verdict
+from lfm_ppl.experiments.transcription import ellipses, experiment, figures, problem, slices, tables
 from lfm_ppl.latent_grid.laplace import laplace
 
 SATURATION, EXPONENTIAL = problem.CONFIGURATIONS[1], problem.CONFIGURATIONS[6]
@@ -217,7 +218,7 @@ def test_the_tables_count_what_was_found():
     (-4.3, "lower than published (z = -4.3)", True), (-31.0, "lower than published (z = -31.0)", True),
     (4.3, "higher than published (z = 4.3)", False), (np.nan, "-", False)])
 def test_a_verdict_is_two_sided_and_lower_is_consistent(z, text, consistent):
-    one = verdict.Verdict(z)
+    one = Verdict(z)
     assert str(one) == text and one.consistent is consistent
     assert one.lower == text.startswith("lower") and one.higher == text.startswith("higher")
 
@@ -239,7 +240,7 @@ def test_each_published_cell_has_its_verdict():
         "higher than published (z = 5.0)", "lower than published (z = -6.0)", "consistent"]
     assert table.loc["repression 1", "ESLS verdict"] == "-"
     assert scores.readable(table).loc["exponential", "ESLS verdict"] == "lower than published (z = -6.0)"
-    assert verdict.summary(tables.verdicts(table).values()) == (
+    assert summary(tables.verdicts(table).values()) == (
         "2 of 3 cells count as consistent with the published table, 1 of them lower than published; 1 higher.")
 
 
@@ -301,7 +302,7 @@ def test_the_report_says_how_many_cells_are_consistent_and_why_lower_ones_are_tr
     experiment.STUDY.save(found, tmp_path)
     assert found.notes == (  # LA has one sound data set alone, ESLS 0.3005 (0.0005) for 0.290, GFS 0.6 for 0.358
         "0 of 2 cells count as consistent with the published table, 0 of them lower than published; 2 higher.",
-        verdict.TRUST)
+        experiment.TRUST)
     assert "higher than published" in (tmp_path / "published.md").read_text()
 
 

@@ -10,7 +10,7 @@ from typing import Any
 from lfm_ppl import checks
 from lfm_ppl.engine.run import Reporter
 from lfm_ppl.engine.task import Task
-from lfm_ppl.experiments import study
+from lfm_ppl.experiments import published, study
 from lfm_ppl.experiments.call_centre import counts, figures, posterior, problem, tables, tracking
 from lfm_ppl.experiments.call_centre.counts import OPEN, OverloadWarning
 from lfm_ppl.experiments.study import Results, Study, Table, setting
@@ -96,7 +96,16 @@ def tabulated(settings: Settings, results: Results) -> dict[str, Table]:
             "learnt": Table("Most likely parameters (medians)", tables.learnt(settings, results))}
 
 
+def notes(settings: Settings, results: Results) -> tuple[str, ...]:
+    """Return how the errors of the queue compare with the published ones, where the counts are those of the source."""
+    if settings.data is None:
+        return ()
+    tests = {"constant": "RMSE of the queue, service rate 10", "changed": "RMSE of the queue, service rate 15, then 5"}
+    return tuple(published.said(what, published.beside(tables.tracked(settings, results, test), "RMSE",
+                                                       "published RMSE")) for test, what in tests.items())
+
+
 KINDS = {"track": tracking.compute, "posterior": posterior.compute, "nuts": posterior.compute_nuts}
 """What the tasks are."""
 
-STUDY = Study(Settings, all_tasks, KINDS, tabulated, figures.draw, label="method", check=check)
+STUDY = Study(Settings, all_tasks, KINDS, tabulated, figures.draw, label="method", notes=notes, check=check)

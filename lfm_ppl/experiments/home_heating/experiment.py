@@ -17,7 +17,7 @@ from jax.scipy.stats import norm
 from lfm_ppl import checks
 from lfm_ppl.engine.run import Reporter
 from lfm_ppl.engine.task import Result, Task
-from lfm_ppl.experiments import scores, study
+from lfm_ppl.experiments import published, scores, study
 from lfm_ppl.experiments.home_heating import figures, learning, prediction, problem, tables
 from lfm_ppl.experiments.study import Results, Study, Table, setting
 
@@ -193,4 +193,12 @@ def tabulated(settings: Settings, results: Results) -> dict[str, Table]:
     return found
 
 
-STUDY = Study(Settings, tasks, compute, tabulated, figures.draw, label="residual")
+def notes(settings: Settings, results: Results) -> tuple[str, ...]:
+    """Return how the errors a day ahead in the real house compare with the published ones, over both of its homes."""
+    shown = tables.every(settings, results)
+    return tuple(published.said(f"RMSE a day ahead, {name.partition('-')[2].replace('-', ' ')}",
+                                published.beside(frame, "RMSE ahead (K)", "published RMSE ahead (K)"))
+                 for name, frame in shown.items() if name.startswith("house-"))
+
+
+STUDY = Study(Settings, tasks, compute, tabulated, figures.draw, label="residual", notes=notes)

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from lfm_ppl.engine.task import Result
-from lfm_ppl.experiments import scores, study
-from lfm_ppl.experiments.scores import Estimate, Z, mean_of, pair
+from lfm_ppl.experiments import chains, study
+from lfm_ppl.experiments.drawing import band, line
+from lfm_ppl.experiments.scores import Z, mean_of, pair
 from lfm_ppl.experiments.study import Results, Study, Table, setting
 from lfm_ppl.experiments.transcription import parameters, problem
 from lfm_ppl.results.plots import style
@@ -64,27 +64,17 @@ def agreement(cells: Mapping[tuple[str, str], list[Result]]) -> pd.DataFrame:
     rows = {}
     for (label, sampler), found in cells.items():
         reference = cells[label, parameters.REFERENCE]
-        pairs = list(zip(found, reference, strict=True))
-        shift = np.stack([(one["mean"] - exact["mean"]) / exact["sd"] for one, exact in pairs])
-        ratio = np.stack([one["sd"] / exact["sd"] for one, exact in pairs])
-        error = np.stack([np.sqrt(1 / one["ess"] + 1 / exact["ess"]) for one, exact in pairs])
-        spread = ratio * np.stack([np.hypot(*(scores.relative_errors_of_sd(which["draws"]) for which in both))
-                                   for both in pairs])
-        worst = np.unravel_index(np.abs(shift).argmax(), shift.shape)
-        with np.errstate(divide="ignore"):
-            widest = np.unravel_index(np.abs(np.log(ratio)).argmax(), ratio.shape)
-        own = sampler == parameters.REFERENCE
-        row = pair("shift", Estimate(float(abs(shift[worst])), np.nan if own else float(error[worst])))
-        row |= pair("sd ratio", Estimate(float(ratio[widest]), np.nan if own else float(spread[widest])))
-        # A chain that does not move has neither; it must not look as if it did.
-        least = [float(np.nan_to_num(one["ess"]).min()) for one in found]
-        r_hat = [float(np.nan_to_num(one["r_hat"], nan=np.inf).max()) for one in found]
+        shift, ratio = chains.agreement(found, reference)
+        if sampler == parameters.REFERENCE:
+            shift, ratio = shift._replace(error=np.nan), ratio._replace(error=np.nan)
+        row = pair("shift", shift) | pair("sd ratio", ratio)
+        least = [chains.least_ess(one) for one in found]
         covered = [np.mean((one["low"] <= one["truth"]) & (one["truth"] <= one["high"])) for one in found]
         for name, values in (("coverage", covered), ("RMSE", [one["rmse"] for one in found]),
                              ("coverage force", [one["coverage"] for one in found]),
                              ("ESS/CPU s", [ess / one["seconds"] for ess, one in zip(least, found, strict=True)])):
             row |= pair(name, mean_of(values))
-        row |= {"least ESS": min(least), "R-hat": max(r_hat),
+        row |= {"least ESS": min(least), "R-hat": max(map(chains.largest_r_hat, found)),
                 "k": float(np.max([one.get("k", np.nan) for one in found])),
                 "divergences": float(np.mean([one["divergences"] for one in found]))}
         rows[f"{label}: {sampler}"] = row
@@ -121,7 +111,7 @@ def plot_posteriors(samplers: Mapping[str, Result], data: problem.DataSet, *, wi
         mean, sd = found["force_mean"], found["force_sd"]
         lower.plot(parameters.AT, mean, color=COLOURS[sampler], ls=LINES[number])
         if sampler == parameters.REFERENCE:
-            lower.fill_between(parameters.AT, mean - Z * sd, mean + Z * sd, color=COLOURS[sampler], alpha=0.3, lw=0)
+            band(lower, parameters.AT, mean, sd, color=COLOURS[sampler], alpha=0.3, label="")
         else:
             for end in (-Z, Z):
                 lower.plot(parameters.AT, mean + end * sd, color=COLOURS[sampler], lw=0.6, ls=LINES[number])
@@ -137,9 +127,8 @@ def plot_posteriors(samplers: Mapping[str, Result], data: problem.DataSet, *, wi
         style.tidy(axes)
     upper.set_xticks(range(len(parameters.NAMES)), parameters.NAMES, rotation=40, ha="right")
     style.legend_above(figure, [
-        *(Line2D([], [], color=COLOURS[sampler], marker=MARKERS[number], ms=2.5, ls=LINES[number], label=sampler)
-          for number, sampler in enumerate(samplers)),
-        Line2D([], [], color=style.BLACK, label="truth")])
+        *(line(sampler, COLOURS[sampler], LINES[number], marker=MARKERS[number], ms=2.5)
+          for number, sampler in enumerate(samplers)), line("truth", style.BLACK)])
     return figure
 
 
