@@ -45,12 +45,12 @@ def plot_homes(settings: Any, results: dict[str, Result], *, store: str | None =
     for method, (upper, lower) in panels.items():
         found = tables.of(results, "homes", store, method)
         low, quarter, middle, upper_quarter, high = found["quantiles"]
-        upper.plot(hours, truth, **_MEASURED)
-        upper.plot(hours, middle, color=style.BLUE, label="predicted", zorder=1.9)
+        upper.plot(hours, middle, color=style.BLUE, label="predicted")
         upper.fill_between(hours, low, high, color=_WIDE, lw=0, label="95% band")
         upper.fill_between(hours, quarter, upper_quarter, color=_NARROW, lw=0, label="50% band")
         upper.step(np.arange(problem.DAY + 1), np.append(*2 * [window.set_points[problem.TRAIN:]])[:problem.DAY + 1],
                    where="post", color=style.GREEN, lw=0.8, label="set point")
+        upper.plot(hours, truth, **_MEASURED)
         _score(upper, method, found["rmse"][0], found["ell"][0])
         lower.fill_between(hours, heater, step="post", color="#D0D0D0", lw=0, label="heater on")
         lower.plot(hours, found["on"][0], color=style.VERMILLION, lw=0.8, label="predicted probability")
@@ -71,10 +71,10 @@ def plot_house(settings: Any, results: dict[str, Result], *, store: str | None =
     for method, (upper, lower) in panels.items():
         found = tables.of(results, "house", store, method)
         mean, sd = found["mean"][settings.shown], found["sd"][settings.shown]
-        upper.plot(hours, window.y[problem.TRAIN:, 0], **_MEASURED)
-        upper.plot(hours, mean, color=style.BLUE, label="predicted", zorder=1.9)
+        upper.plot(hours, mean, color=style.BLUE, label="predicted")
         band(upper, hours, mean, sd, color=_WIDE)
         band(upper, hours, mean, sd, color=_NARROW, z=0.6745, label="50% band")
+        upper.plot(hours, window.y[problem.TRAIN:, 0], **_MEASURED)
         _score(upper, method, found["ahead_rmse"][settings.shown], found["ahead_ell"][settings.shown])
         lower.fill_between(hours, window.y[problem.TRAIN:, 2], step="post", color="#D0D0D0", lw=0,
                            label="heating power (100 units)")
