@@ -42,6 +42,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
+import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
@@ -311,6 +312,16 @@ class Study:
 
 def _by_kind(kinds: Mapping[str, Callable[[Task], Result]], task: Task) -> Result:
     return kinds[task.settings["what"]](task)
+
+
+def stacked(rows: Sequence[Result]) -> Result:
+    """Return the results of data sets, one row each, as one result with an array by name, a row for each data set.
+
+    Example:
+        >>> stacked([{"rmse": 1.0}, {"rmse": 2.0}])["rmse"].tolist()
+        [1.0, 2.0]
+    """
+    return {name: np.stack([np.asarray(row[name]) for row in rows]) for name in rows[0]}
 
 
 def blocks(count: int, size: int) -> list[tuple[int, int]]:

@@ -14,6 +14,7 @@ from lfm_ppl.experiments.ballistic import chains, known, problem, tracking
 from lfm_ppl.experiments.ballistic import parameters as estimates
 from lfm_ppl.experiments.ballistic import particles as by_particles
 from lfm_ppl.experiments.scores import Estimate, mean_of, pair, rate_of
+from lfm_ppl.experiments.study import stacked
 
 UNITS = {"altitude": "m", "speed": "m/s", "u": "m/s^2"}
 UNKNOWN = {"most likely parameters": "likely", "parameters integrated out": "posterior"}
@@ -43,7 +44,7 @@ def of_parameters(settings: Any, results: dict[str, Result], drawn: bool = False
 def of_particles(settings: Any, results: dict[str, Result], count: int) -> dict[str, np.ndarray]:
     """Return what a number of particles gives, for the targets that have them."""
     own = [results[task.name] for task in by_particles.tasks(settings) if task.settings["particles"] == count]
-    return {name: np.stack([np.asarray(one[name]) for one in own]) for name in own[0]}
+    return stacked(own)
 
 
 def tracked(settings: Any, results: dict[str, Result]) -> pd.DataFrame:

@@ -19,7 +19,7 @@ from lfm_ppl.engine.run import Reporter
 from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import published, scores, study
 from lfm_ppl.experiments.home_heating import figures, learning, prediction, problem, tables
-from lfm_ppl.experiments.study import Results, Study, Table, setting
+from lfm_ppl.experiments.study import Results, Study, Table, setting, stacked
 
 QUANTILES = (0.025, 0.25, 0.5, 0.75, 0.975)
 RESIDUALS = ("SQM", "matern")
@@ -126,7 +126,7 @@ def _house(task: Task) -> Result:
             mean, sd = prediction.smoothed(*model)(jnp.asarray(z), jnp.asarray(prediction.masked(window.y)),
                                                    window.outdoor)
             shown = {"residual": np.asarray(mean), "residual_sd": np.asarray(sd)}
-    return {**_stacked(rows), **shown}
+    return stacked(rows) | shown
 
 
 def _homes(task: Task) -> Result:
@@ -142,7 +142,7 @@ def _homes(task: Task) -> Result:
         rows.append({**one, "z": z})
         if index == 0:
             first = {"quantiles": np.asarray(found.observed.quantiles(QUANTILES))[:, prediction.SCORED, 0]}
-    return {**_stacked(rows), **first}
+    return stacked(rows) | first
 
 
 def _posterior(task: Task) -> Result:
@@ -168,11 +168,7 @@ def _posterior(task: Task) -> Result:
                      "point_rmse": point["ahead_rmse"], "r_hat": np.max(sampled["r_hat"]),
                      "ess": np.min(sampled["ess"]),
                      **{name: sampled[name] for name in ("mean", "sd", "divergences", "seconds")}})
-    return _stacked(rows)
-
-
-def _stacked(rows: list[Result]) -> Result:
-    return {key: np.stack([np.asarray(row[key]) for row in rows]) for key in rows[0]}
+    return stacked(rows)
 
 
 def title(settings: Settings, name: str) -> str:
