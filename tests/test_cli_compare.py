@@ -155,6 +155,7 @@ def test_the_help_lists_the_studies(run):
     ("ballistic --nuts 2 0 700 1", "--nuts: expected a whole number of at least 1, got '0'"),
     ("ballistic --runs 20000", "use several seeds for more"),
     ("gps --train-days nan", "--train-days: expected a number above zero, got 'nan'"),
+    ("ballistic --runs 1_000", "--runs/--realisations/--datasets: expected a whole number of at least 1, got '1_000'"),
     ("gps --axes XYZ", "unknown value 'XYZ'"),
     ("transcription --burn-in 100000", "burn_in must lie in"),
     ("transcription --burn-in -1", "--burn-in"),

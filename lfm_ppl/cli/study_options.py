@@ -62,7 +62,7 @@ def _converter(one: Option) -> Callable[[str], Any]:
     def convert(text: str) -> Any:
         if one.kind is not str:
             try:
-                value = one.kind(text)
+                value = one.kind(text) if one.kind is float or (text.isascii() and text.isdigit()) else -1
             except ValueError:
                 value = -1
             if not (value >= least if one.kind is int else 0 < value < float("inf")):
