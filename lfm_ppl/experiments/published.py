@@ -17,6 +17,10 @@ BOUND = ERRORS * math.sqrt(2.0)
 """Three standard errors of the difference, 4.2 of ours, where the published mean has an error as large as ours."""
 
 
+FEWEST = 5
+"""Data sets, of which a standard error is worth a comparison."""
+
+
 class Verdict(NamedTuple):
     """How our error compares with the published one.
 

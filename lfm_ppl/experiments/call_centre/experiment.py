@@ -98,7 +98,7 @@ def tabulated(settings: Settings, results: Results) -> dict[str, Table]:
 
 def notes(settings: Settings, results: Results) -> tuple[str, ...]:
     """Return how the errors of the queue compare with the published ones, where the counts are those of the source."""
-    if settings.data is None:
+    if settings.data is None or settings.days < published.FEWEST:
         return ()
     tests = {"constant": "RMSE of the queue, service rate 10", "changed": "RMSE of the queue, service rate 15, then 5"}
     return tuple(published.said(what, published.beside(tables.tracked(settings, results, test), "RMSE",

@@ -191,6 +191,8 @@ def tabulated(settings: Settings, results: Results) -> dict[str, Table]:
 
 def notes(settings: Settings, results: Results) -> tuple[str, ...]:
     """Return how the errors a day ahead in the real house compare with the published ones, over both of its homes."""
+    if settings.window_count < published.FEWEST:
+        return ()
     shown = tables.every(settings, results)
     return tuple(published.said(f"RMSE a day ahead, {name.partition('-')[2].replace('-', ' ')}",
                                 published.beside(frame, "RMSE ahead (K)", "published RMSE ahead (K)"))
