@@ -43,10 +43,10 @@ from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.ginzburg_landau import experiment, figures, problem, sampling
 
 quick = bool(os.environ.get("LFM_QUICK"))
-settings = experiment.quick(realisations=1, conditional=2) if quick else experiment.Settings()
+settings = experiment.Settings.quick(realisations=1, conditional=2) if quick else experiment.Settings()
 # The folder of an earlier run of `lfm-ppl compare ginzburg-landau`; without one everything is computed here.
 folder = Path(os.environ.get("LFM_COMPARE", "double-well"))
-found = experiment.run(settings, folder)
+found = experiment.STUDY.run(settings, folder)
 data = problem.realisation(settings.figure, settings.seed)
 states = {m: found.results[f"state/{problem.slug(m)}/{settings.figure:03d}"] for m in problem.METHODS}
 pd.set_option("display.width", 160, "display.max_columns", 30)
@@ -88,7 +88,7 @@ figures.plot_conditional(figures.conditional_rows(settings, found.results))
 figures.plot_rates(found.results)
 
 # %%
-scores.readable(found.rates)
+scores.readable(found.tables["rates"])
 
 # %% [markdown]
 # `cut` is the share of posteriors that reach an end of the interval on which the prior is flat, `differs` the share of
@@ -105,7 +105,7 @@ paths = {label: found.results[f"mcmc/{sampling.slug(label)}/{settings.figure:03d
 figures.plot_integrated(data, paths)
 
 # %%
-scores.readable(found.parameters)
+scores.readable(found.tables["parameters"])
 
 # %% [markdown]
 # ## Everything in one table
@@ -116,4 +116,4 @@ scores.readable(found.parameters)
 # gives 0.895 (EKF) and 0.935 (CKF) as root mean squared errors of its one path with the parameters integrated out.
 
 # %%
-scores.readable(found.table)
+scores.readable(found.tables["comparison"])

@@ -48,10 +48,10 @@ from lfm_ppl.experiments.transcription import experiment, figures, parameters, p
 
 quick = bool(os.environ.get("LFM_QUICK"))
 pd.set_option("display.width", 160, "display.max_columns", 30)
-settings = experiment.quick(1, configurations=("exponential",)) if quick else experiment.Settings()
+settings = experiment.Settings.quick(datasets=1, configurations=("exponential",)) if quick else experiment.Settings()
 # The folder of an earlier run of `lfm-ppl compare transcription`; without one everything is computed here.
 folder = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/transcription"))
-found = experiment.run(settings, folder)
+found = experiment.STUDY.run(settings, folder)
 
 # %% [markdown]
 # ## One data set, exponential response
@@ -61,7 +61,8 @@ found = experiment.run(settings, folder)
 
 # %%
 exponential = problem.Configuration("exponential")
-methods = {method: found.cells["exponential", method] for method in ("LA", "ESLS", "GFS", "iterated GHS(7)")}
+cells = experiment.by_cell(settings, found.results)
+methods = {method: cells["exponential", method] for method in ("LA", "ESLS", "GFS", "iterated GHS(7)")}
 figures.plot_force(problem.data_set(exponential, 0, settings.seed), methods)
 
 # %% [markdown]
@@ -79,7 +80,7 @@ figures.plot_force(problem.data_set(exponential, 0, settings.seed), methods)
 # and GFS, which draw nothing.
 
 # %%
-scores.readable(found.published)
+scores.readable(found.tables["published"])
 
 # %% [markdown]
 # ## Errors, coverage and time
@@ -88,16 +89,16 @@ scores.readable(found.published)
 # log predictive density of the force at a point; `CPU s` the time for one data set.
 
 # %%
-figures.plot_errors(found.cells)
+figures.plot_errors(cells)
 
 # %%
-scores.readable(found.table)
+scores.readable(found.tables["comparison"])
 
 # %% [markdown]
 # Against elliptical slice sampling, by pairs on the same data sets: an `RMSE ratio` of 1 is as good, below 1 better.
 
 # %%
-scores.readable(found.paired)
+scores.readable(found.tables["paired"])
 
 # %% [markdown]
 # ## Full Bayes
@@ -113,9 +114,9 @@ scores.readable(found.paired)
 #     lfm-ppl compare transcription-parameters
 
 # %%
-chosen = parameters_report.quick() if quick else parameters_report.Settings()
-posteriors = parameters_report.compute(chosen, folder.parent / "transcription-parameters")
-scores.readable(posteriors.table)
+chosen = parameters_report.Settings.quick() if quick else parameters_report.Settings()
+posteriors = parameters_report.STUDY.run(chosen, folder.parent / "transcription-parameters")
+scores.readable(posteriors.tables["agreement"])
 
 # %% [markdown]
 # `shift` is the largest distance of a posterior mean from the reference's, in its standard deviations, and `sd ratio`
@@ -123,7 +124,7 @@ scores.readable(posteriors.table)
 # Carlo error in brackets.
 
 # %%
-drawn = parameters_report.draw(posteriors)
+drawn = parameters_report.draw(chosen, posteriors.results)
 drawn["posteriors-softplus"]
 
 # %%

@@ -44,10 +44,10 @@ from lfm_ppl.inference.bound_model import likelihood_site
 
 quick = bool(os.environ.get("LFM_QUICK"))
 pd.set_option("display.width", 160, "display.max_columns", 30)
-settings = experiment.quick(2) if quick else experiment.Settings()
+settings = experiment.Settings.quick(runs=2) if quick else experiment.Settings()
 # The folder of an earlier run of `lfm-ppl compare ballistic`; without one everything is computed here.
 folder = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/ballistic"))
-found = experiment.run(settings, folder)
+found = experiment.STUDY.run(settings, folder)
 
 # %% [markdown]
 # ## One target
@@ -67,7 +67,7 @@ figures.plot_paths(settings, found.results)
 # know nothing of the parameters' uncertainty.
 
 # %%
-scores.readable(found.tracking)
+scores.readable(found.tables["tracking"])
 
 # %%
 figures.plot_coverage(settings, found.results)
@@ -80,7 +80,7 @@ figures.plot_coverage(settings, found.results)
 # time over its.
 
 # %%
-scores.readable(found.particles)
+scores.readable(found.tables["particles"])
 
 # %%
 figures.plot_particles(settings, found.results)
@@ -99,10 +99,10 @@ figures.plot_particles(settings, found.results)
 figures.plot_drag(settings, found.results)
 
 # %%
-scores.readable(found.parameters)
+scores.readable(found.tables["parameters"])
 
 # %%
-scores.readable(found.agreement)
+scores.readable(found.tables["agreement"])
 
 # %% [markdown]
 # ## In three dimensions

@@ -67,10 +67,11 @@ else:
     settings = experiment.Settings(data=str(shared) if real else None)
 # The folder of an earlier run of `lfm-ppl compare gps`; without one everything is computed here.
 folder = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/gps"))
-found = experiment.run(settings, folder)
-for reason in found.refused.values():
+found = experiment.STUDY.run(settings, folder)
+satellites = experiment.outcome(settings, found.results)
+for reason in satellites.refused.values():
     print(f"left out, {reason}\n")
-scores.readable(found.pooled)
+scores.readable(found.tables["pooled"])
 
 # %% [markdown]
 # Errors are root mean squares of the distance in metres over the days that were predicted. *Deterministic* has an
@@ -78,17 +79,17 @@ scores.readable(found.pooled)
 # six hours of them, as in the source.
 
 # %%
-figures.plot_all(found.results)
+figures.plot_all(satellites.predicted)
 
 # %%
-found.satellites[["eclipsed", "fit", "deterministic", "latest state", "LFM", "ratio", "coverage"]].round(3)
+found.tables["satellites"][["eclipsed", "fit", "deterministic", "latest state", "LFM", "ratio", "coverage"]].round(3)
 
 # %% [markdown]
 # What the satellites have in common: medians over them in nm/s² and hours, and the factor by which one differs from
 # another. The sunlight's force hardly oscillates; the other two do so mostly once a revolution.
 
 # %%
-found.magnitudes[["common", "factor"]].round(4)
+found.tables["magnitudes"][["common", "factor"]].round(4)
 
 # %% [markdown]
 # ## One satellite
@@ -97,11 +98,11 @@ found.magnitudes[["common", "factor"]].round(4)
 # the levels are wide where a constant push along one axis cannot be told from a slightly different start.
 
 # %%
-one = next(iter(found.online), next(iter(found.results)))
-figures.plot_forces(one, found.results[one])
+one = next(iter(satellites.online), next(iter(satellites.predicted)))
+figures.plot_forces(one, satellites.predicted[one])
 
 # %%
-figures.plot_errors(one, found.results[one])
+figures.plot_errors(one, satellites.predicted[one])
 
 # %% [markdown]
 # ## As positions come in
@@ -110,7 +111,7 @@ figures.plot_errors(one, found.results[one])
 # started again from the latest state.
 
 # %%
-figures.plot_online(one, found.online[one]) if found.online else None
+figures.plot_online(one, satellites.online[one]) if satellites.online else None
 
 # %% [markdown]
 # ## Ways to learn the magnitudes
@@ -123,4 +124,4 @@ figures.plot_online(one, found.online[one]) if found.online else None
 # what the source does.
 
 # %%
-scores.readable(found.learning) if len(found.learning) else None
+scores.readable(found.tables["learning"]) if "learning" in found.tables else None

@@ -42,10 +42,10 @@ from lfm_ppl.experiments.periodic_kernels import experiment, figures
 
 quick = bool(os.environ.get("LFM_QUICK"))
 pd.set_option("display.width", 160, "display.max_columns", 30)
-settings = experiment.quick() if quick else experiment.Settings()
+settings = experiment.Settings.quick() if quick else experiment.Settings()
 # The folder of an earlier run of `lfm-ppl compare periodic-kernels`; without one everything is computed here.
 folder = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/periodic-kernels"))
-found = experiment.run(settings, folder)
+found = experiment.STUDY.run(settings, folder)
 
 # %% [markdown]
 # ## Eigenfunctions
@@ -67,7 +67,7 @@ figures.plot_eigenfunctions()
 figures.plot_errors(settings, found.results)
 
 # %%
-scores.readable(found.covariance)
+scores.readable(found.tables["covariance"])
 
 # %% [markdown]
 # `significant` counts eigenvalues above 1/100 of the largest, those of a pair together. That leaves out less than 0.01
@@ -82,7 +82,7 @@ scores.readable(found.covariance)
 figures.plot_covariances(settings)
 
 # %%
-scores.readable(found.published)
+scores.readable(found.tables["published"])
 
 # %% [markdown]
 # ## Predicting functions
@@ -96,7 +96,7 @@ scores.readable(found.published)
 figures.plot_prediction(settings, found.results)
 
 # %%
-scores.readable(found.regression)
+scores.readable(found.tables["regression"])
 
 # %% [markdown]
 # ## Forces that nearly repeat

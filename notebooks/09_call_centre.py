@@ -48,12 +48,12 @@ quick = bool(os.environ.get("LFM_QUICK"))
 pd.set_option("display.width", 160, "display.max_columns", 30)
 shared = Path(os.environ.get("LFM_DATA", "../shared/data")) / "calls"
 data = str(shared) if shared.is_dir() and not quick else None
-settings = experiment.quick(days=1) if quick else experiment.Settings(data=data)
+settings = experiment.Settings.quick(days=1) if quick else experiment.Settings(data=data)
 # The folder of an earlier run of `lfm-ppl compare call-centre`; without one everything is computed here.
 folder = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/call-centre"))
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", counts.OverloadWarning)
-    found = experiment.run(settings, folder)
+    found = experiment.STUDY.run(settings, folder)
 print("real calls" if data else "simulated calls")
 
 # %% [markdown]
@@ -70,7 +70,7 @@ figures.plot_queues(settings, found.results, "constant")
 # taken, so that only the order can be compared.
 
 # %%
-scores.readable(found.constant)
+scores.readable(found.tables["constant"])
 
 # %% [markdown]
 # ## A changed service rate
@@ -81,7 +81,7 @@ scores.readable(found.constant)
 figures.plot_queues(settings, found.results, "changed")
 
 # %%
-scores.readable(found.changed)
+scores.readable(found.tables["changed"])
 
 # %% [markdown]
 # ## Arrivals
@@ -106,7 +106,7 @@ figures.plot_errors(settings, found.results)
 # estimates a little better. The gain is in the log density of a day's queue.
 
 # %%
-scores.readable(found.gain)
+scores.readable(found.tables["gain"])
 
 # %% [markdown]
 # These are weighted draws about every mode of the posterior that searches from three starts find: `several modes` is
@@ -116,7 +116,7 @@ scores.readable(found.gain)
 # day.
 
 # %%
-scores.readable(found.agreement)
+scores.readable(found.tables["agreement"])
 
 # %%
-scores.readable(found.learnt)
+scores.readable(found.tables["learnt"])

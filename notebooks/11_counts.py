@@ -73,11 +73,11 @@ print(f"log Z by EP: {float(likelihood.log_prob(y)):.4f}")
 # %%
 shared = Path(os.environ.get("LFM_DATA", "../shared/data"))
 data = str(shared) if (shared / problem.EVENTS).is_file() and not quick else None
-settings = experiment.quick() if quick else experiment.Settings(
+settings = experiment.Settings.quick() if quick else experiment.Settings(
     data=data, problems=(problem.COAL, *problem.SIMULATED))
 # The folder of an earlier run with these settings; without one everything is computed here.
 folder = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/counts"))
-found = experiment.run(settings, folder)
+found = experiment.STUDY.run(settings, folder)
 print("real disasters" if data else "simulated disasters")
 
 # %% [markdown]
@@ -97,7 +97,7 @@ figures.plot_coal(settings, found.results)
 # reference's own error is up to 0.03 in `mean` and `sd`, and 0.005 in log Z.
 
 # %%
-scores.readable(found.accuracy)
+scores.readable(found.tables["accuracy"])
 
 # %% [markdown]
 # Dotted: 0.2 in log Z, 0.05 posterior standard deviations, 3%. Laplace's method takes the mode for the mean, which is
@@ -118,7 +118,7 @@ figures.plot_errors(settings, found.results)
 # model of Student's t, which is why fewer than 95% of its data are covered.
 
 # %%
-scores.readable(found.prediction)
+scores.readable(found.tables["prediction"])
 
 # %% [markdown]
 # ## The parameters, and the reference itself
@@ -127,7 +127,7 @@ scores.readable(found.prediction)
 # effective share of the draws of importance sampling.
 
 # %%
-pd.DataFrame(found.parameters).T.astype(float).round(3)
+pd.DataFrame({name: found.results[f"{name}/parameters"] for name in settings.problems}).T.astype(float).round(3)
 
 # %%
 tables.reference(settings, found.results).round(3)

@@ -121,8 +121,8 @@ settings = experiment.Settings()
 # The folder of an earlier run of `lfm-ppl compare constrained`; without one everything is computed here.
 folder = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/constrained"))
 # Quick mode leaves the study out, which compiles for minutes; `lfm-ppl compare constrained --quick` is a little of it.
-result = None if quick else experiment.run(settings, folder)
-quick or scores.readable(result.transcription)
+result = None if quick else experiment.STUDY.run(settings, folder)
+quick or scores.readable(result.tables["transcription"])
 
 # %%
 quick or figures.plot_forces(settings, result.results)
@@ -131,7 +131,7 @@ quick or figures.plot_forces(settings, result.results)
 quick or figures.plot_errors(settings, result.results)
 
 # %%
-quick or scores.readable(result.shapes).T
+quick or scores.readable(result.tables["shapes"]).T
 
 # %% [markdown]
 # ## A target on reentry

@@ -1,12 +1,15 @@
 """`lfm-ppl compare`: what it lists, prints and writes, and what it says about a mistake."""
 
+import dataclasses
 import shlex
+from types import SimpleNamespace
 
 import pandas as pd
 import pytest
 
 from lfm_ppl.cli import main
 from lfm_ppl.experiments import catalogue
+from lfm_ppl.experiments.study import Found, Study, Table, options
 
 
 @pytest.fixture
@@ -30,15 +33,23 @@ def wanted(monkeypatch):
     """Replace the experiment by one that takes no time; return what it was asked."""
     asked = []
 
-    def fake(one):
-        asked.append(one)
-        one.folder.mkdir(parents=True, exist_ok=True)
-        if one.report:
-            one.report("1/1 task")
-        return catalogue.Report({"Rates": pd.DataFrame({"rate": [0.5]}, ["EKF"])}, [one.folder / "rates.csv"],
-                                ("1 of 1 cell is consistent.",))
+    class Fake(Study):
+        """The study with the settings of another, and one table."""
 
-    monkeypatch.setattr(catalogue, "experiment", lambda name: catalogue.Experiment(name, "summary", fake))
+        def run(self, settings, folder, *, overwrite=False, report=None, workers=1):
+            asked.append(SimpleNamespace(settings=settings, folder=folder, overwrite=overwrite, report=report))
+            folder.mkdir(parents=True, exist_ok=True)
+            if report:
+                report("1/1 task")
+            rates = pd.DataFrame({"rate": [0.5]}, ["EKF"])
+            return Found(settings, {}, {"rates": Table("Rates", rates, rates)}, ("1 of 1 cell is consistent.",))
+
+        def save(self, found, folder):
+            return [folder / "rates.csv"]
+
+    real = catalogue.Entry.study.fget
+    monkeypatch.setattr(catalogue.Entry, "study", property(
+        lambda entry: Fake(**{one.name: getattr(real(entry), one.name) for one in dataclasses.fields(Study)})))
     return asked
 
 
@@ -54,7 +65,7 @@ def test_an_unknown_name_gets_the_nearest(run):
     assert "Did you mean 'ginzburg-landau'" in err and len(err.splitlines()) == 1
 
 
-@pytest.mark.parametrize("line", ["--realisations 0", "--conditional -1", "--seed x", "--particles 5"])
+@pytest.mark.parametrize("line", ["--realisations 0", "--conditional -1", "--seed x", "--particels 5"])
 def test_bad_arguments_are_one_line(run, line):
     code, _, err = run(f"compare ginzburg-landau {line}")
     assert code == 2 and err.startswith("lfm-ppl: error:") and len(err.splitlines()) == 1
@@ -73,7 +84,8 @@ def test_it_prints_tables_progress_and_files(run, wanted, tmp_path):
     assert out.index("EKF  0.500") < out.index("1 of 1 cell is consistent.") < out.index("time  ")
     assert err == "1/1 task\n"
     (one,) = wanted
-    assert (one.realisations, one.conditional, one.seed, one.quick, one.overwrite) == (3, 7, 5, False, False)
+    assert (one.settings.realisations, one.settings.conditional, one.settings.seed) == (3, 7, 5)
+    assert one.settings.particles == 40_000 and one.overwrite is False  # not those of --quick
 
 
 def test_it_writes_an_index_of_tables_and_figures(run, wanted, tmp_path):
@@ -108,4 +120,62 @@ def test_the_same_command_has_the_same_folder(run, wanted):
         assert run(f"compare ginzburg-landau {line}")[0] == 0
     first, second, quick = wanted
     assert first.folder == second.folder != quick.folder
-    assert second.report is None and quick.overwrite and quick.quick
+    assert second.report is None and quick.overwrite and quick.settings.particles == 500
+
+
+@pytest.mark.parametrize("name", catalogue.names())
+def test_the_help_of_a_study_has_its_options_and_no_others(run, name):
+    code, out, err = run(f"compare {name} --help")
+    assert code == 0 and err == "" and f"options of {name}" in out
+    own = {flag for one in options(catalogue.experiment(name).study.settings) for flag in one.flags}
+    every = {flag for other in catalogue.names() for one in options(catalogue.experiment(other).study.settings)
+             for flag in one.flags}
+    assert "--seed" in own
+    for flag in every:
+        assert (f"{flag} " in out) == (flag in own), flag
+
+
+def test_the_help_lists_the_studies(run):
+    code, out, _ = run("compare --help")
+    assert code == 0 and all(f"  {name}  " in out for name in catalogue.names()) and "--satellites" in out
+    assert "--train-days D" not in out  # it is in an example alone
+
+
+@pytest.mark.parametrize("line, said", [
+    ("ballistic --conditional 3", "ballistic does not take --conditional; leave it out"),
+    ("call-centre --conditional 3", "does not take --conditional"),
+    ("transcription-parameters --conditional=3", "does not take --conditional"),
+    ("gps --realisations 5", "gps does not take --realisations"),
+    ("gps --train-day 3", "Did you mean --train-days?"),
+    ("--sateliltes G05 gps", "Did you mean --satellites?"),
+    ("ballistic --rules cubature cubic", "unknown value 'cubic'"),
+    ("ballistic --rules Taylor", "rules must hold 'cubature'"),
+    ("ballistic --particles 5 5", "particles must be a tuple of different numbers"),
+    ("ballistic --nuts 2 300 700", "--nuts: expected 4 arguments"),
+    ("ballistic --nuts 2 0 700 1", "--nuts: expected a whole number of at least 1, got '0'"),
+    ("ballistic --runs 20000", "use several seeds for more"),
+    ("gps --train-days nan", "--train-days: expected a number above zero, got 'nan'"),
+    ("ballistic --runs 1_000", "--runs/--realisations/--datasets: expected a whole number of at least 1, got '1_000'"),
+    ("gps --axes XYZ", "unknown value 'XYZ'"),
+    ("transcription --burn-in 100000", "burn_in must lie in"),
+    ("transcription --burn-in -1", "--burn-in"),
+    ("counts gps", "unrecognized arguments: gps"),
+    ("--data '' gps", "expected FOLDER, got ''"),
+])
+def test_a_mistake_is_one_clear_line(run, tmp_path, line, said):
+    code, out, err = run(f"compare {line}")
+    assert code == 2 and out == "" and len(err.splitlines()) == 1 and said in err, err
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("line, asked", [
+    ("ballistic --runs 20 --particles 500 2000 --nuts 2 30 30 1",
+     {"runs": 20, "particles": (500, 2_000), "nuts": (2, 30, 30, 1), "ram": (4, 100, 500, 15)}),
+    ("--satellites G05 G20 --train-days 2.5 gps --quick --seed 3",
+     {"satellites": ("G05", "G20"), "train_days": 2.5, "seed": 3, "most": 2}),
+    ("call_centre --realisations 4 --data calls", {"days": 4, "data": "calls"}),
+    ("--seed 2 --out counts transcription --datasets 7", {"datasets": 7, "seed": 2}),
+])
+def test_what_is_given_are_the_settings(run, wanted, line, asked):
+    assert run(f"compare {line} --quiet")[0] == 0
+    assert {name: getattr(wanted[0].settings, name) for name in asked} == asked

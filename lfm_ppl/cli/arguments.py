@@ -10,8 +10,9 @@ from typing import Any, NoReturn
 
 import lfm_ppl
 from lfm_ppl import calendar_time, checks
-from lfm_ppl.cli import check, compare, fit, forecast, models, new, plot, simulate, version
+from lfm_ppl.cli import check, compare, fit, forecast, models, new, plot, session, simulate, study_options, version
 from lfm_ppl.cli.choices import REFERENCES, RULES
+from lfm_ppl.experiments import catalogue
 from lfm_ppl.inference.samplers import SAMPLERS
 
 MODEL_HELP = "a shipped model (see `lfm-ppl models`) or the path of a Python file"
@@ -29,14 +30,20 @@ class Parser(argparse.ArgumentParser):
 
 def parsed(argv: Sequence[str] | None = None) -> argparse.Namespace:
     """Return the arguments; of an unknown one, or an empty one, the command complains, and names what may be meant."""
+    words = sys.argv[1:] if argv is None else list(argv)
     top = parser()
-    arguments, unknown = top.parse_known_args(argv)
     (commands,) = (action for action in top._actions if isinstance(action, argparse._SubParsersAction))
+    if words[:1] == ["compare"]:
+        _add_study(commands.choices["compare"], words[1:])
+    arguments, unknown = top.parse_known_args(words)
     command = commands.choices[arguments.command]
     if unknown:
         flag = unknown[0].partition("=")[0]
         near = difflib.get_close_matches(flag, command._option_string_actions, n=2) if flag.startswith("-") else []
         hint = f". Did you mean {' or '.join(near)}?" if near else ""
+        study = command.get_default("study")
+        if study is not None and flag.startswith("-"):
+            command.error(f"{study.name} does not take {flag}; leave it out{hint}")
         command.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
     for action in command._actions:
         value = getattr(arguments, action.dest, None)
@@ -166,43 +173,28 @@ def _add_check(commands: Any) -> None:
                          help="no progress (a line that is redrawn, or one every 30 s where there is no terminal)")
 
 
+_COMPARE_EXAMPLES = (
+    "ginzburg-landau --quick",
+    "transcription --datasets 10",
+    "gps --data shared/data/gps --satellites G05 G20 --train-days 3",
+    "ballistic --runs 20 --jobs 2",
+    "call-centre --data shared/data/calls",
+    "ginzburg-landau --realisations 50 --conditional 200 --out double-well",
+)
+
+
 def _add_compare(commands: Any) -> None:
-    examples = (
-        "  lfm-ppl compare\n"
-        "  lfm-ppl compare ginzburg-landau --quick\n"
-        "  lfm-ppl compare transcription --datasets 10\n"
-        "  lfm-ppl compare gps --data shared/data/gps --satellites G05 G20 --train-days 3\n"
-        "  lfm-ppl compare ballistic --runs 20 --jobs 2\n"
-        "  lfm-ppl compare call-centre --data shared/data/calls\n"
-        "  lfm-ppl compare ginzburg-landau --realisations 50 --conditional 200 --out double-well"
-    )
+    examples = "  lfm-ppl compare\n" + "".join(f"  lfm-ppl compare {one}\n" for one in _COMPARE_EXAMPLES) + (
+        f"\nstudies, each with options of its own, which `lfm-ppl compare NAME --help` shows:\n{compare.listed()}")
     help_ = "run a published experiment again, or go on with one that was stopped; without a name, list them"
     command = _command(commands, "compare", compare.run, help_, examples, computes=True)
+    command.set_defaults(study=None)
     command.add_argument("experiment", nargs="?", metavar="EXPERIMENT", help="see `lfm-ppl compare`")
-    command.add_argument(
-        "--realisations",
-        "--datasets",
-        "--runs",
-        type=_whole(1),
-        metavar="N",
-        help="data sets (default: the experiment's)",
-    )
-    command.add_argument(
-        "--conditional",
-        type=_whole(1),
-        metavar="N",
-        help="ginzburg-landau: data sets for the conditional posteriors of single parameters (default: 100)",
-    )
-    command.add_argument(
-        "--data",
-        metavar="FOLDER",
-        help="gps: SP3 files, call-centre: counts, counts: folders coal and calls (default of these: simulated); "
-        "home-heating: house_hourly.csv (default: $LFM_DATA/house)",
-    )
-    command.add_argument("--satellites", nargs="+", metavar="NAME", help="gps: as in G05 G20 (default: all)")
-    command.add_argument("--train-days", type=_positive, metavar="D", help="gps: days to learn from (default: 3)")
-    command.add_argument("--axes", metavar="AXES", help="gps: of the small forces, DYB (Sun-oriented, default) or RTN")
-    command.add_argument("--seed", type=_whole(0), default=0, help="random seed of everything (default: 0)")
+    _add_shared(command)
+
+
+def _add_shared(command: Any) -> None:
+    """Add the options that all studies share."""
     command.add_argument("--quick", action="store_true", help="few and small: it shows that it runs, and no more")
     command.add_argument(
         "--out",
@@ -212,6 +204,28 @@ def _add_compare(commands: Any) -> None:
     command.add_argument("--overwrite", action="store_true", help="replace results that were made with other settings")
     _add_workers(command)
     command.add_argument("--quiet", action="store_true", help="no progress")
+
+
+def _add_study(command: Any, words: Sequence[str]) -> None:
+    """Add the options of the study that is named among the words after ``compare``."""
+    shared = Parser(prog=command.prog, add_help=False, allow_abbrev=False)
+    for flag in ("--help", "-h", "--debug", "--no-cache"):
+        shared.add_argument(flag, action="store_true")
+    _add_shared(shared)
+    name = study_options.name_in(words, shared, catalogue.names())
+    if name is None:
+        return
+    try:
+        study = catalogue.experiment(name)
+    except ValueError as error:
+        command.error(str(error).rstrip("."))
+    session.start(1, "--no-cache" not in words, one_thread=True)  # so that one process finds the numbers of several
+    command.set_defaults(study=study)
+    command.prog, command.description = f"{command.prog} {study.name}", f"{study.summary}."
+    examples = [one for one in _COMPARE_EXAMPLES if one.startswith(f"{study.name} ")] or [f"{study.name} --quick"]
+    command.epilog = "examples:\n" + "\n".join(f"  lfm-ppl compare {one}" for one in examples)
+    next(action for action in command._actions if action.dest == "experiment").help = argparse.SUPPRESS
+    study_options.add(command, study.study.settings, study.name)
 
 
 def _add_workers(group: Any) -> None:

@@ -9,56 +9,56 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lfm_ppl.cli import choices, page, results, session
+from lfm_ppl.cli import choices, page, results, study_options
+from lfm_ppl.experiments import catalogue
 
 if TYPE_CHECKING:  # experiments, which take seconds to import
-    from lfm_ppl.experiments.catalogue import Experiment, Report
+    from lfm_ppl.experiments.catalogue import Entry
+    from lfm_ppl.experiments.study import Found
 
 PAGE = "index.html"
 
 
 def run(arguments: argparse.Namespace) -> int:
     """List the experiments, or run one: what its folder holds already is not computed again."""
-    session.start(1, not arguments.no_cache, one_thread=True)  # so that one process finds the numbers of several
+    chosen = arguments.study
+    if chosen is None:
+        print(f"{listed('')}\n\n`lfm-ppl compare NAME` runs one; `--quick` shows in a few minutes that it runs.")
+        return 0
     from lfm_ppl.engine.progress import Console
-    from lfm_ppl.experiments import catalogue
     from lfm_ppl.progress import duration
     from lfm_ppl.results import tables, web_page
 
-    if arguments.experiment is None:
-        _list()
-        return 0
-    chosen = catalogue.experiment(arguments.experiment)
-    workers = choices.workers(arguments.jobs, arguments.scheduler)
+    report = None if arguments.quiet else Console()
+    workers, study = choices.workers(arguments.jobs, arguments.scheduler), chosen.study
+    settings = study.settings.chosen(report, arguments.quick, **study_options.given(arguments))
     default = Path("lfm-results") / "compare" / (f"{chosen.name}-quick" if arguments.quick else chosen.name)
     with results.lasting(default, arguments.out) as folder:
         web_page.refuse_foreign(folder / PAGE, arguments.overwrite)
-        started = time.perf_counter()
-        found = chosen.run(catalogue.Wanted(
-            folder, arguments.realisations, arguments.conditional, arguments.seed, arguments.quick, arguments.overwrite,
-            None if arguments.quiet else Console(), workers, arguments.data,
-            tuple(arguments.satellites) if arguments.satellites else None, arguments.train_days, arguments.axes))
+        began = time.perf_counter()
+        found = study.run(settings, folder, overwrite=arguments.overwrite, report=report, workers=workers)
+        written = study.save(found, folder)
     width = shutil.get_terminal_size().columns
-    for title, table in found.tables.items():
+    for title, table in found.printed.items():
         print(f"\n{title}\n{tables.text_table(table, width=width)}")
     for note in found.notes:
         print(f"\n{textwrap.fill(note, width)}")
-    print(f"\ntime     {duration(time.perf_counter() - started)}")
-    for path in found.written:
+    print(f"\ntime     {duration(time.perf_counter() - began)}")
+    for path in written:
         print(f"wrote    {path}")
-    return page.attempted(lambda: _index(folder, chosen, found, page.command_line(arguments)))
+    return page.attempted(lambda: _index(folder, chosen, found, written, page.command_line(arguments)))
 
 
-def _index(folder: Path, chosen: Experiment, found: Report, command: str) -> Path:
+def _index(folder: Path, chosen: Entry, found: Found, written: list[Path], command: str) -> Path:
     """Write the tables and figures of an experiment as one page."""
     from lfm_ppl.results import tables, web_page
     from lfm_ppl.results.web_page import Section
 
-    there = [path for path in found.written if path.is_file()]
+    there = [path for path in written if path.is_file()]
     inside = [path.relative_to(folder).as_posix() for path in there if path.is_relative_to(folder)]
     sections = [
         Section("tables", "Tables", "\n".join(web_page.heading(title) + tables.html_table(table)
-                                              for title, table in found.tables.items())),
+                                              for title, table in found.printed.items())),
         Section("notes", "Notes", "\n".join(web_page.paragraph(note) for note in found.notes)),
         Section("figures", "Figures", "\n".join(web_page.picture(path.read_bytes(), path.stem)
                                                 for path in there if path.suffix == ".png")),
@@ -69,11 +69,8 @@ def _index(folder: Path, chosen: Experiment, found: Report, command: str) -> Pat
     return web_page.write(web_page.render(chosen.name, chosen.summary, sections), folder / PAGE, overwrite=True)
 
 
-def _list() -> None:
-    from lfm_ppl.experiments import catalogue
-
+def listed(indent: str = "  ") -> str:
+    """Return a line on each study."""
     shown = [catalogue.experiment(name) for name in catalogue.names()]
     width = max(len(one.name) for one in shown)
-    for one in shown:
-        print(f"{one.name:<{width}}  {one.summary}")
-    print("\n`lfm-ppl compare NAME` runs one; `--quick` shows in a few minutes that it runs.")
+    return "\n".join(f"{indent}{one.name:<{width}}  {one.summary}" for one in shown)

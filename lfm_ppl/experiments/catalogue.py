@@ -1,118 +1,64 @@
-"""The experiments that can be run by name."""
+"""The studies that can be run by name."""
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any, NamedTuple
-
-import pandas as pd
+from typing import TYPE_CHECKING, NamedTuple
 
 from lfm_ppl import checks
-from lfm_ppl.engine.cluster import Workers
-from lfm_ppl.engine.run import Reporter
 
-_MODULES = {"ginzburg-landau": "lfm_ppl.experiments.ginzburg_landau.report",
-            "gps": "lfm_ppl.experiments.gps.report",
-            "home-heating": "lfm_ppl.experiments.home_heating.report",
-            "transcription": "lfm_ppl.experiments.transcription.report",
-            "transcription-parameters": "lfm_ppl.experiments.transcription.parameters_report",
-            "ballistic": "lfm_ppl.experiments.ballistic.report",
-            "periodic-kernels": "lfm_ppl.experiments.periodic_kernels.report",
-            "call-centre": "lfm_ppl.experiments.call_centre.report",
-            "constrained": "lfm_ppl.experiments.constrained.report",
-            "counts": "lfm_ppl.experiments.counts.report"}
+if TYPE_CHECKING:  # which takes a second to import
+    from lfm_ppl.experiments.study import Study
 
-
-class Wanted(NamedTuple):
-    """What a user may ask of an experiment.
-
-    Attributes:
-        folder: for tasks, tables and figures.
-        realisations: number of data sets; None: the experiment's own.
-        conditional: number of data sets for the conditional posteriors, where the experiment has them; None: its own.
-        seed: of everything random.
-        quick: a small version that shows that everything runs.
-        overwrite: compute again what was stored with other settings.
-        report: what to do with a line of progress; None: nothing.
-        workers: what computes; see `run_tasks`.
-        data: a folder of files, where the experiment reads some; None: it makes its own data.
-        satellites: names, where the experiment has satellites; None: all.
-        train_days: days to learn from, where the experiment predicts those after them; None: its own.
-        axes: of small forces, where the experiment has them; None: its own.
-    """
-
-    folder: Path
-    realisations: int | None = None
-    conditional: int | None = None
-    seed: int = 0
-    quick: bool = False
-    overwrite: bool = False
-    report: Reporter | None = None
-    workers: Workers = 1
-    data: str | None = None
-    satellites: tuple[str, ...] | None = None
-    train_days: float | None = None
-    axes: str | None = None
-
-    def counts(self, **names: str) -> dict[str, Any]:
-        """Return the seed, and what a user gave, under the names that the experiment's settings have.
-
-        Args:
-            names: ``realisations``, ``conditional``, ``data``, ``satellites``, ``train_days`` and ``axes``, where the
-                experiment has them -> name in its settings.
-
-        Raises:
-            ValueError: something is given that the experiment does not have.
-
-        Example:
-            >>> Wanted(Path("out"), realisations=10).counts(realisations="datasets")
-            {'seed': 0, 'datasets': 10}
-        """
-        choices = ("realisations", "conditional", "data", "satellites", "train_days", "axes")
-        given = {name: value for name in choices if (value := getattr(self, name)) is not None}
-        for name in given:
-            if name not in names:
-                raise ValueError(f"this experiment does not take --{name.replace('_', '-')}; leave it out.")
-        return {"seed": self.seed} | {names[name]: value for name, value in given.items()}
+_STUDIES = {
+    "ginzburg-landau": ("ginzburg_landau.experiment",
+                        "double well: EKF, CKF, GHKF, particle filter and exact grid, in states and parameters"),
+    "gps": ("gps.experiment",
+            "GPS orbits: predicted for days with and without latent forces, from SP3 files (--data) or simulated"),
+    "home-heating": ("home_heating.experiment", "home heating: a day ahead with residual heat that nearly repeats, "
+                     "under a thermostat and in a real house"),
+    "transcription": ("transcription.experiment", "transcription factors: Laplace, elliptical slice sampling and "
+                      "Gaussian smoothers, eight links, table 1"),
+    "transcription-parameters": ("transcription.parameters_report", "transcription factors with unknown rates: the "
+                                 "marginal posterior against that of the force as latent sites"),
+    "ballistic": ("ballistic.experiment",
+                  "target on reentry: Gaussian smoothers against particles, and the posterior of the drag"),
+    "periodic-kernels": ("periodic_kernels.experiment",
+                         "periodic kernels as forces: eigenfunctions against random frequencies and resonators"),
+    "call-centre": ("call_centre.experiment", "queues of a call centre tracked by forces that nearly repeat, from real "
+                    "counts (--data) or simulated"),
+    "constrained": ("constrained.experiment",
+                    "forces that cannot be negative: moving horizon, full information and bands, also of TRH"),
+    "counts": ("counts.experiment",
+               "counts, gross errors, yes and no: EP, variational and Laplace against exact draws"),
+}
+"""Name -> module with the study, and one line on it: the list of them imports none."""
 
 
-class Report(NamedTuple):
-    """What an experiment found.
-
-    Attributes:
-        tables: title -> table, to be printed.
-        written: the files.
-        notes: what to know when reading the tables, printed below them.
-    """
-
-    tables: dict[str, pd.DataFrame]
-    written: list[Path]
-    notes: tuple[str, ...] = ()
-
-
-class Experiment(NamedTuple):
-    """An experiment.
+class Entry(NamedTuple):
+    """What the list has of a study.
 
     Attributes:
         name: on the command line.
         summary: one line.
-        run: from what is wanted to what was found.
     """
 
     name: str
     summary: str
-    run: Callable[[Wanted], Report]
+
+    @property
+    def study(self) -> Study:
+        """The study."""
+        return importlib.import_module(f"lfm_ppl.experiments.{_STUDIES[self.name][0]}").STUDY
 
 
 def names() -> tuple[str, ...]:
-    """Return the names of the experiments."""
-    return tuple(_MODULES)
+    """Return the names of the studies."""
+    return tuple(_STUDIES)
 
 
-def experiment(name: str) -> Experiment:
-    """Return an experiment by name, with dashes or underscores.
+def experiment(name: str) -> Entry:
+    """Return a study by name, with dashes or underscores.
 
     Raises:
         ValueError: there is none of this name; the message has the nearest ones.
@@ -122,7 +68,6 @@ def experiment(name: str) -> Experiment:
         'ginzburg-landau'
     """
     wanted = name.replace("_", "-")
-    if wanted not in _MODULES:
-        raise ValueError(checks.unknown("experiment", name, _MODULES))
-    module = importlib.import_module(_MODULES[wanted])
-    return Experiment(wanted, module.SUMMARY, module.run)
+    if wanted not in _STUDIES:
+        raise ValueError(checks.unknown("experiment", name, _STUDIES))
+    return Entry(wanted, _STUDIES[wanted][1])

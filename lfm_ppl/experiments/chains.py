@@ -55,3 +55,38 @@ def sample(mcmc: MCMC, names: Sequence[str], key: jax.Array, *data: Any, **given
     draws = np.log(np.stack([np.asarray(drawn[name]) for name in names]))
     divergences = int(np.sum(mcmc.get_extra_fields().get("diverging", 0)))
     return {"draws": draws, "seconds": seconds, "divergences": divergences, **scores.diagnose(names, draws)}
+
+
+def agreement(found: Sequence[Result], reference: Sequence[Result]) -> tuple[scores.Estimate, scores.Estimate]:
+    """Return how far posteriors are from those of a reference, data set by data set.
+
+    Returns:
+        The largest distance of a posterior mean from the reference's in its standard deviations, and the ratio of
+        standard deviations furthest from one, over parameters and data sets, with their Monte Carlo errors, to be held
+        against them as the largest of many.
+    """
+    pairs = list(zip(found, reference, strict=True))
+    shift = np.stack([(one["mean"] - exact["mean"]) / exact["sd"] for one, exact in pairs])
+    ratio = np.stack([one["sd"] / exact["sd"] for one, exact in pairs])
+    error = np.stack([np.sqrt(1 / one["ess"] + 1 / exact["ess"]) for one, exact in pairs])
+    spread = ratio * np.stack([np.hypot(*map(_relative_error_of_sd, both)) for both in pairs])
+    worst = np.unravel_index(np.abs(shift).argmax(), shift.shape)
+    with np.errstate(divide="ignore"):
+        widest = np.unravel_index(np.abs(np.log(ratio)).argmax(), ratio.shape)
+    return (scores.Estimate(float(abs(shift[worst])), float(error[worst])),
+            scores.Estimate(float(ratio[widest]), float(spread[widest])))
+
+
+def _relative_error_of_sd(found: Result) -> np.ndarray:
+    """Return Monte Carlo errors of standard deviations; of weighted draws those of a normal distribution."""
+    return scores.relative_errors_of_sd(found["draws"]) if "draws" in found else np.sqrt(0.5 / found["ess"])
+
+
+def least_ess(one: Result) -> float:
+    """Return the smallest effective sample size; a chain that does not move has none, and must not look otherwise."""
+    return float(np.nan_to_num(one["ess"]).min())
+
+
+def largest_r_hat(one: Result) -> float:
+    """Return the largest R-hat; infinite where a chain does not move."""
+    return float(np.nan_to_num(one["r_hat"], nan=np.inf).max())

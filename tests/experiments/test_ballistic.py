@@ -1,14 +1,13 @@
 """The target on reentry as an experiment: a little of every part, tables and figures, and what they must satisfy."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy import stats
 
 from lfm_ppl.engine.store import write
-from lfm_ppl.experiments import catalogue, scores
+from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.ballistic import (
     chains,
     experiment,
@@ -17,10 +16,10 @@ from lfm_ppl.experiments.ballistic import (
     parameters,
     particles,
     problem,
-    report,
     tables,
     tracking,
 )
+from lfm_ppl.experiments.study import TASKS
 
 SMALL = experiment.Settings(
     runs=2, particle_runs=1, particles=(2_000,), chain_runs=1, drawn_runs=1, draws=200, paths=5, nuts=(2, 10, 10, 1),
@@ -202,18 +201,18 @@ def test_the_figures_are_drawn_and_labelled():
 def test_what_is_stored_is_tabulated_and_drawn_without_computing(tmp_path):
     results = made_up(MADE)
     for task in experiment.all_tasks(MADE):
-        write(task, results[task.name], tmp_path / experiment.TASKS)
+        write(task, results[task.name], tmp_path / TASKS)
     lines = []
-    found = experiment.run(MADE, tmp_path, report=lines.append)
+    found = experiment.STUDY.run(MADE, tmp_path, report=lines.append)
     count = len(results)
     assert lines == [f"{count} of {count} tasks are stored already"]
-    written = experiment.save(found, tmp_path)
+    written = experiment.STUDY.save(found, tmp_path)
     stems = ("tracking", "particles", "parameters", "agreement")
     assert {path.name for path in written} == {f"{stem}.{end}" for stem in stems for end in ("csv", "md")} | {
         "paths.png", "particles.png", "drag.png", "coverage.png"}
-    assert scores.readable(found.tracking).loc["cubature", "coverage u"].startswith("0.95")
+    assert scores.readable(found.tables["tracking"]).loc["cubature", "coverage u"].startswith("0.95")
     with pytest.raises(ValueError, match="seed is 0 there and 1 now"):
-        experiment.run(dataclasses.replace(MADE, seed=1), tmp_path)
+        experiment.STUDY.run(dataclasses.replace(MADE, seed=1), tmp_path)
 
 
 def test_tasks_have_files_of_their_own():
@@ -230,15 +229,14 @@ def test_mistakes():
             ({"ram": (0, 1, 1, 1)}, "ram: chains must be at least 1")):
         with pytest.raises(ValueError, match=message):
             experiment.Settings(**wrong)
-    with pytest.raises(ValueError, match="does not take --conditional"):
-        report.run(catalogue.Wanted(Path("out"), conditional=3))
 
 
 @pytest.mark.slow
 def test_the_quick_version_runs_from_end_to_end(tmp_path):
-    found = report.run(catalogue.Wanted(tmp_path, realisations=2, quick=True))
-    assert len(found.written) == 12 and all(path.stat().st_size > 0 for path in found.written)
-    assert len(found.tables) == 4
+    found = experiment.STUDY.run(experiment.Settings.quick(runs=2), tmp_path)
+    written = experiment.STUDY.save(found, tmp_path)
+    assert len(written) == 12 and all(path.stat().st_size > 0 for path in written)
+    assert len(found.printed) == 4
 
 
 @pytest.mark.slow

@@ -13,8 +13,9 @@ from scipy import integrate, special, stats
 
 import lfm_ppl as lfm
 from lfm_ppl.engine.store import write
-from lfm_ppl.experiments import catalogue, scores, weighting
-from lfm_ppl.experiments.call_centre import counts, experiment, figures, posterior, problem, report, tables, tracking
+from lfm_ppl.experiments import scores, weighting
+from lfm_ppl.experiments.call_centre import counts, experiment, figures, posterior, problem, tables, tracking
+from lfm_ppl.experiments.study import TASKS
 from lfm_ppl.inference.optimise import Objective
 
 DATA = Path(os.environ.get("LFM_DATA", "../shared/data")) / "calls"
@@ -316,19 +317,19 @@ def test_the_figures_are_drawn_and_labelled():
 def test_what_is_stored_is_tabulated_and_drawn_without_computing(tmp_path):
     results = made_up(MADE)
     for task in experiment.all_tasks(MADE):
-        write(task, results[task.name], tmp_path / experiment.TASKS)
+        write(task, results[task.name], tmp_path / TASKS)
     lines = []
     with pytest.warns(counts.OverloadWarning, match="changed service rate: on 3 of 3 test days"):
-        found = experiment.run(MADE, tmp_path, report=lines.append)
+        found = experiment.STUDY.run(MADE, tmp_path, report=lines.append)
     assert lines[0].startswith("the counts are simulated") and lines[1] == "6 of 6 tasks are stored already"
-    kept = experiment.save(found, tmp_path)
+    kept = experiment.STUDY.save(found, tmp_path)
     assert {path.name for path in kept} == {
         f"{stem}.{end}" for stem in ("constant", "changed", "gain", "agreement", "learnt") for end in ("csv", "md")} | {
         "queue-constant.png", "queue-changed.png", "arrivals.png", "cycles.png", "errors.png"}
-    assert scores.readable(found.constant).loc["SQM", "published RMSE"] == "4.6 (2.2)"
+    assert scores.readable(found.tables["constant"]).loc["SQM", "published RMSE"] == "4.6 (2.2)"
     with pytest.raises(ValueError, match="seed is 0 there and 1 now"), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        experiment.run(dataclasses.replace(MADE, seed=1), tmp_path)
+        experiment.STUDY.run(dataclasses.replace(MADE, seed=1), tmp_path)
 
 
 def test_mistakes(tmp_path):
@@ -336,16 +337,14 @@ def test_mistakes(tmp_path):
                            ({"integrated": ("CQM",), "methods": ("SQM",)}, "integrated"),
                            ({"nuts": (2, 10)}, "nuts must be chains, warm-up and draws"),
                            ({"nuts": (2, 0, 10)}, "nuts: warm-up must be at least 1"),
-                           ({"integrated": "SQM"}, "a tuple of at least one method"),
+                           ({"integrated": "SQM"}, "a tuple of different labels, at least one"),
                            ({"weekday": "Thrusday"}, "Did you mean 'Thursday'"), ({"link": "log"}, "link")):
         with pytest.raises(ValueError, match=message):
             experiment.Settings(**wrong)
     with pytest.raises(ValueError, match="there are 31 test days that are Thursday, 40 are asked for"):
-        experiment.run(experiment.Settings(days=40), tmp_path)
-    with pytest.raises(ValueError, match="does not take --conditional"):
-        report.run(catalogue.Wanted(Path("out"), conditional=3))
+        experiment.STUDY.run(experiment.Settings(days=40), tmp_path)
     with pytest.raises(FileNotFoundError, match="there is no file"):
-        report.run(catalogue.Wanted(tmp_path, data=str(tmp_path)))
+        experiment.STUDY.run(experiment.Settings(data=str(tmp_path)), tmp_path)
 
 
 @pytest.mark.slow
@@ -376,9 +375,10 @@ def test_weighted_draws_are_those_of_a_long_chain():
 def test_the_quick_version_runs_from_end_to_end(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", counts.OverloadWarning)
-        found = report.run(catalogue.Wanted(tmp_path, realisations=1, quick=True))
-    assert len(found.written) == 15 and all(path.stat().st_size > 0 for path in found.written)
-    assert len(found.tables) == 5
+        found = experiment.STUDY.run(experiment.Settings.quick(days=1), tmp_path)
+    written = experiment.STUDY.save(found, tmp_path)
+    assert len(written) == 15 and all(path.stat().st_size > 0 for path in written)
+    assert len(found.printed) == 5
 
 
 BOTH = experiment.Settings(days=4, methods=("SQM",), functions=5, draws=2_000, mixed=5, nuts_days=4, nuts=(2, 300, 700))

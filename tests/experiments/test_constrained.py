@@ -13,7 +13,8 @@ from scipy.stats import truncnorm
 import lfm_ppl as lfm
 from lfm_ppl.engine.store import write
 from lfm_ppl.experiments import catalogue
-from lfm_ppl.experiments.constrained import estimators, experiment, figures, problem, report, tables
+from lfm_ppl.experiments.constrained import estimators, experiment, figures, problem, tables
+from lfm_ppl.experiments.study import TASKS
 from lfm_ppl.inference.optimise import Objective
 
 
@@ -161,19 +162,19 @@ def stored(folder, settings):
                      "k": np.where(np.arange(count) == 0, np.inf, 0.2),
                      "converged": np.ones(count, bool), "bands_converged": np.ones(count, bool),
                      "y": random.normal(size=(25, 3)), "measured": hours}
-        write(task, found, Path(folder) / experiment.TASKS, overwrite=False)
+        write(task, found, Path(folder) / TASKS, overwrite=False)
 
 
 def test_tables_and_figures_from_stored_results(tmp_path):
     settings = experiment.Settings(runs=3, patients=4, targets=3, block=2)
     stored(tmp_path, settings)
-    found = experiment.run(settings, tmp_path)
-    assert found.transcription.loc["delayed MHE, 60 samples", "published"] == 0.0103
-    assert found.others.loc["patients, Pareto k above 0.7", "value"] == 0.5  # the first of each block of two
+    found = experiment.STUDY.run(settings, tmp_path)
+    assert found.tables["transcription"].loc["delayed MHE, 60 samples", "published"] == 0.0103
+    assert found.tables["others"].loc["patients, Pareto k above 0.7", "value"] == 0.5  # the first of each block of two
     mse = tables.gathered(found.results, "transcription", "EP/mse")
-    assert mse.shape == (12,) and found.transcription.loc["EP", "median MSE"] == np.median(mse)
+    assert mse.shape == (12,) and found.tables["transcription"].loc["EP", "median MSE"] == np.median(mse)
     assert set(figures.draw(settings, found.results)) == {"forces", "errors", "target", "patient", "peaks"}
-    written = experiment.save(found, tmp_path)
+    written = experiment.STUDY.save(found, tmp_path)
     assert all(path.stat().st_size > 0 for path in written) and len(written) == 2 * 3 + 5
 
 
@@ -184,7 +185,7 @@ def test_settings_say_what_is_wrong():
         experiment.Settings(methods=("EPP",))
     with pytest.raises(ValueError, match="10000 records"):
         experiment.Settings(runs=10_001)
-    assert catalogue.experiment("constrained").run is report.run
+    assert catalogue.experiment("constrained").study is experiment.STUDY
 
 
 @pytest.mark.slow
@@ -215,9 +216,8 @@ def test_a_window_starts_from_the_earlier_estimate():
 @pytest.mark.slow
 def test_a_little_of_everything(tmp_path):
     """The bounds of the experiment, on few records; the estimates are feasible to the last bit."""
-    wanted = catalogue.Wanted(tmp_path, quick=True)
-    assert len(report.run(wanted).written) == 11
-    found = experiment.run(experiment.quick(), tmp_path)
-    assert found.transcription.loc[["full information", "EP"], "least"].min() >= 0.0
-    assert found.transcription.loc["full information", "largest MSE"] < 0.0103
-    assert found.transcription["failed"].sum() == 0
+    found = experiment.STUDY.run(experiment.Settings.quick(), tmp_path)
+    assert len(experiment.STUDY.save(found, tmp_path)) == 11
+    assert found.tables["transcription"].loc[["full information", "EP"], "least"].min() >= 0.0
+    assert found.tables["transcription"].loc["full information", "largest MSE"] < 0.0103
+    assert found.tables["transcription"]["failed"].sum() == 0

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lfm_ppl.experiments import catalogue
-from lfm_ppl.experiments.counts import experiment, methods, problem, report, tables
+from lfm_ppl.experiments.counts import experiment, methods, problem, tables
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 DATA = Path(os.environ.get("LFM_DATA", ROOT.parent / "shared" / "data"))
@@ -35,8 +35,9 @@ def test_settings_are_checked_and_it_is_in_the_catalogue():
         experiment.Settings(draws=0)
     with pytest.raises(FileNotFoundError, match="nowhere"):
         problem.problem(problem.CALLS[0], problem.Size(), 0, "nowhere")
-    assert catalogue.experiment("counts").summary == report.SUMMARY
-    assert len(experiment.comparing(experiment.Settings(), dict.fromkeys(problem.NAMES, {}))) == 7 * 4
+    assert catalogue.experiment("counts").study is experiment.STUDY
+    learnt = {f"{name}/parameters": {} for name in problem.NAMES}
+    assert len(experiment.comparing(experiment.Settings(), learnt)) == 7 * 4
 
 
 def test_tables_measure_against_the_reference(monkeypatch):

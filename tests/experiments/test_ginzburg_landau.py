@@ -6,6 +6,7 @@ import pytest
 from lfm_ppl.engine.store import write
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.ginzburg_landau import conditional, experiment, figures, grid, problem, sampling, state, tables
+from lfm_ppl.experiments.study import TASKS
 
 SMALL = experiment.Settings(
     realisations=1, conditional=2, particles=200, smoother_particles=50, smoother_draws=20, conditional_particles=50,
@@ -174,32 +175,32 @@ def test_the_figures_are_drawn_and_labelled():
 def test_what_is_stored_is_tabulated_and_drawn_without_computing(tmp_path):
     results = made_up(MADE)
     for one in experiment.all_tasks(MADE):
-        write(one, results[one.name], tmp_path / experiment.TASKS)
+        write(one, results[one.name], tmp_path / TASKS)
     lines = []
-    found = experiment.run(MADE, tmp_path, report=lines.append)
+    found = experiment.STUDY.run(MADE, tmp_path, report=lines.append)
     count = len(experiment.all_tasks(MADE))
     assert lines == [f"{count} of {count} tasks are stored already"]
-    written = experiment.save(found, tmp_path)
+    written = experiment.STUDY.save(found, tmp_path)
     assert {path.name for path in written} == {
         "comparison.csv", "comparison.md", "rates.csv", "rates.md", "parameters.csv", "parameters.md", "states.png",
         "marginals.png", "conditional.png", "integrated.png", "rates.png"}
     assert all(path.stat().st_size > 0 for path in written)
     first = (tmp_path / "rates.csv").read_text()
-    experiment.save(experiment.run(MADE, tmp_path), tmp_path)
+    experiment.STUDY.save(experiment.STUDY.run(MADE, tmp_path), tmp_path)
     assert (tmp_path / "rates.csv").read_text() == first
 
 
 def test_a_folder_of_other_settings_is_refused(tmp_path):
     results = made_up(MADE)
     for one in experiment.all_tasks(MADE):
-        write(one, results[one.name], tmp_path / experiment.TASKS)
+        write(one, results[one.name], tmp_path / TASKS)
     other = experiment.Settings(realisations=3, conditional=12, nodes=41, seed=1)
     with pytest.raises(ValueError, match="seed is 0 there and 1 now"):
-        experiment.run(other, tmp_path)
+        experiment.STUDY.run(other, tmp_path)
 
 
 @pytest.mark.slow
 def test_the_quick_version_runs_from_end_to_end(tmp_path):
-    found = experiment.run(experiment.quick(1, 2), tmp_path)
-    assert found.table.loc["grid, true parameters", "RMSE smoother"] < 1.5
-    assert len(experiment.save(found, tmp_path)) == 11
+    found = experiment.STUDY.run(experiment.Settings.quick(realisations=1, conditional=2), tmp_path)
+    assert found.tables["comparison"].loc["grid, true parameters", "RMSE smoother"] < 1.5
+    assert len(experiment.STUDY.save(found, tmp_path)) == 11

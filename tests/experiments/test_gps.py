@@ -9,7 +9,6 @@ from scipy import stats
 import lfm_ppl as lfm
 from lfm_ppl import orbits
 from lfm_ppl.experiments import output
-from lfm_ppl.experiments.catalogue import Wanted
 from lfm_ppl.experiments.gps import (
     experiment,
     figures,
@@ -17,7 +16,6 @@ from lfm_ppl.experiments.gps import (
     magnitudes,
     prediction,
     problem,
-    report,
     training,
     ways,
 )
@@ -53,7 +51,7 @@ def test_each_satellite_is_learnt_then_predicted_with_what_all_have_in_common(da
     assert [task.name for task in first] == ["learn/G01", "learn/G02", "learn/G04"]
     assert first[0].settings["train_days"] == 3.0 and first[0].settings["positions"] == first[1].settings["positions"]
     assert first[2].settings["positions"] is None  # it will be refused
-    second = experiment.plan_predictions(settings, {"G01": learnt(), "G02": learnt()}, first)
+    second = experiment.plan_predictions(settings, {"learn/G01": learnt(), "learn/G02": learnt()})
     assert [task.name for task in second] == ["predict/G01", "predict/G02", "ways/G01", "ways/G02", "online/G01"]
     mean, sd = second[0].settings["prior"]
     assert (mean, sd) == tuple(values.tolist() for values in magnitudes.wide("DYB"))  # two do not say what is common
@@ -148,12 +146,10 @@ def test_what_is_asked_must_be_there(data):
         experiment.plan(experiment.Settings(data="folder", satellites=("G01", "G01")))
     with pytest.raises(ValueError, match="axes"):
         experiment.Settings(axes="XYZ")
-    few = experiment.plan(experiment.quick(data="folder"))
+    few = experiment.plan(experiment.Settings.quick(data="folder"))
     assert [task.name for task in few] == ["learn/G01", "learn/G02"]
     with pytest.raises(ValueError, match="train_days"):
         experiment.Settings(train_days=-1.0)
-    with pytest.raises(ValueError, match="does not take --realisations"):
-        report.run(Wanted("nowhere", realisations=5))
 
 
 def test_a_satellite_without_positions_in_training_is_refused_with_the_reason(data):
@@ -186,7 +182,7 @@ def test_a_search_that_starts_where_there_is_no_density_says_so():
 
 def test_only_refused_satellites_are_an_error(data, tmp_path):
     with pytest.raises(ValueError, match="no satellite can be predicted. G04: 0%"):
-        experiment.run(experiment.Settings(data="folder", satellites=("G04",)), tmp_path)
+        experiment.STUDY.run(experiment.Settings(data="folder", satellites=("G04",)), tmp_path)
 
 
 def test_a_folder_without_files_says_so(tmp_path):
@@ -254,13 +250,14 @@ def test_a_simulated_satellite_is_predicted_better_with_its_forces(tmp_path):
     """One satellite, all kinds of tasks; what is stored is not computed again."""
     pytest.importorskip("erfa", reason="needs the extra gps")
     settings = experiment.Settings(satellites=(problem.SIMULATED[0],), alternatives=1)
-    found = experiment.run(settings, tmp_path)
-    row = found.satellites.loc[problem.SIMULATED[0]]
+    found = experiment.STUDY.run(settings, tmp_path)
+    row = found.tables["satellites"].loc[problem.SIMULATED[0]]
     assert row["LFM"] < 0.3 * row["deterministic"] and 0.6 < row["coverage"] <= 1.0
-    assert len(found.learning) == len(ways.WAYS)
-    again = experiment.run(settings, tmp_path)
-    assert again.satellites.drop(columns="CPU s").equals(found.satellites.drop(columns="CPU s"))
-    assert {path.name for path in experiment.save(found, tmp_path)} >= {"satellites.csv", "pooled.md", "all.png"}
+    assert len(found.tables["learning"]) == len(ways.WAYS)
+    again = experiment.STUDY.run(settings, tmp_path)
+    assert again.tables["satellites"].drop(columns="CPU s").equals(
+        found.tables["satellites"].drop(columns="CPU s"))
+    assert {path.name for path in experiment.STUDY.save(found, tmp_path)} >= {"satellites.csv", "pooled.md", "all.png"}
 
 
 @pytest.fixture(scope="module")

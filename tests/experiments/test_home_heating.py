@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from lfm_ppl.experiments import scores
-from lfm_ppl.experiments.home_heating import experiment, figures, learning, prediction, problem, report, tables
+from lfm_ppl.experiments.home_heating import experiment, figures, learning, prediction, problem, tables
 
 REAL = problem.data_folder()
 SMALL = experiment.Settings(homes=2, methods=("SQM", "none", "matern"), stores=("one store",), functions=3,
@@ -154,13 +154,13 @@ def test_tables_of_simulated_homes(window):
     assert table.loc["SQM", "ELL above matern"] == pytest.approx(20.0)
     drawn = figures.draw(SMALL, made_up(SMALL))
     assert set(drawn) == {"homes-ahead", "scores"}
-    assert "means over 2 homes" in report.title(SMALL, "homes-one-store")
+    assert "means over 2 homes" in experiment.title(SMALL, "homes-one-store")
 
 
 @pytest.mark.skipif(REAL is None, reason="needs ../shared/data/house")
 def test_tables_and_figures_with_the_real_house(window, tmp_path):
     settings = experiment.Settings(data=str(REAL), homes=2, windows=3, methods=SMALL.methods, every=2)
-    found = experiment.Comparison(settings, made_up(settings), tables.every(settings, made_up(settings)))
+    found = experiment.STUDY.found(settings, made_up(settings))
     assert list(found.tables) == ["house-one-store", "homes-one-store", "posterior", "house-envelope",
                                   "homes-envelope"]
     integrated = found.tables["posterior"].loc["integrated out by NUTS"]
@@ -170,10 +170,10 @@ def test_tables_and_figures_with_the_real_house(window, tmp_path):
     assert one.loc["none", "published ELL tracked"] == 31 and envelope.loc["SQM", "published RMSE ahead (K)"] == 0.22
     assert np.isnan(envelope.loc["matern", "published RMSE ahead (K)"])
     assert scores.readable(one).loc["none", "RMSE below none (K)"] == "0"
-    written = {path.name for path in experiment.save(found, tmp_path)}
+    written = {path.name for path in experiment.STUDY.save(found, tmp_path)}
     assert {"house-ahead.png", "homes-ahead.png", "residual.png", "scores.png", "house-envelope.md"} <= written
-    assert "2 windows" in report.title(settings, "posterior")
-    assert "3 windows" in report.title(settings, "house-envelope")
+    assert "2 windows" in experiment.title(settings, "posterior")
+    assert "3 windows" in experiment.title(settings, "house-envelope")
 
 
 @pytest.mark.parametrize("given", [{"homes": 0}, {"windows": 0}, {"methods": ("ARX",)}, {"stores": ("two",)},
@@ -185,10 +185,10 @@ def test_bad_settings(given):
 
 @pytest.mark.slow
 def test_the_quick_version_runs_and_goes_on(tmp_path):
-    settings = experiment.quick(data=None if REAL is None else str(REAL), methods=("SQM", "none"), homes=1)
-    first = experiment.run(settings, tmp_path)
+    settings = experiment.Settings.quick(data=None if REAL is None else str(REAL), methods=("SQM", "none"), homes=1)
+    first = experiment.STUDY.run(settings, tmp_path)
     lines: list[str] = []
-    again = experiment.run(settings, tmp_path, report=lines.append)
+    again = experiment.STUDY.run(settings, tmp_path, report=lines.append)
     assert "stored already" in lines[0]
     for name, table in first.tables.items():
         assert table.equals(again.tables[name])

@@ -12,30 +12,30 @@ SMALL = experiment.Settings(runs=20, functions=(5, 22), draws=20, points=(20, 20
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory):
-    return experiment.run(SMALL, tmp_path_factory.mktemp("kernels"))
+    return experiment.STUDY.run(SMALL, tmp_path_factory.mktemp("kernels"))
 
 
 @pytest.mark.slow
 def test_the_published_comparison(found):
     """Below 1e-4 with 22 eigenfunctions, above 0.1 with random frequencies, and not with 20 points."""
-    error = found.published["error"]
+    error = found.tables["published"]["error"]
     assert error["22 eigenfunctions, 200 points"] < 1e-4 and error["20 eigenfunctions, 20 points"] > 5e-3
     assert error[regression.SPARSE] > error[regression.SPARSE_4] > 0.1
 
 
 @pytest.mark.slow
 def test_the_order_of_the_published_table_holds(found):
-    rmse, density = found.regression["RMSE"], found.regression["log likelihood"]
+    rmse, density = found.tables["regression"]["RMSE"], found.tables["regression"]["log likelihood"]
     assert rmse[regression.SPARSE] > rmse[regression.SPARSE_4] > rmse[regression.KPCA]
     assert density[regression.SPARSE] < density[regression.SPARSE_4] < density[regression.KPCA]
     assert rmse[regression.KPCA] == pytest.approx(rmse[regression.EXACT], rel=1e-2)
-    coverage = found.regression.loc[regression.EXACT]
+    coverage = found.tables["regression"].loc[regression.EXACT]
     assert abs(coverage["coverage"] - 0.95) < 4 * coverage["coverage se"]
 
 
 @pytest.mark.slow
 def test_errors_fall_with_the_number_of_functions(found):
-    table = found.covariance
+    table = found.tables["covariance"]
     for row in table.index[table.index.str.endswith("eigenfunctions")]:
         assert table.loc[row, "22"] < table.loc[row, "5"]
         name = row.removesuffix(", eigenfunctions")
@@ -64,12 +64,12 @@ def test_settings_are_checked():
         experiment.Settings(functions=(5, 3))
     with pytest.raises(ValueError, match="at most 200"):
         experiment.Settings(functions=(500,))
-    assert experiment.quick(3).runs == 3
+    assert experiment.Settings.quick(runs=3).runs == 3
 
 
 @pytest.mark.slow
 def test_files_and_figures(found, tmp_path):
-    written = {path.name for path in experiment.save(found, tmp_path)}
+    written = {path.name for path in experiment.STUDY.save(found, tmp_path)}
     expected = {f"{name}.{kind}" for name in ("covariance", "published", "regression") for kind in ("csv", "md")}
     assert written == expected | {f"{name}.png" for name in
                                   ("errors", "covariances", "eigenfunctions", "draws", "prediction")}

@@ -12,8 +12,10 @@ from scipy.integrate import solve_ivp
 
 from lfm_ppl.engine.store import write
 from lfm_ppl.engine.task import Task
-from lfm_ppl.experiments import catalogue, scores
-from lfm_ppl.experiments.transcription import ellipses, experiment, figures, problem, report, slices, tables, verdict
+from lfm_ppl.experiments import scores
+from lfm_ppl.experiments.published import Verdict, summary
+from lfm_ppl.experiments.study import TASKS
+from lfm_ppl.experiments.transcription import ellipses, experiment, figures, problem, slices, tables
 from lfm_ppl.latent_grid.laplace import laplace
 
 SATURATION, EXPONENTIAL = problem.CONFIGURATIONS[1], problem.CONFIGURATIONS[6]
@@ -216,7 +218,7 @@ def test_the_tables_count_what_was_found():
     (-4.3, "lower than published (z = -4.3)", True), (-31.0, "lower than published (z = -31.0)", True),
     (4.3, "higher than published (z = 4.3)", False), (np.nan, "-", False)])
 def test_a_verdict_is_two_sided_and_lower_is_consistent(z, text, consistent):
-    one = verdict.Verdict(z)
+    one = Verdict(z)
     assert str(one) == text and one.consistent is consistent
     assert one.lower == text.startswith("lower") and one.higher == text.startswith("higher")
 
@@ -238,7 +240,7 @@ def test_each_published_cell_has_its_verdict():
         "higher than published (z = 5.0)", "lower than published (z = -6.0)", "consistent"]
     assert table.loc["repression 1", "ESLS verdict"] == "-"
     assert scores.readable(table).loc["exponential", "ESLS verdict"] == "lower than published (z = -6.0)"
-    assert verdict.summary(tables.verdicts(table).values()) == (
+    assert summary(tables.verdicts(table).values()) == (
         "2 of 3 cells count as consistent with the published table, 1 of them lower than published; 1 higher.")
 
 
@@ -248,7 +250,7 @@ def test_a_killed_run_ends_with_the_same_table(tmp_path, monkeypatch):
     monkeypatch.setattr(experiment, "METHODS", ("ESLS", "GFS"))
     settings = experiment.Settings(datasets=2, draws=400, burn_in=40,
                                    configurations=(SATURATION.label, EXPONENTIAL.label))
-    whole = experiment.run(settings, tmp_path / "whole")
+    whole = experiment.STUDY.run(settings, tmp_path / "whole")
     compute, done = experiment.compute, []
 
     def killed(task):
@@ -257,12 +259,11 @@ def test_a_killed_run_ends_with_the_same_table(tmp_path, monkeypatch):
         done.append(task.name)
         return compute(task)
 
-    monkeypatch.setattr(experiment, "compute", killed)
     with pytest.raises(KeyboardInterrupt):
-        experiment.run(settings, tmp_path / "half")
-    monkeypatch.setattr(experiment, "compute", compute)
-    again = experiment.run(settings, tmp_path / "half")
-    for first, second in ((whole.table, again.table), (whole.published, again.published)):
+        dataclasses.replace(experiment.STUDY, compute=killed).run(settings, tmp_path / "half")
+    again = experiment.STUDY.run(settings, tmp_path / "half")
+    for name in ("comparison", "published"):
+        first, second = whole.tables[name], again.tables[name]
         timeless = [name for name in first if "CPU" not in name]
         pd.testing.assert_frame_equal(first[timeless], second[timeless], check_exact=True)
 
@@ -278,30 +279,30 @@ def test_what_is_not_finite_has_diverged():
 def test_what_is_stored_is_tabulated_and_drawn_without_computing(tmp_path):
     results = made_up(FEW)
     for one in experiment.all_tasks(FEW):
-        write(one, results[one.name], tmp_path / experiment.TASKS)
-    found = experiment.run(FEW, tmp_path)
-    written = experiment.save(found, tmp_path)
+        write(one, results[one.name], tmp_path / TASKS)
+    found = experiment.STUDY.run(FEW, tmp_path)
+    written = experiment.STUDY.save(found, tmp_path)
     assert {path.name for path in written} == {
         "comparison.csv", "comparison.md", "published.csv", "published.md", "paired.csv", "paired.md", "errors.png",
         "force-repression-0.1.png", "force-exponential.png"}
     first = (tmp_path / "comparison.csv").read_text()
-    experiment.save(experiment.run(FEW, tmp_path), tmp_path)
+    experiment.STUDY.save(experiment.STUDY.run(FEW, tmp_path), tmp_path)
     assert (tmp_path / "comparison.csv").read_text() == first
     with pytest.raises(ValueError, match="draws is 400 there and 800 now"):
-        experiment.run(dataclasses.replace(FEW, draws=800), tmp_path)
+        experiment.STUDY.run(dataclasses.replace(FEW, draws=800), tmp_path)
 
 
-def test_the_report_says_how_many_cells_are_consistent_and_why_lower_ones_are_trusted(tmp_path, monkeypatch):
+def test_the_report_says_how_many_cells_are_consistent_and_why_lower_ones_are_trusted(tmp_path):
     settings = experiment.Settings(datasets=2, configurations=(EXPONENTIAL.label,))
-    monkeypatch.setattr(experiment, "Settings", lambda **given: dataclasses.replace(settings, **given))
     results = made_up(settings)
     for one in experiment.all_tasks(settings):
         results[one.name]["rmse"] = results[one.name]["rmse"] + [0.0, 1e-3]
-        write(one, results[one.name], tmp_path / experiment.TASKS)
-    found = report.run(catalogue.Wanted(tmp_path, realisations=2))
+        write(one, results[one.name], tmp_path / TASKS)
+    found = experiment.STUDY.run(settings, tmp_path)
+    experiment.STUDY.save(found, tmp_path)
     assert found.notes == (  # LA has one sound data set alone, ESLS 0.3005 (0.0005) for 0.290, GFS 0.6 for 0.358
         "0 of 2 cells count as consistent with the published table, 0 of them lower than published; 2 higher.",
-        verdict.TRUST)
+        experiment.TRUST)
     assert "higher than published" in (tmp_path / "published.md").read_text()
 
 
@@ -323,7 +324,7 @@ def test_mistakes():
         experiment.Settings(datasets=0)
     with pytest.raises(ValueError, match="burn_in must lie in"):
         experiment.Settings(draws=100, burn_in=200)
-    with pytest.raises(ValueError, match="must be a tuple of labels"):
+    with pytest.raises(ValueError, match="must be a tuple of different labels"):
         experiment.Settings(configurations="exponential")
     with pytest.raises(ValueError, match="gamma must be"):
         problem.activity(jnp.zeros(3), "saturation", -0.1)

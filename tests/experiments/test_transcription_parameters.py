@@ -1,7 +1,6 @@
 """The experiment with unknown rates: its model, its samplers on a little of it, its table and figure."""
 
 import dataclasses
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -10,12 +9,11 @@ import numpyro
 import pytest
 
 from lfm_ppl.engine.task import Task
-from lfm_ppl.experiments import catalogue
 from lfm_ppl.experiments.transcription import parameters, parameters_report, problem
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.results import arviz_data
 
-FEW = dataclasses.replace(parameters_report.quick(), links=tuple(parameters.LINKS))
+FEW = dataclasses.replace(parameters_report.Settings.quick(), links=tuple(parameters.LINKS))
 SOFTPLUS = parameters.LINKS["softplus"]
 
 
@@ -65,12 +63,11 @@ def made_up(settings):
 
 def found_in(results, settings):
     """The comparison of made-up results."""
-    cells = parameters_report.by_cell(settings, results)
-    return parameters_report.Comparison(settings, cells, parameters_report.agreement(cells))
+    return parameters_report.STUDY.found(settings, results)
 
 
 def test_the_table_measures_in_standard_deviations_of_the_reference():
-    table = found_in(made_up(FEW), FEW).table
+    table = found_in(made_up(FEW), FEW).tables["agreement"]
     assert len(table) == len(parameters.LINKS) * len(parameters.SAMPLERS)
     row = table.loc["softplus: RAM, marginal"]
     assert row["shift"] == pytest.approx(0.5) and row["sd ratio"] == pytest.approx(1.1)
@@ -89,13 +86,13 @@ def test_a_chain_that_stands_still_shows():
                  and task.settings["sampler"] == "RAM, marginal" and task.settings["link"] == "softplus")
     for name, value in (("ess", np.nan), ("r_hat", np.nan), ("sd", 0.0)):
         results[still][name][3] = value
-    row = found_in(results, two).table.loc["softplus: RAM, marginal"]
+    row = found_in(results, two).tables["agreement"].loc["softplus: RAM, marginal"]
     assert row["least ESS"] == 0 and row["R-hat"] == np.inf and row["sd ratio"] == 0
     assert row["ESS/CPU s"] == pytest.approx(1.0)
 
 
 def test_the_figures_are_labelled():
-    figures = parameters_report.draw(found_in(made_up(FEW), FEW))
+    figures = parameters_report.draw(FEW, made_up(FEW))
     assert set(figures) == {"posteriors-softplus", "posteriors-saturation-0.5"}
     for figure in figures.values():
         upper, lower = figure.axes
@@ -116,9 +113,6 @@ def test_mistakes():
         parameters_report.Settings(ram=(0, 1, 1, 1))
     with pytest.raises(ValueError, match="tree_depth must be at least 1"):
         parameters_report.Settings(tree_depth=0)
-    wanted = catalogue.Wanted(Path("out"), conditional=3)
-    with pytest.raises(ValueError, match="does not take --conditional"):
-        parameters_report.run(wanted)
 
 
 def settings_of(label, chains, warmup, draws, thin):

@@ -13,7 +13,7 @@ import numpy as np
 
 from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments.ballistic import problem
-from lfm_ppl.experiments.ballistic.tracking import blocks
+from lfm_ppl.experiments.study import blocks
 
 REACH, POINTS = 1.5, 121
 """Of the grid about the true log alpha: a dozen posterior standard deviations wide, of a tenth of one a cell."""

@@ -19,7 +19,8 @@ import numpy as np
 from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.ballistic import problem
-from lfm_ppl.experiments.ballistic.tracking import blocks, judged
+from lfm_ppl.experiments.ballistic.tracking import judged
+from lfm_ppl.experiments.study import blocks, stacked
 from lfm_ppl.experiments.timing import timed
 from lfm_ppl.experiments.weighting import Weighted, moments, weighted
 from lfm_ppl.inference.optimise import Minimum, newton, quasi_newton
@@ -69,7 +70,7 @@ def compute(task: Task) -> Result:
     """
     _warm(task.settings["draws"], task.settings["paths"])
     given = problem.drawn_target if task.settings["what"] == "drawn" else problem.target
-    rows: dict[str, list] = {}
+    rows: list[Result] = []
     first: Result = {}
     for index in range(task.settings["first"], task.settings["last"] + 1):
         target = given(index, task.seed)
@@ -77,9 +78,8 @@ def compute(task: Task) -> Result:
         found = estimate(target, task.settings["draws"], task.settings["paths"], seed)
         drawn = found.pop("draws")
         first = first or {"draws": drawn}
-        for name, value in found.items():
-            rows.setdefault(name, []).append(value)
-    return {**{name: np.stack(values) for name, values in rows.items()}, **first}
+        rows.append(found)
+    return stacked(rows) | first
 
 
 def estimate(target: problem.Target, count: int, paths: int, seed: int) -> Result:

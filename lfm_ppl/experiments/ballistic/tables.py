@@ -9,10 +9,12 @@ import pandas as pd
 from scipy import stats
 
 from lfm_ppl.engine.task import Result, Task
+from lfm_ppl.experiments import chains as common
 from lfm_ppl.experiments.ballistic import chains, known, problem, tracking
 from lfm_ppl.experiments.ballistic import parameters as estimates
 from lfm_ppl.experiments.ballistic import particles as by_particles
-from lfm_ppl.experiments.scores import Estimate, mean_of, pair, rate_of, relative_errors_of_sd
+from lfm_ppl.experiments.scores import Estimate, mean_of, pair, rate_of
+from lfm_ppl.experiments.study import stacked
 
 UNITS = {"altitude": "m", "speed": "m/s", "u": "m/s^2"}
 UNKNOWN = {"most likely parameters": "likely", "parameters integrated out": "posterior"}
@@ -42,7 +44,7 @@ def of_parameters(settings: Any, results: dict[str, Result], drawn: bool = False
 def of_particles(settings: Any, results: dict[str, Result], count: int) -> dict[str, np.ndarray]:
     """Return what a number of particles gives, for the targets that have them."""
     own = [results[task.name] for task in by_particles.tasks(settings) if task.settings["particles"] == count]
-    return {name: np.stack([np.asarray(one[name]) for one in own]) for name in own[0]}
+    return stacked(own)
 
 
 def tracked(settings: Any, results: dict[str, Result]) -> pd.DataFrame:
@@ -186,28 +188,14 @@ def agreement(settings: Any, results: dict[str, Result]) -> pd.DataFrame:
     for label, own in found.items():
         row: dict[str, float] = {}
         if label != NUTS:
-            pairs = list(zip(own, reference, strict=True))
-            shift = np.stack([(one["mean"] - exact["mean"]) / exact["sd"] for one, exact in pairs])
-            ratio = np.stack([one["sd"] / exact["sd"] for one, exact in pairs])
-            error = np.stack([np.sqrt(1 / one["ess"] + 1 / exact["ess"]) for one, exact in pairs])
-            worst = np.unravel_index(np.abs(shift).argmax(), shift.shape)
-            with np.errstate(divide="ignore"):
-                widest = np.unravel_index(np.abs(np.log(ratio)).argmax(), ratio.shape)
-            row |= pair("shift", Estimate(float(abs(shift[worst])), float(error[worst])))
-            spread = ratio * np.stack([np.hypot(*map(_relative_error_of_sd, both)) for both in pairs])
-            row |= pair("sd ratio", Estimate(float(ratio[widest]), float(spread[widest])))
-        # A chain that does not move has neither; it must not look as if it did.
-        row["least ESS"] = min(float(np.nan_to_num(one["ess"]).min()) for one in own)
+            shift, ratio = common.agreement(own, reference)
+            row |= pair("shift", shift) | pair("sd ratio", ratio)
+        row["least ESS"] = min(map(common.least_ess, own))
         row |= pair("CPU s", mean_of([one["seconds"] for one in own]))
         if label == WEIGHTED:
             row["k"] = float(everything["k"][:few].max())
         else:
-            row["R-hat"] = max(float(np.nan_to_num(one["r_hat"], nan=np.inf).max()) for one in own)
+            row["R-hat"] = max(map(common.largest_r_hat, own))
             row["divergences"] = float(np.mean([one["divergences"] for one in own]))
         rows[label] = row
     return pd.DataFrame.from_dict(rows, orient="index", dtype=float)
-
-
-def _relative_error_of_sd(found: Result) -> np.ndarray:
-    """Return Monte Carlo errors of standard deviations; of weighted draws those of a normal distribution."""
-    return relative_errors_of_sd(found["draws"]) if "draws" in found else np.sqrt(0.5 / found["ess"])

@@ -12,6 +12,7 @@ import numpy as np
 from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.ballistic import problem
+from lfm_ppl.experiments.study import blocks, stacked
 from lfm_ppl.experiments.timing import timed
 from lfm_ppl.filtering.filter import filter as gaussian_filter
 from lfm_ppl.filtering.smoother import smooth
@@ -35,16 +36,6 @@ def tasks(settings: Any) -> list[Task]:
             for rule in settings.rules for first, last in blocks(settings.runs, BLOCK)]
 
 
-def blocks(count: int, size: int) -> list[tuple[int, int]]:
-    """Return first and last index of each block.
-
-    Example:
-        >>> blocks(5, 2)
-        [(0, 1), (2, 3), (4, 4)]
-    """
-    return [(first, min(first + size, count) - 1) for first in range(0, count, size)]
-
-
 def compute(task: Task) -> Result:
     """Return errors, coverage and times of every target of the task.
 
@@ -55,18 +46,17 @@ def compute(task: Task) -> Result:
     """
     filtering, smoothing = _programs(task.settings["method"])
     filtering(problem.target(0, task.seed).y), smoothing(problem.target(0, task.seed).y)  # touch the memory once
-    rows: dict[str, list] = {}
+    rows: list[Result] = []
     first: Result = {}
     for index in range(task.settings["first"], task.settings["last"] + 1):
         target = problem.target(index, task.seed)
         filter_s, (filtered, log_likelihood) = timed(filtering, target.y)
         smoother_s, (mean, sd) = timed(smoothing, target.y)
-        one = {"filter_rmse": rmse(filtered, target), "log_likelihood": float(log_likelihood),
-               "filter_seconds": filter_s, "smoother_seconds": smoother_s, **judged("smoother", mean, sd, target)}
-        for name, value in one.items():
-            rows.setdefault(name, []).append(value)
+        rows.append({"filter_rmse": rmse(filtered, target), "log_likelihood": float(log_likelihood),
+                     "filter_seconds": filter_s, "smoother_seconds": smoother_s,
+                     **judged("smoother", mean, sd, target)})
         first = first or {"mean": np.asarray(mean), "sd": np.asarray(sd)}
-    return {**{name: np.stack(values) for name, values in rows.items()}, **first}
+    return stacked(rows) | first
 
 
 def judged(what: str, mean: Any, sd: Any, target: problem.Target) -> Result:

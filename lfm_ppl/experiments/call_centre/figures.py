@@ -7,17 +7,17 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 
 from lfm_ppl.engine.task import Result
 from lfm_ppl.experiments.call_centre import counts, posterior, problem, tables, tracking
 from lfm_ppl.experiments.call_centre.problem import BIN, DAY, GRID, OPEN, TESTED, TRAIN
 from lfm_ppl.experiments.call_centre.tracking import Tracked
+from lfm_ppl.experiments.drawing import TRUTH, band, legend, line, patch
 from lfm_ppl.experiments.scores import Z, mean_of
 from lfm_ppl.results.plots import style
 
 _TRUTH, _ESTIMATE, _READING = style.BLACK, style.BLUE, style.VERMILLION
+_END: dict[str, Any] = {"color": style.GREY, "lw": 0.7, "ls": ":", "label": "end of training"}
 _COLOURS = (style.BLUE, style.GREEN, style.SKY, style.ORANGE, style.VERMILLION, style.PURPLE)
 
 
@@ -59,17 +59,17 @@ def plot_queues(settings: Any, results: dict[str, Result], test: str, *, width: 
     read = np.isfinite(one.y[test][:, 0])
     top = 1.35 * one.queues[test].max()
     for axes, (method, estimate) in zip(panels, found.items(), strict=True):
+        axes.plot(days, estimate.queue(), color=_ESTIMATE, lw=0.9, label="filter, median")
         axes.fill_between(days, estimate.queue(-Z), np.minimum(estimate.queue(Z), 2 * top), color=_ESTIMATE, alpha=0.2,
-                          lw=0)
-        axes.plot(days, estimate.queue(), color=_ESTIMATE, lw=0.9)
-        axes.plot(days, one.queues[test], color=_TRUTH, lw=0.8, ls="--")
-        axes.plot(days[read], np.expm1(one.y[test][read, 0]), ls="", marker=".", ms=3, color=_READING)
-        axes.axvline(TRAIN, color=style.GREY, lw=0.7, ls=":")
+                          lw=0, label="95%")
+        axes.plot(days, one.queues[test], **TRUTH | {"label": "true queue"})
+        axes.plot(days[read], np.expm1(one.y[test][read, 0]), ls="", marker=".", ms=3, color=_READING, label="readings")
+        axes.axvline(TRAIN, **_END)
         axes.set_ylim(-0.03 * top, top)
         axes.set_title(method)
         style.label_values(axes, "queue", "customers")
     style.label_time(panels, "working days")
-    style.legend_above(figure, _handles())
+    legend(figure)
     first, second = TESTED[test]
     style.note_below(figure, f"Test day {one.date}, service rate {first:g}, then {second:g} per minute; the filter's "
                              "estimates, given the readings up to each time.")
@@ -84,18 +84,15 @@ def plot_arrivals(settings: Any, results: dict[str, Result], *, width: str | flo
     top = 1.4 * one.arrivals.max()
     for axes, (method, estimate) in zip(panels, found.items(), strict=True):
         mean, sd = estimate.arrivals, estimate.arrivals_sd
-        axes.fill_between(GRID / DAY, mean - Z * sd, mean + Z * sd, color=_ESTIMATE, alpha=0.2, lw=0)
-        axes.plot(GRID / DAY, mean, color=_ESTIMATE, lw=0.9)
-        axes.plot(GRID[1:] / DAY, one.arrivals, color=_TRUTH, lw=0.5)
-        axes.axvline(TRAIN, color=style.GREY, lw=0.7, ls=":")
+        axes.plot(GRID / DAY, mean, color=_ESTIMATE, lw=0.9, label="filter")
+        band(axes, GRID / DAY, mean, sd, color=_ESTIMATE, alpha=0.2, label="95%")
+        axes.plot(GRID[1:] / DAY, one.arrivals, color=_TRUTH, lw=0.5, label="counts")
+        axes.axvline(TRAIN, **_END)
         axes.set_ylim(-0.3 * top, top)
         axes.set_title(method)
         style.label_values(axes, "arrivals", "1/min")
     style.label_time(panels, "working days")
-    style.legend_above(figure, [Line2D([], [], color=_ESTIMATE, label="filter"),
-                                Patch(color=_ESTIMATE, alpha=0.2, label="95%"),
-                                Line2D([], [], color=_TRUTH, lw=0.8, label="counts"),
-                                Line2D([], [], color=style.GREY, ls=":", label="end of training")])
+    legend(figure)
     return figure
 
 
@@ -112,16 +109,14 @@ def plot_cycles(settings: Any, results: dict[str, Result], *, width: str | float
     hours = 7.0 + BIN * np.arange(1, OPEN + 1) / 60.0
     for day, axes in enumerate(panels):
         own = slice(day * OPEN + 1, (day + 1) * OPEN + 1)
-        axes.fill_between(hours, (mean - Z * sd)[own], (mean + Z * sd)[own], color=_ESTIMATE, alpha=0.2, lw=0)
-        axes.plot(hours, mean[own], color=_ESTIMATE)
-        axes.plot(hours, one.arrivals[day * OPEN:(day + 1) * OPEN], color=_TRUTH, lw=0.5)
+        axes.plot(hours, mean[own], color=_ESTIMATE, label=f"{settings.integrated[0]}, smoothed")
+        band(axes, hours, mean[own], sd[own], color=_ESTIMATE, alpha=0.2, label="95%")
+        axes.plot(hours, one.arrivals[day * OPEN:(day + 1) * OPEN], color=_TRUTH, lw=0.5, label="counts")
         axes.set_ylim(0, 1.15 * max(one.arrivals.max(), mean.max()))
         axes.set_title("test day" if day == TRAIN else f"day {day + 1}")
         style.label_values(axes, "arrivals", "1/min")
     style.label_time(panels, "hours after midnight")
-    style.legend_above(figure, [Line2D([], [], color=_ESTIMATE, label=f"{settings.integrated[0]}, smoothed"),
-                                Patch(color=_ESTIMATE, alpha=0.2, label="95%"),
-                                Line2D([], [], color=_TRUTH, lw=0.8, label="counts")])
+    legend(figure)
     return figure
 
 
@@ -159,17 +154,8 @@ def plot_errors(settings: Any, results: dict[str, Result], *, width: str | float
         axes.set_xticks(range(len(names)), names, rotation=60, fontsize=style.SMALL)
         axes.set_xlim(-0.6, len(names) - 0.4)
         axes.tick_params(labelsize=style.SMALL, length=2.5, width=0.6)
-    style.legend_above(figure, [
-        Line2D([], [], color=style.GREY, marker=".", ms=3, ls="", label="a test day"),
-        Line2D([], [], color=style.GREY, lw=1.5, label="mean"),
-        Line2D([], [], color=style.GREY, marker="o", ms=3.5, ls="", label="constant"),
-        Line2D([], [], color=style.GREY, marker="s", ms=3.5, ls="", label="changed service rate"),
-        Patch(color=style.GREY, alpha=0.15, label="90% to 98%")])
+    legend(figure, line("a test day", style.GREY, "", marker=".", ms=3), line("mean", style.GREY, lw=1.5),
+           line("constant", style.GREY, "", marker="o", ms=3.5),
+           line("changed service rate", style.GREY, "", marker="s", ms=3.5),
+           patch("90% to 98%", style.GREY, alpha=0.15))
     return figure
-
-
-def _handles() -> list[Any]:
-    return [Line2D([], [], color=_ESTIMATE, label="filter, median"), Patch(color=_ESTIMATE, alpha=0.2, label="95%"),
-            Line2D([], [], color=_TRUTH, ls="--", lw=0.8, label="true queue"),
-            Line2D([], [], color=_READING, marker=".", ms=4, ls="", label="readings"),
-            Line2D([], [], color=style.GREY, ls=":", label="end of training")]

@@ -20,6 +20,7 @@ from lfm_ppl.experiments import chains, scores
 from lfm_ppl.experiments.call_centre import problem, tracking
 from lfm_ppl.experiments.call_centre.problem import FIRST, TESTED, Method, Window
 from lfm_ppl.experiments.call_centre.tracking import Tracked
+from lfm_ppl.experiments.study import stacked
 from lfm_ppl.experiments.weighting import Weighted, weighted
 from lfm_ppl.inference.optimise import Minimum
 from lfm_ppl.results import importance
@@ -74,7 +75,7 @@ def compute(task: Task) -> Result:
             best = tracking.learn(method, one.training)
             shape = tracking.shapes(method, best.z, one.y["constant"], TESTED["constant"])
             first = {"shapes": shape.arrivals, "shapes_sd": shape.arrivals_sd}
-    return {**{key: np.array([row[key] for row in rows]) for key in rows[0]}, **first}
+    return stacked(rows) | first
 
 
 def compute_nuts(task: Task) -> Result:

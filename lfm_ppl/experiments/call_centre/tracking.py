@@ -23,6 +23,7 @@ from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.call_centre import counts, problem
 from lfm_ppl.experiments.call_centre.problem import FIRST, GRID, TESTED, Method, Window
+from lfm_ppl.experiments.study import stacked
 from lfm_ppl.filtering.filter import filter
 from lfm_ppl.filtering.smoother import smooth
 from lfm_ppl.inference.optimise import quasi_newton
@@ -250,4 +251,4 @@ def compute(task: Task) -> Result:
             if not rows:
                 first |= {f"{name}_{key}": value for key, value in found._asdict().items()}
         rows.append(row | {"seconds": time.process_time() - began})
-    return {**{key: np.array([row[key] for row in rows]) for key in rows[0]}, **first}
+    return stacked(rows) | first

@@ -1,89 +1,39 @@
-"""The whole experiment: its settings, its tasks, its run, and what it leaves in a folder."""
+"""The study: its settings, tasks, tables and figures."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
-import pandas as pd
 
-from lfm_ppl import checks
-from lfm_ppl.engine.cluster import Workers
-from lfm_ppl.engine.run import Reporter, run_tasks
 from lfm_ppl.engine.task import Result, Task
-from lfm_ppl.experiments import output, weighting
+from lfm_ppl.experiments import study, weighting
 from lfm_ppl.experiments.constrained import estimators, figures, problem, tables
+from lfm_ppl.experiments.study import Results, Study, Table, blocks, setting
 from lfm_ppl.inference.optimise import newton, quasi_newton
 
-TASKS = "tasks"
 _SEARCH = {"ftol": 1e-10, "gtol": 1e-4}
 _FURTHEST = float(np.log(problem.TIMES[-1] / 2.0))
 """Largest logarithm of the lengthscale that is learnt from 60 samples, whose likelihood often has no maximum."""
 
 
 @dataclass(frozen=True)
-class Settings:
-    """How much is computed.
+class Settings(study.Settings):
+    """How much is computed."""
 
-    Attributes:
-        runs: records of each shape of the transcription factor.
-        seed: of everything random.
-        patients: simulated days of TSH, FT3 and FT4.
-        targets: on reentry.
-        draws: of a patient's parameters, over which bands are averaged.
-        weighted: draws from which these are taken.
-        shapes: of the force, names of `problem.SHAPES`.
-        methods: names of `estimators.METHODS`, with full information and EP among them.
-        block: records that are computed in one go, and stored in one file.
-    """
-
-    runs: int = 100
-    seed: int = 0
-    patients: int = 50
-    targets: int = 20
-    draws: int = 16
-    weighted: int = 150
-    shapes: tuple[str, ...] = problem.SHAPES
-    methods: tuple[str, ...] = tuple(estimators.METHODS)
-    block: int = 25
-
-    def __post_init__(self) -> None:
-        """Check what a user gives."""
-        for name in ("runs", "patients", "targets", "draws", "weighted", "block"):
-            checks.positive_integer(name, getattr(self, name))
-        for shape in self.shapes:
-            checks.one_of("shapes", shape, problem.SHAPES)
-        for method in self.methods:
-            checks.one_of("methods", method, estimators.METHODS)
-        if max(self.runs, self.patients, self.targets) > problem.MOST:
-            raise ValueError(f"one seed has {problem.MOST} records of a kind; use several seeds for more.")
-
-
-def quick(runs: int = 2, seed: int = 0) -> Settings:
-    """Return settings that show in minutes that everything runs, and no more."""
-    return Settings(runs, seed, patients=2, targets=2, shapes=problem.SHAPES[:1], methods=(
-        estimators.SMOOTHER, estimators.FULL, estimators.BANDS))
-
-
-class Comparison(NamedTuple):
-    """What the experiment found.
-
-    Attributes:
-        settings: that it ran with.
-        results: of every task, by name.
-        transcription: errors, minima and coverage, one row an estimator.
-        shapes: median errors and coverage by the shape of the force.
-        others: the target's paths and the patients' TRH.
-    """
-
-    settings: Settings
-    results: dict[str, Result]
-    transcription: pd.DataFrame
-    shapes: pd.DataFrame
-    others: pd.DataFrame
+    runs: int = setting(100, "records of each shape of the transcription factor", quick=2,
+                        aliases=study.REALISATIONS, per_seed=problem.MOST)
+    patients: int = setting(50, "simulated days of TSH, FT3 and FT4", quick=2, per_seed=problem.MOST)
+    targets: int = setting(20, "on reentry", quick=2, per_seed=problem.MOST)
+    draws: int = setting(16, "of a patient's parameters, over which bands are averaged")
+    weighted: int = setting(150, "draws from which these are taken")
+    shapes: tuple[str, ...] = setting(problem.SHAPES, "of the force", quick=problem.SHAPES[:1], choices=problem.SHAPES)
+    methods: tuple[str, ...] = setting(
+        tuple(estimators.METHODS), "estimators, with full information and EP among them",
+        quick=(estimators.SMOOTHER, estimators.FULL, estimators.BANDS), choices=tuple(estimators.METHODS))
+    block: int = setting(25, "records that are computed in one go, and stored in one file")
 
 
 def all_tasks(settings: Settings) -> list[Task]:
@@ -96,15 +46,12 @@ def all_tasks(settings: Settings) -> list[Task]:
     return [
         Task("/".join([what, *filter(None, [shape.replace(" ", "-")]), f"{first:04d}"]), settings.seed,
              {"experiment": "constrained", "what": what, "shape": shape, "first": first,
-              "count": min(settings.block, count - first), **own[what]})
-        for what, shape, count in kinds for first in range(0, count, settings.block)]
+              "count": last - first + 1, **own[what]})
+        for what, shape, count in kinds for first, last in blocks(count, settings.block)]
 
 
-def compute(task: Task) -> Result:
-    """Compute one task."""
-    indices = range(task.settings["first"], task.settings["first"] + task.settings["count"])
-    return {"transcription": _transcription, "ballistic": _ballistic, "thyroid": _thyroid}[task.settings["what"]](
-        task, indices)
+def _indices(task: Task) -> range:
+    return range(task.settings["first"], task.settings["first"] + task.settings["count"])
 
 
 def posterior_mode(posterior: Any, y: np.ndarray, prior: float = 1.0, furthest: float = np.inf) -> np.ndarray:
@@ -131,9 +78,9 @@ def drawn(posterior: Any, y: np.ndarray, mode: np.ndarray, seed: int, draws: int
     return found.draws[chosen], found.weights.k
 
 
-def _transcription(task: Task, indices: range) -> Result:
+def _transcription(task: Task) -> Result:
     """Return by estimator, ``{method}/``: ``mse``, ``minimum``, ``coverage`` (N,), and the ``first`` record's paths."""
-    records = [problem.record(task.settings["shape"], index, task.seed) for index in indices]
+    records = [problem.record(task.settings["shape"], index, task.seed) for index in _indices(task)]
     y, truth = (np.stack([getattr(one, name) for one in records]) for name in ("y", "force"))
     values: dict[str, np.ndarray] = {}
     methods = {method: estimators.METHODS[method] for method in task.settings["methods"]}
@@ -159,25 +106,25 @@ def _transcription(task: Task, indices: range) -> Result:
     return result
 
 
-def _ballistic(task: Task, indices: range) -> Result:
+def _ballistic(task: Task) -> Result:
     """Return ``rmse`` (N, 3) and ``converged`` (N,), and the first target's ``estimate`` and ``truth`` (3, T)."""
-    pairs = [problem.target(index, task.seed) for index in indices]
+    pairs = [problem.target(index, task.seed) for index in _indices(task)]
     y, truth = (np.stack(part) for part in zip(*pairs, strict=True))
     paths, converged = (np.asarray(a) for a in estimators.ballistic()(y))
     return {"rmse": np.sqrt(((paths - truth) ** 2).mean(axis=2)), "converged": converged, "estimate": paths[0],
             "truth": truth[0]}
 
 
-def _thyroid(task: Task, indices: range) -> Result:
+def _thyroid(task: Task) -> Result:
     """Return what `estimators.thyroid` does, and ``rmse``, ``coverage`` (N,), ``peak`` (N, 2) in h, ``truth`` (N, K).
 
     A peak is the greatest value and the maximum of the wave of 24 h that fits best; errors of both are returned.
     """
-    patients = [problem.patient(index, task.seed) for index in indices]
+    patients = [problem.patient(index, task.seed) for index in _indices(task)]
     posterior = problem.thyroid_learning()
     z = np.stack([posterior_mode(posterior, one.y) for one in patients])
     y = np.stack([one.y for one in patients])
-    seeds = [problem.MOST * task.seed + index for index in indices]
+    seeds = [problem.MOST * task.seed + index for index in _indices(task)]
     counts = task.settings["draws"], task.settings["weighted"]
     draws, k = zip(*(drawn(posterior, *one, *counts) for one in zip(y, z, seeds, strict=True)), strict=True)
     full, bands = estimators.thyroid()
@@ -211,27 +158,17 @@ def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.abs((a - b + 12.0) % 24.0 - 12.0)
 
 
-def run(settings: Settings, folder: str | Path, *, overwrite: bool = False,
-        report: Reporter | None = None, workers: Workers = 1) -> Comparison:
-    """Compute what is not stored yet in ``folder``, and tabulate everything.
-
-    Args:
-        settings: how much.
-        folder: of the experiment; its subfolder ``tasks`` holds a file for each task.
-        overwrite: compute again what was stored with other settings.
-        report: what to do with a line of progress; None: nothing.
-        workers: what computes; see `run_tasks`.
-
-    Raises:
-        ValueError: the folder holds results made with other settings.
-    """
-    results = run_tasks(all_tasks(settings), compute, Path(folder) / TASKS, overwrite=overwrite, report=report,
-                        workers=workers)
-    return Comparison(settings, results, tables.transcription(settings, results), tables.shapes(settings, results),
-                      tables.others(settings, results))
+def tabulated(settings: Settings, results: Results) -> dict[str, Table]:
+    """Return the tables."""
+    return {"transcription": Table(
+                f"Transcription, {len(settings.shapes)} shapes of force by {settings.runs} records",
+                tables.transcription(settings, results)),
+            "shapes": Table("By the shape of the force", tables.shapes(settings, results)),
+            "others": Table(f"{settings.targets} targets on reentry and {settings.patients} patients",
+                            tables.others(settings, results))}
 
 
-def save(found: Comparison, folder: str | Path) -> list[Path]:
-    """Write tables and figures, replacing older ones, and return their paths."""
-    shown = {"transcription": found.transcription, "shapes": found.shapes, "others": found.others}
-    return output.save(folder, shown, figures.draw(found.settings, found.results), "estimator")
+KINDS = {"transcription": _transcription, "ballistic": _ballistic, "thyroid": _thyroid}
+"""What the tasks are."""
+
+STUDY = Study(Settings, all_tasks, KINDS, tabulated, figures.draw, label="estimator")

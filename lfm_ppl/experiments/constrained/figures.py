@@ -6,16 +6,12 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 from matplotlib.ticker import NullFormatter
 
 from lfm_ppl.engine.task import Result
 from lfm_ppl.experiments.constrained import estimators, problem, tables
+from lfm_ppl.experiments.drawing import SHADE, TRUTH, legend
 from lfm_ppl.results.plots import style
-
-_SHADE = "#B3D5E9"
-_TRUTH = Line2D([], [], color=style.BLACK, lw=0.8, ls="--", label="truth")
 
 
 def draw(settings: Any, results: dict[str, Result]) -> dict[str, Figure]:
@@ -27,43 +23,31 @@ def draw(settings: Any, results: dict[str, Result]) -> dict[str, Figure]:
 
 @style.styled
 def plot_forces(settings: Any, results: dict[str, Result], *, width: str | float = "column") -> Figure:
-    """Draw the first force of each shape, as the source's estimator and full information see it, with its band.
-
-    Args:
-        settings: of the experiment.
-        results: of its tasks.
-        width: "column" (3.4 in), "full" (7 in), or inches.
-    """
+    """Draw the first force of each shape, as the source's estimator and full information see it, with its band."""
     figure = style.new_figure(width, 1.25 * len(settings.shapes) + 0.6)
     panels = figure.subplots(len(settings.shapes), 1, sharex=True, squeeze=False)[:, 0]
     for axes, shape in zip(panels, settings.shapes, strict=True):
         found = results[f"transcription/{shape.replace(' ', '-')}/0000"]
         _, low, high = found[f"{estimators.BANDS}/first"]
-        axes.fill_between(problem.TIMES[:: estimators.ROWS[estimators.BANDS]], low, high, color=_SHADE, lw=0)
+        axes.fill_between(problem.TIMES[:: estimators.ROWS[estimators.BANDS]], low, high, color=SHADE, lw=0,
+                          label="95% band (EP)")
         if estimators.HORIZON in settings.methods:
-            axes.plot(problem.TIMES, found[f"{estimators.HORIZON}/first"][0], color=style.ORANGE, lw=0.8)
-        axes.plot(problem.TIMES, found[f"{estimators.FULL}/first"][0], color=style.BLUE)
-        axes.plot(problem.TIMES, found["truth"], color=style.BLACK, lw=0.8, ls="--")
+            axes.plot(problem.TIMES, found[f"{estimators.HORIZON}/first"][0], color=style.ORANGE, lw=0.8,
+                      label=estimators.HORIZON)
+        axes.plot(problem.TIMES, found[f"{estimators.FULL}/first"][0], color=style.BLUE, label=estimators.FULL)
+        axes.plot(problem.TIMES, found["truth"], **TRUTH)
         axes.set_title(shape)
         axes.set_ylabel("force")
         axes.set_xlim(0.0, problem.TIMES[-1])
         style.tidy(axes)
     panels[-1].set_xlabel("time (s)")
-    style.legend_above(figure, [
-        _TRUTH, Line2D([], [], color=style.ORANGE, lw=0.8, label=estimators.HORIZON),
-        Line2D([], [], color=style.BLUE, label=estimators.FULL), Patch(color=_SHADE, label="95% band (EP)")])
+    legend(figure)
     return figure
 
 
 @style.styled
 def plot_errors(settings: Any, results: dict[str, Result], *, width: str | float = "column") -> Figure:
-    """Draw the mean squared errors of the force of all records, beside the published ones.
-
-    Args:
-        settings: of the experiment.
-        results: of its tasks.
-        width: "column" (3.4 in), "full" (7 in), or inches.
-    """
+    """Draw the mean squared errors of the force of all records, beside the published ones."""
     figure = style.new_figure(width, 2.6)
     axes = figure.subplots()
     errors = [tables.gathered(results, "transcription", f"{method}/mse") for method in settings.methods]
@@ -73,61 +57,47 @@ def plot_errors(settings: Any, results: dict[str, Result], *, width: str | float
         axes.hlines(row, low, high, color=style.BLUE, lw=4.0)
         axes.plot(median, row, color=style.BLACK, marker="|", ms=7.0, ls="")
     for colour, line, published in ((style.BLACK, ":", "smoother"), (style.ORANGE, "--", "delayed MHE")):
-        axes.axvline(problem.PUBLISHED[published], color=colour, ls=line, lw=1.0)
+        axes.axvline(problem.PUBLISHED[published], color=colour, ls=line, lw=1.0, label=f"published, {published}")
     axes.set_xscale("log")
     axes.set_yticks(range(len(errors)), list(settings.methods))
     axes.invert_yaxis()
     axes.set_xlabel("mean squared error of the force")
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.tick_params(labelsize=style.SMALL)
-    style.legend_above(figure, [
-        Line2D([], [], color=style.BLACK, ls=":", label="published, smoother"),
-        Line2D([], [], color=style.ORANGE, ls="--", label="published, delayed MHE")])
+    legend(figure)
     style.note_below(figure, f"{len(errors[0])} records: median, quartiles, extremes")
     return figure
 
 
 @style.styled
 def plot_target(settings: Any, results: dict[str, Result], *, width: str | float = "column") -> Figure:
-    """Draw the first target's altitude, speed and acceleration with their full information estimates.
-
-    Args:
-        settings: of the experiment.
-        results: of its tasks.
-        width: "column" (3.4 in), "full" (7 in), or inches.
-    """
+    """Draw the first target's altitude, speed and acceleration with their full information estimates."""
     found = results["ballistic/0000"]
     figure, panels = style.small_multiples(width, 3, 1.1)
     scales = ((1e-3, "km"), (1e-3, "km/s"), (1.0, "m/s^2"))
     for index, (axes, path) in enumerate(zip(panels, problem.TARGET_PATHS, strict=True)):
         factor, unit = scales[index]
-        axes.plot(problem.TARGET_TIMES, factor * found["estimate"][index], color=style.BLUE)
-        axes.plot(problem.TARGET_TIMES, factor * found["truth"][index], color=style.BLACK, lw=0.8, ls="--")
+        axes.plot(problem.TARGET_TIMES, factor * found["estimate"][index], color=style.BLUE, label=estimators.FULL)
+        axes.plot(problem.TARGET_TIMES, factor * found["truth"][index], **TRUTH)
         axes.set_ylabel(style.with_unit(path, unit))
     style.label_time(panels, "s")
-    style.legend_above(figure, [_TRUTH, Line2D([], [], color=style.BLUE, label=estimators.FULL)])
+    legend(figure)
     return figure
 
 
 @style.styled
 def plot_patient(settings: Any, results: dict[str, Result], *, width: str | float = "column") -> Figure:
-    """Draw the first patient's concentrations, and TRH with its estimate and 95% band.
-
-    Args:
-        settings: of the experiment.
-        results: of its tasks.
-        width: "column" (3.4 in), "full" (7 in), or inches.
-    """
+    """Draw the first patient's concentrations, and TRH with its estimate and 95% band."""
     found, units = results["thyroid/0000"], problem.thyroid().units
     figure = style.new_figure(width, 4.2)
     panels = list(figure.subplots(4, 1, sharex=True, height_ratios=(1, 1, 1, 2)))
     for axes, name, values in zip(panels, problem.thyroid().outputs or (), found["y"].T, strict=False):
-        axes.plot(found["measured"], values, color=style.VERMILLION, marker="o", ms=2.0, ls="")
+        axes.plot(found["measured"], values, color=style.VERMILLION, marker="o", ms=2.0, ls="", label="measured")
         axes.set_ylabel(style.with_unit(name, units[name]))
     trh = panels[-1]
-    trh.fill_between(found["times"], found["low"][0], found["high"][0], color=_SHADE, lw=0)
-    trh.plot(found["times"], found["mode"][0], color=style.BLUE)
-    trh.plot(found["times"], found["truth"][0], color=style.BLACK, lw=0.8, ls="--")
+    trh.fill_between(found["times"], found["low"][0], found["high"][0], color=SHADE, lw=0, label="95% band (EP)")
+    trh.plot(found["times"], found["mode"][0], color=style.BLUE, label=estimators.FULL)
+    trh.plot(found["times"], found["truth"][0], **TRUTH)
     trh.set_ylabel(style.with_unit(problem.HORMONE, units[problem.HORMONE]))
     trh.set_ylim(bottom=0.0)
     for axes in panels:
@@ -136,27 +106,21 @@ def plot_patient(settings: Any, results: dict[str, Result], *, width: str | floa
         style.tidy(axes)
         axes.tick_params(labelbottom=axes is trh)
     trh.set_xlabel("time of day (h)")
-    style.legend_above(figure, [
-        Line2D([], [], color=style.VERMILLION, marker="o", ms=2.0, ls="", label="measured"), _TRUTH,
-        Line2D([], [], color=style.BLUE, label=estimators.FULL), Patch(color=_SHADE, label="95% band (EP)")])
+    legend(figure)
     return figure
 
 
 @style.styled
 def plot_peaks(settings: Any, results: dict[str, Result], *, width: str | float = "column") -> Figure:
-    """Draw by how much the times of the greatest TRH, and of the peak of its daily wave, are off.
-
-    Args:
-        settings: of the experiment.
-        results: of its tasks.
-        width: "column" (3.4 in), "full" (7 in), or inches.
-    """
+    """Draw by how much the times of the greatest TRH, and of the peak of its daily wave, are off."""
     errors = np.sort(tables.gathered(results, "thyroid", "peak"), axis=0)
     share = np.arange(1, len(errors) + 1) / len(errors)
     figure = style.new_figure(width, 2.0)
     axes = figure.subplots()
-    for index, (colour, line) in enumerate(((style.ORANGE, "--"), (style.BLUE, "-"))):
-        axes.step(np.append(0.0, errors[:, index]), np.append(0.0, share), where="post", color=colour, ls=line)
+    kinds = ((style.ORANGE, "--", "greatest TRH"), (style.BLUE, "-", "peak of the wave of 24 h"))
+    for index, (colour, line, label) in enumerate(kinds):
+        axes.step(np.append(0.0, errors[:, index]), np.append(0.0, share), where="post", color=colour, ls=line,
+                  label=label)
     axes.axvline(tables.NEAR, color=style.BLACK, lw=0.6)
     axes.axhline(0.9, color=style.BLACK, lw=0.6)
     axes.set_xlim(0.0, max(3.0, 1.1 * tables.NEAR))
@@ -164,6 +128,5 @@ def plot_peaks(settings: Any, results: dict[str, Result], *, width: str | float 
     axes.set_xlabel("error of the time (h)")
     axes.set_ylabel("share of patients")
     style.tidy(axes)
-    style.legend_above(figure, [Line2D([], [], color=style.ORANGE, ls="--", label="greatest TRH"),
-                                Line2D([], [], color=style.BLUE, label="peak of the wave of 24 h")])
+    legend(figure)
     return figure

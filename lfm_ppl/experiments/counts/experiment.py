@@ -1,69 +1,26 @@
-"""The whole experiment: its settings, its run, and what it leaves in a folder."""
+"""The study: its settings, tasks, tables and figures."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import NamedTuple
 
-import pandas as pd
-
-from lfm_ppl import checks
-from lfm_ppl.engine.cluster import Workers
-from lfm_ppl.engine.run import Reporter, run_tasks
+from lfm_ppl.engine.run import Reporter
 from lfm_ppl.engine.task import Result, Task
-from lfm_ppl.experiments import output
+from lfm_ppl.experiments import study
 from lfm_ppl.experiments.counts import figures, methods, problem, tables
-
-TASKS = "tasks"
+from lfm_ppl.experiments.study import Results, Study, Table, setting
 
 
 @dataclass(frozen=True)
-class Settings:
-    """How much is computed.
+class Settings(study.Settings):
+    """How much is computed."""
 
-    Attributes:
-        seed: of everything random.
-        data: folder with the folders ``coal`` and ``calls``; None: simulated counts.
-        problems: names, of `problem.NAMES`.
-        size: of the problems.
-        draws: of each of four chains of the reference.
-    """
-
-    seed: int = 0
-    data: str | None = None
-    problems: tuple[str, ...] = problem.NAMES
-    size: problem.Size = problem.Size()
-    draws: int = 5000
-
-    def __post_init__(self) -> None:
-        """Check what a user gives."""
-        checks.positive_integer("draws", self.draws)
-        for name in self.problems:
-            checks.one_of("problem", name, problem.NAMES)
-
-
-def quick(seed: int = 0, data: str | None = None) -> Settings:
-    """Return settings that show in a minute that everything runs, and no more."""
-    return Settings(seed, data, (problem.COAL,), problem.Size(bins=56, folds=2), draws=500)
-
-
-class Comparison(NamedTuple):
-    """What the experiment found.
-
-    Attributes:
-        settings: that it ran with.
-        parameters: problem -> what was learnt.
-        results: of every task with a method, by name.
-        accuracy: how far each method is from the reference.
-        prediction: held-out data.
-    """
-
-    settings: Settings
-    parameters: dict[str, Result]
-    results: dict[str, Result]
-    accuracy: pd.DataFrame
-    prediction: pd.DataFrame
+    data: str | None = setting(None, "folder with the folders coal and calls (default: simulated counts)",
+                               metavar="FOLDER")
+    problems: tuple[str, ...] = setting(problem.NAMES, "data and their families", quick=(problem.COAL,),
+                                        choices=problem.NAMES)
+    size: problem.Size = setting(problem.Size(), "", quick=problem.Size(bins=56, folds=2))
+    draws: int = setting(5000, "of each of four chains of the reference", quick=500)
 
 
 def learning(settings: Settings) -> list[Task]:
@@ -72,41 +29,40 @@ def learning(settings: Settings) -> list[Task]:
                  {"problem": name, "size": list(settings.size), "data": settings.data}) for name in settings.problems]
 
 
-def comparing(settings: Settings, parameters: dict[str, Result]) -> list[Task]:
+def comparing(settings: Settings, results: Results) -> list[Task]:
     """Return a task for each problem and method, which takes the parameters of the problem."""
     return [Task(f"{task.settings['problem']}/{method}", settings.seed,
                  {**task.settings, "method": method, "draws": settings.draws,
-                  "parameters": {name: float(value) for name, value in parameters[task.settings["problem"]].items()}})
+                  "parameters": {name: float(value) for name, value in results[task.name].items()}})
             for task in learning(settings) for method in (*methods.METHODS, methods.REFERENCE)]
 
 
-def run(settings: Settings, folder: str | Path, *, overwrite: bool = False, report: Reporter | None = None,
-        workers: Workers = 1) -> Comparison:
-    """Compute what is not stored yet in ``folder``, and tabulate everything.
+def compute(task: Task) -> Result:
+    """Compute one task."""
+    return methods.compute(task) if "method" in task.settings else methods.learn(task)
 
-    Args:
-        settings: how much.
-        folder: of the experiment; its subfolder ``tasks`` holds a file for each task.
-        overwrite: compute again what was stored with other settings.
-        report: what to do with a line of progress; None: nothing.
-        workers: what computes; see `run_tasks`.
 
-    Raises:
-        FileNotFoundError: data that are not there.
-        ValueError: the folder holds results made with other settings.
-    """
+def check(settings: Settings, report: Reporter | None) -> None:
+    """Raise FileNotFoundError or ValueError where something is wrong with the data."""
     for name in settings.problems:
-        problem.problem(name, settings.size, settings.seed, settings.data)  # says what is wrong with the data first
-    where = Path(folder) / TASKS
-    learnt = run_tasks(learning(settings), methods.learn, where, overwrite=overwrite, report=report, workers=workers)
-    parameters = {name: learnt[f"{name}/parameters"] for name in settings.problems}
-    results = run_tasks(comparing(settings, parameters), methods.compute, where, overwrite=overwrite, report=report,
-                        workers=workers)
-    return Comparison(settings, parameters, results, tables.accuracy(settings, results),
-                      tables.prediction(settings, results))
+        problem.problem(name, settings.size, settings.seed, settings.data)
 
 
-def save(found: Comparison, folder: str | Path) -> list[Path]:
-    """Write tables and figures, replacing older ones, and return their paths."""
-    shown = {"accuracy": found.accuracy, "prediction": found.prediction}
-    return output.save(folder, shown, figures.draw(found.settings, found.results), "case")
+def tabulated(settings: Settings, results: Results) -> dict[str, Table]:
+    """Return the tables."""
+    return {"accuracy": Table("Posterior of the predictor (mean: largest error in sds; sd: largest relative error)",
+                              tables.accuracy(settings, results)),
+            "prediction": Table(f"Held-out data, {settings.size.folds} folds", tables.prediction(settings, results))}
+
+
+def notes(settings: Settings, results: Results) -> tuple[str, ...]:
+    """Return what there is to say about the reference and the parameters."""
+    checked = tables.reference(settings, results)
+    return (f"Reference: elliptical slices, at least {checked['ess'].min():.0f} effective draws, R-hat at most "
+            f"{checked['r_hat'].max():.3f}; log Z by importance sampling, effective share of the draws at least "
+            f"{checked['share'].min():.2f}.",
+            "Parameters are those at the mode of the posterior with EP's evidence, or the true ones of simulated data; "
+            "all methods take the same.")
+
+
+STUDY = Study(Settings, learning, compute, tabulated, figures.draw, notes=notes, then=comparing, check=check)

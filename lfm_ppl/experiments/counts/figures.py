@@ -6,18 +6,16 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 from matplotlib.ticker import NullFormatter
 
 from lfm_ppl.engine.task import Result
 from lfm_ppl.experiments.counts import problem, tables
 from lfm_ppl.experiments.counts.methods import METHODS, REFERENCE
+from lfm_ppl.experiments.drawing import SHADE, TRUTH, legend
 from lfm_ppl.experiments.scores import Z
 from lfm_ppl.results.plots import style
 
 _COLOURS = {"ep": (style.BLUE, "o"), "variational": (style.GREEN, "s"), "laplace": (style.VERMILLION, "^")}
-_SHADE = "#B3D5E9"
 _DAYS = 2
 """Days of calls that are drawn."""
 
@@ -47,17 +45,16 @@ def plot_coal(settings: Any, results: dict[str, Result], *, width: str | float =
     counted.vlines(one.times, 0, one.y[:, 0], color=style.GREY, lw=0.8)
     counted.set_ylabel("disasters")
     low, high = (np.exp(found["mean"] + sign * Z * found["sd"]) for sign in (-1, 1))
-    rate.fill_between(one.times, low, high, color=_SHADE, lw=0)
-    rate.plot(one.times, np.exp(found["mean"]), color=style.BLUE)
+    rate.plot(one.times, np.exp(found["mean"]), color=style.BLUE, label="EP: median")
+    rate.fill_between(one.times, low, high, color=SHADE, lw=0, label="95%")
     for sign in (-1, 0, 1):
-        rate.plot(one.times, np.exp(exact["mean"] + sign * Z * exact["sd"]), "--", color=style.BLACK, lw=0.8)
+        rate.plot(one.times, np.exp(exact["mean"] + sign * Z * exact["sd"]), **TRUTH | {"label": "reference"})
     rate.set_ylim(0.0, 1.05 * high.max())
     rate.set_ylabel("rate (1/year)")
     rate.set_xlabel(f"year; bins of {12 / per_year:.0f} months")
     for axes in (counted, rate):
         style.tidy(axes)
-    style.legend_above(figure, [Line2D([], [], color=style.BLUE, label="EP: median"), Patch(color=_SHADE, label="95%"),
-                                Line2D([], [], color=style.BLACK, ls="--", lw=0.8, label="reference")])
+    legend(figure)
     return figure
 
 
@@ -70,8 +67,9 @@ def plot_calls(settings: Any, results: dict[str, Result], *, width: str | float 
     panels = figure.subplots(2, 2, sharex=True, sharey=True).ravel()
     for axes, name in zip(panels, problem.CALLS, strict=True):
         found = results[f"{name}/ep"]
-        axes.fill_between(one.times[rows], found["low"][rows], found["high"][rows], color=_SHADE, lw=0, step="mid")
-        axes.plot(one.times[rows], one.y[rows, 0], ".", color=style.BLACK, ms=2.5)
+        axes.fill_between(one.times[rows], found["low"][rows], found["high"][rows], color=SHADE, lw=0, step="mid",
+                          label="95%, held out")
+        axes.plot(one.times[rows], one.y[rows, 0], ".", color=style.BLACK, ms=2.5, label="calls")
         axes.set_title(name.removeprefix("calls-").replace("-daily", ", daily force").replace("-", " "),
                        fontsize=style.SMALL)
         axes.set_ylim(0.0, 1.6 * one.y[rows].max())
@@ -80,8 +78,7 @@ def plot_calls(settings: Any, results: dict[str, Result], *, width: str | float 
         axes.set_xlabel("hours of opening")
     for axes in panels[::2]:
         axes.set_ylabel("calls in 20 minutes")
-    style.legend_above(figure, [Line2D([], [], color=style.BLACK, ls="", marker=".", ms=3, label="calls"),
-                                Patch(color=_SHADE, label="95%, held out")])
+    legend(figure)
     return figure
 
 
@@ -97,7 +94,7 @@ def plot_errors(settings: Any, results: dict[str, Result], *, width: str | float
         for row, name in enumerate(settings.problems):
             for shift, (method, (colour, marker)) in zip((-0.2, 0.0, 0.2), _COLOURS.items(), strict=True):
                 value = abs(table.loc[f"{name}, {METHODS[method]}", column])
-                axes.plot(max(value, 1e-4), row + shift, marker, color=colour, ms=3.5)
+                axes.plot(max(value, 1e-4), row + shift, marker, color=colour, ms=3.5, label=METHODS[method])
         axes.set_xscale("log")
         # Whole decades, so that two ticks have a number at least.
         low, high = axes.get_xlim()
@@ -107,6 +104,5 @@ def plot_errors(settings: Any, results: dict[str, Result], *, width: str | float
         axes.tick_params(labelsize=style.SMALL)
     panels[0].set_yticks(range(len(settings.problems)), [name.replace("-", " ") for name in settings.problems])
     panels[0].invert_yaxis()
-    style.legend_above(figure, [Line2D([], [], color=colour, ls="", marker=marker, ms=3.5, label=METHODS[method])
-                                for method, (colour, marker) in _COLOURS.items()])
+    legend(figure)
     return figure

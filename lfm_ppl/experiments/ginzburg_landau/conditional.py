@@ -13,6 +13,7 @@ import numpy as np
 from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.ginzburg_landau import grid, problem
+from lfm_ppl.experiments.study import blocks
 from lfm_ppl.experiments.timing import timed
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
@@ -64,8 +65,7 @@ def tasks(settings: Any) -> list[Task]:
             own = {"particles": settings.conditional_particles, "steps": _PARTICLE_STEPS}
         elif method == problem.GRID:
             own = {"cells": settings.cells}
-        for first in range(0, settings.conditional, _CHUNK):
-            last = min(first + _CHUNK, settings.conditional) - 1
+        for first, last in blocks(settings.conditional, _CHUNK):
             found.append(Task(
                 f"conditional/{problem.slug(method)}/{first:03d}-{last:03d}", settings.seed,
                 {"experiment": "ginzburg-landau", "what": "conditional", "method": method, "first": first,

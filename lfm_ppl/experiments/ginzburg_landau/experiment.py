@@ -1,71 +1,40 @@
-"""The whole comparison: its settings, its run, and what it leaves in a folder."""
+"""The study: its settings, tasks, tables and figures."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import NamedTuple
 
-import pandas as pd
-
-from lfm_ppl import checks
-from lfm_ppl.engine.cluster import Workers
-from lfm_ppl.engine.run import Reporter, run_tasks
-from lfm_ppl.engine.task import Result, Task
-from lfm_ppl.experiments import output
+from lfm_ppl.engine.task import Task
+from lfm_ppl.experiments import study
 from lfm_ppl.experiments.ginzburg_landau import conditional, figures, problem, sampling, state, tables
+from lfm_ppl.experiments.study import Results, Study, Table, setting
 
-TASKS = "tasks"
+_PARTS = study.CHAINS[1:]
 
 
 @dataclass(frozen=True)
-class Settings:
-    """How much is computed.
+class Settings(study.Settings):
+    """How much is computed."""
 
-    Attributes:
-        realisations: for states and for MCMC.
-        conditional: realisations for the conditional posteriors.
-        seed: of everything random.
-        particles: of the particle filter, for states and in the figure of the conditional posteriors; the source's.
-        smoother_particles: of the particle smoother.
-        smoother_draws: its trajectories.
-        conditional_particles: of the particle filter for the rates.
-        cells: of the grid.
-        draw_cells: of the grid for many parameter values.
-        nodes: parameter values of a conditional posterior.
-        paths: posterior draws over which the smoothed state is averaged.
-        marginal_particles: of particle-marginal RAM.
-        marginal_steps: of its particles between two observations.
-        ram: warm-up, draws and thinning of a chain of RAM.
-        nuts: of NUTS.
-        pmmh: of particle-marginal RAM.
-        tree_depth: largest of NUTS.
-    """
-
-    realisations: int = 20
-    conditional: int = 100
-    seed: int = 0
-    particles: int = 40_000
-    smoother_particles: int = 1_000
-    smoother_draws: int = 200
-    conditional_particles: int = 4_000
-    cells: int = 400
-    draw_cells: int = 240
-    nodes: int = 61
-    paths: int = 100
-    marginal_particles: int = 1_000
-    marginal_steps: int = 20
-    ram: tuple[int, int, int] = (200, 500, 10)
-    nuts: tuple[int, int, int] = (250, 250, 1)
-    pmmh: tuple[int, int, int] = (80, 240, 5)
-    tree_depth: int = 10
-
-    def __post_init__(self) -> None:
-        """Check the numbers that a user gives."""
-        for name in ("realisations", "conditional"):
-            checks.positive_integer(name, getattr(self, name))
-        if self.realisations > problem.MOST or self.conditional > problem.MOST:
-            raise ValueError(f"one seed has {problem.MOST} realisations; use several seeds for more.")
+    realisations: int = setting(20, "for states and for MCMC", quick=2, aliases=study.REALISATIONS,
+                                per_seed=problem.MOST)
+    conditional: int = setting(100, "realisations for the conditional posteriors of single parameters", quick=4,
+                               per_seed=problem.MOST)
+    particles: int = setting(40_000, "of the filter, for states and in the figure of the conditional posteriors; the "
+                             "source's", quick=500)
+    smoother_particles: int = setting(1_000, "of the particle smoother", quick=200)
+    smoother_draws: int = setting(200, "its trajectories", quick=50)
+    conditional_particles: int = setting(4_000, "of the particle filter for the rates", quick=200)
+    cells: int = setting(400, "of the grid", quick=160)
+    draw_cells: int = setting(240, "of the grid for many parameter values", quick=120)
+    nodes: int = setting(61, "parameter values of a conditional posterior", quick=31)
+    paths: int = setting(100, "posterior draws over which the smoothed state is averaged", quick=10)
+    marginal_particles: int = setting(1_000, "of particle-marginal RAM", quick=50)
+    marginal_steps: int = setting(20, "of its particles between two observations", quick=10)
+    ram: tuple[int, int, int] = setting((200, 500, 10), "RAM", quick=(50, 50, 5), parts=_PARTS)
+    nuts: tuple[int, int, int] = setting((250, 250, 1), "NUTS", quick=(20, 20, 1), parts=_PARTS)
+    pmmh: tuple[int, int, int] = setting((80, 240, 5), "particle-marginal RAM", quick=(10, 20, 2), parts=_PARTS)
+    tree_depth: int = setting(10, "largest of NUTS", quick=4)
 
     @property
     def figure(self) -> int:
@@ -77,32 +46,6 @@ class Settings:
         return {"RAM": self.ram, "NUTS": self.nuts, "PMMH": self.pmmh}[kernel]
 
 
-def quick(realisations: int = 2, conditional: int = 4, seed: int = 0) -> Settings:
-    """Return settings that show in a few minutes that everything runs, and no more."""
-    return Settings(
-        realisations, conditional, seed, particles=500, smoother_particles=200, smoother_draws=50,
-        conditional_particles=200, cells=160, draw_cells=120, nodes=31, paths=10, marginal_particles=50,
-        marginal_steps=10, ram=(50, 50, 5), nuts=(20, 20, 1), pmmh=(10, 20, 2), tree_depth=4)
-
-
-class Comparison(NamedTuple):
-    """What the experiment found.
-
-    Attributes:
-        settings: that it ran with.
-        results: of every task, by name.
-        table: of everything, one row a method.
-        rates: how often the conditional posteriors miss the truth.
-        parameters: posterior means and standard deviations by MCMC.
-    """
-
-    settings: Settings
-    results: dict[str, Result]
-    table: pd.DataFrame
-    rates: pd.DataFrame
-    parameters: pd.DataFrame
-
-
 def all_tasks(settings: Settings) -> list[Task]:
     """Return every task: all methods on the first realisations, then on the next, so that the time left can be told."""
     found = [*state.tasks(settings), *conditional.tasks(settings), conditional.figure_task(settings),
@@ -110,40 +53,17 @@ def all_tasks(settings: Settings) -> list[Task]:
     return sorted(found, key=lambda task: task.settings.get("index", task.settings.get("first")))
 
 
-def compute(task: Task) -> Result:
-    """Compute one task."""
-    return {"state": state.compute, "conditional": conditional.compute,
-            "mcmc": sampling.compute}[task.settings["what"]](task)
+def tabulated(settings: Settings, results: Results) -> dict[str, Table]:
+    """Return the tables."""
+    return {"comparison": Table(f"Means over {settings.realisations} realisations (standard errors)",
+                                tables.comparison(results)),
+            "rates": Table(f"Truth outside the 99% interval of a conditional posterior, {settings.conditional} "
+                           "realisations", tables.rates(results)),
+            "parameters": Table(f"Posteriors of the parameters, {settings.realisations} realisations",
+                                tables.parameters(results))}
 
 
-def run(settings: Settings, folder: str | Path, *, overwrite: bool = False,
-        report: Reporter | None = None, workers: Workers = 1) -> Comparison:
-    """Compute what is not stored yet in ``folder``, and tabulate everything.
+KINDS = {"state": state.compute, "conditional": conditional.compute, "mcmc": sampling.compute}
+"""What the tasks are."""
 
-    Args:
-        settings: how much.
-        folder: of the experiment; its subfolder ``tasks`` holds a file for each task.
-        overwrite: compute again what was stored with other settings.
-        report: what to do with a line of progress; None: nothing.
-        workers: what computes; see `run_tasks`.
-
-    Returns:
-        Results and tables.
-
-    Raises:
-        ValueError: the folder holds results made with other settings.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:  # doctest: +SKIP
-        ...     print(run(quick(), folder).rates)
-    """
-    results = run_tasks(all_tasks(settings), compute, Path(folder) / TASKS, overwrite=overwrite, report=report,
-                        workers=workers)
-    return Comparison(settings, results, tables.comparison(results), tables.rates(results), tables.parameters(results))
-
-
-def save(found: Comparison, folder: str | Path) -> list[Path]:
-    """Write tables and figures of a comparison, replacing older ones, and return their paths."""
-    tables = {"comparison": found.table, "rates": found.rates, "parameters": found.parameters}
-    return output.save(folder, tables, figures.draw(found.settings, found.results), "method")
+STUDY = Study(Settings, all_tasks, KINDS, tabulated, figures.draw, label="method")

@@ -5,15 +5,15 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from scipy import stats
 
 from lfm_ppl.engine.task import Result
+from lfm_ppl.experiments.drawing import legend
 from lfm_ppl.experiments.ginzburg_landau import conditional, problem, sampling, tables
+from lfm_ppl.experiments.scores import Z
 from lfm_ppl.results.plots import style
 
 COLOURS = {"EKF": style.VERMILLION, "CKF": style.BLUE, "GHKF(7)": style.GREEN, problem.PARTICLES: style.ORANGE,
@@ -22,7 +22,6 @@ DASHES: dict[str, Any] = {"EKF": (0, (6, 1.5)), "CKF": (0, (3, 1.5)), "GHKF(7)":
 _TINTS = {"EKF": "#F3CDB3", "CKF": "#B3D5E9", problem.GRID: "#D5D5D5", problem.PARTICLES: "#F8E2B3"}
 _EXACT = "#DDDDDD"
 _SYMBOLS = {"alpha": r"$\alpha$", "beta": r"$\beta$", "sigma": r"$\sigma$"}
-_Z = 1.959963984540054
 
 
 def draw(settings: Any, results: dict[str, Result]) -> dict[str, Figure]:
@@ -75,7 +74,7 @@ def plot_states(data: problem.Realisation, states: dict[str, Result], *, width: 
         axes.set_ylabel("x")
     if max(np.abs(states[method]["filter_high"]).max() for method in methods) > reach:
         style.note_below(figure, "Bands that go beyond the frame are cut. Dotted: times whose densities are shown.")
-    style.legend_above(figure, _band_legend("mean and 95%, ", methods))
+    legend(figure, *_entries(methods))
     return figure
 
 
@@ -99,18 +98,18 @@ def plot_marginals(data: problem.Realisation, states: dict[str, Result], *, widt
         for number, (axes, mark) in enumerate(zip(row, exact["marks"], strict=True)):
             index = int(np.searchsorted(data.fine, mark - 1e-9))
             density = exact[f"{what}_density"][number]
-            axes.fill_between(exact["x"], density, color=_EXACT, lw=0, zorder=0)
+            axes.fill_between(exact["x"], density, color=_EXACT, lw=0, zorder=0, label="exact")
             width_ = exact["x"][1] - exact["x"][0]
             mean = np.sum(density * exact["x"]) * width_
             sd = np.sqrt(np.sum(density * (exact["x"] - mean) ** 2) * width_)
-            axes.plot(x, stats.norm.pdf(x, mean, sd), color=style.BLACK, lw=0.9, zorder=2)
+            axes.plot(x, stats.norm.pdf(x, mean, sd), color=style.BLACK, lw=0.9, zorder=2, label="its best Gaussian")
             for method in problem.GAUSSIAN:
                 one = states[method]
                 mean, high = one[f"{what}_mean"][index], one[f"{what}_high"][index]
-                axes.plot(x, stats.norm.pdf(x, mean, (high - mean) / _Z), color=COLOURS[method], ls=DASHES[method],
-                          zorder=3)
+                axes.plot(x, stats.norm.pdf(x, mean, (high - mean) / Z), color=COLOURS[method], ls=DASHES[method],
+                          zorder=3, label=method)
             axes.plot([data.path[index]], [0.0], marker="*", ms=7, color=style.BLACK, mec="white", mew=0.4, ls="",
-                      clip_on=False, zorder=5)
+                      clip_on=False, zorder=5, label="truth")
             axes.set_title(f"{what}, t = {mark:g}")
             axes.set_xlim(x[0], x[-1])
             axes.set_ylim(0.0, 1.12 * max(density.max(), *(line.get_ydata().max() for line in axes.lines)))
@@ -119,10 +118,7 @@ def plot_marginals(data: problem.Realisation, states: dict[str, Result], *, widt
         axes.set_xlabel("x")
     for axes in grid[:, 0]:
         axes.set_ylabel("density (1/x)")
-    style.legend_above(figure, [
-        Patch(color=_EXACT, label="exact"), Line2D([], [], color=style.BLACK, lw=0.9, label="its best Gaussian"),
-        *(Line2D([], [], color=COLOURS[m], ls=DASHES[m], label=m) for m in problem.GAUSSIAN),
-        Line2D([], [], color=style.BLACK, marker="*", ls="", ms=7, label="truth")])
+    legend(figure)
     return figure
 
 
@@ -139,13 +135,13 @@ def plot_conditional(rows: dict[str, np.ndarray], *, width: str | float = "full"
         found = {method: conditional.posterior(row[number], name) for method, row in rows.items()}
         for method, one in found.items():
             if method == problem.GRID:
-                axes.fill_between(one.x, one.density, color=_EXACT, lw=0, zorder=0)
+                axes.fill_between(one.x, one.density, color=_EXACT, lw=0, zorder=0, label="exact (grid)")
             elif method == problem.PARTICLES:
-                axes.plot(one.x, one.density, color=COLOURS[method], lw=0.8, zorder=2)
+                axes.plot(one.x, one.density, color=COLOURS[method], lw=0.8, zorder=2, label=method)
             else:
-                axes.plot(one.x, one.density, color=COLOURS[method], ls=DASHES[method], zorder=3)
+                axes.plot(one.x, one.density, color=COLOURS[method], ls=DASHES[method], zorder=3, label=method)
         truth = problem.TRUTH[number]
-        axes.axvline(truth, color=style.BLACK, lw=0.9, zorder=1)
+        axes.axvline(truth, color=style.BLACK, lw=0.9, zorder=1, label="truth")
         low = min(truth, *(float(one.quantile(0.003)) for one in found.values()))
         high = max(truth, *(float(one.quantile(0.997)) for one in found.values()))
         axes.set_xlim(low - 0.03 * (high - low), high + 0.03 * (high - low))
@@ -153,11 +149,7 @@ def plot_conditional(rows: dict[str, np.ndarray], *, width: str | float = "full"
         style.tidy(axes)
         axes.set_xlabel(_SYMBOLS[name])
     figure.axes[0].set_ylabel("posterior density")
-    style.legend_above(figure, [
-        Patch(color=_EXACT, label="exact (grid)"),
-        *(Line2D([], [], color=COLOURS[m], ls=DASHES.get(m, "-"), lw=0.8 if m == problem.PARTICLES else 1.1, label=m)
-          for m in problem.METHODS if m != problem.GRID),
-        Line2D([], [], color=style.BLACK, lw=0.9, label="truth")])
+    legend(figure)
     return figure
 
 
@@ -181,18 +173,13 @@ def plot_integrated(data: problem.Realisation, paths: dict[str, Result], *, widt
         axes.set_ylabel("x")
         style.tidy(axes)
     figure.axes[-1].set_xlabel("time")
-    style.legend_above(figure, _band_legend("mean and 95%, ", tuple(shown.values())))
+    legend(figure, *_entries(tuple(shown.values())))
     return figure
 
 
 @style.styled
 def plot_rates(results: dict[str, Result], *, width: str | float = "full") -> Figure:
-    """Draw how often the truth lies outside the central 99% interval of a conditional posterior, with standard errors.
-
-    Args:
-        results: of the tasks, by name.
-        width: "column" (3.4 in), "full" (7 in), or inches.
-    """
+    """Draw how often the truth lies outside the central 99% interval of a conditional posterior, with its error."""
     table = tables.rates(results)
     figure = style.new_figure(width, 2.4)
     axes = figure.subplots()
@@ -203,30 +190,25 @@ def plot_rates(results: dict[str, Result], *, width: str | float = "full") -> Fi
         errors = [table.loc[method, f"{name} se"] for name in names]
         axes.bar(place, values, 0.13, color=COLOURS[method], label=method, zorder=2)
         axes.errorbar(place, values, errors, fmt="none", ecolor=style.BLACK, elinewidth=0.7, capsize=1.5, zorder=3)
-    axes.axhline(conditional.OUTSIDE, color=style.BLACK, lw=0.8, ls=(0, (4, 2)), zorder=4)
+    axes.axhline(conditional.OUTSIDE, color=style.BLACK, lw=0.8, ls=(0, (4, 2)), zorder=4, label="nominal")
     style.tidy(axes)
     axes.set_xticks(range(len(names)), [_SYMBOLS.get(name, "all three") for name in names])
     axes.set_ylim(0.0, 1.0)
     axes.set_xlabel("parameter, the others at the truth")
     axes.set_ylabel("truth outside 99%\n(share of realisations)")
-    style.legend_above(figure, [
-        *(Patch(color=COLOURS[method], label=method) for method in table.index),
-        Line2D([], [], color=style.BLACK, lw=0.8, ls=(0, (4, 2)), label="nominal")])
+    legend(figure)
     return figure
 
 
 def _draw_band(axes: Axes, data: problem.Realisation, one: Result, what: str, like: str) -> None:
     axes.fill_between(data.fine, one[f"{what}_low"], one[f"{what}_high"], color=_TINTS[like], lw=0, zorder=1)
     axes.plot(data.fine, one[f"{what}_mean"], color=COLOURS[like], zorder=3)
-    axes.plot(data.fine, data.path, color=style.BLACK, lw=0.6, zorder=2)
-    axes.plot(data.times, data.y[:, 0], ls="", marker="x", ms=3.2, mew=0.9, color=style.BLACK, zorder=4)
+    axes.plot(data.fine, data.path, color=style.BLACK, lw=0.6, zorder=2, label="truth")
+    axes.plot(data.times, data.y[:, 0], ls="", marker="x", ms=3.2, mew=0.9, color=style.BLACK, zorder=4, label="data")
     axes.set_xlim(data.fine[0], data.fine[-1])
 
 
-def _band_legend(text: str, methods: tuple[str, ...]) -> list[Artist]:
-    handles: list[Artist] = [Line2D([], [], color=style.BLACK, lw=0.6, label="truth"),
-                             Line2D([], [], color=style.BLACK, ls="", marker="x", ms=3.2, label="data")]
-    for method in methods:
-        name = "exact" if method == problem.GRID else method
-        handles.append(Patch(facecolor=_TINTS[method], edgecolor=COLOURS[method], label=f"{text}{name}"))
-    return handles
+def _entries(methods: tuple[str, ...]) -> list[Patch]:
+    names = {method: "exact" if method == problem.GRID else method for method in methods}
+    return [Patch(facecolor=_TINTS[method], edgecolor=COLOURS[method], label=f"mean and 95%, {name}")
+            for method, name in names.items()]

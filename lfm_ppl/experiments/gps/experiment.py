@@ -1,4 +1,4 @@
-"""The comparison on all satellites: one task each, and the tables that follow from them."""
+"""The study: its settings, the tasks of all satellites, and the tables and figures that follow from them."""
 
 from __future__ import annotations
 
@@ -10,76 +10,49 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+from matplotlib.figure import Figure
 
-from lfm_ppl import checks, orbits
-from lfm_ppl.engine.cluster import Workers, started
-from lfm_ppl.engine.run import Reporter, run_tasks
+from lfm_ppl import orbits
 from lfm_ppl.engine.task import Result, Task
-from lfm_ppl.experiments import output
+from lfm_ppl.experiments import study
 from lfm_ppl.experiments.gps import figures, learning, magnitudes, prediction, problem, ways
 from lfm_ppl.experiments.gps.figures import METRE, rms
 from lfm_ppl.experiments.gps.training import Training
 from lfm_ppl.experiments.scores import mean_of, pair
+from lfm_ppl.experiments.study import Results, Study, Table, setting
 
 _REFUSED = "refused"
 _WINDOW = 0.25
 
 
 @dataclasses.dataclass(frozen=True)
-class Settings:
-    """What is asked of the comparison.
+class Settings(study.Settings):
+    """What is asked of the comparison."""
+
+    data: str | None = setting(None, "folder of SP3 files (default: simulated satellites)", metavar="FOLDER")
+    satellites: tuple[str, ...] | None = setting(None, "as in G05 G20 (default: all)", metavar="NAME")
+    train_days: float = setting(3.0, "days to learn from; the others are predicted", metavar="D")
+    axes: str = setting("DYB", "of the small forces, Sun-oriented or of the orbit", choices=tuple(orbits.AXES))
+    alternatives: int = setting(4, "satellites whose magnitudes are learnt in every way", quick=1, least=0)
+    most: int | None = setting(None, "satellites where none are named (default: all)", quick=2)
+
+
+class Outcome(NamedTuple):
+    """What became of the satellites, each satellite -> result of its task.
 
     Attributes:
-        data: folder of SP3 files; None: simulated satellites.
-        satellites: names; None: all GPS satellites, or all that are simulated.
-        train_days: days to learn from; the others are predicted.
-        axes: of the small forces, "DYB" or "RTN".
-        alternatives: number of satellites whose magnitudes are learnt in every way.
-        most: number of satellites where none are named; None: all.
-        seed: of the simulation.
-    """
-
-    data: str | None = None
-    satellites: tuple[str, ...] | None = None
-    train_days: float = 3.0
-    axes: str = "DYB"
-    alternatives: int = 4
-    most: int | None = None
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        """Check the numbers."""
-        checks.positive("train_days", self.train_days, "Give the days to learn from (--train-days).")
-        checks.one_of("axes", self.axes, tuple(orbits.AXES))
-
-
-class Found(NamedTuple):
-    """What the comparison found.
-
-    Attributes:
-        settings: what was asked.
-        results: satellite -> its result.
+        predicted: their predictions.
+        prior: the magnitudes that they have in common.
+        compared: ways to learn the magnitudes.
+        online: predictions as positions come in.
         refused: satellite -> why it was left out.
-        satellites: one row a satellite.
-        pooled: one row a group of satellites.
-        magnitudes: one row a magnitude of the small forces: what satellites have in common, and each of them.
-        learning: one row a way to learn the magnitudes; empty where there are none.
-        online: satellite -> result of its prediction as positions come in.
     """
 
-    settings: Settings
-    results: dict[str, Result]
-    refused: dict[str, str]
-    satellites: pd.DataFrame
-    pooled: pd.DataFrame
-    magnitudes: pd.DataFrame
-    learning: pd.DataFrame
+    predicted: dict[str, Result]
+    prior: magnitudes.Prior
+    compared: dict[str, Result]
     online: dict[str, Result]
-
-
-def quick(**given: Any) -> Settings:
-    """Return settings that show in a few minutes that everything runs: two satellites."""
-    return Settings(**{"most": 2, "alternatives": 1} | given)
+    refused: dict[str, str]
 
 
 def plan(settings: Settings) -> list[Task]:
@@ -105,14 +78,20 @@ def plan(settings: Settings) -> list[Task]:
     return found
 
 
-def plan_predictions(settings: Settings, learnt: Mapping[str, Result], tasks: list[Task]) -> list[Task]:
+def plan_predictions(settings: Settings, results: Results) -> list[Task]:
     """Return the tasks that follow: the predictions, and the ways to learn on the first satellites.
 
     Args:
         settings: what is asked.
-        learnt: satellite -> result of its first task; those that can be predicted.
-        tasks: the first ones.
+        results: of the first tasks.
+
+    Raises:
+        ValueError: no satellite can be predicted.
     """
+    refused: dict[str, str] = {}
+    tasks, learnt = plan(settings), _kept(results, "learn/", refused)
+    if not learnt:
+        raise ValueError("no satellite can be predicted. " + " ".join(refused.values()))
     data = problem.arcs(settings.data, settings.seed)
     prior = magnitudes.common([one["logarithms"] for one in learnt.values()], settings.axes)
     usable = [{**task.settings, "orbit": learnt[name]["orbit"].tolist(), "alone": learnt[name]["logarithms"].tolist(),
@@ -192,56 +171,26 @@ def _online(one: problem.Arc, orbit: orbits.Orbit, logarithms: np.ndarray, asked
             "sd": np.sqrt(variance + problem.NOISE**2), "restarted": restarted[:, :3] - one.positions}
 
 
-def run(settings: Settings, folder: str | Path, *, overwrite: bool = False,
-        report: Reporter | None = None, workers: Workers = 1) -> Found:
-    """Run the comparison, or what is missing of it.
-
-    Args:
-        settings: what is asked.
-        folder: of the tasks.
-        overwrite: compute again what was stored with other settings.
-        report: what to do with a line of progress; None: nothing.
-        workers: what computes; see `run_tasks`.
+def outcome(settings: Settings, results: Results) -> Outcome:
+    """Return what became of the satellites.
 
     Raises:
-        ValueError: data that cannot be used, an unknown satellite, no satellite that can be predicted, or stored
-            results of other settings.
-        FileNotFoundError: there are no files.
+        ValueError: no satellite can be predicted.
     """
-    first = plan(settings)
     refused: dict[str, str] = {}
-    with started(workers) as running:  # once, for both rounds
-        def done(planned: list[Task]) -> dict[str, Result]:
-            return run_tasks(planned, compute, Path(folder) / "tasks", overwrite=overwrite, report=report,
-                             workers=running or 1)
-
-        learnt = _kept(first, done(first), "learn/", refused)
-        if not learnt:
-            raise ValueError("no satellite can be predicted. " + " ".join(refused.values()))
-        second = plan_predictions(settings, learnt, first)
-        results = done(second)
-    predicted = _kept(second, results, "predict/", refused)
-    compared, online = (_kept(second, results, kind, {}) for kind in ("ways/", "online/"))
+    learnt, predicted = (_kept(results, kind, refused) for kind in ("learn/", "predict/"))
     if not predicted:
         raise ValueError("no satellite can be predicted. " + " ".join(refused.values()))
-    for name, result in predicted.items():
-        result["cpu_s"] = result["cpu_s"] + learnt[name]["cpu_s"]
+    predicted = {name: one | {"cpu_s": one["cpu_s"] + learnt[name]["cpu_s"]} for name, one in predicted.items()}
     prior = magnitudes.common([one["logarithms"] for one in learnt.values()], settings.axes)
-    return Found(settings, predicted, refused, satellites(predicted), pooled(predicted),
-                 magnitudes_of(predicted, prior, settings.axes), ways.table(compared), online)
+    return Outcome(predicted, prior, _kept(results, "ways/", {}), _kept(results, "online/", {}), refused)
 
 
-def _kept(planned: list[Task], results: dict[str, Result], kind: str, refused: dict[str, str]) -> dict[str, Result]:
+def _kept(results: Results, kind: str, refused: dict[str, str]) -> dict[str, Result]:
     """Return satellite -> result of one kind of task; why others were refused is added to ``refused``."""
-    found = {}
-    for task in planned:
-        if task.name.startswith(kind):
-            name, result = task.settings["satellite"], results[task.name]
-            if _REFUSED in result:
-                refused[name] = str(result[_REFUSED])
-            else:
-                found[name] = result
-    return found
+    own = {name.removeprefix(kind): one for name, one in results.items() if name.startswith(kind)}
+    refused |= {name: str(one[_REFUSED]) for name, one in own.items() if _REFUSED in one}
+    return {name: one for name, one in own.items() if _REFUSED not in one}
 
 
 def magnitudes_of(results: dict[str, Result], prior: magnitudes.Prior, axes: str) -> pd.DataFrame:
@@ -292,9 +241,34 @@ def pooled(results: dict[str, Result]) -> pd.DataFrame:
     return pd.DataFrame.from_dict(rows, orient="index")
 
 
-def save(found: Found, folder: str | Path) -> list[Path]:
-    """Write tables and figures, and return their paths."""
-    named = {"satellites": found.satellites, "pooled": found.pooled, "magnitudes": found.magnitudes}
-    if len(found.learning):
-        named["learning"] = found.learning
-    return output.save(folder, named, figures.draw(found.results, found.online), "")
+def tabulated(settings: Settings, results: Results) -> dict[str, Table]:
+    """Return the tables."""
+    one = outcome(settings, results)
+    each = satellites(one.predicted)
+    found = {"pooled": Table("Errors after training (m), pooled over satellites, and 95% coverage",
+                             pooled(one.predicted)),
+             "satellites": Table("Each satellite: root mean square errors after training (m)", each, _few(each)),
+             "magnitudes": Table("", magnitudes_of(one.predicted, one.prior, settings.axes))}
+    if one.compared:
+        found["learning"] = Table("Ways to learn the magnitudes of the forces: error after training (m)",
+                                  ways.table(one.compared))
+    if one.refused:
+        reasons = pd.DataFrame({"reason": one.refused})
+        found["left out"] = Table("Left out", reasons, reasons, stored=False)
+    return found
+
+
+def _few(frame: pd.DataFrame) -> pd.DataFrame:
+    columns = ["eclipsed", "fit", "deterministic", "latest state", "LFM", "ratio", "coverage"]
+    digits = {"fit": 2, "deterministic": 1, "latest state": 1, "LFM": 2, "ratio": 3, "coverage": 3}
+    return pd.DataFrame({column: frame[column].map(f"{{:.{digits[column]}f}}".format) if column in digits
+                         else frame[column] for column in columns}, index=frame.index)
+
+
+def drawn(settings: Settings, results: Results) -> dict[str, Figure]:
+    """Return the figures."""
+    one = outcome(settings, results)
+    return figures.draw(one.predicted, one.online)
+
+
+STUDY = Study(Settings, plan, compute, tabulated, drawn, label="", then=plan_predictions)

@@ -7,15 +7,16 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 
 from lfm_ppl.engine.task import Result
-from lfm_ppl.experiments.scores import Z
+from lfm_ppl.experiments.drawing import band, legend, patch
 from lfm_ppl.results.plots import style
 
 DETERMINISTIC, LATEST, LFM, SEEN = style.VERMILLION, style.ORANGE, style.BLUE, style.GREY
 METRE = 1e-3
+_FITTED, _FROM_LATEST = "deterministic, fitted to training", "deterministic, from the latest state"
+_MODEL = "latent force model"
+_END: dict[str, Any] = {"color": SEEN, "lw": 0.7, "ls": ":", "label": "end of training"}
 
 
 def draw(results: Mapping[str, Result], online: Mapping[str, Result]) -> dict[str, Figure]:
@@ -30,32 +31,23 @@ def draw(results: Mapping[str, Result], online: Mapping[str, Result]) -> dict[st
 
 @style.styled
 def plot_forces(name: str, result: Result, *, width: str | float = "full") -> Figure:
-    """Draw the small forces of a satellite: learnt in training, predicted after it, and what all positions show.
-
-    Args:
-        name: of the satellite.
-        result: of its task.
-        width: "column" (3.4 in), "full" (7 in), or inches.
-    """
+    """Draw the small forces of a satellite: learnt in training, predicted after it, and what all positions show."""
     names = [str(one) for one in np.atleast_1d(result["force_names"])]
     figure, panels = style.small_multiples(width, len(names), 1.7)
     days, train = result["times"] / 24.0, result["times"][int(result["train"])] / 24.0
     for index, (axes, force) in enumerate(zip(panels, names, strict=True)):
         mean, sd = result["forces"][:, index], result["forces_sd"][:, index]
-        axes.plot(days, result["seen"][:, index], color=DETERMINISTIC, lw=0.8)
-        axes.fill_between(days, mean - Z * sd, mean + Z * sd, color=LFM, alpha=0.2, lw=0)
-        axes.plot(days, mean, color=LFM, lw=0.9)
-        axes.axvline(train, color=SEEN, lw=0.7, ls=":")
+        axes.plot(days, result["seen"][:, index], color=DETERMINISTIC, lw=0.8, label="smoothed from all positions")
+        axes.plot(days, mean, color=LFM, lw=0.9, label="learnt in training, then predicted")
+        band(axes, days, mean, sd, color=LFM, alpha=0.2, label="95%")
+        axes.axvline(train, **_END)
         middle = np.median(result["seen"][:, index])
         reach = 1.5 * max(np.abs(result["seen"][:, index] - middle).max(), np.abs(mean - middle).max(), 0.05)
         axes.set_ylim(middle - reach, middle + reach)
         axes.set_title(f"{name}: {force}")
         style.label_values(axes, force, "nm/s²")
     style.label_time(panels, "days")
-    style.legend_above(figure, [Line2D([], [], color=LFM, label="learnt in training, then predicted"),
-                                Patch(color=LFM, alpha=0.2, label="95%"),
-                                Line2D([], [], color=DETERMINISTIC, label="smoothed from all positions"),
-                                Line2D([], [], color=SEEN, ls=":", label="end of training")])
+    legend(figure)
     return figure
 
 
@@ -66,22 +58,17 @@ def plot_errors(name: str, result: Result, *, width: str | float = "full") -> Fi
     days, train = result["times"] / 24.0, int(result["train"])
     for index, (axes, direction) in enumerate(zip(panels, ("radial", "tangential", "normal"), strict=True)):
         lfm, sd = result["lfm"][:, index] / METRE, result["sd"][:, index] / METRE
-        axes.plot(days, result["fitted"][:, index] / METRE, color=DETERMINISTIC, lw=0.9)
-        axes.plot(days, result["latest"][:, index] / METRE, color=LATEST, lw=0.9, ls="--")
-        axes.fill_between(days, -Z * sd, Z * sd, color=LFM, alpha=0.2, lw=0)
-        axes.plot(days, lfm, color=LFM, lw=0.9)
-        axes.axvline(days[train], color=SEEN, lw=0.7, ls=":")
+        axes.plot(days, result["fitted"][:, index] / METRE, color=DETERMINISTIC, lw=0.9, label=_FITTED)
+        axes.plot(days, result["latest"][:, index] / METRE, color=LATEST, lw=0.9, ls="--", label=_FROM_LATEST)
+        axes.plot(days, lfm, color=LFM, lw=0.9, label=_MODEL)
+        band(axes, days, 0.0, sd, color=LFM, alpha=0.2, label="its 95% about zero")
+        axes.axvline(days[train], **_END)
         largest = max(np.nanmax(np.abs(result[key][:, index])) for key in ("fitted", "latest", "lfm")) / METRE
         axes.set_ylim(-1.1 * largest, 1.1 * largest)
         axes.set_title(f"{name}: {direction}")
         style.label_values(axes, "error", "m")
     style.label_time(panels, "days")
-    style.legend_above(figure, [
-        Line2D([], [], color=DETERMINISTIC, label="deterministic, fitted to training"),
-        Line2D([], [], color=LATEST, ls="--", label="deterministic, from the latest state"),
-        Line2D([], [], color=LFM, label="latent force model"),
-        Patch(color=LFM, alpha=0.2, label="its 95% about zero"),
-        Line2D([], [], color=SEEN, ls=":", label="end of training")])
+    legend(figure)
     return figure
 
 
@@ -94,18 +81,15 @@ def plot_online(name: str, result: Result, *, width: str | float = "full") -> Fi
         sd = result["sd"][:, index] / METRE
         axes.fill_between(days, 0, 1, where=observed, color=SEEN, alpha=0.2, lw=0,
                           transform=axes.get_xaxis_transform())
-        axes.plot(days, result["restarted"][:, index] / METRE, color=LATEST, lw=0.9, ls="--")
-        axes.fill_between(days, -Z * sd, Z * sd, color=LFM, alpha=0.2, lw=0)
-        axes.plot(days, result["lfm"][:, index] / METRE, color=LFM, lw=0.9)
+        axes.plot(days, result["restarted"][:, index] / METRE, color=LATEST, lw=0.9, ls="--", label=_FROM_LATEST)
+        axes.plot(days, result["lfm"][:, index] / METRE, color=LFM, lw=0.9, label=_MODEL)
+        band(axes, days, 0.0, sd, color=LFM, alpha=0.2, label="its 95% about zero")
         largest = max(np.nanmax(np.abs(result[key][observed.argmin():, index])) for key in ("restarted", "lfm"))
         axes.set_ylim(-1.1 * largest / METRE, 1.1 * largest / METRE)
         axes.set_title(f"{name}: {direction}")
         style.label_values(axes, "error", "m")
     style.label_time(panels, "days")
-    style.legend_above(figure, [Line2D([], [], color=LATEST, ls="--", label="deterministic, from the latest state"),
-                                Line2D([], [], color=LFM, label="latent force model"),
-                                Patch(color=LFM, alpha=0.2, label="its 95% about zero"),
-                                Patch(color=SEEN, alpha=0.2, label="positions observed")])
+    legend(figure, patch("positions observed", SEEN, alpha=0.2))
     return figure
 
 
@@ -126,9 +110,8 @@ def plot_all(results: Mapping[str, Result], *, width: str | float = "full") -> F
             starts[group] = len(names)
             names += own
     place = np.arange(len(names))
-    for key, colour, marker, label in (("fitted", DETERMINISTIC, "o", "deterministic, fitted to training"),
-                                       ("latest", LATEST, "^", "deterministic, from the latest state"),
-                                       ("lfm", LFM, "s", "latent force model")):
+    for key, colour, marker, label in (("fitted", DETERMINISTIC, "o", _FITTED), ("latest", LATEST, "^", _FROM_LATEST),
+                                       ("lfm", LFM, "s", _MODEL)):
         errors = [rms(results[name][key][int(results[name]["train"]):]) for name in names]
         axes.semilogy(place, errors, ls="", marker=marker, ms=3.5, color=colour, label=label)
     for group, first in starts.items():
@@ -138,7 +121,7 @@ def plot_all(results: Mapping[str, Result], *, width: str | float = "full") -> F
     axes.set_xticks(place, names, rotation=90, fontsize=style.SMALL)
     axes.tick_params(labelsize=style.SMALL, length=2.5, width=0.6)
     axes.set_ylabel("error after training (m)")
-    style.legend_above(figure, axes.get_legend_handles_labels()[0])
+    legend(figure)
     return figure
 
 

@@ -1,11 +1,11 @@
-"""The whole experiment: its settings, its run, and what it leaves in a folder."""
+"""The study: its settings, tasks, tables and figures."""
 
 from __future__ import annotations
 
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -15,61 +15,55 @@ from jax.scipy.special import logsumexp
 from jax.scipy.stats import norm
 
 from lfm_ppl import checks
-from lfm_ppl.engine.cluster import Workers
-from lfm_ppl.engine.run import Reporter, run_tasks
+from lfm_ppl.engine.run import Reporter
 from lfm_ppl.engine.task import Result, Task
-from lfm_ppl.experiments import output, scores
+from lfm_ppl.experiments import published, scores, study
 from lfm_ppl.experiments.home_heating import figures, learning, prediction, problem, tables
+from lfm_ppl.experiments.study import Results, Study, Table, setting, stacked
 
 QUANTILES = (0.025, 0.25, 0.5, 0.75, 0.975)
 RESIDUALS = ("SQM", "matern")
 """Residuals whose force is drawn."""
 
+_TITLES = {"house": "Real house, {}: the fifth day, means over {} windows (standard errors)",
+           "homes": "Simulated homes under a thermostat, {}: the fifth day, means over {} homes (standard errors)",
+           "posterior": "Real house, {}: what it gains to integrate the parameters out, {} windows"}
+
 
 @dataclass(frozen=True)
-class Settings:
-    """How much is computed.
+class Settings(study.Settings):
+    """How much is computed."""
 
-    Attributes:
-        data: folder of the real house; None: simulated homes only.
-        homes: simulated homes.
-        windows: of the real house, the first so many; None: all.
-        seed: of everything random.
-        methods: residuals, of `problem.METHODS`.
-        stores: of `problem.STORES`.
-        functions: eigenfunctions.
-        particles: of a prediction under a thermostat.
-        integrated: residual whose parameters are integrated out, too.
-        every: in every so many windows.
-        ram: chains, warm-up and draws of each, of RAM.
-        nuts: of NUTS.
-    """
-
-    data: str | None = None
-    homes: int = 10
-    windows: int | None = None
-    seed: int = 0
-    methods: tuple[str, ...] = problem.METHODS
-    stores: tuple[str, ...] = problem.STORES
-    functions: int = 15
-    particles: int = 1000
-    integrated: str = "SQM"
-    every: int = 7
-    ram: tuple[int, int, int] = (4, 1000, 3000)
-    nuts: tuple[int, int, int] = (2, 120, 180)
+    data: str | None = setting(None, f"folder of {problem.FILE} (default: $LFM_DATA/house or ../shared/data/house; "
+                               "without one there are simulated homes only)", metavar="FOLDER")
+    homes: int = setting(10, "simulated homes", quick=2, aliases=study.REALISATIONS)
+    windows: int | None = setting(None, "of the real house, the first so many (default: all)", quick=2)
+    methods: tuple[str, ...] = setting(problem.METHODS, "residuals", quick=("SQM", "none", "matern"),
+                                       choices=problem.METHODS)
+    stores: tuple[str, ...] = setting(problem.STORES, "of heat", quick=problem.STORES[:1], choices=problem.STORES)
+    functions: int = setting(15, "eigenfunctions", quick=5)
+    particles: int = setting(1000, "of a prediction under a thermostat", quick=200)
+    integrated: str = setting("SQM", "residual whose parameters are integrated out, too", choices=problem.METHODS)
+    every: int = setting(7, "in every so many windows")
+    ram: tuple[int, int, int] = setting((4, 1000, 3000), "RAM", quick=(2, 50, 50), parts=study.CHAINS[:3])
+    nuts: tuple[int, int, int] = setting((2, 120, 180), "NUTS", quick=(2, 8, 8), parts=study.CHAINS[:3])
 
     def __post_init__(self) -> None:
         """Check what a user gives."""
-        for name in ("homes", "functions", "particles", "every"):
-            checks.positive_integer(name, getattr(self, name))
-        if self.windows is not None:
-            checks.positive_integer("windows", self.windows)
-        for name in ("ram", "nuts"):
-            checks.sizes(name, getattr(self, name), ("chains", "warm-up", "draws"))
-        for name, known in (("methods", problem.METHODS), ("stores", problem.STORES)):
-            for one in getattr(self, name):
-                checks.one_of(name, one, known)
+        super().__post_init__()
         checks.one_of("integrated", self.integrated, self.methods)
+
+    @classmethod
+    def chosen(cls, report: Reporter | None, quick: bool = False, **given: Any) -> Self:
+        """Return the settings that a user chose, with the folder of the real house where there is one.
+
+        Raises:
+            FileNotFoundError: the given folder has no real house.
+        """
+        folder = problem.data_folder(given.pop("data", None))
+        if folder is None and report:
+            report(f"no {problem.FILE} in $LFM_DATA/house or ../shared/data/house: simulated homes only")
+        return super().chosen(report, quick, data=None if folder is None else str(folder), **given)
 
     @property
     def shown(self) -> int:
@@ -83,28 +77,6 @@ class Settings:
             return 0
         found = len(problem.house(self.data))
         return found if self.windows is None else min(found, self.windows)
-
-
-def quick(**given: Any) -> Settings:
-    """Return settings that show in a few minutes that everything runs, and no more."""
-    small: dict[str, Any] = {"homes": 2, "windows": 2, "methods": ("SQM", "none", "matern"),
-                             "stores": problem.STORES[:1], "functions": 5, "particles": 200, "ram": (2, 50, 50),
-                             "nuts": (2, 8, 8)}
-    return Settings(**small | given)
-
-
-class Comparison(NamedTuple):
-    """What the experiment found.
-
-    Attributes:
-        settings: that it ran with.
-        results: of every task, by name.
-        tables: name -> table.
-    """
-
-    settings: Settings
-    results: dict[str, Result]
-    tables: dict[str, pd.DataFrame]
 
 
 def tasks(settings: Settings) -> list[Task]:
@@ -154,7 +126,7 @@ def _house(task: Task) -> Result:
             mean, sd = prediction.smoothed(*model)(jnp.asarray(z), jnp.asarray(prediction.masked(window.y)),
                                                    window.outdoor)
             shown = {"residual": np.asarray(mean), "residual_sd": np.asarray(sd)}
-    return {**_stacked(rows), **shown}
+    return stacked(rows) | shown
 
 
 def _homes(task: Task) -> Result:
@@ -170,7 +142,7 @@ def _homes(task: Task) -> Result:
         rows.append({**one, "z": z})
         if index == 0:
             first = {"quantiles": np.asarray(found.observed.quantiles(QUANTILES))[:, prediction.SCORED, 0]}
-    return {**_stacked(rows), **first}
+    return stacked(rows) | first
 
 
 def _posterior(task: Task) -> Result:
@@ -196,32 +168,35 @@ def _posterior(task: Task) -> Result:
                      "point_rmse": point["ahead_rmse"], "r_hat": np.max(sampled["r_hat"]),
                      "ess": np.min(sampled["ess"]),
                      **{name: sampled[name] for name in ("mean", "sd", "divergences", "seconds")}})
-    return _stacked(rows)
+    return stacked(rows)
 
 
-def _stacked(rows: list[Result]) -> Result:
-    return {key: np.stack([np.asarray(row[key]) for row in rows]) for key in rows[0]}
+def title(settings: Settings, name: str) -> str:
+    """Return what a table shows."""
+    what, _, store = name.partition("-")
+    count = settings.homes if what == "homes" else settings.window_count
+    if what == "posterior":
+        store, count = settings.stores[0], -(-count // settings.every)
+    return _TITLES[what].format(store.replace("-", " "), count)
 
 
-def run(settings: Settings, folder: str | Path, *, overwrite: bool = False,
-        report: Reporter | None = None, workers: Workers = 1) -> Comparison:
-    """Compute what is not stored yet in ``folder``, and tabulate everything.
-
-    Args:
-        settings: how much.
-        folder: of the experiment; its subfolder ``tasks`` holds a file for each task.
-        overwrite: compute again what was stored with other settings.
-        report: what to do with a line of progress; None: nothing.
-        workers: what computes; see `run_tasks`.
-
-    Raises:
-        ValueError: the folder holds results made with other settings; a file of the house that cannot be used.
-    """
-    results = run_tasks(tasks(settings), compute, Path(folder) / "tasks", overwrite=overwrite, report=report,
-                        workers=workers)
-    return Comparison(settings, results, tables.every(settings, results))
+def tabulated(settings: Settings, results: Results) -> dict[str, Table]:
+    """Return the tables."""
+    found = {name: Table(title(settings, name), frame) for name, frame in tables.every(settings, results).items()}
+    if settings.data is None:
+        reason = pd.DataFrame({"reason": [f"no {problem.FILE}; give its folder with --data"]}, ["real house"])
+        found["left out"] = Table("Left out", reason, reason, stored=False)
+    return found
 
 
-def save(found: Comparison, folder: str | Path) -> list[Path]:
-    """Write tables and figures, replacing older ones, and return their paths."""
-    return output.save(folder, found.tables, figures.draw(found.settings, found.results), "residual")
+def notes(settings: Settings, results: Results) -> tuple[str, ...]:
+    """Return how the errors a day ahead in the real house compare with the published ones, over both of its homes."""
+    if settings.window_count < published.FEWEST:
+        return ()
+    shown = tables.every(settings, results)
+    return tuple(published.said(f"RMSE a day ahead, {name.partition('-')[2].replace('-', ' ')}",
+                                published.beside(frame, "RMSE ahead (K)", "published RMSE ahead (K)"))
+                 for name, frame in shown.items() if name.startswith("house-"))
+
+
+STUDY = Study(Settings, tasks, compute, tabulated, figures.draw, label="residual", notes=notes)

@@ -7,16 +7,16 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 
 from lfm_ppl.engine.task import Result
+from lfm_ppl.experiments.drawing import TRUTH, band, legend, line
 from lfm_ppl.experiments.home_heating import prediction, problem, tables
-from lfm_ppl.experiments.scores import Z, mean_of
+from lfm_ppl.experiments.scores import mean_of
 from lfm_ppl.results.plots import style
 
 LABELS = {"none": "no residual", "matern": "Matern", **{name: name for name in ("SQM", "CQM", "WQM", "periodic",
                                                                               "resonator")}}
+_MEASURED = TRUTH | {"label": "measured"}
 _WIDE, _NARROW = "#D6E8F3", "#9CC9E3"
 _MARKS = {"one store": (style.BLUE, "o"), "envelope": (style.VERMILLION, "s")}
 _SHOWN = ("SQM", "periodic", "CQM", "none", "matern", "resonator")
@@ -35,14 +35,7 @@ def draw(settings: Any, results: dict[str, Result]) -> dict[str, Figure]:
 @style.styled
 def plot_homes(settings: Any, results: dict[str, Result], *, store: str | None = None,
                width: str | float = "full") -> Figure:
-    """Draw the fifth day of the first simulated home: temperature with bands, set point, and heater.
-
-    Args:
-        settings: of the experiment.
-        results: of its tasks.
-        store: model; None: the first one.
-        width: "column" (3.4 in), "full" (7 in), or inches.
-    """
+    """Draw the fifth day of the first simulated home: temperature with bands, set point, and heater."""
     store = store or settings.stores[0]
     window = problem.home(0, store, settings.seed)
     assert window.fine is not None and window.set_points is not None
@@ -52,35 +45,25 @@ def plot_homes(settings: Any, results: dict[str, Result], *, store: str | None =
     for method, (upper, lower) in panels.items():
         found = tables.of(results, "homes", store, method)
         low, quarter, middle, upper_quarter, high = found["quantiles"]
-        upper.fill_between(hours, low, high, color=_WIDE, lw=0)
-        upper.fill_between(hours, quarter, upper_quarter, color=_NARROW, lw=0)
-        upper.plot(hours, middle, color=style.BLUE)
+        upper.plot(hours, middle, color=style.BLUE, label="predicted")
+        upper.fill_between(hours, low, high, color=_WIDE, lw=0, label="95% band")
+        upper.fill_between(hours, quarter, upper_quarter, color=_NARROW, lw=0, label="50% band")
         upper.step(np.arange(problem.DAY + 1), np.append(*2 * [window.set_points[problem.TRAIN:]])[:problem.DAY + 1],
-                   where="post", color=style.GREEN, lw=0.8)
-        upper.plot(hours, truth, color=style.BLACK, lw=0.8, ls="--")
+                   where="post", color=style.GREEN, lw=0.8, label="set point")
+        upper.plot(hours, truth, **_MEASURED)
         _score(upper, method, found["rmse"][0], found["ell"][0])
-        lower.fill_between(hours, heater, step="post", color="#D0D0D0", lw=0)
-        lower.plot(hours, found["on"][0], color=style.VERMILLION, lw=0.8)
+        lower.fill_between(hours, heater, step="post", color="#D0D0D0", lw=0, label="heater on")
+        lower.plot(hours, found["on"][0], color=style.VERMILLION, lw=0.8, label="predicted probability")
         lower.set_ylim(0.0, 1.05)
     _finish(figure, panels, "heater on")
-    style.legend_above(figure, [
-        *_fan_handles("measured"), Line2D([], [], color=style.GREEN, lw=0.8, label="set point"),
-        Patch(color="#D0D0D0", label="heater on"),
-        Line2D([], [], color=style.VERMILLION, lw=0.8, label="predicted probability")])
+    legend(figure)
     return figure
 
 
 @style.styled
 def plot_house(settings: Any, results: dict[str, Result], *, store: str | None = None,
                width: str | float = "full") -> Figure:
-    """Draw the fifth day of one window of the real house: temperature with bands, and its known heating power.
-
-    Args:
-        settings: of the experiment.
-        results: of its tasks.
-        store: model; None: the first one.
-        width: "column" (3.4 in), "full" (7 in), or inches.
-    """
+    """Draw the fifth day of one window of the real house: temperature with bands, and its known heating power."""
     store = store or settings.stores[0]
     window = problem.house(settings.data)[settings.shown]
     hours = np.arange(problem.DAY)
@@ -88,27 +71,22 @@ def plot_house(settings: Any, results: dict[str, Result], *, store: str | None =
     for method, (upper, lower) in panels.items():
         found = tables.of(results, "house", store, method)
         mean, sd = found["mean"][settings.shown], found["sd"][settings.shown]
-        upper.fill_between(hours, mean - Z * sd, mean + Z * sd, color=_WIDE, lw=0)
-        upper.fill_between(hours, mean - 0.6745 * sd, mean + 0.6745 * sd, color=_NARROW, lw=0)
-        upper.plot(hours, mean, color=style.BLUE)
-        upper.plot(hours, window.y[problem.TRAIN:, 0], color=style.BLACK, lw=0.8, ls="--")
+        upper.plot(hours, mean, color=style.BLUE, label="predicted")
+        band(upper, hours, mean, sd, color=_WIDE)
+        band(upper, hours, mean, sd, color=_NARROW, z=0.6745, label="50% band")
+        upper.plot(hours, window.y[problem.TRAIN:, 0], **_MEASURED)
         _score(upper, method, found["ahead_rmse"][settings.shown], found["ahead_ell"][settings.shown])
-        lower.fill_between(hours, window.y[problem.TRAIN:, 2], step="post", color="#D0D0D0", lw=0)
+        lower.fill_between(hours, window.y[problem.TRAIN:, 2], step="post", color="#D0D0D0", lw=0,
+                           label="heating power (100 units)")
         lower.set_ylim(bottom=0.0)
     _finish(figure, panels, "power")
-    style.legend_above(figure, [*_fan_handles("measured"), Patch(color="#D0D0D0", label="heating power (100 units)")])
+    legend(figure)
     return figure
 
 
 @style.styled
 def plot_residual(settings: Any, results: dict[str, Result], *, width: str | float = "full") -> Figure:
-    """Draw the smoothed residual of the real house day by day, with the band of the day that is predicted.
-
-    Args:
-        settings: of the experiment.
-        results: of its tasks.
-        width: "column" (3.4 in), "full" (7 in), or inches.
-    """
+    """Draw the smoothed residual of the real house day by day, with the band of the day that is predicted."""
     figure, panels = style.in_a_row(width, 2, 2.6, sharey=True)
     colours = ("#BBBBBB", style.SKY, style.GREEN, style.PURPLE)
     hours = np.arange(problem.DAY)
@@ -116,30 +94,22 @@ def plot_residual(settings: Any, results: dict[str, Result], *, width: str | flo
         found = tables.of(results, "house", settings.stores[0], method)
         mean, sd = (found[name].reshape(-1, problem.DAY) for name in ("residual", "residual_sd"))
         for day in range(problem.TRAIN_DAYS):
-            axes.plot(hours, mean[day], color=colours[day], lw=0.9)
-        axes.fill_between(hours, mean[-1] - Z * sd[-1], mean[-1] + Z * sd[-1], color=_WIDE, lw=0)
-        axes.plot(hours, mean[-1], color=style.BLUE, lw=1.4)
+            axes.plot(hours, mean[day], color=colours[day], lw=0.9, label=f"day {day + 1}")
+        axes.plot(hours, mean[-1], color=style.BLUE, lw=1.4, label="day 5, predicted")
+        band(axes, hours, mean[-1], sd[-1], color=_WIDE, label="its 95% band")
         axes.axhline(0.0, color=style.BLACK, lw=0.5)
         style.tidy(axes)
         axes.set_xticks([0, 6, 12, 18, 24])
         axes.set_title(LABELS[method])
         axes.set_xlabel("hour of the day")
     panels[0].set_ylabel("residual heat (K/h)")
-    style.legend_above(figure, [
-        *(Line2D([], [], color=colours[day], lw=0.9, label=f"day {day + 1}") for day in range(problem.TRAIN_DAYS)),
-        Line2D([], [], color=style.BLUE, lw=1.4, label="day 5, predicted"), Patch(color=_WIDE, label="its 95% band")])
+    legend(figure)
     return figure
 
 
 @style.styled
 def plot_scores(settings: Any, results: dict[str, Result], *, width: str | float = "full") -> Figure:
-    """Draw day-ahead RMSE of every residual with two standard errors, and the quartiles of its log likelihood.
-
-    Args:
-        settings: of the experiment.
-        results: of its tasks.
-        width: "column" (3.4 in), "full" (7 in), or inches.
-    """
+    """Draw day-ahead RMSE of every residual with two standard errors, and the quartiles of its log likelihood."""
     kinds = [("homes", "", "simulated homes")] + ([("house", "ahead_", "real house")] if settings.data else [])
     figure = style.new_figure(width, 2.1 * len(kinds) + 0.3)
     grid = figure.subplots(len(kinds), 2, squeeze=False)
@@ -165,8 +135,7 @@ def plot_scores(settings: Any, results: dict[str, Result], *, width: str | float
             axes.set_title(label)
             if score == "ell":
                 axes.set_yscale("symlog", linthresh=20.0)
-    style.legend_above(figure, [Line2D([], [], color=_MARKS[store][0], marker=_MARKS[store][1], ls="", ms=3.0,
-                                       label=store) for store in settings.stores])
+    legend(figure, *(line(store, _MARKS[store][0], "", marker=_MARKS[store][1], ms=3.0) for store in settings.stores))
     style.note_below(figure, "Left: means and two standard errors. Right: medians and quartiles; the axis is linear "
                              "near zero and logarithmic beyond 20.")
     return figure
@@ -207,9 +176,3 @@ def _finish(figure: Figure, panels: dict[str, tuple[Axes, Axes]], label: str) ->
 
 def _score(axes: Axes, method: str, rmse: float, ell: float) -> None:
     axes.set_title(f"{LABELS[method]} ({rmse:.2f} K, {ell:.0f})")
-
-
-def _fan_handles(truth: str) -> list[Any]:
-    return [Line2D([], [], color=style.BLACK, lw=0.8, ls="--", label=truth),
-            Line2D([], [], color=style.BLUE, label="predicted"), Patch(color=_NARROW, label="50% band"),
-            Patch(color=_WIDE, label="95% band")]

@@ -7,12 +7,10 @@ from typing import Any
 import jax
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 
 from lfm_ppl.engine.task import Result
+from lfm_ppl.experiments.drawing import TRUTH, band, legend
 from lfm_ppl.experiments.periodic_kernels import covariance, problem, regression
-from lfm_ppl.experiments.scores import Z
 from lfm_ppl.forces import (
     CQM,
     SQM,
@@ -29,7 +27,6 @@ from lfm_ppl.results.plots import style
 
 _LINES = {covariance.EIGENFUNCTIONS: (style.BLUE, "-", "o"), covariance.RESONATORS: (style.GREEN, "--", "s"),
           covariance.RANDOM: (style.VERMILLION, "-.", "^")}
-_SHADE = "#B3D5E9"
 
 
 def draw(settings: Any, results: dict[str, Result]) -> dict[str, Figure]:
@@ -48,7 +45,7 @@ def plot_errors(settings: Any, results: dict[str, Result], *, width: str | float
     for axes, task in zip(panels, own, strict=True):
         for method, (colour, line, marker) in _LINES.items():
             axes.loglog(settings.functions, np.maximum(results[task.name][method], 1e-16), line, color=colour,
-                        marker=marker, ms=3, mfc="none" if method == covariance.RESONATORS else colour)
+                        marker=marker, ms=3, mfc="none" if method == covariance.RESONATORS else colour, label=method)
         axes.set_title(task.settings["kernel"].replace("_", "/"), fontsize=style.SMALL)
         axes.tick_params(labelsize=style.SMALL)
         axes.set_ylim(1e-13, 3.0)
@@ -56,8 +53,7 @@ def plot_errors(settings: Any, results: dict[str, Result], *, width: str | float
         axes.set_xlabel("functions")
     for axes in panels[::3]:
         axes.set_ylabel("largest error")
-    style.legend_above(figure, [Line2D([], [], color=colour, ls=line, marker=marker, ms=3, label=method)
-                                for method, (colour, line, marker) in _LINES.items()])
+    legend(figure)
     return figure
 
 
@@ -72,14 +68,13 @@ def plot_covariances(settings: Any, *, width: str | float = "full") -> Figure:
         key = jax.random.fold_in(jax.random.key(settings.seed), count)
         chosen[label] = SparseSpectrum(1.0, random_frequencies(key, problem.window_prior(), count))
     for axes, (label, force) in zip(panels, chosen.items(), strict=True):
-        axes.plot(at, exact, color=style.BLACK, lw=0.8)
-        axes.plot(at, np.asarray(force.sde_covariance(at, 0.0)), "--", color=style.BLUE)
+        axes.plot(at, exact, color=style.BLACK, lw=0.8, label="squared exponential, scale 10")
+        axes.plot(at, np.asarray(force.sde_covariance(at, 0.0)), "--", color=style.BLUE, label="approximation")
         axes.set_title(label, fontsize=style.SMALL)
         axes.set_xlabel("distance in time")
         style.tidy(axes)
     panels[0].set_ylabel("covariance")
-    style.legend_above(figure, [Line2D([], [], color=style.BLACK, lw=0.8, label="squared exponential, scale 10"),
-                                Line2D([], [], color=style.BLUE, ls="--", label="approximation")])
+    legend(figure)
     return figure
 
 
@@ -91,15 +86,14 @@ def plot_eigenfunctions(*, width: str | float = "full") -> Figure:
     every = problem.kernels()
     for axes, name in zip(panels, ("periodic Matern-3_2", "moderated periodic Matern-3_2"), strict=True):
         force = Periodic(every[name], functions=3, explained_variance=0.0)
-        for values, colour, line in zip(np.asarray(force.eigenfunctions(t)).T,
-                                        (style.BLUE, style.VERMILLION, style.GREEN), ("-", "--", "-."), strict=True):
-            axes.plot(t, values * np.sign(values[20] + 1e-9), color=colour, ls=line)
+        looks = ((style.BLUE, "-", "first"), (style.VERMILLION, "--", "second"), (style.GREEN, "-.", "third"))
+        for values, (colour, line, label) in zip(np.asarray(force.eigenfunctions(t)).T, looks, strict=True):
+            axes.plot(t, values * np.sign(values[20] + 1e-9), color=colour, ls=line, label=label)
         axes.set_title(name.replace("_", "/"), fontsize=style.SMALL)
         axes.set_xlabel("time (period 10)")
         style.tidy(axes)
     panels[0].set_ylabel("eigenfunction")
-    style.legend_above(figure, [Line2D([], [], color=colour, ls=line, label=label) for colour, line, label in zip(
-        (style.BLUE, style.VERMILLION, style.GREEN), ("-", "--", "-."), ("first", "second", "third"), strict=True)])
+    legend(figure)
     return figure
 
 
@@ -116,8 +110,8 @@ def plot_draws(settings: Any, *, width: str | float = "full") -> Figure:
     generator = np.random.default_rng(settings.seed)
     for (left, right), (label, evolution) in zip(grid, chosen.items(), strict=True):
         force = QuasiPeriodic(kernel, evolution, gamma=1e-6)
-        left.plot(t, np.asarray(force.covariance(t, 5.0)), color=style.BLACK, lw=0.8)
-        left.plot(t, np.asarray(force.sde_covariance(t, 5.0)), "--", color=style.BLUE)
+        left.plot(t, np.asarray(force.covariance(t, 5.0)), color=style.BLACK, lw=0.8, label="product of the kernels")
+        left.plot(t, np.asarray(force.sde_covariance(t, 5.0)), "--", color=style.BLUE, label="state-space form")
         left.set_ylabel("covariance")
         left.set_title(f"{label}: with the force at time 5", fontsize=style.SMALL)
         values, vectors = np.linalg.eigh(np.asarray(force.sde_covariance(t[:, None], t)))
@@ -130,8 +124,7 @@ def plot_draws(settings: Any, *, width: str | float = "full") -> Figure:
             style.tidy(axes)
     for axes in grid[-1]:
         axes.set_xlabel("time (period 10)")
-    style.legend_above(figure, [Line2D([], [], color=style.BLACK, lw=0.8, label="product of the kernels"),
-                                Line2D([], [], color=style.BLUE, ls="--", label="state-space form")])
+    legend(figure)
     return figure
 
 
@@ -146,18 +139,15 @@ def plot_prediction(settings: Any, results: dict[str, Result], *, width: str | f
     at = problem.predicted()
     for axes, method in zip(panels, shown, strict=True):
         mean, sd = own[method]["mean"], np.sqrt(own[method]["variance"])
-        axes.fill_between(at, mean - Z * sd, mean + Z * sd, color=_SHADE, lw=0)
-        axes.plot(at, mean, color=style.BLUE)
-        axes.plot(at, truth, "--", color=style.BLACK, lw=0.8)
-        axes.plot(problem.measured(), data, "o", color=style.BLACK, ms=3)
+        band(axes, at, mean, sd)
+        axes.plot(at, mean, color=style.BLUE, label="mean")
+        axes.plot(at, truth, **TRUTH)
+        axes.plot(problem.measured(), data, "o", color=style.BLACK, ms=3, label="measured")
         axes.set_title(method, fontsize=style.SMALL)
         style.tidy(axes)
     for axes in panels[2:]:
         axes.set_xlabel("time (lengthscale 10)")
     for axes in panels[::2]:
         axes.set_ylabel("function")
-    style.legend_above(figure, [
-        Line2D([], [], color=style.BLACK, lw=0.8, ls="--", label="truth"),
-        Line2D([], [], color=style.BLACK, ls="", marker="o", ms=3, label="measured"),
-        Line2D([], [], color=style.BLUE, label="mean"), Patch(color=_SHADE, label="95% band")])
+    legend(figure)
     return figure

@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 
 from lfm_ppl.engine.task import Result
+from lfm_ppl.experiments.drawing import band, line, patch
 from lfm_ppl.experiments.scores import Z
 from lfm_ppl.experiments.transcription import problem
 from lfm_ppl.results.plots import style
@@ -45,8 +44,8 @@ def plot_force(data: problem.DataSet, methods: Mapping[str, Result], *, width: s
     panels = list(grid.ravel())
     axes = panels[0]
     kinds = zip((style.BLUE, style.VERMILLION, style.GREEN), "os^", ("-", "--", ":"), strict=True)
-    for gene, (colour, marker, line) in enumerate(kinds):
-        axes.plot(data.fine, data.state[:, gene], color=colour, lw=0.9, ls=line)
+    for gene, (colour, marker, dash) in enumerate(kinds):
+        axes.plot(data.fine, data.state[:, gene], color=colour, lw=0.9, ls=dash)
         axes.plot(problem.TIMES, data.y[:, gene], ls="", marker=marker, ms=2.6, color=colour, label=f"gene {gene + 1}")
     axes.set_title("data, and the true expression")
     axes.set_ylim(top=data.y.max() + 0.35 * np.ptp(data.y))
@@ -61,7 +60,7 @@ def plot_force(data: problem.DataSet, methods: Mapping[str, Result], *, width: s
     for axes, (method, found) in zip(panels[1:], methods.items(), strict=False):
         mean, sd = found["mean"][0], found["sd"][0]
         colour = COLOURS[method]
-        axes.fill_between(problem.GRID, mean - Z * sd, mean + Z * sd, color=colour, alpha=0.25, lw=0, zorder=1)
+        band(axes, problem.GRID, mean, sd, color=colour, alpha=0.25, zorder=1)
         axes.plot(problem.GRID, mean, color=colour, zorder=3)
         axes.plot(problem.GRID, data.u, color=style.BLACK, lw=0.7, zorder=2)
         axes.set_ylim(low, high)
@@ -73,8 +72,8 @@ def plot_force(data: problem.DataSet, methods: Mapping[str, Result], *, width: s
     for axes in panels[: 1 + len(methods)]:
         axes.set_xlabel("time")
         axes.set_xlim(0.0, problem.END)
-    style.legend_above(figure, [Line2D([], [], color=style.BLACK, lw=0.7, label="truth"),
-                                Patch(color=style.GREY, alpha=0.5, label="mean and 95% band")])
+    style.legend_above(figure, [line("truth", style.BLACK, lw=0.7),
+                                patch("mean and 95% band", style.GREY, alpha=0.5)])
     return figure
 
 
@@ -114,5 +113,5 @@ def plot_errors(cells: Mapping[tuple[str, str], Result], *, width: str | float =
     axes.set_xlabel("how the factor acts")
     style.note_below(figure, "Bars: means without divergences, whose numbers stand above the frame. Points above 2 are "
                              "drawn at 2.")
-    style.legend_above(figure, [Patch(color=COLOURS[method], label=method) for method in methods])
+    style.legend_above(figure, [patch(method, COLOURS[method]) for method in methods])
     return figure

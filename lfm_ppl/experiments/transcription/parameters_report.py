@@ -1,112 +1,49 @@
-"""The comparison of full posteriors as the command line runs it."""
+"""The study of full posteriors: its settings, table and figures."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
-from lfm_ppl import checks
-from lfm_ppl.engine.cluster import Workers
-from lfm_ppl.engine.run import Reporter, run_tasks
 from lfm_ppl.engine.task import Result
-from lfm_ppl.experiments import output, scores
-from lfm_ppl.experiments.catalogue import Report, Wanted
-from lfm_ppl.experiments.scores import Estimate, Z, mean_of, pair, readable
+from lfm_ppl.experiments import chains, study
+from lfm_ppl.experiments.drawing import band, line
+from lfm_ppl.experiments.scores import Z, mean_of, pair
+from lfm_ppl.experiments.study import Results, Study, Table, setting
 from lfm_ppl.experiments.transcription import parameters, problem
 from lfm_ppl.results.plots import style
 
-TASKS = "tasks"
-SUMMARY = "transcription factors with unknown rates: the marginal posterior against that of the force as latent sites"
 MARKERS, LINES = "osD^", ("-", "--", "-.", ":")
 COLOURS = {parameters.REFERENCE: style.GREY, "NUTS, marginal": style.BLUE, "RAM, marginal": style.ORANGE,
            "RAM, iterated marginal": style.GREEN}
 
 
 @dataclass(frozen=True)
-class Settings:
-    """How much is computed.
+class Settings(study.Settings):
+    """How much is computed."""
 
-    Attributes:
-        datasets: for each link.
-        seed: of everything random.
-        latent: chains, and warm-up, draws and thinning of each, of NUTS on the latent grid.
-        nuts: of NUTS on the marginal likelihood.
-        ram: of RAM.
-        tree_depth: largest of NUTS.
-        links: labels of `parameters.LINKS`.
-    """
-
-    datasets: int = 2
-    seed: int = 0
-    latent: tuple[int, int, int, int] = (2, 500, 1000, 1)
-    nuts: tuple[int, int, int, int] = (2, 500, 1000, 1)
-    ram: tuple[int, int, int, int] = (4, 250, 1000, 200)
-    tree_depth: int = 10
-    links: tuple[str, ...] = tuple(parameters.LINKS)
-
-    def __post_init__(self) -> None:
-        """Check what a user gives."""
-        checks.positive_integer("datasets", self.datasets)
-        if not isinstance(self.links, tuple) or not self.links or len(set(self.links)) < len(self.links):
-            raise ValueError(f"links must be a tuple of different labels, got {self.links!r}.")
-        for name in ("latent", "nuts", "ram"):
-            checks.sizes(name, getattr(self, name), ("chains", "warm-up", "draws", "thinning"))
-        checks.positive_integer("tree_depth", self.tree_depth)
-        for label in self.links:
-            checks.one_of("links", label, parameters.LINKS)
+    datasets: int = setting(2, "for each link", quick=1, aliases=study.REALISATIONS)
+    latent: tuple[int, int, int, int] = setting((2, 500, 1000, 1), "NUTS on the latent grid", quick=(2, 20, 20, 1),
+                                                parts=study.CHAINS)
+    nuts: tuple[int, int, int, int] = setting((2, 500, 1000, 1), "NUTS on the marginal likelihood",
+                                              quick=(2, 20, 20, 1), parts=study.CHAINS)
+    ram: tuple[int, int, int, int] = setting((4, 250, 1000, 200), "RAM", quick=(2, 50, 50, 5), parts=study.CHAINS)
+    tree_depth: int = setting(10, "largest of NUTS", quick=4)
+    links: tuple[str, ...] = setting(tuple(parameters.LINKS), "how the factor acts", quick=("softplus",),
+                                     choices=tuple(parameters.LINKS))
 
 
-class Comparison(NamedTuple):
-    """What the experiment found.
-
-    Attributes:
-        settings: that it ran with.
-        cells: (link, sampler) -> the results of all data sets.
-        table: a row for each link and sampler.
-    """
-
-    settings: Settings
-    cells: dict[tuple[str, str], list[Result]]
-    table: pd.DataFrame
-
-
-def quick(datasets: int = 1, seed: int = 0) -> Settings:
-    """Return settings that show in a few minutes that everything runs, and no more."""
-    return Settings(datasets, seed, latent=(2, 20, 20, 1), nuts=(2, 20, 20, 1), ram=(2, 50, 50, 5), tree_depth=4,
-                    links=("softplus",))
-
-
-def run(wanted: Wanted) -> Report:
-    """Run the comparison, or what is missing of it, and write tables and figures.
-
-    Raises:
-        ValueError: the folder holds results made with other settings; something is asked that it does not have.
-    """
-    make = quick if wanted.quick else Settings
-    settings = make(**wanted.counts(realisations="datasets"))
-    found = compute(settings, wanted.folder, overwrite=wanted.overwrite, report=wanted.report, workers=wanted.workers)
-    written = output.save(wanted.folder, {"agreement": found.table}, draw(found), "case")
+def tabulated(settings: Settings, results: Results) -> dict[str, Table]:
+    """Return the table."""
     title = f"Against {parameters.REFERENCE}, {settings.datasets} data set{'s' if settings.datasets > 1 else ''}"
-    return Report({title: readable(found.table)}, written)
+    return {"agreement": Table(title, agreement(by_cell(settings, results)))}
 
 
-def compute(settings: Settings, folder: str | Path, *, overwrite: bool = False,
-            report: Reporter | None = None, workers: Workers = 1) -> Comparison:
-    """Compute what is not stored yet in ``folder``, and tabulate everything; arguments as in `run_tasks`."""
-    results = run_tasks(parameters.tasks(settings), parameters.compute, Path(folder) / TASKS, overwrite=overwrite,
-                        report=report, workers=workers)
-    cells = by_cell(settings, results)
-    return Comparison(settings, cells, agreement(cells))
-
-
-def by_cell(settings: Settings, results: Mapping[str, Result]) -> dict[tuple[str, str], list[Result]]:
+def by_cell(settings: Settings, results: Results) -> dict[tuple[str, str], list[Result]]:
     """Return (link, sampler) -> results of all data sets."""
     return problem.by_cell(parameters.tasks(settings), results, "sampler")
 
@@ -127,38 +64,29 @@ def agreement(cells: Mapping[tuple[str, str], list[Result]]) -> pd.DataFrame:
     rows = {}
     for (label, sampler), found in cells.items():
         reference = cells[label, parameters.REFERENCE]
-        pairs = list(zip(found, reference, strict=True))
-        shift = np.stack([(one["mean"] - exact["mean"]) / exact["sd"] for one, exact in pairs])
-        ratio = np.stack([one["sd"] / exact["sd"] for one, exact in pairs])
-        error = np.stack([np.sqrt(1 / one["ess"] + 1 / exact["ess"]) for one, exact in pairs])
-        spread = ratio * np.stack([np.hypot(*(scores.relative_errors_of_sd(which["draws"]) for which in both))
-                                   for both in pairs])
-        worst = np.unravel_index(np.abs(shift).argmax(), shift.shape)
-        with np.errstate(divide="ignore"):
-            widest = np.unravel_index(np.abs(np.log(ratio)).argmax(), ratio.shape)
-        own = sampler == parameters.REFERENCE
-        row = pair("shift", Estimate(float(abs(shift[worst])), np.nan if own else float(error[worst])))
-        row |= pair("sd ratio", Estimate(float(ratio[widest]), np.nan if own else float(spread[widest])))
-        # A chain that does not move has neither; it must not look as if it did.
-        least = [float(np.nan_to_num(one["ess"]).min()) for one in found]
-        r_hat = [float(np.nan_to_num(one["r_hat"], nan=np.inf).max()) for one in found]
+        shift, ratio = chains.agreement(found, reference)
+        if sampler == parameters.REFERENCE:
+            shift, ratio = shift._replace(error=np.nan), ratio._replace(error=np.nan)
+        row = pair("shift", shift) | pair("sd ratio", ratio)
+        least = [chains.least_ess(one) for one in found]
         covered = [np.mean((one["low"] <= one["truth"]) & (one["truth"] <= one["high"])) for one in found]
         for name, values in (("coverage", covered), ("RMSE", [one["rmse"] for one in found]),
                              ("coverage force", [one["coverage"] for one in found]),
                              ("ESS/CPU s", [ess / one["seconds"] for ess, one in zip(least, found, strict=True)])):
             row |= pair(name, mean_of(values))
-        row |= {"least ESS": min(least), "R-hat": max(r_hat),
+        row |= {"least ESS": min(least), "R-hat": max(map(chains.largest_r_hat, found)),
                 "k": float(np.max([one.get("k", np.nan) for one in found])),
                 "divergences": float(np.mean([one["divergences"] for one in found]))}
         rows[f"{label}: {sampler}"] = row
     return pd.DataFrame.from_dict(rows, orient="index", dtype=float)
 
 
-def draw(found: Comparison) -> dict[str, Figure]:
+def draw(settings: Settings, results: Results) -> dict[str, Figure]:
     """Return a figure of the first data set of each link."""
+    cells = by_cell(settings, results)
     return {f"posteriors-{problem.slug(link)}": plot_posteriors(
-        {sampler: found.cells[link, sampler][0] for sampler in parameters.SAMPLERS},
-        problem.data_set(parameters.LINKS[link], 0, found.settings.seed)) for link in found.settings.links}
+        {sampler: cells[link, sampler][0] for sampler in parameters.SAMPLERS},
+        problem.data_set(parameters.LINKS[link], 0, settings.seed)) for link in settings.links}
 
 
 @style.styled
@@ -183,7 +111,7 @@ def plot_posteriors(samplers: Mapping[str, Result], data: problem.DataSet, *, wi
         mean, sd = found["force_mean"], found["force_sd"]
         lower.plot(parameters.AT, mean, color=COLOURS[sampler], ls=LINES[number])
         if sampler == parameters.REFERENCE:
-            lower.fill_between(parameters.AT, mean - Z * sd, mean + Z * sd, color=COLOURS[sampler], alpha=0.3, lw=0)
+            band(lower, parameters.AT, mean, sd, color=COLOURS[sampler], alpha=0.3, label="")
         else:
             for end in (-Z, Z):
                 lower.plot(parameters.AT, mean + end * sd, color=COLOURS[sampler], lw=0.6, ls=LINES[number])
@@ -199,7 +127,9 @@ def plot_posteriors(samplers: Mapping[str, Result], data: problem.DataSet, *, wi
         style.tidy(axes)
     upper.set_xticks(range(len(parameters.NAMES)), parameters.NAMES, rotation=40, ha="right")
     style.legend_above(figure, [
-        *(Line2D([], [], color=COLOURS[sampler], marker=MARKERS[number], ms=2.5, ls=LINES[number], label=sampler)
-          for number, sampler in enumerate(samplers)),
-        Line2D([], [], color=style.BLACK, label="truth")])
+        *(line(sampler, COLOURS[sampler], LINES[number], marker=MARKERS[number], ms=2.5)
+          for number, sampler in enumerate(samplers)), line("truth", style.BLACK)])
     return figure
+
+
+STUDY = Study(Settings, parameters.tasks, parameters.compute, tabulated, draw)

@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 
 from lfm_ppl.engine.task import Result
+from lfm_ppl.experiments.published import Verdict
 from lfm_ppl.experiments.scores import mean_of, pair
 from lfm_ppl.experiments.transcription import problem, slices
-from lfm_ppl.experiments.transcription.verdict import Verdict
 
 Cells = Mapping[tuple[str, str], Result]
 """(configuration, method) -> results of all data sets."""

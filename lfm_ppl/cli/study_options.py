@@ -1,0 +1,84 @@
+"""The options of ``lfm-ppl compare NAME``, made from the settings that the study NAME declares."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+from lfm_ppl import checks
+
+if TYPE_CHECKING:  # experiments, which take seconds to import
+    from lfm_ppl.experiments.study import Option, Settings
+
+_DESTINATION = "study setting "
+
+
+def name_in(words: Sequence[str], common: argparse.ArgumentParser, known: Sequence[str]) -> str | None:
+    """Return the word that names the study; None where no word can.
+
+    Args:
+        words: the arguments after ``compare``.
+        common: parser of the options that all studies share; what it leaves over are the name, the options of the
+            study, and their values.
+        known: names of the studies.
+    """
+    _, left = common.parse_known_args(list(words))
+    free = [word for before, word in zip(["", *left], left, strict=False)
+            if not word.startswith("-") and not (before.startswith("--") and "=" not in before)]
+    return next((word for word in free if word.replace("_", "-") in known), next(iter(free), None))
+
+
+def add(command: Any, settings: type[Settings], name: str) -> None:
+    """Add an option for each setting of a study."""
+    from lfm_ppl.experiments.study import options
+
+    group = command.add_argument_group(f"options of {name}")
+    for one in options(settings):
+        about, kind = one.declared, _converter(one)
+        shown: dict[str, Any] = {"metavar": about.metavar or ("N" if one.kind is int else one.name.upper())}
+        if about.parts:
+            shown = {"nargs": len(about.parts), "metavar": tuple(part.upper() for part in about.parts)}
+        elif one.many:
+            shown["nargs"] = "+"
+        elif about.choices:
+            shown["metavar"] = "|".join(about.choices)
+        group.add_argument(*one.flags, dest=_DESTINATION + one.name, type=kind, default=argparse.SUPPRESS,
+                           help=f"{about.help}{_default(one)}".replace("%", "%%"), **shown)
+
+
+def given(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return the settings that a user gave, by name."""
+    return {name.removeprefix(_DESTINATION): tuple(value) if isinstance(value, list) else value
+            for name, value in vars(arguments).items() if name.startswith(_DESTINATION)}
+
+
+def _converter(one: Option) -> Callable[[str], Any]:
+    """Return what makes a word a value of the setting; the error that it raises is part of one line."""
+    least = one.declared.least
+    expected = f"a whole number of at least {least}" if one.kind is int else "a number above zero"
+
+    def convert(text: str) -> Any:
+        if one.kind is not str:
+            try:
+                value = one.kind(text) if one.kind is float or (text.isascii() and text.isdigit()) else -1
+            except ValueError:
+                value = -1
+            if not (value >= least if one.kind is int else 0 < value < float("inf")):
+                raise argparse.ArgumentTypeError(f"expected {expected}, got {text!r}")
+            return value
+        if one.declared.choices and text not in one.declared.choices:
+            raise argparse.ArgumentTypeError(checks.unknown("value", text, one.declared.choices))
+        return text
+
+    return convert
+
+
+def _default(one: Option) -> str:
+    if one.default is None or "default:" in one.declared.help:
+        return ""
+    several = one.default if isinstance(one.default, tuple) else (one.default,)
+    every = one.many and one.declared.choices is not None and several == tuple(one.declared.choices)
+    also = f"; any of: {shlex.join(one.declared.choices)}" if one.many and one.declared.choices and not every else ""
+    return f" (default: {shlex.join(map(str, several))}{also})"

@@ -1,0 +1,139 @@
+"""A study as a declaration: what its settings refuse, and what a run of it leaves."""
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from lfm_ppl.engine.task import Task
+from lfm_ppl.experiments import drawing, published, study
+from lfm_ppl.experiments.scores import Estimate, mean_of, pair
+from lfm_ppl.experiments.study import Study, Table, setting
+from lfm_ppl.results.plots import style
+
+
+@dataclass(frozen=True)
+class Settings(study.Settings):
+    """One field of each kind."""
+
+    runs: int = setting(5, "numbers", quick=2, aliases=study.REALISATIONS, per_seed=100)
+    left_out: int = setting(0, "of them", least=0)
+    scale: float = setting(1.5, "by which they are multiplied")
+    kind: str = setting("plain", "of number", choices=("plain", "odd"))
+    most: int | None = setting(None, "of them")
+    names: tuple[str, ...] = setting(("a", "b"), "of columns", choices=("a", "b", "c"))
+    counts: tuple[int, ...] = setting((1, 3), "of anything", quick=(2,), increasing=True)
+    nuts: tuple[int, int, int] = setting((2, 10, 10), "NUTS", parts=study.CHAINS[:3])
+    data: str | None = setting(None, "a folder")
+    size: complex = setting(1j, "", quick=2j)
+
+
+def tasks(settings):
+    return [Task(f"square/{k}", settings.seed, {"what": "square", "number": k}) for k in range(settings.runs)]
+
+
+def later(settings, results):
+    return [Task("sum", settings.seed, {"what": "sum", "of": [float(one["value"]) for one in results.values()]})]
+
+
+def tabulated(settings, results):
+    values = [float(one["value"]) for name, one in results.items() if name != "sum"]
+    frame = pd.DataFrame({"all": pair("mean", mean_of(values)) | {"sum": float(results["sum"]["value"])}}).T
+    return {"squares": Table("Squares", frame), "hidden": Table("", frame),
+            "only printed": Table("Left out", frame, frame, stored=False)}
+
+
+@style.styled
+def plot(settings, results, *, width="column"):
+    figure = style.new_figure(width, 2.0)
+    for axes in figure.subplots(1, 2):
+        drawing.band(axes, np.arange(3.0), np.zeros(3), np.ones(3))
+        axes.plot(np.zeros(3), **drawing.TRUTH)
+        drawing.bars(axes, [0.0, 1.0], [Estimate(1.0, 0.1)] * 2, color=style.BLUE, marker="o", label="estimate")
+    drawing.legend(figure, drawing.line("more", style.GREY), drawing.patch("area", style.GREY))
+    return figure
+
+
+STUDY = Study(Settings, tasks, {"square": lambda task: {"value": task.settings["number"] ** 2},
+                                "sum": lambda task: {"value": sum(task.settings["of"])}}, tabulated,
+              lambda settings, results: {"squares": plot(settings, results)}, then=later,
+              notes=lambda settings, results: (f"{len(results)} tasks",))
+
+
+def test_a_run_computes_tabulates_and_draws_and_goes_on(tmp_path):
+    found = STUDY.run(Settings.quick(runs=4), tmp_path)
+    assert found.tables["squares"].loc["all", ["mean", "sum"]].tolist() == [3.5, 14.0]
+    assert list(found.tables) == ["squares", "hidden"] and list(found.printed) == ["Squares", "Left out"]
+    assert found.printed["Squares"].loc["all", "mean"] == "3.5 (2.0)"  # of 0, 1, 4 and 9
+    assert found.notes == ("5 tasks",)
+    written = STUDY.save(found, tmp_path)
+    assert [path.name for path in written] == ["squares.csv", "squares.md", "hidden.csv", "hidden.md", "squares.png"]
+    lines = []
+    again = STUDY.run(Settings.quick(runs=4), tmp_path, report=lines.append)
+    assert lines == ["4 of 4 tasks are stored already", "1 of 1 tasks are stored already"]
+    assert again.tables["squares"].equals(found.tables["squares"])
+    with pytest.raises(ValueError, match="seed is 0 there and 1 now"):
+        STUDY.run(Settings.quick(runs=4, seed=1), tmp_path)
+
+
+def test_what_is_checked_first_is_told_before_anything_is_computed(tmp_path):
+    def check(settings, report):
+        raise FileNotFoundError("there are no data")
+
+    with pytest.raises(FileNotFoundError, match="no data"):
+        dataclasses.replace(STUDY, check=check).run(Settings(), tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_quick_version_keeps_what_is_given():
+    assert Settings.quick() == Settings(runs=2, counts=(2,), size=2j)
+    assert Settings.quick(runs=7, seed=3) == Settings(runs=7, counts=(2,), size=2j, seed=3)
+    assert Settings.chosen(None, True, runs=7) == Settings.quick(runs=7) and Settings.chosen(None) == Settings()
+
+
+def test_the_options_are_the_fields():
+    found = {one.name: one for one in study.options(Settings)}
+    assert list(found) == ["runs", "left_out", "scale", "kind", "most", "names", "counts", "nuts", "data", "seed"]
+    assert found["runs"].flags == ["--runs", "--realisations", "--datasets"]
+    assert found["left_out"].flags == ["--left-out"]
+    assert (found["names"].kind, found["names"].many, found["names"].optional) == (str, True, False)
+    assert (found["nuts"].kind, found["nuts"].many) == (int, False)
+    assert (found["most"].kind, found["most"].optional, found["most"].default) == (int, True, None)
+
+
+@pytest.mark.parametrize("wrong, message", [
+    ({"runs": 0}, "runs must be at least 1"), ({"runs": 101}, "one seed has 100 records .* several seeds"),
+    ({"left_out": -1}, "left_out must be at least 0"), ({"scale": 0.0}, "scale must be finite and greater than zero"),
+    ({"kind": "od"}, "Did you mean 'odd'"), ({"most": 0}, "most must be at least 1"),
+    ({"names": ()}, "names must be a tuple of different labels"), ({"names": "ab"}, "a tuple of different labels"),
+    ({"names": ("a", "a")}, "a tuple of different labels"), ({"names": ("d",)}, "unknown names 'd'"),
+    ({"counts": (3, 1)}, "increasing numbers"), ({"counts": (0, 1)}, "counts must be at least 1"),
+    ({"nuts": (2, 10)}, "nuts must be chains, warm-up and draws"), ({"nuts": (2, 0, 1)}, "nuts: warm-up must be"),
+    ({"seed": -1}, "seed must be at least 0")])
+def test_settings_say_what_is_wrong(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        Settings(**wrong)
+
+
+@pytest.mark.parametrize("wrong", [{"runs": 2.5}, {"runs": "2"}, {"left_out": 0.5}, {"counts": (1.5,)}])
+def test_what_is_no_whole_number_is_refused(wrong):
+    with pytest.raises(TypeError, match="must be a whole number"):
+        Settings(**wrong)
+
+
+def test_a_legend_has_each_label_once():
+    (legend,) = plot(Settings(), {}).legends
+    assert [text.get_text() for text in legend.get_texts()] == ["95% band", "truth", "estimate", "more", "area"]
+
+
+def test_published_errors_have_errors_of_their_own():
+    frame = pd.DataFrame({"RMSE": [1.0, 2.0, 3.0, 4.0], "RMSE se": [0.3, 0.3, 0.3, np.nan],
+                          "source": [4.0, 2.5, np.nan, 1.0], "source se": [0.4, 0.4, np.nan, 0.4]}, list("abcd"))
+    found = published.beside(frame, "RMSE", "source")
+    assert {row: str(one) for row, one in found.items()} == {
+        "a": "lower than published (z = -6.0)", "b": "consistent", "d": "-"}
+    assert published.said("RMSE", found) == (
+        "RMSE: 2 of 2 cells count as consistent with the published table, 1 of them lower than published; 0 higher. a: "
+        "lower than published (z = -6.0).")
