@@ -387,8 +387,10 @@ def _add_approximation(group: Any) -> None:
     group.add_argument("--steps", type=_whole(1), metavar="N", help="integration steps between observations")
     group.add_argument("--max-step", type=_positive, metavar="TIME", help="longest integration step")
     group.add_argument("--tolerance", type=_positive, metavar="SD",
-                       help="largest error of an integration step, in standard deviations; steps then follow it")
-    group.add_argument("--iterations", type=_whole(0), metavar="N", help="of posterior linearisation")
+                       help="largest error of an integration step, in standard deviations; steps then follow it, "
+                            "and there are no --iterations")
+    group.add_argument("--iterations", type=_whole(0), metavar="N",
+                       help="of posterior linearisation; 0: a single pass (default: what the model has)")
     group.add_argument("--lower", action="append", default=[], metavar="NAME=VALUE",
                        help="lower bound of a state, force or output, such as \"transcription factor=0\"; may be "
                             "repeated; each likelihood then costs some hundred times as much")

@@ -91,3 +91,15 @@ def test_steps_or_iterations_alone_are_equal_steps(given):
     assert trace(approximate(tolerant, **given), TIMES, Y)["y"]["fn"].tolerance == expected
     panel = trace(approximate(tolerant_panel, **given), TIMES, jnp.stack([Y, Y]))["y"]["fn"]
     assert panel.settings["tolerance"] == expected
+
+
+@pytest.mark.parametrize(("given", "expected"), [
+    ({"tolerance": 1e-3}, 0), ({"lower": {"u": -9.0}}, 0), ({"constraints": lambda x, u, t: u + 9.0}, 0),
+    ({"tolerance": 1e-3, "iterations": 0}, 0), ({"steps": 5}, 2), ({"iterations": 4}, 4), ({"lower": {}}, 2)])
+def test_a_tolerance_or_constraints_end_the_iterations_of_the_model(given, expected):
+    def iterated(times, y=None):
+        numpyro.sample("y", lfm.MarginalLikelihood(build(1.0), times, steps=3, iterations=2), obs=y)
+
+    assert trace(approximate(iterated, **given), TIMES)["y"]["fn"].iterations == expected
+    with pytest.raises(ValueError, match=r"leave out tolerance=0.001 or iterations"):
+        trace(approximate(iterated, tolerance=1e-3, iterations=3), TIMES)

@@ -20,7 +20,7 @@ class approximate(LikelihoodHandler):  # noqa: N801 (an effect handler, named as
         **settings: any of ``rule``, ``steps``, ``max_step``, ``iterations``, ``damping``, ``tolerance``, ``sites``,
             ``lower``, ``upper``, ``constraints``, ``grid`` and ``draws``; what is None or left out stays as the model
             has it. But ``steps`` or ``iterations`` without a tolerance are steps of equal length, also where the model
-            has a tolerance.
+            has a tolerance; and a tolerance or constraints, which exclude iterations, end those of the model.
 
     Raises:
         TypeError: for a setting of another name.
@@ -68,4 +68,6 @@ class approximate(LikelihoodHandler):  # noqa: N801 (an effect handler, named as
 
     def _merged(self, own: dict[str, Any]) -> dict[str, Any]:
         equal = "steps" in self.settings or self.settings.get("iterations", 0) > 0
-        return {**own, **({"tolerance": None} if equal else {}), **self.settings}
+        single = any(self.settings.get(name) for name in ("tolerance", "lower", "upper", "constraints"))
+        return {**own, **({"tolerance": None} if equal else {}), **({"iterations": 0} if single else {}),
+                **self.settings}
