@@ -578,10 +578,11 @@ def _transition(sampler: str, bound: BoundModel, options: Mapping[str, Any] | No
         kernel.prepare(bound, None, Tuned(int(setup["particles"]), float(setup["log_likelihood_sd"])))
         return sampling.particle_marginal(bound, kernel, warmup), None, _remarks(kernel)
     if at_mode and options["dense_mass"] is True:
-        mode = mode_of(bound, seed=seed)
-        known = not mode.unidentified and np.all(np.isfinite(mode.covariance))
-        transition = sampling.nuts(bound, warmup, options, mode.covariance if known else np.eye(bound.size))
-        return transition, _starts(key, bound, init_to_value(values=mode.parameters), chains, transition.evaluate), {}
+        laplace = mode_of(bound, seed=seed)
+        known = not laplace.unidentified and np.all(np.isfinite(laplace.covariance))
+        transition = sampling.nuts(bound, warmup, options, laplace.covariance if known else np.eye(bound.size))
+        strategy = init_to_value(values=laplace.parameters)
+        return transition, _starts(key, bound, strategy, chains, transition.evaluate), {}
     strategy = _strategy(init, bound, seed)
     if sampler == "nuts":
         transition = sampling.nuts(bound, warmup, options)
