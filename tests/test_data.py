@@ -153,6 +153,6 @@ def test_outputs_are_a_sequence_of_names(read):
 def test_codes_of_missing_values_are_told(tmp_path):
     path = tmp_path / "d.csv"
     path.write_text("time,x,z\n0,1.5,-99\n1,-999,-101\n2,2.5,-98\n3,-999,-100\n")
-    with pytest.warns(UserWarning, match=r"row 3, column 2 \(x\).*-999.*\(2 of them\).*leave the cell empty") as said:
+    with pytest.warns(UserWarning, match=r"row 3, column 'x': -999.*\(2 of them\).*leave the cell empty") as said:
         read_csv(path)
     assert len(said) == 1  # z has -99 among its like

@@ -275,7 +275,8 @@ def smoothing_grids(ssm: StateSpaceModel, times: Any, steps: int, max_step: floa
         count = int(np.ceil((joint.requested_times.max() - known[-1]) / gap * (1 - 1e-12)))
         beyond = known[-1] + gap * np.arange(1, min(count, LONGEST_FORECAST) + 1)
         beyond[-1] = max(beyond[-1], joint.requested_times.max())
-    base = build_time_grid(ssm, times, steps, max_step, np.append(known[-1:], beyond), tolerance=tolerance)
+    base = build_time_grid(ssm, times, steps, max_step, np.append(known[-1:], beyond), tolerance=tolerance,
+                           until=float(max(known[-1], joint.requested_times.max())))
     by_step = iterations or (isinstance(ssm.model.observation, ObservationFamily) and not is_linear(ssm))
     where = places(per_step(base) if by_step else base, joint.requested_times)
     return SmoothingGrids(base, joint, where, joint.requested_times)

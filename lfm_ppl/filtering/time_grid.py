@@ -67,7 +67,7 @@ class TimeGrid(NamedTuple):
 
 def build_time_grid(ssm: StateSpaceModel, times: Any, steps: int, max_step: float | None = None, at: Any = None,
                     initial_time: Any = None, interval_per_step: bool = False,
-                    tolerance: float | None = None) -> TimeGrid:
+                    tolerance: float | None = None, until: float | None = None) -> TimeGrid:
     """Lay out the intervals of the scan.
 
     Args:
@@ -79,6 +79,7 @@ def build_time_grid(ssm: StateSpaceModel, times: Any, steps: int, max_step: floa
         initial_time: overrides the model's (when the scan starts from a filter's state).
         interval_per_step: give every integration step an interval of its own, so that a particle smoother reaches each.
         tolerance: of the error of a step, see `TimeGrid`.
+        until: up to which time known inputs have to reach; None: the last of all times.
 
     Raises:
         ValueError, TypeError: see `lfm_ppl.model.state_space.check_times`; non-positive steps or tolerance; a requested
@@ -89,7 +90,7 @@ def build_time_grid(ssm: StateSpaceModel, times: Any, steps: int, max_step: floa
         checks.positive("max_step", max_step)
     if tolerance is not None:
         checks.positive("tolerance", tolerance)
-        grid = build_time_grid(ssm, times, steps, max_step, at, initial_time, interval_per_step)
+        grid = build_time_grid(ssm, times, steps, max_step, at, initial_time, interval_per_step, until=until)
         return grid._replace(tolerance=float(tolerance))
     initial_time = ssm.model.initial_time if initial_time is None else initial_time
     known = check_times(times, initial_time)
@@ -98,7 +99,7 @@ def build_time_grid(ssm: StateSpaceModel, times: Any, steps: int, max_step: floa
     if known is not None and origin is not None:
         requested = None if at is None else checks.concrete(at)
         last = known[-1] if requested is None else max(known[-1], requested.max(initial=known[-1]))
-        ssm.model.check_inputs(float(origin), float(last))
+        ssm.model.check_inputs(float(origin), float(last if until is None else until))
     if known is not None and origin is None and ssm.stack.jump_times and max_step is None and at is None:
         return _traced_origin(known, start, ssm.stack.jump_times, steps, interval_per_step)
     if known is None or origin is None:

@@ -175,3 +175,12 @@ def test_a_warning_names_the_input():
     model = pushed(lambda x, u, t: heater(t) - x)
     with pytest.warns(UserWarning, match="the known input 'the_heater' in dynamics, whose table goes from 0 to 2, is"):
         lfm.filter(model, ROWS, np.full((4, 1), 0.3), steps=1)
+
+
+def test_a_forecast_needs_an_input_as_far_as_it_is_asked_for():
+    """And not as far as the last of its intervals, which are as long as those of the data."""
+    model = pushed(lambda x, u, t: jnp.tanh(x) * lfm.Input([0.0, 3.6], [1.0, 2.0], "linear", outside="error")(t))
+    y = np.full((4, 1), 0.3)
+    assert np.isfinite(lfm.smooth(model, ROWS, y, steps=1, at=[3.6]).mean).all()
+    with pytest.raises(ValueError, match="is read at time 3.7, where its last value holds"):
+        lfm.smooth(model, ROWS, y, steps=1, at=[3.7])
