@@ -16,9 +16,8 @@ ERRORS = 3.0
 BOUND = ERRORS * math.sqrt(2.0)
 """Three standard errors of the difference, 4.2 of ours, where the published mean has an error as large as ours."""
 
-
 FEWEST = 5
-"""Data sets, of which a standard error is worth a comparison."""
+"""As many data sets make a standard error with which errors can be compared."""
 
 
 class Verdict(NamedTuple):

@@ -183,6 +183,8 @@ def test_settings_say_what_is_wrong():
         experiment.Settings(shapes=("sine",))
     with pytest.raises(ValueError, match="Did you mean 'EP'"):
         experiment.Settings(methods=("EPP",))
+    with pytest.raises(ValueError, match="--methods must hold 'EP'"):
+        experiment.Settings(methods=("smoother", "full information"))
     with pytest.raises(ValueError, match="10000 records"):
         experiment.Settings(runs=10_001)
     assert catalogue.experiment("constrained").study is experiment.STUDY

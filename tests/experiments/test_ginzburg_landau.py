@@ -103,6 +103,8 @@ def test_more_realisations_keep_the_tasks_of_fewer():
 def test_settings_are_checked():
     with pytest.raises(ValueError, match="realisations must be at least 1"):
         experiment.Settings(realisations=0)
+    with pytest.raises(ValueError, match="nodes must be at least 4"):
+        experiment.Settings(nodes=3)
     with pytest.raises(ValueError, match="use several seeds"):
         experiment.Settings(conditional=20_000)
 

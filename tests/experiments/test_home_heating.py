@@ -1,5 +1,6 @@
 """Home heating as an experiment: its data, a little of every part, its tables and figures."""
 
+import dataclasses
 import os
 from pathlib import Path
 
@@ -170,6 +171,9 @@ def test_tables_and_figures_with_the_real_house(window, tmp_path):
     assert one.loc["none", "published ELL tracked"] == 31 and envelope.loc["SQM", "published RMSE ahead (K)"] == 0.22
     assert np.isnan(envelope.loc["matern", "published RMSE ahead (K)"])
     assert scores.readable(one).loc["none", "RMSE below none (K)"] == "0"
+    swapped = dataclasses.replace(settings, stores=("envelope", "one store"))
+    again = tables.house(swapped, made_up(swapped), "one store")
+    assert again.loc["none", "published ELL tracked"] == 31
     written = {path.name for path in experiment.STUDY.save(found, tmp_path)}
     assert {"house-ahead.png", "homes-ahead.png", "residual.png", "scores.png", "house-envelope.md"} <= written
     assert "2 windows" in experiment.title(settings, "posterior")
@@ -181,6 +185,11 @@ def test_tables_and_figures_with_the_real_house(window, tmp_path):
 def test_bad_settings(given):
     with pytest.raises(ValueError):
         experiment.Settings(**given)
+
+
+def test_a_residual_that_is_not_in_the_published_figure_is_drawn():
+    settings = dataclasses.replace(SMALL, methods=("WQM",), integrated="WQM")
+    assert set(figures.draw(settings, made_up(settings))) == {"homes-ahead", "scores"}
 
 
 @pytest.mark.slow

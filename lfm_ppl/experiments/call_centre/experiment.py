@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lfm_ppl import checks
 from lfm_ppl.engine.run import Reporter
 from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import published, study
@@ -37,8 +36,8 @@ class Settings(study.Settings):
     def __post_init__(self) -> None:
         """Check what a user gives."""
         super().__post_init__()
-        for method in self.integrated:
-            checks.one_of("integrated", method, self.methods)
+        if other := [method for method in self.integrated if method not in self.methods]:
+            raise ValueError(f"--integrated must be among --methods ({', '.join(self.methods)}), got {other[0]!r}.")
 
     def windows(self) -> dict[str, Any]:
         """Return which windows there are, as tasks store it."""
@@ -97,8 +96,9 @@ def tabulated(settings: Settings, results: Results) -> dict[str, Table]:
 
 
 def notes(settings: Settings, results: Results) -> tuple[str, ...]:
-    """Return how the errors of the queue compare with the published ones, where the counts are those of the source."""
-    if settings.data is None or settings.days < published.FEWEST:
+    """Return how the errors of the queue compare with the published ones, of Thursdays and the linear link."""
+    source = settings.data is not None and settings.weekday == "Thursday" and settings.link == "linear"
+    if not source or settings.days < published.FEWEST:
         return ()
     tests = {"constant": "RMSE of the queue, service rate 10", "changed": "RMSE of the queue, service rate 15, then 5"}
     return tuple(published.said(what, published.beside(tables.tracked(settings, results, test), "RMSE",

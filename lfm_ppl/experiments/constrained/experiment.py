@@ -35,6 +35,14 @@ class Settings(study.Settings):
         quick=(estimators.SMOOTHER, estimators.FULL, estimators.BANDS), choices=tuple(estimators.METHODS))
     block: int = setting(25, "records that are computed in one go, and stored in one file")
 
+    def __post_init__(self) -> None:
+        """Check what a user gives."""
+        super().__post_init__()
+        for method in (estimators.FULL, estimators.BANDS):
+            if method not in self.methods:
+                raise ValueError(f"--methods must hold {method!r}, which figures and tables are about; it names "
+                                 f"{', '.join(self.methods)}.")
+
 
 def all_tasks(settings: Settings) -> list[Task]:
     """Return a task for each block of records of a shape, of targets and of patients."""

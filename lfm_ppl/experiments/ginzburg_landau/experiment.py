@@ -27,7 +27,7 @@ class Settings(study.Settings):
     conditional_particles: int = setting(4_000, "of the particle filter for the rates", quick=200)
     cells: int = setting(400, "of the grid", quick=160)
     draw_cells: int = setting(240, "of the grid for many parameter values", quick=120)
-    nodes: int = setting(61, "parameter values of a conditional posterior", quick=31)
+    nodes: int = setting(61, "parameter values of a conditional posterior", quick=31, least=4)
     paths: int = setting(100, "posterior draws over which the smoothed state is averaged", quick=10)
     marginal_particles: int = setting(1_000, "of particle-marginal RAM", quick=50)
     marginal_steps: int = setting(20, "of its particles between two observations", quick=10)

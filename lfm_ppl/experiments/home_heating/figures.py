@@ -142,7 +142,7 @@ def plot_scores(settings: Any, results: dict[str, Result], *, width: str | float
 
 
 def _grid(methods: tuple[str, ...], width: str | float) -> tuple[Figure, dict[str, tuple[Axes, Axes]]]:
-    shown = [method for method in _SHOWN if method in methods]
+    shown = [method for method in _SHOWN if method in methods] or list(methods)
     columns = min(3, len(shown))
     rows = -(-len(shown) // columns)
     figure = style.new_figure(width, 2.3 * rows + 0.4)

@@ -54,7 +54,7 @@ def every(settings: Any, results: dict[str, Result]) -> dict[str, pd.DataFrame]:
 
 def house(settings: Any, results: dict[str, Result], store: str) -> pd.DataFrame:
     """Return a row for each residual: the fifth day of the real house, predicted and tracked, over all windows."""
-    one = store == settings.stores[0] == "one store"
+    one = store == "one store"
     ahead = {method: of(results, "house", store, method) for method in settings.methods}
     rows = {}
     for method, found in ahead.items():
