@@ -341,19 +341,19 @@ def _read(source: Table, outputs: Sequence[str] | None, time_column: str | None,
                 inputs={name: _input(source, name, way, times) for name, way in wanted.items()})
 
 
-_CODES = np.array([sign * (10.0**digits - 1.0) for digits in (2, 3, 4, 5) for sign in (1, -1)])
+_CODES = np.array([sign * (10.0**digits - 1.0) for digits in (2, 3, 4, 5, 6) for sign in (1, -1)])
 """Numbers that stand for a missing value in many files: 99, -999..."""
 
 
 def _warn_of_codes(source: Table, names: Sequence[str], y: np.ndarray) -> None:
     """Warn of outputs (T, D) in which -999 or its like stands far from all other values."""
     for name, column in zip(names, y.T, strict=True):
-        coded = np.isin(column, _CODES)
-        rest = column[np.isfinite(column) & ~coded]
-        if coded.any() and rest.size > 1 and np.abs(column[coded] - np.median(rest)).min() > 5.0 * np.ptp(rest) > 0:
-            checks.warn(f"{source.place(int(np.argmax(coded)), name)}: {column[coded][0]:g}, far from all other values "
-                        f"of the column, is taken as a measurement ({int(coded.sum())} of them). If it stands for a "
-                        "missing value, leave the cell empty.")
+        for code in _CODES[np.isin(_CODES, column)]:
+            rest = column[np.isfinite(column) & (column != code)]
+            if rest.size > 1 and abs(code - np.median(rest)) > 5.0 * max(np.ptp(rest), abs(np.median(rest))):
+                place, count = source.place(int(np.argmax(column == code)), name), int((column == code).sum())
+                checks.warn(f"{place}: {code:g}, far from all other values of the column, is taken as a measurement "
+                            f"({count} of them). If it stands for a missing value, leave the cell empty.")
 
 
 def _find_time(source: Table, time_column: str | None) -> str:
@@ -498,7 +498,7 @@ def _meant(cell: Any) -> str:
     """Return what to write in place of a number that is written otherwise."""
     text = str(cell).strip()
     if re.fullmatch(r"[+-]?\d+,\d+", text):
-        return f" A decimal point is a point: {text.replace(',', '.')}."
+        return f" A decimal point is a point, {text.replace(',', '.')}; thousands are not marked."
     if re.fullmatch(r"[<>]=?\s*[\d.]+", text):
         return (" A value beyond a limit is written as the limit, a number; lfm.CensoredObservation(left=, right=) "
                 "knows what it means.")

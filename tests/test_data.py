@@ -156,3 +156,7 @@ def test_codes_of_missing_values_are_told(tmp_path):
     with pytest.warns(UserWarning, match=r"row 3, column 'x': -999.*\(2 of them\).*leave the cell empty") as said:
         read_csv(path)
     assert len(said) == 1  # z has -99 among its like
+    path.write_text("time,x,z\n0,0,995\n1,0,999\n2,-9999,1003\n3,0,-999\n")
+    with pytest.warns(UserWarning) as said:
+        read_csv(path)
+    assert sorted(str(one.message).split(": ")[1].split(",")[0] for one in said) == ["-999", "-9999"]

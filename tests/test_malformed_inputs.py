@@ -188,7 +188,11 @@ COLUMNS = {
     "no such unit of the model": Case(
         "fit weekly.py --data d.csv", ("weekly.py says that time is in 'fortnight'", "--time-unit", "d.csv"),
         {"d.csv": DATED, "weekly.py": MODEL + '\nUNITS = {"time": "fortnight"}\n'}),
-    "a decimal comma": csv('time,x\n0,"7,77"\n1,2\n', "row 2", "a point: 7.77"),
+    "no such unit of the model, in series": Case(
+        "fit weekly.py --data d.csv --series who", ("weekly.py says that time is in 'fortnight'", "--time-unit"),
+        {"d.csv": DATED.replace("x\n", "x,who\n", 1).replace("0.3", "0.3,a").replace("0.9", "0.9,a").replace(
+            "0.1", "0.1,a"), "weekly.py": MODEL + '\nUNITS = {"time": "fortnight"}\n'}),
+    "a decimal comma": csv('time,x\n0,"7,77"\n1,2\n', "row 2", "a point, 7.77"),
     "a limit": csv("time,x\n0,<5\n1,2\n", "row 2", "lfm.CensoredObservation"),
     "another unit": csv("time_h,x\n0,1\n1,2\n", "its unit is h", "--time-unit",
                         line="fit model.py --data d.csv --time-unit s"),

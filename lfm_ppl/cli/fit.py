@@ -136,11 +136,16 @@ def read(path: str, model: loading.ModelFile, arguments: argparse.Namespace) -> 
     inputs = choices.inputs(arguments.inputs, model)
     observed = data.read_csv(path, columns(arguments, model), arguments.time_column, dict(inputs.values()),
                              arguments.time_unit, usual_unit=usual_unit(model))
+    check_unit(model, observed, path, arguments)
+    return taken(model, inputs, observed)
+
+
+def check_unit(model: loading.ModelFile, observed: data.Data, path: str, arguments: argparse.Namespace) -> None:
+    """Raise ValueError where the dates of a file cannot be counted in the unit that the model says."""
     unit = model.units.get("time")
     if observed.origin is not None and unit and usual_unit(model) is None and not arguments.time_unit:
         raise ValueError(f"UNITS of {model.path} says that time is in {unit!r}, in which the dates of {path} cannot be "
                          f"counted. Write one of {', '.join(calendar_time.USUAL)}, or give --time-unit.")
-    return taken(model, inputs, observed)
 
 
 def usual_unit(model: loading.ModelFile) -> str | None:

@@ -153,6 +153,8 @@ def _series(arguments: argparse.Namespace, model: loading.ModelFile) -> dict[str
     read = data.read_series(arguments.data, arguments.series, fit.columns(arguments, model), arguments.time_column,
                             dict(inputs.values()), arguments.time_unit, fit.usual_unit(model))
     _check_units(read)
+    for one in read.values():
+        fit.check_unit(model, one, arguments.data, arguments)
     return {name: fit.taken(model, inputs, one) for name, one in read.items()}
 
 

@@ -271,11 +271,11 @@ def _ep(terms: EntryTerms, sites: Sites, at: Cavity, power: float, rough: Any = 
         found = jax.lax.cond(rough, lambda at: terms.tilted(at.cavity, at.marginal, power, True),
                              lambda at: terms.tilted(at.cavity, at.marginal, power), at)
     # Where one node holds all the mass the variance is one of rounding errors, and no new site.
-    variance = jnp.where(found.variance > 1e-13 * at.marginal.variance, found.variance, jnp.nan)
-    found = found._replace(variance=variance)
+    usable = found.variance > 1e-13 * at.marginal.variance
+    variance, unusable = jnp.where(usable, found.variance, 1.0), jnp.where(usable, 0.0, jnp.nan)
     c, v = at.cavity.mean - sites.centre, at.cavity.variance
-    nu = ((found.mean - sites.centre) / found.variance - c / v) / power
-    return nu, (1.0 / found.variance - 1.0 / v) / power, found.log_partition
+    nu = ((found.mean - sites.centre) / variance - c / v) / power
+    return nu + unusable, (1.0 / variance - 1.0 / v) / power + unusable, found.log_partition
 
 
 def _variational(terms: Any, sites: Sites, at: Cavity, power: float, rough: Any = False) -> tuple:
@@ -557,7 +557,8 @@ def _joint_sweeps(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array
                                                 "inside" if maps is None else "all", maps)
         used = Sites(*(at_intervals(a, grid.observed) for a in passed.site_terms.sites))
         at = cavities(predictor, used, terms.present, settings.power)
-        new = new_sites(terms, used, at, settings, settings.damping, rough=True)[0]
+        # Points of linearisation take the derivative of these sites, and that of rough ones is not exact enough.
+        new = new_sites(terms, used, at, settings, settings.damping)[0]
         found = smoothed_points(ssm, rule, grid, passed, smoothed, start)
         whole = _is_whole(predictor, at)
         choose = lambda a, b: jax.tree_util.tree_map(functools.partial(jnp.where, whole), a, b)  # noqa: E731

@@ -27,7 +27,8 @@ class Input(eqx.Module):
         outside: what a model does whose times go beyond the table: "warn", "hold" (nothing) or "error". It is looked at
             where times and table are numbers, not in compiled code. The last value of "previous" may stand for an
             interval as long as the one before; a table of one row is a constant, and ends nowhere.
-        name: how messages call it; that of its column, where it comes from a table.
+        name: how messages call it; that of its column, where it comes from a table. Inputs of different names are
+            different trees: give those the same one that are to be stacked.
 
     Raises:
         ValueError: times not increasing or not finite, values of another length or not finite, unknown interpolation.
