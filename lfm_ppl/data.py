@@ -350,7 +350,7 @@ def _warn_of_codes(source: Table, names: Sequence[str], y: np.ndarray) -> None:
     for name, column in zip(names, y.T, strict=True):
         for code in _CODES[np.isin(_CODES, column)]:
             rest = column[np.isfinite(column) & (column != code)]
-            if rest.size > 1 and abs(code - np.median(rest)) > 5.0 * max(np.ptp(rest), abs(np.median(rest))):
+            if rest.size > 1 and abs(code - np.median(rest)) > 5.0 * np.ptp(rest):
                 place, count = source.place(int(np.argmax(column == code)), name), int((column == code).sum())
                 checks.warn(f"{place}: {code:g}, far from all other values of the column, is taken as a measurement "
                             f"({count} of them). If it stands for a missing value, leave the cell empty.")

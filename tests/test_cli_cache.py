@@ -53,7 +53,7 @@ def test_a_command_keeps_its_programs_unless_told_not_to(tmp_path):
     assert (tmp_path / "cache" / "lfm_ppl").stat().st_mode & 0o077 == 0
 
 
-@pytest.mark.parametrize("line", ["fit spring", "compare", "simulate spring --out {}/x.csv", "check {}/result"])
+@pytest.mark.parametrize("line", ["fit spring", "compare counts", "simulate spring --out {}/x.csv", "check {}/result"])
 def test_every_command_that_computes_keeps_them_and_has_the_flag(line, capsys, tmp_path, monkeypatch):
     lfm.save(arviz_data.build({"posterior": xr.Dataset({"a": (("chain", "draw"), np.ones((1, 4)))})}),
              tmp_path / "result" / "posterior.nc")

@@ -22,8 +22,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         0 after success, 1 where results were saved and a figure or the page could not be made, 2 after an
         error, which is one line on standard error unless ``--debug`` is given, 130 after Ctrl-C.
     """
-    arguments = parsed(argv)
-    arguments.line = list(sys.argv[1:] if argv is None else argv)
+    line = list(sys.argv[1:] if argv is None else argv)
+    try:
+        arguments = parsed(argv)
+    except ValueError as error:  # the options of a study are those of its settings, for which JAX is started
+        if "--debug" in line:
+            raise
+        print(f"lfm-ppl: error: {_one_line(error)}", file=sys.stderr)
+        return 2
+    arguments.line = line
     warnings.showwarning = _Warnings()
     try:
         # A library that swallows KeyboardInterrupt, as some do while they are imported, does not keep us; nor do
