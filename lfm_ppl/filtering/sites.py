@@ -167,7 +167,8 @@ class FamilyTerms(eqx.Module):
 
     def tilted(self, cavity: Marginal, near: Marginal, power: float, rough: bool = False) -> Tilted:
         """Return the tilted moments by quadrature, in half of the time where ``rough``."""
-        # The integral does not depend on where its nodes lie.
+        # Where the rule is exact the integral does not depend on where its nodes lie; that of few nodes may, far from a
+        # Gaussian product, so that nothing that is differentiated is made of rough moments.
         return tilted_moments(lambda f: power * self.log_prob(f), cavity, jax.lax.stop_gradient(near), rough)
 
 
