@@ -647,7 +647,9 @@ def _mode(bound: BoundModel, key: jax.Array, samples: int, seed: int, init: Any,
         # Second derivatives take longer to compile than everything else here takes to run.
         mode = mode_of(bound, seed=seed, init=init)
         remarks = {"map_converged": int(mode.converged), "map_message": mode.message,
-                   "map_log_density": float(mode.log_density), "log_evidence": float(mode.log_evidence)}
+                   "map_log_density": float(mode.log_density), "log_evidence": float(mode.log_evidence),
+                   arviz_data.MODE: json.dumps({name: value.tolist() for name, value in
+                                                {**mode.parameters, **mode.deterministic}.items()})}
         return {"": np.asarray(json.dumps(remarks)), **mode.sample(key, samples)}
 
     found = compute() if run is None else run.once("mode", compute)

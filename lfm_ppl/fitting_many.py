@@ -122,16 +122,18 @@ class ManyFits:
 
         Columns: the number of ``data sets``, the ``mean`` of the posterior means with their standard deviation
         ``between sets``, the least and the largest of them ``lowest`` and ``highest``, the mean posterior standard
-        deviation ``within a set``, the ``least ESS`` and the largest ``R-hat``.
+        deviation ``within a set``, and of chains the ``least ESS`` and the largest ``R-hat``.
         """
         found = self.summary
         if found.empty:
             return found
         grouped = found.groupby(level="parameter", sort=False)
-        return pd.DataFrame({
+        table = pd.DataFrame({
             "data sets": grouped["mean"].count(), "mean": grouped["mean"].mean(), "between sets": grouped["mean"].std(),
-            "lowest": grouped["mean"].min(), "highest": grouped["mean"].max(), "within a set": grouped["sd"].mean(),
-            "least ESS": grouped["ess_bulk"].min(), "R-hat": grouped["r_hat"].max()})
+            "lowest": grouped["mean"].min(), "highest": grouped["mean"].max(), "within a set": grouped["sd"].mean()})
+        if "ess_bulk" not in found:  # draws about a mode
+            return table
+        return table.assign(**{"least ESS": grouped["ess_bulk"].min(), "R-hat": grouped["r_hat"].max()})
 
     def combined(self) -> Any:
         """Return one ArviZ object of all data sets, along a dimension ``data_set``.

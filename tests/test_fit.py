@@ -13,6 +13,7 @@ from scipy.interpolate import CubicSpline
 
 import lfm_ppl as lfm
 from lfm_ppl.results import arviz_data
+from lfm_ppl.results.plots.saving import pages_of
 from tests.inference import linear_motif as motif
 
 TIMES = motif.TIMES
@@ -347,6 +348,14 @@ def test_mode_of_known_parameters(known):
     np.testing.assert_allclose(posterior["noise_sd"], motif.THETA["noise_sd"], rtol=10 * NEAR)
     # With known parameters the evidence is the likelihood
     np.testing.assert_allclose(attrs["log_evidence"], motif.log_density(motif.data(), **motif.THETA), atol=1e-4)
+    # Independent draws have no chains: nothing to diagnose, and no trace to look at.
+    table = arviz_data.summary(known)
+    assert list(table) == ["mode", "mean", "sd", "q2.5", "q97.5"]
+    names = ["decay[a]", "decay[b]", "noise_sd"]
+    expected = [*np.asarray(motif.THETA["decay"]), motif.THETA["noise_sd"]]
+    np.testing.assert_allclose(table.loc[names, "mode"], expected, rtol=10 * NEAR)
+    drawn = [name for name, _, _ in pages_of(known, "full")]
+    assert "pairs" in drawn and "trace" not in drawn
 
 
 # Panels

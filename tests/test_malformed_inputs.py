@@ -722,6 +722,18 @@ def without_data(times, y=None):
     numpyro.sample("y", lfm.MarginalLikelihood(systems.double_well(dispersion=noise, noise=0.1), times, steps=1))
 
 
+def with_times(times, y=None):
+    noise = numpyro.sample("noise", dist.LogNormal(-0.5, 0.3))
+    system = systems.double_well(dispersion=noise, noise=0.1)
+    numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=1), obs=times)
+
+
+def twice(times, y=None):
+    noise = numpyro.sample("noise", dist.LogNormal(-0.5, 0.3))
+    numpyro.deterministic("noise", 2 * noise)
+    numpyro.sample("y", lfm.MarginalLikelihood(systems.double_well(dispersion=noise, noise=0.1), times, steps=1), obs=y)
+
+
 def gaussian(mean=(0.0,), covariance=((1.0,),)):
     return lfm.Gaussian(np.array(mean), np.array(covariance))
 
@@ -775,6 +787,8 @@ CALLS = {
     "fit: times go back": (lambda: lfm.fit(well, T[::-1], Y), ("times",)),
     "fit: infinite data": (lambda: lfm.fit(well, T, np.where(np.isnan(Y), np.inf, Y)), ("y", "NaN")),
     "fit: the data unused": (lambda: lfm.fit(without_data, T, Y), ("does not use the data", "obs=y")),
+    "fit: the times as data": (lambda: lfm.fit(with_times, T, Y), ("'y' observes the times", "obs=y")),
+    "fit: two sites of one name": (lambda: lfm.fit(twice, T, Y), ("two sites", "'noise'")),
     "fit: no such sampler": (lambda: lfm.fit(well, T, Y, sampler="nutz"), ("unknown sampler 'nutz'", "'nuts'")),
     "fit: no chains": (lambda: lfm.fit(well, T, Y, chains=0), ("chains must be at least 1, got 0",)),
     "fit: half a chain": (lambda: lfm.fit(well, T, Y, chains=2.5), ("chains must be a whole number, got 2.5",)),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping
@@ -41,6 +42,9 @@ _MOST_PROGRAMS = 8
 
 _MOST_COMPILED = 64
 """Functions that are kept of one model, such as smoothers with different requested times."""
+
+_NAMED_TWICE = re.compile("unique names but got `(.*)` duplicated")
+"""What NumPyro asserts of a model with two sites of one name."""
 
 _lock = threading.RLock()
 """Held while programs are looked up and made, so that threads share them.
@@ -146,7 +150,10 @@ class _Program:
         self._seeded = handlers.seed(model, self.key)
         self.user = user
         trace = self._trace(data, self.key, init_to_median)
-        self._likelihoods = [site._replace(observed=None) for site in _likelihoods(trace)]
+        found = _likelihoods(trace)
+        self.given_times = [site.name for site in found if arguments and _equal(site.observed, arguments[0])
+                            and not _equal(data, arguments[0])]
+        self._likelihoods = [site._replace(observed=None) for site in found]
         position = _unconstrained(latent_sites(trace))
         self.sites = tuple(position)
         self.names = coordinate_names(position)
@@ -161,7 +168,13 @@ class _Program:
 
     def _trace(self, y: Any, key: jax.Array, strategy: Callable) -> dict[str, Any]:
         drawn = handlers.substitute(handlers.seed(self.model, key), substitute_fn=strategy)
-        trace = handlers.trace(drawn).get_trace(*self.call(y), **self.keywords)
+        try:
+            trace = handlers.trace(drawn).get_trace(*self.call(y), **self.keywords)
+        except AssertionError as error:
+            if (twice := _NAMED_TWICE.search(str(error))) is None:
+                raise
+            raise ValueError(f"two sites of the model are called {twice[1]!r}; each numpyro.sample and "
+                             "numpyro.deterministic needs a name of its own.") from error
         check_latent(latent_sites(trace), self.user)
         return trace
 
@@ -265,6 +278,11 @@ class BoundModel:
     def times(self) -> np.ndarray:
         """Times of the observations, (T,), or (B, T) for a panel whose series have times of their own."""
         return np.asarray(self._program.arguments[0], float)
+
+    @property
+    def given_times(self) -> list[str]:
+        """Names of likelihood sites that observe the times in the place of the data."""
+        return self._program.given_times
 
     @property
     def model(self) -> Callable:
@@ -690,6 +708,9 @@ def bind(model: Callable, times: Any, y: Any, **keywords: Any) -> BoundModel:
     if bound.site.name in bound.sites:
         raise ValueError(f"the model does not use the data: its likelihood site {bound.site.name!r} is not observed. "
                          f"Write numpyro.sample({bound.site.name!r}, ..., obs=y), with the argument y of the model.")
+    if bound.given_times:
+        raise ValueError(f"the likelihood site {bound.given_times[0]!r} observes the times, not the data. Write "
+                         f"numpyro.sample({bound.given_times[0]!r}, ..., obs=y), with the argument y of the model.")
     distribution = bound.site.distribution
     if isinstance(distribution, Panel):
         distribution.checked(given)
@@ -767,6 +788,13 @@ def _traced_once(function: Callable, *example: Any) -> Callable:
 
 def _arrays(z: Any) -> Any:
     return jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf, float), z)
+
+
+def _equal(one: Any, other: Any) -> bool:
+    """Return whether two arrays hold the same known numbers, whatever their shapes."""
+    if any(value is None or checks.traced(value) for value in (one, other)):
+        return False
+    return np.size(one) == np.size(other) > 0 and np.array_equal(np.ravel(one), np.ravel(other), equal_nan=True)
 
 
 def _numeric(value: Any) -> bool:

@@ -153,8 +153,8 @@ class LatentForceModel(eqx.Module):
         drift = trace("dynamics", "f(x, u, t)", self.dynamics, *arguments)
         if getattr(drift.shape, "shape", None) != (size,):
             raise ValueError(f"dynamics must return one derivative for each of the {size} entries of "
-                             f"initial_state.mean, shape ({size},); it returned "
-                             f"{getattr(drift.shape, 'shape', drift.shape)}.")
+                             f"initial_state.mean, shape ({size},); it returned {_returned(drift.shape)}."
+                             f"{'' if getattr(drift.shape, 'shape', ()) else ' Return jnp.array([...]).'}")
         functions = {"dynamics": drift, "observation": self._traced_observation(arguments)}
         if callable(self.process_noise):
             noise = trace("process_noise", "(x, u, t)", self.process_noise, *arguments)
@@ -314,10 +314,18 @@ def _check_types(dynamics: Any, observation: Any, initial_state: Any) -> None:
 
 def _vector_size(found: Any) -> int:
     if len(getattr(found, "shape", ())) != 1:
-        raise ValueError("the observation function must return a vector (D,), got "
-                         f"{f'shape {found.shape}' if hasattr(found, 'shape') else type(found).__name__}. "
+        raise ValueError(f"the observation function must return a vector (D,), got {_returned(found)}. "
                          "For one output, return x[:1] or jnp.array([...]).")
     return found.shape[0]
+
+
+def _returned(found: Any) -> str:
+    """Return in words what a function returned that should have returned a vector."""
+    if hasattr(found, "shape"):
+        return f"{'an array' if found.shape else 'a number'} of shape {found.shape}"
+    if isinstance(found, (list, tuple)):
+        return f"a {type(found).__name__} of {len(found)}, which is no array"
+    return "None, as a function without `return` does" if found is None else type(found).__name__
 
 
 def _named_forces(forces: Any) -> tuple[tuple[str, ...], dict[str, Force]]:

@@ -19,7 +19,7 @@ import pandas as pd
 import xarray as xr
 
 from lfm_ppl.results import convergence, files, netcdf
-from lfm_ppl.results.scalars import scalar_draws
+from lfm_ppl.results.scalars import scalar_draws, scalar_truth
 
 LIBRARY = "lfm_ppl"
 
@@ -28,6 +28,9 @@ SITES = "site_failures"
 
 WEIGHTS = "constraint_weights"
 """Attribute of a result under constraints: what weighted trajectories are worth, `site_failures.PathsWorth` as JSON."""
+
+MODE = "mode"
+"""Attribute of a result of sampler "map": name -> value at the posterior mode, as JSON."""
 
 _SMALLEST_TAIL = 5
 """Fewest importance ratios that a Pareto distribution can be fitted to."""
@@ -236,8 +239,9 @@ def summary(result: Any) -> pd.DataFrame:
     Returns:
         Columns mean, sd, q2.5, q97.5 (quantiles in percent), mcse_mean, ess_bulk, ess_tail, r_hat;
         rows labelled ``noise_sd`` or ``decay[CDKN1A]``. Resampled draws are no chains: the effective size is that of
-        the importance weights, and there is no R-hat. A run that was stopped has a column more, ``partial``, which says
-        what there is.
+        the importance weights, and there is no R-hat. Draws of a Laplace approximation (sampler "map") are independent:
+        the columns are mode, mean, sd, q2.5, q97.5, and there is nothing to diagnose. A run that was stopped has a
+        column more, ``partial``, which says what there is.
 
     Raises:
         ValueError: the result has no posterior.
@@ -251,12 +255,17 @@ def summary(result: Any) -> pd.DataFrame:
     draws = scalar_draws(group(result, "posterior"))
     quantiles = {label: np.quantile(values, (0.025, 0.975)) for label, values in draws.items()}
     resampled = attributes(result).get("effective_draws")
+    moments = {
+        "mean": {label: values.mean() for label, values in draws.items()},
+        "sd": {label: _sd(values) for label, values in draws.items()},
+        "q2.5": {label: low for label, (low, _) in quantiles.items()},
+        "q97.5": {label: high for label, (_, high) in quantiles.items()},
+    }
+    if of_mode(result):
+        return pd.DataFrame({**_mode(result), **moments}, index=list(draws), dtype=float)
     table = pd.DataFrame(
         {
-            "mean": {label: values.mean() for label, values in draws.items()},
-            "sd": {label: _sd(values) for label, values in draws.items()},
-            "q2.5": {label: low for label, (low, _) in quantiles.items()},
-            "q97.5": {label: high for label, (_, high) in quantiles.items()},
+            **moments,
             "mcse_mean": _diagnostic(result, lambda values: _arviz().mcse(values, method="mean")),
             "ess_bulk": ess(result, "bulk"),
             "ess_tail": ess(result, "tail"),
@@ -272,6 +281,12 @@ def summary(result: Any) -> pd.DataFrame:
     if (partial := attributes(result).get("partial")) is not None:
         table["partial"] = str(partial).split(",", 1)[0]
     return table
+
+
+def of_mode(result: Any) -> bool:
+    """Return whether the draws of ``result`` are independent ones of a Laplace approximation, not of chains."""
+    attrs = attributes(result)
+    return attrs.get("sampler") == "map" and "effective_draws" not in attrs
 
 
 def convergence_warnings(result: Any, table: pd.DataFrame | None = None) -> list[str]:
@@ -342,6 +357,16 @@ def psis(log_ratio: np.ndarray, relative_efficiency: float = 1.0) -> tuple[np.nd
     if not np.isfinite(k):  # ties leave too few distinct ratios
         return raw, np.inf
     return np.asarray(smoothed), float(k)
+
+
+def _mode(result: Any) -> dict[str, dict[str, float]]:
+    """Return the column of a summary that holds the posterior mode; none where the result does not tell it."""
+    known = json.loads(str(attributes(result).get(MODE, "{}")))
+    posterior = group(result, "posterior")
+    values = {name.replace("/", "."): np.asarray(value, float) for name, value in known.items()}
+    named = {name: (posterior[name].dims[2:], value) for name, value in values.items() if name in posterior}
+    modes = xr.Dataset(named, {dim: posterior[dim] for dims, _ in named.values() for dim in dims if dim in posterior})
+    return {"mode": scalar_truth(posterior, modes)} if named else {}
 
 
 def _diagnostic(

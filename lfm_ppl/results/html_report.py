@@ -62,7 +62,7 @@ _SETTINGS = {
     "wall_time_s": "time (s)", "created_at": "made at",
 }
 _ELSEWHERE = ("model", "model_file", DESCRIPTION, "data", "note", "versions", "warnings", "partial", "settings", "run",
-              "map_converged", COMMAND, CALL, ORIGIN, PRIORS, MEANINGS, ASSUMPTIONS, "inference_library",
+              "map_converged", arviz_data.MODE, COMMAND, CALL, ORIGIN, PRIORS, MEANINGS, ASSUMPTIONS, "inference_library",
               "site_failures", "constraint_weights")
 """Attributes that stand in other sections, or that nobody needs to read."""
 
@@ -134,9 +134,8 @@ def _state(result: Any, attrs: Mapping[str, Any]) -> str:
     found = arviz_data.convergence_warnings(result)
     shown += web_page.warnings(found)
     if not found:
-        mode = attrs.get("sampler") == "map"
         shown += web_page.paragraph("The draws are of a Laplace approximation at the posterior mode, not of chains."
-                                    if mode else "The diagnostics of the draws give no warning.")
+                                    if arviz_data.of_mode(result) else "The diagnostics of the draws give no warning.")
     if arviz_data.has_group(result, report.GROUP):
         shown += web_page.paragraph(f"Accuracy: {report.AccuracyReport.of(result).verdict.word}.")
     return shown

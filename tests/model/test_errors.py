@@ -22,8 +22,10 @@ def make(dynamics=lambda x, u, t: -x, forces=FORCE, observation=OBSERVATION, ini
 
 
 @pytest.mark.parametrize("options, message", [
-    ({"dynamics": lambda x, u, t: x[0]}, r"dynamics must return.*shape \(2,\); it returned \(\)"),
-    ({"dynamics": lambda x, u, t: jnp.ones(3)}, r"it returned \(3,\)"),
+    ({"dynamics": lambda x, u, t: x[0]}, r"dynamics must return.*shape \(2,\); it returned a number of shape \(\)\. Return jnp"),
+    ({"dynamics": lambda x, u, t: [x[0], x[1]]}, r"it returned a list of 2, which is no array\. Return jnp"),
+    ({"dynamics": lambda x, u, t: None}, r"it returned None, as a function without"),
+    ({"dynamics": lambda x, u, t: jnp.ones(3)}, r"it returned an array of shape \(3,\)\.$"),
     ({"forces": [("u", lfm.Matern(1.0, 1.0)), ("u", lfm.Constant(1.0))]}, "force name 'u' repeats"),
     ({"forces": {"x0": lfm.Matern(1.0, 1.0)}}, "'x0' is used for a state and for a force; rename"),
     ({"state_names": ("a",)}, r"state_names must hold 2 names, got \('a',\)"),
@@ -39,9 +41,9 @@ def make(dynamics=lambda x, u, t: -x, forces=FORCE, observation=OBSERVATION, ini
     ({"initial_time": np.inf}, "initial_time must be finite"),
     ({"nonlinear_inputs": ("y",)}, "unknown name in nonlinear_inputs 'y'"),
     ({"observation": lfm.GaussianObservation(lambda x, u, t: x[0], jnp.ones(1))},
-     r"must return a vector \(D,\), got shape \(\)"),
+     r"must return a vector \(D,\), got a number of shape \(\)\. For one output"),
     ({"observation": lfm.GaussianObservation(lambda x, u, t: [x[0]], jnp.ones(1))},
-     r"must return a vector \(D,\), got list"),
+     r"must return a vector \(D,\), got a list of"),
     ({"observation": lfm.GaussianObservation(whole_state, jnp.ones(3))},
      r"2 components.*must be \(2,\) or \(2, 2\); it is \(3, 3\)"),
     ({"observation": lfm.GaussianObservation(whole_state, jnp.ones(2), angular=(2,))},

@@ -11,7 +11,7 @@ from typing import Any
 from matplotlib.backend_bases import FigureCanvasBase
 from matplotlib.figure import Figure
 
-from lfm_ppl.results.arviz_data import group, has_group
+from lfm_ppl.results.arviz_data import group, has_group, of_mode
 from lfm_ppl.results.files import refuse_existing, writing
 from lfm_ppl.results.inputs import inputs_of
 from lfm_ppl.results.plots import accuracy, chains, inputs, pairs, residuals, style, trajectories
@@ -31,7 +31,8 @@ def save_figures(
 ) -> list[Path]:
     """Draw every figure that ``result`` has the groups for, and write it to ``folder``.
 
-    The figures are fit, inputs, forces, deterministics, states, trace, pairs, residuals and accuracy. What does not fit
+    The figures are fit, inputs, forces, deterministics, states, trace (not of sampler "map", which has no chains), pairs,
+    residuals and accuracy. What does not fit
     on one page goes to numbered ones, such as ``trace-1.png`` and ``trace-2.png``, five at most. Every file is
     written under a temporary name and renamed.
 
@@ -97,7 +98,8 @@ def pages_of(result: Any, width: str | float) -> Iterator[tuple[str, Draw, list[
             yield from _numbered("inputs", inputs.plot_inputs, known, trajectories.MAX_PANELS)
     if has_group(result, "posterior"):
         labels = sampled(group(result, "posterior"))
-        yield from _numbered("trace", chains.plot_trace, labels, chains.MAX_ROWS)
+        if not of_mode(result):  # independent draws have no chains to look at
+            yield from _numbered("trace", chains.plot_trace, labels, chains.MAX_ROWS)
         if labels:
             # Pages would miss most pairs; the figure itself says how to choose others.
             yield "pairs", pairs.plot_pairs, None
