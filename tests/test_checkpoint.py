@@ -310,6 +310,19 @@ def test_where_there_is_no_terminal_lines_say_how_far_it_is(capfd, monkeypatch):
     assert "acceptance" in lines[-1] and "step size" in lines[-1]
 
 
+def test_whoever_waits_for_a_long_warm_up_is_told_once_what_helps(capfd, monkeypatch):
+    said = []
+    for seconds, init in ((0.0, None), (1e9, None), (0.0, "map")):
+        monkeypatch.setattr("lfm_ppl.inference.progress.SURE_S", 0.0)
+        monkeypatch.setattr("lfm_ppl.inference.progress.LONG_S", seconds)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            lfm.fit(well, TIMES, Y, sampler="nuts", init=init, **SIZES)
+        said.append([line for line in capfd.readouterr().err.splitlines() if "this warm-up is slow" in line])
+    assert [len(lines) for lines in said] == [1, 0, 0]
+    assert said[0][0].startswith("note     ") and "--init map" in said[0][0]
+
+
 # The command line
 
 MODEL = '''"""A double well."""

@@ -114,7 +114,7 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
     after = None
     if particles is None and not example.constrained and example.ssm.drift_structure.points:
         after = _after(bound, at)
-    plan = _plan(bound, at, particles is not None or after is not None)
+    plan = _plan(bound, at, particles is not None or after is not None, _first_simulated(bound) if after else -np.inf)
 
     def one(distribution: MarginalLikelihood, y: jax.Array, key: jax.Array) -> dict[str, jax.Array]:
         ssm = distribution.ssm
@@ -124,8 +124,10 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
             smoothed = None
             w, when = distribution.feasible_path(path_key, y, plan.times)
         elif particles is None:
-            smoothed = distribution.smooth(y, plan.times)
-            when = smoothed.times
+            # Where the path is simulated the smoother stays at the last observation, which costs nothing.
+            simulated = after and plan.times is not None
+            smoothed = distribution.smooth(y, np.minimum(plan.times, bound.times.max()) if simulated else plan.times)
+            when = jnp.asarray(plan.times) if simulated else smoothed.times
             states = smoothed.sample_joint(path_key, 1)[0]
             drawn = jnp.ones((len(when), 1), bool)
             if after:
@@ -134,7 +136,7 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
             w = jax.vmap(ssm.inputs)(states, when)
             found = _moments(ssm, smoothed, w, drawn, plan)
             gaussian = not (isinstance(ssm.model.observation, ObservationFamily) or noise_of_rows(distribution))
-            found |= _points(ssm, smoothed, w, drawn, plan, jax.random.fold_in(path_key, 2), gaussian)
+            found |= _points(ssm, smoothed, w, when, drawn, plan, jax.random.fold_in(path_key, 2), gaussian)
             found |= {"log_likelihood": smoothed.log_likelihood.sum()} if log_likelihood else {}
         else:
             smoothed = None
@@ -218,8 +220,8 @@ class _Plan(NamedTuple):
         return len(self.data) if self.times is None else len(self.times)
 
 
-def _plan(bound: BoundModel, at: np.ndarray | None, simulated: bool) -> _Plan:
-    """Lay out the rows.
+def _plan(bound: BoundModel, at: np.ndarray | None, simulated: bool, since: float) -> _Plan:
+    """Lay out the rows, of which those after ``since`` are simulated, if any are.
 
     Those after the data are no longer than the usual distance of the data where something is integrated on the way: a
     simulation, or the known inputs of a linear model.
@@ -241,7 +243,7 @@ def _plan(bound: BoundModel, at: np.ndarray | None, simulated: bool) -> _Plan:
         count = min(int(np.ceil((at.max() - known[-1]) / gap * (1 - 1e-12))), LONGEST_FORECAST)
         beyond = np.linspace(known[-1], at.max(), count + 1)[1:-1]
     everywhere = np.concatenate([at, beyond])
-    steps = _steps_per_interval(example.ssm, known, everywhere, fine) if simulated else fine
+    steps = _steps_per_interval(example.ssm, known, everywhere, fine, since) if simulated else fine
     first = len(everywhere)
     return _Plan(np.concatenate([everywhere, known]), np.arange(len(at)), first + rows, steps)
 
@@ -250,6 +252,12 @@ def _after(bound: BoundModel, at: np.ndarray | None) -> bool:
     """Whether a time of the trajectories lies after the last observation of a series."""
     seen = np.isfinite(np.asarray(bound.y)).any(axis=-1)
     return not bool(np.all(seen[..., -1])) or (at is not None and bool(at.max() > bound.times.max()))
+
+
+def _first_simulated(bound: BoundModel) -> float:
+    """Return the time of the last observation of the series that ends first."""
+    seen = np.isfinite(np.asarray(bound.y)).any(axis=-1)
+    return float(np.where(seen, bound.times, -np.inf).max(axis=-1).min())
 
 
 def _last(y: jax.Array, when: jax.Array, plan: _Plan) -> jax.Array:
@@ -276,8 +284,8 @@ def _moments(ssm: StateSpaceModel, smoothed: SmootherResult, w: jax.Array, drawn
             "force_mean": mean[:, size:], "force_sd": sd[:, size:]}
 
 
-def _points(ssm: StateSpaceModel, smoothed: SmootherResult, w: jax.Array, drawn: jax.Array, plan: _Plan,
-            key: jax.Array, with_noise: bool) -> dict[str, jax.Array]:
+def _points(ssm: StateSpaceModel, smoothed: SmootherResult, w: jax.Array, when: jax.Array, drawn: jax.Array,
+            plan: _Plan, key: jax.Array, with_noise: bool) -> dict[str, jax.Array]:
     """Return functions of state and forces that are not linear, (P, K, ...), at points of their normal distribution.
 
     A point is the same one, in units of the distribution, at all times, so that it moves as smoothly as they do. Where
@@ -290,7 +298,7 @@ def _points(ssm: StateSpaceModel, smoothed: SmootherResult, w: jax.Array, drawn:
     root = jax.vmap(semidefinite_root)(smoothed.input_covariance[there])
     z = jax.random.normal(key, (_POINTS, w.shape[1]), w.dtype)
     points = smoothed.input_mean[there] + jnp.einsum("kij,pj->pki", root, z)
-    points, times = jnp.where(drawn[there], points, w[there]), smoothed.times[there]
+    points, times = jnp.where(drawn[there], points, w[there]), when[there]
     found = {"deterministic_points": jax.vmap(lambda w: jax.vmap(ssm.deterministics)(w, times))(points)}
     if nonlinear:
         expected = jax.vmap(lambda one, t: expected_observation(ssm, one, t))
@@ -343,8 +351,9 @@ def _particle_path(distribution: MarginalLikelihood, y: jax.Array, at: Any, key:
     return jax.vmap(ssm.inputs)(states[best][:, 0], when), when
 
 
-def _steps_per_interval(ssm: StateSpaceModel, times: Any, at: Any, steps: int) -> int:
-    """Return how many steps each row needs so that none is longer than those between two observations."""
+def _steps_per_interval(ssm: StateSpaceModel, times: Any, at: Any, steps: int, since: float = -np.inf) -> int:
+    """Return how many steps each row after ``since`` needs so that none is longer than those between two observations.
+    """
     known = checks.concrete(times)
     if at is None or known is None:
         return steps
@@ -357,7 +366,8 @@ def _steps_per_interval(ssm: StateSpaceModel, times: Any, at: Any, steps: int) -
     # A row after the last observation is measured by the usual distance between two.
     index = np.searchsorted(marks, ends - 1e-12 * np.abs(ends), side="left") - 1
     own = np.where(index < len(gaps), gaps[np.clip(index, 0, len(gaps) - 1)], np.median(gaps))
-    return max(1, int(np.ceil(steps * min(float((rows.length / own).max()), 1.0) - 1e-9)))
+    share = (rows.length / own)[ends > since].max(initial=0.0)
+    return max(1, int(np.ceil(steps * min(float(share), 1.0) - 1e-9)))
 
 
 def each(distribution: MarginalLikelihood | Panel, function: Callable, *arguments: Any) -> Any:

@@ -10,6 +10,13 @@ from typing import Any, NamedTuple
 from lfm_ppl.progress import Clock, bar, duration, on_terminal
 
 
+SURE_S = 60.0
+"""Seconds of sampling before a warm-up is called slow: its first steps, of an untuned length, say little."""
+
+LONG_S = 1200.0
+"""Seconds from which on a run is long enough for advice."""
+
+
 class Stage(NamedTuple):
     """How far chains are.
 
@@ -33,10 +40,13 @@ class Progress:
         total: number of steps.
         done: those of an earlier run.
         shown: whether anything is shown.
+        warmup: how many of the steps are warm-up.
+        if_slow: what to say, once, of a warm-up at whose pace the whole takes longer than `LONG_S`.
     """
 
-    def __init__(self, total: int, done: int, shown: bool) -> None:
+    def __init__(self, total: int, done: int, shown: bool, warmup: int = 0, if_slow: str = "") -> None:
         self._total, self._done, self._shown = total, done, shown
+        self._warmup, self._if_slow = warmup, if_slow
         self._bar: Any = None
         self._first: tuple[float, int] | None = None
         self._clock = Clock()
@@ -64,16 +74,33 @@ class Progress:
         self._done = done
         if self._first is None:  # the steps before it came with the compilation
             self._first = now, done
+        elif self._shown and self._if_slow and done < self._warmup and now - self._first[0] > SURE_S:
+            self._warn(now, done)
 
     def _left(self, now: float, done: int) -> str:
         return _left(self._first, (now, done), self._total)
 
+    def _warn(self, now: float, done: int) -> None:
+        left = _seconds_left(self._first, (now, done), self._total)
+        if left is None or left < LONG_S:
+            return
+        text, self._if_slow = f"note     {self._if_slow}", ""
+        if self._bar is None:
+            print(text, file=sys.stderr, flush=True)
+        else:
+            self._bar.write(text, file=sys.stderr)
 
-def _left(first: tuple[float, int] | None, now: tuple[float, int], total: int) -> str:
+
+def _seconds_left(first: tuple[float, int] | None, now: tuple[float, int], total: int) -> float | None:
     """Return how long it will take from ``now``, where and when the ``first`` step after the compilation began."""
     if first is None or now[1] <= first[1]:
-        return ""
-    return f"; about {duration((now[0] - first[0]) / (now[1] - first[1]) * (total - now[1]))} left"
+        return None
+    return (now[0] - first[0]) / (now[1] - first[1]) * (total - now[1])
+
+
+def _left(first: tuple[float, int] | None, now: tuple[float, int], total: int) -> str:
+    left = _seconds_left(first, now, total)
+    return "" if left is None else f"; about {duration(left)} left"
 
 
 class Counter:

@@ -37,6 +37,10 @@ _GROWTH = 8
 """Most that a block may be longer than the one before it: steps of the warm-up differ in length."""
 
 
+_AT_MODE = ("this warm-up is slow, and the time left may still grow. From the posterior mode, with the covariance there, "
+            "steps are often many times longer: Ctrl-C, and again with init=\"map\" (lfm-ppl fit --init map).")
+
+
 class Transition(NamedTuple):
     """How a chain starts and moves. Both functions are traced, with the data as an argument.
 
@@ -48,6 +52,7 @@ class Transition(NamedTuple):
         evaluate: from z (d,) to the log density and, where the sampler needs it, the gradient (d,), zero elsewhere.
         extra: further arrays that the chain starts from; an argument of the compiled function.
         describe: from a state of all chains to a few words for the progress bar.
+        if_slow: what to tell whoever waits for a long warm-up; empty where there is nothing to do about it.
     """
 
     identity: Hashable
@@ -57,6 +62,7 @@ class Transition(NamedTuple):
     evaluate: Callable[[Any], tuple[Any, Any]]
     extra: Any = None
     describe: Callable[[Any], str] = lambda state: ""
+    if_slow: str = ""
 
 
 def nuts(bound: BoundModel, warmup: int, options: Mapping[str, Any],
@@ -106,7 +112,7 @@ def nuts(bound: BoundModel, warmup: int, options: Mapping[str, Any],
     return Transition(("nuts", warmup, forward_mode, signature(dict(options)) or object()), start, step, fields,
                       lambda z: both(jnp.asarray(z, float), bound.argument),
                       None if covariance is None else jnp.asarray(covariance),
-                      lambda state: _words(state, state.adapt_state.step_size))
+                      lambda state: _words(state, state.adapt_state.step_size), _AT_MODE if covariance is None else "")
 
 
 def random_walk(bound: BoundModel, kernel: RAM, warmup: int) -> Transition:
@@ -249,7 +255,7 @@ def sample(key: jax.Array, bound: BoundModel, transition: Transition, starts: np
         if keeper is not None:
             keeper.save(Saved(done, _on_host(state), jax.tree_util.tree_map(np.asarray, store)), drawn(done))
 
-    with Progress(total, saved.done, progress) as shown, Interruption() as stop:
+    with Progress(total, saved.done, progress, warmup, transition.if_slow) as shown, Interruption() as stop:
         try:
             while now[-1] < total and not stop.requests:
                 state, store, lower = now

@@ -116,7 +116,7 @@ def simulate_onwards(ssm: StateSpaceModel, key: jax.Array, states: jax.Array, ti
 
     def row(state: jax.Array, inputs: tuple) -> tuple[jax.Array, jax.Array]:
         begin, end, row_key, given, is_known = inputs
-        state = jnp.where(is_known, given, advance(state, begin, end, row_key))
+        state = jax.lax.cond(is_known, lambda: given, lambda: advance(state, begin, end, row_key))
         return state, state
 
     keys = jax.random.split(key, times.shape[0] - 1)
