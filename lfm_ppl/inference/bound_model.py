@@ -16,7 +16,7 @@ from jax.extend.core import jaxpr_as_fun
 from jax.flatten_util import ravel_pytree
 from numpyro import handlers
 from numpyro.distributions import biject_to
-from numpyro.infer import init_to_median
+from numpyro.infer import init_to_median, init_to_sample
 from numpyro.infer.util import constrain_fn, potential_energy
 from numpyro.infer.util import log_density as constrained_log_density
 
@@ -42,6 +42,9 @@ _MOST_PROGRAMS = 8
 
 _MOST_COMPILED = 64
 """Functions that are kept of one model, such as smoothers with different requested times."""
+
+_COMPILED = (init_to_median, init_to_sample)
+"""Strategies that are functions of a site alone."""
 
 _NAMED_TWICE = re.compile("unique names but got `(.*)` duplicated")
 """What NumPyro asserts of a model with two sites of one name."""
@@ -198,9 +201,15 @@ class _Program:
         return portable(lambda z, y: potential_energy(self._seeded, self.call(y), self.keywords, self.unravel(z)),
                         self.size, y)
 
-    def draw_sites(self, y: Any, key: jax.Array, strategy: Callable) -> dict[str, jax.Array]:
-        """Return unconstrained values of the latent sites by a NumPyro strategy."""
-        return _unconstrained(latent_sites(self._trace(y, key, strategy)))
+    def draw(self, y: Any, key: jax.Array, strategy: Callable) -> jax.Array:
+        """Return unconstrained values of the latent sites, (d,), by a NumPyro strategy."""
+        def run(key: jax.Array, y: Any) -> jax.Array:
+            return ravel_pytree(_unconstrained(latent_sites(self._trace(y, key, strategy))))[0]
+
+        if strategy not in _COMPILED or self.place is None or checks.traced(y):
+            return run(key, y)
+        # Many data sets of one shape are drawn for; a run of the model takes longer than all else that a draw needs.
+        return self.once(("draw", strategy), lambda: jax.jit(run))(key, y)
 
     def prepared(self, wrap: Callable[[Callable], Callable] | None, times: Any) -> Callable:
         model = self._seeded if times is None else _at_known_times(self._seeded, times)
@@ -258,6 +267,7 @@ class BoundModel:
 
     def __init__(self, program: _Program, y: Any) -> None:
         self._program, self.y = program, y
+        self._trace: dict[str, Any] | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -520,7 +530,7 @@ class BoundModel:
 
     def draw(self, key: jax.Array, strategy: Callable = init_to_median) -> np.ndarray:
         """Return a point z (d,) by a NumPyro initialisation strategy."""
-        return np.asarray(ravel_pytree(self._program.draw_sites(self.y, key, strategy))[0], float)
+        return np.asarray(self._program.draw(self.y, key, strategy), float)
 
     def start(self, key: jax.Array, strategy: Callable = init_to_median, attempts: int = _ATTEMPTS,
               evaluate: Callable[[np.ndarray], Any] | None = None) -> np.ndarray:
@@ -545,7 +555,9 @@ class BoundModel:
 
     def trace(self) -> dict[str, Any]:
         """Return NumPyro's trace of the model at the prior medians: its sites with their priors, plates and values."""
-        return self._program.trace(self.y)
+        if self._trace is None:
+            self._trace = self._program.trace(self.y)
+        return self._trace
 
     # --- the filter and the smoother
 
