@@ -119,7 +119,8 @@ def position(text: str, origin: str | None, unit: str) -> float:
     try:
         stamp = parse(text)
     except ValueError:
-        raise ValueError(f"expected a number or a date such as 2026-03-31 or 2026-03-31T18:00, got {text!r}.") from None
+        raise ValueError("expected a number or a date, year first, such as 2026-03-31 or 2026-03-31T18:00, got "
+                         f"{text!r}.") from None
     if origin is None:
         raise ValueError(f"the times of the data are plain numbers, so the date {text!r} means nothing; give a number.")
     start = datetime.fromisoformat(origin)

@@ -121,7 +121,8 @@ def one_of(name: str, value: str, choices: Iterable[str]) -> None:
 def unknown(kind: str, value: str, choices: Iterable[str]) -> str:
     """Return the message for an unknown name, with the nearest known ones."""
     choices = list(choices)
-    near = difflib.get_close_matches(str(value), choices, n=3, cutoff=0.4)
+    # Two letters that a short word shares with another are no likeness.
+    near = difflib.get_close_matches(str(value), choices, n=3, cutoff=0.4 if len(str(value)) > 4 else 0.6)
     hint = f" Did you mean {' or '.join(repr(n) for n in near)}?" if near else ""
     return f"unknown {kind} {value!r}.{hint} Known: {', '.join(choices) or 'none'}."
 
@@ -156,5 +157,5 @@ def _numeric(name: str, value: Any) -> np.ndarray | None:
 
 
 def _message(name: str, expected: str, got: Any, remedy: str) -> str:
-    text = np.array2string(np.asarray(got), threshold=6, precision=6)
+    text = np.array2string(np.asarray(got), threshold=6, precision=6) if np.ndim(got) else f"{got:.6g}"
     return f"{name} must be {expected}, got {text}. {remedy}".strip()

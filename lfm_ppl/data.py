@@ -326,8 +326,8 @@ def _read(source: Table, outputs: Sequence[str] | None, time_column: str | None,
     others = [name for name in source.columns if name != time_name]
     for name in wanted:
         if name not in others:
-            raise ValueError(f"{source.label}: {checks.unknown('input column', name, others)} Name the column "
-                             "with --inputs (inputs=).")
+            raise ValueError(f"{source.label}: {checks.unknown('input column', name, others)} --inputs A,B "
+                             "(inputs=) names the columns, in the order of the model's inputs.")
     names = _find_outputs(source, [name for name in others if name not in wanted], time_name, outputs)
     if both := sorted(set(names) & set(wanted)):
         raise ValueError(f"the column {both[0]!r} is named as an output and as an input; it can be one of them.")
@@ -408,7 +408,7 @@ def _times(source: Table, name: str, unit: str | None, usual: str | None) -> tup
     if missing := [row for row, cell in enumerate(cells) if _missing(cell)]:
         raise ValueError(f"{source.place(missing[0], name)}: the time is missing.")
     if not calendar_time.is_date(cells[0]):
-        wanted = "expected a number, or a date such as 2026-03-31 in every row, got {}."
+        wanted = "expected a number, or a date, year first, such as 2026-03-31 in every row, got {}."
         times = np.array([_value(source, row, name, wanted) for row in range(len(cells))])
         _check_order(source, times, [f"{time:g}" for time in times])
         own = _unit_of(name)
@@ -421,8 +421,8 @@ def _times(source: Table, name: str, unit: str | None, usual: str | None) -> tup
         try:
             stamps.append(calendar_time.parse(cell))
         except ValueError:
-            raise ValueError(f"{source.place(row, name)}: expected a date such as 2026-03-31 or 2026-03-31T18:00, got "
-                             f"{cell!r}.") from None
+            raise ValueError(f"{source.place(row, name)}: expected a date, year first, such as 2026-03-31 or "
+                             f"2026-03-31T18:00, got {cell!r}.") from None
         if (stamps[-1].tzinfo is None) != (stamps[0].tzinfo is None):
             raise ValueError(f"{source.place(row, name)}: some dates have an offset from UTC and others have none: "
                              f"{cells[0]!s} and {cell!s}. Write it in all of them, or in none.")

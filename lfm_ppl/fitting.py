@@ -6,7 +6,6 @@ import contextlib
 import dataclasses
 import inspect
 import json
-import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -39,6 +38,7 @@ from lfm_ppl.inference.progress import Counter
 from lfm_ppl.inference.samplers import FILTERED, SAMPLERS
 from lfm_ppl.inference.sampling import Transition
 from lfm_ppl.inference.site_failures import failures_at, paths_worth, site_failures
+from lfm_ppl.progress import waiting
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results import checkpoint as checkpoints
 from lfm_ppl.results.checkpoint import Checkpoint
@@ -61,7 +61,7 @@ def fit(
     sampler: str = "nuts",
     chains: int = 4,
     warmup: int = 1000,
-    samples: int = 1000,
+    samples: int | None = None,
     thin: int | None = None,
     seed: int = 0,
     at: Any = None,
@@ -94,9 +94,9 @@ def fit(
             come from its Laplace approximation).
         chains: number of chains.
         warmup: number of warm-up steps in each.
-        samples: number of draws in each; for "map", in all.
+        samples: number of draws in each, by default 1000; for "map", in all, by default 400.
         thin: steps of the chain that make one draw, in the warm-up too. By default 1 for NUTS, 5 for each parameter
-            for RAM, whose steps are cheap and short, and 1 for each parameter for particle-marginal RAM.
+            for RAM, whose steps are cheap and short, and 2 for each parameter for particle-marginal RAM.
         seed: of everything random.
         at: times of the trajectories, and of new observations; by default a grid over the data. Times after the last
             observation are forecasts, see `forecast`.
@@ -175,6 +175,8 @@ def fit(
         (1, 50)
     """
     started = time.perf_counter()
+    if samples is None:
+        samples = 400 if sampler == "map" else 1000
     _check_sizes(sampler, chains, warmup, samples, thin, trajectory_draws)
     check_options(sampler, sampler_options)
     if checkpoint is None and resume:
@@ -275,6 +277,7 @@ class _Asked(NamedTuple):
             "iterations": example.iterations, "tolerance": example.tolerance, "sampler": self.sampler,
             "seed": self.seed, "chains": self.chains, "warmup": self.warmup, "samples": self.samples,
             "fixed": json.dumps({k: np.asarray(v).tolist() for k, v in self.fixed.items()}),
+            **({"sites": example.sites_in_words} if example.sites_in_words else {}),
             **({"constraints": example.constraints_in_words} if example.constrained else {}),
         }  # fmt: skip
 
@@ -345,15 +348,18 @@ class _Run:
         asked, keeper = self.asked, self.keeper
         key = asked.keys[1]
         if asked.sampler == "map":
-            if self.progress:
-                print("posterior mode: compiling and searching", file=sys.stderr, flush=True)
-            self.draws, self.stats, self.remarks = _mode(self.bound, key, asked.samples, asked.seed, asked.init, keeper)
+            known = keeper is not None and keeper.holds(_MODE)
+            with waiting(_SEARCH, self.progress and not known):
+                self.draws, self.stats, self.remarks = _mode(self.bound, key, asked.samples, asked.seed, asked.init,
+                                                             keeper)
             return
         assert asked.thin is not None
         warmup = asked.warmup * asked.thin
         setup = keeper.setup if keeper is not None and keeper.started else None
-        transition, starts, remarks = _transition(asked.sampler, self.bound, asked.options, asked.init, asked.keys[2],
-                                                  asked.seed, asked.chains, warmup, setup)
+        from_mode = asked.sampler != "nuts" or asked.init == "map"
+        with waiting(_SEARCH if from_mode else _START, self.progress and setup is None):
+            transition, starts, remarks = _transition(asked.sampler, self.bound, asked.options, asked.init,
+                                                      asked.keys[2], asked.seed, asked.chains, warmup, setup)
         if keeper is not None:
             if setup is None:
                 keeper.setup = {name: remarks[name] for name in ("particles", "log_likelihood_sd") if name in remarks}
@@ -466,6 +472,11 @@ class _Stopped(KeyboardInterrupt):
 
 _OF_PARTICLES = ("particle_settings", "particle_steps")
 """What the trajectories of pmmh need to know of its particles."""
+
+_MODE = "mode"
+"""Name under which a run keeps the mode and the draws about it."""
+
+_SEARCH, _START = "posterior mode: compiling and searching", "start: compiling, and looking for where chains begin"
 
 _BARE = "all draws, without scores and trajectories"
 
@@ -652,7 +663,7 @@ def _mode(bound: BoundModel, key: jax.Array, samples: int, seed: int, init: Any,
                                                 {**mode.parameters, **mode.deterministic}.items()})}
         return {"": np.asarray(json.dumps(remarks)), **mode.sample(key, samples)}
 
-    found = compute() if run is None else run.once("mode", compute)
+    found = compute() if run is None else run.once(_MODE, compute)
     remarks = json.loads(str(found.pop("")))
     return {label: np.asarray(value)[None] for label, value in found.items()}, {}, remarks
 

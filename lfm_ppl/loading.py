@@ -197,6 +197,8 @@ def load(name: str) -> ModelFile:
         return _checked(path.resolve(), _execute(path.resolve()))
     shipped = available()
     wanted = name.replace("_", "-")
+    if wanted not in shipped and Path(f"{name}.py").is_file():
+        raise ValueError(f"unknown model {name!r}. Did you mean the file {name}.py?")
     if wanted not in shipped:
         message = checks.unknown("model", name, shipped)
         raise ValueError(f"{message} A model of your own is given by its path, as in ./{name}.py.")

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
+import threading
 import time
+from collections.abc import Iterator
 from typing import Any, TextIO
 
 from lfm_ppl import checks
 
 EVERY_S = 30.0
 """Between two lines, where no terminal redraws one."""
+
+
+_SHORTEST_S = 1.0
+"""Least time between two lines of a thread, whatever `EVERY_S` is set to."""
 
 
 def on_terminal(file: TextIO | None = None) -> bool:
@@ -37,6 +44,41 @@ class Clock:
             return False
         self._said = now
         return True
+
+
+class Waiting:
+    """Says every `EVERY_S`, until it is stopped, how long something has taken that tells nothing itself, a compilation.
+
+    Args:
+        text: what goes on.
+    """
+
+    def __init__(self, text: str) -> None:
+        self._over, began = threading.Event(), time.perf_counter()
+
+        def tell() -> None:
+            while not self._over.wait(max(EVERY_S, _SHORTEST_S)):
+                print(f"{text} ({duration(time.perf_counter() - began)} so far)", file=sys.stderr, flush=True)
+
+        threading.Thread(target=tell, daemon=True).start()
+
+    def stop(self) -> None:
+        """Say nothing more."""
+        self._over.set()
+
+
+@contextlib.contextmanager
+def waiting(text: str, shown: bool) -> Iterator[None]:
+    """Say what begins, and as long as it lasts that it goes on; nothing where that is not ``shown``."""
+    if not shown:
+        yield
+        return
+    print(text, file=sys.stderr, flush=True)
+    told = Waiting(text)
+    try:
+        yield
+    finally:
+        told.stop()
 
 
 def duration(seconds: float) -> str:

@@ -46,7 +46,7 @@ def test_a_date_is_found_again_on_the_axis():
 
 
 @pytest.mark.parametrize(("text", "origin", "message"), [
-    ("tomorrow", "2026-01-05T00:00:00", "a number or a date such as 2026-03-31"),
+    ("tomorrow", "2026-01-05T00:00:00", "a number or a date, year first, such as 2026-03-31"),
     ("2026-01-06", None, "the times of the data are plain numbers"),
     ("2026-01-06T00:00+01:00", "2026-01-05T00:00:00", "has an offset from UTC and the times of the data have none"),
 ])

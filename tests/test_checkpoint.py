@@ -24,7 +24,9 @@ import lfm_ppl as lfm
 from lfm_ppl.cli import main
 from lfm_ppl.cli.interruption import watched
 from lfm_ppl.inference import progress, sampling
+from lfm_ppl.inference.handlers.settings import approximate
 from lfm_ppl.inference.samplers import SAMPLERS
+from lfm_ppl.progress import waiting
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results import checkpoint as checkpoints
 from lfm_ppl.results.checkpoint import Checkpoint
@@ -210,6 +212,7 @@ def wider(times, y=None):
     ({"sampler_options": {"target_accept_prob": 0.5}}, "sampler_options target_accept_prob was not given and is 0.5"),
     ({"chain_method": "sequential"}, "chain_method was vectorized and is sequential"),
     ({"init": "map"}, "init was not given and is map"),
+    ({"model": approximate(well, steps=2)}, "another one: steps was 1 and is 2. Repeat"),  # and no word of the model
 ])
 def test_another_run_is_not_gone_on_with(unfinished, changes, message):
     before = {path: path.read_bytes() for path in unfinished.rglob("*") if path.is_file()}
@@ -321,6 +324,20 @@ def test_whoever_waits_for_a_long_warm_up_is_told_once_what_helps(capfd, monkeyp
         said.append([line for line in capfd.readouterr().err.splitlines() if "this warm-up is slow" in line])
     assert [len(lines) for lines in said] == [1, 0, 0]
     assert said[0][0].startswith("note     ") and "--init map" in said[0][0]
+
+
+def test_what_tells_nothing_itself_is_told_of_as_long_as_it_lasts(capfd, monkeypatch):
+    monkeypatch.setattr("lfm_ppl.progress.EVERY_S", 0.0)
+    monkeypatch.setattr("lfm_ppl.progress._SHORTEST_S", 0.02)
+    with waiting("compiling", shown=True):
+        time.sleep(0.2)
+    time.sleep(0.1)
+    lines = capfd.readouterr().err.splitlines()
+    assert lines[0] == "compiling" and lines[-1].startswith("compiling (0.") and lines[-1].endswith(" s so far)")
+    time.sleep(0.1)
+    with waiting("compiling", shown=False):
+        time.sleep(0.1)
+    assert capfd.readouterr().err == ""
 
 
 # The command line

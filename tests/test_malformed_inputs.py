@@ -281,10 +281,12 @@ OPTIONS = {
     "no such element": Case("fit model.py --set noise[3]=1", ("error: noise has shape ()", "Fix it as a whole")),
     "a parameter in words": Case("fit model.py --set noise=low", ("--set noise: expected a number", "'low'")),
     "a parameter NaN": Case("fit model.py --set noise=nan", ("--set noise must be finite",)),
-    "a parameter below zero": Case("fit model.py --set noise=-1", ("error: noise cannot be fixed at -1.0", "support")),
+    "a parameter below zero": Case("fit model.py --set noise=-1",
+                                   ("error: noise cannot be fixed at -1.0", "its prior allows > 0")),
     "a parameter too long": Case("fit model.py --set noise=1,2", ("error: noise has shape ()", "(2,)")),
     "free already": Case("fit model.py --set noise=free", ("the model does not fix noise", "none")),
     "nothing left": Case("fit model.py --set noise=1", ("no latent site", "Give at least one parameter a prior")),
+    "a file without its ending": Case("fit model", ("unknown model 'model'", "Did you mean the file model.py?")),
     "no such option": Case("fit model.py --option dept=1", ("unknown option of model 'dept'", "'depth'")),
     "an option without a value": Case("fit model.py --option depth", ("--option takes NAME=VALUE, got 'depth'",)),
     "an option in words": Case("fit model.py --option depth=deep", ("option depth of model", "float", "'deep'")),
@@ -403,6 +405,11 @@ MODELS = {
                          {"bad.py": with_model("def model(**options):\n    pass\n")}),
     "an argument too many": Case("fit bad.py", ("bad.py", "size"),
                                  {"bad.py": with_model("def model(times, y, size, **options):\n    pass\n")}),
+    "a negative scale": Case("fit bad.py", ("bad.py, line", "scale out of its range", "dist.LogNormal(-0.5, -0.3)"),
+                             {"bad.py": MODEL.replace("dist.LogNormal(-0.5, 0.3)", "dist.LogNormal(-0.5, -0.3)")}),
+    "an argument of a force": Case("fit bad.py", ("bad.py, line", "'nu'", "It takes scale, lengthscale, order"),
+                                   {"bad.py": with_model(
+        "def model(times, y=None, **options):\n    lfm.Matern(1.0, 1.0, nu=1.5)\n")}),
     "options it does not take": Case("fit bad.py", ("bad.py", "depth", "OPTIONS"),
                                      {"bad.py": with_model("def model(times, y=None):\n    pass\n")}),
     "OUTPUTS of text": Case("fit bad.py", ('OUTPUTS must be a tuple of names, as in ("x",)',),
@@ -461,7 +468,7 @@ MODELS = {
     noise = numpyro.sample("noise", dist.LogNormal(-0.5, 0.3))
     numpyro.sample("y", lfm.MarginalLikelihood(system(noise), times, steps=1), obs=y)
     numpyro.sample("z", lfm.MarginalLikelihood(system(noise), times, steps=1), obs=y)\n''')}),
-    "one name twice": Case("fit bad.py", ("bad.py, line 27", "`noise` duplicated"), {"bad.py": with_model(
+    "one name twice": Case("fit bad.py", ("bad.py, line 27", "two sites of the model are called 'noise'"), {"bad.py": with_model(
         '''def model(times, y=None, **options):
     noise = numpyro.sample("noise", dist.LogNormal(-0.5, 0.3))
     noise = numpyro.sample("noise", dist.LogNormal(-0.5, 0.3))
@@ -734,6 +741,12 @@ def twice(times, y=None):
     numpyro.sample("y", lfm.MarginalLikelihood(systems.double_well(dispersion=noise, noise=0.1), times, steps=1), obs=y)
 
 
+def counted(times, y=None):
+    level = numpyro.sample("level", dist.Normal(0.0, 1.0))
+    system = linear(observation=lfm.PoissonObservation(lambda x, u, t: x + level))
+    numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=1), obs=y)
+
+
 def gaussian(mean=(0.0,), covariance=((1.0,),)):
     return lfm.Gaussian(np.array(mean), np.array(covariance))
 
@@ -789,6 +802,9 @@ CALLS = {
     "fit: the data unused": (lambda: lfm.fit(without_data, T, Y), ("does not use the data", "obs=y")),
     "fit: the times as data": (lambda: lfm.fit(with_times, T, Y), ("'y' observes the times", "obs=y")),
     "fit: two sites of one name": (lambda: lfm.fit(twice, T, Y), ("two sites", "'noise'")),
+    "fit: a count with a fraction": (
+        lambda: lfm.fit(counted, T, np.array([[1.0], [2.5], [0.0], [3.0]])),
+        ("y[1, 0] (y0, row 2 of the data) is 2.5", "PoissonObservation needs", "NaN for a missing entry")),
     "fit: no such sampler": (lambda: lfm.fit(well, T, Y, sampler="nutz"), ("unknown sampler 'nutz'", "'nuts'")),
     "fit: no chains": (lambda: lfm.fit(well, T, Y, chains=0), ("chains must be at least 1, got 0",)),
     "fit: half a chain": (lambda: lfm.fit(well, T, Y, chains=2.5), ("chains must be a whole number, got 2.5",)),

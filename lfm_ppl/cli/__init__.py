@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
+import linecache
+import re
 import sys
 import warnings
 from collections.abc import Sequence
@@ -52,7 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _one_line(error: Exception) -> str:
     """Return what is wrong, and where, if it comes from a model file."""
-    text = " ".join(str(error).split()) or type(error).__name__
+    text = (" ".join(str(error).split()) or type(error).__name__) + _remedy(error)
     place = loading.place_in_model(error)
     if isinstance(error, KeyError) and place is not None and (known := loading.known_inputs(error)) is not None:
         return (f"{place.file}, line {place.line}: the model reads the known input {text}, and "
@@ -68,6 +71,24 @@ def _one_line(error: Exception) -> str:
     if isinstance(error, (ValueError, TypeError, OSError, EngineError)):
         return text
     return f"{type(error).__name__}: {text} (--debug shows where)"
+
+
+_UNEXPECTED = re.compile(r"(\w+)\.__init__\(\) got an unexpected keyword argument")
+_INVALID = re.compile(r"distribution got invalid (\w+) parameter")
+
+
+def _remedy(error: Exception) -> str:
+    """Return what to write instead, for errors that Python and NumPyro raise; empty for others."""
+    if isinstance(error, TypeError) and (called := _UNEXPECTED.search(str(error))) is not None:
+        import lfm_ppl
+
+        known = getattr(lfm_ppl, called[1], None)
+        return "" if known is None else f". It takes {', '.join(inspect.signature(known).parameters)}."
+    if isinstance(error, ValueError) and (wrong := _INVALID.search(str(error))) is not None:
+        place = loading.place_in_model(error)
+        line = "" if place is None else linecache.getline(str(place.file), place.line).strip()
+        return f" A {wrong[1]} out of its range, such as a negative scale, stands in: {line}" if line else ""
+    return ""
 
 
 class _Warnings:

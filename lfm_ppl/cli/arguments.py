@@ -9,8 +9,21 @@ from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
 import lfm_ppl
-from lfm_ppl import calendar_time, checks
-from lfm_ppl.cli import check, compare, fit, forecast, models, new, plot, session, simulate, study_options, version
+from lfm_ppl import calendar_time
+from lfm_ppl.cli import (
+    check,
+    compare,
+    fit,
+    forecast,
+    models,
+    new,
+    plot,
+    session,
+    simulate,
+    study_options,
+    values,
+    version,
+)
 from lfm_ppl.cli.choices import REFERENCES, RULES
 from lfm_ppl.experiments import catalogue
 from lfm_ppl.inference.samplers import SAMPLERS
@@ -110,7 +123,7 @@ def _add_simulate(commands: Any) -> None:
     command = _command(commands, "simulate", simulate.run, help_, examples, computes=True)
     command.add_argument("model", metavar="MODEL", help=MODEL_HELP)
     command.add_argument("--out", metavar="FILE", help="CSV file to write (default: MODEL.csv)")
-    command.add_argument("--seed", type=_whole(0), help="random seed (default: that of the model's default data)")
+    command.add_argument("--seed", type=values.whole(0), help="random seed (default: that of the model's default data)")
     command.add_argument("--option", action="append", default=[], metavar="NAME=VALUE", help=OPTION_HELP)
     command.add_argument("--overwrite", action="store_true", help="replace files that exist")
 
@@ -143,17 +156,19 @@ def _add_check(commands: Any) -> None:
     command.add_argument("result", metavar="RESULT", help="a results folder or a posterior.nc")
     command.add_argument(
         "--reference",
-        type=_one_of("reference", REFERENCES),
+        type=values.one_of("reference", REFERENCES),
         default="auto",
         metavar="|".join(REFERENCES),
         help="what gives the exact likelihood (default: auto, the grid for one state, else particles)",
     )
     command.add_argument(
-        "--draws", type=_whole(1), metavar="N", help="posterior draws to compare at (default: 200; to correct, 1000, "
-        "or none where an earlier check says that new chains are needed)"
+        "--draws", type=values.whole(1), metavar="N",
+        help="posterior draws to compare at (default: 200; to correct, 1000, or none where an earlier check says that "
+        "new chains are needed)"
     )
-    command.add_argument("--particles", type=_whole(1), metavar="N", help="default: as many as keep the noise low")
-    command.add_argument("--seed", type=_whole(0), default=0, help="of the particle filter (default: 0)")
+    command.add_argument("--particles", type=values.whole(1), metavar="N",
+                         help="default: as many as keep the noise low")
+    command.add_argument("--seed", type=values.whole(0), default=0, help="of the particle filter (default: 0)")
     command.add_argument(
         "--correct",
         action="store_true",
@@ -231,7 +246,7 @@ def _add_study(command: Any, words: Sequence[str]) -> None:
 def _add_workers(group: Any) -> None:
     group.add_argument(
         "--jobs",
-        type=_whole(1),
+        type=values.whole(1),
         metavar="N",
         help="processes that compute (default: one for each core, at most 4; one without Dask)",
     )
@@ -299,9 +314,9 @@ def _add_forecast(commands: Any) -> None:
     command.add_argument("--inputs", metavar="A,B,...",
                          help="its columns of known inputs, in the result's order (default: of their names); its "
                          "outputs may then all be empty")
-    command.add_argument("--draws", type=_whole(1), default=400, metavar="N",
+    command.add_argument("--draws", type=values.whole(1), default=400, metavar="N",
                          help="posterior draws that are propagated (default: 400)")
-    command.add_argument("--seed", type=_whole(0), default=0, help="random seed of paths and noise (default: 0)")
+    command.add_argument("--seed", type=values.whole(0), default=0, help="random seed of paths and noise (default: 0)")
     command.add_argument("--model", metavar="FILE", help="the model file, where the result does not know it")
     command.add_argument("--out", metavar="DIR",
                          help="folder for the result with its predictions, table and figure (default: RESULT's)")
@@ -322,47 +337,52 @@ def _add_data(group: Any) -> None:
                       "column")
     group.add_argument("--time-column", metavar="NAME",
                        help="the time column, of numbers or dates (default: time, t or time_h, else one of dates)")
-    group.add_argument("--time-unit", type=_one_of("unit of time", calendar_time.SECONDS), metavar="UNIT",
+    group.add_argument("--time-unit", type=values.one_of("unit of time", calendar_time.SECONDS), metavar="UNIT",
                        help=f"unit of times that are dates: {', '.join(calendar_time.USUAL)} (default: the "
                        "model's, else by the gaps)")
     group.add_argument("--outputs", metavar="A,B,...", help="the columns to use (default: those of the model)")
     group.add_argument("--inputs", metavar="A,B:linear,...",
                        help="columns of known inputs, in the model's order; a value holds until the next row, or with "
                        ":linear is joined to it by a line (default: columns of the names that the model gives)")
-    group.add_argument("--truth", metavar="FILE", help="the truth that `simulate` wrote, to be drawn in figures")
+    group.add_argument("--truth", metavar="FILE", help="the truth, to be drawn in figures: what `simulate` wrote "
+                       "beside its data, or a JSON file of your own with \"times\" and \"forces\", \"state\" or "
+                       "\"parameters\"")
 
 
 def _add_inference(group: Any) -> None:
     group.add_argument(
         "--sampler",
-        type=_one_of("sampler", SAMPLERS),
+        type=values.one_of("sampler", SAMPLERS),
         default="nuts",
         metavar="|".join(SAMPLERS),
         help="default: nuts; pmmh is ram on a particle filter's likelihood, exact and slow",
     )
-    group.add_argument("--chains", type=_whole(1), default=4, help="default: 4")
-    group.add_argument("--warmup", type=_whole(0), default=1000, help="per chain (default: 1000)")
-    group.add_argument("--samples", type=_whole(1), default=1000, help="per chain (default: 1000)")
+    group.add_argument("--chains", type=values.whole(1), default=4, help="default: 4")
+    group.add_argument("--warmup", type=values.whole(0), default=1000, help="per chain (default: 1000)")
+    group.add_argument("--samples", type=values.whole(1), metavar="N",
+                       help="draws of each chain (default: 1000); with map, in all (default: 400)")
+    group.add_argument("--trajectory-draws", type=values.whole(0), default=400, metavar="N",
+                       help="draws that get trajectories of forces and states (default: 400; 0: none)")
     group.add_argument(
         "--thin",
-        type=_whole(1),
+        type=values.whole(1),
         help="steps that make one draw (default: 1 for nuts, 5 per parameter for ram, 1 per parameter for pmmh)",
     )
-    group.add_argument("--seed", type=_whole(0), default=0, help="random seed of the sampler (default: 0)")
-    group.add_argument("--init", type=_one_of("init", ("map", "median")), metavar="map|median",
+    group.add_argument("--seed", type=values.whole(0), default=0, help="random seed of the sampler (default: 0)")
+    group.add_argument("--init", type=values.one_of("init", ("map", "median")), metavar="map|median",
                        help="where chains start: at the posterior mode, nuts then with the covariance there, which "
                        "helps where its first steps are slow; or at the prior median (default: median for nuts, about "
                        "the mode for the others)")
     group.add_argument(
         "--target-accept",
-        type=_fraction,
+        type=values.fraction,
         metavar="P",
         help="acceptance to aim at (default: the model's own or 0.8 for nuts; for ram 0.234, or 0.44 for one "
         "parameter; half for pmmh)",
     )
     group.add_argument(
         "--particles",
-        type=_whole(1),
+        type=values.whole(1),
         metavar="N",
         help="of the particle filter of pmmh (default: as many as make the sd of the log likelihood about 1)",
     )
@@ -380,59 +400,22 @@ def _add_inference(group: Any) -> None:
 def _add_approximation(group: Any) -> None:
     group.add_argument(
         "--rule",
-        type=_one_of("rule", RULES),
+        type=values.one_of("rule", RULES),
         metavar="RULE",
         help=f"how functions are linearised: {', '.join(RULES)}",
     )
-    group.add_argument("--steps", type=_whole(1), metavar="N", help="integration steps between observations")
-    group.add_argument("--max-step", type=_positive, metavar="TIME", help="longest integration step")
-    group.add_argument("--tolerance", type=_positive, metavar="SD",
+    group.add_argument("--steps", type=values.whole(1), metavar="N", help="integration steps between observations")
+    group.add_argument("--max-step", type=values.positive, metavar="TIME", help="longest integration step")
+    group.add_argument("--tolerance", type=values.positive, metavar="SD",
                        help="largest error of an integration step, in standard deviations; steps then follow it, "
                             "and there are no --iterations")
-    group.add_argument("--iterations", type=_whole(0), metavar="N",
+    group.add_argument("--iterations", type=values.whole(0), metavar="N",
                        help="of posterior linearisation; 0: a single pass (default: what the model has)")
     group.add_argument("--lower", action="append", default=[], metavar="NAME=VALUE",
                        help="lower bound of a state, force or output, such as \"transcription factor=0\"; may be "
                             "repeated; each likelihood then costs some hundred times as much")
     group.add_argument("--upper", action="append", default=[], metavar="NAME=VALUE", help="upper bound")
-    group.add_argument("--grid", type=_whole(2), metavar="N",
+    group.add_argument("--grid", type=values.whole(2), metavar="N",
                        help="at how many times, at equal distances over the record, --lower and --upper hold; cost and "
                             "error grow with them (default: the times of the data, and more where they are further "
                             "apart than 1/20 of the record; 100 where the data have more)")
-
-
-def _one_of(kind: str, choices: Any) -> Callable[[str], str]:
-    def convert(text: str) -> str:
-        if text not in choices:
-            raise argparse.ArgumentTypeError(checks.unknown(kind, text, choices))
-        return text
-
-    return convert
-
-
-def _whole(least: int) -> Callable[[str], int]:
-    def convert(text: str) -> int:
-        if not text.isascii() or not text.isdigit() or int(text) < least:
-            message = f"expected a whole number of at least {least}, got {text!r}"
-            raise argparse.ArgumentTypeError(message)
-        return int(text)
-
-    return convert
-
-
-def _positive(text: str) -> float:
-    return _between(text, float("inf"), "a number above zero")
-
-
-def _fraction(text: str) -> float:
-    return _between(text, 1.0, "a number between 0 and 1")
-
-
-def _between(text: str, end: float, expected: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0 < value < end:
-        raise argparse.ArgumentTypeError(f"expected {expected}, got {text!r}")
-    return value

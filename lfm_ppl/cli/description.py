@@ -31,6 +31,7 @@ class Description(NamedTuple):
         states: name -> unit.
         deterministics: name -> unit.
         approximation: the likelihood's settings.
+        unitless: names in the file's UNITS that are those of nothing, at the options' defaults.
     """
 
     parameters: list[Parameter]
@@ -39,6 +40,7 @@ class Description(NamedTuple):
     states: dict[str, str]
     deterministics: dict[str, str]
     approximation: str
+    unitless: list[str]
 
 
 def describe(model: loading.ModelFile) -> Description:
@@ -67,12 +69,16 @@ def describe(model: loading.ModelFile) -> Description:
     example = site.example
     approximation = ("exact: the model is linear" if _exact(example) else
                      f"{example.rule.name}, {example.steps} steps"
-                     + (f", {example.iterations} iterations" if example.iterations else ""))
+                     + (f", {example.iterations} iterations" if example.iterations else "")
+                     + (f"; sites by {example.sites_in_words}" if example.sites_in_words else ""))
+    named = {"time", *data.inputs, *system.output_names, *system.state_names, *system.force_names,
+             *system.deterministic_names, *bound.trace()}
     return Description(
         parameters, derived, {name: " ".join([type(force).__name__, _bracketed(units.get(name))]).strip()
                               for name, force in system.forces.items()},
         {name: _bracketed(units.get(name)) for name in system.state_names},
-        {name: _bracketed(units.get(name)) for name in system.deterministic_names}, approximation)
+        {name: _bracketed(units.get(name)) for name in system.deterministic_names}, approximation,
+        [name for name in model.units if name not in named])
 
 
 def _made_up(model: loading.ModelFile) -> Data:

@@ -18,6 +18,7 @@ import numpy as np
 from lfm_ppl import calendar_time, data, loading
 from lfm_ppl.cli import choices, fit_many, forecast, page, results, session
 from lfm_ppl.cli.interruption import INTERRUPTED, watched
+from lfm_ppl.progress import duration
 
 SETTINGS = ("rule", "steps", "max_step", "iterations", "tolerance")
 """Flags of the approximation; None where the user leaves one to the model."""
@@ -211,7 +212,7 @@ def _print_task(
     if observed.note:
         print(f"note     {observed.note}")
     if arguments.sampler != "map":
-        size = f"{arguments.chains} chains of {arguments.warmup} warm-up and {arguments.samples} kept draws"
+        size = f"{arguments.chains} chains of {arguments.warmup} warm-up and {arguments.samples or 1000} kept draws"
         print(f"sampler  {arguments.sampler}, {size}")
     sys.stdout.flush()
 
@@ -308,6 +309,7 @@ def sampling(arguments: argparse.Namespace, model: loading.ModelFile) -> dict[st
         "warmup": arguments.warmup,
         "samples": arguments.samples,
         "thin": arguments.thin,
+        "trajectory_draws": arguments.trajectory_draws,
         "init": arguments.init,
         "sampler_options": {name: value for name, value in given if value is not None},
     }
@@ -317,6 +319,7 @@ def report(posterior: Any, folder: Path, seconds: float, overwrite: bool) -> int
     """Write and print everything, of a partial result all but figures; return 1 where figures or page failed."""
     from lfm_ppl.results import arviz_data, files, tables
     from lfm_ppl.results.plots import save_figures
+    from lfm_ppl.results.residuals import misfit
 
     # A run that was kept on its way has left a partial result, or the whole one, under this name.
     written = [arviz_data.save(posterior, folder / files.POSTERIOR, overwrite=True)]
@@ -325,6 +328,8 @@ def report(posterior: Any, folder: Path, seconds: float, overwrite: bool) -> int
     print(f"\n{tables.text_table(table, width=shutil.get_terminal_size().columns)}\n")
     status = 0
     attrs = arviz_data.attributes(posterior)
+    for message in misfit(posterior):
+        print(f"note     {message}")
     figures: list[Path] = []
     try:
         if "partial" not in attrs:
@@ -337,7 +342,9 @@ def report(posterior: Any, folder: Path, seconds: float, overwrite: bool) -> int
     if "log_likelihood_sd" in attrs:
         print(f"particles {attrs['particles']}; the log likelihood estimate has a standard deviation of "
               f"{attrs['log_likelihood_sd']:.2f} (near 1 is best)")
-    print(f"time     {seconds:.0f} s")
+    whole = float(attrs.get("wall_time_s", 0.0))
+    before = f", and {duration(whole - seconds)} before it was stopped" if whole > 1.05 * seconds + 1.0 else ""
+    print(f"time     {seconds:.0f} s{before}")
     for path in written:
         print(f"wrote    {path}")
     return max(status, page.save(posterior, folder, overwrite, figures))

@@ -140,6 +140,9 @@ def _held_out(arguments: argparse.Namespace, task: check.Check) -> data.Data:
         raise ValueError(f"{arguments.held_out}: its times are {kinds[0]}, and those of the result {kinds[1]}; give "
                          "both in one form.")
     read = data.on_clock_of(read, task.observed)
+    if again := int(np.isin(read.times, task.observed.times).sum()):
+        print(f"note     {again} of {len(read.times)} rows of {arguments.held_out} are at times of the fitted data: if "
+              "they are the same data, scores on them say nothing of a forecast")
     taken = task.file.prepare(dataclasses.replace(read, inputs={
         name: joined(task.observed.inputs[name], later) for name, later in read.inputs.items()}))
     if not np.array_equal(taken.y, read.y, equal_nan=True):

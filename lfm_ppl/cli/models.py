@@ -48,6 +48,8 @@ def _describe(model: loading.ModelFile) -> None:
         for title, entries in (("forces", found.forces), ("states", found.states), *more):
             _table(title, [(name, text) for name, text in entries.items()])
         print(f"likelihood: {found.approximation}\n")
+        if found.unitless and not model.options:  # which may change what there is
+            print(f"UNITS has {', '.join(found.unitless)}, of which the model has nothing; correct the name.\n")
     rows = [(name, _option(*entry)) for name, entry in model.options.items()]
     _table("options (choose with --option NAME=VALUE)", rows)
 

@@ -7,7 +7,7 @@ import shlex
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from lfm_ppl import checks
+from lfm_ppl.cli import values
 
 if TYPE_CHECKING:  # experiments, which take seconds to import
     from lfm_ppl.experiments.study import Option, Settings
@@ -15,16 +15,16 @@ if TYPE_CHECKING:  # experiments, which take seconds to import
 _DESTINATION = "study setting "
 
 
-def name_in(words: Sequence[str], common: argparse.ArgumentParser, known: Sequence[str]) -> str | None:
+def name_in(given: Sequence[str], common: argparse.ArgumentParser, known: Sequence[str]) -> str | None:
     """Return the word that names the study; None where no word can.
 
     Args:
-        words: the arguments after ``compare``.
+        given: the arguments after ``compare``.
         common: parser of the options that all studies share; what it leaves over are the name, the options of the
             study, and their values.
         known: names of the studies.
     """
-    _, left = common.parse_known_args(list(words))
+    _, left = common.parse_known_args(list(given))
     free = [word for before, word in zip(["", *left], left, strict=False)
             if not word.startswith("-") and not (before.startswith("--") and "=" not in before)]
     return next((word for word in free if word.replace("_", "-") in known), next(iter(free), None))
@@ -55,24 +55,11 @@ def given(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def _converter(one: Option) -> Callable[[str], Any]:
-    """Return what makes a word a value of the setting; the error that it raises is part of one line."""
-    least = one.declared.least
-    expected = f"a whole number of at least {least}" if one.kind is int else "a number above zero"
-
-    def convert(text: str) -> Any:
-        if one.kind is not str:
-            try:
-                value = one.kind(text) if one.kind is float or (text.isascii() and text.isdigit()) else -1
-            except ValueError:
-                value = -1
-            if not (value >= least if one.kind is int else 0 < value < float("inf")):
-                raise argparse.ArgumentTypeError(f"expected {expected}, got {text!r}")
-            return value
-        if one.declared.choices and text not in one.declared.choices:
-            raise argparse.ArgumentTypeError(checks.unknown("value", text, one.declared.choices))
-        return text
-
-    return convert
+    if one.kind is int:
+        return values.whole(one.declared.least)
+    if one.kind is float:
+        return values.positive
+    return values.one_of("value", one.declared.choices) if one.declared.choices else str
 
 
 def _default(one: Option) -> str:

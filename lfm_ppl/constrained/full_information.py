@@ -161,7 +161,8 @@ def check_settings(model: LatentForceModel, tolerance: float, max_passes: int) -
     """Raise where the model's observation is not Gaussian, or a setting is out of range."""
     if not isinstance(model.observation, GaussianObservation):
         raise TypeError("estimation under constraints takes an lfm.GaussianObservation; the observation is "
-                        f"{type(model.observation).__name__}.")
+                        f"{type(model.observation).__name__}. Leave the bounds out, or keep the quantity in them by a "
+                        "link, such as softplus, in the dynamics.")
     checks.positive("tolerance", tolerance, "It is in units of the log density.")
     checks.positive_integer("max_passes", max_passes)
 

@@ -204,6 +204,8 @@ def _embedded(workers: int) -> Iterator[Any]:
         "distributed.nanny.pre-spawn-environ": {**_nanny_environment(), **ONE_THREAD, **double},
         "distributed.scheduler.allowed-failures": _DEATHS - 1,
         "distributed.scheduler.work-stealing": False,
+        # It looks at the stack of a task every hundredth of a second, for a page of the dashboard.
+        "distributed.worker.profile.enabled": False,
     }
     with contextlib.ExitStack() as stack:
         stack.enter_context(dask.config.set(settings))

@@ -429,7 +429,7 @@ def check_observations(y: Any, count: int, outputs: int, empty: bool = False,
         if np.isnan(known).all() and not empty:
             raise ValueError("every entry of y is missing (NaN); there is nothing to learn from.")
         if model is not None and isinstance(model.observation, ObservationFamily):
-            model.observation.check_data(known)
+            model.observation.check_data(known, names=model.output_names)
     return jnp.asarray(y, float)
 
 

@@ -268,6 +268,15 @@ class MarginalLikelihood(dist.Distribution):
     def _site_settings(self) -> SiteSettings:
         return as_settings(self.sites, self.iterations)
 
+    @property
+    def sites_in_words(self) -> str:
+        """How an observation family is approximated; empty where the observation is Gaussian."""
+        if not isinstance(self.model.observation, ObservationFamily):
+            return ""
+        settings = self._site_settings
+        linear = not (self.ssm.drift_structure.points or self.ssm.observation_structure.points)
+        return f"{settings.method}" + ("" if linear else f", linearised anew {settings.relinearisations} times at most")
+
     def evidence(self, y: jax.Array) -> Evidence:
         """Return the log evidence of an observation family and what it is made of; ``y`` (T, D) is not checked."""
         assert isinstance(self.model.observation, ObservationFamily)

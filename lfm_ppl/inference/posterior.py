@@ -125,9 +125,9 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
             w, when = distribution.feasible_path(path_key, y, plan.times)
         elif particles is None:
             # Where the path is simulated the smoother stays at the last observation, which costs nothing.
-            simulated = after and plan.times is not None
-            smoothed = distribution.smooth(y, np.minimum(plan.times, bound.times.max()) if simulated else plan.times)
-            when = jnp.asarray(plan.times) if simulated else smoothed.times
+            reached = plan.times if plan.times is None or not after else np.minimum(plan.times, bound.times.max())
+            smoothed = distribution.smooth(y, reached)
+            when = smoothed.times if plan.times is None else jnp.asarray(plan.times, float)
             states = smoothed.sample_joint(path_key, 1)[0]
             drawn = jnp.ones((len(when), 1), bool)
             if after:
@@ -352,8 +352,7 @@ def _particle_path(distribution: MarginalLikelihood, y: jax.Array, at: Any, key:
 
 
 def _steps_per_interval(ssm: StateSpaceModel, times: Any, at: Any, steps: int, since: float = -np.inf) -> int:
-    """Return how many steps each row after ``since`` needs so that none is longer than those between two observations.
-    """
+    """Return how many steps a row after ``since`` needs, so that none is longer than those between two observations."""
     known = checks.concrete(times)
     if at is None or known is None:
         return steps

@@ -7,8 +7,7 @@ import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from lfm_ppl.progress import Clock, bar, duration, on_terminal
-
+from lfm_ppl.progress import Clock, Waiting, bar, duration, on_terminal
 
 SURE_S = 60.0
 """Seconds of sampling before a warm-up is called slow: its first steps, of an untuned length, say little."""
@@ -50,19 +49,27 @@ class Progress:
         self._bar: Any = None
         self._first: tuple[float, int] | None = None
         self._clock = Clock()
+        self._compiling: Waiting | None = None
 
     def __enter__(self) -> Progress:
         if self._shown and on_terminal():
             self._bar = bar(self._total, self._done)
+            self._bar.set_postfix_str("compiling")
+        elif self._shown:
+            self._compiling = Waiting("compiling the sampler, and its first step")
         return self
 
     def __exit__(self, *error: Any) -> None:
         if self._bar is not None:
             self._bar.close()
+        if self._compiling is not None:
+            self._compiling.stop()
 
     def advance(self, done: int, stage: Callable[[], Stage]) -> None:
         """Show that so many steps are done; ``stage`` is asked only where it is shown."""
         now = time.perf_counter()
+        if self._compiling is not None:
+            self._compiling.stop()
         if self._bar is not None:
             what = stage()
             self._bar.set_postfix_str(_divergences(what, ", ") + what.words, refresh=False)
@@ -116,6 +123,7 @@ class Counter:
         self._label, self._shown = label, shown
         self._clock = Clock(at_once)
         self._first: tuple[float, int] | None = None
+        self._compiling: Waiting | None = None
 
     def of(self, label: str) -> Counter:
         """Return the counter, for something else."""
@@ -128,6 +136,7 @@ class Counter:
             return
         now = time.perf_counter(), done
         text = f"{self._label}: {done:,} of {count:,} draws{_left(self._first, now, count)}"
+        self._wait(f"{self._label}: compiling, and the first of {count:,} draws" if not done else "")
         if done and self._first is None:  # the first batch came with the compilation
             self._first = now
         if on_terminal():
@@ -135,8 +144,15 @@ class Counter:
         elif self._clock.due():
             print(text, file=sys.stderr, flush=True)
 
+    def _wait(self, text: str) -> None:
+        """Say every now and then that this goes on; nothing: stop saying it."""
+        if self._compiling is not None:
+            self._compiling.stop()
+        self._compiling = Waiting(text) if text and not on_terminal() else None
+
     def close(self) -> None:
         """Leave an empty line on a terminal."""
+        self._wait("")
         if self._shown and on_terminal():
             print(f"\r{'':<70}\r", end="", file=sys.stderr, flush=True)
 

@@ -37,8 +37,8 @@ _GROWTH = 8
 """Most that a block may be longer than the one before it: steps of the warm-up differ in length."""
 
 
-_AT_MODE = ("this warm-up is slow, and the time left may still grow. From the posterior mode, with the covariance there, "
-            "steps are often many times longer: Ctrl-C, and again with init=\"map\" (lfm-ppl fit --init map).")
+_AT_MODE = ("this warm-up is slow, and the time left may still grow. From the posterior mode, with the covariance "
+            "there, steps are often many times longer: Ctrl-C, and again with init=\"map\" (lfm-ppl fit --init map).")
 
 
 class Transition(NamedTuple):

@@ -350,7 +350,11 @@ def _names(argument: str, given: Sequence[str] | None, size: int, prefix: str) -
     if given is None:
         return tuple(f"{prefix}{index}" for index in range(size))
     if isinstance(given, str) or len(given) != size:
-        raise ValueError(f"{argument} must hold {size} names, got {given!r}.")
+        names = (given,) if isinstance(given, str) else tuple(given)
+        what = {"output_names": "the observation returns", "state_names": "initial_state.mean has"}.get(argument)
+        why = f": {what} {size} {'entry' if size == 1 else 'entries'}" if what else ""
+        raise ValueError(f"{argument} must hold {size} {'name' if size == 1 else 'names'}{why}. It holds "
+                         f"{', '.join(map(repr, names)) or 'none'}.")
     if len(set(given)) != size:
         raise ValueError(f"{argument} must not repeat, got {tuple(given)}.")
     return tuple(str(name) for name in given)

@@ -176,6 +176,10 @@ class Checkpoint:
         with np.load(path) as file:
             return {key: file[key] for key in file.files}
 
+    def holds(self, name: str) -> bool:
+        """Whether what `once` computes under this name is there."""
+        return (self._own / f"{name}.npz").is_file()
+
     def parts(self, name: str) -> Parts:
         """Return what keeps batches of what is computed from draws."""
         return Parts(self._own / re.sub(r"\W+", "-", name))
@@ -287,6 +291,9 @@ def digest(*values: Any) -> str:
 
 _DIGEST = "sha256:"
 
+_OF_MODEL = ("rule", "steps", "max_step", "iterations", "tolerance", "constraints", "fixed")
+"""What is recorded by itself, and a part of the model's fingerprint, too."""
+
 
 def versions() -> dict[str, str]:
     """Return the versions of all that numbers depend on, and their precision."""
@@ -303,6 +310,9 @@ def check_same(folder: str | Path, kept: Mapping[str, Any], record: Mapping[str,
     """Raise ValueError where two records differ, with all in which they do."""
     record = _plain(record)
     differences = list(_differences(kept, record))
+    if any(part.partition(" ")[0] in _OF_MODEL for part in differences):
+        # The fingerprint of a model follows from these, too.
+        differences = [part for part in differences if part != "model differs"]
     if differences:
         more = [f"and {len(differences) - _SHOWN} more"] if len(differences) > _SHOWN else []
         raise ValueError(f"cannot go on with the run in {folder}, which was another one: "

@@ -19,6 +19,7 @@ from lfm_ppl.results import arviz_data, predictions, report, tables, web_page
 from lfm_ppl.results.files import POSTERIOR
 from lfm_ppl.results.inputs import ORIGIN, input_unit, inputs_of, time_origin, time_unit
 from lfm_ppl.results.plots import saving, style
+from lfm_ppl.results.residuals import misfit
 from lfm_ppl.results.scalars import unit_of
 from lfm_ppl.results.web_page import Section
 
@@ -54,7 +55,8 @@ _CAPTIONS = {
 _SETTINGS = {
     "sampler": "sampler", "chains": "chains", "warmup": "warm-up steps", "samples": "draws a chain",
     "thin": "steps a draw", "seed": "seed", "rule": "rule", "steps": "integration steps", "max_step": "longest step",
-    "tolerance": "tolerance of a step (sd)", "iterations": "iterations", "fixed": "fixed", "options": "options",
+    "tolerance": "tolerance of a step (sd)", "iterations": "iterations", "sites": "observation family",
+    "fixed": "fixed", "options": "options",
     "constraints": "constraints",
     "particles": "particles", "log_likelihood_sd": "sd of the log likelihood", "delayed": "delayed acceptance",
     "effective_draws": "effective draws", "map_message": "optimiser",
@@ -62,8 +64,8 @@ _SETTINGS = {
     "wall_time_s": "time (s)", "created_at": "made at",
 }
 _ELSEWHERE = ("model", "model_file", DESCRIPTION, "data", "note", "versions", "warnings", "partial", "settings", "run",
-              "map_converged", arviz_data.MODE, COMMAND, CALL, ORIGIN, PRIORS, MEANINGS, ASSUMPTIONS, "inference_library",
-              "site_failures", "constraint_weights")
+              "map_converged", arviz_data.MODE, COMMAND, CALL, ORIGIN, PRIORS, MEANINGS, ASSUMPTIONS,
+              "inference_library", "site_failures", "constraint_weights")
 """Attributes that stand in other sections, or that nobody needs to read."""
 
 _FILES = re.compile(r"(.*\.nc|(summary|accuracy|forecast|scores)\.csv"
@@ -132,10 +134,12 @@ def _state(result: Any, attrs: Mapping[str, Any]) -> str:
     if (partial := attrs.get("partial")) is not None:
         shown += web_page.warnings([f"This result is partial: {partial}."])
     found = arviz_data.convergence_warnings(result)
-    shown += web_page.warnings(found)
+    shown += web_page.warnings([*found, *misfit(result)])
     if not found:
         shown += web_page.paragraph("The draws are of a Laplace approximation at the posterior mode, not of chains."
-                                    if arviz_data.of_mode(result) else "The diagnostics of the draws give no warning.")
+                                    if arviz_data.of_mode(result) else
+                                    "The chains agree, and are long enough: the draws are those of the posterior of "
+                                    "this model. Whether the model fits the data, the residuals tell.")
     if arviz_data.has_group(result, report.GROUP):
         shown += web_page.paragraph(f"Accuracy: {report.AccuracyReport.of(result).verdict.word}.")
     return shown

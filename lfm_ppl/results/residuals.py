@@ -9,9 +9,10 @@ import pandas as pd
 import xarray as xr
 from scipy import stats
 
-from lfm_ppl.results.arviz_data import group
+from lfm_ppl.results.arviz_data import group, has_group
 
 MIN_OBSERVATIONS = 8
+_FAR, _RARE = 3.0, 1e-3
 
 
 def mean_residuals(result: Any) -> xr.DataArray:
@@ -35,7 +36,8 @@ def autocorrelation(residual: np.ndarray, lags: int) -> tuple[np.ndarray, np.nda
     """Return the autocorrelation of a series with gaps, and how many pairs each lag has.
 
     rho_h = mean of (e_k - m)(e_k+h - m) over the pairs that are both there, divided by the mean of
-    (e_k - m)^2. Lags count observations, also where these are not equally spaced in time.
+    (e_k - m)^2. Lags count rows, also where these are not equally spaced in time; of an output that fewer than half of
+    the rows have, its own observations.
 
     Args:
         residual: shape (T,), NaN where missing.
@@ -45,6 +47,9 @@ def autocorrelation(residual: np.ndarray, lags: int) -> tuple[np.ndarray, np.nda
         rho and the number of pairs, both of shape (lags,), for lags 1, 2, ...; rho is NaN for a
         lag without pairs.
     """
+    there = np.isfinite(residual)
+    if there.mean() < 0.5:
+        residual = residual[there]
     centred = residual - np.nanmean(residual)
     variance = np.nanmean(centred**2)
     rho, pairs = np.full(lags, np.nan), np.zeros(lags, int)
@@ -108,6 +113,32 @@ def residual_tests(result: Any) -> pd.DataFrame:
         }
     frame = pd.DataFrame.from_dict(rows, orient="index")
     return frame.astype({"count": int, "lags": int})
+
+
+def misfit(result: Any) -> list[str]:
+    """Return what the residuals say against the model, one message for each finding.
+
+    Findings are those that a right model gives once in a thousand results: residuals beyond three standard deviations,
+    the Kolmogorov-Smirnov and the Ljung-Box test. Of a panel nothing is said.
+    """
+    if not has_group(result, "one_step_ahead") or "series" in group(result, "one_step_ahead")["residual"].dims:
+        return []
+    found, residual = [], mean_residuals(result)
+    for name, test in residual_tests(result).iterrows():
+        count = int(test["count"])
+        beyond = int((np.abs(residual.sel(output=name).values) > _FAR).sum())
+        share = 2.0 * stats.norm.sf(_FAR)
+        if beyond > 1 and stats.binom.sf(beyond - 1, count, share) < _RARE:
+            found.append(f"{beyond} of {count} residuals of {name} lie beyond {_FAR:g} sd, where {count * share:.1g} "
+                         "are expected: gross errors (lfm.StudentTObservation), or what the model does not know. See "
+                         "residuals.png.")
+        elif test["ks_p"] < _RARE:
+            found.append(f"the residuals of {name} are not standard normal (KS p = {test['ks_p']:.1g}): the bands of "
+                         "new data are too wide or too narrow. See residuals.png.")
+        if test["ljung_box_p"] < _RARE:
+            found.append(f"the residuals of {name} follow from one another (Ljung-Box p = {test['ljung_box_p']:.1g}): "
+                         "the model misses something that lasts. See residuals.png.")
+    return found
 
 
 def default_lags(count: int) -> int:

@@ -103,7 +103,7 @@ def test_a_whole_vector_is_fixed_by_a_number_or_by_its_values():
         ({"decay[d]": 1.0}, r"unknown element of decay 'd'\..*Known: a, b, c"),
         ({"decay[3]": 1.0}, r"unknown element of decay '3'"),
         ({"u[a]": 1.0}, r"unknown element of u 'a'.*Known: 0, 1, 2, 3"),
-        ({"decay[a]": -1.0}, r"decay cannot be fixed at .*Positive"),
+        ({"decay[a]": -1.0}, r"decay cannot be fixed at .*its prior allows > 0"),
         ({"noise_sd": -1.0}, r"noise_sd cannot be fixed at -1.0"),
         ({"noise_sd[0]": 1.0}, r"noise_sd has shape \(\); single elements .* of a vector only"),
         ({"decay": [1.0, 2.0]}, r"decay has shape \(3,\), got a value of shape \(2,\)"),

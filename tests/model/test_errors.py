@@ -22,16 +22,18 @@ def make(dynamics=lambda x, u, t: -x, forces=FORCE, observation=OBSERVATION, ini
 
 
 @pytest.mark.parametrize("options, message", [
-    ({"dynamics": lambda x, u, t: x[0]}, r"dynamics must return.*shape \(2,\); it returned a number of shape \(\)\. Return jnp"),
+    ({"dynamics": lambda x, u, t: x[0]},
+     r"dynamics must return.*shape \(2,\); it returned a number of shape \(\)\. Return jnp"),
     ({"dynamics": lambda x, u, t: [x[0], x[1]]}, r"it returned a list of 2, which is no array\. Return jnp"),
     ({"dynamics": lambda x, u, t: None}, r"it returned None, as a function without"),
     ({"dynamics": lambda x, u, t: jnp.ones(3)}, r"it returned an array of shape \(3,\)\.$"),
     ({"forces": [("u", lfm.Matern(1.0, 1.0)), ("u", lfm.Constant(1.0))]}, "force name 'u' repeats"),
     ({"forces": {"x0": lfm.Matern(1.0, 1.0)}}, "'x0' is used for a state and for a force; rename"),
-    ({"state_names": ("a",)}, r"state_names must hold 2 names, got \('a',\)"),
-    ({"state_names": "ab"}, "state_names must hold 2 names, got 'ab'"),
+    ({"state_names": ("a",)}, r"state_names must hold 2 names: initial_state.mean has 2 entries\. It holds 'a'"),
+    ({"state_names": "ab"}, "state_names must hold 2 names: .* It holds 'ab'"),
     ({"state_names": ("a", "a")}, "state_names must not repeat"),
-    ({"output_names": ("a", "b", "c")}, "output_names must hold 2 names"),
+    ({"output_names": ("a", "b", "c")},
+     "output_names must hold 2 names: the observation returns 2 entries. It holds 'a', 'b'"),
     ({"process_noise": jnp.ones(2)}, r"process_noise must be a dispersion matrix \(2, S\).*got shape \(2,\).*jnp.diag"),
     ({"process_noise": jnp.full((2, 1), jnp.nan)}, "process_noise must be finite"),
     ({"process_noise": lambda x, u, t: jnp.ones(3)}, r"process_noise must return a dispersion matrix.*got \(3,\)"),

@@ -10,6 +10,7 @@ from lfm_ppl.results.residuals import (
     autocorrelation,
     ljung_box,
     mean_residuals,
+    misfit,
     normal_scores,
     residual_tests,
 )
@@ -50,6 +51,34 @@ def test_autocorrelation_uses_only_the_pairs_that_are_there():
     first = (centred[2] * centred[3] + centred[6] * centred[7]) / 2 / variance
     np.testing.assert_allclose(rho[0], first)
     np.testing.assert_allclose(rho[1], centred[0] * centred[2] / variance)
+
+
+def test_lags_of_an_output_that_few_rows_have_count_its_observations():
+    dense = np.random.default_rng(1).normal(size=40)
+    sparse = np.full(120, np.nan)
+    sparse[::3] = dense
+    for found, expected in zip(autocorrelation(sparse, 8), autocorrelation(dense, 8), strict=True):
+        np.testing.assert_allclose(found, expected)
+    assert ljung_box(sparse, 8) == pytest.approx(ljung_box(dense, 8))
+
+
+def test_a_misfit_is_said_and_a_fit_is_not():
+    rng = np.random.default_rng(4)
+    right = rng.normal(size=(60, 1))
+    assert misfit(result_with(right)) == []
+    gross = right.copy()
+    gross[[5, 20, 40], 0] = 4.0, -4.5, 5.0
+    (message,) = misfit(result_with(gross))
+    assert message.startswith("3 of 60 residuals of y0 lie beyond 3 sd") and "lfm.StudentTObservation" in message
+    slow = np.convolve(rng.normal(size=69), np.ones(10), mode="valid")[:, None] / np.sqrt(10.0)
+    assert any("follow from one another" in one for one in misfit(result_with(slow)))
+    (message,) = misfit(result_with(0.3 * right))
+    assert "are not standard normal" in message and "too wide" in message
+
+
+def test_a_misfit_is_rarely_said_where_the_model_holds():
+    residual = np.random.default_rng(6).normal(size=(60, 500))
+    assert len(misfit(result_with(residual))) <= 5  # three tests of 500 outputs, each wrong once in a thousand
 
 
 @pytest.mark.parametrize("gaps", [0.0, 0.2])

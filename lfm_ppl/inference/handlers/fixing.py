@@ -20,6 +20,7 @@ import numpyro.distributions as dist
 from lfm_ppl import checks
 from lfm_ppl.inference.handlers.likelihood_handler import Handler
 from lfm_ppl.inference.handlers.pinned import Pinned, elementwise
+from lfm_ppl.inference.priors import support as in_words
 
 _ELEMENT = re.compile(r"^(?P<site>[^\[\]]+)\[(?P<label>[^\[\]]+)\]$")
 
@@ -160,5 +161,5 @@ def _inside(name: str, support: Any, value: jax.Array) -> None:
     inside = checks.concrete(support(value))
     if inside is not None and not np.all(inside):
         raise ValueError(
-            f"{name} cannot be fixed at {np.asarray(value)}: its support is {support!r}."
+            f"{name} cannot be fixed at {np.asarray(value)}: its prior allows {in_words(support)}."
         )

@@ -146,12 +146,13 @@ class ObservationFamily(eqx.Module):
                              f"{predictor[index]:g}. Change initial_state.mean or the units of the predictor, or take "
                              "another link, such as link='softplus'.")
 
-    def check_data(self, y: Any, first_column: int = 0) -> None:
+    def check_data(self, y: Any, first_column: int = 0, names: Sequence[str] = ()) -> None:
         """Raise ValueError for data (T, D) that the family cannot give; the message names row and column.
 
         Args:
             y: (T, D), NaN where missing.
             first_column: which column of all data the first of these is, for the message.
+            names: of all outputs, for the message.
         """
         known = checks.concrete(y)
         if known is None or checks.traced(self):
@@ -161,11 +162,19 @@ class ObservationFamily(eqx.Module):
         if found is None:
             return
         wrong, expected = found
+        self._refuse(wrong, known, f"{type(self).__name__} needs {expected}", first_column, names)
+
+    def _refuse(self, wrong: np.ndarray, known: np.ndarray, needs: str, first_column: int,
+                names: Sequence[str]) -> None:
+        """Raise ValueError where an entry that is there is ``wrong``."""
         wrong = wrong & np.isfinite(known)
         if wrong.any():
             row, column = np.argwhere(wrong)[0]
-            raise ValueError(f"y[{row}, {column + first_column}] is {known[row, column]:g}, but "
-                             f"{type(self).__name__} needs {expected}; use NaN for a missing entry.")
+            place = int(column) + first_column
+            of = f" ({names[place]}, row {row + 1} of the data)" if len(names) > place else ""
+            order = f" Outputs are in the order {', '.join(names)}." if len(names) > 1 else ""
+            raise ValueError(f"y[{row}, {place}]{of} is {known[row, column]:g}, but {needs}; use NaN for a "
+                             f"missing entry.{order}")
 
 
 def _averaged(family: ObservationFamily) -> ObservationFamily:

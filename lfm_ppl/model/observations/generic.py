@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import jax
@@ -82,7 +82,7 @@ class Observation(ObservationFamily):
         """Return the distribution's mean (D,)."""
         return jnp.asarray(self.make(predictor).mean, float)
 
-    def check_data(self, y: Any, first_column: int = 0) -> None:
+    def check_data(self, y: Any, first_column: int = 0, names: Sequence[str] = ()) -> None:
         """Raise ValueError where an entry lies outside of the distribution's support."""
         known = checks.concrete(y)
         if known is None:
@@ -92,8 +92,4 @@ class Observation(ObservationFamily):
         if found is None:  # within compiled code
             return
         inside = np.broadcast_to(found, known.shape)
-        wrong = ~inside & np.isfinite(known)
-        if wrong.any():
-            row, column = np.argwhere(wrong)[0]
-            raise ValueError(f"y[{row}, {column + first_column}] is {known[row, column]:g}, outside of the support of "
-                             f"the distribution ({support}); use NaN for a missing entry.")
+        self._refuse(~inside, known, f"the distribution needs {support}", first_column, names)

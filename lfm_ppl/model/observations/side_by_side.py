@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -131,13 +131,13 @@ class Observations(ObservationFamily):
         """Say for which entries the law of the data is not finite."""
         return np.concatenate([part.overflows(predictor[columns]) for part, columns in self._each()])
 
-    def check_data(self, y: Any, first_column: int = 0) -> None:
+    def check_data(self, y: Any, first_column: int = 0, names: Sequence[str] = ()) -> None:
         """Check the columns of each part."""
         known = checks.concrete(y)
         if known is None:
             return
         for part, columns in self._each():
-            part.check_data(known[:, columns], first_column + columns.start)
+            part.check_data(known[:, columns], first_column + columns.start, names)
 
 
 class _Stacked(eqx.Module):

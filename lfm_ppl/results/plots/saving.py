@@ -31,10 +31,9 @@ def save_figures(
 ) -> list[Path]:
     """Draw every figure that ``result`` has the groups for, and write it to ``folder``.
 
-    The figures are fit, inputs, forces, deterministics, states, trace (not of sampler "map", which has no chains), pairs,
-    residuals and accuracy. What does not fit
-    on one page goes to numbered ones, such as ``trace-1.png`` and ``trace-2.png``, five at most. Every file is
-    written under a temporary name and renamed.
+    The figures are fit, inputs, forces, deterministics, states, trace (not of sampler "map", which has no chains),
+    pairs, residuals and accuracy. What does not fit on one page goes to numbered ones, such as ``trace-1.png`` and
+    ``trace-2.png``, five at most. Every file is written under a temporary name and renamed.
 
     Args:
         result: an ArviZ object.
