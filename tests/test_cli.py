@@ -322,6 +322,7 @@ def test_the_default_folder_must_be_one(run, tmp_path, monkeypatch):
         ("fit MOTIF --target-accept 1.5", "expected a number between 0 and 1, got '1.5'"),
         ("fit MOTIF --target-accept 0.9 --sampler map", "--target-accept is for the samplers nuts, ram and pmmh"),
         ("fit MOTIF --until 3", "--until takes a time after the last observation, at 7, got 3"),
+        ("fit MOTIF --until 9 --trajectory-draws 0", "--until and --at ask for trajectories, of which"),
         ("fit MOTIF --until nan", "--until takes a time after the last observation, at 7, got nan"),
         ("fit MOTIF --data absent.csv", "there is no file absent.csv"),
         ("fit MOTIF --data empty.csv", "empty.csv is empty"),

@@ -99,6 +99,8 @@ def check_sampler(arguments: argparse.Namespace) -> None:
     """Raise ValueError for a setting of another sampler."""
     if arguments.target_accept is not None and arguments.sampler == "map":
         raise ValueError("--target-accept is for the samplers nuts, ram and pmmh; map accepts and rejects nothing.")
+    if arguments.trajectory_draws == 0 and (arguments.until is not None or arguments.at is not None):
+        raise ValueError("--until and --at ask for trajectories, of which --trajectory-draws 0 gives none.")
     if arguments.init is not None and arguments.sampler == "map":
         raise ValueError("--init says where chains start; the sampler map has none, and finds the mode itself.")
     if arguments.particles is not None and arguments.sampler != "pmmh":

@@ -130,8 +130,8 @@ def misfit(result: Any) -> list[str]:
         share = 2.0 * stats.norm.sf(_FAR)
         if beyond > 1 and stats.binom.sf(beyond - 1, count, share) < _RARE:
             found.append(f"{beyond} of {count} residuals of {name} lie beyond {_FAR:g} sd, where {count * share:.1g} "
-                         "are expected: gross errors (lfm.StudentTObservation), or what the model does not know. See "
-                         "residuals.png.")
+                         "are expected: gross errors (lfm.StudentTObservation; fewer degrees of freedom where it is "
+                         "one), or what the model does not know. See residuals.png.")
         elif test["ks_p"] < _RARE:
             found.append(f"the residuals of {name} are not standard normal (KS p = {test['ks_p']:.1g}): the bands of "
                          "new data are too wide or too narrow. See residuals.png.")
