@@ -414,9 +414,10 @@ class _Run:
             self.drawn = kept("trajectories", lambda: draw_paths(
                 asked.keys[3], self.bound, flat, asked.at, asked.trajectory_draws, asked.chains, asked.samples,
                 **{label: self.particles.get(label) for label in _OF_PARTICLES}, **watched("trajectories")), self.drawn)
-            counter.close()
         except KeyboardInterrupt:
             self.partial = _BARE if self.rated is None else "all draws and their scores, without trajectories"
+        finally:
+            counter.close()
 
     def _found_of_sites(self, flat: Mapping[str, Any]) -> dict[str, str]:
         """Return attributes that say where sites do not converge, and what the weights of trajectories are worth."""
@@ -582,7 +583,8 @@ def _transition(sampler: str, bound: BoundModel, options: Mapping[str, Any] | No
         options.setdefault("dense_mass", True)
     if setup is not None:
         if sampler == "nuts":
-            return sampling.nuts(bound, warmup, options), None, {}
+            transition = sampling.nuts(bound, warmup, options)
+            return transition._replace(if_slow="") if at_mode else transition, None, {}
         kernel = KERNELS[sampler](bound.model, **options)
         if not isinstance(kernel, ParticleMarginalRAM):
             return sampling.random_walk(bound, kernel, warmup), None, {}

@@ -102,7 +102,7 @@ def test_wrong_inputs_are_named(folder, changed, message):
 @pytest.mark.parametrize(("text", "message"), [
     ("date,x,h\n2026-01-05,1,\n2026-01-06,2,1\n", "row 2, column 'h': the known input has no value at the first time"),
     ("date,x,h\n2026-01-05,1,1\n2026-01-05,2,3\n", "row 3, column 'h': the known input is 3 here and 1 in another row"),
-    ("date,x,h\n2026-01-05,1,1\n2026-01-32,2,3\n", "row 3, column 'date': expected a date .* got '2026-01-32'"),
+    ("date,x,h\n2026-01-05,1,1\n2026-01-32,2,3\n", "row 3, column 'date': expected a date, year .* got '2026-01-32'"),
     ("date,x,h\n2026-01-05,1,1\n2026-01-06T00:00Z,2,3\n", "row 3, column 'date': some dates have an offset from UTC"),
     ("date,x,h\n2026-01-05,1,1\n,2,3\n", "row 3, column 'date': the time is missing"),
     ("date,x,h\n2026-10-25 02:30,1,1\n2026-10-25 02:15,2,3\n", "row 3: the time goes back .* needs offsets from UTC"),

@@ -405,7 +405,7 @@ MODELS = {
                          {"bad.py": with_model("def model(**options):\n    pass\n")}),
     "an argument too many": Case("fit bad.py", ("bad.py", "size"),
                                  {"bad.py": with_model("def model(times, y, size, **options):\n    pass\n")}),
-    "a negative scale": Case("fit bad.py", ("bad.py, line", "scale out of its range", "dist.LogNormal(-0.5, -0.3)"),
+    "a negative scale": Case("fit bad.py", ("bad.py, line", "scale outside of its range", "dist.LogNormal(-0.5, -0.3)"),
                              {"bad.py": MODEL.replace("dist.LogNormal(-0.5, 0.3)", "dist.LogNormal(-0.5, -0.3)")}),
     "an argument of a force": Case("fit bad.py", ("bad.py, line", "'nu'", "It takes scale, lengthscale, order"),
                                    {"bad.py": with_model(
@@ -468,7 +468,7 @@ MODELS = {
     noise = numpyro.sample("noise", dist.LogNormal(-0.5, 0.3))
     numpyro.sample("y", lfm.MarginalLikelihood(system(noise), times, steps=1), obs=y)
     numpyro.sample("z", lfm.MarginalLikelihood(system(noise), times, steps=1), obs=y)\n''')}),
-    "one name twice": Case("fit bad.py", ("bad.py, line 27", "two sites of the model are called 'noise'"), {"bad.py": with_model(
+    "one name twice": Case("fit bad.py", ("bad.py, line 27", "two sites", "called 'noise'"), {"bad.py": with_model(
         '''def model(times, y=None, **options):
     noise = numpyro.sample("noise", dist.LogNormal(-0.5, 0.3))
     noise = numpyro.sample("noise", dist.LogNormal(-0.5, 0.3))

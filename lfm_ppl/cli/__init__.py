@@ -87,7 +87,7 @@ def _remedy(error: Exception) -> str:
     if isinstance(error, ValueError) and (wrong := _INVALID.search(str(error))) is not None:
         place = loading.place_in_model(error)
         line = "" if place is None else linecache.getline(str(place.file), place.line).strip()
-        return f" A {wrong[1]} out of its range, such as a negative scale, stands in: {line}" if line else ""
+        return f" A {wrong[1]} outside of its range stands in: {line}" if line else ""
     return ""
 
 

@@ -366,7 +366,7 @@ def _add_inference(group: Any) -> None:
     group.add_argument(
         "--thin",
         type=values.whole(1),
-        help="steps that make one draw (default: 1 for nuts, 5 per parameter for ram, 1 per parameter for pmmh)",
+        help="steps that make one draw (default: 1 for nuts, 5 per parameter for ram, 2 per parameter for pmmh)",
     )
     group.add_argument("--seed", type=values.whole(0), default=0, help="random seed of the sampler (default: 0)")
     group.add_argument("--init", type=values.one_of("init", ("map", "median")), metavar="map|median",

@@ -15,16 +15,16 @@ if TYPE_CHECKING:  # experiments, which take seconds to import
 _DESTINATION = "study setting "
 
 
-def name_in(given: Sequence[str], common: argparse.ArgumentParser, known: Sequence[str]) -> str | None:
+def name_in(line: Sequence[str], common: argparse.ArgumentParser, known: Sequence[str]) -> str | None:
     """Return the word that names the study; None where no word can.
 
     Args:
-        given: the arguments after ``compare``.
+        line: the arguments after ``compare``.
         common: parser of the options that all studies share; what it leaves over are the name, the options of the
             study, and their values.
         known: names of the studies.
     """
-    _, left = common.parse_known_args(list(given))
+    _, left = common.parse_known_args(list(line))
     free = [word for before, word in zip(["", *left], left, strict=False)
             if not word.startswith("-") and not (before.startswith("--") and "=" not in before)]
     return next((word for word in free if word.replace("_", "-") in known), next(iter(free), None))

@@ -154,8 +154,8 @@ class _Program:
         self.user = user
         trace = self._trace(data, self.key, init_to_median)
         found = _likelihoods(trace)
-        self.given_times = [site.name for site in found if arguments and _equal(site.observed, arguments[0])
-                            and not _equal(data, arguments[0])]
+        self.given_times = [site.name for site in found if arguments and _are(site.observed, arguments[0])
+                            and not _hold(data, arguments[0])]
         self._likelihoods = [site._replace(observed=None) for site in found]
         position = _unconstrained(latent_sites(trace))
         self.sites = tuple(position)
@@ -555,9 +555,13 @@ class BoundModel:
 
     def trace(self) -> dict[str, Any]:
         """Return NumPyro's trace of the model at the prior medians: its sites with their priors, plates and values."""
-        if self._trace is None:
-            self._trace = self._program.trace(self.y)
-        return self._trace
+        if self._trace is not None:
+            return self._trace
+        with jax.ensure_compile_time_eval():  # compiled code may be the first to ask
+            trace = self._program.trace(self.y)
+        if not checks.traced(self.y):
+            self._trace = trace
+        return trace
 
     # --- the filter and the smoother
 
@@ -802,11 +806,19 @@ def _arrays(z: Any) -> Any:
     return jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf, float), z)
 
 
-def _equal(one: Any, other: Any) -> bool:
-    """Return whether two arrays hold the same known numbers, whatever their shapes."""
-    if any(value is None or checks.traced(value) for value in (one, other)):
+def _are(observed: Any, times: Any) -> bool:
+    """Return whether what a site observes are the times, known numbers, whatever their shape."""
+    if not all(isinstance(value, (np.ndarray, jax.Array)) and not checks.traced(value) for value in (observed, times)):
         return False
-    return np.size(one) == np.size(other) > 0 and np.array_equal(np.ravel(one), np.ravel(other), equal_nan=True)
+    return np.size(observed) == np.size(times) > 1 and np.array_equal(np.ravel(observed), np.ravel(times))
+
+
+def _hold(data: Any, times: Any) -> bool:
+    """Return whether a column of the data holds the times, so that observing them may be meant; True if not known."""
+    if checks.traced(data):
+        return True
+    columns = [np.moveaxis(np.atleast_1d(leaf), -1, 0) for leaf in jax.tree_util.tree_leaves(data)]
+    return any(_are(np.asarray(one), times) for leaf in columns for one in (leaf, *leaf))
 
 
 def _numeric(value: Any) -> bool:

@@ -485,11 +485,11 @@ class Panel(dist.Distribution):
             raise ValueError("y has infinite entries; use NaN for a missing entry.")
         if known is not None:
             for index, rows in enumerate(known):
-                family = self.series(index).model.observation if self._series_times else self.first.model.observation
-                if not isinstance(family, ObservationFamily):
+                model = self.series(index).model if self._series_times else self.first.model
+                if not isinstance(model.observation, ObservationFamily):
                     break
                 try:
-                    family.check_data(rows)
+                    model.observation.check_data(rows, names=model.output_names)
                 except ValueError as error:
                     raise ValueError(f"series {index}: {error}") from None
         return jnp.asarray(value, float)

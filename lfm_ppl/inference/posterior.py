@@ -124,7 +124,7 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
             smoothed = None
             w, when = distribution.feasible_path(path_key, y, plan.times)
         elif particles is None:
-            # Where the path is simulated the smoother stays at the last observation, which costs nothing.
+            # Where the path is simulated the smoother stays at the last row of the data, which costs nothing.
             reached = plan.times if plan.times is None or not after else np.minimum(plan.times, bound.times.max())
             smoothed = distribution.smooth(y, reached)
             when = smoothed.times if plan.times is None else jnp.asarray(plan.times, float)

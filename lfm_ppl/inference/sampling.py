@@ -79,6 +79,7 @@ def nuts(bound: BoundModel, warmup: int, options: Mapping[str, Any],
     """
     options = {"forward_mode_differentiation": bound.forward_mode, "dense_mass": bound.forward_mode, **options}
     forward_mode = bool(options.pop("forward_mode_differentiation"))
+    given = "inverse_mass_matrix" in options
     both = bound.gradient(forward_mode)
     if isinstance(options["dense_mass"], bool):
         # In blocks of named sites, as NUTS itself has it where it knows their names.
@@ -112,7 +113,8 @@ def nuts(bound: BoundModel, warmup: int, options: Mapping[str, Any],
     return Transition(("nuts", warmup, forward_mode, signature(dict(options)) or object()), start, step, fields,
                       lambda z: both(jnp.asarray(z, float), bound.argument),
                       None if covariance is None else jnp.asarray(covariance),
-                      lambda state: _words(state, state.adapt_state.step_size), _AT_MODE if covariance is None else "")
+                      lambda state: _words(state, state.adapt_state.step_size),
+                      "" if covariance is not None or given else _AT_MODE)
 
 
 def random_walk(bound: BoundModel, kernel: RAM, warmup: int) -> Transition:

@@ -291,7 +291,7 @@ def digest(*values: Any) -> str:
 
 _DIGEST = "sha256:"
 
-_OF_MODEL = ("rule", "steps", "max_step", "iterations", "tolerance", "constraints", "fixed")
+_OF_MODEL = ("rule", "steps", "max_step", "iterations", "tolerance", "constraints", "sites", "fixed")
 """What is recorded by itself, and a part of the model's fingerprint, too."""
 
 

@@ -138,6 +138,8 @@ def _state(result: Any, attrs: Mapping[str, Any]) -> str:
     if not found:
         shown += web_page.paragraph("The draws are of a Laplace approximation at the posterior mode, not of chains."
                                     if arviz_data.of_mode(result) else
+                                    "The draws are weighted ones; how many they are worth stands in the table."
+                                    if "effective_draws" in attrs else
                                     "The chains agree, and are long enough: the draws are those of the posterior of "
                                     "this model. Whether the model fits the data, the residuals tell.")
     if arviz_data.has_group(result, report.GROUP):

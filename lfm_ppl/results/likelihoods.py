@@ -249,9 +249,10 @@ def _one_by_one(problem: PosteriorDraws, key: jax.Array, name: Hashable, per_dra
                 progress: bool) -> np.ndarray:
     """Map over draws, one after another, and say how far that is."""
     counter = Counter(label, shown=progress, at_once=True)
-    found = over_draws(problem.bound, name, per_draw, problem.draws, key, show=counter, parts=problem.kept(label))
-    counter.close()
-    return found
+    try:
+        return over_draws(problem.bound, name, per_draw, problem.draws, key, show=counter, parts=problem.kept(label))
+    finally:
+        counter.close()
 
 
 def _scouted(problem: PosteriorDraws) -> list[Any]:

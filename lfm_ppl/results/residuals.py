@@ -9,7 +9,7 @@ import pandas as pd
 import xarray as xr
 from scipy import stats
 
-from lfm_ppl.results.arviz_data import group, has_group
+from lfm_ppl.results.arviz_data import attributes, group, has_group
 
 MIN_OBSERVATIONS = 8
 _FAR, _RARE = 3.0, 1e-3
@@ -119,19 +119,25 @@ def misfit(result: Any) -> list[str]:
     """Return what the residuals say against the model, one message for each finding.
 
     Findings are those that a right model gives once in a thousand results: residuals beyond three standard deviations,
-    the Kolmogorov-Smirnov and the Ljung-Box test. Of a panel nothing is said.
+    the Kolmogorov-Smirnov and the Ljung-Box test. Nothing is said of a panel, and of a result whose residuals are those
+    of another filter than its posterior: under constraints, and by a particle filter.
     """
-    if not has_group(result, "one_step_ahead") or "series" in group(result, "one_step_ahead")["residual"].dims:
+    attrs = attributes(result)
+    other = "constraints" in attrs or str(attrs.get("sampler", "")).startswith("pmmh")
+    if other or not has_group(result, "one_step_ahead") or (
+            "series" in group(result, "one_step_ahead")["residual"].dims):
         return []
-    found, residual = [], mean_residuals(result)
-    for name, test in residual_tests(result).iterrows():
-        count = int(test["count"])
-        beyond = int((np.abs(residual.sel(output=name).values) > _FAR).sum())
+    remedy = "" if "sites" in attrs else " (lfm.StudentTObservation)"
+    found, residual, tests = [], mean_residuals(result), residual_tests(result)
+    for index in range(residual.sizes["output"]):
+        name, test = tests.index[index], tests.iloc[index]
+        series = residual.isel(output=index).values
+        series = series[np.isfinite(series)]
+        count, beyond = len(series), int((np.abs(series) > _FAR).sum())
         share = 2.0 * stats.norm.sf(_FAR)
-        if beyond > 1 and stats.binom.sf(beyond - 1, count, share) < _RARE:
-            found.append(f"{beyond} of {count} residuals of {name} lie beyond {_FAR:g} sd, where {count * share:.1g} "
-                         "are expected: gross errors (lfm.StudentTObservation; fewer degrees of freedom where it is "
-                         "one), or what the model does not know. See residuals.png.")
+        if count >= MIN_OBSERVATIONS and beyond > 1 and stats.binom.sf(beyond - 1, count, share) < _RARE:
+            found.append(f"{beyond} of {count} residuals of {name} lie beyond {_FAR:g} sd, where {count * share:.2g} "
+                         f"are expected: gross errors{remedy}, or what the model does not know. See residuals.png.")
         elif test["ks_p"] < _RARE:
             found.append(f"the residuals of {name} are not standard normal (KS p = {test['ks_p']:.1g}): the bands of "
                          "new data are too wide or too narrow. See residuals.png.")

@@ -137,7 +137,8 @@ def model(observation, mean=0.0):
 ], ids=lambda value: type(value).__name__ if isinstance(value, lfm.ObservationFamily) else "")
 def test_data_that_a_family_cannot_give_are_errors_that_name_row_and_column(family, entry, needs):
     y = np.array([[0.0, np.nan], [1.0, entry]])
-    message = rf"y\[1, 1\] is {entry:g}, " + (f"but {type(family).__name__} needs {needs}" if needs else "outside")
+    what = f"{type(family).__name__} needs {needs}" if needs else "the distribution needs"
+    message = rf"y\[1, 1\] \(y1, row 2 of the data\) is {entry:g}, but {what}.*in the order y0, y1"
     for call in (lambda: lfm.filter(model(family), [0.0, 1.0], y), lambda: lfm.smooth(model(family), [0.0, 1.0], y),
                  lambda: lfm.MarginalLikelihood(model(family), [0.0, 1.0]).log_prob(y)):
         with pytest.raises(ValueError, match=message):
@@ -146,7 +147,8 @@ def test_data_that_a_family_cannot_give_are_errors_that_name_row_and_column(fami
 
 def test_columns_of_families_side_by_side_keep_their_numbers():
     both = lfm.Observations(lfm.GaussianObservation(lambda x, u, t: x, jnp.ones(2)), lfm.BernoulliObservation(state))
-    with pytest.raises(ValueError, match=r"y\[0, 3\] is 0.5, but BernoulliObservation needs 0"):
+    said = r"y\[0, 3\] \(y3, row 1 of the data\) is 0.5, but BernoulliObservation needs 0"
+    with pytest.raises(ValueError, match=said):
         lfm.filter(model(both), [0.0], np.array([[0.3, -2.0, 1.0, 0.5]]))
 
 
@@ -216,5 +218,5 @@ def test_a_panel_checks_the_data_of_a_family():
                                     lfm.PoissonObservation(lambda x, u, t: x), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
 
     panel = lfm.panel(build, jnp.array([1.0, 2.0]), np.arange(3.0))
-    with pytest.raises(ValueError, match=r"series 1: y\[2, 0\] is -2.5"):
+    with pytest.raises(ValueError, match=r"series 1: y\[2, 0\] \(y0, row 3 of the data\) is -2.5"):
         panel.checked(np.array([[[1.0], [0.0], [2.0]], [[1.0], [np.nan], [-2.5]]]))

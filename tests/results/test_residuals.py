@@ -76,6 +76,17 @@ def test_a_misfit_is_said_and_a_fit_is_not():
     assert "are not standard normal" in message and "too wide" in message
 
 
+def test_a_misfit_is_not_said_of_the_residuals_of_another_filter():
+    wide = result_with(3.0 * np.random.default_rng(7).normal(size=(60, 1)))
+    assert misfit(wide)
+    for name, value in (("constraints", "x >= 0"), ("sampler", "pmmh")):
+        other = result_with(3.0 * np.random.default_rng(7).normal(size=(60, 1)))
+        other.attrs[name] = value
+        assert misfit(other) == []
+    few = result_with(np.full((3, 1), 9.0))
+    assert misfit(few) == []
+
+
 def test_a_misfit_is_rarely_said_where_the_model_holds():
     residual = np.random.default_rng(6).normal(size=(60, 500))
     assert len(misfit(result_with(residual))) <= 5  # three tests of 500 outputs, each wrong once in a thousand
