@@ -121,8 +121,7 @@ def one_of(name: str, value: str, choices: Iterable[str]) -> None:
 def unknown(kind: str, value: str, choices: Iterable[str]) -> str:
     """Return the message for an unknown name, with the nearest known ones."""
     choices = list(choices)
-    # Two letters that a short word shares with another are no likeness.
-    near = difflib.get_close_matches(str(value), choices, n=3, cutoff=0.4 if len(str(value)) > 4 else 0.6)
+    near = difflib.get_close_matches(str(value), choices, n=3, cutoff=0.4)
     hint = f" Did you mean {' or '.join(repr(n) for n in near)}?" if near else ""
     return f"unknown {kind} {value!r}.{hint} Known: {', '.join(choices) or 'none'}."
 
