@@ -16,6 +16,11 @@ import jax
 import numpy as np
 from numpyro.util import is_prng_key
 
+_LIKENESS = 0.4
+
+ABBREVIATIONS = 0.6
+"""The likeness for `unknown` of names that are abbreviations."""
+
 
 def concrete(value: Any) -> np.ndarray | None:
     """Return ``value`` as a NumPy array, or None where it is (or contains) a tracer."""
@@ -111,17 +116,25 @@ def time_vector(name: str, value: Any, earliest: float | None = None, order: str
     return known
 
 
-def one_of(name: str, value: str, choices: Iterable[str]) -> None:
-    """Raise ValueError unless ``value`` is among ``choices``; name the nearest ones."""
+def one_of(name: str, value: str, choices: Iterable[str], likeness: float = _LIKENESS) -> None:
+    """Raise ValueError unless ``value`` is among ``choices``; name the nearest ones, see `unknown`."""
     choices = list(choices)
     if value not in choices:
-        raise ValueError(unknown(name, value, choices))
+        raise ValueError(unknown(name, value, choices, likeness))
 
 
-def unknown(kind: str, value: str, choices: Iterable[str]) -> str:
-    """Return the message for an unknown name, with the nearest known ones."""
+def unknown(kind: str, value: str, choices: Iterable[str], likeness: float = _LIKENESS) -> str:
+    """Return the message for an unknown name, with the nearest known ones.
+
+    Args:
+        kind: what was asked for.
+        value: the unknown name.
+        choices: the known ones.
+        likeness: from 0 to 1, how alike two names must be for one to be taken for a misspelling of the other. More
+            is needed where names are abbreviations, which share letters by chance ("mcmc" and "pmmh").
+    """
     choices = list(choices)
-    near = difflib.get_close_matches(str(value), choices, n=3, cutoff=0.4)
+    near = difflib.get_close_matches(str(value), choices, n=3, cutoff=likeness)
     hint = f" Did you mean {' or '.join(repr(n) for n in near)}?" if near else ""
     return f"unknown {kind} {value!r}.{hint} Known: {', '.join(choices) or 'none'}."
 

@@ -236,7 +236,7 @@ def fit(
 
 
 def _check_sizes(sampler: str, chains: int, warmup: int, samples: int, thin: int | None, paths: int) -> None:
-    checks.one_of("sampler", sampler, SAMPLERS)
+    checks.one_of("sampler", sampler, SAMPLERS, likeness=checks.ABBREVIATIONS)
     for label, value, none in (("chains", chains, ()), ("samples", samples, ()), ("warmup", warmup, (0,)),
                                ("thin", thin, (None,)), ("trajectory_draws", paths, (0,))):
         if value not in none:

@@ -25,6 +25,7 @@ from lfm_ppl.cli import main
 from lfm_ppl.cli.interruption import watched
 from lfm_ppl.inference import progress, sampling
 from lfm_ppl.inference.handlers.settings import approximate
+from lfm_ppl.inference.progress import Progress, Stage
 from lfm_ppl.inference.samplers import SAMPLERS
 from lfm_ppl.progress import waiting
 from lfm_ppl.results import arviz_data
@@ -310,7 +311,22 @@ def test_where_there_is_no_terminal_lines_say_how_far_it_is(capfd, monkeypatch):
     lines = [line for line in capfd.readouterr().err.splitlines() if line.startswith("sampling")]
     assert lines[0].startswith("sampling 1 of 14 steps, 0 of 6 draws a chain, ")
     assert lines[-1].startswith("sampling 14 of 14 steps, 6 of 6 draws a chain, ") and lines[-1].endswith(" left")
+    assert any(line.endswith("left at the pace of the warm-up so far") for line in lines[:-1])
     assert "acceptance" in lines[-1] and "step size" in lines[-1]
+
+
+def test_the_time_left_is_that_at_the_pace_of_the_last_minute(capfd, monkeypatch):
+    clock = [0.0]
+    monkeypatch.setattr("time.perf_counter", lambda: clock[0])
+    monkeypatch.setattr("lfm_ppl.progress.EVERY_S", 0.0)
+    with Progress(1000, 0, shown=True, warmup=100) as shown:
+        for done in range(1, 1001):
+            clock[0] += 10.0 if done <= 100 else 1.0
+            shown.advance(done, lambda: Stage(0, 0, 0, "words"))
+    lines = capfd.readouterr().err.splitlines()
+    assert lines[0].endswith("words")  # the first step comes with the compilation, and says nothing of the pace
+    assert lines[99 - 1].endswith("; about 2.5 h left at the pace of the warm-up so far")  # 901 steps of 10 s
+    assert lines[200 - 1].endswith("; about 13 min left")  # 800 steps of 1 s: the slow ones are forgotten
 
 
 def test_whoever_waits_for_a_long_warm_up_is_told_once_what_helps(capfd, monkeypatch):

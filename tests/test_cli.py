@@ -350,9 +350,10 @@ def test_the_default_folder_must_be_one(run, tmp_path, monkeypatch):
 def test_mistakes_are_one_line_that_says_what_to_do(run, motif, tmp_path, line, message):
     (tmp_path / "empty.csv").write_text("")
     (tmp_path / "other.csv").write_text("time,q\n0,1\n")
-    code, _, err = run(line.replace("MOTIF", motif))
+    code, out, err = run(line.replace("MOTIF", motif))
     assert code == 2
     assert err.startswith("lfm-ppl: error: ") and err.count("\n") == 1, err
+    assert "fixed    dacay" not in out, "what is refused is not announced as done"
     assert message in err
     assert not list(tmp_path.glob("lfm-results/*")), "no empty folder is left behind"
 

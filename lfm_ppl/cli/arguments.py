@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
 import lfm_ppl
-from lfm_ppl import calendar_time
+from lfm_ppl import calendar_time, checks
 from lfm_ppl.cli import (
     check,
     compare,
@@ -352,7 +352,7 @@ def _add_data(group: Any) -> None:
 def _add_inference(group: Any) -> None:
     group.add_argument(
         "--sampler",
-        type=values.one_of("sampler", SAMPLERS),
+        type=values.one_of("sampler", SAMPLERS, likeness=checks.ABBREVIATIONS),
         default="nuts",
         metavar="|".join(SAMPLERS),
         help="default: nuts; pmmh is ram on a particle filter's likelihood, exact and slow",

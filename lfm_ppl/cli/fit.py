@@ -42,6 +42,7 @@ def run(arguments: argparse.Namespace) -> int:
     fixed = choices.fixed(arguments.set, model.anchors(observed))
     at = requested(observed, arguments.until, arguments.at)
     check_sampler(arguments)
+    numpyro_model = approximated(arguments, model)
     if arguments.resume and arguments.out is None:
         raise ValueError("--resume goes on with the run in a folder; name the folder with --out.")
     if arguments.resume and arguments.overwrite:
@@ -52,12 +53,14 @@ def run(arguments: argparse.Namespace) -> int:
         finished = arguments.resume and checkpoint.is_finished(folder)
         if arguments.resume and not finished and not checkpoint.is_kept(folder):
             print(f"resume   there is nothing to go on with in {folder}: this is a new run")
+        if arguments.set:  # a name that the model does not have must not be printed as fixed
+            _check_fixed(numpyro_model, observed, model.keywords(observed, options), fixed)
         _print_task(arguments, model, observed, options, fixed)
         started = time.perf_counter()
         go_on = f"go on with: {_again(arguments, folder)}"
         with watched(lambda: go_on if checkpoint.is_kept(folder) else _nothing_left(folder)) as watch:
             try:
-                posterior = sample(arguments, model, observed, options, fixed, folder, at)
+                posterior = _sample(arguments, model, numpyro_model, observed, options, fixed, folder, at)
             except KeyboardInterrupt as error:
                 said = str(error) or "stopped before there were draws"
                 print(f"\nlfm-ppl: {said}" + (f"; {go_on}" if checkpoint.is_kept(folder) else ""), file=sys.stderr)
@@ -219,30 +222,28 @@ def _print_task(
     sys.stdout.flush()
 
 
-def sample(
+def _check_fixed(numpyro_model: Any, observed: data.Data, keywords: dict[str, Any], fixed: dict[str, Any]) -> None:
+    from lfm_ppl.inference.bound_model import bind
+
+    with calendar_time.in_messages(observed.origin, observed.units.get("time", "")):
+        bind(numpyro_model, observed.times, observed.y, **keywords).fix(fixed)
+
+
+def _sample(
     arguments: argparse.Namespace,
     model: loading.ModelFile,
+    numpyro_model: Any,
     observed: data.Data,
     options: dict[str, Any],
     fixed: dict[str, Any],
     folder: Path,
     at: np.ndarray | None = None,
 ) -> Any:
-    """Return the ArviZ object of a fit, with a record of the options and the data; kept in a folder meanwhile.
-
-    Args:
-        arguments: the sampler's and the approximation's settings.
-        model: what to fit.
-        observed: the data, as the model takes them.
-        options: the model's options.
-        fixed: parameters that are not learnt.
-        folder: of the result.
-        at: times of the trajectories; None: a grid over the data.
-    """
+    """Return the ArviZ object of a fit, with a record of the options and the data; kept in the folder meanwhile."""
     import lfm_ppl
 
     return lfm_ppl.fit(
-        approximated(arguments, model),
+        numpyro_model,
         observed,
         seed=arguments.seed,
         at=at,

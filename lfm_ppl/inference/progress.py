@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections import deque
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -14,6 +15,9 @@ SURE_S = 60.0
 
 LONG_S = 1200.0
 """Seconds from which on a run is long enough for advice."""
+
+RECENT_S = 60.0
+"""Seconds of which the pace is taken: steps before them, of the warm-up above all, may have cost much more or less."""
 
 
 class Stage(NamedTuple):
@@ -47,7 +51,8 @@ class Progress:
         self._total, self._done, self._shown = total, done, shown
         self._warmup, self._if_slow = warmup, if_slow
         self._bar: Any = None
-        self._first: tuple[float, int] | None = None
+        self._began: float | None = None
+        self._pace = _Remaining(total)
         self._clock = Clock()
         self._compiling: Waiting | None = None
 
@@ -68,27 +73,28 @@ class Progress:
     def advance(self, done: int, stage: Callable[[], Stage]) -> None:
         """Show that so many steps are done; ``stage`` is asked only where it is shown."""
         now = time.perf_counter()
+        self._pace.add(now, done)
+        tuning = done < self._warmup
         if self._compiling is not None:
             self._compiling.stop()
         if self._bar is not None:
             what = stage()
-            self._bar.set_postfix_str(_divergences(what, ", ") + what.words, refresh=False)
+            words = ("warm-up, " if tuning else "") + _divergences(what, ", ") + what.words
+            self._bar.set_postfix_str(words, refresh=False)
             self._bar.update(done - self._done)
         elif self._shown and self._clock.due():
             what = stage()
+            left = self._pace.words(" at the pace of the warm-up so far" if tuning else "")
             print(f"sampling {done:,} of {self._total:,} steps, {what.draws:,} of {what.samples:,} draws a chain, "
-                  f"{_divergences(what, ', ')}{what.words}{self._left(now, done)}", file=sys.stderr, flush=True)
+                  f"{_divergences(what, ', ')}{what.words}{left}", file=sys.stderr, flush=True)
         self._done = done
-        if self._first is None:  # the steps before it came with the compilation
-            self._first = now, done
-        elif self._shown and self._if_slow and done < self._warmup and now - self._first[0] > SURE_S:
-            self._warn(now, done)
+        if self._began is None:  # the steps before it came with the compilation
+            self._began = now
+        elif self._shown and self._if_slow and tuning and now - self._began > SURE_S:
+            self._advise()
 
-    def _left(self, now: float, done: int) -> str:
-        return _left(self._first, (now, done), self._total)
-
-    def _warn(self, now: float, done: int) -> None:
-        left = _seconds_left(self._first, (now, done), self._total)
+    def _advise(self) -> None:
+        left = self._pace.left()
         if left is None or left < LONG_S:
             return
         text, self._if_slow = f"note     {self._if_slow}", ""
@@ -98,16 +104,33 @@ class Progress:
             self._bar.write(text, file=sys.stderr)
 
 
-def _seconds_left(first: tuple[float, int] | None, now: tuple[float, int], total: int) -> float | None:
-    """Return how long it will take from ``now``, where and when the ``first`` step after the compilation began."""
-    if first is None or now[1] <= first[1]:
-        return None
-    return (now[0] - first[0]) / (now[1] - first[1]) * (total - now[1])
+class _Remaining:
+    """How long is left, at the pace of the last `RECENT_S`.
 
+    Args:
+        total: how many there are to do.
+    """
 
-def _left(first: tuple[float, int] | None, now: tuple[float, int], total: int) -> str:
-    left = _seconds_left(first, now, total)
-    return "" if left is None else f"; about {duration(left)} left"
+    def __init__(self, total: int) -> None:
+        self._total, self._seen = total, deque[tuple[float, int]]()
+
+    def add(self, now: float, done: int) -> None:
+        """Take note that so many are done; what came before the first note is not counted, but for what is left."""
+        self._seen.append((now, done))
+        while len(self._seen) > 2 and self._seen[1][0] <= now - RECENT_S:
+            self._seen.popleft()
+
+    def left(self) -> float | None:
+        """Return the seconds that are left; None where there is no pace yet."""
+        if len(self._seen) < 2 or self._seen[-1][1] <= self._seen[0][1]:
+            return None
+        (began, before), (now, done) = self._seen[0], self._seen[-1]
+        return (now - began) / (done - before) * (self._total - done)
+
+    def words(self, how: str = "") -> str:
+        """Return the time left as the end of a line; nothing where it is not known."""
+        left = self.left()
+        return "" if left is None else f"; about {duration(left)} left{how}"
 
 
 class Counter:
@@ -122,23 +145,23 @@ class Counter:
     def __init__(self, label: str = "", shown: bool = True, at_once: bool = False) -> None:
         self._label, self._shown = label, shown
         self._clock = Clock(at_once)
-        self._first: tuple[float, int] | None = None
+        self._pace: _Remaining | None = None
         self._compiling: Waiting | None = None
 
     def of(self, label: str) -> Counter:
         """Return the counter, for something else."""
-        self._label, self._first = label, None
+        self._label, self._pace = label, None
         return self
 
     def __call__(self, done: int, count: int) -> None:
         """Show that ``done`` of ``count`` are done."""
         if not self._shown:
             return
-        now = time.perf_counter(), done
-        text = f"{self._label}: {done:,} of {count:,} draws{_left(self._first, now, count)}"
+        if done:  # the first batch comes with the compilation, and begins the count
+            self._pace = self._pace or _Remaining(count)
+            self._pace.add(time.perf_counter(), done)
+        text = f"{self._label}: {done:,} of {count:,} draws{self._pace.words() if self._pace else ''}"
         self._wait(f"{self._label}: compiling, and the first of {count:,} draws" if not done else "")
-        if done and self._first is None:  # the first batch came with the compilation
-            self._first = now
         if on_terminal():
             print(f"\r{text:<70}\r", end="", file=sys.stderr, flush=True)
         elif self._clock.due():
