@@ -53,7 +53,7 @@ class Data:
         outputs: the names of the D outputs.
         units: name -> unit, for ``time``, outputs, states, forces and known inputs; incomplete is fine.
         truth: for simulated data, a mapping with any of ``times`` (K,), ``forces`` (name -> (K,)),
-            ``state`` (K, M) and ``parameters`` (name -> array).
+            ``deterministics`` (name -> (K,)), ``state`` (K, M) and ``parameters`` (name -> array).
         note: what was done to the numbers, to be printed with the results.
         inputs: known inputs: name -> (times, values) or (times, values, "linear"), or an `lfm.Input`; kept as
             `InputTable`. `known_inputs` gives them as functions of time.
@@ -301,16 +301,63 @@ def write_truth(data: Data, path: str | Path) -> None:
 
 
 def read_truth(path: str | Path) -> dict[str, Any]:
-    """Read what :func:`write_truth` wrote: the truth in the form of :attr:`Data.truth`."""
+    """Read the truth in the form of :attr:`Data.truth`, as :func:`write_truth` writes it.
+
+    Raises:
+        ValueError: the file is not JSON, or holds something else, see :func:`check_truth`.
+    """
     try:
         raw = json.loads(Path(path).read_text(encoding="utf-8"))
         if not isinstance(raw, dict):
             raise ValueError(f"it holds a {type(raw).__name__}, not a mapping of names to values")
-        return {key: {k: np.array(v) for k, v in value.items()} if isinstance(value, dict) else np.array(value)
-                for key, value in raw.items()}
-    except ValueError as error:  # of JSON, of UTF-8, or of rows of different lengths
+    except ValueError as error:  # of JSON or of UTF-8
         reason = str(error).rstrip(".")
-        raise ValueError(f"{path} is not a truth file written by `lfm-ppl simulate`: {reason}.") from None
+        raise ValueError(f"{path} is not a truth file, JSON such as `lfm-ppl simulate` writes: {reason}.") from None
+    try:
+        check_truth(raw)
+    except ValueError as error:
+        raise ValueError(f"{path} is not a truth file: {error}") from None
+    return {key: {k: np.array(v) for k, v in value.items()} if isinstance(value, dict) else np.array(value)
+            for key, value in raw.items() if value is not None}
+
+
+_TRUE_PATHS = ("forces", "deterministics")
+TRUTH = ("times", *_TRUE_PATHS, "state", "parameters")
+"""What may be known of the truth."""
+
+
+def check_truth(truth: Mapping[str, Any]) -> None:
+    """Raise ValueError where a truth, in the form of :attr:`Data.truth`, does not fit together.
+
+    Its names are those of a model, which is not asked here.
+    """
+    for name in truth:
+        checks.one_of("entry", name, TRUTH)
+    for kind in (*_TRUE_PATHS, "parameters"):
+        if not isinstance(truth.get(kind) or {}, Mapping):
+            raise ValueError(f'"{kind}" must be a mapping of names to values, got a {type(truth[kind]).__name__}.')
+    paths = {f'"{name}" of "{kind}"': value for kind in _TRUE_PATHS for name, value in (truth.get(kind) or {}).items()}
+    paths |= {'"state"': truth["state"]} if truth.get("state") is not None else {}
+    if truth.get("times") is None:
+        if paths:
+            raise ValueError(f'{next(iter(paths))} needs "times", at which it was.')
+        times = 0
+    else:
+        times = len(checks.time_vector('"times"', _numbers('"times"', truth["times"])))
+    for name, value in paths.items():
+        size = _numbers(name, value).shape
+        if size[:1] != (times,) or len(size) > 1 + (name == '"state"'):
+            what = "rows" if name == '"state"' else "values"
+            raise ValueError(f'{name} must hold {times} {what}, one for each of "times", got shape {size}.')
+    for name, value in (truth.get("parameters") or {}).items():
+        _numbers(f'"{name}" of "parameters"', value)
+
+
+def _numbers(name: str, value: Any) -> np.ndarray:
+    try:
+        return np.asarray(value, float)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be numbers, in rows of one length.") from None
 
 
 def _read(source: Table, outputs: Sequence[str] | None, time_column: str | None,

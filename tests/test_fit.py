@@ -13,6 +13,7 @@ from scipy.interpolate import CubicSpline
 
 import lfm_ppl as lfm
 from lfm_ppl.results import arviz_data
+from lfm_ppl.results.layout import Labels, unplaced
 from lfm_ppl.results.plots.saving import pages_of
 from tests.inference import linear_motif as motif
 
@@ -46,6 +47,7 @@ def nuts(y):
 def known(y):
     """Independent draws for parameters that are all but known."""
     return quiet_fit(motif.model, TIMES, y, sampler="map", samples=2000, trajectory_draws=2000, at=FORECAST, seed=3,
+                     truth={"times": TIMES, "deterministics": {"rate": np.cos(TIMES)}},
                      model_kwargs={"spread": NEAR})
 
 
@@ -107,6 +109,24 @@ def test_coordinates_carry_names_times_and_units(nuts, y):
     truth = group(nuts, "truth")["outputs"]  # the states themselves
     np.testing.assert_array_equal(truth, np.ones((len(TIMES), 2)))
     assert truth.attrs["units"] == "nM" and truth["output"].values.tolist() == ["a", "b"]
+
+
+def test_a_truth_may_be_that_of_a_deterministic_alone(known):
+    truth = group(known, "truth")
+    assert set(truth.data_vars) == {"deterministics"}
+    np.testing.assert_array_equal(truth["deterministics"].sel(deterministic="rate"), np.cos(TIMES))
+
+
+def test_what_a_truth_says_of_something_else_is_told(y):
+    bound = lfm.bind(motif.model, TIMES, y)
+    truth = {"times": TIMES, "forces": {"drvie": TIMES}, "state": np.ones((len(TIMES), 3)),
+             "parameters": {**motif.THETA, "dacay": 1.0}, "deterministics": {"rate": TIMES}}
+    told = unplaced(bound, truth, Labels.of(bound))
+    assert [message.split(".")[0] for message in told] == [
+        "unknown force in the truth 'drvie'", "unknown parameter in the truth 'dacay'",
+        "the truth has 3 states, the model 2: x0, x1"]
+    assert all(message.endswith("It is left out of the figures.") for message in told)
+    assert unplaced(bound, {"parameters": motif.THETA}, Labels.of(bound)) == []
 
 
 def test_attributes_say_how_it_was_made(nuts):

@@ -175,7 +175,10 @@ def lay_out(bound: BoundModel, draws: dict, stats: dict, rated: dict | None, pat
         groups["truth"] = _truth(truth, named, units, groups["posterior"])
         for kind, values in _true_functions(bound, truth, draws).items():
             new = {f"{kind}s": variable(("at_truth", kind), values, named[kind])}
-            groups["truth"] = groups["truth"].assign(new).assign_coords({kind: named[kind]})
+            told = groups["truth"]
+            if f"{kind}s" in told:  # some of them, by the user
+                told = told.drop_dims(kind)
+            groups["truth"] = told.assign(new).assign_coords({kind: named[kind]})
     return groups
 
 
@@ -290,19 +293,39 @@ def _held_elsewhere(draws: np.ndarray, truth: Any) -> bool:
         return True
 
 
+def _true_states(truth: Mapping[str, Any]) -> np.ndarray:
+    state = truth.get("state")
+    return np.zeros(0) if state is None else np.asarray(state, float)
+
+
+def unplaced(bound: BoundModel, truth: Mapping[str, Any], labels: Labels) -> list[str]:
+    """Return what a truth says of something that the model does not have, a message each."""
+    model = bound.site.example.ssm.model
+    known = {"force": model.force_names, "deterministic": model.deterministic_names,
+             "parameter": (*bound.sites, *sorted(labels.derived))}
+    found = [checks.unknown(f"{kind} in the truth", name, names) for kind, names in known.items()
+             for name in truth.get(f"{kind}s") or {} if name not in names]
+    columns = _true_states(truth).shape[1:]
+    if columns and columns != (len(model.state_names),):
+        found.append(f"the truth has {columns[0]} states, the model {len(model.state_names)}: "
+                     f"{', '.join(model.state_names) or 'none'}.")
+    return [f"{message} It is left out of the figures." for message in found]
+
+
 def _truth(truth: Mapping[str, Any], named: dict, units: Mapping[str, str],
            posterior: xr.Dataset) -> xr.Dataset:
     variables: dict[str, Any] = {}
     coords: dict[str, Any] = {}
     if truth.get("times") is not None:
         coords["at_truth"] = ("at_truth", np.asarray(truth["times"], float), units_attribute(["time"], units))
-    forces = truth.get("forces") or {}
-    known = [label for label in named["force"] if label in forces]
-    if known:
-        coords["force"] = known
-        variables["forces"] = (("at_truth", "force"), np.stack([np.asarray(forces[n]) for n in known], axis=1),
-                               units_attribute(known, units))
-    if truth.get("state") is not None and np.ndim(truth["state"]) == 2:
+    for kind in ("force", "deterministic"):
+        paths = truth.get(f"{kind}s") or {}
+        known = [label for label in named[kind] if label in paths]
+        if known:
+            coords[kind] = known
+            variables[f"{kind}s"] = (("at_truth", kind), np.stack([np.asarray(paths[n]) for n in known], axis=1),
+                                     units_attribute(known, units))
+    if _true_states(truth).shape[1:] == (len(named["state"]),):
         coords["state"] = named["state"]
         variables["states"] = (("at_truth", "state"), np.asarray(truth["state"]),
                                units_attribute(named["state"], units))
