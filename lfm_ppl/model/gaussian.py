@@ -41,4 +41,4 @@ class Gaussian(eqx.Module):
         size = self.mean.shape[0]
         if self.covariance.shape != (size, size):
             raise ValueError(f"initial_state.covariance must have shape ({size}, {size}) or ({size},) to go with a "
-                             f"mean of {size} entries, got {covariance.shape}.")
+                             f"mean of that length, got {covariance.shape}.")

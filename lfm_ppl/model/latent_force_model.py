@@ -262,7 +262,8 @@ class LatentForceModel(eqx.Module):
             if value is not None and not np.all(np.isfinite(value)):
                 name = names[int(np.argmin(np.isfinite(value)))]
                 raise ValueError(f"the {label} returned {value} {where}: the entry for {name!r} is not finite. "
-                                 "Change initial_state.mean, or guard the expression (for example jnp.maximum).")
+                                 "Change initial_state.mean, or guard the expression (for example jnp.maximum)."
+                                 + self._traced()[label.split()[0]].not_finite(*map(np.asarray, (x, u, t))))
             if label.split()[0] in self._with_roots:
                 self._check_derivative(label, function, names, (x, u, t), where)
             if value is not None and function is self.observation.function and isinstance(self.observation,

@@ -10,10 +10,13 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
+import equinox
 import jax
 import numpy as np
+import numpyro
 from jax.extend.core import Literal
 
 _LARGEST = 4096
@@ -74,7 +77,9 @@ class Traced(NamedTuple):
             ValueError: one is out of range; the message has the array and the range.
         """
         scope = _Scope.of(self.closed, [None] * len(self.closed.jaxpr.invars))
+        written = None
         for inner, equation in scope.equations():
+            written = equation if inner is scope else written  # those of a function that it calls follow it
             index = _INDEX_OF.get(equation.primitive.name)
             wrong = None if index is None else index(inner, equation)
             if wrong is None:
@@ -89,7 +94,16 @@ class Traced(NamedTuple):
             has = f"{name or 'that axis'} has {size} {'entry' if size == 1 else 'entries'}"
             valid = f"; use an index from 0 to {size - 1}, or from -{size} to -1 to count from the end" if size else ""
             raise ValueError(f"{self.what} {_VERBS[equation.primitive.name.startswith('scatter')]} {read}, but {has}"
-                             f"{valid}. JAX does not raise here, and would compute something else.")
+                             f"{valid}. JAX does not raise here, and would compute something else.{_place(written)}")
+
+    def not_finite(self, *arguments: np.ndarray) -> str:
+        """Return a sentence about where a value first is not finite, given the arguments; empty where none is known."""
+        scope = _Scope.of(self.closed, arguments)
+        for equation in scope.jaxpr.eqns:
+            values = [scope.known(variable) for variable in equation.outvars]
+            if any(value is not None and not np.all(np.isfinite(value)) for value in values):
+                return _place(equation)
+        return ""
 
     def table_reads(self, mark: str, t: Any) -> Iterator[tuple[str, Any, np.ndarray]]:
         """Yield (name, table times, times at which it is read) for functions jitted under a name with ``mark``.
@@ -155,6 +169,19 @@ def trace(what: str, form: str, function: Callable, *arguments: Any) -> Traced:
                             f"number. JAX says: {said}") from error
         raise
     return Traced(what, shape, closed)
+
+
+_LIBRARIES = tuple(str(Path(module.__file__ or "").parent) for module in (jax, equinox, numpyro)) + (
+    str(Path(__file__).parents[1]),)
+
+
+def _place(equation: Any) -> str:
+    """Return a sentence about the line of a user's file that an equation comes from; empty where there is none."""
+    for frame in getattr(getattr(equation.source_info, "traceback", None), "frames", ()):
+        if not frame.file_name.startswith(_LIBRARIES):
+            # Not so the cells of a notebook, and what is typed.
+            return f" It stands in {frame.file_name}, line {frame.line_num}." if Path(frame.file_name).is_file() else ""
+    return ""
 
 
 class _Scope:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 
 import jax
@@ -89,6 +90,18 @@ def test_every_function_of_a_model_is_looked_at():
             ({"process_noise": lambda x, u, t: x[4] * jnp.ones((2, 1))}, r"process_noise reads x\[4\]")):
         with pytest.raises(ValueError, match=message):
             make(**options)
+
+
+def test_the_line_is_named():
+    def dynamics(x, u, t):
+        growth = jax.nn.softplus(x[0])
+        return growth * jnp.log(x) - jax.nn.relu(u[1])
+
+    line = inspect.getsourcelines(dynamics)[1] + 2
+    with pytest.raises(ValueError, match=rf"reads u\[1\].* It stands in .*test_user_functions.py, line {line}\."):
+        make(dynamics)
+    with pytest.raises(ValueError, match=rf"is not finite.* It stands in .*test_user_functions.py, line {line}\."):
+        make(lambda x, u, t: dynamics(x - 1.0, jnp.ones(2), t))
 
 
 def test_parameters_may_be_traced():
