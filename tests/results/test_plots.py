@@ -114,6 +114,18 @@ def test_forces_go_on_with_their_forecast(datasets):
     np.testing.assert_allclose(bars.get_segments()[0][:, 0], 30.0)
 
 
+def test_an_input_is_drawn_as_it_is_held_to_the_end_of_a_forecast(result, readable):
+    table = InputTable(np.array([0.0, 6.0]), np.array([0.0, 2.0]), "linear")
+    known = arviz_data.add_group(result, "constant_data", to_dataset({"heater": table}))
+    predictions = xr.Dataset({"y": ("time", np.zeros(2))}, {"time": [8.0, 9.0]}, {"last_observation": 7.0})
+    figure = plot_inputs(arviz_data.add_group(known, "predictions", predictions))
+    readable(figure)
+    read, held, end = figure.axes[0].lines
+    np.testing.assert_array_equal(held.get_xydata(), [[6.0, 2.0], [9.0, 2.0]])
+    assert held.is_dashed() and set(end.get_xdata()) == {7.0}
+    assert legend_texts(figure) == ["known input", "held beyond its table", "last observation"]
+
+
 def test_known_inputs_are_drawn_as_they_are_read(result, readable):
     tables = {"heater": InputTable(np.array([0.0, 6.0, 22.0]), np.array([0.0, 1.0, 0.0]), "previous"),
               "outside": InputTable(np.array([0.0, 24.0]), np.array([3.0, 5.0]), "linear")}
@@ -129,6 +141,7 @@ def test_known_inputs_are_drawn_as_they_are_read(result, readable):
     ahead = arviz_data.add_group(known, "predictions_constant_data", to_dataset(longer))
     (axes,) = plot_inputs(ahead, "heater").axes
     np.testing.assert_array_equal(axes.lines[0].get_xdata(), [0.0, 30.0])
+    assert legend_texts(axes.figure) == ["known input"]
     with pytest.raises(ValueError, match="unknown input 'heatre'. Did you mean 'heater'"):
         plot_inputs(known, "heatre")
 

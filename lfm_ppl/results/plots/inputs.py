@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from lfm_ppl.checks import unknown
 from lfm_ppl.results.inputs import FORECAST, input_unit, inputs_of, time_origin, time_unit
 from lfm_ppl.results.plots import style
-from lfm_ppl.results.plots.trajectories import MAX_PANELS
+from lfm_ppl.results.plots.trajectories import END, MAX_PANELS, forecast_span
 
 _MANY = 150  # values, from which they have no marks
 
@@ -19,6 +20,8 @@ _MANY = 150  # values, from which they have no marks
 @style.styled
 def plot_inputs(result: Any, inputs: Sequence[str] | None = None, *, width: str | float = "column") -> Figure:
     """Draw the known inputs of a model as it reads them, steps or straight lines, as far as its forecast.
+
+    Beyond its last value an input is held, which a dashed line shows.
 
     Args:
         result: of a model with known inputs in a data file or `lfm_ppl.Data`.
@@ -51,15 +54,26 @@ def plot_inputs(result: Any, inputs: Sequence[str] | None = None, *, width: str 
     names, note = style.first_of(wanted, inputs, MAX_PANELS, "inputs")
     figure, panels = style.small_multiples(width, len(names), 1.25)
     line: dict[str, Any] = {"color": style.PURPLE, "mew": 0}
+    held: dict[str, Any] = {"color": style.PURPLE, "ls": "--"}
+    last, end = forecast_span(result)
+    drawn_on = False
     for axes, name in zip(panels, names, strict=True):
         table = known[name]
         drawn = "steps-post" if table.interpolation == "previous" else "default"
         axes.plot(table.times, table.values, drawstyle=drawn, marker="o" if len(table.times) <= _MANY else "", ms=2.2,
                   **line)
+        if table.times[-1] < end:
+            axes.plot([table.times[-1], end], np.repeat(table.values[-1], 2), **held)
+            drawn_on = True
+        if last < end:
+            axes.axvline(last, **END)
         style.label_values(axes, name, input_unit(result, name))
     style.label_time(panels, time_unit(result), time_origin(result))
     figure.align_ylabels(panels)
-    style.legend_above(figure, [Line2D([], [], label="known input", **line)])
+    handles = [Line2D([], [], label="known input", **line)]
+    handles += [Line2D([], [], label="held beyond its table", **held)] if drawn_on else []
+    handles += [Line2D([], [], label="last observation", **END)] if last < end else []
+    style.legend_above(figure, handles)
     if note:
         style.note_below(figure, note)
     return figure

@@ -23,7 +23,7 @@ from lfm_ppl.results.scalars import unit_of
 MAX_PANELS = 12
 _MANY = 150  # measurements
 _BARS = 12  # forecasts from which they are drawn as bands
-_END: dict[str, Any] = {"color": style.GREY, "lw": 0.8, "ls": (0, (1, 2)), "zorder": 2.5}
+END: dict[str, Any] = {"color": style.GREY, "lw": 0.8, "ls": (0, (1, 2)), "zorder": 2.5}
 _TRUTH: dict[str, Any] = {"color": style.BLACK, "lw": 0.9, "ls": (0, (4, 2)), "zorder": 3.5}
 _HELD_OUT: dict[str, Any] = {"color": style.BLACK, "ls": "", "marker": "o", "ms": 2.6, "mfc": "white", "mew": 0.6,
                              "zorder": 4}
@@ -104,7 +104,7 @@ def plot_fit(
                                (time[-1], mean[-1], *wide, low[-1], high[-1]))
         if predicted is not None:
             if forecast := _ends_before(predicted):
-                axes.axvline(predicted.attrs["last_observation"], **_END)
+                axes.axvline(predicted.attrs["last_observation"], **END)
         known |= _draw_truth(axes, truth, "output", name)
         _draw_data(axes, data)
         if later is not None:
@@ -121,7 +121,7 @@ def plot_fit(
     if known:
         handles += [Line2D([], [], label="truth", **_TRUTH)]
     if forecast:
-        handles += [Line2D([], [], label="last observation", **_END)]
+        handles += [Line2D([], [], label="last observation", **END)]
     if np.isnan(observed.sel(output=names)).any():
         handles += [Line2D([], [], label="missing", **_missing_style(observed.sizes["time"]))]
     style.legend_above(figure, handles)
@@ -263,7 +263,7 @@ def _panels(
                 flat = paths.values.reshape(-1, paths.sizes["time"])
                 curves = (paths["time"].values, flat.mean(axis=0), *np.quantile(flat, INTERVAL, axis=0))
                 _draw_ahead(axes, curves, line, (tint,), (time[-1], mean[-1], low[-1], high[-1]))
-            axes.axvline(last, **_END)
+            axes.axvline(last, **END)
         known |= _draw_truth(axes, truth, kind, name)
         style.label_values(axes, name, unit_of(draws, name))
     style.label_time(panels, time_unit(result), time_origin(result))
@@ -272,7 +272,7 @@ def _panels(
     if known:
         handles += [Line2D([], [], label="truth", **_TRUTH)]
     if later:
-        handles += [Line2D([], [], label="last observation", **_END)]
+        handles += [Line2D([], [], label="last observation", **END)]
     style.legend_above(figure, handles)
     if note:
         style.note_below(figure, note)
@@ -315,6 +315,15 @@ def _predicted(result: Any) -> xr.Dataset | None:
         return None
     dataset = group(result, GROUP)
     return None if "series" in dataset.dims else dataset.drop_duplicates("time")
+
+
+def forecast_span(result: Any) -> tuple[float, float]:
+    """Return the times of the last observation and of the last prediction; minus infinity without predictions."""
+    predicted = _predicted(result)
+    if predicted is None or predicted.sizes["time"] == 0:
+        return -np.inf, -np.inf
+    end = float(predicted["time"].values.max())
+    return float(predicted.attrs.get("last_observation", end)), end
 
 
 def _ends_before(predicted: xr.Dataset) -> bool:
