@@ -76,6 +76,6 @@ def test_a_model_that_does_not_run_is_described_by_its_file(tmp_path, capsys):
     path = tmp_path / "broken.py"
     path.write_text('"""Broken."""\nPARAMETERS = {"rate": "how fast (1/h)"}\nOUTPUTS = ("x",)\n'
                     "def model(times, y=None):\n    raise ValueError('not yet written')\n")
-    code, out, _ = run(f"models {path}", capsys)
-    assert code == 0
-    assert "how fast (1/h)" in out and "could not be run: ValueError: not yet written" in out
+    code, out, err = run(f"models {path}", capsys)
+    assert code == 2 and "how fast (1/h)" in out and "could not be run" in out
+    assert err == f"lfm-ppl: error: {path}, line 5: not yet written\n"

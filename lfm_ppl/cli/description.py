@@ -31,7 +31,7 @@ class Description(NamedTuple):
         states: name -> unit.
         deterministics: name -> unit.
         approximation: the likelihood's settings.
-        unitless: names in the file's UNITS that are those of nothing, at the options' defaults.
+        strange: table of the file (UNITS, PARAMETERS) -> its names that are those of nothing, at the options' defaults.
     """
 
     parameters: list[Parameter]
@@ -40,7 +40,7 @@ class Description(NamedTuple):
     states: dict[str, str]
     deterministics: dict[str, str]
     approximation: str
-    unitless: list[str]
+    strange: dict[str, list[str]]
 
 
 def describe(model: loading.ModelFile) -> Description:
@@ -78,7 +78,8 @@ def describe(model: loading.ModelFile) -> Description:
                               for name, force in system.forces.items()},
         {name: _bracketed(units.get(name)) for name in system.state_names},
         {name: _bracketed(units.get(name)) for name in system.deterministic_names}, approximation,
-        [name for name in model.units if name not in named])
+        {"UNITS": [name for name in model.units if name not in named],
+         "PARAMETERS": [name for name in model.parameters if name not in bound.trace()]})
 
 
 def _made_up(model: loading.ModelFile) -> Data:

@@ -39,17 +39,19 @@ def _describe(model: loading.ModelFile) -> None:
     print()
     try:
         found = description.describe(model)
-    except Exception as error:  # a model that does not run can still be described by what its file says
+    except Exception:  # a model that does not run can still be described by what its file says
         _table("parameters (fix one with --set NAME=VALUE)", list(model.parameters.items()))
-        print(f"The model itself could not be run: {type(error).__name__}: {' '.join(str(error).split())}\n")
+        print("The model itself could not be run.")
+        raise
     else:
         _print_parameters(found)
         more = (("of states and forces (deterministics)", found.deterministics),) if found.deterministics else ()
         for title, entries in (("forces", found.forces), ("states", found.states), *more):
             _table(title, [(name, text) for name, text in entries.items()])
         print(f"likelihood: {found.approximation}\n")
-        if found.unitless and not model.options:  # which may change what there is
-            print(f"UNITS has {', '.join(found.unitless)}, of which the model has nothing; correct the name.\n")
+        for table, names in found.strange.items():
+            if names and not model.options:  # which may change what there is
+                print(f"{table} has {', '.join(names)}, of which the model has nothing; correct the name.\n")
     rows = [(name, _option(*entry)) for name, entry in model.options.items()]
     _table("options (choose with --option NAME=VALUE)", rows)
 
