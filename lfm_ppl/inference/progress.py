@@ -146,26 +146,40 @@ class Counter:
         self._label, self._shown = label, shown
         self._clock = Clock(at_once)
         self._pace: _Remaining | None = None
+        self._whole: _Remaining | None = None
         self._compiling: Waiting | None = None
 
     def of(self, label: str) -> Counter:
         """Return the counter, for something else."""
-        self._label, self._pace = label, None
+        self._label, self._pace, self._whole = label, None, None
         return self
 
     def __call__(self, done: int, count: int) -> None:
         """Show that ``done`` of ``count`` are done."""
         if not self._shown:
             return
-        if done:  # the first batch comes with the compilation, and begins the count
-            self._pace = self._pace or _Remaining(count)
-            self._pace.add(time.perf_counter(), done)
-        text = f"{self._label}: {done:,} of {count:,} draws{self._pace.words() if self._pace else ''}"
+        text = f"{self._label}: {done:,} of {count:,} draws{self._left(done, count)}"
         self._wait(f"{self._label}: compiling, and the first of {count:,} draws" if not done else "")
         if on_terminal():
             print(f"\r{text:<70}\r", end="", file=sys.stderr, flush=True)
         elif self._clock.due():
             print(text, file=sys.stderr, flush=True)
+
+    def _left(self, done: int, count: int) -> str:
+        now = time.perf_counter()
+        if not done:
+            self._whole = _Remaining(count)
+            self._whole.add(now, done)
+            return ""
+        if self._pace is None:  # the first batch comes with the compilation, and begins the count
+            self._pace = _Remaining(count)
+            self._pace.add(now, done)
+            if self._whole is None:
+                return ""
+            self._whole.add(now, done)
+            return self._whole.words(" at most")
+        self._pace.add(now, done)
+        return self._pace.words()
 
     def _wait(self, text: str) -> None:
         """Say every now and then that this goes on; nothing: stop saying it."""
