@@ -134,9 +134,18 @@ def unknown(kind: str, value: str, choices: Iterable[str], likeness: float = _LI
             is needed where names are abbreviations, which share letters by chance ("mcmc" and "pmmh").
     """
     choices = list(choices)
+    return f"unknown {kind} {value!r}.{nearest(value, choices, likeness)} Known: {', '.join(choices) or 'none'}."
+
+
+def nearest(value: str, choices: Sequence[str], likeness: float = _LIKENESS) -> str:
+    """Return " Did you mean ...?" of the choices that are most like a value; empty where none is, see `unknown`."""
     near = difflib.get_close_matches(str(value), choices, n=3, cutoff=likeness)
-    hint = f" Did you mean {' or '.join(repr(n) for n in near)}?" if near else ""
-    return f"unknown {kind} {value!r}.{hint} Known: {', '.join(choices) or 'none'}."
+    return f" Did you mean {' or '.join(repr(n) for n in near)}?" if near else ""
+
+
+def counted(number: int, noun: str) -> str:
+    """Return a number with its noun: "1 column", "2 columns"."""
+    return f"{number} {noun}{'s' * (number != 1)}"
 
 
 def covariance_matrix(name: str, value: Any) -> None:

@@ -9,7 +9,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 
-from lfm_ppl import loading
+from lfm_ppl import checks, loading
 from lfm_ppl.cli.arguments import parsed
 from lfm_ppl.cli.interruption import INTERRUPTED, watched
 from lfm_ppl.engine.errors import EngineError
@@ -73,7 +73,7 @@ def _one_line(error: Exception) -> str:
     return f"{type(error).__name__}: {text} (--debug shows where)"
 
 
-_UNEXPECTED = re.compile(r"(\w+)\.__init__\(\) got an unexpected keyword argument")
+_UNEXPECTED = re.compile(r"(\w+)\.__init__\(\) got an unexpected keyword argument '(\w+)'")
 _INVALID = re.compile(r"distribution got invalid (\w+) parameter")
 
 
@@ -83,7 +83,10 @@ def _remedy(error: Exception) -> str:
         import lfm_ppl
 
         known = getattr(lfm_ppl, called[1], None)
-        return "" if known is None else f". It takes {', '.join(inspect.signature(known).parameters)}."
+        if known is None:
+            return ""
+        names = list(inspect.signature(known).parameters)
+        return f".{checks.nearest(called[2], names)} It takes {', '.join(names)}."
     if isinstance(error, ValueError) and (wrong := _INVALID.search(str(error))) is not None:
         place = loading.place_in_model(error)
         line = "" if place is None else linecache.getline(str(place.file), place.line).strip()

@@ -83,8 +83,8 @@ def inputs(given: str | None, model: ModelFile) -> dict[str, tuple[str, str]]:
     names = list(model.inputs) or [column for column, _ in columns]
     if len(names) != len(columns) or len(set(columns)) < len(columns):
         known = ", ".join(names)
-        raise ValueError(f"{model.name} takes {len(names)} known inputs ({known}); --inputs names {len(columns)} "
-                         "columns, which must be as many, each of them once.")
+        raise ValueError(f"{model.name} takes {checks.counted(len(names), 'known input')} ({known}); --inputs names "
+                         f"{checks.counted(len(columns), 'column')}, which must be as many, each of them once.")
     return {name: (column, way or model.inputs.get(name, "previous"))
             for name, (column, way) in zip(names, columns, strict=True)}
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from lfm_ppl import calendar_time, data, loading
+from lfm_ppl import calendar_time, checks, data, loading
 from lfm_ppl.cli import choices, fit_many, forecast, page, results, session
 from lfm_ppl.cli.interruption import INTERRUPTED, watched
 from lfm_ppl.progress import duration
@@ -60,7 +60,7 @@ def run(arguments: argparse.Namespace) -> int:
         go_on = f"go on with: {_again(arguments, folder)}"
         with watched(lambda: go_on if checkpoint.is_kept(folder) else _nothing_left(folder)) as watch:
             try:
-                posterior = _sample(arguments, model, numpyro_model, observed, options, fixed, folder, at)
+                posterior = sample(arguments, model, numpyro_model, observed, options, fixed, folder, at)
             except KeyboardInterrupt as error:
                 said = str(error) or "stopped before there were draws"
                 print(f"\nlfm-ppl: {said}" + (f"; {go_on}" if checkpoint.is_kept(folder) else ""), file=sys.stderr)
@@ -131,8 +131,8 @@ def columns(arguments: argparse.Namespace, model: loading.ModelFile) -> tuple[st
         columns = tuple(name.strip() for name in arguments.outputs.split(","))
         if model.outputs is not None and len(columns) != len(model.outputs):
             raise ValueError(
-                f"{model.name} has {len(model.outputs)} outputs ({', '.join(model.outputs)}); "
-                f"--outputs names {len(columns)} columns."
+                f"{model.name} has {checks.counted(len(model.outputs), 'output')} ({', '.join(model.outputs)}); "
+                f"--outputs names {checks.counted(len(columns), 'column')}."
             )
     return columns
 
@@ -229,7 +229,7 @@ def _check_fixed(numpyro_model: Any, observed: data.Data, keywords: dict[str, An
         bind(numpyro_model, observed.times, observed.y, **keywords).fix(fixed)
 
 
-def _sample(
+def sample(
     arguments: argparse.Namespace,
     model: loading.ModelFile,
     numpyro_model: Any,

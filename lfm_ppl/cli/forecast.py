@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from lfm_ppl import calendar_time, data
+from lfm_ppl import calendar_time, checks, data
 from lfm_ppl.cli import check, choices, page, results, session
 
 TABLE = "forecast.csv"
@@ -124,8 +124,8 @@ def _held_out(arguments: argparse.Namespace, task: check.Check) -> data.Data:
     if arguments.outputs is not None:
         columns = tuple(name.strip() for name in arguments.outputs.split(","))
         if len(columns) != len(outputs):
-            raise ValueError(f"the result has {len(outputs)} outputs ({', '.join(outputs)}); --outputs names "
-                             f"{len(columns)} columns.")
+            raise ValueError(f"the result has {checks.counted(len(outputs), 'output')} ({', '.join(outputs)}); "
+                             f"--outputs names {checks.counted(len(columns), 'column')}.")
     known = {name: one.interpolation for name, one in task.observed.inputs.items()}
     if arguments.inputs is not None and not known:
         raise ValueError("--inputs names columns of known inputs, and the result has no known inputs; leave it out.")
