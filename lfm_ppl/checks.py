@@ -19,7 +19,7 @@ from numpyro.util import is_prng_key
 _LIKENESS = 0.4
 
 ABBREVIATIONS = 0.6
-"""The likeness for `unknown` of names that are abbreviations."""
+"""The likeness for `unknown` of names that are abbreviations, or not alike to begin with."""
 
 
 def concrete(value: Any) -> np.ndarray | None:

@@ -407,7 +407,8 @@ def _find_time(source: Table, time_column: str | None) -> str:
     header = list(source.columns)
     if time_column is not None:
         if time_column not in header:
-            raise ValueError(f"{source.label}: {checks.unknown('time column', time_column, header)}")
+            message = checks.unknown("time column", time_column, header, checks.ABBREVIATIONS)
+            raise ValueError(f"{source.label}: {message}")
         return time_column
     for test in (
         lambda name: name.lower() == "time" or name == "t" or _unit_of(name),

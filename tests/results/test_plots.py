@@ -114,6 +114,15 @@ def test_forces_go_on_with_their_forecast(datasets):
     np.testing.assert_allclose(bars.get_segments()[0][:, 0], 30.0)
 
 
+def test_the_truth_is_drawn_as_far_as_the_trajectories(datasets):
+    at, truth = datasets["trajectories"]["at"].values, datasets["truth"]
+    later = truth.assign_coords(at_truth=truth["at_truth"].values + 0.5 * np.ptp(at))
+    for axes in plot_forces(arviz_data.build({**datasets, "truth": later})).axes:
+        (drawn,) = [one for one in axes.lines if one.get_color() == style.BLACK and one.is_dashed()]
+        assert 0 < len(drawn.get_xdata()) < truth.sizes["at_truth"]
+        assert at.min() <= drawn.get_xdata().min() and drawn.get_xdata().max() <= at.max()
+
+
 def test_an_input_is_drawn_as_it_is_held_to_the_end_of_a_forecast(result, readable):
     table = InputTable(np.array([0.0, 6.0]), np.array([0.0, 2.0]), "linear")
     known = arviz_data.add_group(result, "constant_data", to_dataset({"heater": table}))

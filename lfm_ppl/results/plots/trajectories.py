@@ -296,11 +296,13 @@ def _true(result: Any, kind: str) -> xr.DataArray | None:
 
 
 def _draw_truth(axes: Axes, truth: xr.DataArray | None, kind: str, name: str) -> bool:
-    """Draw the true trajectory where it is known, and return whether it is."""
+    """Draw the true trajectory where it is known, as far as the axes are in use, and return whether it is."""
     if truth is None or kind not in truth.dims or name not in truth[kind].values:
         return False
-    axes.plot(truth["at_truth"], truth.sel({kind: name}), **_TRUTH)
-    return True
+    times, (low, high) = truth["at_truth"].values, axes.dataLim.intervalx
+    used = (times >= low) & (times <= high) | (low > high)  # nothing else is drawn yet
+    axes.plot(times[used], truth.sel({kind: name}).values[used], **_TRUTH)
+    return bool(used.any())
 
 
 def _predictive(result: Any) -> xr.DataArray | None:
