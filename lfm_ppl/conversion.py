@@ -23,7 +23,7 @@ from lfm_ppl.fitting import (
 from lfm_ppl.inference.bound_model import BoundModel, bind
 from lfm_ppl.inference.posterior import scores
 from lfm_ppl.results import arviz_data
-from lfm_ppl.results.layout import Labels, lay_out
+from lfm_ppl.results.layout import Labels, checked_truth, lay_out
 
 _STATISTICS = {"diverging": "diverging", "accept_prob": "acceptance_rate", "num_steps": "n_steps", "energy": "energy",
                "adapt_state.step_size": "step_size", "potential_energy": "lp"}
@@ -95,6 +95,7 @@ def to_arviz(mcmc: Any, numpyro_model: Callable, times: Any, y: Any, *, at: Any 
     check_requested(bound, at)
     draws = _checked(bound, draws)
     labels = Labels.of(bound, dims, coords, y)
+    truth = checked_truth(bound, truth, labels)
     chains, samples = next(iter(draws.values())).shape[:2]
     flat = {site: draws[site].reshape(-1, *draws[site].shape[2:]) for site in bound.sites}
     rated = kept("scores of the observations", lambda: scores(bound, flat), None)

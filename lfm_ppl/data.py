@@ -317,8 +317,8 @@ def read_truth(path: str | Path) -> dict[str, Any]:
         check_truth(raw)
     except ValueError as error:
         raise ValueError(f"{path} is not a truth file: {error}") from None
-    return {key: {k: np.array(v) for k, v in value.items()} if isinstance(value, dict) else np.array(value)
-            for key, value in raw.items() if value is not None}
+    return {key: {k: np.array(v, float) for k, v in value.items()} if isinstance(value, dict) else
+            np.array(value, float) for key, value in raw.items() if value is not None}
 
 
 _TRUE_PATHS = ("forces", "deterministics")
@@ -333,23 +333,23 @@ def check_truth(truth: Mapping[str, Any]) -> None:
     """
     for name in truth:
         checks.one_of("entry", name, TRUTH)
+    known = {name: value for name, value in truth.items() if value is not None}
     for kind in (*_TRUE_PATHS, "parameters"):
-        if not isinstance(truth.get(kind) or {}, Mapping):
-            raise ValueError(f'"{kind}" must be a mapping of names to values, got a {type(truth[kind]).__name__}.')
-    paths = {f'"{name}" of "{kind}"': value for kind in _TRUE_PATHS for name, value in (truth.get(kind) or {}).items()}
-    paths |= {'"state"': truth["state"]} if truth.get("state") is not None else {}
-    if truth.get("times") is None:
-        if paths:
-            raise ValueError(f'{next(iter(paths))} needs "times", at which it was.')
-        times = 0
-    else:
-        times = len(checks.time_vector('"times"', _numbers('"times"', truth["times"])))
+        if not isinstance(known.get(kind, {}), Mapping):
+            raise ValueError(f'"{kind}" must be a mapping of names to values, got a {type(known[kind]).__name__}.')
+    paths = {f'"{name}" of "{kind}"': value for kind in _TRUE_PATHS for name, value in known.get(kind, {}).items()}
+    paths |= {'"state"': known["state"]} if "state" in known else {}
+    if paths and "times" not in known:
+        raise ValueError(f'{next(iter(paths))} needs "times", at which it was.')
+    times = _numbers('"times"', known.get("times", []))
+    if times.ndim != 1 or not np.all(np.isfinite(times)):
+        raise ValueError(f'"times" must be finite numbers, one after the other, got shape {times.shape}.')
     for name, value in paths.items():
-        size = _numbers(name, value).shape
-        if size[:1] != (times,) or len(size) > 1 + (name == '"state"'):
-            what = "rows" if name == '"state"' else "values"
-            raise ValueError(f'{name} must hold {times} {what}, one for each of "times", got shape {size}.')
-    for name, value in (truth.get("parameters") or {}).items():
+        size, state = _numbers(name, value).shape, name == '"state"'
+        if size[:1] != times.shape or len(size) != 1 + state:
+            raise ValueError(f'{name} must hold {len(times)} {"rows of states" if state else "values"}, one for each '
+                             f'of "times", got shape {size}.')
+    for name, value in known.get("parameters", {}).items():
         _numbers(f'"{name}" of "parameters"', value)
 
 

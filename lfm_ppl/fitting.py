@@ -21,7 +21,7 @@ from jax.stages import Lowered
 from numpyro.infer import init_to_median, init_to_value
 
 from lfm_ppl import calendar_time, checks
-from lfm_ppl.data import Data, as_data, check_truth, model_keywords
+from lfm_ppl.data import Data, as_data, model_keywords
 from lfm_ppl.filtering.breakdown import FilterWarning, breakdown
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference import sampling
@@ -44,7 +44,7 @@ from lfm_ppl.results import checkpoint as checkpoints
 from lfm_ppl.results.checkpoint import Checkpoint
 from lfm_ppl.results.files import POSTERIOR
 from lfm_ppl.results.inputs import remember
-from lfm_ppl.results.layout import Labels, lay_out, unplaced
+from lfm_ppl.results.layout import Labels, checked_truth, lay_out
 
 _GRID = 200
 """Number of grid points of trajectories where no times are asked for."""
@@ -195,10 +195,7 @@ def fit(
         bound = _bound(numpyro_model, times, values, dict(model_kwargs or {}))
         check_requested(bound, at)
     labels = Labels.of(bound, dims, coords, y)
-    if truth:
-        check_truth(truth)
-        for message in unplaced(bound, truth, labels):
-            checks.warn(message)
+    truth = checked_truth(bound, truth, labels)
     # Traces the model once more, for the record of a run that is kept.
     fingerprint = None if checkpoint is None else bound.fingerprint
     bound = bound.fix(fixed)

@@ -13,7 +13,7 @@ from scipy.interpolate import CubicSpline
 
 import lfm_ppl as lfm
 from lfm_ppl.results import arviz_data
-from lfm_ppl.results.layout import Labels, unplaced
+from lfm_ppl.results.layout import Labels, checked_truth, unplaced
 from lfm_ppl.results.plots.saving import pages_of
 from tests.inference import linear_motif as motif
 
@@ -126,6 +126,10 @@ def test_what_a_truth_says_of_something_else_is_told(y):
         "unknown force in the truth 'drvie'", "unknown parameter in the truth 'dacay'",
         "the truth has 3 states, the model 2: x0, x1"]
     assert all(message.endswith("It is left out of the figures.") for message in told)
+    with pytest.warns(UserWarning, match="unknown entry of the truth 'state_'. Did you mean 'state'"):
+        assert checked_truth(bound, {"state_": 0, "parameters": {}}, Labels.of(bound)) == {"parameters": {}}
+    with pytest.raises(ValueError, match="the truth does not fit together: \"times\" must be"):
+        checked_truth(bound, {"times": 3.0}, Labels.of(bound))
     assert unplaced(bound, {"parameters": motif.THETA}, Labels.of(bound)) == []
 
 

@@ -41,6 +41,7 @@ def _describe(model: loading.ModelFile) -> None:
         found = description.describe(model)
     except Exception:  # a model that does not run can still be described by what its file says
         _table("parameters (fix one with --set NAME=VALUE)", list(model.parameters.items()))
+        _print_options(model)
         print("The model itself could not be run.")
         raise
     else:
@@ -52,6 +53,10 @@ def _describe(model: loading.ModelFile) -> None:
         for table, names in found.strange.items():
             if names and not model.options:  # which may change what there is
                 print(f"{table} has {', '.join(names)}, of which the model has nothing; correct the name.\n")
+    _print_options(model)
+
+
+def _print_options(model: loading.ModelFile) -> None:
     rows = [(name, _option(*entry)) for name, entry in model.options.items()]
     _table("options (choose with --option NAME=VALUE)", rows)
 

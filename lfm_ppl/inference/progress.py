@@ -177,7 +177,7 @@ class Counter:
             if self._whole is None:
                 return ""
             self._whole.add(now, done)
-            return self._whole.words(" at most")
+            return self._whole.words(" at most") if done < count else ""
         self._pace.add(now, done)
         return self._pace.words()
 

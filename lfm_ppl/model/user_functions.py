@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import inspect
 import math
+import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -98,12 +99,22 @@ class Traced(NamedTuple):
 
     def not_finite(self, *arguments: np.ndarray) -> str:
         """Return a sentence about where a value first is not finite, given the arguments; empty where none is known."""
-        scope = _Scope.of(self.closed, arguments)
-        for equation in scope.jaxpr.eqns:
-            values = [scope.known(variable) for variable in equation.outvars]
-            if any(value is not None and not np.all(np.isfinite(value)) for value in values):
-                return _place(equation)
-        return ""
+        scope, found = _Scope.of(self.closed, arguments), ""
+
+        def bad(atom: Any) -> bool:
+            try:
+                value = scope.known(atom)
+                return value is not None and not np.all(np.isfinite(value))
+            except Exception:  # NumPy does not know the value; a hint must not stand in the way of the error
+                return False
+
+        # Back from the value: what a jnp.where discards is on no way that is not finite.
+        reached = [atom for atom in self.closed.jaxpr.outvars if bad(atom)]
+        while reached and reached[0] in scope.producer:
+            equation, _ = scope.producer[reached[0]]
+            found = _place(equation) or found
+            reached = [atom for atom in equation.invars if not isinstance(atom, Literal) and bad(atom)]
+        return found
 
     def table_reads(self, mark: str, t: Any) -> Iterator[tuple[str, Any, np.ndarray]]:
         """Yield (name, table times, times at which it is read) for functions jitted under a name with ``mark``.
@@ -171,8 +182,8 @@ def trace(what: str, form: str, function: Callable, *arguments: Any) -> Traced:
     return Traced(what, shape, closed)
 
 
-_LIBRARIES = tuple(str(Path(module.__file__ or "").parent) for module in (jax, equinox, numpyro)) + (
-    str(Path(__file__).parents[1]),)
+_LIBRARIES = tuple(f"{Path(file or '').parent}{os.sep}" for file in (
+    jax.__file__, equinox.__file__, numpyro.__file__, str(Path(__file__).parent)))
 
 
 def _place(equation: Any) -> str:

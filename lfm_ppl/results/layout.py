@@ -11,6 +11,7 @@ import numpy as np
 import xarray as xr
 
 from lfm_ppl import checks
+from lfm_ppl.data import TRUTH, check_truth
 from lfm_ppl.model.observation_noise import expected_observation
 from lfm_ppl.results.predictions import GROUP, INTERVAL, NOISE_FREE, mixture_quantiles, predictions
 from lfm_ppl.results.scalars import DERIVED, units_attribute
@@ -296,6 +297,28 @@ def _held_elsewhere(draws: np.ndarray, truth: Any) -> bool:
 def _true_states(truth: Mapping[str, Any]) -> np.ndarray:
     state = truth.get("state")
     return np.zeros(0) if state is None else np.asarray(state, float)
+
+
+def checked_truth(bound: BoundModel, truth: Mapping[str, Any] | None, labels: Labels) -> dict[str, Any]:
+    """Return what a result can hold of a truth, in the form of `lfm_ppl.Data.truth`, and warn of the rest.
+
+    Raises:
+        ValueError: its parts do not fit together.
+    """
+    given = dict(truth or {})
+    for name in [name for name in given if name not in TRUTH]:
+        checks.warn(f"{checks.unknown('entry of the truth', name, TRUTH)} It is left out.")
+        del given[name]
+    if np.ndim(bound.y) != 2 and set(given) - {"parameters"}:
+        checks.warn("of the truth of several series only parameters are drawn; states and forces are left out.")
+        given = {name: value for name, value in given.items() if name == "parameters"}
+    try:
+        check_truth(given)
+    except ValueError as error:
+        raise ValueError(f"the truth does not fit together: {error}") from None
+    for message in unplaced(bound, given, labels):
+        checks.warn(message)
+    return given
 
 
 def unplaced(bound: BoundModel, truth: Mapping[str, Any], labels: Labels) -> list[str]:

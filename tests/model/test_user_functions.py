@@ -104,6 +104,18 @@ def test_the_line_is_named():
         make(lambda x, u, t: dynamics(x - 1.0, jnp.ones(2), t))
 
 
+def test_the_line_is_that_of_what_reaches_the_value():
+    def dynamics(x, u, t):
+        guarded = jnp.where(x > 0.0, 1.0 / x, 0.0)
+        return jnp.sqrt(guarded - 1.0)
+
+    line = inspect.getsourcelines(dynamics)[1] + 2
+    with pytest.raises(ValueError, match=rf"is not finite.* It stands in .*test_user_functions.py, line {line}\."):
+        make(dynamics)
+    with pytest.raises(ValueError, match=r"is not finite.*jnp.maximum\)\.$"):  # of keys NumPy knows nothing
+        make(lambda x, u, t: dynamics(x, u, t) + jax.random.normal(jax.random.key(0), (2,)))
+
+
 def test_parameters_may_be_traced():
     """A NumPyro model is compiled: then only the indices are known."""
     with pytest.raises(ValueError, match=r"dynamics reads u\[1\], but u has 1 entry"):
