@@ -314,6 +314,7 @@ def test_the_default_folder_must_be_one(run, tmp_path, monkeypatch):
     ("line", "message"),
     [
         ("fit ginsburg-landau", "unknown model 'ginsburg-landau'. Did you mean 'ginzburg-landau'"),
+        ("fit MOTIF --sampler mcmc", "unknown sampler 'mcmc'. Known: nuts, ram, pmmh, map"),
         ("fit MOTIF --sampler nutz", "unknown sampler 'nutz'. Did you mean 'nuts'"),
         ("fit MOTIF --rule cubatur", "unknown rule 'cubatur'. Did you mean 'cubature'"),
         ("fit MOTIF --chains 0", "expected a whole number of at least 1, got '0'"),

@@ -489,6 +489,7 @@ def test_what_fails_after_sampling_does_not_cost_the_draws(y, monkeypatch):
 
 @pytest.mark.parametrize(("change", "error", "message"), [
     ({"sampler": "nut"}, ValueError, r"unknown sampler 'nut'\. Did you mean 'nuts'.*Known: nuts, ram, pmmh, map"),
+    ({"sampler": "hmc"}, ValueError, "unknown sampler 'hmc'.*Known: nuts, ram, pmmh, map"),
     ({"sampler": "mcmc"}, ValueError, r"unknown sampler 'mcmc'\. Known: nuts, ram, pmmh, map"),
     ({"chains": 0}, ValueError, "chains must be at least 1"),
     ({"samples": 2.5}, TypeError, "samples must be a whole number, got 2.5"),

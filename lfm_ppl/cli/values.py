@@ -12,10 +12,8 @@ from lfm_ppl import checks
 def one_of(kind: str, choices: Any, **likeness: float) -> Callable[[str], str]:
     """Return what takes one of the choices; for ``likeness`` see `checks.unknown`."""
     def convert(text: str) -> str:
-        try:
-            checks.one_of(kind, text, choices, **likeness)
-        except ValueError as error:
-            raise argparse.ArgumentTypeError(str(error)) from None
+        if text not in choices:
+            raise argparse.ArgumentTypeError(checks.unknown(kind, text, choices, **likeness))
         return text
 
     return convert

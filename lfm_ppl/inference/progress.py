@@ -115,7 +115,7 @@ class _Remaining:
         self._total, self._seen = total, deque[tuple[float, int]]()
 
     def add(self, now: float, done: int) -> None:
-        """Take note that so many are done; what came before the first note is not counted, but for what is left."""
+        """Take note that so many are done; those before the first note say nothing of the pace."""
         self._seen.append((now, done))
         while len(self._seen) > 2 and self._seen[1][0] <= now - RECENT_S:
             self._seen.popleft()

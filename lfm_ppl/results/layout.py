@@ -305,7 +305,9 @@ def checked_truth(bound: BoundModel, truth: Mapping[str, Any] | None, labels: La
     Raises:
         ValueError: its parts do not fit together.
     """
-    given = dict(truth or {})
+    if not truth:
+        return {}
+    given = dict(truth)
     for name in [name for name in given if name not in TRUTH]:
         checks.warn(f"{checks.unknown('entry of the truth', name, TRUTH)} It is left out.")
         del given[name]

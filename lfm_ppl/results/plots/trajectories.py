@@ -78,7 +78,7 @@ def plot_fit(
     new = None if noise_free is None else _summary(result, "new_data")
     later = group(result, HELD_OUT)["y"] if has_group(result, HELD_OUT) else None
     truth = _true(result, "output")
-    forecast = known = False
+    known, (last, end) = False, forecast_span(result)
     names, note = style.first_of(pick(observed, "output", outputs), outputs, MAX_PANELS, "outputs")
     figure, panels = style.small_multiples(width, len(names), 1.35)
     for axes, name in zip(panels, names, strict=True):
@@ -102,9 +102,8 @@ def plot_fit(
                 wide = (low[-1], high[-1]) if new is None else new.sel(output=name).values[1:, -1]
                 _draw_forecast(axes, predicted.sel(output=[name]).isel(time=predicted["time"].values >= time[-1]),
                                (time[-1], mean[-1], *wide, low[-1], high[-1]))
-        if predicted is not None:
-            if forecast := _ends_before(predicted):
-                axes.axvline(predicted.attrs["last_observation"], **END)
+        if last < end:
+            axes.axvline(last, **END)
         known |= _draw_truth(axes, truth, "output", name)
         _draw_data(axes, data)
         if later is not None:
@@ -120,7 +119,7 @@ def plot_fit(
         handles += [Patch(color=_PREDICTIVE, label="95%, new data")]
     if known:
         handles += [Line2D([], [], label="truth", **_TRUTH)]
-    if forecast:
+    if last < end:
         handles += [Line2D([], [], label="last observation", **END)]
     if np.isnan(observed.sel(output=names)).any():
         handles += [Line2D([], [], label="missing", **_missing_style(observed.sizes["time"]))]
@@ -251,8 +250,8 @@ def _panels(
     known = False
     predicted = _predicted(result)
     ahead = None if predicted is None else predicted.get(f"{kind}s")
-    last = np.inf if ahead is None or predicted is None else predicted.attrs.get("last_observation", np.inf)
-    later = ahead is not None and bool(ahead["time"].max() > last)
+    last, end = forecast_span(result)
+    later = ahead is not None and last < end
     for axes, name in zip(panels, names, strict=True):
         time, mean, low, high = _band(result, kind, name)
         axes.fill_between(time, low, high, color=tint, lw=0, zorder=1)
@@ -326,11 +325,6 @@ def forecast_span(result: Any) -> tuple[float, float]:
         return -np.inf, -np.inf
     end = float(predicted["time"].values.max())
     return float(predicted.attrs.get("last_observation", end)), end
-
-
-def _ends_before(predicted: xr.Dataset) -> bool:
-    """Whether the last observation comes before the last prediction."""
-    return bool(predicted.attrs.get("last_observation", np.inf) < predicted["time"].values.max())
 
 
 def _covers(times: np.ndarray, at: np.ndarray) -> bool:
