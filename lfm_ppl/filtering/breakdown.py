@@ -26,12 +26,12 @@ _HUGE = 1e6
 
 
 class FilterWarning(UserWarning):
-    """The filter breaks down: its log likelihood is -inf. The message says where, how, and what to try."""
+    """The filter breaks down, its log likelihood is -inf, or sites do not converge. The message says where and how."""
 
 
 def warn_of_breakdown(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, start: Moments | None,
-                      log_likelihood: Any, sites: SiteSettings | None = None) -> None:
-    """Warn where a log likelihood is not finite; nothing happens in compiled code.
+                      log_likelihood: Any, sites: SiteSettings | None = None, converged: Any = True) -> None:
+    """Warn where a log likelihood is not finite or sites have not converged; nothing happens in compiled code.
 
     Args:
         ssm: the model.
@@ -41,11 +41,15 @@ def warn_of_breakdown(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, 
         start: moments at the initial time; the model's by default.
         log_likelihood: what the filter found, of any shape.
         sites: how those of an observation family were refined; None where the filter ran alone.
+        converged: whether they have.
     """
-    if checks.traced((ssm, grid, y, start, log_likelihood)) or np.isfinite(np.asarray(log_likelihood)).all():
+    if checks.traced((ssm, grid, y, start, log_likelihood, converged)):
+        return
+    finite = bool(np.isfinite(np.asarray(log_likelihood)).all())
+    if finite and np.all(converged):
         return
     if isinstance(ssm.model.observation, ObservationFamily):
-        checks.warn(_site_trouble(ssm, rule, grid, y, start, sites), FilterWarning)
+        checks.warn(_site_trouble(ssm, rule, grid, y, start, sites, finite), FilterWarning)
         return
     checks.warn(breakdown(ssm, rule, grid, y, start) or "the log likelihood is -inf, but the filter does not break "
                 "down without posterior linearisation: try iterations=0, or more damping (a smaller share).",
@@ -53,8 +57,8 @@ def warn_of_breakdown(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, 
 
 
 def _site_trouble(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, start: Moments | None,
-                  settings: SiteSettings | None) -> str:
-    """Say which sites do not converge, or what else is wrong with a family's log likelihood."""
+                  settings: SiteSettings | None, finite: bool) -> str:
+    """Say which sites do not converge, or what else is wrong with a family's log likelihood, ``finite`` or not."""
     remedy = ("Try a smaller share of each new site, sites=lfm.SiteSettings(damping=0.5), half powers, "
               "sites=lfm.SiteSettings(power=0.5), or a tighter prior")
     if settings is None:
@@ -73,7 +77,8 @@ def _site_trouble(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, star
     if bool(found.converged):
         return "the log likelihood of the observation family is not finite, though its sites converge. " + remedy + "."
     return (f"the sites of the observation family do not converge in {int(found.sweeps)} sweeps (the last changes one "
-            f"by {float(found.change):.2g}){where}. The log likelihood is -inf. {remedy}.")
+            f"by {float(found.change):.2g}){where}. The log likelihood is "
+            f"{'that of assumed density filtering, which is rougher' if finite else '-inf'}. {remedy}.")
 
 
 def breakdown(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, start: Moments | None = None) -> str | None:

@@ -315,7 +315,7 @@ def transitions_about(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, points: 
 
 def forward(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, *, start: Moments | None = None,
             linearization_point: Points | None = None, keep: str = "likelihood",
-            sites: Sites | Callable[..., Sites] | None = None, transitions: Transitions | None = None) -> Pass:
+            sites: Sites | Callable[..., Any] | None = None, transitions: Transitions | None = None) -> Pass:
     """Run the one forward scan.
 
     Args:
@@ -328,8 +328,8 @@ def forward(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, *, s
         keep: "likelihood" (log likelihoods only), "moments" (and the moments), "all" (what the smoother needs),
             "steps" (and the steps within the intervals), "inside" (what the adjoint and the iterations need).
         sites: (T, D) each, of an observation family: pseudo-observations in the place of ``y``, whose log likelihoods
-            are then integrals of the sites. Or what makes those of a row from the mean (D,) and the covariance (D, D)
-            of the predictor as predicted, the row's index, and its entries of y.
+            are then integrals of the sites. Or what makes those of a row, and its log likelihood, from the mean (D,)
+            and the covariance (D, D) of the predictor as predicted, the row's index, and its entries of y.
         transitions: of the intervals, where they are known; of ``linearization_point`` only the ends are used then.
     """
     prepared = preparation(ssm, rule, grid)
@@ -357,9 +357,11 @@ def forward(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, *, s
         if sites is None:
             new = update(ssm, affine, observed, jnp.isfinite(observed), one.moments, scale)
         else:
-            at = (sites(affine.value, predictor_variance(affine, one.moments), jnp.maximum(interval.observation, 0),
-                        observed) if callable(sites) else Sites(*given))
-            new = update_by_sites(affine, at, one.moments)
+            made = sites(affine.value, predictor_variance(affine, one.moments), jnp.maximum(interval.observation, 0),
+                         observed) if callable(sites) else None
+            new = update_by_sites(affine, Sites(*given) if made is None else made.sites, one.moments)
+            if made is not None:
+                new = new._replace(log_likelihood=made.log_likelihood)
         out = Pass(new.log_likelihood)
         if keep != "likelihood":
             out = out._replace(predicted=one.moments, filtered=new.moments, innovation=new.innovation,

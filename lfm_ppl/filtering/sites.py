@@ -222,11 +222,13 @@ class Refined(NamedTuple):
         found: where the sweeps ended; fixed numbers for a derivative.
         points: about which the model is linearised; None for a linear model.
         transitions: of the intervals, linearised about them; None where a pass has its own.
+        assumed: log likelihood of assumed density filtering, which a model that is not linear begins with; else -inf.
     """
 
     found: Converged
     points: Points | None
     transitions: Transitions | None
+    assumed: jax.Array
 
 
 # --- one sweep
@@ -377,26 +379,43 @@ def _of_known_value(function: Callable[[], jax.Array], value: jax.Array) -> jax.
 # --- first sites
 
 
-def assumed_density(family: ObservationFamily) -> Callable[..., Sites]:
-    """Return what makes the sites of a row in the forward scan itself, with the prediction as their cavity.
+class AssumedRow(NamedTuple):
+    """The sites of a row, and log p(y_k | y_1:k-1)."""
 
-    It is the first pass of EP, and assumed density filtering. In rows of several entries, of which the prediction is
-    correlated, precisions are at least zero.
+    sites: Sites
+    log_likelihood: jax.Array
+
+
+def assumed_density(family: ObservationFamily) -> Callable[..., AssumedRow]:
+    """Return what makes the sites of a row in the forward scan itself: the first pass of EP, assumed density filtering.
+
+    The entries of a row are taken in one after the other, each with what the earlier ones have left of the prediction
+    as its cavity. Prediction times sites then has the moments of the last tilted distribution, so that its covariance is
+    positive definite whatever the signs of the precisions, and the product of the entries' Z is a density of the row.
     """
 
-    def sites(mean: jax.Array, covariance: jax.Array, row: jax.Array, y: jax.Array) -> Sites:
-        log_prob = lambda f: row_log_prob(family, row, f, y)  # noqa: E731
-        cavity, found = assumed_tilted(log_prob, mean, diagonal(covariance))
-        present = jnp.isfinite(y) & jnp.isfinite(found.log_partition) & (found.variance > 0)
-        variance = jnp.where(present, found.variance, 1.0)
-        tau = jnp.where(present, 1.0 / variance - 1.0 / cavity.variance, 0.0)
-        nu = jnp.where(present, (found.mean - mean) / variance, 0.0)
-        if mean.shape[0] > 1:
-            nu = jnp.where(tau < 0, (found.mean - mean) / cavity.variance, nu)
-            tau = jnp.maximum(tau, 0.0)
-        return Sites(mean, nu, tau)
+    def assumed(mean: jax.Array, covariance: jax.Array, row: jax.Array, y: jax.Array) -> AssumedRow:
+        def entry(left: tuple[jax.Array, jax.Array], index: Any) -> tuple:
+            m, covariance = left
+            everywhere = assumed_tilted(lambda f: row_log_prob(family, row, f, y), m, diagonal(covariance))
+            cavity, found = jax.tree_util.tree_map(lambda a: a[index], everywhere)
+            present = jnp.isfinite(y[index])
+            usable = present & jnp.isfinite(found.log_partition) & (found.variance > 0)
+            variance = jnp.where(usable, found.variance, cavity.variance)
+            moved = jnp.where(usable, found.mean - m[index], 0.0)
+            tau = 1.0 / variance - 1.0 / cavity.variance
+            gain = covariance[:, index] / cavity.variance
+            left = m + gain * moved, covariance + jnp.outer(gain, gain) * (variance - cavity.variance)
+            return left, (moved / variance + tau * (m[index] - mean[index]), tau,
+                          jnp.where(present, found.log_partition, 0.0))
 
-    return sites
+        if mean.shape[0] == 1:
+            nu, tau, log_partition = jax.tree_util.tree_map(lambda a: a[None], entry((mean, covariance), 0)[1])
+        else:
+            nu, tau, log_partition = jax.lax.scan(entry, (mean, covariance), jnp.arange(mean.shape[0]))[1]
+        return AssumedRow(Sites(mean, nu, tau), log_partition.sum())
+
+    return assumed
 
 
 def assumed_tilted(log_prob: Callable, mean: jax.Array, variance: jax.Array) -> tuple[Marginal, Tilted]:
@@ -458,7 +477,8 @@ def refine(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, terms
 
     A model that is not linear is first smoothed a fixed number of times, and after each pass linearised about the
     smoothed moments and its sites refined; all of that has a derivative. Then the points of linearisation stay, and the
-    sites are refined until they do not change, with no derivative.
+    sites are refined until they do not change, with no derivative. Where they go on changing, the sites are those of
+    assumed density filtering.
 
     Args:
         ssm: the model.
@@ -471,19 +491,24 @@ def refine(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, terms
         first: sites to begin with; None, of a model with an observation family: from the prior's marginals in a linear
             model, by `assumed_density` in another.
     """
-    points = transitions = None
+    points = transitions = assumed = None
     if is_linear(ssm):
         transitions = transitions_about(ssm, rule, grid, None)
         if first is None:
             first = _held(lambda *a: _from_prior(ssm, rule, grid, _family(ssm), *a), y, start, transitions)
     else:
-        first, points = _joint_sweeps(ssm, rule, grid, y, terms, settings, start,
-                                      assumed_density(_family(ssm)) if first is None else first)
+        begin = assumed_density(_family(ssm)) if first is None else first
+        (first, points), passed = _joint_sweeps(ssm, rule, grid, y, terms, settings, start, begin)
+        assumed = passed if callable(begin) else None
         transitions = transitions_about(ssm, rule, grid, points)
     # The terms hold functions, so that they are closed over, and no argument.
     found = _held(lambda *a: _until_converged(ssm, rule, grid, settings, terms, *a), y, start, first, points,
                   transitions)
-    return Refined(found, points, transitions)
+    if assumed is None:
+        return Refined(found, points, transitions, jnp.asarray(-jnp.inf))
+    known = _held(lambda found, sites: jax.tree_util.tree_map(
+        functools.partial(jnp.where, found.converged), found.sites, sites), found, _used(assumed, grid))
+    return Refined(found._replace(sites=known), points, transitions, assumed.log_likelihood.sum())
 
 
 def _family(ssm: StateSpaceModel) -> ObservationFamily:
@@ -535,7 +560,7 @@ def _known(mean: jax.Array, variance: jax.Array) -> Marginal:
 
 
 def _smoothed(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments,
-              sites: Sites | Callable[..., Sites], points: Points | None, keep: str,
+              sites: Sites | Callable[..., AssumedRow], points: Points | None, keep: str,
               transitions: Transitions | None = None) -> tuple[Pass, Smoothed, Predictor]:
     passed = forward(ssm, rule, grid, y, start=start, linearization_point=points, keep=keep, sites=sites,
                      transitions=transitions)
@@ -545,31 +570,37 @@ def _smoothed(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, st
     return passed, smoothed, predictor
 
 
+def _used(passed: Pass, grid: TimeGrid) -> Sites:
+    """Return the sites of a forward scan (T, D)."""
+    return Sites(*(at_intervals(a, grid.observed) for a in passed.site_terms.sites))
+
+
 def _joint_sweeps(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, terms: EntryTerms,
                   settings: SiteSettings, start: Moments,
-                  first: Sites | Callable[..., Sites]) -> tuple[Sites, Points]:
+                  first: Sites | Callable[..., AssumedRow]) -> tuple[tuple[Sites, Points], Pass]:
+    """Return sites and points of linearisation, and the first forward scan."""
     whole_intervals = grid.steps == 1 and ssm.stack.jump_table() is None
 
     # A sweep in which an entry has no cavity tells nothing.
-    def sweep(sites: Sites | Callable[..., Sites], points: Points | None) -> tuple[Sites, Points]:
+    def sweep(sites: Sites | Callable[..., AssumedRow], points: Points | None) -> tuple[tuple[Sites, Points], Pass]:
         # Without nodes inside of an interval its map is all that is needed of it.
         maps = transitions_about(ssm, rule, grid, points) if points is not None and whole_intervals else None
         passed, smoothed, predictor = _smoothed(ssm, rule, grid, y, start, sites, points,
                                                 "inside" if maps is None else "all", maps)
-        used = Sites(*(at_intervals(a, grid.observed) for a in passed.site_terms.sites))
+        used = _used(passed, grid)
         at = cavities(predictor, used, terms.present, settings.power)
         # Points of linearisation take the derivative of these sites, and that of rough ones is not exact enough.
-        new = new_sites(terms, used, at, settings, settings.damping)[0]
+        refined = new_sites(terms, used, at, settings, settings.damping)[0]
         found = smoothed_points(ssm, rule, grid, passed, smoothed, start)
         whole = _is_whole(predictor, at)
         choose = lambda a, b: jax.tree_util.tree_map(functools.partial(jnp.where, whole), a, b)  # noqa: E731
-        return choose(new, _that_leave_cavities(used)), found if points is None else choose(found, points)
+        return (choose(refined, _that_leave_cavities(used)), found if points is None else choose(found, points)), passed
 
-    carry, more = sweep(first, None), max(settings.relinearisations - 1, 0)
+    (carry, passed), more = sweep(first, None), max(settings.relinearisations - 1, 0)
     if more == 1:
         # Of the last sites nothing needs the derivative, which a loop would take.
-        return sweep(*carry)
-    return jax.lax.scan(lambda carry, _: (sweep(*carry), None), carry, None, length=more)[0]
+        return sweep(*carry)[0], passed
+    return jax.lax.scan(lambda carry, _: (sweep(*carry)[0], None), carry, None, length=more)[0], passed
 
 
 def _is_whole(predictor: Predictor, at: Cavity) -> jax.Array:
@@ -730,17 +761,9 @@ def assumed_density_filter(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: 
 
     Source: Maybeck (1982), Stochastic Models, Estimation and Control 2, section 12.7.
     """
-    family = ssm.model.observation
-    assert isinstance(family, ObservationFamily)
-    passed = forward(ssm, rule, grid, y, start=start, keep="moments", sites=assumed_density(family))
-    at = jax.tree_util.tree_map(lambda a: at_intervals(a, grid.observed), passed.site_terms)
-    variance = diagonal(at.variance)
-    cavity, found = jax.vmap(lambda row, m, v, y: assumed_tilted(
-        lambda f: row_log_prob(family, row, f, y), m, v))(jnp.arange(len(y)), at.value, variance, y)
-    # An entry's own term stands in the place of its site; one entry a row: this is log Z of the tilted prediction.
-    gaussian = gaussian_terms(at.sites, cavity, 1.0)
-    entries = jnp.where(jnp.isfinite(y), found.log_partition - gaussian, 0.0).sum(1)
-    return Prequential(at_intervals(passed.log_likelihood, grid.observed) + entries, passed, cavity)
+    passed = forward(ssm, rule, grid, y, start=start, keep="moments", sites=assumed_density(_family(ssm)))
+    at = jax.tree_util.tree_map(lambda a: at_intervals(a, grid.observed), passed)
+    return Prequential(at.log_likelihood, passed, _known(at.site_terms.value, diagonal(at.site_terms.variance)))
 
 
 def quantile_residuals(family: ObservationFamily, prediction: Marginal, y: jax.Array) -> jax.Array:
@@ -805,7 +828,8 @@ class Evidence(NamedTuple):
     """What the evidence is made of.
 
     Attributes:
-        log_evidence: log p(y), -inf where the sites do not converge.
+        log_evidence: log p(y). Where the sites do not converge, that of assumed density filtering in a model that is
+            not linear, else -inf.
         entries: (T, D), what each entry adds to the integral of the sites.
         passed: the forward scan with the sites.
         refined: the sites.
@@ -831,4 +855,4 @@ def evidence(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, ter
                      transitions=None if keep in ("steps", "inside") else refined.transitions)
     entries = log_evidence_terms(terms, sites, at, settings, found.log_partition)
     total = passed.log_likelihood.sum() + entries.sum()
-    return Evidence(jnp.where(found.converged, total, -jnp.inf), entries, passed, refined)
+    return Evidence(jnp.where(found.converged, total, refined.assumed), entries, passed, refined)

@@ -97,6 +97,9 @@ class SmootherResult(eqx.Module):
             of an observation family, NaN where missing.
         change: largest change of a smoothed mean in the last iteration, in smoothed standard deviations; NaN
             with fewer than two iterations.
+        converged: whether the sites of an observation family have; without sites true. Where they have not, a model
+            that is not linear is smoothed with the sites of assumed density filtering, and ``leave_one_out`` is
+            ``log_likelihood``; in a linear model both are -inf.
     """
 
     times: jax.Array
@@ -108,6 +111,7 @@ class SmootherResult(eqx.Module):
     leave_one_out: jax.Array
     whitened_innovation: jax.Array
     change: jax.Array
+    converged: jax.Array
     _joint: Joint
     _input_map: Any
     state_names: tuple[str, ...] = eqx.field(static=True)
@@ -240,7 +244,7 @@ def smooth(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
     y = check_observations(y, len(grids.marginals.observed), ssm.output_dim, model=model)
     warn_single_precision()
     result = _run_smoother(ssm, rule, grids, y, iterations, damping, settings)
-    warn_of_breakdown(ssm, rule, grids.marginals, y, None, result.log_likelihood, settings)
+    warn_of_breakdown(ssm, rule, grids.marginals, y, None, result.log_likelihood, settings, result.converged)
     return result
 
 
@@ -303,12 +307,12 @@ def smooth_on(ssm: StateSpaceModel, rule: Rule, grids: SmoothingGrids, y: jax.Ar
     matrix, offset = jax.vmap(ssm.input_map)(times)
     observed = jnp.asarray(grid.observed)
     at_data = jax.tree_util.tree_map(lambda a: a[observed], passed._replace(steps=None))
-    one_step_ahead, left_out, residual = scored or (
-        at_data.log_likelihood, smoothed.leave_one_out[observed], whitened_innovations(at_data, y))
+    one_step_ahead, left_out, residual, converged = scored or (
+        at_data.log_likelihood, smoothed.leave_one_out[observed], whitened_innovations(at_data, y), jnp.asarray(True))
     return SmootherResult(
         times, mean, covariance, matmul(matrix, mean[..., None])[..., 0] + offset, congruence(matrix, covariance),
         one_step_ahead, left_out, residual,
-        jnp.asarray(jnp.nan) if found is None else found.change, joint, (matrix, offset),
+        jnp.asarray(jnp.nan) if found is None else found.change, converged, joint, (matrix, offset),
         ssm.model.state_names, ssm.model.force_names)
 
 
@@ -333,11 +337,12 @@ def _smooth_family(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Arra
     assert smoothed.predictor is not None
     refined_sites = found.refined.found
     at = jax.tree_util.tree_map(lambda a: at_intervals(a, grid.observed), smoothed.predictor)
-    failed = lambda a: jnp.where(refined_sites.converged, a, -jnp.inf)  # noqa: E731
     ahead = assumed_density_filter(ssm, rule, grid, y, start)
-    scored = (failed(ahead.log_likelihood), failed(leave_one_out(at, refined_sites.sites, found.entries)),
-              quantile_residuals(family, ahead.prediction, y))
-    points = found.refined.points
+    points, converged = found.refined.points, refined_sites.converged
+    else_ahead = lambda a: jnp.where(  # noqa: E731
+        converged, a, -jnp.inf if points is None else ahead.log_likelihood)
+    scored = (else_ahead(ahead.log_likelihood), else_ahead(leave_one_out(at, refined_sites.sites, found.entries)),
+              quantile_residuals(family, ahead.prediction, y), converged)
     iterated = None if points is None else Iterated(points, refined_sites.change)
     return found.passed, smoothed, iterated, scored
 

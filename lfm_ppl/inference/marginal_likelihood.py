@@ -93,8 +93,9 @@ class MarginalLikelihood(dist.Distribution):
             five times ``steps`` are tried. None: ``steps`` equal steps. Not with ``iterations``.
         sites: of an observation family, how its sites are refined: "ep" (expectation propagation, the default),
             "variational", "laplace", or `lfm_ppl.SiteSettings`. The log density is then the log evidence of the
-            converged sites, and -inf where they do not converge. Where the model is not linear it is linearised about
-            smoothed moments, ``iterations`` times (8 by default).
+            converged sites. Where the model is not linear it is linearised about smoothed moments, ``iterations`` times
+            (8 by default). Where sites do not converge, the log density of a model that is not linear is that of
+            assumed density filtering, which is rougher, and -inf in a linear one.
         lower: name of a state, force or output -> its lower bound. Under constraints the log density is
             log Z(y, c) - log Z(c), that of the data given that the constraints are respected: by expectation
             propagation, made right with ``draws`` trajectories that respect them. It is -inf where that does not
@@ -115,7 +116,7 @@ class MarginalLikelihood(dist.Distribution):
             failure is a log density of -inf.
 
     Warns:
-        FilterWarning: outside of compiled code, where a log density is -inf: which row and step breaks down, and how.
+        FilterWarning: outside of compiled code, where a log density is -inf or sites do not converge: where and how.
 
     Example:
         >>> import jax.numpy as jnp, lfm_ppl as lfm
@@ -257,7 +258,7 @@ class MarginalLikelihood(dist.Distribution):
         if self.constrained:
             return finite_or_minus_infinity(lambda y: self.bounded().log_likelihood(y, self.draws), y)
         if isinstance(self.model.observation, ObservationFamily):
-            return self._said(y, finite_or_minus_infinity(lambda y: self.evidence(y).log_evidence, y))
+            return self._said(y, *finite_or_minus_infinity(self._evidence_and_convergence, y))
         return self._said(y, finite_or_minus_infinity(lambda y: self._one_step_ahead(y).sum(), y))
 
     def _checked(self, y: Any) -> jax.Array:
@@ -283,13 +284,17 @@ class MarginalLikelihood(dist.Distribution):
         terms = FamilyTerms(self.model.observation, y)
         return evidence(self.ssm, self.rule, self.time_grid, y, terms, self._site_settings)
 
-    def _said(self, y: jax.Array, log_likelihood: jax.Array, alone: bool = False) -> jax.Array:
+    def _evidence_and_convergence(self, y: jax.Array) -> jax.Array:
+        found = self.evidence(y)
+        return jnp.stack([found.log_evidence, found.refined.found.converged.astype(found.log_evidence.dtype)])
+
+    def _said(self, y: jax.Array, log_likelihood: jax.Array, converged: Any = True, alone: bool = False) -> jax.Array:
         """Return the log likelihood; outside of compiled code say what breaks down if something does.
 
-        Of a family, the filter ``alone`` was run or its sites were refined.
+        Of a family, the filter ``alone`` was run or its sites were refined, which have ``converged`` or not.
         """
         warn_of_breakdown(self.ssm, self.rule, self.time_grid, y, None, log_likelihood,
-                          None if alone else self._site_settings)
+                          None if alone else self._site_settings, converged)
         return log_likelihood
 
     def expand(self, batch_shape: tuple[int, ...]) -> dist.Distribution:

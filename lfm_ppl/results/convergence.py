@@ -85,11 +85,12 @@ def of_sites(points: int, unconverged: int, impossible: int, *, constrained: boo
         return []
     which, remedy = (("constraints", _OF_CONSTRAINTS) if constrained else ("observation family", _OF_FAMILY))
     where = "draws of the Laplace approximation" if from_mode else "points a step away from the draws"
-    return [
-        f"the sites of the {which} do not converge at {unconverged} of {points} {where} "
-        f"({100.0 * unconverged / points:.2g}%), and the likelihood counts as zero there (and at {impossible} "
-        f"points in all){'' if from_mode else ': draws may miss these parameters'}. {remedy}"
-    ]
+    said = (f"the sites of the {which} do not converge at {unconverged} of {points} {where} "
+            f"({100.0 * unconverged / points:.2g}%), ")
+    if not impossible:
+        return [f"{said}where the likelihood is that of assumed density filtering, which is rougher. {remedy}"]
+    return [f"{said}and the likelihood is zero at {impossible} of the {points}"
+            f"{'' if from_mode else ': draws may miss these parameters'}. {remedy}"]
 
 
 def of_weights(trajectories: int, median: float, least: float) -> list[str]:

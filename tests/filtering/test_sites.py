@@ -1,5 +1,6 @@
 """The site engine against dense Gaussian algebra, importance sampling, differences and unrolled differentiation."""
 
+import itertools
 from typing import Any
 
 import jax
@@ -264,6 +265,51 @@ def pushed(theta):
         lambda x, u, t: jnp.exp(theta[1]) * (jax.nn.softplus(u) - 0.5 * x), {"u": lfm.Matern(jnp.exp(theta[0]), 2.0)},
         lfm.PoissonObservation(lambda x, u, t: x, "softplus", exposure=jnp.exp(theta[2])),
         lfm.Gaussian(jnp.ones(1), 0.1 * jnp.eye(1)))
+
+
+def test_sites_that_do_not_converge_leave_assumed_density_filtering_to_a_model_that_is_not_linear():
+    """Value and gradient, a warning, and moments all the same."""
+    theta, hopeless = jnp.array([0.0, 0.0, 1.5]), SiteSettings(sweeps=1, relinearisations=2)
+    y = lfm.simulate(jax.random.key(1), pushed(theta), TIMES).y
+
+    def distribution(th):
+        return lfm.MarginalLikelihood(pushed(th), TIMES, steps=2, sites=hopeless)
+
+    with pytest.warns(lfm.FilterWarning, match="in 1 sweeps .* is that of assumed density filtering, which is rougher"):
+        value = distribution(theta).log_prob(y)
+    assert value == pytest.approx(float(distribution(theta).log_prob_per_observation(y).sum()), abs=1e-10)
+    both = jax.jit(jax.value_and_grad(lambda th: distribution(th).log_prob(y)))
+    np.testing.assert_allclose(both(theta)[1], differences(lambda th: both(th)[0], theta), atol=1e-6)
+    with pytest.warns(lfm.FilterWarning, match="assumed density filtering"):
+        smoothed = lfm.smooth(pushed(theta), TIMES, y, steps=2, sites=hopeless)
+    assert not smoothed.converged
+    np.testing.assert_array_equal(smoothed.leave_one_out, smoothed.log_likelihood)
+    right = lfm.smooth(pushed(theta), TIMES, y, steps=2)
+    assert right.converged
+    # Sites that have not looked back still give nearly the same force.
+    away = np.abs(np.asarray(smoothed.force("u").mean - right.force("u").mean)) / np.asarray(right.force("u").sd)
+    assert away.max() < 0.5
+
+
+def test_assumed_density_filtering_is_a_density_of_several_entries_a_row():
+    """Of two rows of two correlated answers the probabilities of all sixteen add up to one."""
+    model = process(lfm.BernoulliObservation(lambda x, u, t: jnp.concatenate([2.0 * u, 0.5 - 3.0 * u])))
+    distribution = lfm.MarginalLikelihood(model, np.array([0.0, 0.7]))
+    every = np.array(list(itertools.product([0.0, 1.0], repeat=4))).reshape(16, 2, 2)
+    log_prob = jax.vmap(lambda y: distribution.log_prob_per_observation(y).sum())(every)
+    assert float(jnp.exp(log_prob).sum()) == pytest.approx(1.0, abs=1e-7)
+
+
+def test_assumed_density_filtering_of_gaussian_entries_is_the_kalman_filter():
+    """Entries one after the other are all entries at once, with a missing one, too."""
+    y = np.random.default_rng(0).normal(size=(TIMES.size, 2))
+    y[3, 0] = y[7] = np.nan
+    gaussian = lfm.GaussianObservation(lambda x, u, t: jnp.concatenate([u, 0.3 - 2.0 * u]), jnp.array([0.04, 0.3]))
+    exact, assumed = (lfm.filter(process(observation), TIMES, y)
+                      for observation in (gaussian, lfm.Observations(gaussian)))
+    np.testing.assert_allclose(assumed.log_likelihood, exact.log_likelihood, atol=1e-8)
+    np.testing.assert_allclose(assumed.filtered_mean, exact.filtered_mean, atol=1e-8)
+    np.testing.assert_allclose(assumed.filtered_covariance, exact.filtered_covariance, atol=1e-8)
 
 
 @pytest.mark.slow
