@@ -390,8 +390,8 @@ def assumed_density(family: ObservationFamily) -> Callable[..., AssumedRow]:
     """Return what makes the sites of a row in the forward scan itself: the first pass of EP, assumed density filtering.
 
     The entries of a row are taken in one after the other, each with what the earlier ones have left of the prediction
-    as its cavity. Prediction times sites then has the moments of the last tilted distribution, so that its covariance is
-    positive definite whatever the signs of the precisions, and the product of the entries' Z is a density of the row.
+    as its cavity. Prediction times sites then has the moments of the last tilted distribution: a positive definite
+    covariance, whatever the signs of the precisions. The product of the entries' Z is a density of the row.
     """
 
     def assumed(mean: jax.Array, covariance: jax.Array, row: jax.Array, y: jax.Array) -> AssumedRow:

@@ -115,6 +115,15 @@ def test_random_walks_with_expectation_propagation_are_calibrated():
     assert_uniform(found, bins=4)
 
 
+def test_nuts_with_expectation_propagation_is_calibrated_on_few_counts():
+    """A small one of the next: 40 data sets of 6 rows, two parameters."""
+    found = calibration.calibrate(jax.random.key(3), counts, np.arange(6.0),
+                                  lambda model: NUTS(model, max_tree_depth=5), data_sets=40, draws=15, thin=3,
+                                  warmup=150)
+    assert {"level", "scale", "log likelihood"} == set(found.ranks)
+    assert_uniform(found, bins=4)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["Poisson", "Student-t"])
 def test_nuts_with_expectation_propagation_is_calibrated(name, tmp_path):

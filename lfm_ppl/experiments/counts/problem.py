@@ -161,7 +161,8 @@ def _calls(name: str, size: Size, seed: int, data: str | None, generator: np.ran
         forces: dict[str, Force] = {"trend": lfm.Matern(scale, lengthscale, order=1)}
         if daily:
             kernel = PeriodicSquaredExponential(daily_scale, daily_lengthscale, HOURS)
-            forces["daily"] = lfm.Periodic(kernel, functions=11, explained_variance=0.0)
+            # With half of them the evidence of eight days is off by four nats.
+            forces["daily"] = lfm.Periodic(kernel, functions=21, explained_variance=0.0)
         family = ((lambda h: lfm.NegativeBinomialObservation(h, concentration)) if overdispersed
                   else lfm.PoissonObservation)
         return process(forces, family, level)
