@@ -397,17 +397,19 @@ def assumed_density(family: ObservationFamily) -> Callable[..., AssumedRow]:
     def assumed(mean: jax.Array, covariance: jax.Array, row: jax.Array, y: jax.Array) -> AssumedRow:
         def entry(left: tuple[jax.Array, jax.Array], index: Any) -> tuple:
             m, covariance = left
-            everywhere = assumed_tilted(lambda f: row_log_prob(family, row, f, y), m, diagonal(covariance))
+            log_prob = lambda f: row_log_prob(family, row, f, y)  # noqa: E731
+            everywhere = assumed_tilted(log_prob, m, diagonal(covariance))
             cavity, found = jax.tree_util.tree_map(lambda a: a[index], everywhere)
-            present = jnp.isfinite(y[index])
-            usable = present & jnp.isfinite(found.log_partition) & (found.variance > 0)
+            known = _is_known(m[index], covariance[index, index])
+            log_partition = jnp.where(known, log_prob(m)[index], found.log_partition)
+            usable = ~known & jnp.isfinite(y[index]) & jnp.isfinite(log_partition) & (found.variance > 0)
             variance = jnp.where(usable, found.variance, cavity.variance)
             moved = jnp.where(usable, found.mean - m[index], 0.0)
             tau = 1.0 / variance - 1.0 / cavity.variance
             gain = covariance[:, index] / cavity.variance
             left = m + gain * moved, covariance + jnp.outer(gain, gain) * (variance - cavity.variance)
             return left, (moved / variance + tau * (m[index] - mean[index]), tau,
-                          jnp.where(present, found.log_partition, 0.0))
+                          jnp.where(jnp.isfinite(y[index]), log_partition, 0.0))
 
         if mean.shape[0] == 1:
             nu, tau, log_partition = jax.tree_util.tree_map(lambda a: a[None], entry((mean, covariance), 0)[1])

@@ -144,9 +144,12 @@ def test_unconverged_sites_are_counted_and_named(result):
     assert 0 < found.unconverged < found.points and found.unconverged <= found.impossible
     result.attrs["site_failures"] = json.dumps([100, 7, 9])
     said = arviz_data.convergence_warnings(result)[-1]
-    result.attrs["site_failures"] = json.dumps(kept)
-    assert "at 7 of 100 points a step away from the draws (7%)" in said and "(and at 9 points in all)" in said
+    assert "at 7 of 100 points a step away from the draws (7%), and the likelihood is zero at 9 of the 100: dr" in said
     assert "damping=0.5" in said
+    result.attrs["site_failures"] = json.dumps([100, 7, 0])
+    said = arviz_data.convergence_warnings(result)[-1]
+    assert "(7%), where the likelihood is that of assumed density filtering" in said
+    result.attrs["site_failures"] = json.dumps(kept)
 
 
 def test_figures_of_counts(ahead):
