@@ -399,6 +399,11 @@ def test_what_the_user_fixes_wins_over_the_anchors(given, expected):
     assert choices.fixed(given, ANCHORS) == expected
 
 
+def test_an_option_is_no_parameter():
+    with pytest.raises(ValueError, match="--set df=4: df is an option of the model, and no parameter: --option df=4"):
+        choices.fixed(["df=4"], {}, {"df", "link"})
+
+
 def test_a_warning_is_shown_once(capsys):
     show = cli._Warnings()
     for text in ("the input\n ends", "the input ends", "another"):

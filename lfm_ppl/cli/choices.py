@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -31,20 +31,23 @@ def options(model: ModelFile, given: Sequence[str]) -> dict[str, Any]:
     return {name: model.option(name, value) for name, value in pairs}
 
 
-def fixed(given: Sequence[str], anchors: Mapping[str, float]) -> dict[str, Any]:
+def fixed(given: Sequence[str], anchors: Mapping[str, float], options: Collection[str] = ()) -> dict[str, Any]:
     """Return the parameters to fix: name -> value.
 
     Args:
         given: ``NAME=VALUE``, ``NAME[ELEMENT]=VALUE``, ``NAME=V1,V2,...`` or ``NAME=free``.
         anchors: what the model fixes for this data. What the user says of an element replaces the
             anchor of that element, what the user says of a whole parameter all anchors of it.
+        options: of the model, which are no parameters.
 
     Raises:
-        ValueError: for what does not have one of these forms.
+        ValueError: for what does not have one of these forms, and for an option.
     """
     chosen = dict(anchors)
     for text in given:
         name, value = _pair("--set", text)
+        if name in options:
+            raise ValueError(f"--set {text}: {name} is an option of the model, and no parameter: --option {text}.")
         for anchor in list(chosen):
             if anchor == name or anchor.partition("[")[0] == name:
                 del chosen[anchor]

@@ -39,7 +39,7 @@ def run(arguments: argparse.Namespace) -> int:
     model = loading.load(arguments.model)
     options = choices.options(model, arguments.option)
     observed = _observed(arguments, model, options)
-    fixed = choices.fixed(arguments.set, model.anchors(observed))
+    fixed = choices.fixed(arguments.set, model.anchors(observed), model.options)
     at = requested(observed, arguments.until, arguments.at)
     check_sampler(arguments)
     numpyro_model = approximated(arguments, model)

@@ -49,7 +49,8 @@ def run(arguments: argparse.Namespace) -> int:
             observed = model.prepare(one)
             own[name] = {"model_kwargs": model.keywords(observed, options),
                          "at": fit.requested(observed, arguments.until, arguments.at),
-                         "fixed": choices.fixed(arguments.set, model.anchors(observed)), "name": model.name}
+                         "fixed": choices.fixed(arguments.set, model.anchors(observed), model.options),
+                         "name": model.name}
         except ValueError as error:
             failed[name] = str(error)
         else:
