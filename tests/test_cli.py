@@ -402,6 +402,8 @@ def test_what_the_user_fixes_wins_over_the_anchors(given, expected):
 def test_an_option_is_no_parameter():
     with pytest.raises(ValueError, match="--set df=4: df is an option of the model, and no parameter: --option df=4"):
         choices.fixed(["df=4"], {}, {"df", "link"})
+    with pytest.raises(ValueError, match=r"--set link\[a\]=free: link is an option of the model.*--option link=VALUE"):
+        choices.fixed(["link[a]=free"], {}, {"df", "link"})
 
 
 def test_a_warning_is_shown_once(capsys):

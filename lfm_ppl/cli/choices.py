@@ -46,8 +46,9 @@ def fixed(given: Sequence[str], anchors: Mapping[str, float], options: Collectio
     chosen = dict(anchors)
     for text in given:
         name, value = _pair("--set", text)
-        if name in options:
-            raise ValueError(f"--set {text}: {name} is an option of the model, and no parameter: --option {text}.")
+        if (option := name.partition("[")[0]) in options:
+            chosen_by = f"--option {option}={'VALUE' if value == FREE else value}"
+            raise ValueError(f"--set {text}: {option} is an option of the model, and no parameter: {chosen_by}.")
         for anchor in list(chosen):
             if anchor == name or anchor.partition("[")[0] == name:
                 del chosen[anchor]

@@ -222,7 +222,8 @@ class Refined(NamedTuple):
         found: where the sweeps ended; fixed numbers for a derivative.
         points: about which the model is linearised; None for a linear model.
         transitions: of the intervals, linearised about them; None where a pass has its own.
-        assumed: log likelihood of assumed density filtering, which a model that is not linear begins with; else -inf.
+        assumed: log likelihood of assumed density filtering, with which a model that is not linear begins; -inf in a
+            linear model.
     """
 
     found: Converged
@@ -392,23 +393,27 @@ def assumed_density(family: ObservationFamily) -> Callable[..., AssumedRow]:
     The entries of a row are taken in one after the other, each with what the earlier ones have left of the prediction
     as its cavity. Prediction times sites then has the moments of the last tilted distribution: a positive definite
     covariance, whatever the signs of the precisions. The product of the entries' Z is a density of the row.
+
+    Far from the data a tilted distribution may have two modes, where the law is not log-concave. The quadrature has its
+    nodes about the nearer one: log Z is then off by up to a nat, and its derivative, which holds the nodes, by more.
     """
 
     def assumed(mean: jax.Array, covariance: jax.Array, row: jax.Array, y: jax.Array) -> AssumedRow:
         def entry(left: tuple[jax.Array, jax.Array], index: Any) -> tuple:
             m, covariance = left
-            log_prob = lambda f: row_log_prob(family, row, f, y)  # noqa: E731
-            everywhere = assumed_tilted(log_prob, m, diagonal(covariance))
-            cavity, found = jax.tree_util.tree_map(lambda a: a[index], everywhere)
-            known = _is_known(m[index], covariance[index, index])
-            log_partition = jnp.where(known, log_prob(m)[index], found.log_partition)
+            middle, spread = m[index], covariance[index, index]
+            log_prob = lambda f: row_log_prob(family, row, m.at[index].set(f[0]), y)[index][None]  # noqa: E731
+            cavity, found = jax.tree_util.tree_map(
+                lambda a: a[0], assumed_tilted(log_prob, middle[None], spread[None]))
+            known = _is_known(middle, spread)
+            log_partition = jnp.where(known, log_prob(middle[None])[0], found.log_partition)
             usable = ~known & jnp.isfinite(y[index]) & jnp.isfinite(log_partition) & (found.variance > 0)
             variance = jnp.where(usable, found.variance, cavity.variance)
-            moved = jnp.where(usable, found.mean - m[index], 0.0)
+            moved = jnp.where(usable, found.mean - middle, 0.0)
             tau = 1.0 / variance - 1.0 / cavity.variance
             gain = covariance[:, index] / cavity.variance
             left = m + gain * moved, covariance + jnp.outer(gain, gain) * (variance - cavity.variance)
-            return left, (moved / variance + tau * (m[index] - mean[index]), tau,
+            return left, (moved / variance + tau * (middle - mean[index]), tau,
                           jnp.where(jnp.isfinite(y[index]), log_partition, 0.0))
 
         if mean.shape[0] == 1:
@@ -480,7 +485,7 @@ def refine(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, terms
     A model that is not linear is first smoothed a fixed number of times, and after each pass linearised about the
     smoothed moments and its sites refined; all of that has a derivative. Then the points of linearisation stay, and the
     sites are refined until they do not change, with no derivative. Where they go on changing, the sites are those of
-    assumed density filtering.
+    assumed density filtering, but for precisions below zero: a variance could be negative about other points.
 
     Args:
         ssm: the model.
@@ -509,7 +514,8 @@ def refine(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, terms
     if assumed is None:
         return Refined(found, points, transitions, jnp.asarray(-jnp.inf))
     known = _held(lambda found, sites: jax.tree_util.tree_map(
-        functools.partial(jnp.where, found.converged), found.sites, sites), found, _used(assumed, grid))
+        functools.partial(jnp.where, found.converged), found.sites, sites), found,
+        _that_leave_cavities(_used(assumed, grid)))
     return Refined(found._replace(sites=known), points, transitions, assumed.log_likelihood.sum())
 
 
@@ -852,7 +858,8 @@ def evidence(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, ter
     found = refined.found
     sites, at = found.sites, found.cavity
     if settings.method == "laplace":
-        sites, at = _newton_step(ssm, rule, grid, y, terms, settings, start, refined)
+        newer, at = _newton_step(ssm, rule, grid, y, terms, settings, start, refined)
+        sites = jax.tree_util.tree_map(functools.partial(jnp.where, found.converged), newer, sites)
     passed = forward(ssm, rule, grid, y, start=start, linearization_point=refined.points, keep=keep, sites=sites,
                      transitions=None if keep in ("steps", "inside") else refined.transitions)
     entries = log_evidence_terms(terms, sites, at, settings, found.log_partition)

@@ -97,9 +97,9 @@ class SmootherResult(eqx.Module):
             of an observation family, NaN where missing.
         change: largest change of a smoothed mean in the last iteration, in smoothed standard deviations; NaN
             with fewer than two iterations.
-        converged: whether the sites of an observation family have; without sites true. Where they have not, a model
-            that is not linear is smoothed with the sites of assumed density filtering, and ``leave_one_out`` is
-            ``log_likelihood``; in a linear model both are -inf.
+        converged: whether the sites of an observation family have converged; true where there are none. Where they
+            have not, a model that is not linear is smoothed with the sites of assumed density filtering, and
+            ``leave_one_out`` is ``log_likelihood``; in a linear model both are -inf.
     """
 
     times: jax.Array

@@ -22,7 +22,7 @@ _OF_WEIGHTS = 25
 
 
 class SiteFailures(NamedTuple):
-    """How often there is no likelihood, at draws or a step away from them.
+    """How often sites do not converge or there is no likelihood, at draws or a step away from them.
 
     Attributes:
         points: at which it was tried.
@@ -52,8 +52,9 @@ class PathsWorth(NamedTuple):
 def site_failures(bound: BoundModel, z: np.ndarray, seed: int = 0, points: int = POINTS) -> SiteFailures | None:
     """Try the likelihood where a sampler would look next: at draws plus scaled differences of two others.
 
-    At draws themselves the likelihood is never zero, for a point where it is gets rejected. The differences are those
-    of differential evolution, z_i + 2.38 / sqrt(2 d) (z_j - z_k), which have the shape of the posterior.
+    At draws themselves the likelihood is never zero, for a point where it is gets rejected, and sites that do not
+    converge at a draw often do not converge beside it. The differences are those of differential evolution,
+    z_i + 2.38 / sqrt(2 d) (z_j - z_k), which have the shape of the posterior.
 
     Args:
         bound: the model and its data.

@@ -86,7 +86,7 @@ def of_sites(points: int, unconverged: int, impossible: int, *, constrained: boo
     which, remedy = (("constraints", _OF_CONSTRAINTS) if constrained else ("observation family", _OF_FAMILY))
     where = "draws of the Laplace approximation" if from_mode else "points a step away from the draws"
     said = (f"the sites of the {which} do not converge at {unconverged} of {points} {where} "
-            f"({100.0 * unconverged / points:.2g}%), ")
+            f"({100.0 * unconverged / points:.3g}%), ")
     if not impossible:
         return [f"{said}where the likelihood is that of assumed density filtering, which is rougher. {remedy}"]
     return [f"{said}and the likelihood is zero at {impossible} of the {points}"

@@ -323,6 +323,7 @@ def test_sites_that_do_not_converge_are_told_and_leave_nearly_the_same_force():
     with pytest.warns(lfm.FilterWarning, match="assumed density filtering"):
         smoothed = lfm.smooth(pushed(theta), TIMES, y, steps=2, sites=HOPELESS)
     assert not smoothed.converged
+    assert np.linalg.eigvalsh(smoothed.covariance).min() > -1e-12
     np.testing.assert_array_equal(smoothed.leave_one_out, smoothed.log_likelihood)
     right = lfm.smooth(pushed(theta), TIMES, y, steps=2)
     assert right.converged
