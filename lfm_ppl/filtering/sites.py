@@ -435,7 +435,7 @@ def assumed_tilted(log_prob: Callable, mean: jax.Array, variance: jax.Array) -> 
         good = jnp.isfinite(found.log_partition) & (found.variance > 0)
         return Marginal(jnp.where(good, found.mean, near.mean), jnp.where(good, found.variance, near.variance))
 
-    # The integral does not depend on where its nodes lie.
+    # The integral of a product with one mode does not depend on where its nodes lie.
     return cavity, tilted_moments(jax.vmap(log_prob), cavity, _held(about, cavity))
 
 
