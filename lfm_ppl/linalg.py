@@ -331,6 +331,30 @@ def semidefinite_root(p: jax.Array, tolerance: float = 1e-14) -> jax.Array:
     return sd[:, None] * cholesky(p * inverse[:, None] * inverse[None, :], floor=tolerance, keep=False).chol
 
 
+def pivoted_root(p: jax.Array) -> jax.Array:
+    """Return ``R`` (n, n) with ``R R' = P`` for a semi-definite ``P``, by Cholesky's method with complete pivoting.
+
+    ``R R'`` is as accurate as ``P``, however singular that is. `semidefinite_root`, which takes the coordinates in their
+    own order, loses the variance of a later one where an earlier one varies, given those before it, by rounding only.
+    It is triangular and continuous in ``P``, and this is neither.
+
+    Source: Higham (2002), Accuracy and Stability of Numerical Algorithms, section 10.3.
+    """
+    sd = safe_sqrt(diagonal(p))
+    inverse = _divide(jnp.ones(()), sd)
+    least = p.shape[-1] * jnp.finfo(p.dtype).eps
+
+    def take(left: jax.Array, _: None) -> tuple[jax.Array, jax.Array]:
+        index = jnp.argmax(diagonal(left))
+        column = left[:, index]
+        live = column[index] > least
+        column = jnp.where(live, column / jnp.sqrt(jnp.where(live, column[index], 1.0)), 0.0)
+        return left - column[:, None] * column, column
+
+    _, columns = jax.lax.scan(take, p * inverse[:, None] * inverse, None, length=p.shape[-1])
+    return sd[:, None] * columns.T
+
+
 def masked(residual: jax.Array, covariance: jax.Array, present: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Leave out missing entries: return the residual with zeros, the covariance with rows of the identity for them.
 

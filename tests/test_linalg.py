@@ -18,6 +18,7 @@ from lfm_ppl.linalg import (
     matmul,
     outer_square,
     safe_sqrt,
+    pivoted_root,
     semidefinite_root,
     solve_lower,
     solve_semidefinite,
@@ -63,6 +64,20 @@ def test_singular_matrices(rank, scale):
     root = np.asarray(semidefinite_root(jnp.asarray(p)))
     assert np.allclose(root @ root.T / scale[:, None] / scale, p / scale[:, None] / scale, atol=1e-12)
     assert (np.linalg.matrix_rank(root / scale[:, None], tol=1e-6) == rank)
+    pivoted = np.asarray(pivoted_root(jnp.asarray(p)))
+    assert np.allclose(pivoted @ pivoted.T / scale[:, None] / scale, p / scale[:, None] / scale, atol=1e-14)
+
+
+@pytest.mark.parametrize("count", [2, 6, 12])
+def test_a_pivoted_root_is_as_accurate_as_a_matrix_that_is_singular_but_for_rounding(count):
+    """Gram matrices of exp(-d s) on [0, 2], whose last conditional variances are far below their rounding errors."""
+    d = np.linspace(0.3, 1.0, count)
+    rates = d[:, None] + d
+    gram = -np.expm1(-2.0 * rates) / rates
+    with_white = np.block([[gram, 0.7 * gram[:, -1:]], [0.7 * gram[-1:], gram[-1:, -1:]]])
+    for p in (gram, with_white):
+        root = np.asarray(pivoted_root(jnp.asarray(p)))
+        np.testing.assert_allclose(root @ root.T, p, atol=1e-14)
 
 
 def test_degenerate_pivots_are_reported_and_replaced():

@@ -14,7 +14,7 @@ from lfm_ppl.linalg import (
     congruence,
     masked,
     matmul,
-    semidefinite_root,
+    pivoted_root,
     solve_lower,
     solve_upper,
 )
@@ -50,13 +50,14 @@ def smoothing_errors(key: jax.Array, passed: Pass, start: Moments, draws: int) -
     rows, size = passed.phi.shape[:2]
     outputs = passed.innovation.shape[-1]
     keys = jax.random.split(key, 3)
-    first = matmul(semidefinite_root(start.covariance), jax.random.normal(keys[0], (size, draws)))
+    first = matmul(pivoted_root(start.covariance), jax.random.normal(keys[0], (size, draws)))
     standard = (jax.random.normal(keys[1], (rows, size, draws)), jax.random.normal(keys[2], (rows, outputs, draws)))
+    roots = jax.vmap(pivoted_root)(passed.process_cov), jax.vmap(pivoted_root)(passed.obs_cov)
 
     def simulate(error: jax.Array, row: tuple) -> tuple[jax.Array, tuple]:
-        one, moving, observing = row
-        error = matmul(one.phi, error) + matmul(semidefinite_root(one.process_cov), moving)
-        innovation = matmul(one.jacobian, error) + matmul(semidefinite_root(one.obs_cov), observing)
+        one, (process_root, obs_root), moving, observing = row
+        error = matmul(one.phi, error) + matmul(process_root, moving)
+        innovation = matmul(one.jacobian, error) + matmul(obs_root, observing)
         return error - matmul(one.gain, innovation), (error, innovation)
 
     def smooth(r: jax.Array, row: tuple) -> tuple[jax.Array, jax.Array]:
@@ -65,7 +66,7 @@ def smoothing_errors(key: jax.Array, passed: Pass, start: Moments, draws: int) -
         r = matmul(one.jacobian.T, white - matmul(one.gain.T, r)) + r
         return matmul(one.phi.T, r), error - matmul(one.predicted.covariance, r)
 
-    _, (errors, innovations) = jax.lax.scan(simulate, first, (passed, *standard))
+    _, (errors, innovations) = jax.lax.scan(simulate, first, (passed, roots, *standard))
     _, drawn = jax.lax.scan(smooth, jnp.zeros((size, draws)), (passed, errors, innovations), reverse=True)
     return drawn
 
@@ -93,7 +94,7 @@ def _backward_sampled(key: jax.Array, passed: Pass, start: Moments, draws: int) 
     """
     rows, size = passed.phi.shape[:2]
     standard = jax.random.normal(key, (rows, size, draws))
-    last = matmul(semidefinite_root(passed.filtered.covariance[-1]), standard[-1])
+    last = matmul(pivoted_root(passed.filtered.covariance[-1]), standard[-1])
 
     def step(error: jax.Array, row: tuple) -> tuple[jax.Array, jax.Array]:
         now, predicted, phi, process_cov, noise = row
@@ -103,7 +104,7 @@ def _backward_sampled(key: jax.Array, passed: Pass, start: Moments, draws: int) 
         proper = jnp.min(conditional_shares(predicted.covariance)) > 0
         gain = jnp.where(proper, gain, general)
         conditional = jnp.where(proper, conditional, now.covariance - congruence(general, predicted.covariance))
-        error = matmul(gain, error) + matmul(semidefinite_root(conditional), noise)
+        error = matmul(gain, error) + matmul(pivoted_root(conditional), noise)
         return error, error
 
     tree = jax.tree_util.tree_map

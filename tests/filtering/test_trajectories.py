@@ -68,6 +68,11 @@ def test_draws_have_the_reported_moments(link, genes, variance, steps, iteration
     check(link, genes, variance, steps, iterations)
 
 
+def test_draws_of_many_steps_at_the_data_have_the_reported_moments():
+    """What moves five genes over an interval is of rank two but for rounding, and no ``at`` corrects the draws."""
+    check(softplus, 5, 1.0, 50, 0, at=None)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("iterations", [0, 3])
 @pytest.mark.parametrize("steps", [1, 10, 50])
