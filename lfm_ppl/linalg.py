@@ -334,9 +334,9 @@ def semidefinite_root(p: jax.Array, tolerance: float = 1e-14) -> jax.Array:
 def pivoted_root(p: jax.Array) -> jax.Array:
     """Return ``R`` (n, n) with ``R R' = P`` for a semi-definite ``P``, by Cholesky's method with complete pivoting.
 
-    ``R R'`` is as accurate as ``P``, however singular that is. `semidefinite_root`, which takes the coordinates in their
-    own order, loses the variance of a later one where an earlier one varies, given those before it, by rounding only.
-    It is triangular and continuous in ``P``, and this is neither.
+    ``R R'`` is as accurate as ``P``, however singular that is. `semidefinite_root` takes the coordinates in their own
+    order, and loses variance of a later one where an earlier one varies, given those before it, by rounding only. It is
+    triangular and continuous in ``P``, and this is neither.
 
     Source: Higham (2002), Accuracy and Stability of Numerical Algorithms, section 10.3.
     """
