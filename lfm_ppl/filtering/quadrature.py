@@ -69,12 +69,7 @@ def tilted_moments(log_function: Callable[[jax.Array], jax.Array], cavity: Margi
     Source: Mori and Sugihara (2001), Journal of Computational and Applied Mathematics 127.
     """
     cavity, near = _once((cavity, near))
-    nodes, log_weights = map(jnp.asarray, _rule(_ROUGH_NODES, _ROUGH_STRETCH) if rough else _rule())
-    lead = (len(nodes),) + (1,) * jnp.ndim(cavity.mean)
-    f, half = near.mean + jnp.sqrt(near.variance) * nodes.reshape(lead), -0.5 / cavity.variance
-    log_mass = log_weights.reshape(lead) + half * (f - cavity.mean) ** 2 + log_function(f)
-    # Not a number is no mass: a link that overflows far out.
-    log_mass = jnp.where(jnp.isnan(log_mass), -jnp.inf, log_mass)
+    nodes, log_mass = _log_masses(log_function, cavity, near, rough)
     # The barriers keep XLA from computing the moments again at each node, and the function in each sum, 4 times slower;
     # so does a table of 2 axes.
     log_mass = _once(log_mass.reshape(len(nodes), -1))
@@ -92,6 +87,28 @@ def tilted_moments(log_function: Callable[[jax.Array], jax.Array], cavity: Margi
         jnp.where(possible, largest + jnp.log(total), -jnp.inf), middle, second / total - middle**2))
     log_partition = log_total + 0.5 * (jnp.log(near.variance / cavity.variance) - _LOG_2PI)
     return Tilted(log_partition, near.mean + jnp.sqrt(near.variance) * middle, near.variance * spread)
+
+
+def _log_masses(log_function: Callable[[jax.Array], jax.Array], cavity: Marginal, near: Marginal,
+                rough: bool) -> tuple[jax.Array, jax.Array]:
+    """Return the nodes x (J,), and the logarithm (J, ...) of the mass of N(f; m, v) p(f) at near.mean + near.sd x."""
+    nodes, log_weights = map(jnp.asarray, _rule(_ROUGH_NODES, _ROUGH_STRETCH) if rough else _rule())
+    lead = (len(nodes),) + (1,) * jnp.ndim(cavity.mean)
+    f, half = near.mean + jnp.sqrt(near.variance) * nodes.reshape(lead), -0.5 / cavity.variance
+    log_mass = log_weights.reshape(lead) + half * (f - cavity.mean) ** 2 + log_function(f)
+    # Not a number is no mass: a link that overflows far out.
+    return nodes, jnp.where(jnp.isnan(log_mass), -jnp.inf, log_mass)
+
+
+def tilted_shape(log_function: Callable[[jax.Array], jax.Array], cavity: Marginal,
+                 near: Marginal) -> tuple[jax.Array, jax.Array]:
+    """Return skewness and excess kurtosis of N(f; m, v) p(f), both zero for a Gaussian; arguments as above."""
+    nodes, log_mass = _log_masses(log_function, cavity, near, False)
+    share = jax.nn.softmax(log_mass, axis=0)
+    x = nodes.reshape((-1,) + (1,) * (share.ndim - 1))
+    away = x - (share * x).sum(0)
+    variance = (share * away**2).sum(0)
+    return (share * away**3).sum(0) / variance**1.5, (share * away**4).sum(0) / variance**2 - 3.0
 
 
 def expectations(function: Callable[[jax.Array], jax.Array], about: Marginal) -> tuple[jax.Array, jax.Array, jax.Array]:

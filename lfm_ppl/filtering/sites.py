@@ -93,6 +93,8 @@ class SiteSettings(NamedTuple):
         sweeps: most sweeps.
         relinearisations: sweeps in which the sites and the points of linearisation are refined together, before the
             points are held fixed; for models that are not linear.
+        linear_response: whether smoothed covariances of EP are those of its linear response, in a linear model of at
+            most 12 joint states.
     """
 
     method: str = "ep"
@@ -100,6 +102,7 @@ class SiteSettings(NamedTuple):
     damping: float = 1.0
     sweeps: int = 200
     relinearisations: int = 8
+    linear_response: bool = True
 
 
 def as_settings(sites: Any, iterations: int = 0) -> SiteSettings:

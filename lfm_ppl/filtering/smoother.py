@@ -22,6 +22,7 @@ from lfm_ppl.filtering.filter import (
     whitened_innovations,
 )
 from lfm_ppl.filtering.iterated import Iterated, posterior_linearisation, refined
+from lfm_ppl.filtering.linear_response import responds, response
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.rts import Smoothed, backward
 from lfm_ppl.filtering.simulation_smoother import smoothing_errors
@@ -74,8 +75,8 @@ class Joint(NamedTuple):
         start: moments at the initial time.
         passed: forward scan over intervals that end at the requested times, among others.
         requested: (K,) the requested times among these.
-        covariance: (K, n, n), smoothed by that scan; None where it is that of the result. In intervals that are cut at
-            the requested times integration errors differ, and draws take the result's moments.
+        covariance: (K, n, n), smoothed by that scan; None where it is that of the result. Of draws it is the result's:
+            integration errors differ in intervals that are cut at the requested times, and linear response is added.
     """
 
     start: Moments
@@ -291,19 +292,21 @@ def smooth_on(ssm: StateSpaceModel, rule: Rule, grids: SmoothingGrids, y: jax.Ar
     """The same on time grids, without checks; for compiled code."""
     grid = grids.marginals
     start = Moments(*ssm.initial())
-    passed, smoothed, found, scored = _smooth_intervals(ssm, rule, grid, y, start, iterations, damping, settings)
+    passed, smoothed, found, scored, added = _smooth_intervals(ssm, rule, grid, y, start, iterations, damping, settings)
     times = jnp.asarray(grids.times, float)
     if grids.joint is None or grids.where is None:
         at = jnp.asarray(grid.requested)
         mean, covariance = (a[at + 1] for a in smoothed.moments)
-        joint = Joint(start, passed._replace(steps=None), at, None)
+        joint = Joint(start, passed._replace(steps=None), at, None if added is None else covariance)
     else:
-        drawn, pieces, *_ = _smooth_intervals(ssm, rule, grids.joint, y, start, iterations, damping, settings)
+        drawn, pieces, *_, added = _smooth_intervals(ssm, rule, grids.joint, y, start, iterations, damping, settings)
         at = jnp.asarray(grids.joint.requested)
         joint = Joint(start, drawn._replace(steps=None), at, pieces.moments.covariance[at + 1])
         branches = (Branches(grid, passed.filtered, smoothed.moments, smoothed.adjoint, None) if found is None
                     else refined(ssm, rule, grid, found, passed, smoothed))
         mean, covariance = dense_output(ssm, rule, branches, start, grids.where)
+    if added is not None:
+        covariance = covariance + added[at + 1]
     matrix, offset = jax.vmap(ssm.input_map)(times)
     observed = jnp.asarray(grid.observed)
     at_data = jax.tree_util.tree_map(lambda a: a[observed], passed._replace(steps=None))
@@ -317,8 +320,12 @@ def smooth_on(ssm: StateSpaceModel, rule: Rule, grids: SmoothingGrids, y: jax.Ar
 
 
 def _smooth_intervals(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments, iterations: int,
-                      damping: float, settings: SiteSettings) -> tuple[Pass, Smoothed, Iterated | None, tuple | None]:
-    """Smooth on one time grid; of a family also its one-step-ahead and leave-one-out terms, and its residuals."""
+                      damping: float, settings: SiteSettings
+                      ) -> tuple[Pass, Smoothed, Iterated | None, tuple | None, jax.Array | None]:
+    """Smooth on one time grid; of a family also its one-step-ahead and leave-one-out terms, and its residuals.
+
+    And what linear response adds to the covariances of the nodes; None where it is left out.
+    """
     if isinstance(ssm.model.observation, ObservationFamily):
         return _smooth_family(ssm, rule, grid, y, start, settings, ssm.model.observation)
     found = None
@@ -326,7 +333,7 @@ def _smooth_intervals(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.A
         found = posterior_linearisation(ssm, rule, grid, y, start, iterations, damping)
     passed = forward(ssm, rule, grid, y, start=start, linearization_point=None if found is None else found.points,
                      keep="steps" if iterations else "all")
-    return passed, backward(passed, start, grid), found, None
+    return passed, backward(passed, start, grid), found, None, None
 
 
 def _smooth_family(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments,
@@ -344,7 +351,10 @@ def _smooth_family(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Arra
     scored = (else_ahead(ahead.log_likelihood), else_ahead(leave_one_out(at, refined_sites.sites, found.entries)),
               quantile_residuals(family, ahead.prediction, y), converged)
     iterated = None if points is None else Iterated(points, refined_sites.change)
-    return found.passed, smoothed, iterated, scored
+    added = None
+    if settings.method == "ep" and settings.linear_response and responds(ssm):
+        added = response(found.passed, smoothed, start, grid, FamilyTerms(family, y), refined_sites, settings.power)
+    return found.passed, smoothed, iterated, scored, added
 
 
 _run_smoother = eqx.filter_jit(smooth_on)
