@@ -3,11 +3,13 @@
 import os
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
+import lfm_ppl as lfm
 from lfm_ppl.experiments import catalogue
-from lfm_ppl.experiments.counts import experiment, methods, problem, tables
+from lfm_ppl.experiments.counts import experiment, methods, problem, reference, tables
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 DATA = Path(os.environ.get("LFM_DATA", ROOT.parent / "shared" / "data"))
@@ -56,3 +58,17 @@ def test_tables_measure_against_the_reference(monkeypatch):
     row = tables.prediction(settings, results).loc["student-t, EP"]
     assert row[["NLPD", "less reference", "covered"]].tolist() == pytest.approx([2.0, 0.5, 0.75])
     assert row["less reference se"] == pytest.approx(0.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", problem.SIMULATED)
+def test_moments_of_the_simulated_data_are_exact_but_for_the_mark(name):
+    """200 rows, of which 20 are off by 20 scales for Student-t: means within 0.05 sd, sds within 3% of exact draws."""
+    one = problem.problem(name, problem.Size(), 0, None)
+    model = one.build(**one.given)
+    drawn = reference.Reference(model, one.times, one.sites).sample(jax.random.key(0), one.y, 20_000)
+    mean, sd = lfm.smooth(model, one.times, one.y, sites=one.sites).force("u")
+    exact, spread = drawn.mean((0, 1)), drawn.std((0, 1))
+    away, wider = np.abs(mean - exact) / spread, np.abs(sd / spread - 1)
+    print(f"{name}: means {away.max():.4f} sd at most, sds {wider.max():.4f}")
+    assert away.max() < 0.05 and wider.max() < 0.03

@@ -76,20 +76,48 @@ def likelihood(name, theta, sites=None):
     return lfm.MarginalLikelihood(model, TIMES, sites=sites)
 
 
-def importance(name, y, mean, cov):
-    """Log evidence, its standard error, and posterior means and sds, by draws from a Gaussian near the posterior."""
-    theta, k = np.asarray(THETA), covariance(np.asarray(THETA))
-    rng = np.random.default_rng(2)
-    root, prior = np.linalg.cholesky(cov), np.linalg.cholesky(k)
-    white = rng.normal(size=(DRAWS, TIMES.size))
-    f = mean + white @ root.T
-    log_weight = (FAMILIES[name][1](y.T, f, theta).sum(1) - 0.5 * (np.linalg.solve(prior, f.T) ** 2).sum(0)
-                  - np.log(np.diag(prior)).sum() + 0.5 * (white**2).sum(1) + np.log(np.diag(root)).sum())
+def importance(name, y, mean, cov, draws=DRAWS):
+    """Log evidence, its standard error, and posterior means and sds, by draws of Student's t near the posterior.
+
+    With 8 degrees of freedom: beside gross errors the posterior has tails, or a second mode, beyond a Gaussian's.
+    """
+    theta, k, size = np.asarray(THETA), covariance(np.asarray(THETA)), TIMES.size
+    prior = np.linalg.inv(k + 1e-12 * np.eye(size))
+    proposal = stats.multivariate_t(mean, cov, df=8, seed=np.random.default_rng(2))
+    found, log_weight = [], []
+    for _ in range(0, draws, DRAWS):
+        f = proposal.rvs(DRAWS)
+        found.append(f)
+        log_weight.append(FAMILIES[name][1](y.T, f, theta).sum(1) - 0.5 * np.einsum("ij,jk,ik->i", f, prior, f)
+                          + 0.5 * np.linalg.slogdet(prior)[1] - 0.5 * size * np.log(2 * np.pi) - proposal.logpdf(f))
+    f, log_weight = np.concatenate(found), np.concatenate(log_weight)
     weight = np.exp(log_weight - log_weight.max())
-    error = weight.std() / weight.mean() / np.sqrt(DRAWS)
+    error = weight.std() / weight.mean() / np.sqrt(len(f))
     share = weight / weight.sum()
     first = share @ f
     return log_weight.max() + np.log(weight.mean()), error, first, np.sqrt(share @ (f - first) ** 2)
+
+
+def exact_moments(y, chains=200, sweeps=3000, burn_in=300):
+    """Posterior means and sds under Student-t errors, good to 0.002: a Gibbs sampler of their scale mixture of normals.
+
+    Averaged are the moments given the scales.
+    """
+    theta, y = np.asarray(THETA), y.ravel()
+    prior, df = np.linalg.inv(covariance(theta) + 1e-12 * np.eye(y.size)), 4.0
+    variance, rng = (0.2 * np.exp(theta[2])) ** 2, np.random.default_rng(0)
+    weight, first, second = rng.gamma(df / 2, 2 / df, (chains, y.size)), 0.0, 0.0
+    for sweep in range(burn_in + sweeps):
+        cov = np.linalg.inv(prior + weight[:, :, None] * np.eye(y.size) / variance)
+        mean = np.einsum("cij,cj->ci", cov, weight * y / variance)
+        root = np.linalg.cholesky(0.5 * (cov + cov.transpose(0, 2, 1)))
+        f = mean + np.einsum("cij,cj->ci", root, rng.normal(size=mean.shape))
+        weight = rng.gamma((df + 1) / 2, 2.0, mean.shape) / (df + (y - f) ** 2 / variance)
+        if sweep >= burn_in:
+            first = first + mean.mean(0)
+            second = second + (mean**2 + np.einsum("cii->ci", cov)).mean(0)
+    first = first / sweeps
+    return first, np.sqrt(second / sweeps - first**2)
 
 
 @pytest.mark.parametrize("name", [name if name == "Student-t" else pytest.param(name, marks=pytest.mark.slow)
@@ -129,15 +157,20 @@ def test_evidence_and_moments_of_many_records(name):
         rng = np.random.default_rng(seed)
         y = FAMILIES[name][2](rng, np.linalg.cholesky(k + 1e-12 * np.eye(len(k))) @ rng.normal(size=len(k)))
         log_evidence, mean, sd, cov = map(np.asarray, run(jnp.asarray(y, float)[:, None]))
-        log_z, error, first, spread = importance(name, y.astype(float)[:, None], mean, 1.25 * cov)
+        log_z, error, first, spread = importance(name, y.astype(float)[:, None], mean, 1.25 * cov, 500_000)
+        if name == "Student-t":  # two modes are too much for the weights
+            first, spread = exact_moments(y)
         found.append([abs(log_evidence - log_z), np.max(np.abs(mean - first) / spread),
                       np.max(np.abs(sd / spread - 1.0)), error])
     away = np.array(found)
     print(f"{name}: log evidence, means, sds, error of the reference: median {np.median(away, 0).round(3)}, "
           f"largest {away.max(0).round(3)}")
     away = away[away[:, 3] < 0.02]
-    assert len(away) > 8 and away[:, 0].max() < 0.2 and away[:, 1].max() < 0.06
-    assert np.median(away[:, 2]) < 0.05 if name == "Student-t" else away[:, 2].max() < 0.03
+    assert len(away) == 16 and away[:, 0].max() < 0.2 and away[:, 1].max() < 0.05
+    if name == "Student-t":
+        assert np.median(away[:, 2]) < 0.015 and np.sum(away[:, 2] < 0.03) >= 14 and away[:, 2].max() < 0.07
+    else:
+        assert away[:, 2].max() < 0.01
 
 
 def differences(value, theta, h=1e-3):
