@@ -89,6 +89,7 @@ def test_covariances_are_the_response_of_the_means_to_a_source(drift, requested)
         assert np.abs(found.force("u").sd / held.force("u").sd - 1).max() > 0.005, "it is no small change"
 
 
+@pytest.mark.slow
 def test_draws_have_the_covariances_of_the_result():
     result = lfm.smooth(linear(lfm.Observations(*parts())), TIMES, data(), at=AT)
     drawn = np.asarray(result.sample_joint(jax.random.key(0), 40_000))
