@@ -340,6 +340,8 @@ def pivoted_root(p: jax.Array) -> jax.Array:
 
     Source: Higham (2002), Accuracy and Stability of Numerical Algorithms, section 10.3.
     """
+    if p.shape[-1] == 0:
+        return p
     sd = safe_sqrt(diagonal(p))
     inverse = _divide(jnp.ones(()), sd)
     least = p.shape[-1] * jnp.finfo(p.dtype).eps

@@ -75,7 +75,7 @@ def test_a_pivoted_root_is_as_accurate_as_a_matrix_that_is_singular_but_for_roun
     rates = d[:, None] + d
     gram = -np.expm1(-2.0 * rates) / rates
     with_white = np.block([[gram, 0.7 * gram[:, -1:]], [0.7 * gram[-1:], gram[-1:, -1:]]])
-    for p in (gram, with_white):
+    for p in (gram, with_white, np.zeros((count, count)), np.zeros((0, 0))):
         root = np.asarray(pivoted_root(jnp.asarray(p)))
         np.testing.assert_allclose(root @ root.T, p, atol=1e-14)
 

@@ -50,7 +50,7 @@ from lfm_ppl.linalg import (
 )
 from lfm_ppl.model.state_space import StateSpaceModel
 
-LARGEST_STATE = 12
+LARGEST_STATE = 8
 """Most joint states whose products, half of the square of them, are carried along."""
 
 _SINGULAR = 1e-9
@@ -94,7 +94,7 @@ def response(passed: Pass, smoothed: Smoothed, start: Moments, grid: TimeGrid, t
              power: float) -> jax.Array:
     """Return what linear response adds to the smoothed covariances (N + 1, n, n) of the nodes.
 
-    Zero where sites have not converged, and where any variance would change by more than a factor of four.
+    Zero where sites have not converged, and at nodes at which a variance would change by more than a factor of four.
 
     Args:
         passed: the forward scan with the converged sites.
@@ -117,18 +117,20 @@ def response(passed: Pass, smoothed: Smoothed, start: Moments, grid: TimeGrid, t
     def give_back(adjoint: jax.Array, at: tuple[_Row, jax.Array]) -> tuple[jax.Array, jax.Array]:
         row, change = at
         through, weight = _site(row, change)
-        features = _features(row.jacobian)
-        left = jnp.eye(dim) - matmul(through, matmul(weight, features))
+        features, gain = _features(row.jacobian), matmul(through, weight)
         adjoint = congruence(_lifted(row.gain).T, adjoint)
-        adjoint = congruence(features.T, weight) + congruence(left.T, adjoint)
+        # (I - K E)' Lambda (I - K E) + E' W E, without a product of large matrices.
+        pulled = matmul(adjoint, gain)
+        crossed = matmul(pulled, features)
+        adjoint = adjoint - crossed - crossed.T + congruence(features.T, weight + symmetric(matmul(gain.T, pulled)))
         own = (_moments(row.covariance) + change)[:size]
         return adjoint, change[:size, :size] - congruence(own, adjoint)
 
     first, changes = jax.lax.scan(take_in, jnp.zeros((dim, dim)), rows, reverse=True)
     _, at_ends = jax.lax.scan(give_back, jnp.zeros((dim, dim)), (rows, changes))
     added = jnp.concatenate([first[None, :size, :size], at_ends])
-    small = found.converged & jax.vmap(_is_small)(added, smoothed.moments.covariance).all()
-    return jnp.where(small, added, 0.0)
+    small = found.converged & jax.vmap(_is_small)(added, smoothed.moments.covariance)
+    return jnp.where(small[:, None, None], added, 0.0)
 
 
 def _rows(passed: Pass, smoothed: Smoothed, start: Moments, grid: TimeGrid, terms: FamilyTerms, found: Converged,
@@ -144,9 +146,11 @@ def _rows(passed: Pass, smoothed: Smoothed, start: Moments, grid: TimeGrid, term
     has = jnp.zeros((count, by_entry.shape[2]), bool).at[jnp.asarray(grid.observed)].set(usable)
     still = (jnp.asarray(grid.intervals.length) == 0) & (jnp.asarray(grid.intervals.jump) < 0)
 
+    singular = max(_SINGULAR, 1e3 * float(jnp.finfo(passed.phi.dtype).eps))
+
     def row(now: jax.Array, predicted: jax.Array, phi: jax.Array, at_rest: jax.Array, covariance: jax.Array,
             jacobian: jax.Array, of_predictor: jax.Array, precision: jax.Array, has: jax.Array) -> _Row:
-        gain = solve_semidefinite(predicted, matmul(phi, now), tolerance=_SINGULAR).T
+        gain = solve_semidefinite(predicted, matmul(phi, now), tolerance=singular).T
         gain = jnp.where(at_rest, jnp.eye(len(now)), gain)
         inverse_sd = jnp.where(has, 1.0 / jnp.sqrt(jnp.where(has, diagonal(of_predictor), 1.0)), 0.0)
         first, both, second = map(jnp.diag, precision)

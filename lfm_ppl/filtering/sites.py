@@ -94,7 +94,7 @@ class SiteSettings(NamedTuple):
         relinearisations: sweeps in which the sites and the points of linearisation are refined together, before the
             points are held fixed; for models that are not linear.
         linear_response: whether smoothed covariances of EP are those of its linear response, in a linear model of at
-            most 12 joint states.
+            most 8 joint states; at times at which no variance changes by more than a factor of four.
     """
 
     method: str = "ep"

@@ -90,7 +90,8 @@ class SmootherResult(eqx.Module):
 
     Attributes:
         times: (K,) requested times.
-        mean, covariance: (K, n), (K, n, n) of the joint state, given all observations.
+        mean, covariance: (K, n), (K, n, n) of the joint state, given all observations; of an observation family the
+            covariance is that of linear response (`SiteSettings`).
         input_mean, input_covariance: (K, M + R), (K, M + R, M + R) of w = (x, u).
         log_likelihood: (T,), log p(y_k | y_1:k-1).
         leave_one_out: (T,), log p(y_k | y_-k).
@@ -137,6 +138,9 @@ class SmootherResult(eqx.Module):
 
     def sample(self, key: jax.Array, draws: int = 1) -> Trajectories:
         """Draw whole trajectories from the joint smoothing distribution, by `smoothing_errors`.
+
+        At each time they have the covariance of the result. Of an observation family, correlations between times are
+        those of the Gaussian under all sites.
 
         Args:
             key: a JAX random key.
@@ -282,7 +286,8 @@ def smoothing_grids(ssm: StateSpaceModel, times: Any, steps: int, max_step: floa
         beyond[-1] = max(beyond[-1], joint.requested_times.max())
     base = build_time_grid(ssm, times, steps, max_step, np.append(known[-1:], beyond), tolerance=tolerance,
                            until=float(max(known[-1], joint.requested_times.max())))
-    by_step = iterations or (isinstance(ssm.model.observation, ObservationFamily) and not is_linear(ssm))
+    by_step = iterations or (isinstance(ssm.model.observation, ObservationFamily) and not is_linear(ssm)
+                             and tolerance is None)
     where = places(per_step(base) if by_step else base, joint.requested_times)
     return SmoothingGrids(base, joint, where, joint.requested_times)
 
@@ -302,7 +307,9 @@ def smooth_on(ssm: StateSpaceModel, rule: Rule, grids: SmoothingGrids, y: jax.Ar
         drawn, pieces, *_, added = _smooth_intervals(ssm, rule, grids.joint, y, start, iterations, damping, settings)
         at = jnp.asarray(grids.joint.requested)
         joint = Joint(start, drawn._replace(steps=None), at, pieces.moments.covariance[at + 1])
-        branches = (Branches(grid, passed.filtered, smoothed.moments, smoothed.adjoint, None) if found is None
+        # Steps that follow a tolerance are linearised about the filter's own moments.
+        branches = (Branches(grid, passed.filtered, smoothed.moments, smoothed.adjoint, None)
+                    if found is None or grid.tolerance is not None
                     else refined(ssm, rule, grid, found, passed, smoothed))
         mean, covariance = dense_output(ssm, rule, branches, start, grids.where)
     if added is not None:

@@ -162,14 +162,32 @@ def test_known_starts_stay_known(known):
 
 
 @pytest.mark.slow
-def test_models_of_many_states_keep_the_covariance_of_the_gaussian():
+@pytest.mark.parametrize("count", [LARGEST_STATE // 2, LARGEST_STATE // 2 + 1])
+def test_models_of_many_states_keep_the_covariance_of_the_gaussian(count):
     model = lfm.LatentForceModel(
-        lambda x, u, t: u - x, {f"u{i}": lfm.Matern(1.0, 1.0 + i, order=1) for i in range(5)},
-        lfm.PoissonObservation(lambda x, u, t: x), lfm.Gaussian(jnp.zeros(5), jnp.eye(5)))
-    assert lfm.state_space(model).state_dim > LARGEST_STATE
-    y = np.random.default_rng(0).poisson(1.0, (3, 5)).astype(float)
+        lambda x, u, t: jnp.zeros(0), {f"u{i}": lfm.Matern(1.0, 1.0 + i, order=1) for i in range(count)},
+        lfm.PoissonObservation(lambda x, u, t: u.sum()[None]), lfm.Gaussian(jnp.zeros(0), jnp.zeros((0, 0))))
+    y = np.random.default_rng(0).poisson(1.0, (3, 1)).astype(float)
     found, held = (lfm.smooth(model, np.arange(3.0), y, sites=one) for one in (None, EP_ONLY))
-    np.testing.assert_array_equal(found.covariance, held.covariance)
+    assert np.array_equal(found.covariance, held.covariance) == (lfm.state_space(model).state_dim > LARGEST_STATE)
+
+
+@pytest.mark.slow
+def test_a_row_with_two_modes_leaves_the_others_as_they_are():
+    """A record whose variances would change by more than a factor of four, long after one that responds."""
+    model = lfm.LatentForceModel(
+        lambda x, u, t: jnp.zeros(0), {"u": lfm.Matern(1.0, 2.0, order=1)},
+        lfm.StudentTObservation(lambda x, u, t: u, 2.0, 0.1), lfm.Gaussian(jnp.zeros(0), jnp.zeros((0, 0))))
+    good = np.array([0.1, 0.2, 0.9, 0.3, 0.2, 0.1])
+    bad = np.array([0.081, 0.158, -0.47, 2.314, 1.071, -0.186])
+    times = np.arange(6.0)
+    alone = [lfm.smooth(model, times, good, sites=one).force("u").sd for one in (None, EP_ONLY)]
+    both = [lfm.smooth(model, np.append(times, times + 200.0), np.append(good, bad), sites=one).force("u").sd
+            for one in (None, EP_ONLY)]
+    np.testing.assert_allclose(both[0][:6], alone[0], rtol=1e-5)
+    assert np.abs(alone[0] / alone[1] - 1).max() > 0.002
+    kept = np.asarray(both[0][6:] == both[1][6:])
+    assert kept.any() and np.all((both[0] / both[1] > 0.5) & (both[0] / both[1] < 2.0))
 
 
 def test_shape_of_a_tilted_distribution():

@@ -329,6 +329,25 @@ def pushed(theta):
         lfm.Gaussian(jnp.ones(1), 0.1 * jnp.eye(1)))
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("linear", [False, True])
+def test_steps_that_follow_a_tolerance_give_the_moments_at_any_time(linear):
+    """At the data those without requested times; in a linear model those of many steps, which are not linearised."""
+    drift = (lambda x, u, t: u - (1.0 + 0.2 * jnp.sin(t)) * x) if linear else lambda x, u, t: jax.nn.softplus(u) - x
+    model = lfm.LatentForceModel(drift, {"u": lfm.Matern(1.0, 1.0)}, lfm.PoissonObservation(lambda x, u, t: x),
+                                 lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
+    times, at = 0.5 * np.arange(8.0), np.array([0.0, 0.7, 2.0, 3.2, 4.0])
+    y = np.random.default_rng(0).poisson(1.5, (8, 1)).astype(float)
+    found, whole = (lfm.smooth(model, times, y, at=wanted, tolerance=1e-5) for wanted in (at, None))
+    np.testing.assert_allclose(found.input_mean[:3:2], whole.input_mean[:5:4], atol=1e-9)
+    np.testing.assert_allclose(found.input_covariance[:3:2], whole.input_covariance[:5:4], atol=1e-4)
+    assert np.isfinite(found.sample(jax.random.key(0), 3).state).all()
+    if linear:
+        fixed = lfm.smooth(model, times, y, at=at, steps=20)
+        np.testing.assert_allclose(found.input_mean, fixed.input_mean, atol=1e-4)
+        np.testing.assert_allclose(found.input_covariance, fixed.input_covariance, atol=1e-4)
+
+
 HOPELESS = SiteSettings(sweeps=1, relinearisations=2)
 """With which sites do not converge."""
 
