@@ -17,11 +17,11 @@ state is a Markov process, s = m + G (s_later - m_later) + noise, and so is phi,
 of one scan that takes the sites in as observations of phi with precisions -S, from the last row to the first, and of
 one adjoint scan back: no inverse of a covariance, and linear in time. Where sites are Gaussian, S is zero.
 
-Errors of a standard deviation are of second order in what tilted distributions have beyond a Gaussian's moments, those
-of q of first order. Where two modes have nearly the same mass the response is no small change, and no better.
+How near the exact covariance it is, docs/observations.md has. Where two modes have nearly the same mass the response is
+no small change, and no better.
 
-Source: Opper and Winther (2004), Variational linear response, NIPS 16; Opper and Winther (2005), Expectation consistent
-approximate inference, Journal of Machine Learning Research 6, section 5.
+Source: Opper and Winther (2004), Variational linear response, NIPS 16; Welling and Teh (2004), Linear response
+algorithms for approximate inference in graphical models, Neural Computation 16.
 """
 
 from __future__ import annotations
@@ -145,7 +145,6 @@ def _rows(passed: Pass, smoothed: Smoothed, start: Moments, grid: TimeGrid, term
     at_end = jnp.zeros((3, count, by_entry.shape[2])).at[:, jnp.asarray(grid.observed)].set(by_entry)
     has = jnp.zeros((count, by_entry.shape[2]), bool).at[jnp.asarray(grid.observed)].set(usable)
     still = (jnp.asarray(grid.intervals.length) == 0) & (jnp.asarray(grid.intervals.jump) < 0)
-
     singular = max(_SINGULAR, 1e3 * float(jnp.finfo(passed.phi.dtype).eps))
 
     def row(now: jax.Array, predicted: jax.Array, phi: jax.Array, at_rest: jax.Array, covariance: jax.Array,
