@@ -34,9 +34,9 @@ def varying(x, u, t):
     return u - (0.8 + 0.3 * jnp.sin(t)) * x
 
 
-def parts(df=4.0):
+def parts():
     return (lfm.PoissonObservation(lambda x, u, t: 0.5 * u),
-            lfm.StudentTObservation(lambda x, u, t: x + 0.2 * u, df, 0.2))
+            lfm.StudentTObservation(lambda x, u, t: x + 0.2 * u, 4.0, 0.2))
 
 
 def linear(observation, drift=steady):
