@@ -283,7 +283,8 @@ def integrate(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, linear: LinearPa
     return predict_interval(ssm, rule, linear, factor, grid.steps, start, length, moments, nodes, with_map, each)
 
 
-def transitions_about(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, points: Points | None) -> Transitions | None:
+def transitions_about(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, points: Points | None,
+                      prepared: Preparation | None = None) -> Transitions | None:
     """Return the maps of all intervals of a model that is linearised about fixed points.
 
     Passes over the same points then integrate nothing.
@@ -293,13 +294,14 @@ def transitions_about(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, points: 
         rule: the linearisation rule.
         grid: the time grid.
         points: about which it is linearised; None: its dynamics is linear.
+        prepared: as in `forward`.
 
     Returns:
         None where a pass has its transitions at hand, or where the moments decide on its steps.
     """
     if ssm.time_invariant or grid.tolerance is not None:
         return None
-    prepared = preparation(ssm, rule, grid)
+    prepared = preparation(ssm, rule, grid) if prepared is None else prepared
 
     def one(at: tuple[Intervals, Moments | None]) -> Transitions:
         interval, nodes = at
@@ -315,7 +317,8 @@ def transitions_about(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, points: 
 
 def forward(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, *, start: Moments | None = None,
             linearization_point: Points | None = None, keep: str = "likelihood",
-            sites: Sites | Callable[..., Any] | None = None, transitions: Transitions | None = None) -> Pass:
+            sites: Sites | Callable[..., Any] | None = None, transitions: Transitions | None = None,
+            prepared: Preparation | None = None) -> Pass:
     """Run the one forward scan.
 
     Args:
@@ -331,8 +334,9 @@ def forward(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, *, s
             are then integrals of the sites. Or what makes those of a row, and its log likelihood, from the mean (D,)
             and the covariance (D, D) of the predictor as predicted, the row's index, and its entries of y.
         transitions: of the intervals, where they are known; of ``linearization_point`` only the ends are used then.
+        prepared: what the intervals share, where several passes share it.
     """
-    prepared = preparation(ssm, rule, grid)
+    prepared = preparation(ssm, rule, grid) if prepared is None else prepared
     with_map = keep in ("all", "steps") or (keep == "inside" and grid.tolerance is not None)
     each: Callable[[Prediction], Any] | None = None
     if keep == "steps":

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from lfm_ppl.filtering.dense_output import Branches
-from lfm_ppl.filtering.filter import Pass, Points, bends, columns, completed, forward, needed
+from lfm_ppl.filtering.filter import Pass, Points, Preparation, bends, columns, completed, forward, needed
 from lfm_ppl.filtering.jumps import jump_map
 from lfm_ppl.filtering.predict import Moments, compose
 from lfm_ppl.filtering.rts import Smoothed, backward
@@ -32,7 +32,7 @@ class Iterated(NamedTuple):
 
 
 def posterior_linearisation(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments,
-                            iterations: int, damping: float) -> Iterated:
+                            iterations: int, damping: float, prepared: Preparation) -> Iterated:
     """Iterate: smooth, linearise about the smoothed marginals, smooth again.
 
     Args:
@@ -43,11 +43,13 @@ def posterior_linearisation(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y:
         start: moments at the initial time.
         iterations: fixed number, so that the result is a smooth function of the parameters.
         damping: share of the new marginals that is taken, in (0, 1].
+        prepared: what the intervals of all passes share, so that its derivative is taken once.
 
     Source: García-Fernández, Svensson and Särkkä (2017), IEEE Transactions on Signal Processing 65(21).
     """
     def smoothed(linearization_point: Points | None) -> Points:
-        passed = forward(ssm, rule, grid, y, start=start, linearization_point=linearization_point, keep="inside")
+        passed = forward(ssm, rule, grid, y, start=start, linearization_point=linearization_point, keep="inside",
+                         prepared=prepared)
         return smoothed_points(ssm, rule, grid, passed, backward(passed, start, grid, moments=False), start)
 
     def iterate(carry: tuple[Points, jax.Array], _: None) -> tuple[tuple[Points, jax.Array], None]:

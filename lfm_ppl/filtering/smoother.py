@@ -18,6 +18,7 @@ from lfm_ppl.filtering.filter import (
     at_intervals,
     check_observations,
     forward,
+    preparation,
     warn_single_precision,
     whitened_innovations,
 )
@@ -335,11 +336,11 @@ def _smooth_intervals(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.A
     """
     if isinstance(ssm.model.observation, ObservationFamily):
         return _smooth_family(ssm, rule, grid, y, start, settings, ssm.model.observation)
-    found = None
+    found, prepared = None, preparation(ssm, rule, grid)
     if iterations:
-        found = posterior_linearisation(ssm, rule, grid, y, start, iterations, damping)
+        found = posterior_linearisation(ssm, rule, grid, y, start, iterations, damping, prepared)
     passed = forward(ssm, rule, grid, y, start=start, linearization_point=None if found is None else found.points,
-                     keep="steps" if iterations else "all")
+                     keep="steps" if iterations else "all", prepared=prepared)
     return passed, backward(passed, start, grid), found, None, None
 
 

@@ -29,6 +29,7 @@ from lfm_ppl.filtering.filter import (
     check_observations,
     filter_on,
     forward,
+    preparation,
     warn_single_precision,
 )
 from lfm_ppl.filtering.iterated import posterior_linearisation
@@ -314,11 +315,12 @@ class MarginalLikelihood(dist.Distribution):
         start = Moments(*self.ssm.initial())
         if isinstance(self.model.observation, ObservationFamily):
             return assumed_density_filter(self.ssm, self.rule, self.time_grid, y, start).log_likelihood
-        point = None
+        point, prepared = None, preparation(self.ssm, self.rule, self.time_grid)
         if self.iterations:
             point = posterior_linearisation(self.ssm, self.rule, self.time_grid, y, start, self.iterations,
-                                            self.damping).points
-        passed = forward(self.ssm, self.rule, self.time_grid, y, start=start, linearization_point=point)
+                                            self.damping, prepared).points
+        passed = forward(self.ssm, self.rule, self.time_grid, y, start=start, linearization_point=point,
+                         prepared=prepared)
         return at_intervals(passed.log_likelihood, self.time_grid.observed)
 
     def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:

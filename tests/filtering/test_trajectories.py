@@ -13,7 +13,7 @@ from systems import identity, motif, softplus
 
 import lfm_ppl as lfm
 from lfm_ppl import loading
-from lfm_ppl.filtering.filter import forward
+from lfm_ppl.filtering.filter import forward, preparation
 from lfm_ppl.filtering.iterated import posterior_linearisation
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.time_grid import build_time_grid
@@ -118,7 +118,8 @@ def test_nodes_after_a_known_start_are_those_of_dense_algebra():
     @jax.jit
     def run(y):
         passed = forward(ssm, lfm.Cubature(), grid, y, start=start, keep="steps")
-        return passed, posterior_linearisation(ssm, lfm.Cubature(), grid, y, start, 1, 1.0).points.nodes
+        prepared = preparation(ssm, lfm.Cubature(), grid)
+        return passed, posterior_linearisation(ssm, lfm.Cubature(), grid, y, start, 1, 1.0, prepared).points.nodes
 
     passed, nodes = jax.tree_util.tree_map(np.asarray, run(y))
     force = 5
