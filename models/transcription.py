@@ -16,7 +16,7 @@ Expression starts near the resting level, x_j(0) ~ N(basal_j / decay_j, 0.1^2).
 
 Where the link is not linear, a single pass of the filter biases the posterior, on the p53 data by up to half a
 posterior standard deviation. So the likelihood is that of three iterations of posterior linearisation, whose log
-evidence is within 0.03 there. `--iterations 0` is the single pass, three to four times as fast: for a first look.
+evidence is within 0.03 there. `--iterations 0` is the single pass, four times as fast: for a first look.
 
 With the option `df` the errors e_jk are noise_sd_j times Student's t of that many degrees of freedom, so that
 a few gross errors move the rates little; the noise_sd of their gene grows. As in
