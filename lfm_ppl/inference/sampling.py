@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from numpyro.infer import NUTS
 from numpyro.infer.util import ParamInfo
 
@@ -32,6 +33,9 @@ CHAIN_METHODS = ("parallel", "vectorized", "sequential")
 
 BLOCK_S = 2.0
 """Time that a block of steps is to take: that long, and no longer, Ctrl-C waits for it."""
+
+_CHAINS = PartitionSpec("chains")
+"""Arrays whose first axis is split over the devices, a chain on each."""
 
 _GROWTH = 8
 """Most that a block may be longer than the one before it: steps of the warm-up differ in length."""
@@ -245,11 +249,14 @@ def sample(key: jax.Array, bound: BoundModel, transition: Transition, starts: np
             keeper.save(saved, 0)
     chains = len(saved.leaves[0])
     method = available_method(chain_method, chains)
-    block = bound.compiled(("block", transition.identity, method), lambda: _block(transition, _recorder(transition),
-                                                                                  method))
+    mesh = _mesh(chains) if method == "parallel" else None
+    block = bound.compiled(("block", transition.identity, method, mesh),
+                           lambda: _block(transition, _recorder(transition), method, mesh))
     run = _one_by_one(block, chains) if method == "sequential" else block
     state = _on_device(saved.leaves, _like(bound, transition, chains))
-    now = (state, jax.tree_util.tree_map(jnp.asarray, saved.rows), saved.done)
+    begun = jax.tree_util.tree_map(jnp.asarray, (state, saved.rows))
+    # Laid out as the program leaves them, or the second block would be compiled anew for another layout.
+    now = (*(begun if mesh is None else jax.device_put(begun, NamedSharding(mesh, _CHAINS))), saved.done)
     pace, on_disk = _Pace(), saved.done
     drawn = lambda done: max((done - warmup) // thin, 0)  # noqa: E731
 
@@ -369,7 +376,12 @@ def _recorder(transition: Transition) -> Callable[[Any], dict[str, jax.Array]]:
     return record
 
 
-def _block(transition: Transition, record: Callable, method: str) -> Callable:
+def _mesh(chains: int) -> Mesh:
+    """Return the devices of chains side by side, one for each."""
+    return Mesh(np.array(jax.local_devices()[:chains]), tuple(_CHAINS))
+
+
+def _block(transition: Transition, record: Callable, method: str, mesh: Mesh | None) -> Callable:
     """Return the compiled function that takes steps ``lower`` to ``upper`` of all chains (of one, in sequence)."""
 
     def advance(state: Any, store: Any, lower: Any, upper: Any, warmup: Any, thin: Any, y: Any) -> tuple[Any, Any]:
@@ -385,8 +397,17 @@ def _block(transition: Transition, record: Callable, method: str) -> Callable:
 
     if method == "sequential":
         return jax.jit(advance)
-    axes = (0, 0, None, None, None, None, None)
-    return jax.pmap(advance, in_axes=axes) if method == "parallel" else jax.jit(jax.vmap(advance, in_axes=axes))
+    if mesh is None:
+        return jax.jit(jax.vmap(advance, in_axes=(0, 0, None, None, None, None, None)))
+
+    def own(state: Any, store: Any, *rest: Any) -> tuple[Any, Any]:
+        """Advance the one chain of a device."""
+        only = lambda tree, at: jax.tree_util.tree_map(lambda leaf: leaf[at], tree)  # noqa: E731
+        return only(advance(*only((state, store), 0), *rest), None)
+
+    one = PartitionSpec()
+    return jax.jit(jax.shard_map(own, mesh=mesh, in_specs=(_CHAINS, _CHAINS, one, one, one, one, one),
+                                 out_specs=_CHAINS, check_vma=False))
 
 
 def _one_by_one(block: Callable, chains: int) -> Callable:
