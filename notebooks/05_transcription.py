@@ -108,8 +108,8 @@ scores.readable(found.tables["paired"])
 # model is an ordinary NumPyro model with the marginal likelihood of the filter, which NUTS and robust adaptive
 # Metropolis sample in 14 dimensions. `lfm.on_latent_grid` turns the same model into one with the force as latent
 # sites, exact up to its grid of 61 points: the reference, for which NUTS goes through 78 dimensions. Posterior
-# linearisation costs several times the likelihood, so it enters last: the draws of the plain posterior are weighted by it
-# (`RAM, iterated marginal`).
+# linearisation costs several times the likelihood, so it enters last: the draws of the plain posterior are weighted by
+# it (`RAM, iterated marginal`).
 #
 #     lfm-ppl compare transcription-parameters
 

@@ -18,6 +18,11 @@ from lfm_ppl.linalg import congruence, matmul, safe_sqrt
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.state_space import StateSpaceModel
 
+_LEAST_VARIANCE = 1e-100
+"""Of a coordinate that is not known."""
+_NO_STEP = 1e-8
+"""Square of a step, in standard deviations, that is too small to learn from."""
+
 
 class Iterated(NamedTuple):
     """What the iterations leave.
@@ -33,7 +38,14 @@ class Iterated(NamedTuple):
 
 def posterior_linearisation(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments,
                             iterations: int, damping: float, prepared: Preparation) -> Iterated:
-    """Iterate: smooth, linearise about the smoothed marginals, smooth again.
+    r"""Iterate: smooth, linearise about the smoothed marginals, smooth again.
+
+    Where an iteration moves the means m of a time by r and the one before, of which the share s was taken, moved them
+    by r', the share that is taken now is that of the secant method,
+
+        s / (1 - lambda),    lambda = sum_i r_i r'_i / v_i  /  sum_i r'_i^2 / v_i,
+
+    with the variances v, and at most the damping: means that go back and forth between two values meet between them.
 
     Args:
         ssm: the model.
@@ -42,7 +54,7 @@ def posterior_linearisation(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y:
         y: (T, D), NaN where missing.
         start: moments at the initial time.
         iterations: fixed number, so that the result is a smooth function of the parameters.
-        damping: share of the new marginals that is taken, in (0, 1].
+        damping: largest share of the new marginals that is taken, in (0, 1].
         prepared: what the intervals of all passes share, so that its derivative is taken once.
 
     Source: García-Fernández, Svensson and Särkkä (2017), IEEE Transactions on Signal Processing 65(21).
@@ -52,24 +64,46 @@ def posterior_linearisation(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y:
                          prepared=prepared)
         return smoothed_points(ssm, rule, grid, passed, backward(passed, start, grid, moments=False), start)
 
-    def iterate(carry: tuple[Points, jax.Array], _: None) -> tuple[tuple[Points, jax.Array], None]:
-        points = carry[0]
+    def iterate(carry: tuple, _: None) -> tuple[tuple, None]:
+        points, moves, _ = carry
         new = smoothed(points)
-        change = _largest_change(points.nodes, new.nodes)
-        if points.ends is not None and new.ends is not None:
-            change = jnp.maximum(change, _largest_change(points.ends, new.ends))
-        return (jax.tree_util.tree_map(lambda a, b: a + damping * (b - a), points, new), change), None
+        moved = [_moved(*each, damping) for each in zip(_parts(points), _parts(new), moves, strict=True)]
+        return (Points(*(moments for moments, *_ in moved), *[None] * (2 - len(moved))),
+                [move for _, move, _ in moved], jnp.max(jnp.stack([change for *_, change in moved]))), None
 
-    first = smoothed(None), jnp.asarray(jnp.nan)
-    (points, change), _ = jax.lax.scan(iterate, first, None, length=iterations - 1)
+    first = smoothed(None)
+    moves = [_Move(jnp.zeros_like(part.mean), jnp.full(part.mean.shape[:-1], damping)) for part in _parts(first)]
+    (points, _, change), _ = jax.lax.scan(iterate, (first, moves, jnp.asarray(jnp.nan)), None, length=iterations - 1)
     return Iterated(points, change)
 
 
-def _largest_change(old: Moments, new: Moments) -> jax.Array:
-    """Return the largest change of a mean, in standard deviations."""
-    sd = safe_sqrt(jnp.diagonal(new.covariance, axis1=-2, axis2=-1))
-    change = jnp.abs(new.mean - old.mean) / jnp.where(sd > 0, sd, 1.0)
-    return jnp.max(jnp.where(sd > 0, change, 0.0), initial=0.0)
+class _Move(NamedTuple):
+    """How an iteration moved the moments of all times.
+
+    Attributes:
+        step: (..., n) difference of the new means from those about which they were linearised.
+        share: (...) of it that was taken.
+    """
+
+    step: jax.Array
+    share: jax.Array
+
+
+def _parts(points: Points) -> list[Moments]:
+    return [part for part in points if part is not None]
+
+
+def _moved(old: Moments, new: Moments, before: _Move, damping: float) -> tuple[Moments, _Move, jax.Array]:
+    """Return moments between the old and the new ones, the move, and the largest step in standard deviations."""
+    step = new.mean - old.mean
+    variance = jnp.diagonal(new.covariance, axis1=-2, axis2=-1)
+    known = variance <= _LEAST_VARIANCE
+    precision = jnp.where(known, 0.0, 1.0 / jnp.where(known, 1.0, variance))
+    both, square = (jnp.sum(precision * before.step * each, axis=-1) for each in (step, before.step))
+    share = before.share / jnp.maximum(1.0 - both / (square + _NO_STEP), before.share / damping)
+    by = lambda a: share.reshape(share.shape + (1,) * (a.ndim - share.ndim))  # noqa: E731
+    moved = jax.tree_util.tree_map(lambda a, b: a + by(a) * (b - a), old, new)
+    return moved, _Move(step, share), jnp.max(jnp.abs(step) * safe_sqrt(precision), initial=0.0)
 
 
 def smoothed_points(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, passed: Pass, smoothed: Smoothed,

@@ -192,7 +192,8 @@ def check_iterations(iterations: int, damping: float, tolerance: float | None = 
     if iterations != 0:
         checks.positive_integer("iterations", iterations)
     if not 0 < damping <= 1:
-        raise ValueError(f"damping must lie in (0, 1] (the share of each new iterate that is taken), got {damping}.")
+        raise ValueError("damping must lie in (0, 1] (the largest share of each new iterate that is taken), "
+                         f"got {damping}.")
     if iterations and tolerance is not None:
         raise ValueError("iterations need integration steps of equal length, whose ends all passes share, and with a "
                          f"tolerance the steps follow the moments; leave out tolerance={tolerance:g} or iterations.")
@@ -215,7 +216,7 @@ def smooth(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
         at: (K,) times at which results are wanted, in any order, also after the last observation (a forecast).
             The observation times by default. They change nothing elsewhere.
         iterations: of posterior linearisation, 0 for none.
-        damping: share of each new iterate that is taken, in (0, 1].
+        damping: largest share of each new iterate that is taken, in (0, 1]; less where the iterates turn back.
         tolerance: largest error of an integration step, in standard deviations, as in `lfm_ppl.MarginalLikelihood`.
         sites: of an observation family, how its sites are refined: "ep" (the default), "variational", "laplace", or
             `lfm_ppl.SiteSettings`.

@@ -88,7 +88,7 @@ class MarginalLikelihood(dist.Distribution):
         steps: integration steps between two consecutive times.
         max_step: longest step; longer intervals get more.
         iterations: of posterior linearisation; 0 for none.
-        damping: share of each new iterate that is taken.
+        damping: largest share of each new iterate that is taken; less where the iterates turn back.
         tolerance: largest error of an integration step, in standard deviations. With it the length of the steps follows
             the moments, for every parameter anew, for stiff models and for posteriors over slow and fast ones; up to
             five times ``steps`` are tried. None: ``steps`` equal steps. Not with ``iterations``.
@@ -523,7 +523,7 @@ def panel(build: Callable[..., LatentForceModel], parameters: Any, times: Any, r
         steps: integration steps between two consecutive times.
         max_step: longest step.
         iterations: of posterior linearisation.
-        damping: share of each new iterate that is taken.
+        damping: largest share of each new iterate that is taken; less where the iterates turn back.
         tolerance: largest error of an integration step, in standard deviations; None for equal steps.
         sites: of an observation family.
 

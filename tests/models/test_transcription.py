@@ -161,8 +161,9 @@ def test_p53_posterior(file):
 def test_p53_posterior_is_that_of_the_force_on_a_grid(file):
     """Means of all log parameters, and of the force, are within 0.1 sd of those without a filter.
 
-    With three iterations, as the model has them; a single pass is off by 0.5. The reference has the force as latent values 0.2 hours apart, so that its likelihood is
-    exact up to the grid. The 0.1 sd are beyond four Monte Carlo errors of the difference.
+    With three iterations, as the model has them; a single pass is off by 0.5. The reference has the force as latent
+    values 0.2 hours apart, so that its likelihood is exact up to the grid. The 0.1 sd are beyond four Monte Carlo
+    errors of the difference.
     """
     data = file.prepare(lfm.read_csv(P53))
     anchors, keywords, hours = file.anchors(data), file.keywords(data, {}), np.unique(data.times)
@@ -238,7 +239,8 @@ def log_evidence(parameters, times, y, link_function, samples=200_000):
     mean = jnp.zeros(at.size)
     for _ in range(100):
         step, precision = newton(mean)
-        share = next(share for share in (*0.5 ** np.arange(30), 0.0) if log_joint(mean + share * step) >= log_joint(mean))
+        share = next(share for share in (*0.5 ** np.arange(30), 0.0)
+                     if log_joint(mean + share * step) >= log_joint(mean))
         mean = mean + share * step
     mean, covariance = np.asarray(mean), np.linalg.inv(precision)
     random = np.random.default_rng(0)

@@ -24,7 +24,7 @@ class Smoother(NamedTuple):
         rule: of linearisation.
         steps: Runge-Kutta steps between two observations.
         iterations: of posterior linearisation.
-        damping: share of each new iterate that is taken.
+        damping: largest share of each new iterate that is taken.
     """
 
     rule: Rule
