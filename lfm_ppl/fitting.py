@@ -559,11 +559,11 @@ def check_requested(bound: BoundModel, at: Any) -> None:
 
 def _strategy(init: Any, bound: BoundModel, seed: int) -> Any:
     if init is None:
-        return init_to_median(num_samples=15)
+        return init_to_median
     if isinstance(init, str):
         checks.one_of("init", init, ("map", "median"))
         if init == "median":
-            return init_to_median(num_samples=15)
+            return init_to_median
         return init_to_value(values=mode_of(bound, seed=seed).parameters)
     if not callable(init):
         raise TypeError('init must be None, "map", "median" or a NumPyro strategy such as '

@@ -545,8 +545,8 @@ class BoundModel:
         Raises:
             ValueError: there is none among so many attempts.
         """
-        for attempt in jax.random.split(key, attempts):
-            z = self.draw(attempt, strategy)
+        for data in np.asarray(jax.random.key_data(jax.random.split(key, attempts))):
+            z = self.draw(jax.random.wrap_key_data(data, impl=jax.random.key_impl(key)), strategy)
             found = jax.tree_util.tree_leaves((evaluate or self.log_density_gradient)(z))
             if all(np.all(np.isfinite(one)) for one in found):
                 return z

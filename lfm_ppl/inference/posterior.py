@@ -394,7 +394,7 @@ def over_draws(bound: BoundModel, name: Hashable, per_draw: Callable, draws: Map
         lower: return the program of a batch (`jax.stages.Lowered`), whatever the draws' values. As long as it lives,
             what it compiles to need not be compiled again.
     """
-    draws = {site: jnp.asarray(value) for site, value in draws.items()}
+    draws = {site: np.asarray(value) for site, value in draws.items()}
     count = next(iter(draws.values())).shape[0]
     example = bound.site.example
     several = rows is not None and (example.tolerance is None or example.ssm.time_invariant)
@@ -405,18 +405,22 @@ def over_draws(bound: BoundModel, name: Hashable, per_draw: Callable, draws: Map
         one_by_one = lambda d, k, y: jax.lax.map(lambda pair: per_draw(*pair, y), (d, k))  # noqa: E731
         return jax.jit(jax.vmap(per_draw, in_axes=(0, 0, None)) if several else one_by_one)
 
-    run, keys = bound.compiled(("over draws", several, name), make), jax.random.split(key, count)
+    run, keys = bound.compiled(("over draws", several, name), make), np.asarray(
+        jax.random.key_data(jax.random.split(key, count)))
+
+    def some(start: int) -> tuple[dict[str, np.ndarray], jax.Array, Any]:
+        index = np.minimum(np.arange(start, start + batch), count - 1)  # full batches: one shape
+        return ({site: value[index] for site, value in draws.items()},
+                jax.random.wrap_key_data(keys[index], impl=jax.random.key_impl(key)), bound.argument)
+
     if lower:
-        one = {site: value[jnp.arange(batch)] for site, value in draws.items()}
-        return cast(Any, run).lower(one, keys[jnp.arange(batch)], bound.argument)
+        return cast(Any, run).lower(*some(0))
     found = []
     for start in range(0, count, batch):
         show(start, count)
         part = None if parts is None else parts.get(start)
         if part is None:
-            index = np.minimum(np.arange(start, start + batch), count - 1)  # full batches: one shape
-            part = run({site: value[index] for site, value in draws.items()}, keys[index], bound.argument)
-            part = jax.tree_util.tree_map(np.asarray, part)
+            part = jax.tree_util.tree_map(np.asarray, run(*some(start)))
             if parts is not None:
                 parts.put(start, part)
         found.append(part)

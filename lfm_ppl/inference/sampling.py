@@ -253,10 +253,10 @@ def sample(key: jax.Array, bound: BoundModel, transition: Transition, starts: np
     block = bound.compiled(("block", transition.identity, method, mesh),
                            lambda: _block(transition, _recorder(transition), method, mesh))
     run = _one_by_one(block, chains) if method == "sequential" else block
-    state = _on_device(saved.leaves, _like(bound, transition, chains))
-    begun = jax.tree_util.tree_map(jnp.asarray, (state, saved.rows))
     # Laid out as the program leaves them, or the second block would be compiled anew for another layout.
-    now = (*(begun if mesh is None else jax.device_put(begun, NamedSharding(mesh, _CHAINS))), saved.done)
+    layout = None if mesh is None else NamedSharding(mesh, _CHAINS)
+    state = _on_device(saved.leaves, _like(bound, transition, chains), layout)
+    now = state, {name: jax.device_put(rows, layout) for name, rows in saved.rows.items()}, saved.done
     pace, on_disk = _Pace(), saved.done
     drawn = lambda done: max((done - warmup) // thin, 0)  # noqa: E731
 
@@ -304,24 +304,28 @@ class _Pace:
 def _first(key: jax.Array, bound: BoundModel, transition: Transition, starts: np.ndarray, samples: int) -> Saved:
     """Return the state before the first step."""
     chains = len(starts)
-    begin = bound.compiled(("start", transition.identity), lambda: jax.jit(
-        jax.vmap(transition.start, in_axes=(0, 0, None, None))))
-    state = begin(jax.random.split(key, chains), _points(bound, transition, starts), bound.argument, transition.extra)
+    begin = bound.compiled(("start", transition.identity), lambda: jax.jit(_start(bound, transition)))
+    found = [transition.evaluate(start) for start in starts]
+    energy, slope = (-np.stack([np.asarray(each) for each in values]) for values in zip(*found, strict=True))
+    state = begin(jax.random.split(key, chains), np.asarray(starts), energy, slope, bound.argument, transition.extra)
     row = jax.eval_shape(jax.vmap(_recorder(transition)), state)
     return Saved(0, _on_host(state), {name: np.zeros((chains, samples, *leaf.shape[1:]), leaf.dtype)
                                       for name, leaf in row.items()})
 
 
+def _start(bound: BoundModel, transition: Transition) -> Callable:
+    """Return the function from keys (C,), first points (C, d), energies and their gradients to states."""
+    def start(key: jax.Array, z: jax.Array, energy: jax.Array, slope: jax.Array, y: Any, extra: Any) -> Any:
+        return transition.start(key, ParamInfo(bound.unravel(z), energy, bound.unravel(slope)), y, extra)
+
+    return jax.vmap(start, in_axes=(0, 0, 0, 0, None, None))
+
+
 def _like(bound: BoundModel, transition: Transition, chains: int) -> Any:
     """Return shapes and types of the state of all chains."""
-    unravel = jax.vmap(bound.unravel)
-
-    def start(keys: jax.Array, z: jax.Array, energy: jax.Array) -> Any:
-        points = ParamInfo(unravel(z), energy, unravel(z))
-        return jax.vmap(transition.start, in_axes=(0, 0, None, None))(keys, points, bound.argument, transition.extra)
-
-    return jax.eval_shape(start, jax.random.split(jax.random.key(0), chains), jnp.zeros((chains, bound.size)),
-                          jnp.zeros(chains))
+    points, energy = (jax.ShapeDtypeStruct((chains, *shape), float) for shape in ((bound.size,), ()))
+    return jax.eval_shape(_start(bound, transition), jax.random.split(jax.random.key(0), chains), points, energy,
+                          points, bound.argument, transition.extra)
 
 
 def _on_host(state: Any) -> list[np.ndarray]:
@@ -329,12 +333,13 @@ def _on_host(state: Any) -> list[np.ndarray]:
             for leaf in jax.tree_util.tree_leaves(state)]
 
 
-def _on_device(leaves: Sequence[np.ndarray], like: Any) -> Any:
-    """Return the state whose arrays are ``leaves``; the inverse of `_on_host`."""
+def _on_device(leaves: Sequence[np.ndarray], like: Any, layout: NamedSharding | None) -> Any:
+    """Return the state whose arrays are ``leaves``, laid out over devices; the inverse of `_on_host`."""
     shapes, structure = jax.tree_util.tree_flatten(like)
     return jax.tree_util.tree_unflatten(structure, [
-        jax.random.wrap_key_data(jnp.asarray(leaf)) if jnp.issubdtype(shape.dtype, jax.dtypes.prng_key)
-        else jnp.asarray(leaf, shape.dtype) for leaf, shape in zip(leaves, shapes, strict=True)])
+        jax.random.wrap_key_data(jax.device_put(leaf, layout)) if jnp.issubdtype(shape.dtype, jax.dtypes.prng_key)
+        else jax.device_put(np.asarray(leaf, shape.dtype), layout)
+        for leaf, shape in zip(leaves, shapes, strict=True)])
 
 
 def _draws(rows: Mapping[str, np.ndarray], count: int, done: int, total: int) -> Draws:
@@ -358,14 +363,6 @@ def available_method(chosen: str | None, chains: int) -> str:
                       stacklevel=3)
         return "sequential"
     return chosen
-
-
-def _points(bound: BoundModel, transition: Transition, starts: np.ndarray) -> ParamInfo:
-    """Return position, energy and gradient at the first point of each chain, by site and with chains as first axis."""
-    found = [transition.evaluate(start) for start in starts]
-    unravel = jax.vmap(bound.unravel)
-    return ParamInfo(unravel(jnp.asarray(starts)), -jnp.stack([value for value, _ in found]),
-                     unravel(-jnp.stack([gradient for _, gradient in found])))
 
 
 def _recorder(transition: Transition) -> Callable[[Any], dict[str, jax.Array]]:
