@@ -52,7 +52,7 @@ def warn_of_breakdown(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, 
         checks.warn(_site_trouble(ssm, rule, grid, y, start, sites, finite), FilterWarning)
         return
     checks.warn(breakdown(ssm, rule, grid, y, start) or "the log likelihood is -inf, but the filter does not break "
-                "down without posterior linearisation: try iterations=0, or more damping (a smaller share).",
+                "down without posterior linearisation: try iterations=0, or a smaller damping, such as damping=0.5.",
                 FilterWarning)
 
 

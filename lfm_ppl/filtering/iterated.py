@@ -18,8 +18,6 @@ from lfm_ppl.linalg import congruence, matmul, safe_sqrt
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.state_space import StateSpaceModel
 
-_LEAST_VARIANCE = 1e-100
-"""Of a coordinate that is not known."""
 _NO_STEP = 1e-8
 """Square of a step, in standard deviations, that is too small to learn from."""
 
@@ -97,7 +95,8 @@ def _moved(old: Moments, new: Moments, before: _Move, damping: float) -> tuple[M
     """Return moments between the old and the new ones, the move, and the largest step in standard deviations."""
     step = new.mean - old.mean
     variance = jnp.diagonal(new.covariance, axis1=-2, axis2=-1)
-    known = variance <= _LEAST_VARIANCE
+    # The derivative of 1 / variance must not overflow.
+    known = variance <= jnp.finfo(variance.dtype).tiny ** 0.25
     precision = jnp.where(known, 0.0, 1.0 / jnp.where(known, 1.0, variance))
     both, square = (jnp.sum(precision * before.step * each, axis=-1) for each in (step, before.step))
     share = before.share / jnp.maximum(1.0 - both / (square + _NO_STEP), before.share / damping)

@@ -257,6 +257,8 @@ def sample(key: jax.Array, bound: BoundModel, transition: Transition, starts: np
     layout = None if mesh is None else NamedSharding(mesh, _CHAINS)
     state = _on_device(saved.leaves, _like(bound, transition, chains), layout)
     now = state, {name: jax.device_put(rows, layout) for name, rows in saved.rows.items()}, saved.done
+    # Data may lie on one device, where chains on several cannot read them.
+    argument = bound.argument if mesh is None else jax.device_put(bound.argument, NamedSharding(mesh, PartitionSpec()))
     pace, on_disk = _Pace(), saved.done
     drawn = lambda done: max((done - warmup) // thin, 0)  # noqa: E731
 
@@ -269,7 +271,7 @@ def sample(key: jax.Array, bound: BoundModel, transition: Transition, starts: np
             while now[-1] < total and not stop.requests:
                 state, store, lower = now
                 upper, began = min(lower + pace.steps, total), time.perf_counter()
-                state, store = jax.block_until_ready(run(state, store, lower, upper, warmup, thin, bound.argument))
+                state, store = jax.block_until_ready(run(state, store, lower, upper, warmup, thin, argument))
                 now = state, store, upper
                 pace.took(time.perf_counter() - began)
                 stop.defer()

@@ -18,7 +18,8 @@ sampling.BLOCK_S = 0.02
 draws = {}
 for method in ("sequential", "parallel"):
     with compilations() as compiled:
-        found = lfm.fit(motif.model, motif.TIMES, motif.data(), sampler="ram", chains=2, warmup=400, samples=400,
+        y = jax.device_put(motif.data(), jax.devices()[0])  # the other chain must find them, too
+        found = lfm.fit(motif.model, motif.TIMES, y, sampler="ram", chains=2, warmup=400, samples=400,
                         thin=1, trajectory_draws=0, progress=False, chain_method=method,
                         sampler_options={"initial_covariance": 0.1 * np.eye(4)})
     draws[method] = np.asarray(lfm.results.arviz_data.group(found, "posterior")["decay"])
