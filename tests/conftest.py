@@ -5,11 +5,18 @@ import ctypes
 import gc
 import os
 import re
+import warnings
 from pathlib import Path
 
 import jax
 import jaxlib.version
 import pytest
+
+# ArviZ 0.23 writes the date of an announcement when it is first imported on a day, which two workers cannot do at once:
+# the process that starts them does it before.
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore", FutureWarning)
+    import arviz  # noqa: F401
 
 jax.config.update("jax_enable_x64", True)
 

@@ -408,5 +408,8 @@ def _arviz() -> ModuleType:
     # the reader of our output can do nothing about.
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", r"\s*ArviZ is undergoing a major", FutureWarning)
-        import arviz
+        try:
+            import arviz
+        except FileNotFoundError:  # another process wrote the date of that announcement at the same time
+            import arviz
     return arviz
