@@ -47,7 +47,7 @@ class Sampler(NamedTuple):
         kernel: "NUTS" or "RAM".
         latent: whether the force is a latent site on a grid; otherwise it is filtered out.
         iterations: of posterior linearisation in the likelihood that the draws are weighted to. They come from the
-            likelihood without, which is some ten times as fast and close enough for importance weights.
+            likelihood without, which is several times as fast and close enough for importance weights.
     """
 
     kernel: str
