@@ -256,7 +256,7 @@ def summary(result: Any) -> pd.DataFrame:
     quantiles = {label: np.quantile(values, (0.025, 0.975)) for label, values in draws.items()}
     resampled = attributes(result).get("effective_draws")
     moments = {
-        "mean": {label: values.mean() for label, values in draws.items()},
+        "mean": {label: _mean(values) for label, values in draws.items()},
         "sd": {label: _sd(values) for label, values in draws.items()},
         "q2.5": {label: low for label, (low, _) in quantiles.items()},
         "q97.5": {label: high for label, (_, high) in quantiles.items()},
@@ -385,10 +385,19 @@ def _diagnostic(
     return pd.Series(values, dtype=float)
 
 
+def _mean(values: np.ndarray) -> float:
+    return float(values.flat[0] if _equal(values) else values.mean())
+
+
 def _sd(values: np.ndarray) -> float:
     if values.size < 2 or not np.isfinite(values).all():
         return np.nan
-    return 0.0 if np.ptp(values) == 0.0 else float(values.std(ddof=1))  # the mean of equal numbers may be rounded
+    return 0.0 if _equal(values) else float(values.std(ddof=1))
+
+
+def _equal(values: np.ndarray) -> bool:
+    """Whether all are the same number, whose mean may be rounded."""
+    return bool(values.size and (values == values.flat[0]).all())
 
 
 def _checked(name: str, dataset: Any) -> xr.Dataset:

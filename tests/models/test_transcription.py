@@ -140,7 +140,7 @@ def test_p53_posterior(file):
     free = table[table["sd"] > 0]
     assert len(free) == 20
     assert free["r_hat"].max() <= 1.01 and free["ess_bulk"].min() >= 400
-    assert table.loc["decay[CDKN1A]", "mean"] == pytest.approx(0.8, rel=1e-14)  # a mean of 4,000, rounded
+    assert table.loc["decay[CDKN1A]", "mean"] == 0.8
 
     ram = summary(lfm.fit(file.model, data.times, data.y, sampler="ram", trajectory_draws=0, **task))
     assert ram.loc[free.index, "r_hat"].max() <= 1.01 and ram.loc[free.index, "ess_bulk"].min() >= 400

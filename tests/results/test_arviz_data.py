@@ -403,4 +403,5 @@ def test_equal_draws_have_no_spread_and_give_no_warning():
     result = arviz_data.build({"posterior": posterior})
     assert draws.std(ddof=1) != 0.0
     assert arviz_data.summary(result)["sd"]["fixed"] == 0.0
+    assert draws.mean() != 0.8 and arviz_data.summary(result)["mean"]["fixed"] == 0.8
     assert arviz_data.convergence_warnings(result) == []
