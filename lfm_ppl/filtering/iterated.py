@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -62,47 +63,51 @@ def posterior_linearisation(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y:
                          prepared=prepared)
         return smoothed_points(ssm, rule, grid, passed, backward(passed, start, grid, moments=False), start)
 
-    def iterate(carry: tuple, _: None) -> tuple[tuple, None]:
-        points, moves, _ = carry
-        new = smoothed(points)
-        moved = [_moved(*each, damping) for each in zip(_parts(points), _parts(new), moves, strict=True)]
-        return (Points(*(moments for moments, *_ in moved), *[None] * (2 - len(moved))),
-                [move for _, move, _ in moved], jnp.max(jnp.stack([change for *_, change in moved]))), None
+    def iterate(now: tuple, _: None) -> tuple[tuple, None]:
+        new = smoothed(Points(*_each(lambda part: part.moments, now)))
+        return _each(lambda part, new: _moved(part, new, damping), now, new), None
 
-    first = smoothed(None)
-    moves = [_Move(jnp.zeros_like(part.mean), jnp.full(part.mean.shape[:-1], damping)) for part in _parts(first)]
-    (points, _, change), _ = jax.lax.scan(iterate, (first, moves, jnp.asarray(jnp.nan)), None, length=iterations - 1)
-    return Iterated(points, change)
+    first = _each(lambda moments: _Iterate(moments, jnp.zeros_like(moments.mean),
+                                           jnp.full(moments.mean.shape[:-1], damping), jnp.asarray(jnp.nan)),
+                  smoothed(None))
+    last, _ = jax.lax.scan(iterate, first, None, length=iterations - 1)
+    change = jnp.max(jnp.stack([part.change for part in last if part is not None]))
+    return Iterated(Points(*_each(lambda part: part.moments, last)), change)
 
 
-class _Move(NamedTuple):
-    """How an iteration moved the moments of all times.
+class _Iterate(NamedTuple):
+    """Moments about which a pass is linearised, and how the last iteration moved them.
 
     Attributes:
-        step: (..., n) difference of the new means from those about which they were linearised.
+        moments: (..., n) and (..., n, n).
+        step: (..., n) difference of the smoothed means from those about which they were linearised.
         share: (...) of it that was taken.
+        change: largest step of a mean, in standard deviations.
     """
 
+    moments: Moments
     step: jax.Array
     share: jax.Array
+    change: jax.Array
 
 
-def _parts(points: Points) -> list[Moments]:
-    return [part for part in points if part is not None]
+def _each(function: Callable, *points: tuple) -> tuple:
+    """Apply a function to the nodes, and to the ends where there are any."""
+    return tuple(None if parts[0] is None else function(*parts) for parts in zip(*points, strict=True))
 
 
-def _moved(old: Moments, new: Moments, before: _Move, damping: float) -> tuple[Moments, _Move, jax.Array]:
-    """Return moments between the old and the new ones, the move, and the largest step in standard deviations."""
-    step = new.mean - old.mean
+def _moved(now: _Iterate, new: Moments, damping: float) -> _Iterate:
+    """Return the iterate between the present moments and those that were smoothed about them."""
+    step = new.mean - now.moments.mean
     variance = jnp.diagonal(new.covariance, axis1=-2, axis2=-1)
     # The derivative of 1 / variance must not overflow.
     known = variance <= jnp.finfo(variance.dtype).tiny ** 0.25
     precision = jnp.where(known, 0.0, 1.0 / jnp.where(known, 1.0, variance))
-    both, square = (jnp.sum(precision * before.step * each, axis=-1) for each in (step, before.step))
-    share = before.share / jnp.maximum(1.0 - both / (square + _NO_STEP), before.share / damping)
+    both, square = (jnp.sum(precision * now.step * each, axis=-1) for each in (step, now.step))
+    share = now.share / jnp.maximum(1.0 - both / (square + _NO_STEP), now.share / damping)
     by = lambda a: share.reshape(share.shape + (1,) * (a.ndim - share.ndim))  # noqa: E731
-    moved = jax.tree_util.tree_map(lambda a, b: a + by(a) * (b - a), old, new)
-    return moved, _Move(step, share), jnp.max(jnp.abs(step) * safe_sqrt(precision), initial=0.0)
+    moments = jax.tree_util.tree_map(lambda a, b: a + by(a) * (b - a), now.moments, new)
+    return _Iterate(moments, step, share, jnp.max(jnp.abs(step) * safe_sqrt(precision), initial=0.0))
 
 
 def smoothed_points(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, passed: Pass, smoothed: Smoothed,
