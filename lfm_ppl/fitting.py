@@ -35,6 +35,7 @@ from lfm_ppl.inference.marginal_likelihood import Panel
 from lfm_ppl.inference.posterior import evenly_spaced, scores, trajectories
 from lfm_ppl.inference.priors import assumptions, prior
 from lfm_ppl.inference.progress import Counter
+from lfm_ppl.inference.random_keys import split_keys
 from lfm_ppl.inference.samplers import FILTERED, SAMPLERS
 from lfm_ppl.inference.sampling import Transition
 from lfm_ppl.inference.site_failures import failures_at, paths_worth, site_failures
@@ -633,7 +634,8 @@ def _remarks(kernel: ParticleMarginalRAM) -> dict[str, Any]:
 
 def _starts(key: jax.Array, bound: BoundModel, strategy: Any, chains: int, evaluate: Any) -> np.ndarray:
     """Return a point (C, d) for each chain, by a NumPyro strategy, where what ``evaluate`` gives is finite."""
-    return np.stack([bound.start(each, strategy, evaluate=evaluate) for each in jax.random.split(key, chains)])
+    keys = split_keys(key, chains)
+    return np.stack([bound.start(keys(chain), strategy, evaluate=evaluate) for chain in range(chains)])
 
 
 def _about(key: jax.Array, bound: BoundModel, mode: MAPResult, chains: int) -> np.ndarray:

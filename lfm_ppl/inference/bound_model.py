@@ -29,6 +29,7 @@ from lfm_ppl.inference.handlers.likelihood_handler import LikelihoodHandler
 from lfm_ppl.inference.handlers.settings import approximate
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
 from lfm_ppl.inference.optimise import Objective, value_and_gradient
+from lfm_ppl.inference.random_keys import split_keys
 from lfm_ppl.inference.unconstrained import check_latent, coordinate_names, latent_sites
 
 FORWARD_MODE_LIMIT = 10
@@ -545,8 +546,9 @@ class BoundModel:
         Raises:
             ValueError: there is none among so many attempts.
         """
-        for data in np.asarray(jax.random.key_data(jax.random.split(key, attempts))):
-            z = self.draw(jax.random.wrap_key_data(data, impl=jax.random.key_impl(key)), strategy)
+        keys = split_keys(key, attempts)
+        for attempt in range(attempts):
+            z = self.draw(keys(attempt), strategy)
             found = jax.tree_util.tree_leaves((evaluate or self.log_density_gradient)(z))
             if all(np.all(np.isfinite(one)) for one in found):
                 return z

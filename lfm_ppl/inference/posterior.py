@@ -15,6 +15,7 @@ from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.fingerprint import signature
 from lfm_ppl.inference.marginal_likelihood import SIMULATION_STEPS, MarginalLikelihood, Panel
+from lfm_ppl.inference.random_keys import split_keys
 from lfm_ppl.linalg import semidefinite_root
 from lfm_ppl.model.observation_noise import expected_observation, noisy_observation, with_noise
 from lfm_ppl.model.observations.family import ObservationFamily
@@ -405,13 +406,11 @@ def over_draws(bound: BoundModel, name: Hashable, per_draw: Callable, draws: Map
         one_by_one = lambda d, k, y: jax.lax.map(lambda pair: per_draw(*pair, y), (d, k))  # noqa: E731
         return jax.jit(jax.vmap(per_draw, in_axes=(0, 0, None)) if several else one_by_one)
 
-    run, keys = bound.compiled(("over draws", several, name), make), np.asarray(
-        jax.random.key_data(jax.random.split(key, count)))
+    run, keys = bound.compiled(("over draws", several, name), make), split_keys(key, count)
 
     def some(start: int) -> tuple[dict[str, np.ndarray], jax.Array, Any]:
         index = np.minimum(np.arange(start, start + batch), count - 1)  # full batches: one shape
-        return ({site: value[index] for site, value in draws.items()},
-                jax.random.wrap_key_data(keys[index], impl=jax.random.key_impl(key)), bound.argument)
+        return {site: value[index] for site, value in draws.items()}, keys(index), bound.argument
 
     if lower:
         return cast(Any, run).lower(*some(0))

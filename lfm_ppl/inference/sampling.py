@@ -401,8 +401,8 @@ def _block(transition: Transition, record: Callable, method: str, mesh: Mesh | N
 
     def own(state: Any, store: Any, *rest: Any) -> tuple[Any, Any]:
         """Advance the one chain of a device."""
-        only = lambda tree, at: jax.tree_util.tree_map(lambda leaf: leaf[at], tree)  # noqa: E731
-        return only(advance(*only((state, store), 0), *rest), None)
+        state, store = jax.tree_util.tree_map(lambda leaf: leaf[0], (state, store))
+        return jax.tree_util.tree_map(lambda leaf: leaf[None], advance(state, store, *rest))
 
     one = PartitionSpec()
     return jax.jit(jax.shard_map(own, mesh=mesh, in_specs=(_CHAINS, _CHAINS, one, one, one, one, one),
