@@ -28,6 +28,7 @@ from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalRAM, Par
 from lfm_ppl.inference.kernels.ram import RAM
 from lfm_ppl.inference.kernels.robust_metropolis import RAMState, finite_or_infinity, initial_state
 from lfm_ppl.inference.progress import Progress, Stage
+from lfm_ppl.inference.random_keys import split_keys
 
 CHAIN_METHODS = ("parallel", "vectorized", "sequential")
 
@@ -309,7 +310,8 @@ def _first(key: jax.Array, bound: BoundModel, transition: Transition, starts: np
     begin = bound.compiled(("start", transition.identity), lambda: jax.jit(_start(bound, transition)))
     found = [transition.evaluate(start) for start in starts]
     energy, slope = (-np.stack([np.asarray(each) for each in values]) for values in zip(*found, strict=True))
-    state = begin(jax.random.split(key, chains), np.asarray(starts), energy, slope, bound.argument, transition.extra)
+    keys = split_keys(key, chains)(slice(None))
+    state = begin(keys, np.asarray(starts), energy, slope, bound.argument, transition.extra)
     row = jax.eval_shape(jax.vmap(_recorder(transition)), state)
     return Saved(0, _on_host(state), {name: np.zeros((chains, samples, *leaf.shape[1:]), leaf.dtype)
                                       for name, leaf in row.items()})

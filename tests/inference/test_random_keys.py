@@ -1,0 +1,25 @@
+"""Keys that are picked on the host are those of JAX, of which few programs make any number."""
+
+import jax
+import pytest
+
+from lfm_ppl.inference.random_keys import split_keys
+from tests.inference.test_bound_model import compilations
+
+
+@pytest.mark.parametrize("kind", ["threefry2x32", "rbg"])
+@pytest.mark.parametrize("partitionable", [True, False])
+@pytest.mark.parametrize("count", [0, 1, 4, 64, 65, 300])
+def test_keys_are_those_of_jax(kind, partitionable, count):
+    with jax.threefry_partitionable(partitionable):
+        key = jax.random.key(7, impl=kind)
+        assert (split_keys(key, count)(slice(None)) == jax.random.split(key, count)).all()
+
+
+def test_numbers_of_keys_share_a_program():
+    key = jax.random.key(7)
+    split_keys(key, 3)(0)
+    with compilations() as compiled:
+        for count in (2, 20, 64):
+            split_keys(key, count)(-1)
+    assert not compiled
