@@ -40,7 +40,7 @@ def test_a_wheel_installs_one_package_with_the_models_inside(unpacked):
     assert packages == {"lfm_ppl"}
     assert {path.name for path in (unpacked / "lfm_ppl/_models").glob("*.py")} == MODELS
     entry_points = next(unpacked.glob("*.dist-info")) / "entry_points.txt"
-    assert "lfm-ppl = lfm_ppl.cli:main" in entry_points.read_text()
+    assert "lfm-ppl = lfm_ppl.__main__:main" in entry_points.read_text()
 
 
 @pytest.mark.parametrize("installed", ["wheel", "checkout"])
