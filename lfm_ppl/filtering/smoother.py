@@ -291,7 +291,22 @@ def smoothing_grids(ssm: StateSpaceModel, times: Any, steps: int, max_step: floa
     by_step = iterations or (isinstance(ssm.model.observation, ObservationFamily) and not is_linear(ssm)
                              and tolerance is None)
     where = places(per_step(base) if by_step else base, joint.requested_times)
+    if tolerance is None:
+        joint = joint._replace(steps=_steps_as_long(joint, base))
     return SmoothingGrids(base, joint, where, joint.requested_times)
+
+
+def _steps_as_long(grid: TimeGrid, base: TimeGrid) -> int:
+    """Return with how many steps in each interval those of a grid are as short as the base's, or with all of its own.
+
+    Many requested times cut the intervals of the data into short ones, of which each would take as many steps as a
+    whole one.
+    """
+    begin, length = (np.asarray(a) for a in (grid.intervals.start, grid.intervals.length))
+    around = np.searchsorted(np.asarray(base.intervals.start), begin + length / 2, side="right") - 1
+    step = np.asarray(base.intervals.length)[around] / base.steps
+    moved = length > 0
+    return int(np.clip(np.ceil(length[moved] / step[moved] * (1 - 1e-9)).max(initial=1), 1, grid.steps))
 
 
 def smooth_on(ssm: StateSpaceModel, rule: Rule, grids: SmoothingGrids, y: jax.Array, iterations: int,

@@ -16,7 +16,9 @@ from lfm_ppl import loading
 from lfm_ppl.filtering.filter import forward, preparation
 from lfm_ppl.filtering.iterated import posterior_linearisation
 from lfm_ppl.filtering.predict import Moments
+from lfm_ppl.filtering.smoother import smoothing_grids
 from lfm_ppl.filtering.time_grid import build_time_grid
+from lfm_ppl.model.state_space import state_space
 
 TIMES = np.array([0.0, 0.0, 2.0, 4.0, 4.0, 6.0, 12.0, 14.0])  # replicates and a gap
 AT = np.array([0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 9.0, 14.0, 15.0, 20.0])  # ends with a forecast
@@ -165,3 +167,19 @@ def test_nodes_after_a_known_start_are_those_of_dense_algebra():
     variance = np.array([marginal[node + 1][force, force] for node in range(count)])
     expected = variance - np.einsum("ij,ij->i", cross, np.linalg.solve(gram, cross.T).T)
     np.testing.assert_allclose(nodes.covariance[:, 1:, 0, 0].ravel(), expected, rtol=1e-9)
+
+
+def test_many_requested_times_share_the_steps_of_an_interval():
+    """The scan for draws integrates in steps as short as the data's, however many times are asked for."""
+    def grids(at, **settings):
+        return smoothing_grids(state_space(motif(softplus)), TIMES, 12, settings.get("max_step"), at, 0)
+
+    assert grids(np.linspace(0.0, 14.0, 141)).joint.steps == 1  # 0.1 of the gap of 2, whose steps take a sixth
+    assert grids(np.linspace(0.0, 14.0, 29)).joint.steps == 3
+    assert grids(np.array([1.0])).joint.steps == 12  # other gaps are whole
+    # Gaps of 2 are cut into four pieces of 12 steps by max_step, and each of these in halves by the requested times.
+    assert grids(np.linspace(0.0, 14.0, 57), max_step=0.05).joint.steps == 6
+    assert grids(np.linspace(0.0, 300.0, 31)).joint.steps == 12, "a forecast takes no more than before"
+    model, y = motif(softplus, genes=2), observed(2, softplus)
+    many = lfm.smooth(model, TIMES, y, steps=12, at=np.linspace(0.0, 14.0, 141))
+    assert_draws_have_the_moments_of(many)
