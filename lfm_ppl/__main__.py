@@ -15,7 +15,7 @@ def main() -> int:
     tenth of the time of a short fit.
     """
     gc.set_threshold(_NEW_OBJECTS, 20, 100)
-    from lfm_ppl import cli
+    from lfm_ppl import cli  # which imports the most
 
     try:
         return cli.main()

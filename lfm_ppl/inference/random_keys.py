@@ -30,4 +30,3 @@ def split_keys(key: jax.Array, count: int) -> Callable[[Any], jax.Array]:
     made = max(_FEWEST, 1 << (count - 1).bit_length()) if by_index else count
     data = np.asarray(jax.random.key_data(jax.random.split(key, made)))[:count]
     return lambda index: jax.random.wrap_key_data(data[index], impl=kind)
-

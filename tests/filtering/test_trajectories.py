@@ -171,8 +171,8 @@ def test_nodes_after_a_known_start_are_those_of_dense_algebra():
 
 def test_many_requested_times_share_the_steps_of_an_interval():
     """The scan for draws integrates in steps as short as the data's, however many times are asked for."""
-    def grids(at, **settings):
-        return smoothing_grids(state_space(motif(softplus)), TIMES, 12, settings.get("max_step"), at, 0)
+    def grids(at, max_step=None):
+        return smoothing_grids(state_space(motif(softplus)), TIMES, 12, max_step, at, 0)
 
     assert grids(np.linspace(0.0, 14.0, 141)).joint.steps == 1  # 0.1 of the gap of 2, whose steps take a sixth
     assert grids(np.linspace(0.0, 14.0, 29)).joint.steps == 3
