@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from lfm_ppl.filtering.dense_output import Branches
 from lfm_ppl.filtering.filter import Pass, Points, Preparation, bends, columns, completed, forward, needed
@@ -14,7 +15,7 @@ from lfm_ppl.filtering.jumps import jump_map
 from lfm_ppl.filtering.predict import Moments, compose
 from lfm_ppl.filtering.rts import Smoothed, backward
 from lfm_ppl.filtering.smoothing_kernel import smoothed_moments, smoothing_kernel
-from lfm_ppl.filtering.time_grid import TimeGrid, per_step
+from lfm_ppl.filtering.time_grid import TimeGrid, containing, per_step
 from lfm_ppl.linalg import congruence, matmul, safe_sqrt
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.state_space import StateSpaceModel
@@ -108,6 +109,47 @@ def _moved(now: _Iterate, new: Moments, damping: float) -> _Iterate:
     by = lambda a: share.reshape(share.shape + (1,) * (a.ndim - share.ndim))  # noqa: E731
     moments = jax.tree_util.tree_map(lambda a, b: a + by(a) * (b - a), now.moments, new)
     return _Iterate(moments, step, share, jnp.max(jnp.abs(step) * safe_sqrt(precision), initial=0.0))
+
+
+class Crossings(NamedTuple):
+    """Where the nodes of one time grid lie on another that spans the same time.
+
+    Attributes:
+        interval: (N, J + 1) the other's interval that a node lies in.
+        step: (N, J + 1) its step within that.
+        share: (N, J + 1) of the step that has passed.
+        end: (N,) the other's interval with the observation that an interval ends at; without one, that it lies in.
+    """
+
+    interval: Any
+    step: Any
+    share: Any
+    end: Any
+
+
+def crossings(grid: TimeGrid, other: TimeGrid) -> Crossings:
+    """Find the nodes of a time grid on another; both are known before compilation."""
+    begin, length = (np.asarray(a)[:, None] for a in (grid.intervals.start, grid.intervals.length))
+    share = np.linspace(0.0, 1.0, grid.steps + 1)
+    time, inward = begin + length * share, length * (0.5 - share)
+    # At an end of the other's intervals, before a jump or after it, the node belongs to the one on its own side.
+    row = containing(time + 1e-6 * inward, other)
+    first, whole = (np.asarray(a)[row] for a in (other.intervals.start, other.intervals.length))
+    passed = np.clip((time - first) / np.where(whole > 0, whole, 1.0), 0.0, 1.0) * other.steps
+    step = np.minimum(passed.astype(int), other.steps - 1)
+    observation = np.asarray(grid.intervals.observation)
+    end = np.where(observation >= 0, np.asarray(other.observed)[observation], row[:, -1])
+    return Crossings(row, step, passed - step, end)
+
+
+def between(points: Points, at: Crossings) -> Points:
+    """Return the moments about which a pass is linearised at the nodes of another time grid, linear within a step."""
+    def inside(nodes: jax.Array) -> jax.Array:
+        left, right = nodes[at.interval, at.step], nodes[at.interval, at.step + 1]
+        return left + at.share.reshape(at.share.shape + (1,) * (left.ndim - 2)) * (right - left)
+
+    tree = jax.tree_util.tree_map
+    return Points(tree(inside, points.nodes), tree(lambda a: a[at.end], points.ends))
 
 
 def smoothed_points(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, passed: Pass, smoothed: Smoothed,

@@ -22,7 +22,7 @@ from lfm_ppl.filtering.filter import (
     warn_single_precision,
     whitened_innovations,
 )
-from lfm_ppl.filtering.iterated import Iterated, posterior_linearisation, refined
+from lfm_ppl.filtering.iterated import Crossings, Iterated, between, crossings, posterior_linearisation, refined
 from lfm_ppl.filtering.linear_response import responds, response
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.rts import Smoothed, backward
@@ -37,7 +37,7 @@ from lfm_ppl.filtering.sites import (
     quantile_residuals,
 )
 from lfm_ppl.filtering.sites import evidence as site_evidence
-from lfm_ppl.filtering.time_grid import TimeGrid, build_time_grid, per_step
+from lfm_ppl.filtering.time_grid import TimeGrid, build_time_grid, containing, per_step
 from lfm_ppl.linalg import congruence, matmul, safe_sqrt, semidefinite_root, solve_lower
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.latent_force_model import LatentForceModel
@@ -263,12 +263,15 @@ class SmoothingGrids(NamedTuple):
         joint: for draws of trajectories, with intervals that end at the requested times too; None where ``marginals``
             serves: without requested times, and for a model whose intervals are exact whatever their length.
         where: the requested times among ``marginals``; None where ``joint`` is.
+        nodes: those of ``joint`` among those of ``marginals``, about whose iterated moments it is linearised; None
+            where ``joint`` is, and without iterations.
         times: (K,) requested times.
     """
 
     marginals: TimeGrid
     joint: TimeGrid | None
     where: Places | None
+    nodes: Crossings | None
     times: Any
 
 
@@ -277,7 +280,7 @@ def smoothing_grids(ssm: StateSpaceModel, times: Any, steps: int, max_step: floa
     """Lay out the time grids of a smoother; a forecast goes on in intervals as long as the data's median interval."""
     joint = build_time_grid(ssm, times, steps, max_step, at, tolerance=tolerance)
     if at is None or ssm.time_invariant:
-        return SmoothingGrids(joint, None, None, joint.requested_times)
+        return SmoothingGrids(joint, None, None, None, joint.requested_times)
     known = np.asarray(times, float)
     beyond = np.array([])
     if joint.requested_times.max() > known[-1]:
@@ -288,12 +291,13 @@ def smoothing_grids(ssm: StateSpaceModel, times: Any, steps: int, max_step: floa
         beyond[-1] = max(beyond[-1], joint.requested_times.max())
     base = build_time_grid(ssm, times, steps, max_step, np.append(known[-1:], beyond), tolerance=tolerance,
                            until=float(max(known[-1], joint.requested_times.max())))
-    by_step = iterations or (isinstance(ssm.model.observation, ObservationFamily) and not is_linear(ssm)
-                             and tolerance is None)
+    family = isinstance(ssm.model.observation, ObservationFamily)
+    by_step = iterations or (family and not is_linear(ssm) and tolerance is None)
     where = places(per_step(base) if by_step else base, joint.requested_times)
     if tolerance is None:
         joint = joint._replace(steps=_steps_as_long(joint, base))
-    return SmoothingGrids(base, joint, where, joint.requested_times)
+    nodes = crossings(joint, base) if iterations and not family else None
+    return SmoothingGrids(base, joint, where, nodes, joint.requested_times)
 
 
 def _steps_as_long(grid: TimeGrid, base: TimeGrid) -> int:
@@ -303,8 +307,7 @@ def _steps_as_long(grid: TimeGrid, base: TimeGrid) -> int:
     whole one.
     """
     begin, length = (np.asarray(a) for a in (grid.intervals.start, grid.intervals.length))
-    around = np.searchsorted(np.asarray(base.intervals.start), begin + length / 2, side="right") - 1
-    step = np.asarray(base.intervals.length)[around] / base.steps
+    step = np.asarray(base.intervals.length)[containing(begin + length / 2, base)] / base.steps
     moved = length > 0
     return int(np.clip(np.ceil(length[moved] / step[moved] * (1 - 1e-9)).max(initial=1), 1, grid.steps))
 
@@ -321,7 +324,13 @@ def smooth_on(ssm: StateSpaceModel, rule: Rule, grids: SmoothingGrids, y: jax.Ar
         mean, covariance = (a[at + 1] for a in smoothed.moments)
         joint = Joint(start, passed._replace(steps=None), at, None if added is None else covariance)
     else:
-        drawn, pieces, *_, added = _smooth_intervals(ssm, rule, grids.joint, y, start, iterations, damping, settings)
+        if found is not None and grids.nodes is not None:
+            drawn = forward(ssm, rule, grids.joint, y, start=start, keep="all",
+                            linearization_point=between(found.points, grids.nodes))
+            pieces = backward(drawn, start, grids.joint)
+        else:
+            drawn, pieces, *_, added = _smooth_intervals(ssm, rule, grids.joint, y, start, iterations, damping,
+                                                         settings)
         at = jnp.asarray(grids.joint.requested)
         joint = Joint(start, drawn._replace(steps=None), at, pieces.moments.covariance[at + 1])
         # Steps that follow a tolerance are linearised about the filter's own moments.

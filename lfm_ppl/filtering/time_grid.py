@@ -266,6 +266,11 @@ def per_step(grid: TimeGrid) -> TimeGrid:
                          requested=grid.requested * steps + steps - 1)
 
 
+def containing(times: np.ndarray, grid: TimeGrid) -> np.ndarray:
+    """Return the last interval that starts at or before each time; the grid is known before compilation."""
+    return np.searchsorted(np.asarray(grid.intervals.start), times, side="right") - 1
+
+
 def with_observations(intervals: Intervals, y: Any) -> tuple[Intervals, jax.Array]:
     """Return the intervals as JAX arrays, and the entry of ``y`` (T, ...) at the end of each, NaN where it has none."""
     y = jnp.asarray(y, float)

@@ -183,3 +183,47 @@ def test_many_requested_times_share_the_steps_of_an_interval():
     model, y = motif(softplus, genes=2), observed(2, softplus)
     many = lfm.smooth(model, TIMES, y, steps=12, at=np.linspace(0.0, 14.0, 141))
     assert_draws_have_the_moments_of(many)
+
+
+def test_draws_of_iterations_have_the_correlations_of_rows_without_data():
+    """The scan for draws is linearised about the likelihood's marginals; rows of NaN at its times iterate over it."""
+    model, y = motif(softplus, genes=2, noise_sd=0.0682), observed(2, softplus)
+    end = TIMES[-1]
+    at = np.linspace(0.0, end, 29)
+    result = lfm.smooth(model, TIMES, y, steps=48, iterations=3, at=at)  # of the longest gap as long as below
+    rows = np.concatenate([TIMES, np.setdiff1d(at, TIMES)])
+    order = np.argsort(rows, kind="stable")
+    missing = np.concatenate([y, np.full((len(rows) - len(TIMES), 2), np.nan)])[order]
+    iterated = lfm.smooth(model, rows[order], missing, steps=4, iterations=3)
+    keep = np.searchsorted(rows[order], at, side="right") - 1
+
+    def correlations(result, keep):
+        drawn = result.sample(jax.random.key(5), DRAWS)
+        joint = np.concatenate([drawn.forces["u"][:, keep], drawn.state[:, keep[1:], 0]], axis=1)  # the start is known
+        return np.corrcoef(joint.T)
+
+    found, wanted = correlations(result, np.arange(len(at))), correlations(iterated, keep)
+    distant = np.abs(wanted) < 0.98
+    assert distant.mean() > 0.8 and np.abs(wanted[distant]).max() > 0.9
+    np.testing.assert_allclose(found, wanted, atol=0.03)  # 4.5 standard errors of a difference of 20,000 draws
+
+
+@pytest.mark.parametrize("max_step", [None, 0.05])
+def test_nodes_of_the_scan_for_draws_are_found_on_that_of_the_marginals(max_step):
+    kernel = lfm.forces.PeriodicSquaredExponential(1.0, 1.5, 3.0)
+    jumping = {"u": lfm.QuasiPeriodic(kernel, lfm.forces.SQM(1.5, (3.0, 4.0, 13.0)), functions=7)}
+    genes = motif(softplus)
+    model = lfm.LatentForceModel(genes.dynamics, jumping, genes.observation, genes.initial_state, initial_time=0.0)
+    base, joint, _, at, _ = smoothing_grids(state_space(model), TIMES, 6, max_step, np.append(AT, 2.5), 3)
+    times = joint.intervals.start[:, None] + joint.intervals.length[:, None] * np.linspace(0, 1, joint.steps + 1)
+    length = base.intervals.length[at.interval]
+    found = base.intervals.start[at.interval] + length * (at.step + at.share) / base.steps
+    np.testing.assert_allclose(found, times, atol=1e-12)
+    assert at.step.max() == base.steps - 1 and (at.share >= 0).all() and (at.share <= 1).all()
+    np.testing.assert_array_equal(at.end[joint.observed], base.observed)
+    # Just before a jump a node lies in the interval that ends with it, just after it in the next.
+    ends = np.flatnonzero(joint.intervals.jump >= 0)
+    assert len(ends) == 3
+    np.testing.assert_array_equal(base.intervals.jump[at.interval[ends, -1]], joint.intervals.jump[ends])
+    after = ends + 1 + (joint.intervals.length[ends + 1] == 0)
+    assert (at.interval[after, 0] > at.interval[ends, -1]).all()
