@@ -9,8 +9,9 @@ import warnings
 from pathlib import Path
 
 import jax
-import jaxlib.version
 import pytest
+
+from lfm_ppl.compilation import quick_compilation
 
 # ArviZ 0.23 writes the date of an announcement when it is first imported on a day, which two workers cannot do at once:
 # the process that starts them does it before.
@@ -41,19 +42,12 @@ def pytest_configure(config: pytest.Config) -> None:
     """Compile faster, before a backend exists, except where speed is measured.
 
     Without optimisations tests take two thirds of the time, since they compile more than they compute (but for slow
-    ones), and XLA's older emitters compile these small loops in half of what is left. A program is compiled in one
-    piece: by default XLA cuts it into 32, for threads that a test has not, and compiles what they share in each. Newer
-    versions may lack these switches, and XLA ends the process at a switch that it does not know.
+    ones, whose programs are optimised in full).
     """
     if _asked_for(config, "performance"):
         return
     _keep_to_one_cpu(os.environ.get("PYTEST_XDIST_WORKER", ""))
-    flags = [] if _asked_for(config, "slow") else ["--xla_backend_optimization_level=0"]
-    if jaxlib.version.__version_info__ < (0, 13):
-        flags.append("--xla_cpu_parallel_codegen_split_count=1")
-    if jaxlib.version.__version_info__ < (0, 11):
-        flags.append("--xla_cpu_use_fusion_emitters=false")
-    os.environ["XLA_FLAGS"] = " ".join([*flags, os.environ.get("XLA_FLAGS", "")])
+    quick_compilation(3 if _asked_for(config, "slow") else 0)
 
 
 def _keep_to_one_cpu(worker: str) -> None:
