@@ -1,6 +1,7 @@
 """Keys that are picked on the host are those of JAX, of which few programs make any number."""
 
 import jax
+import numpy as np
 import pytest
 
 from lfm_ppl.inference.random_keys import split_keys
@@ -9,7 +10,7 @@ from tests.inference.test_bound_model import compilations
 
 @pytest.mark.parametrize("kind", ["threefry2x32", "rbg"])
 @pytest.mark.parametrize("partitionable", [True, False])
-@pytest.mark.parametrize("count", [0, 1, 4, 64, 65, 300])
+@pytest.mark.parametrize("count", [0, 1, 4, 64, 65, 300, np.int64(5)])
 def test_keys_are_those_of_jax(kind, partitionable, count):
     with jax.threefry_partitionable(partitionable):
         key = jax.random.key(7, impl=kind)
