@@ -15,7 +15,7 @@ from lfm_ppl.filtering.jumps import jump_map
 from lfm_ppl.filtering.predict import Moments, compose
 from lfm_ppl.filtering.rts import Smoothed, backward
 from lfm_ppl.filtering.smoothing_kernel import smoothed_moments, smoothing_kernel
-from lfm_ppl.filtering.time_grid import TimeGrid, containing, per_step
+from lfm_ppl.filtering.time_grid import TimeGrid, interval_at, per_step
 from lfm_ppl.linalg import congruence, matmul, safe_sqrt
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.state_space import StateSpaceModel
@@ -111,14 +111,15 @@ def _moved(now: _Iterate, new: Moments, damping: float) -> _Iterate:
     return _Iterate(moments, step, share, jnp.max(jnp.abs(step) * safe_sqrt(precision), initial=0.0))
 
 
-class Crossings(NamedTuple):
-    """Where the nodes of one time grid lie on another that spans the same time.
+class NodePlaces(NamedTuple):
+    """Where the nodes of one time grid lie among those of another that spans the same time.
 
     Attributes:
-        interval: (N, J + 1) the other's interval that a node lies in.
-        step: (N, J + 1) its step within that.
-        share: (N, J + 1) of the step that has passed.
-        end: (N,) the other's interval with the observation that an interval ends at; without one, that it lies in.
+        interval: (N, J + 1) interval of the other grid in which a node lies.
+        step: (N, J + 1) step of that interval.
+        share: (N, J + 1) share of that step before the node.
+        end: (N,) interval of the other grid that ends with the same observation; where there is none, the one in which
+            the end lies.
     """
 
     interval: Any
@@ -127,29 +128,29 @@ class Crossings(NamedTuple):
     end: Any
 
 
-def crossings(grid: TimeGrid, other: TimeGrid) -> Crossings:
-    """Find the nodes of a time grid on another; both are known before compilation."""
+def node_places(grid: TimeGrid, other: TimeGrid) -> NodePlaces:
+    """Find the nodes of a time grid among those of another; both are known before compilation."""
     begin, length = (np.asarray(a)[:, None] for a in (grid.intervals.start, grid.intervals.length))
     share = np.linspace(0.0, 1.0, grid.steps + 1)
     time, inward = begin + length * share, length * (0.5 - share)
-    # At an end of the other's intervals, before a jump or after it, the node belongs to the one on its own side.
-    row = containing(time + 1e-6 * inward, other)
+    # Where two intervals of the other grid meet, the node belongs to the one on its own side: a jump may lie between.
+    row = interval_at(time + 1e-6 * inward, other)
     first, whole = (np.asarray(a)[row] for a in (other.intervals.start, other.intervals.length))
-    passed = np.clip((time - first) / np.where(whole > 0, whole, 1.0), 0.0, 1.0) * other.steps
-    step = np.minimum(passed.astype(int), other.steps - 1)
+    before = np.clip((time - first) / np.where(whole > 0, whole, 1.0), 0.0, 1.0) * other.steps
+    step = np.minimum(before.astype(int), other.steps - 1)
     observation = np.asarray(grid.intervals.observation)
     end = np.where(observation >= 0, np.asarray(other.observed)[observation], row[:, -1])
-    return Crossings(row, step, passed - step, end)
+    return NodePlaces(row, step, before - step, end)
 
 
-def between(points: Points, at: Crossings) -> Points:
-    """Return the moments about which a pass is linearised at the nodes of another time grid, linear within a step."""
-    def inside(nodes: jax.Array) -> jax.Array:
-        left, right = nodes[at.interval, at.step], nodes[at.interval, at.step + 1]
-        return left + at.share.reshape(at.share.shape + (1,) * (left.ndim - 2)) * (right - left)
+def interpolated(points: Points, where: NodePlaces) -> Points:
+    """Return the moments about which a pass over another time grid is linearised: linear in time within each step."""
+    def at_nodes(nodes: jax.Array) -> jax.Array:
+        left, right = nodes[where.interval, where.step], nodes[where.interval, where.step + 1]
+        return left + where.share.reshape(where.share.shape + (1,) * (left.ndim - 2)) * (right - left)
 
     tree = jax.tree_util.tree_map
-    return Points(tree(inside, points.nodes), tree(lambda a: a[at.end], points.ends))
+    return Points(tree(at_nodes, points.nodes), tree(lambda a: a[where.end], points.ends))
 
 
 def smoothed_points(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, passed: Pass, smoothed: Smoothed,

@@ -14,6 +14,7 @@ from lfm_ppl.filtering.breakdown import warn_of_breakdown
 from lfm_ppl.filtering.dense_output import Branches, Places, dense_output, places
 from lfm_ppl.filtering.filter import (
     Pass,
+    Points,
     as_rule,
     at_intervals,
     check_observations,
@@ -22,7 +23,7 @@ from lfm_ppl.filtering.filter import (
     warn_single_precision,
     whitened_innovations,
 )
-from lfm_ppl.filtering.iterated import Crossings, Iterated, between, crossings, posterior_linearisation, refined
+from lfm_ppl.filtering.iterated import Iterated, NodePlaces, interpolated, node_places, posterior_linearisation, refined
 from lfm_ppl.filtering.linear_response import responds, response
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.rts import Smoothed, backward
@@ -37,7 +38,7 @@ from lfm_ppl.filtering.sites import (
     quantile_residuals,
 )
 from lfm_ppl.filtering.sites import evidence as site_evidence
-from lfm_ppl.filtering.time_grid import TimeGrid, build_time_grid, containing, per_step
+from lfm_ppl.filtering.time_grid import TimeGrid, build_time_grid, interval_at, per_step
 from lfm_ppl.linalg import congruence, matmul, safe_sqrt, semidefinite_root, solve_lower
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.latent_force_model import LatentForceModel
@@ -263,15 +264,15 @@ class SmoothingGrids(NamedTuple):
         joint: for draws of trajectories, with intervals that end at the requested times too; None where ``marginals``
             serves: without requested times, and for a model whose intervals are exact whatever their length.
         where: the requested times among ``marginals``; None where ``joint`` is.
-        nodes: those of ``joint`` among those of ``marginals``, about whose iterated moments it is linearised; None
-            where ``joint`` is, and without iterations.
+        nodes: where those of ``joint`` lie among those of ``marginals``, about whose iterated moments it is
+            linearised; None without iterations, for an observation family, and where ``joint`` is None.
         times: (K,) requested times.
     """
 
     marginals: TimeGrid
     joint: TimeGrid | None
     where: Places | None
-    nodes: Crossings | None
+    nodes: NodePlaces | None
     times: Any
 
 
@@ -291,12 +292,12 @@ def smoothing_grids(ssm: StateSpaceModel, times: Any, steps: int, max_step: floa
         beyond[-1] = max(beyond[-1], joint.requested_times.max())
     base = build_time_grid(ssm, times, steps, max_step, np.append(known[-1:], beyond), tolerance=tolerance,
                            until=float(max(known[-1], joint.requested_times.max())))
-    family = isinstance(ssm.model.observation, ObservationFamily)
-    by_step = iterations or (family and not is_linear(ssm) and tolerance is None)
+    has_family = isinstance(ssm.model.observation, ObservationFamily)
+    by_step = iterations or (has_family and not is_linear(ssm) and tolerance is None)
     where = places(per_step(base) if by_step else base, joint.requested_times)
     if tolerance is None:
         joint = joint._replace(steps=_steps_as_long(joint, base))
-    nodes = crossings(joint, base) if iterations and not family else None
+    nodes = node_places(joint, base) if iterations and not has_family else None
     return SmoothingGrids(base, joint, where, nodes, joint.requested_times)
 
 
@@ -307,7 +308,7 @@ def _steps_as_long(grid: TimeGrid, base: TimeGrid) -> int:
     whole one.
     """
     begin, length = (np.asarray(a) for a in (grid.intervals.start, grid.intervals.length))
-    step = np.asarray(base.intervals.length)[containing(begin + length / 2, base)] / base.steps
+    step = np.asarray(base.intervals.length)[interval_at(begin + length / 2, base)] / base.steps
     moved = length > 0
     return int(np.clip(np.ceil(length[moved] / step[moved] * (1 - 1e-9)).max(initial=1), 1, grid.steps))
 
@@ -324,13 +325,9 @@ def smooth_on(ssm: StateSpaceModel, rule: Rule, grids: SmoothingGrids, y: jax.Ar
         mean, covariance = (a[at + 1] for a in smoothed.moments)
         joint = Joint(start, passed._replace(steps=None), at, None if added is None else covariance)
     else:
-        if found is not None and grids.nodes is not None:
-            drawn = forward(ssm, rule, grids.joint, y, start=start, keep="all",
-                            linearization_point=between(found.points, grids.nodes))
-            pieces = backward(drawn, start, grids.joint)
-        else:
-            drawn, pieces, *_, added = _smooth_intervals(ssm, rule, grids.joint, y, start, iterations, damping,
-                                                         settings)
+        points = None if found is None or grids.nodes is None else interpolated(found.points, grids.nodes)
+        drawn, pieces, *_, added = _smooth_intervals(ssm, rule, grids.joint, y, start, iterations, damping, settings,
+                                                     points)
         at = jnp.asarray(grids.joint.requested)
         joint = Joint(start, drawn._replace(steps=None), at, pieces.moments.covariance[at + 1])
         # Steps that follow a tolerance are linearised about the filter's own moments.
@@ -353,19 +350,21 @@ def smooth_on(ssm: StateSpaceModel, rule: Rule, grids: SmoothingGrids, y: jax.Ar
 
 
 def _smooth_intervals(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments, iterations: int,
-                      damping: float, settings: SiteSettings
+                      damping: float, settings: SiteSettings, points: Points | None = None
                       ) -> tuple[Pass, Smoothed, Iterated | None, tuple | None, jax.Array | None]:
     """Smooth on one time grid; of a family also its one-step-ahead and leave-one-out terms, and its residuals.
 
-    And what linear response adds to the covariances of the nodes; None where it is left out.
+    And what linear response adds to the covariances of the nodes; None where it is left out. About ``points``, where
+    they are given, a model with Gaussian observations is linearised once, without iterations.
     """
     if isinstance(ssm.model.observation, ObservationFamily):
         return _smooth_family(ssm, rule, grid, y, start, settings, ssm.model.observation)
     found, prepared = None, preparation(ssm, rule, grid)
-    if iterations:
+    if iterations and points is None:
         found = posterior_linearisation(ssm, rule, grid, y, start, iterations, damping, prepared)
-    passed = forward(ssm, rule, grid, y, start=start, linearization_point=None if found is None else found.points,
-                     keep="steps" if iterations else "all", prepared=prepared)
+        points = found.points
+    passed = forward(ssm, rule, grid, y, start=start, linearization_point=points,
+                     keep="all" if found is None else "steps", prepared=prepared)
     return passed, backward(passed, start, grid), found, None, None
 
 

@@ -266,8 +266,8 @@ def per_step(grid: TimeGrid) -> TimeGrid:
                          requested=grid.requested * steps + steps - 1)
 
 
-def containing(times: np.ndarray, grid: TimeGrid) -> np.ndarray:
-    """Return the last interval that starts at or before each time; the grid is known before compilation."""
+def interval_at(times: np.ndarray, grid: TimeGrid) -> np.ndarray:
+    """Return the last interval that starts at or before each time, also after the end; the grid is concrete."""
     return np.searchsorted(np.asarray(grid.intervals.start), times, side="right") - 1
 
 

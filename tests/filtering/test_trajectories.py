@@ -185,36 +185,44 @@ def test_many_requested_times_share_the_steps_of_an_interval():
     assert_draws_have_the_moments_of(many)
 
 
-def test_draws_of_iterations_have_the_correlations_of_rows_without_data():
-    """The scan for draws is linearised about the likelihood's marginals; rows of NaN at its times iterate over it."""
-    model, y = motif(softplus, genes=2, noise_sd=0.0682), observed(2, softplus)
-    end = TIMES[-1]
-    at = np.linspace(0.0, end, 29)
-    result = lfm.smooth(model, TIMES, y, steps=48, iterations=3, at=at)  # of the longest gap as long as below
-    rows = np.concatenate([TIMES, np.setdiff1d(at, TIMES)])
-    order = np.argsort(rows, kind="stable")
-    missing = np.concatenate([y, np.full((len(rows) - len(TIMES), 2), np.nan)])[order]
-    iterated = lfm.smooth(model, rows[order], missing, steps=4, iterations=3)
-    keep = np.searchsorted(rows[order], at, side="right") - 1
+def bent(x, u, t):
+    return softplus(x)
 
-    def correlations(result, keep):
-        drawn = result.sample(jax.random.key(5), DRAWS)
-        joint = np.concatenate([drawn.forces["u"][:, keep], drawn.state[:, keep[1:], 0]], axis=1)  # the start is known
-        return np.corrcoef(joint.T)
 
-    found, wanted = correlations(result, np.arange(len(at))), correlations(iterated, keep)
-    distant = np.abs(wanted) < 0.98
-    assert distant.mean() > 0.8 and np.abs(wanted[distant]).max() > 0.9
-    np.testing.assert_allclose(found, wanted, atol=0.03)  # 4.5 standard errors of a difference of 20,000 draws
+def jumping(functions=7):
+    kernel = lfm.forces.PeriodicSquaredExponential(1.0, 1.5, 3.0)
+    return {"u": lfm.QuasiPeriodic(kernel, lfm.forces.SQM(1.5, (3.0, 4.0, 13.0)), functions=functions)}
+
+
+def genes_with(forces=None, observe=None, initial_time=0.0):
+    genes = motif(softplus, noise_sd=0.0682)
+    noise = genes.observation if observe is None else lfm.GaussianObservation(observe, 0.0682**2 * jnp.ones(2))
+    return lfm.LatentForceModel(genes.dynamics, forces or genes.forces, noise, genes.initial_state,
+                                initial_time=initial_time)
+
+
+@pytest.mark.parametrize("model", [
+    genes_with(observe=bent), pytest.param(genes_with(initial_time=-1.0), marks=pytest.mark.slow),
+    pytest.param(genes_with(jumping(5), bent), marks=pytest.mark.slow)], ids=["plain", "early start", "jumps"])
+def test_the_scan_for_draws_repeats_that_of_the_iterations(model):
+    """It is linearised about the same moments: at the ends of the same steps the filter is the same."""
+    steps, y = 6, observed(2, softplus)
+    ssm, start = state_space(model), model.initial_time
+    grid = build_time_grid(ssm, TIMES, steps)
+    row_start, length = grid.intervals.start[:, None], grid.intervals.length[:, None]
+    ends = np.unique(np.append(row_start + length * np.arange(1, steps) / steps, TIMES))
+    wanted = lfm.smooth(model, TIMES, y, steps=steps, iterations=3)._joint.passed
+    at = ends[ends > start]
+    rows = smoothing_grids(ssm, TIMES, steps, None, at, 3).joint.observed
+    found = lfm.smooth(model, TIMES, y, steps=steps, iterations=3, at=at)._joint.passed
+    np.testing.assert_allclose(found.filtered.covariance[rows], wanted.filtered.covariance[grid.observed], atol=1e-10)
+    np.testing.assert_allclose(found.gain[rows], wanted.gain[grid.observed], atol=1e-9)
 
 
 @pytest.mark.parametrize("max_step", [None, 0.05])
 def test_nodes_of_the_scan_for_draws_are_found_on_that_of_the_marginals(max_step):
-    kernel = lfm.forces.PeriodicSquaredExponential(1.0, 1.5, 3.0)
-    jumping = {"u": lfm.QuasiPeriodic(kernel, lfm.forces.SQM(1.5, (3.0, 4.0, 13.0)), functions=7)}
-    genes = motif(softplus)
-    model = lfm.LatentForceModel(genes.dynamics, jumping, genes.observation, genes.initial_state, initial_time=0.0)
-    base, joint, _, at, _ = smoothing_grids(state_space(model), TIMES, 6, max_step, np.append(AT, 2.5), 3)
+    ssm = state_space(genes_with(jumping()))
+    base, joint, _, at, _ = smoothing_grids(ssm, TIMES, 6, max_step, np.append(AT, 2.5), 3)
     times = joint.intervals.start[:, None] + joint.intervals.length[:, None] * np.linspace(0, 1, joint.steps + 1)
     length = base.intervals.length[at.interval]
     found = base.intervals.start[at.interval] + length * (at.step + at.share) / base.steps
