@@ -4,7 +4,7 @@ import gc
 import sys
 
 _NEW_OBJECTS = 100_000
-"""That are made before Python looks among them for garbage."""
+"""Number of new objects after which Python looks among them for garbage."""
 
 
 def main() -> int:

@@ -33,7 +33,12 @@ from lfm_ppl.compilation import fast_loops, quick_compilation
 FOLDER = Path(__file__).resolve().parent
 CELL_TIMEOUT_S = 3600
 # Tracing makes millions of objects that live, through which Python would look for garbage again and again.
-KERNEL_ARGUMENTS = ["--IPKernelApp.exec_lines=import gc; gc.set_threshold(50_000, 20, 50)"]
+RARE_GARBAGE_COLLECTION = "--IPKernelApp.exec_lines=import gc; gc.set_threshold(50_000, 20, 50)"
+
+
+def quick() -> bool:
+    """Return whether the notebooks are run in quick mode."""
+    return bool(os.environ.get("LFM_QUICK"))
 
 
 def sources() -> list[Path]:
@@ -48,7 +53,7 @@ def execute(source: Path, folder: Path) -> nbformat.NotebookNode:
         notebook,
         timeout=CELL_TIMEOUT_S,
         kernel_name="python3",
-        extra_arguments=KERNEL_ARGUMENTS,
+        extra_arguments=[RARE_GARBAGE_COLLECTION] if quick() else [],
         resources={"metadata": {"path": str(folder)}},
     )
     client.execute()
@@ -81,15 +86,15 @@ def main() -> int:
         known = ", ".join(path.stem for path in sources())
         print(f"no notebook {' '.join(arguments.names)}; there are: {known}", file=sys.stderr)
         return 2
-    if not arguments.check and os.environ.get("LFM_QUICK"):
+    if not arguments.check and quick():
         print("LFM_QUICK is for --check: quick results are not to be kept", file=sys.stderr)
         return 2
     if arguments.jobs < 1:
         print(f"--jobs must be at least 1, got {arguments.jobs}", file=sys.stderr)
         return 2
 
-    fast_loops()  # kernels inherit the environment
-    if os.environ.get("LFM_QUICK"):
+    if quick():  # kernels inherit the environment; those that are kept run as a reader's would
+        fast_loops()
         quick_compilation(1)
 
     def run(source: Path) -> None:
