@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 
-import jaxlib.version
-
 _OPTION = "xla_cpu_small_while_loop_byte_threshold"
 _BYTES = 1_000_000
 _FLAG = "--xla_backend_extra_options="
@@ -51,9 +49,11 @@ def quick_compilation(level: int) -> None:
     lack these switches, and XLA ends the process at a switch that it does not know. Flags that are set already stay.
 
     Args:
-        level: of optimisation, 0 to 3. Programs at level 0 are compiled in a third of the time and run up to ten times
+        level: of optimisation, 0 to 3. Programs at level 0 are compiled in a third of the time and run many times
             slower; at level 1 they run about as fast as ever.
     """
+    import jaxlib.version  # takes 30 ms, which the command line, with `fast_loops` alone, does not need
+
     flags = [f"--xla_backend_optimization_level={level}"]
     if jaxlib.version.__version_info__ < (0, 13):
         flags.append("--xla_cpu_parallel_codegen_split_count=1")
