@@ -152,9 +152,9 @@ def completed(ssm: StateSpaceModel, rule: Rule, nodes: Moments) -> Moments:
 
 
 def _inside(ssm: StateSpaceModel, rule: Rule, prepared: Preparation, interval: Intervals,
-            steps: Any) -> tuple[jax.Array, Inside]:
-    """Return phi of an interval and what the iterations need, from (mean, covariance with all, phi) of its steps."""
-    mean, own, phi = steps
+            one: Prediction) -> Prediction:
+    """Give a prediction its phi, and `Inside` as its steps, from (mean, covariance with all, phi) of these."""
+    mean, own, phi = one.steps
     to_end = jnp.eye(ssm.state_dim)
     if prepared.jumps is not None:
         to_end, _ = jump_map(ssm, prepared.jumps, interval.jump)
@@ -164,7 +164,7 @@ def _inside(ssm: StateSpaceModel, rule: Rule, prepared: Preparation, interval: I
         return matmul(to_end, phi), matmul(own, to_end.T)
 
     whole, cross = jax.lax.scan(back, to_end, (own, phi), reverse=True)
-    return whole, Inside(Moments(mean, columns(own, needed(ssm, rule))), cross)
+    return one._replace(phi=whole, steps=Inside(Moments(mean, columns(own, needed(ssm, rule))), cross))
 
 
 def at_intervals(a: jax.Array, intervals: Any) -> jax.Array:
@@ -256,16 +256,25 @@ class FilterResult(eqx.Module):
 
 def predict(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, prepared: Preparation, interval: Intervals,
             moments: Moments, nodes: Moments | None = None, with_map: bool = False,
-            each: Callable[[Prediction], Any] | None = None) -> Prediction:
-    """Predict over an interval, a jump at its end included; arguments as in `predict_interval`."""
+            each: Callable[[Prediction], Any] | None = None,
+            gathered: Callable[[Prediction], Prediction] = lambda one: one) -> Prediction:
+    """Predict over an interval, a jump at its end included; arguments as in `predict_interval`.
+
+    ``gathered`` makes of the steps, before the jump, what is kept of them.
+    """
     transition = prepared.transition(interval)
     if ssm.time_invariant:
         one = predict_exact(ssm, transition, grid.steps, interval.start, interval.length, moments)
     else:
-        move = lambda: integrate(  # noqa: E731
+        move = lambda: gathered(integrate(  # noqa: E731
             ssm, rule, grid, prepared.linear, transition, interval.start, interval.length, moments, nodes, with_map,
-            each)
-        stay = lambda: unmoved(moments, with_map, each, grid.steps)  # noqa: E731
+            each))
+
+        def stay() -> Prediction:
+            one = gathered(unmoved(moments, with_map, each))
+            return one._replace(steps=jax.tree_util.tree_map(
+                lambda a: jnp.broadcast_to(a, (grid.steps, *a.shape[1:])), one.steps))
+
         one = jax.lax.cond(interval.length > 0, move, stay) if grid.replicated else move()
     if prepared.jumps is not None:
         one = after_jump(ssm, prepared.jumps, interval.jump, one, with_map=with_map or ssm.time_invariant)
@@ -341,7 +350,8 @@ def forward(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, *, s
     each: Callable[[Prediction], Any] | None = None
     if keep == "steps":
         each = lambda one: one  # noqa: E731
-    if keep == "inside" and not ssm.time_invariant:
+    inside = keep == "inside" and not with_map and not ssm.time_invariant
+    if inside:
         used = needed(ssm, rule)
         each = lambda one: (columns(one.moments.mean, used), columns(one.moments.covariance, used).T,  # noqa: E731
                             one.phi)
@@ -350,7 +360,8 @@ def forward(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, *, s
         interval, observed, point, given, transition = inputs
         if transition is None:
             nodes = None if point is None else completed(ssm, rule, point.nodes)
-            one = predict(ssm, rule, grid, prepared, interval, moments, nodes, with_map, each)
+            gathered = (lambda one: _inside(ssm, rule, prepared, interval, one)) if inside else (lambda one: one)
+            one = predict(ssm, rule, grid, prepared, interval, moments, nodes, with_map, each, gathered)
         else:
             one = transition.predict(moments)
         centre = one.moments if point is None or point.ends is None else point.ends
@@ -371,11 +382,8 @@ def forward(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, *, s
             out = out._replace(predicted=one.moments, filtered=new.moments, innovation=new.innovation,
                                present=jnp.isfinite(observed), chol=new.chol, site_terms=new.site_terms)
         if with_map or keep == "inside":
-            phi, steps = one.phi, one.steps
-            if keep == "inside" and steps is not None:
-                phi, steps = _inside(ssm, rule, prepared, interval, steps)
-            out = out._replace(phi=phi, process_cov=one.process_cov if with_map else None, gain=new.gain,
-                               jacobian=new.jacobian, obs_cov=new.obs_cov, steps=steps)
+            out = out._replace(phi=one.phi, process_cov=one.process_cov if with_map else None, gain=new.gain,
+                               jacobian=new.jacobian, obs_cov=new.obs_cov, steps=one.steps)
         return new.moments, out
 
     first = Moments(*ssm.initial()) if start is None else start

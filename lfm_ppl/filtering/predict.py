@@ -176,14 +176,11 @@ def predict_interval(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, facto
     return Prediction(moments, whole, added, within)
 
 
-def unmoved(moments: Moments, with_map: bool, each: Callable[[Prediction], Any] | None = None,
-            steps: int = 0) -> Prediction:
-    """Predict over an interval of length zero; the same structure as what `predict_interval` returns."""
+def unmoved(moments: Moments, with_map: bool, each: Callable[[Prediction], Any] | None = None) -> Prediction:
+    """Predict over an interval of length zero; the same structure as what `predict_interval` returns for one step."""
     size = moments.mean.shape[0]
     still = Prediction(moments, jnp.eye(size), jnp.zeros((size, size)))
-    within = None
-    if each is not None:
-        within = jax.tree_util.tree_map(lambda a: jnp.broadcast_to(a, (steps, *a.shape)), each(still))
+    within = None if each is None else jax.tree_util.tree_map(lambda a: a[None], each(still))
     if not with_map:
         still = still._replace(phi=jnp.zeros(0), process_cov=jnp.zeros(0))
     return still._replace(steps=within)
