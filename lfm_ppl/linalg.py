@@ -78,13 +78,47 @@ def _taken(a: Any, indices: list[int], axis: int) -> jax.Array:
 
 def outer_square(a: jax.Array) -> jax.Array:
     """Return ``A A'`` for matrices of shape (..., n, k), symmetric to the last bit."""
-    return matmul(a, jnp.swapaxes(a, -1, -2))
+    return _outer_square(jnp.asarray(a))
+
+
+@jax.custom_jvp
+def _outer_square(a: jax.Array) -> jax.Array:
+    return matmul(a, a.mT)
+
+
+@_outer_square.defjvp
+def _outer_square_jvp(primals: tuple, tangents: tuple) -> tuple[jax.Array, jax.Array]:
+    """Differentiate by dA A' and its transpose: one product, where the product rule takes two."""
+    (a,), (change,) = primals, tangents
+    half = matmul(change, a.mT)
+    return matmul(a, a.mT), half + half.mT
 
 
 def congruence(a: jax.Array | np.ndarray, p: jax.Array) -> jax.Array:
     """Return the symmetric matrix ``A P A'`` for ``A`` (..., n, k) and a symmetric ``P`` (..., k, k)."""
-    transposed = np.swapaxes(a, -1, -2) if isinstance(a, np.ndarray) else jnp.swapaxes(a, -1, -2)
-    return symmetric(matmul(matmul(a, p), transposed))
+    return _congruence_product(a, p) if isinstance(a, np.ndarray) else _congruence(a, jnp.asarray(p))
+
+
+def _congruence_product(a: jax.Array | np.ndarray, p: jax.Array) -> jax.Array:
+    return symmetric(matmul(matmul(a, p), a.swapaxes(-1, -2)))
+
+
+@jax.custom_jvp
+def _congruence(a: jax.Array, p: jax.Array) -> jax.Array:
+    return _congruence_product(a, p)
+
+
+@functools.partial(_congruence.defjvp, symbolic_zeros=True)
+def _congruence_jvp(primals: tuple, tangents: tuple) -> tuple[jax.Array, jax.Array]:
+    """Differentiate by A dP A' and, as P is symmetric, by dA P A' and its transpose: three products, not four."""
+    (a, p), (change, of_p) = primals, tangents
+    left = matmul(a, p)
+    value = symmetric(matmul(left, a.mT))
+    tangent = jnp.zeros_like(value) if isinstance(of_p, SymbolicZero) else _congruence_product(a, of_p)
+    if not isinstance(change, SymbolicZero):
+        half = matmul(change, left.mT)
+        tangent = tangent + half + half.mT
+    return value, tangent
 
 
 def symmetric(a: jax.Array) -> jax.Array:

@@ -42,6 +42,36 @@ def test_products(shapes):
     assert np.array_equal(square, np.swapaxes(square, -1, -2))
 
 
+@pytest.mark.parametrize("shapes", [((3, 4), (4, 4)), ((5, 2, 3), (3, 3)), ((2, 3), (5, 3, 3)), ((9, 12), (12, 12)),
+                                    ((0, 2), (2, 2))])
+def test_derivatives_of_products(shapes):
+    """In both modes, of second order too, and beside a constant: as those of A P A' by the product rule."""
+    rng = np.random.default_rng(3)
+    a, change, turn, weight = (rng.normal(size=size) for size in (shapes[0], shapes[0], shapes[1], shapes[1]))
+    p, change_of_p = turn + np.swapaxes(turn, -1, -2), weight + np.swapaxes(weight, -1, -2)
+
+    def plain(a, p):
+        return jnp.einsum("...ij,...jk,...lk->...il", a, p, a)
+
+    def slope(function, x, directions):
+        """Tangent of the square of the value along a direction, and its own gradient."""
+        def total(*x):
+            return jax.jvp(lambda *x: (function(*x) ** 2).sum(), x, directions)[1]
+        return [total(*x), *jax.grad(total, tuple(range(len(x))))(*x)]
+
+    def symmetrised(found):
+        return [part + np.swapaxes(part, -1, -2) if np.shape(part) == p.shape else part for part in found]
+
+    cases = [(congruence, plain, (a, p), (change, change_of_p)),
+             (lambda a: congruence(a, p), lambda a: plain(a, p), (a,), (change,)),
+             (lambda p: congruence(jnp.asarray(a), p), lambda p: plain(a, p), (p,), (change_of_p,)),
+             (outer_square, lambda a: a @ jnp.swapaxes(a, -1, -2), (a,), (change,))]
+    for ours, theirs, x, directions in cases:
+        # The gradient in a symmetric matrix is known up to an antisymmetric part.
+        for found, expected in zip(*(symmetrised(slope(f, x, directions)) for f in (ours, theirs)), strict=True):
+            assert np.allclose(found, expected, rtol=1e-10, atol=1e-10 * np.abs(expected).max(initial=1.0))
+
+
 @pytest.mark.parametrize("size", [1, 2, 5, 9])
 def test_cholesky_and_triangular_solves(size):
     p, b = definite(size), np.random.default_rng(1).normal(size=(size, 3))
