@@ -346,11 +346,13 @@ def forward(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, *, s
         prepared: what the intervals share, where several passes share it.
     """
     prepared = preparation(ssm, rule, grid) if prepared is None else prepared
-    with_map = keep in ("all", "steps") or (keep == "inside" and grid.tolerance is not None)
+    # Steps whose length follows the moments are not kept.
+    equal = grid.tolerance is None
+    with_map = keep in ("all", "steps") or (keep == "inside" and not equal)
     each: Callable[[Prediction], Any] | None = None
-    if keep == "steps":
+    if keep == "steps" and equal:
         each = lambda one: one  # noqa: E731
-    inside = keep == "inside" and not with_map and not ssm.time_invariant
+    inside = keep == "inside" and equal and not ssm.time_invariant
     if inside:
         used = needed(ssm, rule)
         each = lambda one: (columns(one.moments.mean, used), columns(one.moments.covariance, used).T,  # noqa: E731

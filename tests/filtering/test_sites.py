@@ -329,6 +329,28 @@ def pushed(theta):
         lfm.Gaussian(jnp.ones(1), 0.1 * jnp.eye(1)))
 
 
+AT_ONCE, ONE_AFTER_ANOTHER = (np.repeat(np.arange(1.0, 3.0), 2) + np.tile([0.0, lag], 2) for lag in (0.0, 1e-9))
+COUNTS = np.array([1.0, 2.0, 0.0, 3.0])[:, None]
+
+
+def test_replicates_with_steps_that_follow_a_tolerance():
+    """Smoothed moments are those of counts that follow each other at once."""
+    found, expected = (lfm.smooth(pushed(THETA), times, COUNTS, lfm.Taylor(), tolerance=1e-2)
+                       for times in (AT_ONCE, ONE_AFTER_ANOTHER))
+    np.testing.assert_allclose(found.input_mean, expected.input_mean, rtol=1e-6)
+    np.testing.assert_allclose(found.input_covariance, expected.input_covariance, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_gradients_of_replicates_with_steps_that_follow_a_tolerance():
+    def likelihood(times):
+        return jax.jit(jax.value_and_grad(
+            lambda theta: lfm.MarginalLikelihood(pushed(theta), times, tolerance=1e-3).log_prob(COUNTS)))(THETA)
+
+    for found, expected in zip(likelihood(AT_ONCE), likelihood(ONE_AFTER_ANOTHER), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("linear", [False, True])
 def test_steps_that_follow_a_tolerance_give_the_moments_at_any_time(linear):
