@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.filtering.filter import integrate, step_transition
-from lfm_ppl.filtering.jumps import after_jump
-from lfm_ppl.filtering.predict import Moments, Prediction
+from lfm_ppl.filtering.jumps import after_jump, jump_map
+from lfm_ppl.filtering.predict import Moments, Prediction, compose
 from lfm_ppl.filtering.rts import at_start
 from lfm_ppl.filtering.smoothing_kernel import smoothed_moments, smoothing_kernel
 from lfm_ppl.filtering.time_grid import Intervals, TimeGrid, as_arrays
@@ -25,11 +25,13 @@ class Places(NamedTuple):
 
     Attributes:
         interval: (K,) the interval that contains the time.
+        step: (K,) the integration step of it.
         time: (K,).
         at_end: (K,) whether it is the interval's end.
     """
 
     interval: Any
+    step: Any
     time: Any
     at_end: Any
 
@@ -37,40 +39,60 @@ class Places(NamedTuple):
 def places(grid: TimeGrid, times: Any) -> Places:
     """Find times among the intervals of a time grid that is known before compilation."""
     times = np.asarray(times, float)
-    ends = np.append(np.asarray(grid.intervals.start)[1:], grid.intervals.start[-1] + grid.intervals.length[-1])
+    begins, lengths = (np.asarray(a) for a in (grid.intervals.start, grid.intervals.length))
+    ends = np.append(begins[1:], begins[-1] + lengths[-1])
     tolerance = 1e-13 * (1.0 + np.abs(times))
     row = np.minimum(np.searchsorted(ends, times - tolerance, side="left"), len(ends) - 1)
     at_end = np.abs(times - ends[row]) <= tolerance
     # Of several intervals that end at this time (replicates), the last.
     last = np.searchsorted(ends, ends[row] + tolerance, side="right") - 1
-    return Places(np.where(at_end, last, row), times, at_end)
+    row = np.where(at_end, last, row)
+    share = (times - begins[row]) / np.where(lengths[row] > 0, lengths[row], 1.0)
+    return Places(row, np.clip((share * grid.steps).astype(int), 0, grid.steps - 1), times, at_end)
+
+
+class Steps(NamedTuple):
+    """The integration steps of each interval.
+
+    Attributes:
+        moments: predicted, (N, J, n) and (N, J, n, n) at their ends, before a jump.
+        to_end: phi and process_cov (N, J, n, n) from there to the interval's end, a jump there included.
+    """
+
+    moments: Moments
+    to_end: tuple[jax.Array, jax.Array]
 
 
 class Branches(NamedTuple):
-    """Intervals from whose starts the marginals within them branch off.
+    """Intervals, from within which the marginals branch off.
 
     Attributes:
         grid: the time grid.
+        predicted: (N, ...) at their ends.
         filtered: (N, ...) at their ends.
         smoothed: (N + 1, ...) at the nodes.
         adjoint: r and Lambda at the intervals' ends.
-        linearization_point: moments (N, ...) at the intervals' starts and ends to linearise about; None: the filter's
-            own.
+        steps: from whose starts the marginals branch off; None: from those of the intervals.
+        linearization_point: moments (N, J + 1, ...) at the ends of the steps to linearise about; None: the filter's
+            own, as always without steps.
     """
 
     grid: TimeGrid
+    predicted: Moments
     filtered: Moments
     smoothed: Moments
     adjoint: tuple[jax.Array, jax.Array]
-    linearization_point: tuple[Moments, Moments] | None
+    steps: Steps | None = None
+    linearization_point: Moments | None = None
 
 
 def dense_output(ssm: StateSpaceModel, rule: Rule, given: Branches, start: Moments, where: Places) -> Moments:
     """Return smoothed moments at any times within the intervals.
 
-    Each time branches off on its own: the filter's moments at the start of its interval are predicted up to it, and on
-    to the end of the interval, whence what the later observations say comes back through the second piece. The steps of
-    the scan itself are not cut, so that asking for times changes nothing, neither there nor at other requested times.
+    Each time branches off on its own: the filter's moments at the start of its integration step are predicted up to it,
+    and on to the end of the step and, by its map, of the interval, whence what the later observations say comes back.
+    The steps of the scan itself are not cut, so that asking for times changes nothing, neither there nor at other
+    requested times. Without steps (of which one interval may make many) both pieces are those of the interval.
 
     The pieces therefore differ from the interval by an integration error, which `smoothed_moments` keeps from being
     magnified.
@@ -82,35 +104,46 @@ def dense_output(ssm: StateSpaceModel, rule: Rule, given: Branches, start: Momen
         start: moments at the initial time.
         where: the requested times.
     """
-    grid, filtered, smoothed, adjoint, linearization_point = given
+    grid, steps = given.grid, given.steps
     linear, jumps = linear_part(ssm, jnp.asarray(grid.initial_time, float)), ssm.stack.jump_table()
-    before = at_start(filtered, start)
+    before = at_start(given.filtered, start)
     intervals = as_arrays(grid.intervals)
+    pieces = grid if steps is None else grid._replace(steps=1)
 
     def piece(begin: jax.Array, length: jax.Array, moments: Moments, points: Any, with_map: bool) -> Prediction:
-        factor = step_transition(ssm, rule, linear, grid, length)
-        return integrate(ssm, rule, grid, linear, factor, begin, length, moments, points, with_map)
+        factor = step_transition(ssm, rule, linear, pieces, length)
+        return integrate(ssm, rule, pieces, linear, factor, begin, length, moments, points, with_map)
 
-    def one(index: jax.Array, t: jax.Array, exactly: jax.Array) -> Moments:
+    def one(index: jax.Array, step: jax.Array, t: jax.Array, exactly: jax.Array) -> Moments:
         here: Intervals = _entry(intervals, index)
-        first, last = _entry(smoothed, index), _entry(smoothed, index + 1)
-        length = jnp.clip(t - here.start, 0.0, here.length)
+        first, last = _entry(given.smoothed, index), _entry(given.smoothed, index + 1)
+        origin, begin, whole = _entry(before, index), here.start, here.length
+        if steps is not None:
+            whole = here.length / grid.steps
+            begin = here.start + step * whole
+            inside = jax.tree_util.tree_map(lambda a: a[index, jnp.maximum(step - 1, 0)], steps.moments)
+            origin = jax.tree_util.tree_map(lambda a, b: jnp.where(step > 0, a, b), inside, origin)
+        length = jnp.clip(t - begin, 0.0, whole)
         points: tuple[Any, Any] = (None, None)
-        if linearization_point is not None:
-            left, right = _entry(linearization_point, index)
-            share = jnp.where(here.length > 0, length / jnp.where(here.length > 0, here.length, 1.0), 0.0)
+        if given.linearization_point is not None:
+            left, right = (jax.tree_util.tree_map(lambda a: a[index, step + k], given.linearization_point)  # noqa: B023
+                           for k in (0, 1))
+            share = jnp.where(whole > 0, length / jnp.where(whole > 0, whole, 1.0), 0.0)
             middle = jax.tree_util.tree_map(lambda a, b: a + share * (b - a), left, right)
             pair = lambda *ends: jax.tree_util.tree_map(lambda a, b: jnp.stack([a, b]), *ends)  # noqa: E731
             points = pair(left, middle), pair(middle, right)
-        now = piece(here.start, length, _entry(before, index), points[0], False).moments
-        rest = piece(here.start + length, here.length - length, now, points[1], True)
-        if jumps is not None:
+        now = piece(begin, length, origin, points[0], False).moments
+        rest = piece(begin + length, whole - length, now, points[1], True)
+        if steps is not None:
+            rest = _to_end(rest, _entry(given.predicted, index),
+                           *jax.tree_util.tree_map(lambda a: a[index, step], steps))
+        elif jumps is not None:
             rest = after_jump(ssm, jumps, here.jump, rest, with_map=True)
         gain, conditional = smoothing_kernel(now, rest.moments, rest.phi, rest.process_cov)
-        r, curvature = adjoint[0][index], adjoint[1][index]
+        r, curvature = given.adjoint[0][index], given.adjoint[1][index]
         back = matmul(rest.phi.T, r[:, None])[:, 0], congruence(rest.phi.T, curvature)
         inside = smoothed_moments(now, rest.moments, last, gain, conditional, *back)
-        begins = length == 0
+        begins = t - here.start <= 0
         return jax.tree_util.tree_map(
             lambda inside, node, end: jnp.where(exactly, end, jnp.where(begins, node, inside)), inside, first, last)
 
@@ -119,6 +152,30 @@ def dense_output(ssm: StateSpaceModel, rule: Rule, given: Branches, start: Momen
         # Side by side, every piece would make as many steps as may be tried.
         return jax.lax.map(lambda place: one(*place), places)
     return jax.vmap(one)(*places)
+
+
+def _to_end(rest: Prediction, predicted: Moments, end_of_step: Moments,
+            to_end: tuple[jax.Array, jax.Array]) -> Prediction:
+    """Carry a prediction on from the end of its step to the interval's, where the filter predicts ``predicted``."""
+    on, added = to_end
+    phi, process_cov = compose((rest.phi, rest.process_cov), to_end)
+    mean = predicted.mean + matmul(on, (rest.moments.mean - end_of_step.mean)[:, None])[:, 0]
+    return Prediction(Moments(mean, congruence(on, rest.moments.covariance) + added), phi, process_cov)
+
+
+def steps_to_end(ssm: StateSpaceModel, grid: TimeGrid, made: Prediction) -> Steps:
+    """Return the steps of intervals from their predictions (N, J, ...)."""
+    last = jnp.eye(ssm.state_dim), jnp.zeros((ssm.state_dim,) * 2)
+    last = jax.tree_util.tree_map(lambda a: jnp.broadcast_to(a, (made.phi.shape[0], *a.shape)), last)
+    if (jumps := ssm.stack.jump_table()) is not None:
+        last = jax.vmap(lambda index: jump_map(ssm, jumps, index))(jnp.asarray(grid.intervals.jump))
+
+    def step(later: tuple, one: tuple) -> tuple[tuple, tuple]:
+        return compose(one, later), later
+
+    by_step = lambda a: jnp.moveaxis(a, 1, 0)  # noqa: E731
+    _, found = jax.lax.scan(step, last, (by_step(made.phi), by_step(made.process_cov)), reverse=True)
+    return Steps(made.moments, jax.tree_util.tree_map(by_step, found))
 
 
 def _entry(tree: Any, index: jax.Array) -> Any:

@@ -9,13 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.filtering.dense_output import Branches
-from lfm_ppl.filtering.filter import Pass, Points, Preparation, bends, columns, completed, forward, needed
-from lfm_ppl.filtering.jumps import jump_map
-from lfm_ppl.filtering.predict import Moments, compose
+from lfm_ppl.filtering.filter import Pass, Points, Preparation, bends, columns, forward, needed
+from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.rts import Smoothed, backward
-from lfm_ppl.filtering.smoothing_kernel import smoothed_moments, smoothing_kernel
-from lfm_ppl.filtering.time_grid import TimeGrid, interval_at, per_step
+from lfm_ppl.filtering.time_grid import TimeGrid, interval_at
 from lfm_ppl.linalg import congruence, matmul, safe_sqrt
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.state_space import StateSpaceModel
@@ -194,66 +191,3 @@ def smoothed_points(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, passed: Pa
         lambda first, after, inside: jnp.concatenate(
             [jnp.concatenate([first[None], after[:-1]])[:, None], inside], axis=1), first, after, inside)
     return Points(nodes, ends)
-
-
-def _to_end(ssm: StateSpaceModel, grid: TimeGrid, passed: Pass) -> tuple[jax.Array, jax.Array]:
-    """Return phi and process_cov (N, J + 1, n, n) from the ends of the steps to that of the interval, after a jump."""
-    phi, process_cov = passed.steps.phi, passed.steps.process_cov
-    identity = jnp.broadcast_to(jnp.eye(phi.shape[-1]), phi[:, 0].shape)
-    last = identity, jnp.zeros_like(identity)
-    if (jumps := ssm.stack.jump_table()) is not None:
-        last = jax.vmap(lambda index: jump_map(ssm, jumps, index))(jnp.asarray(grid.intervals.jump))
-
-    def step(later: tuple, one: tuple) -> tuple[tuple, tuple]:
-        now = compose(one, later)
-        return now, now
-
-    _, found = jax.lax.scan(step, last, tuple(jnp.moveaxis(a, 1, 0) for a in (phi, process_cov)), reverse=True)
-    return (jnp.concatenate([jnp.moveaxis(found[0], 0, 1), last[0][:, None]], axis=1),
-            jnp.concatenate([jnp.moveaxis(found[1], 0, 1), last[1][:, None]], axis=1))
-
-
-def refined(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, found: Iterated, passed: Pass,
-            smoothed: Smoothed) -> Branches:
-    """Return the last pass of the iterations with an interval for each integration step.
-
-    Args:
-        ssm: the model; its intervals are not exact.
-        rule: the linearisation rule.
-        grid: the time grid.
-        found: what the iterations left.
-        passed: the forward scan about ``found.points``.
-        smoothed: the backward scan over that.
-    """
-    tree = jax.tree_util.tree_map
-    flat = lambda a: a.reshape(-1, *a.shape[2:])  # noqa: E731
-    to_end = _to_end(ssm, grid, passed)
-    ends = tree(lambda a: a[1:], smoothed.moments)
-    r, adjoint = smoothed.adjoint
-
-    def row(now: Moments, to_end: tuple, predicted: Moments, end: Moments, r: jax.Array,
-            adjoint: jax.Array) -> tuple[Moments, tuple[jax.Array, jax.Array]]:
-        def node(now: Moments, phi: jax.Array, process_cov: jax.Array) -> tuple[Moments, tuple[jax.Array, jax.Array]]:
-            gain, conditional = smoothing_kernel(now, predicted, phi, process_cov)
-            back = matmul(phi.T, r[:, None])[:, 0], congruence(phi.T, adjoint)
-            return smoothed_moments(now, predicted, end, gain, conditional, *back), back
-
-        return jax.vmap(node)(now, *to_end)
-
-    filtered = tree(lambda a: a[:, :-1], passed.steps.moments)
-    inside, back = jax.vmap(row)(filtered, tuple(a[:, 1:-1] for a in to_end), passed.predicted, ends, r, adjoint)
-    # In an interval without length every node is its start, but for the observation and the jump at its end.
-    still = jnp.asarray(grid.intervals.length) == 0
-    inside = tree(lambda a, b: jnp.where(still.reshape(-1, *(1,) * (a.ndim - 1)), b[:-1, None], a), inside,
-                  smoothed.moments)
-
-    def by_steps(inside: jax.Array, end: jax.Array) -> jax.Array:
-        return flat(jnp.concatenate([inside, end[:, None]], axis=1))
-
-    nodes = completed(ssm, rule, found.points.nodes)
-    return Branches(
-        per_step(grid), tree(by_steps, filtered, passed.filtered),
-        tree(lambda first, inside: jnp.concatenate([flat(jnp.concatenate([first[:-1, None], inside], axis=1)),
-                                                    first[-1:]]), smoothed.moments, inside),
-        (by_steps(back[0], r), by_steps(back[1], adjoint)),
-        (tree(lambda a: flat(a[:, :-1]), nodes), tree(lambda a: flat(a[:, 1:]), nodes)))

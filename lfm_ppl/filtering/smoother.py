@@ -11,19 +11,20 @@ import numpy as np
 
 from lfm_ppl import checks
 from lfm_ppl.filtering.breakdown import warn_of_breakdown
-from lfm_ppl.filtering.dense_output import Branches, Places, dense_output, places
+from lfm_ppl.filtering.dense_output import Branches, Places, dense_output, places, steps_to_end
 from lfm_ppl.filtering.filter import (
     Pass,
     Points,
     as_rule,
     at_intervals,
     check_observations,
+    completed,
     forward,
     preparation,
     warn_single_precision,
     whitened_innovations,
 )
-from lfm_ppl.filtering.iterated import Iterated, NodePlaces, interpolated, node_places, posterior_linearisation, refined
+from lfm_ppl.filtering.iterated import Iterated, NodePlaces, interpolated, node_places, posterior_linearisation
 from lfm_ppl.filtering.linear_response import responds, response
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.rts import Smoothed, backward
@@ -38,7 +39,7 @@ from lfm_ppl.filtering.sites import (
     quantile_residuals,
 )
 from lfm_ppl.filtering.sites import evidence as site_evidence
-from lfm_ppl.filtering.time_grid import TimeGrid, build_time_grid, interval_at, per_step
+from lfm_ppl.filtering.time_grid import TimeGrid, build_time_grid, interval_at
 from lfm_ppl.linalg import congruence, matmul, safe_sqrt, semidefinite_root, solve_lower
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.latent_force_model import LatentForceModel
@@ -48,6 +49,12 @@ from lfm_ppl.model.state_space import StateSpaceModel, state_space
 
 LONGEST_FORECAST = 10_000
 """Most intervals of a forecast; a longer one gets a long last interval (or `max_step`)."""
+
+_MOST_KEPT = 2_000_000
+"""Entries of a covariance at each integration step up to which steps are kept for requested times between the data.
+
+Beyond, each such time makes a whole interval's steps of its own. The data alone decide, not the times requested."""
+
 
 class Marginal(NamedTuple):
     """Mean (K,) and standard deviation (K,) of one force or state at the requested times."""
@@ -293,8 +300,7 @@ def smoothing_grids(ssm: StateSpaceModel, times: Any, steps: int, max_step: floa
     base = build_time_grid(ssm, times, steps, max_step, np.append(known[-1:], beyond), tolerance=tolerance,
                            until=float(max(known[-1], joint.requested_times.max())))
     has_family = isinstance(ssm.model.observation, ObservationFamily)
-    by_step = iterations or (has_family and not is_linear(ssm) and tolerance is None)
-    where = places(per_step(base) if by_step else base, joint.requested_times)
+    where = places(base, joint.requested_times)
     if tolerance is None:
         joint = joint._replace(steps=_steps_as_long(joint, base))
     nodes = node_places(joint, base) if iterations and not has_family else None
@@ -318,7 +324,10 @@ def smooth_on(ssm: StateSpaceModel, rule: Rule, grids: SmoothingGrids, y: jax.Ar
     """The same on time grids, without checks; for compiled code."""
     grid = grids.marginals
     start = Moments(*ssm.initial())
-    passed, smoothed, found, scored, added = _smooth_intervals(ssm, rule, grid, y, start, iterations, damping, settings)
+    small = len(grid.observed) * grid.steps * ssm.state_dim**2 <= _MOST_KEPT
+    with_steps = grids.where is not None and (small or bool(iterations))
+    passed, smoothed, found, scored, added = _smooth_intervals(ssm, rule, grid, y, start, iterations, damping, settings,
+                                                               with_steps=with_steps)
     times = jnp.asarray(grids.times, float)
     if grids.joint is None or grids.where is None:
         at = jnp.asarray(grid.requested)
@@ -330,10 +339,11 @@ def smooth_on(ssm: StateSpaceModel, rule: Rule, grids: SmoothingGrids, y: jax.Ar
                                                      points)
         at = jnp.asarray(grids.joint.requested)
         joint = Joint(start, drawn._replace(steps=None), at, pieces.moments.covariance[at + 1])
-        # Steps that follow a tolerance are linearised about the filter's own moments.
-        branches = (Branches(grid, passed.filtered, smoothed.moments, smoothed.adjoint, None)
-                    if found is None or grid.tolerance is not None
-                    else refined(ssm, rule, grid, found, passed, smoothed))
+        branches = Branches(grid, passed.predicted, passed.filtered, smoothed.moments, smoothed.adjoint)
+        if passed.steps is not None:
+            branches = branches._replace(
+                steps=steps_to_end(ssm, grid, passed.steps),
+                linearization_point=None if found is None else completed(ssm, rule, found.points.nodes))
         mean, covariance = dense_output(ssm, rule, branches, start, grids.where)
     if added is not None:
         covariance = covariance + added[at + 1]
@@ -350,12 +360,13 @@ def smooth_on(ssm: StateSpaceModel, rule: Rule, grids: SmoothingGrids, y: jax.Ar
 
 
 def _smooth_intervals(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments, iterations: int,
-                      damping: float, settings: SiteSettings, points: Points | None = None
+                      damping: float, settings: SiteSettings, points: Points | None = None, with_steps: bool = False
                       ) -> tuple[Pass, Smoothed, Iterated | None, tuple | None, jax.Array | None]:
     """Smooth on one time grid; of a family also its one-step-ahead and leave-one-out terms, and its residuals.
 
     And what linear response adds to the covariances of the nodes; None where it is left out. About ``points``, where
-    they are given, a model with Gaussian observations is linearised once, without iterations.
+    they are given, a model with Gaussian observations is linearised once, without iterations. Its integration steps
+    are kept ``with_steps``.
     """
     if isinstance(ssm.model.observation, ObservationFamily):
         return _smooth_family(ssm, rule, grid, y, start, settings, ssm.model.observation)
@@ -364,7 +375,7 @@ def _smooth_intervals(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.A
         found = posterior_linearisation(ssm, rule, grid, y, start, iterations, damping, prepared)
         points = found.points
     passed = forward(ssm, rule, grid, y, start=start, linearization_point=points,
-                     keep="all" if found is None else "steps", prepared=prepared)
+                     keep="steps" if with_steps else "all", prepared=prepared)
     return passed, backward(passed, start, grid), found, None, None
 
 
