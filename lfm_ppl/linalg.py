@@ -112,7 +112,8 @@ def _congruence(a: jax.Array, p: jax.Array) -> jax.Array:
 def _congruence_jvp(primals: tuple, tangents: tuple) -> tuple[jax.Array, jax.Array]:
     """Differentiate by A dP A' and, as P is symmetric, by dA P A' and its transpose: three products, not four."""
     (a, p), (change, of_p) = primals, tangents
-    left = matmul(a, p)
+    # A traced P may be anything; only its symmetric part counts, whose derivative it is in second order, too.
+    left = matmul(a, symmetric(p))
     value = symmetric(matmul(left, a.mT))
     tangent = jnp.zeros_like(value) if isinstance(of_p, SymbolicZero) else _congruence_product(a, of_p)
     if not isinstance(change, SymbolicZero):

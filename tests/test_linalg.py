@@ -72,6 +72,23 @@ def test_derivatives_of_products(shapes):
             assert np.allclose(found, expected, rtol=1e-10, atol=1e-10 * np.abs(expected).max(initial=1.0))
 
 
+def test_derivatives_of_a_congruence_off_symmetry():
+    """Of a matrix that is not symmetric the symmetric part counts, in the first and the second order."""
+    rng = np.random.default_rng(4)
+    a, general = rng.normal(size=(2, 3)), rng.normal(size=(3, 3))
+
+    def plain(a, p):
+        return a @ (p + p.T) @ a.T / 2
+
+    for p in (general, definite(3)):
+        for derivative in (jax.jacfwd, jax.jacrev, jax.hessian):
+            for of in (0, 1):
+                np.testing.assert_allclose(derivative(congruence, of)(jnp.asarray(a), jnp.asarray(p)),
+                                           derivative(plain, of)(a, p), atol=1e-12)
+        mixed = [jax.jacfwd(jax.jacrev(f, 0), 1)(jnp.asarray(a), jnp.asarray(p)) for f in (congruence, plain)]
+        np.testing.assert_allclose(*mixed, atol=1e-12)
+
+
 @pytest.mark.parametrize("size", [1, 2, 5, 9])
 def test_cholesky_and_triangular_solves(size):
     p, b = definite(size), np.random.default_rng(1).normal(size=(size, 3))
