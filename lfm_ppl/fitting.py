@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.stages import Lowered
 from numpyro.infer import init_to_median, init_to_value
@@ -25,7 +26,7 @@ from lfm_ppl.data import Data, as_data, model_keywords
 from lfm_ppl.filtering.breakdown import FilterWarning, breakdown
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference import sampling
-from lfm_ppl.inference.ahead import Ahead, worthwhile
+from lfm_ppl.inference.ahead import Ahead
 from lfm_ppl.inference.bound_model import BoundModel, bind
 from lfm_ppl.inference.interruption import was_interrupt
 from lfm_ppl.inference.kernels.options import KERNELS, check_options
@@ -318,7 +319,9 @@ class _Run:
         rated: scores of the observations; None where there are none yet.
         drawn: chosen draws, their trajectories, and the times of these.
         partial: what a result that was stopped lacks; None: nothing.
-        ahead: the programs of `follow`, compiled while the chains run.
+        ahead: compiles the sampler, and what `follow` runs.
+        compiled: waits for the sampler's programs.
+        followed: waits for those of `follow`.
     """
 
     bound: BoundModel
@@ -339,7 +342,9 @@ class _Run:
     rated: Any = None
     drawn: tuple = (None, None, None)
     partial: str | None = None
-    ahead: Ahead | None = None
+    ahead: Ahead = field(default_factory=Ahead)
+    compiled: Callable[[], None] = lambda: None
+    followed: Callable[[], None] = lambda: None
 
     def sample(self) -> None:
         """Draw parameters, or find the mode; after Ctrl-C, as far as it came.
@@ -361,17 +366,17 @@ class _Run:
         from_mode = asked.sampler != "nuts" or asked.init == "map"
         with waiting(_SEARCH if from_mode else _START, self.progress and setup is None):
             transition, starts, remarks = _transition(asked.sampler, self.bound, asked.options, asked.init,
-                                                      asked.keys[2], asked.seed, asked.chains, warmup, setup)
+                                                      asked.keys[2], asked.seed, asked.chains, warmup, setup,
+                                                      self._compile_ahead)
         if keeper is not None:
             if setup is None:
                 keeper.setup = {name: remarks[name] for name in ("particles", "log_likelihood_sd") if name in remarks}
             keeper.look = self._look
         self.particles = {label: remarks.pop(label, None) for label in _OF_PARTICLES}
         self.remarks = {**remarks, "thin": asked.thin}
-        if asked.sampler != "pmmh" and worthwhile():  # pmmh is told its particles by the warm-up
-            self.ahead = Ahead(self._programs)
         collected = sampling.sample(key, self.bound, transition, starts, warmup=warmup, samples=asked.samples,
-                                    thin=asked.thin, chain_method=asked.method, progress=self.progress, keeper=keeper)
+                                    thin=asked.thin, chain_method=asked.method, progress=self.progress, keeper=keeper,
+                                    compiled=self.compiled)
         count = collected.z.shape[1]
         if count == 0:
             raise KeyboardInterrupt(f"stopped in the warm-up, after {collected.done:,} of {collected.total:,} steps; "
@@ -381,6 +386,17 @@ class _Run:
         self.z = collected.z
         self.draws, self.stats = _draws(self.bound, {"z": collected.z, **collected.statistics}, asked.samples)
 
+    def _compile_ahead(self, transition: Transition) -> None:
+        """Compile all programs while it is found out where the chains start, and then while they run."""
+        asked, thin = self.asked, self.asked.thin or 1
+        evaluated = self.ahead.add(transition.lower)
+        self.compiled = self.ahead.add(lambda: sampling.programs(
+            self.bound, transition, chains=asked.chains, warmup=asked.warmup * thin, samples=asked.samples, thin=thin,
+            chain_method=asked.method))
+        self.followed = self.ahead.add(self._programs)
+        arviz_data.load_arviz()  # takes a second or two, which the compilation takes, too
+        evaluated()
+
     def _programs(self) -> list[Lowered]:
         """Return the programs of `follow`, for draws of any values."""
         asked = self.asked
@@ -388,7 +404,8 @@ class _Run:
         flat = {site: np.zeros((asked.chains * asked.samples, *shapes[site].shape), shapes[site].dtype)
                 for site in self.bound.sites}
         _, rows, grid = _paths(self.bound, asked.at, asked.trajectory_draws, asked.chains, asked.samples)
-        found = [scores(self.bound, flat, lower=True)]
+        found = [self.bound.lower_constrain_draws(asked.chains * asked.samples),
+                 scores(self.bound, flat, lower=True)]
         if len(rows):
             subset = {site: value[rows] for site, value in flat.items()}
             found.append(trajectories(asked.keys[3], self.bound, subset, grid, lower=True))
@@ -408,8 +425,7 @@ class _Run:
             return {"show": counter.of(what), "parts": None if keeper is None else keeper.parts(what)}
 
         try:
-            if self.ahead is not None:
-                self.ahead.wait()
+            self.followed()
             self.rated = kept("scores of the observations",
                               lambda: scores(self.bound, flat, **watched("scores")), None)
             self.remarks |= self._found_of_sites(flat)
@@ -492,9 +508,8 @@ def _draws(bound: BoundModel, rows: Mapping[str, np.ndarray], samples: int) -> t
     """Return site name -> draws, and the statistics, of rows that the chains left."""
     z = rows["z"]
     count = z.shape[1]
-    # A power of two of rows: compiled a few times, whatever their number.
-    rows_there = min(1 << max(count - 1, 0).bit_length(), samples)
-    whole = np.concatenate([z, np.repeat(z[:, -1:], rows_there - count, axis=1)], axis=1)
+    # As many rows as there will be: compiled once, whatever their number.
+    whole = np.concatenate([z, np.repeat(z[:, -1:], samples - count, axis=1)], axis=1)
     draws = {site: values[:, :count] for site, values in bound.constrain_draws(whole).items()}
     return draws, _statistics({name: values for name, values in rows.items() if name != "z"})
 
@@ -573,11 +588,12 @@ def _strategy(init: Any, bound: BoundModel, seed: int) -> Any:
 
 
 def _transition(sampler: str, bound: BoundModel, options: Mapping[str, Any] | None, init: Any, key: jax.Array,
-                seed: int, chains: int, warmup: int,
-                setup: Mapping[str, Any] | None) -> tuple[Transition, np.ndarray | None, dict[str, Any]]:
+                seed: int, chains: int, warmup: int, setup: Mapping[str, Any] | None,
+                known: Callable[[Transition], None]) -> tuple[Transition, np.ndarray | None, dict[str, Any]]:
     """Return how the chains move, where each of them starts (C, d), and what to remember of it.
 
-    Chains that go on start nowhere: all that their transition needs to know is in ``setup``.
+    Chains that go on start nowhere: all that their transition needs to know is in ``setup``. ``known`` is called as
+    soon as it is known how they move.
     """
     options = dict(options or {})
     at_mode = sampler == "nuts" and isinstance(init, str) and init == "map" and "inverse_mass_matrix" not in options
@@ -586,22 +602,31 @@ def _transition(sampler: str, bound: BoundModel, options: Mapping[str, Any] | No
     if setup is not None:
         if sampler == "nuts":
             transition = sampling.nuts(bound, warmup, options)
+            known(transition)
             return transition._replace(if_slow="") if at_mode else transition, None, {}
         kernel = KERNELS[sampler](bound.model, **options)
         if not isinstance(kernel, ParticleMarginalRAM):
-            return sampling.random_walk(bound, kernel, warmup), None, {}
+            transition = sampling.random_walk(bound, kernel, warmup)
+            known(transition)
+            return transition, None, {}
         kernel.prepare(bound, None, Tuned(int(setup["particles"]), float(setup["log_likelihood_sd"])))
         return sampling.particle_marginal(bound, kernel, warmup), None, _remarks(kernel)
-    if at_mode and options["dense_mass"] is True:
-        laplace = mode_of(bound, seed=seed)
-        known = not laplace.unidentified and np.all(np.isfinite(laplace.covariance))
-        transition = sampling.nuts(bound, warmup, options, laplace.covariance if known else np.eye(bound.size))
-        strategy = init_to_value(values=laplace.parameters)
+    if sampler == "nuts":
+        dense = at_mode and options["dense_mass"] is True
+        transition = sampling.nuts(bound, warmup, options, np.eye(bound.size) if dense else None)
+        known(transition)
+        if dense:
+            laplace = mode_of(bound, seed=seed)
+            strategy: Any = init_to_value(values=laplace.parameters)
+            if not laplace.unidentified and np.all(np.isfinite(laplace.covariance)):
+                transition = transition._replace(extra=jnp.asarray(laplace.covariance))
+        else:
+            strategy = _strategy(init, bound, seed)
         return transition, _starts(key, bound, strategy, chains, transition.evaluate), {}
     strategy = _strategy(init, bound, seed)
-    if sampler == "nuts":
-        transition = sampling.nuts(bound, warmup, options)
-        return transition, _starts(key, bound, strategy, chains, transition.evaluate), {}
+    if sampler == "ram":
+        # Whatever covariance it begins with, its programs are these.
+        known(sampling.random_walk(bound, KERNELS[sampler](bound.model, **options), warmup))
     mode = None
     if "initial_covariance" not in options:
         # A random walk that starts with the shape of the posterior needs no gradient afterwards, but learning that

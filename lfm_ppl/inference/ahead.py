@@ -4,41 +4,45 @@ from __future__ import annotations
 
 import contextlib
 import os
-import threading
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 
 from jax.stages import Lowered
 
 
 class Ahead:
-    """Programs that a thread compiles; as long as this lives, calls of their functions find them compiled.
+    """A thread that compiles programs, one after another; as long as this lives, their functions find them compiled.
 
     XLA compiles without Python's lock. Tracing is done before, in the thread of the caller: NumPyro's handlers are
-    global. Whatever fails here fails again, and is told, where the program is called.
-
-    Args:
-        lower: traces and lowers the programs.
+    global. Where there is one CPU alone nothing is done ahead.
     """
 
-    def __init__(self, lower: Callable[[], Sequence[Lowered]]) -> None:
-        self._lowered: Sequence[Lowered] = ()
-        with contextlib.suppress(Exception):
-            self._lowered = lower()
-        self._thread = threading.Thread(target=self._compile, name="compile ahead")
-        self._thread.start()
+    def __init__(self) -> None:
+        self._thread = ThreadPoolExecutor(1, "compile ahead") if _cpus() > 1 else None
+        self._lowered: list[Lowered] = []
 
-    def _compile(self) -> None:
-        for one in self._lowered:
+    def add(self, lower: Callable[[], Sequence[Lowered]]) -> Callable[[], None]:
+        """Compile programs after those that were added before, and return a function that waits until they are.
+
+        Whatever fails here fails again, and is told, where the program is called.
+
+        Args:
+            lower: traces and lowers the programs, at once.
+        """
+        found: Sequence[Lowered] = ()
+        if self._thread is not None:
             with contextlib.suppress(Exception):
-                one.compile()
+                found = lower()
+        self._lowered += found
+        begun = [] if self._thread is None else [self._thread.submit(one.compile) for one in found]
 
-    def wait(self) -> None:
-        """Return when all are compiled."""
-        self._thread.join()
+        def ready() -> None:
+            wait(begun)  # an exception stays in them
+
+        return ready
 
 
-def worthwhile() -> bool:
-    """Whether there is a CPU besides the one that is busy."""
+def _cpus() -> int:
     if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0)) > 1
-    return (os.cpu_count() or 1) > 1
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import jaxpr_as_fun
 from jax.flatten_util import ravel_pytree
+from jax.stages import Lowered
 from numpyro import handlers
 from numpyro.distributions import biject_to
 from numpyro.infer import init_to_median, init_to_sample
@@ -417,7 +418,7 @@ class BoundModel:
         """Return the log density and its gradient (d,); arguments as `log_density`."""
         return self.gradient(self.forward_mode)(self._position(z), self._argument(y))
 
-    def gradient(self, forward_mode: bool, jacobian: bool = True) -> Callable[[jax.Array, Any], tuple]:
+    def gradient(self, forward_mode: bool, jacobian: bool = True) -> Any:
         """Return the compiled function from z and y to the log density and its gradient, by either mode."""
         target = self._target(jacobian)
         example = jnp.zeros(self.size), self.argument
@@ -495,10 +496,17 @@ class BoundModel:
 
     def constrain_draws(self, z: Any) -> dict[str, np.ndarray]:
         """Return site name -> values (..., *shape) at draws z (..., d)."""
-        program, lead = self._program, np.shape(z)[:-1]
-        run = program.once("constrain draws", lambda: jax.jit(jax.vmap(program.constrain, in_axes=(0, None))))
-        found = run(jnp.asarray(z, float).reshape(-1, self.size), self.argument)
+        lead = np.shape(z)[:-1]
+        found = self._constrain_draws()(jnp.asarray(z, float).reshape(-1, self.size), self.argument)
         return {name: np.asarray(value).reshape(*lead, *value.shape[1:]) for name, value in found.items()}
+
+    def lower_constrain_draws(self, count: int) -> Lowered:
+        """Return the program of `constrain_draws` for so many draws; as long as it lives, it is compiled once."""
+        return self._constrain_draws().lower(jnp.zeros((count, self.size)), self.argument)
+
+    def _constrain_draws(self) -> Any:
+        program = self._program
+        return program.once("constrain draws", lambda: jax.jit(jax.vmap(program.constrain, in_axes=(0, None))))
 
     def unconstrain(self, values: Mapping[str, Any]) -> jax.Array:
         """Return z (d,) where every latent site has its value.

@@ -9,13 +9,14 @@ import time
 import warnings
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from operator import attrgetter
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.stages import Lowered
 from numpyro.infer import NUTS
 from numpyro.infer.util import ParamInfo
 
@@ -55,6 +56,7 @@ class Transition(NamedTuple):
         step: ``(state, y) -> state``.
         fields: name of a statistic -> attribute of the state, dots for nested ones.
         evaluate: from z (d,) to the log density and, where the sampler needs it, the gradient (d,), zero elsewhere.
+        lower: returns the programs of ``evaluate``, which need not be compiled to have those of the chains.
         extra: further arrays that the chain starts from; an argument of the compiled function.
         describe: from a state of all chains to a few words for the progress bar.
         if_slow: what to tell whoever waits for a long warm-up; empty where there is nothing to do about it.
@@ -65,6 +67,7 @@ class Transition(NamedTuple):
     step: Callable[[Any, Any], Any]
     fields: Mapping[str, str]
     evaluate: Callable[[Any], tuple[Any, Any]]
+    lower: Callable[[], list[Lowered]] = list
     extra: Any = None
     describe: Callable[[Any], str] = lambda state: ""
     if_slow: str = ""
@@ -117,6 +120,7 @@ def nuts(bound: BoundModel, warmup: int, options: Mapping[str, Any],
               "step_size": "adapt_state.step_size", "lp": "potential_energy"}
     return Transition(("nuts", warmup, forward_mode, signature(dict(options)) or object()), start, step, fields,
                       lambda z: both(jnp.asarray(z, float), bound.argument),
+                      lambda: [both.lower(jnp.zeros(bound.size), bound.argument)],
                       None if covariance is None else jnp.asarray(covariance),
                       lambda state: _words(state, state.adapt_state.step_size),
                       "" if covariance is not None or given else _AT_MODE)
@@ -133,7 +137,8 @@ def random_walk(bound: BoundModel, kernel: RAM, warmup: int) -> Transition:
 
     fields = {"acceptance_rate": "accept_prob", "accepted": "accepted", "lp": "potential_energy"}
     return Transition(("ram", warmup, kernel.adaptation), start, step, fields, _value(bound),
-                      jnp.asarray(kernel.initial_factor(bound.size)), lambda state: _words(state, state.step_size))
+                      extra=jnp.asarray(kernel.initial_factor(bound.size)),
+                      describe=lambda state: _words(state, state.step_size))
 
 
 def particle_marginal(bound: BoundModel, kernel: ParticleMarginalRAM, warmup: int) -> Transition:
@@ -156,8 +161,9 @@ def particle_marginal(bound: BoundModel, kernel: ParticleMarginalRAM, warmup: in
     identity = ("pmmh", warmup, kernel.adaptation, kernel.settings, kernel.particle_steps, kernel.delayed)
     fields = {"acceptance_rate": "accept_prob", "accepted": "accepted", "lp": "potential_energy",
               "estimated": "estimated"}
-    return Transition(identity, start, step, fields, _value(bound), jnp.asarray(kernel.initial_factor(bound.size)),
-                      lambda state: _words(state, state.step_size))
+    return Transition(identity, start, step, fields, _value(bound),
+                      extra=jnp.asarray(kernel.initial_factor(bound.size)),
+                      describe=lambda state: _words(state, state.step_size))
 
 
 def _value(bound: BoundModel) -> Callable[[Any], tuple[Any, Any]]:
@@ -217,7 +223,7 @@ class Keeper(Protocol):
 
 def sample(key: jax.Array, bound: BoundModel, transition: Transition, starts: np.ndarray | None, *, warmup: int,
            samples: int, thin: int = 1, chain_method: str | None = None, progress: bool = False,
-           keeper: Keeper | None = None) -> Draws:
+           keeper: Keeper | None = None, compiled: Callable[[], None] = lambda: None) -> Draws:
     """Run chains; the same seed gives the same draws whatever the blocks, the progress bar, and stops on the way.
 
     Warm-up and sampling are one program, in which the data are an argument: another data set compiles nothing. It is
@@ -235,6 +241,7 @@ def sample(key: jax.Array, bound: BoundModel, transition: Transition, starts: np
             enough devices, sequential otherwise.
         progress: show on standard error how far it is.
         keeper: keeps the state of the chains and their draws, and knows those of an earlier run.
+        compiled: waits for `programs`, where they are compiled ahead.
 
     Raises:
         KeyboardInterrupt: the second Ctrl-C.
@@ -248,18 +255,8 @@ def sample(key: jax.Array, bound: BoundModel, transition: Transition, starts: np
         saved = _first(key, bound, transition, starts, samples)
         if keeper is not None:
             keeper.save(saved, 0)
-    chains = len(saved.leaves[0])
-    method = available_method(chain_method, chains)
-    mesh = _mesh(chains) if method == "parallel" else None
-    block = bound.compiled(("block", transition.identity, method, mesh),
-                           lambda: _block(transition, _recorder(transition), method, mesh))
-    run = _one_by_one(block, chains) if method == "sequential" else block
-    # Laid out as the program leaves them, or the second block would be compiled anew for another layout.
-    layout = None if mesh is None else NamedSharding(mesh, _CHAINS)
-    state = _on_device(saved.leaves, _like(bound, transition, chains), layout)
-    now = state, {name: jax.device_put(rows, layout) for name, rows in saved.rows.items()}, saved.done
-    # Data may lie on one device, where chains on several cannot read them.
-    argument = bound.argument if mesh is None else jax.device_put(bound.argument, NamedSharding(mesh, PartitionSpec()))
+    run = _Block(bound, transition, len(saved.leaves[0]), chain_method)
+    now = *run.placed(saved), saved.done
     pace, on_disk = _Pace(), saved.done
     drawn = lambda done: max((done - warmup) // thin, 0)  # noqa: E731
 
@@ -269,10 +266,11 @@ def sample(key: jax.Array, bound: BoundModel, transition: Transition, starts: np
 
     with Progress(total, saved.done, progress, warmup, transition.if_slow) as shown, Interruption() as stop:
         try:
+            compiled()
             while now[-1] < total and not stop.requests:
                 state, store, lower = now
                 upper, began = min(lower + pace.steps, total), time.perf_counter()
-                state, store = jax.block_until_ready(run(state, store, lower, upper, warmup, thin, argument))
+                state, store = jax.block_until_ready(run(state, store, lower, upper, warmup, thin))
                 now = state, store, upper
                 pace.took(time.perf_counter() - began)
                 stop.defer()
@@ -288,6 +286,21 @@ def sample(key: jax.Array, bound: BoundModel, transition: Transition, starts: np
             keep(*now)
     _, store, done = now
     return _draws(jax.tree_util.tree_map(np.asarray, store), drawn(done), done, total)
+
+
+def programs(bound: BoundModel, transition: Transition, *, chains: int, warmup: int, samples: int, thin: int = 1,
+             chain_method: str | None = None) -> list[Lowered]:
+    """Return the programs that `sample` will run, for chains that start anywhere; arguments as there.
+
+    The transition may know less of where they start, but must know ``extra`` of the shape that it will have.
+    """
+    keys, points = split_keys(jax.random.key(0), chains)(slice(None)), np.zeros((chains, bound.size))
+    start = cast(Any, _beginning(bound, transition)).lower(keys, points, points[:, :1].ravel(), points, bound.argument,
+                                                           transition.extra)
+    block = _Block(bound, transition, chains, chain_method)
+    leaves = [np.zeros(leaf.shape, leaf.dtype) for leaf in map(_as_data, jax.tree_util.tree_leaves(block.like))]
+    return [start, block.lower(*block.placed(Saved(0, leaves, _rows(transition, block.like, samples))), 0, 1, warmup,
+                               thin)]
 
 
 class _Pace:
@@ -306,15 +319,22 @@ class _Pace:
 
 def _first(key: jax.Array, bound: BoundModel, transition: Transition, starts: np.ndarray, samples: int) -> Saved:
     """Return the state before the first step."""
-    chains = len(starts)
-    begin = bound.compiled(("start", transition.identity), lambda: jax.jit(_start(bound, transition)))
     found = [transition.evaluate(start) for start in starts]
     energy, slope = (-np.stack([np.asarray(each) for each in values]) for values in zip(*found, strict=True))
-    keys = split_keys(key, chains)(slice(None))
-    state = begin(keys, np.asarray(starts), energy, slope, bound.argument, transition.extra)
+    keys = split_keys(key, len(starts))(slice(None))
+    state = _beginning(bound, transition)(keys, np.asarray(starts), energy, slope, bound.argument, transition.extra)
+    return Saved(0, _on_host(state), _rows(transition, state, samples))
+
+
+def _rows(transition: Transition, state: Any, samples: int) -> dict[str, np.ndarray]:
+    """Return where so many draws of chains in a ``state``, or of its shapes, will stand."""
     row = jax.eval_shape(jax.vmap(_recorder(transition)), state)
-    return Saved(0, _on_host(state), {name: np.zeros((chains, samples, *leaf.shape[1:]), leaf.dtype)
-                                      for name, leaf in row.items()})
+    return {name: np.zeros((leaf.shape[0], samples, *leaf.shape[1:]), leaf.dtype) for name, leaf in row.items()}
+
+
+def _beginning(bound: BoundModel, transition: Transition) -> Callable:
+    """Return `_start`, compiled."""
+    return bound.compiled(("start", transition.identity), lambda: jax.jit(_start(bound, transition)))
 
 
 def _start(bound: BoundModel, transition: Transition) -> Callable:
@@ -335,6 +355,11 @@ def _like(bound: BoundModel, transition: Transition, chains: int) -> Any:
 def _on_host(state: Any) -> list[np.ndarray]:
     return [np.asarray(jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf)
             for leaf in jax.tree_util.tree_leaves(state)]
+
+
+def _as_data(leaf: jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
+    """Return shape and type of what `_on_host` makes of an array."""
+    return jax.eval_shape(jax.random.key_data, leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
 
 
 def _on_device(leaves: Sequence[np.ndarray], like: Any, layout: NamedSharding | None) -> Any:
@@ -382,8 +407,46 @@ def _mesh(chains: int) -> Mesh:
     return Mesh(np.array(jax.local_devices()[:chains]), tuple(_CHAINS))
 
 
-def _block(transition: Transition, record: Callable, method: str, mesh: Mesh | None) -> Callable:
+class _Block:
+    """The compiled function that takes a block of steps of all chains; arguments as in `sample`."""
+
+    def __init__(self, bound: BoundModel, transition: Transition, chains: int, chain_method: str | None) -> None:
+        method = available_method(chain_method, chains)
+        mesh = _mesh(chains) if method == "parallel" else None
+        self._function = bound.compiled(("block", transition.identity, method, mesh),
+                                        lambda: _advance(transition, method, mesh))
+        self._chains, self._one_by_one = chains, method == "sequential"
+        # Laid out as the program leaves them, or the second block would be compiled anew for another layout.
+        self._layout = None if mesh is None else NamedSharding(mesh, _CHAINS)
+        # Data may lie on one device, where chains on several cannot read them.
+        self._argument = (bound.argument if mesh is None
+                          else jax.device_put(bound.argument, NamedSharding(mesh, PartitionSpec())))
+        self.like = _like(bound, transition, chains)
+
+    def placed(self, saved: Saved) -> tuple[Any, dict[str, jax.Array]]:
+        """Return the state of all chains, and their draws, on the devices."""
+        return (_on_device(saved.leaves, self.like, self._layout),
+                {name: jax.device_put(rows, self._layout) for name, rows in saved.rows.items()})
+
+    def lower(self, state: Any, store: Any, *rest: Any) -> Lowered:
+        """Return the program that a call with such arguments compiles."""
+        return cast(Any, self._function).lower(*(self._one(state, store, 0) if self._one_by_one else (state, store)),
+                                               *rest, self._argument)
+
+    def __call__(self, state: Any, store: Any, *rest: Any) -> tuple[Any, Any]:
+        """Return the state and the draws after steps; ``rest``: the first step, the last, the warm-up, and thinning."""
+        if not self._one_by_one:
+            return self._function(state, store, *rest, self._argument)
+        found = [self._function(*self._one(state, store, c), *rest, self._argument) for c in range(self._chains)]
+        return jax.tree_util.tree_map(lambda *leaves: jnp.stack(leaves), *found)
+
+    def _one(self, state: Any, store: Any, chain: int) -> tuple[Any, Any]:
+        return jax.tree_util.tree_map(lambda leaf: leaf[chain], (state, store))
+
+
+def _advance(transition: Transition, method: str, mesh: Mesh | None) -> Callable:
     """Return the compiled function that takes steps ``lower`` to ``upper`` of all chains (of one, in sequence)."""
+    record = _recorder(transition)
 
     def advance(state: Any, store: Any, lower: Any, upper: Any, warmup: Any, thin: Any, y: Any) -> tuple[Any, Any]:
         def body(i: Any, carry: tuple) -> tuple:
@@ -409,14 +472,3 @@ def _block(transition: Transition, record: Callable, method: str, mesh: Mesh | N
     one = PartitionSpec()
     return jax.jit(jax.shard_map(own, mesh=mesh, in_specs=(_CHAINS, _CHAINS, one, one, one, one, one),
                                  out_specs=_CHAINS, check_vma=False))
-
-
-def _one_by_one(block: Callable, chains: int) -> Callable:
-    """Return the function that runs one chain after another."""
-
-    def run(state: Any, store: Any, *rest: Any) -> tuple[Any, Any]:
-        take = lambda c: jax.tree_util.tree_map(lambda leaf: leaf[c], (state, store))  # noqa: E731
-        found = [block(*take(c), *rest) for c in range(chains)]
-        return jax.tree_util.tree_map(lambda *leaves: jnp.stack(leaves), *found)
-
-    return run

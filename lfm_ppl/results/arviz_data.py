@@ -73,7 +73,7 @@ def build(groups: Mapping[str, xr.Dataset], attrs: Mapping[str, Any] | None = No
     kept = {name: dataset for name, dataset in kept.items() if dataset.data_vars}
     attrs = {"inference_library": LIBRARY, **(attrs or {})}
     if not _uses_datatree():
-        return _arviz().InferenceData(attrs=attrs, **kept)
+        return load_arviz().InferenceData(attrs=attrs, **kept)
     tree = xr.DataTree.from_dict({f"/{name}": dataset for name, dataset in kept.items()})
     tree.attrs = attrs
     return tree
@@ -212,7 +212,7 @@ def rhat(result: Any) -> pd.Series:
     NaN where it does not exist: one chain, fewer than four draws, a constant or non-finite chain.
     Source: Vehtari et al. (2021), Bayesian Analysis 16(2), eq. 3 and section 4.1.
     """
-    return _diagnostic(result, lambda draws: _arviz().rhat(draws), min_chains=2)
+    return _diagnostic(result, lambda draws: load_arviz().rhat(draws), min_chains=2)
 
 
 def ess(result: Any, method: str = "bulk") -> pd.Series:
@@ -225,9 +225,9 @@ def ess(result: Any, method: str = "bulk") -> pd.Series:
     if method == "tail":
         # ArviZ 1.x has another default probability than 0.23.
         return _diagnostic(
-            result, lambda draws: _arviz().ess(draws, method="tail", prob=(0.05, 0.95))
+            result, lambda draws: load_arviz().ess(draws, method="tail", prob=(0.05, 0.95))
         )
-    return _diagnostic(result, lambda draws: _arviz().ess(draws, method=method))
+    return _diagnostic(result, lambda draws: load_arviz().ess(draws, method=method))
 
 
 def summary(result: Any) -> pd.DataFrame:
@@ -266,7 +266,7 @@ def summary(result: Any) -> pd.DataFrame:
     table = pd.DataFrame(
         {
             **moments,
-            "mcse_mean": _diagnostic(result, lambda values: _arviz().mcse(values, method="mean")),
+            "mcse_mean": _diagnostic(result, lambda values: load_arviz().mcse(values, method="mean")),
             "ess_bulk": ess(result, "bulk"),
             "ess_tail": ess(result, "tail"),
             "r_hat": rhat(result),
@@ -330,7 +330,7 @@ def mcse_mean(values: np.ndarray) -> float:
         return 0.0
     size = float(values.size)
     if values.shape[1] >= 4:
-        size = min(float(_arviz().ess(values, method="mean")), size)
+        size = min(float(load_arviz().ess(values, method="mean")), size)
     return float(values.std(ddof=1) / np.sqrt(size))
 
 
@@ -353,7 +353,7 @@ def psis(log_ratio: np.ndarray, relative_efficiency: float = 1.0) -> tuple[np.nd
         # ArviZ 1.x takes the log of what is divided by.
         smoothed, k = array_stats.psislw(-raw, r_eff=relative_efficiency)
     else:
-        smoothed, k = _arviz().psislw(raw.copy(), relative_efficiency)
+        smoothed, k = load_arviz().psislw(raw.copy(), relative_efficiency)
     if not np.isfinite(k):  # ties leave too few distinct ratios
         return raw, np.inf
     return np.asarray(smoothed), float(k)
@@ -408,13 +408,13 @@ def _checked(name: str, dataset: Any) -> xr.Dataset:
 
 
 def _uses_datatree() -> bool:
-    return int(_arviz().__version__.split(".")[0]) >= 1
+    return int(load_arviz().__version__.split(".")[0]) >= 1
 
 
 @functools.cache
-def _arviz() -> ModuleType:
-    # Imported on first use: it takes two seconds. ArviZ 0.23 announces ArviZ 1.x at import, which
-    # the reader of our output can do nothing about.
+def load_arviz() -> ModuleType:
+    """Return ArviZ, imported on first use: it takes two seconds."""
+    # ArviZ 0.23 announces ArviZ 1.x at import, which the reader of our output can do nothing about.
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", r"\s*ArviZ is undergoing a major", FutureWarning)
         try:
