@@ -364,7 +364,9 @@ def test_trace_and_ranks(result, datasets):
     (diverged,) = points(trace, "|")
     assert list(diverged.get_xdata()) == [10, 50, 99]
     assert line(trace, style.BLACK, dashed=True).get_ydata()[0] == 0.4
-    heights = np.array([bar.get_height() for bar in ranks.patches]).reshape(4, 10)
+    bars = [patch.get_data() for patch in ranks.patches]
+    assert [bar.baseline for bar in bars] == [0, 1, 2, 3]
+    heights = np.array([bar.values - bar.baseline for bar in bars])
     order = stats.rankdata(draws).reshape(4, 100)
     counts = np.array([np.histogram(one, 10, (0.5, 400.5))[0] for one in order])
     np.testing.assert_allclose(heights / heights.sum(), counts / 400)

@@ -150,16 +150,8 @@ def _draw_ranks(axes: Axes, draws: np.ndarray) -> None:
     level = count / (len(edges) - 1)
     scale = 0.9 / max(heights.max() / level, 1.8)
     for chain, colour in enumerate(_colours(chains)):
-        axes.bar(
-            edges[:-1],
-            heights[chain] / level * scale,
-            np.diff(edges),
-            bottom=chain,
-            align="edge",
-            color=colour,
-            edgecolor="white",
-            linewidth=0.2,
-        )
+        # One shape for all bars, where each by itself takes longer to draw than all else in the figure.
+        axes.stairs(chain + heights[chain] / level * scale, edges, baseline=chain, fill=True, color=colour)
         axes.axhline(chain + scale, color=style.BLACK, lw=0.5, ls=(0, (2, 2)))
     axes.set_xlim(0, draws.size)
     axes.set_xticks([0, draws.size // 2, draws.size])
