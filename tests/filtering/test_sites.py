@@ -123,7 +123,10 @@ def exact_moments(y, chains=200, sweeps=3000, burn_in=300):
 @pytest.mark.parametrize("name", [name if name == "Student-t" else pytest.param(name, marks=pytest.mark.slow)
                                   for name in FAMILIES])
 def test_evidence_and_posterior_against_importance_sampling(name):
-    """The proposal is dense algebra with the smoothed marginals' own precisions; its weights correct it."""
+    """The proposal is dense algebra with the smoothed marginals' own precisions; its weights correct it.
+
+    Beside gross errors a few weights decide about the moments, on one machine or another: there a sampler gives them.
+    """
     y, k = data(name), covariance(np.asarray(THETA))
     distribution = likelihood(name, THETA)
     result = distribution.smooth(y)
@@ -134,6 +137,10 @@ def test_evidence_and_posterior_against_importance_sampling(name):
     log_z, error, first, spread = importance(name, y, np.asarray(mean), cov)
     assert error < 0.02
     assert abs(float(distribution.log_prob(y)) - log_z) < 0.05 + 4 * error
+    if name == "Student-t":
+        first, spread = exact_moments(y, sweeps=600)
+        assert np.abs((mean - first) / spread).max() < 0.01 and np.abs(sd / spread - 1).max() < 0.01
+        return
     assert np.abs(mean - first).max() < 0.05 * np.min(spread) + 4 * error * spread.max()
     assert np.abs(sd / spread - 1).max() < 0.03 + 4 * error
     assert np.isfinite(k).all()
