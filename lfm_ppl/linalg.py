@@ -328,33 +328,53 @@ def inverse_and_log_det(a: jax.Array) -> tuple[jax.Array, jax.Array]:
     return left[:, size:], log_det
 
 
+class SemidefiniteFactor(NamedTuple):
+    """A positive semi-definite matrix, factorised after it was scaled to unit diagonal.
+
+    Attributes:
+        factor: of the scaled matrix, with zero columns where a pivot was at or below the tolerance.
+        scale: (n,), by which rows and columns were multiplied; zero where the variance is not positive.
+        variance: (n,), its diagonal.
+    """
+
+    factor: CholeskyFactor
+    scale: jax.Array
+    variance: jax.Array
+
+    def solve(self, b: jax.Array) -> jax.Array:
+        """Solve ``P X = B`` for ``B`` (n, m) in the range of ``P``; directions without a pivot get zero weight."""
+        return self.factor.solve_upper(self.factor.solve_lower(b * self.scale[:, None])) * self.scale[:, None]
+
+    def conditional_shares(self) -> jax.Array:
+        """Return the variance of each coordinate given those before it, as a share (n,) of its own.
+
+        Where that is zero it is 1, and -inf where a variance is negative. The least of them says by how much solving
+        magnifies rounding errors.
+        """
+        pivots = diagonal(self.factor.chol) ** 2
+        # Sites of negative precision leave what is no covariance: nothing is solved with it.
+        return jnp.where(self.scale > 0, pivots, jnp.where(self.variance < 0, -jnp.inf, 1.0))
+
+
+def factorise_semidefinite(p: jax.Array, tolerance: float = 1e-14) -> SemidefiniteFactor:
+    """Factorise a positive semi-definite ``P`` (n, n).
+
+    Directions whose conditional variance is at or below ``tolerance`` of their marginal variance carry no information.
+    """
+    variance = diagonal(p)
+    live = variance > 0
+    scale = jnp.where(live, 1.0 / jnp.sqrt(jnp.where(live, variance, 1.0)), 0.0)
+    return SemidefiniteFactor(cholesky(p * scale[:, None] * scale[None, :], floor=tolerance, keep=False), scale,
+                              variance)
+
+
 def solve_semidefinite(p: jax.Array, b: jax.Array, tolerance: float = 1e-14) -> jax.Array:
-    """Solve ``P X = B`` for a positive semi-definite ``P`` (n, n) and ``B`` (n, m) in the range of ``P``.
+    """Solve ``P X = B`` for a positive semi-definite ``P`` (n, n) and ``B`` (n,) or (n, m) in the range of ``P``.
 
-    The matrix is scaled to unit diagonal first, and directions whose conditional variance is below ``tolerance`` of
-    their marginal variance carry no information: they get zero weight.
+    See `factorise_semidefinite` for the tolerance.
     """
-    variance = diagonal(p)
-    live = variance > 0
-    scale = jnp.where(live, 1.0 / jnp.sqrt(jnp.where(live, variance, 1.0)), 0.0)
-    factor = cholesky(p * scale[:, None] * scale[None, :], floor=tolerance, keep=False)
-    columns = b if b.ndim > 1 else b[:, None]
-    solution = factor.solve_upper(factor.solve_lower(columns * scale[:, None])) * scale[:, None]
+    solution = factorise_semidefinite(p, tolerance).solve(b if b.ndim > 1 else b[:, None])
     return solution if b.ndim > 1 else solution[:, 0]
-
-
-def conditional_shares(p: jax.Array) -> jax.Array:
-    """Return the variance of each coordinate given those before it, as a share (n,) of its own; 1 where that is zero.
-
-    The least of them says by how much solving with ``P`` magnifies rounding errors; it is -inf where a variance is
-    negative.
-    """
-    variance = diagonal(p)
-    live = variance > 0
-    scale = jnp.where(live, 1.0 / jnp.sqrt(jnp.where(live, variance, 1.0)), 0.0)
-    pivots = diagonal(cholesky(p * scale[:, None] * scale[None, :], keep=False).chol) ** 2
-    # Sites of negative precision leave what is no covariance: nothing is solved with it.
-    return jnp.where(live, pivots, jnp.where(variance < 0, -jnp.inf, 1.0))
 
 
 def semidefinite_root(p: jax.Array, tolerance: float = 1e-14) -> jax.Array:

@@ -109,7 +109,7 @@ def feasible_paths(key: jax.Array, passed: Pass, held: jax.Array, widths: jax.Ar
         later, total = carry
         row, predicted, phi, process_cov = inputs
         filtered = row[0].filtered
-        gain, conditional = smoothing_kernel(filtered, predicted, phi, process_cov)
+        gain, conditional, _ = smoothing_kernel(filtered, predicted, phi, process_cov)
         mean = filtered.mean[:, None] + matmul(gain, later - predicted.mean[:, None])
         state, values, more = at_row(mean, conditional, row)
         return (state, total + more), (state, values)

@@ -139,10 +139,10 @@ def dense_output(ssm: StateSpaceModel, rule: Rule, given: Branches, start: Momen
                            *jax.tree_util.tree_map(lambda a: a[index, step], steps))
         elif jumps is not None:
             rest = after_jump(ssm, jumps, here.jump, rest, with_map=True)
-        gain, conditional = smoothing_kernel(now, rest.moments, rest.phi, rest.process_cov)
+        kernel = smoothing_kernel(now, rest.moments, rest.phi, rest.process_cov)
         r, curvature = given.adjoint[0][index], given.adjoint[1][index]
         back = matmul(rest.phi.T, r[:, None])[:, 0], congruence(rest.phi.T, curvature)
-        inside = smoothed_moments(now, rest.moments, last, gain, conditional, *back)
+        inside = smoothed_moments(now, rest.moments, last, kernel, *back)
         begins = t - here.start <= 0
         return jax.tree_util.tree_map(
             lambda inside, node, end: jnp.where(exactly, end, jnp.where(begins, node, inside)), inside, first, last)

@@ -85,8 +85,8 @@ def backward(passed: Pass, start: Moments, grid: TimeGrid, moments: bool = True)
         back = matmul(one.phi.T, r[:, None])[:, 0], congruence(one.phi.T, adjoint)
         if not moments:
             return (at, *back), (later, left_out, (r, adjoint), predictor)
-        gain, conditional = smoothing_kernel(at, one.predicted, one.phi, one.process_cov)
-        smoothed = smoothed_moments(at, one.predicted, later, gain, conditional, *back)
+        kernel = smoothing_kernel(at, one.predicted, one.phi, one.process_cov)
+        smoothed = smoothed_moments(at, one.predicted, later, kernel, *back)
         # Nothing happens in an interval without length but for the observation at its end.
         smoothed = jax.tree_util.tree_map(lambda a, b: jnp.where(at_rest, a, b), later, smoothed)
         return (smoothed, *back), (later, left_out, (r, adjoint), predictor)

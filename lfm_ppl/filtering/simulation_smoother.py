@@ -10,7 +10,6 @@ from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.smoothing_kernel import smoothing_kernel
 from lfm_ppl.linalg import (
     cholesky,
-    conditional_shares,
     congruence,
     masked,
     matmul,
@@ -98,10 +97,10 @@ def _backward_sampled(key: jax.Array, passed: Pass, start: Moments, draws: int) 
 
     def step(error: jax.Array, row: tuple) -> tuple[jax.Array, jax.Array]:
         now, predicted, phi, process_cov, noise = row
-        gain, conditional = smoothing_kernel(now, predicted, phi, process_cov)
+        gain, conditional, share = smoothing_kernel(now, predicted, phi, process_cov)
         through = matmul(phi, now.covariance)
         general = matmul(jnp.linalg.pinv(predicted.covariance, rtol=1e-13, hermitian=True), through).T
-        proper = jnp.min(conditional_shares(predicted.covariance)) > 0
+        proper = share > 0
         gain = jnp.where(proper, gain, general)
         conditional = jnp.where(proper, conditional, now.covariance - congruence(general, predicted.covariance))
         error = matmul(gain, error) + matmul(pivoted_root(conditional), noise)

@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 
 from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.linalg import (
-    conditional_shares,
-    congruence,
-    matmul,
-    solve_semidefinite,
-)
+from lfm_ppl.linalg import congruence, factorise_semidefinite, matmul
 
 
-def smoothing_kernel(now: Moments, predicted: Moments, phi: jax.Array,
-                     process_cov: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the gain G = P Phi' P_p^-1, and the covariance C now given the state at the later time.
+class SmoothingKernel(NamedTuple):
+    """The state at a time given a later one: N(m + G (s - m_p), C).
 
-    C = (I - G Phi) P (I - G Phi)' + G Q G', a sum of squares.
+    Attributes:
+        gain: G.
+        conditional: C.
+        share: the least conditional share of P_p, which is solved with for the gain.
+    """
+
+    gain: jax.Array
+    conditional: jax.Array
+    share: jax.Array
+
+
+def smoothing_kernel(now: Moments, predicted: Moments, phi: jax.Array, process_cov: jax.Array) -> SmoothingKernel:
+    """Return the gain G = P Phi' P_p^-1, and C = (I - G Phi) P (I - G Phi)' + G Q G', a sum of squares.
 
     Args:
         now: filtered, m and P.
@@ -26,13 +34,15 @@ def smoothing_kernel(now: Moments, predicted: Moments, phi: jax.Array,
         phi: Phi, from now to the later time.
         process_cov: Q, gained on the way.
     """
-    gain = solve_semidefinite(predicted.covariance, matmul(phi, now.covariance)).T
+    factor = factorise_semidefinite(predicted.covariance)
+    gain = factor.solve(matmul(phi, now.covariance)).T
     kept = jnp.eye(phi.shape[0]) - matmul(gain, phi)
-    return gain, congruence(kept, now.covariance) + congruence(gain, process_cov)
+    conditional = congruence(kept, now.covariance) + congruence(gain, process_cov)
+    return SmoothingKernel(gain, conditional, jnp.min(factor.conditional_shares()))
 
 
-def smoothed_moments(now: Moments, predicted: Moments, later: Moments, gain: jax.Array, conditional: jax.Array,
-                     r: jax.Array, adjoint: jax.Array) -> Moments:
+def smoothed_moments(now: Moments, predicted: Moments, later: Moments, kernel: SmoothingKernel, r: jax.Array,
+                     adjoint: jax.Array) -> Moments:
     """Return smoothed moments at a time from the filtered ones there.
 
     Rauch, Tung and Striebel's way goes through the smoothed moments at a later time, with G and C of
@@ -52,8 +62,7 @@ def smoothed_moments(now: Moments, predicted: Moments, later: Moments, gain: jax
         now: filtered, m and P.
         predicted: m_p and P_p at the later time.
         later: smoothed, m_s and P_s there.
-        gain: G.
-        conditional: C.
+        kernel: G and C.
         r: adjoint of the mean, at this time.
         adjoint: Lambda, at this time.
 
@@ -63,7 +72,8 @@ def smoothed_moments(now: Moments, predicted: Moments, later: Moments, gain: jax
     reduced = now.covariance - congruence(now.covariance, adjoint)
     before = jnp.diagonal(now.covariance)
     shares = jnp.where(before > 0, jnp.diagonal(reduced) / jnp.where(before > 0, before, 1.0), 1.0)
-    trusted = jnp.min(conditional_shares(predicted.covariance)) > jnp.min(shares)
+    gain, conditional, share = kernel
+    trusted = share > jnp.min(shares)
     mean = jnp.where(trusted, matmul(gain, (later.mean - predicted.mean)[:, None])[:, 0],
                      matmul(now.covariance, r[:, None])[:, 0])
     covariance = jnp.where(trusted, conditional + congruence(gain, later.covariance), reduced)

@@ -46,10 +46,10 @@ def passes(model, variance, noise):
     passed = forward(ssm, lfm.Cubature(), grid, jnp.asarray(Y), keep="all")
     start = Moments(*ssm.initial())
     smoothed = backward(passed, start, grid)
-    _, conditional = jax.vmap(smoothing_kernel)(at_start(passed.filtered, start), passed.predicted, passed.phi,
-                                                passed.process_cov)
+    kernel = jax.vmap(smoothing_kernel)(at_start(passed.filtered, start), passed.predicted, passed.phi,
+                                        passed.process_cov)
     return (passed.predicted.covariance, passed.filtered.covariance, passed.process_cov, smoothed.moments.covariance,
-            conditional), passed.log_likelihood, smoothed.leave_one_out
+            kernel.conditional), passed.log_likelihood, smoothed.leave_one_out
 
 
 @pytest.mark.parametrize("linear", [True, False], ids=["linear", "non-linear"])
