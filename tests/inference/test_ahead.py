@@ -13,29 +13,47 @@ from tests import systems
 from tests.inference.test_bound_model import compilations
 
 
-def test_a_call_finds_what_was_compiled_ahead():
-    function = jax.jit(lambda x: jnp.sin(x) @ jnp.cos(x))
-    ahead = Ahead(lambda: [function.lower(jax.ShapeDtypeStruct((17, 17), float))])
-    ahead.wait()
+def test_calls_find_what_was_compiled_ahead(monkeypatch):
+    monkeypatch.setattr("lfm_ppl.inference.ahead._cpus", lambda: 2)
+    function, other = jax.jit(lambda x: jnp.sin(x) @ jnp.cos(x)), jax.jit(lambda x: jnp.tanh(x) @ x)
     x = jnp.ones((17, 17))
+    ahead = Ahead()
+    first = ahead.add(lambda: [function.lower(jax.ShapeDtypeStruct((17, 17), float))])
+    second = ahead.add(lambda: [other.lower(jax.ShapeDtypeStruct((17, 17), float))])
+    first()
+    second()
     with compilations() as compiled:
         function(x)
+        other(x)
     assert not compiled
 
 
-def test_what_fails_ahead_is_left_for_the_call():
+def test_what_fails_ahead_is_left_for_the_call(monkeypatch):
+    monkeypatch.setattr("lfm_ppl.inference.ahead._cpus", lambda: 2)
+
     def broken():
         raise ValueError("no program")
 
-    Ahead(broken).wait()
+    Ahead().add(broken)()
+
+
+def test_one_cpu_compiles_nothing_ahead(monkeypatch):
+    monkeypatch.setattr("lfm_ppl.inference.ahead._cpus", lambda: 1)
+    asked = []
+    Ahead().add(lambda: asked.append(1) or [])()
+    assert not asked
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-def test_a_fit_compiles_scores_and_trajectories_once(monkeypatch):
-    found = []
-    for ahead in (True, False):
-        monkeypatch.setattr("lfm_ppl.fitting.worthwhile", lambda ahead=ahead: ahead)
+@pytest.mark.parametrize("settings", [
+    {"sampler": "ram"}, {"sampler": "ram", "chain_method": "vectorized"}, {"sampler": "nuts"},
+    {"sampler": "nuts", "init": "map", "chain_method": "vectorized"}], ids=lambda one: "-".join(one.values()))
+def test_a_fit_compiles_each_program_once(monkeypatch, settings):
+    """As many as without a thread, and the same numbers."""
+    found, draws = [], []
+    for cpus in (2, 1):
+        monkeypatch.setattr("lfm_ppl.inference.ahead._cpus", lambda cpus=cpus: cpus)
 
         def model(times, y=None):
             noise = numpyro.sample("noise", dist.LogNormal(-0.5, 0.3))
@@ -43,7 +61,10 @@ def test_a_fit_compiles_scores_and_trajectories_once(monkeypatch):
 
         jax.clear_caches()
         with compilations() as compiled:
-            lfm.fit(model, np.arange(4.0), np.ones((4, 1)), sampler="ram", chains=2, warmup=8, samples=6,
-                    trajectory_draws=4, progress=False)
-        found.append([sum(name in one for one in compiled) for name in ("per_draw", "<lambda>")])
-    assert found[0] == found[1] and sum(found[0]) >= 2
+            result = lfm.fit(model, np.arange(4.0), np.ones((4, 1)), chains=2, warmup=8, samples=6, trajectory_draws=4,
+                             progress=False, **settings)
+        found.append([sum(name in one for one in compiled)
+                      for name in ("per_draw", "constrain", "advance", "start", "<lambda>")])
+        draws.append(np.asarray(result["posterior"]["noise"]))
+    np.testing.assert_array_equal(*draws)
+    assert found[0] == found[1] and found[0][0] == 2 and found[0][2] == 1

@@ -217,19 +217,19 @@ def test_a_step_is_that_of_numpyros_nuts(model):
 def test_chains_from_the_mode_begin_with_the_covariance_there(monkeypatch):
     begun = {}
 
-    def nuts(*given):
-        begun["covariance"] = given[3]
-        return sampling_nuts(*given)
+    def sample(key, bound, transition, *rest, **more):
+        begun["covariance"] = transition.extra
+        return run(key, bound, transition, *rest, **more)
 
-    sampling_nuts = sampling.nuts
-    monkeypatch.setattr(sampling, "nuts", nuts)
+    run = sampling.sample
+    monkeypatch.setattr(sampling, "sample", sample)
     lfm.fit(small, TIMES, Y, init="map", chains=1, warmup=2, samples=2, trajectory_draws=0, progress=False)
     bound = lfm.bind(small, TIMES, Y)
     mode = lfm.map_estimate(small, TIMES, Y)
     np.testing.assert_allclose(begun["covariance"], mode.covariance, rtol=1e-4)
     value, gradient = bound.log_density_gradient(mode.mode)
     point = ParamInfo(bound.unravel(mode.mode), -value, bound.unravel(-gradient))
-    transition = sampling_nuts(bound, 30, {"dense_mass": True}, mode.covariance)
+    transition = sampling.nuts(bound, 30, {"dense_mass": True}, mode.covariance)
     state = transition.start(jax.random.key(5), point, bound.y, transition.extra)
     (found,) = state.adapt_state.inverse_mass_matrix.values()
     np.testing.assert_allclose(found, mode.covariance)
