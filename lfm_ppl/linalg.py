@@ -110,9 +110,11 @@ def _congruence(a: jax.Array, p: jax.Array) -> jax.Array:
 
 @functools.partial(_congruence.defjvp, symbolic_zeros=True)
 def _congruence_jvp(primals: tuple, tangents: tuple) -> tuple[jax.Array, jax.Array]:
-    """Differentiate by A dP A' and, as P is symmetric, by dA P A' and its transpose: three products, not four."""
+    """Differentiate A P A', P the symmetric part of what was given, by A dP A' + dA P A' and the latter's transpose.
+
+    Three products, where the product rule takes four.
+    """
     (a, p), (change, of_p) = primals, tangents
-    # A traced P may be anything; only its symmetric part counts, whose derivative it is in second order, too.
     left = matmul(a, symmetric(p))
     value = symmetric(matmul(left, a.mT))
     tangent = jnp.zeros_like(value) if isinstance(of_p, SymbolicZero) else _congruence_product(a, of_p)

@@ -13,7 +13,7 @@ from lfm_ppl import checks
 from lfm_ppl.filtering.filter import Pass, forward
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.sites import FamilyTerms, SiteSettings, refine
-from lfm_ppl.filtering.time_grid import Intervals, TimeGrid, per_step
+from lfm_ppl.filtering.time_grid import Intervals, TimeGrid
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel
@@ -96,11 +96,7 @@ def breakdown(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, start: M
     before = start if row == 0 else Moments(passed.filtered.mean[row - 1], passed.filtered.covariance[row - 1])
     count = 1 if ssm.time_invariant or grid.tolerance is not None else grid.steps
     one = Intervals(*(column[row:row + 1] for column in rows))
-    first = np.zeros(1, int)
-    single = grid._replace(intervals=one._replace(length_index=first), lengths=None, observed=first, requested=first,
-                           requested_times=one.start, replicated=False)
-    stepped = _run(ssm, rule, single if grid.tolerance is not None else per_step(single._replace(steps=count)), y,
-                   before)
+    stepped = _run(ssm, rule, _in_pieces(grid, one, count), y, before)
     step = _first_bad(stepped)
     # Steps of their own differ by rounding, and need not break down.
     found, at = (passed, row) if step is None else (stepped, step)
@@ -118,6 +114,17 @@ def breakdown(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, start: M
               else "Try more steps (steps=...), a longest step (max_step=...), steps that follow a tolerance "
               "(tolerance=1e-3), another rule, or a tighter prior")
     return f"the filter breaks down at {where}: {reason}. The log likelihood is -inf. {remedy}."
+
+
+def _in_pieces(grid: TimeGrid, one: Intervals, count: int) -> TimeGrid:
+    """Return the grid of a single interval cut into ``count``, each a step of its own but where a tolerance cuts it."""
+    index, length = np.arange(count), np.repeat(one.length, count) / count
+    at_end = lambda column: np.where(index == count - 1, column, -1)  # noqa: E731
+    intervals = Intervals(one.start + index * length, length, at_end(one.observation), at_end(one.jump),
+                          np.zeros_like(index))
+    last = np.array([count - 1])
+    return grid._replace(intervals=intervals, lengths=None, steps=1 if grid.tolerance is None else grid.steps,
+                         observed=last, requested=last, requested_times=one.start, replicated=False)
 
 
 @eqx.filter_jit

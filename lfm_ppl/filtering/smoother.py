@@ -325,7 +325,8 @@ def smooth_on(ssm: StateSpaceModel, rule: Rule, grids: SmoothingGrids, y: jax.Ar
     grid = grids.marginals
     start = Moments(*ssm.initial())
     small = len(grid.observed) * grid.steps * ssm.state_dim**2 <= _MOST_KEPT
-    with_steps = grids.where is not None and (small or bool(iterations))
+    about_points = bool(iterations) or isinstance(ssm.model.observation, ObservationFamily)
+    with_steps = grids.where is not None and (small or about_points)
     passed, smoothed, found, scored, added = _smooth_intervals(ssm, rule, grid, y, start, iterations, damping, settings,
                                                                with_steps=with_steps)
     times = jnp.asarray(grids.times, float)
@@ -369,7 +370,7 @@ def _smooth_intervals(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.A
     are kept ``with_steps``.
     """
     if isinstance(ssm.model.observation, ObservationFamily):
-        return _smooth_family(ssm, rule, grid, y, start, settings, ssm.model.observation)
+        return _smooth_family(ssm, rule, grid, y, start, settings, ssm.model.observation, with_steps)
     found, prepared = None, preparation(ssm, rule, grid)
     if iterations and points is None:
         found = posterior_linearisation(ssm, rule, grid, y, start, iterations, damping, prepared)
@@ -380,9 +381,9 @@ def _smooth_intervals(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.A
 
 
 def _smooth_family(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments,
-                   settings: SiteSettings, family: ObservationFamily) -> tuple:
+                   settings: SiteSettings, family: ObservationFamily, with_steps: bool) -> tuple:
     found = site_evidence(ssm, rule, grid, y, FamilyTerms(family, y), settings, start,
-                          keep="all" if is_linear(ssm) else "steps")
+                          keep="steps" if with_steps and not is_linear(ssm) else "all")
     smoothed = backward(found.passed, start, grid)
     assert smoothed.predictor is not None
     refined_sites = found.refined.found

@@ -251,21 +251,6 @@ def by_length(grid: TimeGrid, make: Callable[[jax.Array], Any]) -> Callable[[Int
     return lambda row: table.at(row.length_index)
 
 
-def per_step(grid: TimeGrid) -> TimeGrid:
-    """Return the time grid with an interval for each integration step."""
-    intervals, steps = grid.intervals, grid.steps
-    # In NumPy where the time grid is known, so that requested times can be found in it before compilation.
-    xp: Any = np if isinstance(intervals.length, np.ndarray) else jnp
-    index = np.tile(np.arange(steps), len(intervals.length))
-    start, length, observation, jump = (xp.repeat(a, steps) for a in intervals[:4])
-    last = index == steps - 1
-    length = length / steps
-    fine = Intervals(start + index * length, length, xp.where(last, observation, -1), xp.where(last, jump, -1),
-                     np.zeros_like(index))
-    return grid._replace(intervals=fine, lengths=None, steps=1, observed=grid.observed * steps + steps - 1,
-                         requested=grid.requested * steps + steps - 1)
-
-
 def interval_at(times: np.ndarray, grid: TimeGrid) -> np.ndarray:
     """Return the last interval that starts at or before each time, also after the end; the grid is concrete."""
     return np.searchsorted(np.asarray(grid.intervals.start), times, side="right") - 1
