@@ -219,7 +219,7 @@ def fit(
         if resume and (finished := checkpoints.finished(checkpoint, record)) is not None:
             return finished
         run.keeper = checkpoints.begin_or_resume(checkpoint, record, resume)
-    with checkpoints.closing(run.keeper), calendar_time.in_messages(*clock):
+    with contextlib.closing(run.ahead), checkpoints.closing(run.keeper), calendar_time.in_messages(*clock):
         with _start_explained(bound):
             run.sample()
         run.follow()
@@ -320,8 +320,8 @@ class _Run:
         drawn: chosen draws, their trajectories, and the times of these.
         partial: what a result that was stopped lacks; None: nothing.
         ahead: compiles the sampler, and what `follow` runs.
-        compiled: waits for the sampler's programs.
-        followed: waits for those of `follow`.
+        compiled: waits for the sampler's program.
+        followed: waits for those of `follow`, and all before.
     """
 
     bound: BoundModel
@@ -387,18 +387,24 @@ class _Run:
         self.draws, self.stats = _draws(self.bound, {"z": collected.z, **collected.statistics}, asked.samples)
 
     def _compile_ahead(self, transition: Transition) -> None:
-        """Compile all programs while it is found out where the chains start, and then while they run."""
-        asked, thin = self.asked, self.asked.thin or 1
-        evaluated = self.ahead.add(transition.lower)
-        self.compiled = self.ahead.add(lambda: sampling.programs(
-            self.bound, transition, chains=asked.chains, warmup=asked.warmup * thin, samples=asked.samples, thin=thin,
-            chain_method=asked.method))
+        """Compile all programs: while it is found out where the chains start, and then while they run.
+
+        All are traced at once, and when this returns those that find the starts are compiled: the search would compile
+        them itself.
+        """
+        asked, keeper, thin = self.asked, self.keeper, self.asked.thin or 1
+        saved, warmup = None if keeper is None else keeper.restore(), asked.warmup * thin
+        ready = self.ahead.add(lambda: [] if saved else sampling.lower_start(self.bound, transition, asked.chains))
+        if saved is None or saved.done < warmup + asked.samples * thin:
+            self.compiled = self.ahead.add(lambda: sampling.lower_block(
+                self.bound, transition, chains=asked.chains, warmup=warmup, samples=asked.samples, thin=thin,
+                chain_method=asked.method))
         self.followed = self.ahead.add(self._programs)
         arviz_data.load_arviz()  # takes a second or two, which the compilation takes, too
-        evaluated()
+        ready()
 
     def _programs(self) -> list[Lowered]:
-        """Return the programs of `follow`, for draws of any values."""
+        """Return what computes parameters from the chains, and the programs of `follow`, for draws of any values."""
         asked = self.asked
         shapes = jax.eval_shape(self.bound.constrain, jax.ShapeDtypeStruct((self.bound.size,), float))
         flat = {site: np.zeros((asked.chains * asked.samples, *shapes[site].shape), shapes[site].dtype)
@@ -573,28 +579,29 @@ def check_requested(bound: BoundModel, at: Any) -> None:
     build_time_grid(example.ssm, bound.times, example.steps, example.max_step, at, tolerance=example.tolerance)
 
 
-def _strategy(init: Any, bound: BoundModel, seed: int) -> Any:
-    if init is None:
-        return init_to_median
+def _check_init(init: Any) -> None:
     if isinstance(init, str):
         checks.one_of("init", init, ("map", "median"))
-        if init == "median":
-            return init_to_median
-        return init_to_value(values=mode_of(bound, seed=seed).parameters)
-    if not callable(init):
+    elif init is not None and not callable(init):
         raise TypeError('init must be None, "map", "median" or a NumPyro strategy such as '
                         f"numpyro.infer.init_to_uniform, got {init!r}.")
-    return init
+
+
+def _strategy(init: Any, bound: BoundModel, seed: int) -> Any:
+    if init is None or isinstance(init, str) and init == "median":
+        return init_to_median
+    return init_to_value(values=mode_of(bound, seed=seed).parameters) if isinstance(init, str) else init
 
 
 def _transition(sampler: str, bound: BoundModel, options: Mapping[str, Any] | None, init: Any, key: jax.Array,
                 seed: int, chains: int, warmup: int, setup: Mapping[str, Any] | None,
-                known: Callable[[Transition], None]) -> tuple[Transition, np.ndarray | None, dict[str, Any]]:
+                prepare: Callable[[Transition], None]) -> tuple[Transition, np.ndarray | None, dict[str, Any]]:
     """Return how the chains move, where each of them starts (C, d), and what to remember of it.
 
-    Chains that go on start nowhere: all that their transition needs to know is in ``setup``. ``known`` is called as
+    Chains that go on start nowhere: all that their transition needs to know is in ``setup``. ``prepare`` is called as
     soon as it is known how they move.
     """
+    _check_init(init)
     options = dict(options or {})
     at_mode = sampler == "nuts" and isinstance(init, str) and init == "map" and "inverse_mass_matrix" not in options
     if at_mode:
@@ -602,19 +609,19 @@ def _transition(sampler: str, bound: BoundModel, options: Mapping[str, Any] | No
     if setup is not None:
         if sampler == "nuts":
             transition = sampling.nuts(bound, warmup, options)
-            known(transition)
+            prepare(transition)
             return transition._replace(if_slow="") if at_mode else transition, None, {}
         kernel = KERNELS[sampler](bound.model, **options)
         if not isinstance(kernel, ParticleMarginalRAM):
             transition = sampling.random_walk(bound, kernel, warmup)
-            known(transition)
+            prepare(transition)
             return transition, None, {}
         kernel.prepare(bound, None, Tuned(int(setup["particles"]), float(setup["log_likelihood_sd"])))
         return sampling.particle_marginal(bound, kernel, warmup), None, _remarks(kernel)
     if sampler == "nuts":
         dense = at_mode and options["dense_mass"] is True
         transition = sampling.nuts(bound, warmup, options, np.eye(bound.size) if dense else None)
-        known(transition)
+        prepare(transition)
         if dense:
             laplace = mode_of(bound, seed=seed)
             strategy: Any = init_to_value(values=laplace.parameters)
@@ -623,10 +630,10 @@ def _transition(sampler: str, bound: BoundModel, options: Mapping[str, Any] | No
         else:
             strategy = _strategy(init, bound, seed)
         return transition, _starts(key, bound, strategy, chains, transition.evaluate), {}
-    strategy = _strategy(init, bound, seed)
     if sampler == "ram":
         # Whatever covariance it begins with, its programs are these.
-        known(sampling.random_walk(bound, KERNELS[sampler](bound.model, **options), warmup))
+        prepare(sampling.random_walk(bound, KERNELS[sampler](bound.model, **options), warmup))
+    strategy = _strategy(init, bound, seed)
     mode = None
     if "initial_covariance" not in options:
         # A random walk that starts with the shape of the posterior needs no gradient afterwards, but learning that

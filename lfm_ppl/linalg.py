@@ -350,8 +350,8 @@ class SemidefiniteFactor(NamedTuple):
     def conditional_shares(self) -> jax.Array:
         """Return the variance of each coordinate given those before it, as a share (n,) of its own.
 
-        Where that is zero it is 1, and -inf where a variance is negative. The least of them says by how much solving
-        magnifies rounding errors.
+        It is 0 at or below the tolerance, 1 where the coordinate's own variance is zero, and -inf where that is
+        negative. The least of them says by how much solving magnifies rounding errors.
         """
         pivots = diagonal(self.factor.chol) ** 2
         # Sites of negative precision leave what is no covariance: nothing is solved with it.

@@ -17,7 +17,7 @@ class SmoothingKernel(NamedTuple):
     Attributes:
         gain: G.
         conditional: C.
-        share: the least conditional share of P_p, which is solved with for the gain.
+        share: the least conditional share of P_p, by which G is to be trusted.
     """
 
     gain: jax.Array
@@ -62,7 +62,7 @@ def smoothed_moments(now: Moments, predicted: Moments, later: Moments, kernel: S
         now: filtered, m and P.
         predicted: m_p and P_p at the later time.
         later: smoothed, m_s and P_s there.
-        kernel: G and C.
+        kernel: G and C, and how far they are to be trusted.
         r: adjoint of the mean, at this time.
         adjoint: Lambda, at this time.
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 
 from jax.stages import Lowered
+
+from lfm_ppl.inference.interruption import was_interrupt
 
 
 class Ahead:
@@ -29,17 +30,26 @@ class Ahead:
         Args:
             lower: traces and lowers the programs, at once.
         """
+        if self._thread is None:
+            return lambda: None
         found: Sequence[Lowered] = ()
-        if self._thread is not None:
-            with contextlib.suppress(Exception):
-                found = lower()
+        try:
+            found = lower()
+        except Exception as error:
+            if was_interrupt(error):
+                raise KeyboardInterrupt from error
         self._lowered += found
-        begun = [] if self._thread is None else [self._thread.submit(one.compile) for one in found]
+        begun = [self._thread.submit(one.compile) for one in found]
 
         def ready() -> None:
             wait(begun)  # an exception stays in them
 
         return ready
+
+    def close(self) -> None:
+        """Compile nothing more than what was begun; no one may wait for the rest afterwards."""
+        if self._thread is not None:
+            self._thread.shutdown(wait=False, cancel_futures=True)
 
 
 def _cpus() -> int:

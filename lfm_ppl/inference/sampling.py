@@ -56,7 +56,7 @@ class Transition(NamedTuple):
         step: ``(state, y) -> state``.
         fields: name of a statistic -> attribute of the state, dots for nested ones.
         evaluate: from z (d,) to the log density and, where the sampler needs it, the gradient (d,), zero elsewhere.
-        lower: returns the programs of ``evaluate``, which need not be compiled to have those of the chains.
+        lower: returns the programs that ``evaluate`` runs; none where they are not to be compiled ahead.
         extra: further arrays that the chain starts from; an argument of the compiled function.
         describe: from a state of all chains to a few words for the progress bar.
         if_slow: what to tell whoever waits for a long warm-up; empty where there is nothing to do about it.
@@ -241,7 +241,7 @@ def sample(key: jax.Array, bound: BoundModel, transition: Transition, starts: np
             enough devices, sequential otherwise.
         progress: show on standard error how far it is.
         keeper: keeps the state of the chains and their draws, and knows those of an earlier run.
-        compiled: waits for `programs`, where they are compiled ahead.
+        compiled: waits for the program of `lower_block`, where it is compiled ahead.
 
     Raises:
         KeyboardInterrupt: the second Ctrl-C.
@@ -255,7 +255,8 @@ def sample(key: jax.Array, bound: BoundModel, transition: Transition, starts: np
         saved = _first(key, bound, transition, starts, samples)
         if keeper is not None:
             keeper.save(saved, 0)
-    run = _Block(bound, transition, len(saved.leaves[0]), chain_method)
+    chains = len(saved.leaves[0])
+    run = _Block(bound, transition, chains, available_method(chain_method, chains))
     now = *run.placed(saved), saved.done
     pace, on_disk = _Pace(), saved.done
     drawn = lambda done: max((done - warmup) // thin, 0)  # noqa: E731
@@ -288,19 +289,20 @@ def sample(key: jax.Array, bound: BoundModel, transition: Transition, starts: np
     return _draws(jax.tree_util.tree_map(np.asarray, store), drawn(done), done, total)
 
 
-def programs(bound: BoundModel, transition: Transition, *, chains: int, warmup: int, samples: int, thin: int = 1,
-             chain_method: str | None = None) -> list[Lowered]:
-    """Return the programs that `sample` will run, for chains that start anywhere; arguments as there.
-
-    The transition may know less of where they start, but must know ``extra`` of the shape that it will have.
-    """
+def lower_start(bound: BoundModel, transition: Transition, chains: int) -> list[Lowered]:
+    """Return the programs that find where chains start; of the transition's ``extra`` only the shape matters."""
     keys, points = split_keys(jax.random.key(0), chains)(slice(None)), np.zeros((chains, bound.size))
-    start = cast(Any, _beginning(bound, transition)).lower(keys, points, points[:, :1].ravel(), points, bound.argument,
-                                                           transition.extra)
-    block = _Block(bound, transition, chains, chain_method)
+    return [*transition.lower(), _beginning(bound, transition).lower(keys, points, np.zeros(chains), points,
+                                                                     bound.argument, transition.extra)]
+
+
+def lower_block(bound: BoundModel, transition: Transition, *, chains: int, warmup: int, samples: int, thin: int = 1,
+                chain_method: str | None = None) -> list[Lowered]:
+    """Return the program that advances the chains; arguments as in `sample`."""
+    block = _Block(bound, transition, chains, available_method(chain_method, chains))
     leaves = [np.zeros(leaf.shape, leaf.dtype) for leaf in map(_as_data, jax.tree_util.tree_leaves(block.like))]
-    return [start, block.lower(*block.placed(Saved(0, leaves, _rows(transition, block.like, samples))), 0, 1, warmup,
-                               thin)]
+    nothing = Saved(0, leaves, _rows(transition, block.like, samples))
+    return [block.lower(*block.placed(nothing), 0, 1, warmup, thin)]
 
 
 class _Pace:
@@ -311,7 +313,7 @@ class _Pace:
         self._compiled = False
 
     def took(self, seconds: float) -> None:
-        """Learn what a block took; the first one takes as long as the compilation."""
+        """Learn what a block took; the first one may take as long as the compilation."""
         if self._compiled:
             self.steps = max(1, int(self.steps * min(BLOCK_S / max(seconds, 1e-9), _GROWTH)))
         self._compiled = True
@@ -332,7 +334,7 @@ def _rows(transition: Transition, state: Any, samples: int) -> dict[str, np.ndar
     return {name: np.zeros((leaf.shape[0], samples, *leaf.shape[1:]), leaf.dtype) for name, leaf in row.items()}
 
 
-def _beginning(bound: BoundModel, transition: Transition) -> Callable:
+def _beginning(bound: BoundModel, transition: Transition) -> Any:
     """Return `_start`, compiled."""
     return bound.compiled(("start", transition.identity), lambda: jax.jit(_start(bound, transition)))
 
@@ -348,7 +350,7 @@ def _start(bound: BoundModel, transition: Transition) -> Callable:
 def _like(bound: BoundModel, transition: Transition, chains: int) -> Any:
     """Return shapes and types of the state of all chains."""
     points, energy = (jax.ShapeDtypeStruct((chains, *shape), float) for shape in ((bound.size,), ()))
-    return jax.eval_shape(_start(bound, transition), jax.random.split(jax.random.key(0), chains), points, energy,
+    return jax.eval_shape(_beginning(bound, transition), jax.random.split(jax.random.key(0), chains), points, energy,
                           points, bound.argument, transition.extra)
 
 
@@ -408,10 +410,9 @@ def _mesh(chains: int) -> Mesh:
 
 
 class _Block:
-    """The compiled function that takes a block of steps of all chains; arguments as in `sample`."""
+    """The compiled function that takes a block of steps of all chains, by one of `CHAIN_METHODS`."""
 
-    def __init__(self, bound: BoundModel, transition: Transition, chains: int, chain_method: str | None) -> None:
-        method = available_method(chain_method, chains)
+    def __init__(self, bound: BoundModel, transition: Transition, chains: int, method: str) -> None:
         mesh = _mesh(chains) if method == "parallel" else None
         self._function = bound.compiled(("block", transition.identity, method, mesh),
                                         lambda: _advance(transition, method, mesh))

@@ -1,5 +1,7 @@
 """What is compiled ahead is not compiled again, and what cannot be is left for its call."""
 
+import threading
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -35,6 +37,33 @@ def test_what_fails_ahead_is_left_for_the_call(monkeypatch):
         raise ValueError("no program")
 
     Ahead().add(broken)()
+
+
+def test_a_key_that_was_pressed_while_tracing_is_not_lost(monkeypatch):
+    monkeypatch.setattr("lfm_ppl.inference.ahead._cpus", lambda: 2)
+
+    def pressed():
+        raise ValueError("tracing") from KeyboardInterrupt()
+
+    with pytest.raises(KeyboardInterrupt):
+        Ahead().add(pressed)
+
+
+def test_what_waits_is_not_compiled_after_the_end(monkeypatch):
+    monkeypatch.setattr("lfm_ppl.inference.ahead._cpus", lambda: 2)
+    compiled, go_on = [], threading.Event()
+
+    class Slow:
+        def compile(self):
+            go_on.wait(10.0)
+            compiled.append(self)
+
+    ahead = Ahead()
+    ahead.add(lambda: [Slow(), Slow(), Slow()])
+    ahead.close()
+    go_on.set()
+    ahead._thread.shutdown(wait=True)
+    assert len(compiled) <= 1
 
 
 def test_one_cpu_compiles_nothing_ahead(monkeypatch):
