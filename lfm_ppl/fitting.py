@@ -389,8 +389,9 @@ class _Run:
     def _compile_ahead(self, transition: Transition) -> None:
         """Compile all programs: while it is found out where the chains start, and then while they run.
 
-        All are traced at once, and when this returns those that find the starts are compiled: the search would compile
-        them itself.
+        When this returns, those that find the starts are compiled: the search would compile them itself. Where the
+        density is not finite at the prior median, there may be nowhere to start, and this be told soon: what follows
+        the chains is left for later.
         """
         asked, keeper, thin = self.asked, self.keeper, self.asked.thin or 1
         saved, warmup = None if keeper is None else keeper.restore(), asked.warmup * thin
@@ -399,9 +400,11 @@ class _Run:
             self.compiled = self.ahead.add(lambda: sampling.lower_block(
                 self.bound, transition, chains=asked.chains, warmup=warmup, samples=asked.samples, thin=thin,
                 chain_method=asked.method))
+        ready()
+        if saved is None and not np.isfinite(transition.evaluate(self.bound.draw(asked.keys[2]))[0]):
+            return
         self.followed = self.ahead.add(self._programs)
         arviz_data.load_arviz()  # takes a second or two, which the compilation takes, too
-        ready()
 
     def _programs(self) -> list[Lowered]:
         """Return what computes parameters from the chains, and the programs of `follow`, for draws of any values."""
