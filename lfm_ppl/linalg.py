@@ -381,11 +381,8 @@ def solve_semidefinite(p: jax.Array, b: jax.Array, tolerance: float = 1e-14) -> 
 
 def semidefinite_root(p: jax.Array, tolerance: float = 1e-14) -> jax.Array:
     """Return a lower triangular ``L`` with ``L L' = P`` for a semi-definite ``P``; null directions are zero."""
-    variance = diagonal(p)
-    live = variance > 0
-    sd = jnp.where(live, jnp.sqrt(jnp.where(live, variance, 1.0)), 0.0)
-    inverse = jnp.where(live, 1.0 / jnp.where(live, sd, 1.0), 0.0)
-    return sd[:, None] * cholesky(p * inverse[:, None] * inverse[None, :], floor=tolerance, keep=False).chol
+    found = factorise_semidefinite(p, tolerance)
+    return safe_sqrt(found.variance)[:, None] * found.factor.chol
 
 
 def pivoted_root(p: jax.Array) -> jax.Array:
