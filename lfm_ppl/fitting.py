@@ -394,14 +394,15 @@ class _Run:
         the chains is left for later.
         """
         asked, keeper, thin = self.asked, self.keeper, self.asked.thin or 1
-        saved, warmup = None if keeper is None else keeper.restore(), asked.warmup * thin
-        ready = self.ahead.add(lambda: [] if saved else sampling.lower_start(self.bound, transition, asked.chains))
-        if saved is None or saved.done < warmup + asked.samples * thin:
+        done, warmup = None if keeper is None else keeper.done, asked.warmup * thin
+        ready = self.ahead.add(
+            lambda: sampling.lower_start(self.bound, transition, asked.chains) if done is None else [])
+        if done is None or done < warmup + asked.samples * thin:
             self.compiled = self.ahead.add(lambda: sampling.lower_block(
                 self.bound, transition, chains=asked.chains, warmup=warmup, samples=asked.samples, thin=thin,
                 chain_method=asked.method))
         ready()
-        if saved is None and not np.isfinite(transition.evaluate(self.bound.draw(asked.keys[2]))[0]):
+        if done is None and not np.isfinite(transition.evaluate(self.bound.draw(asked.keys[2]))[0]):
             return
         self.followed = self.ahead.add(self._programs)
         arviz_data.load_arviz()  # takes a second or two, which the compilation takes, too

@@ -101,7 +101,7 @@ class Checkpoint:
                                     "and not finished.")
         checkpoint.record = _record(path)
         check_same(folder, checkpoint.record, record)
-        checkpoint._earlier_s = float(checkpoint._state_seconds())
+        checkpoint._earlier_s = checkpoint._of_state("seconds") or 0.0
         checkpoint._hold()
         for left in Path(folder).glob(".*.part*"):  # by a process that was killed
             left.unlink(missing_ok=True)
@@ -116,6 +116,11 @@ class Checkpoint:
     def started(self) -> bool:
         """Whether there is a state of chains to go on from."""
         return (self._own / _STATE).is_file()
+
+    @property
+    def done(self) -> int | None:
+        """Steps that the chains have taken; None before the first state."""
+        return self._of_state("done")
 
     @property
     def setup(self) -> dict[str, Any] | None:
@@ -198,12 +203,13 @@ class Checkpoint:
     def _rows(self, name: str) -> Path:
         return self._own / f"draws-{name}.npy"
 
-    def _state_seconds(self) -> float:
+    def _of_state(self, name: str) -> Any:
+        """Return a number that was written with the state of the chains; None before the first one."""
         path = self._own / _STATE
         if not path.is_file():
-            return 0.0
+            return None
         with _readable(path), np.load(path) as file:
-            return float(file["seconds"])
+            return file[name].item()
 
     def _write(self, name: str, content: Mapping[str, Any]) -> None:
         with writing(self._own / name, overwrite=True) as temporary:
