@@ -15,7 +15,7 @@ import numpyro.distributions as dist
 from numpyro.distributions import constraints
 from numpyro.primitives import _PYRO_STACK
 
-from lfm_ppl import checks
+from lfm_ppl import checks, side_by_side
 from lfm_ppl.constrained.augmented import COARSE, is_count, rows, stacked_model, with_times
 from lfm_ppl.constrained.boxes import boxes
 from lfm_ppl.constrained.constraints import build_constraints
@@ -456,10 +456,9 @@ class Panel(dist.Distribution):
     def mapped(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Return ``function(distribution of a series, *its arguments)``, with the series as leading axis."""
         times = jnp.asarray(self.times, float) if self._series_times else None
-        call = lambda p, t, *rest: function(  # noqa: E731
-            self._one(p, self.times if t is None else t), *rest)
-        return jax.vmap(call, in_axes=(0, None if times is None else 0, *(0 for _ in arguments)))(
-            self.parameters, times, *arguments)
+        return side_by_side.mapped(
+            lambda p, t, *rest: function(self._one(p, self.times if t is None else t), *rest),
+            jax.tree_util.tree_map(jnp.asarray, self.parameters), times, *arguments)
 
     def log_prob_per_observation(self, value: Any) -> jax.Array:
         """Return (B, T): the one-step-ahead log densities of each series."""

@@ -82,6 +82,27 @@ def test_panel_equals_a_loop(y, looped):
     np.testing.assert_allclose(by_lengthscale, sum(e[1][1] for e in each), rtol=1e-10, atol=1e-10)
 
 
+@pytest.mark.parametrize("own_times", [False, True], ids=["shared times", "own times"])
+def test_many_series_go_one_after_another_on_a_cpu(y, monkeypatch, own_times):
+    """To the same values and gradients as side by side."""
+    count = 9
+    index = np.arange(count) % 3
+    rates, several = RATES[index] + 0.01 * np.arange(count), y[index]
+    times = TIMES * (1.0 + 0.1 * np.arange(count)[:, None]) if own_times else TIMES
+
+    def evaluate():
+        total = lambda rates, lengthscale: panel(rates, lengthscale, times).log_prob(several).sum()  # noqa: E731
+        return jax.jit(jax.value_and_grad(total, argnums=(0, 1)))
+
+    loops = lambda: str(jax.make_jaxpr(evaluate())(rates, LENGTHSCALE)).count(f"length={count}")  # noqa: E731
+    assert loops()
+    one_by_one = evaluate()(rates, LENGTHSCALE)
+    monkeypatch.setattr("lfm_ppl.side_by_side._on_cpu", lambda: False)
+    assert not loops()
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-12), one_by_one,
+                 evaluate()(rates, LENGTHSCALE))
+
+
 def test_series_with_times_of_their_own(y, looped, together):
     _, loop = looped
     times = np.stack([TIMES, 1.7 * TIMES, TIMES**1.2 + 1.0])
