@@ -357,6 +357,8 @@ class _Run:
         if asked.sampler == "map":
             known = keeper is not None and keeper.holds(_MODE)
             with waiting(_SEARCH, self.progress and not known):
+                if not known:
+                    self._compile_ahead_of_search()
                 self.draws, self.stats, self.remarks = _mode(self.bound, key, asked.samples, asked.seed, asked.init,
                                                              keeper)
             return
@@ -385,6 +387,17 @@ class _Run:
             self.partial = _some(count, asked.samples)
         self.z = collected.z
         self.draws, self.stats = _draws(self.bound, {"z": collected.z, **collected.statistics}, asked.samples)
+
+    def _compile_ahead_of_search(self) -> None:
+        """Compile what the search for the mode runs, and what `follow` does while that goes on, as `_compile_ahead`."""
+        bound = self.bound
+        ready = self.ahead.add(lambda: [bound.lower_gradient(bound.forward_mode)])
+
+        def wanted() -> bool:
+            ready()
+            return bool(np.isfinite(bound.log_density_gradient(bound.draw(self.asked.keys[2]))[0]))
+
+        self.followed = self.ahead.add(self._programs, wanted)
 
     def _compile_ahead(self, transition: Transition) -> None:
         """Compile all programs: while it is found out where the chains start, and then while they run.

@@ -22,19 +22,22 @@ class Ahead:
         self._thread = ThreadPoolExecutor(1, "compile ahead") if _cpus() > 1 else None
         self._lowered: list[Lowered] = []
 
-    def add(self, lower: Callable[[], Sequence[Lowered]]) -> Callable[[], None]:
+    def add(self, lower: Callable[[], Sequence[Lowered]],
+            wanted: Callable[[], bool] = lambda: True) -> Callable[[], None]:
         """Compile programs after those that were added before, and return a function that waits until they are.
 
         Whatever fails here fails again, and is told, where the program is called.
 
         Args:
             lower: traces and lowers the programs, at once.
+            wanted: whether to compile them, asked when that is done.
         """
         if self._thread is None:
             return lambda: None
         found: Sequence[Lowered] = ()
         try:
-            found = lower()
+            lowered = lower()
+            found = lowered if wanted() else ()
         except Exception as error:
             if was_interrupt(error):
                 raise KeyboardInterrupt from error

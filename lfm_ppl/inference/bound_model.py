@@ -425,6 +425,10 @@ class BoundModel:
         return self._program.once(("gradient", jacobian, forward_mode),
                                   lambda: _traced_once(value_and_gradient(target, forward_mode), *example))
 
+    def lower_gradient(self, forward_mode: bool) -> Lowered:
+        """Return the program of `gradient`; as long as it lives, it is compiled once."""
+        return self.gradient(forward_mode).lower(jnp.zeros(self.size), self.argument)
+
     def log_likelihood(self, z: Any, y: Any = None) -> jax.Array:
         """Return log p(y | T(z)), summed over the series of a panel; arguments as `log_density`."""
         def log_likelihood(z: jax.Array, y: Any) -> jax.Array:

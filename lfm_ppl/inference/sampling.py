@@ -120,7 +120,7 @@ def nuts(bound: BoundModel, warmup: int, options: Mapping[str, Any],
               "step_size": "adapt_state.step_size", "lp": "potential_energy"}
     return Transition(("nuts", warmup, forward_mode, signature(dict(options)) or object()), start, step, fields,
                       lambda z: both(jnp.asarray(z, float), bound.argument),
-                      lambda: [both.lower(jnp.zeros(bound.size), bound.argument)],
+                      lambda: [bound.lower_gradient(forward_mode)],
                       None if covariance is None else jnp.asarray(covariance),
                       lambda state: _words(state, state.adapt_state.step_size),
                       "" if covariance is not None or given else _AT_MODE)
