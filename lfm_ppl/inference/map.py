@@ -21,7 +21,7 @@ from lfm_ppl.inference.optimise import Minimum, Objective, newton, quasi_newton
 _HESSIANS = ("autodiff", "finite-differences")
 _ATTEMPTS = 20
 _SEARCH = {"maxcor": 40, "ftol": 1e-9, "gtol": 1e-3}
-"""Of L-BFGS: to 1e-6 in the log density, from where two steps of Newton's method do what takes it a hundred gradients."""
+"""Of L-BFGS: to 1e-6 in the log density, from where two steps of Newton's method lead to the mode."""
 _REMEDY = (
     "Try more restarts, a starting point of your own (init={'site': value}), more max_iterations, "
     "or a prior that says more about these parameters."

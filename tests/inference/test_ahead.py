@@ -77,7 +77,8 @@ def test_one_cpu_compiles_nothing_ahead(monkeypatch):
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("settings", [
     {"sampler": "ram"}, {"sampler": "ram", "chain_method": "vectorized"}, {"sampler": "nuts"},
-    {"sampler": "nuts", "init": "map", "chain_method": "vectorized"}, {"sampler": "map"}], ids=lambda one: "-".join(one.values()))
+    {"sampler": "nuts", "init": "map", "chain_method": "vectorized"}, {"sampler": "map"}],
+    ids=lambda one: "-".join(one.values()))
 def test_a_fit_compiles_each_program_once(monkeypatch, settings):
     """As many as without a thread, and the same numbers."""
     found, draws = [], []
