@@ -31,7 +31,7 @@ from lfm_ppl.inference.bound_model import BoundModel, bind
 from lfm_ppl.inference.interruption import was_interrupt
 from lfm_ppl.inference.kernels.options import KERNELS, check_options
 from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalRAM, Tuned
-from lfm_ppl.inference.map import MAPResult, mode_of
+from lfm_ppl.inference.map import MAPResult, check_sites, mode_of
 from lfm_ppl.inference.marginal_likelihood import Panel
 from lfm_ppl.inference.posterior import evenly_spaced, scores, trajectories
 from lfm_ppl.inference.priors import assumptions, prior
@@ -355,6 +355,10 @@ class _Run:
         asked, keeper = self.asked, self.keeper
         key = asked.keys[1]
         if asked.sampler == "map":
+            if isinstance(asked.init, Mapping):
+                check_sites(self.bound, asked.init)
+            else:
+                _check_init(asked.init)
             known = keeper is not None and keeper.holds(_MODE)
             with waiting(_SEARCH, self.progress and not known):
                 if not known:
@@ -389,7 +393,10 @@ class _Run:
         self.draws, self.stats = _draws(self.bound, {"z": collected.z, **collected.statistics}, asked.samples)
 
     def _compile_ahead_of_search(self) -> None:
-        """Compile what the search for the mode runs, and what `follow` does while that goes on, as `_compile_ahead`."""
+        """Compile the gradient, and while the mode is sought the programs of `follow`.
+
+        The latter are left for later where the density is not finite at the prior median, as in `_compile_ahead`.
+        """
         bound = self.bound
         ready = self.ahead.add(lambda: [bound.lower_gradient(bound.forward_mode)])
 
@@ -398,6 +405,8 @@ class _Run:
             return bool(np.isfinite(bound.log_density_gradient(bound.draw(self.asked.keys[2]))[0]))
 
         self.followed = self.ahead.add(self._programs, wanted)
+        ready()
+        arviz_data.load_arviz()
 
     def _compile_ahead(self, transition: Transition) -> None:
         """Compile all programs: while it is found out where the chains start, and then while they run.
@@ -705,7 +714,6 @@ def _statistics(collected: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 def _mode(bound: BoundModel, key: jax.Array, samples: int, seed: int, init: Any,
           run: Checkpoint | None) -> tuple[dict, dict, dict]:
     if isinstance(init, str):
-        checks.one_of("init", init, ("map", "median"))
         init = None
 
     def compute() -> dict[str, Any]:

@@ -25,6 +25,7 @@ from lfm_ppl.cli import main
 from lfm_ppl.cli.interruption import watched
 from lfm_ppl.inference import progress, sampling
 from lfm_ppl.inference.handlers.settings import approximate
+from lfm_ppl.inference.posterior import scores
 from lfm_ppl.inference.progress import Progress, Stage
 from lfm_ppl.inference.samplers import SAMPLERS
 from lfm_ppl.progress import waiting
@@ -271,6 +272,28 @@ def test_nothing_is_left_where_nothing_was_sampled(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         fit("ram", checkpoint=tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+def test_draws_are_computed_in_batches_to_the_same_numbers_and_parts_of_other_batches_are_not_taken(monkeypatch):
+    bound, count = lfm.bind(well, TIMES, Y), 10
+    draws = {"noise": np.linspace(0.5, 0.8, count)}
+
+    class Kept(dict):
+        def put(self, start, part):
+            self[start] = part
+
+        def flush(self):
+            pass
+
+    kept = Kept()
+    expected = scores(bound, draws, parts=kept)
+    assert list(kept) == [0] and len(kept[0]["residual"]) == 12  # three batches of four in one program
+    for name, value in expected.items():
+        each = [scores(bound, {"noise": draws["noise"][k:k + 1]})[name][0] for k in range(count)]
+        np.testing.assert_allclose(value, each, rtol=1e-12, atol=1e-12)
+    other = Kept({0: {name: value[:3] for name, value in kept[0].items()}})
+    for name, value in scores(bound, draws, parts=other).items():
+        np.testing.assert_array_equal(value, expected[name])
 
 
 # Accuracy

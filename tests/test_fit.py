@@ -498,6 +498,8 @@ def test_what_fails_after_sampling_does_not_cost_the_draws(y, monkeypatch):
     ({"trajectory_draws": -3}, ValueError, "trajectory_draws must be at least 1"),
     ({"init": "mode"}, ValueError, "unknown init 'mode'.*Known: map, median"),
     ({"init": 3}, TypeError, "init must be None"),
+    ({"sampler": "map", "init": "mode"}, ValueError, "unknown init 'mode'.*Known: map, median"),
+    ({"sampler": "map", "init": {"rates": 1.0}}, ValueError, "unknown site in init 'rates'"),
     ({"chain_method": "threads"}, ValueError, "unknown chain_method 'threads'.*Known: parallel, vectorized"),
     ({"fixed": {"decoy": 1.0}}, ValueError, r"unknown parameter to fix 'decoy'\. Did you mean 'decay'"),
     ({"fixed": {"decay[c]": 1.0}}, ValueError, "unknown element of decay 'c'.*Known: a, b"),

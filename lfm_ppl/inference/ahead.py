@@ -30,7 +30,7 @@ class Ahead:
 
         Args:
             lower: traces and lowers the programs, at once.
-            wanted: whether to compile them, asked when that is done.
+            wanted: called after tracing; where it returns False, nothing is compiled.
         """
         if self._thread is None:
             return lambda: None

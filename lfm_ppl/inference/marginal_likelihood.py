@@ -15,7 +15,8 @@ import numpyro.distributions as dist
 from numpyro.distributions import constraints
 from numpyro.primitives import _PYRO_STACK
 
-from lfm_ppl import checks, side_by_side
+from lfm_ppl import checks
+from lfm_ppl.batching import mapped
 from lfm_ppl.constrained.augmented import COARSE, is_count, rows, stacked_model, with_times
 from lfm_ppl.constrained.boxes import boxes
 from lfm_ppl.constrained.constraints import build_constraints
@@ -456,7 +457,7 @@ class Panel(dist.Distribution):
     def mapped(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Return ``function(distribution of a series, *its arguments)``, with the series as leading axis."""
         times = jnp.asarray(self.times, float) if self._series_times else None
-        return side_by_side.mapped(
+        return mapped(
             lambda p, t, *rest: function(self._one(p, self.times if t is None else t), *rest),
             jax.tree_util.tree_map(jnp.asarray, self.parameters), times, *arguments)
 

@@ -120,7 +120,7 @@ def quasi_newton(objective: Objective, start: np.ndarray, max_iterations: int = 
         start: (d,).
         max_iterations: where the search ends at the latest.
         bounds: (d, 2), least and largest value of each coordinate; None: there are none.
-        options: of SciPy's L-BFGS-B, in place of the strict ones that serve Newton's method afterwards.
+        options: of SciPy's L-BFGS-B, in place of strict ones.
     """
     best = End(np.asarray(start, float), np.inf)
     highest = -np.inf

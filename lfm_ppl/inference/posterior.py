@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl import checks, side_by_side
+from lfm_ppl import checks
+from lfm_ppl.batching import BATCH_SIZE, mapped
 from lfm_ppl.filtering.smoother import LONGEST_FORECAST, SmootherResult
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.bound_model import BoundModel
@@ -388,7 +389,7 @@ def over_draws(bound: BoundModel, name: Hashable, per_draw: Callable, draws: Map
         per_draw: maps site values, a random key and the model's ``argument`` to a pytree of arrays.
         draws: site name -> (S, ...).
         key: a JAX random key.
-        rows: of the scan over time, from which follows how many draws an accelerator holds side by side; None: one draw
+        rows: of the scan over time, from which follows how many draws go into one call of the program; None: one draw
             after another, as always with steps that follow a tolerance, of which each would make as many as are tried.
         show: is told before each batch how many draws of how many are done.
         parts: keeps the batches, and knows those of an earlier run.
@@ -400,11 +401,14 @@ def over_draws(bound: BoundModel, name: Hashable, per_draw: Callable, draws: Map
     example = bound.site.example
     several = rows is not None and (example.tolerance is None or example.ssm.time_invariant)
     numbers = (rows or 1) * example.ssm.state_dim**2 * 6
-    batch = int(np.clip(_BATCH_NUMBERS // max(numbers, 1), 1, side_by_side.width(count))) if several else _BATCH
+    batch = int(np.clip(_BATCH_NUMBERS // max(numbers, 1), 1, count)) if several else _BATCH
+    if several and batch > BATCH_SIZE:
+        batch = -(-batch // BATCH_SIZE) * BATCH_SIZE  # full batches
 
     def make() -> Callable:
         one_by_one = lambda d, k, y: jax.lax.map(lambda pair: per_draw(*pair, y), (d, k))  # noqa: E731
-        return jax.jit(jax.vmap(per_draw, in_axes=(0, 0, None)) if several else one_by_one)
+        by_fours = lambda d, k, y: mapped(lambda d, k: per_draw(d, k, y), d, k, batch_size=BATCH_SIZE)  # noqa: E731
+        return jax.jit(by_fours if several else one_by_one)
 
     run, keys = bound.compiled(("over draws", several, name), make), split_keys(key, count)
 
@@ -418,7 +422,7 @@ def over_draws(bound: BoundModel, name: Hashable, per_draw: Callable, draws: Map
     for start in range(0, count, batch):
         show(start, count)
         part = None if parts is None else parts.get(start)
-        if part is None:
+        if part is None or len(jax.tree_util.tree_leaves(part)[0]) != batch:  # or kept by other batches
             part = jax.tree_util.tree_map(np.asarray, run(*some(start)))
             if parts is not None:
                 parts.put(start, part)
