@@ -25,16 +25,23 @@ def mapped(function: Callable[..., Any], *arguments: Any, batch_size: int = 1) -
     Args:
         function: to be vectorised.
         *arguments: pytrees of arrays with one leading axis.
-        batch_size: how many entries a CPU computes at once, where there are more than a few of them.
+        batch_size: how many entries a CPU computes at once, where there are more than a few of them; a divisor of
+            their number.
 
     Example:
         >>> import jax.numpy as jnp
         >>> mapped(lambda a, b: a @ b, jnp.ones((3, 2)), jnp.ones((3, 2))).tolist()
         [2.0, 2.0, 2.0]
     """
-    if jax.tree_util.tree_leaves(arguments)[0].shape[0] <= _FEW or not _on_cpu():
+    count = jax.tree_util.tree_leaves(arguments)[0].shape[0]
+    if count <= _FEW or not _on_cpu():
         return jax.vmap(function)(*arguments)
-    return jax.lax.map(lambda entry: function(*entry), arguments, batch_size=None if batch_size == 1 else batch_size)
+    if batch_size == 1:
+        return jax.lax.map(lambda entry: function(*entry), arguments)
+    # The batches of `jax.lax.map` itself fail where a result has no entries.
+    batches = jax.tree_util.tree_map(lambda x: x.reshape(count // batch_size, batch_size, *x.shape[1:]), arguments)
+    found = jax.lax.map(lambda batch: jax.vmap(function)(*batch), batches)
+    return jax.tree_util.tree_map(lambda x: x.reshape(count, *x.shape[2:]), found)
 
 
 def _on_cpu() -> bool:
