@@ -274,7 +274,7 @@ def test_nothing_is_left_where_nothing_was_sampled(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def test_draws_are_computed_in_batches_to_the_same_numbers_and_parts_of_other_batches_are_not_taken(monkeypatch):
+def test_draws_are_computed_in_batches_to_the_same_numbers_and_parts_of_other_batches_are_not_taken():
     bound, count = lfm.bind(well, TIMES, Y), 10
     draws = {"noise": np.linspace(0.5, 0.8, count)}
 
