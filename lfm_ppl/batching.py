@@ -7,10 +7,14 @@ of its small operations becomes a loop of its own: the gradient of a panel of 48
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
+
+from lfm_ppl import compilation
 
 BATCH_SIZE = 4
 """Draws that a CPU computes in one batch."""
@@ -34,7 +38,7 @@ def mapped(function: Callable[..., Any], *arguments: Any, batch_size: int = 1) -
         [2.0, 2.0, 2.0]
     """
     count = jax.tree_util.tree_leaves(arguments)[0].shape[0]
-    if count <= _FEW or not _on_cpu():
+    if count <= _FEW or not on_cpu():
         return jax.vmap(function)(*arguments)
     if batch_size == 1:
         return jax.lax.map(lambda entry: function(*entry), arguments)
@@ -44,5 +48,47 @@ def mapped(function: Callable[..., Any], *arguments: Any, batch_size: int = 1) -
     return jax.tree_util.tree_map(lambda x: x.reshape(count, *x.shape[2:]), found)
 
 
-def _on_cpu() -> bool:
+def threads() -> int:
+    """Return how many compiled programs gain by running side by side: one for each CPU, one on an accelerator.
+
+    Within a ``with jax.enable_x64(...)`` it is one, too: other threads do not see that.
+    """
+    if not on_cpu() or compilation.one_thread() or (count := compilation.cpus()) == 1:
+        return 1
+    with ThreadPoolExecutor(1) as other:
+        return count if other.submit(_double).result() == _double() else 1
+
+
+def side_by_side(program: Callable[..., Any], arguments: Sequence[tuple]) -> Iterator[Any]:
+    """Yield ``program(*one)`` for each of ``arguments``, in their order, computed by as many `threads` as there are.
+
+    Args:
+        program: compiled: tracing is for one thread alone.
+        arguments: of each call.
+
+    Example:
+        >>> list(side_by_side(lambda a, b: a * b, [(2, 3), (4, 5)]))
+        [6, 20]
+    """
+    count = min(threads(), len(arguments))
+    if count <= 1:
+        for one in arguments:
+            yield program(*one)
+        return
+    with ThreadPoolExecutor(count, "side by side") as pool:
+        begun = deque(pool.submit(program, *one) for one in arguments)
+        try:
+            while begun:
+                yield begun.popleft().result()
+        finally:  # after Ctrl-C what has not begun never does
+            for later in begun:
+                later.cancel()
+
+
+def _double() -> bool:
+    return jax.config.jax_enable_x64  # type: ignore[attr-defined]
+
+
+def on_cpu() -> bool:
+    """Whether JAX computes on a CPU."""
     return jax.default_backend() == "cpu"

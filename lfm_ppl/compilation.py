@@ -15,6 +15,18 @@ Processes side by side would otherwise have as many threads each as there are CP
 another: two Hamiltonian chains on two CPUs took over four times as long as one by itself."""
 
 
+def cpus() -> int:
+    """Return how many CPUs this process may run on."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def one_thread() -> bool:
+    """Whether this process was told to compute with one thread, as by `ONE_THREAD`."""
+    return os.environ.get("PJRT_NPROC") == "1"
+
+
 def fast_loops() -> None:
     """Let XLA compile a loop over small matrices as one function, which its CPU runtime calls once.
 

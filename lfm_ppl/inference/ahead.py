@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 
 from jax.stages import Lowered
 
+from lfm_ppl import compilation
 from lfm_ppl.inference.interruption import was_interrupt
 
 
@@ -19,7 +19,7 @@ class Ahead:
     """
 
     def __init__(self) -> None:
-        self._thread = ThreadPoolExecutor(1, "compile ahead") if _cpus() > 1 else None
+        self._thread = ThreadPoolExecutor(1, "compile ahead") if compilation.cpus() > 1 else None
         self._lowered: list[Lowered] = []
 
     def add(self, lower: Callable[[], Sequence[Lowered]],
@@ -54,8 +54,3 @@ class Ahead:
         if self._thread is not None:
             self._thread.shutdown(wait=False, cancel_futures=True)
 
-
-def _cpus() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1

@@ -16,7 +16,7 @@ from tests.inference.test_bound_model import compilations
 
 
 def test_calls_find_what_was_compiled_ahead(monkeypatch):
-    monkeypatch.setattr("lfm_ppl.inference.ahead._cpus", lambda: 2)
+    monkeypatch.setattr("lfm_ppl.compilation.cpus", lambda: 2)
     function, other = jax.jit(lambda x: jnp.sin(x) @ jnp.cos(x)), jax.jit(lambda x: jnp.tanh(x) @ x)
     x = jnp.ones((17, 17))
     ahead = Ahead()
@@ -31,7 +31,7 @@ def test_calls_find_what_was_compiled_ahead(monkeypatch):
 
 
 def test_what_fails_ahead_is_left_for_the_call(monkeypatch):
-    monkeypatch.setattr("lfm_ppl.inference.ahead._cpus", lambda: 2)
+    monkeypatch.setattr("lfm_ppl.compilation.cpus", lambda: 2)
 
     def broken():
         raise ValueError("no program")
@@ -40,7 +40,7 @@ def test_what_fails_ahead_is_left_for_the_call(monkeypatch):
 
 
 def test_a_key_that_was_pressed_while_tracing_is_not_lost(monkeypatch):
-    monkeypatch.setattr("lfm_ppl.inference.ahead._cpus", lambda: 2)
+    monkeypatch.setattr("lfm_ppl.compilation.cpus", lambda: 2)
 
     def pressed():
         raise ValueError("tracing") from KeyboardInterrupt()
@@ -50,7 +50,7 @@ def test_a_key_that_was_pressed_while_tracing_is_not_lost(monkeypatch):
 
 
 def test_what_waits_is_not_compiled_after_the_end(monkeypatch):
-    monkeypatch.setattr("lfm_ppl.inference.ahead._cpus", lambda: 2)
+    monkeypatch.setattr("lfm_ppl.compilation.cpus", lambda: 2)
     compiled, go_on = [], threading.Event()
 
     class Slow:
@@ -67,7 +67,7 @@ def test_what_waits_is_not_compiled_after_the_end(monkeypatch):
 
 
 def test_one_cpu_compiles_nothing_ahead(monkeypatch):
-    monkeypatch.setattr("lfm_ppl.inference.ahead._cpus", lambda: 1)
+    monkeypatch.setattr("lfm_ppl.compilation.cpus", lambda: 1)
     asked = []
     Ahead().add(lambda: asked.append(1) or [])()
     assert not asked
@@ -83,7 +83,7 @@ def test_a_fit_compiles_each_program_once(monkeypatch, settings):
     """As many as without a thread, and the same numbers."""
     found, draws = [], []
     for cpus in (2, 1):
-        monkeypatch.setattr("lfm_ppl.inference.ahead._cpus", lambda cpus=cpus: cpus)
+        monkeypatch.setattr("lfm_ppl.compilation.cpus", lambda cpus=cpus: cpus)
 
         def model(times, y=None):
             noise = numpyro.sample("noise", dist.LogNormal(-0.5, 0.3))

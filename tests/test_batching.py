@@ -1,0 +1,80 @@
+"""How many computations run at once: in a batch, and side by side."""
+
+import threading
+
+import jax
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
+
+import lfm_ppl as lfm
+from lfm_ppl import batching, compilation
+from lfm_ppl.inference.posterior import scores, trajectories
+from tests import systems
+
+
+def well(times, y=None):
+    """A double well whose noise is unknown."""
+    noise = numpyro.sample("noise", dist.LogNormal(-0.5, 0.3))
+    numpyro.sample("y", lfm.MarginalLikelihood(systems.double_well(dispersion=noise, noise=0.1), times, steps=1), obs=y)
+
+
+@pytest.fixture
+def two_cpus(monkeypatch):
+    monkeypatch.setattr(compilation, "cpus", lambda: 2)
+    monkeypatch.delenv("PJRT_NPROC", raising=False)
+
+
+def test_there_is_a_thread_for_each_cpu_unless_the_process_has_one_or_settings_are_of_this_thread_alone(
+        two_cpus, monkeypatch):
+    assert batching.threads() == 2
+    with jax.enable_x64(False):
+        assert batching.threads() == 1
+    monkeypatch.setattr(batching, "on_cpu", lambda: False)
+    assert batching.threads() == 1
+    monkeypatch.undo()
+    monkeypatch.setenv("PJRT_NPROC", "1")
+    assert batching.threads() == 1
+
+
+def test_calls_run_side_by_side_and_come_in_their_order(two_cpus):
+    together = threading.Barrier(2, timeout=60)
+
+    def program(number):
+        together.wait()  # passes when two are here
+        return number
+
+    assert list(batching.side_by_side(program, [(k,) for k in range(6)])) == list(range(6))
+
+
+def test_after_an_error_or_an_interruption_nothing_more_begins(two_cpus):
+    begun, passes = [], threading.Semaphore(2)
+
+    def program(number):
+        begun.append(number)
+        passes.acquire(timeout=60)
+        return number
+
+    results = batching.side_by_side(program, [(number,) for number in range(20)])
+    assert next(results) == 0
+    threading.Timer(0.2, passes.release, [20]).start()
+    results.close()  # as by Ctrl-C between two results; waits for what runs
+    assert len(begun) <= 4
+    with pytest.raises(ZeroDivisionError):
+        list(batching.side_by_side(lambda number: 1 / number, [(0,), (1,)]))
+
+
+def test_draws_are_shared_out_to_the_threads_with_the_same_numbers(two_cpus, monkeypatch):
+    bound, count = lfm.bind(well, np.arange(4.0), np.array([[0.3], [0.9], [np.nan], [-0.8]])), 70
+    draws = {"noise": np.linspace(0.5, 0.8, count)}
+    shown = []
+    compute = {"scores": lambda **more: scores(bound, draws, **more),
+               "trajectories": lambda **more: trajectories(jax.random.key(0), bound, draws, None, **more)}
+    several = {name: run(show=lambda done, of: shown.append((done, of))) for name, run in compute.items()}
+    assert shown == [(start, count) for start in (0, 20, 40, 60)] * 2  # full batches of fours
+    monkeypatch.setattr(compilation, "cpus", lambda: 1)
+    for name, run in compute.items():
+        alone = run()
+        for one, value in several[name].items():
+            np.testing.assert_array_equal(value, alone[one], err_msg=f"{name}: {one}")
