@@ -86,7 +86,8 @@ class ManyFits:
         for name, reason in self.refused.items():
             yield Fitted(name, None, ValueError(reason))
         names = {task.name: name for name, task in self._tasks.items()}
-        for one in outcomes(self._tasks.values(), _Fit(self._model), self._out and self._out / FITS, **self._engine):
+        for one in outcomes(self._tasks.values(), _Fit(self._model), self._out and self._out / FITS, alike=True,
+                            **self._engine):
             name = names[one.task.name]
             if one.result is None:
                 self.failed[name] = one.reason

@@ -94,10 +94,12 @@ def run_tasks(tasks: Iterable[Task], compute: Callable[[Task], Mapping[str, Any]
 
 
 def outcomes(tasks: Iterable[Task], compute: Callable[[Task], Mapping[str, Any]], folder: str | Path | None, *,
-             overwrite: bool = False, report: Reporter | None = None, workers: Workers = 1) -> Iterator[Outcome]:
+             overwrite: bool = False, report: Reporter | None = None, workers: Workers = 1,
+             alike: bool = False) -> Iterator[Outcome]:
     """Yield how each task ended, one by one as they end, those first that were stored; arguments as in `run_tasks`.
 
-    The folder is held, and workers are kept, until the last one was taken or the iterator is closed.
+    The folder is held, and workers are kept, until the last one was taken or the iterator is closed. Tasks that are
+    ``alike`` run the same programs: the first one compiles them by itself, for all processes of this machine.
 
     Raises:
         ValueError, FolderInUseError, ClusterError: as `run_tasks`. A task that fails raises nothing.
@@ -117,7 +119,7 @@ def outcomes(tasks: Iterable[Task], compute: Callable[[Task], Mapping[str, Any]]
         for task in tasks:
             if (result := found.pop(task.name, None)) is not None:
                 yield Outcome(task, result, stored=True)
-        for task, new in _computed(stack, missing, compute, workers, progress):
+        for task, new in _computed(stack, missing, compute, workers, alike, progress):
             if isinstance(new, Exception):
                 one = Outcome(task, None, new)
                 progress.say(f"failed: {task.name}: {one.reason}")
@@ -131,7 +133,7 @@ def outcomes(tasks: Iterable[Task], compute: Callable[[Task], Mapping[str, Any]]
 
 
 def _computed(stack: contextlib.ExitStack, tasks: list[Task], compute: Callable[[Task], Mapping[str, Any]],
-              workers: Workers, progress: Progress) -> Iterator[tuple[Task, Any]]:
+              workers: Workers, alike: bool, progress: Progress) -> Iterator[tuple[Task, Any]]:
     """Yield each task with its arrays, or with the error that it ended with."""
     if not tasks:
         return
@@ -140,7 +142,7 @@ def _computed(stack: contextlib.ExitStack, tasks: list[Task], compute: Callable[
         if cluster.dashboard:
             progress.say(f"dashboard {cluster.dashboard}")
         progress.begin()
-        yield from cluster.computed(tasks, compute)
+        yield from cluster.computed(tasks, compute, alike)
         return
     progress.begin()
     for task in tasks:

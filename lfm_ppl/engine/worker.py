@@ -8,6 +8,7 @@ import functools
 import os
 import pickle
 import platform
+import time
 from collections.abc import Callable, Mapping
 from importlib import metadata
 from typing import Any, NamedTuple
@@ -46,8 +47,9 @@ class Setup(NamedTuple):
         environment = dict(ONE_THREAD)
         if "XLA_FLAGS" in os.environ:
             environment["XLA_FLAGS"] = os.environ["XLA_FLAGS"]
-        return cls(versions(), environment, bool(jax.config.read("jax_enable_x64")), programs,
-                   jax.config.jax_persistent_cache_min_compile_time_secs)  # type: ignore[attr-defined]
+        kept = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
+        shortest = jax.config.jax_persistent_cache_min_compile_time_secs if kept else 0.0  # type: ignore[attr-defined]
+        return cls(versions(), environment, bool(jax.config.read("jax_enable_x64")), programs, shortest)
 
 
 def versions() -> dict[str, str]:
@@ -85,10 +87,14 @@ def prepare(setup: Setup) -> None:
     _prepared[:] = [setup]
 
 
-def work(setup: Setup, program: bytes, task: bytes) -> dict[str, np.ndarray]:
-    """Compute a task in a worker; both are pickled, so that nothing of them is imported before the preparation."""
+def work(setup: Setup, program: bytes, task: bytes) -> tuple[dict[str, np.ndarray], float]:
+    """Compute a task in a worker, and say how many seconds that took.
+
+    Both are pickled, so that nothing of them is imported before the preparation.
+    """
+    began = time.monotonic()
     prepare(setup)
-    return computed(_loaded(program), pickle.loads(task))
+    return computed(_loaded(program), pickle.loads(task)), time.monotonic() - began
 
 
 @functools.lru_cache(maxsize=4)
