@@ -14,9 +14,11 @@ from lfm_ppl.orbits.ephemerides import Ephemerides, Gap, calendar, check_satelli
 from lfm_ppl.orbits.frames import AXES, dyb, rtn
 from lfm_ppl.orbits.geopotential import GM
 from lfm_ppl.orbits.satellite import (
+    GPS_PERIOD,
     HARMONICS,
     SOLAR_PRESSURE,
     START_SD,
+    period_of,
     satellite,
     small_forces,
     start_near,
@@ -27,6 +29,7 @@ from lfm_ppl.orbits.sp3 import read_sp3
 __all__ = [
     "AXES",
     "GM",
+    "GPS_PERIOD",
     "HARMONICS",
     "NANO",
     "SOLAR_PRESSURE",
@@ -46,6 +49,7 @@ __all__ = [
     "propagate",
     "read_sp3",
     "rtn",
+    "period_of",
     "satellite",
     "small_forces",
     "start_near",

@@ -17,7 +17,7 @@ from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.orbits import frames
 from lfm_ppl.orbits.deterministic import Orbit, propagate
 from lfm_ppl.orbits.environment import Environment
-from lfm_ppl.orbits.satellite import Motion, pushed, wide_start
+from lfm_ppl.orbits.satellite import GPS_PERIOD, Motion, period_of, pushed, wide_start
 from lfm_ppl.orbits.table import Table
 
 _FINEST = 1 / 120
@@ -32,12 +32,14 @@ class Neighbourhood(eqx.Module):
         slopes: table of the derivatives (3, 6 + R) of the acceleration by position, velocity and small forces.
         on_orbit: (R,) the small forces on the orbit itself: sunlight of constant amplitude, and nothing else.
         axes: of the small forces.
+        period: hours in which the orbit turns once.
     """
 
     path: jax.Array
     slopes: Table
     on_orbit: jax.Array
     axes: str = eqx.field(static=True)
+    period: Any = GPS_PERIOD
 
     @classmethod
     def of(cls, environment: Environment, orbit: Orbit, times: Any, axes: str = "DYB", nodes: int = 2
@@ -70,7 +72,8 @@ class Neighbourhood(eqx.Module):
         values = np.asarray(slopes).reshape(len(fine), 3, -1)
         by_force = _means(values[:, :, 6:].reshape(len(fine), -1), finer).reshape(-1, 3, len(on_orbit))
         table = np.concatenate([values[::finer, :, :6], by_force], axis=2)
-        return cls(jnp.asarray(path[::count]), Table(fine[0], spacing, table.reshape(len(table), -1)), on_orbit, axes)
+        return cls(jnp.asarray(path[::count]), Table(fine[0], spacing, table.reshape(len(table), -1)), on_orbit, axes,
+                   period_of(path))
 
     def __call__(self, x: jax.Array, u: jax.Array, t: Any) -> jax.Array:
         """Return the derivatives (6,) of a departure x (6,) under the small forces u (R,)."""

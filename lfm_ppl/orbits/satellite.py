@@ -17,16 +17,17 @@ from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation import GaussianObservation
 from lfm_ppl.orbits import frames
 from lfm_ppl.orbits.environment import NANO, Environment
+from lfm_ppl.orbits.geopotential import GM
 
 SOLAR_PRESSURE = 100.0
 """Acceleration of a GPS satellite by sunlight, in nm/s^2, before anything is known of the satellite."""
-SIDEREAL_DAY = 23.9344696
-"""Hours in which the Earth turns once, and a GPS satellite twice around it."""
+GPS_PERIOD = 23.9344696 / 2
+"""Hours in which a GPS satellite turns once around the Earth: half a sidereal day."""
 HARMONICS: dict[str, Mapping[str, Sequence[int]]] = {
     "DYB": {"solar": (1, 2, 3, 4), "panel": (1, 2, 3, 4), "remaining": (1, 2, 3, 4)},
     "RTN": {"radial": range(1, 8), "tangential": range(1, 8), "normal": range(1, 11)},
 }
-"""Axes -> force -> multiples of the base frequency: of the orbit for DYB, of the day for RTN (as in the source)."""
+"""Axes -> force -> multiples of the base frequency: of the orbit for DYB, of half of it for RTN, a day for GPS."""
 STATES = ("x", "y", "z", "vx", "vy", "vz")
 START_SD = (0.1, 0.1)
 """Of the start (km, km/h): far wider than what a few positions tell."""
@@ -99,7 +100,8 @@ def _position(x: jax.Array, u: jax.Array, t: Any) -> jax.Array:
 
 
 def small_forces(axes: str = "DYB", amplitude: Any = 1.0, wander: Any = 0.01, drift: Any = 0.003,
-                 level: Any = (10.0, 2.0), harmonics: Mapping[str, Sequence[int]] | None = None) -> dict[str, Force]:
+                 level: Any = (10.0, 2.0), harmonics: Mapping[str, Sequence[int]] | None = None,
+                 period: Any = GPS_PERIOD) -> dict[str, Force]:
     """Return quasi-periodic forces for `satellite`, in nm/s^2: on each axis a level and resonators.
 
         u(t) = b(t) + sum_n c_n(t),    db = drift dbeta,    c_n'' = -(2 pi n f)^2 c_n + white noise,
@@ -107,13 +109,14 @@ def small_forces(axes: str = "DYB", amplitude: Any = 1.0, wander: Any = 0.01, dr
     c_n with standard deviation amplitude / n at the start, and wander / n gained per square root of an hour.
 
     Args:
-        axes: "DYB", with the orbit's frequency, or "RTN", with that of the sidereal day.
+        axes: "DYB", where f is the orbit's frequency, or "RTN", where it is half of that: once a day for GPS.
         amplitude: nm/s^2; or force -> one number for each of its multiples n, not divided by n.
         wander: nm/s^2 / sqrt(h); or force -> numbers, as amplitude.
         drift: nm/s^2 / sqrt(h); or force -> number.
         level: standard deviation of the sunlight's acceleration, and of the levels b on the other axes (nm/s^2); or
             force -> number.
         harmonics: force -> multiples of the base frequency; None: `HARMONICS`.
+        period: of the orbit (h), as `period_of` finds it; the default is that of a GPS satellite.
 
     Raises:
         ValueError: unknown axes.
@@ -123,7 +126,7 @@ def small_forces(axes: str = "DYB", amplitude: Any = 1.0, wander: Any = 0.01, dr
         {'solar': 9, 'panel': 9, 'remaining': 9}
     """
     checks.one_of("axes", axes, tuple(HARMONICS))
-    period = SIDEREAL_DAY / 2 if axes == "DYB" else SIDEREAL_DAY
+    base = period if axes == "DYB" else 2 * period
     own = level if isinstance(level, Mapping) else {}
     sunlight, others = (0.0, 0.0) if own else level
     found: dict[str, Force] = {}
@@ -136,9 +139,27 @@ def small_forces(axes: str = "DYB", amplitude: Any = 1.0, wander: Any = 0.01, dr
                                   mean=SOLAR_PRESSURE if sunward else 0.0)
         sizes = zip(multiples, _each(amplitude, name, multiples), _each(wander, name, multiples), strict=True)
         for n, size, gain in sizes:
-            force = force + Resonator(period / n, size, gain)
+            force = force + Resonator(base / n, size, gain)
         found[name] = force
     return found
+
+
+def period_of(path: Any) -> jax.Array:
+    """Return the hours in which a satellite turns once, from the mean of the semi-major axis along its path.
+
+        1/a = 2/|r| - |v|^2/GM,    period = 2 pi (a^3/GM)^(1/2)
+
+    Args:
+        path: (T, 6) position (km) and velocity (km/h).
+
+    Example:
+        >>> round(float(period_of(jnp.array([[29_600.0, 0.0, 0.0, 0.0, 13_210.7, 0.0]]))), 2)  # as of Galileo
+        14.08
+    """
+    gm = GM * 3600.0**2
+    path = jnp.asarray(path)
+    inverse = 2.0 / jnp.linalg.norm(path[:, :3], axis=1) - (path[:, 3:] ** 2).sum(axis=1) / gm
+    return 2.0 * jnp.pi * jnp.sqrt((1.0 / inverse).mean() ** 3 / gm)
 
 
 def _each(given: Any, name: str, multiples: Sequence[int]) -> Sequence[Any]:

@@ -204,7 +204,7 @@ def test_tables():
     each = experiment.satellites(results)
     assert each.loc["G02", "deterministic"] == pytest.approx(20.0 * np.sqrt(3))
     assert each.loc["G02", "LFM radial"] == pytest.approx(2.0) and each.loc["G02", "ratio"] == pytest.approx(0.1)
-    sizes = experiment.magnitudes_of(results, magnitudes.wide("DYB"), "DYB")
+    sizes = experiment.magnitudes_of(results, {"GPS": magnitudes.wide("DYB")}, "DYB")
     assert sizes.loc["amplitude of panel 2", "common"] == pytest.approx(0.05) and (sizes["G01"] == 1.0).all()
     together = experiment.pooled(results)
     assert list(together.index) == ["without gaps", "without gaps, never in shadow", "without gaps, in shadow",
@@ -213,6 +213,23 @@ def test_tables():
     assert row["satellites"] == 2 and row["improved"] == 2
     assert row["deterministic"] == pytest.approx(np.sqrt(3 * (10.0**2 + 20.0**2) / 2))
     assert row["ratio"] == pytest.approx(0.1) and row["ratio, latest"] == pytest.approx(0.2)
+
+
+def test_each_constellation_has_magnitudes_and_pooled_errors_of_its_own():
+    learnt = {f"learn/{letter}{number:02d}": {"logarithms": np.full(21, value), "cpu_s": 1.0}
+              for letter, value in (("G", 1.0), ("E", -1.0)) for number in range(1, 6)}
+    predicted = {f"predict/{name[6:]}": result(10.0 if "G" in name else 20.0) for name in learnt}
+    found = experiment.outcome(experiment.Settings(), learnt | predicted)
+    assert {name: float(prior.mean[0]) for name, prior in found.priors.items()} == {"GPS": 1.0, "Galileo": -1.0}
+    sizes = experiment.magnitudes_of(found.predicted, found.priors, "DYB")
+    assert sizes["common, Galileo"].iloc[0] == pytest.approx(np.exp(-1.0))
+    together = experiment.pooled(found.predicted)
+    assert together["satellites"].to_dict() == {
+        "without gaps": 10, "without gaps, never in shadow": 10,
+        "GPS, without gaps": 5, "GPS, without gaps, never in shadow": 5,
+        "Galileo, without gaps": 5, "Galileo, without gaps, never in shadow": 5}
+    assert together.loc["Galileo, without gaps", "deterministic"] == pytest.approx(20.0 * np.sqrt(3))
+    assert problem.system("C21") == "BeiDou" and problem.system("X01") == "X"
 
 
 def test_tables_are_written_with_their_text(tmp_path):

@@ -42,14 +42,14 @@ class Outcome(NamedTuple):
 
     Attributes:
         predicted: their predictions.
-        prior: the magnitudes that they have in common.
+        priors: constellation -> the magnitudes that its satellites have in common.
         compared: ways to learn the magnitudes.
         online: predictions as positions come in.
         refused: satellite -> why it was left out.
     """
 
     predicted: dict[str, Result]
-    prior: magnitudes.Prior
+    priors: dict[str, magnitudes.Prior]
     compared: dict[str, Result]
     online: dict[str, Result]
     refused: dict[str, str]
@@ -93,9 +93,9 @@ def plan_predictions(settings: Settings, results: Results) -> list[Task]:
     if not learnt:
         raise ValueError("no satellite can be predicted. " + " ".join(refused.values()))
     data = problem.arcs(settings.data, settings.seed)
-    prior = magnitudes.common([one["logarithms"] for one in learnt.values()], settings.axes)
+    priors = _priors(learnt, settings.axes)
     usable = [{**task.settings, "orbit": learnt[name]["orbit"].tolist(), "alone": learnt[name]["logarithms"].tolist(),
-               "prior": [values.tolist() for values in prior]}
+               "prior": [values.tolist() for values in priors[problem.system(name)]]}
               for task in tasks if (name := task.settings["satellite"]) in learnt]
     found = [Task(f"predict/{one['satellite']}", settings.seed, one) for one in usable]
     found += [Task(f"ways/{one['satellite']}", settings.seed, one) for one in usable[:settings.alternatives]]
@@ -182,8 +182,16 @@ def outcome(settings: Settings, results: Results) -> Outcome:
     if not predicted:
         raise ValueError("no satellite can be predicted. " + " ".join(refused.values()))
     predicted = {name: one | {"cpu_s": one["cpu_s"] + learnt[name]["cpu_s"]} for name, one in predicted.items()}
-    prior = magnitudes.common([one["logarithms"] for one in learnt.values()], settings.axes)
-    return Outcome(predicted, prior, _kept(results, "ways/", {}), _kept(results, "online/", {}), refused)
+    return Outcome(predicted, _priors(learnt, settings.axes), _kept(results, "ways/", {}),
+                   _kept(results, "online/", {}), refused)
+
+
+def _priors(learnt: Mapping[str, Result], axes: str) -> dict[str, magnitudes.Prior]:
+    """Return what the satellites of each constellation have in common."""
+    groups: dict[str, list[np.ndarray]] = {}
+    for name, one in learnt.items():
+        groups.setdefault(problem.system(name), []).append(one["logarithms"])
+    return {system: magnitudes.common(own, axes) for system, own in groups.items()}
 
 
 def _kept(results: Results, kind: str, refused: dict[str, str]) -> dict[str, Result]:
@@ -193,9 +201,12 @@ def _kept(results: Results, kind: str, refused: dict[str, str]) -> dict[str, Res
     return {name: one for name, one in own.items() if _REFUSED not in one}
 
 
-def magnitudes_of(results: dict[str, Result], prior: magnitudes.Prior, axes: str) -> pd.DataFrame:
+def magnitudes_of(results: dict[str, Result], priors: Mapping[str, magnitudes.Prior], axes: str) -> pd.DataFrame:
     """Return one row a magnitude of the small forces, in nm/s^2 and hours: what is common, and each satellite's."""
-    columns = {"common": np.exp(prior.mean), "factor": np.exp(prior.sd)}
+    columns: dict[str, np.ndarray] = {}
+    for system, prior in priors.items():
+        of = f", {system}" if len(priors) > 1 else ""
+        columns |= {f"common{of}": np.exp(prior.mean), f"factor{of}": np.exp(prior.sd)}
     columns |= {name: np.exp(one["logarithms"]) for name, one in results.items()}
     return pd.DataFrame(columns, index=list(magnitudes.names(axes)))
 
@@ -219,14 +230,25 @@ def satellites(results: dict[str, Result]) -> pd.DataFrame:
 def pooled(results: dict[str, Result]) -> pd.DataFrame:
     """Return one row a group of satellites: pooled errors in metres, ratios and coverage.
 
-    Satellites with gaps stand apart: a gap is often a manoeuvre, which no model of small forces predicts.
+    Satellites with gaps stand apart: a gap is often a manoeuvre, which no model of small forces predicts. Several
+    constellations are pooled each by itself, too.
     """
+    systems = list(dict.fromkeys(map(problem.system, results)))
+    rows = _pooled(results)
+    if len(systems) > 1:
+        for system in systems:
+            own = {name: one for name, one in results.items() if problem.system(name) == system}
+            rows |= {f"{system}, {group}": row for group, row in _pooled(own).items()}
+    return pd.DataFrame.from_dict(rows, orient="index")
+
+
+def _pooled(results: dict[str, Result]) -> dict[str, dict[str, Any]]:
     complete = [name for name, one in results.items() if one["complete"]]
     groups = {"without gaps": complete,
               "without gaps, never in shadow": [name for name in complete if not results[name]["eclipsed"]],
               "without gaps, in shadow": [name for name in complete if results[name]["eclipsed"]],
               "with gaps": [name for name in results if name not in complete]}
-    rows = {}
+    rows: dict[str, dict[str, Any]] = {}
     for group, names in groups.items():
         if not names:
             continue
@@ -238,7 +260,7 @@ def pooled(results: dict[str, Result]) -> pd.DataFrame:
             "median": own["LFM"].median(), "ratio": together["LFM"] / together["deterministic"],
             "ratio, latest": together["LFM"] / together["latest state"],
             "improved": int((own["LFM"] < own["deterministic"]).sum()), **pair("coverage", mean_of(own["coverage"]))}
-    return pd.DataFrame.from_dict(rows, orient="index")
+    return rows
 
 
 def tabulated(settings: Settings, results: Results) -> dict[str, Table]:
@@ -248,7 +270,7 @@ def tabulated(settings: Settings, results: Results) -> dict[str, Table]:
     found = {"pooled": Table("Errors after training (m), pooled over satellites, and 95% coverage",
                              pooled(one.predicted)),
              "satellites": Table("Each satellite: root mean square errors after training (m)", each, _few(each)),
-             "magnitudes": Table("", magnitudes_of(one.predicted, one.prior, settings.axes))}
+             "magnitudes": Table("", magnitudes_of(one.predicted, one.priors, settings.axes))}
     if one.compared:
         found["learning"] = Table("Ways to learn the magnitudes of the forces: error after training (m)",
                                   ways.table(one.compared))

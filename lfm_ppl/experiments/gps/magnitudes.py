@@ -72,8 +72,15 @@ def _entries(axes: str) -> Iterator[tuple[str, tuple[float, float]]]:
     yield "white", _WHITE
 
 
-def forces(logarithms: jax.Array, axes: str) -> tuple[dict[str, Force], jax.Array]:
-    """Return the small forces, and the dispersion of white noise; the logarithms (d,) may be traced."""
+def forces(logarithms: jax.Array, axes: str, period: Any = orbits.GPS_PERIOD
+           ) -> tuple[dict[str, Force], jax.Array]:
+    """Return the small forces, and the dispersion of white noise; the logarithms (d,) may be traced.
+
+    Args:
+        logarithms: (d,) of the magnitudes.
+        axes: of the small forces.
+        period: of the orbit (h).
+    """
     value = dict(zip(names(axes), jnp.exp(logarithms), strict=True))
     harmonics = orbits.HARMONICS[axes]
     amplitude = {name: [value[f"amplitude of {name} {n}"] for n in multiples] for name, multiples in harmonics.items()}
@@ -82,4 +89,4 @@ def forces(logarithms: jax.Array, axes: str) -> tuple[dict[str, Force], jax.Arra
     level: dict[str, Any] = {"solar": _SUNLIGHT} | {
         name: value[f"level of {name}"] for name in harmonics if name != "solar"}
     drift = {name: value[f"drift of {name}"] for name in harmonics}
-    return orbits.small_forces(axes, amplitude, wander, drift, level), value["white"]
+    return orbits.small_forces(axes, amplitude, wander, drift, level, period=period), value["white"]

@@ -221,15 +221,15 @@ def filter_positions(one: Arc, orbit: orbits.Orbit, logarithms: np.ndarray, axes
     Nothing is taken to be small here: the filter follows the satellite in steps of 30 s.
     """
     found = _filter(one.environment, orbits.wide_start(orbit.state), jnp.asarray(y), jnp.asarray(logarithms),
-                    (tuple(one.times), axes))
+                    orbits.period_of(orbit.state[None]), (tuple(one.times), axes))
     return np.asarray(found[0]), np.asarray(found[1])
 
 
-@functools.partial(jax.jit, static_argnums=(4,))
-def _filter(environment: orbits.Environment, start: Gaussian, y: jax.Array, logarithms: jax.Array, fixed: tuple
-            ) -> tuple[jax.Array, jax.Array]:
+@functools.partial(jax.jit, static_argnums=(5,))
+def _filter(environment: orbits.Environment, start: Gaussian, y: jax.Array, logarithms: jax.Array, period: jax.Array,
+            fixed: tuple) -> tuple[jax.Array, jax.Array]:
     times, axes = np.array(fixed[0]), fixed[1]
-    forces, white = magnitudes.forces(logarithms, axes)
+    forces, white = magnitudes.forces(logarithms, axes, period)
     system = orbits.satellite(environment, start, forces, axes, white, NOISE)
     found = filter(system, times, y, rule=Taylor(), steps=training.steps_of(times, orbits.STEP))
     return found.predicted_mean[:, :3], found.predicted_covariance[:, :3, :3]

@@ -23,6 +23,11 @@ _HIDDEN_WHITE = 0.03
 _DAYS, _INTERVAL = 10, 900.0
 
 
+SYSTEMS = {"G": "GPS", "R": "GLONASS", "E": "Galileo", "C": "BeiDou", "J": "QZSS", "I": "NavIC", "S": "SBAS",
+           "L": "low orbits"}
+"""First letter of a satellite's name -> constellation."""
+
+
 class Arcs(NamedTuple):
     """Positions in axes that do not turn.
 
@@ -65,9 +70,19 @@ class Arc(NamedTuple):
         return hashlib.sha256(np.ascontiguousarray(self.positions).tobytes()).hexdigest()[:16]
 
 
+def system(satellite: str) -> str:
+    """Return the constellation of a satellite.
+
+    Example:
+        >>> system("E12"), system("X01")
+        ('Galileo', 'X')
+    """
+    return SYSTEMS.get(satellite[:1], satellite[:1])
+
+
 @functools.lru_cache(maxsize=2)
 def arcs(folder: str | None, seed: int = 0) -> Arcs:
-    """Return the positions of all GPS satellites in a folder of SP3 files, or of twelve simulated ones.
+    """Return the positions of all satellites in a folder of SP3 files, or of twelve simulated ones like those of GPS.
 
     Args:
         folder: of SP3 files; None: simulate ten days.
@@ -79,15 +94,11 @@ def arcs(folder: str | None, seed: int = 0) -> Arcs:
     if folder is None:
         return _simulated(seed)
     published = orbits.read_sp3(Path(folder))
-    gps = [name for name in published.satellites if name.startswith("G")]
-    if not gps:
-        raise ValueError(f"{folder}: there is no GPS satellite (G01, G02, ...) in these files, only "
-                         f"{', '.join(published.satellites[:5])}.")
-    published = published.select(gps)
     environment = orbits.Environment.over(published.epochs[0], 24.0 * published.days)
     positions = environment.celestial(published)
     times = (published.epochs - published.epochs[0]) / 3600.0
-    return Arcs(environment, times, {name: positions[:, index] for index, name in enumerate(gps)}, published)
+    found = {name: positions[:, index] for index, name in enumerate(published.satellites)}
+    return Arcs(environment, times, found, published)
 
 
 def _simulated(seed: int) -> Arcs:

@@ -104,7 +104,7 @@ def steps_of(times: np.ndarray, step: float = _STEP) -> int:
 
 def departing(logarithms: jax.Array, near: orbits.Neighbourhood, axes: str) -> LatentForceModel:
     """Return the model of departures with these magnitudes."""
-    forces, white = magnitudes.forces(logarithms, axes)
+    forces, white = magnitudes.forces(logarithms, axes, near.period)
     return orbits.departure(near, forces, white, NOISE)
 
 
@@ -136,7 +136,7 @@ def scales(logarithms: jax.Array, axes: str) -> tuple[jax.Array, jax.Array]:
 
 def _responses(near: orbits.Neighbourhood, times: np.ndarray, axes: str) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return m, O and K of `Training`: those of one force at a time, as forces do not see one another."""
-    levels, resonators = _members(magnitudes.forces(jnp.asarray(magnitudes.wide(axes).mean), axes)[0])
+    levels, resonators = _members(magnitudes.forces(jnp.asarray(magnitudes.wide(axes).mean), axes, near.period)[0])
     along = np.eye(len(near.on_orbit))
     fixed = tuple(times)
     # White noise goes first, with a level that does not drift.

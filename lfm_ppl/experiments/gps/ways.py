@@ -81,7 +81,7 @@ def _of_smoothed_forces(data: Training) -> Callable[[np.ndarray], tuple[float, n
     fixed = tuple(data.times[::thin]), data.axes
 
     def evidence(logarithms: np.ndarray) -> tuple[float, np.ndarray]:
-        value, gradient = _score_forces(jnp.asarray(logarithms), mean[::thin], sd[::thin], fixed)
+        value, gradient = _score_forces(jnp.asarray(logarithms), mean[::thin], sd[::thin], data.near.period, fixed)
         return float(value), np.asarray(gradient)
 
     return evidence
@@ -97,11 +97,12 @@ def _smooth_forces(near: orbits.Neighbourhood, y: jax.Array, fixed: tuple) -> tu
     return found.input_mean[:, 6:], jnp.sqrt(jnp.diagonal(found.input_covariance, axis1=1, axis2=2)[:, 6:])
 
 
-@functools.partial(jax.jit, static_argnums=(3,))
+@functools.partial(jax.jit, static_argnums=(4,))
 @jax.value_and_grad
-def _score_forces(logarithms: jax.Array, mean: jax.Array, sd: jax.Array, fixed: tuple) -> jax.Array:
+def _score_forces(logarithms: jax.Array, mean: jax.Array, sd: jax.Array, period: jax.Array, fixed: tuple
+                  ) -> jax.Array:
     times, axes = np.array(fixed[0]), fixed[1]
-    forces, white = magnitudes.forces(logarithms, axes)
+    forces, white = magnitudes.forces(logarithms, axes, period)
     # A value stands for some time, over which white noise averages.
     errors = jax.vmap(jnp.diag)(sd**2 + white**2 / _APART)
     system = LatentForceModel(lambda x, u, t: jnp.zeros(1), forces, GaussianObservation(lambda x, u, t: u, errors),
