@@ -650,12 +650,10 @@ def _transition(sampler: str, bound: BoundModel, options: Mapping[str, Any] | No
         prepare(transition)
         if dense:
             laplace = mode_of(bound, seed=seed)
-            strategy: Any = init_to_value(values=laplace.parameters)
             if not laplace.unidentified and np.all(np.isfinite(laplace.covariance)):
                 transition = transition._replace(extra=jnp.asarray(laplace.covariance))
-        else:
-            strategy = _strategy(init, bound, seed)
-        return transition, _starts(key, bound, strategy, chains, transition.evaluate), {}
+            return transition, np.tile(laplace.mode, (chains, 1)), {}
+        return transition, _starts(key, bound, _strategy(init, bound, seed), chains, transition.evaluate), {}
     if sampler == "ram":
         # Whatever covariance it begins with, its programs are these.
         prepare(sampling.random_walk(bound, KERNELS[sampler](bound.model, **options), warmup))

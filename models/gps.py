@@ -81,7 +81,8 @@ def build(
         axes: of the small forces.
         units: name -> unit.
     """
-    forces = lfm.orbits.small_forces(axes, amplitude, wander, drift)
+    period = lfm.orbits.period_of(start.mean[None])
+    forces = lfm.orbits.small_forces(axes, amplitude, wander, drift, period=period)
     return lfm.orbits.satellite(environment, start, forces, axes, white, noise_sd, units)
 
 

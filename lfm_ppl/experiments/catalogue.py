@@ -14,7 +14,7 @@ _STUDIES = {
     "ginzburg-landau": ("ginzburg_landau.experiment",
                         "double well: EKF, CKF, GHKF, particle filter and exact grid, in states and parameters"),
     "gps": ("gps.experiment",
-            "GPS orbits: predicted for days with and without latent forces, from SP3 files (--data) or simulated"),
+            "orbits of GPS and others, predicted for days with and without latent forces, from SP3 files or simulated"),
     "home-heating": ("home_heating.experiment", "home heating: a day ahead with residual heat that nearly repeats, "
                      "under a thermostat and in a real house"),
     "transcription": ("transcription.experiment", "transcription factors: Laplace, elliptical slice sampling and "

@@ -1,1 +1,1 @@
-"""GPS orbits: predicted with and without forces that nobody measured."""
+"""Orbits of GPS and other satellites: predicted with and without forces that nobody measured."""

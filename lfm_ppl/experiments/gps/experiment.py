@@ -188,10 +188,8 @@ def outcome(settings: Settings, results: Results) -> Outcome:
 
 def _priors(learnt: Mapping[str, Result], axes: str) -> dict[str, magnitudes.Prior]:
     """Return what the satellites of each constellation have in common."""
-    groups: dict[str, list[np.ndarray]] = {}
-    for name, one in learnt.items():
-        groups.setdefault(problem.system(name), []).append(one["logarithms"])
-    return {system: magnitudes.common(own, axes) for system, own in groups.items()}
+    return {system: magnitudes.common([one["logarithms"] for one in own.values()], axes)
+            for system, own in problem.by_system(learnt).items()}
 
 
 def _kept(results: Results, kind: str, refused: dict[str, str]) -> dict[str, Result]:
@@ -233,11 +231,9 @@ def pooled(results: dict[str, Result]) -> pd.DataFrame:
     Satellites with gaps stand apart: a gap is often a manoeuvre, which no model of small forces predicts. Several
     constellations are pooled each by itself, too.
     """
-    systems = list(dict.fromkeys(map(problem.system, results)))
-    rows = _pooled(results)
+    rows, systems = _pooled(results), problem.by_system(results)
     if len(systems) > 1:
-        for system in systems:
-            own = {name: one for name, one in results.items() if problem.system(name) == system}
+        for system, own in systems.items():
             rows |= {f"{system}, {group}": row for group, row in _pooled(own).items()}
     return pd.DataFrame.from_dict(rows, orient="index")
 

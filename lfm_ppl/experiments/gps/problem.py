@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,8 +22,6 @@ SIMULATED = tuple(f"S{number:02d}" for number in range(1, 13))
 _HIDDEN: dict[str, Any] = {"amplitude": 0.5, "wander": 0.02, "drift": 0.005}
 _HIDDEN_WHITE = 0.03
 _DAYS, _INTERVAL = 10, 900.0
-
-
 SYSTEMS = {"G": "GPS", "R": "GLONASS", "E": "Galileo", "C": "BeiDou", "J": "QZSS", "I": "NavIC", "S": "SBAS",
            "L": "low orbits"}
 """First letter of a satellite's name -> constellation."""
@@ -80,12 +79,31 @@ def system(satellite: str) -> str:
     return SYSTEMS.get(satellite[:1], satellite[:1])
 
 
+def by_system(results: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return constellation -> satellite -> what belongs to it.
+
+    Example:
+        >>> by_system({"G01": 1, "E12": 2, "G05": 3})
+        {'GPS': {'G01': 1, 'G05': 3}, 'Galileo': {'E12': 2}}
+    """
+    found: dict[str, dict[str, Any]] = {}
+    for name, one in results.items():
+        found.setdefault(system(name), {})[name] = one
+    return found
+
+
+def _place(satellite: str) -> tuple[int, str]:
+    """GPS first, as in `SYSTEMS`."""
+    letters = [*SYSTEMS, satellite[:1]]
+    return letters.index(satellite[:1]), satellite
+
+
 @functools.lru_cache(maxsize=2)
 def arcs(folder: str | None, seed: int = 0) -> Arcs:
     """Return the positions of all satellites in a folder of SP3 files, or of twelve simulated ones like those of GPS.
 
     Args:
-        folder: of SP3 files; None: simulate ten days.
+        folder: of SP3 files; their satellites are ordered by constellation, GPS first. None: simulate ten days.
         seed: of the simulation.
 
     Raises:
@@ -96,8 +114,9 @@ def arcs(folder: str | None, seed: int = 0) -> Arcs:
     published = orbits.read_sp3(Path(folder))
     environment = orbits.Environment.over(published.epochs[0], 24.0 * published.days)
     positions = environment.celestial(published)
+    order = sorted(range(len(published.satellites)), key=lambda index: _place(published.satellites[index]))
     times = (published.epochs - published.epochs[0]) / 3600.0
-    found = {name: positions[:, index] for index, name in enumerate(published.satellites)}
+    found = {published.satellites[index]: positions[:, index] for index in order}
     return Arcs(environment, times, found, published)
 
 
