@@ -8,7 +8,7 @@ of its small operations becomes a loop of its own: the gradient of a panel of 48
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -49,7 +49,7 @@ def mapped(function: Callable[..., Any], *arguments: Any, batch_size: int = 1) -
 
 
 def threads() -> int:
-    """Return how many compiled programs gain by running side by side: one for each CPU, one on an accelerator.
+    """Return how many compiled programs should run side by side: one for each CPU, one on an accelerator.
 
     Within a ``with jax.enable_x64(...)`` it is one, too: other threads do not see that.
     """
@@ -59,19 +59,19 @@ def threads() -> int:
         return count if other.submit(_double).result() == _double() else 1
 
 
-def side_by_side(program: Callable[..., Any], arguments: Sequence[tuple]) -> Iterator[Any]:
-    """Yield ``program(*one)`` for each of ``arguments``, in their order, computed by as many `threads` as there are.
+def side_by_side(program: Callable[..., Any], arguments: Sequence[tuple], count: int) -> Generator[Any, None, None]:
+    """Yield ``program(*one)`` for each of ``arguments``, in their order, computed by several threads.
 
     Args:
         program: compiled: tracing is for one thread alone.
         arguments: of each call.
+        count: of threads.
 
     Example:
-        >>> list(side_by_side(lambda a, b: a * b, [(2, 3), (4, 5)]))
+        >>> list(side_by_side(lambda a, b: a * b, [(2, 3), (4, 5)], 2))
         [6, 20]
     """
-    count = min(threads(), len(arguments))
-    if count <= 1:
+    if min(count, len(arguments)) <= 1:
         for one in arguments:
             yield program(*one)
         return

@@ -187,8 +187,9 @@ def fit_many(
     """Fit a latent force model to many data sets, each by itself.
 
     Data sets with equal times and shapes share the compiled programs of `fit` in each process, and processes share what
-    they compile. The numbers of a data set follow from the seed and from its name alone: they are those of a `fit` with
-    the seed `seed_of` gives, whatever other data sets there are and however many workers.
+    they compile: on one machine the first data set is fitted by itself, or at least begins a minute before the others.
+    The numbers of a data set follow from the seed and from its name alone: they are those of a `fit` with the seed
+    `seed_of` gives, whatever other data sets there are and however many workers.
 
     Args:
         numpyro_model: as for `fit`.

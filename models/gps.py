@@ -12,7 +12,7 @@ the pressure of sunlight with the Earth's shadow, and the small forces u are qua
 
 The option `axes` chooses where they act. DYB: along the direction to the Sun (D, together with the sunlight), the
 axis of the solar panels (Y) and the third axis (B), in sunlight only, f that of the orbit. RTN: radial, tangential
-and normal as in the source, f that of the sidereal day. All are in nm/s^2, distances in km, times in hours.
+and normal as in the source, f half of that. All are in nm/s^2, distances in km, times in hours.
 
 Positions are in axes that do not turn (GCRS). A data file has the columns time_h, x, y and z, the time in hours
 after the option `epoch`, which is in seconds of GPS time; `lfm_ppl.orbits.read_sp3` and `Environment.celestial`

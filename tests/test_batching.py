@@ -10,6 +10,7 @@ import pytest
 
 import lfm_ppl as lfm
 from lfm_ppl import batching, compilation
+from lfm_ppl.inference import posterior
 from lfm_ppl.inference.posterior import scores, trajectories
 from tests import systems
 
@@ -31,24 +32,34 @@ def test_there_is_a_thread_for_each_cpu_unless_the_process_has_one_or_settings_a
     assert batching.threads() == 2
     with jax.enable_x64(False):
         assert batching.threads() == 1
-    monkeypatch.setattr(batching, "on_cpu", lambda: False)
-    assert batching.threads() == 1
-    monkeypatch.undo()
+    with monkeypatch.context() as patch:
+        patch.setattr(batching, "on_cpu", lambda: False)
+        assert batching.threads() == 1
     monkeypatch.setenv("PJRT_NPROC", "1")
     assert batching.threads() == 1
 
 
-def test_calls_run_side_by_side_and_come_in_their_order(two_cpus):
+@pytest.mark.parametrize(("said", "expected"), [("150000 100000", 2), ("50000 100000", 1), ("max 100000", 8),
+                                                ("900000 100000", 8), (None, 8)])
+def test_a_container_may_have_a_share_of_the_cpus(said, expected, monkeypatch, tmp_path):
+    monkeypatch.setattr(compilation.os, "sched_getaffinity", lambda process: set(range(8)), raising=False)
+    monkeypatch.setattr(compilation, "_SHARE", str(tmp_path / "cpu.max"))
+    if said is not None:
+        (tmp_path / "cpu.max").write_text(f"{said}\n")
+    assert compilation.cpus() == expected
+
+
+def test_calls_run_side_by_side_and_come_in_their_order():
     together = threading.Barrier(2, timeout=60)
 
     def program(number):
         together.wait()  # passes when two are here
         return number
 
-    assert list(batching.side_by_side(program, [(k,) for k in range(6)])) == list(range(6))
+    assert list(batching.side_by_side(program, [(number,) for number in range(6)], 2)) == list(range(6))
 
 
-def test_after_an_error_or_an_interruption_nothing_more_begins(two_cpus):
+def test_after_an_interruption_nothing_more_begins():
     begun, passes = [], threading.Semaphore(2)
 
     def program(number):
@@ -56,13 +67,67 @@ def test_after_an_error_or_an_interruption_nothing_more_begins(two_cpus):
         passes.acquire(timeout=60)
         return number
 
-    results = batching.side_by_side(program, [(number,) for number in range(20)])
+    results = batching.side_by_side(program, [(number,) for number in range(20)], 2)
     assert next(results) == 0
     threading.Timer(0.2, passes.release, [20]).start()
     results.close()  # as by Ctrl-C between two results; waits for what runs
     assert len(begun) <= 4
+
+
+def test_after_an_error_nothing_more_begins():
+    begun, passes = [], threading.Event()
+
+    def program(number):
+        begun.append(number)
+        if number:
+            passes.wait(60)
+        return 1 / number
+
+    threading.Timer(0.2, passes.set).start()
     with pytest.raises(ZeroDivisionError):
-        list(batching.side_by_side(lambda number: 1 / number, [(0,), (1,)]))
+        list(batching.side_by_side(program, [(number,) for number in range(20)], 2))
+    assert len(begun) <= 3
+
+
+def test_programs_that_run_for_a_moment_are_compiled_quickly_unless_the_user_chooses(monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "--xla_backend_optimization_level=3")
+    assert compilation.for_a_moment() is None
+    monkeypatch.setenv("XLA_FLAGS", "")
+    options = compilation.for_a_moment()
+    assert options and float(jax.jit(lambda x: 2 * x, compiler_options=options)(1.5)) == 3.0
+
+
+def test_an_interruption_between_two_batches_ends_the_others(two_cpus):
+    bound, count = lfm.bind(well, np.arange(4.0), np.array([[0.3], [0.9], [np.nan], [-0.8]])), 70
+    kept = {}
+
+    class Kept(dict):
+        def put(self, start, part):
+            kept[start] = part
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        scores(bound, {"noise": np.linspace(0.5, 0.8, count)}, parts=Kept())
+    assert list(kept) == [0] and not [one for one in threading.enumerate() if "side by side" in one.name]
+
+
+def test_an_accelerator_has_larger_batches_and_what_is_large_by_itself_has_nothing_beside_it(two_cpus, monkeypatch):
+    bound, count = lfm.bind(well, np.arange(4.0), np.array([[0.3], [0.9], [np.nan], [-0.8]])), 400
+    draws = {"noise": np.linspace(0.5, 0.8, count)}
+
+    def batches():
+        shown = []
+        scores(bound, draws, show=lambda done, of: shown.append(done))
+        return len(shown)
+
+    numbers = 4 * 1**2 * 6  # of one draw: four rows, one state
+    monkeypatch.setattr(posterior, "_BATCH_NUMBERS", 100 * numbers)
+    assert batches() == 8  # of fifty each, for two threads
+    monkeypatch.setattr(posterior, "_BATCH_NUMBERS", 10 * numbers)
+    assert batches() == 50  # of eight
+    monkeypatch.setattr(batching, "on_cpu", lambda: False)
+    monkeypatch.setattr(posterior, "on_cpu", lambda: False)
+    assert batches() == 2
 
 
 def test_draws_are_shared_out_to_the_threads_with_the_same_numbers(two_cpus, monkeypatch):

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import collections
 import contextlib
 import functools
 import importlib.util
+import itertools
 import logging
 import os
 import pickle
@@ -34,13 +34,14 @@ _WORKER_S = 60
 _ALONE_S = 60.0
 """Seconds for which tasks that are alike wait for the first one, which compiles for all."""
 
-_SHORT_S = 2.0
-"""A task that takes less has another one sent after it before it ends, so that its worker need not wait."""
-
-_MEMORY = "XLA_PYTHON_CLIENT_PREALLOCATE"
+_RESERVE = "XLA_PYTHON_CLIENT_PREALLOCATE"
+"""Environment variable: whether JAX takes three quarters of an accelerator's memory at its first computation."""
 
 _COUNT_S = 1.0
 """Seconds after which workers are counted again."""
+
+_LOST_S = 0.1
+"""Seconds after which it is looked again whether a lost result is there."""
 
 _RESTART_S = 20.0
 """Seconds in which Dask must have started a dead worker again, or another takes its place."""
@@ -69,35 +70,32 @@ class Cluster:
                  ) -> Iterator[tuple[Task, dict[str, np.ndarray] | Exception]]:
         """Yield each task when it is computed, with its arrays or with the error that it ended with.
 
-        A task whose worker dies is computed by another one. A worker has one task, while tasks are short another one
-        that waits there: so what waits for the client is little, and there is hardly a doubt over which task a worker
-        died. Where one died too often while others waited behind it, no task waits behind another any more, and it is
-        tried again.
+        A task whose worker dies is computed by another one. There are never more tasks under way than there are
+        workers: so a dead worker leaves no doubt over which task it died, and what waits for the client is little.
 
         Args:
             tasks: the tasks.
             compute: from a task to its result.
-            alike: whether they run the same programs. The first one then begins by itself, and workers of this machine
-                find what it compiled.
+            alike: whether they run the same programs. On this machine others then wait for the first one that is
+                computed, a minute at most, and find what it compiled.
 
         Raises:
             ClusterError: the scheduler is lost, or a worker has other versions.
         """
         import cloudpickle
-        from distributed import CancelledError, KilledWorker, wait
+        from distributed import CancelledError, wait
 
-        program, waiting = cloudpickle.dumps(compute), collections.deque(tasks)
+        program, waiting = cloudpickle.dumps(compute), iter(tasks)
         running: dict[Any, Task] = {}
         counted, workers, begun = -np.inf, 1, time.monotonic()
-        first, each, may_wait = alike and self._local is not None, 1, True
+        first = alike and self._local is not None
 
         def submit() -> None:
             nonlocal counted, workers
             if time.monotonic() - counted > _COUNT_S:
                 counted, workers = time.monotonic(), max(self._count(), 1)
-            most = 1 if first and time.monotonic() - begun < _ALONE_S else workers * each
-            while waiting and len(running) < most:
-                task = waiting.popleft()
+            most = 1 if first and time.monotonic() - begun < _ALONE_S else workers
+            for task in itertools.islice(waiting, max(most - len(running), 0)):
                 future = self._client.submit(worker.work, self._setup, program, pickle.dumps(task), pure=False,
                                              key=f"{task.name}-{uuid.uuid4().hex}")
                 running[future] = task
@@ -111,17 +109,15 @@ class Cluster:
                     submit()
                     continue
                 for future in ended:
-                    task = running.pop(future)
-                    if each > 1 and isinstance(future.exception(), KilledWorker):
-                        each, may_wait = 1, False
-                        waiting.appendleft(task)
+                    if future.status == "lost":  # its worker died with the result: Dask computes it again
+                        time.sleep(_LOST_S)
                         continue
-                    found, seconds = self._outcome(future)
-                    first, each = False, 2 if may_wait and seconds < _SHORT_S else 1
+                    task = running.pop(future)
+                    found = self._outcome(future)
+                    first = first and isinstance(found, Exception)
                     submit()
                     yield task, found
                 del future, ended  # results need not stay with the workers
-                submit()
         except (OSError, TimeoutError, CancelledError) as error:  # of Dask's own communication
             raise ClusterError(self._lost()) from error
         finally:
@@ -139,8 +135,7 @@ class Cluster:
             self._complete = time.monotonic()
         return found
 
-    def _outcome(self, future: Any) -> tuple[dict[str, np.ndarray] | Exception, float]:
-        """Return a result, or the error, and the seconds that it took."""
+    def _outcome(self, future: Any) -> dict[str, np.ndarray] | Exception:
         from distributed import KilledWorker
 
         if future.status == "finished":
@@ -149,11 +144,10 @@ class Cluster:
             raise ClusterError(self._lost())
         error = future.exception()
         if isinstance(error, KilledWorker):
-            return ClusterError(f"{_DEATHS} workers died over it, most likely for want of memory; take fewer "
-                                "(--jobs)."), np.inf
+            return ClusterError(f"{_DEATHS} workers died over it, most likely for want of memory; take fewer (--jobs).")
         if isinstance(error, ClusterError):
             raise error
-        return error if isinstance(error, Exception) else RuntimeError(f"{type(error).__name__}: {error}"), np.inf
+        return error if isinstance(error, Exception) else RuntimeError(f"{type(error).__name__}: {error}")
 
     def _lost(self) -> str:
         return ("the connection to the scheduler is lost. What is stored stays; the same call or command computes the "
@@ -226,9 +220,9 @@ def _embedded(workers: int) -> Iterator[Any]:
     import dask
     from distributed import Client, LocalCluster
 
-    # Of an accelerator's memory JAX takes three quarters at its first computation, which two processes cannot.
+    # Two processes cannot each take most of an accelerator's memory.
     own = {"JAX_ENABLE_X64": str(int(jax.config.read("jax_enable_x64"))),
-           _MEMORY: os.environ.get(_MEMORY, "false")}
+           _RESERVE: os.environ.get(_RESERVE, "false")}
     settings = {
         "distributed.worker.multiprocessing-method": "spawn",
         "distributed.nanny.pre-spawn-environ": {**_nanny_environment(), **ONE_THREAD, **own},

@@ -99,7 +99,7 @@ def outcomes(tasks: Iterable[Task], compute: Callable[[Task], Mapping[str, Any]]
     """Yield how each task ended, one by one as they end, those first that were stored; arguments as in `run_tasks`.
 
     The folder is held, and workers are kept, until the last one was taken or the iterator is closed. Tasks that are
-    ``alike`` run the same programs: the first one compiles them by itself, for all processes of this machine.
+    ``alike`` run the same programs: others wait for the first one, which compiles for all processes of this machine.
 
     Raises:
         ValueError, FolderInUseError, ClusterError: as `run_tasks`. A task that fails raises nothing.

@@ -8,7 +8,6 @@ import functools
 import os
 import pickle
 import platform
-import time
 from collections.abc import Callable, Mapping
 from importlib import metadata
 from typing import Any, NamedTuple
@@ -87,14 +86,10 @@ def prepare(setup: Setup) -> None:
     _prepared[:] = [setup]
 
 
-def work(setup: Setup, program: bytes, task: bytes) -> tuple[dict[str, np.ndarray], float]:
-    """Compute a task in a worker, and say how many seconds that took.
-
-    Both are pickled, so that nothing of them is imported before the preparation.
-    """
-    began = time.monotonic()
+def work(setup: Setup, program: bytes, task: bytes) -> dict[str, np.ndarray]:
+    """Compute a task in a worker; both are pickled, so that nothing of them is imported before the preparation."""
     prepare(setup)
-    return computed(_loaded(program), pickle.loads(task)), time.monotonic() - began
+    return computed(_loaded(program), pickle.loads(task))
 
 
 @functools.lru_cache(maxsize=4)

@@ -53,4 +53,3 @@ class Ahead:
         """Compile nothing more than what was begun; no one may wait for the rest afterwards."""
         if self._thread is not None:
             self._thread.shutdown(wait=False, cancel_futures=True)
-

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Hashable, Mapping
 from typing import Any, NamedTuple, Protocol, cast
 
@@ -11,6 +12,7 @@ import numpy as np
 
 from lfm_ppl import checks
 from lfm_ppl.batching import BATCH_SIZE, mapped, on_cpu, side_by_side, threads
+from lfm_ppl.compilation import for_a_moment
 from lfm_ppl.filtering.smoother import LONGEST_FORECAST, SmootherResult
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.bound_model import BoundModel
@@ -41,7 +43,7 @@ _TRIED = 5
 """How many times as many steps a model may take whose steps follow a tolerance."""
 
 _BATCH_NUMBERS, _ACCELERATED = 2_000_000, 25
-"""Numbers that the smoother may hold for one batch of draws, and how many times as many on an accelerator.
+"""Numbers that the smoother may hold for batches side by side, and how many times as many on an accelerator.
 
 More draws go one batch after another. Trajectories of 512 draws took 76 ms in one batch on a GPU, 300 ms in nine.
 """
@@ -407,10 +409,13 @@ def over_draws(bound: BoundModel, name: Hashable, per_draw: Callable, draws: Map
     example = bound.site.example
     several = rows is not None and (example.tolerance is None or example.ssm.time_invariant)
     numbers = (rows or 1) * example.ssm.state_dim**2 * 6
+    most = _BATCH_NUMBERS * (1 if on_cpu() else _ACCELERATED) // max(numbers, 1)
+    # What is unknown in size, or a batch by itself, has no other beside it.
+    beside = 1 if rows is None else int(np.clip(most, 1, threads()))
     batch = _BATCH
     if several:
-        largest = int(np.clip(_BATCH_NUMBERS * (1 if on_cpu() else _ACCELERATED) // max(numbers, 1), 1, count))
-        shared = min(_CALLS * threads(), count // _WORTH) if threads() > 1 else 1
+        largest = int(np.clip(most // beside, 1, count))
+        shared = min(_CALLS * beside, count // _WORTH) if beside > 1 else 1
         batch = -(-count // max(-(-count // largest), shared))  # all of one size
         if batch > BATCH_SIZE:
             batch = -(-batch // BATCH_SIZE) * BATCH_SIZE
@@ -418,7 +423,9 @@ def over_draws(bound: BoundModel, name: Hashable, per_draw: Callable, draws: Map
     def make() -> Callable:
         one_by_one = lambda d, k, y: jax.lax.map(lambda pair: per_draw(*pair, y), (d, k))  # noqa: E731
         by_fours = lambda d, k, y: mapped(lambda d, k: per_draw(d, k, y), d, k, batch_size=BATCH_SIZE)  # noqa: E731
-        return jax.jit(by_fours if several else one_by_one)
+        if not several:  # particle filters among them, which run for minutes
+            return jax.jit(one_by_one)
+        return jax.jit(by_fours, compiler_options=for_a_moment() if on_cpu() else None)
 
     run, keys = bound.compiled(("over draws", several, name), make), split_keys(key, count)
 
@@ -433,15 +440,16 @@ def over_draws(bound: BoundModel, name: Hashable, per_draw: Callable, draws: Map
     missing = [start for start, part in known.items()
                if part is None or len(jax.tree_util.tree_leaves(part)[0]) != batch]  # or kept by other batches
     arguments = [some(start) for start in missing]
-    if len(missing) > 1 and threads() > 1:
+    if len(missing) > 1 and beside > 1:
         run = cast(Any, run).lower(*arguments[0]).compile()
-    new = side_by_side(lambda *own: jax.tree_util.tree_map(np.asarray, run(*own)), arguments)
-    for start in starts:
-        show(start, count)
-        if start in missing:
-            known[start] = next(new)
-            if parts is not None:
-                parts.put(start, known[start])
+    computed = side_by_side(lambda *own: jax.tree_util.tree_map(np.asarray, run(*own)), arguments, beside)
+    with contextlib.closing(computed) as new:
+        for start in starts:
+            show(start, count)
+            if start in missing:
+                known[start] = next(new)
+                if parts is not None:
+                    parts.put(start, known[start])
     if parts is not None:
         parts.flush()
     return jax.tree_util.tree_map(lambda *parts: np.concatenate(parts)[:count], *known.values())

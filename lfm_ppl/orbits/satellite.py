@@ -27,7 +27,7 @@ HARMONICS: dict[str, Mapping[str, Sequence[int]]] = {
     "DYB": {"solar": (1, 2, 3, 4), "panel": (1, 2, 3, 4), "remaining": (1, 2, 3, 4)},
     "RTN": {"radial": range(1, 8), "tangential": range(1, 8), "normal": range(1, 11)},
 }
-"""Axes -> force -> multiples of the base frequency: of the orbit for DYB, of half of it for RTN, a day for GPS."""
+"""Axes -> force -> multiples of the base frequency. DYB: that of the orbit. RTN: half of it, for GPS once a day."""
 STATES = ("x", "y", "z", "vx", "vy", "vz")
 START_SD = (0.1, 0.1)
 """Of the start (km, km/h): far wider than what a few positions tell."""
@@ -119,7 +119,7 @@ def small_forces(axes: str = "DYB", amplitude: Any = 1.0, wander: Any = 0.01, dr
         period: of the orbit (h), as `period_of` finds it; the default is that of a GPS satellite.
 
     Raises:
-        ValueError: unknown axes.
+        ValueError: unknown axes, or a period that is not positive.
 
     Example:
         >>> {name: force.state_dim for name, force in small_forces().items()}
@@ -152,13 +152,21 @@ def period_of(path: Any) -> jax.Array:
     Args:
         path: (T, 6) position (km) and velocity (km/h).
 
+    Raises:
+        ValueError: another shape, or a satellite so fast that it leaves the Earth.
+
     Example:
         >>> round(float(period_of(jnp.array([[29_600.0, 0.0, 0.0, 0.0, 13_210.7, 0.0]]))), 2)  # as of Galileo
         14.08
     """
     gm = GM * 3600.0**2
     path = jnp.asarray(path)
+    if path.ndim != 2 or path.shape[1] != 6:
+        raise ValueError(f"path must have shape (times, 6), position and velocity, got {path.shape}.")
     inverse = 2.0 / jnp.linalg.norm(path[:, :3], axis=1) - (path[:, 3:] ** 2).sum(axis=1) / gm
+    known = checks.concrete(inverse)
+    if known is not None and not (known > 0).all():
+        raise ValueError("this is no orbit around the Earth: the velocity (km/h) is beyond that of escape.")
     return 2.0 * jnp.pi * jnp.sqrt((1.0 / inverse).mean() ** 3 / gm)
 
 

@@ -215,14 +215,26 @@ def test_tables():
     assert row["ratio"] == pytest.approx(0.1) and row["ratio, latest"] == pytest.approx(0.2)
 
 
+def test_an_orbit_that_is_too_low_is_refused(data, monkeypatch):
+    low = orbits.Orbit(0.0, np.array([7_000.0, 0.0, 0.0, 0.0, 27_000.0, 0.0]), 100.0, 1e-3)
+    monkeypatch.setattr(orbits, "fit_orbit", lambda environment, times, positions, solar=None: low)
+    task = experiment.plan(experiment.Settings(data="folder", satellites=("G01",)))[0]
+    assert "G01: it turns in 1.6 h; positions and steps are too far apart" in str(experiment.compute(task)["refused"])
+
+
 def test_each_constellation_has_magnitudes_and_pooled_errors_of_its_own():
-    learnt = {f"learn/{letter}{number:02d}": {"logarithms": np.full(21, value), "cpu_s": 1.0}
+    hours = {"G": 12, "E": 14}
+    radius = {letter: (orbits.GM * (3600.0 * turn / (2 * np.pi)) ** 2) ** (1 / 3) for letter, turn in hours.items()}
+    orbit = {letter: np.array([r, 0.0, 0.0, 0.0, 3600.0 * np.sqrt(orbits.GM / r), 0.0, 100.0, 1e-3])
+             for letter, r in radius.items()}
+    learnt = {f"learn/{letter}{number:02d}": {"logarithms": np.full(21, value), "orbit": orbit[letter], "cpu_s": 1.0}
               for letter, value in (("G", 1.0), ("E", -1.0)) for number in range(1, 6)}
     predicted = {f"predict/{name[6:]}": result(10.0 if "G" in name else 20.0) for name in learnt}
     found = experiment.outcome(experiment.Settings(), learnt | predicted)
-    assert {name: float(prior.mean[0]) for name, prior in found.priors.items()} == {"GPS": 1.0, "Galileo": -1.0}
+    assert {name: float(prior.mean[0]) for name, prior in found.priors.items()} == {
+        "GPS 12 h": 1.0, "Galileo 14 h": -1.0}
     sizes = experiment.magnitudes_of(found.predicted, found.priors, "DYB")
-    assert sizes["common, Galileo"].iloc[0] == pytest.approx(np.exp(-1.0))
+    assert sizes["common, Galileo 14 h"].iloc[0] == pytest.approx(np.exp(-1.0))
     together = experiment.pooled(found.predicted)
     assert together["satellites"].to_dict() == {
         "without gaps": 10, "without gaps, never in shadow": 10,

@@ -112,6 +112,31 @@ def test_points_are_placed_in_position_and_velocity_alone(around, axes, states):
     assert tuple(ssm.drift_structure.points) == wanted
 
 
+@pytest.mark.parametrize(("axes", "turns"), [("DYB", 1), ("RTN", 2)])
+def test_resonators_have_multiples_of_the_frequency_of_the_orbit_or_of_half_of_it(axes, turns):
+    for force, (name, multiples) in zip(orbits.small_forces(axes, period=14.08).values(),
+                                        orbits.HARMONICS[axes].items() if axes == "DYB"
+                                        else [("solar", ()), *orbits.HARMONICS[axes].items()], strict=True):
+        periods = [float(one.period) for one in getattr(force, "forces", ()) if hasattr(one, "period")]
+        np.testing.assert_allclose(periods, [turns * 14.08 / n for n in multiples], err_msg=name)
+
+
+def test_the_period_of_an_orbit_is_that_of_kepler_along_an_ellipse_too():
+    axis, eccentricity, gm = 29_600.0, 0.16, orbits.GM * 3600.0**2
+    anomaly = np.linspace(0.0, 6.0, 50)
+    rate = np.sqrt(gm / axis**3) / (1 - eccentricity * np.cos(anomaly))
+    path = np.zeros((50, 6))
+    path[:, 0], path[:, 3] = axis * (np.cos(anomaly) - eccentricity), -axis * np.sin(anomaly) * rate
+    minor = axis * np.sqrt(1 - eccentricity**2)
+    path[:, 1], path[:, 4] = minor * np.sin(anomaly), minor * np.cos(anomaly) * rate
+    assert float(orbits.period_of(path)) == pytest.approx(2 * np.pi * np.sqrt(axis**3 / gm), rel=1e-12)
+    assert float(orbits.period_of(path)) == pytest.approx(14.08, abs=0.01)  # as Galileo's
+    with pytest.raises(ValueError, match=r"path must have shape \(times, 6\).* got \(6,\)"):
+        orbits.period_of(path[0])
+    with pytest.raises(ValueError, match="no orbit around the Earth"):
+        orbits.period_of(2.0 * path)
+
+
 def test_small_forces_and_satellite_say_what_is_wrong(around):
     start = lfm.Gaussian(jnp.asarray(START), jnp.eye(6))
     with pytest.raises(ValueError, match="axes"):

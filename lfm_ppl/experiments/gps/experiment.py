@@ -23,6 +23,7 @@ from lfm_ppl.experiments.study import Results, Study, Table, setting
 
 _REFUSED = "refused"
 _WINDOW = 0.25
+_SHORTEST = 5.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,7 +43,7 @@ class Outcome(NamedTuple):
 
     Attributes:
         predicted: their predictions.
-        priors: constellation -> the magnitudes that its satellites have in common.
+        priors: constellation and hours of a turn -> the magnitudes that such satellites have in common.
         compared: ways to learn the magnitudes.
         online: predictions as positions come in.
         refused: satellite -> why it was left out.
@@ -95,7 +96,7 @@ def plan_predictions(settings: Settings, results: Results) -> list[Task]:
     data = problem.arcs(settings.data, settings.seed)
     priors = _priors(learnt, settings.axes)
     usable = [{**task.settings, "orbit": learnt[name]["orbit"].tolist(), "alone": learnt[name]["logarithms"].tolist(),
-               "prior": [values.tolist() for values in priors[problem.system(name)]]}
+               "prior": [values.tolist() for values in priors[_kind(name, learnt[name])]]}
               for task in tasks if (name := task.settings["satellite"]) in learnt]
     found = [Task(f"predict/{one['satellite']}", settings.seed, one) for one in usable]
     found += [Task(f"ways/{one['satellite']}", settings.seed, one) for one in usable[:settings.alternatives]]
@@ -140,6 +141,10 @@ def _compute(kind: str, one: problem.Arc, task: Task) -> Result:
 def _learn(one: problem.Arc, axes: str) -> Result:
     orbit = orbits.fit_orbit(one.environment, one.times[:one.train], one.positions[:one.train])
     prediction.latest_orbit(one, one.train, orbit.solar)
+    period = float(orbits.period_of(orbit.state[None]))
+    if period < _SHORTEST:
+        raise ValueError(f"it turns in {period:.1f} h; positions and steps are too far apart for less than "
+                         f"{_SHORTEST:g} h, and the drag of the air is left out.")
     target = learning.held_out(Training.of(one, orbit, axes), magnitudes.wide(axes))
     return {"orbit": np.array([*orbit.state, orbit.solar, orbit.residual]), "logarithms": target.mode()}
 
@@ -187,9 +192,16 @@ def outcome(settings: Settings, results: Results) -> Outcome:
 
 
 def _priors(learnt: Mapping[str, Result], axes: str) -> dict[str, magnitudes.Prior]:
-    """Return what the satellites of each constellation have in common."""
-    return {system: magnitudes.common([one["logarithms"] for one in own.values()], axes)
-            for system, own in problem.by_system(learnt).items()}
+    """Return what the satellites of each constellation have in common that turn in about the same time."""
+    groups: dict[str, list[np.ndarray]] = {}
+    for name, one in learnt.items():
+        groups.setdefault(_kind(name, one), []).append(one["logarithms"])
+    return {kind: magnitudes.common(own, axes) for kind, own in groups.items()}
+
+
+def _kind(satellite: str, learnt: Result) -> str:
+    """Return the constellation of a satellite, and in how many hours it turns: BeiDou has orbits of 13 and of 24."""
+    return f"{problem.system(satellite)} {float(orbits.period_of(learnt['orbit'][None, :6])):.0f} h"
 
 
 def _kept(results: Results, kind: str, refused: dict[str, str]) -> dict[str, Result]:

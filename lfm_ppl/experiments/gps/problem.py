@@ -22,8 +22,7 @@ SIMULATED = tuple(f"S{number:02d}" for number in range(1, 13))
 _HIDDEN: dict[str, Any] = {"amplitude": 0.5, "wander": 0.02, "drift": 0.005}
 _HIDDEN_WHITE = 0.03
 _DAYS, _INTERVAL = 10, 900.0
-SYSTEMS = {"G": "GPS", "R": "GLONASS", "E": "Galileo", "C": "BeiDou", "J": "QZSS", "I": "NavIC", "S": "SBAS",
-           "L": "low orbits"}
+SYSTEMS = {"G": "GPS", "R": "GLONASS", "E": "Galileo", "C": "BeiDou", "J": "QZSS", "I": "NavIC"}
 """First letter of a satellite's name -> constellation."""
 
 
