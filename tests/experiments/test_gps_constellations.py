@@ -10,7 +10,7 @@ from lfm_ppl.experiments.gps import experiment, problem
 
 PRESSURE = 6.5
 """Of sunlight on a square metre of a satellite of 700 kg (nm/s^2)."""
-DAYS, STEPS = 10, 30
+DAYS, STEPS, NOISE = 10, 30, 5e-5
 RUNGE_KUTTA = jnp.array([[0.0, 1 / 6], [0.5, 1 / 3], [0.5, 1 / 3], [1.0, 1 / 6]])
 
 
@@ -71,7 +71,7 @@ def constellation(letter, count, radius, inclination, seed=0):
         own = {"tilt": random.normal(0, 0.01), "lag": random.normal(0, 0.01), "body": random.uniform(0.8, 1.2),
                "scale": random.uniform(0.95, 1.05), "thrust": random.uniform(0.8, 1.5)}
         found[f"{letter}{number + 1:02d}"] = (np.asarray(path(jnp.asarray(start), own))
-                                              + problem.NOISE * random.normal(size=(len(times), 3)))
+                                              + NOISE * random.normal(size=(len(times), 3)))
     return problem.Arcs(environment, times, found, None)
 
 

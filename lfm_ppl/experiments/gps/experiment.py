@@ -68,7 +68,7 @@ def plan(settings: Settings) -> list[Task]:
         files = () if data.published is None else data.published.files
         names = orbits.check_satellites(settings.satellites, tuple(data.positions), files)
     shared = {"data": settings.data and str(Path(settings.data).resolve()), "train_days": settings.train_days,
-              "axes": settings.axes}
+              "axes": settings.axes, "noise": problem.NOISE, "weight": learning.WEIGHT}
     found = []
     for name in names:
         try:

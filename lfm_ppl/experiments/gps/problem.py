@@ -16,11 +16,16 @@ from lfm_ppl import orbits
 from lfm_ppl.model.gaussian import Gaussian
 from lfm_ppl.model.simulate import simulate
 
-NOISE = 5e-5
-"""Standard deviation of a coordinate's error, in km: published positions are smoothed, their scatter says nothing."""
+NOISE = 1e-4
+"""Standard deviation of a coordinate (km): of its error, and of what gravity leaves out here, such as the ocean tides.
+
+Published positions are smoothed, so that their scatter says nothing. With half of it, most of the radial and normal
+bands were too narrow, and forces were learnt that explain decimetres; chosen from 5 and 10 cm by the errors of the GPS
+satellites, as `learning.WEIGHT`.
+"""
 SIMULATED = tuple(f"S{number:02d}" for number in range(1, 13))
 _HIDDEN: dict[str, Any] = {"amplitude": 0.5, "wander": 0.02, "drift": 0.005}
-_HIDDEN_WHITE = 0.03
+_HIDDEN_WHITE, _HIDDEN_NOISE = 0.03, 5e-5
 _DAYS, _INTERVAL = 10, 900.0
 SYSTEMS = {"G": "GPS", "R": "GLONASS", "E": "Galileo", "C": "BeiDou", "J": "QZSS", "I": "NavIC"}
 """First letter of a satellite's name -> constellation."""
@@ -129,7 +134,7 @@ def _simulated(seed: int) -> Arcs:
     @jax.jit
     def draw(key: jax.Array, start: jax.Array) -> jax.Array:
         system = orbits.satellite(environment, Gaussian(start, jnp.zeros((6, 6))), orbits.small_forces(**_HIDDEN),
-                                  white=_HIDDEN_WHITE, noise_sd=NOISE)
+                                  white=_HIDDEN_WHITE, noise_sd=_HIDDEN_NOISE)
         return simulate(key, system, times, steps=int(_INTERVAL / 30)).y
 
     keys = jax.random.split(jax.random.key(seed), len(SIMULATED))
