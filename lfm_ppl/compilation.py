@@ -12,7 +12,6 @@ _SHARE = "/sys/fs/cgroup/cpu.max"
 _OPTION = "xla_cpu_small_while_loop_byte_threshold"
 _BYTES = 1_000_000
 _FLAG = "--xla_backend_extra_options="
-_LEVEL = "xla_backend_optimization_level"
 
 ONE_THREAD = {"PJRT_NPROC": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 """Environment in which a process computes with one thread: JAX reads it at its first computation, NumPy when imported.
@@ -61,15 +60,6 @@ def fast_loops() -> None:
     os.environ["XLA_FLAGS"] = " ".join(words)
 
 
-def for_a_moment() -> dict[str, int] | None:
-    """Return options of `jax.jit` for a program of a CPU that runs for seconds, and takes longer to compile.
-
-    At level 1 LLVM compiles trajectories of the p53 model in a quarter less CPU time, and they run as fast. None where
-    the environment variable ``XLA_FLAGS`` chooses a level.
-    """
-    return None if _LEVEL in os.environ.get("XLA_FLAGS", "") else {_LEVEL: 1}
-
-
 def quick_compilation(level: int) -> None:
     """Let XLA spend less on compiling programs that run for a moment, as those of tests do.
 
@@ -83,7 +73,7 @@ def quick_compilation(level: int) -> None:
     """
     import jaxlib.version  # takes 30 ms, which the command line, with `fast_loops` alone, does not need
 
-    flags = [f"--{_LEVEL}={level}"]
+    flags = [f"--xla_backend_optimization_level={level}"]
     if jaxlib.version.__version_info__ < (0, 13):
         flags.append("--xla_cpu_parallel_codegen_split_count=1")
     if jaxlib.version.__version_info__ < (0, 11):

@@ -89,14 +89,6 @@ def test_after_an_error_nothing_more_begins():
     assert len(begun) <= 3
 
 
-def test_programs_that_run_for_a_moment_are_compiled_quickly_unless_the_user_chooses(monkeypatch):
-    monkeypatch.setenv("XLA_FLAGS", "--xla_backend_optimization_level=3")
-    assert compilation.for_a_moment() is None
-    monkeypatch.setenv("XLA_FLAGS", "")
-    options = compilation.for_a_moment()
-    assert options and float(jax.jit(lambda x: 2 * x, compiler_options=options)(1.5)) == 3.0
-
-
 def test_an_interruption_between_two_batches_ends_the_others(two_cpus):
     bound, count = lfm.bind(well, np.arange(4.0), np.array([[0.3], [0.9], [np.nan], [-0.8]])), 70
     kept = {}

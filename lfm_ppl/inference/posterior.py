@@ -12,7 +12,6 @@ import numpy as np
 
 from lfm_ppl import checks
 from lfm_ppl.batching import BATCH_SIZE, mapped, on_cpu, side_by_side, threads
-from lfm_ppl.compilation import for_a_moment
 from lfm_ppl.filtering.smoother import LONGEST_FORECAST, SmootherResult
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.bound_model import BoundModel
@@ -423,9 +422,7 @@ def over_draws(bound: BoundModel, name: Hashable, per_draw: Callable, draws: Map
     def make() -> Callable:
         one_by_one = lambda d, k, y: jax.lax.map(lambda pair: per_draw(*pair, y), (d, k))  # noqa: E731
         by_fours = lambda d, k, y: mapped(lambda d, k: per_draw(d, k, y), d, k, batch_size=BATCH_SIZE)  # noqa: E731
-        if not several:  # particle filters among them, which run for minutes
-            return jax.jit(one_by_one)
-        return jax.jit(by_fours, compiler_options=for_a_moment() if on_cpu() else None)
+        return jax.jit(by_fours if several else one_by_one)
 
     run, keys = bound.compiled(("over draws", several, name), make), split_keys(key, count)
 
