@@ -417,7 +417,7 @@ def over_draws(bound: BoundModel, name: Hashable, per_draw: Callable, draws: Map
         shared = min(_CALLS * beside, count // _WORTH) if beside > 1 else 1
         batch = -(-count // max(-(-count // largest), shared))  # all of one size
         if batch > BATCH_SIZE:
-            batch = -(-batch // BATCH_SIZE) * BATCH_SIZE
+            batch = -(-batch // BATCH_SIZE) * BATCH_SIZE  # whole fours
 
     def make() -> Callable:
         one_by_one = lambda d, k, y: jax.lax.map(lambda pair: per_draw(*pair, y), (d, k))  # noqa: E731

@@ -24,6 +24,7 @@ from lfm_ppl.experiments.study import Results, Study, Table, setting
 _REFUSED = "refused"
 _WINDOW = 0.25
 _SHORTEST = 5.0
+"""Hours in which a satellite turns at least."""
 
 
 @dataclasses.dataclass(frozen=True)
