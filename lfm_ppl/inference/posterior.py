@@ -433,20 +433,22 @@ def over_draws(bound: BoundModel, name: Hashable, per_draw: Callable, draws: Map
     if lower:
         return cast(Any, run).lower(*some(0))
     starts = range(0, count, batch)
-    known = {start: None if parts is None else parts.get(start) for start in starts}
-    missing = [start for start, part in known.items()
-               if part is None or len(jax.tree_util.tree_leaves(part)[0]) != batch]  # or kept by other batches
-    arguments = [some(start) for start in missing]
-    if len(missing) > 1 and beside > 1:
+    kept = {start: None if parts is None else parts.get(start) for start in starts}
+    # Those that were kept by batches of another length are of no use.
+    known = {start: part for start, part in kept.items()
+             if part is not None and len(jax.tree_util.tree_leaves(part)[0]) == batch}
+    arguments = [some(start) for start in starts if start not in known]
+    if len(arguments) > 1 and beside > 1:
         run = cast(Any, run).lower(*arguments[0]).compile()
     computed = side_by_side(lambda *own: jax.tree_util.tree_map(np.asarray, run(*own)), arguments, beside)
     with contextlib.closing(computed) as new:
         for start in starts:
             show(start, count)
-            if start in missing:
+            if start not in known:
                 known[start] = next(new)
                 if parts is not None:
                     parts.put(start, known[start])
     if parts is not None:
         parts.flush()
-    return jax.tree_util.tree_map(lambda *parts: np.concatenate(parts)[:count], *known.values())
+    return jax.tree_util.tree_map(lambda *parts: np.concatenate(parts)[:count],
+                                  *(known[start] for start in starts))

@@ -194,10 +194,8 @@ def outcome(settings: Settings, results: Results) -> Outcome:
 
 def _priors(learnt: Mapping[str, Result], axes: str) -> dict[str, magnitudes.Prior]:
     """Return what the satellites of each constellation have in common that turn in about the same time."""
-    groups: dict[str, list[np.ndarray]] = {}
-    for name, one in learnt.items():
-        groups.setdefault(_kind(name, one), []).append(one["logarithms"])
-    return {kind: magnitudes.common(own, axes) for kind, own in groups.items()}
+    groups = problem.grouped(learnt, lambda name: _kind(name, learnt[name]))
+    return {kind: magnitudes.common([one["logarithms"] for one in own.values()], axes) for kind, own in groups.items()}
 
 
 def _kind(satellite: str, learnt: Result) -> str:
@@ -244,7 +242,7 @@ def pooled(results: dict[str, Result]) -> pd.DataFrame:
     Satellites with gaps stand apart: a gap is often a manoeuvre, which no model of small forces predicts. Several
     constellations are pooled each by itself, too.
     """
-    rows, systems = _pooled(results), problem.by_system(results)
+    rows, systems = _pooled(results), problem.grouped(results)
     if len(systems) > 1:
         for system, own in systems.items():
             rows |= {f"{system}, {group}": row for group, row in _pooled(own).items()}

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from lfm_ppl.engine.task import Result
 from lfm_ppl.experiments.drawing import band, legend, patch
-from lfm_ppl.experiments.gps.problem import by_system
+from lfm_ppl.experiments.gps.problem import grouped
 from lfm_ppl.results.plots import style
 
 DETERMINISTIC, LATEST, LFM, SEEN = style.VERMILLION, style.ORANGE, style.BLUE, style.GREY
@@ -23,7 +23,7 @@ _END: dict[str, Any] = {"color": SEEN, "lw": 0.7, "ls": ":", "label": "end of tr
 def draw(results: Mapping[str, Result], online: Mapping[str, Result]) -> dict[str, Figure]:
     """Return every figure of the comparison by name."""
     name = next(iter(online), next(iter(results)))
-    systems = by_system(results)
+    systems = grouped(results)
     found = {"all" if len(systems) == 1 else f"all-{system}": plot_all(own) for system, own in systems.items()}
     found |= {f"errors-{name}": plot_errors(name, results[name]), f"forces-{name}": plot_forces(name, results[name])}
     if name in online:

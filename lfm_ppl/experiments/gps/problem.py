@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -83,16 +83,16 @@ def system(satellite: str) -> str:
     return SYSTEMS.get(satellite[:1], satellite[:1])
 
 
-def by_system(results: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return constellation -> satellite -> what belongs to it.
+def grouped(results: Mapping[str, Any], kind: Callable[[str], str] = system) -> dict[str, dict[str, Any]]:
+    """Return kind of satellite, by default its constellation -> satellite -> what belongs to it.
 
     Example:
-        >>> by_system({"G01": 1, "E12": 2, "G05": 3})
+        >>> grouped({"G01": 1, "E12": 2, "G05": 3})
         {'GPS': {'G01': 1, 'G05': 3}, 'Galileo': {'E12': 2}}
     """
     found: dict[str, dict[str, Any]] = {}
     for name, one in results.items():
-        found.setdefault(system(name), {})[name] = one
+        found.setdefault(kind(name), {})[name] = one
     return found
 
 
