@@ -19,7 +19,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from lfm_ppl import checks
+from lfm_ppl import checks, compilation
 from lfm_ppl.compilation import ONE_THREAD
 from lfm_ppl.engine import worker
 from lfm_ppl.engine.errors import ClusterError
@@ -100,6 +100,10 @@ class Cluster:
                                              key=f"{task.name}-{uuid.uuid4().hex}")
                 running[future] = task
 
+        # While the first task compiles, the others import what tasks need.
+        ready = [self._client.submit(worker.get_ready, self._setup, program, pure=False, workers=[address],
+                                     allow_other_workers=True)
+                 for address in (self._client.nthreads() if first else ())]
         try:
             submit()
             while running:
@@ -122,7 +126,7 @@ class Cluster:
             raise ClusterError(self._lost()) from error
         finally:
             with contextlib.suppress(Exception):
-                self._client.cancel(list(running), asynchronous=False)
+                self._client.cancel([*running, *ready], asynchronous=False)
 
     def _count(self) -> int:
         """Return the number of workers; where one was started here and stays away, start another in its place."""
@@ -177,12 +181,8 @@ def check_workers(workers: Workers) -> None:
 
 
 def available() -> int:
-    """Return how many processes this machine has CPUs for, as far as Dask can tell; 1 where Dask is not installed."""
-    if importlib.util.find_spec("distributed") is None:
-        return 1
-    from dask.system import CPU_COUNT
-
-    return int(CPU_COUNT)
+    """Return how many processes there are CPUs for; 1 where Dask, which starts them, is not installed."""
+    return 1 if importlib.util.find_spec("distributed") is None else compilation.cpus()
 
 
 @contextlib.contextmanager

@@ -92,6 +92,12 @@ def work(setup: Setup, program: bytes, task: bytes) -> dict[str, np.ndarray]:
     return computed(_loaded(program), pickle.loads(task))
 
 
+def get_ready(setup: Setup, program: bytes) -> None:
+    """Prepare a worker, and import what the tasks of a run need, before it is given the first one."""
+    prepare(setup)
+    _loaded(program)
+
+
 @functools.lru_cache(maxsize=4)
 def _loaded(program: bytes) -> Callable[[Task], Mapping[str, Any]]:
     """Return the function of a run, the same one for all its tasks: what was compiled for it is found by it."""
