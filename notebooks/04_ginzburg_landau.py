@@ -40,15 +40,15 @@ numpyro.enable_x64()
 import pandas as pd
 
 from lfm_ppl.experiments import scores
-from lfm_ppl.experiments.ginzburg_landau import experiment, figures, problem, sampling
+from lfm_ppl.experiments.ginzburg_landau import experiment, figures, problem
 
 quick = bool(os.environ.get("LFM_QUICK"))
 settings = experiment.Settings.quick(realisations=1, conditional=2) if quick else experiment.Settings()
 # The folder of an earlier run of `lfm-ppl compare ginzburg-landau`; without one everything is computed here.
 folder = Path(os.environ.get("LFM_COMPARE", "double-well"))
 found = experiment.STUDY.run(settings, folder)
-data = problem.realisation(settings.figure, settings.seed)
-states = {m: found.results[f"state/{problem.slug(m)}/{settings.figure:03d}"] for m in problem.METHODS}
+truth = problem.realisation(settings.figure, settings.seed)
+states, chains = (found.data[kind].isel(dataset=settings.figure) for kind in ("state", "mcmc"))
 pd.set_option("display.width", 160, "display.max_columns", 30)
 
 # %% [markdown]
@@ -60,7 +60,7 @@ pd.set_option("display.width", 160, "display.max_columns", 30)
 # the mean.
 
 # %%
-figures.plot_states(data, states)
+figures.plot_states(truth, states)
 
 # %% [markdown]
 # The densities behind the bands, at the two times of the source's figure, and at the time elsewhere at which the exact
@@ -69,7 +69,7 @@ figures.plot_states(data, states)
 # be unsure about.
 
 # %%
-figures.plot_marginals(data, states)
+figures.plot_marginals(truth, states)
 
 # %% [markdown]
 # ## Parameters, one at a time
@@ -78,14 +78,14 @@ figures.plot_marginals(data, states)
 # known the truth should be well inside. For the EKF it is not.
 
 # %%
-figures.plot_conditional(figures.conditional_rows(settings, found.results))
+figures.plot_conditional(found.data, settings.figure)
 
 # %% [markdown]
 # One path proves little. Over many paths: how often does the truth lie outside the central 99% interval? The nominal
 # rate is 1%.
 
 # %%
-figures.plot_rates(found.results)
+figures.plot_rates(found.data)
 
 # %%
 scores.readable(found.tables["rates"])
@@ -101,8 +101,7 @@ scores.readable(found.tables["rates"])
 # states have the parameters integrated out: means and variances by the law of total variance over posterior draws.
 
 # %%
-paths = {label: found.results[f"mcmc/{sampling.slug(label)}/{settings.figure:03d}"] for label in sampling.SAMPLERS}
-figures.plot_integrated(data, paths)
+figures.plot_integrated(truth, chains)
 
 # %%
 scores.readable(found.tables["parameters"])

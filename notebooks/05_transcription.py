@@ -61,9 +61,7 @@ found = experiment.STUDY.run(settings, folder)
 
 # %%
 exponential = problem.Configuration("exponential")
-cells = experiment.by_cell(settings, found.results)
-methods = {method: cells["exponential", method] for method in ("LA", "ESLS", "GFS", "iterated GHS(7)")}
-figures.plot_force(problem.data_set(exponential, 0, settings.seed), methods)
+figures.plot_force(found.data["exponential"], problem.data_set(exponential, 0, settings.seed))
 
 # %% [markdown]
 # ## All data sets beside the published table
@@ -89,7 +87,7 @@ scores.readable(found.tables["published"])
 # log predictive density of the force at a point; `CPU s` the time for one data set.
 
 # %%
-figures.plot_errors(cells)
+figures.plot_errors(found.data)
 
 # %%
 scores.readable(found.tables["comparison"])
@@ -124,7 +122,7 @@ scores.readable(posteriors.tables["agreement"])
 # Carlo error in brackets.
 
 # %%
-drawn = parameters_report.draw(chosen, posteriors.results)
+drawn = parameters_report.draw(chosen, posteriors.data)
 drawn["posteriors-softplus"]
 
 # %%

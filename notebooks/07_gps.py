@@ -68,8 +68,8 @@ else:
 # The folder of an earlier run of `lfm-ppl compare gps`; without one everything is computed here.
 folder = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/gps"))
 found = experiment.STUDY.run(settings, folder)
-satellites = experiment.outcome(settings, found.results)
-for reason in satellites.refused.values():
+predicted, online = found.data["predict"], found.data.get("online")
+for reason in found.data["left out"].reason.values if "left out" in found.data else ():
     print(f"left out, {reason}\n")
 scores.readable(found.tables["pooled"])
 
@@ -79,7 +79,7 @@ scores.readable(found.tables["pooled"])
 # six hours of them, as in the source.
 
 # %%
-figures.plot_all(satellites.predicted)
+figures.plot_all(predicted)
 
 # %%
 found.tables["satellites"][["eclipsed", "fit", "deterministic", "latest state", "LFM", "ratio", "coverage"]].round(3)
@@ -98,11 +98,11 @@ found.tables["magnitudes"][["common", "factor"]].round(4)
 # the levels are wide where a constant push along one axis cannot be told from a slightly different start.
 
 # %%
-one = next(iter(satellites.online), next(iter(satellites.predicted)))
-figures.plot_forces(one, satellites.predicted[one])
+name = (predicted if online is None else online).satellite.values[0]
+figures.plot_forces(predicted.sel(satellite=name))
 
 # %%
-figures.plot_errors(one, satellites.predicted[one])
+figures.plot_errors(predicted.sel(satellite=name))
 
 # %% [markdown]
 # ## As positions come in
@@ -111,7 +111,7 @@ figures.plot_errors(one, satellites.predicted[one])
 # started again from the latest state.
 
 # %%
-figures.plot_online(one, satellites.online[one]) if satellites.online else None
+figures.plot_online(online.sel(satellite=name)) if online is not None else None
 
 # %% [markdown]
 # ## Ways to learn the magnitudes

@@ -64,7 +64,7 @@ figures.plot_eigenfunctions()
 # sparse spectrum) gain little from more of them.
 
 # %%
-figures.plot_errors(settings, found.results)
+figures.plot_errors(settings, found.data)
 
 # %%
 scores.readable(found.tables["covariance"])
@@ -93,7 +93,7 @@ scores.readable(found.tables["published"])
 # the variance of 1e-8 that is added to them; the order is that of its table 1.
 
 # %%
-figures.plot_prediction(settings, found.results)
+figures.plot_prediction(settings, found.data)
 
 # %%
 scores.readable(found.tables["regression"])

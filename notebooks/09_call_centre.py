@@ -42,7 +42,7 @@ numpyro.enable_x64()
 import pandas as pd
 
 from lfm_ppl.experiments import scores
-from lfm_ppl.experiments.call_centre import counts, experiment, figures
+from lfm_ppl.experiments.call_centre import counts, experiment, figures, problem
 
 quick = bool(os.environ.get("LFM_QUICK"))
 pd.set_option("display.width", 160, "display.max_columns", 30)
@@ -54,6 +54,7 @@ folder = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/call-centre"))
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", counts.OverloadWarning)
     found = experiment.STUDY.run(settings, folder)
+first = problem.window(settings.data, settings.weekday, 0, settings.seed)
 print("real calls" if data else "simulated calls")
 
 # %% [markdown]
@@ -62,7 +63,7 @@ print("real calls" if data else "simulated calls")
 # Three days of training, then the test day. A force without a period (Matern) knows nothing of the next three hours.
 
 # %%
-figures.plot_queues(settings, found.results, "constant")
+figures.plot_queues(first, found.data, "constant")
 
 # %% [markdown]
 # A model whose days are all alike (periodic) is far too sure of itself. RMSE over the day's 168 five minutes, and the
@@ -78,7 +79,7 @@ scores.readable(found.tables["constant"])
 # At $\Omega = 5$ in the afternoon the bank's calls exceed what is served for hours, and the queue grows to hundreds.
 
 # %%
-figures.plot_queues(settings, found.results, "changed")
+figures.plot_queues(first, found.data, "changed")
 
 # %%
 scores.readable(found.tables["changed"])
@@ -87,16 +88,16 @@ scores.readable(found.tables["changed"])
 # ## Arrivals
 
 # %%
-figures.plot_arrivals(settings, found.results)
+figures.plot_arrivals(first, found.data)
 
 # %%
-figures.plot_cycles(settings, found.results)
+figures.plot_cycles(first, found.data)
 
 # %% [markdown]
 # ## All test days
 
 # %%
-figures.plot_errors(settings, found.results)
+figures.plot_errors(found.data)
 
 # %% [markdown]
 # ## Parameters integrated out

@@ -137,7 +137,7 @@ show("house-envelope", ("below", "above"))
 # One of the days, with the heating power below:
 
 # %%
-figures.plot_house(settings, found.results) if settings.data else None
+figures.plot_house(settings, found.data) if settings.data else None
 
 # %% [markdown]
 # In all 29 windows CQM has an RMSE of 0.45 K (0.39 K with the walls), the Matern force 0.66 K (0.52 K), no residual
@@ -151,7 +151,7 @@ figures.plot_house(settings, found.results) if settings.data else None
 # The residual, day by day. What repeats is carried over to the fifth day; a Matern force forgets it within hours.
 
 # %%
-figures.plot_residual(settings, found.results) if settings.data else None
+figures.plot_residual(found.data) if settings.data else None
 
 # %% [markdown]
 # ## Parameters integrated out
@@ -181,7 +181,7 @@ show("homes-one-store", ("RMSE ahead", "ELL ahead", "coverage"))
 show("homes-envelope", ("RMSE ahead", "ELL ahead", "coverage"))
 
 # %%
-figures.plot_homes(settings, found.results)
+figures.plot_homes(settings, found.data)
 
 # %%
-figures.plot_scores(settings, found.results)
+figures.plot_scores(found.data)

@@ -43,7 +43,7 @@ import pandas as pd
 
 import lfm_ppl as lfm
 from lfm_ppl.experiments import scores
-from lfm_ppl.experiments.counts import experiment, figures, problem, tables
+from lfm_ppl.experiments.counts import experiment, figures, problem
 
 quick = bool(os.environ.get("LFM_QUICK"))
 pd.set_option("display.width", 160, "display.max_columns", 30)
@@ -86,7 +86,7 @@ print("real disasters" if data else "simulated disasters")
 # The reference's median and 95% band are the dashed lines.
 
 # %%
-figures.plot_coal(settings, found.results)
+figures.plot_coal(settings, found.data)
 
 # %% [markdown]
 # ## The posterior of the predictor
@@ -109,7 +109,7 @@ scores.readable(found.tables["accuracy"])
 # the sites held, as in the variational update, yes or no misses the mark of 3%.
 
 # %%
-figures.plot_errors(settings, found.results)
+figures.plot_errors(settings, found.data)
 
 # %% [markdown]
 # ## Held-out data
@@ -128,7 +128,7 @@ scores.readable(found.tables["prediction"])
 # effective share of the draws of importance sampling.
 
 # %%
-pd.DataFrame({name: found.results[f"{name}/parameters"] for name in settings.problems}).T.astype(float).round(3)
+found.data["parameters"].to_dataframe().round(3)
 
 # %%
-tables.reference(settings, found.results).round(3)
+found.data["comparison"].sel({"method": "reference"}, drop=True)[["ess", "r_hat", "share"]].to_dataframe().round(3)

@@ -95,7 +95,7 @@ print("least value of the draws:", draws.min())
 states = lfm.full_information(problem.companion(1.0, np.zeros(3), learnt=True), times, y,
                               lower={"factor": 0.0, "rate": 0.0}, grid=times, tolerance=1e-8)
 learning = problem.learning("all")
-likeliest = experiment.posterior_mode(learning, record.y)
+likeliest = estimators.posterior_mode(learning, record.y)
 pd.Series({"a state, Q constant": float(np.sqrt(3.0) / states.state("rate")[0]),
            "a state, Q with it": estimators.states("weight", record.y[None])[0, 0],
            "marginal likelihood": np.exp(likeliest[0])}, name="lengthscale (s)").round(2)
@@ -125,10 +125,10 @@ result = None if quick else experiment.STUDY.run(settings, folder)
 quick or scores.readable(result.tables["transcription"])
 
 # %%
-quick or figures.plot_forces(settings, result.results)
+quick or figures.plot_forces(result.data)
 
 # %%
-quick or figures.plot_errors(settings, result.results)
+quick or figures.plot_errors(result.data)
 
 # %%
 quick or scores.readable(result.tables["shapes"]).T
@@ -140,7 +140,7 @@ quick or scores.readable(result.tables["shapes"]).T
 # weight. Only distances are measured; dynamics and measurement are not linear.
 
 # %%
-quick or figures.plot_target(settings, result.results)
+quick or figures.plot_target(result.data)
 
 # %% [markdown]
 # ## Pituitary and thyroid
@@ -156,10 +156,10 @@ print(thyroid.summary)
 pd.Series(thyroid.parameters)
 
 # %%
-quick or figures.plot_patient(settings, result.results)
+quick or figures.plot_patient(result.data)
 
 # %%
-quick or figures.plot_peaks(settings, result.results)
+quick or figures.plot_peaks(result.data)
 
 # %%
-quick or scores.readable(result.others)
+quick or scores.readable(result.tables["others"])

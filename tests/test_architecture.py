@@ -25,6 +25,7 @@ LAYERS = (
     ("particles", "fokker_planck_grid", "latent_grid", "constrained"),
     ("switching",),
     ("inference",),
+    ("orbits.training", "orbits.learning", "orbits.prediction"),
     ("results", "engine"),
     ("fitting", "forecasting"),
     ("backtesting", "conversion", "fitting_many"),

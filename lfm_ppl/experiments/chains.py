@@ -8,11 +8,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import xarray as xr
 from numpyro.infer import MCMC, NUTS
 
 from lfm_ppl.engine.task import Result
 from lfm_ppl.experiments import scores
+from lfm_ppl.experiments.datasets import cell
 from lfm_ppl.experiments.timing import timed
+from lfm_ppl.inference.kernels.ram import RAM
 
 APART = 0.3
 """Standard deviation of the chains' starts around a mode, in the logarithm of every parameter: were they alike, R-hat
@@ -22,6 +25,21 @@ would say nothing."""
 def nuts(model: Any, **settings: Any) -> NUTS:
     """Return NUTS with a dense mass matrix and forward-mode gradients, which are cheaper for up to ten parameters."""
     return NUTS(model, dense_mass=True, forward_mode_differentiation=True, **settings)
+
+
+def sampler(kernel: Any, chains: int, warmup: int, draws: int, thin: int = 1, **settings: Any) -> MCMC:
+    """Return the sampler of a kernel: RAM's chains side by side, those of others one after another.
+
+    Args:
+        kernel: the kernel.
+        chains: their number.
+        warmup: draws of the warm-up, thinned as the others.
+        draws: that are kept of each chain.
+        thin: steps for one draw.
+        **settings: of `MCMC`.
+    """
+    return MCMC(kernel, num_warmup=warmup * thin, num_samples=draws * thin, thinning=thin, num_chains=chains,
+                chain_method="vectorized" if isinstance(kernel, RAM) else "sequential", progress_bar=False, **settings)
 
 
 def starts(names: Sequence[str], near: Any, chains: int, key: jax.Array, sd: float = APART) -> dict[str, jax.Array]:
@@ -57,7 +75,28 @@ def sample(mcmc: MCMC, names: Sequence[str], key: jax.Array, *data: Any, **given
     return {"draws": draws, "seconds": seconds, "divergences": divergences, **scores.diagnose(names, draws)}
 
 
-def agreement(found: Sequence[Result], reference: Sequence[Result]) -> tuple[scores.Estimate, scores.Estimate]:
+def compared(found: xr.Dataset, reference: xr.Dataset | None) -> dict[str, Any]:
+    """Return how well a sampler's posteriors agree with those of a reference, as a row of a table.
+
+    Args:
+        found: ``mean``, ``sd`` and ``ess`` (dataset, parameter), ``seconds`` (dataset); of chains ``r_hat``, ``draws``
+            and ``divergences``, of weighted draws their Pareto index ``k``.
+        reference: the same of another sampler; None: ``found`` is the reference.
+
+    Returns:
+        See `agreement`, and the smallest effective sample size, CPU seconds, and the largest R-hat or Pareto index.
+    """
+    row: dict[str, Any] = {}
+    if reference is not None:
+        for name, one in zip(("shift", "sd ratio"), agreement(found, reference), strict=True):
+            row |= cell(name, one)
+    row |= {"least ESS": least_ess(found), **cell("CPU s", found.seconds)}
+    if "k" in found:
+        return row | {"k": float(found.k.max())}
+    return row | {"R-hat": largest_r_hat(found), "divergences": float(found.divergences.mean())}
+
+
+def agreement(found: xr.Dataset, reference: xr.Dataset) -> tuple[scores.Estimate, scores.Estimate]:
     """Return how far posteriors are from those of a reference, data set by data set.
 
     Returns:
@@ -65,28 +104,33 @@ def agreement(found: Sequence[Result], reference: Sequence[Result]) -> tuple[sco
         standard deviations furthest from one, over parameters and data sets, with their Monte Carlo errors, to be held
         against them as the largest of many.
     """
-    pairs = list(zip(found, reference, strict=True))
-    shift = np.stack([(one["mean"] - exact["mean"]) / exact["sd"] for one, exact in pairs])
-    ratio = np.stack([one["sd"] / exact["sd"] for one, exact in pairs])
-    error = np.stack([np.sqrt(1 / one["ess"] + 1 / exact["ess"]) for one, exact in pairs])
-    spread = ratio * np.stack([np.hypot(*map(_relative_error_of_sd, both)) for both in pairs])
+    both = found, reference
+    mean, sd, ess = ([one[name].transpose("dataset", "parameter").values for one in both]
+                     for name in ("mean", "sd", "ess"))
+    errors = [_relative_errors_of_sd(one) for one in both]
+    shift, ratio = (mean[0] - mean[1]) / sd[1], sd[0] / sd[1]
     worst = np.unravel_index(np.abs(shift).argmax(), shift.shape)
     with np.errstate(divide="ignore"):
         widest = np.unravel_index(np.abs(np.log(ratio)).argmax(), ratio.shape)
-    return (scores.Estimate(float(abs(shift[worst])), float(error[worst])),
-            scores.Estimate(float(ratio[widest]), float(spread[widest])))
+    return (scores.Estimate(float(abs(shift[worst])), float(np.sqrt(1 / ess[0] + 1 / ess[1])[worst])),
+            scores.Estimate(float(ratio[widest]), float((ratio * np.hypot(*errors))[widest])))
 
 
-def _relative_error_of_sd(found: Result) -> np.ndarray:
-    """Return Monte Carlo errors of standard deviations; of weighted draws those of a normal distribution."""
-    return scores.relative_errors_of_sd(found["draws"]) if "draws" in found else np.sqrt(0.5 / found["ess"])
+def _relative_errors_of_sd(found: xr.Dataset) -> np.ndarray:
+    """Return Monte Carlo errors (N, P) of standard deviations; of weighted draws those of a normal distribution."""
+    if "draws" not in found:
+        return np.sqrt(0.5 / found.ess.transpose("dataset", "parameter").values)
+    # Where samplers draw a different number, the shorter ones are filled up.
+    every = found.draws.transpose("dataset", "parameter", "chain", "draw")
+    return np.stack([scores.relative_errors_of_sd(one.dropna("chain", how="all").dropna("draw", how="all").values)
+                     for one in every])
 
 
-def least_ess(one: Result) -> float:
+def least_ess(found: xr.Dataset) -> float:
     """Return the smallest effective sample size; a chain that does not move has none, and must not look otherwise."""
-    return float(np.nan_to_num(one["ess"]).min())
+    return float(np.nan_to_num(found.ess).min())
 
 
-def largest_r_hat(one: Result) -> float:
+def largest_r_hat(found: xr.Dataset) -> float:
     """Return the largest R-hat; infinite where a chain does not move."""
-    return float(np.nan_to_num(one["r_hat"], nan=np.inf).max())
+    return float(np.nan_to_num(found.r_hat, nan=np.inf).max())

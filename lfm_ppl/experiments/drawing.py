@@ -21,6 +21,9 @@ from lfm_ppl.results.plots import style
 SHADE = "#B3D5E9"
 """Of a band about a blue line."""
 
+SPAN = "#DDDDDD"
+"""Of what is allowed, or expected."""
+
 TRUTH: dict[str, Any] = {"color": style.BLACK, "lw": 0.8, "ls": "--", "label": "truth"}
 """How the truth is drawn."""
 

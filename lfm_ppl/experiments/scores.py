@@ -81,6 +81,11 @@ def mean_of(values: Any) -> Estimate:
     return Estimate(float(known.mean()), float(error))
 
 
+def sd_of(values: Any) -> float:
+    """Return the standard deviation of independent numbers; NaN of a single one."""
+    return float(np.std(values, ddof=1)) if np.size(values) > 1 else np.nan
+
+
 def rate_of(hits: Any) -> Estimate:
     """Return the share of True among independent outcomes with its binomial standard error sqrt(p (1 - p) / n).
 
@@ -97,6 +102,18 @@ def rate_of(hits: Any) -> Estimate:
         return Estimate(np.nan, np.nan)
     p = k / n if 0 < k < n else (k + 1) / (n + 2)
     return Estimate(k / n, float(np.sqrt(p * (1 - p) / n)))
+
+
+def paired_ratio(first: Any, second: Any) -> Estimate:
+    """Return the ratio r of means of paired values, with the standard error of mean(first - r second) / mean(second).
+
+    Example:
+        >>> str(paired_ratio(np.array([1.0, 2.1]), np.array([2.0, 4.0])))
+        '0.517 (0.011)'
+    """
+    first, second = np.asarray(first, float), np.asarray(second, float)
+    ratio = first.mean() / second.mean()
+    return Estimate(float(ratio), mean_of(first - ratio * second).error / float(second.mean()))
 
 
 def rmse(estimate: Any, truth: Any) -> float:

@@ -4,8 +4,10 @@ What a study adds to its problem is a module ``experiment.py`` in a folder of it
 
 - a frozen dataclass of `Settings`, each field made by `setting`, which are checked, and are the options of
   ``lfm-ppl compare NAME``;
-- a function of the settings that returns the `lfm_ppl.engine.task.Task` objects, and one that computes a task;
-- functions of the settings and of the results by the tasks' names that return the tables (`Table`) and the figures;
+- a function of the settings that returns the `lfm_ppl.engine.task.Task` objects;
+- for each kind of task how one is computed and which dimensions its results have (`Kind`): all of them become one
+  `xarray.Dataset`;
+- functions of the settings and these datasets that return the tables (`Table`) and the figures;
 - ``STUDY``, a `Study` of these;
 
 and a line in `lfm_ppl.experiments.catalogue`. `lfm_ppl.experiments.ballistic` shows one. Everything else is here: a run
@@ -17,19 +19,20 @@ command line prints the tables and puts them on one page.
         runs: int = setting(500, "simulated targets", quick=4, aliases=study.REALISATIONS)
 
     def tasks(settings: Settings) -> list[Task]:
-        return [Task(f"track/{index:04d}", settings.seed, {"index": index}) for index in range(settings.runs)]
+        return [Task(f"track/{rule}/{index:04d}", settings.seed, {"rule": rule, "index": index})
+                for index in range(settings.runs) for rule in ("EKF", "CKF")]
 
     def compute(task: Task) -> Result:
-        return {"error": ...}
+        return {"rmse": ...}
 
-    def tables(settings: Settings, results: Results) -> dict[str, Table]:
-        errors = mean_of([one["error"] for one in results.values()])
-        return {"errors": Table("Errors", pd.DataFrame({"all": pair("RMSE", errors)}).T)}
+    def tables(settings: Settings, data: Data) -> dict[str, Table]:
+        track = data["track"]
+        return {"errors": Table.of("Errors", {rule: row(track.sel(rule=rule), {"RMSE": "rmse"}) for rule in ...})}
 
-    def figures(settings: Settings, results: Results) -> dict[str, Figure]:
-        return {"errors": ...}
+    def figures(settings: Settings, data: Data) -> dict[str, Figure]:
+        return {"errors": plot_errors(data["track"])}
 
-    STUDY = Study(Settings, tasks, compute, tables, figures)
+    STUDY = Study(Settings, tasks, {"track": Kind(compute, {"dataset": "rmse"}, by=("rule",))}, tables, figures)
 """
 
 from __future__ import annotations
@@ -44,16 +47,24 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 import pandas as pd
+import xarray as xr
 from matplotlib.figure import Figure
 
 from lfm_ppl import checks
 from lfm_ppl.engine.cluster import Workers, started
 from lfm_ppl.engine.run import Reporter, run_tasks
 from lfm_ppl.engine.task import Result, Task
-from lfm_ppl.experiments import output, scores
+from lfm_ppl.experiments import scores
+from lfm_ppl.experiments.datasets import Kind
+from lfm_ppl.results.files import writing
+from lfm_ppl.results.plots import style
+from lfm_ppl.results.tables import write_csv, write_markdown
 
 Results = dict[str, Result]
 """Name of a task -> its result."""
+
+Data = Mapping[str, xr.Dataset]
+"""Kind of task -> the results of all such tasks."""
 
 TASKS = "tasks"
 """The subfolder of a study's folder with a file for each task."""
@@ -67,14 +78,11 @@ CHAINS = ("chains", "warm-up", "draws", "thinning")
 _KEPT: Any = object()
 
 
-def setting(default: Any, help: str, *, quick: Any = _KEPT, choices: Sequence[str] | None = None, parts:
-            Sequence[str] | None = None, metavar: str | None = None, aliases: Sequence[str] = (), least: int = 1,
-            per_seed: int | None = None, increasing: bool = False) -> Any:
-    """Return a field of a study's `Settings`.
+class Declared(NamedTuple):
+    """What a study says of a setting.
 
-    Args:
-        default: its value; a tuple for several.
-        help: what it is, for the command line.
+    Attributes:
+        help: what it is, for the command line; empty: no option is made of it.
         quick: its value in the quick version; as the default where it is left out.
         choices: what a text, or each of several, may be.
         parts: what the whole numbers of a tuple of fixed length are.
@@ -84,22 +92,21 @@ def setting(default: Any, help: str, *, quick: Any = _KEPT, choices: Sequence[st
         per_seed: the largest number that one seed has data sets for.
         increasing: whether several numbers must increase.
     """
-    return dataclasses.field(default=default, metadata={"declared": Declared(
-        help, quick, choices, parts, metavar, aliases, least, per_seed, increasing)})
-
-
-class Declared(NamedTuple):
-    """What `setting` says of a field."""
 
     help: str
-    quick: Any
-    choices: Sequence[str] | None
-    parts: Sequence[str] | None
-    metavar: str | None
-    aliases: Sequence[str]
-    least: int
-    per_seed: int | None
-    increasing: bool
+    quick: Any = _KEPT
+    choices: Sequence[str] | None = None
+    parts: Sequence[str] | None = None
+    metavar: str | None = None
+    aliases: Sequence[str] = ()
+    least: int = 1
+    per_seed: int | None = None
+    increasing: bool = False
+
+
+def setting(default: Any, help: str, **about: Any) -> Any:
+    """Return a field of a study's `Settings`: its value, a tuple for several, and what else is `Declared` of it."""
+    return dataclasses.field(default=default, metadata={"declared": Declared(help, **about)})
 
 
 class Option(NamedTuple):
@@ -111,7 +118,7 @@ class Option(NamedTuple):
         many: whether it is a tuple of any length of these.
         optional: whether it may be None.
         default: its value.
-        declared: what `setting` says of it.
+        declared: what the study says of it.
     """
 
     name: str
@@ -171,7 +178,7 @@ class Settings:
     """How much is computed; the fields of a study's own subclass follow."""
 
     seed: int = dataclasses.field(default=0, kw_only=True, metadata={
-        "declared": Declared("of everything random", _KEPT, None, None, "N", (), 0, None, False)})
+        "declared": Declared("of everything random", metavar="N", least=0)})
 
     def __post_init__(self) -> None:
         """Check every setting by itself; a study that has more to check extends this."""
@@ -221,6 +228,11 @@ class Table(NamedTuple):
     printed: pd.DataFrame | None = None
     stored: bool = True
 
+    @classmethod
+    def of(cls, title: str, rows: Mapping[str, Mapping[str, Any]]) -> Self:
+        """Return a table of rows by name, each a column -> value."""
+        return cls(title, pd.DataFrame.from_dict(rows, orient="index"))
+
 
 class Found(NamedTuple):
     """What a study found.
@@ -228,12 +240,14 @@ class Found(NamedTuple):
     Attributes:
         settings: that it ran with.
         results: of every task, by name.
+        data: the same as one dataset for each kind of task.
         named: the tables, by the names of their files.
         notes: what to know when reading them.
     """
 
     settings: Any
     results: Results
+    data: Data
     named: dict[str, Table]
     notes: tuple[str, ...] = ()
 
@@ -256,24 +270,28 @@ class Study:
     Attributes:
         settings: the class of its settings.
         tasks: from the settings to the tasks, in the order in which they are computed.
-        compute: of a task, or what the task's setting ``what`` says -> of such a task.
-        tables: from settings and results to tables, by the names of their files.
-        figures: from settings and results to figures, by the names of their files.
+        kinds: kind of task -> how it is computed, and what its results are.
+        tables: from settings and data to tables, by the names of their files.
+        figures: from settings and data to figures, by the names of their files.
+        coords: name -> dimension and values of a coordinate of the data.
         label: header of the tables' first column, which holds the names of the rows.
-        notes: from settings and results to what is to be known when reading the tables.
-        then: from settings and the results of ``tasks`` to further tasks; None: there are none.
+        notes: from settings and data to what is to be known when reading the tables.
+        then: from settings and the results of ``tasks`` to further tasks.
         check: of the settings, before anything is computed, with what to do with a line of progress.
+        what: from a task to its kind; by default its setting ``what``, or what its name begins with.
     """
 
     settings: type[Settings]
     tasks: Callable[[Any], list[Task]]
-    compute: Callable[[Task], Result] | Mapping[str, Callable[[Task], Result]]
-    tables: Callable[[Any, Any], dict[str, Table]]
-    figures: Callable[[Any, Any], dict[str, Figure]]
+    kinds: Mapping[str, Kind]
+    tables: Callable[[Any, Data], dict[str, Table]]
+    figures: Callable[[Any, Data], dict[str, Figure]]
+    coords: Mapping[str, tuple[str, Sequence[Any]]] = dataclasses.field(default_factory=dict)
     label: str = "case"
-    notes: Callable[[Any, Any], tuple[str, ...]] = lambda settings, results: ()
-    then: Callable[[Any, Any], list[Task]] | None = None
+    notes: Callable[[Any, Data], tuple[str, ...]] = lambda settings, data: ()
+    then: Callable[[Any, Results], list[Task]] | None = None
     check: Callable[[Any, Reporter | None], None] = lambda settings, report: None
+    what: Callable[[Task], str] = lambda task: task.settings.get("what", task.name.partition("/")[0])
 
     def run(self, settings: Any, folder: str | Path, *, overwrite: bool = False, report: Reporter | None = None,
             workers: Workers = 1) -> Found:
@@ -291,8 +309,8 @@ class Study:
                 with other settings.
         """
         self.check(settings, report)
-        compute = functools.partial(_by_kind, self.compute) if isinstance(self.compute, Mapping) else self.compute
-        done = functools.partial(run_tasks, compute=compute, folder=Path(folder) / TASKS, overwrite=overwrite,
+        computed = functools.partial(_computed, self.what, {what: kind.compute for what, kind in self.kinds.items()})
+        done = functools.partial(run_tasks, compute=computed, folder=Path(folder) / TASKS, overwrite=overwrite,
                                  report=report)
         if self.then is None:
             return self.found(settings, done(self.tasks(settings), workers=workers))
@@ -303,25 +321,55 @@ class Study:
 
     def found(self, settings: Any, results: Results) -> Found:
         """Return what follows from the results of all tasks."""
-        return Found(settings, results, self.tables(settings, results), self.notes(settings, results))
+        data = self.gathered(settings, results)
+        return Found(settings, results, data, self.tables(settings, data), self.notes(settings, data))
+
+    def gathered(self, settings: Any, results: Results) -> Data:
+        """Return the results of all tasks as one dataset for each kind."""
+        tasks, data = self.tasks(settings), {}
+        if self.then is not None:
+            tasks = [*tasks, *self.then(settings, results)]
+        for what, kind in self.kinds.items():
+            if own := [task for task in tasks if self.what(task) == what]:
+                one = kind.gathered(own, results)
+                data[what] = one.assign_coords({name: (dim, list(values)) for name, (dim, values)
+                                                in self.coords.items() if dim in one.dims})
+        return data
 
     def save(self, found: Found, folder: str | Path) -> list[Path]:
-        """Write tables and figures, replacing older ones, and return their paths."""
-        return output.save(folder, found.tables, self.figures(found.settings, found.results), self.label)
+        """Write tables as CSV in full and as Markdown, and figures as PNG, replacing older ones; return their paths."""
+        folder, written = Path(folder), []
+        for name, table in found.tables.items():
+            written.append(write_csv(table, folder / f"{name}.csv", True, index_label=self.label))
+            written.append(write_markdown(scores.readable(table), folder / f"{name}.md", True))
+        for name, figure in self.figures(found.settings, found.data).items():
+            written.append(folder / f"{name}.png")
+            with writing(written[-1], True) as temporary, style.in_style():
+                figure.savefig(temporary, format="png")
+        return written
 
 
-def _by_kind(kinds: Mapping[str, Callable[[Task], Result]], task: Task) -> Result:
-    return kinds[task.settings["what"]](task)
+def _computed(what: Callable[[Task], str], kinds: Mapping[str, Callable[[Task], Result]], task: Task) -> Result:
+    return kinds[what(task)](task)
 
 
-def stacked(rows: Sequence[Result]) -> Result:
-    """Return the results of data sets, one row each, as one result with an array by name, a row for each data set.
+def stacked(rows: Sequence[Result], shown: Sequence[str] = ()) -> Result:
+    """Return the results of data sets, one row each, as one result.
+
+    Args:
+        rows: of the data sets.
+        shown: entries that are kept of the first one alone, for a figure.
+
+    Returns:
+        Entry -> array, a row for each data set.
 
     Example:
-        >>> stacked([{"rmse": 1.0}, {"rmse": 2.0}])["rmse"].tolist()
-        [1.0, 2.0]
+        >>> found = stacked([{"rmse": 1.0, "path": [0.0]}, {"rmse": 2.0, "path": [3.0]}], shown=["path"])
+        >>> found["rmse"].tolist(), found["path"].tolist()
+        ([1.0, 2.0], [0.0])
     """
-    return {name: np.stack([np.asarray(row[name]) for row in rows]) for name in rows[0]}
+    return {name: np.asarray(rows[0][name]) if name in shown else np.stack([np.asarray(row[name]) for row in rows])
+            for name in rows[0]}
 
 
 def blocks(count: int, size: int) -> list[tuple[int, int]]:
@@ -332,3 +380,13 @@ def blocks(count: int, size: int) -> list[tuple[int, int]]:
         [(0, 1), (2, 3), (4, 4)]
     """
     return [(first, min(first + size, count) - 1) for first in range(0, count, size)]
+
+
+def slug(label: str) -> str:
+    """Return a label as part of the name of a task or a file.
+
+    Example:
+        >>> slug("cubature, whole state"), slug("GHKF(7)")
+        ('cubature-whole-state', 'GHKF7')
+    """
+    return "".join(one for one in label.replace(" ", "-") if one not in "(),")

@@ -17,7 +17,7 @@ from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.orbits import frames
 from lfm_ppl.orbits.deterministic import Orbit, propagate
 from lfm_ppl.orbits.environment import Environment
-from lfm_ppl.orbits.satellite import GPS_PERIOD, Motion, period_of, pushed, wide_start
+from lfm_ppl.orbits.satellite import Motion, period_of, pushed, wide_start
 from lfm_ppl.orbits.table import Table
 
 _FINEST = 1 / 120
@@ -39,7 +39,7 @@ class Neighbourhood(eqx.Module):
     slopes: Table
     on_orbit: jax.Array
     axes: str = eqx.field(static=True)
-    period: Any = GPS_PERIOD
+    period: Any
 
     @classmethod
     def of(cls, environment: Environment, orbit: Orbit, times: Any, axes: str = "DYB", nodes: int = 2
@@ -143,7 +143,7 @@ def departure(near: Neighbourhood, forces: Mapping[str, Force], white: Any = 0.0
         >>> import lfm_ppl as lfm
         >>> near = Neighbourhood.of(environment, orbit, times)  # doctest: +SKIP
         >>> nowhere = Table(0.0, 1.0, np.zeros((4, 27)))  # no gravity, no sunlight
-        >>> near = Neighbourhood(jnp.zeros((4, 6)), nowhere, jnp.zeros(3), "DYB")
+        >>> near = Neighbourhood(jnp.zeros((4, 6)), nowhere, jnp.zeros(3), "DYB", lfm.orbits.GPS_PERIOD)
         >>> model = departure(near, lfm.orbits.small_forces("DYB"))
         >>> found = lfm.filter(model, np.arange(2.0), np.zeros((2, 3)), lfm.Taylor(), steps=1)
         >>> bool(abs(found.predicted_mean[1, :6]).max() < 1e-12)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 AXES = {"RTN": ("radial", "tangential", "normal"), "DYB": ("sunward", "panel", "remaining")}
 """Frame -> names of its axes."""
@@ -22,6 +23,21 @@ def rtn(r: jax.Array, v: jax.Array) -> jax.Array:
     """
     radial, normal = _unit(r), _unit(jnp.cross(r, v))
     return jnp.stack([radial, jnp.cross(normal, radial), normal], axis=1)
+
+
+def rtn_along(path: np.ndarray) -> np.ndarray:
+    """Return the radial, tangential and normal directions (T, 3, 3), as columns, along positions and velocities (T, 6).
+
+    Example:
+        >>> rtn_along(np.array([[26_560.0, 0.0, 0.0, 0.0, 13_900.0, 0.0]])).shape
+        (1, 3, 3)
+    """
+    return np.asarray(_rtn_along(jnp.asarray(path)))
+
+
+@jax.jit
+def _rtn_along(path: jax.Array) -> jax.Array:
+    return jax.vmap(lambda x: rtn(x[:3], x[3:]))(path)
 
 
 def dyb(r: jax.Array, sun: jax.Array) -> jax.Array:

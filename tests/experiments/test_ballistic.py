@@ -8,22 +8,16 @@ from scipy import stats
 
 from lfm_ppl.engine.store import write
 from lfm_ppl.experiments import scores
-from lfm_ppl.experiments.ballistic import (
-    chains,
-    experiment,
-    figures,
-    known,
-    parameters,
-    particles,
-    problem,
-    tables,
-    tracking,
-)
+from lfm_ppl.experiments.ballistic import experiment, figures, parameters, problem, smoothing
 from lfm_ppl.experiments.study import TASKS
 
 SMALL = experiment.Settings(
     runs=2, particle_runs=1, particles=(2_000,), chain_runs=1, drawn_runs=1, draws=200, paths=5, nuts=(2, 10, 10, 1),
     ram=(2, 10, 10, 2))
+
+
+def tasks_of(what, settings):
+    return [task for task in experiment.all_tasks(settings) if task.settings["what"] == what]
 
 
 @pytest.mark.slow
@@ -54,8 +48,8 @@ def test_the_densities_are_those_of_the_model():
 @pytest.mark.slow
 def test_a_gaussian_smoother_tracks():
     """Its errors are those of its own mean, and its band is honest about them."""
-    (task,) = [one for one in tracking.tasks(SMALL) if one.settings["method"] == "Taylor"]
-    found = tracking.compute(task)
+    (task,) = [one for one in tasks_of("tracking", SMALL) if one.settings["method"] == "Taylor"]
+    found = smoothing.gaussian(task)
     target = problem.target(0)
     assert found["smoother_rmse"].shape == found["smoother_coverage"].shape == (2, 3)
     np.testing.assert_allclose(found["smoother_rmse"][0], np.sqrt(np.mean((found["mean"] - target.paths) ** 2, axis=1)))
@@ -66,8 +60,8 @@ def test_a_gaussian_smoother_tracks():
 
 @pytest.mark.slow
 def test_particles_agree_with_the_gaussian_smoother_where_it_is_nearly_exact():
-    (task,) = particles.tasks(SMALL)
-    found = particles.compute(task)
+    (task,) = tasks_of("particles", SMALL)
+    found = smoothing.particles(task)
     given = problem.true_likelihood()
     target = problem.target(0)
     mean, sd = map(np.asarray, problem.paths_of(given.smooth(target.y)))
@@ -151,20 +145,24 @@ def made_up(settings):
 MADE = experiment.Settings(runs=100, particle_runs=3, particles=(500, 1_000), chain_runs=2, drawn_runs=20)
 
 
+def data_of(settings):
+    return experiment.STUDY.gathered(settings, made_up(settings))
+
+
 def test_the_tables_hold_what_was_found():
-    results = made_up(MADE)
-    tracked = tables.tracked(MADE, results)
+    tables = {name: table.frame for name, table in experiment.tables(MADE, data_of(MADE)).items()}
+    tracked = tables["tracking"]
     assert list(tracked.index) == [
-        *tracking.RULES, *(f"cubature, {label}{end}" for end in ("", "; parameters drawn from the prior")
-                           for label in tables.UNKNOWN)]
+        *smoothing.RULES, *(f"cubature, {label}{end}" for end in ("", "; parameters drawn from the prior")
+                            for label in experiment.UNKNOWN)]
     assert tracked.loc["Taylor", "RMSE speed (m/s)"] == 30.0 and tracked.loc["cubature", "coverage u"] == 0.95
-    against = tables.against_particles(MADE, results)
+    against = tables["particles"]
     row = against.loc["smoother, 1,000 particles"]
     assert row["ratio u"] == pytest.approx(1 / 1.1) and row["ratio u se"] == pytest.approx(0.0, abs=1e-12)
     assert row["times as long"] == pytest.approx(500.0) and row["distinct"] == 7.0
     assert row["log likelihood - Gaussian"] == pytest.approx(2.0) and row["its sd"] == pytest.approx(1.0)
     assert against.loc["smoother, Gaussian", "CPU s"] == 2e-3
-    found = tables.parameters(MADE, results)
+    found = tables["parameters"]
     row = found.loc["log alpha"]
     assert row["maximum"] == 0.9 and row["truth"] == pytest.approx(-7.708, abs=1e-3)
     assert [row[f"coverage {level}%"] for level in (50, 80, 95)] == pytest.approx([0.5, 0.8, 0.96], abs=0.011)
@@ -172,7 +170,7 @@ def test_the_tables_hold_what_was_found():
     alone = found.loc["log alpha, the force's parameters known"]
     assert alone["coverage 80%"] == pytest.approx(0.8, abs=0.011) and np.isnan(alone["posterior sd"])
     assert row["coverage 50% se"] == pytest.approx(0.05, abs=1e-3) and row["rank p"] > 0.99
-    agreement = tables.agreement(MADE, results)
+    agreement = tables["agreement"]
     assert agreement.loc["RAM", "shift"] == pytest.approx(0.5)
     assert agreement.loc["RAM", "sd ratio"] == pytest.approx(1.1)
     assert agreement.loc["RAM", "shift se"] == pytest.approx(0.1)
@@ -181,15 +179,15 @@ def test_the_tables_hold_what_was_found():
 
 def test_a_chain_that_stands_still_shows():
     results = made_up(MADE)
-    still = next(task.name for task in chains.tasks(MADE) if task.settings["sampler"] == "RAM")
+    still = next(task.name for task in tasks_of("chains", MADE) if task.settings["sampler"] == "RAM")
     for name, value in (("ess", np.nan), ("r_hat", np.nan), ("sd", 0.0)):
         results[still][name][1] = value
-    row = tables.agreement(MADE, results).loc["RAM"]
+    row = experiment.agreement(experiment.STUDY.gathered(MADE, results))["RAM"]
     assert row["least ESS"] == 0 and row["R-hat"] == np.inf and row["sd ratio"] == 0
 
 
 def test_the_figures_are_drawn_and_labelled():
-    drawn = figures.draw(MADE, made_up(MADE))
+    drawn = figures.draw(MADE, data_of(MADE))
     assert list(drawn) == ["paths", "particles", "drag", "coverage"]
     for figure in drawn.values():
         assert figure.get_figwidth() == 7.0 and figure.legends
@@ -248,4 +246,4 @@ def test_the_drag_alone_is_integrated_right():
     log_likelihood, _ = problem.posterior().log_densities_of(points, target.y, batch=20)
     density = np.exp(log_likelihood - log_likelihood.max())
     cells = 0.5 * (density[1:] + density[:-1]) * np.diff(z)
-    assert known.below(target) == pytest.approx(cells[z[1:] <= target.z[0]].sum() / cells.sum(), abs=0.02)
+    assert parameters.below(target) == pytest.approx(cells[z[1:] <= target.z[0]].sum() / cells.sum(), abs=0.02)

@@ -14,19 +14,20 @@ from scipy import integrate, special, stats
 import lfm_ppl as lfm
 from lfm_ppl.engine.store import write
 from lfm_ppl.experiments import scores, weighting
-from lfm_ppl.experiments.call_centre import counts, experiment, figures, posterior, problem, tables, tracking
+from lfm_ppl.experiments.call_centre import counts, experiment, figures, learning, problem, tracking
 from lfm_ppl.experiments.study import TASKS
-from lfm_ppl.inference.optimise import Objective
+from lfm_ppl.inference.optimise import End, Objective
 
 DATA = Path(os.environ.get("LFM_DATA", "../shared/data")) / "calls"
 real = pytest.mark.skipif(not DATA.is_dir(), reason="the counts of real calls are not there (LFM_DATA)")
 
 
 def window(index=0, data=None):
-    """Return a window; that its queues grow is no news here."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", counts.OverloadWarning)
-        return problem.window(data, "Thursday", index)
+    return problem.window(data, "Thursday", index)
+
+
+def tasks_of(what, settings):
+    return [task for task in experiment.all_tasks(settings) if task.settings["what"] == what]
 
 
 def written(path, change=lambda table: table):
@@ -96,7 +97,7 @@ def test_real_days_have_the_stated_utilisation():
     own, rate = problem.days(str(DATA), "Thursday", 0)
     assert everything.calls.shape == (164, 168) and len(own.dates) == 34
     assert rate * everything.calls.mean() == pytest.approx(7.0)
-    assert problem.windows(str(DATA), "Thursday", 0) == 31
+    assert len(own.dates) - problem.TRAIN == 31
 
 
 def test_a_window_has_its_readings_where_they_belong():
@@ -161,8 +162,8 @@ def test_the_gradient_is_that_of_finite_differences():
     steps = 1e-5 * np.eye(4)
     expected = [(objective.value(z + step) - objective.value(z - step)) / 2e-5 for step in steps]
     np.testing.assert_allclose(gradient, expected, rtol=1e-5, atol=1e-5)
-    learnt = tracking.learn(method, one.training)
-    assert -learnt.log_likelihood < problem.posterior(method).objective(one.training, 0.0).value(z)
+    (best, *_), _ = learning.searches(method, one.training)
+    assert best.value < problem.posterior(method).objective(one.training, 0.0).value(z)
 
 
 def searched(monkeypatch, value_and_gradient):
@@ -179,25 +180,28 @@ def searched(monkeypatch, value_and_gradient):
 def test_searches_from_several_starts_find_several_modes(monkeypatch):
     """Three wells, one of them far higher than the others."""
     method = problem.Method("sqm")
-    starts = np.log([[start[name] for name in method.names] for start in tracking.STARTS])
-    wells, depth = starts + 0.05, np.array([3.0, -2.0, 30.0])
+    starts = np.log([[start[name] for name in method.names] for start in learning.STARTS])
+    wells, depth, evaluated = starts + 0.05, np.array([3.0, -2.0, 30.0]), []
 
     def value_and_gradient(z, prior):
         k = np.argmin(((z - wells) ** 2).sum(axis=1))
+        evaluated.append(k)
         return 20 * ((z - wells[k]) ** 2).sum() + depth[k] + prior, 40 * (z - wells[k])
 
     searched(monkeypatch, value_and_gradient)
-    found = tracking.modes(method, np.zeros((63, 1)), prior=1.0)
-    np.testing.assert_allclose([one.z for one in found], wells[[1, 0]], atol=1e-4)
-    assert [one.log_likelihood for one in found] == pytest.approx([1.0, -4.0])
-    best = tracking.learn(method, np.zeros((63, 1)))
-    np.testing.assert_array_equal(best.z, found[0].z)
-    assert best.log_likelihood == pytest.approx(2.0) and best.evaluations > sum(one.evaluations for one in found)
+    found = learning.modes(method, np.zeros((63, 1)))
+    np.testing.assert_allclose([mode.point for mode in found], wells[[1, 0]], atol=1e-4)
+    assert [-mode.value for mode in found] == pytest.approx([1.0, -4.0])
+    evaluated.clear()
+    (best, *_), evaluations = learning.searches(method, np.zeros((63, 1)))
+    np.testing.assert_array_equal(best.point, found[0].point)
+    assert -best.value == pytest.approx(2.0)
+    assert set(evaluated) == {0, 1, 2} and evaluations == len(evaluated)
     depth[:], wells[:] = 0.0, wells[0]
-    assert len(tracking.modes(method, np.zeros((63, 1)))) == 1
+    assert len(learning.modes(method, np.zeros((63, 1)))) == 1
     searched(monkeypatch, lambda z, prior: (np.inf, np.zeros(len(method.names))))
     with pytest.raises(ValueError, match="not finite wherever a search for the parameters of sqm starts"):
-        tracking.learn(method, np.zeros((63, 1)))
+        learning.searches(method, np.zeros((63, 1)))
 
 
 def test_a_lower_mode_without_curvature_is_none(monkeypatch):
@@ -212,9 +216,9 @@ def test_a_lower_mode_without_curvature_is_none(monkeypatch):
 
     searched(monkeypatch, value_and_gradient)
     for order, kept in (([0, 1, 2], [0]), ([1, 0, 2], [1, 0])):
-        monkeypatch.setattr(tracking, "modes", lambda *_, order=order, **__: [
-            tracking.Learnt(points[k], 0.0, 1) for k in order])
-        found = posterior.modes(method, np.zeros((63, 1)))
+        monkeypatch.setattr(learning, "searches", lambda *_, order=order, **__: (
+            [End(points[k], 0.0) for k in order], 3))
+        found = learning.modes(method, np.zeros((63, 1)))
         np.testing.assert_array_equal([mode.point for mode in found], [points[k] for k in kept])
     np.testing.assert_allclose(found[1].curvature.factor @ found[1].curvature.factor.T, np.eye(4), atol=1e-6)
 
@@ -263,14 +267,15 @@ def test_scores_are_those_of_the_log_normal_distribution():
     one = window()
     x = np.log1p(one.queues["constant"])
     found = tracking.Tracked(x + 0.1, np.full(x.shape, 0.1), np.append(0, one.arrivals) + 0.2, np.full(x.shape, 0.05))
-    judged = tracking.judge(found, one, "constant")
+    judged = tracking.judge([found], one, "constant")
     queue = one.queues["constant"][505:]
     assert judged["rmse"] == pytest.approx(np.sqrt(np.mean(((1 + queue) * (np.exp(0.1) - 1)) ** 2)))
     expected = stats.lognorm(0.1, scale=(1 + queue) * np.exp(0.1)).logpdf(1 + queue).sum()
     assert judged["ell"] == pytest.approx(expected)
     assert judged["coverage"] == 1.0 and judged["rate_coverage"] == 0.0
     assert judged["rate_rmse"] == pytest.approx(0.2)
-    mixed = posterior.judge([found, found], one, "constant")
+    mixed = tracking.judge([found, found], one, "constant")
+    assert mixed.keys() == judged.keys()
     for key, value in mixed.items():
         assert value == pytest.approx(judged[key], rel=1e-9), key
 
@@ -278,34 +283,38 @@ def test_scores_are_those_of_the_log_normal_distribution():
 def test_quantiles_of_a_mixture():
     mean, sd = np.array([[0.0, 1.0], [3.0, 1.0]]), np.array([[1.0, 2.0], [0.5, 2.0]])
     p = np.array([0.1, 0.5, 0.9])
-    found = posterior.quantiles(mean, sd, p)
+    found = tracking.quantiles(mean, sd, p)
     np.testing.assert_allclose(special.ndtr((found[:, None] - mean) / sd).mean(axis=1), np.repeat(p, 2).reshape(3, 2),
                                rtol=1e-9)
     np.testing.assert_allclose(found[:, 1], stats.norm(1.0, 2.0).ppf(p))
 
 
+def data_of(settings):
+    return experiment.STUDY.gathered(settings, made_up(settings))
+
+
 def test_the_tables_hold_what_was_found():
-    results = made_up(MADE)
-    table = tables.tracked(MADE, results, "constant")
+    tables = {name: table.frame for name, table in experiment.tables(MADE, data_of(MADE)).items()}
+    table = tables["constant"]
     assert list(table.index) == ["SQM", "periodic", "Matern", "SQM, parameters integrated out"]
     assert table.loc["SQM", "RMSE"] == pytest.approx(1.1) and table.loc["SQM", "of Matern"] == pytest.approx(1 / 3)
     assert table.loc["Matern", "published RMSE"] == 10.6 and table.loc["SQM", "published ELL"] == -146
-    assert tables.tracked(MADE, results, "changed").loc["periodic", "published RMSE"] == 5.7
-    gain = tables.gain(MADE, results)
+    assert tables["changed"].loc["periodic", "published RMSE"] == 5.7
+    gain = tables["gain"]
     assert gain.loc["SQM, changed", "gain"] == pytest.approx(11.0) and gain.loc["SQM, constant", "days"] == 1.0
     assert gain.loc["SQM, constant", "RMSE ratio"] == pytest.approx(0.9)
     assert gain.loc["SQM, changed", ["several modes", "beyond"]].tolist() == pytest.approx([2 / 3, 0.4])
-    agreement = tables.agreement(MADE, results).loc["SQM"]
+    agreement = tables["agreement"].loc["SQM"]
     assert agreement["windows"] == 2 and agreement["means apart (sd)"] == pytest.approx(0.125)
     assert agreement["ratio of sds"] == pytest.approx(1.25)
     assert agreement["gain constant, NUTS"] == pytest.approx(35.0)  # of -100 and -110
     assert agreement["gain constant, weighted"] == pytest.approx(10.5)
-    learnt = tables.learnt(MADE, results)
+    learnt = tables["learnt"]
     assert learnt.loc["SQM", "memory"] == 1.0 and np.isnan(learnt.loc["Matern", "memory"])
 
 
 def test_the_figures_are_drawn_and_labelled():
-    drawn = figures.draw(MADE, made_up(MADE))
+    drawn = figures.draw(MADE, data_of(MADE))
     assert list(drawn) == ["queue-constant", "queue-changed", "arrivals", "cycles", "errors"]
     for figure in drawn.values():
         assert figure.get_figwidth() == 7.0 and figure.legends
@@ -351,7 +360,7 @@ def test_mistakes(tmp_path):
 def test_weighted_draws_are_those_of_a_long_chain():
     """The posterior of one window against random-walk Metropolis with the same density."""
     method, one = problem.Method("sqm", functions=5), window()
-    draws, weights, _ = posterior.posterior(method, one.training, 1_000, 0)
+    draws, weights, _ = learning.posterior(method, one.training, 1_000, 0)
     weight = np.exp(weights.log_weight[0])
     mean = weight @ draws
     sd = np.sqrt(weight @ (draws - mean) ** 2)
@@ -388,12 +397,12 @@ BOTH = experiment.Settings(days=4, methods=("SQM",), functions=5, draws=2_000, m
 @pytest.mark.slow
 def test_nuts_and_weighted_draws_have_the_same_posterior():
     """Two samplers that share the density and the modes about which they start, on the fourth window, which has one."""
-    task = posterior.nuts_tasks(BOTH)[3]
+    task = tasks_of("nuts", BOTH)[3]
     method, (one,) = tracking.method_of(task), tracking.windows_of(task)
-    draws, weights, mass = posterior.posterior(method, one.training, BOTH.draws, BOTH.seed)
+    draws, weights, mass = learning.posterior(method, one.training, BOTH.draws, BOTH.seed)
     assert len(mass) == 1 and weights.reliable
     mean, covariance = weighting.moments(draws, np.exp(weights.log_weight[0]))
-    found = posterior.compute_nuts(task)
+    found = tracking.by_nuts(task)
     assert found["divergences"] == 0 and found["r_hat"].max() < 1.02
     error = np.sqrt(1 / found["ess"] + 1 / weights.ess)
     assert error.max() < 0.1
@@ -407,11 +416,11 @@ NOISE = 4
 
 def with_two_modes(count):
     """Return method, training, weighted draws and modes of the first window; the second mode is one of small noises."""
-    task = posterior.nuts_tasks(BOTH)[0]
+    task = tasks_of("nuts", BOTH)[0]
     method, (one,) = tracking.method_of(task), tracking.windows_of(task)
-    draws, weights, mass = posterior.posterior(method, one.training, count, BOTH.seed)
+    draws, weights, mass = learning.posterior(method, one.training, count, BOTH.seed)
     assert len(mass) == 2 and weights.reliable and method.names[NOISE] == "noise_sd"
-    return method, one.training, draws, np.exp(weights.log_weight[0]), posterior.modes(method, one.training)
+    return method, one.training, draws, np.exp(weights.log_weight[0]), learning.modes(method, one.training)
 
 
 @pytest.mark.slow
@@ -444,7 +453,7 @@ def test_nuts_and_weighted_draws_agree_about_the_first_mode():
     own = weight[above] / weight[above].sum()
     mean, covariance = weighting.moments(draws[above], own)
     sd = np.sqrt(np.diag(covariance))
-    found = posterior.compute_nuts(posterior.nuts_tasks(BOTH)[0])
+    found = tracking.by_nuts(tasks_of("nuts", BOTH)[0])
     elsewhere = found["draws"][NOISE] < edge
     assert elsewhere.mean() < 0.5
     chain = found["draws"][:, ~elsewhere]

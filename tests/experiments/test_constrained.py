@@ -13,7 +13,7 @@ from scipy.stats import truncnorm
 import lfm_ppl as lfm
 from lfm_ppl.engine.store import write
 from lfm_ppl.experiments import catalogue
-from lfm_ppl.experiments.constrained import estimators, experiment, figures, problem, tables
+from lfm_ppl.experiments.constrained import estimators, experiment, figures, problem
 from lfm_ppl.experiments.study import TASKS
 from lfm_ppl.inference.optimise import Objective
 
@@ -81,7 +81,7 @@ def test_a_patient_without_curvature_has_its_mode():
         def objective(self, y):
             return Objective(lambda z: (jnp.sum(z**2), jnp.full_like(z, jnp.nan)))
 
-    draws, k = experiment.drawn(Flat(), np.zeros(1), np.array([0.3, -0.2]), 0, 16, 150)
+    draws, k = estimators.drawn(Flat(), np.zeros(1), np.array([0.3, -0.2]), 0, 16, 150)
     np.testing.assert_array_equal(draws, np.tile([0.3, -0.2], (16, 1)))
     assert k == np.inf
 
@@ -132,9 +132,9 @@ def test_the_rate_as_a_constant_state_against_a_search_on_the_dense_cost():
 def test_times_of_peaks():
     times = np.linspace(0.0, 24.0, 241)
     path = 1.0 + 0.5 * np.cos(2 * np.pi * (times - 23.5) / 24.0)
-    assert experiment.acrophase(times, path[None])[0] == pytest.approx(23.5)
-    assert experiment.peak(times, path[None])[0] == pytest.approx(23.5)
-    assert experiment._apart(np.array([23.5]), np.array([0.5]))[0] == pytest.approx(1.0)
+    assert estimators.acrophase(times, path[None])[0] == pytest.approx(23.5)
+    assert estimators.peak(times, path[None])[0] == pytest.approx(23.5)
+    assert estimators._apart(np.array([23.5]), np.array([0.5]))[0] == pytest.approx(1.0)
 
 
 def stored(folder, settings):
@@ -145,11 +145,11 @@ def stored(folder, settings):
         if what == "transcription":
             path = np.abs(random.normal(size=(3, len(problem.TIMES))))
             found = {"truth": path[0]}
-            for method in estimators.METHODS:
+            for method, (_, learnt, every, _) in estimators.METHODS.items():
                 found |= {f"{method}/mse": random.uniform(1e-3, 1e-2, count), f"{method}/minimum": np.zeros(count),
                           f"{method}/coverage": np.full(count, 0.95), f"{method}/failed": np.zeros(count, bool),
-                          f"hyperparameters/{estimators.METHODS[method]}": np.ones((count, 2)),
-                          f"{method}/first": np.sort(path, axis=0)[[1, 0, 2], ::estimators.ROWS[method]]}
+                          f"hyperparameters/{learnt}": np.ones((count, 2)),
+                          f"{method}/first": np.sort(path, axis=0)[[1, 0, 2], ::every]}
         elif what == "ballistic":
             paths = random.normal(size=(3, len(problem.TARGET_TIMES)))
             found = {"rmse": random.uniform(size=(count, 3)), "converged": np.ones(count, bool), "estimate": paths,
@@ -171,9 +171,10 @@ def test_tables_and_figures_from_stored_results(tmp_path):
     found = experiment.STUDY.run(settings, tmp_path)
     assert found.tables["transcription"].loc["delayed MHE, 60 samples", "published"] == 0.0103
     assert found.tables["others"].loc["patients, Pareto k above 0.7", "value"] == 0.5  # the first of each block of two
-    mse = tables.gathered(found.results, "transcription", "EP/mse")
+    mse = np.concatenate([found.results[task.name]["EP/mse"] for task in experiment.all_tasks(settings)
+                          if task.settings["what"] == "transcription"])
     assert mse.shape == (12,) and found.tables["transcription"].loc["EP", "median MSE"] == np.median(mse)
-    assert set(figures.draw(settings, found.results)) == {"forces", "errors", "target", "patient", "peaks"}
+    assert set(figures.draw(settings, found.data)) == {"forces", "errors", "target", "patient", "peaks"}
     written = experiment.STUDY.save(found, tmp_path)
     assert all(path.stat().st_size > 0 for path in written) and len(written) == 2 * 3 + 5
 

@@ -9,7 +9,7 @@ import pytest
 
 import lfm_ppl as lfm
 from lfm_ppl.experiments import catalogue
-from lfm_ppl.experiments.counts import experiment, methods, problem, reference, tables
+from lfm_ppl.experiments.counts import experiment, figures, methods, problem, reference
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 DATA = Path(os.environ.get("LFM_DATA", ROOT.parent / "shared" / "data"))
@@ -42,8 +42,8 @@ def test_settings_are_checked_and_it_is_in_the_catalogue():
     assert len(experiment.comparing(experiment.Settings(), learnt)) == 7 * 4
 
 
-def test_tables_measure_against_the_reference(monkeypatch):
-    """From results that are made up, and errors that are known."""
+def made_up(monkeypatch):
+    """Settings of one problem, and results whose errors are known."""
     settings = experiment.Settings(problems=("student-t",), size=problem.Size(rows=4))
     truth = np.array([0.0, 0.1, 5.0, 0.0])
     one = problem.Problem(np.arange(4.0), truth[:, None], np.zeros(4, int), lambda: None, {}, {}, truth)
@@ -52,12 +52,37 @@ def test_tables_measure_against_the_reference(monkeypatch):
              "log density": -np.arange(4.0), "low": -np.ones(4), "high": np.ones(4)}
     rough = exact | {"log evidence": -10.5, "mean": np.array([0, 0, 0.2, 0]), "sd": np.full(4, 0.9),
                      "log density": -np.arange(4.0) - 0.5}
-    results = {f"student-t/{method}": rough for method in methods.METHODS} | {"student-t/reference": exact}
-    row = tables.accuracy(settings, results).loc["student-t, EP"]
+    del rough["log evidence error"]
+    results = {f"student-t/{method}": rough.copy() for method in methods.METHODS} | {
+        "student-t/reference": exact, "student-t/parameters": {"level": 0.5}}
+    return settings, results
+
+
+def test_tables_measure_against_the_reference(monkeypatch):
+    """From results that are made up, and errors that are known."""
+    settings, results = made_up(monkeypatch)
+    tables = experiment.tables(settings, experiment.STUDY.gathered(settings, results))
+    row = tables["accuracy"].frame.loc["student-t, EP"]
     assert row[["less reference", "mean", "sd", "covered"]].tolist() == pytest.approx([-0.5, 0.2, 0.1, 0.75])
-    row = tables.prediction(settings, results).loc["student-t, EP"]
+    assert row["less reference se"] == 0.01 and np.isnan(row["log Z se"])
+    row = tables["prediction"].frame.loc["student-t, EP"]
     assert row[["NLPD", "less reference", "covered"]].tolist() == pytest.approx([2.0, 0.5, 0.75])
     assert row["less reference se"] == pytest.approx(0.0)
+    exact = tables["accuracy"].frame.loc["student-t, reference"]
+    assert exact["log Z se"] == 0.01 and exact["seconds"] == 3.0
+    assert exact[["less reference", "less reference se", "mean", "sd"]].isna().all()
+
+
+def test_sites_that_did_not_converge_show_and_shorter_data_do_not(monkeypatch):
+    """Both are NaN; data of four rows stand beside those of another problem with six."""
+    settings, results = made_up(monkeypatch)
+    results["student-t/laplace"] |= {"mean": np.array([0.0, np.nan, 0.2, 0.0])}
+    data = dict(experiment.STUDY.gathered(settings, results))
+    data["comparison"] = data["comparison"].pad(dataset=(0, 2))
+    table = experiment.tables(settings, data)["accuracy"].frame
+    assert np.isnan(table.loc["student-t, Laplace", "mean"]) and table.loc["student-t, Laplace", "covered"] == 0.5
+    assert table.loc["student-t, EP", ["mean", "covered"]].tolist() == pytest.approx([0.2, 0.75])
+    assert len(figures.plot_errors(settings, data).axes) == 3
 
 
 @pytest.mark.slow
@@ -66,7 +91,8 @@ def test_moments_of_the_simulated_data_are_exact_but_for_the_mark(name):
     """200 rows, of which 20 are off by 20 scales for Student-t: means within 0.05 sd, sds within 3% of exact draws."""
     one = problem.problem(name, problem.Size(), 0, None)
     model = one.build(**one.given)
-    drawn = reference.Reference(model, one.times, one.sites).sample(jax.random.key(0), one.y, 20_000)
+    posterior = reference.Reference(model, one.times, one.sites)
+    drawn = posterior.sample(jax.random.key(0), one.y, posterior.proposal(one.y), 20_000)
     mean, sd = lfm.smooth(model, one.times, one.y, sites=one.sites).force("u")
     exact, spread = drawn.mean((0, 1)), drawn.std((0, 1))
     away, wider = np.abs(mean - exact) / spread, np.abs(sd / spread - 1)

@@ -5,8 +5,8 @@ import pytest
 
 from lfm_ppl.engine.store import write
 from lfm_ppl.experiments import scores
-from lfm_ppl.experiments.ginzburg_landau import conditional, experiment, figures, grid, problem, sampling, state, tables
-from lfm_ppl.experiments.study import TASKS
+from lfm_ppl.experiments.ginzburg_landau import experiment, figures, parameters, problem, states
+from lfm_ppl.experiments.study import TASKS, slug
 
 SMALL = experiment.Settings(
     realisations=1, conditional=2, particles=200, smoother_particles=50, smoother_draws=20, conditional_particles=50,
@@ -14,8 +14,8 @@ SMALL = experiment.Settings(
     pmmh=(4, 6, 1), tree_depth=2)
 
 
-def task(found, *words):
-    return next(one for one in found if all(word in one.name for word in words))
+def task(kind, label):
+    return next(one for one in experiment.all_tasks(SMALL) if one.name.startswith(f"{kind}/{slug(label)}/"))
 
 
 def test_the_realisations_are_those_of_the_model_file():
@@ -32,7 +32,7 @@ def test_the_realisations_are_those_of_the_model_file():
 @pytest.mark.parametrize("method", [
     method if method == "CKF" else pytest.param(method, marks=pytest.mark.slow) for method in problem.METHODS])
 def test_every_method_filters_and_smooths(method):
-    result = state.compute(task(state.tasks(SMALL), "state", problem.slug(method)))
+    result = states.compute(task("state", method))
     for what in ("filter", "smoother"):
         low, mean, high = (result[f"{what}_{end}"] for end in ("low", "mean", "high"))
         assert low.shape == (501,) and np.isfinite(mean).all()
@@ -45,29 +45,30 @@ def test_every_method_filters_and_smooths(method):
 @pytest.mark.parametrize("method", [
     pytest.param(method, marks=() if method == "CKF" else pytest.mark.slow) for method in problem.METHODS])
 def test_every_method_has_conditional_posteriors(method):
-    result = conditional.compute(task(conditional.tasks(SMALL), problem.slug(method)))
+    computed = task("conditional", method)
+    result = parameters.conditional(computed)
     values = result["log_likelihood"]
     assert values.shape == (2, 3, 5) and np.isfinite(values).mean() > 0.8
-    found = conditional.outcomes({task(conditional.tasks(SMALL), problem.slug(method)).name: result})[method]
+    gathered = experiment.STUDY.kinds["conditional"].gathered([computed], {computed.name: result})
+    found = parameters.outcomes(gathered).sel({"method": method})
     assert found["outside"].shape == (2, 3)
     np.testing.assert_array_equal(found["outside"], np.abs(found["below"] - 0.5) > 0.495)
 
 
 def test_the_grid_gives_the_same_likelihood_in_one_step_and_in_twenty():
     """exp(2 A) = exp(0.1 A)^20: the fine times change nothing."""
-    once = state.compute(task(state.tasks(SMALL), "grid"))["log_likelihood"]
-    rows = conditional.thetas(5)
-    rows[0] = problem.TRUTH
-    data = problem.realisation(0)
-    found = grid.log_likelihoods(rows[:1], data.y[None], data.times, SMALL.cells)
-    np.testing.assert_allclose(found[0, 0], once, rtol=1e-9)
+    once = states.compute(task("state", "grid"))["log_likelihood"]
+    found = parameters.conditional(task("conditional", "grid"))["log_likelihood"]
+    place = problem.NAMES.index("sigma")
+    np.testing.assert_allclose(parameters.nodes("sigma", SMALL.nodes)[1], problem.TRUTH[place], rtol=1e-14)
+    np.testing.assert_allclose(found[0, place, 1], once, rtol=1e-9)
 
 
 @pytest.mark.parametrize("label", [
-    pytest.param(label, marks=pytest.mark.slow) for label in sampling.SAMPLERS])
+    pytest.param(label, marks=pytest.mark.slow) for label in parameters.SAMPLERS])
 def test_every_sampler_draws_parameters_and_states(label):
-    result = sampling.compute(task(sampling.tasks(SMALL), sampling.slug(label)))
-    assert result["draws"].shape == (3, sampling.CHAINS, 6)
+    result = parameters.by_chains(task("mcmc", label))
+    assert result["draws"].shape == (3, parameters.CHAINS, 6)
     alpha, beta, sigma = result["draws"]
     assert (beta > 0).all() and (sigma > 0).all() and np.isfinite(alpha).all()
     assert result["smoother_mean"].shape == (501,)
@@ -121,7 +122,7 @@ def made_up(settings):
             rows = np.stack([
                 -8.0 * (nodes - truth - away) ** 2 if name == "alpha" else -8.0 * (np.log(nodes / truth) - away) ** 2
                 for name, truth in zip(problem.NAMES, problem.TRUTH, strict=True)
-                for nodes in [conditional.nodes(name, given["nodes"])]])
+                for nodes in [parameters.nodes(name, given["nodes"])]])
             results[one.name] = {"log_likelihood": np.tile(rows, (count, 1, 1)), "seconds": 1.0}
             continue
         mean = generator.normal(size=501)
@@ -145,24 +146,28 @@ def made_up(settings):
 MADE = experiment.Settings(realisations=3, conditional=12, nodes=41)
 
 
+def data_of(settings):
+    return experiment.STUDY.gathered(settings, made_up(settings))
+
+
 def test_the_tables_count_what_was_found():
-    results = made_up(MADE)
-    rates = tables.rates(results)
+    tables = {name: table.frame for name, table in experiment.tables(MADE, data_of(MADE)).items()}
+    rates = tables["rates"]
     assert list(rates.index) == list(problem.METHODS)
     assert rates.loc["EKF", "pooled"] == 1.0 and rates.loc["grid", "pooled"] == 0.0
     assert rates.loc["EKF", "differs"] == 1.0 and rates.loc["grid", "differs"] == 0.0
     assert rates.loc["grid", "alpha se"] == pytest.approx(np.sqrt(1 / 14 * 13 / 14 / 12))
-    table = tables.comparison(results)
+    table = tables["comparison"]
     assert table.loc["RAM, CKF", "ESS/CPU s"] == 50.0
     # alpha = -1 and beta = 0.1 lie in (-3, 1), sigma = 2 does not.
     assert table.loc["RAM, CKF", "coverage parameters"] == pytest.approx(2 / 3)
     assert table.loc["RAM, EKF", "RMSE published"] == 0.895
-    assert tables.parameters(results).loc["RAM, CKF", "coverage sigma"] == 0.0
+    assert tables["parameters"].loc["RAM, CKF", "coverage sigma"] == 0.0
     assert scores.readable(table).loc["RAM, CKF", "ESS/CPU s"] == "50"
 
 
 def test_the_figures_are_drawn_and_labelled():
-    drawn = figures.draw(MADE, made_up(MADE))
+    drawn = figures.draw(MADE, data_of(MADE))
     assert list(drawn) == ["states", "marginals", "conditional", "integrated", "rates"]
     for figure in drawn.values():
         assert figure.get_figwidth() == 7.0

@@ -2,24 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
-from scipy import stats
 
-import lfm_ppl as lfm
 from lfm_ppl import orbits
-from lfm_ppl.experiments import output
-from lfm_ppl.experiments.gps import (
-    experiment,
-    figures,
-    learning,
-    magnitudes,
-    prediction,
-    problem,
-    training,
-    ways,
-)
-from lfm_ppl.orbits.table import Table
+from lfm_ppl.experiments.gps import experiment, figures, problem, ways
+from lfm_ppl.experiments.study import Found
+from lfm_ppl.orbits import magnitudes, prediction
+from lfm_ppl.orbits.arc import Unusable
 
 TIMES = 0.25 * np.arange(960)
 
@@ -40,9 +32,27 @@ def data(monkeypatch):
     return found
 
 
-def learnt(value=0.0):
+def learnt(value=0.0, orbit=range(8)):
     """Result of a first task, all logarithms alike."""
-    return {"orbit": np.arange(8.0), "logarithms": np.full(len(magnitudes.names("DYB")), value), "cpu_s": 1.0}
+    return {"orbit": np.array(orbit, float), "logarithms": np.full(len(magnitudes.names("DYB")), value), "cpu_s": 1.0}
+
+
+def compute(task):
+    return experiment.STUDY.kinds[experiment.STUDY.what(task)].compute(task)
+
+
+@pytest.fixture
+def gather(monkeypatch):
+    """From predictions of satellites, and results of other tasks by name, to the settings and the data of the study."""
+    def gather(predicted, others=None):
+        positions, others = {name: np.ones((960, 3)) for name in predicted}, others or {}
+        monkeypatch.setattr(problem, "arcs", lambda folder, seed=0: problem.Arcs(None, TIMES, positions, None))
+        settings = experiment.Settings(alternatives=sum(name.startswith("ways/") for name in others))
+        results = {f"learn/{name}": learnt() for name in predicted}
+        results |= {f"predict/{name}": one for name, one in predicted.items()}
+        return settings, experiment.STUDY.gathered(settings, results | others)
+
+    return gather
 
 
 def test_each_satellite_is_learnt_then_predicted_with_what_all_have_in_common(data):
@@ -51,7 +61,8 @@ def test_each_satellite_is_learnt_then_predicted_with_what_all_have_in_common(da
     assert [task.name for task in first] == ["learn/G01", "learn/G02", "learn/G04"]
     assert first[0].settings["train_days"] == 3.0 and first[0].settings["positions"] == first[1].settings["positions"]
     assert first[2].settings["positions"] is None  # it will be refused
-    second = experiment.plan_predictions(settings, {"learn/G01": learnt(), "learn/G02": learnt()})
+    second = experiment.plan_predictions(settings, {
+        "learn/G01": learnt(), "learn/G02": learnt(), "learn/G04": {"refused": "G04: no positions"}})
     assert [task.name for task in second] == ["predict/G01", "predict/G02", "ways/G01", "ways/G02", "online/G01"]
     mean, sd = second[0].settings["prior"]
     assert (mean, sd) == tuple(values.tolist() for values in magnitudes.wide("DYB"))  # two do not say what is common
@@ -64,75 +75,6 @@ def test_other_positions_are_another_task(data):
     before = experiment.plan(experiment.Settings(data="folder"))[0].settings["positions"]
     data.positions["G01"][7, 1] += 1e-6
     assert experiment.plan(experiment.Settings(data="folder"))[0].settings["positions"] != before
-
-
-def test_common_magnitudes_are_the_mean_and_the_scatter_of_the_satellites():
-    several = [np.full(21, value) for value in (-2.0, -1.0, 0.0, 1.0, 2.0)]
-    mean, sd = magnitudes.common(several, "DYB")
-    assert np.allclose(mean, 0.0) and np.allclose(sd, np.sqrt(2.0))
-    assert np.allclose(magnitudes.common([np.zeros(21)] * 5, "DYB").sd, 0.5)
-    assert magnitudes.common(several[:4], "DYB").mean is not mean and np.allclose(
-        magnitudes.common(several[:4], "DYB").mean, magnitudes.wide("DYB").mean)
-
-
-@pytest.mark.parametrize(("axes", "size", "states"), [("DYB", 21, 27), ("RTN", 34, 1 + 15 + 15 + 21)])
-def test_magnitudes_become_forces(axes, size, states):
-    names = magnitudes.names(axes)
-    assert len(names) == size == len(set(names))
-    vector = np.log(np.arange(1.0, size + 1))
-    forces, white = magnitudes.forces(vector, axes)
-    assert sum(force.state_dim for force in forces.values()) == states and float(white) == pytest.approx(size)
-    force = forces["panel" if axes == "DYB" else "radial"]
-    value = dict(zip(names, np.exp(vector), strict=True))
-    name = "panel" if axes == "DYB" else "radial"
-    level, first = force.forces[0], force.forces[1]
-    assert float(level.initial_sd) == pytest.approx(value[f"level of {name}"])
-    assert float(level.scale) == pytest.approx(value[f"drift of {name}"])
-    assert float(first.scale) == pytest.approx(value[f"amplitude of {name} 1"])
-    assert float(first.noise) == pytest.approx(value[f"amplitude of {name} 1"]
-                                               * value[f"wander of {name} over amplitude"])
-
-
-def test_target_of_a_normal_evidence_has_its_mode_and_its_covariance():
-    centre, precision = np.array([1.0, -2.0]), np.array([[4.0, 1.0], [1.0, 3.0]])
-    prior = magnitudes.Prior(np.array([0.5, 0.5]), np.array([2.0, 0.5]))
-
-    def evidence(z):
-        return -0.5 * (z - centre) @ precision @ (z - centre), -precision @ (z - centre)
-
-    target = learning.Target(evidence, prior)
-    total = precision + np.diag(prior.sd**-2)
-    mode = np.linalg.solve(total, precision @ centre + prior.mean / prior.sd**2)
-    assert target.mode() == pytest.approx(mode, abs=1e-5)
-    draws = target.draws(mode, 20_000)
-    covariance = np.linalg.inv(total)
-    # The standard error of a variance is sqrt(2/N) of it.
-    assert np.abs(np.cov(draws.T) - covariance).max() < 4 * np.sqrt(2 / 20_000) * covariance.max()
-    assert np.abs(draws.mean(axis=0) - mode).max() < 4 * np.sqrt(covariance.max() / 20_000)
-
-
-def test_where_positions_say_nothing_the_prior_is_left():
-    prior = magnitudes.Prior(np.array([0.5, -1.0]), np.array([2.0, 0.5]))
-    target = learning.Target(lambda z: (0.0, np.zeros(2)), prior)
-    assert target.mode() == pytest.approx(prior.mean)
-    assert np.cov(target.draws(prior.mean, 20_000).T) == pytest.approx(np.diag(prior.sd**2), abs=0.16)
-
-
-def test_a_breakdown_turns_the_search_back():
-    def evidence(z):
-        value = -0.5 * float(z @ z) if z[0] > -1.0 else np.nan
-        return value, -z
-    target = learning.Target(evidence, magnitudes.Prior(np.array([4.0]), np.array([100.0])))
-    assert target.mode() == pytest.approx([0.0], abs=1e-2)
-
-
-def test_log_density_of_errors():
-    random = np.random.default_rng(0)
-    root = random.normal(size=(5, 3, 3))
-    error, covariance = random.normal(size=(5, 3)), root @ root.transpose(0, 2, 1)
-    expected = [stats.multivariate_normal.logpdf(e, cov=c + problem.NOISE**2 * np.eye(3))
-                for e, c in zip(error, covariance, strict=True)]
-    assert np.asarray(training.log_density(error, covariance)) == pytest.approx(np.array(expected), rel=1e-10)
 
 
 def test_what_is_asked_must_be_there(data):
@@ -153,31 +95,24 @@ def test_what_is_asked_must_be_there(data):
 
 
 def test_a_satellite_without_positions_in_training_is_refused_with_the_reason(data):
-    with pytest.raises(prediction.Unusable, match="G04: 0% of its positions in training.*2019-04-07 00:00:00 to"):
-        prediction.arc(data, "G04", 3.0)
-    one = prediction.arc(data, "G01", 3.0)
+    with pytest.raises(Unusable, match="G04: 0% of its positions in training.*2019-04-07 00:00:00 to"):
+        data.arc("G04", 3.0)
+    one = data.arc("G01", 3.0)
     assert one.train == 288 and np.isnan(one.learnt()[288:]).all() and np.isfinite(one.learnt()[:288]).all()
     task = experiment.plan(experiment.Settings(data="folder", satellites=("G04",)))[0]
-    assert "G04" in experiment.compute(task)["refused"]
+    assert "G04" in compute(task)["refused"]
 
 
 def test_a_gap_at_the_end_of_training_refuses_one_satellite(data, monkeypatch):
     """Enough positions to be learnt from, too few of the latest ones; the other satellites are not lost."""
     data.positions["G01"][278:288] = np.nan
     data.positions["G01"][264:272] = np.nan
-    monkeypatch.setattr(orbits, "fit_orbit", lambda around, times, positions, solar=None: orbits.Orbit(
-        0.0, orbits.deterministic.polynomial_state(times, positions)[0], 100.0, 0.0))
+    for module in (orbits, prediction):
+        monkeypatch.setattr(module, "fit_orbit", lambda around, times, positions, solar=None: orbits.Orbit(
+            0.0, orbits.deterministic.polynomial_state(times, positions)[0], 100.0, 0.0))
     task = experiment.plan(experiment.Settings(data="folder", satellites=("G01",)))[0]
     assert "G01: the start of an orbit is taken from its first 9 positions; there are 6" in str(
-        experiment.compute(task)["refused"])
-
-
-def test_a_search_that_starts_where_there_is_no_density_says_so():
-    target = learning.Target(lambda z: (np.nan, np.zeros(2)), magnitudes.Prior(np.zeros(2), np.ones(2)))
-    with pytest.raises(ValueError, match="no density at the first magnitudes"):
-        target.mode()
-    with pytest.raises(ValueError, match="no finite curvature"):
-        learning.Target(lambda z: (0.0, np.full(2, np.nan)), target.prior).draws(np.zeros(2), 3)
+        compute(task)["refused"])
 
 
 def test_only_refused_satellites_are_an_error(data, tmp_path):
@@ -199,14 +134,18 @@ def result(scale, eclipsed=False, complete=True):
             "force_names": np.array(["solar", "panel", "remaining"]), "logarithms": np.zeros(21), "cpu_s": 1.0}
 
 
-def test_tables():
-    results = {"G01": result(10.0), "G02": result(20.0, eclipsed=True), "G08": result(40.0, complete=False)}
-    each = experiment.satellites(results)
+def test_tables(gather):
+    settings, data = gather(
+        {"G01": result(10.0), "G02": result(20.0, eclipsed=True), "G08": result(40.0, complete=False)})
+    found = experiment.tables(settings, data)
+    assert list(found) == ["pooled", "satellites", "magnitudes"]
+    each = found["satellites"].frame
     assert each.loc["G02", "deterministic"] == pytest.approx(20.0 * np.sqrt(3))
     assert each.loc["G02", "LFM radial"] == pytest.approx(2.0) and each.loc["G02", "ratio"] == pytest.approx(0.1)
-    sizes = experiment.magnitudes_of(results, {"GPS": magnitudes.wide("DYB")}, "DYB")
+    assert (each["CPU s"] == 2.0).all()
+    sizes = found["magnitudes"].frame
     assert sizes.loc["amplitude of panel 2", "common"] == pytest.approx(0.05) and (sizes["G01"] == 1.0).all()
-    together = experiment.pooled(results)
+    together = found["pooled"].frame
     assert list(together.index) == ["without gaps", "without gaps, never in shadow", "without gaps, in shadow",
                                     "with gaps"]
     row = together.loc["without gaps"]
@@ -217,61 +156,82 @@ def test_tables():
 
 def test_an_orbit_that_is_too_low_is_refused(data, monkeypatch):
     low = orbits.Orbit(0.0, np.array([7_000.0, 0.0, 0.0, 0.0, 27_000.0, 0.0]), 100.0, 1e-3)
-    monkeypatch.setattr(orbits, "fit_orbit", lambda environment, times, positions, solar=None: low)
+    for module in (orbits, prediction):
+        monkeypatch.setattr(module, "fit_orbit", lambda environment, times, positions, solar=None: low)
     task = experiment.plan(experiment.Settings(data="folder", satellites=("G01",)))[0]
-    assert "G01: it turns in 1.6 h; positions and steps are too far apart" in str(experiment.compute(task)["refused"])
+    assert "G01: it turns in 1.6 h; positions and steps are too far apart" in str(compute(task)["refused"])
 
 
-def test_each_constellation_has_magnitudes_and_pooled_errors_of_its_own():
+def test_each_constellation_has_magnitudes_and_pooled_errors_of_its_own(gather):
     hours = {"G": 12, "E": 14}
     radius = {letter: (orbits.GM * (3600.0 * turn / (2 * np.pi)) ** 2) ** (1 / 3) for letter, turn in hours.items()}
     orbit = {letter: np.array([r, 0.0, 0.0, 0.0, 3600.0 * np.sqrt(orbits.GM / r), 0.0, 100.0, 1e-3])
              for letter, r in radius.items()}
-    learnt = {f"learn/{letter}{number:02d}": {"logarithms": np.full(21, value), "orbit": orbit[letter], "cpu_s": 1.0}
-              for letter, value in (("G", 1.0), ("E", -1.0)) for number in range(1, 6)}
-    predicted = {f"predict/{name[6:]}": result(10.0 if "G" in name else 20.0) for name in learnt}
-    found = experiment.outcome(experiment.Settings(), learnt | predicted)
-    assert {name: float(prior.mean[0]) for name, prior in found.priors.items()} == {
+    first = {f"learn/{letter}{number:02d}": learnt(value, orbit[letter])
+             for letter, value in (("G", 1.0), ("E", -1.0)) for number in range(1, 6)}
+    settings, data = gather({name[6:]: result(10.0 if "G" in name else 20.0) for name in first}, first)
+    prior = data["prior"]
+    assert prior["mean"].dims == ("group", "magnitude")
+    assert dict(zip(prior.group.values, prior["mean"].values[:, 0], strict=True)) == {
         "GPS 12 h": 1.0, "Galileo 14 h": -1.0}
-    sizes = experiment.magnitudes_of(found.predicted, found.priors, "DYB")
-    assert sizes["common, Galileo 14 h"].iloc[0] == pytest.approx(np.exp(-1.0))
-    together = experiment.pooled(found.predicted)
+    found = experiment.tables(settings, data)
+    assert found["magnitudes"].frame["common, Galileo 14 h"].iloc[0] == pytest.approx(np.exp(-1.0))
+    together = found["pooled"].frame
     assert together["satellites"].to_dict() == {
         "without gaps": 10, "without gaps, never in shadow": 10,
         "GPS, without gaps": 5, "GPS, without gaps, never in shadow": 5,
         "Galileo, without gaps": 5, "Galileo, without gaps, never in shadow": 5}
     assert together.loc["Galileo, without gaps", "deterministic"] == pytest.approx(20.0 * np.sqrt(3))
     assert problem.system("C21") == "BeiDou" and problem.system("X01") == "X"
+    assert {"all-GPS", "all-Galileo"} < set(figures.draw(settings, data))
 
 
-def test_tables_are_written_with_their_text(tmp_path):
-    each = experiment.satellites({"G01": result(10.0), "G02": result(20.0, eclipsed=True)})
-    output.save(tmp_path, {"satellites": each}, {}, "")
+def test_what_is_refused_is_left_out_and_said(gather):
+    """Two satellites are refused, one of them after it was learnt; the third one's table is as if it were alone."""
+    refused = {"learn/G01": {"refused": "G01: a gap"}, "predict/G02": {"refused": "G02: no curvature"}}
+    settings, data = gather({name: result(10.0) for name in ("G01", "G02", "G03")}, refused)
+    found = experiment.tables(settings, data)
+    assert list(found["satellites"].frame.index) == ["G03"] and found["pooled"].frame["satellites"].tolist() == [1, 1]
+    assert found["left out"].frame["reason"].to_dict() == {"G01": "G01: a gap", "G02": "G02: no curvature"}
+    assert not found["left out"].stored
+    assert data["predict"].complete.dtype == bool and set(figures.draw(settings, data)) == {
+        "all", "errors-G03", "forces-G03"}
+    with pytest.raises(ValueError, match="no satellite can be predicted. G01: a gap G02: no curvature"):
+        gather({name: result(10.0) for name in ("G01", "G02")}, refused)
+
+
+def test_tables_are_written_with_their_text(gather, tmp_path):
+    settings, data = gather({"G01": result(10.0), "G02": result(20.0, eclipsed=True)})
+    plain = dataclasses.replace(experiment.STUDY, figures=lambda settings, data: {})
+    plain.save(Found(settings, {}, data, experiment.tables(settings, data)), tmp_path)
     assert "| yes " in (tmp_path / "satellites.md").read_text() and ",no," in (tmp_path / "satellites.csv").read_text()
 
 
-def test_missing_positions_after_training_do_not_count():
+def test_missing_positions_after_training_do_not_count(gather):
     one = result(10.0)
     one["lfm"][500] = np.nan
-    assert experiment.satellites({"G01": one}).loc["G01", "LFM"] == pytest.approx(np.sqrt(3))
+    assert experiment.satellites(gather({"G01": one})[1]).loc["G01", "LFM"] == pytest.approx(np.sqrt(3))
 
 
-def test_figures():
-    results = {"G01": result(10.0), "G02": result(20.0, eclipsed=True)}
+WAYS = {"error": 1e-3 * np.arange(1.0, 6.0), "coverage": np.full(5, 0.9), "logarithms": np.zeros((5, 21)), "cpu_s": 1.0}
+
+
+def test_figures(gather):
     online = {"times": TIMES, "observed": TIMES < 72, "lfm": np.ones((960, 3)), "sd": np.ones((960, 3)),
-              "restarted": np.full((960, 3), 2.0)}
-    drawn = figures.draw(results, {"G01": online})
+              "restarted": np.full((960, 3), 2.0), "cpu_s": 1.0}
+    drawn = figures.draw(*gather({"G01": result(10.0), "G02": result(20.0, eclipsed=True)},
+                                 {"ways/G01": WAYS, "online/G01": online}))
     assert set(drawn) == {"all", "errors-G01", "forces-G01", "online-G01"}
     labels = {axes.get_ylabel() for figure in drawn.values() for axes in figure.axes}
     assert {"error (m)", "error after training (m)", "solar (nm/s²)"} <= labels
 
 
-def test_table_of_the_ways_to_learn():
-    one = {"error": 1e-3 * np.arange(1.0, 6.0), "coverage": np.full(5, 0.9)}
-    table = ways.table({"G01": one, "G02": one})
+def test_table_of_the_ways_to_learn(gather):
+    settings, data = gather({"G01": result(10.0), "G02": result(10.0)}, {
+        "ways/G01": WAYS, "ways/G02": WAYS, "online/G01": {"refused": "G01: a window without positions"}})
+    table = experiment.tables(settings, data)["learning"].frame
     assert table.loc["marginal likelihood, mode", "error"] == pytest.approx(3.0)
-    assert list(table.index) == list(ways.WAYS)
-    assert ways.table({}).empty
+    assert list(table.index) == list(ways.WAYS) and table["satellites"].tolist() == [2] * 5
 
 
 @pytest.mark.slow
@@ -287,166 +247,3 @@ def test_a_simulated_satellite_is_predicted_better_with_its_forces(tmp_path):
     assert again.tables["satellites"].drop(columns="CPU s").equals(
         found.tables["satellites"].drop(columns="CPU s"))
     assert {path.name for path in experiment.STUDY.save(found, tmp_path)} >= {"satellites.csv", "pooled.md", "all.png"}
-
-
-@pytest.fixture(scope="module")
-def satellite():
-    """A day of a simulated satellite, learnt from its first eighteen hours."""
-    pytest.importorskip("erfa", reason="needs the extra gps")
-    data = problem.arcs(None)
-    return problem.Arc(data.environment, data.times[:96], data.positions[problem.SIMULATED[0]][:96], 72)
-
-
-@pytest.mark.slow
-def test_departures_are_predicted_as_the_satellite_itself(satellite):
-    """The linear model of departures, in steps fifteen times as long, against the filter of the satellite."""
-    one, axes = satellite, "DYB"
-    orbit = orbits.fit_orbit(one.environment, one.times[:one.train], one.positions[:one.train])
-    near = prediction.surroundings(one, orbit, axes)
-    vector = magnitudes.wide(axes).mean
-    mean, covariance = prediction.filter_positions(one, orbit, vector, axes, one.learnt())
-    found = prediction.predict(one, near, vector[None])
-    after = slice(one.train, None)
-    sd = np.sqrt(np.diagonal(covariance[after], axis1=1, axis2=2))
-    assert np.abs(found.state[after, :3] - mean[after]).max() < 2e-2 * sd.min()
-    assert np.abs(found.covariance[after] / covariance[after] - 1)[:, [0, 1, 2], [0, 1, 2]].max() < 1e-2
-
-
-BEGIN, COUNT, GROWTH = 10.25, 11, 0.1
-
-
-@pytest.fixture(scope="module", params=["DYB", pytest.param("RTN", marks=pytest.mark.slow)])
-def freely(request):
-    """A training far from everything, its magnitudes and moments: forces push along axes that grow with time.
-
-    One position is missing, and one coordinate of another.
-    """
-    axes, times, random = request.param, BEGIN + 0.5 * np.arange(COUNT), np.random.default_rng(2)
-    along = np.zeros((3, 9)) if axes == "DYB" else np.zeros((3, 10))
-    along[:, 6:9] = orbits.NANO * np.linalg.qr(random.normal(size=(3, 3)))[0]
-    if axes == "RTN":
-        along[:, 9] = orbits.NANO * random.normal(size=3)
-    table = Table(BEGIN, 1.0, (1 + GROWTH * np.arange(8.0)[:, None]) * along.ravel())
-    on_orbit = 90.0 * np.eye(along.shape[1] - 6)[0]
-    near = orbits.Neighbourhood(np.zeros((COUNT, 6)), table, on_orbit, axes)
-    # Forces and noises that move a satellite by far more than its positions' noise within hours.
-    larger = {"level": 100.0, "amplitude": 100.0, "drift": 1e4, "wander": 30.0, "white": 1e3}
-    vector = (magnitudes.wide(axes).mean + 0.3 * random.normal(size=len(magnitudes.names(axes)))
-              + np.log([larger[name.split()[0]] for name in magnitudes.names(axes)]))
-    mean, covariance = moments(times - BEGIN, axes, along[:, 6:], on_orbit, vector)
-    y = (mean + np.linalg.cholesky(covariance) @ random.normal(size=3 * COUNT)).reshape(-1, 3)
-    y[4] = y[8, 1] = np.nan
-    return training.Training.along(near, times, y, axes), vector, mean, covariance
-
-
-def moments(times, axes, along, on_orbit, vector):
-    """Mean (3 T,) and covariance (3 T, 3 T) of free positions, by the textbook's covariances of the forces."""
-    forces, white = magnitudes.forces(vector, axes)
-    late, early = np.maximum.outer(times, times), np.minimum.outer(times, times)
-    nodes, weights = np.polynomial.legendre.leggauss(12)
-
-    def pushed(force):
-        """Covariance of twice the integral of a force: its covariance function (a - v) (b - u) k(u, v), integrated."""
-        a, b = late[..., None, None, None], early[..., None, None]
-        u = 0.5 * b * (nodes[:, None] + 1)
-        weight = 0.5 * b * weights[:, None] * (b - u) * (1 + GROWTH * u)
-        # It has a kink where both times are the same; the square is cut there.
-        bounds = np.stack([np.stack([0 * u, u], axis=-1), np.stack([u, a[..., 0] + 0 * u], axis=-1)])
-        low, high = bounds[..., :1], bounds[..., 1:]
-        v = low + 0.5 * (high - low) * (nodes + 1)
-        inner = (0.5 * (high - low) * weights * (a - v) * (1 + GROWTH * v)
-                 * np.asarray(force.covariance(u[..., None] + 0 * v, v)))
-        return (weight[..., None] * inner).sum(axis=(0, 3, 4, 5))
-
-    unit = np.multiply.outer
-    covariance = np.einsum("ts,ij->tisj", orbits.START_SD[0] ** 2 + orbits.START_SD[1] ** 2 * unit(times, times),
-                           np.eye(3))
-    integral = late * early**2 / 2 - early**3 / 6
-    covariance = covariance + np.einsum("ts,ij->tisj", (orbits.NANO * float(white)) ** 2 * integral, np.eye(3))
-    mean = np.zeros((len(times), 3))
-    for axis, force, already in zip(along.T, forces.values(), on_orbit, strict=True):
-        covariance = covariance + np.einsum("ts,i,j->tisj", pushed(force), axis, axis)
-        response = 0.5 * times**2 + GROWTH * times**3 / 6
-        mean = mean + (float(force.mean_at(0.0)) - already) * response[:, None] * axis
-    size = 3 * len(times)
-    return mean.ravel(), covariance.reshape(size, size) + problem.NOISE**2 * np.eye(size)
-
-
-@pytest.mark.slow
-def test_densities_of_positions_are_those_of_a_gaussian(freely):
-    """Covariances by quadrature of the forces' covariance functions, densities by SciPy."""
-    data, vector, mean, covariance = freely
-    y = data.y.ravel()
-    known = np.isfinite(y)
-    expected = stats.multivariate_normal.logpdf(y[known], mean[known], covariance[np.ix_(known, known)])
-    assert float(training.log_likelihood(vector, data.regression, data.axes)) == pytest.approx(expected, rel=1e-5)
-    total = 0.0
-    for seen in (3, 7):
-        some = np.flatnonzero(known & (np.arange(len(y)) < 3 * seen))
-        rows = []
-        for row in (row for row in range(seen, COUNT) if np.isfinite(data.y[row]).all()):
-            at = np.arange(3 * row, 3 * row + 3)
-            gain = np.linalg.solve(covariance[np.ix_(some, some)], covariance[np.ix_(some, at)]).T
-            rows.append(stats.multivariate_normal.logpdf(
-                y[at], mean[at] + gain @ (y - mean)[some],
-                covariance[np.ix_(at, at)] - gain @ covariance[np.ix_(some, at)]))
-        total += np.mean(rows)
-    assert float(training.held_out(vector, data.regression, data.axes)) == pytest.approx(total, rel=1e-5)
-
-
-@pytest.mark.parametrize("slope", [training.slope_of_held_out, training.slope_of_log_likelihood])
-@pytest.mark.parametrize("logarithm", [400.0, np.inf, np.nan])
-def test_magnitudes_beyond_numbers_have_minus_infinity_and_zero_slopes(freely, slope, logarithm):
-    data, vector, _, _ = freely
-    value, found = slope(np.full_like(vector, logarithm), data.regression, data.axes)
-    assert value == -np.inf and (np.asarray(found) == 0.0).all()
-    value, found = slope(np.full_like(vector, -400.0), data.regression, data.axes)
-    assert np.isfinite(value) and np.isfinite(found).all()
-
-
-def test_a_matrix_without_a_root_has_no_density_and_zero_slopes(freely):
-    data, vector, _, _ = freely
-    wrong = data.regression._replace(noise=-data.noise)
-    for slope in (training.slope_of_held_out, training.slope_of_log_likelihood):
-        value, found = slope(vector, wrong, data.axes)
-        assert value == -np.inf and (np.asarray(found) == 0.0).all()
-
-
-@pytest.fixture(scope="module", params=["DYB", "RTN"])
-def learning_from(request, satellite):
-    """The training of the simulated satellite, one position missing, and magnitudes."""
-    one, axes = satellite, request.param
-    positions = one.positions.copy()
-    positions[10] = np.nan
-    one = one._replace(positions=positions)
-    orbit = orbits.fit_orbit(one.environment, one.times[:one.train], one.positions[:one.train])
-    return training.Training.of(one, orbit, axes), magnitudes.wide(axes).mean + 0.1
-
-
-@pytest.mark.slow
-def test_the_regression_has_the_densities_of_the_filter(learning_from):
-    data, vector = learning_from
-    assert np.isnan(data.y).any() and len(data.times) == 36
-    settings = {"rule": lfm.Taylor(), "steps": training.steps_of(data.times)}
-    system = training.departing(vector, data.near, data.axes)
-    found = lfm.filter(system, data.times, data.y, **settings)
-    assert float(training.log_likelihood(vector, data.regression, data.axes)) == pytest.approx(
-        float(found.log_likelihood.sum()), rel=1e-8)
-    total = 0.0
-    for seen in (12, 24):
-        passed = lfm.filter(system, data.times, np.where(np.arange(36)[:, None] < seen, data.y, np.nan), **settings)
-        density = training.log_density(data.y - passed.predicted_mean[:, :3], passed.predicted_covariance[:, :3, :3])
-        total += np.nanmean(density[seen:])
-    assert float(training.held_out(vector, data.regression, data.axes)) == pytest.approx(total, rel=1e-8)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("target", [learning.held_out, learning.likelihood])
-def test_slopes_of_the_targets_are_those_of_differences(learning_from, target):
-    data, point = learning_from
-    target = target(data, magnitudes.wide(data.axes))
-    _, slope = target.evidence(point)
-    for index in (0, 3, len(point) // 2, len(point) - 1):
-        step = 1e-4 * np.eye(len(point))[index]
-        difference = (target.evidence(point + step)[0] - target.evidence(point - step)[0]) / 2e-4
-        assert slope[index] == pytest.approx(difference, rel=1e-4, abs=1e-5)

@@ -10,7 +10,8 @@ import pytest
 from scipy import stats
 
 from lfm_ppl.experiments import scores
-from lfm_ppl.experiments.home_heating import experiment, figures, learning, prediction, problem, tables
+from lfm_ppl.experiments.home_heating import experiment, figures, prediction, problem
+from lfm_ppl.experiments.home_heating.problem import Model
 
 REAL = problem.data_folder()
 SMALL = experiment.Settings(homes=2, methods=("SQM", "none", "matern"), stores=("one store",), functions=3,
@@ -67,16 +68,16 @@ def test_without_data_there_are_simulated_homes_only(tmp_path, monkeypatch):
 def test_a_window_without_set_points_cannot_be_predicted_under_a_thermostat():
     window = problem.Window(np.zeros((120, 3)), {})
     with pytest.raises(ValueError, match="needs a set point"):
-        prediction.thermostat_ahead("SQM", "one store", 3, window, np.zeros(6), 10, jax.random.key(0))
+        prediction.thermostat_ahead(Model("SQM", "one store", 3), window, np.zeros(6), 10, jax.random.key(0))
 
 
 def test_what_is_hidden():
     y = np.ones((120, 3))
     hidden = np.isnan(prediction.masked(y))
     assert hidden[96:, 0].all() and hidden.sum() == 24
-    some = np.isnan(prediction.masked(y, "some"))[:, 0]
+    some = np.isnan(prediction.masked(y, tracked=True))[:, 0]
     assert (np.flatnonzero(~some[96:]) == [3, 6, 9, 12, 15, 18, 21]).all() and not some[:96].any()
-    assert np.isnan(prediction.masked(y, outdoor=False))[96:, :2].all()
+    assert np.isnan(prediction.masked(y, weather=False))[96:, :2].all()
 
 
 def test_gaussian_scores_against_scipy():
@@ -92,24 +93,24 @@ def test_gaussian_scores_against_scipy():
 @pytest.mark.slow
 def test_the_most_likely_parameters(window):
     """No residual: the search ends where nothing near is better."""
-    model = ("none", "one store", 3)
-    z, density = learning.most_likely(*model, window)
-    objective = learning._posterior(*model).objective(learning._data(window))
+    model = Model("none", "one store", 3)
+    z, density = prediction.most_likely(model, window)
+    objective = prediction._log_posterior(model).objective(window.learnt)
     value, gradient = objective.value_and_gradient(z)
     assert density == pytest.approx(-value)
     np.testing.assert_allclose(gradient, 0.0, atol=1e-2)
-    assert problem.names(*model[:2]) == ("alpha", "beta", "noise_sd")
+    assert model.names == ("alpha", "beta", "noise_sd")
     for step in 0.05 * np.eye(3):
         assert min(objective.value(z + step), objective.value(z - step)) > value
 
 
 @pytest.mark.slow
 def test_both_predictions(window):
-    model = ("none", "one store", 3)
-    z, _ = learning.most_likely(*model, window)
-    known = prediction.known_heater(*model, window, z)
+    model = Model("none", "one store", 3)
+    z, _ = prediction.most_likely(model, window)
+    known = prediction.known_heater(model, window, z)
     assert known["ahead_rmse"] < 1.5 and known["mean"].shape == (24,)
-    found, whole = prediction.thermostat_ahead(*model, window, z, 200, jax.random.key(0))
+    found, whole = prediction.thermostat_ahead(model, window, z, 200, jax.random.key(0))
     assert found["rmse"] < 1.5 and found["mean"].shape == found["on"].shape == (144,)
     truth = window.fine[prediction.SCORED, 0]
     density = whole.observed.log_density(window.fine)[prediction.SCORED, 0]
@@ -145,17 +146,18 @@ def made_up(settings):
 
 
 def test_tables_of_simulated_homes(window):
-    found = tables.every(SMALL, made_up(SMALL))
-    assert list(found) == ["homes-one-store"]
-    table = found["homes-one-store"]
+    data = experiment.STUDY.gathered(SMALL, made_up(SMALL))
+    found = experiment.tables(SMALL, data)
+    assert [name for name, table in found.items() if table.stored] == ["homes-one-store"]
+    table = found["homes-one-store"].frame
     assert list(table.index) == ["SQM", "none", "matern"]
     assert table.loc["SQM", "RMSE ahead (K)"] == pytest.approx(0.505)
     assert table.loc["SQM", "published RMSE ahead (K)"] == 1.0
     assert table.loc["SQM", "RMSE below none (K)"] == pytest.approx(0.1)
     assert table.loc["SQM", "ELL above matern"] == pytest.approx(20.0)
-    drawn = figures.draw(SMALL, made_up(SMALL))
+    drawn = figures.draw(SMALL, data)
     assert set(drawn) == {"homes-ahead", "scores"}
-    assert "means over 2 homes" in experiment.title(SMALL, "homes-one-store")
+    assert "means over 2 homes" in found["homes-one-store"].title
 
 
 @pytest.mark.skipif(REAL is None, reason="needs ../shared/data/house")
@@ -172,12 +174,12 @@ def test_tables_and_figures_with_the_real_house(window, tmp_path):
     assert np.isnan(envelope.loc["matern", "published RMSE ahead (K)"])
     assert scores.readable(one).loc["none", "RMSE below none (K)"] == "0"
     swapped = dataclasses.replace(settings, stores=("envelope", "one store"))
-    again = tables.house(swapped, made_up(swapped), "one store")
+    again = experiment.STUDY.found(swapped, made_up(swapped)).tables["house-one-store"]
     assert again.loc["none", "published ELL tracked"] == 31
     written = {path.name for path in experiment.STUDY.save(found, tmp_path)}
     assert {"house-ahead.png", "homes-ahead.png", "residual.png", "scores.png", "house-envelope.md"} <= written
-    assert "2 windows" in experiment.title(settings, "posterior")
-    assert "3 windows" in experiment.title(settings, "house-envelope")
+    assert "2 windows" in found.named["posterior"].title
+    assert "3 windows" in found.named["house-envelope"].title
 
 
 @pytest.mark.parametrize("given", [{"homes": 0}, {"windows": 0}, {"methods": ("ARX",)}, {"stores": ("two",)},
@@ -189,7 +191,8 @@ def test_bad_settings(given):
 
 def test_a_residual_that_is_not_in_the_published_figure_is_drawn():
     settings = dataclasses.replace(SMALL, methods=("WQM",), integrated="WQM")
-    assert set(figures.draw(settings, made_up(settings))) == {"homes-ahead", "scores"}
+    data = experiment.STUDY.gathered(settings, made_up(settings))
+    assert set(figures.draw(settings, data)) == {"homes-ahead", "scores"}
 
 
 @pytest.mark.slow
@@ -206,10 +209,10 @@ def test_the_quick_version_runs_and_goes_on(tmp_path):
 
 @pytest.mark.slow
 def test_nuts_and_ram_have_the_same_posterior(window):
-    model = ("none", "one store", 3)
-    z, _ = learning.most_likely(*model, window)
-    nuts = learning.posterior("NUTS", *model, window, z, jax.random.key(0), (2, 300, 700))
-    ram = learning.posterior("RAM", *model, window, z, jax.random.key(1), (4, 1000, 4000))
+    model = Model("none", "one store", 3)
+    z, _ = prediction.most_likely(model, window)
+    nuts = prediction.posterior("NUTS", model, window, z, jax.random.key(0), (2, 300, 700))
+    ram = prediction.posterior("RAM", model, window, z, jax.random.key(1), (4, 1000, 4000))
     assert nuts["divergences"] == 0 and max(nuts["r_hat"].max(), ram["r_hat"].max()) < 1.03
     error = np.sqrt(1 / nuts["ess"] + 1 / ram["ess"])
     assert (np.abs(nuts["mean"] - ram["mean"]) < 4 * error * nuts["sd"]).all()

@@ -5,7 +5,7 @@ import pytest
 
 from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import catalogue
-from lfm_ppl.experiments.periodic_kernels import covariance, experiment, figures, problem, regression
+from lfm_ppl.experiments.periodic_kernels import experiment, figures, methods, problem
 
 SMALL = experiment.Settings(runs=20, functions=(5, 22), draws=20, points=(20, 200))
 
@@ -20,16 +20,16 @@ def test_the_published_comparison(found):
     """Below 1e-4 with 22 eigenfunctions, above 0.1 with random frequencies, and not with 20 points."""
     error = found.tables["published"]["error"]
     assert error["22 eigenfunctions, 200 points"] < 1e-4 and error["20 eigenfunctions, 20 points"] > 5e-3
-    assert error[regression.SPARSE] > error[regression.SPARSE_4] > 0.1
+    assert error[methods.SPARSE] > error[methods.SPARSE_4] > 0.1
 
 
 @pytest.mark.slow
 def test_the_order_of_the_published_table_holds(found):
     rmse, density = found.tables["regression"]["RMSE"], found.tables["regression"]["log likelihood"]
-    assert rmse[regression.SPARSE] > rmse[regression.SPARSE_4] > rmse[regression.KPCA]
-    assert density[regression.SPARSE] < density[regression.SPARSE_4] < density[regression.KPCA]
-    assert rmse[regression.KPCA] == pytest.approx(rmse[regression.EXACT], rel=1e-2)
-    coverage = found.tables["regression"].loc[regression.EXACT]
+    assert rmse[methods.SPARSE] > rmse[methods.SPARSE_4] > rmse[methods.KPCA]
+    assert density[methods.SPARSE] < density[methods.SPARSE_4] < density[methods.KPCA]
+    assert rmse[methods.KPCA] == pytest.approx(rmse[methods.EXACT], rel=1e-2)
+    coverage = found.tables["regression"].loc[methods.EXACT]
     assert abs(coverage["coverage"] - 0.95) < 4 * coverage["coverage se"]
 
 
@@ -49,14 +49,14 @@ def test_errors_fall_with_the_number_of_functions(found):
 def test_prediction_is_conditioning():
     """Against the conditional of one joint normal, by its precision matrix."""
     task = Task("x", 0, {})
-    prior = regression.covariances(task, regression.EXACT, 0)
-    data = np.cos(np.arange(len(problem.measured())))
-    one = regression.predict(prior, data)
-    times = np.append(problem.measured(), problem.predicted()[40])
+    prior = methods.covariances(task, methods.EXACT, 0)
+    data = np.cos(np.arange(len(problem.MEASURED)))
+    mean, variance = methods.predict(prior, data)
+    times = np.append(problem.MEASURED, problem.PREDICTED[40])
     joint = np.exp(-0.5 * ((times[:, None] - times) / 10.0) ** 2) + 1e-8 * np.eye(len(times))
     precision = np.linalg.inv(joint)
-    assert one.variance[40] == pytest.approx(1.0 / precision[-1, -1], rel=1e-5)
-    assert one.mean[40] == pytest.approx(-precision[-1, :-1] @ data / precision[-1, -1], rel=1e-5)
+    assert variance[40] == pytest.approx(1.0 / precision[-1, -1], rel=1e-5)
+    assert mean[40] == pytest.approx(-precision[-1, :-1] @ data / precision[-1, -1], rel=1e-5)
 
 
 def test_settings_are_checked():
@@ -73,9 +73,9 @@ def test_files_and_figures(found, tmp_path):
     expected = {f"{name}.{kind}" for name in ("covariance", "published", "regression") for kind in ("csv", "md")}
     assert written == expected | {f"{name}.png" for name in
                                   ("errors", "covariances", "eigenfunctions", "draws", "prediction")}
-    assert len(figures.plot_errors(SMALL, found.results).axes) == len(problem.kernels())
+    assert len(figures.plot_errors(SMALL, found.data).axes) == len(problem.kernels())
 
 
 def test_it_is_in_the_catalogue():
     assert catalogue.experiment("periodic_kernels").name == "periodic-kernels"
-    assert [task.settings["what"] for task in covariance.tasks(SMALL)].count("covariance") == 6
+    assert [task.settings["what"] for task in experiment.all_tasks(SMALL)].count("covariance") == 6

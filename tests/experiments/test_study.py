@@ -9,7 +9,8 @@ import pytest
 
 from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import drawing, published, study
-from lfm_ppl.experiments.scores import Estimate, mean_of, pair
+from lfm_ppl.experiments.datasets import Kind, row
+from lfm_ppl.experiments.scores import Estimate
 from lfm_ppl.experiments.study import Study, Table, setting
 from lfm_ppl.results.plots import style
 
@@ -31,22 +32,23 @@ class Settings(study.Settings):
 
 
 def tasks(settings):
-    return [Task(f"square/{k}", settings.seed, {"what": "square", "number": k}) for k in range(settings.runs)]
+    return [Task(f"square/{k}", settings.seed, {"number": k, "index": k}) for k in range(settings.runs)]
 
 
 def later(settings, results):
-    return [Task("sum", settings.seed, {"what": "sum", "of": [float(one["value"]) for one in results.values()]})]
+    of = [float(one["value"]) for name, one in results.items() if name != "all"]
+    return [Task("all", settings.seed, {"what": "sum", "of": of})]
 
 
-def tabulated(settings, results):
-    values = [float(one["value"]) for name, one in results.items() if name != "sum"]
-    frame = pd.DataFrame({"all": pair("mean", mean_of(values)) | {"sum": float(results["sum"]["value"])}}).T
+def tabulated(settings, data):
+    rows = {"all": row(data["square"], {"mean": "value", "sum": lambda squares: data["sum"]["value"]})}
+    frame = Table.of("Squares", rows).frame
     return {"squares": Table("Squares", frame), "hidden": Table("", frame),
             "only printed": Table("Left out", frame, frame, stored=False)}
 
 
 @style.styled
-def plot(settings, results, *, width="column"):
+def plot(*, width="column"):
     figure = style.new_figure(width, 2.0)
     for axes in figure.subplots(1, 2):
         drawing.band(axes, np.arange(3.0), np.zeros(3), np.ones(3))
@@ -56,10 +58,12 @@ def plot(settings, results, *, width="column"):
     return figure
 
 
-STUDY = Study(Settings, tasks, {"square": lambda task: {"value": task.settings["number"] ** 2},
-                                "sum": lambda task: {"value": sum(task.settings["of"])}}, tabulated,
-              lambda settings, results: {"squares": plot(settings, results)}, then=later,
-              notes=lambda settings, results: (f"{len(results)} tasks",))
+STUDY = Study(
+    Settings, tasks, {
+        "square": Kind(lambda task: {"value": task.settings["number"] ** 2}, {"dataset": "value"}),
+        "sum": Kind(lambda task: {"value": sum(task.settings["of"])}, {"": "value"})},
+    tabulated, lambda settings, data: {"squares": plot()}, {"number": ("dataset", range(4))}, then=later,
+    notes=lambda settings, data: (f"{data['square'].sizes['dataset']} squares",))
 
 
 def test_a_run_computes_tabulates_and_draws_and_goes_on(tmp_path):
@@ -67,7 +71,9 @@ def test_a_run_computes_tabulates_and_draws_and_goes_on(tmp_path):
     assert found.tables["squares"].loc["all", ["mean", "sum"]].tolist() == [3.5, 14.0]
     assert list(found.tables) == ["squares", "hidden"] and list(found.printed) == ["Squares", "Left out"]
     assert found.printed["Squares"].loc["all", "mean"] == "3.5 (2.0)"  # of 0, 1, 4 and 9
-    assert found.notes == ("5 tasks",)
+    assert found.notes == ("4 squares",)
+    assert found.data["square"]["value"].sel(dataset=2).item() == 4 and len(found.results) == 5
+    assert found.data["square"].number.dims == ("dataset",) and found.data["sum"]["value"].shape == ()
     written = STUDY.save(found, tmp_path)
     assert [path.name for path in written] == ["squares.csv", "squares.md", "hidden.csv", "hidden.md", "squares.png"]
     lines = []
@@ -124,7 +130,7 @@ def test_what_is_no_whole_number_is_refused(wrong):
 
 
 def test_a_legend_has_each_label_once():
-    (legend,) = plot(Settings(), {}).legends
+    (legend,) = plot().legends
     assert [text.get_text() for text in legend.get_texts()] == ["95% band", "truth", "estimate", "more", "area"]
 
 

@@ -8,14 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
+import xarray as xr
 from scipy.integrate import solve_ivp
 
 from lfm_ppl.engine.store import write
 from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import scores
-from lfm_ppl.experiments.published import Verdict, summary
+from lfm_ppl.experiments.published import Verdict
 from lfm_ppl.experiments.study import TASKS
-from lfm_ppl.experiments.transcription import ellipses, experiment, figures, problem, slices, tables
+from lfm_ppl.experiments.transcription import experiment, figures, problem, slices
 from lfm_ppl.latent_grid.laplace import laplace
 
 SATURATION, EXPONENTIAL = problem.CONFIGURATIONS[1], problem.CONFIGURATIONS[6]
@@ -77,22 +78,21 @@ def test_every_method_finds_the_force(method):
         assert (found["draws"] >= 4000).all() and (found["low"] < found["mean"]).all()
 
 
-def linear(monkeypatch):
+def linear():
     """A data set whose activity is u itself, and its model on the grid."""
-    monkeypatch.setattr(problem, "activity", lambda u, link, gamma: u)
-    data = problem.data_set.__wrapped__(problem.Configuration("softplus"), 1)
-    return data, ellipses.on_grid("softplus", 1.0, data.rates)
+    data = problem.data_set(problem.Configuration("linear"), 1)
+    return data, problem.on_grid("linear", None, data.rates)
 
 
 @pytest.mark.slow
-def test_the_gaussian_of_the_ellipses_is_the_posterior_of_a_linear_link(monkeypatch):
+def test_the_gaussian_of_the_ellipses_is_the_posterior_of_a_linear_link():
     """Found from any draws; a draw of it is one of the posterior, and the ratio of likelihoods is flat."""
-    data, latent = linear(monkeypatch)
+    data, latent = linear()
     exact = laplace(latent, data.y)
     draws = jax.vmap(latent.force)(jax.random.normal(jax.random.key(0), (50, 1, problem.POINTS)))[:, 0]
-    found = ellipses.resembling(latent, data.y, draws)
+    found = slices.resembling(latent, data.y, draws)
     assert np.allclose(found.mean, exact.mode[0], atol=1e-7)
-    own = ellipses.around(latent, data.y, found)
+    own = slices.ellipses(latent, data.y, found)
     some = jax.vmap(own.draw)(jax.random.split(jax.random.key(1), 4000))
     assert np.all(np.abs(np.asarray(some.force).std(axis=0) / exact.sd[0] - 1) < 5 / np.sqrt(2 * 4000))
     assert np.abs(some.force.mean(axis=0) - exact.mode[0]).max() < 4.5 * float(jnp.max(exact.sd)) / np.sqrt(4000)
@@ -127,14 +127,12 @@ def test_both_kinds_of_ellipses_have_the_same_posterior(monkeypatch):
 
 
 @pytest.mark.slow
-def test_slices_of_a_linear_link_have_the_exact_posterior(monkeypatch):
+def test_slices_of_a_linear_link_have_the_exact_posterior():
     """The experiment's own sampler on u itself as activity, against dense algebra on the grid."""
-    data, latent = linear(monkeypatch)
-    slices._program.cache_clear()
-    found = slices.compute({"link": "softplus", "gamma": None, "draws": 40_000, "burn_in": 2_000}, [data],
+    data, latent = linear()
+    found = slices.compute({"link": "linear", "gamma": None, "draws": 40_000, "burn_in": 2_000}, [data],
                            jax.random.split(jax.random.key(1), 1))
     exact = laplace(latent, data.y)
-    slices._program.cache_clear()
     error = 4.5 * np.asarray(exact.sd[0]) / np.sqrt(found["ess"][0])
     assert found["ess"][0] > 200
     assert np.all(np.abs(found["mean"][0] - exact.mode[0]) < error)
@@ -150,7 +148,7 @@ def test_the_slices_agree_with_blackjax(configuration, index):
     data = problem.data_set(configuration, index)
     found = slices.compute({"link": configuration.link, "gamma": configuration.gamma, "draws": 100_000,
                             "burn_in": 5_000}, [data], jax.random.split(jax.random.key(0), 1))
-    latent = ellipses.on_grid(configuration.link, configuration.gamma or 1.0, data.rates)
+    latent = problem.on_grid(configuration.link, configuration.gamma or 1.0, data.rates)
     algorithm = blackjax.elliptical_slice(lambda u: latent.log_likelihood(u[None], jnp.asarray(data.y)),
                                           mean=jnp.zeros(problem.POINTS), cov=latent.root[0] @ latent.root[0].T)
     at = slices.MONITORED
@@ -188,6 +186,10 @@ def made_up(settings):
         found = {"mean": truth + shift, "sd": np.full(truth.shape, 0.25), "seconds": np.full(count, 2.0)}
         if task.settings["method"] == "LA":
             found["stopped"] = np.arange(count) != 1
+        if "LA" in task.settings["method"]:
+            found["converged"] = np.arange(count) != 1
+        if "iterated" in task.settings["method"]:
+            found["change"] = np.full(count, 1e-3)
         if task.settings["method"] == "ESLS":
             found |= {"r_hat": np.full(count, 1.005), "r_hat_first": np.full(count, 1.02), "ess": np.full(count, 50.0),
                       "seconds": np.full(count, 400.0), "seconds_more": np.full(count, 50.0)}
@@ -195,9 +197,13 @@ def made_up(settings):
     return results
 
 
+def data_of(settings):
+    return experiment.STUDY.gathered(settings, made_up(settings))
+
+
 def test_the_tables_count_what_was_found():
-    cells = experiment.by_cell(FEW, made_up(FEW))
-    table = tables.comparison(cells)
+    tables = {name: table.frame for name, table in experiment.tables(FEW, data_of(FEW)).items()}
+    table = tables["comparison"]
     assert table.loc["exponential: LA", "divergences"] == 2  # one in each of two blocks
     assert table.loc["exponential: LA", "RMSE"] == pytest.approx(0.3)
     assert table.loc["softplus: ESLS", "mixed"] == 1.0 and table.loc["softplus: ESLS", "mixed at first"] == 0.0
@@ -205,9 +211,12 @@ def test_the_tables_count_what_was_found():
     assert table.loc["softplus: GFS", "coverage"] == 0.0 and table.loc["softplus: GHS(7)", "coverage"] == 1.0
     nlpd = 0.5 * (0.3 / 0.25) ** 2 + np.log(0.25) + 0.5 * np.log(2 * np.pi)
     assert table.loc["softplus: GHS(7)", "NLPD"] == pytest.approx(nlpd)
-    published = tables.beside_published(cells)
+    assert table.loc["softplus: iterated GHS(7)", "last change"] == 1e-3
+    assert table.loc["exponential: LA", "at a mode"] == pytest.approx(10 / 12)
+    published = tables["published"]
+    assert published.loc["exponential", "no mode"] == 2
     assert published.loc["exponential", "LA div. published"] == 55 and len(published) == 7
-    paired = tables.against_slices(cells)
+    paired = tables["paired"]
     assert paired.loc["softplus: GFS", "RMSE ratio"] == pytest.approx(2.0)
     assert paired.loc["softplus: GFS", "times as fast"] == 200.0
     assert not any(name.endswith("ESLS") for name in paired.index)
@@ -231,23 +240,28 @@ def test_each_published_cell_has_its_verdict():
         spread = np.where(np.arange(count) % 2, 1.0, -1.0)  # of standard error 0.01, once it is scaled
         return 0.01 * (spread * np.sqrt(count - 1) + z)
 
-    cells = {("exponential", method): {"rmse": published[method][0] + errors(z), "diverged": np.zeros(100, bool)}
-             for method, z in (("LA", 5.0), ("ESLS", -6.0), ("GFS", -2.0))}
-    cells["repression 1", "ESLS"] = {"rmse": np.array([0.4]), "diverged": np.array([False])}
-    table = tables.beside_published(cells)
+    def found(rmse):
+        return xr.Dataset({"rmse": (("method", "dataset"), np.array(list(rmse.values()))),
+                           "diverged": (("method", "dataset"), np.zeros((3, len(rmse["LA"])), bool)),
+                           "converged": (("method", "dataset"), np.ones((3, len(rmse["LA"]))))}, {"method": list(rmse)})
+
+    data = {"repression 1": found({"LA": [np.nan], "ESLS": [0.4], "GFS": [np.nan]}),
+            "exponential": found({method: published[method][0] + errors(z)
+                                  for method, z in (("LA", 5.0), ("ESLS", -6.0), ("GFS", -2.0))})}
+    table = pd.DataFrame.from_dict(experiment.beside_published(data), orient="index")
     assert table.loc["exponential", [f"{method} z" for method in published]].tolist() == pytest.approx([5, -6, -2])
     assert table.loc["exponential", [f"{method} verdict" for method in published]].tolist() == [
         "higher than published (z = 5.0)", "lower than published (z = -6.0)", "consistent"]
     assert table.loc["repression 1", "ESLS verdict"] == "-"
     assert scores.readable(table).loc["exponential", "ESLS verdict"] == "lower than published (z = -6.0)"
-    assert summary(tables.verdicts(table).values()) == (
+    assert experiment.notes(FEW, data)[0] == (
         "2 of 3 cells count as consistent with the published table, 1 of them lower than published; 1 higher.")
 
 
 @pytest.mark.slow
 def test_a_killed_run_ends_with_the_same_table(tmp_path, monkeypatch):
     """The experiment itself, stopped after three tasks and started again: the same tables but for the times."""
-    monkeypatch.setattr(experiment, "METHODS", ("ESLS", "GFS"))
+    monkeypatch.setattr(experiment, "METHODS", ("LA", "ESLS", "GFS"))
     settings = experiment.Settings(datasets=2, draws=400, burn_in=40,
                                    configurations=(SATURATION.label, EXPONENTIAL.label))
     whole = experiment.STUDY.run(settings, tmp_path / "whole")
@@ -260,7 +274,8 @@ def test_a_killed_run_ends_with_the_same_table(tmp_path, monkeypatch):
         return compute(task)
 
     with pytest.raises(KeyboardInterrupt):
-        dataclasses.replace(experiment.STUDY, compute=killed).run(settings, tmp_path / "half")
+        kinds = {label: kind._replace(compute=killed) for label, kind in experiment.STUDY.kinds.items()}
+        dataclasses.replace(experiment.STUDY, kinds=kinds).run(settings, tmp_path / "half")
     again = experiment.STUDY.run(settings, tmp_path / "half")
     for name in ("comparison", "published"):
         first, second = whole.tables[name], again.tables[name]
@@ -307,7 +322,7 @@ def test_the_report_says_how_many_cells_are_consistent_and_why_lower_ones_are_tr
 
 
 def test_the_figures_are_labelled():
-    for figure in figures.draw(FEW, experiment.by_cell(FEW, made_up(FEW))).values():
+    for figure in figures.draw(FEW, data_of(FEW)).values():
         assert figure.get_figwidth() == 7.0 and figure.legends
         for axes in figure.axes:
             assert not axes.axison or (axes.get_xlabel() and axes.get_ylabel())
@@ -326,7 +341,7 @@ def test_mistakes():
         experiment.Settings(draws=100, burn_in=200)
     with pytest.raises(ValueError, match="must be a tuple of different labels"):
         experiment.Settings(configurations="exponential")
-    with pytest.raises(ValueError, match="gamma must be"):
-        problem.activity(jnp.zeros(3), "saturation", -0.1)
-    with pytest.raises(ValueError, match="unknown link 'cubic'"):
-        problem.activity(jnp.zeros(3), "cubic", 1.0)
+    with pytest.raises(ValueError, match="gamma, the saturation constant, must be positive"):
+        problem.data_set(problem.Configuration("saturation", -0.1), 0)
+    with pytest.raises(ValueError, match="link must be one of .*, got 'cubic'"):
+        problem.data_set(problem.Configuration("cubic", 1.0), 0)

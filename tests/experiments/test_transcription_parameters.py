@@ -48,7 +48,7 @@ def test_true_values_stand_in_the_order_of_the_names():
 def made_up(settings):
     """Results of every task: the marginal samplers half a standard deviation off, and 10% too wide."""
     results, draws = {}, np.random.default_rng(0).normal(size=(len(parameters.NAMES), 2, 500))
-    for task in parameters.tasks(settings):
+    for task in parameters_report.tasks(settings):
         label = task.settings["sampler"]
         truth = np.linspace(0.1, 1.0, len(parameters.NAMES))
         off = label != parameters.REFERENCE
@@ -82,7 +82,7 @@ def test_the_table_measures_in_standard_deviations_of_the_reference():
 def test_a_chain_that_stands_still_shows():
     two = dataclasses.replace(FEW, datasets=2)
     results = made_up(two)
-    still = next(task.name for task in parameters.tasks(two) if task.settings["index"] == 1
+    still = next(task.name for task in parameters_report.tasks(two) if task.settings["index"] == 1
                  and task.settings["sampler"] == "RAM, marginal" and task.settings["link"] == "softplus")
     for name, value in (("ess", np.nan), ("r_hat", np.nan), ("sd", 0.0)):
         results[still][name][3] = value
@@ -92,7 +92,7 @@ def test_a_chain_that_stands_still_shows():
 
 
 def test_the_figures_are_labelled():
-    figures = parameters_report.draw(FEW, made_up(FEW))
+    figures = parameters_report.draw(FEW, parameters_report.STUDY.gathered(FEW, made_up(FEW)))
     assert set(figures) == {"posteriors-softplus", "posteriors-saturation-0.5"}
     for figure in figures.values():
         upper, lower = figure.axes
@@ -132,13 +132,11 @@ def test_every_sampler_draws_parameters_and_force(label):
 
 
 @pytest.mark.slow
-def test_on_a_linear_link_marginal_and_latent_posteriors_are_the_same(monkeypatch):
+def test_on_a_linear_link_marginal_and_latent_posteriors_are_the_same():
     """There the filter is exact, so that nothing but Monte Carlo error and the grid stands between them."""
-    monkeypatch.setattr(problem, "activity", lambda u, link, gamma: u)
-    problem.data_set.cache_clear()
-    marginal = parameters.compute(Task("marginal", 0, settings_of("RAM, marginal", 4, 500, 1000, 50)))
-    latent = parameters.compute(Task("latent", 0, settings_of("NUTS, latent grid", 2, 400, 600, 1)))
-    problem.data_set.cache_clear()
+    linear = {"link": "linear"}
+    marginal = parameters.compute(Task("marginal", 0, settings_of("RAM, marginal", 4, 500, 1000, 50) | linear))
+    latent = parameters.compute(Task("latent", 0, settings_of("NUTS, latent grid", 2, 400, 600, 1) | linear))
     error = np.sqrt(1 / marginal["ess"] + 1 / latent["ess"])
     assert max(marginal["r_hat"].max(), latent["r_hat"].max()) < 1.05
     assert np.all(np.abs(marginal["mean"] - latent["mean"]) / latent["sd"] < 4.5 * error)

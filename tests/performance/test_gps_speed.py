@@ -11,7 +11,7 @@ import pytest
 
 import lfm_ppl as lfm
 from lfm_ppl import orbits
-from lfm_ppl.experiments.gps import magnitudes
+from lfm_ppl.orbits import magnitudes
 
 pytestmark = pytest.mark.performance
 pytest.importorskip("erfa", reason="needs the extra gps")
@@ -28,7 +28,7 @@ def test_ten_days_of_33_states(benchmark, rule):
 
     @jax.jit
     def likelihood(logarithms, y):
-        forces, white = magnitudes.forces(logarithms, "DYB")
+        forces, white = magnitudes.forces(logarithms, "DYB", orbits.GPS_PERIOD)
         system = orbits.satellite(environment, start, forces, white=white)
         found = lfm.filter(system, times, y, rule=rule, steps=30)
         return found.log_likelihood.sum(), found.filtered_mean

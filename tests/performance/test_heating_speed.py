@@ -13,12 +13,12 @@ pytestmark = pytest.mark.performance
 
 def test_a_day_ahead_with_a_thousand_particles(benchmark):
     """Envelope, quasi-periodic residual of 15 functions, a decision every ten minutes: under 2 s."""
-    model = ("SQM", "envelope", 15)
+    model = problem.Model("SQM", "envelope", 15)
     window = problem.home(0, "envelope")
-    z = problem.medians(*model[:2])
+    z = model.medians
 
     def predict():
-        return jax.block_until_ready(prediction.thermostat_ahead(*model, window, z, 1000, jax.random.key(0))[1])
+        return jax.block_until_ready(prediction.thermostat_ahead(model, window, z, 1000, jax.random.key(0))[1])
 
     found = predict()
     assert np.isfinite(found.mean).all() and found.inputs.shape == (149, 1000)

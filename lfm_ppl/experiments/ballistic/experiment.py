@@ -1,13 +1,24 @@
-"""The study: its settings, tasks, tables and figures."""
+"""The study: its settings, tasks and tables."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from scipy import stats
 
 from lfm_ppl.engine.task import Task
-from lfm_ppl.experiments import study
-from lfm_ppl.experiments.ballistic import chains, figures, known, parameters, particles, problem, tables, tracking
-from lfm_ppl.experiments.study import Results, Study, Table, setting
+from lfm_ppl.experiments import chains, study
+from lfm_ppl.experiments.ballistic import figures, parameters, problem, smoothing
+from lfm_ppl.experiments.datasets import Column, Kind, part, row
+from lfm_ppl.experiments.scores import paired_ratio, sd_of
+from lfm_ppl.experiments.study import Data, Study, Table, setting
+
+LEVELS = (0.5, 0.8, 0.95)
+UNKNOWN = {"most likely parameters": "likely", "parameters integrated out": "posterior"}
+ERRORS = {"RMSE {path} ({unit})": "rmse", "coverage {path}": "coverage", "CPU s": "seconds"}
 
 
 @dataclass(frozen=True)
@@ -15,8 +26,8 @@ class Settings(study.Settings):
     """How much is computed."""
 
     runs: int = setting(500, "simulated targets", quick=4, aliases=study.REALISATIONS, per_seed=problem.MOST)
-    rules: tuple[str, ...] = setting(tuple(tracking.RULES), "linearisation; the model's own must be among them",
-                                     quick=(tracking.REPORTED,), choices=tuple(tracking.RULES))
+    rules: tuple[str, ...] = setting(tuple(smoothing.RULES), "linearisation; the model's own must be among them",
+                                     quick=(smoothing.REPORTED,), choices=tuple(smoothing.RULES))
     particle_runs: int = setting(20, "of the targets, the first so many by particles, too", quick=2)
     particles: tuple[int, ...] = setting((500, 2_000, 10_000, 50_000), "their numbers; the source has 50,000",
                                          quick=(500,))
@@ -30,31 +41,144 @@ class Settings(study.Settings):
     def __post_init__(self) -> None:
         """Check what a user gives."""
         super().__post_init__()
-        if tracking.REPORTED not in self.rules:
-            raise ValueError(f"rules must hold {tracking.REPORTED!r}, got {self.rules!r}.")
+        if smoothing.REPORTED not in self.rules:
+            raise ValueError(f"rules must hold {smoothing.REPORTED!r}, got {self.rules!r}.")
 
 
 def all_tasks(settings: Settings) -> list[Task]:
     """Return every task: those of the first targets first, so that the time left can be told."""
-    found = [*tracking.tasks(settings), *parameters.tasks(settings), *particles.tasks(settings),
-             *chains.tasks(settings), *parameters.drawn_tasks(settings), *known.tasks(settings)]
-    return sorted(found, key=lambda task: task.settings.get("index", task.settings.get("first")))
+    def task(name: str, what: str, **own: Any) -> Task:
+        return Task(name, settings.seed, {"experiment": "ballistic", "what": what, **own})
+
+    def blocks(what: str, count: int, size: int, name: str, **own: Any) -> list[Task]:
+        return [task(f"{name}/{first:04d}-{last:04d}", what, first=first, last=last, **own)
+                for first, last in study.blocks(count, size)]
+
+    weighted = {"draws": settings.draws, "paths": settings.paths}
+    found = [one for rule in settings.rules for one in blocks(
+        "tracking", settings.runs, 50, f"tracking/{study.slug(rule)}", method=rule)]
+    found += blocks("parameters", settings.runs, 10, "parameters", **weighted)
+    found += [task(f"particles/{count}/{index:04d}", "particles", particles=count, index=index, steps=2, draws=4_000)
+              for count in settings.particles for index in range(min(settings.runs, settings.particle_runs))]
+    for index in range(min(settings.runs, settings.chain_runs)):
+        for sampler in parameters.SAMPLERS:
+            size = dict(zip(("chains", "warmup", "draws", "thin"), getattr(settings, sampler.lower()), strict=True))
+            found.append(task(f"chains/{sampler}/{index:04d}", "chains", sampler=sampler, index=index, **size))
+    found += blocks("drawn", settings.drawn_runs, 10, "drawn", **weighted)
+    found += blocks("known", settings.runs, 50, "known")
+    return sorted(found, key=lambda one: one.settings.get("index", one.settings.get("first")))
 
 
-def tabulated(settings: Settings, results: Results) -> dict[str, Table]:
+def tables(settings: Settings, data: Data) -> dict[str, Table]:
     """Return the tables."""
     few, chained = (min(settings.runs, count) for count in (settings.particle_runs, settings.chain_runs))
-    return {"tracking": Table(f"Means over {settings.runs} targets (standard errors)",
-                              tables.tracked(settings, results)),
-            "particles": Table(f"Particles against the Gaussian filter and smoother, {few} targets",
-                               tables.against_particles(settings, results)),
-            "parameters": Table(f"Parameters, in logarithms, {settings.runs} targets",
-                                tables.parameters(settings, results)),
-            "agreement": Table(f"Against NUTS, {chained} targets", tables.agreement(settings, results))}
+    return {"tracking": Table.of(f"Means over {settings.runs} targets (standard errors)", tracked(data)),
+            "particles": Table.of(f"Particles against the Gaussian filter and smoother, {few} targets",
+                                  against_particles(data)),
+            "parameters": Table.of(f"Parameters, in logarithms, {settings.runs} targets", of_parameters(data)),
+            "agreement": Table.of(f"Against NUTS, {chained} targets", agreement(data))}
 
 
-KINDS = {"tracking": tracking.compute, "particles": particles.compute, "parameters": parameters.compute,
-         "drawn": parameters.compute, "known": known.compute, "chains": chains.compute}
-"""What the tasks are."""
+def tracked(data: Data) -> dict[str, Any]:
+    """Return errors and coverage of each smoother over the measurement times, and CPU seconds without compilation.
 
-STUDY = Study(Settings, all_tasks, KINDS, tabulated, figures.draw)
+    Where parameters are known the seconds are those of filter and smoother, else of searches and weights.
+    """
+    rows = {rule: row(part(data["tracking"].sel({"method": rule}), "smoother"), ERRORS)
+            for rule in data["tracking"].method.values}
+    for what, ending in (("parameters", ""), ("drawn", "; parameters drawn from the prior")):
+        for label, name in UNKNOWN.items():
+            found = part(data[what], name).assign(seconds=data[what].seconds)
+            rows[f"{smoothing.REPORTED}, {label}{ending}"] = row(found, ERRORS)
+    return rows
+
+
+def against_particles(data: Data) -> dict[str, Any]:
+    """Return errors of the Gaussian filter and smoother and of particles on the same targets.
+
+    ``ratio`` is the Gaussian's mean RMSE over that of particles, with the standard error of the paired differences. The
+    log likelihood's difference has the filter's error in it, and the Monte Carlo error of particles. Traced paths pass
+    through ``distinct`` particles at the first time.
+    """
+    particles = data["particles"]
+    gaussian = data["tracking"].sel({"method": smoothing.REPORTED}).isel(dataset=slice(particles.sizes["dataset"]))
+    rows: dict[str, Any] = {}
+    for what in ("filter", "smoother"):
+        exact = part(gaussian, what).assign(log_likelihood=gaussian.log_likelihood)
+        rows[f"{what}, Gaussian"] = row(exact, {"RMSE {path} ({unit})": "rmse", "CPU s": "seconds"})
+        for count in particles.particles.values:
+            several = particles.sel(particles=count)
+            compared = part(several, what).assign(several[["log_likelihood", "distinct"]])
+            compared = compared.assign({f"exact_{name}": value for name, value in exact.items() if name in compared})
+            rows[f"{what}, {count:,} particles"] = row(compared, COMPARED | (DISTINCT if what == "smoother" else {}))
+    return rows
+
+
+COMPARED: dict[str, Column] = {
+    "RMSE {path} ({unit})": "rmse", "ratio {path}": lambda one: paired_ratio(one.exact_rmse, one.rmse),
+    "CPU s": "seconds", "times as long": lambda one: one.seconds.mean() / one.exact_seconds.mean(),
+    "log likelihood - Gaussian": lambda one: one.log_likelihood - one.exact_log_likelihood,
+    "its sd": lambda one: sd_of(one.log_likelihood - one.exact_log_likelihood)}
+DISTINCT: dict[str, Column] = {"distinct": lambda one: one.distinct.isel(time=0).mean()}
+"""Columns of the table of particles."""
+
+
+def of_parameters(data: Data) -> dict[str, Any]:
+    """Return the truth, the maximum of the likelihood, and the posterior, in the logarithms of the parameters.
+
+    ``maximum`` is the share of targets whose likelihood has one; ``coverage`` that of those whose central posterior
+    intervals hold the truth: nominal for parameters drawn from the prior if the posterior is right, for one and the
+    same truth as far as the data outweigh the prior. ``rank p`` is the p-value of Kolmogorov and Smirnov's test that
+    the posterior probability of less than the truth is uniform over targets, ``k > 0.7`` the share of targets whose
+    weights are not to be relied on.
+    """
+    most_likely: dict[str, Column] = {
+        "truth": lambda one: problem.true_z()[problem.NAMES.index(one.parameter)],
+        "maximum": "exists", "most likely": lambda one: one.likely[one.exists],
+        "its sd": lambda one: sd_of(one.likely[one.exists]), "posterior mean": "posterior_mean"}
+    posterior: dict[str, Column] = {
+        "posterior sd": "posterior_sd", **COVERED, "k > 0.7": lambda one: (one.k > 0.7).mean()}
+    rows: dict[str, Any] = {}
+    for what, columns, ending in (("parameters", most_likely | posterior, ""),
+                                  ("drawn", posterior, ", drawn from the prior")):
+        rows |= {f"log {name}{ending}": row(data[what].sel(parameter=name), columns) for name in problem.NAMES}
+    return rows | {"log alpha, the force's parameters known": row(data["known"], COVERED)}
+
+
+def _coverage(level: float) -> Any:
+    return lambda one: np.abs(one.below - 0.5) <= level / 2
+
+
+COVERED: dict[str, Column] = {f"coverage {level:.0%}": _coverage(level) for level in LEVELS} | {
+    "rank p": lambda one: stats.kstest(one.below, "uniform").pvalue}
+"""Of posterior probabilities of less than the truth."""
+
+
+def agreement(data: Data) -> dict[str, Any]:
+    """Return how NUTS, RAM and weighted draws agree, see `chains.agreement`; chains' times are with compilation."""
+    found, all_ = data["chains"], data["parameters"]
+    weighted = xr.Dataset({"mean": all_.posterior_mean, "sd": all_.posterior_sd, "k": all_.k, "seconds": all_.seconds,
+                           "ess": all_.ess.expand_dims(parameter=all_.parameter)})
+    samplers = {name: found.sel(sampler=name) for name in parameters.SAMPLERS}
+    samplers["weighted draws"] = weighted.isel(dataset=slice(found.sizes["dataset"]))
+    return {name: chains.compared(one, None if name == "NUTS" else samplers["NUTS"]) for name, one in samplers.items()}
+
+
+STUDY = Study(
+    Settings, all_tasks,
+    {"tracking": Kind(smoothing.gaussian, {
+        "dataset path": "filter_rmse, smoother_rmse, smoother_coverage", "path time": "mean, sd",
+        "dataset": "log_likelihood, filter_seconds, smoother_seconds"}, ("method",)),
+     "particles": Kind(smoothing.particles, {
+         "dataset path": "filter_rmse, smoother_rmse, smoother_coverage", "dataset path time": "mean, sd",
+         "dataset": "log_likelihood, filter_seconds, smoother_seconds", "dataset time": "distinct"}, ("particles",)),
+     **{what: Kind(parameters.compute, {
+         "dataset parameter": "likely, posterior_mean, posterior_sd, below", "dataset": "exists, k, ess, seconds",
+         "dataset path": "likely_rmse, likely_coverage, posterior_rmse, posterior_coverage", "parameter draw": "draws"})
+        for what in ("parameters", "drawn")},
+     "known": Kind(parameters.known, {"dataset": "below"}),
+     "chains": Kind(parameters.by_chains, {
+         "dataset parameter": "mean, sd, ess, r_hat", "dataset": "seconds, divergences",
+         "dataset parameter chain draw": "draws"}, ("sampler",))},
+    tables, figures.draw, {"path": ("path", problem.PATHS), "unit": ("path", problem.UNITS),
+                           "parameter": ("parameter", problem.NAMES)})

@@ -23,6 +23,9 @@ NAMES = ("alpha", "scale", "lengthscale")
 PATHS = ("altitude", "speed", "u")
 """What is estimated, in the order of the rows of every array of paths."""
 
+UNITS = ("m", "m/s", "m/s^2")
+"""Theirs."""
+
 _FINER = 10
 """Cells of the simulation between two measurements, those of the model file."""
 

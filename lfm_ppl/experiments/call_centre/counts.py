@@ -34,22 +34,13 @@ class OverloadWarning(UserWarning):
 
 
 class Counts(NamedTuple):
-    """Days of the call centre.
-
-    Attributes:
-        dates: (N,) datetime64[D], increasing.
-        calls: (N, `OPEN`) in each five minutes.
-    """
+    """Days of the call centre: ``dates`` (N,) datetime64[D], increasing, and ``calls`` (N, `OPEN`) by five minutes."""
 
     dates: np.ndarray
     calls: np.ndarray
 
     def on(self, weekday: str) -> Counts:
-        """Return the days that are a certain weekday.
-
-        Raises:
-            ValueError: an unknown weekday.
-        """
+        """Return the days that are a certain weekday, one of `WEEKDAYS`; ValueError for another."""
         checks.one_of("weekday", weekday, WEEKDAYS)
         # 1 January 1970 was a Thursday.
         chosen = (self.dates.astype(int) + 3) % 7 == WEEKDAYS.index(weekday)
@@ -68,8 +59,7 @@ def read(path: str | Path) -> Counts:
         ValueError: a column is missing, a count is not a number or negative, a time cannot be read or is not in order,
             or a day does not have the counts of 7:00 to 21:00; with the row as an editor counts it.
     """
-    path = Path(path)
-    path = path / FILE if path.is_dir() else path
+    path = Path(path, FILE) if Path(path).is_dir() else Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"there is no file {path}; give the folder of {FILE} (--data), or leave it out for "
                                 "simulated counts.")
@@ -79,35 +69,28 @@ def read(path: str | Path) -> Counts:
             raise ValueError(f"{path} has no column {name!r}; its columns are {', '.join(map(str, table.columns))}.")
     times = pd.to_datetime(table["DateTime"], errors="coerce", utc=True).dt.tz_localize(None).to_numpy()
     calls = pd.to_numeric(table["Calls"], errors="coerce").to_numpy(float)
-    _refuse(path, "DateTime", table, np.isnat(times), "a time such as 2003-03-03T07:00:00Z")
-    _refuse(path, "Calls", table, ~(np.isfinite(calls) & (calls >= 0)), "a number of calls, zero or more")
-    _refuse(path, "DateTime", table, np.append(False, np.diff(times) <= np.timedelta64(0)), "a later time than before")
+    unordered = np.append(False, np.diff(times) <= np.timedelta64(0, "ns"))
+    for column, wrong, expected in (("DateTime", np.isnat(times), "a time such as 2003-03-03T07:00:00Z"),
+                                    ("Calls", ~(np.isfinite(calls) & (calls >= 0)), "a number of calls, zero or more"),
+                                    ("DateTime", unordered, "a later time than before")):
+        if wrong.any():
+            index = int(np.argmax(wrong))
+            raise ValueError(f"{path}, row {index + 2}, column {column!r}: expected {expected}, got "
+                             f"{table[column][index]!r}.")
     days = times.astype("datetime64[D]")
     place = (times - days) / np.timedelta64(1, "m") / BIN - 7 * 60 / BIN
-    kept = (place >= 0) & (place < OPEN)
-    dates, counts = np.unique(days[kept], return_counts=True)
-    whole = kept & (place == np.round(place))
-    short = counts != OPEN
-    if short.any() or not (whole == kept).all() or not len(dates):
-        what = f"{dates[short][0]} has {counts[short][0]}" if short.any() else "some are at other times or missing"
+    opened = (place >= 0) & (place < OPEN)
+    dates, sizes = np.unique(days[opened], return_counts=True)
+    short, between = sizes != OPEN, place[opened] != np.round(place[opened])
+    if short.any() or between.any() or not len(dates):
+        what = f"{dates[short][0]} has {sizes[short][0]}" if short.any() else "some are at other times or missing"
         raise ValueError(f"{path}: every day needs {OPEN} counts, one for each five minutes from 7:00 to 21:00; "
                          f"{what}.")
-    return Counts(dates, calls[kept].reshape(len(dates), OPEN))
-
-
-def _refuse(path: Path, column: str, table: pd.DataFrame, wrong: Any, expected: str) -> None:
-    if np.any(wrong):
-        row = int(np.argmax(wrong))
-        raise ValueError(f"{path}, row {row + 2}, column {column!r}: expected {expected}, got {table[column][row]!r}.")
+    return Counts(dates, calls[opened].reshape(len(dates), OPEN))
 
 
 def simulated(days: int, seed: int = 0) -> Counts:
-    """Simulate days of calls that look like those of a bank: Poisson counts about a profile that wanders.
-
-    Args:
-        days: number of Thursdays.
-        seed: of everything random.
-    """
+    """Simulate Thursdays that look like those of a bank: Poisson counts about a profile that wanders."""
     checks.positive_integer("days", days)
     generator = np.random.default_rng(seed)
     hours = 7.0 + BIN / 60.0 * (np.arange(OPEN) + 0.5)
@@ -119,8 +102,7 @@ def simulated(days: int, seed: int = 0) -> Counts:
         wander = 0.8 * wander + 0.6 * 0.03 * generator.normal(size=len(waves))
         change.append(wander @ waves)
     calls = generator.poisson(BIN * shape * np.exp(np.array(change)))
-    dates = np.datetime64("2003-03-06") + 7 * np.arange(days)
-    return Counts(dates, calls.astype(float))
+    return Counts(np.datetime64("2003-03-06") + 7 * np.arange(days), calls.astype(float))
 
 
 def overload(arrivals: np.ndarray, service: np.ndarray) -> float:
@@ -129,23 +111,11 @@ def overload(arrivals: np.ndarray, service: np.ndarray) -> float:
 
 
 def queue(arrivals: Any, service: Any, start: float = 0.0) -> np.ndarray:
-    """Return the mean number of customers at the ends of all counts, with the given rates as the truth.
+    """Return the mean number of customers (N + 1,), the truth: at the start and at the ends of N counts.
 
-    The equation dL/dt = -Omega L / (1 + L) + zeta is integrated finely, both rates constant within a count.
-
-    Args:
-        arrivals: zeta, (N,) in customers/min.
-        service: Omega, a number or (N,).
-        start: customers at the beginning.
-
-    Returns:
-        (N + 1,), from the beginning on.
-
-    Raises:
-        ValueError: rates or a start that are negative or not finite.
-
-    Warns:
-        OverloadWarning: more customers come than are served for over two hours, all in all.
+    The equation dL/dt = -Omega L / (1 + L) + zeta is integrated finely, with arrivals zeta (N,) and the service rate
+    Omega, a number or (N,), in customers/min, both constant within a count. Negative rates are refused (ValueError);
+    an `OverloadWarning` says that more customers come than are served for over two hours, all in all.
 
     Example:
         >>> f"{queue(np.full(60, 5.0), 10.0)[-1]:.4f}"
@@ -157,8 +127,7 @@ def queue(arrivals: Any, service: Any, start: float = 0.0) -> np.ndarray:
         checks.finite(name, values)
         if np.min(values, initial=0.0) < 0:
             raise ValueError(f"{name} must not be negative, got {np.min(values):g}.")
-    over = overload(zeta, omega)
-    if over > WARNED:
+    if (over := overload(zeta, omega)) > WARNED:
         warnings.warn(f"more customers come than are served for {over:.1f} h; the queue grows meanwhile.",
                       OverloadWarning, stacklevel=2)
     h, path = BIN / _STEPS, [float(start)]

@@ -1,18 +1,30 @@
-"""The study: its settings, tasks, tables and figures."""
+"""The study: its settings, tasks and tables."""
 
 from __future__ import annotations
 
+import itertools
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import xarray as xr
+
 from lfm_ppl.engine.run import Reporter
 from lfm_ppl.engine.task import Task
-from lfm_ppl.experiments import published, study
-from lfm_ppl.experiments.call_centre import counts, figures, posterior, problem, tables, tracking
-from lfm_ppl.experiments.call_centre.counts import OPEN, OverloadWarning
-from lfm_ppl.experiments.study import Results, Study, Table, setting
+from lfm_ppl.experiments import chains, published, study
+from lfm_ppl.experiments.call_centre import counts, figures, learning, problem, tracking
+from lfm_ppl.experiments.datasets import Column, Kind, cell, part, row
+from lfm_ppl.experiments.study import Data, Study, Table, setting
+
+PUBLISHED = {
+    "constant": {"SQM": (4.6, 2.2, -146, 22), "CQM": (4.4, 1.3, -142, 15), "WQM": (1.8, 0.2, -139, 20),
+                 "periodic": (2.2, 0.4, -276, 60), "Matern": (10.6, 5.9, -209, 29)},
+    "changed": {"SQM": (7.2, 1.8, -183, 21), "CQM": (15.2, 4.0, -205, 24), "WQM": (3.3, 0.6, -152, 15),
+                "periodic": (5.7, 1.2, -725, 301), "Matern": (11.6, 1.1, -305, 49)},
+}
+"""Test -> method -> RMSE, its error, expected log likelihood, its error: tables 2 and 3 of the source."""
 
 
 @dataclass(frozen=True)
@@ -22,12 +34,11 @@ class Settings(study.Settings):
     days: int = setting(11, "test days, from the fourth day of the weekday on", quick=2, aliases=study.REALISATIONS)
     data: str | None = setting(None, "folder of the counts (default: simulated counts)", metavar="FOLDER")
     weekday: str = setting("Thursday", "of all days", choices=counts.WEEKDAYS)
-    methods: tuple[str, ...] = setting(tuple(tracking.METHODS), "forces", quick=("SQM", "Matern"),
-                                       choices=tuple(tracking.METHODS))
+    methods: tuple[str, ...] = setting(problem.METHODS, "forces", quick=("SQM", "Matern"), choices=problem.METHODS)
     link: str = setting("linear", "of the model file", choices=("linear", "softplus"))
     functions: int = setting(15, "of which a cycle is made", quick=7)
     integrated: tuple[str, ...] = setting(("SQM",), "the methods whose parameters are integrated out, too",
-                                          choices=tuple(tracking.METHODS))
+                                          choices=problem.METHODS)
     draws: int = setting(200, "of their parameters, that are weighted", quick=60)
     mixed: int = setting(20, "of them, so many are drawn to track with", quick=5)
     nuts_days: int = setting(1, "of the test days, the first so many by NUTS, too")
@@ -39,73 +50,161 @@ class Settings(study.Settings):
         if other := [method for method in self.integrated if method not in self.methods]:
             raise ValueError(f"--integrated must be among --methods ({', '.join(self.methods)}), got {other[0]!r}.")
 
-    def windows(self) -> dict[str, Any]:
-        """Return which windows there are, as tasks store it."""
-        data = self.data and str(Path(self.data).resolve())
-        return {"data": data, "weekday": self.weekday, "first": 0, "count": self.days}
-
 
 def all_tasks(settings: Settings) -> list[Task]:
-    """Return every task."""
-    return [*tracking.tasks(settings), *posterior.tasks(settings), *posterior.nuts_tasks(settings)]
+    """Return every task: what is compiled for a method serves all windows, but for the chains."""
+    shared = {"experiment": "call-centre", "link": settings.link, "functions": settings.functions,
+              "starts": len(learning.STARTS), "data": settings.data and str(Path(settings.data).resolve()),
+              "weekday": settings.weekday, "first": 0, "count": settings.days}
+    sizes: dict[str, Any] = {"draws": settings.draws, "mixed": settings.mixed}
+    nuts = {**sizes, "chains": list(settings.nuts), "accepted": tracking.ACCEPTED, "count": 1}
+
+    def task(what: str, method: str, ending: str = "", **more: Any) -> Task:
+        return Task(f"{what}/{method}{ending}", settings.seed, {**shared, "what": what, "method": method, **more})
+
+    return [*(task("track", method) for method in settings.methods),
+            *(task("posterior", method, **sizes) for method in settings.integrated),
+            *(task("nuts", method, f"/{index:02d}", **nuts, first=index) for method in settings.integrated
+              for index in range(min(settings.nuts_days, settings.days)))]
 
 
 def check(settings: Settings, report: Reporter | None) -> None:
-    """Check that there are counts of so many days, and say what they are.
+    """Check that there are counts of so many days, and say what they are; errors as of `problem.days`.
 
-    Raises:
-        FileNotFoundError, ValueError: counts that cannot be read, too few days.
-
-    Warns:
-        OverloadWarning: on some test days more customers come than are served, for hours.
+    An `OverloadWarning` says on how many test days more customers come than are served, for hours.
     """
-    there = problem.windows(settings.data, settings.weekday, settings.seed)
-    if settings.days > there:
-        raise ValueError(f"there are {there} test days that are {settings.weekday}, {settings.days} are asked for; "
-                         "take fewer (--realisations).")
+    chosen, rate = problem.days(settings.data, settings.weekday, settings.seed)
+    arrivals = rate * chosen.calls[problem.TRAIN:]
+    if settings.days > len(arrivals):
+        raise ValueError(f"there are {len(arrivals)} test days that are {settings.weekday}, {settings.days} are asked "
+                         "for; take fewer (--realisations).")
     if report is not None and settings.data is None:
         report("the counts are simulated; give the folder of real ones with --data")
-    _warn_overload(settings)
-
-
-def _warn_overload(settings: Settings) -> None:
-    """Say once on how many test days more customers come than are served for hours."""
-    own, rate = problem.days(settings.data, settings.weekday, settings.seed)
-    for name, tested in problem.TESTED.items():
-        served = problem.service(tested)[-OPEN:]
-        tests = rate * own.calls[problem.TRAIN:problem.TRAIN + settings.days]
-        hours = [counts.overload(one, served) for one in tests]
-        many = sum(one > counts.WARNED for one in hours)
-        if many:
-            warnings.warn(f"{name} service rate: on {many} of {settings.days} test days more customers come than are "
+    for test, rates in problem.TESTED.items():
+        served = problem.service(rates)[problem.FIRST:]
+        hours = [counts.overload(day, served) for day in arrivals[:settings.days]]
+        if many := sum(over > counts.WARNED for over in hours):
+            warnings.warn(f"{test} service rate: on {many} of {settings.days} test days more customers come than are "
                           f"served for over {counts.WARNED:g} hours, {max(hours):.1f} at most; queues grow meanwhile.",
-                          OverloadWarning, stacklevel=4)
+                          counts.OverloadWarning, stacklevel=3)
 
 
-def tabulated(settings: Settings, results: Results) -> dict[str, Table]:
+def tables(settings: Settings, data: Data) -> dict[str, Table]:
     """Return the tables."""
     source = "simulated counts" if settings.data is None else f"counts in {settings.data}"
-    days = f"{settings.days} test days, {source}"
-    both = min(settings.days, settings.nuts_days)
-    return {"constant": Table(f"Service rate 10 as in training, {days}", tables.tracked(settings, results, "constant")),
-            "changed": Table(f"Service rate 15, then 5, {days}", tables.tracked(settings, results, "changed")),
-            "gain": Table("Gain in the log density of a day by integrating the parameters out",
-                          tables.gain(settings, results)),
-            "agreement": Table(f"Weighted draws against NUTS, test days: {both}", tables.agreement(settings, results)),
-            "learnt": Table("Most likely parameters (medians)", tables.learnt(settings, results))}
+    days, chained = f"{settings.days} test days, {source}", data["nuts"].sizes["first"]
+    return {"constant": Table.of(f"Service rate 10 as in training, {days}", tracked(data, "constant")),
+            "changed": Table.of(f"Service rate 15, then 5, {days}", tracked(data, "changed")),
+            "gain": Table.of("Gain in the log density of a day by integrating the parameters out", gain(data)),
+            "agreement": Table.of(f"Weighted draws against NUTS, test days: {chained}", agreement(data)),
+            "learnt": Table.of("Most likely parameters (medians)", learnt(settings, data))}
 
 
-def notes(settings: Settings, results: Results) -> tuple[str, ...]:
+def tracked(data: Data, test: str) -> dict[str, Any]:
+    """Return means over test days by method, and what the source has.
+
+    They are the root mean squared error of the queue over the ends of the day's 168 counts; the sum of the log
+    densities of the true queue at these times (ELL; the source does not give its number of times, so that only the
+    order can be compared); coverage of 95% bands; the same error and coverage of the arrivals; the median error of a
+    day, since the mean is that of few days with long queues; and both relative to those of Matern.
+    """
+    matern = data["track"][f"{test}_rmse"].reindex({"method": ["Matern"]}).values  # NaN where it is not there
+    columns: dict[str, Column] = {
+        "RMSE": "rmse", "ELL": "ell", "coverage": "coverage", "RMSE arrivals": "rate_rmse",
+        "coverage arrivals": "rate_coverage", "median RMSE": lambda one: np.median(one.rmse),
+        "of Matern": lambda one: np.mean(one.rmse.values) / np.mean(matern),
+        "of Matern, medians": lambda one: np.median(one.rmse) / np.median(matern)}
+    rows = {}
+    for what, label in (("track", "{}"), ("posterior", "{}, parameters integrated out")):
+        for method in data[what].method.values:
+            name = label.format(method)
+            rows[name] = row(part(data[what].sel({"method": method}), test), columns) | dict(zip(
+                ("published RMSE", "published RMSE se", "published ELL", "published ELL se"),
+                map(float, PUBLISHED[test].get(name, (np.nan,) * 4)), strict=True))
+    return rows
+
+
+def gain(data: Data) -> dict[str, Any]:
+    """Return what marginalising the parameters adds to the most likely ones, by method and test.
+
+    That is the gain in log density of a day's queue, ``days`` the share of days on which there is one, the RMSE as a
+    share of that of the most likely parameters, both coverages; the largest Pareto index and the least effective number
+    of the importance samples; the share of days whose posterior has ``several modes``, and the largest share of a
+    posterior ``beyond`` its highest mode.
+    """
+    rows = {}
+    for method, test in itertools.product(data["posterior"].method.values, problem.TESTED):
+        likely, whole = (data[what].sel({"method": method}) for what in ("track", "posterior"))
+        before, after = part(likely, test), part(whole, test)
+        rows[f"{method}, {test}"] = cell("gain", after.ell - before.ell) | {
+            "days": float((after.ell > before.ell).mean()), "RMSE ratio": float(after.rmse.mean() / before.rmse.mean()),
+            "coverage, most likely": float(before.coverage.mean()),
+            "coverage, integrated": float(after.coverage.mean()), "k": float(whole.k.max()),
+            "least ESS": float(whole.ess.min()), "several modes": float((whole.modes > 1).mean()),
+            "beyond": float(whole.beyond.max())}
+    return rows
+
+
+def agreement(data: Data) -> dict[str, Any]:
+    """Return how well importance samples and NUTS agree, by method, over the windows that have both.
+
+    That is how far means and standard deviations are apart at most, see `chains.agreement`; the gains in log density of
+    a day's queue over the most likely parameters, both tests, by NUTS and by importance samples of the same windows;
+    the largest R-hat, the least effective number of draws, divergences, and CPU seconds of a window.
+    """
+    rows = {}
+    for method in data["nuts"].method.values:
+        nuts = data["nuts"].sel({"method": method}).rename(first="dataset").dropna("parameter", how="all")
+        same = {name: slice(nuts.sizes[name]) for name in ("dataset", "parameter")}
+        likely, weighted = (data[what].sel({"method": method}).isel(same) for what in ("track", "posterior"))
+        moments = xr.Dataset({"mean": weighted.posterior_mean, "sd": weighted.posterior_sd,
+                              "ess": weighted.ess.broadcast_like(weighted.posterior_mean)})
+        shift, ratio = chains.agreement(moments, nuts)
+        rows[method] = {"windows": nuts.sizes["dataset"], "means apart (sd)": shift.value, "ratio of sds": ratio.value}
+        for test, (name, sampler) in itertools.product(problem.TESTED, (("NUTS", nuts), ("weighted", weighted))):
+            rows[method] |= cell(f"gain {test}, {name}", sampler[f"{test}_ell"] - likely[f"{test}_ell"])
+        rows[method] |= {"R-hat": chains.largest_r_hat(nuts), "least ESS": chains.least_ess(nuts),
+                         "divergences": int(nuts.divergences.sum()), "CPU s": float(nuts.seconds.mean())}
+    return rows
+
+
+def learnt(settings: Settings, data: Data) -> dict[str, Any]:
+    """Return the most likely parameters: medians over windows, the log likelihood, and what a window took.
+
+    Evaluations and CPU seconds are those of all its searches.
+    """
+    rows = {}
+    for method in settings.methods:
+        found = data["track"].sel({"method": method})
+        names = problem.Method(method.lower(), settings.link, settings.functions).names
+        rows[method] = dict(zip(names, np.exp(found.z.median("dataset")).values, strict=False)) | {
+            "log likelihood": float(found.log_likelihood.mean()), "evaluations": float(found.evaluations.mean()),
+            "CPU s": float(found.seconds.median())}
+    return rows
+
+
+def notes(settings: Settings, data: Data) -> tuple[str, ...]:
     """Return how the errors of the queue compare with the published ones, of Thursdays and the linear link."""
-    source = settings.data is not None and settings.weekday == "Thursday" and settings.link == "linear"
-    if not source or settings.days < published.FEWEST:
+    real = settings.data is not None and settings.weekday == "Thursday" and settings.link == "linear"
+    if not real or settings.days < published.FEWEST:
         return ()
     tests = {"constant": "RMSE of the queue, service rate 10", "changed": "RMSE of the queue, service rate 15, then 5"}
-    return tuple(published.said(what, published.beside(tables.tracked(settings, results, test), "RMSE",
+    return tuple(published.said(what, published.beside(Table.of(what, tracked(data, test)).frame, "RMSE",
                                                        "published RMSE")) for test, what in tests.items())
 
 
-KINDS = {"track": tracking.compute, "posterior": posterior.compute, "nuts": posterior.compute_nuts}
-"""What the tasks are."""
+SCORES = ", ".join(f"{test}_{score}" for test in problem.TESTED for score in (
+    "rmse", "coverage", "ell", "rate_rmse", "rate_coverage"))
+TRACKED = ", ".join(f"{test}_{name}" for test in problem.TESTED for name in tracking.Tracked._fields)
 
-STUDY = Study(Settings, all_tasks, KINDS, tabulated, figures.draw, label="method", notes=notes, check=check)
+STUDY = Study(
+    Settings, all_tasks,
+    {"track": Kind(tracking.most_likely, {
+        "dataset": f"log_likelihood, evaluations, seconds, {SCORES}", "dataset parameter": "z", "time": TRACKED},
+                   ("method",)),
+     "posterior": Kind(tracking.marginalised, {
+         "dataset": f"k, ess, modes, beyond, {SCORES}", "dataset parameter": "posterior_mean, posterior_sd",
+         "time": "shapes, shapes_sd"}, ("method",)),
+     "nuts": Kind(tracking.by_nuts, {"": f"divergences, seconds, {SCORES}", "parameter": "mean, sd, ess, r_hat"},
+                  ("method", "first"))},
+    tables, figures.draw, label="method", notes=notes, check=check)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import functools
+import warnings
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpyro import handlers
 
 from lfm_ppl import loading
 from lfm_ppl.experiments.call_centre import counts
@@ -25,14 +25,13 @@ SERVICE = 10.0
 """Service rate of training (customers/min)."""
 
 TESTED = {"constant": (10.0, 10.0), "changed": (15.0, 5.0)}
-"""Service rates in the two halves of the test day (customers/min)."""
+"""Test -> service rates in the two halves of the test day (customers/min)."""
 
 NOISE = 0.5
 """Standard deviation of the error of a reading (customers); the source does not give its own."""
 
-TRAIN = 3
-EVERY, RARELY = 40.0, 180.0
-"""Minutes between readings, in training and on the test day."""
+TRAIN, EVERY, RARELY = 3, 40.0, 180.0
+"""Days of training before the test day, and minutes between readings, in training and on the test day."""
 
 GRID = BIN * np.arange((TRAIN + 1) * OPEN + 1)
 """(673,) ends of all counts, in minutes."""
@@ -46,14 +45,12 @@ READ = np.concatenate([TRAINING, np.arange(TRAIN * DAY, (TRAIN + 1) * DAY - 1e-9
 
 
 class Window(NamedTuple):
-    """Three days to learn from and one to track, at both service rates of it.
+    """Three days to learn from and one to track, whose ``date`` it is, at both service rates.
 
     Attributes:
-        date: of the test day.
         arrivals: (672,) true rate in each five minutes (customers/min).
-        queues: name in `TESTED` -> (673,) true number of customers on `GRID`.
-        y: name in `TESTED` -> (673, 1) readings as log(1 + customers), NaN where there is none; those below zero as
-            zero.
+        queues: test -> (673,) true number of customers on `GRID`.
+        y: test -> (673, 1) readings as log(1 + customers), NaN where there is none; those below zero as zero.
     """
 
     date: np.datetime64
@@ -71,25 +68,15 @@ class Window(NamedTuple):
 def days(data: str | None, weekday: str, seed: int) -> tuple[Counts, float]:
     """Return the days of one weekday, and the rate that one call of their counts stands for (customers/min).
 
-    Args:
-        data: folder or file of counts; None: simulated ones.
-        weekday: name of it.
-        seed: of the simulation.
-
-    Raises:
-        FileNotFoundError, ValueError: as `counts.read`; too few days.
+    The data are a folder or file of counts, None: simulated ones, of this seed. Raises FileNotFoundError or ValueError
+    as `counts.read`, or because there are too few days.
     """
     everything = counts.simulated(34, seed) if data is None else counts.read(data)
-    own = everything if data is None else everything.on(weekday)
-    if len(own.dates) <= TRAIN:
-        raise ValueError(f"there are {len(own.dates)} days that are {weekday}; {TRAIN} to learn from and one to track "
-                         "are needed.")
-    return own, UTILISATION * SERVICE / float(everything.calls.mean())
-
-
-def windows(data: str | None, weekday: str, seed: int) -> int:
-    """Return the number of test days."""
-    return len(days(data, weekday, seed)[0].dates) - TRAIN
+    chosen = everything if data is None else everything.on(weekday)
+    if len(chosen.dates) <= TRAIN:
+        raise ValueError(f"there are {len(chosen.dates)} days that are {weekday}; {TRAIN} to learn from and one to "
+                         "track are needed.")
+    return chosen, UTILISATION * SERVICE / float(everything.calls.mean())
 
 
 def service(tested: tuple[float, float]) -> np.ndarray:
@@ -98,31 +85,24 @@ def service(tested: tuple[float, float]) -> np.ndarray:
 
 
 def window(data: str | None, weekday: str, index: int, seed: int = 0) -> Window:
-    """Return window ``index``: the days ``index`` to ``index + 3`` of a weekday.
-
-    Args:
-        data: folder or file of counts; None: simulated ones.
-        weekday: name of it.
-        index: from zero.
-        seed: of the errors of readings, and of the simulation.
-    """
-    own, rate = days(data, weekday, seed)
-    arrivals = rate * own.calls[index:index + TRAIN + 1].ravel()
+    """Return the days ``index``, from zero, to ``index + 3`` of a weekday, see `days`; the seed is of errors, too."""
+    chosen, rate = days(data, weekday, seed)
+    arrivals = rate * chosen.calls[index:index + TRAIN + 1].ravel()
     errors = NOISE * np.random.default_rng([seed, index]).normal(size=len(GRID))
-    queues = {name: counts.queue(arrivals, service(rates)) for name, rates in TESTED.items()}
-    y = {name: np.log1p(np.maximum(np.where(np.isin(GRID, READ), path + errors, np.nan), 0.0))[:, None]
-         for name, path in queues.items()}
-    return Window(own.dates[index + TRAIN], arrivals, queues, y)
+    with warnings.catch_warnings():  # the study says on how many days queues grow for hours
+        warnings.simplefilter("ignore", counts.OverloadWarning)
+        queues = {test: counts.queue(arrivals, service(rates)) for test, rates in TESTED.items()}
+    y = {test: np.log1p(np.maximum(np.where(np.isin(GRID, READ), path + errors, np.nan), 0.0))[:, None]
+         for test, path in queues.items()}
+    return Window(chosen.dates[index + TRAIN], arrivals, queues, y)
+
+
+METHODS = ("SQM", "CQM", "WQM", "periodic", "Matern", "resonator")
+"""Forces of the model file, which writes them in lower case."""
 
 
 class Method(NamedTuple):
-    """A model of the arrivals; options of the model file.
-
-    Attributes:
-        force: name there.
-        link: name there.
-        functions: of which a cycle is made.
-    """
+    """A model of the arrivals: options of the model file, with the number of ``functions`` of which a cycle is made."""
 
     force: str
     link: str = "linear"
@@ -131,21 +111,13 @@ class Method(NamedTuple):
     @property
     def names(self) -> tuple[str, ...]:
         """The parameters; everything here is in their logarithms z."""
-        return _names(self)
+        return tuple(model_file().model.__globals__["names"](self.force))
 
 
 @functools.cache
 def model_file() -> loading.ModelFile:
     """Return the shipped model."""
     return loading.load("call-centre")
-
-
-@functools.cache
-def _names(method: Method) -> tuple[str, ...]:
-    with jax.ensure_compile_time_eval():
-        seeded = handlers.seed(model_file().model, jax.random.key(0))
-        trace = handlers.trace(seeded).get_trace(TRAINING, **method._asdict())
-    return tuple(name for name, site in trace.items() if site["type"] == "sample" and name != "y")
 
 
 @functools.cache

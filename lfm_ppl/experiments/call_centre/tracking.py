@@ -1,254 +1,195 @@
-"""Learn from three days, track the fourth: one method on one window.
+"""Track the fourth day, with the parameters that are most likely given the first three, or marginalised.
 
 Tracking is filtering: at every five minutes of the test day the queue and the rate of arrivals are estimated from the
-readings up to then, so that the longest prediction is one of three hours. The parameters are those most likely given
-the training, and stay. The model's state is x = log(1 + L) with the queue L, so that L has a shifted log-normal
-distribution: its median is the estimate, its quantiles are the bands.
+readings up to then, so that the longest prediction is one of three hours. The model's state is x = log(1 + L) with the
+queue L, so that L has a shifted log-normal distribution: its median is the estimate, its quantiles are the bands.
+
+Where parameters are marginalised, draws of them track the test day, and the estimates of all, mixed, stand for the
+prediction. The draws are importance samples, and in the first windows those of NUTS, too, which they must agree with
+where there is one mode (chains are far too short to tell how much of the posterior is about each of several).
 """
 
 from __future__ import annotations
 
 import functools
 import time
-import warnings
-from collections.abc import Callable
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import stats
+from scipy import special, stats
 
 from lfm_ppl.engine.task import Result, Task
-from lfm_ppl.experiments import scores
-from lfm_ppl.experiments.call_centre import counts, problem
+from lfm_ppl.experiments import chains, scores
+from lfm_ppl.experiments.call_centre import problem
+from lfm_ppl.experiments.call_centre.learning import posterior, searches
 from lfm_ppl.experiments.call_centre.problem import FIRST, GRID, TESTED, Method, Window
 from lfm_ppl.experiments.study import stacked
+from lfm_ppl.experiments.weighting import moments
 from lfm_ppl.filtering.filter import filter
 from lfm_ppl.filtering.smoother import smooth
-from lfm_ppl.inference.optimise import quasi_newton
 from lfm_ppl.linalg import congruence, matmul
 from lfm_ppl.model.state_space import state_space
-
-METHODS = {"SQM": "sqm", "CQM": "cqm", "WQM": "wqm", "periodic": "periodic", "Matern": "matern",
-           "resonator": "resonator"}
-"""Method -> force of the model file."""
-
-LIMITS = {"mean": (1.0, 30.0), "scale": (0.1, 30.0), "lengthscale": (10.0, 10_000.0), "memory": (0.2, 10_000.0),
-          "noise_sd": (0.01, 5.0)}
-"""Parameter -> least and largest value."""
-
-STARTS = (
-    {"mean": 6.0, "scale": 2.0, "lengthscale": 150.0, "memory": 10.0, "noise_sd": 2.0},
-    {"mean": 4.0, "scale": 3.5, "lengthscale": 220.0, "memory": 1.0, "noise_sd": 1.5},
-    {"mean": 7.0, "scale": 1.3, "lengthscale": 110.0, "memory": 60.0, "noise_sd": 1.0},
-)
-"""Where searches start: cycles somewhat alike, hardly alike, and nearly the same. From a small noise a search gets lost
-where cycles differ more than a model allows."""
-
-SAME = 0.1
-"""Ends of searches that differ by less than this in every logarithm are the same mode."""
-
-FAR = 7.0
-"""Modes that are so much lower in log density than the highest are left out: below a thousandth of it. Unless they are
-much wider, they hold next to nothing."""
+from lfm_ppl.results import importance
 
 STEPS = 3
 """Integration steps in five minutes, about as long as those of the model file."""
 
-_SEARCH = {"ftol": 1e-7, "gtol": 1e-3, "maxfun": 60}
-
-
-class Learnt(NamedTuple):
-    """Where a search ended.
-
-    Attributes:
-        z: (P,) logarithms of the parameters.
-        log_likelihood: of the training; with the log prior density of z where that was asked for.
-        evaluations: of it and its gradient.
-    """
-
-    z: np.ndarray
-    log_likelihood: float
-    evaluations: int
-
-
-def learn(method: Method, y: np.ndarray, prior: float = 0.0) -> Learnt:
-    """Return the most likely parameters within `LIMITS`, with the evaluations of all searches; otherwise as `modes`."""
-    found = _searches(method, y, prior)
-    return found[0]._replace(evaluations=sum(one.evaluations for one in found))
-
-
-def modes(method: Method, y: np.ndarray, prior: float = 0.0) -> list[Learnt]:
-    """Return the different modes within `LIMITS` that searches from `STARTS` find, the highest first.
-
-    Args:
-        method: the model of the arrivals.
-        y: (63, 1) logarithms of the readings of the training.
-        prior: 0 for maxima of the likelihood, 1 for those of the posterior density of z.
-
-    Raises:
-        ValueError: the density is not finite wherever a search starts.
-    """
-    found = _searches(method, y, prior)
-    kept: list[Learnt] = []
-    for one in found:
-        high = found[0].log_likelihood - one.log_likelihood < FAR
-        if high and all(np.abs(one.z - other.z).max() > SAME for other in kept):
-            kept.append(one)
-    return kept
-
-
-def _searches(method: Method, y: np.ndarray, prior: float) -> list[Learnt]:
-    """Return the ends of all searches, the highest first."""
-    bounds, found = np.log([LIMITS[name] for name in method.names]), []
-    for start in STARTS:
-        objective = problem.posterior(method).objective(y, prior)
-        end = quasi_newton(objective, np.log([start[name] for name in method.names]), bounds=bounds, options=_SEARCH)
-        if np.isfinite(end.value):
-            found.append(Learnt(end.point, -end.value, objective.evaluations))
-    if not found:
-        raise ValueError(f"the likelihood is not finite wherever a search for the parameters of {method.force} starts; "
-                         "are there readings that no queue can have?")
-    return sorted(found, key=lambda one: -one.log_likelihood)
+ACCEPTED = 0.95
+"""Acceptance that NUTS aims at: steps fine enough for the walls of the posterior, where arrivals exceed what is served
+and the log density falls by hundreds within a few standard deviations."""
 
 
 class Tracked(NamedTuple):
-    """What a filter says on `GRID`.
+    """Means and standard deviations (T,) on `GRID`: of log(1 + customers), and of the rate of arrivals (1/min)."""
 
-    Attributes:
-        log_queue: (T,) mean of log(1 + customers).
-        log_queue_sd: (T,).
-        arrivals: (T,) mean rate of arrivals (customers/min).
-        arrivals_sd: (T,).
+    log_queue: Any
+    log_queue_sd: Any
+    arrivals: Any
+    arrivals_sd: Any
+
+
+def customers(log_queue: Any) -> Any:
+    """Return the queue from x = log(1 + customers), which a band may take below zero."""
+    return np.expm1(np.maximum(log_queue, 0.0))
+
+
+@functools.partial(jax.jit, static_argnames=("method", "smoothed"))
+def track(method: Method, z: Any, y: Any, tested: Any, smoothed: bool = False) -> Tracked:
+    """Filter a window, or smooth it, with parameters exp(z) and service rates ``tested`` in the halves of the test day.
+
+    The readings y (673, 1) are logarithms on `GRID`, NaN where there is none.
     """
-
-    log_queue: np.ndarray
-    log_queue_sd: np.ndarray
-    arrivals: np.ndarray
-    arrivals_sd: np.ndarray
-
-    def queue(self, deviations: float = 0.0) -> np.ndarray:
-        """Return customers (T,), so many standard deviations above the median."""
-        return np.expm1(np.maximum(self.log_queue + deviations * self.log_queue_sd, 0.0))
-
-
-def track(method: Method, z: np.ndarray, y: np.ndarray, tested: tuple[float, float]) -> Tracked:
-    """Filter a window.
-
-    Args:
-        method: the model of the arrivals.
-        z: logarithms of its parameters.
-        y: (673, 1) logarithms of readings on `GRID`, NaN where there is none.
-        tested: service rates in the halves of the test day.
-    """
-    found = _tracker(method)(jnp.asarray(z), jnp.asarray(y), jnp.asarray(tested))
-    return Tracked(*map(np.asarray, found))
-
-
-@functools.cache
-def _tracker(method: Method) -> Callable:
-    def run(z: jax.Array, y: jax.Array, tested: jax.Array) -> tuple[jax.Array, ...]:
-        model = problem.system(method, z, tested)
-        passed = filter(model, GRID, y, steps=STEPS)
-        return _estimates(method, model, passed.filtered_mean, passed.filtered_covariance)
-
-    return jax.jit(run)
-
-
-def shapes(method: Method, z: np.ndarray, y: np.ndarray, tested: tuple[float, float]) -> Tracked:
-    """Smooth a window, given all of its readings; otherwise as `track`."""
-    return Tracked(*map(np.asarray, _smoother(method)(jnp.asarray(z), jnp.asarray(y), jnp.asarray(tested))))
-
-
-@functools.cache
-def _smoother(method: Method) -> Callable:
-    def run(z: jax.Array, y: jax.Array, tested: jax.Array) -> tuple[jax.Array, ...]:
-        model = problem.system(method, z, tested)
-        found = smooth(model, GRID, y, steps=STEPS)
-        return _estimates(method, model, found.mean, found.covariance)
-
-    return jax.jit(run)
-
-
-def _estimates(method: Method, model: Any, mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, ...]:
-    """Return means and standard deviations of queue and arrivals from those of the joint state."""
+    model = problem.system(method, z, jnp.array(tested))
+    path: Any = (smooth if smoothed else filter)(model, GRID, y, steps=STEPS)
+    states = (path.mean, path.covariance) if smoothed else (path.filtered_mean, path.filtered_covariance)
     ssm = state_space(model)
 
-    def at(t: jax.Array, m: jax.Array, p: jax.Array) -> tuple[jax.Array, ...]:
+    def queue_and_arrivals(t: jax.Array, m: jax.Array, p: jax.Array) -> tuple[jax.Array, jax.Array]:
         matrix, offset = ssm.input_map(t)
         return matmul(matrix, m[:, None])[:, 0] + offset, congruence(matrix, p)
 
-    centre, spread = jax.vmap(at)(jnp.asarray(GRID), mean, covariance)
-    sd = jnp.sqrt(jnp.maximum(jnp.diagonal(spread, axis1=1, axis2=2), 0.0))
-    rate, rate_sd = centre[:, 1], sd[:, 1]
+    mean, covariance = jax.vmap(queue_and_arrivals)(jnp.asarray(GRID), *states)
+    sd = jnp.sqrt(jnp.maximum(jnp.diagonal(covariance, axis1=1, axis2=2), 0.0))
+    rate, rate_sd = mean[:, 1], sd[:, 1]
     if method.link == "softplus":
         nodes, weights = np.polynomial.hermite_e.hermegauss(20)
         values = jax.nn.softplus(rate[:, None] + rate_sd[:, None] * nodes)
         rate = values @ (weights / weights.sum())
         rate_sd = jnp.sqrt((values - rate[:, None]) ** 2 @ (weights / weights.sum()))
-    return centre[:, 0], sd[:, 0], rate, rate_sd
+    return Tracked(mean[:, 0], sd[:, 0], rate, rate_sd)
 
 
-def judge(found: Tracked, one: Window, name: str) -> dict[str, float]:
-    """Return how good the estimates of the test day are, at the ends of its five-minute counts.
+def judge(parts: Sequence[Tracked], window: Window, test: str) -> dict[str, float]:
+    """Return how good an equal mixture of estimates of the test day is, at the ends of its five-minute counts.
 
-    Returns:
-        ``rmse`` and ``coverage`` of the 95% bands, of the queue and (``rate_``) of the arrivals; ``ell``, the log
-        density of the true queue, summed over these times; and ``largest``, the longest true queue.
+    These are ``rmse`` of the median and ``coverage`` of the 95% bands of the queue, ``ell``, the log density of the
+    true queue, summed over these times, and ``rate_rmse`` of the mean and ``rate_coverage`` of the arrivals.
     """
-    test, z = slice(FIRST + 1, None), scores.Z
-    queue, arrivals = one.queues[name][test], one.arrivals[FIRST:]
+    ends = slice(FIRST + 1, None)
+    queue, arrivals = window.queues[test][ends], window.arrivals[FIRST:]
+    mean, sd, rate, rate_sd = (np.stack(entry)[:, ends] for entry in zip(*parts, strict=True))
+    low, middle, high = customers(quantiles(mean, sd, np.array([0.025, 0.5, 0.975])))
+    rate_low, rate_high = quantiles(rate, rate_sd, np.array([0.025, 0.975]))
     # The density of L is that of x = log(1 + L) times dx/dL = exp(-x).
-    x, rate, rate_sd = np.log1p(queue), found.arrivals[test], found.arrivals_sd[test]
-    density = stats.norm(found.log_queue[test], found.log_queue_sd[test]).logpdf(x) - x
-    return {"rmse": scores.rmse(found.queue()[test], queue),
-            "coverage": scores.covered(found.queue(-z)[test], found.queue(z)[test], queue),
-            "ell": float(density.sum()), "rate_rmse": scores.rmse(rate, arrivals),
-            "rate_coverage": scores.covered(rate - z * rate_sd, rate + z * rate_sd, arrivals),
-            "largest": float(queue.max())}
+    x = np.log1p(queue)
+    density = special.logsumexp(stats.norm(mean, sd).logpdf(x), axis=0) - np.log(len(parts)) - x
+    return {"rmse": scores.rmse(middle, queue), "coverage": scores.covered(low, high, queue),
+            "ell": float(density.sum()), "rate_rmse": scores.rmse(rate.mean(axis=0), arrivals),
+            "rate_coverage": scores.covered(rate_low, rate_high, arrivals)}
 
 
-def tasks(settings: Any) -> list[Task]:
-    """Return one task for each method: what is compiled for it serves all windows."""
-    return [Task(f"track/{name}", settings.seed, {
-        "experiment": "call-centre", "what": "track", "method": name, "link": settings.link,
-        "functions": settings.functions, "starts": len(STARTS), **settings.windows()}) for name in settings.methods]
+def quantiles(mean: np.ndarray, sd: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """Return quantiles (Q, K) of equal mixtures of normal distributions with mean and sd (S, K), by bisection.
+
+    Example:
+        >>> quantiles(np.array([[1.0], [3.0]]), np.ones((2, 1)), np.array([0.5])).round(6).tolist()
+        [[2.0]]
+    """
+    shape = (len(p), mean.shape[1])
+    low = np.broadcast_to((mean - 10 * sd).min(axis=0), shape)
+    high = np.broadcast_to((mean + 10 * sd).max(axis=0), shape)
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        below = special.ndtr((middle[:, None] - mean) / sd).mean(axis=1) < p[:, None]
+        low, high = np.where(below, middle, low), np.where(below, high, middle)
+    return 0.5 * (low + high)
 
 
 def method_of(task: Task) -> Method:
     """Return the method of a task."""
-    return Method(METHODS[task.settings["method"]], task.settings["link"], task.settings["functions"])
+    return Method(task.settings["method"].lower(), task.settings["link"], task.settings["functions"])
 
 
 def windows_of(task: Task) -> list[Window]:
-    """Return the windows of a task; what is warned of them is said once, by the experiment."""
+    """Return the windows of a task."""
     given = task.settings
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", counts.OverloadWarning)
-        return [problem.window(given["data"], given["weekday"], given["first"] + index, task.seed)
-                for index in range(given["count"])]
+    return [problem.window(given["data"], given["weekday"], given["first"] + index, task.seed)
+            for index in range(given["count"])]
 
 
-def compute(task: Task) -> Result:
-    """Return what a method finds of all windows.
+def most_likely(task: Task) -> Result:
+    """Return what a method finds of all windows with its most likely parameters.
 
-    Returns:
-        ``z`` (N, P), ``log_likelihood`` (N,), and for both tests, with its name before it, the entries of `judge` (N,)
-        and those of `Tracked` of the first window; CPU ``seconds`` of all windows but the first, which compiles.
+    These are z, the log likelihood, and the evaluations of it, the entries of `mixed`, and ``largest``, the longest
+    true queue, by test; CPU ``seconds``, the first with compilation; the entries of `Tracked` of the first window, by
+    test.
     """
-    method = method_of(task)
-    first: Result = {}
-    rows: list[dict[str, Any]] = []
-    for one in windows_of(task):
+    method, windows, rows = method_of(task), windows_of(task), []
+    for window in windows:
         began = time.process_time()
-        learnt = learn(method, one.training)
-        row: dict[str, Any] = {"z": learnt.z, "log_likelihood": learnt.log_likelihood,
-                               "evaluations": learnt.evaluations}
-        for name, tested in TESTED.items():
-            found = track(method, learnt.z, one.y[name], tested)
-            row |= {f"{name}_{key}": value for key, value in judge(found, one, name).items()}
-            if not rows:
-                first |= {f"{name}_{key}": value for key, value in found._asdict().items()}
-        rows.append(row | {"seconds": time.process_time() - began})
-    return stacked(rows) | first
+        (best, *_), evaluations = searches(method, window.training)
+        scored = mixed(method, best.point[None], window)
+        largest = {f"{test}_largest": queue[FIRST + 1:].max() for test, queue in window.queues.items()}
+        rows.append({"z": best.point, "log_likelihood": -best.value, "evaluations": evaluations, **scored, **largest,
+                     "seconds": time.process_time() - began})
+    tracked = {test: track(method, rows[0]["z"], windows[0].y[test], rates) for test, rates in TESTED.items()}
+    return stacked(rows) | {f"{test}_{name}": np.asarray(value) for test, path in tracked.items()
+                            for name, value in path._asdict().items()}
+
+
+def marginalised(task: Task) -> Result:
+    """Return what the posterior says of all windows, and the entries of `mixed`.
+
+    Of the importance samples these are the Pareto index ``k`` and ``ess``, the number of ``modes`` and the share of the
+    posterior ``beyond`` the highest of them (N,), ``posterior_mean`` and ``posterior_sd`` of z (N, P); of the first
+    window the arrivals ``shapes`` and ``shapes_sd`` (673,), smoothed at the most likely parameters.
+    """
+    method, windows, rows = method_of(task), windows_of(task), []
+    for seed, window in enumerate(windows, task.seed):
+        draws, weights, mass = posterior(method, window.training, task.settings["draws"], seed)
+        mean, covariance = moments(draws, np.exp(weights.log_weight[0]))
+        chosen = draws[importance.resample(weights.log_weight, task.settings["mixed"], seed)]
+        rows.append({"k": weights.k, "ess": weights.ess, "modes": len(mass), "beyond": mass[1:].sum(),
+                     "posterior_mean": mean, "posterior_sd": np.sqrt(np.diag(covariance)),
+                     **mixed(method, chosen, window)})
+    (best, *_), _ = searches(method, windows[0].training)
+    path = track(method, best.point, windows[0].y["constant"], TESTED["constant"], smoothed=True)
+    return stacked(rows) | {"shapes": np.asarray(path.arrivals), "shapes_sd": np.asarray(path.arrivals_sd)}
+
+
+def by_nuts(task: Task) -> Result:
+    """Return the entries of `mixed` of one window, and those of `chains.sample`."""
+    method, (window,) = method_of(task), windows_of(task)
+    count, warmup, draws = task.settings["chains"]
+
+    def model(y: np.ndarray) -> None:
+        problem.model_file().model(problem.TRAINING, y, **method._asdict())
+
+    mcmc = chains.sampler(chains.nuts(model, target_accept_prob=task.settings["accepted"]), count, warmup, draws)
+    start_key, run_key = jax.random.split(task.key)
+    (near, *_), _ = searches(method, window.training, prior=1.0)
+    starts = chains.starts(method.names, near.point, count, start_key)
+    found = chains.sample(mcmc, method.names, run_key, window.training, init_params=starts)
+    return found | mixed(method, scores.spread(found["draws"], task.settings["mixed"]), window)
+
+
+def mixed(method: Method, several: np.ndarray, window: Window) -> dict[str, float]:
+    """Return the entries of `judge` of several z (S, P), mixed, by test: with its name before theirs."""
+    row: dict[str, float] = {}
+    for test, rates in TESTED.items():
+        parts = [track(method, z, window.y[test], rates) for z in several]
+        row |= {f"{test}_{name}": value for name, value in judge(parts, window, test).items()}
+    return row

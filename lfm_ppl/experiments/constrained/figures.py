@@ -8,77 +8,71 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from lfm_ppl.engine.task import Result
-from lfm_ppl.experiments.constrained import estimators, problem, tables
+from lfm_ppl.experiments.constrained import problem
+from lfm_ppl.experiments.constrained.estimators import BANDS, FULL, HORIZON, METHODS, NEAR
 from lfm_ppl.experiments.drawing import SHADE, TRUTH, legend
+from lfm_ppl.experiments.study import Data
 from lfm_ppl.results.plots import style
 
 
-def draw(settings: Any, results: dict[str, Result]) -> dict[str, Figure]:
+def draw(settings: Any, data: Data) -> dict[str, Figure]:
     """Return every figure by name."""
-    return {"forces": plot_forces(settings, results), "errors": plot_errors(settings, results),
-            "target": plot_target(settings, results), "patient": plot_patient(settings, results),
-            "peaks": plot_peaks(settings, results)}
+    return {"forces": plot_forces(data), "errors": plot_errors(data), "target": plot_target(data),
+            "patient": plot_patient(data), "peaks": plot_peaks(data)}
 
 
 @style.styled
-def plot_forces(settings: Any, results: dict[str, Result], *, width: str | float = "column") -> Figure:
+def plot_forces(data: Data, *, width: str | float = "column") -> Figure:
     """Draw the first force of each shape, as the source's estimator and full information see it, with its band."""
-    figure = style.new_figure(width, 1.25 * len(settings.shapes) + 0.6)
-    panels = figure.subplots(len(settings.shapes), 1, sharex=True, squeeze=False)[:, 0]
-    for axes, shape in zip(panels, settings.shapes, strict=True):
-        found = results[f"transcription/{shape.replace(' ', '-')}/0000"]
-        _, low, high = found[f"{estimators.BANDS}/first"]
-        axes.fill_between(problem.TIMES[:: estimators.ROWS[estimators.BANDS]], low, high, color=SHADE, lw=0,
-                          label="95% band (EP)")
-        if estimators.HORIZON in settings.methods:
-            axes.plot(problem.TIMES, found[f"{estimators.HORIZON}/first"][0], color=style.ORANGE, lw=0.8,
-                      label=estimators.HORIZON)
-        axes.plot(problem.TIMES, found[f"{estimators.FULL}/first"][0], color=style.BLUE, label=estimators.FULL)
-        axes.plot(problem.TIMES, found["truth"], **TRUTH)
-        axes.set_title(shape)
-        axes.set_ylabel("force")
-        axes.set_xlim(0.0, problem.TIMES[-1])
-        style.tidy(axes)
+    shapes, rows = data["transcription"]["shape"].values, problem.TIMES[:: METHODS[BANDS].every]
+    figure = style.new_figure(width, 1.25 * len(shapes) + 0.6)
+    panels = figure.subplots(len(shapes), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, shape in zip(panels, shapes, strict=True):
+        first = data["transcription"]["first"].sel(shape=shape)
+        _, low, high = first.sel({"method": BANDS})[:, :len(rows)]
+        axes.fill_between(rows, low, high, color=SHADE, lw=0, label="95% band (EP)")
+        if HORIZON in first["method"]:
+            axes.plot(problem.TIMES, first.sel({"method": HORIZON})[0], color=style.ORANGE, lw=0.8, label=HORIZON)
+        axes.plot(problem.TIMES, first.sel({"method": FULL})[0], color=style.BLUE, label=FULL)
+        axes.plot(problem.TIMES, data["transcription"]["truth"].sel({"shape": shape, "method": FULL}), **TRUTH)
+        style.tidy(axes, title=shape, ylabel="force", xlim=(0.0, problem.TIMES[-1]))
     panels[-1].set_xlabel("time (s)")
     legend(figure)
     return figure
 
 
 @style.styled
-def plot_errors(settings: Any, results: dict[str, Result], *, width: str | float = "column") -> Figure:
+def plot_errors(data: Data, *, width: str | float = "column") -> Figure:
     """Draw the mean squared errors of the force of all records, beside the published ones."""
+    errors = data["transcription"]["mse"].transpose("method", ...)
     figure = style.new_figure(width, 2.6)
     axes = figure.subplots()
-    errors = [tables.gathered(results, "transcription", f"{method}/mse") for method in settings.methods]
-    for row, mse in enumerate(errors):
+    for row, mse in enumerate(errors.values):
         least, low, median, high, largest = np.quantile(mse, [0.0, 0.25, 0.5, 0.75, 1.0])
         axes.hlines(row, least, largest, color=style.BLUE, lw=0.8)
         axes.hlines(row, low, high, color=style.BLUE, lw=4.0)
         axes.plot(median, row, color=style.BLACK, marker="|", ms=7.0, ls="")
     for colour, line, published in ((style.BLACK, ":", "smoother"), (style.ORANGE, "--", "delayed MHE")):
         axes.axvline(problem.PUBLISHED[published], color=colour, ls=line, lw=1.0, label=f"published, {published}")
-    axes.set_xscale("log")
-    axes.set_yticks(range(len(errors)), list(settings.methods))
+    axes.set(xscale="log", xlabel="mean squared error of the force")
+    axes.set_yticks(range(len(errors)), list(errors["method"].values))
     axes.invert_yaxis()
-    axes.set_xlabel("mean squared error of the force")
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.tick_params(labelsize=style.SMALL)
     legend(figure)
-    style.note_below(figure, f"{len(errors[0])} records: median, quartiles, extremes")
+    style.note_below(figure, f"{errors[0].size} records: median, quartiles, extremes")
     return figure
 
 
 @style.styled
-def plot_target(settings: Any, results: dict[str, Result], *, width: str | float = "column") -> Figure:
+def plot_target(data: Data, *, width: str | float = "column") -> Figure:
     """Draw the first target's altitude, speed and acceleration with their full information estimates."""
-    found = results["ballistic/0000"]
     figure, panels = style.small_multiples(width, 3, 1.1)
     scales = ((1e-3, "km"), (1e-3, "km/s"), (1.0, "m/s^2"))
-    for index, (axes, path) in enumerate(zip(panels, problem.TARGET_PATHS, strict=True)):
-        factor, unit = scales[index]
-        axes.plot(problem.TARGET_TIMES, factor * found["estimate"][index], color=style.BLUE, label=estimators.FULL)
-        axes.plot(problem.TARGET_TIMES, factor * found["truth"][index], **TRUTH)
+    for axes, path, (factor, unit) in zip(panels, problem.TARGET_PATHS, scales, strict=True):
+        found = factor * data["ballistic"][["estimate", "truth"]].sel(path=path)
+        axes.plot(problem.TARGET_TIMES, found["estimate"], color=style.BLUE, label=FULL)
+        axes.plot(problem.TARGET_TIMES, found["truth"], **TRUTH)
         axes.set_ylabel(style.with_unit(path, unit))
     style.label_time(panels, "s")
     legend(figure)
@@ -86,47 +80,36 @@ def plot_target(settings: Any, results: dict[str, Result], *, width: str | float
 
 
 @style.styled
-def plot_patient(settings: Any, results: dict[str, Result], *, width: str | float = "column") -> Figure:
+def plot_patient(data: Data, *, width: str | float = "column") -> Figure:
     """Draw the first patient's concentrations, and TRH with its estimate and 95% band."""
-    found, units = results["thyroid/0000"], problem.thyroid().units
+    found, units = data["thyroid"].isel(dataset=0), problem.thyroid().units
     figure = style.new_figure(width, 4.2)
-    panels = list(figure.subplots(4, 1, sharex=True, height_ratios=(1, 1, 1, 2)))
+    *panels, trh = figure.subplots(4, 1, sharex=True, height_ratios=(1, 1, 1, 2))
     for axes, name, values in zip(panels, problem.thyroid().outputs or (), found["y"].T, strict=False):
         axes.plot(found["measured"], values, color=style.VERMILLION, marker="o", ms=2.0, ls="", label="measured")
-        axes.set_ylabel(style.with_unit(name, units[name]))
-    trh = panels[-1]
-    trh.fill_between(found["times"], found["low"][0], found["high"][0], color=SHADE, lw=0, label="95% band (EP)")
-    trh.plot(found["times"], found["mode"][0], color=style.BLUE, label=estimators.FULL)
-    trh.plot(found["times"], found["truth"][0], **TRUTH)
-    trh.set_ylabel(style.with_unit(problem.HORMONE, units[problem.HORMONE]))
-    trh.set_ylim(bottom=0.0)
-    for axes in panels:
-        axes.set_xlim(0.0, 24.0)
-        axes.set_xticks(range(0, 25, 6))
-        style.tidy(axes)
-        axes.tick_params(labelbottom=axes is trh)
-    trh.set_xlabel("time of day (h)")
+        style.tidy(axes, ylabel=style.with_unit(name, units[name]))
+        axes.tick_params(labelbottom=False)
+    trh.fill_between(found["times"], found["low"], found["high"], color=SHADE, lw=0, label="95% band (EP)")
+    trh.plot(found["times"], found["mode"], color=style.BLUE, label=FULL)
+    trh.plot(found["times"], found["truth"], **TRUTH)
+    style.tidy(trh, xlabel="time of day (h)", ylabel=style.with_unit(problem.HORMONE, units[problem.HORMONE]),
+               xlim=(0.0, 24.0), ylim=(0.0, None))
     legend(figure)
     return figure
 
 
 @style.styled
-def plot_peaks(settings: Any, results: dict[str, Result], *, width: str | float = "column") -> Figure:
+def plot_peaks(data: Data, *, width: str | float = "column") -> Figure:
     """Draw by how much the times of the greatest TRH, and of the peak of its daily wave, are off."""
-    errors = np.sort(tables.gathered(results, "thyroid", "peak"), axis=0)
-    share = np.arange(1, len(errors) + 1) / len(errors)
+    errors = np.sort(data["thyroid"]["peak"].values, axis=0)
+    share = np.arange(len(errors) + 1) / len(errors)
     figure = style.new_figure(width, 2.0)
     axes = figure.subplots()
     kinds = ((style.ORANGE, "--", "greatest TRH"), (style.BLUE, "-", "peak of the wave of 24 h"))
-    for index, (colour, line, label) in enumerate(kinds):
-        axes.step(np.append(0.0, errors[:, index]), np.append(0.0, share), where="post", color=colour, ls=line,
-                  label=label)
-    axes.axvline(tables.NEAR, color=style.BLACK, lw=0.6)
+    for own, (colour, line, label) in zip(errors.T, kinds, strict=True):
+        axes.step(np.append(0.0, own), share, where="post", color=colour, ls=line, label=label)
+    axes.axvline(NEAR, color=style.BLACK, lw=0.6)
     axes.axhline(0.9, color=style.BLACK, lw=0.6)
-    axes.set_xlim(0.0, max(3.0, 1.1 * tables.NEAR))
-    axes.set_ylim(0.0, 1.02)
-    axes.set_xlabel("error of the time (h)")
-    axes.set_ylabel("share of patients")
-    style.tidy(axes)
+    style.tidy(axes, xlim=(0.0, 3.0), ylim=(0.0, 1.02), xlabel="error of the time (h)", ylabel="share of patients")
     legend(figure)
     return figure

@@ -14,6 +14,7 @@ import numpyro.distributions as dist
 from scipy.signal import lfilter
 
 from lfm_ppl import loading
+from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments.posteriors import LogPosterior
 from lfm_ppl.forces import Matern
 from lfm_ppl.inference.bound_model import bind, likelihood_site
@@ -24,40 +25,36 @@ from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation import GaussianObservation
 from lfm_ppl.model.simulate import simulate
 
+MOST = 10_000
+"""Records of a shape, targets and patients for one seed of the experiment."""
+
 # --- transcription: x' = 0.25 l - 0.6 x + w
 
 SENSITIVITY, DECAY, PROCESS_SD, NOISE_SD = 0.25, 0.6, 1e-3, 0.025
+FACTOR = "factor"
 WINDOW = 60
 """Samples from which the source learns the lengthscale, which do not count in errors, and intervals of its window."""
-
 TIMES = np.linspace(0.0, 15.0, 1501)
 """Seconds. The source has 1,500 samples."""
-
 SHAPES = ("pulses", "half sines", "rectified GP", "softplus of a GP")
 """The source does not say what its force is; the largest value of these is about 2."""
-
-FACTOR = "factor"
 ARRIVAL = 1e-2
 """P = 1e-2 I, the weight of the source's arrival cost."""
 GUESSED = 1.0
 """Lengthscale (s) from which a search or an arrival cost of it starts; the source does not say."""
 PUBLISHED = {"smoother": 0.0192, "delayed MHE": 0.0103}
 """Mean squared errors of the force in the source, of one realisation."""
-
-MOST = 10_000
-"""Records of a shape for one seed of the experiment."""
-
 _FINE = 10
 """Cells of the simulation between two samples."""
 
 
-class Record(NamedTuple):
-    """A simulated record.
+def indices(task: Task) -> range:
+    """Return which records, targets or patients a task is about."""
+    return range(task.settings["first"], task.settings["first"] + task.settings["count"])
 
-    Attributes:
-        y: (T, 1), the measured concentration.
-        force: (T,), the true force.
-    """
+
+class Record(NamedTuple):
+    """The measured concentration ``y`` (T, 1), and the true ``force`` (T,)."""
 
     y: np.ndarray
     force: np.ndarray
@@ -87,82 +84,64 @@ def _force(shape: str, t: np.ndarray, random: np.random.Generator) -> np.ndarray
     return np.maximum(draw, 0.0) if shape == "rectified GP" else np.logaddexp(0.0, 1.5 * draw)
 
 
-class Motif(eqx.Module):
-    """Dynamics x' = 0.25 g(u) - 0.6 x."""
-
-    softplus: bool = eqx.field(static=True, default=False)
-
-    def __call__(self, x: jax.Array, u: jax.Array, t: jax.Array) -> jax.Array:
-        """Return the rate (1,)."""
-        return SENSITIVITY * (jax.nn.softplus(u) if self.softplus else u) - DECAY * x
-
-
 def _state(x: jax.Array, u: jax.Array, t: jax.Array) -> jax.Array:
     return x[:1]
 
 
-def transcription(scale: Any, lengthscale: Any, level: Any = 0.0, softplus: bool = False) -> LatentForceModel:
+def transcription(lengthscale: Any, scale: Any = 1.0, *, softplus: bool = False) -> LatentForceModel:
     """Return the model with a Matern-3/2 force of these parameters, through a softplus link where that is asked."""
-    force = Matern(scale, lengthscale, 1, mean=level) if softplus else Matern(scale, lengthscale, 1)
+    link = jax.nn.softplus if softplus else lambda u: u
     return LatentForceModel(
-        Motif(softplus), {FACTOR: force}, GaussianObservation(_state, jnp.array([NOISE_SD**2])),
-        Gaussian(jnp.zeros(1), 0.01 * jnp.eye(1)), process_noise=PROCESS_SD * jnp.eye(1), initial_time=0.0)
+        lambda x, u, t: SENSITIVITY * link(u) - DECAY * x, {FACTOR: Matern(scale, lengthscale, 1)},
+        GaussianObservation(_state, jnp.array([NOISE_SD**2])), Gaussian(jnp.zeros(1), 0.01 * jnp.eye(1)),
+        process_noise=PROCESS_SD * jnp.eye(1), initial_time=0.0)
 
 
 class Companion(eqx.Module):
-    """Dynamics of (x, l, l') in equation 7 of the source, or with a constant state more, the rate sqrt(3)/lengthscale.
-
-    Attributes:
-        rate: None: it is the last state.
-    """
+    """Dynamics of (x, l, l') in equation 7 of the source; where the rate sqrt(3)/lengthscale is None it is a state."""
 
     rate: Any
 
     def __call__(self, x: jax.Array, u: jax.Array, t: jax.Array) -> jax.Array:
-        """Return the rates (3,) or (4,)."""
+        """Return the rates of change (3,) or (4,), of which the last is zero."""
         rate = x[3] if self.rate is None else self.rate
-        found = [SENSITIVITY * x[1] - DECAY * x[0], x[2], -(rate**2) * x[1] - 2.0 * rate * x[2]]
-        return jnp.stack(found if self.rate is not None else [*found, jnp.zeros_like(rate)])
+        changes = [SENSITIVITY * x[1] - DECAY * x[0], x[2], -(rate**2) * x[1] - 2.0 * rate * x[2], jnp.zeros(())]
+        return jnp.stack(changes[: len(x)])
 
 
 def companion(lengthscale: Any, mean: Any, weighted: Any = None, learnt: bool = False) -> LatentForceModel:
     """Return the model of a window of the source: the force of scale 1 among the states, from an arrival mean (3,).
 
     Its cost 2 |chi - mean|^2_P + sum of 2 |w|^2_Q + |y - x|^2_R, with P = 1e-2 I and Q and R the inverses of the
-    noises' variances, is twice that of an arrival covariance I / (2 P) and half the process covariance.
-
-    Args:
-        lengthscale: of the force. Where it is learnt, that of the arrival mean.
-        mean: (3,), of the arrival cost.
-        weighted: the lengthscale at which Q is taken; None: the force's.
-        learnt: whether the rate is a constant state of unknown value.
+    noises' variances, is twice that of an arrival covariance I / (2 P) and half the process covariance. Q is that of
+    the lengthscale ``weighted``, or of the force's. Where that is ``learnt``, its rate is a constant state of unknown
+    value, whose arrival mean is that of ``lengthscale``.
     """
     rate = np.sqrt(3.0) / lengthscale
     weight = rate if weighted is None else np.sqrt(3.0) / weighted
-    noise = [jnp.asarray(PROCESS_SD**2), jnp.asarray(0.0), jnp.asarray(4.0 * weight**3), *[jnp.asarray(0.0)] * learnt]
+    variances = jnp.array([PROCESS_SD**2, 0.0, 4.0 * weight**3, *[0.0] * learnt])
     return LatentForceModel(
         Companion(None if learnt else rate), {}, GaussianObservation(_state, jnp.array([NOISE_SD**2])),
         Gaussian(jnp.append(mean, rate) if learnt else mean, 0.5 / ARRIVAL * jnp.eye(3 + learnt)),
-        process_noise=jnp.sqrt(jnp.diag(jnp.stack(noise)) / 2.0), initial_time=0.0,
+        process_noise=jnp.sqrt(jnp.diag(variances) / 2.0), initial_time=0.0,
         state_names=("x", FACTOR, "derivative", *["rate"] * learnt))
-
-
-def _learnt(times: Any, y: Any = None, softplus: bool = False, alone: bool = False) -> None:
-    lengthscale = numpyro.sample("lengthscale", dist.LogNormal(0.0, 1.0))
-    scale = 1.0 if alone else numpyro.sample("scale", dist.LogNormal(0.0, 1.0))
-    model = transcription(scale, lengthscale, 0.0, softplus)
-    rule = GaussHermite(5) if softplus else Cubature()
-    numpyro.sample("y", MarginalLikelihood(model, times, rule, steps=1), obs=y)
 
 
 @functools.cache
 def learning(kind: str) -> LogPosterior:
     """Return the posterior of hyperparameters: of "early" samples, in which the scale is 1, "all", or "softplus"."""
-    count = WINDOW if kind == "early" else len(TIMES)
-    names = ("lengthscale",) if kind == "early" else ("lengthscale", "scale")
+    early, softplus = kind == "early", kind == "softplus"
+    count, rule = WINDOW if early else len(TIMES), GaussHermite(5) if softplus else Cubature()
+
+    def model(times: Any, y: Any = None) -> None:
+        lengthscale = numpyro.sample("lengthscale", dist.LogNormal(0.0, 1.0))
+        scale = 1.0 if early else numpyro.sample("scale", dist.LogNormal(0.0, 1.0))
+        system = transcription(lengthscale, scale, softplus=softplus)
+        numpyro.sample("y", MarginalLikelihood(system, times, rule, steps=1), obs=y)
+
     with jax.ensure_compile_time_eval():
-        return LogPosterior(bind(_learnt, TIMES[:count], np.zeros((count, 1)), softplus=kind == "softplus",
-                                 alone=kind == "early"), names)
+        bound = bind(model, TIMES[:count], np.zeros((count, 1)))
+        return LogPosterior(bound, ("lengthscale",) if early else ("lengthscale", "scale"))
 
 
 # --- ballistic target, section 4.2 of the source

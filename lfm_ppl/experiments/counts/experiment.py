@@ -1,14 +1,18 @@
-"""The study: its settings, tasks, tables and figures."""
+"""The study: its settings, tasks and tables."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from lfm_ppl.engine.run import Reporter
-from lfm_ppl.engine.task import Result, Task
+from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import study
-from lfm_ppl.experiments.counts import figures, methods, problem, tables
-from lfm_ppl.experiments.study import Results, Study, Table, setting
+from lfm_ppl.experiments.counts import figures, methods, problem
+from lfm_ppl.experiments.datasets import Column, Kind, row
+from lfm_ppl.experiments.scores import Estimate
+from lfm_ppl.experiments.study import Data, Results, Study, Table, setting
 
 
 @dataclass(frozen=True)
@@ -34,12 +38,7 @@ def comparing(settings: Settings, results: Results) -> list[Task]:
     return [Task(f"{task.settings['problem']}/{method}", settings.seed,
                  {**task.settings, "method": method, "draws": settings.draws,
                   "parameters": {name: float(value) for name, value in results[task.name].items()}})
-            for task in learning(settings) for method in (*methods.METHODS, methods.REFERENCE)]
-
-
-def compute(task: Task) -> Result:
-    """Compute one task."""
-    return methods.compute(task) if "method" in task.settings else methods.learn(task)
+            for task in learning(settings) for method in methods.METHODS]
 
 
 def check(settings: Settings, report: Reporter | None) -> None:
@@ -48,21 +47,53 @@ def check(settings: Settings, report: Reporter | None) -> None:
         problem.problem(name, settings.size, settings.seed, settings.data)
 
 
-def tabulated(settings: Settings, results: Results) -> dict[str, Table]:
+def tables(settings: Settings, data: Data) -> dict[str, Table]:
     """Return the tables."""
-    return {"accuracy": Table("Posterior of the predictor (mean: largest error in sds; sd: largest relative error)",
-                              tables.accuracy(settings, results)),
-            "prediction": Table(f"Held-out data, {settings.size.folds} folds", tables.prediction(settings, results))}
+    return {"accuracy": Table.of("Posterior of the predictor (mean: largest error in sds; sd: largest relative error)",
+                                 rows(settings, data, ACCURACY)),
+            "prediction": Table.of(f"Held-out data, {settings.size.folds} folds", rows(settings, data, PREDICTION))}
 
 
-def notes(settings: Settings, results: Results) -> tuple[str, ...]:
+ACCURACY: dict[str, Column] = {
+    "log Z": lambda one: Estimate(float(one["log evidence"]), float(one["log evidence error"])),
+    "less reference": lambda one: Estimate(float(one["excess"]), float(one["excess error"])),
+    "mean": "mean error", "sd": "sd error", "covered": "covered", "seconds": "seconds"}
+"""Of the predictor's posterior, see `methods.compared`; log Z of the reference has the standard error of importance
+sampling. ``seconds`` of CPU time are those of an evidence with its gradient, or of all draws."""
+
+PREDICTION: dict[str, Column] = {"NLPD": lambda one: -one["log density"], "less reference": "excess NLPD",
+                                 "covered": "inside"}
+"""Means over all data, each held out with its fold: the negative log predictive density, by how much it exceeds the
+reference's, and the share of data in their 95% predictive intervals."""
+
+
+def rows(settings: Settings, data: Data, columns: Mapping[str, Column]) -> dict[str, Any]:
+    """Return one row for each problem and method; columns of what a problem does not have are left out."""
+    found = {}
+    for name in settings.problems:
+        every = methods.compared(settings, data, name)
+        known = {title: column for title, column in columns.items() if callable(column) or column in every}
+        for method, label in methods.METHODS.items():
+            found[f"{name}, {label}"] = row(every.sel({"method": method}), known)
+    return found
+
+
+def notes(settings: Settings, data: Data) -> tuple[str, ...]:
     """Return what there is to say about the reference and the parameters."""
-    checked = tables.reference(settings, results)
-    return (f"Reference: elliptical slices, at least {checked['ess'].min():.0f} effective draws, R-hat at most "
-            f"{checked['r_hat'].max():.3f}; log Z by importance sampling, effective share of the draws at least "
-            f"{checked['share'].min():.2f}.",
+    reference = data["comparison"].sel({"method": methods.REFERENCE})
+    return (f"Reference: elliptical slices, at least {reference.ess.min():.0f} effective draws, R-hat at most "
+            f"{reference.r_hat.max():.3f}; log Z by importance sampling, effective share of the draws at least "
+            f"{reference.share.min():.2f}.",
             "Parameters are those at the mode of the posterior with EP's evidence, or the true ones of simulated data; "
             "all methods take the same.")
 
 
-STUDY = Study(Settings, learning, compute, tabulated, figures.draw, notes=notes, then=comparing, check=check)
+STUDY = Study(
+    Settings, learning,
+    {"parameters": Kind(methods.learn, {"": "level, scale, lengthscale, daily_scale, daily_lengthscale, concentration, "
+                                            "noise"}, ("problem",)),
+     "comparison": Kind(methods.compute, {
+         "dataset": "mean, sd, log density, low, high",
+         "": "log evidence, log evidence error, share, ess, r_hat, seconds"}, ("problem", "method"))},
+    tables, figures.draw, notes=notes, then=comparing, check=check,
+    what=lambda task: "comparison" if "method" in task.settings else "parameters")

@@ -8,38 +8,33 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import xarray as xr
 
 import lfm_ppl as lfm
 from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import scores
-from lfm_ppl.experiments.counts.problem import Problem, Size, problem
-from lfm_ppl.experiments.counts.reference import Reference
+from lfm_ppl.experiments.counts import problem
+from lfm_ppl.experiments.counts.reference import CHAINS, Reference
+from lfm_ppl.experiments.datasets import DATASET
+from lfm_ppl.experiments.study import Data
 from lfm_ppl.experiments.timing import timed
 from lfm_ppl.inference.map import map_estimate
-from lfm_ppl.model.observations.family import ObservationFamily
 
-METHODS = {"ep": "EP", "variational": "variational", "laplace": "Laplace"}
 REFERENCE = "reference"
+
+METHODS = {"ep": "EP", "variational": "variational", "laplace": "Laplace", REFERENCE: REFERENCE}
+"""Those of sites, by what `lfm_ppl.SiteSettings` calls them, and the reference -> the name of a row."""
 
 NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(60)
 """Of the integral of a density over the predictor."""
 
-REPEATS = 5
-"""Evidences with gradient over which the time is averaged."""
-
-DRAWN = 4000
-"""Predictive draws of a held-out entry, whose quantiles are an interval."""
-
-
-def of_task(task: Task) -> Problem:
-    """Return the problem of a task."""
-    given = task.settings
-    return problem(given["problem"], Size(*given["size"]), task.seed, given["data"])
+REPEATS, DRAWN = 5, 4000
+"""Evidences with gradient over which the time is averaged; predictive draws whose quantiles are an interval."""
 
 
 def learn(task: Task) -> Result:
     """Return the parameters at the mode of the posterior with EP's evidence."""
-    one = of_task(task)
+    one = _problem(task)
     if one.given is not None:
         return dict(one.given)
     found = map_estimate(one.model, one.times, one.y, restarts=1)
@@ -49,14 +44,23 @@ def learn(task: Task) -> Result:
 
 
 def compute(task: Task) -> Result:
-    """Return what a method finds, with parameters that are given."""
-    one, theta = of_task(task), dict(task.settings["parameters"])
-    if task.settings["method"] == REFERENCE:
-        return _reference(task, one, theta)
-    return _sites(task, one, theta)
+    """Return what a method finds, with parameters that are given.
+
+    Returns:
+        ``log evidence``; ``mean`` and ``sd`` (T,) of the predictor; the entries of `held_out`; CPU ``seconds`` of an
+        evidence with its gradient, or of all draws. Of the reference, too: ``log evidence error``, the standard error;
+        ``share``, the effective one of importance samples; the least ``ess`` and the largest ``r_hat`` of 40 entries.
+    """
+    judge = _reference if task.settings["method"] == REFERENCE else _sites
+    return judge(task, _problem(task), dict(task.settings["parameters"]))
 
 
-def _sites(task: Task, one: Problem, theta: dict[str, float]) -> Result:
+def _problem(task: Task) -> problem.Problem:
+    given = task.settings
+    return problem.problem(given["problem"], problem.Size(*given["size"]), task.seed, given["data"])
+
+
+def _sites(task: Task, one: problem.Problem, theta: dict[str, float]) -> Result:
     settings = one.sites._replace(method=task.settings["method"])
 
     def likelihood(values: dict[str, Any]) -> lfm.MarginalLikelihood:
@@ -75,83 +79,95 @@ def _sites(task: Task, one: Problem, theta: dict[str, float]) -> Result:
 
         return jax.vmap(row)(result.mean, result.covariance, jnp.asarray(one.times))
 
+    def moments(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return means and sds (T,); NaN where a variance is not positive: sites that did not converge."""
+        mean, variance = map(np.asarray, smoothed(theta, y))
+        return np.where(variance > 0, mean, np.nan), np.sqrt(np.where(variance > 0, variance, np.nan))
+
+    def predicted(y: np.ndarray, held: np.ndarray, key: jax.Array) -> tuple[np.ndarray, ...]:
+        m, s = (moment[held][:, None] for moment in moments(y))
+        normal = np.asarray(jax.random.normal(key, (held.sum(), DRAWN)))
+        return m + s * NODES, WEIGHTS / WEIGHTS.sum(), m + s * normal
+
     log_z = float(evidence(theta, one.y)[0])  # compiled here
     seconds, _ = timed(lambda: [evidence(theta, one.y) for _ in range(REPEATS)])
-    mean, sd = _moments(smoothed(theta, one.y))
-    family = _family(one.build(**theta))
-
-    def predicted(y: np.ndarray, held: np.ndarray, key: jax.Array) -> tuple[np.ndarray, np.ndarray]:
-        m, s = (a[held][:, None] for a in _moments(smoothed(theta, y)))
-        density = np.asarray(_densities(family, jnp.asarray(m + s * NODES), jnp.asarray(one.y[held])))
-        return (np.log(density @ (WEIGHTS / WEIGHTS.sum())),
-                m + s * np.asarray(jax.random.normal(key, (held.sum(), DRAWN))))
-
+    mean, sd = moments(one.y)
     return {"log evidence": log_z, "mean": mean, "sd": sd, "seconds": seconds / REPEATS,
-            **held_out(task, one, family, predicted)}
+            **held_out(task, one, predicted)}
 
 
-def _reference(task: Task, one: Problem, theta: dict[str, float]) -> Result:
-    draws = task.settings["draws"]
-    system = one.build(**theta)
-    family = _family(system)
-    reference = Reference(system, one.times, one.sites)
+def _reference(task: Task, one: problem.Problem, theta: dict[str, float]) -> Result:
+    draws, reference = task.settings["draws"], Reference(one.build(**theta), one.times, one.sites)
     key, fold_key = jax.random.split(task.key)
-    seconds, found = timed(lambda: reference.sample(key, one.y, draws))
-    weighed = reference.weigh(jax.random.fold_in(key, 1), one.y, draws)
 
-    def predicted(y: np.ndarray, held: np.ndarray, key: jax.Array) -> tuple[np.ndarray, np.ndarray]:
-        f = reference.sample(jax.random.fold_in(fold_key, int(held.argmax())), y, max(draws // 5, 100))
-        f = f.reshape(-1, f.shape[-1])[:, held].T
-        density = np.asarray(_densities(family, jnp.asarray(f), jnp.asarray(one.y[held])))
-        return np.log(density.mean(axis=1)), f[:, np.linspace(0, f.shape[1] - 1, DRAWN).astype(int)]
+    def sampled(key: jax.Array, y: np.ndarray, draws: int) -> np.ndarray:
+        return np.asarray(reference.sample(key, y, reference.proposal(y), draws))
 
-    return {"log evidence": weighed.log_evidence, "log evidence error": weighed.error, "share": weighed.share,
-            "mean": found.mean(axis=(0, 1)), "sd": found.std(axis=(0, 1)), "seconds": seconds,
-            **scores_of_chains(found), **held_out(task, one, family, predicted)}
+    seconds, f = timed(sampled, key, one.y, draws)
+    rows = np.unique(np.linspace(0, len(one.y) - 1, 40).astype(int))
+    checked = scores.diagnose([str(row) for row in rows], np.moveaxis(f[..., rows], -1, 0))
+    log_weight = np.asarray(reference.log_weights(jax.random.fold_in(key, 1), one.y, reference.proposal(one.y),
+                                                  CHAINS * draws))
+    weight = np.exp(log_weight - log_weight.max())
 
+    def predicted(y: np.ndarray, held: np.ndarray, key: jax.Array) -> tuple[np.ndarray, ...]:
+        f = sampled(jax.random.fold_in(fold_key, int(held.argmax())), y, max(draws // 5, 100))
+        f = f[..., held].reshape(-1, held.sum()).T
+        spread = np.linspace(0, f.shape[1] - 1, DRAWN).astype(int)
+        return f, np.full(f.shape[1], 1.0 / f.shape[1]), f[:, spread]
 
-def _family(model: lfm.LatentForceModel) -> ObservationFamily:
-    assert isinstance(model.observation, ObservationFamily)
-    return model.observation
-
-
-def scores_of_chains(draws: np.ndarray) -> Result:
-    """Return the smallest effective sample size and the largest R-hat of the predictor's entries."""
-    rows = np.unique(np.linspace(0, draws.shape[-1] - 1, 40).astype(int))
-    found = scores.diagnose([str(row) for row in rows], np.moveaxis(draws[..., rows], -1, 0))
-    return {"ess": float(found["ess"].min()), "r_hat": float(found["r_hat"].max())}
+    return {"log evidence": log_weight.max() + np.log(weight.mean()),
+            "log evidence error": weight.std() / weight.mean() / np.sqrt(weight.size),
+            "share": weight.sum() ** 2 / (weight**2).sum() / weight.size, "mean": f.mean(axis=(0, 1)),
+            "sd": f.std(axis=(0, 1)), "seconds": seconds, "ess": checked["ess"].min(), "r_hat": checked["r_hat"].max(),
+            **held_out(task, one, predicted)}
 
 
-def held_out(task: Task, one: Problem, family: ObservationFamily, predicted: Callable) -> Result:
-    """Predict each fold from the others.
+def held_out(task: Task, one: problem.Problem, predicted: Callable) -> Result:
+    """Return the ``log density`` (T,) of each entry given the other folds, and its 95% interval, ``low`` and ``high``.
 
     Args:
         task: whose key is that of the draws.
         one: the problem.
-        family: of the data.
-        predicted: from data (T, 1), which rows are held out (T,), and a key to their log predictive densities (K,) and
-            draws of their predictor (K, S).
-
-    Returns:
-        ``log density`` (T,) of each entry, held out, and ends ``low`` and ``high`` (T,) of its 95% interval.
+        predicted: from data (T, 1), which K rows are held out (T,), and a key, to predictors (K, S), their weights
+            (S,), and draws of predictors (K, D).
     """
+    family: Any = one.build(**task.settings["parameters"]).observation
     density, low, high = (np.full(len(one.y), np.nan) for _ in range(3))
     for fold in range(int(one.folds.max()) + 1):
         held = one.folds == fold
         key, sample_key = jax.random.split(jax.random.fold_in(task.key, fold))
-        density[held], f = predicted(np.where(held[:, None], np.nan, one.y), held, key)
-        y = np.asarray(family.sample(sample_key, jnp.asarray(f)))
+        f, weights, draws = predicted(np.where(held[:, None], np.nan, one.y), held, key)
+        log_density = family.log_prob(jnp.asarray(f), jnp.asarray(one.y[held]))
+        density[held] = np.log(np.exp(np.asarray(log_density)) @ weights)
+        y = np.asarray(family.sample(sample_key, jnp.asarray(draws)))
         low[held], high[held] = np.quantile(y, (0.025, 0.975), axis=1)
     return {"log density": density, "low": low, "high": high}
 
 
-def _moments(found: tuple[jax.Array, jax.Array]) -> tuple[np.ndarray, np.ndarray]:
-    """Return means and sds (T,); NaN where a variance is not positive: sites that did not converge."""
-    mean, variance = (np.asarray(a) for a in found)
-    valid = variance > 0
-    return np.where(valid, mean, np.nan), np.sqrt(np.where(valid, variance, np.nan))
+def compared(settings: Any, data: Data, name: str) -> xr.Dataset:
+    """Return the results of all methods for a problem, with what they are judged by.
 
-
-def _densities(family: ObservationFamily, f: jax.Array, y: jax.Array) -> jax.Array:
-    """Return p(y | f) (K, S) of entries (K, 1) at predictors (K, S)."""
-    return jnp.exp(family.log_prob(f, y))
+    Returns:
+        What is stored, with ``times`` and ``y`` (dataset), and ``inside`` (method, dataset): whether a held-out value
+        is in its interval; left out where all are yes or no. ``covered`` (method): share of the true predictor in 95%
+        bands; left out where nobody knows it. Less the reference's, and NaN for the reference itself: ``excess`` of the
+        log evidence, with ``excess error``, the standard error; ``excess NLPD`` (dataset); ``mean error``, the largest
+        of the predictor's means in posterior sds; ``sd error``, that of its sds, as a share.
+    """
+    one = problem.problem(name, settings.size, settings.seed, settings.data)
+    # What fills up shorter data is cut off: NaN that are left are sites that did not converge, and must show.
+    found = data["comparison"].sel(problem=name, drop=True).isel({DATASET: slice(len(one.times))})
+    found = found.assign(times=(DATASET, one.times), y=(DATASET, one.y[:, 0]))
+    exact, other = found.sel({"method": REFERENCE}, drop=True), found.where(found.method != REFERENCE)
+    if name != "bernoulli":
+        found["inside"] = (found["low"] <= found["y"]) & (found["y"] <= found["high"])
+    if one.truth is not None:
+        reach = scores.Z * found["sd"]
+        found["covered"] = ((found["mean"] - reach <= one.truth) & (one.truth <= found["mean"] + reach)).mean(DATASET)
+    away, wider = (other["mean"] - exact["mean"]) / exact["sd"], other["sd"] / exact["sd"] - 1.0
+    return found.assign({
+        "excess": other["log evidence"] - exact["log evidence"],
+        "excess error": exact["log evidence error"].where(found.method != REFERENCE),
+        "excess NLPD": exact["log density"] - other["log density"],
+        "mean error": abs(away).max(DATASET, skipna=False), "sd error": abs(wider).max(DATASET, skipna=False)})

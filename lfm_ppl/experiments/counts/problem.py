@@ -30,17 +30,25 @@ FIRST, LAST = 1851.2026, 1962.2218
 EVENTS = Path("coal") / "coal.csv"
 """The dates of the disasters, in the folder of data."""
 
-JOINED = 4
-"""Counts of five minutes that are added to one."""
-
-BLOCK = 6
-"""Counts of calls that are held out together: two hours."""
-
-HOURS = 14.0
-"""Length of a day of calls."""
+JOINED, BLOCK, HOURS = 4, 6, 14.0
+"""Of calls: counts of five minutes that are added to one; of these, how many are held out together, two hours; length
+of a day."""
 
 OUTLIER, EVERY = 4.0, 10
 """Gross errors of the simulated measurements, and how often there is one."""
+
+GIVEN = {"bernoulli": {"level": 0.0, "scale": 2.0, "lengthscale": 1.3},
+         "student-t": {"level": 0.0, "scale": 1.0, "lengthscale": 1.3, "noise": 0.2}}
+"""Parameters of the simulated data."""
+
+
+class Size(NamedTuple):
+    """Bins of the disasters, days of calls, rows of the simulated data, and folds in which all are held out."""
+
+    bins: int = 333
+    days: int = 8
+    rows: int = 200
+    folds: int = 10
 
 
 class Problem(NamedTuple):
@@ -73,120 +81,79 @@ class Problem(NamedTuple):
         numpyro.sample("y", lfm.MarginalLikelihood(self.build(**values), times), obs=y)
 
 
-class Size(NamedTuple):
-    """How large the problems are.
-
-    Attributes:
-        bins: of the disasters.
-        days: of calls.
-        rows: of the simulated data.
-        folds: in which data are held out.
-    """
-
-    bins: int = 333
-    days: int = 8
-    rows: int = 200
-    folds: int = 10
-
-
 @functools.lru_cache(maxsize=8)
 def problem(name: str, size: Size, seed: int, data: str | None) -> Problem:
-    """Return a problem.
-
-    Args:
-        name: one of `NAMES`.
-        size: of it.
-        seed: of the simulated data, and of the folds.
-        data: a folder with the folders ``coal`` and ``calls``; None: simulated counts.
+    """Return a problem of `NAMES`, with data of the folders ``coal`` and ``calls`` in ``data``; None: simulated counts.
 
     Raises:
         FileNotFoundError, ValueError: data that are not there, or cannot be read.
     """
-    generator = np.random.default_rng([seed, NAMES.index(name)])
-    if name == COAL:
-        return _coal(size, seed, data, generator)
-    return _calls(name, size, seed, data, generator) if name in CALLS else _simulated(name, size, seed, generator)
+    if name in SIMULATED:
+        return _simulated(name, size, seed)
+    return _coal(size, seed, data) if name == COAL else _calls(name, size, seed, data)
 
 
-def process(forces: Mapping[str, Force], observation: Any, level: Any) -> lfm.LatentForceModel:
+def _build(family: Callable[..., Any], level: Any, scale: Any, lengthscale: Any, daily_scale: Any = None,
+           daily_lengthscale: Any = None, **of_family: Any) -> lfm.LatentForceModel:
     """Return forces that are observed themselves: the predictor is the level and their sum."""
-    return lfm.LatentForceModel(lambda x, u, t: jnp.zeros(0), dict(forces),
-                                observation(lambda x, u, t: level + u.sum(keepdims=True)),
+    forces: dict[str, Force] = {"u": lfm.Matern(scale, lengthscale, order=1)}
+    if daily_scale is not None:
+        kernel = PeriodicSquaredExponential(daily_scale, daily_lengthscale, HOURS)
+        # With half of them the evidence of eight days is off by four nats.
+        forces["daily"] = lfm.Periodic(kernel, functions=21, explained_variance=0.0)
+    observation = family(lambda x, u, t: level + u.sum(keepdims=True), **of_family)
+    return lfm.LatentForceModel(lambda x, u, t: jnp.zeros(0), forces, observation,
                                 lfm.Gaussian(jnp.zeros(0), jnp.zeros((0, 0))))
 
 
-def _folds(rows: int, count: int, block: int, generator: np.random.Generator) -> np.ndarray:
+def _folds(rows: int, count: int, block: int, seed: Any) -> np.ndarray:
     """Return the fold of each row: blocks of rows, dealt out at random."""
-    blocks = -(-rows // block)
-    return np.repeat(generator.permutation(np.arange(blocks) % count), block)[:rows]
+    dealt = np.random.default_rng(seed).permutation(np.arange(-(-rows // block)) % count)
+    return np.repeat(dealt, block)[:rows]
 
 
-def _coal(size: Size, seed: int, data: str | None, generator: np.random.Generator) -> Problem:
-    file = loading.load("coal")
-    functions = file.model.__globals__
+def _coal(size: Size, seed: int, data: str | None) -> Problem:
+    functions = loading.load("coal").model.__globals__
     width = (LAST - FIRST) / size.bins
+    build = functools.partial(functions["build"], width=width)
     times = FIRST + width * (0.5 + np.arange(size.bins))
     if data is None:
-        system = functions["build"](**functions["TRUTH"], width=width)
-        y = np.asarray(lfm.simulate(jax.random.key(seed), system, times).y)
+        y = np.asarray(lfm.simulate(jax.random.key(seed), build(**functions["TRUTH"]), times).y)
     else:
         times, y = functions["count"](pd.read_csv(Path(data) / EVENTS)["date"], FIRST, LAST, size.bins)
-
-    def build(level: Any, scale: Any, lengthscale: Any) -> lfm.LatentForceModel:
-        force = lfm.Matern(scale, lengthscale, order=2)
-        return process({"log rate": force}, lambda h: lfm.PoissonObservation(h, exposure=width), level)
-
     priors = {"level": dist.Normal(0.0, 1.5), "scale": dist.LogNormal(-0.3, 0.6),
               "lengthscale": dist.LogNormal(3.0, 0.7)}
-    return Problem(times, y, _folds(size.bins, size.folds, 1, generator), build, priors)
+    return Problem(times, y, _folds(size.bins, size.folds, 1, [seed, NAMES.index(COAL)]), build, priors)
 
 
-def _calls(name: str, size: Size, seed: int, data: str | None, generator: np.random.Generator) -> Problem:
+def _calls(name: str, size: Size, seed: int, data: str | None) -> Problem:
     days = counts.simulated(size.days, seed) if data is None else counts.read(Path(data) / "calls")
     if len(days.dates) < size.days:
         raise ValueError(f"there are {len(days.dates)} days of calls; {size.days} are needed.")
     y = days.calls[:size.days].reshape(-1, JOINED).sum(axis=1)[:, None]
-    step = JOINED * counts.BIN / 60.0
-    times = step * (0.5 + np.arange(len(y)))
-    daily, overdispersed = name.endswith("daily"), "negative" in name
+    times = JOINED * counts.BIN / 60.0 * (0.5 + np.arange(len(y)))
     priors: dict[str, dist.Distribution] = {
         "level": dist.Normal(6.0, 1.5), "scale": dist.LogNormal(-1.5, 0.8), "lengthscale": dist.LogNormal(0.7, 0.8)}
-    if daily:
+    if name.endswith("daily"):
         priors |= {"daily_scale": dist.LogNormal(-1.0, 0.8), "daily_lengthscale": dist.LogNormal(-0.3, 0.5)}
-    if overdispersed:
-        priors["concentration"] = dist.LogNormal(4.0, 1.5)
-
-    def build(level: Any, scale: Any, lengthscale: Any, daily_scale: Any = None, daily_lengthscale: Any = None,
-              concentration: Any = None) -> lfm.LatentForceModel:
-        forces: dict[str, Force] = {"trend": lfm.Matern(scale, lengthscale, order=1)}
-        if daily:
-            kernel = PeriodicSquaredExponential(daily_scale, daily_lengthscale, HOURS)
-            # With half of them the evidence of eight days is off by four nats.
-            forces["daily"] = lfm.Periodic(kernel, functions=21, explained_variance=0.0)
-        family = ((lambda h: lfm.NegativeBinomialObservation(h, concentration)) if overdispersed
-                  else lfm.PoissonObservation)
-        return process(forces, family, level)
-
+    family: Callable[..., Any] = lfm.PoissonObservation
+    if "negative" in name:
+        family, priors["concentration"] = lfm.NegativeBinomialObservation, dist.LogNormal(4.0, 1.5)
     # All models of calls have the same folds.
-    folds = _folds(len(y), size.folds, BLOCK, np.random.default_rng(seed))
-    return Problem(times, y.astype(float), folds, build, priors)
+    return Problem(times, y.astype(float), _folds(len(y), size.folds, BLOCK, seed),
+                   functools.partial(_build, family), priors)
 
 
-def _simulated(name: str, size: Size, seed: int, generator: np.random.Generator) -> Problem:
-    given = {"level": 0.0, "scale": 2.0, "lengthscale": 1.3} if name == "bernoulli" else {
-        "level": 0.0, "scale": 1.0, "lengthscale": 1.3, "noise": 0.2}
-    times = 0.1 * np.arange(size.rows)
-
-    def build(level: Any, scale: Any, lengthscale: Any, noise: Any = None) -> lfm.LatentForceModel:
-        family = lfm.BernoulliObservation if noise is None else lambda h: lfm.StudentTObservation(h, 4.0, noise)
-        return process({"u": lfm.Matern(scale, lengthscale, order=1)}, family, level)
-
+def _simulated(name: str, size: Size, seed: int) -> Problem:
+    given, times = GIVEN[name], 0.1 * np.arange(size.rows)
+    build = functools.partial(_build, lfm.BernoulliObservation if name == "bernoulli" else
+                              lambda h, noise: lfm.StudentTObservation(h, 4.0, noise))
     drawn = lfm.simulate(jax.random.fold_in(jax.random.key(seed), NAMES.index(name)), build(**given), times)
-    y = np.array(drawn.y)
+    y, sites = np.array(drawn.y), lfm.SiteSettings()
     if name == "student-t":
         y[EVERY // 2::EVERY] += OUTLIER
+        sites = lfm.SiteSettings(damping=0.5, sweeps=2000)
     priors = {"level": dist.Normal(0.0, 1.0), "scale": dist.LogNormal(0.0, 0.5),
               "lengthscale": dist.LogNormal(0.3, 0.5), "noise": dist.LogNormal(-1.6, 0.5)}
-    return Problem(times, y, _folds(size.rows, size.folds, 1, generator), build,
-                   {key: priors[key] for key in given}, given, np.asarray(drawn.forces["u"]),
-                   lfm.SiteSettings(damping=0.5, sweeps=2000) if name == "student-t" else lfm.SiteSettings())
+    return Problem(times, y, _folds(size.rows, size.folds, 1, [seed, NAMES.index(name)]), build,
+                   {key: priors[key] for key in given}, given, np.asarray(drawn.forces["u"]), sites)

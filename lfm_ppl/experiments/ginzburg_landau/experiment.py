@@ -1,15 +1,19 @@
-"""The study: its settings, tasks, tables and figures."""
+"""The study: its settings, tasks and tables."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
 
 from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import study
-from lfm_ppl.experiments.ginzburg_landau import conditional, figures, problem, sampling, state, tables
-from lfm_ppl.experiments.study import Results, Study, Table, setting
-
-_PARTS = study.CHAINS[1:]
+from lfm_ppl.experiments.datasets import Column, Kind, row
+from lfm_ppl.experiments.ginzburg_landau import figures, parameters, problem, states
+from lfm_ppl.experiments.scores import Estimate
+from lfm_ppl.experiments.study import CHAINS, Data, Study, Table, setting
 
 
 @dataclass(frozen=True)
@@ -31,9 +35,9 @@ class Settings(study.Settings):
     paths: int = setting(100, "posterior draws over which the smoothed state is averaged", quick=10)
     marginal_particles: int = setting(1_000, "of particle-marginal RAM", quick=50)
     marginal_steps: int = setting(20, "of its particles between two observations", quick=10)
-    ram: tuple[int, int, int] = setting((200, 500, 10), "RAM", quick=(50, 50, 5), parts=_PARTS)
-    nuts: tuple[int, int, int] = setting((250, 250, 1), "NUTS", quick=(20, 20, 1), parts=_PARTS)
-    pmmh: tuple[int, int, int] = setting((80, 240, 5), "particle-marginal RAM", quick=(10, 20, 2), parts=_PARTS)
+    ram: tuple[int, int, int] = setting((200, 500, 10), "RAM", quick=(50, 50, 5), parts=CHAINS[1:])
+    nuts: tuple[int, int, int] = setting((250, 250, 1), "NUTS", quick=(20, 20, 1), parts=CHAINS[1:])
+    pmmh: tuple[int, int, int] = setting((80, 240, 5), "particle-marginal RAM", quick=(10, 20, 2), parts=CHAINS[1:])
     tree_depth: int = setting(10, "largest of NUTS", quick=4)
 
     @property
@@ -41,29 +45,116 @@ class Settings(study.Settings):
         """The realisation of the figures: the model's default data where it is among those computed."""
         return problem.DEFAULT if min(self.realisations, self.conditional) > problem.DEFAULT else 0
 
-    def chain(self, kernel: str) -> tuple[int, int, int]:
-        """Return warm-up, draws and thinning of a chain of "RAM", "NUTS" or "PMMH"."""
-        return {"RAM": self.ram, "NUTS": self.nuts, "PMMH": self.pmmh}[kernel]
-
 
 def all_tasks(settings: Settings) -> list[Task]:
-    """Return every task: all methods on the first realisations, then on the next, so that the time left can be told."""
-    found = [*state.tasks(settings), *conditional.tasks(settings), conditional.figure_task(settings),
-             *sampling.tasks(settings)]
-    return sorted(found, key=lambda task: task.settings.get("index", task.settings.get("first")))
+    """Return every task: all methods on the first realisations, then on the next, so that the time left can be told.
+
+    The figure of the conditional posteriors has a task of its own, with as many particles as the source.
+    """
+    def task(name: str, **own: Any) -> Task:
+        return Task(name, settings.seed, {"experiment": "ginzburg-landau", **own})
+
+    def repeated(name: str, **own: Any) -> list[Task]:
+        return [task(f"{name}/{index:03d}", index=index, **own) for index in range(settings.realisations)]
+
+    steps, particle_steps = {"steps": problem.STEPS}, {"steps": parameters.PARTICLE_STEPS}
+    at_truth: dict[str, dict[str, Any]] = {
+        problem.PARTICLES: {"particles": settings.particles, "smoother_particles": settings.smoother_particles,
+                            "smoother_draws": settings.smoother_draws, **states.PARTICLE_STEPS},
+        problem.GRID: {"cells": settings.cells, "marks": list(states.MARKS), "apart": states.APART}}
+    likelihoods = {problem.PARTICLES: {"particles": settings.conditional_particles, **particle_steps},
+                   problem.GRID: {"cells": settings.cells}}
+    priors = {name: list(ends) for name, ends in parameters.INTERVALS.items()}
+    posterior: dict[str, Any] = {"what": "conditional", "nodes": settings.nodes, "intervals": priors}
+    found = [task("conditional-figure/particle-filter", method=problem.PARTICLES, first=settings.figure,
+                  last=settings.figure, particles=settings.particles, **particle_steps, **posterior)]
+    for method in problem.METHODS:
+        name = study.slug(method)
+        found += repeated(f"state/{name}", what="state", method=method, **at_truth.get(method, steps))
+        found += [task(f"conditional/{name}/{first:03d}-{last:03d}", method=method, first=first, last=last,
+                       **posterior, **likelihoods.get(method, steps))
+                  for first, last in study.blocks(settings.conditional, 10)]
+    kernels = {"RAM": steps, "NUTS": steps | {"tree_depth": settings.tree_depth}, "PMMH": {
+        "particles": settings.marginal_particles, "steps": settings.marginal_steps, "cells": settings.draw_cells}}
+    for label, (kernel, _) in parameters.SAMPLERS.items():
+        size = dict(zip(("warmup", "draws", "thin"), getattr(settings, kernel.lower()), strict=True))
+        found += repeated(f"mcmc/{study.slug(label)}", what="mcmc", sampler=label, chains=parameters.CHAINS,
+                          paths=settings.paths, **size, **kernels[kernel])
+    return sorted(found, key=lambda one: one.settings.get("index", one.settings.get("first")))
 
 
-def tabulated(settings: Settings, results: Results) -> dict[str, Table]:
+def tables(settings: Settings, data: Data) -> dict[str, Table]:
     """Return the tables."""
-    return {"comparison": Table(f"Means over {settings.realisations} realisations (standard errors)",
-                                tables.comparison(results)),
-            "rates": Table(f"Truth outside the 99% interval of a conditional posterior, {settings.conditional} "
-                           "realisations", tables.rates(results)),
-            "parameters": Table(f"Posteriors of the parameters, {settings.realisations} realisations",
-                                tables.parameters(results))}
+    some, many = (f"{count} realisations" for count in (settings.realisations, settings.conditional))
+    return {"comparison": Table.of(f"Means over {some} (standard errors)", comparison(data)),
+            "rates": Table.of(f"Truth outside the 99% interval of a conditional posterior, {many}", rates(data)),
+            "parameters": Table.of(f"Posteriors of the parameters, {some}", posteriors(data))}
 
 
-KINDS = {"state": state.compute, "conditional": conditional.compute, "mcmc": sampling.compute}
-"""What the tasks are."""
+def comparison(data: Data) -> dict[str, Any]:
+    """Return scores of every method and sampler, with means over realisations.
 
-STUDY = Study(Settings, all_tasks, KINDS, tabulated, figures.draw, label="method")
+    RMSE of filter and smoother over the fine times; the share of these times at which the 95% band holds the path; for
+    MCMC the share of realisations in which the 95% interval of a parameter (all three pooled) holds the truth, the
+    smallest bulk effective sample size of the three per second of CPU time of warm-up and draws, and the largest R-hat;
+    CPU seconds, of all threads, for one realisation, without compilation.
+    """
+    smoother: dict[str, Column] = {"RMSE smoother": "smoother_rmse", "coverage smoother": "smoother_coverage"}
+    empty = dict.fromkeys(("coverage parameters", "ESS/CPU s"), lambda one: Estimate(np.nan, np.nan))
+    at_truth = {"RMSE filter": "filter_rmse", "coverage filter": "filter_coverage", **smoother, **empty,
+                "CPU s": "seconds"}
+    sampled = {
+        **smoother, "coverage parameters": lambda one: _covered(one).mean("parameter"),
+        "ESS/CPU s": lambda one: one.ess.min("parameter", skipna=False) / one.seconds, "CPU s": "seconds",
+        "R-hat": lambda one: one.r_hat.max("parameter", skipna=False),
+        "RMSE published": lambda one: parameters.PUBLISHED.get(one.sampler.item(), np.nan)}
+    rows = {f"{method}, true parameters": row(data["state"].sel({"method": method}), at_truth)
+            for method in problem.METHODS}
+    return rows | {label: row(data["mcmc"].sel(sampler=label), sampled) for label in parameters.SAMPLERS}
+
+
+def rates(data: Data) -> dict[str, Any]:
+    """Return how often the truth lies outside the central 99% interval of a conditional posterior.
+
+    ``cut`` is the share of posteriors that an end of the flat prior's interval cuts off, ``differs`` the share of
+    intervals that decide otherwise than the grid's.
+    """
+    found = parameters.outcomes(data["conditional"])
+    exact = found.outside.sel({"method": problem.GRID})
+    columns: dict[str, Column] = {
+        "{parameter}": "outside", "pooled": lambda one: parameters.pooled(one.outside),
+        "cut": lambda one: one.cut.mean(), "differs": lambda one: (one.outside != exact).mean(), "CPU s": "seconds"}
+    return {method: row(found.sel({"method": method}), columns) for method in problem.METHODS}
+
+
+def posteriors(data: Data) -> dict[str, Any]:
+    """Return posterior means and standard deviations by MCMC, averaged over realisations, and the coverage of each."""
+    found = data["mcmc"].assign(coverage=_covered(data["mcmc"]))
+    columns = {f"{name} {{parameter}}": name for name in ("mean", "sd", "coverage")}
+    rows: dict[str, dict[str, Any]] = {label: {} for label in parameters.SAMPLERS}
+    for label, cells in rows.items():
+        for name in problem.NAMES:
+            cells |= row(found.sel(sampler=label, parameter=name), columns)
+        cells |= row(found.sel(sampler=label), {"divergences": lambda one: one.divergences.mean()})
+    return rows
+
+
+def _covered(one: xr.Dataset) -> xr.DataArray:
+    return (one.low <= one.truth) & (one.truth <= one.high)
+
+
+STUDY = Study(
+    Settings, all_tasks,
+    {"state": Kind(states.compute, {
+        "dataset": "filter_rmse, filter_coverage, smoother_rmse, smoother_coverage, log_likelihood, seconds",
+        "dataset time": "filter_mean, filter_low, filter_high, smoother_mean, smoother_low, smoother_high",
+        "dataset cell": "x", "dataset mark": "marks", "dataset mark cell": "filter_density, smoother_density"},
+        ("method",)),
+     "conditional": Kind(parameters.conditional, {"member parameter node": "log_likelihood", "": "seconds"},
+                         ("method", "first")),
+     "conditional-figure": Kind(parameters.conditional, {"member parameter node": "log_likelihood"}),
+     "mcmc": Kind(parameters.by_chains, {
+         "dataset parameter": "mean, sd, low, high, ess, r_hat", "dataset": "divergences, seconds, smoother_rmse, "
+         "smoother_coverage", "dataset time": "smoother_mean, smoother_low, smoother_high"}, ("sampler",))},
+    tables, figures.draw, {"parameter": ("parameter", problem.NAMES), "truth": ("parameter", problem.TRUTH)},
+    label="method", what=lambda task: task.name.partition("/")[0])

@@ -39,7 +39,6 @@ class Realisation(NamedTuple):
         y: (T, 1).
         fine: (K,) times of the path, among them the observation times.
         path: (K,) the state.
-        sparse: (K, 1) the observations on the fine times, NaN between them.
     """
 
     times: np.ndarray
@@ -49,7 +48,7 @@ class Realisation(NamedTuple):
 
     @property
     def sparse(self) -> np.ndarray:
-        """The observations among the fine times, NaN between them."""
+        """The observations on the fine times (K, 1), NaN between them."""
         values = np.full((len(self.fine), 1), np.nan)
         values[np.searchsorted(self.fine, self.times - 1e-9)] = self.y
         return values
@@ -61,19 +60,14 @@ def model_file() -> loading.ModelFile:
     return loading.load("ginzburg-landau")
 
 
+@functools.lru_cache(maxsize=256)
 def realisation(index: int, seed: int = 0) -> Realisation:
     """Return realisation ``index`` of the experiment with this seed.
 
     It is what ``lfm-ppl simulate ginzburg-landau --seed N`` writes for N = 10000 seed + index: the path starts in the
     right well, at sqrt(10), while the filters' prior is N(0, 10). With seed 0, number 2 is the model's default data.
     """
-    return from_model(MOST * seed + index)
-
-
-@functools.lru_cache(maxsize=256)
-def from_model(seed: int) -> Realisation:
-    """Return the data that the model file simulates with this seed."""
-    data = model_file().simulate(seed=seed)
+    data = model_file().simulate(seed=MOST * seed + index)
     truth: Any = data.truth
     return Realisation(data.times, data.y, np.asarray(truth["times"]), np.asarray(truth["state"])[:, 0])
 
@@ -82,17 +76,11 @@ def system(theta: Any) -> LatentForceModel:
     """Return the double well with parameters (alpha, beta, sigma); they may be traced."""
     alpha, beta, sigma = theta
     sites = {"sigma": sigma, "linear": alpha / sigma**2, "cubic": beta / sigma**2}
-    times = np.arange(0.0, 51.0, 2.0)
-    return likelihood_site(model_file().model, (times,), {}, jax.random.key(0), sites).distribution.model
+    given = likelihood_site(model_file().model, (np.arange(0.0, 51.0, 2.0),), {}, jax.random.key(0), sites)
+    return given.distribution.model
 
 
 @functools.cache
 def true_system() -> LatentForceModel:
     """Return the double well at the truth: one object, so that what is compiled for it serves all realisations."""
-    with jax.ensure_compile_time_eval():
-        return system(jnp.asarray(TRUTH))
-
-
-def slug(method: str) -> str:
-    """Return the name of a method as part of the name of a task."""
-    return method.replace(" ", "-").replace("(", "").replace(")", "")
+    return system(jnp.asarray(TRUTH))

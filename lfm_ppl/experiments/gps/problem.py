@@ -1,10 +1,8 @@
-"""The problem: positions of satellites, from files or simulated, and the model that predicts them."""
+"""The problem: positions of satellites, from files or simulated."""
 
 from __future__ import annotations
 
 import functools
-import hashlib
-from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,14 +13,9 @@ import numpy as np
 from lfm_ppl import orbits
 from lfm_ppl.model.gaussian import Gaussian
 from lfm_ppl.model.simulate import simulate
+from lfm_ppl.orbits.arc import Arc
+from lfm_ppl.orbits.prediction import LATEST
 
-NOISE = 1e-4
-"""Standard deviation of a coordinate (km): of its error, and of what gravity leaves out here, such as the ocean tides.
-
-Published positions are smoothed, so that their scatter says nothing. With half of it, most of the radial and normal
-bands were too narrow, and forces were learnt that explain decimetres; chosen from 5 and 10 cm by the errors of the GPS
-satellites, as `learning.WEIGHT`.
-"""
 SIMULATED = tuple(f"S{number:02d}" for number in range(1, 13))
 _HIDDEN: dict[str, Any] = {"amplitude": 0.5, "wander": 0.02, "drift": 0.005}
 _HIDDEN_WHITE, _HIDDEN_NOISE = 0.03, 5e-5
@@ -46,31 +39,24 @@ class Arcs(NamedTuple):
     positions: dict[str, np.ndarray]
     published: orbits.Ephemerides | None
 
+    def arc(self, satellite: str, train_days: float) -> Arc:
+        """Return the arc of a satellite, all epochs of the data.
 
-class Arc(NamedTuple):
-    """A satellite and the part of its positions that may be learnt from.
-
-    Attributes:
-        environment: Earth, Moon and Sun.
-        times: (T,) hours, equally spaced.
-        positions: (T, 3) km; NaN where missing.
-        train: number of epochs to learn from.
-    """
-
-    environment: orbits.Environment
-    times: np.ndarray
-    positions: np.ndarray
-    train: int
-
-    def learnt(self, count: int | None = None) -> np.ndarray:
-        """Return the positions (T, 3), NaN after the first ``count`` epochs, by default those of training."""
-        return np.where((np.arange(len(self.times)) < (self.train if count is None else count))[:, None],
-                        self.positions, np.nan)
-
-    @property
-    def digest(self) -> str:
-        """What tells these positions from others."""
-        return hashlib.sha256(np.ascontiguousarray(self.positions).tobytes()).hexdigest()[:16]
+        Raises:
+            Unusable: too few positions to learn from, or none to judge by.
+            ValueError: the training is longer than the data.
+        """
+        days = float(self.times[-1] - self.times[0] + np.median(np.diff(self.times))) / 24.0
+        train = int(np.searchsorted(self.times, 24.0 * train_days - 1e-9))
+        if 24.0 * train_days < 2 * LATEST:
+            raise ValueError(f"training takes {train_days:g} days; half a day is the least (--train-days).")
+        if train >= len(self.times):
+            raise ValueError(f"training takes {train_days:g} days, but the data have {days:g}, the last position "
+                             f"{self.times[-1] / 24.0:.6g} days after the first; take fewer (--train-days), so that "
+                             "days are left to judge by.")
+        arc = Arc(self.environment, self.times, self.positions[satellite], train)
+        arc.check(satellite, "" if self.published is None else "; ".join(map(str, self.published.gaps(satellite))))
+        return arc
 
 
 def system(satellite: str) -> str:
@@ -81,19 +67,6 @@ def system(satellite: str) -> str:
         ('Galileo', 'X')
     """
     return SYSTEMS.get(satellite[:1], satellite[:1])
-
-
-def grouped(results: Mapping[str, Any], kind: Callable[[str], str] = system) -> dict[str, dict[str, Any]]:
-    """Return kind of satellite, by default its constellation -> satellite -> what belongs to it.
-
-    Example:
-        >>> grouped({"G01": 1, "E12": 2, "G05": 3})
-        {'GPS': {'G01': 1, 'G05': 3}, 'Galileo': {'E12': 2}}
-    """
-    found: dict[str, dict[str, Any]] = {}
-    for name, one in results.items():
-        found.setdefault(kind(name), {})[name] = one
-    return found
 
 
 def _place(satellite: str) -> tuple[int, str]:
@@ -118,9 +91,9 @@ def arcs(folder: str | None, seed: int = 0) -> Arcs:
     published = orbits.read_sp3(Path(folder))
     environment = orbits.Environment.over(published.epochs[0], 24.0 * published.days)
     positions = environment.celestial(published)
-    order = sorted(range(len(published.satellites)), key=lambda index: _place(published.satellites[index]))
     times = (published.epochs - published.epochs[0]) / 3600.0
-    found = {published.satellites[index]: positions[:, index] for index in order}
+    found = {name: positions[:, published.satellites.index(name)]
+             for name in sorted(published.satellites, key=_place)}
     return Arcs(environment, times, found, published)
 
 
@@ -138,36 +111,15 @@ def _simulated(seed: int) -> Arcs:
         return simulate(key, system, times, steps=int(_INTERVAL / 30)).y
 
     keys = jax.random.split(jax.random.key(seed), len(SIMULATED))
-    found = {name: np.asarray(draw(key, jnp.asarray(_circular(*turn))))
+    found = {name: np.asarray(draw(key, jnp.asarray(circular(*turn))))
              for name, key, turn in zip(SIMULATED, keys, turns, strict=True)}
     return Arcs(environment, times, found, None)
 
 
-def _circular(node: float, along: float) -> np.ndarray:
-    """Return a state on a circular orbit of half a sidereal day, inclined by 55 degrees."""
-    radius, inclination = 26_560.0, np.radians(55.0)
-    speed = 3600.0 * np.sqrt(orbits.GM / radius)
+def circular(node: float, along: float, radius: float = 26_560.0, degrees: float = 55.0) -> np.ndarray:
+    """Return a state (6,) on a circular orbit: angles in radians, radius in km, by default of half a sidereal day."""
+    slant, speed = np.radians(degrees), 3600.0 * np.sqrt(orbits.GM / radius)
     first = np.array([np.cos(node), np.sin(node), 0.0])
-    second = np.array([-np.sin(node) * np.cos(inclination), np.cos(node) * np.cos(inclination), np.sin(inclination)])
-    place = np.cos(along) * first + np.sin(along) * second
-    return np.concatenate([radius * place, speed * (np.cos(along) * second - np.sin(along) * first)])
-
-
-def axes_of(state: np.ndarray) -> np.ndarray:
-    """Return the radial, tangential and normal directions (T, 3, 3), as columns, along states (T, 6)."""
-    return np.asarray(_rtn(jnp.asarray(state)))
-
-
-@jax.jit
-def _rtn(state: jax.Array) -> jax.Array:
-    return jax.vmap(lambda x: orbits.rtn(x[:3], x[3:]))(state)
-
-
-def eclipsed(environment: orbits.Environment, times: np.ndarray, state: np.ndarray) -> bool:
-    """Return whether the Earth's shadow falls on an orbit (T, 6) at any of the times."""
-    return bool((np.asarray(_light(environment, jnp.asarray(times), jnp.asarray(state))) < 1.0).any())
-
-
-@jax.jit
-def _light(environment: orbits.Environment, times: jax.Array, state: jax.Array) -> jax.Array:
-    return jax.vmap(lambda t, x: orbits.sunlight(x[:3], environment.sun(t)))(times, state)
+    second = np.array([-np.sin(node) * np.cos(slant), np.cos(node) * np.cos(slant), np.sin(slant)])
+    return np.concatenate([radius * (np.cos(along) * first + np.sin(along) * second),
+                           speed * (np.cos(along) * second - np.sin(along) * first)])

@@ -1,32 +1,43 @@
-"""The study: its settings, tasks, tables and figures."""
+"""The study: its settings, tasks and tables."""
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pandas as pd
-from jax.scipy.special import logsumexp
-from jax.scipy.stats import norm
+import xarray as xr
 
 from lfm_ppl.engine.run import Reporter
-from lfm_ppl.engine.task import Result, Task
-from lfm_ppl.experiments import scores, study
-from lfm_ppl.experiments.home_heating import figures, learning, prediction, problem, tables
-from lfm_ppl.experiments.study import Results, Study, Table, setting, stacked
+from lfm_ppl.engine.task import Task
+from lfm_ppl.experiments import chains, study
+from lfm_ppl.experiments.datasets import Column, Kind, cell, part, row
+from lfm_ppl.experiments.home_heating import figures, prediction, problem
+from lfm_ppl.experiments.scores import Estimate, pair
+from lfm_ppl.experiments.study import Data, Study, Table, setting
 
-QUANTILES = (0.025, 0.25, 0.5, 0.75, 0.975)
-RESIDUALS = ("SQM", "matern")
-"""Residuals whose force is drawn."""
+PUBLISHED = {
+    "SQM": {5: (0.67, 0.13, -116, 15), 6: (0.22, 0.02, 56, 15), 7: (1.00, 0.16, -190, 28), 8: (0.22, 0.02, 51, 14)},
+    "CQM": {5: (0.87, 0.11, -157, 13), 6: (0.22, 0.02, 34, 15), 7: (1.37, 0.17, -268, 37), 8: (0.29, 0.05, 4, 19)},
+    "WQM": {5: (1.06, 0.11, -227, 18), 6: (0.27, 0.04, 21, 26), 7: (1.45, 0.21, -239, 21), 8: (0.23, 0.02, 29, 21)},
+    "periodic": {5: (0.52, 0.05, -106, 13), 6: (0.24, 0.02, 35, 21), 7: (1.16, 0.19, -364, 97),
+                 8: (0.25, 0.02, 23, 18)},
+    "none": {5: (0.61, 0.06, -142, 25), 6: (0.25, 0.02, 31, 14), 7: (1.66, 0.26, -367, 77), 8: (0.27, 0.04, 19, 18)},
+    "matern": {5: (0.92, 0.12, -162, 16), 6: (0.23, 0.02, 55, 14), 7: (1.43, 0.19, -279, 54)},
+    "resonator": {5: (1.15, 0.22, -1373, 1027), 6: (0.82, 0.24, -251, 101), 7: (1.43, 0.19, -279, 54)}}
+"""By tables of the source: RMSE (K) and expected log likelihood with what it gives after them, over both its homes."""
 
-_TITLES = {"house": "Real house, {}: the fifth day, means over {} windows (standard errors)",
-           "homes": "Simulated homes under a thermostat, {}: the fifth day, means over {} homes (standard errors)",
-           "posterior": "Real house, {}: what it gains to integrate the parameters out, {} windows"}
+SOURCES = {("house", "one store", "ahead"): 5, ("house", "one store", "tracked"): 6,
+           ("homes", "one store", "ahead"): 7, ("house", "envelope", "ahead"): 8}
+"""Its tables of what the tables here are of."""
+
+TITLES = {"house": "Real house, {}: the fifth day, means over {} windows (standard errors)",
+          "homes": "Simulated homes under a thermostat, {}: the fifth day, means over {} homes (standard errors)",
+          "posterior": "Real house, {}: what it gains to integrate the parameters out, {} windows"}
+REFERENCES = ("none", "matern")
+"""What a residual that repeats is compared with, day by day."""
 
 
 @dataclass(frozen=True)
@@ -56,138 +67,111 @@ class Settings(study.Settings):
 
     @classmethod
     def chosen(cls, report: Reporter | None, quick: bool = False, **given: Any) -> Self:
-        """Return the settings that a user chose, with the folder of the real house where there is one.
-
-        Raises:
-            FileNotFoundError: the given folder has no real house.
-        """
+        """Return the settings that a user chose, with the folder of the real house where there is one."""
         folder = problem.data_folder(given.pop("data", None))
         if folder is None and report:
             report(f"no {problem.FILE} in $LFM_DATA/house or ../shared/data/house: simulated homes only")
         return super().chosen(report, quick, data=None if folder is None else str(folder), **given)
 
-    @property
-    def shown(self) -> int:
-        """The window that is drawn: one in the middle."""
-        return self.window_count // 2
-
-    @property
-    def window_count(self) -> int:
-        """Windows of the real house."""
-        if self.data is None:
-            return 0
-        found = len(problem.house(self.data))
-        return found if self.windows is None else min(found, self.windows)
-
 
 def tasks(settings: Settings) -> list[Task]:
     """Return every task, those of a residual together, since they share what is compiled."""
     found = []
-    shared = {"experiment": "home-heating", "functions": settings.functions}
-    for store in settings.stores:
-        for method in settings.methods:
-            own = {**shared, "store": store, "method": method}
-            if settings.data is not None:
-                house = {**own, "data": str(Path(settings.data).resolve()), "windows": settings.window_count}
-                found.append(Task(name("house", store, method), settings.seed, {**house, "shown": settings.shown}))
-                if method == settings.integrated and store == settings.stores[0]:
-                    found.extend(Task(name(f"posterior/{sampler}", store, method), settings.seed, {
-                        **house, "sampler": sampler, "every": settings.every,
-                        "chains": list(getattr(settings, sampler.lower()))}) for sampler in learning.SAMPLERS)
-            found.append(Task(name("homes", store, method), settings.seed,
-                              {**own, "homes": settings.homes, "particles": settings.particles}))
+    for store, method in ((store, method) for store in settings.stores for method in settings.methods):
+        model = {"experiment": "home-heating", "functions": settings.functions, "store": store, "method": method}
+        name, seed = f"{study.slug(store)}/{method}", settings.seed
+        if settings.data is not None:
+            count = len(problem.house(settings.data)[:settings.windows])
+            house = {**model, "data": str(Path(settings.data).resolve()), "windows": count}
+            found.append(Task(f"house/{name}", seed, {**house, "shown": count // 2}))
+            if (store, method) == (settings.stores[0], settings.integrated):
+                found += [Task(f"posterior/{sampler}/{name}", seed, {
+                    **house, "sampler": sampler, "every": settings.every,
+                    "chains": list(getattr(settings, sampler.lower()))}) for sampler in prediction.SAMPLERS]
+        found.append(Task(f"homes/{name}", seed, {**model, "homes": settings.homes, "particles": settings.particles}))
     return found
 
 
-def name(what: str, store: str, method: str) -> str:
-    """Return the name of a task."""
-    return f"{what}/{store.replace(' ', '-')}/{method}"
-
-
-def compute(task: Task) -> Result:
-    """Compute one task."""
-    started = time.process_time()
-    found = {"house": _house, "homes": _homes, "posterior": _posterior}[task.name.split("/")[0]](task)
-    return {**found, "cpu_s": time.process_time() - started}
-
-
-def _model(task: Task) -> tuple[str, str, int]:
-    return task.settings["method"], task.settings["store"], task.settings["functions"]
-
-
-def _house(task: Task) -> Result:
-    """Return scores and paths of every window, one after another; each search begins where the last one ended."""
-    model, z = _model(task), None
-    rows: list[Result] = []
-    shown: Result = {}
-    for index, window in enumerate(problem.house(task.settings["data"])[:task.settings["windows"]]):
-        z, density = learning.most_likely(*model, window, z)
-        rows.append({**prediction.known_heater(*model, window, z), "z": z, "density": density})
-        if index == task.settings["shown"] and model[0] in RESIDUALS:
-            mean, sd = prediction.smoothed(*model)(jnp.asarray(z), jnp.asarray(prediction.masked(window.y)),
-                                                   window.outdoor)
-            shown = {"residual": np.asarray(mean), "residual_sd": np.asarray(sd)}
-    return stacked(rows) | shown
-
-
-def _homes(task: Task) -> Result:
-    """Return scores and paths of every simulated home, and quantiles (5, 144) of the first."""
-    model = _model(task)
-    rows: list[Result] = []
-    first: Result = {}
-    for index in range(task.settings["homes"]):
-        window = problem.home(index, model[1], task.seed)
-        z, _ = learning.most_likely(*model, window)
-        key = jax.random.fold_in(task.key, index)
-        one, found = prediction.thermostat_ahead(*model, window, z, task.settings["particles"], key)
-        rows.append({**one, "z": z})
-        if index == 0:
-            first = {"quantiles": np.asarray(found.observed.quantiles(QUANTILES))[:, prediction.SCORED, 0]}
-    return stacked(rows) | first
-
-
-def _posterior(task: Task) -> Result:
-    """Return scores of some windows with the most likely parameters and with the posterior of all of them."""
-    model, z = _model(task), None
-    rows: list[Result] = []
-    windows = problem.house(task.settings["data"])[:task.settings["windows"]]
-    test = problem.TIMES >= problem.TRAIN
-    for index, window in enumerate(windows):
-        z, _ = learning.most_likely(*model, window, z)
-        if index % task.settings["every"]:
-            continue
-        sampled = learning.posterior(task.settings["sampler"], *model, window, z, jax.random.fold_in(task.key, index),
-                                     tuple(task.settings["chains"]))
-        draws = sampled["draws"]
-        truth, y = window.y[test, 0], jnp.asarray(prediction.masked(window.y))
-        several = prediction.filtered_under_draws(*model)(jnp.asarray(scores.spread(draws, 100)), y, window.outdoor)
-        mean, variance = several.mean[:, test], several.variance[:, test]
-        terms = norm.logpdf(truth, mean, jnp.sqrt(variance))
-        point = prediction.known_heater(*model, window, z)
-        rows.append({"ell": float((logsumexp(terms, axis=0) - np.log(len(mean))).sum()),
-                     "rmse": scores.rmse(mean.mean(axis=0), truth), "point_ell": point["ahead_ell"],
-                     "point_rmse": point["ahead_rmse"], "r_hat": np.max(sampled["r_hat"]),
-                     "ess": np.min(sampled["ess"]),
-                     **{name: sampled[name] for name in ("mean", "sd", "divergences", "seconds")}})
-    return stacked(rows)
-
-
-def title(settings: Settings, name: str) -> str:
-    """Return what a table shows."""
-    what, _, store = name.partition("-")
-    count = settings.homes if what == "homes" else settings.window_count
-    if what == "posterior":
-        store, count = settings.stores[0], -(-count // settings.every)
-    return _TITLES[what].format(store.replace("-", " "), count)
-
-
-def tabulated(settings: Settings, results: Results) -> dict[str, Table]:
+def tables(settings: Settings, data: Data) -> dict[str, Table]:
     """Return the tables."""
-    found = {name: Table(title(settings, name), frame) for name, frame in tables.every(settings, results).items()}
+    found = {}
+    for store in settings.stores:
+        for what in (what for what in ("house", "homes") if what in data):
+            found[f"{what}-{study.slug(store)}"] = Table.of(
+                TITLES[what].format(store, data[what].sizes["dataset"]), fifth_day(data[what].sel(store=store), what))
+        if store == settings.stores[0] and "posterior" in data:
+            found["posterior"] = Table.of(TITLES["posterior"].format(store, data["posterior"].sizes["dataset"]),
+                                          marginalised(data["posterior"]))
     if settings.data is None:
         reason = pd.DataFrame({"reason": [f"no {problem.FILE}; give its folder with --data"]}, ["real house"])
         found["left out"] = Table("Left out", reason, reason, stored=False)
     return found
 
 
-STUDY = Study(Settings, tasks, compute, tabulated, figures.draw, label="residual")
+def fifth_day(found: xr.Dataset, what: str) -> dict[str, Any]:
+    """Return a row for each residual: the fifth day of the real house, or of simulated homes under their thermostats.
+
+    Differences from the references are paired, and positive where the row's residual is better. A few days with tiny
+    log likelihoods rule the means, so the share of days with a higher one stands beside them.
+    """
+    rows, store, house = {}, found.store.item(), what == "house"
+    days = {"ahead": part(found, "ahead"), "tracked": part(found, "track")} if house else {"ahead": found}
+    for method in found.method.values:
+        cells: dict[str, Any] = {}
+        for name, day in days.items():
+            columns: dict[str, Column] = {f"RMSE {name} (K)": "rmse", f"ELL {name}": "ell"}
+            if name == "ahead":
+                columns |= {"median ELL ahead": lambda own: own.ell.median(), "coverage ahead": "inside"}
+            cells |= row(day.sel({"method": method}), columns)
+            if (what, store, name) in SOURCES:
+                numbers = PUBLISHED[method].get(SOURCES[what, store, name], 4 * (np.nan,))
+                cells |= pair(f"published RMSE {name} (K)", Estimate(*numbers[:2]))
+                cells |= pair(f"published ELL {name}", Estimate(*numbers[2:]))
+        if house:
+            cells |= cell("RMSE ahead, weather unknown (K)", found.blind_rmse.sel({"method": method}))
+        own = days["ahead"].sel({"method": method})
+        for reference in (name for name in REFERENCES if name in found.method):
+            other = days["ahead"].sel({"method": reference})
+            cells |= cell(f"RMSE below {reference} (K)", other.rmse - own.rmse)
+            cells |= cell(f"ELL above {reference}", own.ell - other.ell)
+            if reference != method:
+                cells |= cell(f"share of days above {reference}", own.ell > other.ell)
+        rows[method] = cells | {"CPU time (s)": float(found.cpu_s.sel({"method": method})) / found.sizes["dataset"]}
+    return rows
+
+
+def marginalised(found: xr.Dataset) -> dict[str, Any]:
+    """Return what is gained where the parameters are integrated out, over some windows of the real house.
+
+    How far a sampler's posterior is from that of RAM: the largest distance of two means in standard deviations of RAM,
+    over parameters and windows.
+    """
+    first = prediction.SAMPLERS[0]
+    reference = found.sel(sampler=first)
+    rows = {"most likely parameters": row(reference, {"RMSE ahead (K)": "point_rmse", "ELL ahead": "point_ell"})}
+    for sampler in prediction.SAMPLERS:
+        own = found.sel(sampler=sampler)
+        gain, away = own.ell - own.point_ell, np.abs(own["mean"] - reference["mean"]) / reference["sd"]
+        rows[f"integrated out by {sampler}"] = {
+            **row(own, {"RMSE ahead (K)": "rmse", "ELL ahead": "ell"}), **cell("gain in ELL", gain),
+            "median gain": float(gain.median()),
+            f"means from {first} (sd)": np.nan if sampler == first else float(away.max()),
+            "largest R-hat": chains.largest_r_hat(own), "smallest ESS": chains.least_ess(own),
+            "divergences": float(own.divergences.sum()), "CPU time (s)": float(own.seconds.mean())}
+    return rows
+
+
+_BY = ("store", "method")
+STUDY = Study(
+    Settings, tasks,
+    {"house": Kind(prediction.compute, {
+        "dataset": "ahead_rmse, ahead_ell, ahead_inside, track_rmse, track_ell, track_inside, blind_rmse, blind_ell, "
+                   "blind_inside, density", "dataset parameter": "z", "dataset hour": "mean, sd",
+        "time": "residual, residual_sd", "": "cpu_s"}, _BY),
+     "homes": Kind(prediction.compute, {
+         "dataset": "rmse, ell, inside", "dataset parameter": "z", "dataset time": "mean, on",
+         "probability time": "quantiles", "": "cpu_s"}, _BY),
+     "posterior": Kind(prediction.compute, {
+         "dataset": "rmse, ell, point_rmse, point_ell, r_hat, ess, divergences, seconds",
+         "dataset parameter": "mean, sd", "": "cpu_s"}, ("sampler",))},
+    tables, figures.draw, label="residual")

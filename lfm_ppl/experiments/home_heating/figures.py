@@ -5,174 +5,145 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lfm_ppl.engine.task import Result
-from lfm_ppl.experiments.drawing import TRUTH, band, legend, line
-from lfm_ppl.experiments.home_heating import prediction, problem, tables
+from lfm_ppl.experiments.datasets import part
+from lfm_ppl.experiments.drawing import TRUTH, band, bars, legend, line
+from lfm_ppl.experiments.home_heating import prediction, problem
 from lfm_ppl.experiments.scores import mean_of
+from lfm_ppl.experiments.study import Data
 from lfm_ppl.results.plots import style
 
-LABELS = {"none": "no residual", "matern": "Matern", **{name: name for name in ("SQM", "CQM", "WQM", "periodic",
-                                                                              "resonator")}}
+LABELS = {method: method for method in problem.METHODS} | {"none": "no residual", "matern": "Matern"}
 _MEASURED = TRUTH | {"label": "measured"}
-_WIDE, _NARROW = "#D6E8F3", "#9CC9E3"
-_MARKS = {"one store": (style.BLUE, "o"), "envelope": (style.VERMILLION, "s")}
+_WIDE, _NARROW, _HEAT = "#D6E8F3", "#9CC9E3", "#D0D0D0"
+_MARKS: dict[str, dict[str, Any]] = {"one store": {"color": style.BLUE, "marker": "o"},
+                                     "envelope": {"color": style.VERMILLION, "marker": "s"}}
 _SHOWN = ("SQM", "periodic", "CQM", "none", "matern", "resonator")
+_DAY: dict[str, Any] = {"xlim": (0.0, float(problem.DAY)), "xticks": range(0, problem.DAY + 1, 6)}
 
 
-def draw(settings: Any, results: dict[str, Result]) -> dict[str, Figure]:
+def draw(settings: Any, data: Data) -> dict[str, Figure]:
     """Return every figure by name."""
-    found = {"homes-ahead": plot_homes(settings, results), "scores": plot_scores(settings, results)}
-    if settings.data is not None:
-        found["house-ahead"] = plot_house(settings, results)
-        if all(one in settings.methods for one in ("SQM", "matern")):
-            found["residual"] = plot_residual(settings, results)
+    found = {"homes-ahead": plot_homes(settings, data), "scores": plot_scores(data)}
+    if "house" in data:
+        found["house-ahead"] = plot_house(settings, data)
+        if {"SQM", "matern"} <= set(settings.methods):
+            found["residual"] = plot_residual(data)
     return found
 
 
 @style.styled
-def plot_homes(settings: Any, results: dict[str, Result], *, store: str | None = None,
-               width: str | float = "full") -> Figure:
+def plot_homes(settings: Any, data: Data, *, store: str | None = None, width: str | float = "full") -> Figure:
     """Draw the fifth day of the first simulated home: temperature with bands, set point, and heater."""
     store = store or settings.stores[0]
     window = problem.home(0, store, settings.seed)
     assert window.fine is not None and window.set_points is not None
-    hours = problem.FINE[prediction.SCORED] - problem.TRAIN
-    truth, heater = window.fine[prediction.SCORED][:, [0, 2]].T
-    figure, panels = _grid(settings.methods, width)
-    for method, (upper, lower) in panels.items():
-        found = tables.of(results, "homes", store, method)
-        low, quarter, middle, upper_quarter, high = found["quantiles"]
+    hours, set_points = problem.FINE[prediction.SCORED] - problem.TRAIN, window.set_points[problem.TRAIN:]
+    truth, _, heater = window.fine[prediction.SCORED].T
+    figure, panels = _panels(width, data["homes"].sel(store=store).isel(dataset=0), "heater on")
+    for own, upper, lower in panels:
+        low, quarter, middle, upper_quarter, high = own.quantiles
         upper.plot(hours, middle, color=style.BLUE, label="predicted")
         upper.fill_between(hours, low, high, color=_WIDE, lw=0, label="95% band")
         upper.fill_between(hours, quarter, upper_quarter, color=_NARROW, lw=0, label="50% band")
-        upper.step(np.arange(problem.DAY + 1), np.append(*2 * [window.set_points[problem.TRAIN:]])[:problem.DAY + 1],
-                   where="post", color=style.GREEN, lw=0.8, label="set point")
+        upper.step(np.arange(problem.DAY + 1), np.append(set_points, set_points[0]), where="post", color=style.GREEN,
+                   lw=0.8, label="set point")
         upper.plot(hours, truth, **_MEASURED)
-        _score(upper, method, found["rmse"][0], found["ell"][0])
-        lower.fill_between(hours, heater, step="post", color="#D0D0D0", lw=0, label="heater on")
-        lower.plot(hours, found["on"][0], color=style.VERMILLION, lw=0.8, label="predicted probability")
+        lower.fill_between(hours, heater, step="post", color=_HEAT, lw=0, label="heater on")
+        lower.plot(hours, own.on, color=style.VERMILLION, lw=0.8, label="predicted probability")
         lower.set_ylim(0.0, 1.05)
-    _finish(figure, panels, "heater on")
     legend(figure)
     return figure
 
 
 @style.styled
-def plot_house(settings: Any, results: dict[str, Result], *, store: str | None = None,
-               width: str | float = "full") -> Figure:
+def plot_house(settings: Any, data: Data, *, store: str | None = None, width: str | float = "full") -> Figure:
     """Draw the fifth day of one window of the real house: temperature with bands, and its known heating power."""
-    store = store or settings.stores[0]
-    window = problem.house(settings.data)[settings.shown]
-    hours = np.arange(problem.DAY)
-    figure, panels = _grid(settings.methods, width)
-    for method, (upper, lower) in panels.items():
-        found = tables.of(results, "house", store, method)
-        mean, sd = found["mean"][settings.shown], found["sd"][settings.shown]
-        upper.plot(hours, mean, color=style.BLUE, label="predicted")
-        band(upper, hours, mean, sd, color=_WIDE)
-        band(upper, hours, mean, sd, color=_NARROW, z=0.6745, label="50% band")
-        upper.plot(hours, window.y[problem.TRAIN:, 0], **_MEASURED)
-        _score(upper, method, found["ahead_rmse"][settings.shown], found["ahead_ell"][settings.shown])
-        lower.fill_between(hours, window.y[problem.TRAIN:, 2], step="post", color="#D0D0D0", lw=0,
-                           label="heating power (100 units)")
+    found, hours = data["house"].sel(store=store or settings.stores[0]), np.arange(problem.DAY)
+    shown = found.sizes["dataset"] // 2
+    temperature, _, power = problem.house(settings.data)[shown].y[problem.TRAIN:].T
+    found = found.isel(dataset=shown)
+    figure, panels = _panels(width, found.assign(part(found, "ahead")), "power")
+    for own, upper, lower in panels:
+        upper.plot(hours, own["mean"], color=style.BLUE, label="predicted")
+        band(upper, hours, own["mean"], own["sd"], color=_WIDE)
+        band(upper, hours, own["mean"], own["sd"], color=_NARROW, z=0.6745, label="50% band")
+        upper.plot(hours, temperature, **_MEASURED)
+        lower.fill_between(hours, power, step="post", color=_HEAT, lw=0, label="heating power (100 units)")
         lower.set_ylim(bottom=0.0)
-    _finish(figure, panels, "power")
     legend(figure)
     return figure
 
 
+def _panels(width: str | float, found: xr.Dataset,
+            heating: str) -> tuple[Figure, list[tuple[xr.Dataset, Axes, Axes]]]:
+    """Return a figure, and for each residual that is shown its results, and axes of temperature and heating."""
+    shown = [method for method in _SHOWN if method in found.method] or list(found.method.values)
+    columns = min(3, len(shown))
+    rows = -(-len(shown) // columns)
+    figure = style.new_figure(width, 2.3 * rows + 0.4)
+    grid = figure.subplots(2 * rows, columns, sharex=True, sharey="row", squeeze=False, height_ratios=[3.0, 1.0] * rows)
+    panels = []
+    for index, (upper, lower) in enumerate(zip(grid[::2].flat, grid[1::2].flat, strict=True)):
+        if index >= len(shown):
+            upper.remove()
+            lower.remove()
+            continue
+        own = found.sel({"method": shown[index]})
+        style.tidy(upper, title=f"{LABELS[shown[index]]} ({float(own.rmse):.2f} K, {float(own.ell):.0f})", **_DAY)
+        style.tidy(lower, y_ticks=2, **_DAY)
+        if index % columns == 0:
+            upper.set_ylabel("temperature (degC)")
+            lower.set_ylabel(heating)
+        if index + columns >= len(shown):
+            lower.set_xlabel("hour of the day")
+        panels.append((own, upper, lower))
+    style.note_below(figure, "In brackets: root mean squared error and log likelihood of the day.")
+    return figure, panels
+
+
 @style.styled
-def plot_residual(settings: Any, results: dict[str, Result], *, width: str | float = "full") -> Figure:
+def plot_residual(data: Data, *, width: str | float = "full") -> Figure:
     """Draw the smoothed residual of the real house day by day, with the band of the day that is predicted."""
     figure, panels = style.in_a_row(width, 2, 2.6, sharey=True)
-    colours = ("#BBBBBB", style.SKY, style.GREEN, style.PURPLE)
-    hours = np.arange(problem.DAY)
+    colours, hours = ("#BBBBBB", style.SKY, style.GREEN, style.PURPLE), np.arange(problem.DAY)
     for axes, method in zip(panels, ("SQM", "matern"), strict=True):
-        found = tables.of(results, "house", settings.stores[0], method)
-        mean, sd = (found[name].reshape(-1, problem.DAY) for name in ("residual", "residual_sd"))
-        for day in range(problem.TRAIN_DAYS):
-            axes.plot(hours, mean[day], color=colours[day], lw=0.9, label=f"day {day + 1}")
-        axes.plot(hours, mean[-1], color=style.BLUE, lw=1.4, label="day 5, predicted")
-        band(axes, hours, mean[-1], sd[-1], color=_WIDE, label="its 95% band")
+        own = data["house"].isel(store=0).sel({"method": method})
+        *days, last = own.residual.values.reshape(-1, problem.DAY)
+        for day, (mean, colour) in enumerate(zip(days, colours, strict=True), start=1):
+            axes.plot(hours, mean, color=colour, lw=0.9, label=f"day {day}")
+        axes.plot(hours, last, color=style.BLUE, lw=1.4, label="day 5, predicted")
+        band(axes, hours, last, own.residual_sd.values[-problem.DAY:], color=_WIDE, label="its 95% band")
         axes.axhline(0.0, color=style.BLACK, lw=0.5)
-        style.tidy(axes)
-        axes.set_xticks([0, 6, 12, 18, 24])
-        axes.set_title(LABELS[method])
-        axes.set_xlabel("hour of the day")
+        style.tidy(axes, xticks=_DAY["xticks"], title=LABELS[method], xlabel="hour of the day")
     panels[0].set_ylabel("residual heat (K/h)")
     legend(figure)
     return figure
 
 
 @style.styled
-def plot_scores(settings: Any, results: dict[str, Result], *, width: str | float = "full") -> Figure:
+def plot_scores(data: Data, *, width: str | float = "full") -> Figure:
     """Draw day-ahead RMSE of every residual with two standard errors, and the quartiles of its log likelihood."""
-    kinds = [("homes", "", "simulated homes")] + ([("house", "ahead_", "real house")] if settings.data else [])
-    figure = style.new_figure(width, 2.1 * len(kinds) + 0.3)
-    grid = figure.subplots(len(kinds), 2, squeeze=False)
-    places = np.arange(len(settings.methods))
-    for (what, prefix, label), row in zip(kinds, grid, strict=True):
-        for axes, score, axis in zip(row, ("rmse", "ell"), ("RMSE a day ahead (K)", "log likelihood of a day"),
-                                     strict=True):
-            for index, store in enumerate(settings.stores):
-                values = [tables.of(results, what, store, method)[prefix + score] for method in settings.methods]
-                colour, marker = _MARKS[store]
-                if score == "rmse":
-                    means = [mean_of(one) for one in values]
-                    middle, bars = [one.value for one in means], 2 * np.array([[one.error for one in means]] * 2)
-                else:
-                    low, middle, high = np.array([np.quantile(one, [0.25, 0.5, 0.75]) for one in values]).T
-                    bars = np.stack([middle - low, high - middle])
-                axes.errorbar(places + 0.16 * (index - 0.5), middle, bars, color=colour, marker=marker, ls="", ms=3.0,
-                              elinewidth=0.8, capsize=1.5)
-            style.tidy(axes)
-            axes.set_xlim(-0.5, len(places) - 0.5)
-            axes.set_xticks(places, [LABELS[method] for method in settings.methods], rotation=30, ha="right")
-            axes.set_ylabel(axis)
-            axes.set_title(label)
-            if score == "ell":
-                axes.set_yscale("symlog", linthresh=20.0)
-    legend(figure, *(line(store, _MARKS[store][0], "", marker=_MARKS[store][1], ms=3.0) for store in settings.stores))
+    kinds = {"simulated homes": data["homes"]}
+    if "house" in data:
+        kinds["real house"] = part(data["house"], "ahead")
+    methods, stores = data["homes"].method.values, data["homes"].store.values
+    figure, places = style.new_figure(width, 2.1 * len(kinds) + 0.3), np.arange(len(methods))
+    for (title, found), (left, right) in zip(kinds.items(), figure.subplots(len(kinds), 2, squeeze=False), strict=True):
+        for index, store in enumerate(stores):
+            own, at = found.sel(store=store), places + 0.16 * (index - 0.5)
+            bars(left, at, [mean_of(errors) for errors in own.rmse], **_MARKS[store])
+            low, middle, high = own.ell.quantile([0.25, 0.5, 0.75], "dataset").values
+            right.errorbar(at, middle, [middle - low, high - middle], ls="", ms=3.0, elinewidth=0.8, capsize=1.5,
+                           **_MARKS[store])
+        for axes, ylabel in ((left, "RMSE a day ahead (K)"), (right, "log likelihood of a day")):
+            style.tidy(axes, xlim=(-0.5, len(places) - 0.5), ylabel=ylabel, title=title)
+            axes.set_xticks(places, [LABELS[method] for method in methods], rotation=30, ha="right")
+        right.set_yscale("symlog", linthresh=20.0)
+    legend(figure, *(line(store, ls="", ms=3.0, **_MARKS[store]) for store in stores))
     style.note_below(figure, "Left: means and two standard errors. Right: medians and quartiles; the axis is linear "
                              "near zero and logarithmic beyond 20.")
     return figure
-
-
-def _grid(methods: tuple[str, ...], width: str | float) -> tuple[Figure, dict[str, tuple[Axes, Axes]]]:
-    shown = [method for method in _SHOWN if method in methods] or list(methods)
-    columns = min(3, len(shown))
-    rows = -(-len(shown) // columns)
-    figure = style.new_figure(width, 2.3 * rows + 0.4)
-    grid = figure.subplots(2 * rows, columns, sharex=True, sharey="row", squeeze=False,
-                           height_ratios=[3.0, 1.0] * rows)
-    panels = {}
-    for index, method in enumerate(shown):
-        row, column = divmod(index, columns)
-        panels[method] = (grid[2 * row, column], grid[2 * row + 1, column])
-    for index in range(len(shown), rows * columns):
-        row, column = divmod(index, columns)
-        grid[2 * row, column].remove()
-        grid[2 * row + 1, column].remove()
-    return figure, panels
-
-
-def _finish(figure: Figure, panels: dict[str, tuple[Axes, Axes]], label: str) -> None:
-    columns = min(3, len(panels))
-    for index, (upper, lower) in enumerate(panels.values()):
-        for axes in (upper, lower):
-            style.tidy(axes, y_ticks=4 if axes is upper else 2)
-            axes.set_xlim(0.0, float(problem.DAY))
-            axes.set_xticks([0, 6, 12, 18, 24])
-        if index % columns == 0:
-            upper.set_ylabel("temperature (degC)")
-            lower.set_ylabel(label)
-        if index + columns >= len(panels):
-            lower.set_xlabel("hour of the day")
-    style.note_below(figure, "In brackets: root mean squared error and log likelihood of the day.")
-
-
-def _score(axes: Axes, method: str, rmse: float, ell: float) -> None:
-    axes.set_title(f"{LABELS[method]} ({rmse:.2f} K, {ell:.0f})")

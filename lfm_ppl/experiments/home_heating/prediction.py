@@ -1,169 +1,232 @@
-"""The fifth day: predicted or tracked with a known heater, or predicted under a thermostat."""
+"""What is learnt from four days, and the fifth: predicted or tracked with a known heater, or under a thermostat."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Iterator
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import ndtr
+from numpyro.infer import MCMC
+from scipy.special import logsumexp, ndtr
 from scipy.stats import norm
 
-from lfm_ppl.engine.task import Result
-from lfm_ppl.experiments.home_heating import learning, problem
+from lfm_ppl.engine.task import Result, Task
+from lfm_ppl.experiments import chains, scores, timing
+from lfm_ppl.experiments.home_heating import problem
+from lfm_ppl.experiments.home_heating.problem import FINE, TIMES, TRAIN, Model, Window
+from lfm_ppl.experiments.posteriors import LogPosterior
+from lfm_ppl.experiments.study import stacked
 from lfm_ppl.filtering.filter import FilterState
-from lfm_ppl.filtering.filter import filter as gaussian_filter
-from lfm_ppl.filtering.smoother import smooth
+from lfm_ppl.inference.bound_model import bind_arguments
+from lfm_ppl.inference.kernels.ram import RAM
+from lfm_ppl.inference.optimise import quasi_newton
+from lfm_ppl.switching.mixture import Mixture
 from lfm_ppl.switching.rao_blackwellised import RaoBlackwellisedResult, rao_blackwellised
 
+SAMPLERS = ("RAM", "NUTS")
+RESIDUALS = ("SQM", "matern")
+"""Residuals whose force is drawn."""
+
+QUANTILES = (0.025, 0.25, 0.5, 0.75, 0.975)
 EVERY = 3
 """Hours between two measurements where a day is tracked; the source has 100 minutes."""
 
-_LAST = problem.TRAIN - 1
-SCORED = problem.FINE >= problem.TRAIN
-"""Which of the times `problem.FINE` are of the fifth day."""
+SCORED, AHEAD, TRACKED = FINE >= TRAIN, TIMES >= TRAIN, (TIMES > TRAIN) & (TIMES % EVERY == 0)
+"""Which times of `FINE` (149,) and `TIMES` (120,) are of the fifth day; and which are measured where it is tracked."""
 
 
-class Filtered(NamedTuple):
-    """Temperature inside at every hour, and the joint state at the last hour of learning.
+def compute(task: Task) -> Result:
+    """Return the result of a task, with the CPU time ``cpu_s`` that it took."""
+    model = Model(*(task.settings[name] for name in Model._fields))
+    run = {"house": _house, "homes": _homes, "posterior": _posterior}[task.name.split("/")[0]]
+    seconds, result = timing.timed(run, task, model)
+    return {**result, "cpu_s": seconds}
 
-    Attributes:
-        mean, variance: (120,) given all measurements so far, the variance that of a measurement.
-        state, covariance: (n,), (n, n).
+
+def _windows(task: Task, model: Model) -> Iterator[tuple[Window, np.ndarray, float]]:
+    """Yield every window with its most likely parameters and their log density; searches begin where the last ended."""
+    z = None
+    for window in problem.house(task.settings["data"])[:task.settings["windows"]]:
+        z, density = most_likely(model, window, z)
+        yield window, z, density
+
+
+def _house(task: Task, model: Model) -> Result:
+    """Return scores and paths of every window, and the residual (120,) of the one that is drawn."""
+    rows, shown = [], {}
+    for index, (window, z, density) in enumerate(_windows(task, model)):
+        rows.append({**known_heater(model, window, z), "z": z, "density": density})
+        if index == task.settings["shown"] and model.method in RESIDUALS:
+            mean, sd = smoothed(model, z, masked(window.y), window.outdoor)
+            shown = {"residual": np.asarray(mean), "residual_sd": np.asarray(sd)}
+    return stacked(rows) | shown
+
+
+def _homes(task: Task, model: Model) -> Result:
+    """Return scores and paths of every simulated home, and quantiles (5, 144) of the first."""
+    rows = []
+    for index in range(task.settings["homes"]):
+        window = problem.home(index, model.store, task.seed)
+        z, _ = most_likely(model, window)
+        key = jax.random.fold_in(task.key, index)
+        result, prediction = thermostat_ahead(model, window, z, task.settings["particles"], key)
+        rows.append({**result, "z": z})
+        if index == 0:
+            rows[0]["quantiles"] = np.asarray(prediction.observed.quantiles(QUANTILES))[:, SCORED, 0]
+    return stacked(rows, shown=("quantiles",))
+
+
+def _posterior(task: Task, model: Model) -> Result:
+    """Return scores of some windows with the most likely parameters and with the posterior of all of them."""
+    rows = []
+    for index, (window, z, _) in enumerate(_windows(task, model)):
+        if index % task.settings["every"]:
+            continue
+        sampled = posterior(task.settings["sampler"], model, window, z, jax.random.fold_in(task.key, index),
+                            tuple(task.settings["chains"]))
+        draws = scores.spread(sampled["draws"], 100)
+        moments = filtered_under_draws(model, draws, masked(window.y), window.outdoor)
+        mean, variance = (np.asarray(moment)[:, AHEAD] for moment in moments[:2])
+        truth, point = window.y[AHEAD, 0], known_heater(model, window, z)
+        densities = logsumexp(norm.logpdf(truth, mean, np.sqrt(variance)), axis=0) - np.log(len(draws))
+        rows.append({"ell": float(densities.sum()), "rmse": scores.rmse(mean.mean(axis=0), truth),
+                     "point_ell": point["ahead_ell"], "point_rmse": point["ahead_rmse"],
+                     "r_hat": np.max(sampled["r_hat"]), "ess": np.min(sampled["ess"]),
+                     **{name: sampled[name] for name in ("mean", "sd", "divergences", "seconds")}})
+    return stacked(rows)
+
+
+def most_likely(model: Model, window: Window, start: np.ndarray | None = None) -> tuple[np.ndarray, float]:
+    """Return the most likely logarithms z (P,) of the parameters given the first four days, and their log density.
+
+    The priors are the model file's, with standard deviations of 0.7 to 1 in the logarithm: without them some of the
+    scales run away where four days say nothing of them. The prior of what is known of the weather adds a constant to
+    the log density. The search begins at ``start``, or at the prior medians.
     """
-
-    mean: jax.Array
-    variance: jax.Array
-    state: jax.Array
-    covariance: jax.Array
+    objective = _log_posterior(model).objective(window.learnt)
+    found = quasi_newton(objective, model.medians if start is None else start, 60)
+    return found.point, -found.value
 
 
-def masked(y: np.ndarray, indoor: str = "none", outdoor: bool = True) -> np.ndarray:
-    """Return measurements (120, 3) without those inside on the fifth day: "none", or one in `EVERY` hours ("some").
+@functools.cache
+def _log_posterior(model: Model) -> LogPosterior:
+    """Return the posterior given the first four days; what is compiled for it serves all windows."""
+    with jax.ensure_compile_time_eval():
+        example = jnp.zeros((TRAIN, 3)), dict.fromkeys(problem.OUTDOOR, jnp.ones(()))
+        return LogPosterior(bind_arguments(model.program, (example,), {}), model.names)
 
-    Args:
-        y: (120, 3).
-        indoor: what is kept.
-        outdoor: whether the temperature outside is known on the fifth day, a perfect forecast of the weather.
+
+def posterior(sampler: str, model: Model, window: Window, near: np.ndarray, key: jax.Array,
+              size: tuple[int, int, int]) -> Result:
+    """Return draws of z and what is known of them, see `chains.sample`.
+
+    Chains start around the mode ``near`` (P,); ``size`` is their number, and warm-up and draws of each.
+    """
+    start_key, run_key = jax.random.split(key)
+    return chains.sample(_sampler(sampler, model, *size), model.names, run_key, window.learnt,
+                         init_params=chains.starts(model.names, near, size[0], start_key))
+
+
+@functools.cache
+def _sampler(sampler: str, model: Model, count: int, warmup: int, draws: int) -> MCMC:
+    """Return the sampler of a model: one, so that its programs are compiled once for all windows."""
+    kernel: Any = (RAM(model.program, initial_scale=0.3, initial_covariance=np.eye(len(model.names)))
+                   if sampler == "RAM" else chains.nuts(model.program))
+    return chains.sampler(kernel, count, warmup, draws, jit_model_args=True)
+
+
+def masked(y: np.ndarray, tracked: bool = False, weather: bool = True) -> np.ndarray:
+    """Return measurements (120, 3) without those inside on the fifth day, but for one in `EVERY` hours if ``tracked``.
+
+    With ``weather`` the temperature outside is known on the fifth day, a perfect forecast.
     """
     y = y.copy()
-    hidden = np.arange(len(y)) >= problem.TRAIN
-    y[hidden if indoor == "none" else hidden & ~tracked(), 0] = np.nan
-    if not outdoor:
-        y[hidden, 1] = np.nan
+    y[AHEAD & ~TRACKED if tracked else AHEAD, 0] = np.nan
+    if not weather:
+        y[AHEAD, 1] = np.nan
     return y
 
 
-def tracked() -> np.ndarray:
-    """Return which hours (120,) of the fifth day are measured where it is tracked."""
-    return (problem.TIMES >= problem.TRAIN) & (problem.TIMES % EVERY == 0) & (problem.TIMES > problem.TRAIN)
+@functools.partial(jax.jit, static_argnums=0)
+def filtered(model: Model, z: Any, y: Any, outdoor: dict[str, Any]) -> tuple[jax.Array, ...]:
+    """Filter measurements y (120, 3) with parameters exp(z).
 
-
-@functools.cache
-def filtered(method: str, store: str, functions: int) -> Callable[..., Filtered]:
-    """Return the compiled filter: from z, measurements (120, 3) and the weather to `Filtered`."""
-
-    def run(z: jax.Array, y: jax.Array, outdoor: dict[str, Any]) -> Filtered:
-        values = learning.values_of(method, store, z, outdoor)
-        home = problem.site(method, store, functions, values, y).model
-        found = gaussian_filter(home, problem.TIMES, problem.given(y)[0], steps=1)
-        return Filtered(found.filtered_mean[:, 0], found.filtered_covariance[:, 0, 0] + values["noise_sd"] ** 2,
-                        found.filtered_mean[_LAST], found.filtered_covariance[_LAST])
-
-    return jax.jit(run)
-
-
-@functools.cache
-def filtered_under_draws(method: str, store: str, functions: int) -> Callable[..., Filtered]:
-    """Return the same for several z (S, P)."""
-    one = filtered(method, store, functions)
-    return jax.jit(lambda zs, y, outdoor: jax.lax.map(lambda z: one(z, y, outdoor), zs))
-
-
-@functools.cache
-def smoothed(method: str, store: str, functions: int) -> Callable[..., tuple[jax.Array, jax.Array]]:
-    """Return the compiled smoother of the residual: mean and standard deviation (120,) in K/h."""
-
-    def run(z: jax.Array, y: jax.Array, outdoor: dict[str, Any]) -> tuple[jax.Array, jax.Array]:
-        values = learning.values_of(method, store, z, outdoor)
-        home = problem.site(method, store, functions, values, y).model
-        found = smooth(home, problem.TIMES, problem.given(y)[0], steps=1)
-        return found.force("residual").mean, found.force("residual").sd
-
-    return jax.jit(run)
-
-
-@functools.cache
-def under_thermostat(method: str, store: str, functions: int, particles: int) -> Callable[..., RaoBlackwellisedResult]:
-    """Return the compiled prediction, from the filter's state at the last measurement to the end of the fifth day."""
-
-    def run(key: jax.Array, z: jax.Array, outdoor: dict[str, Any], start: Filtered, weather: jax.Array,
-            set_points: jax.Array, on: jax.Array) -> RaoBlackwellisedResult:
-        values = learning.values_of(method, store, z, outdoor)
-        y = jnp.full((len(problem.FINE), 2), jnp.nan).at[:, 1].set(weather)
-        return rao_blackwellised(
-            key, lambda heater: problem.under(method, store, functions, values, heater), problem.thermostat(set_points),
-            problem.FINE, y=y, start=FilterState(np.asarray(float(_LAST)), start.state, start.covariance),
-            initial=on, particles=particles, steps=1)
-
-    return jax.jit(run)
-
-
-def known_heater(method: str, store: str, functions: int, window: problem.Window, z: np.ndarray) -> Result:
-    """Return scores and paths of the fifth day with its heater known: predicted, tracked, and without the weather.
-
-    Returns:
-        ``{what}_rmse``, ``{what}_ell`` and ``{what}_inside`` for ``ahead``, ``track`` and ``blind``; ``mean`` and
-        ``sd`` (24,) of the day ahead.
+    Mean and variance (120,) of a measurement inside at every hour, given all so far, are returned with mean (n,) and
+    covariance (n, n) of the joint state at the last hour of learning.
     """
-    run = filtered(method, store, functions)
-    found: Result = {}
-    test = problem.TIMES >= problem.TRAIN
-    between = test & ~tracked()
-    for what, y, rows in (("ahead", masked(window.y), test), ("track", masked(window.y, "some"), between),
-                          ("blind", masked(window.y, outdoor=False), test)):
-        one = run(jnp.asarray(z), jnp.asarray(y), window.outdoor)
-        mean, variance = np.asarray(one.mean)[rows], np.asarray(one.variance)[rows]
-        found |= {f"{what}_{name}": value for name, value in gaussian_scores(mean, variance, window.y[rows, 0]).items()}
+    values = model.values(z, outdoor)
+    found = model.likelihood(values, y[:, 2]).filter(y[:, :2])
+    mean, covariance = found.filtered_mean, found.filtered_covariance
+    return mean[:, 0], covariance[:, 0, 0] + values["noise_sd"] ** 2, mean[TRAIN - 1], covariance[TRAIN - 1]
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def filtered_under_draws(model: Model, draws: Any, y: Any, outdoor: dict[str, Any]) -> tuple[jax.Array, ...]:
+    """Return the same for several z (S, P)."""
+    return jax.lax.map(lambda z: filtered(model, z, y, outdoor), draws)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def smoothed(model: Model, z: Any, y: Any, outdoor: dict[str, Any]) -> tuple[jax.Array, jax.Array]:
+    """Return mean and standard deviation (120,) in K/h of the smoothed residual."""
+    residual = model.likelihood(model.values(z, outdoor), y[:, 2]).smooth(y[:, :2]).force("residual")
+    return residual.mean, residual.sd
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def under_thermostat(model: Model, particles: int, key: jax.Array, z: Any, outdoor: dict[str, Any], mean: jax.Array,
+                     covariance: jax.Array, weather: Any, set_points: Any, on: Any) -> RaoBlackwellisedResult:
+    """Predict from the filter's state at the last measurement, and its heater, to the end of the fifth day."""
+    values, y = model.values(z, outdoor), jnp.full((len(FINE), 2), jnp.nan).at[:, 1].set(weather)
+    return rao_blackwellised(
+        key, lambda heater: model.likelihood(values, heater).model, problem.thermostat(set_points), FINE, y=y,
+        initial=on, start=FilterState(np.asarray(TRAIN - 1.0), mean, covariance), particles=particles, steps=1)
+
+
+def known_heater(model: Model, window: Window, z: np.ndarray) -> Result:
+    """Return scores and paths of the fifth day with its heater known.
+
+    ``{what}_rmse``, ``{what}_ell`` and ``{what}_inside`` are of what is predicted ("ahead"), tracked ("track"), and
+    predicted without the weather ("blind"); ``mean`` and ``sd`` (24,) of the day ahead.
+    """
+    result: Result = {}
+    for what, y, hours in (("ahead", masked(window.y), AHEAD),
+                           ("track", masked(window.y, tracked=True), AHEAD & ~TRACKED),
+                           ("blind", masked(window.y, weather=False), AHEAD)):
+        mean, variance = (np.asarray(moment)[hours] for moment in filtered(model, z, y, window.outdoor)[:2])
+        result |= {f"{what}_{name}": value
+                   for name, value in gaussian_scores(mean, variance, window.y[hours, 0]).items()}
         if what == "ahead":
-            found |= {"mean": mean, "sd": np.sqrt(variance)}
-    return found
+            result |= {"mean": mean, "sd": np.sqrt(variance)}
+    return result
 
 
 def gaussian_scores(mean: np.ndarray, variance: np.ndarray, truth: np.ndarray) -> Result:
     """Return root mean squared error, sum of the log densities of all measurements, and share in 95% bands."""
-    away = truth - mean
-    return {"rmse": float(np.sqrt(np.mean(away**2))),
-            "ell": float(norm.logpdf(truth, mean, np.sqrt(variance)).sum()),
-            "inside": float(np.mean(np.abs(away) <= 1.959963984540054 * np.sqrt(variance)))}
+    sd = np.sqrt(variance)
+    return {"rmse": scores.rmse(mean, truth), "ell": float(norm.logpdf(truth, mean, sd).sum()),
+            "inside": scores.covered(mean - scores.Z * sd, mean + scores.Z * sd, truth)}
 
 
-def thermostat_ahead(method: str, store: str, functions: int, window: problem.Window, z: np.ndarray, particles: int,
-                     key: jax.Array, hourly_weather: bool = True) -> tuple[Result, RaoBlackwellisedResult]:
+def thermostat_ahead(model: Model, window: Window, z: np.ndarray, particles: int,
+                     key: jax.Array) -> tuple[Result, RaoBlackwellisedResult]:
     """Return scores of the fifth day under its thermostat, every ten minutes, and the prediction itself.
 
-    Raises:
-        ValueError: the set points of the window are not known.
+    The temperature outside is known at every full hour. A ValueError says that nobody recorded the set points.
     """
     problem.thermostat(window.set_points)
     assert window.fine is not None
-    start = filtered(method, store, functions)(jnp.asarray(z), jnp.asarray(masked(window.y)), window.outdoor)
-    weather = np.where(np.isclose(problem.FINE % 1.0, 0.0) & hourly_weather, window.fine[:, 1], np.nan)
-    found = under_thermostat(method, store, functions, particles)(
-        key, jnp.asarray(z), window.outdoor, start, jnp.asarray(weather), jnp.asarray(window.set_points), window.on)
-    truth = window.fine[:, :1]
-    mean, density, below = (np.asarray(part)[SCORED, 0] for part in _judge(found.observed, jnp.asarray(truth)))
-    return {"rmse": float(np.sqrt(np.mean((truth[SCORED, 0] - mean) ** 2))), "ell": float(density.sum()),
-            "inside": float(np.mean(np.abs(below - 0.5) <= 0.475)), "mean": mean,
+    weather = np.where(np.isclose(FINE % 1.0, 0.0), window.fine[:, 1], np.nan)
+    found = under_thermostat(model, particles, key, z, window.outdoor,
+                             *filtered(model, z, masked(window.y), window.outdoor)[2:], weather, window.set_points,
+                             window.on)
+    day: Mixture = jax.tree.map(lambda part: part[SCORED], found.observed)
+    indoor, truth = Mixture(day.mean[:, :, :1], day.variance[:, :, :1], day.log_weights), window.fine[SCORED, :1]
+    mean, away = indoor.moments()[0], (truth[:, None] - indoor.mean) / jnp.sqrt(indoor.variance)
+    below = (np.exp(day.log_weights) * ndtr(away)[:, :, 0]).sum(axis=1)
+    return {"rmse": scores.rmse(mean, truth), "ell": float(indoor.log_density(truth).sum()),
+            "inside": float(np.mean(np.abs(below - 0.5) <= 0.475)), "mean": np.asarray(mean)[:, 0],
             "on": np.asarray(found.input_mean)[SCORED]}, found
-
-
-@jax.jit
-def _judge(mixture: Any, truth: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    one = type(mixture)(mixture.mean[:, :, :1], mixture.variance[:, :, :1], mixture.log_weights)
-    away = (truth[:, None, :] - one.mean) / jnp.sqrt(one.variance)
-    below = (jnp.exp(one.log_weights)[:, :, None] * ndtr(away)).sum(1)
-    return one.moments()[0], one.log_density(truth), below

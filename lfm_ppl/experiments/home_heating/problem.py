@@ -16,6 +16,7 @@ from numpyro import handlers
 from lfm_ppl import loading
 from lfm_ppl.data import Data
 from lfm_ppl.inference.bound_model import likelihood_site
+from lfm_ppl.inference.handlers.fixing import fix
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.model.inputs import Input
 from lfm_ppl.model.latent_force_model import LatentForceModel
@@ -25,6 +26,7 @@ from lfm_ppl.switching.switched_simulation import simulate_switched
 
 METHODS = ("SQM", "CQM", "WQM", "periodic", "none", "matern", "resonator")
 STORES = ("one store", "envelope")
+OUTDOOR = ("outdoor_mean", "outdoor_scale", "outdoor_lengthscale")
 FILE = "house_hourly.csv"
 TRAIN_DAYS, DAY = 4, 24
 TRAIN = TRAIN_DAYS * DAY
@@ -32,12 +34,9 @@ TIMES = np.arange(TRAIN + DAY, dtype=float)
 """Hours from the midnight at which a window begins: four days to learn from, one to predict."""
 
 PER_HOUR = 6
-"""Decisions of a thermostat in an hour, every ten minutes as in the source."""
-
 FINE = TRAIN - 1 + np.arange(1, (DAY + 1) * PER_HOUR) / PER_HOUR
-"""Times of a prediction under a thermostat, from the last measurement on."""
+"""Times of a prediction under a thermostat from the last measurement on: every ten minutes, as in the source."""
 
-OUTDOOR = ("outdoor_mean", "outdoor_scale", "outdoor_lengthscale")
 _POWER = 100.0
 """Unit of the recorded heating power, so that full power is about one."""
 
@@ -45,9 +44,8 @@ _HOME = {"alpha": 0.1, "beta": 2.5, "scale": 0.3, "lengthscale": 0.5, "memory": 
          "outdoor_mean": 6.0, "outdoor_scale": 3.0, "outdoor_lengthscale": 10.0, "gamma": 0.05, "psi": 0.05}
 """The simulated home, that of the model file's default data and its walls."""
 
-_METER_ERROR = 1e-3
 _VARIED = ("alpha", "beta", "scale", "gamma", "psi")
-_FUNCTIONS = 15
+_METER_ERROR, _FUNCTIONS = 1e-3, 15
 
 
 class Window(NamedTuple):
@@ -57,7 +55,7 @@ class Window(NamedTuple):
         y: (120, 3), indoor and outdoor temperature (degC) and heater, from each hour to the next.
         outdoor: what is known of the temperature outside from the first four days, name -> value.
         set_points: (120,) degC, from each hour to the next; None where nobody recorded them.
-        fine: (149, 3), the same at the times `FINE`; None for the real house.
+        fine: (149, 3), the same as ``y`` at the times `FINE`; None for the real house.
         on: whether the heater is on at the last measurement of the first four days.
     """
 
@@ -67,6 +65,49 @@ class Window(NamedTuple):
     fine: np.ndarray | None = None
     on: int = 0
 
+    @property
+    def learnt(self) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """Measurements (96, 3) of the first four days, and what is known of the weather."""
+        return jnp.asarray(self.y[:TRAIN]), {name: jnp.asarray(self.outdoor[name]) for name in OUTDOOR}
+
+
+class Model(NamedTuple):
+    """What is compared: a residual of `METHODS`, one of the `STORES` of heat, and the number of eigenfunctions."""
+
+    method: str
+    store: str
+    functions: int
+
+    @property
+    def keywords(self) -> dict[str, Any]:
+        """The options of the model file."""
+        return {"residual": self.method, "envelope": self.store == STORES[1], "functions": self.functions}
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the P parameters that are learnt."""
+        return tuple(name for name in _priors(self) if name not in OUTDOOR)
+
+    @property
+    def medians(self) -> np.ndarray:
+        """Logarithms (P,) of their prior medians."""
+        return np.array([float(_priors(self)[name].loc) for name in self.names])
+
+    def program(self, learnt: tuple[jax.Array, dict[str, jax.Array]]) -> None:
+        """Run the NumPyro model of what is ``learnt`` from in a window."""
+        (y, outdoor), times = learnt, TIMES[:TRAIN]
+        fix(model_file().model, outdoor)(times, y[:, :2], inputs={"heater": Input(times, y[:, 2])}, **self.keywords)
+
+    def values(self, z: Any, outdoor: dict[str, Any]) -> dict[str, Any]:
+        """Return every parameter by name; the logarithms z (P,) may be traced."""
+        return dict(zip(self.names, jnp.exp(z), strict=True)) | outdoor
+
+    def likelihood(self, values: dict[str, Any], heater: Any) -> MarginalLikelihood:
+        """Return the likelihood of five days, given parameters and a heater (120,) or one value; both may be traced."""
+        inputs = {"heater": Input(TIMES, jnp.broadcast_to(jnp.asarray(heater, float), TIMES.shape))}
+        return likelihood_site(model_file().model, (TIMES, np.zeros((len(TIMES), 2))),
+                               {**self.keywords, "inputs": inputs}, jax.random.key(0), values).example
+
 
 @functools.cache
 def model_file() -> loading.ModelFile:
@@ -74,23 +115,22 @@ def model_file() -> loading.ModelFile:
     return loading.load("home-heating")
 
 
-def keywords(method: str, store: str, functions: int) -> dict[str, Any]:
-    """Return the options of the model file."""
-    return {"residual": method, "envelope": store == STORES[1], "functions": functions}
+@functools.cache
+def _priors(model: Model) -> dict[str, Any]:
+    with jax.ensure_compile_time_eval():
+        seeded = handlers.seed(model_file().model, jax.random.key(0))
+        trace = handlers.trace(seeded).get_trace(TIMES, np.zeros((len(TIMES), 2)), **model.keywords)
+    return {name: site["fn"] for name, site in trace.items() if site["type"] == "sample" and not site["is_observed"]}
 
 
 def data_folder(given: str | None = None) -> Path | None:
-    """Return the folder of the real house: the given one, that in LFM_DATA, or ../shared/data; None: there is none.
-
-    Raises:
-        FileNotFoundError: a folder is given that has no such file.
-    """
+    """Return the folder of the real house: the given one, which must have it, that in LFM_DATA, or ../shared/data."""
+    folder = Path(os.environ.get("LFM_DATA", "../shared/data")) / "house" if given is None else Path(given)
+    if (folder / FILE).is_file():
+        return folder
     if given is not None:
-        if not (Path(given) / FILE).is_file():
-            raise FileNotFoundError(f"{given} has no file {FILE}; leave --data out for simulated homes only.")
-        return Path(given)
-    folder = Path(os.environ.get("LFM_DATA", "../shared/data")) / "house"
-    return folder if (folder / FILE).is_file() else None
+        raise FileNotFoundError(f"{given} has no file {FILE}; leave --data out for simulated homes only.")
+    return None
 
 
 @functools.cache
@@ -109,111 +149,57 @@ def house(folder: str) -> tuple[Window, ...]:
     if gaps.any() or not np.isfinite(y).all():
         row = int(np.argmax(gaps)) if gaps.any() else int(np.argmax(~np.isfinite(y).all(axis=1)))
         raise ValueError(f"{path}: expected a row an hour without gaps; see the row after {frame.index[row]}.")
-    first = int(-frame.index[0].hour % DAY)
-    starts = range(first, len(y) - len(TIMES) + 1, DAY)
+    starts = range(-frame.index[0].hour % DAY, len(y) - len(TIMES) + 1, DAY)
     if not starts:
         raise ValueError(f"{path} has {len(y)} hours; expected at least five whole days.")
     return tuple(_window(y[start:start + len(TIMES)]) for start in starts)
 
 
 def _window(y: np.ndarray, **more: Any) -> Window:
-    learnt = Data(TIMES[:TRAIN], y[:TRAIN, :2], model_file().outputs or ())
-    return Window(y, model_file().anchors(learnt), **more)
-
-
-def site(method: str, store: str, functions: int, values: dict[str, Any], y: Any,
-         times: np.ndarray = TIMES) -> MarginalLikelihood:
-    """Return the likelihood of ``times`` with these parameters, which may be traced, and the heater of ``y`` (T, 3)."""
-    y, inputs = given(y, times)
-    return likelihood_site(model_file().model, (times, y), {**keywords(method, store, functions), "inputs": inputs},
-                           jax.random.key(0), values).example
-
-
-def given(y: Any, times: np.ndarray = TIMES) -> tuple[jax.Array, dict[str, Input]]:
-    """Split measurements (T, 3) into temperatures (T, 2) and the known input."""
-    y = jnp.asarray(y)
-    return y[:, :2], {"heater": Input(times, y[:, 2])}
-
-
-def under(method: str, store: str, functions: int, values: dict[str, Any], heater: Any) -> LatentForceModel:
-    """Return the model while the heater has one value."""
-    y = jnp.zeros((len(TIMES), 3)).at[:, 2].set(heater)
-    return site(method, store, functions, values, y).model
-
-
-@functools.cache
-def names(method: str, store: str) -> tuple[str, ...]:
-    """Return the names of the parameters that are learnt."""
-    return tuple(name for name in _priors(method, store) if name not in OUTDOOR)
-
-
-@functools.cache
-def medians(method: str, store: str) -> np.ndarray:
-    """Return the logarithms of the prior medians (P,)."""
-    return np.array([float(_priors(method, store)[name].loc) for name in names(method, store)])
-
-
-@functools.cache
-def _priors(method: str, store: str) -> dict[str, Any]:
-    with jax.ensure_compile_time_eval():
-        seeded = handlers.seed(model_file().model, jax.random.key(0))
-        trace = handlers.trace(seeded).get_trace(TIMES, np.zeros((len(TIMES), 2)), **keywords(method, store, 3))
-    return {name: one["fn"] for name, one in trace.items() if one["type"] == "sample" and not one["is_observed"]}
+    return Window(y, model_file().anchors(Data(TIMES[:TRAIN], y[:TRAIN, :2], model_file().outputs or ())), **more)
 
 
 @functools.lru_cache(maxsize=256)
 def home(index: int, store: str, seed: int = 0) -> Window:
     """Return a simulated home with a residual drawn from SQM, under a thermostat with its own set points.
 
-    Rates vary by a fifth from home to home. The set points of the last day differ from those before.
+    Rates vary by a fifth from home to home. Set points are those of a night and a day, the same every day but the last.
     """
-    generator = np.random.default_rng([seed, index, STORES.index(store)])
-    points = _set_points(generator)
+    generator, hours = np.random.default_rng([seed, index, STORES.index(store)]), np.arange(DAY)
+    night, day, wake, sleep = 16.0 + generator.normal(), 20.0, generator.integers(5, 8), generator.integers(21, 24)
+    usual = np.where((hours >= wake) & (hours < sleep), day, night)
+    away = (hours >= 10) & (hours < 15)
+    last_day = np.where(away, night, usual + generator.choice([-1.0, 1.0]) * (usual == day))
+    set_points = np.concatenate([*[usual] * TRAIN_DAYS, last_day])
     values = {name: _HOME[name] * np.exp(0.2 * generator.normal()) if name in _VARIED else _HOME[name]
               for name in _HOME if store == STORES[1] or name not in ("gamma", "psi")}
     key = jax.random.fold_in(jax.random.key(seed), index)
-    y, inputs = (np.asarray(part) for part in _simulator(store)(key, values, points))
-    share = inputs[:-1].reshape(-1, PER_HOUR).mean(axis=1)
-    hourly = np.column_stack([y[:-1:PER_HOUR, :2], share])
+    y, heater = (np.asarray(path) for path in _simulator(store)(key, values, set_points))
+    hourly = np.column_stack([y[:-1:PER_HOUR, :2], heater[:-1].reshape(-1, PER_HOUR).mean(axis=1)])
     last = (TRAIN - 1) * PER_HOUR
-    fine = np.column_stack([y[last + 1:-1, :2], inputs[last + 1:-1]])
-    return _window(hourly, set_points=points, fine=fine, on=int(inputs[last]))
-
-
-def _set_points(generator: np.random.Generator) -> np.ndarray:
-    """Return set points (120,): a night and a day every day, and another day on the last one."""
-    night, day, wake, sleep = 16.0 + generator.normal(), 20.0, generator.integers(5, 8), generator.integers(21, 24)
-    hours = np.arange(DAY)
-    usual = np.where((hours >= wake) & (hours < sleep), day, night)
-    away = (hours >= 10) & (hours < 15)
-    changed = np.where(away, night, usual + generator.choice([-1.0, 1.0]) * (usual == day))
-    return np.concatenate([*[usual] * TRAIN_DAYS, changed])
+    fine = np.column_stack([y[last + 1:-1, :2], heater[last + 1:-1]])
+    return _window(hourly, set_points=set_points, fine=fine, on=int(heater[last]))
 
 
 @functools.cache
 def _simulator(store: str) -> Any:
-    times = np.arange(len(TIMES) * PER_HOUR + 1) / PER_HOUR
+    model, times = Model("SQM", store, _FUNCTIONS), np.arange(len(TIMES) * PER_HOUR + 1) / PER_HOUR
 
-    def draw(key: jax.Array, values: dict[str, Any], points: jax.Array) -> tuple[jax.Array, jax.Array]:
-        build = lambda heater: _metered(under("SQM", store, _FUNCTIONS, values, heater), heater)  # noqa: E731
-        found = simulate_switched(key, build, thermostat(points), times, steps=1)
+    def draw(key: jax.Array, values: dict[str, Any], set_points: jax.Array) -> tuple[jax.Array, jax.Array]:
+        def metered(heater: Any) -> LatentForceModel:
+            """A meter of the heater is a third output: the errors of the simulated homes are drawn for three."""
+            home = model.likelihood(values, heater).model
+            observation = GaussianObservation(lambda x, u, t: jnp.append(home.observation.function(x, u, t), heater),
+                                              jnp.append(home.observation.covariance, _METER_ERROR**2))
+            return LatentForceModel(home.dynamics, home.forces, observation, home.initial_state,
+                                    state_names=home.state_names)
+
+        found = simulate_switched(key, metered, thermostat(set_points), times, steps=1)
         return found.y[:, 0], found.inputs[:, 0]
 
     return jax.jit(draw)
 
 
-def _metered(home: LatentForceModel, heater: Any) -> LatentForceModel:
-    """Return a home whose heater has a meter, a third output: the errors of the simulated homes are drawn for three."""
-    own = home.observation
-    observation = GaussianObservation(
-        lambda x, u, t: jnp.append(own.function(x, u, t), heater), jnp.append(own.covariance, _METER_ERROR**2))
-    return LatentForceModel(home.dynamics, home.forces, observation, home.initial_state, state_names=home.state_names)
-
-
 def thermostat(set_points: Any) -> Thermostat:
-    """Return the thermostat of a home.
-
-    Raises:
-        ValueError: nobody recorded its set points.
-    """
+    """Return the thermostat of a home; a ValueError says that nobody recorded its set points."""
     return Thermostat(None if set_points is None else Input(TIMES, set_points))

@@ -1,13 +1,22 @@
-"""The study: its settings, tasks, tables and figures."""
+"""The study: its settings, tasks and tables."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
 
 from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import study
-from lfm_ppl.experiments.periodic_kernels import covariance, figures, regression, tables
-from lfm_ppl.experiments.study import Results, Study, Table, setting
+from lfm_ppl.experiments.datasets import Column, Kind, row
+from lfm_ppl.experiments.periodic_kernels import figures, methods, problem
+from lfm_ppl.experiments.periodic_kernels.methods import KPCA, SPARSE, SPARSE_4
+from lfm_ppl.experiments.scores import Estimate, mean_of, pair
+from lfm_ppl.experiments.study import Data, Study, Table, setting
+
+PUBLISHED = {SPARSE: (0.36, 3.03, -6.9e4), SPARSE_4: (0.23, 2.74, -1.2e4), KPCA: (9.6e-5, 2.49, 75.0)}
+"""Largest error of the covariance, error and expected log likelihood that the source publishes."""
 
 
 @dataclass(frozen=True)
@@ -29,21 +38,78 @@ class Settings(study.Settings):
 
 
 def all_tasks(settings: Settings) -> list[Task]:
-    """Return every task."""
-    return [*covariance.tasks(settings), *regression.tasks(settings)]
+    """Return one task for each kernel, one for the quadrature grid, and one for each method of prediction."""
+    def task(name: str, what: str, **given: Any) -> Task:
+        return Task(name.replace(" ", "_").replace(",", ""), settings.seed, {"what": what, **given})
+
+    size = {"functions": list(settings.functions), "draws": settings.draws}
+    return [*(task(f"covariance/{name}", "covariance", **size, kernel=name) for name in problem.kernels()),
+            task("quadrature", "quadrature", points=list(settings.points)),
+            *(task(f"regression/{name}", "regression", method=name, runs=settings.runs) for name in methods.PREDICTING)]
 
 
-def tabulated(settings: Settings, results: Results) -> dict[str, Table]:
+def tables(settings: Settings, data: Data) -> dict[str, Table]:
     """Return the tables."""
-    return {"covariance": Table("Largest error of the covariance, by the number of functions",
-                                tables.covariances(settings, results)),
-            "published": Table("Squared exponential of scale 10, on a window of 130",
-                               tables.published(settings, results)),
-            "regression": Table(f"Means over {settings.runs} functions (standard errors)",
-                                tables.predictions(settings, results))}
+    return {"covariance": Table.of("Largest error of the covariance, by the number of functions",
+                                   covariances(settings, data)),
+            "published": Table.of("Squared exponential of scale 10, on a window of 130", published(settings, data)),
+            "regression": Table.of(f"Means over {settings.runs} functions (standard errors)", predictions(data))}
 
 
-KINDS = {"covariance": covariance.compute, "quadrature": covariance.quadrature, "regression": regression.compute}
-"""What the tasks are."""
+def covariances(settings: Settings, data: Data) -> dict[str, Any]:
+    """Return the largest error of the covariance for each kernel and method, in a column for each number of functions.
 
-STUDY = Study(Settings, all_tasks, KINDS, tabulated, figures.draw)
+    The row ``left out`` is the mean variance that the eigenfunctions miss. ``significant`` is the number at the default
+    share of the largest eigenvalue, 1/100, and ``error there`` that of its covariance.
+    """
+    found, rows = data["covariance"].assign_coords(functions=list(settings.functions)), {}
+    for kernel in found.kernel.values:
+        for method in (*methods.METHODS, "left out"):
+            columns: dict[str, Column] = {"{functions}": method}
+            if method == methods.EIGENFUNCTIONS:
+                columns |= {"significant": "significant", "error there": "at default"}
+            if found[method].sel(kernel=kernel).notnull().any():
+                rows[f"{kernel.replace('_', '/')}, {method}"] = row(found.sel(kernel=kernel), columns)
+    return rows
+
+
+def published(settings: Settings, data: Data) -> dict[str, Any]:
+    """Return the errors of 22 eigenfunctions by their quadrature points, and of random frequencies.
+
+    ``error`` is that of the covariance, for random frequencies the mean over 100 draws, ``least`` of them, and
+    ``published`` what the source has.
+    """
+    found = data["quadrature"]
+    rows = {f"{min(22, points)} eigenfunctions, {points} points": pair("error", Estimate(float(error), np.nan))
+            for points, error in zip(settings.points, found.error, strict=True)}
+    if settings.points[-1] >= 22:
+        rows[f"22 eigenfunctions, {settings.points[-1]} points"]["published"] = PUBLISHED[KPCA][0]
+    for label, errors in ((SPARSE, found["sparse 22"]), (SPARSE_4, found["sparse 88"])):
+        rows[label] = pair("error", mean_of(errors)) | {"least": float(errors.min()), "published": PUBLISHED[label][0]}
+    return rows
+
+
+def predictions(data: Data) -> dict[str, Any]:
+    """Return how each approximation predicts the functions that were drawn, and what the source has.
+
+    Means with standard errors: ``RMSE`` over the predicted points, ``root of sum``, the same without the division by
+    their number, ``log likelihood``, the sum of the points' log densities, ``coverage`` of 95% bands. The source does
+    not state the window and the points of its figures.
+    """
+    columns: dict[str, Column] = {
+        "RMSE": "rmse", "root of sum": lambda one: one.rmse * np.sqrt(one.sizes["time"]),
+        "log likelihood": "log likelihood", "coverage": "coverage"}
+    rows = {method: row(data["regression"].sel({"method": method}), columns) for method in methods.PREDICTING}
+    for method, (_, rmse, log_likelihood) in PUBLISHED.items():
+        rows[method] |= {"published RMSE": rmse, "published log likelihood": log_likelihood}
+    return rows
+
+
+STUDY = Study(
+    Settings, all_tasks,
+    {"covariance": Kind(methods.covariance_errors, {"functions": ", ".join((*methods.METHODS, "left out")),
+                                             "": "significant, at default"}, ("kernel",)),
+     "quadrature": Kind(methods.quadrature_errors, {"points": "error", "draw": "sparse 22, sparse 88"}),
+     "regression": Kind(methods.predictions, {"dataset": "rmse, log likelihood, coverage", "time": "mean, variance"},
+                        ("method",))},
+    tables, figures.draw)

@@ -1,18 +1,12 @@
-"""The kernels that are compared, and the functions that are drawn."""
+"""The kernels that are compared, and the times at which functions are measured and predicted."""
 
 from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.forces import (
-    ModeratedPeriodicMatern,
-    PeriodicKernel,
-    PeriodicMatern,
-    PeriodicSquaredExponential,
-    SquaredExponential,
-)
-from lfm_ppl.forces.periodic_kernels import Kernel
+from lfm_ppl import forces
+from lfm_ppl.forces import Kernel
 
 PERIOD, WINDOW, LENGTHSCALE = 10.0, 130.0, 10.0
 """Of the periodic kernels; and of the squared exponential that is not periodic, on a window of time."""
@@ -22,40 +16,33 @@ NOT_PERIODIC = "squared exponential on a window"
 NUGGET = 1e-8
 """Variance of the measurements, which have no noise otherwise, and of what is predicted."""
 
+MEASURED = np.arange(5.0, WINDOW, 10.0)
+"""Times of the measurements."""
+
+PREDICTED = np.setdiff1d(np.arange(WINDOW), MEASURED)
+"""Times at which functions are predicted, every unit but where they are measured."""
+
 
 def kernels() -> dict[str, Kernel]:
     """Return every kernel by name, all of scale one."""
-    found: dict[str, Kernel] = {"periodic squared exponential": PeriodicSquaredExponential(1.0, 0.5, PERIOD)}
-    found |= {f"periodic Matern-{2 * order + 1}_2": PeriodicMatern(1.0, 0.5, PERIOD, order) for order in (2, 1, 0)}
-    found["moderated periodic Matern-3_2"] = ModeratedPeriodicMatern(1.0, 0.5, PERIOD, 0.3, 1)
+    found: dict[str, Kernel] = {"periodic squared exponential": forces.PeriodicSquaredExponential(1.0, 0.5, PERIOD)}
+    found |= {f"periodic Matern-{2 * order + 1}_2": forces.PeriodicMatern(1.0, 0.5, PERIOD, order)
+              for order in (2, 1, 0)}
+    found["moderated periodic Matern-3_2"] = forces.ModeratedPeriodicMatern(1.0, 0.5, PERIOD, 0.3, 1)
     return found | {NOT_PERIODIC: window_kernel()}
 
 
-def window_kernel() -> PeriodicKernel:
+def window_kernel() -> forces.PeriodicKernel:
     """Return the squared exponential of the source, repeated after the window, which nobody leaves."""
-
-    def squared_exponential(t, s):
-        return jnp.exp(-0.5 * ((t - s) / LENGTHSCALE) ** 2)
-
-    return PeriodicKernel(squared_exponential, WINDOW)
+    return forces.PeriodicKernel(lambda t, s: jnp.exp(-0.5 * ((t - s) / LENGTHSCALE) ** 2), WINDOW)
 
 
-def window_prior() -> SquaredExponential:
+def window_prior() -> forces.SquaredExponential:
     """Return the same as a force, from whose spectrum frequencies are drawn."""
-    return SquaredExponential(1.0, LENGTHSCALE)
+    return forces.SquaredExponential(1.0, LENGTHSCALE)
 
 
-def grid(kernel: Kernel, count: int = 131) -> np.ndarray:
-    """Return times of one cycle (count,), its end left out."""
-    return np.linspace(0.0, float(kernel.period), count + 1)[:-1]
-
-
-def measured() -> np.ndarray:
-    """Return the times of the measurements, every 10 units."""
-    return np.arange(5.0, WINDOW, 10.0)
-
-
-def predicted() -> np.ndarray:
-    """Return the times at which functions are predicted, every unit but where they are measured."""
-    times = np.arange(0.0, WINDOW, 1.0)
-    return np.setdiff1d(times, measured())
+def on_grid(kernel: Kernel) -> tuple[np.ndarray, np.ndarray]:
+    """Return times (K,) of one cycle, its end left out, and the kernel's covariance (K, K) at them."""
+    times = np.linspace(0.0, float(kernel.period), 132)[:-1]
+    return times, np.asarray(kernel(times[:, None], times))

@@ -1,19 +1,24 @@
-"""The study: its settings, tasks, tables and figures."""
+"""The study: its settings, tasks and tables."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.figure import Figure
+import xarray as xr
 from scipy.stats import norm
 
 from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import published, scores, study
-from lfm_ppl.experiments.study import Results, Study, Table, blocks, setting
-from lfm_ppl.experiments.transcription import figures, laplace_modes, problem, slices, smoothers, tables
+from lfm_ppl.experiments.datasets import Column, Kind, cell, row
+from lfm_ppl.experiments.published import Verdict
+from lfm_ppl.experiments.scores import mean_of
+from lfm_ppl.experiments.study import Data, Study, Table, blocks, setting
+from lfm_ppl.experiments.transcription import approximations, figures, problem, slices
 
 METHODS = ("LA", "ESLS", "GFS", "GHS(7)", "iterated GHS(7)", "LA, trust region")
 BLOCK = 10
@@ -48,34 +53,26 @@ class Settings(study.Settings):
 
 def all_tasks(settings: Settings) -> list[Task]:
     """Return every task: all methods on the first data sets, then on the next, so that the time left can be told."""
-    found = []
-    for first, last in blocks(settings.datasets, BLOCK):
-        for configuration in problem.CONFIGURATIONS:
-            for method in METHODS if configuration.label in settings.configurations else ():
-                own: dict = {"draws": settings.draws, "burn_in": settings.burn_in} if method == "ESLS" else {}
-                found.append(Task(
-                    f"{problem.slug(configuration.label)}/{problem.slug(method)}/{first:03d}-{last:03d}", settings.seed,
-                    {"experiment": "transcription", "method": method, "link": configuration.link,
-                     "gamma": configuration.gamma, "first": first, "last": last, **own}))
-    return found
+    sampling = {"draws": settings.draws, "burn_in": settings.burn_in}
+    return [Task(f"{problem.slug(configuration.label)}/{problem.slug(method)}/{first:03d}-{last:03d}", settings.seed,
+                 {"experiment": "transcription", "method": method, **configuration._asdict(), "first": first,
+                  "last": last, **(sampling if method == "ESLS" else {})})
+            for first, last in blocks(settings.datasets, BLOCK)
+            for configuration in problem.CONFIGURATIONS if configuration.label in settings.configurations
+            for method in METHODS]
 
 
 def compute(task: Task) -> Result:
     """Return what the method says of the force of each data set of the task, and how good it is."""
-    settings = task.settings
-    configuration = problem.Configuration(settings["link"], settings["gamma"])
-    data = [problem.data_set(configuration, index, task.seed)
-            for index in range(settings["first"], settings["last"] + 1)]
-    method = settings["method"]
-    if method in smoothers.SMOOTHERS:
-        found = smoothers.compute(settings, data)
-    elif method in laplace_modes.SEARCHES:
-        found = laplace_modes.compute(settings, data)
-    else:
-        cell = Task(f"{problem.slug(configuration.label)}/{problem.slug(method)}", task.seed)
-        keys = jax.vmap(lambda index: jax.random.fold_in(cell.key, index))(
-            jnp.arange(settings["first"], settings["last"] + 1))
+    settings, configuration = task.settings, problem.configuration(task)
+    indices = np.arange(settings["first"], settings["last"] + 1)
+    data = [problem.data_set(configuration, int(index), task.seed) for index in indices]
+    if settings["method"] == "ESLS":
+        key = Task(f"{problem.slug(configuration.label)}/ESLS", task.seed).key
+        keys = jax.vmap(lambda index: jax.random.fold_in(key, index))(jnp.asarray(indices))
         found = slices.compute(settings, data, keys)
+    else:
+        found = approximations.compute(settings, data)
     return found | judged(found, np.stack([one.u for one in data]))
 
 
@@ -86,42 +83,105 @@ def judged(found: Result, truth: np.ndarray) -> Result:
     deviation, for all methods; the band is the mean +- 1.96 standard deviations.
     """
     mean, sd = found["mean"], np.maximum(found["sd"], 1e-12)
-    error = np.array([scores.rmse(one, u) if np.isfinite(one).all() else np.inf
-                      for one, u in zip(mean, truth, strict=True)])
-    z = (truth - mean) / sd
-    diverged = ~(error <= problem.DIVERGED)
-    if "stopped" in found:
-        diverged |= ~np.asarray(found["stopped"], bool)
-    return {"rmse": error, "coverage": (np.abs(z) <= scores.Z).mean(axis=1),
-            "nlpd": -norm.logpdf(truth, mean, sd).mean(axis=1), "diverged": diverged}
+    error = np.sqrt(np.mean((mean - truth) ** 2, axis=1))
+    error = np.where(np.isfinite(error), error, np.inf)
+    stopped = np.asarray(found.get("stopped", True), bool)
+    return {"rmse": error, "coverage": (np.abs((truth - mean) / sd) <= scores.Z).mean(axis=1),
+            "nlpd": -norm.logpdf(truth, mean, sd).mean(axis=1), "diverged": ~(error <= problem.DIVERGED) | ~stopped}
 
 
-def by_cell(settings: Settings, results: Results) -> dict[tuple[str, str], Result]:
-    """Return (configuration, method) -> the results of all its data sets, one after another."""
-    cells = problem.by_cell(all_tasks(settings), results, "method")
-    return {cell: {name: np.concatenate([np.atleast_1d(part[name]) for part in parts]) for name in parts[0]}
-            for cell, parts in cells.items()}
+def _sound(name: str) -> Callable[[xr.Dataset], xr.DataArray]:
+    """Return the column of a variable on the data sets that did not diverge; NaN on others."""
+    return lambda found: found[name].where(~found.diverged)
 
 
-def tabulated(settings: Settings, results: Results) -> dict[str, Table]:
+ERRORS: dict[str, Column] = {
+    "RMSE": _sound("rmse"), "divergences": lambda found: found.diverged.sum(), "coverage": _sound("coverage"),
+    "NLPD": _sound("nlpd"), "CPU s": "seconds"}
+OF_METHOD: dict[str, dict[str, Column]] = {
+    **dict.fromkeys(approximations.SEARCHES, {"at a mode": lambda found: found.converged.mean()}),
+    "iterated GHS(7)": {"last change": lambda found: found.change.max()},
+    "ESLS": {"mixed": lambda found: (found.r_hat <= slices.R_HAT).mean(),
+             "mixed at first": lambda found: (found.r_hat_first <= slices.R_HAT).mean(),
+             "all CPU s": lambda found: found.seconds + found.seconds_more, "ESS": "ess"}}
+
+
+def comparison(data: Data) -> dict[str, Any]:
+    """Return one row for each configuration and method.
+
+    ``RMSE`` of the force over the grid, without diverged data sets, and ``divergences``, their number; ``coverage`` of
+    the 95% band, pooled over data sets and points; ``NLPD``, the negative log predictive density of the force at a
+    point; ``CPU s`` for one data set, compilation apart; of elliptical slice sampling ``mixed`` (the share of data sets
+    whose R-hat is at most 1.01 at every monitored point of the grid), ``mixed at first`` (the same after the draws that
+    ``CPU s`` is of), ``all CPU s`` (with those that followed where it was not) and ``ESS``, the smallest among these
+    points, of the draws that are kept; of Laplace ``at a mode``, the share of data sets on which the search ended at
+    one, which it may not and yet stop; of the iterated smoother ``last change``, the largest by which the last
+    iteration moved a mean, in standard deviations. ``name se`` are standard errors over data sets.
+    """
+    return {f"{label}: {method}": row(found.sel({"method": method}), ERRORS | OF_METHOD.get(method, {}))
+            for label, found in data.items() for method in found.method.values}
+
+
+def beside_published(data: Data) -> dict[str, Any]:
+    """Return one row for each configuration: RMSE and divergences of the source's methods beside the published ones.
+
+    ``z`` is the difference of the RMSE in standard errors of ours; the published mean over 100 data sets has an error
+    as large again. ``verdict`` says what that means, see `Verdict`. The source averages over the data sets on which no
+    method failed. What Newton's method counts as a failure there is not said in full; ``at modes`` is ``z`` over the
+    data sets on which ours ends at a mode, and ``no mode`` the number of others.
+    """
+    rows = {}
+    for label in (label for label in problem.PUBLISHED if label in data):
+        found = data[label].assign(rmse=_sound("rmse"))
+        at_mode = found.converged.sel({"method": "LA"}).values == 1
+        cells: dict[str, Any] = {"no mode": float((~at_mode).sum())}
+        for method, (error, diverged) in problem.PUBLISHED[label].items():
+            ours = found.sel({"method": method})
+            means = mean_of(ours.rmse), mean_of(ours.rmse[at_mode])
+            z, z_at_modes = ((mean.value - error) / mean.error for mean in means)
+            cells |= {**cell(method, ours.rmse), f"{method} published": error, f"{method} z": z,
+                      f"{method} verdict": str(Verdict(z)), f"{method} div.": float(ours.diverged.sum()),
+                      f"{method} div. published": float(diverged), f"{method} z at modes": z_at_modes}
+        rows[label] = cells
+    return rows
+
+
+def against_slices(data: Data) -> dict[str, Any]:
+    """Return one row for each configuration and method: the RMSE relative to elliptical slice sampling's, by pairs.
+
+    ``RMSE ratio`` of the means over data sets on which neither diverged; ``difference`` of the RMSE, with its paired
+    standard error; ``times as fast`` in CPU time for one data set.
+    """
+    rows = {}
+    for label, found in data.items():
+        slicing = found.sel({"method": "ESLS"})
+        for method in found.method.values[found.method.values != "ESLS"]:
+            other = found.sel({"method": method})
+            ours, reference = (one.rmse.where(~(other.diverged | slicing.diverged)) for one in (other, slicing))
+            rows[f"{label}: {method}"] = {
+                **cell("RMSE ratio", ours.mean() / reference.mean()), **cell("difference", ours - reference),
+                **cell("times as fast", slicing.seconds.mean() / other.seconds.mean())}
+    return rows
+
+
+def tables(settings: Settings, data: Data) -> dict[str, Table]:
     """Return the tables."""
-    cells = by_cell(settings, results)
-    return {"published": Table(f"RMSE of the force and divergences, {settings.datasets} data sets, beside the "
-                               "published table", tables.beside_published(cells)),
-            "comparison": Table(f"Means over {settings.datasets} data sets (standard errors)",
-                                tables.comparison(cells)),
-            "paired": Table("Against elliptical slice sampling on the same data sets", tables.against_slices(cells))}
+    count = settings.datasets
+    return {"published": Table.of(f"RMSE of the force and divergences, {count} data sets, beside the published table",
+                                  beside_published(data)),
+            "comparison": Table.of(f"Means over {count} data sets (standard errors)", comparison(data)),
+            "paired": Table.of("Against elliptical slice sampling on the same data sets", against_slices(data))}
 
 
-def drawn(settings: Settings, results: Results) -> dict[str, Figure]:
-    """Return the figures."""
-    return figures.draw(settings, by_cell(settings, results))
-
-
-def notes(settings: Settings, results: Results) -> tuple[str, ...]:
+def notes(settings: Settings, data: Data) -> tuple[str, ...]:
     """Return how many cells are consistent with the published table, and why lower ones are trusted."""
-    table = tables.beside_published(by_cell(settings, results))
-    return published.summary(tables.verdicts(table).values()), TRUST
+    verdicts = [Verdict(z) for cells in beside_published(data).values() for name, z in cells.items()
+                if name.endswith(" z")]
+    return published.summary(verdicts), TRUST
 
 
-STUDY = Study(Settings, all_tasks, compute, tabulated, drawn, notes=notes)
+KIND = Kind(compute, {
+    "dataset time": "mean, sd, low, high", "dataset": "rmse, coverage, nlpd, diverged, seconds, stopped, converged, "
+    "iterations, change, r_hat, r_hat_first, ess, draws, seconds_more"}, ("method",))
+STUDY = Study(Settings, all_tasks, dict.fromkeys(_LABELS, KIND), tables, figures.draw, notes=notes,
+              what=lambda task: problem.configuration(task).label)

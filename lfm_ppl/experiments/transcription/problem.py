@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl import checks
-from lfm_ppl.engine.task import Result, Task
-from lfm_ppl.forces import Matern
-from lfm_ppl.model.gaussian import Gaussian
+from lfm_ppl import loading
+from lfm_ppl.engine.task import Task
+from lfm_ppl.latent_grid.latent_grid import LatentGrid
 from lfm_ppl.model.latent_force_model import LatentForceModel
-from lfm_ppl.model.observation import GaussianObservation
 
 GENES, END, OBSERVED, POINTS = 3, 15.0, 13, 363
 SCALE, LENGTHSCALE, NOISE = 1.0, 2.0, 0.1
@@ -33,10 +30,8 @@ _REFINED = 6
 class Configuration(NamedTuple):
     """How the factor acts.
 
-    Attributes:
-        link: "saturation" e^u / (gamma + e^u), "repression" 1 / (gamma + e^u), "exponential" e^u, or "softplus"
-            log(1 + e^u).
-        gamma: of the first two.
+    "saturation" e^u / (gamma + e^u), "repression" 1 / (gamma + e^u), "exponential" e^u, "softplus" log(1 + e^u), or
+    "linear" u, whose posterior is known exactly.
     """
 
     link: str
@@ -63,65 +58,18 @@ PUBLISHED = {
 """Configuration -> method -> RMSE of the force and number of divergences among 100 data sets, table 1 of the source."""
 
 
+def configuration(task: Task) -> Configuration:
+    """Return the configuration of a task of either study."""
+    return Configuration(task.settings["link"], task.settings["gamma"])
+
+
 def slug(label: str) -> str:
     """Return a label as part of the name of a task or a file."""
     return label.replace(", ", "-").replace(" ", "-")
 
 
-def by_cell(tasks: Iterable[Task], results: Mapping[str, Result], by: str) -> dict[tuple[str, str], list[Result]]:
-    """Return (label of the configuration, setting ``by``) -> results of all its tasks, in their order."""
-    cells: dict[tuple[str, str], list[Result]] = {}
-    for task in tasks:
-        label = Configuration(task.settings["link"], task.settings["gamma"]).label
-        cells.setdefault((label, task.settings[by]), []).append(results[task.name])
-    return cells
-
-
-def activity(u: jax.Array, link: str, gamma: Any) -> jax.Array:
-    """Return g(u), the activity of the factor.
-
-    Raises:
-        ValueError: an unknown link, or a gamma that is not positive.
-    """
-    checks.one_of("link", link, ("saturation", "repression", "exponential", "softplus"))
-    if link == "exponential":
-        return jnp.exp(u)
-    if link == "softplus":
-        return jax.nn.softplus(u)
-    checks.positive("gamma", gamma)
-    if link == "saturation":
-        return jax.nn.sigmoid(u - jnp.log(gamma))
-    return jax.nn.sigmoid(jnp.log(gamma) - u) / gamma
-
-
-class Genes(eqx.Module):
-    """dx_j/dt = B_j + S_j g(u) - D_j x_j, with rates that compiled code takes as arguments."""
-
-    basal: Any
-    sensitivity: Any
-    decay: Any
-    gamma: Any
-    link: str = eqx.field(static=True)
-
-    def __call__(self, x: jax.Array, u: jax.Array, t: Any) -> jax.Array:
-        """Return the derivatives (3,)."""
-        return self.basal + self.sensitivity * activity(u[0], self.link, self.gamma) - self.decay * x
-
-
-def expression(x: jax.Array, u: jax.Array, t: Any) -> jax.Array:
-    """Return what is observed."""
-    return x
-
-
 class Rates(NamedTuple):
-    """What is known of a data set besides the observations; each (3,).
-
-    Attributes:
-        basal: B.
-        sensitivity: S.
-        decay: D.
-        start: x(0).
-    """
+    """What is known of a data set besides the observations: B, S, D and x(0), each (3,)."""
 
     basal: Any
     sensitivity: Any
@@ -129,25 +77,30 @@ class Rates(NamedTuple):
     start: Any
 
 
+@functools.cache
+def shipped() -> Mapping[str, Any]:
+    """Return the functions of the shipped model."""
+    return loading.load("transcription").model.__globals__
+
+
 def system(link: str, gamma: Any, rates: Rates, noise_sd: Any = NOISE, lengthscale: Any = LENGTHSCALE
            ) -> LatentForceModel:
-    """Return the model; all but the link may be traced."""
+    """Return the model dx_j/dt = B_j + S_j g(u) - D_j x_j; all but the link may be traced."""
     names = tuple(f"gene {index + 1}" for index in range(GENES))
-    return LatentForceModel(
-        Genes(rates.basal, rates.sensitivity, rates.decay, gamma, link), {FACTOR: Matern(SCALE, lengthscale, 1)},
-        GaussianObservation(expression, noise_sd**2 * jnp.ones(GENES)),
-        Gaussian(rates.start, jnp.zeros((GENES, GENES))), state_names=names, output_names=names, initial_time=0.0)
+    return shipped()["build"](rates.basal, rates.sensitivity, rates.decay, SCALE, lengthscale, noise_sd, names, link,
+                              gamma, start=rates.start)
+
+
+def on_grid(link: str, gamma: Any, rates: Rates, rule: str = "riemann") -> LatentGrid:
+    """Return the model with its force on the grid, by default with the integration rule of the source."""
+    return LatentGrid(system(link, gamma, rates), TIMES, GRID, rule)
 
 
 class DataSet(NamedTuple):
     """One simulated data set.
 
-    Attributes:
-        rates: known to all methods.
-        y: (13, 3) observations at TIMES.
-        u: (363,) the force on GRID.
-        fine: (K,) the times of the simulation.
-        state: (K, 3) expression at these.
+    All methods know its ``rates``; ``y`` (13, 3) is observed at TIMES, ``u`` (363,) the force on GRID, and ``state``
+    (K, 3) the expression at the times ``fine`` (K,) of the simulation.
     """
 
     rates: Rates
@@ -168,29 +121,36 @@ def data_set(configuration: Configuration, index: int, seed: int = 0) -> DataSet
     basal, decay = random.uniform(0.0, 0.1, GENES), random.uniform(0.0, 2.0, GENES)
     away, sensitivity = random.uniform(-0.1, 0.1, GENES), random.uniform(0.0, 1.0, GENES)
     fine = np.linspace(0.0, END, _REFINED * (POINTS - 1) + 1)
-    h = fine[1]
-    rate = np.sqrt(3.0) / LENGTHSCALE
+    h, rate = fine[1], np.sqrt(3.0) / LENGTHSCALE
     white = random.normal(size=(len(fine), 2))
     # Matern-3/2: u and its derivative, from their stationary distribution on.
     transition = np.exp(-rate * h) * np.array([[1 + rate * h, h], [-(rate**2) * h, 1 - rate * h]])
     stationary = SCALE**2 * np.diag([1.0, rate**2])
     root = np.linalg.cholesky(stationary - transition @ stationary @ transition.T)
-    path = np.empty((len(fine), 2))
-    path[0] = np.sqrt(np.diag(stationary)) * white[0]
-    for step in range(1, len(fine)):
-        path[step] = transition @ path[step - 1] + root @ white[step]
-    u = path[:, 0]
+    path = [np.sqrt(np.diag(stationary)) * white[0]]
+    for noise in white[1:]:
+        path.append(transition @ path[-1] + root @ noise)
+    u = np.stack(path)[:, 0]
     with jax.ensure_compile_time_eval():
-        active = np.asarray(activity(jnp.asarray(u), configuration.link, configuration.gamma))
-    made = basal + sensitivity * active[:, None]
-    z = -decay * h
+        active = np.asarray(shipped()["activity"](jnp.asarray(u), *configuration))
+    made, z = basal + sensitivity * active[:, None], -decay * h
     first = np.expm1(z) / z
     second = (first - 1.0) / z
-    state = np.empty((len(fine), GENES))
-    state[0] = away + basal / decay
-    for step in range(1, len(fine)):
-        change = made[step] - made[step - 1]
-        state[step] = np.exp(z) * state[step - 1] + h * (first * made[step - 1] + second * change)
+    states = [away + basal / decay]
+    for gained in h * (first * made[:-1] + second * np.diff(made, axis=0)):
+        states.append(np.exp(z) * states[-1] + gained)
+    state = np.stack(states)
     observed = np.arange(OBSERVED) * (len(fine) - 1) // (OBSERVED - 1)
     y = state[observed] + NOISE * random.normal(size=(OBSERVED, GENES))
     return DataSet(Rates(basal, sensitivity, decay, state[0]), y, u[::_REFINED], fine, state)
+
+
+def inputs(settings: Mapping[str, Any], data: Sequence[DataSet]) -> tuple[jax.Array, Rates, jax.Array]:
+    """Return gamma, any number where the link has none, and rates (N, 3) and observations (N, 13, 3) of data sets."""
+    gamma = jnp.asarray(1.0 if settings["gamma"] is None else settings["gamma"])
+    return gamma, *jax.tree_util.tree_map(lambda *arrays: jnp.stack(arrays), *((one.rates, one.y) for one in data))
+
+
+def rows(tree: Any, index: Any) -> Any:
+    """Return rows of every array of a tree."""
+    return jax.tree_util.tree_map(lambda array: array[index], tree)

@@ -1,25 +1,30 @@
-"""The force by elliptical slice sampling, many data sets and chains side by side."""
+"""The force by elliptical slice sampling, many data sets and chains side by side.
+
+The ellipses are those of the prior, as in the source, or of a Gaussian like the posterior. A posterior proportional to
+N(u; 0, C) L(u) is also proportional to N(u; m, P) L(u)/l(u) where N(u; m, P) is the posterior of a Gaussian likelihood
+l(u) = N(y; H u + b, S). Slices of L/l on ellipses of that Gaussian leave the same posterior invariant, and the nearer l
+is to L the farther a step goes.
+"""
 
 from __future__ import annotations
 
-import functools
 import math
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import xarray as xr
 
+from lfm_ppl.engine.task import Result
+from lfm_ppl.experiments import scores
+from lfm_ppl.experiments.study import stacked
 from lfm_ppl.experiments.timing import timed
-from lfm_ppl.experiments.transcription import ellipses, problem
-from lfm_ppl.experiments.transcription.smoothers import rates, saturation
+from lfm_ppl.experiments.transcription import problem
 from lfm_ppl.inference.kernels.elliptical_slice import SliceState, elliptical_slice_step
 from lfm_ppl.latent_grid.latent_grid import LatentGrid
 from lfm_ppl.particles.normals import normals
-from lfm_ppl.results import arviz_data
 
 CHAINS = 4
 KEPT = 625
@@ -28,79 +33,150 @@ KEPT = 625
 MONITORED = np.arange(6, problem.POINTS, 13)
 """The 28 points of the grid for which R-hat and effective sample sizes are computed."""
 
-R_HAT = 1.01
-_STAGES = 5
-"""Times that the chains of a data set are run at most, the first time on ellipses of the prior."""
+R_HAT, _STAGES = 1.01, 5
+"""Largest R-hat of chains that have mixed, and how often others are run at most, first on ellipses of the prior."""
+
+_USED = 10
+"""One in so many of the kept draws serves to find the Gaussian."""
 
 
-def compute(settings: Any, data: list[problem.DataSet], keys: jax.Array) -> dict[str, np.ndarray]:
+class Gaussian(NamedTuple):
+    """A Gaussian like the posterior of a data set, and the likelihood l that makes it from the prior.
+
+    H (39, 363), y - b (39,), the lower triangular factor of S (39, 39), m (363,), and C H' (H C H' + S)^-1 (363, 39).
+    """
+
+    slope: Any
+    residual: Any
+    noise_root: Any
+    mean: Any
+    gain: Any
+
+
+class Point(NamedTuple):
+    """A force, and H times it, so that l costs no product of matrices at each point of an ellipse."""
+
+    force: jax.Array
+    linear: jax.Array
+
+
+class Ellipses(NamedTuple):
+    """How to slice: `Point` of a force, its log L or log L/l, draws, and the mean, of the prior or of the Gaussian."""
+
+    point: Callable[[jax.Array], Point]
+    log_ratio: Callable[[Point], jax.Array]
+    draw: Callable[[jax.Array], Point]
+    mean: Point
+
+
+def ellipses(latent: LatentGrid, y: jax.Array, gaussian: Gaussian | None) -> Ellipses:
+    """Return the ellipses of a Gaussian; without one, those of the prior."""
+    def point(u: jax.Array) -> Point:
+        return Point(u, jnp.zeros(0) if gaussian is None else gaussian.slope @ u)
+
+    def log_ratio(at: Point) -> jax.Array:
+        value = latent.log_likelihood(at.force[None], y)
+        if gaussian is None:
+            return value
+        z = jax.scipy.linalg.solve_triangular(gaussian.noise_root, gaussian.residual - at.linear, lower=True)
+        return value + 0.5 * z @ z
+
+    def white(key: jax.Array, count: int) -> jax.Array:
+        return normals(key, 2, (count + 1) // 2).ravel()[:count]
+
+    def draw(key: jax.Array) -> Point:
+        if gaussian is None:
+            return point(latent.root[0] @ white(key, problem.POINTS))
+        # Matheron's rule: a draw of the prior, corrected by its observation.
+        first, second = jax.random.split(key)
+        u = latent.root[0] @ white(first, problem.POINTS)
+        noisy = gaussian.slope @ u + gaussian.noise_root @ white(second, y.size)
+        return point(u + gaussian.gain @ (gaussian.residual - noisy))
+
+    return Ellipses(point, log_ratio, draw, point(jnp.zeros(problem.POINTS) if gaussian is None else gaussian.mean))
+
+
+def resembling(latent: LatentGrid, y: jax.Array, draws: jax.Array) -> Gaussian:
+    """Return the Gaussian of the posterior linearisation over draws (S, 363).
+
+    H is the mean Jacobian of the expression x(u) at the observation times, b the mean of x(u) - H u, and S the
+    observation noise and the covariance of x(u) - H u.
+    """
+    def output(u: jax.Array) -> jax.Array:
+        return latent.state(u[None]).ravel()
+
+    slope = jax.lax.map(jax.jacrev(output), draws).mean(axis=0)
+    rest = jax.vmap(output)(draws) - draws @ slope.T
+    offset = rest.mean(axis=0)
+    noise = (rest - offset).T @ (rest - offset) / len(draws) + problem.NOISE**2 * jnp.eye(y.size)
+    across = latent.root[0] @ (slope @ latent.root[0]).T
+    gain = jnp.linalg.solve(slope @ across + noise, across.T).T
+    residual = y.ravel() - offset
+    return Gaussian(slope, residual, jnp.linalg.cholesky(noise), gain @ residual, gain)
+
+
+@eqx.filter_jit
+def _gaussians(draws: jax.Array, link: str, gamma: jax.Array, rates: problem.Rates, y: jax.Array) -> Gaussian:
+    """Return `resembling` of data sets; draws (N, S, 363)."""
+    return jax.vmap(lambda known, *own: resembling(problem.on_grid(link, gamma, known), *own))(rates, y, draws)
+
+
+def compute(settings: Mapping[str, Any], data: list[problem.DataSet], keys: jax.Array) -> Result:
     """Return ``mean``, ``sd``, ``low``, ``high`` (N, 363), and ``r_hat``, ``ess``, ``draws`` and ``seconds`` (N,).
 
     ``keys`` (N,) are those of the data sets. The draws of all chains together number ``settings["draws"]``, of which
     ``settings["burn_in"]`` are left out; both parts are rounded up to multiples of 2,500. The chains of a data set
     whose R-hat is above 1.01 then run as long once more, on ellipses of a Gaussian that resembles the posterior (see
-    `ellipses.resembling`), and what was before becomes burn-in. ``draws`` counts all of them, ``seconds`` is the time
-    of the first run and ``r_hat_first`` its R-hat, ``seconds_more`` the time of the others.
+    `resembling`), and what was before becomes burn-in. ``draws`` counts all of them, ``seconds`` is the CPU time of the
+    first run, without compilation, and ``r_hat_first`` its R-hat, ``seconds_more`` the time of the others. R-hat is the
+    largest and ``ess``, in bulk, the smallest of the kept draws at `MONITORED` points; that of all draws is larger.
     """
     burn_in, ahead = (math.ceil(number / CHAINS / KEPT)
                       for number in (settings["burn_in"], settings["draws"] - settings["burn_in"]))
-    count, link, gamma = len(data), settings["link"], saturation(settings)
-    known, y = rates(data), jnp.stack([jnp.asarray(one.y) for one in data])
-    found = {name: np.zeros(count) for name in ("r_hat", "ess", "seconds", "seconds_more", "draws")}
-    found |= {name: np.zeros((count, problem.POINTS)) for name in ("mean", "sd", "low", "high")}
-    left, states, around = np.arange(count), _unstarted(keys), None
+    link, (gamma, *given) = settings["link"], problem.inputs(settings, data)
+    left, around, shape = np.arange(len(data)), None, (len(data), CHAINS)
+    states = (jax.vmap(lambda key: jax.random.split(key, CHAINS))(keys), jnp.zeros((*shape, problem.POINTS)),
+              jnp.full(shape, jnp.nan, float))
+    found = {name: np.zeros(len(data)) for name in ("draws", "seconds", "seconds_more")}
     for stage in range(_STAGES):
-        own = (gamma, *jax.tree_util.tree_map(lambda a, i=left: a[i], (known, y)), around)
-        taken_first, (states, _, _) = timed(_program(link, len(left), stage > 0), jnp.asarray(burn_in), *own, *states)
-        taken, (states, kept, sums) = timed(_program(link, len(left), stage > 0), jnp.asarray(ahead), *own, *states)
-        found["seconds_more" if stage else "seconds"][left] += (taken_first + taken) / len(left)
+        fixed = gamma, *problem.rows(given, left), around
+        timed(_run, link, jnp.asarray(0), *fixed, *states)  # compiles
+        first, (states, _, _) = timed(_run, link, jnp.asarray(burn_in), *fixed, *states)
+        second, (states, kept, sums) = timed(_run, link, jnp.asarray(ahead), *fixed, *states)
+        found["seconds_more" if stage else "seconds"][left] += (first + second) / len(left)
         found["draws"][left] += CHAINS * KEPT * (burn_in + ahead)
         kept, (mean, square) = np.asarray(kept), np.moveaxis(np.asarray(sums), 1, 0) / (CHAINS * KEPT * ahead)
-        found["mean"][left], found["sd"][left] = mean, np.sqrt(np.maximum(square - mean**2, 0.0))
         flat = kept.reshape(len(left), -1, problem.POINTS)
-        found["low"][left], found["high"][left] = np.quantile(flat, [0.025, 0.975], axis=1)
-        found["r_hat"][left], found["ess"][left] = np.transpose([diagnose(one) for one in kept])
-        if stage == 0:
-            found["r_hat_first"] = found["r_hat"].copy()
-        open_ = np.flatnonzero(~(found["r_hat"][left] <= R_HAT))
-        left, states = left[open_], jax.tree_util.tree_map(lambda a, i=open_: a[i], states)
+        low, high = np.quantile(flat, [0.025, 0.975], axis=1)
+        checked = stacked([scores.diagnose([*map(str, MONITORED)], np.moveaxis(draws[..., MONITORED], -1, 0))
+                           for draws in kept])
+        r_hat = checked["r_hat"].max(axis=1)
+        for name, value in {"mean": mean, "sd": np.sqrt(np.maximum(square - mean**2, 0.0)), "low": low, "high": high,
+                            "r_hat": r_hat, "ess": checked["ess"].min(axis=1)}.items():
+            found.setdefault(name, np.zeros_like(value))[left] = value
+        found.setdefault("r_hat_first", r_hat)
+        unmixed = np.flatnonzero(~(r_hat <= R_HAT))
+        left, states = left[unmixed], problem.rows(states, unmixed)
         if not left.size or stage == _STAGES - 1:
             break
-        around = ellipses.program(link)(
-            gamma, *jax.tree_util.tree_map(lambda a, i=left: a[i], (known, y)), jnp.asarray(flat[open_]))
+        around = _gaussians(jnp.asarray(flat[unmixed, ::_USED]), link, gamma, *problem.rows(given, left))
     return found
 
 
-def _unstarted(keys: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return key data (N, chains, 2), and positions (N, chains, 363) and likelihoods that the first steps replace."""
-    count = len(keys)
-    own = jax.vmap(lambda key: jax.random.split(key, CHAINS))(keys)
-    return jax.random.key_data(own), jnp.zeros((count, CHAINS, problem.POINTS)), jnp.full((count, CHAINS), jnp.nan)
+@eqx.filter_jit
+def _run(link: str, apart: jax.Array, gamma: jax.Array, rates: problem.Rates, y: jax.Array, around: Gaussian | None,
+         *states: jax.Array) -> tuple:
+    """Take steps of every chain, ``apart`` of them to each of the kept draws; fresh chains start from the prior.
 
-
-def diagnose(draws: np.ndarray) -> tuple[float, float]:
-    """Return the largest R-hat and the smallest bulk effective sample size of kept draws (chains, K, 363).
-
-    At `MONITORED` points. The effective size cannot exceed the number of kept draws by much; that of all is larger.
+    ``states`` are keys, positions and log ratios (N, 4, ...), the last NaN where fresh. Returns the states after, kept
+    draws (N, 4, 625, 363), and sums of all draws and of their squares (N, 2, 363).
     """
-    dataset = xr.Dataset({"u": (("chain", "draw", "point"), draws[..., MONITORED])})
-    summary = arviz_data.summary(arviz_data.build({"posterior": dataset}))
-    return float(summary["r_hat"].max(skipna=False)), float(summary["ess_bulk"].min(skipna=False))
+    # One factor of the prior for all data sets, so that prior draws are one product of matrices.
+    root = problem.on_grid(link, gamma, problem.rows(rates, 0)).root
 
-
-@functools.cache
-def _program(link: str, count: int, informed: bool) -> Callable:
-    """Compile steps of every chain, any number of them to a draw that is kept. Fresh chains start from the prior.
-
-    ``informed``: the ellipses are those of a Gaussian that is given.
-    """
-    def chain(latent: LatentGrid, y: jax.Array, around: ellipses.Gaussian | None, apart: jax.Array, key: jax.Array,
-              position: jax.Array, value: jax.Array) -> tuple:
-        key, first = jax.random.split(key)
-        position = jnp.where(jnp.isnan(value), latent.root[0] @ normals(first, problem.POINTS, 2)[:, 0], position)
-        own = ellipses.around(latent, y, around)
-        begun = own.point(position)
-        state = SliceState(begun, own.log_ratio(begun), jnp.zeros((), int))
+    def of_data_set(rates: problem.Rates, y: jax.Array, around: Gaussian | None, *states: jax.Array) -> tuple:
+        latent = eqx.tree_at(lambda grid: grid.root, problem.on_grid(link, gamma, rates), root)
+        own = ellipses(latent, y, around)
 
         def step(_: jax.Array, carry: tuple) -> tuple:
             key, state, sums = carry
@@ -113,27 +189,15 @@ def _program(link: str, count: int, informed: bool) -> Callable:
             carry = jax.lax.fori_loop(0, apart, step, carry)
             return carry, carry[1].position.force
 
-        (key, state, sums), paths = jax.lax.scan(
-            segment, (key, state, jnp.zeros((2, problem.POINTS))), None, length=KEPT)
-        return (key, state.position.force, state.log_likelihood), paths, sums
+        def chain(key: jax.Array, position: jax.Array, value: jax.Array) -> tuple:
+            key, first = jax.random.split(key)
+            start = own.point(jnp.where(jnp.isnan(value), root[0] @ normals(first, problem.POINTS, 2)[:, 0], position))
+            state = SliceState(start, own.log_ratio(start), jnp.zeros((), int))
+            (key, state, sums), paths = jax.lax.scan(
+                segment, (key, state, jnp.zeros((2, problem.POINTS))), None, length=KEPT)
+            return (key, state.position.force, state.log_likelihood), paths, sums
 
-    def run(apart: jax.Array, gamma: jax.Array, known: problem.Rates, y: jax.Array, around: ellipses.Gaussian | None,
-            data: jax.Array, position: jax.Array, value: jax.Array) -> tuple:
-        keys = jax.random.wrap_key_data(data)
-        # One factor of the prior for all data sets, so that prior draws are one product of matrices.
-        shared = ellipses.on_grid(link, gamma, jax.tree_util.tree_map(lambda a: a[0], known)).root
+        return jax.vmap(chain)(*states)
 
-        def one(own: problem.Rates, y: jax.Array, around: ellipses.Gaussian | None, keys: jax.Array,
-                position: jax.Array, value: jax.Array) -> tuple:
-            latent = eqx.tree_at(lambda grid: grid.root, ellipses.on_grid(link, gamma, own), shared)
-            return jax.vmap(lambda k, p, v: chain(latent, y, around, apart, k, p, v))(keys, position, value)
-
-        (keys, position, value), paths, sums = jax.vmap(one)(known, y, around, keys, position, value)
-        return (jax.random.key_data(keys), position, value), paths, sums.sum(axis=1)
-
-    shapes = ellipses.shapes(count)
-    chains = (jax.eval_shape(lambda: jax.random.key_data(jax.random.split(jax.random.key(0), (count, CHAINS)))),
-              jax.ShapeDtypeStruct((count, CHAINS, problem.POINTS), float),
-              jax.ShapeDtypeStruct((count, CHAINS), float))
-    return jax.jit(run).lower(jax.ShapeDtypeStruct((), int), *shapes[:3], shapes[3] if informed else None,
-                              *chains).compile()
+    states, paths, sums = jax.vmap(of_data_set)(rates, y, around, *states)
+    return states, paths, sums.sum(axis=1)

@@ -115,11 +115,12 @@ def new_figure(width: str | float, height: float) -> Figure:
     return Drawing(figsize=(inches(width), height), layout="constrained")
 
 
-def tidy(axes: Axes, x_ticks: int = 5, y_ticks: int = 4) -> None:
-    """Give ``axes`` small ticks that keep their size, and at most so many intervals."""
+def tidy(axes: Axes, x_ticks: int = 5, y_ticks: int = 4, **properties: Any) -> None:
+    """Give ``axes`` small ticks that keep their size, and at most so many intervals; then set its ``properties``."""
     axes.tick_params(labelsize=SMALL, length=2.5, width=0.6, pad=2.0)
     axes.xaxis.set_major_locator(MaxNLocator(x_ticks, steps=[1, 2, 2.5, 5, 10]))
     axes.yaxis.set_major_locator(MaxNLocator(y_ticks, steps=[1, 2, 2.5, 5, 10]))
+    axes.set(**properties)
 
 
 class PlainNumbers(Formatter):

@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl import orbits
 from lfm_ppl.forces import Force
+from lfm_ppl.orbits.satellite import HARMONICS, small_forces
 
 _SUNLIGHT = 10.0
 """Standard deviation of the sunlight's acceleration (nm/s^2); the positions tell it far better."""
@@ -58,7 +58,7 @@ def common(learnt: list[np.ndarray], axes: str) -> Prior:
 
 
 def _entries(axes: str) -> Iterator[tuple[str, tuple[float, float]]]:
-    harmonics = orbits.HARMONICS[axes]
+    harmonics = HARMONICS[axes]
     for name in harmonics:
         if name != "solar":
             yield f"level of {name}", _LEVEL
@@ -72,8 +72,7 @@ def _entries(axes: str) -> Iterator[tuple[str, tuple[float, float]]]:
     yield "white", _WHITE
 
 
-def forces(logarithms: jax.Array, axes: str, period: Any = orbits.GPS_PERIOD
-           ) -> tuple[dict[str, Force], jax.Array]:
+def forces(logarithms: jax.Array, axes: str, period: Any) -> tuple[dict[str, Force], jax.Array]:
     """Return the small forces, and the dispersion of white noise; the logarithms (d,) may be traced.
 
     Args:
@@ -82,11 +81,11 @@ def forces(logarithms: jax.Array, axes: str, period: Any = orbits.GPS_PERIOD
         period: of the orbit (h).
     """
     value = dict(zip(names(axes), jnp.exp(logarithms), strict=True))
-    harmonics = orbits.HARMONICS[axes]
+    harmonics = HARMONICS[axes]
     amplitude = {name: [value[f"amplitude of {name} {n}"] for n in multiples] for name, multiples in harmonics.items()}
     wander = {name: [value[f"wander of {name} over amplitude"] * one for one in own]
               for name, own in amplitude.items()}
     level: dict[str, Any] = {"solar": _SUNLIGHT} | {
         name: value[f"level of {name}"] for name in harmonics if name != "solar"}
     drift = {name: value[f"drift of {name}"] for name in harmonics}
-    return orbits.small_forces(axes, amplitude, wander, drift, level, period=period), value["white"]
+    return small_forces(axes, amplitude, wander, drift, level, period=period), value["white"]

@@ -1,4 +1,4 @@
-"""One satellite: fit, choose, predict, by the deterministic model and by the latent force model."""
+"""One satellite, predicted by the deterministic model and by the latent force model."""
 
 from __future__ import annotations
 
@@ -8,55 +8,26 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.stats import norm
 
-from lfm_ppl import orbits
-from lfm_ppl.experiments.gps import magnitudes, training
-from lfm_ppl.experiments.gps.problem import NOISE, Arc, Arcs
-from lfm_ppl.experiments.scores import Z
 from lfm_ppl.filtering.filter import FilterState, filter
 from lfm_ppl.filtering.smoother import smooth
 from lfm_ppl.linalg import congruence, matmul
 from lfm_ppl.linearisation.taylor import Taylor
 from lfm_ppl.model.gaussian import Gaussian
 from lfm_ppl.model.state_space import state_space
+from lfm_ppl.orbits import magnitudes, training
+from lfm_ppl.orbits.arc import NOISE, Arc
+from lfm_ppl.orbits.deterministic import STEP, Orbit, fit_orbit, propagate
+from lfm_ppl.orbits.deviations import Neighbourhood
+from lfm_ppl.orbits.environment import Environment
+from lfm_ppl.orbits.satellite import period_of, satellite, wide_start
 
-_LATEST = 6.0
+LATEST = 6.0
 """Hours before the end of training that determine the latest state."""
 _STEP = 0.125
 """Longest integration step of a departure in predictions (h)."""
-
-
-class Unusable(ValueError):
-    """A satellite that cannot be predicted or judged; the message says why."""
-
-
-def arc(data: Arcs, satellite: str, train_days: float) -> Arc:
-    """Return the arc of a satellite, all epochs of the data.
-
-    Raises:
-        Unusable: too few positions to learn from, or none to judge by.
-        ValueError: the training is longer than the data.
-    """
-    train = int(np.searchsorted(data.times, 24.0 * train_days - 1e-9))
-    if 24.0 * train_days < 2 * _LATEST:
-        raise ValueError(f"training takes {train_days:g} days; half a day is the least (--train-days).")
-    if train >= len(data.times):
-        raise ValueError(f"training takes {train_days:g} days, but the data have {_days(data.times):g}, the last "
-                         f"position {data.times[-1] / 24.0:.6g} days after the first; take fewer (--train-days), so "
-                         "that days are left to judge by.")
-    positions = data.positions[satellite]
-    known = np.isfinite(positions).all(axis=1)
-    gaps = "" if data.published is None else "; ".join(map(str, data.published.gaps(satellite)))
-    if known[:train].mean() < 0.9:
-        raise Unusable(f"{satellite}: {known[:train].mean():.0%} of its positions in training are there, 90% are "
-                       f"needed; missing {gaps}")
-    if not known[train:].any():
-        raise Unusable(f"{satellite}: there is no position after training to judge by; missing {gaps}")
-    return Arc(data.environment, data.times, positions, train)
-
-
-def _days(times: np.ndarray) -> float:
-    return float(times[-1] - times[0] + np.median(np.diff(times))) / 24.0
+_Z = norm.ppf(0.975)
 
 
 class Deterministic(NamedTuple):
@@ -68,54 +39,34 @@ class Deterministic(NamedTuple):
         latest: path from the state at the end of training on; NaN before.
     """
 
-    orbit: orbits.Orbit
+    orbit: Orbit
     fitted: np.ndarray
     latest: np.ndarray
 
 
-def deterministic(one: Arc, orbit: orbits.Orbit) -> Deterministic:
+def deterministic(arc: Arc, orbit: Orbit) -> Deterministic:
     """Follow the orbit that was fitted to training, and another one that is fitted to its last six hours."""
-    fitted = orbits.propagate(one.environment, orbit, one.times)
-    first, path = _from_latest(one, one.train, orbit.solar)
+    fitted = propagate(arc.environment, orbit, arc.times)
+    first, path = _from_latest(arc, arc.train, orbit.solar)
     latest = np.full_like(fitted, np.nan)
     latest[first:] = path
     return Deterministic(orbit, fitted, latest)
 
 
-def latest_orbit(one: Arc, end: int, solar: float) -> tuple[int, orbits.Orbit]:
+def latest_orbit(arc: Arc, end: int, solar: float) -> tuple[int, Orbit]:
     """Fit the last six hours before the epoch ``end``; return their first epoch and the orbit.
 
     Raises:
         ValueError: too few positions in them, or no orbit that fits.
     """
-    first = end - int(round(_LATEST / (one.times[1] - one.times[0])))
-    return first, orbits.fit_orbit(one.environment, one.times[first:end], one.positions[first:end], solar)
+    first = end - int(round(LATEST / (arc.times[1] - arc.times[0])))
+    return first, fit_orbit(arc.environment, arc.times[first:end], arc.positions[first:end], solar)
 
 
-def _from_latest(one: Arc, end: int, solar: float) -> tuple[int, np.ndarray]:
+def _from_latest(arc: Arc, end: int, solar: float) -> tuple[int, np.ndarray]:
     """Return the first epoch of the last six hours before ``end``, and the path from it on that they determine."""
-    first, orbit = latest_orbit(one, end, solar)
-    return first, orbits.propagate(one.environment, orbit, one.times[first:])
-
-
-def judge(one: Arc, mean: np.ndarray, covariance: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return errors and their standard deviations along some axes, and how many lie within the 95% bands.
-
-    Args:
-        one: the satellite.
-        mean: (T, 3) predicted positions.
-        covariance: (T, 3, 3) of these.
-        axes: (T, 3, 3), as columns.
-
-    Returns:
-        Errors (T, 3) and standard deviations (T, 3) in km, those of the published positions included, and the share of
-        errors after training that are covered, (3,) by axis.
-    """
-    error = np.einsum("tji,tj->ti", axes, mean - one.positions)
-    sd = np.sqrt(np.einsum("tji,tjk,tki->ti", axes, covariance, axes) + NOISE**2)
-    known = np.isfinite(one.positions[one.train:]).all(axis=1)
-    inside = np.abs(error[one.train:]) < Z * sd[one.train:]
-    return error, sd, inside[known].mean(axis=0)
+    first, orbit = latest_orbit(arc, end, solar)
+    return first, propagate(arc.environment, orbit, arc.times[first:])
 
 
 class Prediction(NamedTuple):
@@ -134,28 +85,27 @@ class Prediction(NamedTuple):
     forces_sd: np.ndarray
 
 
-def predict(one: Arc, near: orbits.Neighbourhood, logarithms: np.ndarray, y: np.ndarray | None = None) -> Prediction:
+def predict(arc: Arc, near: Neighbourhood, logarithms: np.ndarray, y: np.ndarray | None = None) -> Prediction:
     """Smooth the positions of training, and predict all others.
 
     Args:
-        one: the satellite.
+        arc: the satellite.
         near: the orbit that was fitted to it, at all times; see `surroundings`.
         logarithms: (K, d) of the magnitudes, over which the moments are averaged.
         y: (T, 3) positions to learn from; None: those of training.
     """
-    y = (one.learnt() if y is None else y) - np.asarray(near.path[:, :3])
+    y = (arc.learnt() if y is None else y) - np.asarray(near.path[:, :3])
     known = np.flatnonzero(np.isfinite(y).any(axis=1))
     if not len(known):
         raise ValueError("every position is missing (NaN); there is nothing to learn from.")
-    found = _predict(near, jnp.asarray(y), jnp.asarray(logarithms), (tuple(one.times), near.axes, int(known[-1]) + 1))
+    found = _predict(near, jnp.asarray(y), jnp.asarray(logarithms), (tuple(arc.times), near.axes, int(known[-1]) + 1))
     mean, covariance = map(np.asarray, found)
     sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     return Prediction(np.asarray(near.path) + mean[:, :6], covariance[:, :3, :3], mean[:, 6:], sd[:, 6:])
 
 
 @functools.partial(jax.jit, static_argnums=(3,))
-def _predict(near: orbits.Neighbourhood, y: jax.Array, logarithms: jax.Array, fixed: tuple
-             ) -> tuple[jax.Array, jax.Array]:
+def _predict(near: Neighbourhood, y: jax.Array, logarithms: jax.Array, fixed: tuple) -> tuple[jax.Array, jax.Array]:
     times, (axes, seen) = np.array(fixed[0]), fixed[1:]
     settings: dict[str, Any] = {"rule": Taylor(), "steps": training.steps_of(times, _STEP)}
 
@@ -178,17 +128,35 @@ def _predict(near: orbits.Neighbourhood, y: jax.Array, logarithms: jax.Array, fi
     return mean, covariances.mean(axis=0) + jnp.einsum("kti,ktj->tij", away, away) / len(away)
 
 
-def surroundings(one: Arc, orbit: orbits.Orbit, axes: str) -> orbits.Neighbourhood:
+def judge(arc: Arc, predicted: Prediction, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return how good a prediction is along axes, the columns of (T, 3, 3), by the positions of all times.
+
+    Returns:
+        Errors (T, 3) and standard deviations (T, 3) in km, those of the published positions included, and the share of
+        errors after training that lie within the 95% bands, (3,) by axis.
+    """
+    error = errors(arc, predicted.state, axes)
+    sd = np.sqrt(np.einsum("tji,tjk,tki->ti", axes, predicted.covariance, axes) + NOISE**2)
+    after = slice(arc.train, None)
+    known = np.isfinite(arc.positions[after]).all(axis=1)
+    return error, sd, (np.abs(error[after]) < _Z * sd[after])[known].mean(axis=0)
+
+
+def errors(arc: Arc, path: np.ndarray, axes: np.ndarray) -> np.ndarray:
+    """Return the errors (T, 3) in km of the positions on a path (T, 6) along axes, the columns of (T, 3, 3)."""
+    return np.einsum("tji,tj->ti", axes, path[:, :3] - arc.positions)
+
+
+def surroundings(arc: Arc, orbit: Orbit, axes: str) -> Neighbourhood:
     """Return the orbit and what is around it, at all times."""
-    return orbits.Neighbourhood.of(one.environment, orbit, one.times, axes,
-                                   nodes=2 * training.steps_of(one.times, _STEP))
+    return Neighbourhood.of(arc.environment, orbit, arc.times, axes, nodes=2 * training.steps_of(arc.times, _STEP))
 
 
-def online(one: Arc, orbit: orbits.Orbit, logarithms: np.ndarray, axes: str, windows: Any) -> tuple[np.ndarray, ...]:
+def online(arc: Arc, orbit: Orbit, logarithms: np.ndarray, axes: str, windows: Any) -> tuple[np.ndarray, ...]:
     """Predict as positions come in: in training, and in windows after it.
 
     Args:
-        one: the satellite.
+        arc: the satellite.
         orbit: that was fitted to it.
         logarithms: (d,) of the magnitudes.
         axes: of the small forces.
@@ -198,38 +166,38 @@ def online(one: Arc, orbit: orbits.Orbit, logarithms: np.ndarray, axes: str, win
         One-step-ahead mean (T, 3) and variances (T, 3), the observed epochs (T,), and the path (T, 6) of the
         deterministic model that is started again from the latest state, after each window.
     """
-    days = one.times / 24.0
-    observed = np.arange(len(days)) < one.train
-    ends = [one.train]
+    days = arc.times / 24.0
+    observed = np.arange(len(days)) < arc.train
+    ends = [arc.train]
     for begin, end in windows:
         inside = (days >= begin) & (days < end)
         observed |= inside
         ends.append(int(np.flatnonzero(inside)[-1]) + 1)
-    y = np.where(observed[:, None], one.positions, np.nan)
-    mean, covariance = filter_positions(one, orbit, logarithms, axes, y)
+    y = np.where(observed[:, None], arc.positions, np.nan)
+    mean, covariance = filter_positions(arc, orbit, logarithms, axes, y)
     restarted = np.full((len(days), 6), np.nan)
     for end in ends:
-        first, path = _from_latest(one, end, orbit.solar)
+        first, path = _from_latest(arc, end, orbit.solar)
         restarted[first:] = path
     return mean, np.diagonal(covariance, axis1=1, axis2=2), observed, restarted
 
 
-def filter_positions(one: Arc, orbit: orbits.Orbit, logarithms: np.ndarray, axes: str, y: np.ndarray
+def filter_positions(arc: Arc, orbit: Orbit, logarithms: np.ndarray, axes: str, y: np.ndarray
                      ) -> tuple[np.ndarray, np.ndarray]:
     """Return mean (T, 3) and covariance (T, 3, 3) of each position before it is seen, of the satellite itself.
 
     Nothing is taken to be small here: the filter follows the satellite in steps of 30 s.
     """
-    found = _filter(one.environment, orbits.wide_start(orbit.state), jnp.asarray(y), jnp.asarray(logarithms),
-                    orbits.period_of(orbit.state[None]), (tuple(one.times), axes))
+    found = _filter(arc.environment, wide_start(orbit.state), jnp.asarray(y), jnp.asarray(logarithms),
+                    period_of(orbit.state[None]), (tuple(arc.times), axes))
     return np.asarray(found[0]), np.asarray(found[1])
 
 
 @functools.partial(jax.jit, static_argnums=(5,))
-def _filter(environment: orbits.Environment, start: Gaussian, y: jax.Array, logarithms: jax.Array, period: jax.Array,
+def _filter(environment: Environment, start: Gaussian, y: jax.Array, logarithms: jax.Array, period: jax.Array,
             fixed: tuple) -> tuple[jax.Array, jax.Array]:
     times, axes = np.array(fixed[0]), fixed[1]
     forces, white = magnitudes.forces(logarithms, axes, period)
-    system = orbits.satellite(environment, start, forces, axes, white, NOISE)
-    found = filter(system, times, y, rule=Taylor(), steps=training.steps_of(times, orbits.STEP))
+    system = satellite(environment, start, forces, axes, white, NOISE)
+    found = filter(system, times, y, rule=Taylor(), steps=training.steps_of(times, STEP))
     return found.predicted_mean[:, :3], found.predicted_covariance[:, :3, :3]

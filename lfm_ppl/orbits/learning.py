@@ -11,15 +11,28 @@ All this runs on departures from an orbit, as a linear regression: see `training
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.experiments.gps.magnitudes import Prior
-from lfm_ppl.experiments.gps.training import Training, slope_of_held_out, slope_of_log_likelihood
+from lfm_ppl.filtering.filter import filter
+from lfm_ppl.filtering.smoother import smooth
+from lfm_ppl.forces import Matern
 from lfm_ppl.inference.optimise import Objective, quasi_newton
+from lfm_ppl.linearisation.taylor import Taylor
+from lfm_ppl.model.gaussian import Gaussian
+from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.observation import GaussianObservation
+from lfm_ppl.orbits import magnitudes
+from lfm_ppl.orbits.arc import NOISE
+from lfm_ppl.orbits.deviations import Neighbourhood, departure
+from lfm_ppl.orbits.magnitudes import Prior
+from lfm_ppl.orbits.satellite import SOLAR_PRESSURE, small_forces
+from lfm_ppl.orbits.training import Training, slope_of_held_out, slope_of_log_likelihood, steps_of
 
 WEIGHT = 3.0
 """How many positions a fold counts for: neighbours in time are wrong together, most of all along the track.
@@ -29,6 +42,10 @@ DRAWS = 16
 """Magnitudes over which a prediction is averaged."""
 _EVALUATIONS = 40
 _DIFFERENCE = 1e-4
+_SCALE, _LENGTHSCALE = 2.0, 3.0
+"""Of the Matern model that smooths the forces: nm/s^2, hours."""
+_APART = 1.0
+"""Hours between the values of a smoothed force that count: neighbours say much the same."""
 
 
 class Target(NamedTuple):
@@ -100,3 +117,37 @@ def _target(value_and_slope: Callable, weight: float, data: Training, prior: Pri
         return weight * float(value), weight * np.asarray(slope)
 
     return Target(evidence, prior)
+
+
+def smoothed_forces(data: Training, prior: Prior) -> Target:
+    """Return the log likelihood where forces that a Matern model smooths are the data, as in the source: a target."""
+    thin = max(1, int(round(_APART / (data.times[1] - data.times[0]))))
+    mean, sd = _smooth_forces(data.near, jnp.asarray(data.y), (tuple(data.times), data.axes))
+    fixed = tuple(data.times[::thin]), data.axes
+
+    def evidence(logarithms: np.ndarray) -> tuple[float, np.ndarray]:
+        value, gradient = _score_forces(jnp.asarray(logarithms), mean[::thin], sd[::thin], data.near.period, fixed)
+        return float(value), np.asarray(gradient)
+
+    return Target(evidence, prior)
+
+
+@functools.partial(jax.jit, static_argnums=(2,))
+def _smooth_forces(near: Neighbourhood, y: jax.Array, fixed: tuple) -> tuple[jax.Array, jax.Array]:
+    times, axes = np.array(fixed[0]), fixed[1]
+    forces = {name: Matern(_SCALE, _LENGTHSCALE, mean=SOLAR_PRESSURE if name == "solar" else 0.0)
+              for name in small_forces(axes)}
+    smoothed = smooth(departure(near, forces, noise_sd=NOISE), times, y, rule=Taylor(), steps=steps_of(times))
+    return smoothed.input_mean[:, 6:], jnp.sqrt(jnp.diagonal(smoothed.input_covariance, axis1=1, axis2=2)[:, 6:])
+
+
+@functools.partial(jax.jit, static_argnums=(4,))
+@jax.value_and_grad
+def _score_forces(logarithms: jax.Array, mean: jax.Array, sd: jax.Array, period: Any, fixed: tuple) -> jax.Array:
+    times, axes = np.array(fixed[0]), fixed[1]
+    forces, white = magnitudes.forces(logarithms, axes, period)
+    # A value stands for some time, over which white noise averages.
+    errors = jax.vmap(jnp.diag)(sd**2 + white**2 / _APART)
+    system = LatentForceModel(lambda x, u, t: jnp.zeros(1), forces, GaussianObservation(lambda x, u, t: u, errors),
+                              Gaussian(jnp.zeros(1), jnp.zeros((1, 1))))
+    return filter(system, times, mean, steps=1).log_likelihood.sum()

@@ -21,9 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import solve_triangular
 
-from lfm_ppl import linalg, orbits
-from lfm_ppl.experiments.gps import magnitudes
-from lfm_ppl.experiments.gps.problem import NOISE, Arc
+from lfm_ppl import linalg
 from lfm_ppl.filtering.filter import forward
 from lfm_ppl.filtering.predict import compose
 from lfm_ppl.filtering.time_grid import build_time_grid
@@ -35,6 +33,12 @@ from lfm_ppl.model.gaussian import Gaussian
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation import GaussianObservation
 from lfm_ppl.model.state_space import state_space
+from lfm_ppl.orbits import magnitudes
+from lfm_ppl.orbits.arc import NOISE, Arc
+from lfm_ppl.orbits.deterministic import Orbit
+from lfm_ppl.orbits.deviations import Neighbourhood, departure
+from lfm_ppl.orbits.environment import NANO
+from lfm_ppl.orbits.satellite import START_SD
 
 _LONGEST = 0.5
 """Hours from one position to the next in learning; closer ones say the same."""
@@ -60,7 +64,7 @@ class Training(NamedTuple):
             acceleration, the drifts of the levels that have one, then the noise of each resonator.
     """
 
-    near: orbits.Neighbourhood
+    near: Neighbourhood
     times: np.ndarray
     y: np.ndarray
     axes: str
@@ -69,17 +73,17 @@ class Training(NamedTuple):
     noise: jax.Array
 
     @classmethod
-    def of(cls, one: Arc, orbit: orbits.Orbit, axes: str) -> Training:
+    def of(cls, arc: Arc, orbit: Orbit, axes: str) -> Training:
         """Return the training of a satellite, thinned to half an hour from one position to the next."""
-        interval = float(one.times[1] - one.times[0])
+        interval = float(arc.times[1] - arc.times[0])
         thin = max(1, int(_LONGEST / interval + 1e-9))
-        times = one.times[:one.train:thin]
-        near = orbits.Neighbourhood.of(one.environment, orbit, times, axes, nodes=2 * steps_of(times))
-        y = one.positions[:one.train:thin] - np.asarray(near.path[:, :3])
+        times = arc.times[:arc.train:thin]
+        near = Neighbourhood.of(arc.environment, orbit, times, axes, nodes=2 * steps_of(times))
+        y = arc.positions[:arc.train:thin] - np.asarray(near.path[:, :3])
         return cls.along(near, times, y, axes)
 
     @classmethod
-    def along(cls, near: orbits.Neighbourhood, times: np.ndarray, y: np.ndarray, axes: str) -> Training:
+    def along(cls, near: Neighbourhood, times: np.ndarray, y: np.ndarray, axes: str) -> Training:
         """Return the training on these departures y (T, 3)."""
         return cls(near, times, y, axes, *_responses(near, times, axes))
 
@@ -102,10 +106,10 @@ def steps_of(times: np.ndarray, step: float = _STEP) -> int:
     return max(1, int(np.ceil((times[1] - times[0]) / step - 1e-9)))
 
 
-def departing(logarithms: jax.Array, near: orbits.Neighbourhood, axes: str) -> LatentForceModel:
+def departing(logarithms: jax.Array, near: Neighbourhood, axes: str) -> LatentForceModel:
     """Return the model of departures with these magnitudes."""
     forces, white = magnitudes.forces(logarithms, axes, near.period)
-    return orbits.departure(near, forces, white, NOISE)
+    return departure(near, forces, white, NOISE)
 
 
 class _Members(NamedTuple):
@@ -125,16 +129,16 @@ def _members(forces: dict[str, Force]) -> _Members:
 
 def scales(logarithms: jax.Array, axes: str) -> tuple[jax.Array, jax.Array]:
     """Return the standard deviations S (n,) at the first time, and the noises q (J,), in the order of `Training`."""
-    forces, white = magnitudes.forces(logarithms, axes)
+    forces, white = magnitudes.forces(logarithms, axes, period=1.0)  # sizes do not depend on it
     levels, resonators = _members(forces)
-    start = [*np.repeat(orbits.START_SD, 3)]
+    start = [*np.repeat(START_SD, 3)]
     start += [force.initial_sd if isinstance(force, RandomWalk) else force.scale for _, force in levels]
     start += [force.scale for _, force in resonators for _ in range(2)]
     drifts = [force.scale for _, force in levels if isinstance(force, RandomWalk)]
     return jnp.stack(start), jnp.stack([white, *drifts, *(force.noise for _, force in resonators)])
 
 
-def _responses(near: orbits.Neighbourhood, times: np.ndarray, axes: str) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _responses(near: Neighbourhood, times: np.ndarray, axes: str) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return m, O and K of `Training`: those of one force at a time, as forces do not see one another."""
     levels, resonators = _members(magnitudes.forces(jnp.asarray(magnitudes.wide(axes).mean), axes, near.period)[0])
     along = np.eye(len(near.on_orbit))
@@ -155,7 +159,7 @@ def _responses(near: orbits.Neighbourhood, times: np.ndarray, axes: str) -> tupl
 
 
 @functools.partial(jax.jit, static_argnums=(5,))
-def _response(near: orbits.Neighbourhood, axes: jax.Array, periods: jax.Array | None, noises: jax.Array,
+def _response(near: Neighbourhood, axes: jax.Array, periods: jax.Array | None, noises: jax.Array,
               whites: jax.Array, times: tuple) -> tuple[jax.Array, jax.Array]:
     """Return, for several forces of unit magnitude, the responses (K, 3 T, n) and the covariances (K, 3 T, 3 T).
 
@@ -172,7 +176,7 @@ def _response(near: orbits.Neighbourhood, axes: jax.Array, periods: jax.Array | 
     def one(inputs: tuple) -> tuple[jax.Array, jax.Array]:
         axis, period, noise, white = inputs
         force = RandomWalk(noise, 1.0) if period is None else Resonator(period, 1.0, noise)
-        push = jnp.concatenate([jnp.zeros((3, 3)), orbits.NANO * white * jnp.eye(3)])
+        push = jnp.concatenate([jnp.zeros((3, 3)), NANO * white * jnp.eye(3)])
         system = LatentForceModel(
             lambda x, u, t: near(x, near.on_orbit + axis * u[0], t), {"force": force},
             GaussianObservation(lambda x, u, t: x[:3], jnp.ones(3)), Gaussian(jnp.zeros(6), jnp.eye(6)),
