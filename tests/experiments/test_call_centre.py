@@ -13,10 +13,11 @@ from scipy import integrate, special, stats
 
 import lfm_ppl as lfm
 from lfm_ppl.engine.store import write
-from lfm_ppl.experiments import scores, weighting
+from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.call_centre import counts, experiment, figures, learning, problem, tracking
 from lfm_ppl.experiments.study import TASKS
 from lfm_ppl.inference.optimise import End, Objective
+from lfm_ppl.results import importance_at_modes
 
 DATA = Path(os.environ.get("LFM_DATA", "../shared/data")) / "calls"
 real = pytest.mark.skipif(not DATA.is_dir(), reason="the counts of real calls are not there (LFM_DATA)")
@@ -401,7 +402,7 @@ def test_nuts_and_weighted_draws_have_the_same_posterior():
     method, (one,) = tracking.method_of(task), tracking.windows_of(task)
     draws, weights, mass = learning.posterior(method, one.training, BOTH.draws, BOTH.seed)
     assert len(mass) == 1 and weights.reliable
-    mean, covariance = weighting.moments(draws, np.exp(weights.log_weight[0]))
+    mean, covariance = importance_at_modes.moments(draws, np.exp(weights.log_weight[0]))
     found = tracking.by_nuts(task)
     assert found["divergences"] == 0 and found["r_hat"].max() < 1.02
     error = np.sqrt(1 / found["ess"] + 1 / weights.ess)
@@ -451,7 +452,7 @@ def test_nuts_and_weighted_draws_agree_about_the_first_mode():
     above = draws[:, NOISE] > edge
     assert weight[above].sum() > 0.98
     own = weight[above] / weight[above].sum()
-    mean, covariance = weighting.moments(draws[above], own)
+    mean, covariance = importance_at_modes.moments(draws[above], own)
     sd = np.sqrt(np.diag(covariance))
     found = tracking.by_nuts(tasks_of("nuts", BOTH)[0])
     elsewhere = found["draws"][NOISE] < edge

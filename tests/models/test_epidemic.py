@@ -10,9 +10,9 @@ import lfm_ppl as lfm
 from lfm_ppl import loading
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.posteriors import LogPosterior
-from lfm_ppl.experiments.weighting import weighted
 from lfm_ppl.inference.bound_model import bind
 from lfm_ppl.inference.optimise import newton, quasi_newton
+from lfm_ppl.results.importance_at_modes import weighted
 
 EPIDEMICS = 100
 NAMES = ("r0", "scale", "lengthscale", "concentration")

@@ -1,10 +1,10 @@
 """Drag, scale and lengthscale from the distances alone: the maximum of the likelihood, and the posterior.
 
 The posterior is that of the model with its priors and the Gaussian filter's likelihood, in the logarithms z of the
-parameters, by importance samples about its mode (`lfm_ppl.experiments.weighting`), whose Pareto index says whether they
-are good enough; NUTS and RAM must agree with them on a few targets. How often it covers one and the same truth depends
-on how far the prior pulls. Where scale and lengthscale are known it hardly pulls beside 120 distances: the posterior of
-the drag alone, by quadrature, covers the truth about as often as it says if the filter's likelihood is right.
+parameters, by importance samples about its mode, whose Pareto index says whether they are good enough; NUTS and RAM
+must agree with them on a few targets. How often it covers one and the same truth depends on how far the prior pulls.
+Where scale and lengthscale are known it hardly pulls beside 120 distances: the posterior of the drag alone, by
+quadrature, covers the truth about as often as it says if the filter's likelihood is right.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from lfm_ppl.experiments.ballistic import problem
 from lfm_ppl.experiments.ballistic.smoothing import judged
 from lfm_ppl.experiments.study import stacked
 from lfm_ppl.experiments.timing import timed
-from lfm_ppl.experiments.weighting import Weighted, moments, weighted
 from lfm_ppl.inference.kernels.ram import RAM
 from lfm_ppl.inference.optimise import Minimum, newton, quasi_newton
 from lfm_ppl.results import importance
+from lfm_ppl.results.importance_at_modes import Weighted, moments, weighted
 
 SAMPLERS = ("NUTS", "RAM")
 

@@ -27,12 +27,12 @@ from lfm_ppl.experiments.call_centre import problem
 from lfm_ppl.experiments.call_centre.learning import posterior, searches
 from lfm_ppl.experiments.call_centre.problem import FIRST, GRID, TESTED, Method, Window
 from lfm_ppl.experiments.study import stacked
-from lfm_ppl.experiments.weighting import moments
 from lfm_ppl.filtering.filter import filter
 from lfm_ppl.filtering.smoother import smooth
 from lfm_ppl.linalg import congruence, matmul
 from lfm_ppl.model.state_space import state_space
 from lfm_ppl.results import importance
+from lfm_ppl.results.importance_at_modes import moments
 
 STEPS = 3
 """Integration steps in five minutes, about as long as those of the model file."""

@@ -16,13 +16,13 @@ from scipy.optimize import minimize_scalar
 from lfm_ppl.constrained.full_information import ConstrainedEstimate, full_information
 from lfm_ppl.constrained.posterior import ConstrainedPosterior, constrained_posterior
 from lfm_ppl.engine.task import Result, Task
-from lfm_ppl.experiments import weighting
 from lfm_ppl.experiments.constrained import problem
 from lfm_ppl.experiments.constrained.problem import FACTOR, HORMONE, TIMES, WINDOW
 from lfm_ppl.experiments.scores import Z
 from lfm_ppl.filtering.smoother import smooth
 from lfm_ppl.inference.optimise import newton, quasi_newton
 from lfm_ppl.linearisation.sigma_points import GaussHermite
+from lfm_ppl.results import importance_at_modes
 
 NEAR = 1.0
 """Hours within which a peak counts as found."""
@@ -313,7 +313,8 @@ def drawn(posterior: Any, y: np.ndarray, mode: np.ndarray, seed: int, draws: int
     minimum = newton(posterior.objective(y), mode)
     if minimum.curvature is None:
         return np.tile(mode, (draws, 1)), np.inf
-    found = weighting.weighted(lambda z: np.sum(posterior.log_densities_of(z, y), axis=0), [minimum], weighted, seed)
+    found = importance_at_modes.weighted(lambda z: np.sum(posterior.log_densities_of(z, y), axis=0), [minimum], weighted,
+                                         seed)
     share = np.cumsum(np.exp(found.weights.log_weight[0]))
     chosen = np.searchsorted(share / share[-1], (np.arange(draws) + 0.5) / draws)
     return found.draws[chosen], found.weights.k

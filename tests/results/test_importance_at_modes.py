@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-from lfm_ppl.experiments import weighting
+from lfm_ppl.results.importance_at_modes import moments, weighted
 
 
 def test_weighted_draws_have_the_moments_of_their_density():
@@ -14,21 +14,21 @@ def test_weighted_draws_have_the_moments_of_their_density():
     factor = np.array([[2.0, 0.0, 0.0], [0.5, 1.0, 0.0], [0.0, -0.3, 0.4]])
     target = stats.multivariate_normal([1.0, -2.0, 3.0], factor @ factor.T)
     mode = SimpleNamespace(point=target.mean + [1.0, 0.0, 0.2], curvature=SimpleNamespace(factor=0.8 * factor))
-    draws, found, _ = weighting.weighted(target.logpdf, [mode], 20_000, 0)
-    mean, covariance = weighting.moments(draws, np.exp(found.log_weight[0]))
+    draws, found, _ = weighted(target.logpdf, [mode], 20_000, 0)
+    mean, covariance = moments(draws, np.exp(found.log_weight[0]))
     # Without the second t distribution it is below 12,000.
     assert found.k < 0.5 and found.ess > 15_000
     variance = np.diag(target.cov)
     np.testing.assert_array_less(np.abs(mean - target.mean), 4 * np.sqrt(variance / found.ess))
     np.testing.assert_allclose(np.diag(covariance), variance, rtol=4 * np.sqrt(2 / found.ess))
     with pytest.raises(ValueError, match="no curvature"):
-        weighting.weighted(target.logpdf, [SimpleNamespace(point=mode.point, curvature=None)], 10, 0)
+        weighted(target.logpdf, [SimpleNamespace(point=mode.point, curvature=None)], 10, 0)
 
 
 def test_weights_that_one_draw_has_do_not_end_the_search():
     """A density far narrower than its curvature says: the second proposal must not be singular."""
     mode = SimpleNamespace(point=np.zeros(3), curvature=SimpleNamespace(factor=np.eye(3)))
-    draws, found, _ = weighting.weighted(lambda z: -0.5 * ((z - 3.0) ** 2).sum(axis=1) / 1e-8, [mode], 50, 0)
+    draws, found, _ = weighted(lambda z: -0.5 * ((z - 3.0) ** 2).sum(axis=1) / 1e-8, [mode], 50, 0)
     assert np.isfinite(draws).all() and found.k > 0.7
 
 
@@ -50,7 +50,7 @@ def modes(*parts, wrong=1.3):
 
 
 def test_a_small_second_mode_has_its_share():
-    draws, found, mass = weighting.weighted(two_modes, modes(FIRST, SECOND), 6_000, 0)
+    draws, found, mass = weighted(two_modes, modes(FIRST, SECOND), 6_000, 0)
     weight = np.exp(found.log_weight[0])
     second = draws[:, 0] > 5
     # It gets some of the draws whatever its share, which is therefore known better than by draws of the density.
@@ -59,7 +59,7 @@ def test_a_small_second_mode_has_its_share():
     error = np.sqrt((weight**2 * (second - share) ** 2).sum())
     assert abs(share - SHARE) < 4 * error < SHARE / 4
     assert mass.sum() == pytest.approx(1.0) and mass[1] == pytest.approx(share, rel=0.01)
-    mean, covariance = weighting.moments(draws[second], weight[second] / share)
+    mean, covariance = moments(draws[second], weight[second] / share)
     ess = share**2 / (weight[second] ** 2).sum()
     # The second t distribution has the moments about the mode, and no longer the wrong curvature of it.
     assert found.reliable and ess > 0.8 * second.sum() and ess > 300
@@ -69,7 +69,7 @@ def test_a_small_second_mode_has_its_share():
 
 def test_a_mode_that_is_not_given_is_not_seen():
     """The limitation that is documented: not even the Pareto index tells."""
-    draws, found, _ = weighting.weighted(two_modes, modes(FIRST), 2_000, 0)
+    draws, found, _ = weighted(two_modes, modes(FIRST), 2_000, 0)
     assert found.k < 0.5 and np.exp(found.log_weight[0])[draws[:, 0] > 5].sum() < SHARE / 10
 
 
@@ -77,8 +77,8 @@ def test_a_mode_that_is_not_given_is_not_seen():
 def test_what_is_no_mode_does_no_harm(where):
     """A second point without mass about it; and the same mode given twice."""
     other = stats.multivariate_normal(where, FIRST.cov)
-    draws, found, mass = weighting.weighted(FIRST.logpdf, modes(FIRST, other), 4_000, 0)
-    mean, covariance = weighting.moments(draws, np.exp(found.log_weight[0]))
+    draws, found, mass = weighted(FIRST.logpdf, modes(FIRST, other), 4_000, 0)
+    mean, covariance = moments(draws, np.exp(found.log_weight[0]))
     assert found.reliable and found.ess > 3_000
     np.testing.assert_array_less(np.abs(mean), 4 * np.sqrt(np.diag(FIRST.cov) / found.ess))
     np.testing.assert_allclose(np.diag(covariance), np.diag(FIRST.cov), rtol=4 * np.sqrt(2 / found.ess))
@@ -89,14 +89,14 @@ def test_what_is_no_mode_does_no_harm(where):
 
 
 @pytest.mark.parametrize("share", [0.1, 0.01, 0.001])
-def test_masses_are_right_from_few_draws(share):
+def test_mixture_weights_are_right_from_few_draws(share):
     """In five dimensions, where the tails of a t distribution about one mode reach the other."""
     parts = [stats.multivariate_normal(np.zeros(5)), stats.multivariate_normal([6.0, 0.0, 0.0, 0.0, 0.0])]
 
     def log_density(z):
         return special.logsumexp([np.log(1 - share) + parts[0].logpdf(z), np.log(share) + parts[1].logpdf(z)], axis=0)
 
-    found = [weighting.weighted(log_density, modes(*parts, wrong=1.0), 200, seed).mass[1] for seed in range(30)]
+    found = [weighted(log_density, modes(*parts, wrong=1.0), 200, seed).mixture_weights[1] for seed in range(30)]
     assert abs(np.mean(found) - share) < 0.35 * share + 4 * np.std(found) / np.sqrt(30)
     assert np.std(found) < max(0.3 * share, 0.002)
 
@@ -109,17 +109,17 @@ def test_densities_that_are_not_finite_have_no_weight():
 
     given = [SimpleNamespace(point=np.array([9.0]), curvature=None),
              SimpleNamespace(point=np.array([1.0]), curvature=SimpleNamespace(factor=np.array([[2.0]])))]
-    draws, found, mass = weighting.weighted(log_density, given, 5_000, 0)
+    draws, found, mass = weighted(log_density, given, 5_000, 0)
     weight = np.exp(found.log_weight[0])
     assert draws.shape == (5_000, 1) and mass.tolist() == pytest.approx([1.0])
     assert (weight[(draws[:, 0] < -2.0) | (draws[:, 0] > 4.0)] == 0).all()
     expected = stats.truncnorm(-1.5, 1.5, 1.0, 2.0)
     assert weight @ draws[:, 0] == pytest.approx(1.0, abs=4 * expected.std() / np.sqrt(found.ess))
     with pytest.raises(ValueError, match="likelihood of zero"):
-        weighting.weighted(lambda z: np.full(len(z), np.nan), given[1:], 10, 0)
+        weighted(lambda z: np.full(len(z), np.nan), given[1:], 10, 0)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 5, 50])
 def test_every_mode_has_draws(count):
-    draws, _, _ = weighting.weighted(two_modes, modes(FIRST, SECOND, FIRST), count, 0)
+    draws, _, _ = weighted(two_modes, modes(FIRST, SECOND, FIRST), count, 0)
     assert len(draws) == max(count, 3)

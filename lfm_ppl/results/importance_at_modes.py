@@ -1,11 +1,11 @@
-"""A posterior by weighted draws of multivariate t distributions: at its modes first, then with the moments about them.
+"""Importance samples of a posterior, from multivariate t distributions at its modes, then with the moments about them.
 
 With several modes the proposal is the mixture of one t distribution about each,
 
     q(z) = sum_k (n_k / n) t_k(z),    w_i proportional to p(z_i) / q(z_i),
 
-and n_k of the n draws come from the k-th. How much of the posterior is about each mode say the masses m_k with which
-sum_k m_k t_k fits the weighted draws best. A mode that is not given and lies far from those that are is not seen,
+and n_k of the n draws come from the k-th. How much of the posterior is about each mode say the mixture weights m_k with
+which sum_k m_k t_k fits the weighted draws best. A mode that is not given and lies far from those that are is not seen,
 neither in the draws nor in the Pareto index of their weights.
 """
 
@@ -34,7 +34,7 @@ LEAST_MASS = 1e-3
 """With less of the posterior about a mode its t distribution stays as it was: draws there say nothing of moments."""
 
 _ITERATIONS = 100
-"""In which masses are fitted. They settle in a few, unless t distributions overlap so much that masses mean little."""
+"""In which they are fitted. They settle in a few, unless t distributions overlap so much that they mean little."""
 
 _LEAST = 0.01
 """Share of the first covariance that is added to the weighted one: a few draws with all the weight make it singular."""
@@ -46,13 +46,13 @@ class Weighted(NamedTuple):
     Attributes:
         draws: (D, P).
         weights: their importance weights.
-        mass: (K,) share of the posterior about each mode, as far as their t distributions can be told apart; sums to
-            one.
+        mixture_weights: (K,) share of the posterior about each mode, as far as their t distributions can be told
+            apart; they sum to one.
     """
 
     draws: np.ndarray
     weights: importance.Importance
-    mass: np.ndarray
+    mixture_weights: np.ndarray
 
 
 def weighted(log_density: Callable[[np.ndarray], np.ndarray], modes: Sequence[Minimum], count: int,
@@ -82,15 +82,15 @@ def weighted(log_density: Callable[[np.ndarray], np.ndarray], modes: Sequence[Mi
         log_t = np.stack([proposal.logpdf(draws) for proposal in proposals])
         log_ratio = log_density(draws) - special.logsumexp(log_t, axis=0, b=(sizes / sizes.sum())[:, None])
         weights = importance.smooth(np.where(np.isfinite(log_ratio), log_ratio, -np.inf)[None])
-        mass, belongs = _masses(np.exp(weights.log_weight[0]), log_t)
+        mass, belongs = _mixture_weights(np.exp(weights.log_weight[0]), log_t)
         about = [_next(draws, own, *one) for own, one in zip(belongs, about, strict=True)]
         share = np.maximum(mass, LEAST_SHARE)
         sizes = _shared_out(count, share / share.sum())
     return Weighted(draws, weights, mass)
 
 
-def _masses(weight: np.ndarray, log_t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return masses (K,) of the mixture that fits best, by expectation maximisation, and parts of the weights (K, D).
+def _mixture_weights(weight: np.ndarray, log_t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return weights (K,) of the mixture that fits best, by expectation maximisation, and parts of the weights (K, D).
 
     Args:
         weight: (D,) of the draws.
