@@ -313,8 +313,8 @@ def drawn(posterior: Any, y: np.ndarray, mode: np.ndarray, seed: int, draws: int
     minimum = newton(posterior.objective(y), mode)
     if minimum.curvature is None:
         return np.tile(mode, (draws, 1)), np.inf
-    found = importance_at_modes.weighted(lambda z: np.sum(posterior.log_densities_of(z, y), axis=0), [minimum], weighted,
-                                         seed)
+    found = importance_at_modes.weighted(
+        lambda z: np.sum(posterior.log_densities_of(z, y), axis=0), [minimum], weighted, seed)
     share = np.cumsum(np.exp(found.weights.log_weight[0]))
     chosen = np.searchsorted(share / share[-1], (np.arange(draws) + 0.5) / draws)
     return found.draws[chosen], found.weights.k
