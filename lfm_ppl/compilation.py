@@ -9,6 +9,9 @@ from pathlib import Path
 _SHARE = "/sys/fs/cgroup/cpu.max"
 """What a container may use, on Linux: microseconds of CPU time in so many microseconds."""
 
+_OLDER = "/sys/fs/cgroup/cpu/cpu.cfs_quota_us", "/sys/fs/cgroup/cpu/cpu.cfs_period_us"
+"""The same of older systems, each in a file of its own; a negative share is none."""
+
 _OPTION = "xla_cpu_small_while_loop_byte_threshold"
 _BYTES = 1_000_000
 _FLAG = "--xla_backend_extra_options="
@@ -23,9 +26,11 @@ another: two Hamiltonian chains on two CPUs took over four times as long as one 
 def cpus() -> int:
     """Return how many CPUs this process may use, where it is kept to some, or a container to a share of their time."""
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    with contextlib.suppress(OSError, ValueError):  # no such file, or "max"
-        share, of = map(int, Path(_SHARE).read_text().split())
-        count = min(count, max(1, -(-share // of)))
+    for files in ((_SHARE,), _OLDER):
+        with contextlib.suppress(OSError, ValueError):  # no such file, or "max"
+            share, of = map(int, " ".join(Path(name).read_text() for name in files).split())
+            if share > 0:
+                count = min(count, -(-share // of))
     return count
 
 

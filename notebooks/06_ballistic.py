@@ -56,7 +56,7 @@ found = experiment.STUDY.run(settings, folder)
 # and those of the smoother with the most particles.
 
 # %%
-figures.plot_paths(settings, found.results)
+figures.plot_paths(found.data, settings.seed)
 
 # %% [markdown]
 # ## All targets
@@ -70,7 +70,7 @@ figures.plot_paths(settings, found.results)
 scores.readable(found.tables["tracking"])
 
 # %%
-figures.plot_coverage(settings, found.results)
+figures.plot_coverage(found.data)
 
 # %% [markdown]
 # ## Particles
@@ -83,7 +83,7 @@ figures.plot_coverage(settings, found.results)
 scores.readable(found.tables["particles"])
 
 # %%
-figures.plot_particles(settings, found.results)
+figures.plot_particles(found.data)
 
 # %% [markdown]
 # ## The drag
@@ -96,7 +96,7 @@ figures.plot_particles(settings, found.results)
 # row has the force's scale and lengthscale known, and a flat prior of the drag alone.
 
 # %%
-figures.plot_drag(settings, found.results)
+figures.plot_drag(found.data)
 
 # %%
 scores.readable(found.tables["parameters"])

@@ -43,10 +43,17 @@ def test_there_is_a_thread_for_each_cpu_unless_the_process_has_one_or_settings_a
                                                 ("900000 100000", 8), (None, 8)])
 def test_a_container_may_have_a_share_of_the_cpus(said, expected, monkeypatch, tmp_path):
     monkeypatch.setattr(compilation.os, "sched_getaffinity", lambda process: set(range(8)), raising=False)
+    older = tmp_path / "quota", tmp_path / "period"
     monkeypatch.setattr(compilation, "_SHARE", str(tmp_path / "cpu.max"))
+    monkeypatch.setattr(compilation, "_OLDER", tuple(map(str, older)))
     if said is not None:
         (tmp_path / "cpu.max").write_text(f"{said}\n")
     assert compilation.cpus() == expected
+    if said is not None:
+        (tmp_path / "cpu.max").unlink()
+        for file, number in zip(older, said.replace("max", "-1").split(), strict=True):
+            file.write_text(f"{number}\n")
+        assert compilation.cpus() == expected
 
 
 def test_calls_run_side_by_side_and_come_in_their_order():

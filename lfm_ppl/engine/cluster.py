@@ -100,11 +100,12 @@ class Cluster:
                                              key=f"{task.name}-{uuid.uuid4().hex}")
                 running[future] = task
 
-        # While the first task compiles, the others import what tasks need.
-        ready = [self._client.submit(worker.get_ready, self._setup, program, pure=False, workers=[address],
-                                     allow_other_workers=True)
-                 for address in (self._client.nthreads() if first else ())]
+        ready: list[Any] = []
         try:
+            for address in self._client.nthreads() if first else ():
+                # While the first task compiles, the others import what tasks need.
+                ready.append(self._client.submit(worker.get_ready, self._setup, program, pure=False, workers=[address],
+                                                 allow_other_workers=True))
             submit()
             while running:
                 try:

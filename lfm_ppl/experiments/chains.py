@@ -92,8 +92,8 @@ def compared(found: xr.Dataset, reference: xr.Dataset | None) -> dict[str, Any]:
             row |= cell(name, one)
     row |= {"least ESS": least_ess(found), **cell("CPU s", found.seconds)}
     if "k" in found:
-        return row | {"k": float(found.k.max())}
-    return row | {"R-hat": largest_r_hat(found), "divergences": float(found.divergences.mean())}
+        return row | {"k": float(found.k.max(skipna=False))}
+    return row | {"R-hat": largest_r_hat(found), "divergences": float(found.divergences.mean(skipna=False))}
 
 
 def agreement(found: xr.Dataset, reference: xr.Dataset) -> tuple[scores.Estimate, scores.Estimate]:

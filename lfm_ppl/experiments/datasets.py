@@ -41,6 +41,11 @@ class Kind(NamedTuple):
     def gathered(self, tasks: Iterable[Task], results: Mapping[str, Result]) -> xr.Dataset:
         """Return the results of tasks; NaN where a cell lacks an entry or has fewer data sets than others.
 
+        What is True or False is 1 and 0 then, and text that is missing is empty.
+
+        Raises:
+            ValueError: some tasks of a cell have an entry that others lack.
+
         Example:
             >>> kind = Kind(lambda task: {"rmse": 2.0}, {"dataset": "rmse"}, ("rule",))
             >>> tasks = [Task(f"{rule}/{k}", 0, {"rule": rule, "index": k}) for rule in ("EKF", "CKF") for k in (0, 1)]
@@ -55,27 +60,32 @@ class Kind(NamedTuple):
         for names, entries in self.entries.items():
             for entry in entries.split(", "):
                 arrays = {tuple(column.index(label) for column, label in zip(labels, cell, strict=True)):
-                          _joined([(task, results[task.name][entry]) for task in own], names)
-                          for cell, own in cells.items() if entry in results[own[0].name]}
+                          _joined(own, results, entry, names)
+                          for cell, own in cells.items() if any(entry in results[task.name] for task in own)}
                 if arrays:
                     variables[entry] = ((*self.by, *names.split()), _filled(arrays, tuple(map(len, labels))))
         return xr.Dataset(variables, dict(zip(self.by, labels, strict=True)))
 
 
-def _joined(entries: list[tuple[Task, Any]], names: str) -> np.ndarray:
+def _joined(tasks: list[Task], results: Mapping[str, Result], entry: str, names: str) -> np.ndarray:
     """Return one entry of the tasks of a cell, one data set after another."""
+    if missing := [task.name for task in tasks if entry not in results[task.name]]:
+        raise ValueError(f"{entry!r} is missing in the result of {missing[0]}, and other tasks of its kind have it.")
     if DATASET not in names.split():
-        return np.asarray(entries[0][1])
-    return np.concatenate([np.asarray(value)[None] if "index" in task.settings else np.asarray(value)
-                           for task, value in entries])
+        return np.asarray(results[tasks[0].name][entry])
+    arrays = [(task, np.asarray(results[task.name][entry])) for task in tasks]
+    return np.concatenate([array[None] if "index" in task.settings else array for task, array in arrays])
 
 
 def _filled(arrays: Mapping[tuple[int, ...], np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
-    """Return arrays by their places in a table of this shape as one array, NaN where there is nothing."""
+    """Return arrays by their places in a table of this shape as one array, NaN or "" where there is nothing."""
     shapes = {array.shape for array in arrays.values()}
     whole = len(shapes) == 1 and len(arrays) == np.prod(shape, dtype=int)
+    dtype = np.result_type(*arrays.values())
+    if not (whole or dtype.kind == "U"):
+        dtype = np.dtype(float)
     full = (*shape, *(max(sizes) for sizes in zip(*shapes, strict=True)))
-    every: np.ndarray = np.empty(full, np.result_type(*arrays.values())) if whole else np.full(full, np.nan)
+    every: np.ndarray = np.full(full, np.nan if dtype.kind == "f" else np.zeros((), dtype), dtype)
     for place, array in arrays.items():
         within: tuple[Any, ...] = (*place, *(slice(size) for size in array.shape))
         every[within] = array
@@ -130,3 +140,13 @@ def cell(name: str, value: Any) -> dict[str, Any]:
     if isinstance(value, Estimate):
         return pair(name, value)
     return {name: value if isinstance(value, str | int) else float(value)}
+
+
+def number(statistic: Callable[[np.ndarray], Any], values: Any) -> float:
+    """Return a statistic of NumPy, which is NaN where a value is; those of xarray leave NaN out.
+
+    Example:
+        >>> number(np.max, xr.DataArray([1.0, np.nan]))
+        nan
+    """
+    return float(statistic(np.asarray(values)))

@@ -328,7 +328,7 @@ class Study:
         """Return the results of all tasks as one dataset for each kind."""
         tasks, data = self.tasks(settings), {}
         if self.then is not None:
-            tasks = [*tasks, *self.then(settings, results)]
+            tasks = [*tasks, *self.then(settings, {task.name: results[task.name] for task in tasks})]
         for what, kind in self.kinds.items():
             if own := [task for task in tasks if self.what(task) == what]:
                 one = kind.gathered(own, results)

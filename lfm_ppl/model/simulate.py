@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -72,8 +71,9 @@ def simulate(key: jax.Array, model: LatentForceModel, times: Any, steps: int = 5
     model.check_at(times[0] if model.initial_time is None else model.initial_time, np.shape(times)[0])
     times = jnp.asarray(times, float)
     start = times[0] if model.initial_time is None else jnp.asarray(model.initial_time, float)
-    run = simulate_on if checks.traced((model, times, key)) else _compiled
-    return run(ssm, key, times, start, steps)
+    run = lambda key, times, start: simulate_on(ssm, key, times, start, steps)  # noqa: E731
+    traced = checks.traced((model, times, key))
+    return (run if traced else jax.jit(run))(key, times, start)
 
 
 def simulate_on(ssm: StateSpaceModel, key: jax.Array, times: jax.Array, start: jax.Array, steps: int) -> Simulation:
@@ -95,9 +95,6 @@ def simulate_on(ssm: StateSpaceModel, key: jax.Array, times: jax.Array, start: j
     size = ssm.physical_dim
     forces = {name: inputs[:, size + index] for index, name in enumerate(ssm.model.force_names)}
     return Simulation(times, inputs[:, :size], forces, y)
-
-
-_compiled = eqx.filter_jit(simulate_on)
 
 
 def simulate_onwards(ssm: StateSpaceModel, key: jax.Array, states: jax.Array, times: jax.Array, known: jax.Array,

@@ -50,6 +50,22 @@ def test_what_a_cell_lacks_is_missing():
     assert "k" not in kind.gathered(tasks[:1], {"EKF": {"rmse": 1.0}})
 
 
+def test_what_is_no_number_is_filled_up_as_well():
+    found = gathered([*blocks("EKF", (0, 1)), *blocks("CKF", (0, 0))], {"dataset": "held"})
+    assert found["held"].sel(rule="EKF").values.tolist() == [1.0, 0.0] and np.isnan(found["held"].values[1, 1])
+    tasks = [Task(rule, 0, {"rule": rule, "index": 0}) for rule in ("EKF", "CKF")]
+    found = Kind(made, {"": "why, k"}, ("rule",)).gathered(tasks, {"EKF": {"why": "a gap"}, "CKF": {"k": 1.0}})
+    assert found["why"].values.tolist() == ["a gap", ""]
+
+
+def test_an_entry_that_some_tasks_of_a_cell_lack_is_an_error():
+    tasks = [Task(f"EKF/{index}", 0, {"rule": "EKF", "index": index}) for index in range(2)]
+    for lacking in ("EKF/0", "EKF/1"):
+        results = {task.name: {} if task.name == lacking else {"k": 1.0} for task in tasks}
+        with pytest.raises(ValueError, match=f"'k' is missing in the result of {lacking}"):
+            Kind(made, {"dataset": "k"}, ("rule",)).gathered(tasks, results)
+
+
 def test_several_settings_become_dimensions():
     tasks = [Task(f"{store}/{rule}/{index}", 0, {"store": store, "rule": rule, "index": index})
              for index in range(3) for store, rule in (("one", "EKF"), ("one", "CKF"), ("two", "CKF"))]

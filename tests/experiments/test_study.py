@@ -36,8 +36,7 @@ def tasks(settings):
 
 
 def later(settings, results):
-    of = [float(one["value"]) for name, one in results.items() if name != "all"]
-    return [Task("all", settings.seed, {"what": "sum", "of": of})]
+    return [Task("all", settings.seed, {"what": "sum", "of": [float(one["value"]) for one in results.values()]})]
 
 
 def tabulated(settings, data):

@@ -98,22 +98,3 @@ def test_a_jump_at_a_row_is_never_lost():
         lambda x, u, t: u, jnp.array([0.1])), lfm.Gaussian(jnp.zeros(0), jnp.zeros((0, 0))))
     drawn = lfm.simulate(jax.random.key(0), model, times, steps=3).forces["u"]
     assert len(np.unique(drawn)) == 40
-
-
-def test_another_key_compiles_nothing():
-    traced = []
-
-    def dynamics(x, u, t):
-        traced.append(None)
-        return u - 0.7 * x
-
-    model = lfm.LatentForceModel(dynamics, {"u": lfm.Matern(1.2, 1.3, 1)},
-                                 lfm.GaussianObservation(whole_state, jnp.array([0.09])),
-                                 lfm.Gaussian(jnp.array([0.3]), jnp.array([[0.2]])))
-    first = lfm.simulate(jax.random.key(0), model, TIMES, steps=1)
-    before = len(traced)
-    second = lfm.simulate(jax.random.key(1), model, TIMES, steps=1)
-    checked = len(traced) - before
-    lfm.simulate(jax.random.key(2), model, TIMES, steps=1)
-    assert len(traced) - before == 2 * checked  # the eager checks of every call, and no tracing of the scan
-    assert checked < before and not np.allclose(first.y, second.y)

@@ -15,7 +15,7 @@ from lfm_ppl.engine.run import Reporter
 from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import chains, published, study
 from lfm_ppl.experiments.call_centre import counts, figures, learning, problem, tracking
-from lfm_ppl.experiments.datasets import Column, Kind, cell, part, row
+from lfm_ppl.experiments.datasets import Column, Kind, cell, number, part, row
 from lfm_ppl.experiments.study import Data, Study, Table, setting
 
 PUBLISHED = {
@@ -137,11 +137,12 @@ def gain(data: Data) -> dict[str, Any]:
         likely, whole = (data[what].sel({"method": method}) for what in ("track", "posterior"))
         before, after = part(likely, test), part(whole, test)
         rows[f"{method}, {test}"] = cell("gain", after.ell - before.ell) | {
-            "days": float((after.ell > before.ell).mean()), "RMSE ratio": float(after.rmse.mean() / before.rmse.mean()),
-            "coverage, most likely": float(before.coverage.mean()),
-            "coverage, integrated": float(after.coverage.mean()), "k": float(whole.k.max()),
-            "least ESS": float(whole.ess.min()), "several modes": float((whole.modes > 1).mean()),
-            "beyond": float(whole.beyond.max())}
+            "days": number(np.mean, after.ell > before.ell),
+            "RMSE ratio": number(np.mean, after.rmse) / number(np.mean, before.rmse),
+            "coverage, most likely": number(np.mean, before.coverage),
+            "coverage, integrated": number(np.mean, after.coverage), "k": number(np.max, whole.k),
+            "least ESS": number(np.min, whole.ess), "several modes": number(np.mean, whole.modes > 1),
+            "beyond": number(np.max, whole.beyond)}
     return rows
 
 
@@ -164,7 +165,7 @@ def agreement(data: Data) -> dict[str, Any]:
         for test, (name, sampler) in itertools.product(problem.TESTED, (("NUTS", nuts), ("weighted", weighted))):
             rows[method] |= cell(f"gain {test}, {name}", sampler[f"{test}_ell"] - likely[f"{test}_ell"])
         rows[method] |= {"R-hat": chains.largest_r_hat(nuts), "least ESS": chains.least_ess(nuts),
-                         "divergences": int(nuts.divergences.sum()), "CPU s": float(nuts.seconds.mean())}
+                         "divergences": int(nuts.divergences.sum()), "CPU s": number(np.mean, nuts.seconds)}
     return rows
 
 
@@ -177,9 +178,9 @@ def learnt(settings: Settings, data: Data) -> dict[str, Any]:
     for method in settings.methods:
         found = data["track"].sel({"method": method})
         names = problem.Method(method.lower(), settings.link, settings.functions).names
-        rows[method] = dict(zip(names, np.exp(found.z.median("dataset")).values, strict=False)) | {
-            "log likelihood": float(found.log_likelihood.mean()), "evaluations": float(found.evaluations.mean()),
-            "CPU s": float(found.seconds.median())}
+        rows[method] = dict(zip(names, np.exp(found.z.median("dataset", skipna=False)).values, strict=False)) | {
+            "log likelihood": number(np.mean, found.log_likelihood),
+            "evaluations": number(np.mean, found.evaluations), "CPU s": number(np.median, found.seconds)}
     return rows
 
 

@@ -14,7 +14,7 @@ from numpyro.infer import MCMC, init_to_value
 
 from lfm_ppl import orbits
 from lfm_ppl.engine.task import Result, Task
-from lfm_ppl.experiments.datasets import DATASET, Column, row
+from lfm_ppl.experiments.datasets import DATASET, Column, number, row
 from lfm_ppl.experiments.gps.figures import METRE
 from lfm_ppl.experiments.gps.satellite import given
 from lfm_ppl.inference.kernels.ram import RAM
@@ -67,5 +67,5 @@ def table(found: xr.Dataset) -> dict[str, Any]:
     """Return one row a way to learn: means over satellites of error (m) and coverage."""
     columns: dict[str, Column] = {
         "satellites": lambda one: one.sizes[DATASET], "error": lambda one: one.error / METRE,
-        "median": lambda one: (one.error / METRE).median(), "coverage": "coverage"}
+        "median": lambda one: number(np.median, one.error / METRE), "coverage": "coverage"}
     return {way: row(found.isel(way=index).rename(satellite=DATASET), columns) for index, way in enumerate(WAYS)}

@@ -13,7 +13,7 @@ import xarray as xr
 from lfm_ppl.engine.run import Reporter
 from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import chains, study
-from lfm_ppl.experiments.datasets import Column, Kind, cell, part, row
+from lfm_ppl.experiments.datasets import Column, Kind, cell, number, part, row
 from lfm_ppl.experiments.home_heating import figures, prediction, problem
 from lfm_ppl.experiments.scores import Estimate, pair
 from lfm_ppl.experiments.study import Data, Study, Table, setting
@@ -121,7 +121,7 @@ def fifth_day(found: xr.Dataset, what: str) -> dict[str, Any]:
         for name, day in days.items():
             columns: dict[str, Column] = {f"RMSE {name} (K)": "rmse", f"ELL {name}": "ell"}
             if name == "ahead":
-                columns |= {"median ELL ahead": lambda own: own.ell.median(), "coverage ahead": "inside"}
+                columns |= {"median ELL ahead": lambda own: number(np.median, own.ell), "coverage ahead": "inside"}
             cells |= row(day.sel({"method": method}), columns)
             if (what, store, name) in SOURCES:
                 numbers = PUBLISHED[method].get(SOURCES[what, store, name], 4 * (np.nan,))
@@ -154,10 +154,10 @@ def marginalised(found: xr.Dataset) -> dict[str, Any]:
         gain, away = own.ell - own.point_ell, np.abs(own["mean"] - reference["mean"]) / reference["sd"]
         rows[f"integrated out by {sampler}"] = {
             **row(own, {"RMSE ahead (K)": "rmse", "ELL ahead": "ell"}), **cell("gain in ELL", gain),
-            "median gain": float(gain.median()),
-            f"means from {first} (sd)": np.nan if sampler == first else float(away.max()),
+            "median gain": number(np.median, gain),
+            f"means from {first} (sd)": np.nan if sampler == first else number(np.max, away),
             "largest R-hat": chains.largest_r_hat(own), "smallest ESS": chains.least_ess(own),
-            "divergences": float(own.divergences.sum()), "CPU time (s)": float(own.seconds.mean())}
+            "divergences": float(own.divergences.sum()), "CPU time (s)": number(np.mean, own.seconds)}
     return rows
 
 

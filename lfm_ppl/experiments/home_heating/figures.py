@@ -136,7 +136,7 @@ def plot_scores(data: Data, *, width: str | float = "full") -> Figure:
         for index, store in enumerate(stores):
             own, at = found.sel(store=store), places + 0.16 * (index - 0.5)
             bars(left, at, [mean_of(errors) for errors in own.rmse], **_MARKS[store])
-            low, middle, high = own.ell.quantile([0.25, 0.5, 0.75], "dataset").values
+            low, middle, high = own.ell.quantile([0.25, 0.5, 0.75], "dataset", skipna=False).values
             right.errorbar(at, middle, [middle - low, high - middle], ls="", ms=3.0, elinewidth=0.8, capsize=1.5,
                            **_MARKS[store])
         for axes, ylabel in ((left, "RMSE a day ahead (K)"), (right, "log likelihood of a day")):

@@ -14,7 +14,7 @@ from scipy.stats import norm
 
 from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import published, scores, study
-from lfm_ppl.experiments.datasets import Column, Kind, cell, row
+from lfm_ppl.experiments.datasets import Column, Kind, cell, number, row
 from lfm_ppl.experiments.published import Verdict
 from lfm_ppl.experiments.scores import mean_of
 from lfm_ppl.experiments.study import Data, Study, Table, blocks, setting
@@ -100,7 +100,7 @@ ERRORS: dict[str, Column] = {
     "NLPD": _sound("nlpd"), "CPU s": "seconds"}
 OF_METHOD: dict[str, dict[str, Column]] = {
     **dict.fromkeys(approximations.SEARCHES, {"at a mode": lambda found: found.converged.mean()}),
-    "iterated GHS(7)": {"last change": lambda found: found.change.max()},
+    "iterated GHS(7)": {"last change": lambda found: number(np.max, found.change)},
     "ESLS": {"mixed": lambda found: (found.r_hat <= slices.R_HAT).mean(),
              "mixed at first": lambda found: (found.r_hat_first <= slices.R_HAT).mean(),
              "all CPU s": lambda found: found.seconds + found.seconds_more, "ESS": "ess"}}
