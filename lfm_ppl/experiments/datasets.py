@@ -73,6 +73,8 @@ def _joined(tasks: list[Task], results: Mapping[str, Result], entry: str, names:
         raise ValueError(f"{entry!r} is missing in the result of {missing[0]}, and other tasks of its kind have it.")
     if DATASET not in names.split():
         return np.asarray(results[tasks[0].name][entry])
+    if names.split()[0] != DATASET:
+        raise ValueError(f"the dimension {DATASET!r} of {entry!r} must come first, got {names!r}.")
     arrays = [(task, np.asarray(results[task.name][entry])) for task in tasks]
     return np.concatenate([array[None] if "index" in task.settings else array for task, array in arrays])
 

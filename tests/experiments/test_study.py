@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from lfm_ppl.engine.task import Task
-from lfm_ppl.experiments import drawing, published, study
+from lfm_ppl.experiments import drawing, published, study, timing
 from lfm_ppl.experiments.datasets import Kind, row
 from lfm_ppl.experiments.scores import Estimate
 from lfm_ppl.experiments.study import Study, Table, setting
@@ -126,6 +126,15 @@ def test_settings_say_what_is_wrong(wrong, message):
 def test_what_is_no_whole_number_is_refused(wrong):
     with pytest.raises(TypeError, match="must be a whole number"):
         Settings(**wrong)
+
+
+def test_what_is_compiled_at_the_first_call_is_not_timed():
+    calls = []
+    for label in ("a test", "another test", "a test"):
+        calls.append(label)
+        seconds, found = timing.timed_again(label, lambda: calls.append("called") or len(calls))
+        assert seconds >= 0.0 and found == len(calls)
+    assert calls == ["a test", "called", "called", "another test", "called", "called", "a test", "called"]
 
 
 def test_a_legend_has_each_label_once():

@@ -16,7 +16,6 @@ from lfm_ppl.experiments.datasets import Column, Kind, part, row
 from lfm_ppl.experiments.scores import paired_ratio, sd_of
 from lfm_ppl.experiments.study import Data, Study, Table, setting
 
-LEVELS = (0.5, 0.8, 0.95)
 UNKNOWN = {"most likely parameters": "likely", "parameters integrated out": "posterior"}
 ERRORS = {"RMSE {path} ({unit})": "rmse", "coverage {path}": "coverage", "CPU s": "seconds"}
 
@@ -149,7 +148,7 @@ def _coverage(level: float) -> Any:
     return lambda one: np.abs(one.below - 0.5) <= level / 2
 
 
-COVERED: dict[str, Column] = {f"coverage {level:.0%}": _coverage(level) for level in LEVELS} | {
+COVERED: dict[str, Column] = {f"coverage {level:.0%}": _coverage(level) for level in parameters.LEVELS} | {
     "rank p": lambda one: stats.kstest(one.below, "uniform").pvalue}
 """Of posterior probabilities of less than the truth."""
 

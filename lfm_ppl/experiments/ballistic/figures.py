@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy import stats
 
-from lfm_ppl.experiments.ballistic import problem, smoothing
+from lfm_ppl.experiments.ballistic import parameters, problem, smoothing
 from lfm_ppl.experiments.datasets import part
 from lfm_ppl.experiments.drawing import SHADE, SPAN, TRUTH, band, bars, legend, line, patch
 from lfm_ppl.experiments.scores import Z, mean_of, paired_ratio, rate_of
@@ -116,7 +116,7 @@ def _densities(axes: Axes, weighted: np.ndarray, chain: np.ndarray) -> None:
 @style.styled
 def plot_coverage(data: Data, *, width: str | float = "full") -> Figure:
     """Draw the coverage of the 95% bands of paths, and of the posterior intervals of parameters."""
-    found, levels = data["parameters"], np.array([0.5, 0.8, 0.95])
+    found, levels = data["parameters"], np.array(parameters.LEVELS)
     rows = {"truth": data["tracking"].smoother_coverage.sel({"method": smoothing.REPORTED}),
             "most\nlikely": found.likely_coverage, "integrated\nout": found.posterior_coverage}
     figure, (left, right) = style.in_a_row(width, 2, 2.5)

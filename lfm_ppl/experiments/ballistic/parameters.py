@@ -30,6 +30,8 @@ from lfm_ppl.results import importance
 from lfm_ppl.results.importance_at_modes import Weighted, moments, weighted
 
 SAMPLERS = ("NUTS", "RAM")
+LEVELS = (0.5, 0.8, 0.95)
+"""Probabilities of the central intervals whose coverage is reported."""
 
 START = np.log([5e-4, 30.0, 5.0])
 """Where every search starts: the prior medians."""

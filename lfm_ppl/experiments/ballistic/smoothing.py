@@ -73,8 +73,9 @@ def particles(task: Task) -> Result:
     target, given = problem.target(task.settings["index"], task.seed), problem.true_likelihood().model
     options = {"particles": task.settings["particles"], "steps": task.settings["steps"]}
     keys, common = jax.random.split(task.key), (given, target.times, target.y)
-    filter_s, filtered = timed_again(f"filter, {options}", lambda: particle_filter(keys[0], *common, **options))
-    smoother_s, smoothed = timed_again(f"smoother, {options}", lambda: particle_smoother(
+    filter_s, filtered = timed_again(f"ballistic filter, {options}", lambda: particle_filter(
+        keys[0], *common, **options))
+    smoother_s, smoothed = timed_again(f"ballistic smoother, {options}", lambda: particle_smoother(
         keys[1], *common, draws=task.settings["draws"], method=TRACING, **options))
     paths = [smoothed.state("altitude"), smoothed.state("speed"), smoothed.force("u")]
     mean, sd = np.stack([path.mean for path in paths]), np.stack([path.sd for path in paths])

@@ -178,7 +178,7 @@ def learnt(settings: Settings, data: Data) -> dict[str, Any]:
     for method in settings.methods:
         found = data["track"].sel({"method": method})
         names = problem.Method(method.lower(), settings.link, settings.functions).names
-        rows[method] = dict(zip(names, np.exp(found.z.median("dataset", skipna=False)).values, strict=False)) | {
+        rows[method] = dict(zip(names, np.exp(np.median(found.z.values, axis=0))[:len(names)], strict=True)) | {
             "log likelihood": number(np.mean, found.log_likelihood),
             "evaluations": number(np.mean, found.evaluations), "CPU s": number(np.median, found.seconds)}
     return rows

@@ -66,14 +66,13 @@ def all_tasks(settings: Settings) -> list[Task]:
                    problem.GRID: {"cells": settings.cells}}
     priors = {name: list(ends) for name, ends in parameters.INTERVALS.items()}
     posterior: dict[str, Any] = {"what": "conditional", "nodes": settings.nodes, "intervals": priors}
-    found = [task("conditional-figure/particle-filter", method=problem.PARTICLES, first=settings.figure,
-                  last=settings.figure, particles=settings.particles, **particle_steps, **posterior)]
-    for method in problem.METHODS:
-        name = study.slug(method)
-        found += repeated(f"state/{name}", what="state", method=method, **at_truth.get(method, steps))
-        found += [task(f"conditional/{name}/{first:03d}-{last:03d}", method=method, first=first, last=last,
-                       **posterior, **likelihoods.get(method, steps))
-                  for first, last in study.blocks(settings.conditional, 10)]
+    found = [one for method in problem.METHODS for one in repeated(
+        f"state/{study.slug(method)}", what="state", method=method, **at_truth.get(method, steps))]
+    found += [task(f"conditional/{study.slug(method)}/{first:03d}-{last:03d}", method=method, first=first, last=last,
+                   **posterior, **likelihoods.get(method, steps))
+              for method in problem.METHODS for first, last in study.blocks(settings.conditional, 10)]
+    found.append(task("conditional-figure/particle-filter", method=problem.PARTICLES, first=settings.figure,
+                      last=settings.figure, particles=settings.particles, **particle_steps, **posterior))
     kernels = {"RAM": steps, "NUTS": steps | {"tree_depth": settings.tree_depth}, "PMMH": {
         "particles": settings.marginal_particles, "steps": settings.marginal_steps, "cells": settings.draw_cells}}
     for label, (kernel, _) in parameters.SAMPLERS.items():

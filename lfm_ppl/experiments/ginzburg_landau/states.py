@@ -141,8 +141,8 @@ def _particles(task: Task, data: problem.Realisation) -> Result:
                                   steps=settings["steps"])
     smoothing = functools.partial(particle_smoother, keys[1], *given, particles=settings["smoother_particles"],
                                   draws=settings["smoother_draws"], steps=settings["smoother_steps"])
-    filter_s, filtered = timed_again(f"particle filter, {settings['particles']}", filtering)
-    smoother_s, smoothed = timed_again(f"particle smoother, {settings['particles']}", smoothing)
+    filter_s, filtered = timed_again(f"double well, {filtering.keywords}", filtering)
+    smoother_s, smoothed = timed_again(f"double well, {smoothing.keywords}", smoothing)
     draws = np.asarray(smoothed.draws)[:, :, 0]
     low, high = np.quantile(draws, _LEVELS, axis=0)
     return {**band("filter", filtered.mean[:, 0], np.sqrt(filtered.covariance[:, 0, 0])),

@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
-from numpyro.infer import MCMC, NUTS, init_to_uniform
+from numpyro.infer import NUTS, init_to_uniform
 
 from lfm_ppl.engine.task import Result, Task
-from lfm_ppl.experiments import scores
+from lfm_ppl.experiments import chains, scores
 from lfm_ppl.experiments.timing import timed
 from lfm_ppl.experiments.transcription import problem
 from lfm_ppl.inference.handlers.on_latent_grid import on_latent_grid
@@ -86,16 +86,13 @@ def compute(task: Task) -> Result:
     # The programs of one task serve no other, and would stay: half a gigabyte each.
     jax.clear_caches()
     settings, configuration = task.settings, problem.configuration(task)
-    sampler, thin = SAMPLERS[settings["sampler"]], settings["thin"]
+    sampler = SAMPLERS[settings["sampler"]]
     data = problem.data_set(configuration, settings["index"], task.seed)
-    random_walk = sampler.kernel == "RAM"
     start = init_to_uniform(radius=1.0)  # chains start apart, or R-hat would say nothing
-    kernel: Any = RAM(model, init_strategy=start) if random_walk else NUTS(
+    kernel: Any = RAM(model, init_strategy=start) if sampler.kernel == "RAM" else NUTS(
         on_latent_grid(model, AT) if sampler.latent else model, init_strategy=start, dense_mass=not sampler.latent,
         max_tree_depth=settings["tree_depth"])
-    mcmc = MCMC(kernel, num_warmup=settings["warmup"] * thin, num_samples=settings["draws"] * thin, thinning=thin,
-                num_chains=settings["chains"], chain_method="vectorized" if random_walk else "sequential",
-                progress_bar=False)
+    mcmc = chains.sampler(kernel, *(settings[name] for name in ("chains", "warmup", "draws", "thin")))
 
     def run() -> dict[str, jax.Array]:
         mcmc.run(task.key, problem.TIMES, data.y, **configuration._asdict())

@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 
 from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import chains, study
-from lfm_ppl.experiments.datasets import Column, Kind, row
-from lfm_ppl.experiments.scores import Estimate, pair
+from lfm_ppl.experiments.datasets import Column, Kind, number, row
+from lfm_ppl.experiments.scores import pair
 from lfm_ppl.experiments.study import Data, Study, Table, setting
 from lfm_ppl.experiments.transcription import figures, parameters, problem
 from lfm_ppl.experiments.transcription.parameters import LINKS, REFERENCE, SAMPLERS
@@ -44,14 +44,11 @@ def tasks(settings: Settings) -> list[Task]:
             for one in SAMPLERS.items()]
 
 
-SAME = Estimate(0.0, np.nan), Estimate(1.0, np.nan)
-"""How a posterior agrees with itself."""
-
 COLUMNS: dict[str, Column] = {
     "coverage": lambda found: ((found.low <= found.truth) & (found.truth <= found.high)).mean("parameter"),
     "RMSE": "rmse", "coverage force": "coverage",
     "ESS/CPU s": lambda found: found.ess.fillna(0.0).min("parameter") / found.seconds,
-    "least ESS": chains.least_ess, "R-hat": chains.largest_r_hat, "k": lambda found: found.k.max(),
+    "least ESS": chains.least_ess, "R-hat": chains.largest_r_hat, "k": lambda found: number(np.max, found.k),
     "divergences": lambda found: found.divergences.mean()}
 
 
@@ -69,7 +66,9 @@ def agreement(settings: Settings, data: Data) -> dict[str, Any]:
     for link in settings.links:
         for sampler in SAMPLERS:
             found, reference = (data[link].sel(sampler=label) for label in (sampler, REFERENCE))
-            shift, ratio = SAME if sampler == REFERENCE else chains.agreement(found, reference)
+            shift, ratio = chains.agreement(found, reference)
+            if sampler == REFERENCE:  # it is no estimate how it agrees with itself
+                shift, ratio = shift._replace(error=np.nan), ratio._replace(error=np.nan)
             rows[f"{link}: {sampler}"] = pair("shift", shift) | pair("sd ratio", ratio) | row(found, COLUMNS)
     return rows
 

@@ -64,7 +64,7 @@ def configuration(task: Task) -> Configuration:
 
 
 def slug(label: str) -> str:
-    """Return a label as part of the name of a task or a file."""
+    """Return a label as part of the name of a task or a file; its brackets stay, as in the names of stored tasks."""
     return label.replace(", ", "-").replace(" ", "-")
 
 
