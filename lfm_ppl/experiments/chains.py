@@ -30,13 +30,7 @@ def nuts(model: Any, **settings: Any) -> NUTS:
 def sampler(kernel: Any, chains: int, warmup: int, draws: int, thin: int = 1, **settings: Any) -> MCMC:
     """Return the sampler of a kernel: RAM's chains side by side, those of others one after another.
 
-    Args:
-        kernel: the kernel.
-        chains: their number.
-        warmup: draws of the warm-up, thinned as the others.
-        draws: that are kept of each chain.
-        thin: steps for one draw.
-        **settings: of `MCMC`.
+    ``thin`` steps make one draw, in the warm-up, too; further ``settings`` are of `MCMC`.
     """
     return MCMC(kernel, num_warmup=warmup * thin, num_samples=draws * thin, thinning=thin, num_chains=chains,
                 chain_method="vectorized" if isinstance(kernel, RAM) else "sequential", progress_bar=False, **settings)
