@@ -42,7 +42,7 @@ def wanted(monkeypatch):
             if report:
                 report("1/1 task")
             rates = pd.DataFrame({"rate": [0.5]}, ["EKF"])
-            return Found(settings, {}, {"rates": Table("Rates", rates, rates)}, ("1 of 1 cell is consistent.",))
+            return Found(settings, {}, {}, {"rates": Table("Rates", rates, rates)}, ("1 of 1 cell is consistent.",))
 
         def save(self, found, folder):
             return [folder / "rates.csv"]
