@@ -13,7 +13,7 @@ from numpyro.infer import MCMC, NUTS
 
 from lfm_ppl.engine.task import Result
 from lfm_ppl.experiments import scores
-from lfm_ppl.experiments.datasets import cell
+from lfm_ppl.experiments.datasets import cell, number
 from lfm_ppl.experiments.timing import timed
 from lfm_ppl.inference.kernels.ram import RAM
 
@@ -86,8 +86,8 @@ def compared(found: xr.Dataset, reference: xr.Dataset | None) -> dict[str, Any]:
             row |= cell(name, one)
     row |= {"least ESS": least_ess(found), **cell("CPU s", found.seconds)}
     if "k" in found:
-        return row | {"k": float(found.k.max(skipna=False))}
-    return row | {"R-hat": largest_r_hat(found), "divergences": float(found.divergences.mean(skipna=False))}
+        return row | {"k": number(np.max, found.k)}
+    return row | {"R-hat": largest_r_hat(found), "divergences": number(np.mean, found.divergences)}
 
 
 def agreement(found: xr.Dataset, reference: xr.Dataset) -> tuple[scores.Estimate, scores.Estimate]:

@@ -83,7 +83,8 @@ def mean_of(values: Any) -> Estimate:
 
 def sd_of(values: Any) -> float:
     """Return the standard deviation of independent numbers; NaN of a single one."""
-    return float(np.std(values, ddof=1)) if np.size(values) > 1 else np.nan
+    known = np.asarray(values, float)  # xarray's own would leave NaN out
+    return float(known.std(ddof=1)) if known.size > 1 else np.nan
 
 
 def rate_of(hits: Any) -> Estimate:

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import xarray as xr
+
 from lfm_ppl.engine.run import Reporter
 from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import study
@@ -49,9 +51,10 @@ def check(settings: Settings, report: Reporter | None) -> None:
 
 def tables(settings: Settings, data: Data) -> dict[str, Table]:
     """Return the tables."""
+    every = {name: methods.compared(settings, data, name) for name in settings.problems}
     return {"accuracy": Table.of("Posterior of the predictor (mean: largest error in sds; sd: largest relative error)",
-                                 rows(settings, data, ACCURACY)),
-            "prediction": Table.of(f"Held-out data, {settings.size.folds} folds", rows(settings, data, PREDICTION))}
+                                 rows(every, ACCURACY)),
+            "prediction": Table.of(f"Held-out data, {settings.size.folds} folds", rows(every, PREDICTION))}
 
 
 ACCURACY: dict[str, Column] = {
@@ -67,14 +70,13 @@ PREDICTION: dict[str, Column] = {"NLPD": lambda one: -one["log density"], "less 
 reference's, and the share of data in their 95% predictive intervals."""
 
 
-def rows(settings: Settings, data: Data, columns: Mapping[str, Column]) -> dict[str, Any]:
-    """Return one row for each problem and method; columns of what a problem does not have are left out."""
+def rows(every: Mapping[str, xr.Dataset], columns: Mapping[str, Column]) -> dict[str, Any]:
+    """Return one row for each problem, see `methods.compared`, and method; columns of what it lacks are left out."""
     found = {}
-    for name in settings.problems:
-        every = methods.compared(settings, data, name)
-        known = {title: column for title, column in columns.items() if callable(column) or column in every}
+    for name, compared in every.items():
+        known = {title: column for title, column in columns.items() if callable(column) or column in compared}
         for method, label in methods.METHODS.items():
-            found[f"{name}, {label}"] = row(every.sel({"method": method}), known)
+            found[f"{name}, {label}"] = row(compared.sel({"method": method}), known)
     return found
 
 

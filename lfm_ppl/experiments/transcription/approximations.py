@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 
 from lfm_ppl.engine.task import Result
 from lfm_ppl.experiments.study import stacked
-from lfm_ppl.experiments.timing import timed
+from lfm_ppl.experiments.timing import timed, timed_again
 from lfm_ppl.experiments.transcription import problem
 from lfm_ppl.filtering.smoother import smooth
 from lfm_ppl.latent_grid import laplace
@@ -45,9 +46,12 @@ def compute(settings: Mapping[str, Any], data: list[problem.DataSet]) -> Result:
         seconds, found = timed(_smooth, *fixed, *given)
         return {name: np.asarray(value) for name, value in found.items()} | {
             "seconds": np.full(len(data), seconds / len(data))}
-    each = [problem.rows(given, index) for index in range(len(data))]
-    timed(_search, *fixed, *each[0])
-    return stacked([found | {"seconds": seconds} for seconds, found in (timed(_search, *fixed, *one) for one in each)])
+    rows = []
+    for index in range(len(data)):
+        search = functools.partial(_search, *fixed, *problem.rows(given, index))
+        seconds, found = timed_again(f"transcription, {settings['method']}, {settings['link']}", search)
+        rows.append(found | {"seconds": seconds})
+    return stacked(rows)
 
 
 @eqx.filter_jit
