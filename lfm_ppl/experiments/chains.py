@@ -17,6 +17,9 @@ from lfm_ppl.experiments.datasets import cell, number
 from lfm_ppl.experiments.timing import timed
 from lfm_ppl.inference.kernels.ram import RAM
 
+LENGTHS = ("chains", "warmup", "draws", "thin")
+"""Settings of a task: how many chains, and how long they are; see `sampler`."""
+
 APART = 0.3
 """Standard deviation of the chains' starts around a mode, in the logarithm of every parameter: were they alike, R-hat
 would say nothing."""
@@ -73,8 +76,8 @@ def compared(found: xr.Dataset, reference: xr.Dataset | None) -> dict[str, Any]:
     """Return how well a sampler's posteriors agree with those of a reference, as a row of a table.
 
     Args:
-        found: ``mean``, ``sd`` and ``ess`` (dataset, parameter), ``seconds`` (dataset); of chains ``r_hat``, ``draws``
-            and ``divergences``, of weighted draws their Pareto index ``k``.
+        found: ``mean`` and ``sd`` (dataset, parameter), ``seconds`` (dataset); of chains ``draws``, ``divergences``,
+            ``ess`` and ``r_hat`` (dataset, parameter), of weighted draws ``ess`` and the Pareto index ``k`` (dataset).
         reference: the same of another sampler; None: ``found`` is the reference.
 
     Returns:
@@ -99,8 +102,7 @@ def agreement(found: xr.Dataset, reference: xr.Dataset) -> tuple[scores.Estimate
         against them as the largest of many.
     """
     both = found, reference
-    mean, sd, ess = ([one[name].transpose("dataset", "parameter").values for one in both]
-                     for name in ("mean", "sd", "ess"))
+    mean, sd, ess = ([_by_parameter(one, name) for one in both] for name in ("mean", "sd", "ess"))
     errors = [_relative_errors_of_sd(one) for one in both]
     shift, ratio = (mean[0] - mean[1]) / sd[1], sd[0] / sd[1]
     worst = np.unravel_index(np.abs(shift).argmax(), shift.shape)
@@ -110,10 +112,15 @@ def agreement(found: xr.Dataset, reference: xr.Dataset) -> tuple[scores.Estimate
             scores.Estimate(float(ratio[widest]), float((ratio * np.hypot(*errors))[widest])))
 
 
+def _by_parameter(found: xr.Dataset, name: str) -> np.ndarray:
+    """Return a variable (N, P), also where there is one value for all parameters."""
+    return found[name].broadcast_like(found["mean"]).transpose("dataset", "parameter").values
+
+
 def _relative_errors_of_sd(found: xr.Dataset) -> np.ndarray:
     """Return Monte Carlo errors (N, P) of standard deviations; of weighted draws those of a normal distribution."""
     if "draws" not in found:
-        return np.sqrt(0.5 / found.ess.transpose("dataset", "parameter").values)
+        return np.sqrt(0.5 / _by_parameter(found, "ess"))
     # Where samplers draw a different number, the shorter ones are filled up.
     every = found.draws.transpose("dataset", "parameter", "chain", "draw")
     return np.stack([scores.relative_errors_of_sd(one.dropna("chain", how="all").dropna("draw", how="all").values)

@@ -117,15 +117,32 @@ def paired_ratio(first: Any, second: Any) -> Estimate:
     return Estimate(float(ratio), mean_of(first - ratio * second).error / float(second.mean()))
 
 
-def rmse(estimate: Any, truth: Any) -> float:
-    """Return the root of the mean squared difference."""
-    return float(np.sqrt(np.mean((np.asarray(estimate) - np.asarray(truth)) ** 2)))
+def rmse(estimate: Any, truth: Any) -> Any:
+    """Return the root of the mean squared difference over the last axis."""
+    return np.sqrt(np.mean((np.asarray(estimate) - np.asarray(truth)) ** 2, axis=-1))
 
 
-def covered(low: Any, high: Any, truth: Any) -> float:
-    """Return the share of entries of ``truth`` that lie between ``low`` and ``high``."""
+def covered(low: Any, high: Any, truth: Any) -> Any:
+    """Return the share of entries of ``truth`` along the last axis that lie between ``low`` and ``high``."""
     truth = np.asarray(truth)
-    return float(np.mean((np.asarray(low) <= truth) & (truth <= np.asarray(high))))
+    return np.mean((np.asarray(low) <= truth) & (truth <= np.asarray(high)), axis=-1)
+
+
+def interval(mean: Any, sd: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return the ends of the 95% interval of a normal distribution."""
+    mean, reach = np.asarray(mean), Z * np.asarray(sd)
+    return mean - reach, mean + reach
+
+
+def judged(what: str, mean: Any, band: tuple[Any, Any], truth: Any) -> dict[str, Any]:
+    """Return ``{what}_rmse`` and ``{what}_coverage`` of paths (..., T): of their mean, and of their band.
+
+    Example:
+        >>> found = judged("smoother", [0.0, 1.0], interval([0.0, 1.0], [1.0, 1.0]), [0.0, 4.0])
+        >>> {name: round(float(value), 3) for name, value in found.items()}
+        {'smoother_rmse': 2.121, 'smoother_coverage': 0.5}
+    """
+    return {f"{what}_rmse": rmse(mean, truth), f"{what}_coverage": covered(*band, truth)}
 
 
 def spread(draws: np.ndarray, count: int) -> np.ndarray:
@@ -135,7 +152,7 @@ def spread(draws: np.ndarray, count: int) -> np.ndarray:
 
 
 def total_moments(mean: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and standard deviation (K,) of a mixture of components with mean and variance (S, K)."""
+    """Return mean and standard deviation (...) of a mixture of components with mean and variance (S, ...)."""
     return mean.mean(axis=0), np.sqrt(variance.mean(axis=0) + mean.var(axis=0))
 
 

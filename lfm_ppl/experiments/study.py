@@ -45,7 +45,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
-import numpy as np
 import pandas as pd
 import xarray as xr
 from matplotlib.figure import Figure
@@ -312,29 +311,34 @@ class Study:
         computed = functools.partial(_computed, self.what, {what: kind.compute for what, kind in self.kinds.items()})
         done = functools.partial(run_tasks, compute=computed, folder=Path(folder) / TASKS, overwrite=overwrite,
                                  report=report)
+        tasks = self.tasks(settings)
         if self.then is None:
-            return self.found(settings, done(self.tasks(settings), workers=workers))
-        first = self.tasks(settings)
+            return self.found(settings, done(tasks, workers=workers), tasks)
         with started(workers) as running:  # once, for both rounds
-            results = done(first, workers=running or 1)
-            return self.found(settings, results | done(self.then(settings, results), workers=running or 1))
+            results = done(tasks, workers=running or 1)
+            more = self.then(settings, results)
+            return self.found(settings, results | done(more, workers=running or 1), [*tasks, *more])
 
-    def found(self, settings: Any, results: Results) -> Found:
-        """Return what follows from the results of all tasks."""
-        data = self.gathered(settings, results)
+    def found(self, settings: Any, results: Results, tasks: Sequence[Task] | None = None) -> Found:
+        """Return what follows from the results of all tasks, which are asked for where they are not given."""
+        data = self.gathered(settings, results, tasks)
         return Found(settings, results, data, self.tables(settings, data), self.notes(settings, data))
 
-    def gathered(self, settings: Any, results: Results) -> Data:
+    def gathered(self, settings: Any, results: Results, tasks: Sequence[Task] | None = None) -> Data:
         """Return the results of all tasks as one dataset for each kind."""
-        tasks, data = self.tasks(settings), {}
-        if self.then is not None:
-            tasks = [*tasks, *self.then(settings, {task.name: results[task.name] for task in tasks})]
-        for what, kind in self.kinds.items():
-            if own := [task for task in tasks if self.what(task) == what]:
-                one = kind.gathered(own, results)
-                data[what] = one.assign_coords({name: (dim, list(values)) for name, (dim, values)
-                                                in self.coords.items() if dim in one.dims})
+        data = {}
+        for what, own in self.by_kind(settings, results, tasks).items():
+            one = self.kinds[what].gathered(own, results)
+            data[what] = one.assign_coords({name: (dim, list(values)) for name, (dim, values) in self.coords.items()
+                                            if dim in one.dims})
         return data
+
+    def by_kind(self, settings: Any, results: Results, tasks: Sequence[Task] | None = None) -> dict[str, list[Task]]:
+        """Return the tasks of each kind of which there are any, in the order of the kinds."""
+        if tasks is None:
+            tasks = [*self.tasks(settings), *(self.then(settings, results) if self.then else ())]
+        found = {what: [task for task in tasks if self.what(task) == what] for what in self.kinds}
+        return {what: own for what, own in found.items() if own}
 
     def save(self, found: Found, folder: str | Path) -> list[Path]:
         """Write tables as CSV in full and as Markdown, and figures as PNG, replacing older ones; return their paths."""
@@ -351,42 +355,3 @@ class Study:
 
 def _computed(what: Callable[[Task], str], kinds: Mapping[str, Callable[[Task], Result]], task: Task) -> Result:
     return kinds[what(task)](task)
-
-
-def stacked(rows: Sequence[Result], shown: Sequence[str] = ()) -> Result:
-    """Return the results of data sets, one row each, as one result.
-
-    Args:
-        rows: of the data sets.
-        shown: entries that are kept of the first one alone, for a figure.
-
-    Returns:
-        Entry -> array, a row for each data set.
-
-    Example:
-        >>> found = stacked([{"rmse": 1.0, "path": [0.0]}, {"rmse": 2.0, "path": [3.0]}], shown=["path"])
-        >>> found["rmse"].tolist(), found["path"].tolist()
-        ([1.0, 2.0], [0.0])
-    """
-    return {name: np.asarray(rows[0][name]) if name in shown else np.stack([np.asarray(row[name]) for row in rows])
-            for name in rows[0]}
-
-
-def blocks(count: int, size: int) -> list[tuple[int, int]]:
-    """Return first and last index of each block of data sets that are computed in one go, and stored in one file.
-
-    Example:
-        >>> blocks(5, 2)
-        [(0, 1), (2, 3), (4, 4)]
-    """
-    return [(first, min(first + size, count) - 1) for first in range(0, count, size)]
-
-
-def slug(label: str) -> str:
-    """Return a label as part of the name of a task or a file.
-
-    Example:
-        >>> slug("cubature, whole state"), slug("GHKF(7)")
-        ('cubature-whole-state', 'GHKF7')
-    """
-    return "".join(one for one in label.replace(" ", "-") if one not in "(),")

@@ -12,11 +12,12 @@ neither in the draws nor in the Pareto index of their weights.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import special, stats
 
+from lfm_ppl.inference.log_posterior import LogPosterior
 from lfm_ppl.inference.optimise import Minimum
 from lfm_ppl.results import importance
 
@@ -54,6 +55,22 @@ class Weighted(NamedTuple):
     weights: importance.Importance
     mixture_weights: np.ndarray
 
+    @property
+    def weight(self) -> np.ndarray:
+        """Weights (D,), which sum to one."""
+        return np.exp(self.weights.log_weight[0])
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """``posterior_mean`` and ``posterior_sd`` (P,), Pareto index ``k``, and effective number of draws ``ess``."""
+        mean, covariance = moments(self.draws, self.weight)
+        return {"posterior_mean": mean, "posterior_sd": np.sqrt(np.diag(covariance)), "k": self.weights.k,
+                "ess": self.weights.ess}
+
+    def resampled(self, count: int, seed: int) -> np.ndarray:
+        """Return (count, P) of the draws, each as often as its weight says, in random order."""
+        return self.draws[importance.resample(self.weights.log_weight, count, seed)]
+
 
 def weighted(log_density: Callable[[np.ndarray], np.ndarray], modes: Sequence[Minimum], count: int,
              seed: int) -> Weighted:
@@ -87,6 +104,11 @@ def weighted(log_density: Callable[[np.ndarray], np.ndarray], modes: Sequence[Mi
         share = np.maximum(mass, LEAST_SHARE)
         sizes = _shared_out(count, share / share.sum())
     return Weighted(draws, weights, mass)
+
+
+def weighted_posterior(posterior: LogPosterior, y: Any, modes: Sequence[Minimum], count: int, seed: int) -> Weighted:
+    """Return weighted draws of the posterior of the logarithms z of parameters, given the data y; see `weighted`."""
+    return weighted(lambda z: np.sum(posterior.log_densities_of(z, y), axis=0), modes, count, seed)
 
 
 def _mixture_weights(weight: np.ndarray, log_t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -6,7 +6,8 @@ import pytest
 from lfm_ppl.engine.store import write
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.ginzburg_landau import experiment, figures, parameters, problem, states
-from lfm_ppl.experiments.study import TASKS, slug
+from lfm_ppl.experiments.study import TASKS
+from lfm_ppl.experiments.tasks import slug
 
 SMALL = experiment.Settings(
     realisations=1, conditional=2, particles=200, smoother_particles=50, smoother_draws=20, conditional_particles=50,

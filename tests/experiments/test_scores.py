@@ -77,6 +77,10 @@ def test_estimates_show_as_many_digits_as_the_error_leaves():
 def test_errors_and_coverage():
     assert scores.rmse([1.0, 3.0], [0.0, 0.0]) == pytest.approx(np.sqrt(5.0))
     assert scores.covered([0.0, 0.0], [1.0, 1.0], [0.5, 2.0]) == 0.5
+    mean, sd = np.array([[0.0, 1.0, 2.0], [1.0, 1.0, 1.0]]), np.array([[1.0, 1.0, 1.0], [0.1, 1.0, 1.0]])
+    found = scores.judged("smoother", mean, scores.interval(mean, sd), [1.0, 1.0, 5.0])
+    np.testing.assert_allclose(found["smoother_rmse"], np.sqrt([10.0 / 3.0, 16.0 / 3.0]))
+    np.testing.assert_allclose(found["smoother_coverage"], [2.0 / 3.0, 2.0 / 3.0])
 
 
 def test_the_error_of_a_standard_deviation_follows_from_the_fourth_moment():

@@ -9,10 +9,10 @@ from scipy.integrate import solve_ivp
 import lfm_ppl as lfm
 from lfm_ppl import loading
 from lfm_ppl.experiments import scores
-from lfm_ppl.experiments.posteriors import LogPosterior
 from lfm_ppl.inference.bound_model import bind
+from lfm_ppl.inference.log_posterior import LogPosterior
 from lfm_ppl.inference.optimise import newton, quasi_newton
-from lfm_ppl.results.importance_at_modes import weighted
+from lfm_ppl.results.importance_at_modes import weighted_posterior
 
 EPIDEMICS = 100
 NAMES = ("r0", "scale", "lengthscale", "concentration")
@@ -72,8 +72,8 @@ def test_the_posterior_covers_the_truth(file, functions, simulated):
         y = np.asarray(drawn.y)
         objective = posterior.objective(y)
         mode = newton(objective, quasi_newton(objective, np.log(np.array([2.0, 0.3, 15.0, 10.0]))).point)
-        found = weighted(lambda z, y=y: np.add(*posterior.log_densities_of(z, y)), [mode], 300, index)
-        share = np.exp(found.weights.log_weight[0])
+        found = weighted_posterior(posterior, y, [mode], 300, index)
+        share = found.weight
         pareto.append(float(found.weights.k))
         rank = float(share @ (found.draws[:, 0] < np.log(theta[0])))
         ranks.append(rank)

@@ -14,13 +14,19 @@ def test_weighted_draws_have_the_moments_of_their_density():
     factor = np.array([[2.0, 0.0, 0.0], [0.5, 1.0, 0.0], [0.0, -0.3, 0.4]])
     target = stats.multivariate_normal([1.0, -2.0, 3.0], factor @ factor.T)
     mode = SimpleNamespace(point=target.mean + [1.0, 0.0, 0.2], curvature=SimpleNamespace(factor=0.8 * factor))
-    draws, found, _ = weighted(target.logpdf, [mode], 20_000, 0)
-    mean, covariance = moments(draws, np.exp(found.log_weight[0]))
+    draws, found, _ = every = weighted(target.logpdf, [mode], 20_000, 0)
+    mean, covariance = moments(draws, every.weight)
     # Without the second t distribution it is below 12,000.
     assert found.k < 0.5 and found.ess > 15_000
     variance = np.diag(target.cov)
     np.testing.assert_array_less(np.abs(mean - target.mean), 4 * np.sqrt(variance / found.ess))
     np.testing.assert_allclose(np.diag(covariance), variance, rtol=4 * np.sqrt(2 / found.ess))
+    summary, taken = every.summary, every.resampled(5_000, 0)
+    np.testing.assert_allclose(summary["posterior_mean"], mean)
+    np.testing.assert_allclose(summary["posterior_sd"], np.sqrt(np.diag(covariance)))
+    assert (summary["k"], summary["ess"]) == (found.k, found.ess)
+    assert taken.shape == (5_000, 3)
+    np.testing.assert_array_less(np.abs(taken.mean(axis=0) - target.mean), 4 * np.sqrt(variance / 4_000))
     with pytest.raises(ValueError, match="no curvature"):
         weighted(target.logpdf, [SimpleNamespace(point=mode.point, curvature=None)], 10, 0)
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import xarray as xr
 from scipy import stats
 
 from lfm_ppl.engine.task import Task
@@ -15,6 +14,7 @@ from lfm_ppl.experiments.ballistic import figures, parameters, problem, smoothin
 from lfm_ppl.experiments.datasets import Column, Kind, part, row
 from lfm_ppl.experiments.scores import paired_ratio, sd_of
 from lfm_ppl.experiments.study import Data, Study, Table, setting
+from lfm_ppl.experiments.tasks import Tasks, in_order, slug
 
 UNKNOWN = {"most likely parameters": "likely", "parameters integrated out": "posterior"}
 ERRORS = {"RMSE {path} ({unit})": "rmse", "coverage {path}": "coverage", "CPU s": "seconds"}
@@ -45,32 +45,25 @@ class Settings(study.Settings):
 
 
 def all_tasks(settings: Settings) -> list[Task]:
-    """Return every task: those of the first targets first, so that the time left can be told."""
-    def task(name: str, what: str, **own: Any) -> Task:
-        return Task(name, settings.seed, {"experiment": "ballistic", "what": what, **own})
-
-    def blocks(what: str, count: int, size: int, name: str, **own: Any) -> list[Task]:
-        return [task(f"{name}/{first:04d}-{last:04d}", what, first=first, last=last, **own)
-                for first, last in study.blocks(count, size)]
-
-    weighted = {"draws": settings.draws, "paths": settings.paths}
-    found = [one for rule in settings.rules for one in blocks(
-        "tracking", settings.runs, 50, f"tracking/{study.slug(rule)}", method=rule)]
-    found += blocks("parameters", settings.runs, 10, "parameters", **weighted)
-    found += [task(f"particles/{count}/{index:04d}", "particles", particles=count, index=index, steps=2, draws=4_000)
-              for count in settings.particles for index in range(min(settings.runs, settings.particle_runs))]
-    for index in range(min(settings.runs, settings.chain_runs)):
-        for sampler in parameters.SAMPLERS:
-            size = dict(zip(("chains", "warmup", "draws", "thin"), getattr(settings, sampler.lower()), strict=True))
-            found.append(task(f"chains/{sampler}/{index:04d}", "chains", sampler=sampler, index=index, **size))
-    found += blocks("drawn", settings.drawn_runs, 10, "drawn", **weighted)
-    found += blocks("known", settings.runs, 50, "known")
-    return sorted(found, key=lambda one: one.settings.get("index", one.settings.get("first")))
+    """Return every task."""
+    few, chained = (min(settings.runs, count) for count in (settings.particle_runs, settings.chain_runs))
+    tasks, weighted = Tasks("ballistic", settings.seed), {"draws": settings.draws, "paths": settings.paths}
+    found = [*(one for rule in settings.rules
+               for one in tasks.blocks(f"tracking/{slug(rule)}", settings.runs, 50, method=rule)),
+             *tasks.blocks("parameters", settings.runs, 10, **weighted),
+             *(one for count in settings.particles
+               for one in tasks.each(f"particles/{count}", few, particles=count, steps=2, draws=4_000)),
+             *(one for sampler in parameters.SAMPLERS for one in tasks.each(
+                 f"chains/{sampler}", chained, sampler=sampler,
+                 **dict(zip(chains.LENGTHS, getattr(settings, sampler.lower()), strict=True)))),
+             *tasks.blocks("drawn", settings.drawn_runs, 10, **weighted),
+             *tasks.blocks("known", settings.runs, 50)]
+    return in_order(found)
 
 
 def tables(settings: Settings, data: Data) -> dict[str, Table]:
     """Return the tables."""
-    few, chained = (min(settings.runs, count) for count in (settings.particle_runs, settings.chain_runs))
+    few, chained = (data[what].sizes["dataset"] for what in ("particles", "chains"))
     return {"tracking": Table.of(f"Means over {settings.runs} targets (standard errors)", tracked(data)),
             "particles": Table.of(f"Particles against the Gaussian filter and smoother, {few} targets",
                                   against_particles(data)),
@@ -155,11 +148,10 @@ COVERED: dict[str, Column] = {f"coverage {level:.0%}": _coverage(level) for leve
 
 def agreement(data: Data) -> dict[str, Any]:
     """Return how NUTS, RAM and weighted draws agree, see `chains.agreement`; chains' times are with compilation."""
-    found, all_ = data["chains"], data["parameters"]
-    weighted = xr.Dataset({"mean": all_.posterior_mean, "sd": all_.posterior_sd, "k": all_.k, "seconds": all_.seconds,
-                           "ess": all_.ess.expand_dims(parameter=all_.parameter)})
+    found, weighted = data["chains"], data["parameters"]
     samplers = {name: found.sel(sampler=name) for name in parameters.SAMPLERS}
-    samplers["weighted draws"] = weighted.isel(dataset=slice(found.sizes["dataset"]))
+    samplers["weighted draws"] = part(weighted, "posterior").assign(weighted[["k", "ess", "seconds"]]).isel(
+        dataset=slice(found.sizes["dataset"]))
     return {name: chains.compared(one, None if name == "NUTS" else samplers["NUTS"]) for name, one in samplers.items()}
 
 

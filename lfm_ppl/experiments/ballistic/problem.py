@@ -11,9 +11,9 @@ import numpy as np
 from numpyro import handlers
 
 from lfm_ppl import loading
-from lfm_ppl.experiments.posteriors import LogPosterior
 from lfm_ppl.inference.bound_model import bind
 from lfm_ppl.inference.handlers.fixing import fix
+from lfm_ppl.inference.log_posterior import LogPosterior
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.model.simulate import simulate
 

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import xarray as xr
 
 from lfm_ppl.engine.run import Reporter
 from lfm_ppl.engine.task import Task
@@ -158,9 +157,7 @@ def agreement(data: Data) -> dict[str, Any]:
         nuts = data["nuts"].sel({"method": method}).rename(first="dataset").dropna("parameter", how="all")
         same = {name: slice(nuts.sizes[name]) for name in ("dataset", "parameter")}
         likely, weighted = (data[what].sel({"method": method}).isel(same) for what in ("track", "posterior"))
-        moments = xr.Dataset({"mean": weighted.posterior_mean, "sd": weighted.posterior_sd,
-                              "ess": weighted.ess.broadcast_like(weighted.posterior_mean)})
-        shift, ratio = chains.agreement(moments, nuts)
+        shift, ratio = chains.agreement(part(weighted, "posterior").assign(ess=weighted.ess), nuts)
         rows[method] = {"windows": nuts.sizes["dataset"], "means apart (sd)": shift.value, "ratio of sds": ratio.value}
         for test, (name, sampler) in itertools.product(problem.TESTED, (("NUTS", nuts), ("weighted", weighted))):
             rows[method] |= cell(f"gain {test}, {name}", sampler[f"{test}_ell"] - likely[f"{test}_ell"])

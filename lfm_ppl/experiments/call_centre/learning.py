@@ -11,7 +11,7 @@ import numpy as np
 from lfm_ppl.experiments.call_centre import problem
 from lfm_ppl.experiments.call_centre.problem import Method
 from lfm_ppl.inference.optimise import End, Minimum, quasi_newton
-from lfm_ppl.results.importance_at_modes import Weighted, weighted
+from lfm_ppl.results.importance_at_modes import Weighted, weighted_posterior
 
 LIMITS = {"mean": (1.0, 30.0), "scale": (0.1, 30.0), "lengthscale": (10.0, 10_000.0), "memory": (0.2, 10_000.0),
           "noise_sd": (0.01, 5.0)}
@@ -53,8 +53,7 @@ def searches(method: Method, y: np.ndarray, prior: float = 0.0) -> tuple[list[En
 
 def posterior(method: Method, y: np.ndarray, count: int, seed: int) -> Weighted:
     """Return ``count`` importance samples of z about all modes; method and readings as for `searches`."""
-    density = problem.posterior(method).log_densities_of
-    return weighted(lambda draws: np.sum(density(draws, y), axis=0), modes(method, y), count, seed)
+    return weighted_posterior(problem.posterior(method), y, modes(method, y), count, seed)
 
 
 def modes(method: Method, y: np.ndarray) -> list[Minimum]:

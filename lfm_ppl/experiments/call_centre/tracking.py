@@ -26,13 +26,11 @@ from lfm_ppl.experiments import chains, scores
 from lfm_ppl.experiments.call_centre import problem
 from lfm_ppl.experiments.call_centre.learning import posterior, searches
 from lfm_ppl.experiments.call_centre.problem import FIRST, GRID, TESTED, Method, Window
-from lfm_ppl.experiments.study import stacked
+from lfm_ppl.experiments.tasks import indices, stacked
 from lfm_ppl.filtering.filter import filter
 from lfm_ppl.filtering.smoother import smooth
 from lfm_ppl.linalg import congruence, matmul
 from lfm_ppl.model.state_space import state_space
-from lfm_ppl.results import importance
-from lfm_ppl.results.importance_at_modes import moments
 
 STEPS = 3
 """Integration steps in five minutes, about as long as those of the model file."""
@@ -125,9 +123,8 @@ def method_of(task: Task) -> Method:
 
 def windows_of(task: Task) -> list[Window]:
     """Return the windows of a task."""
-    given = task.settings
-    return [problem.window(given["data"], given["weekday"], given["first"] + index, task.seed)
-            for index in range(given["count"])]
+    data, weekday = task.settings["data"], task.settings["weekday"]
+    return [problem.window(data, weekday, index, task.seed) for index in indices(task)]
 
 
 def most_likely(task: Task) -> Result:
@@ -159,12 +156,9 @@ def marginalised(task: Task) -> Result:
     """
     method, windows, rows = method_of(task), windows_of(task), []
     for seed, window in enumerate(windows, task.seed):
-        draws, weights, mass = posterior(method, window.training, task.settings["draws"], seed)
-        mean, covariance = moments(draws, np.exp(weights.log_weight[0]))
-        chosen = draws[importance.resample(weights.log_weight, task.settings["mixed"], seed)]
-        rows.append({"k": weights.k, "ess": weights.ess, "modes": len(mass), "beyond": mass[1:].sum(),
-                     "posterior_mean": mean, "posterior_sd": np.sqrt(np.diag(covariance)),
-                     **mixed(method, chosen, window)})
+        found = posterior(method, window.training, task.settings["draws"], seed)
+        rows.append({**found.summary, "modes": len(found.mixture_weights), "beyond": found.mixture_weights[1:].sum(),
+                     **mixed(method, found.resampled(task.settings["mixed"], seed), window)})
     (best, *_), _ = searches(method, windows[0].training)
     path = track(method, best.point, windows[0].y["constant"], TESTED["constant"], smoothed=True)
     return stacked(rows) | {"shapes": np.asarray(path.arrivals), "shapes_sd": np.asarray(path.arrivals_sd)}

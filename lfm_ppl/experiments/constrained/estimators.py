@@ -18,18 +18,21 @@ from lfm_ppl.constrained.posterior import ConstrainedPosterior, constrained_post
 from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments.constrained import problem
 from lfm_ppl.experiments.constrained.problem import FACTOR, HORMONE, TIMES, WINDOW
-from lfm_ppl.experiments.scores import Z
+from lfm_ppl.experiments.scores import Z, covered, rmse
+from lfm_ppl.experiments.tasks import indices
 from lfm_ppl.filtering.smoother import smooth
+from lfm_ppl.inference.log_posterior import LogPosterior
 from lfm_ppl.inference.optimise import newton, quasi_newton
 from lfm_ppl.linearisation.sigma_points import GaussHermite
-from lfm_ppl.results import importance_at_modes
+from lfm_ppl.results.importance_at_modes import weighted_posterior
 
 NEAR = 1.0
 """Hours within which a peak counts as found."""
 
 _SEARCH = {"ftol": 1e-10, "gtol": 1e-4}
 _FURTHEST = float(np.log(TIMES[-1] / 2.0))
-"""Largest logarithm of the lengthscale that is learnt from 60 samples, whose likelihood often has no maximum."""
+"""How far from its start, in logarithms, a lengthscale is learnt from 60 samples: their likelihood often has no
+maximum."""
 _LENGTHSCALES = np.geomspace(0.02, 1000.0, 12)
 """Among which a lengthscale that is a state of the cost is searched for first (s); the last is as good as infinity."""
 _BELOW = np.array([0.0, 0.01, 0.025, 0.04])
@@ -42,10 +45,9 @@ def _compiled(estimate: Callable) -> Callable[..., Any]:
     return jax.jit(jax.vmap(estimate))
 
 
-def posterior_mode(posterior: Any, y: np.ndarray, prior: float = 1.0, furthest: float = np.inf) -> np.ndarray:
-    """Return the mode (P,) of the density of logarithms of parameters, no further from their medians than that."""
-    medians = dict(zip(posterior.bound.names, posterior.bound.draw(jax.random.key(0)), strict=True))
-    start = np.array([medians[name] for name in posterior.names])
+def posterior_mode(posterior: LogPosterior, y: np.ndarray, prior: float = 1.0, furthest: float = np.inf) -> np.ndarray:
+    """Return the mode (P,) of the density of logarithms of parameters, no further from the start than that."""
+    start = posterior.start
     bounds = np.stack([start - furthest, start + furthest], axis=1)
     return quasi_newton(posterior.objective(y, prior), start, bounds=bounds, options=_SEARCH).point
 
@@ -164,7 +166,7 @@ def transcription(task: Task) -> Result:
     ends of the band, and its ``truth`` (T,). ``hyperparameters/{kind}`` (N, P) begin with the lengthscale.
     """
     y, truth = map(np.stack, zip(*(problem.record(task.settings["shape"], index, task.seed)
-                                   for index in problem.indices(task)), strict=True))
+                                   for index in indices(task)), strict=True))
     methods = {label: METHODS[label] for label in task.settings["methods"]}
     learnt = {kind: _learnt(kind, y) for kind in dict.fromkeys(method.learnt for method in methods.values())}
     result: Result = {f"hyperparameters/{kind}": values for kind, values in learnt.items()} | {"truth": truth[0]}
@@ -245,9 +247,9 @@ def _target(y: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 def ballistic(task: Task) -> Result:
     """Return ``rmse`` (N, 3) and ``converged`` (N,), and the first target's ``estimate`` and ``truth`` (3, T)."""
-    y, truth = map(np.stack, zip(*(problem.target(index, task.seed) for index in problem.indices(task)), strict=True))
+    y, truth = map(np.stack, zip(*(problem.target(index, task.seed) for index in indices(task)), strict=True))
     paths, converged = map(np.asarray, _compiled(_target)(y))
-    return {"rmse": np.sqrt(((paths - truth) ** 2).mean(axis=2)), "converged": converged, "estimate": paths[0],
+    return {"rmse": rmse(paths, truth), "converged": converged, "estimate": paths[0],
             "truth": truth[0]}
 
 
@@ -283,11 +285,11 @@ def thyroid(task: Task) -> Result:
     ``lowest`` (N,) is the least of all concentrations. Logarithms of parameters at the mode ``z`` (N, P), and ``draws``
     (N, D, P) with their Pareto index ``k`` (N,); ``y`` (T, 3) of the first patient at the times ``measured`` (T,).
     """
-    indices, posterior = problem.indices(task), problem.thyroid_learning()
-    patients = [problem.patient(index, task.seed) for index in indices]
+    posterior = problem.thyroid_learning()
+    patients = [problem.patient(index, task.seed) for index in indices(task)]
     y = np.stack([patient.y for patient in patients])
     z = np.stack([posterior_mode(posterior, values) for values in y])
-    seeds = [problem.MOST * task.seed + index for index in indices]
+    seeds = [problem.MOST * task.seed + index for index in indices(task)]
     counts = task.settings["draws"], task.settings["weighted"]
     draws, k = map(np.stack, zip(*(drawn(posterior, *own, *counts) for own in zip(y, z, seeds, strict=True)),
                                  strict=True))
@@ -299,11 +301,11 @@ def thyroid(task: Task) -> Result:
     errors = [_apart(when(times, found["mode"]), when(times, truth)) for when in (peak, acrophase)]
     return found | {
         "times": times, "truth": truth, "z": z, "draws": draws, "k": k, "peak": np.stack(errors, axis=1),
-        "coverage": ((found["low"] <= truth) & (truth <= found["high"])).mean(axis=1),
-        "rmse": np.sqrt(((found["mode"] - truth) ** 2).mean(axis=1)), "y": y[0], "measured": patients[0].times}
+        "coverage": covered(found["low"], found["high"], truth), "rmse": rmse(found["mode"], truth), "y": y[0],
+        "measured": patients[0].times}
 
 
-def drawn(posterior: Any, y: np.ndarray, mode: np.ndarray, seed: int, draws: int,
+def drawn(posterior: LogPosterior, y: np.ndarray, mode: np.ndarray, seed: int, draws: int,
           weighted: int) -> tuple[np.ndarray, float]:
     """Return draws (draws, P) of the logarithms of parameters from their posterior, and the weights' Pareto index.
 
@@ -313,9 +315,8 @@ def drawn(posterior: Any, y: np.ndarray, mode: np.ndarray, seed: int, draws: int
     minimum = newton(posterior.objective(y), mode)
     if minimum.curvature is None:
         return np.tile(mode, (draws, 1)), np.inf
-    found = importance_at_modes.weighted(
-        lambda z: np.sum(posterior.log_densities_of(z, y), axis=0), [minimum], weighted, seed)
-    share = np.cumsum(np.exp(found.weights.log_weight[0]))
+    found = weighted_posterior(posterior, y, [minimum], weighted, seed)
+    share = np.cumsum(found.weight)
     chosen = np.searchsorted(share / share[-1], (np.arange(draws) + 0.5) / draws)
     return found.draws[chosen], found.weights.k
 

@@ -15,6 +15,7 @@ from lfm_ppl.experiments.constrained.estimators import BANDS, FULL, METHODS, SMO
 from lfm_ppl.experiments.datasets import Column, Kind, row
 from lfm_ppl.experiments.scores import SE, rate_of
 from lfm_ppl.experiments.study import Data, Study, Table, setting
+from lfm_ppl.experiments.tasks import blocks, slug
 from lfm_ppl.results.importance import LARGEST_K
 
 
@@ -48,9 +49,9 @@ def all_tasks(settings: Settings) -> list[Task]:
         ("ballistic", "", settings.targets, {}),
         ("thyroid", "", settings.patients, {"draws": settings.draws, "weighted": settings.weighted}),
         *(("transcription", shape, settings.runs, {"methods": list(settings.methods)}) for shape in settings.shapes)]
-    return [Task("/".join(filter(None, [what, study.slug(shape), f"{first:04d}"])), settings.seed, {
+    return [Task("/".join(filter(None, [what, slug(shape), f"{first:04d}"])), settings.seed, {
         "experiment": "constrained", "what": what, "shape": shape, "first": first, "count": last - first + 1, **own})
-        for what, shape, count, own in kinds for first, last in study.blocks(count, settings.block)]
+        for what, shape, count, own in kinds for first, last in blocks(count, settings.block)]
 
 
 class ByMethod(Kind):
@@ -61,7 +62,7 @@ class ByMethod(Kind):
         each, found = [], {}
         for task in tasks:
             for method in task.settings["methods"]:
-                one = Task(f"{task.name}/{study.slug(method)}", task.seed, {**task.settings, "method": method})
+                one = Task(f"{task.name}/{slug(method)}", task.seed, {**task.settings, "method": method})
                 result = {name.removeprefix(f"{method}/"): value for name, value in results[task.name].items()}
                 learnt = result[f"hyperparameters/{estimators.METHODS[method].learnt}"]
                 found[one.name] = result | {"lengthscale": learnt[:, 0]}

@@ -14,10 +14,9 @@ import numpyro.distributions as dist
 from scipy.signal import lfilter
 
 from lfm_ppl import loading
-from lfm_ppl.engine.task import Task
-from lfm_ppl.experiments.posteriors import LogPosterior
 from lfm_ppl.forces import Matern
 from lfm_ppl.inference.bound_model import bind, likelihood_site
+from lfm_ppl.inference.log_posterior import LogPosterior
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.linearisation.sigma_points import Cubature, GaussHermite
 from lfm_ppl.model.gaussian import Gaussian
@@ -46,11 +45,6 @@ PUBLISHED = {"smoother": 0.0192, "delayed MHE": 0.0103}
 """Mean squared errors of the force in the source, of one realisation."""
 _FINE = 10
 """Cells of the simulation between two samples."""
-
-
-def indices(task: Task) -> range:
-    """Return which records, targets or patients a task is about."""
-    return range(task.settings["first"], task.settings["first"] + task.settings["count"])
 
 
 class Record(NamedTuple):

@@ -10,10 +10,12 @@ import xarray as xr
 
 from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import study
+from lfm_ppl.experiments.chains import LENGTHS
 from lfm_ppl.experiments.datasets import Column, Kind, row
 from lfm_ppl.experiments.ginzburg_landau import figures, parameters, problem, states
 from lfm_ppl.experiments.scores import Estimate
 from lfm_ppl.experiments.study import CHAINS, Data, Study, Table, setting
+from lfm_ppl.experiments.tasks import Tasks, in_order, slug
 
 
 @dataclass(frozen=True)
@@ -47,16 +49,11 @@ class Settings(study.Settings):
 
 
 def all_tasks(settings: Settings) -> list[Task]:
-    """Return every task: all methods on the first realisations, then on the next, so that the time left can be told.
+    """Return every task: all methods on the first realisations, then on the next.
 
     The figure of the conditional posteriors has a task of its own, with as many particles as the source.
     """
-    def task(name: str, **own: Any) -> Task:
-        return Task(name, settings.seed, {"experiment": "ginzburg-landau", **own})
-
-    def repeated(name: str, **own: Any) -> list[Task]:
-        return [task(f"{name}/{index:03d}", index=index, **own) for index in range(settings.realisations)]
-
+    tasks, count = Tasks("ginzburg-landau", settings.seed, digits=3), settings.realisations
     steps, particle_steps = {"steps": problem.STEPS}, {"steps": parameters.PARTICLE_STEPS}
     at_truth: dict[str, dict[str, Any]] = {
         problem.PARTICLES: {"particles": settings.particles, "smoother_particles": settings.smoother_particles,
@@ -66,20 +63,20 @@ def all_tasks(settings: Settings) -> list[Task]:
                    problem.GRID: {"cells": settings.cells}}
     priors = {name: list(ends) for name, ends in parameters.INTERVALS.items()}
     posterior: dict[str, Any] = {"what": "conditional", "nodes": settings.nodes, "intervals": priors}
-    found = [one for method in problem.METHODS for one in repeated(
-        f"state/{study.slug(method)}", what="state", method=method, **at_truth.get(method, steps))]
-    found += [task(f"conditional/{study.slug(method)}/{first:03d}-{last:03d}", method=method, first=first, last=last,
-                   **posterior, **likelihoods.get(method, steps))
-              for method in problem.METHODS for first, last in study.blocks(settings.conditional, 10)]
-    found.append(task("conditional-figure/particle-filter", method=problem.PARTICLES, first=settings.figure,
-                      last=settings.figure, particles=settings.particles, **particle_steps, **posterior))
+    found = [one for method in problem.METHODS for one in tasks.each(
+        f"state/{slug(method)}", count, method=method, **at_truth.get(method, steps))]
+    found += [one for method in problem.METHODS for one in tasks.blocks(
+        f"conditional/{slug(method)}", settings.conditional, 10, method=method, **posterior,
+        **likelihoods.get(method, steps))]
+    found.append(tasks.one("conditional-figure/particle-filter", method=problem.PARTICLES, first=settings.figure,
+                           last=settings.figure, particles=settings.particles, **particle_steps, **posterior))
     kernels = {"RAM": steps, "NUTS": steps | {"tree_depth": settings.tree_depth}, "PMMH": {
         "particles": settings.marginal_particles, "steps": settings.marginal_steps, "cells": settings.draw_cells}}
     for label, (kernel, _) in parameters.SAMPLERS.items():
-        size = dict(zip(("warmup", "draws", "thin"), getattr(settings, kernel.lower()), strict=True))
-        found += repeated(f"mcmc/{study.slug(label)}", what="mcmc", sampler=label, chains=parameters.CHAINS,
-                          paths=settings.paths, **size, **kernels[kernel])
-    return sorted(found, key=lambda one: one.settings.get("index", one.settings.get("first")))
+        size = dict(zip(LENGTHS, (parameters.CHAINS, *getattr(settings, kernel.lower())), strict=True))
+        found += tasks.each(f"mcmc/{slug(label)}", count, sampler=label, paths=settings.paths, **size,
+                            **kernels[kernel])
+    return in_order(found)
 
 
 def tables(settings: Settings, data: Data) -> dict[str, Table]:

@@ -19,6 +19,7 @@ from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.chains import nuts
 from lfm_ppl.experiments.ginzburg_landau import problem, states
+from lfm_ppl.experiments.tasks import indices
 from lfm_ppl.experiments.timing import timed
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.fokker_planck_grid import grid_filter
@@ -64,11 +65,10 @@ def nodes(name: str, count: int) -> np.ndarray:
 def conditional(task: Task) -> Result:
     """Return ``log_likelihood`` (realisations, 3, nodes), and CPU ``seconds`` for all of them, without compilation."""
     settings = task.settings
-    indices = np.arange(settings["first"], settings["last"] + 1)
-    data = [problem.realisation(int(index), task.seed) for index in indices]
+    data = [problem.realisation(index, task.seed) for index in indices(task)]
     run = _likelihoods(settings["method"], settings.get("particles", settings.get("cells")), settings.get("steps", 1),
                        tuple(data[0].times), len(data), settings["nodes"])
-    keys = jax.vmap(functools.partial(jax.random.fold_in, jax.random.key(task.seed)))(indices)
+    keys = jax.vmap(functools.partial(jax.random.fold_in, jax.random.key(task.seed)))(np.array(indices(task)))
     seconds, values = timed(run, np.stack([one.y for one in data]), keys)
     return {"log_likelihood": np.asarray(values).reshape(len(data), 3, -1), "seconds": seconds}
 

@@ -51,16 +51,15 @@ def compute(task: Task) -> Result:
     return found | judged("filter", found, data.path) | judged("smoother", found, data.path)
 
 
-def judged(what: str, found: Result, path: np.ndarray) -> dict[str, float]:
+def judged(what: str, found: Result, path: np.ndarray) -> Result:
     """Return ``{what}_rmse``, and ``{what}_coverage``, the share of the path that lies in the 95% band."""
-    return {f"{what}_rmse": scores.rmse(found[f"{what}_mean"], path),
-            f"{what}_coverage": scores.covered(found[f"{what}_low"], found[f"{what}_high"], path)}
+    return scores.judged(what, found[f"{what}_mean"], (found[f"{what}_low"], found[f"{what}_high"]), path)
 
 
 def band(what: str, mean: Any, sd: Any) -> Result:
     """Return mean and 95% band of a Gaussian as entries of a result."""
-    mean, sd = np.asarray(mean), np.asarray(sd)
-    return {f"{what}_mean": mean, f"{what}_low": mean - scores.Z * sd, f"{what}_high": mean + scores.Z * sd}
+    low, high = scores.interval(mean, sd)
+    return {f"{what}_mean": np.asarray(mean), f"{what}_low": low, f"{what}_high": high}
 
 
 def size_of(settings: Any, data: problem.Realisation) -> int:

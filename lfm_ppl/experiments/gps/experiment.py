@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -108,23 +109,22 @@ def _none_left(results: Results) -> ValueError:
 class SatelliteStudy(Study):
     """A study of the satellites that can be predicted; its data say what groups have in common, and who is left out."""
 
-    def gathered(self, settings: Settings, results: Results) -> Data:
+    def gathered(self, settings: Settings, results: Results, tasks: Sequence[Task] | None = None) -> Data:
         """Return the results by satellite, without those refused, the ``prior`` of each group, and who is ``left out``.
 
         Raises:
             ValueError: no satellite can be predicted.
         """
-        data, following = {}, plan_predictions(settings, results)
-        usable = [task for task in [*plan(settings), *following] if REFUSED not in results[task.name]]
-        for what, kind in self.kinds.items():
-            if tasks := [task for task in usable if self.what(task) == what]:
-                data[what] = kind.gathered(tasks, results)
+        data, asked = {}, self.by_kind(settings, results, tasks)
+        for what, own in asked.items():
+            if usable := [task for task in own if REFUSED not in results[task.name]]:
+                data[what] = self.kinds[what].gathered(usable, results)
         if "predict" not in data:
             raise _none_left(results)
         found = data["predict"]
         data["predict"] = found.assign_coords(system=("satellite", [*map(problem.system, found.satellite.values)]))
         priors = {_group(task.settings["satellite"], task.settings["orbit"]): task.settings["prior"]
-                  for task in following if self.what(task) == "predict"}
+                  for task in asked["predict"]}
         data["prior"] = xr.DataArray(list(priors.values()), {
             "group": list(priors), "moment": ["mean", "sd"], "magnitude": list(magnitudes.names(settings.axes))}
             ).to_dataset("moment")
@@ -137,7 +137,8 @@ class SatelliteStudy(Study):
 def tables(settings: Settings, data: Data) -> dict[str, Table]:
     """Return the tables."""
     each = satellites(data)
-    found = {"pooled": Table.of("Errors after training (m), pooled over satellites, and 95% coverage", pooled(data)),
+    found = {"pooled": Table.of("Errors after training (m), pooled over satellites, and 95% coverage",
+                                 pooled(data["predict"], each)),
              "satellites": Table("Each satellite: root mean square errors after training (m)", each, pd.DataFrame(
                  {name: each[name].map(form.format) for name, form in _PRINTED.items()})),
              "magnitudes": Table("", magnitudes_of(data))}
@@ -165,13 +166,13 @@ def satellites(data: Data) -> pd.DataFrame:
                         | {name: column.values for name, column in columns.items()}, found.satellite.values)
 
 
-def pooled(data: Data) -> dict[str, Any]:
-    """Return one row a group of satellites: pooled errors in metres, ratios and coverage.
+def pooled(found: xr.Dataset, each: pd.DataFrame) -> dict[str, Any]:
+    """Return one row a group of `satellites`: pooled errors in metres, ratios and coverage.
 
     Satellites with gaps stand apart: a gap is often a manoeuvre, which no model of small forces predicts. Several
     constellations are pooled each by itself, too.
     """
-    found, each, rows = data["predict"], satellites(data), {}
+    rows: dict[str, Any] = {}
     complete, eclipsed, system = (found[name].values for name in ("complete", "eclipsed", "system"))
     groups = {"without gaps": complete, "without gaps, never in shadow": complete & ~eclipsed,
               "without gaps, in shadow": complete & eclipsed, "with gaps": ~complete}

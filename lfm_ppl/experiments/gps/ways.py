@@ -10,10 +10,11 @@ import numpy as np
 import numpyro
 import numpyro.distributions as dist
 import xarray as xr
-from numpyro.infer import MCMC, init_to_value
+from numpyro.infer import init_to_value
 
 from lfm_ppl import orbits
 from lfm_ppl.engine.task import Result, Task
+from lfm_ppl.experiments import chains
 from lfm_ppl.experiments.datasets import DATASET, Column, number, row
 from lfm_ppl.experiments.gps.figures import METRE
 from lfm_ppl.experiments.gps.satellite import given
@@ -58,7 +59,7 @@ def _posterior(data: Training, prior: Prior, start: np.ndarray, key: jax.Array) 
 
     strategy = init_to_value(values={"logarithms": jnp.asarray(start)})
     kernel = RAM(model, initial_covariance=(0.1 * prior.sd) ** 2, init_strategy=strategy)
-    chain = MCMC(kernel, num_warmup=_WARMUP, num_samples=_SAMPLES, progress_bar=False)
+    chain = chains.sampler(kernel, 1, _WARMUP, _SAMPLES)
     chain.run(key, data.regression)
     return np.asarray(chain.get_samples()["logarithms"])[::_SAMPLES // DRAWS][:DRAWS]
 

@@ -17,6 +17,7 @@ from lfm_ppl.experiments.datasets import Column, Kind, cell, number, part, row
 from lfm_ppl.experiments.home_heating import figures, prediction, problem
 from lfm_ppl.experiments.scores import Estimate, pair
 from lfm_ppl.experiments.study import Data, Study, Table, setting
+from lfm_ppl.experiments.tasks import slug
 
 PUBLISHED = {
     "SQM": {5: (0.67, 0.13, -116, 15), 6: (0.22, 0.02, 56, 15), 7: (1.00, 0.16, -190, 28), 8: (0.22, 0.02, 51, 14)},
@@ -79,7 +80,7 @@ def tasks(settings: Settings) -> list[Task]:
     found = []
     for store, method in ((store, method) for store in settings.stores for method in settings.methods):
         model = {"experiment": "home-heating", "functions": settings.functions, "store": store, "method": method}
-        name, seed = f"{study.slug(store)}/{method}", settings.seed
+        name, seed = f"{slug(store)}/{method}", settings.seed
         if settings.data is not None:
             count = len(problem.house(settings.data)[:settings.windows])
             house = {**model, "data": str(Path(settings.data).resolve()), "windows": count}
@@ -97,7 +98,7 @@ def tables(settings: Settings, data: Data) -> dict[str, Table]:
     found = {}
     for store in settings.stores:
         for what in (what for what in ("house", "homes") if what in data):
-            found[f"{what}-{study.slug(store)}"] = Table.of(
+            found[f"{what}-{slug(store)}"] = Table.of(
                 TITLES[what].format(store, data[what].sizes["dataset"]), fifth_day(data[what].sel(store=store), what))
         if store == settings.stores[0] and "posterior" in data:
             found["posterior"] = Table.of(TITLES["posterior"].format(store, data["posterior"].sizes["dataset"]),

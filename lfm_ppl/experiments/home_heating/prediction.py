@@ -17,11 +17,11 @@ from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import chains, scores, timing
 from lfm_ppl.experiments.home_heating import problem
 from lfm_ppl.experiments.home_heating.problem import FINE, TIMES, TRAIN, Model, Window
-from lfm_ppl.experiments.posteriors import LogPosterior
-from lfm_ppl.experiments.study import stacked
+from lfm_ppl.experiments.tasks import stacked
 from lfm_ppl.filtering.filter import FilterState
 from lfm_ppl.inference.bound_model import bind_arguments
 from lfm_ppl.inference.kernels.ram import RAM
+from lfm_ppl.inference.log_posterior import LogPosterior
 from lfm_ppl.inference.optimise import quasi_newton
 from lfm_ppl.switching.mixture import Mixture
 from lfm_ppl.switching.rao_blackwellised import RaoBlackwellisedResult, rao_blackwellised
@@ -208,7 +208,7 @@ def gaussian_scores(mean: np.ndarray, variance: np.ndarray, truth: np.ndarray) -
     """Return root mean squared error, sum of the log densities of all measurements, and share in 95% bands."""
     sd = np.sqrt(variance)
     return {"rmse": scores.rmse(mean, truth), "ell": float(norm.logpdf(truth, mean, sd).sum()),
-            "inside": scores.covered(mean - scores.Z * sd, mean + scores.Z * sd, truth)}
+            "inside": scores.covered(*scores.interval(mean, sd), truth)}
 
 
 def thermostat_ahead(model: Model, window: Window, z: np.ndarray, particles: int,
@@ -227,6 +227,6 @@ def thermostat_ahead(model: Model, window: Window, z: np.ndarray, particles: int
     indoor, truth = Mixture(day.mean[:, :, :1], day.variance[:, :, :1], day.log_weights), window.fine[SCORED, :1]
     mean, away = indoor.moments()[0], (truth[:, None] - indoor.mean) / jnp.sqrt(indoor.variance)
     below = (np.exp(day.log_weights) * ndtr(away)[:, :, 0]).sum(axis=1)
-    return {"rmse": scores.rmse(mean, truth), "ell": float(indoor.log_density(truth).sum()),
+    return {"rmse": scores.rmse(mean[:, 0], truth[:, 0]), "ell": float(indoor.log_density(truth).sum()),
             "inside": float(np.mean(np.abs(below - 0.5) <= 0.475)), "mean": np.asarray(mean)[:, 0],
             "on": np.asarray(found.input_mean)[SCORED]}, found

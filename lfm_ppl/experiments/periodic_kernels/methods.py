@@ -14,7 +14,7 @@ from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.periodic_kernels import problem
 from lfm_ppl.experiments.periodic_kernels.problem import MEASURED, PREDICTED
-from lfm_ppl.experiments.study import stacked
+from lfm_ppl.experiments.tasks import stacked
 from lfm_ppl.forces import Force, Kernel, random_frequencies
 
 EIGENFUNCTIONS, RESONATORS, RANDOM = METHODS = ("eigenfunctions", "resonators", "sparse spectrum")
@@ -112,8 +112,8 @@ def predictions(task: Task) -> Result:
     mean, variance = (np.stack(rows) for rows in zip(*(
         predict(fixed or covariances(task, method, index), data[index]) for index in range(runs)), strict=True))
     density = norm.logpdf(truth, mean, np.sqrt(variance))
-    return {"rmse": np.sqrt(np.mean((truth - mean) ** 2, axis=1)), "log likelihood": density.sum(axis=1),
-            "coverage": np.mean(np.abs(truth - mean) < scores.Z * np.sqrt(variance), axis=1),
+    return {"rmse": scores.rmse(mean, truth), "log likelihood": density.sum(axis=1),
+            "coverage": scores.covered(*scores.interval(mean, np.sqrt(variance)), truth),
             "mean": mean[0], "variance": variance[0]}
 
 

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from lfm_ppl.engine.task import Result
-from lfm_ppl.experiments.study import stacked
+from lfm_ppl.experiments.tasks import stacked
 from lfm_ppl.experiments.timing import timed, timed_again
 from lfm_ppl.experiments.transcription import problem
 from lfm_ppl.filtering.smoother import smooth

@@ -17,7 +17,8 @@ from lfm_ppl.experiments import published, scores, study
 from lfm_ppl.experiments.datasets import Column, Kind, cell, number, row
 from lfm_ppl.experiments.published import Verdict
 from lfm_ppl.experiments.scores import mean_of
-from lfm_ppl.experiments.study import Data, Study, Table, blocks, setting
+from lfm_ppl.experiments.study import Data, Study, Table, setting
+from lfm_ppl.experiments.tasks import blocks, indices
 from lfm_ppl.experiments.transcription import approximations, figures, problem, slices
 
 METHODS = ("LA", "ESLS", "GFS", "GHS(7)", "iterated GHS(7)", "LA, trust region")
@@ -65,11 +66,10 @@ def all_tasks(settings: Settings) -> list[Task]:
 def compute(task: Task) -> Result:
     """Return what the method says of the force of each data set of the task, and how good it is."""
     settings, configuration = task.settings, problem.configuration(task)
-    indices = np.arange(settings["first"], settings["last"] + 1)
-    data = [problem.data_set(configuration, int(index), task.seed) for index in indices]
+    data = [problem.data_set(configuration, index, task.seed) for index in indices(task)]
     if settings["method"] == "ESLS":
         key = Task(f"{problem.slug(configuration.label)}/ESLS", task.seed).key
-        keys = jax.vmap(lambda index: jax.random.fold_in(key, index))(jnp.asarray(indices))
+        keys = jax.vmap(lambda index: jax.random.fold_in(key, index))(jnp.array(indices(task)))
         found = slices.compute(settings, data, keys)
     else:
         found = approximations.compute(settings, data)

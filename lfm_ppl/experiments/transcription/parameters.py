@@ -92,7 +92,7 @@ def compute(task: Task) -> Result:
     kernel: Any = RAM(model, init_strategy=start) if sampler.kernel == "RAM" else NUTS(
         on_latent_grid(model, AT) if sampler.latent else model, init_strategy=start, dense_mass=not sampler.latent,
         max_tree_depth=settings["tree_depth"])
-    mcmc = chains.sampler(kernel, *(settings[name] for name in ("chains", "warmup", "draws", "thin")))
+    mcmc = chains.sampler(kernel, *(settings[name] for name in chains.LENGTHS))
 
     def run() -> dict[str, jax.Array]:
         mcmc.run(task.key, problem.TIMES, data.y, **configuration._asdict())
@@ -114,7 +114,7 @@ def compute(task: Task) -> Result:
     return {"draws": draws, **found, "divergences": int(np.sum(mcmc.get_extra_fields().get("diverging", 0))),
             "seconds": seconds, **scores.diagnose(NAMES, draws), "force_mean": mean, "force_sd": sd,
             "rmse": scores.rmse(mean, truth), "truth": true_values(data),
-            "coverage": scores.covered(mean - scores.Z * sd, mean + scores.Z * sd, truth)}
+            "coverage": scores.covered(*scores.interval(mean, sd), truth)}
 
 
 def true_values(data: problem.DataSet) -> np.ndarray:

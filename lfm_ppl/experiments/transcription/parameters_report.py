@@ -37,7 +37,7 @@ def tasks(settings: Settings) -> list[Task]:
         lengths = getattr(settings, "latent" if sampler.latent else sampler.kernel.lower())
         return Task(f"parameters/{problem.slug(f'{link} {label}')}/{index:03d}", settings.seed, {
             "experiment": "transcription-parameters", "sampler": label, **LINKS[link]._asdict(), "index": index,
-            **dict(zip(("chains", "warmup", "draws", "thin"), lengths, strict=True)), "tree_depth": settings.tree_depth,
+            **dict(zip(chains.LENGTHS, lengths, strict=True)), "tree_depth": settings.tree_depth,
             **({"iterations": sampler.iterations} if sampler.iterations else {})})
 
     return [task(index, link, *one) for index in range(settings.datasets) for link in settings.links

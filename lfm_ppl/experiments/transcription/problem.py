@@ -12,6 +12,7 @@ import numpy as np
 
 from lfm_ppl import loading
 from lfm_ppl.engine.task import Task
+from lfm_ppl.experiments import tasks
 from lfm_ppl.latent_grid.latent_grid import LatentGrid
 from lfm_ppl.model.latent_force_model import LatentForceModel
 
@@ -63,9 +64,8 @@ def configuration(task: Task) -> Configuration:
     return Configuration(task.settings["link"], task.settings["gamma"])
 
 
-def slug(label: str) -> str:
-    """Return a label as part of the name of a task or a file; its brackets stay, as in the names of stored tasks."""
-    return label.replace(", ", "-").replace(" ", "-")
+slug = functools.partial(tasks.slug, dropped=",")
+"""Brackets stay, as in the names of stored tasks."""
 
 
 class Rates(NamedTuple):

@@ -19,7 +19,7 @@ import numpy as np
 
 from lfm_ppl.engine.task import Result
 from lfm_ppl.experiments import scores
-from lfm_ppl.experiments.study import stacked
+from lfm_ppl.experiments.tasks import stacked
 from lfm_ppl.experiments.timing import timed
 from lfm_ppl.experiments.transcription import problem
 from lfm_ppl.inference.kernels.elliptical_slice import SliceState, elliptical_slice_step

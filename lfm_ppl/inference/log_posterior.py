@@ -1,4 +1,4 @@
-"""The posterior of positive parameters in their logarithms, compiled once for all data sets of an experiment."""
+"""The posterior of positive parameters in their logarithms, compiled once for all data sets of one shape."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lfm_ppl.inference.optimise import Objective, value_and_gradient
 
 
 class LogPosterior:
-    """The posterior of a bound model in the logarithms z of its parameters, in the order that an experiment gives them.
+    """The posterior of a bound model in the logarithms z of its parameters, in an order of one's own.
 
     The unconstrained value of a positive parameter is its logarithm, so that z is the bound model's vector, permuted.
 
@@ -40,6 +40,12 @@ class LogPosterior:
                              "expected a prior of positive numbers without an upper end.")
         self._order = np.array([self.names.index(name) for name in bound.names])
         self._forward_mode = bound.forward_mode if forward_mode is None else forward_mode
+
+    @property
+    def start(self) -> np.ndarray:
+        """Where a search may start (P,): the median of a few draws from the prior, always the same ones."""
+        medians = dict(zip(self.bound.names, self.bound.draw(jax.random.key(0)), strict=True))
+        return np.array([medians[name] for name in self.names])
 
     def values(self, z: Any) -> dict[str, jax.Array]:
         """Return every parameter by name; z (P,) may be traced."""

@@ -10,8 +10,8 @@ import systems
 from scipy import stats
 
 import lfm_ppl as lfm
-from lfm_ppl.experiments.posteriors import LogPosterior
 from lfm_ppl.inference.bound_model import bind_arguments
+from lfm_ppl.inference.log_posterior import LogPosterior
 
 TIMES = np.array([0.0, 0.7, 1.1, 2.0])
 SETS = [(jnp.array([[0.4], [0.8], [jnp.nan], [0.7]]) * factor, {"shift": jnp.asarray(factor)}) for factor in (1.0, 2.0)]
@@ -46,6 +46,11 @@ def test_the_densities_are_those_of_the_model_in_the_order_asked_for(bound, name
     found = posterior.likelihood(z, data).model
     np.testing.assert_allclose(found.observation.covariance, system.observation.covariance)
     np.testing.assert_allclose(found.initial_state.mean, system.initial_state.mean)
+    # The medians of 15 draws are within 4 standard errors, 1.25 sd / sqrt(15), of those of the prior.
+    away = {"decay": 0.0, "amount": 1.0}, {"decay": 0.3, "amount": 0.5}
+    medians, sds = (np.array([of[name] for name in names]) for of in away)
+    assert (np.abs(posterior.start - medians) < 4 * 1.25 * sds / np.sqrt(15)).all()
+    np.testing.assert_array_equal(posterior.start, posterior.start)
     several = posterior.log_densities_of(np.stack([z, z + 0.1, z - 0.1]), data, batch=2)
     np.testing.assert_allclose([part[0] for part in several], [expected, prior], rtol=1e-10)
 
