@@ -31,7 +31,7 @@ import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import ModuleType
+from types import MappingProxyType, ModuleType
 from typing import Any, NamedTuple
 
 from lfm_ppl import checks
@@ -73,6 +73,16 @@ class ModelFile:
     _simulate: Callable[..., Data] | None = None
     _prepare: Callable[[Data], Data] | None = None
     _anchors: Callable[[Data], Mapping[str, float]] | None = None
+
+    @property
+    def definitions(self) -> Mapping[str, Any]:
+        """What the file defines beside the model, functions and constants, by name.
+
+        Example:
+            >>> load("epidemic").definitions["FORCE"]
+            'log transmission'
+        """
+        return MappingProxyType(inspect.unwrap(self.model).__globals__)
 
     @property
     def can_simulate(self) -> bool:

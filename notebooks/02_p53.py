@@ -203,7 +203,7 @@ plt.show()
 # The activity of p53 under each shape, median and 95% band: the peak in the first hours is common to all.
 
 # %%
-response, gamma = transcription.model.__globals__["activity"], transcription.options["gamma"][0]
+response, gamma = transcription.definitions["activity"], transcription.options["gamma"][0]
 figure, panels = plt.subplots(1, 4, figsize=(7.0, 2.2), layout="constrained")
 for axes, colour, (link, one) in zip(panels, colours, results.items(), strict=True):
     trajectories = group(one, "trajectories")

@@ -72,6 +72,9 @@ def test_a_complete_file(model_file):
     prepared = loaded.prepare(data)
     assert (prepared.y[1, 0], prepared.note) == (2, "halved")
     assert loaded.anchors(data) == {"slope": 1.0}
+    assert loaded.definitions["OUTPUTS"] == ("y",) and loaded.definitions["model"] is loaded.model
+    with pytest.raises(TypeError):
+        loaded.definitions["OUTPUTS"] = ("z",)
 
 
 def test_a_file_with_the_model_alone(model_file):

@@ -127,6 +127,11 @@ def row(found: xr.Dataset, columns: Mapping[str, Column]) -> dict[str, Any]:
     return cells
 
 
+def rows(found: xr.Dataset, dim: str, columns: Mapping[str, Column], label: str = "{}") -> dict[str, dict[str, Any]]:
+    """Return a row for each entry of a dimension by its label, which may stand within a longer one."""
+    return {label.format(one): row(found.sel({dim: one}), columns) for one in found[dim].values}
+
+
 def _split(found: xr.Dataset, name: str) -> list[xr.Dataset]:
     named = _LABEL.search(name)
     if named is None or not found[named[1]].dims:

@@ -19,15 +19,14 @@ command line prints the tables and puts them on one page.
         runs: int = setting(500, "simulated targets", quick=4, aliases=study.REALISATIONS)
 
     def tasks(settings: Settings) -> list[Task]:
-        return [Task(f"track/{rule}/{index:04d}", settings.seed, {"rule": rule, "index": index})
-                for index in range(settings.runs) for rule in ("EKF", "CKF")]
+        made = Tasks("made-up", settings.seed)
+        return in_order(one for rule in ("EKF", "CKF") for one in made.each(f"track/{rule}", settings.runs, rule=rule))
 
     def compute(task: Task) -> Result:
         return {"rmse": ...}
 
     def tables(settings: Settings, data: Data) -> dict[str, Table]:
-        track = data["track"]
-        return {"errors": Table.of("Errors", {rule: row(track.sel(rule=rule), {"RMSE": "rmse"}) for rule in ...})}
+        return {"errors": Table.of("Errors", rows(data["track"], "rule", {"RMSE": "rmse"}))}
 
     def figures(settings: Settings, data: Data) -> dict[str, Figure]:
         return {"errors": plot_errors(data["track"])}

@@ -25,7 +25,7 @@ def file():
 
 @pytest.fixture(scope="module")
 def functions(file):
-    return file.model.__globals__
+    return file.definitions
 
 
 @pytest.fixture(scope="module")

@@ -39,7 +39,7 @@ def genes(file):
 
 @pytest.fixture
 def activity(file):
-    return file.model.__globals__["activity"]
+    return file.definitions["activity"]
 
 
 @pytest.mark.parametrize("gamma", [0.1, 0.5, 1.0])

@@ -11,7 +11,7 @@ from scipy import stats
 from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import chains, study
 from lfm_ppl.experiments.ballistic import figures, parameters, problem, smoothing
-from lfm_ppl.experiments.datasets import Column, Kind, part, row
+from lfm_ppl.experiments.datasets import Column, Kind, part, row, rows
 from lfm_ppl.experiments.scores import paired_ratio, sd_of
 from lfm_ppl.experiments.study import Data, Study, Table, setting
 from lfm_ppl.experiments.tasks import Tasks, in_order, slug
@@ -76,13 +76,12 @@ def tracked(data: Data) -> dict[str, Any]:
 
     Where parameters are known the seconds are those of filter and smoother, else of searches and weights.
     """
-    rows = {rule: row(part(data["tracking"].sel({"method": rule}), "smoother"), ERRORS)
-            for rule in data["tracking"].method.values}
+    found = rows(part(data["tracking"], "smoother"), "method", ERRORS)
     for what, ending in (("parameters", ""), ("drawn", "; parameters drawn from the prior")):
         for label, name in UNKNOWN.items():
-            found = part(data[what], name).assign(seconds=data[what].seconds)
-            rows[f"{smoothing.REPORTED}, {label}{ending}"] = row(found, ERRORS)
-    return rows
+            errors = part(data[what], name).assign(seconds=data[what].seconds)
+            found[f"{smoothing.REPORTED}, {label}{ending}"] = row(errors, ERRORS)
+    return found
 
 
 def against_particles(data: Data) -> dict[str, Any]:
@@ -94,16 +93,14 @@ def against_particles(data: Data) -> dict[str, Any]:
     """
     particles = data["particles"]
     gaussian = data["tracking"].sel({"method": smoothing.REPORTED}).isel(dataset=slice(particles.sizes["dataset"]))
-    rows: dict[str, Any] = {}
-    for what in ("filter", "smoother"):
+    found: dict[str, Any] = {}
+    for what, columns in (("filter", COMPARED), ("smoother", COMPARED | DISTINCT)):
         exact = part(gaussian, what).assign(log_likelihood=gaussian.log_likelihood)
-        rows[f"{what}, Gaussian"] = row(exact, {"RMSE {path} ({unit})": "rmse", "CPU s": "seconds"})
-        for count in particles.particles.values:
-            several = particles.sel(particles=count)
-            compared = part(several, what).assign(several[["log_likelihood", "distinct"]])
-            compared = compared.assign({f"exact_{name}": value for name, value in exact.items() if name in compared})
-            rows[f"{what}, {count:,} particles"] = row(compared, COMPARED | (DISTINCT if what == "smoother" else {}))
-    return rows
+        found[f"{what}, Gaussian"] = row(exact, {"RMSE {path} ({unit})": "rmse", "CPU s": "seconds"})
+        both = part(particles, what).assign(particles[["log_likelihood", "distinct"]]).assign(
+            {f"exact_{name}": exact[name] for name in ("rmse", "seconds", "log_likelihood")})
+        found |= rows(both, "particles", columns, f"{what}, {{:,}} particles")
+    return found
 
 
 COMPARED: dict[str, Column] = {
@@ -130,11 +127,9 @@ def of_parameters(data: Data) -> dict[str, Any]:
         "its sd": lambda one: sd_of(one.likely[one.exists]), "posterior mean": "posterior_mean"}
     posterior: dict[str, Column] = {
         "posterior sd": "posterior_sd", **COVERED, "k > 0.7": lambda one: (one.k > 0.7).mean()}
-    rows: dict[str, Any] = {}
-    for what, columns, ending in (("parameters", most_likely | posterior, ""),
-                                  ("drawn", posterior, ", drawn from the prior")):
-        rows |= {f"log {name}{ending}": row(data[what].sel(parameter=name), columns) for name in problem.NAMES}
-    return rows | {"log alpha, the force's parameters known": row(data["known"], COVERED)}
+    return {**rows(data["parameters"], "parameter", most_likely | posterior, "log {}"),
+            **rows(data["drawn"], "parameter", posterior, "log {}, drawn from the prior"),
+            "log alpha, the force's parameters known": row(data["known"], COVERED)}
 
 
 def _coverage(level: float) -> Any:

@@ -111,7 +111,7 @@ class Method(NamedTuple):
     @property
     def names(self) -> tuple[str, ...]:
         """The parameters; everything here is in their logarithms z."""
-        return tuple(model_file().model.__globals__["names"](self.force))
+        return tuple(model_file().definitions["names"](self.force))
 
 
 @functools.cache

@@ -12,7 +12,7 @@ from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import study
 from lfm_ppl.experiments.constrained import estimators, figures, problem
 from lfm_ppl.experiments.constrained.estimators import BANDS, FULL, METHODS, SMOOTHER
-from lfm_ppl.experiments.datasets import Column, Kind, row
+from lfm_ppl.experiments.datasets import Column, Kind, row, rows
 from lfm_ppl.experiments.scores import SE, rate_of
 from lfm_ppl.experiments.study import Data, Study, Table, setting
 from lfm_ppl.experiments.tasks import blocks, slug
@@ -72,12 +72,12 @@ class ByMethod(Kind):
 
 def tables(settings: Settings, data: Data) -> dict[str, Table]:
     """Return the tables."""
-    methods = {method: data["transcription"].sel({"method": method}) for method in settings.methods}
+    found = data["transcription"]
     return {"transcription": Table.of(
                 f"Transcription, {len(settings.shapes)} shapes of force by {settings.runs} records",
-                {method: row(found, ERRORS) for method, found in methods.items()}),
+                rows(found, "method", ERRORS)),
             "shapes": Table.of("By the shape of the force",
-                               {method: by_shape(found) for method, found in methods.items()}),
+                               {method: by_shape(found.sel({"method": method})) for method in settings.methods}),
             "others": Table.of(f"{settings.targets} targets on reentry and {settings.patients} patients", others(data))}
 
 
@@ -100,7 +100,7 @@ def by_shape(found: xr.Dataset) -> dict[str, Any]:
     """Return median MSE and coverage of one estimator for each shape of the force."""
     columns: dict[str, Column] = {"median MSE, {shape}": lambda of: of.mse.median(skipna=False),
                                   "coverage, {shape}": "coverage"}
-    return {name: value for shape in found["shape"] for name, value in row(found.sel(shape=shape), columns).items()}
+    return {name: value for own in rows(found, "shape", columns).values() for name, value in own.items()}
 
 
 def others(data: Data) -> dict[str, Any]:

@@ -113,7 +113,7 @@ def _folds(rows: int, count: int, block: int, seed: Any) -> np.ndarray:
 
 
 def _coal(size: Size, seed: int, data: str | None) -> Problem:
-    functions = loading.load("coal").model.__globals__
+    functions = loading.load("coal").definitions
     width = (LAST - FIRST) / size.bins
     build = functools.partial(functions["build"], width=width)
     times = FIRST + width * (0.5 + np.arange(size.bins))

@@ -11,7 +11,7 @@ import xarray as xr
 from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import study
 from lfm_ppl.experiments.chains import LENGTHS
-from lfm_ppl.experiments.datasets import Column, Kind, row
+from lfm_ppl.experiments.datasets import Column, Kind, rows
 from lfm_ppl.experiments.ginzburg_landau import figures, parameters, problem, states
 from lfm_ppl.experiments.scores import Estimate
 from lfm_ppl.experiments.study import CHAINS, Data, Study, Table, setting
@@ -104,9 +104,7 @@ def comparison(data: Data) -> dict[str, Any]:
         "ESS/CPU s": lambda one: one.ess.min("parameter", skipna=False) / one.seconds, "CPU s": "seconds",
         "R-hat": lambda one: one.r_hat.max("parameter", skipna=False),
         "RMSE published": lambda one: parameters.PUBLISHED.get(one.sampler.item(), np.nan)}
-    rows = {f"{method}, true parameters": row(data["state"].sel({"method": method}), at_truth)
-            for method in problem.METHODS}
-    return rows | {label: row(data["mcmc"].sel(sampler=label), sampled) for label in parameters.SAMPLERS}
+    return {**rows(data["state"], "method", at_truth, "{}, true parameters"), **rows(data["mcmc"], "sampler", sampled)}
 
 
 def rates(data: Data) -> dict[str, Any]:
@@ -120,19 +118,16 @@ def rates(data: Data) -> dict[str, Any]:
     columns: dict[str, Column] = {
         "{parameter}": "outside", "pooled": lambda one: parameters.pooled(one.outside),
         "cut": lambda one: one.cut.mean(), "differs": lambda one: (one.outside != exact).mean(), "CPU s": "seconds"}
-    return {method: row(found.sel({"method": method}), columns) for method in problem.METHODS}
+    return rows(found, "method", columns)
 
 
 def posteriors(data: Data) -> dict[str, Any]:
     """Return posterior means and standard deviations by MCMC, averaged over realisations, and the coverage of each."""
     found = data["mcmc"].assign(coverage=_covered(data["mcmc"]))
     columns = {f"{name} {{parameter}}": name for name in ("mean", "sd", "coverage")}
-    rows: dict[str, dict[str, Any]] = {label: {} for label in parameters.SAMPLERS}
-    for label, cells in rows.items():
-        for name in problem.NAMES:
-            cells |= row(found.sel(sampler=label, parameter=name), columns)
-        cells |= row(found.sel(sampler=label), {"divergences": lambda one: one.divergences.mean()})
-    return rows
+    every = rows(found, "sampler", {"divergences": lambda one: one.divergences.mean()})
+    return {label: {name: value for own in rows(found.sel(sampler=label), "parameter", columns).values()
+                    for name, value in own.items()} | divergences for label, divergences in every.items()}
 
 
 def _covered(one: xr.Dataset) -> xr.DataArray:

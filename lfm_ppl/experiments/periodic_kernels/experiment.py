@@ -9,7 +9,7 @@ import numpy as np
 
 from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import study
-from lfm_ppl.experiments.datasets import Column, Kind, row
+from lfm_ppl.experiments.datasets import Column, Kind, row, rows
 from lfm_ppl.experiments.periodic_kernels import figures, methods, problem
 from lfm_ppl.experiments.periodic_kernels.methods import KPCA, SPARSE, SPARSE_4
 from lfm_ppl.experiments.scores import Estimate, mean_of, pair
@@ -62,15 +62,15 @@ def covariances(settings: Settings, data: Data) -> dict[str, Any]:
     The row ``left out`` is the mean variance that the eigenfunctions miss. ``significant`` is the number at the default
     share of the largest eigenvalue, 1/100, and ``error there`` that of its covariance.
     """
-    found, rows = data["covariance"].assign_coords(functions=list(settings.functions)), {}
+    found, every = data["covariance"].assign_coords(functions=list(settings.functions)), {}
     for kernel in found.kernel.values:
         for method in (*methods.METHODS, "left out"):
             columns: dict[str, Column] = {"{functions}": method}
             if method == methods.EIGENFUNCTIONS:
                 columns |= {"significant": "significant", "error there": "at default"}
             if found[method].sel(kernel=kernel).notnull().any():
-                rows[f"{kernel.replace('_', '/')}, {method}"] = row(found.sel(kernel=kernel), columns)
-    return rows
+                every[f"{kernel.replace('_', '/')}, {method}"] = row(found.sel(kernel=kernel), columns)
+    return every
 
 
 def published(settings: Settings, data: Data) -> dict[str, Any]:
@@ -80,13 +80,13 @@ def published(settings: Settings, data: Data) -> dict[str, Any]:
     ``published`` what the source has.
     """
     found = data["quadrature"]
-    rows = {f"{min(22, points)} eigenfunctions, {points} points": pair("error", Estimate(float(error), np.nan))
-            for points, error in zip(settings.points, found.error, strict=True)}
+    every = {f"{min(22, points)} eigenfunctions, {points} points": pair("error", Estimate(float(error), np.nan))
+             for points, error in zip(settings.points, found.error, strict=True)}
     if settings.points[-1] >= 22:
-        rows[f"22 eigenfunctions, {settings.points[-1]} points"]["published"] = PUBLISHED[KPCA][0]
+        every[f"22 eigenfunctions, {settings.points[-1]} points"]["published"] = PUBLISHED[KPCA][0]
     for label, errors in ((SPARSE, found["sparse 22"]), (SPARSE_4, found["sparse 88"])):
-        rows[label] = pair("error", mean_of(errors)) | {"least": float(errors.min()), "published": PUBLISHED[label][0]}
-    return rows
+        every[label] = pair("error", mean_of(errors)) | {"least": float(errors.min()), "published": PUBLISHED[label][0]}
+    return every
 
 
 def predictions(data: Data) -> dict[str, Any]:
@@ -99,10 +99,10 @@ def predictions(data: Data) -> dict[str, Any]:
     columns: dict[str, Column] = {
         "RMSE": "rmse", "root of sum": lambda one: one.rmse * np.sqrt(one.sizes["time"]),
         "log likelihood": "log likelihood", "coverage": "coverage"}
-    rows = {method: row(data["regression"].sel({"method": method}), columns) for method in methods.PREDICTING}
+    found = rows(data["regression"], "method", columns)
     for method, (_, rmse, log_likelihood) in PUBLISHED.items():
-        rows[method] |= {"published RMSE": rmse, "published log likelihood": log_likelihood}
-    return rows
+        found[method] |= {"published RMSE": rmse, "published log likelihood": log_likelihood}
+    return found
 
 
 STUDY = Study(

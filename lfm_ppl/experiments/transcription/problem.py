@@ -80,7 +80,7 @@ class Rates(NamedTuple):
 @functools.cache
 def shipped() -> Mapping[str, Any]:
     """Return the functions of the shipped model."""
-    return loading.load("transcription").model.__globals__
+    return loading.load("transcription").definitions
 
 
 def system(link: str, gamma: Any, rates: Rates, noise_sd: Any = NOISE, lengthscale: Any = LENGTHSCALE
