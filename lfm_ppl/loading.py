@@ -73,16 +73,17 @@ class ModelFile:
     _simulate: Callable[..., Data] | None = None
     _prepare: Callable[[Data], Data] | None = None
     _anchors: Callable[[Data], Mapping[str, float]] | None = None
+    _names: Mapping[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def definitions(self) -> Mapping[str, Any]:
-        """What the file defines beside the model, functions and constants, by name.
+        """Functions and constants of the file, and whatever else it names, by name.
 
         Example:
             >>> load("epidemic").definitions["FORCE"]
             'log transmission'
         """
-        return MappingProxyType(inspect.unwrap(self.model).__globals__)
+        return MappingProxyType(self._names)
 
     @property
     def can_simulate(self) -> bool:
@@ -272,6 +273,7 @@ def _checked(path: Path, module: ModuleType) -> ModelFile:
         _simulate=getattr(module, "simulate", None),
         _prepare=getattr(module, "prepare", None),
         _anchors=getattr(module, "anchors", None),
+        _names=vars(module),
     )
     taken = inspect.signature(loaded.model).parameters
     told = {name: None for name in ("outputs", "units", "inputs") if name in taken}

@@ -191,7 +191,8 @@ class GridPosterior:
         p(theta | y) = exp(L(theta)) / integral of exp(L)   on the interval that the nodes span.
 
     Between the nodes L is a cubic spline, which is exact for a Gaussian likelihood; the integrals are trapezoidal
-    sums on nodes forty times as dense.
+    sums on nodes forty times as dense. Between a node where the likelihood is zero, or NaN, and its neighbours there is
+    no posterior.
 
     Args:
         nodes: (G,), increasing; at least four.
@@ -217,10 +218,15 @@ class GridPosterior:
         if not np.isfinite(values).any():
             raise ValueError("log_likelihood is nowhere finite: there is no posterior on these nodes.")
         relative = np.where(np.isnan(values), -np.inf, values) - np.max(values[np.isfinite(values)])
-        spline = CubicSpline(nodes, np.maximum(relative, _FLOOR))
         self.x = np.unique(np.concatenate([np.linspace(a, b, _FINER + 1) for a, b in
                                            zip(nodes[:-1], nodes[1:], strict=True)]))
-        log_density = spline(self.x)
+        log_density = np.full(self.x.size, -np.inf)
+        possible = np.flatnonzero(relative > _FLOOR)
+        for run in np.split(possible, np.flatnonzero(np.diff(possible) > 1) + 1):
+            # A spline across the edge of a run would overshoot beside it, by more than the peak is high.
+            spline = CubicSpline(nodes[run], relative[run]) if len(run) > 1 else lambda x, own=relative[run]: own
+            inside = (self.x >= nodes[run[0]]) & (self.x <= nodes[run[-1]])
+            log_density[inside] = spline(self.x[inside])
         density = np.exp(log_density - log_density.max())
         steps = 0.5 * np.diff(self.x) * (density[1:] + density[:-1])
         self.density = density / steps.sum()

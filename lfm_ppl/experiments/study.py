@@ -335,7 +335,9 @@ class Study:
     def by_kind(self, settings: Any, results: Results, tasks: Sequence[Task] | None = None) -> dict[str, list[Task]]:
         """Return the tasks of each kind of which there are any, in the order of the kinds."""
         if tasks is None:
-            tasks = [*self.tasks(settings), *(self.then(settings, results) if self.then else ())]
+            tasks = self.tasks(settings)
+            if self.then is not None:
+                tasks = [*tasks, *self.then(settings, {task.name: results[task.name] for task in tasks})]
         found = {what: [task for task in tasks if self.what(task) == what] for what in self.kinds}
         return {what: own for what, own in found.items() if own}
 

@@ -32,16 +32,19 @@ class Tasks:
     seed: int
     digits: int = 4
 
-    def one(self, name: str, **settings: Any) -> Task:
-        """Return a task of this name, whose settings hold the study, and what it is: the first part of its name."""
+    def one(self, name: str, /, **settings: Any) -> Task:
+        """Return a task of this name, whose settings hold the study, and ``what`` it is.
+
+        That is the first part of its name unless it is given.
+        """
         own = {"experiment": self.experiment, "what": name.partition("/")[0], **settings}
         return Task(name, self.seed, own)
 
-    def each(self, name: str, count: int, **settings: Any) -> list[Task]:
+    def each(self, name: str, count: int, /, **settings: Any) -> list[Task]:
         """Return a task for each of ``count`` data sets, its setting ``index``."""
         return [self.one(f"{name}/{index:0{self.digits}d}", **settings, index=index) for index in range(count)]
 
-    def blocks(self, name: str, count: int, size: int, **settings: Any) -> list[Task]:
+    def blocks(self, name: str, count: int, size: int, /, **settings: Any) -> list[Task]:
         """Return a task for each block of at most ``size`` data sets, its settings ``first`` and ``last``."""
         return [self.one(f"{name}/{first:0{self.digits}d}-{last:0{self.digits}d}", **settings, first=first, last=last)
                 for first, last in blocks(count, size)]
@@ -60,6 +63,8 @@ def indices(task: Task) -> range:
     Example:
         >>> indices(Task("a", 0, {"index": 2})), indices(Task("b", 0, {"first": 0, "last": 4}))
         (range(2, 3), range(0, 5))
+        >>> indices(Task("c", 0, {"first": 3, "count": 2}))
+        range(3, 5)
     """
     given = task.settings
     if "index" in given:

@@ -15,7 +15,7 @@ from lfm_ppl.inference.optimise import Objective, value_and_gradient
 
 
 class LogPosterior:
-    """The posterior of a bound model in the logarithms z of its parameters, in an order of one's own.
+    """The posterior of a bound model in the logarithms z of its parameters, in the order of ``names``.
 
     The unconstrained value of a positive parameter is its logarithm, so that z is the bound model's vector, permuted.
 
@@ -23,6 +23,10 @@ class LogPosterior:
         bound: the model; its data are an example of their shape.
         names: its parameters, all of them positive numbers, in the order of z.
         forward_mode: how gradients are taken; None: the faster way.
+
+    Attributes:
+        central: z (P,) in the middle of the prior, the median of a few draws, where a search may start; whether the
+            density is finite there is not known.
 
     Raises:
         ValueError: other names than the model's; a parameter that is not positive.
@@ -38,14 +42,10 @@ class LogPosterior:
         if np.any(wrong := ~np.isclose(bound.unconstrain(positive), start, rtol=1e-9, atol=1e-9)):
             raise ValueError(f"the logarithm of {bound.names[int(np.argmax(wrong))]} is not its unconstrained value; "
                              "expected a prior of positive numbers without an upper end.")
+        about = dict(zip(bound.names, start, strict=True))
+        self.central = np.array([about[name] for name in names])
         self._order = np.array([self.names.index(name) for name in bound.names])
         self._forward_mode = bound.forward_mode if forward_mode is None else forward_mode
-
-    @property
-    def start(self) -> np.ndarray:
-        """Where a search may start (P,): the median of a few draws from the prior, always the same ones."""
-        medians = dict(zip(self.bound.names, self.bound.draw(jax.random.key(0)), strict=True))
-        return np.array([medians[name] for name in self.names])
 
     def values(self, z: Any) -> dict[str, jax.Array]:
         """Return every parameter by name; z (P,) may be traced."""

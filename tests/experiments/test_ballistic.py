@@ -6,9 +6,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from lfm_ppl import loading
 from lfm_ppl.engine.store import write
 from lfm_ppl.experiments import scores
-from lfm_ppl.experiments.ballistic import experiment, figures, parameters, problem, smoothing
+from lfm_ppl.experiments.ballistic import experiment, figures
+from lfm_ppl.experiments.ballistic.problem import TARGETS
+from lfm_ppl.experiments.simulated import parameters, states
+from lfm_ppl.experiments.simulated.problem import MOST, posterior, record, true_likelihood, true_z
 from lfm_ppl.experiments.study import TASKS
 
 SMALL = experiment.Settings(
@@ -22,35 +26,35 @@ def tasks_of(what, settings):
 
 @pytest.mark.slow
 def test_the_targets_are_those_of_the_model_file():
-    data = problem.model_file().simulate(seed=problem.MOST + 3)
-    target = problem.target(3, seed=1)
+    data = loading.load("ballistic").simulate(seed=MOST + 3)
+    target = record(TARGETS, 3, seed=1)
     np.testing.assert_array_equal(target.y, data.y)
     at = np.isin(data.truth["times"], target.times)
     np.testing.assert_array_equal(target.paths[0], np.asarray(data.truth["state"])[at, 0])
     np.testing.assert_array_equal(target.paths[2], np.asarray(data.truth["forces"]["u"])[at])
-    assert np.exp(problem.true_z()) == pytest.approx([4.49e-4, 50.0, 5.0])
-    assert problem.true_z()[0] == pytest.approx(-7.7, abs=0.01)  # as published
+    assert np.exp(true_z(TARGETS)) == pytest.approx([4.49e-4, 50.0, 5.0])
+    assert true_z(TARGETS)[0] == pytest.approx(-7.7, abs=0.01)  # as published
 
 
 @pytest.mark.slow
 def test_the_densities_are_those_of_the_model():
     """The prior against scipy's, and the likelihood against that of the system built by hand."""
-    z = problem.true_z() + np.array([0.3, -0.2, 0.1])
-    target = problem.target(0)
-    log_likelihood, log_prior = problem.posterior().log_densities(z, target.y)
+    z = true_z(TARGETS) + np.array([0.3, -0.2, 0.1])
+    target = record(TARGETS, 0)
+    log_likelihood, log_prior = posterior(TARGETS).log_densities(z, target.y)
     expected = stats.norm([np.log(5e-4), np.log(30.0), np.log(5.0)], [1.0, 1.0, 0.7]).logpdf(z).sum()
     # The levels of the noise are fixed at the medians of their priors, whose densities there belong to it.
     expected += sum(stats.lognorm(0.7, scale=level).logpdf(level) for level in (50.0, 10.0, 30.0))
     assert log_prior == pytest.approx(expected, rel=1e-12)
-    assert log_likelihood == pytest.approx(float(problem.posterior().likelihood(z).log_prob(target.y)), rel=1e-10)
+    assert log_likelihood == pytest.approx(float(posterior(TARGETS).likelihood(z).log_prob(target.y)), rel=1e-10)
 
 
 @pytest.mark.slow
 def test_a_gaussian_smoother_tracks():
     """Its errors are those of its own mean, and its band is honest about them."""
     (task,) = [one for one in tasks_of("tracking", SMALL) if one.settings["method"] == "Taylor"]
-    found = smoothing.gaussian(task)
-    target = problem.target(0)
+    found = states.gaussian(TARGETS, task)
+    target = record(TARGETS, 0)
     assert found["smoother_rmse"].shape == found["smoother_coverage"].shape == (2, 3)
     np.testing.assert_allclose(found["smoother_rmse"][0], np.sqrt(np.mean((found["mean"] - target.paths) ** 2, axis=1)))
     assert (found["smoother_rmse"] < found["filter_rmse"]).all()
@@ -61,10 +65,10 @@ def test_a_gaussian_smoother_tracks():
 @pytest.mark.slow
 def test_particles_agree_with_the_gaussian_smoother_where_it_is_nearly_exact():
     (task,) = tasks_of("particles", SMALL)
-    found = smoothing.particles(task)
-    given = problem.true_likelihood()
-    target = problem.target(0)
-    mean, sd = map(np.asarray, problem.paths_of(given.smooth(target.y)))
+    found = states.particles(TARGETS, task)
+    given = true_likelihood(TARGETS)
+    target = record(TARGETS, 0)
+    mean, sd = map(np.asarray, states.paths_of(TARGETS, given.smooth(target.y)))
     # 2,000 particles leave an error of the log likelihood of about 1, and many different paths at the end alone.
     assert abs(found["log_likelihood"] - float(given.log_prob(target.y))) < 4.0
     assert found["distinct"][0] < found["distinct"][-1] <= 2_000
@@ -78,13 +82,13 @@ def test_particles_agree_with_the_gaussian_smoother_where_it_is_nearly_exact():
 @pytest.mark.slow
 def test_the_posterior_is_that_of_a_grid():
     """Mean and standard deviation of each parameter against a sum over a grid of all three."""
-    target = problem.target(0)
-    found = parameters.estimate(target, 1_000, 5, 0)
+    target = record(TARGETS, 0)
+    found = parameters.estimate(TARGETS, target, 1_000, 5, 0)
     assert found["k"] < 0.7 and found["exists"]
     axes = [np.linspace(m - 5 * s, m + 5 * s, 25)
             for m, s in zip(found["posterior_mean"], found["posterior_sd"], strict=True)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    log_density = np.sum(problem.posterior().log_densities_of(nodes, target.y, batch=25), axis=0)
+    log_density = np.sum(posterior(TARGETS).log_densities_of(nodes, target.y, batch=25), axis=0)
     weight = np.exp(log_density - log_density.max())
     weight /= weight.sum()
     mean = weight @ nodes
@@ -92,10 +96,10 @@ def test_the_posterior_is_that_of_a_grid():
     error = sd / np.sqrt(found["ess"])
     np.testing.assert_array_less(np.abs(found["posterior_mean"] - mean), 4 * error)
     np.testing.assert_allclose(found["posterior_sd"], sd, rtol=4 / np.sqrt(found["ess"]))
-    np.testing.assert_allclose(found["below"], weight @ (nodes < problem.true_z()), atol=0.1)
+    np.testing.assert_allclose(found["below"], weight @ (nodes < true_z(TARGETS)), atol=0.1)
     # No point of the grid is more likely than the most likely one.
     some = np.stack([found["likely"], *nodes[np.argsort(log_density)[-5:]]])
-    best, *others = problem.posterior().log_densities_of(some, target.y)[0]
+    best, *others = posterior(TARGETS).log_densities_of(some, target.y)[0]
     assert best >= max(others) - 1e-6
 
 
@@ -105,10 +109,10 @@ def made_up(settings):
     for task in experiment.all_tasks(settings):
         given = task.settings
         if given["what"] == "chains":
-            draws = problem.true_z()[:, None, None] + 0.1 * generator.normal(size=(3, 2, 300))
+            draws = true_z(TARGETS)[:, None, None] + 0.1 * generator.normal(size=(3, 2, 300))
             off = given["sampler"] == "RAM"
             results[task.name] = {"draws": draws, "seconds": 10.0, "divergences": 1, "r_hat": np.full(3, 1.002),
-                                  "mean": problem.true_z() + 0.05 * off, "sd": np.full(3, 0.11 if off else 0.1),
+                                  "mean": true_z(TARGETS) + 0.05 * off, "sd": np.full(3, 0.11 if off else 0.1),
                                   "ess": np.full(3, 200.0)}
             continue
         if given["what"] == "particles":
@@ -124,18 +128,18 @@ def made_up(settings):
             found = {"filter_rmse": np.full((count, 3), 2.0), "smoother_rmse": np.tile([50.0, 30.0, 20.0], (count, 1)),
                      "smoother_coverage": np.full((count, 3), 0.95), "log_likelihood": np.full(count, -601.0),
                      "filter_seconds": np.full(count, 1e-3), "smoother_seconds": np.full(count, 2e-3),
-                     "mean": problem.target(0).paths, "sd": np.ones((3, 120))}
+                     "mean": record(TARGETS, 0).paths, "sd": np.ones((3, 120))}
         else:
             total = settings.drawn_runs if given["what"] == "drawn" else settings.runs
             below = (np.arange(given["first"], given["last"] + 1)[:, None] + 0.5) / total * np.ones(3)
             if given["what"] == "known":
                 results[task.name] = {"below": below[:, 0]}
                 continue
-            found = {"likely": problem.true_z() + np.zeros((count, 3)), "exists": np.arange(count) > 0,
-                     "posterior_mean": problem.true_z() + np.zeros((count, 3)),
+            found = {"likely": true_z(TARGETS) + np.zeros((count, 3)), "exists": np.arange(count) > 0,
+                     "posterior_mean": true_z(TARGETS) + np.zeros((count, 3)),
                      "posterior_sd": np.full((count, 3), 0.1), "below": below, "k": np.full(count, 0.2),
                      "ess": np.full(count, 300.0), "seconds": np.full(count, 0.5),
-                     "draws": problem.true_z()[:, None] + 0.1 * generator.normal(size=(3, 200)),
+                     "draws": true_z(TARGETS)[:, None] + 0.1 * generator.normal(size=(3, 200)),
                      **{f"{what}_{name}": np.full((count, 3), 0.9) for what in ("likely", "posterior")
                         for name in ("rmse", "coverage")}}
         results[task.name] = found
@@ -153,7 +157,7 @@ def test_the_tables_hold_what_was_found():
     tables = {name: table.frame for name, table in experiment.tables(MADE, data_of(MADE)).items()}
     tracked = tables["tracking"]
     assert list(tracked.index) == [
-        *smoothing.RULES, *(f"cubature, {label}{end}" for end in ("", "; parameters drawn from the prior")
+        *states.RULES, *(f"cubature, {label}{end}" for end in ("", "; parameters drawn from the prior")
                             for label in experiment.UNKNOWN)]
     assert tracked.loc["Taylor", "RMSE speed (m/s)"] == 30.0 and tracked.loc["cubature", "coverage u"] == 0.95
     against = tables["particles"]
@@ -240,10 +244,11 @@ def test_the_quick_version_runs_from_end_to_end(tmp_path):
 @pytest.mark.slow
 def test_the_drag_alone_is_integrated_right():
     """With the force's parameters known, on another grid and equally spaced in the drag."""
-    target = problem.target(0)
+    target = record(TARGETS, 0)
     z = np.log(np.linspace(*np.exp(target.z[0] + np.array([-1.0, 1.0])), 400))  # equally spaced in alpha
     points = np.stack([z, np.full(400, target.z[1]), np.full(400, target.z[2])], axis=1)
-    log_likelihood, _ = problem.posterior().log_densities_of(points, target.y, batch=20)
+    log_likelihood, _ = posterior(TARGETS).log_densities_of(points, target.y, batch=20)
     density = np.exp(log_likelihood - log_likelihood.max())
     cells = 0.5 * (density[1:] + density[:-1]) * np.diff(z)
-    assert parameters.below(target) == pytest.approx(cells[z[1:] <= target.z[0]].sum() / cells.sum(), abs=0.02)
+    expected = cells[z[1:] <= target.z[0]].sum() / cells.sum()
+    assert parameters.below(TARGETS, experiment.REACH, target) == pytest.approx(expected, abs=0.02)

@@ -28,12 +28,25 @@ def test_a_truncated_exponential_is_cut_and_right():
     np.testing.assert_allclose(posterior.mean, truth.mean(), atol=1e-5)
 
 
-def test_impossible_values_have_no_posterior_mass():
+@pytest.mark.parametrize("impossible", [-np.inf, np.nan, -2_000.0])
+def test_impossible_values_have_no_posterior_mass(impossible):
+    """What is left is the density between the others, cut off there and no different."""
     nodes = np.linspace(-3.0, 3.0, 61)
-    values = np.where(nodes < -1.0, -np.inf, -0.5 * nodes**2)
-    posterior = scores.GridPosterior(nodes, values)
-    assert posterior.below(-1.2) < 1e-12
-    assert np.isfinite(posterior.density).all()
+    for low, high in ((-1.0, 3.0), (-1.5, 0.5), (-3.0, 2.7)):
+        values = np.where((nodes < low - 0.05) | (nodes > high + 0.05), impossible, -0.5 * nodes**2)
+        posterior, truth = scores.GridPosterior(nodes, values), stats.truncnorm(low, high)
+        assert posterior.below(low - 0.2) < 1e-12 and np.isfinite(posterior.density).all()
+        np.testing.assert_allclose(posterior.below(0.0), truth.cdf(0.0), atol=2e-3)
+        np.testing.assert_allclose([posterior.mean, posterior.sd], [truth.mean(), truth.std()], atol=2e-3)
+
+
+def test_a_value_that_is_missing_takes_no_more_than_its_place():
+    nodes = np.linspace(-4.0, 4.0, 81)
+    values = -0.5 * nodes**2
+    for missing in ([5], [0, 80], [76, 78]):
+        posterior = scores.GridPosterior(nodes, np.where(np.isin(np.arange(81), missing), np.nan, values))
+        for value in (-1.0, 0.0, 2.0):
+            assert posterior.below(value) == pytest.approx(stats.norm.cdf(value), abs=3e-4)
 
 
 def test_what_is_no_posterior_is_refused():

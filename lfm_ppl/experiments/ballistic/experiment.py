@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,11 +11,17 @@ from scipy import stats
 
 from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import chains, study
-from lfm_ppl.experiments.ballistic import figures, parameters, problem, smoothing
+from lfm_ppl.experiments.ballistic import figures
+from lfm_ppl.experiments.ballistic.problem import TARGETS
 from lfm_ppl.experiments.datasets import Column, Kind, part, row, rows
 from lfm_ppl.experiments.scores import paired_ratio, sd_of
+from lfm_ppl.experiments.simulated import parameters, states
+from lfm_ppl.experiments.simulated.problem import MOST, true_z
 from lfm_ppl.experiments.study import Data, Study, Table, setting
 from lfm_ppl.experiments.tasks import Tasks, in_order, slug
+
+REACH = 1.5
+"""Of the grid about the true log alpha: a dozen posterior standard deviations wide."""
 
 UNKNOWN = {"most likely parameters": "likely", "parameters integrated out": "posterior"}
 ERRORS = {"RMSE {path} ({unit})": "rmse", "coverage {path}": "coverage", "CPU s": "seconds"}
@@ -24,9 +31,9 @@ ERRORS = {"RMSE {path} ({unit})": "rmse", "coverage {path}": "coverage", "CPU s"
 class Settings(study.Settings):
     """How much is computed."""
 
-    runs: int = setting(500, "simulated targets", quick=4, aliases=study.REALISATIONS, per_seed=problem.MOST)
-    rules: tuple[str, ...] = setting(tuple(smoothing.RULES), "linearisation; the model's own must be among them",
-                                     quick=(smoothing.REPORTED,), choices=tuple(smoothing.RULES))
+    runs: int = setting(500, "simulated targets", quick=4, aliases=study.REALISATIONS, per_seed=MOST)
+    rules: tuple[str, ...] = setting(tuple(states.RULES), "linearisation; the model's own must be among them",
+                                     quick=(states.REPORTED,), choices=tuple(states.RULES))
     particle_runs: int = setting(20, "of the targets, the first so many by particles, too", quick=2)
     particles: tuple[int, ...] = setting((500, 2_000, 10_000, 50_000), "their numbers; the source has 50,000",
                                          quick=(500,))
@@ -40,8 +47,8 @@ class Settings(study.Settings):
     def __post_init__(self) -> None:
         """Check what a user gives."""
         super().__post_init__()
-        if smoothing.REPORTED not in self.rules:
-            raise ValueError(f"rules must hold {smoothing.REPORTED!r}, got {self.rules!r}.")
+        if states.REPORTED not in self.rules:
+            raise ValueError(f"rules must hold {states.REPORTED!r}, got {self.rules!r}.")
 
 
 def all_tasks(settings: Settings) -> list[Task]:
@@ -80,7 +87,7 @@ def tracked(data: Data) -> dict[str, Any]:
     for what, ending in (("parameters", ""), ("drawn", "; parameters drawn from the prior")):
         for label, name in UNKNOWN.items():
             errors = part(data[what], name).assign(seconds=data[what].seconds)
-            found[f"{smoothing.REPORTED}, {label}{ending}"] = row(errors, ERRORS)
+            found[f"{states.REPORTED}, {label}{ending}"] = row(errors, ERRORS)
     return found
 
 
@@ -92,7 +99,7 @@ def against_particles(data: Data) -> dict[str, Any]:
     through ``distinct`` particles at the first time.
     """
     particles = data["particles"]
-    gaussian = data["tracking"].sel({"method": smoothing.REPORTED}).isel(dataset=slice(particles.sizes["dataset"]))
+    gaussian = data["tracking"].sel({"method": states.REPORTED}).isel(dataset=slice(particles.sizes["dataset"]))
     found: dict[str, Any] = {}
     for what, columns in (("filter", COMPARED), ("smoother", COMPARED | DISTINCT)):
         exact = part(gaussian, what).assign(log_likelihood=gaussian.log_likelihood)
@@ -122,7 +129,7 @@ def of_parameters(data: Data) -> dict[str, Any]:
     weights are not to be relied on.
     """
     most_likely: dict[str, Column] = {
-        "truth": lambda one: problem.true_z()[problem.NAMES.index(one.parameter)],
+        "truth": lambda one: true_z(TARGETS)[TARGETS.names.index(one.parameter)],
         "maximum": "exists", "most likely": lambda one: one.likely[one.exists],
         "its sd": lambda one: sd_of(one.likely[one.exists]), "posterior mean": "posterior_mean"}
     posterior: dict[str, Column] = {
@@ -152,19 +159,19 @@ def agreement(data: Data) -> dict[str, Any]:
 
 STUDY = Study(
     Settings, all_tasks,
-    {"tracking": Kind(smoothing.gaussian, {
+    {"tracking": Kind(partial(states.gaussian, TARGETS), {
         "dataset path": "filter_rmse, smoother_rmse, smoother_coverage", "path time": "mean, sd",
         "dataset": "log_likelihood, filter_seconds, smoother_seconds"}, ("method",)),
-     "particles": Kind(smoothing.particles, {
+     "particles": Kind(partial(states.particles, TARGETS), {
          "dataset path": "filter_rmse, smoother_rmse, smoother_coverage", "dataset path time": "mean, sd",
          "dataset": "log_likelihood, filter_seconds, smoother_seconds", "dataset time": "distinct"}, ("particles",)),
-     **{what: Kind(parameters.compute, {
+     **{what: Kind(partial(parameters.weighted, TARGETS, drawn=what == "drawn"), {
          "dataset parameter": "likely, posterior_mean, posterior_sd, below", "dataset": "exists, k, ess, seconds",
          "dataset path": "likely_rmse, likely_coverage, posterior_rmse, posterior_coverage", "parameter draw": "draws"})
         for what in ("parameters", "drawn")},
-     "known": Kind(parameters.known, {"dataset": "below"}),
-     "chains": Kind(parameters.by_chains, {
+     "known": Kind(partial(parameters.alone, TARGETS, REACH), {"dataset": "below"}),
+     "chains": Kind(partial(parameters.by_chains, TARGETS), {
          "dataset parameter": "mean, sd, ess, r_hat", "dataset": "seconds, divergences",
          "dataset parameter chain draw": "draws"}, ("sampler",))},
-    tables, figures.draw, {"path": ("path", problem.PATHS), "unit": ("path", problem.UNITS),
-                           "parameter": ("parameter", problem.NAMES)})
+    tables, figures.draw, {"path": ("path", TARGETS.paths), "unit": ("path", TARGETS.units),
+                           "parameter": ("parameter", TARGETS.names)})

@@ -9,10 +9,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy import stats
 
-from lfm_ppl.experiments.ballistic import parameters, problem, smoothing
+from lfm_ppl.experiments.ballistic.problem import TARGETS
 from lfm_ppl.experiments.datasets import part
 from lfm_ppl.experiments.drawing import SHADE, SPAN, TRUTH, band, bars, legend, line, patch
 from lfm_ppl.experiments.scores import Z, mean_of, paired_ratio, rate_of
+from lfm_ppl.experiments.simulated import parameters
+from lfm_ppl.experiments.simulated.problem import record, true_z
+from lfm_ppl.experiments.simulated.states import REPORTED
 from lfm_ppl.experiments.study import Data
 from lfm_ppl.results.plots import style
 
@@ -31,12 +34,12 @@ def draw(settings: Any, data: Data) -> dict[str, Figure]:
 @style.styled
 def plot_paths(data: Data, seed: int = 0, *, width: str | float = "full") -> Figure:
     """Draw the first target: smoothed paths with 95% bands (figure 1 a to c of the source), and their errors."""
-    target, own = problem.target(0, seed), data["tracking"].sel({"method": smoothing.REPORTED})
+    target, own = record(TARGETS, 0, seed), data["tracking"].sel({"method": REPORTED})
     particles = data["particles"].isel(dataset=0).sortby("particles").isel(particles=-1)
     figure = style.new_figure(width, 3.8)
-    for index, (upper, lower) in enumerate(figure.subplots(2, len(problem.PATHS), sharex=True).T):
+    for index, (upper, lower) in enumerate(figure.subplots(2, len(TARGETS.paths), sharex=True).T):
         mean, sd, truth = own["mean"][index], own["sd"][index], target.paths[index]
-        (factor, unit), path = _SCALES[index], problem.PATHS[index]
+        (factor, unit), path = _SCALES[index], TARGETS.paths[index]
         upper.plot(target.times, factor * mean, color=style.BLUE, label="Gaussian smoother")
         band(upper, target.times, factor * mean, factor * sd, label="its 95% band")
         upper.plot(target.times, factor * truth, **TRUTH)
@@ -46,7 +49,7 @@ def plot_paths(data: Data, seed: int = 0, *, width: str | float = "full") -> Fig
                    label=f"{int(particles.particles):,} particles")
         lower.axhline(0.0, color=style.BLACK, lw=0.6)
         style.tidy(upper, ylabel=style.with_unit(path, unit), xlim=target.times[[0, -1]])
-        style.tidy(lower, ylabel=style.with_unit(f"error of {path}", problem.UNITS[index], 24), xlabel="time (s)")
+        style.tidy(lower, ylabel=style.with_unit(f"error of {path}", TARGETS.units[index], 24), xlabel="time (s)")
     legend(figure)
     return figure
 
@@ -56,9 +59,9 @@ def plot_particles(data: Data, *, width: str | float = "full") -> Figure:
     """Draw RMSE relative to the Gaussian smoother's, and CPU time, against the number of particles."""
     found = data["particles"].sortby("particles")
     counts, few = found.particles.values, found.sizes["dataset"]
-    gaussian = data["tracking"].sel({"method": smoothing.REPORTED}).isel(dataset=slice(few))
+    gaussian = data["tracking"].sel({"method": REPORTED}).isel(dataset=slice(few))
     figure, (left, right) = style.in_a_row(width, 2, 2.5)
-    for index, path in enumerate(problem.PATHS):
+    for index, path in enumerate(TARGETS.paths):
         ratios = [paired_ratio(one[:, index], gaussian.smoother_rmse[:, index]) for one in found.smoother_rmse]
         bars(left, counts * 1.06 ** (index - 1), ratios, color=COLOURS[index], ls=LINES[index], marker=MARKERS[index],
              lw=1.0, label=path)
@@ -78,7 +81,7 @@ def plot_particles(data: Data, *, width: str | float = "full") -> Figure:
 @style.styled
 def plot_drag(data: Data, *, width: str | float = "full") -> Figure:
     """Draw the posterior of log alpha of one target (figure 1 d of the source), of several, and ranks of the truth."""
-    truth, (found, drawn) = problem.true_z()[0], (data[name].isel(parameter=0) for name in ("parameters", "drawn"))
+    truth, (found, drawn) = true_z(TARGETS)[0], (data[name].isel(parameter=0) for name in ("parameters", "drawn"))
     figure, (first, several, ranks) = style.in_a_row(width, 3, 2.5)
     chain = data["chains"].draws.sel(sampler="NUTS").isel(dataset=0, parameter=0).values.ravel()
     _densities(first, found.draws.values, chain[np.isfinite(chain)])
@@ -117,13 +120,13 @@ def _densities(axes: Axes, weighted: np.ndarray, chain: np.ndarray) -> None:
 def plot_coverage(data: Data, *, width: str | float = "full") -> Figure:
     """Draw the coverage of the 95% bands of paths, and of the posterior intervals of parameters."""
     found, levels = data["parameters"], np.array(parameters.LEVELS)
-    rows = {"truth": data["tracking"].smoother_coverage.sel({"method": smoothing.REPORTED}),
+    rows = {"truth": data["tracking"].smoother_coverage.sel({"method": REPORTED}),
             "most\nlikely": found.likely_coverage, "integrated\nout": found.posterior_coverage}
     figure, (left, right) = style.in_a_row(width, 2, 2.5)
     left.axhspan(0.93, 0.97, color=SPAN, lw=0)
     left.axhline(0.95, color=style.BLACK, lw=0.8)
     right.plot([0.4, 1.0], [0.4, 1.0], color=style.BLACK, lw=0.8)
-    for index, name in enumerate(problem.NAMES):
+    for index, name in enumerate(TARGETS.names):
         bars(left, np.arange(len(rows)) + 0.12 * (index - 1), [mean_of(one[:, index]) for one in rows.values()],
              color=COLOURS[index], marker=MARKERS[index])
         inside = np.abs(found.below[:, index] - 0.5)
@@ -134,7 +137,7 @@ def plot_coverage(data: Data, *, width: str | float = "full") -> Figure:
     style.tidy(right, xlabel="probability of the posterior interval", ylabel="intervals that hold the truth")
     right.legend(loc="lower right")
     style.legend_above(figure, [
-        *(line(path, COLOURS[index], "", marker=MARKERS[index], ms=3.0) for index, path in enumerate(problem.PATHS)),
+        *(line(path, COLOURS[index], "", marker=MARKERS[index], ms=3.0) for index, path in enumerate(TARGETS.paths)),
         line("nominal", style.BLACK, lw=0.8), patch("93% to 97%", SPAN)])
     style.note_below(figure, f"{found.sizes['dataset']} targets; error bars are two standard errors.")
     return figure

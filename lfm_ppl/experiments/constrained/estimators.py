@@ -31,8 +31,8 @@ NEAR = 1.0
 
 _SEARCH = {"ftol": 1e-10, "gtol": 1e-4}
 _FURTHEST = float(np.log(TIMES[-1] / 2.0))
-"""How far from its start, in logarithms, a lengthscale is learnt from 60 samples: their likelihood often has no
-maximum."""
+"""How far from the middle of its prior, in logarithms, a parameter is searched for where 60 samples are given: their
+likelihood often has no maximum."""
 _LENGTHSCALES = np.geomspace(0.02, 1000.0, 12)
 """Among which a lengthscale that is a state of the cost is searched for first (s); the last is as good as infinity."""
 _BELOW = np.array([0.0, 0.01, 0.025, 0.04])
@@ -46,8 +46,8 @@ def _compiled(estimate: Callable) -> Callable[..., Any]:
 
 
 def posterior_mode(posterior: LogPosterior, y: np.ndarray, prior: float = 1.0, furthest: float = np.inf) -> np.ndarray:
-    """Return the mode (P,) of the density of logarithms of parameters, no further from the start than that."""
-    start = posterior.start
+    """Return the mode (P,) of the density of logarithms of parameters, no further from the prior's middle than that."""
+    start = posterior.central
     bounds = np.stack([start - furthest, start + furthest], axis=1)
     return quasi_newton(posterior.objective(y, prior), start, bounds=bounds, options=_SEARCH).point
 

@@ -138,7 +138,7 @@ def tables(settings: Settings, data: Data) -> dict[str, Table]:
     """Return the tables."""
     each = satellites(data)
     found = {"pooled": Table.of("Errors after training (m), pooled over satellites, and 95% coverage",
-                                 pooled(data["predict"], each)),
+                                pooled(data["predict"], each)),
              "satellites": Table("Each satellite: root mean square errors after training (m)", each, pd.DataFrame(
                  {name: each[name].map(form.format) for name, form in _PRINTED.items()})),
              "magnitudes": Table("", magnitudes_of(data))}
