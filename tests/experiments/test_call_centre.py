@@ -281,15 +281,6 @@ def test_scores_are_those_of_the_log_normal_distribution():
         assert value == pytest.approx(judged[key], rel=1e-9), key
 
 
-def test_quantiles_of_a_mixture():
-    mean, sd = np.array([[0.0, 1.0], [3.0, 1.0]]), np.array([[1.0, 2.0], [0.5, 2.0]])
-    p = np.array([0.1, 0.5, 0.9])
-    found = tracking.quantiles(mean, sd, p)
-    np.testing.assert_allclose(special.ndtr((found[:, None] - mean) / sd).mean(axis=1), np.repeat(p, 2).reshape(3, 2),
-                               rtol=1e-9)
-    np.testing.assert_allclose(found[:, 1], stats.norm(1.0, 2.0).ppf(p))
-
-
 def data_of(settings):
     return experiment.STUDY.gathered(settings, made_up(settings))
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy import stats
 
@@ -84,7 +83,12 @@ def plot_drag(data: Data, *, width: str | float = "full") -> Figure:
     truth, (found, drawn) = true_z(TARGETS)[0], (data[name].isel(parameter=0) for name in ("parameters", "drawn"))
     figure, (first, several, ranks) = style.in_a_row(width, 3, 2.5)
     chain = data["chains"].draws.sel(sampler="NUTS").isel(dataset=0, parameter=0).values.ravel()
-    _densities(first, found.draws.values, chain[np.isfinite(chain)])
+    both = found.draws.values, chain[np.isfinite(chain)]
+    low, high = np.quantile(np.concatenate(both), [0.0005, 0.9995])
+    places = np.linspace(low, high, 200)
+    weighted, drawn_by_nuts = (stats.gaussian_kde(draws)(places) for draws in both)
+    first.fill_between(places, weighted, color=SHADE, lw=0, label="weighted draws")
+    first.plot(places, drawn_by_nuts, color=style.VERMILLION, ls="--", label="NUTS")
     count = min(_SHOWN, runs := found.sizes["dataset"])
     mean, sd, outside = (one[:count].values for one in (
         found.posterior_mean, found.posterior_sd, np.abs(found.below - 0.5) > 0.475))
@@ -107,13 +111,6 @@ def plot_drag(data: Data, *, width: str | float = "full") -> Figure:
            line("95% interval without the truth", style.ORANGE, marker="o", ms=2.0),
            line("parameters drawn from the prior", style.GREEN, "--"))
     return figure
-
-
-def _densities(axes: Axes, weighted: np.ndarray, chain: np.ndarray) -> None:
-    low, high = np.quantile(np.concatenate([weighted, chain]), [0.0005, 0.9995])
-    places = np.linspace(low, high, 200)
-    axes.fill_between(places, stats.gaussian_kde(weighted)(places), color=SHADE, lw=0, label="weighted draws")
-    axes.plot(places, stats.gaussian_kde(chain)(places), color=style.VERMILLION, ls="--", label="NUTS")
 
 
 @style.styled

@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import special, stats
 
 from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import chains, scores
@@ -31,6 +30,7 @@ from lfm_ppl.filtering.filter import filter
 from lfm_ppl.filtering.smoother import smooth
 from lfm_ppl.linalg import congruence, matmul
 from lfm_ppl.model.state_space import state_space
+from lfm_ppl.switching.mixture import Mixture
 
 STEPS = 3
 """Integration steps in five minutes, about as long as those of the model file."""
@@ -88,32 +88,17 @@ def judge(parts: Sequence[Tracked], window: Window, test: str) -> dict[str, floa
     """
     ends = slice(FIRST + 1, None)
     queue, arrivals = window.queues[test][ends], window.arrivals[FIRST:]
-    mean, sd, rate, rate_sd = (np.stack(entry)[:, ends] for entry in zip(*parts, strict=True))
-    low, middle, high = customers(quantiles(mean, sd, np.array([0.025, 0.5, 0.975])))
-    rate_low, rate_high = quantiles(rate, rate_sd, np.array([0.025, 0.975]))
+    mean, sd, rate, rate_sd = (jnp.stack(entry, axis=1)[ends, :, None] for entry in zip(*parts, strict=True))
+    even = jnp.full(mean.shape[:2], -np.log(len(parts)))
+    logarithms, rates = Mixture(mean, sd**2, even), Mixture(rate, rate_sd**2, even)
+    low, middle, high = customers(np.asarray(logarithms.quantiles([0.025, 0.5, 0.975]))[:, :, 0])
+    rate_low, rate_high = np.asarray(rates.quantiles([0.025, 0.975]))[:, :, 0]
     # The density of L is that of x = log(1 + L) times dx/dL = exp(-x).
     x = np.log1p(queue)
-    density = special.logsumexp(stats.norm(mean, sd).logpdf(x), axis=0) - np.log(len(parts)) - x
-    return {"rmse": scores.rmse(middle, queue), "coverage": scores.covered(low, high, queue),
-            "ell": float(density.sum()), "rate_rmse": scores.rmse(rate.mean(axis=0), arrivals),
+    density = np.asarray(logarithms.log_density(x[:, None]))[:, 0] - x
+    return {"rmse": scores.rmse(middle, queue), "coverage": scores.covered(low, high, queue), "ell": density.sum(),
+            "rate_rmse": scores.rmse(rate.mean(axis=1)[:, 0], arrivals),
             "rate_coverage": scores.covered(rate_low, rate_high, arrivals)}
-
-
-def quantiles(mean: np.ndarray, sd: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """Return quantiles (Q, K) of equal mixtures of normal distributions with mean and sd (S, K), by bisection.
-
-    Example:
-        >>> quantiles(np.array([[1.0], [3.0]]), np.ones((2, 1)), np.array([0.5])).round(6).tolist()
-        [[2.0]]
-    """
-    shape = (len(p), mean.shape[1])
-    low = np.broadcast_to((mean - 10 * sd).min(axis=0), shape)
-    high = np.broadcast_to((mean + 10 * sd).max(axis=0), shape)
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        below = special.ndtr((middle[:, None] - mean) / sd).mean(axis=1) < p[:, None]
-        low, high = np.where(below, middle, low), np.where(below, high, middle)
-    return 0.5 * (low + high)
 
 
 def method_of(task: Task) -> Method:

@@ -86,21 +86,12 @@ def paths_of(problem: Problem, found: Any) -> tuple[jax.Array, jax.Array]:
 
 def _judged(problem: Problem, task: Task, index: int, label: str, filtering: Callable, smoothing: Callable,
             paths: Callable[[Any], tuple] = lambda found: found) -> tuple[Result, Any]:
-    """Filter and smooth a data set.
-
-    Args:
-        problem: what is simulated.
-        task: whose seed is that of the data set.
-        index: of the data set.
-        label: of what is compiled in the first call.
-        filtering: from measurements to means (T, n) of the joint state, and log likelihoods (T,).
-        smoothing: from measurements to a result.
-        paths: from this to means and standard deviations (K, T) of the problem's paths.
+    """Filter and smooth a data set; what is compiled in the first call with this label takes no time.
 
     Returns:
         ``filter_rmse``, ``smoother_rmse`` and ``smoother_coverage`` (K,), ``log_likelihood``, CPU times
-        ``filter_seconds`` and ``smoother_seconds``, which has its own filter's in it, ``mean`` and ``sd`` (K, T); and
-        the result of ``smoothing``.
+        ``filter_seconds`` and ``smoother_seconds``, which has its own filter's in it, ``mean`` and ``sd`` (K, T) of the
+        problem's paths; and the result of ``smoothing``, from which ``paths`` takes these.
     """
     one, label = record(problem, index, task.seed), f"{problem.file}, {label}"
     filter_s, (joint, log_likelihood) = timed_again(f"{label}, filter", lambda: filtering(one.y))
