@@ -113,7 +113,7 @@ def test_both_predictions(window):
     found, whole = prediction.thermostat_ahead(model, window, z, 200, jax.random.key(0))
     assert found["rmse"] < 1.5 and found["mean"].shape == found["on"].shape == (144,)
     truth = window.fine[prediction.SCORED, 0]
-    density = whole.observed.log_density(window.fine)[prediction.SCORED, 0]
+    density = whole.observed.log_density(window.fine[:, :2])[prediction.SCORED, 0]
     assert found["ell"] == pytest.approx(float(density.sum()))
     assert found["rmse"] == pytest.approx(scores.rmse(found["mean"], truth))
     assert ((found["on"] >= 0) & (found["on"] <= 1 + 1e-12)).all()
