@@ -86,9 +86,8 @@ def plot_drag(data: Data, *, width: str | float = "full") -> Figure:
     both = found.draws.values, chain[np.isfinite(chain)]
     low, high = np.quantile(np.concatenate(both), [0.0005, 0.9995])
     places = np.linspace(low, high, 200)
-    weighted, drawn_by_nuts = (stats.gaussian_kde(draws)(places) for draws in both)
-    first.fill_between(places, weighted, color=SHADE, lw=0, label="weighted draws")
-    first.plot(places, drawn_by_nuts, color=style.VERMILLION, ls="--", label="NUTS")
+    first.fill_between(places, stats.gaussian_kde(both[0])(places), color=SHADE, lw=0, label="weighted draws")
+    first.plot(places, stats.gaussian_kde(both[1])(places), color=style.VERMILLION, ls="--", label="NUTS")
     count = min(_SHOWN, runs := found.sizes["dataset"])
     mean, sd, outside = (one[:count].values for one in (
         found.posterior_mean, found.posterior_sd, np.abs(found.below - 0.5) > 0.475))
@@ -97,16 +96,16 @@ def plot_drag(data: Data, *, width: str | float = "full") -> Figure:
                          elinewidth=0.8)
     cells = 10 if runs >= 100 else 5
     ranks.axhspan(*stats.binom(runs, 1 / cells).ppf([0.025, 0.975]) / runs, color=SPAN, lw=0, label="95% of shares")
-    for given, colour, dash in ((found.below, style.BLUE, "-"), (drawn.below, style.GREEN, "--")):
-        ranks.hist(given, cells, range=(0.0, 1.0), weights=np.full(given.size, 1 / given.size), histtype="step",
-                   color=colour, ls=dash)
+    shares = [ranks.hist(given, cells, range=(0.0, 1.0), weights=np.full(given.size, 1 / given.size), histtype="step",
+                         color=colour, ls=dash)[0]
+              for given, colour, dash in ((found.below, style.BLUE, "-"), (drawn.below, style.GREEN, "--"))]
     for mark, place in ((first.axvline, truth), (several.axhline, truth), (ranks.axhline, 1 / cells)):
         mark(place, color=style.BLACK, lw=0.9)
-    style.tidy(first, xlabel="log alpha (alpha in 1/m)", ylabel="posterior density", title="first target")
-    first.set_ylim(bottom=0.0)
+    style.tidy(first, xlabel="log alpha (alpha in 1/m)", ylabel="posterior density", title="first target",
+               ylim=(0.0, None))
     style.tidy(several, xlabel="target", ylabel="log alpha, mean and 1.96 sd", title=f"{count} targets")
     style.tidy(ranks, xlabel="posterior probability\nof less than the truth", ylabel="share of targets",
-               ylim=(0.0, 1.8 / cells), title=f"{runs} targets")
+               ylim=(0.0, max(1.8 / cells, 1.1 * float(np.max(shares)))), title=f"{runs} targets")
     legend(figure, line("truth, and what is expected", style.BLACK, lw=0.9),
            line("95% interval without the truth", style.ORANGE, marker="o", ms=2.0),
            line("parameters drawn from the prior", style.GREEN, "--"))

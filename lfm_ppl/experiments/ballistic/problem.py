@@ -1,7 +1,7 @@
 """The problem: a target on reentry, seen by a radar.
 
-It starts at the means of the smoothers' prior, 65 km and 3 km/s, as in the source, whose filter takes cubature points of
-the whole state.
+It starts at the means of the smoothers' prior, 65 km and 3 km/s, as in the source, whose filter takes cubature points
+of the whole state.
 """
 
 from lfm_ppl.experiments.simulated.problem import Problem
