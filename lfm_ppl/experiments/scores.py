@@ -192,7 +192,7 @@ class GridPosterior:
 
     Between the nodes L is a cubic spline, which is exact for a Gaussian likelihood; the integrals are trapezoidal
     sums on nodes forty times as dense. Between a node where the likelihood is zero, or NaN, and its neighbours there is
-    no posterior.
+    no posterior. It counts as zero more than 700 below its peak: several nodes must lie where there is a posterior.
 
     Args:
         nodes: (G,), increasing; at least four.

@@ -1,14 +1,19 @@
 """Data simulated from a model whose measurements are counts, with what serves the target on reentry, too."""
 
+import dataclasses
+import pickle
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from lfm_ppl import loading
 from lfm_ppl.engine.task import Task
+from lfm_ppl.experiments.ballistic import experiment
+from lfm_ppl.experiments.ballistic.problem import TARGETS
 from lfm_ppl.experiments.scores import Z
-from lfm_ppl.experiments.simulated import states
-from lfm_ppl.experiments.simulated.problem import Problem, drawn_record, record, true_likelihood, true_z
+from lfm_ppl.experiments.simulated import parameters, states
+from lfm_ppl.experiments.simulated.problem import Problem, drawn_record, model_file, record, true_likelihood, true_z
 
 EPIDEMICS = Problem("epidemic", ("r0", "scale", "lengthscale", "concentration"), ("log transmission",), ("",),
                     medians=(2.0, 0.3, 15.0, 10.0), steps=10)
@@ -39,3 +44,32 @@ def test_a_force_is_tracked_by_counts():
         assert found["smoother_coverage"][index, 0] == np.mean(np.abs(error) <= Z * np.asarray(force.sd))
     assert found["filter_rmse"].shape == (2, 1) and found["mean"].shape == (1, 60)
     assert (found["smoother_rmse"] < found["filter_rmse"]).all()
+
+
+@pytest.mark.slow
+def test_parameters_are_found_from_counts():
+    """What is drawn from the prior lies among the weighted draws, and particles agree about the force."""
+    task = Task("drawn/0", 0, {"first": 0, "last": 1, "draws": 200, "paths": 10})
+    found = parameters.weighted(EPIDEMICS, task, drawn=True)
+    assert found["posterior_mean"].shape == found["below"].shape == (2, 4) and found["draws"].shape == (4, 200)
+    assert (found["k"] < 0.7).all() and (found["ess"] > 50).all()
+    truth = np.stack([drawn_record(EPIDEMICS, index).z for index in (0, 1)])
+    assert (np.abs(found["posterior_mean"] - truth) < 4 * found["posterior_sd"]).all()
+    assert ((found["below"] > 0) & (found["below"] < 1)).all()
+    few = states.particles(EPIDEMICS, Task("particles/0", 0, {"index": 0, "particles": 500, "steps": 2, "draws": 200}))
+    force = true_likelihood(EPIDEMICS).smooth(jnp.asarray(record(EPIDEMICS, 0).y)).force("log transmission")
+    late = few["distinct"] > 100
+    assert late.any() and few["mean"].shape == (1, 60)
+    assert np.sqrt(np.mean(((few["mean"][0] - force.mean) / force.sd)[late] ** 2)) < 0.5
+
+
+def test_wrong_names_are_refused():
+    with pytest.raises(ValueError, match="unknown parameter 'r1'"):
+        true_z(dataclasses.replace(EPIDEMICS, names=("r1",)))
+
+
+def test_kinds_reach_the_workers():
+    for kind in experiment.STUDY.kinds.values():
+        again = pickle.loads(pickle.dumps(kind.compute))
+        assert again.func is kind.compute.func and again.args == kind.compute.args and again.args[0] == TARGETS
+    assert model_file("epidemic") is model_file("epidemic")

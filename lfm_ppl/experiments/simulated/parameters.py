@@ -38,10 +38,7 @@ none among plausible values."""
 
 
 def weighted(problem: Problem, task: Task, drawn: bool = False) -> Result:
-    """Return what `estimate` finds of every data set of a task, and ``draws`` (P, D) of the first.
-
-    Where they are ``drawn`` the true parameters are of the prior.
-    """
+    """Return what `estimate` finds of every data set, with the truth or one ``drawn``, and ``draws`` of the first."""
     taken = drawn_record if drawn else record
     return stacked([estimate(problem, taken(problem, index, task.seed), task.settings["draws"], task.settings["paths"],
                              int(jax.random.bits(jax.random.fold_in(task.key, index)))) for index in indices(task)],
@@ -71,7 +68,7 @@ def estimate(problem: Problem, one: Record, count: int, paths: int, seed: int) -
         mode, likely = (newton(each, quasi_newton(each, start, 200).point) for each in objectives)
         return likely, weighted_posterior(density, one.y, [mode], count, seed)
 
-    seconds, (likely, found) = timed_again(f"{problem.file}, {count} weighted draws", search)
+    seconds, (likely, found) = timed_again(f"{problem}, {count} weighted draws", search)
     row = {**found.summary, "likely": likely.point, "seconds": seconds, "draws": found.resampled(count, seed).T,
            "below": found.weight @ (found.draws < one.z),
            "exists": likely.curvature is not None and likely.curvature.definite
@@ -105,9 +102,9 @@ def alone(problem: Problem, reach: float, task: Task) -> Result:
 
 
 def below(problem: Problem, reach: float, one: Record, nodes: int = 121) -> float:
-    """Return the posterior probability that the first parameter is less than it is, for a flat prior, by quadrature.
+    """Return the posterior probability that the first parameter is less than it is, the others known, by quadrature.
 
-    All others are known. The nodes span its logarithm within ``reach`` of the truth: several posterior standard
+    The prior of its logarithm is flat within ``reach`` of the truth, where the nodes are: several posterior standard
     deviations on either side, a few nodes in each.
     """
     points = np.tile(one.z, (nodes, 1))

@@ -1,6 +1,7 @@
 """What is simulated from a shipped model, and the densities of its parameters.
 
-Everything that is compiled for a problem serves all its data sets.
+Everything that is compiled for a problem serves all its data sets. The model takes no known inputs, and its data are
+simulated with the values at which some of its parameters are fixed.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpyro import handlers
 
-from lfm_ppl import loading
+from lfm_ppl import checks, loading
 from lfm_ppl.data import Data
 from lfm_ppl.inference.bound_model import bind
 from lfm_ppl.inference.handlers.fixing import fix
@@ -32,8 +33,8 @@ class Problem:
 
     Attributes:
         file: the name of the model.
-        names: of its P unknown parameters, all positive; everything is in their logarithms z. Others have the values
-            at which they are fixed by default.
+        names: of its P unknown parameters, positive numbers; everything is in their logarithms z. Others are fixed by
+            default.
         paths: the K states and forces that are estimated, in the order of the rows of every array of paths.
         units: theirs.
         medians: of the priors of the parameters, where searches start.
@@ -67,8 +68,7 @@ class Record(NamedTuple):
 @functools.lru_cache(maxsize=1024)
 def record(problem: Problem, index: int, seed: int = 0) -> Record:
     """Return data set ``index``: what ``lfm-ppl simulate`` writes of the model for the seed 10000 seed + index."""
-    with jax.ensure_compile_time_eval():  # compiled code may be the first to ask
-        data = loading.load(problem.file).simulate(seed=MOST * seed + index)
+    data = model_file(problem.file).simulate(seed=MOST * seed + index)
     truth: Any = data.truth
     return _record(problem, data.times, data.y, truth["times"], truth["state"], truth["forces"], true_z(problem))
 
@@ -76,21 +76,18 @@ def record(problem: Problem, index: int, seed: int = 0) -> Record:
 @functools.lru_cache(maxsize=1024)
 def drawn_record(problem: Problem, index: int, seed: int = 0) -> Record:
     """Return a data set whose parameters and start are drawn from their priors, too."""
-    with jax.ensure_compile_time_eval():
-        z, found = _drawing(problem)(jax.random.fold_in(jax.random.key(seed), index))
-    at = _within(found.times, times := default(problem).times)
+    z, found = _drawing(problem)(jax.random.fold_in(jax.random.key(seed), index))
+    times = default(problem).times
+    at = np.searchsorted(np.asarray(found.times), times - 1e-9)
     return _record(problem, times, np.asarray(found.y)[at], found.times, found.state, found.forces, z)
 
 
 def _record(problem: Problem, times: np.ndarray, y: Any, fine: Any, state: Any, forces: Any, z: Any) -> Record:
-    names, at = true_likelihood(problem).model.state_names, _within(fine, times)
+    names, at = true_likelihood(problem).model.state_names, np.searchsorted(np.asarray(fine), times - 1e-9)
+    for name in problem.paths:
+        checks.one_of("path", name, (*names, *forces))
     paths = [state[:, names.index(name)] if name in names else forces[name] for name in problem.paths]
     return Record(times, np.asarray(y), np.stack([np.asarray(path)[at] for path in paths]), np.asarray(z))
-
-
-def _within(fine: Any, times: np.ndarray) -> np.ndarray:
-    """Return the indices of times among finer ones."""
-    return np.searchsorted(np.asarray(fine), times - 1e-9)
 
 
 @functools.cache
@@ -109,22 +106,31 @@ def _drawing(problem: Problem) -> Any:
 
 
 @functools.cache
+def model_file(name: str) -> loading.ModelFile:
+    """Return a shipped model, loaded once, so that its simulator is compiled once."""
+    return loading.load(name)
+
+
+@functools.cache
 def default(problem: Problem) -> Data:
     """Return the model's default data."""
     with jax.ensure_compile_time_eval():
-        return loading.load(problem.file).simulate()
+        return model_file(problem.file).simulate()
 
 
 def true_z(problem: Problem) -> np.ndarray:
     """Return the logarithms of the true parameters (P,)."""
     truth: Any = default(problem).truth
-    return np.log([truth["parameters"][name] for name in problem.names])
+    known = {name: value for name, value in truth["parameters"].items() if np.ndim(value) == 0}
+    for name in problem.names:
+        checks.one_of("parameter", name, known)
+    return np.log([known[name] for name in problem.names])
 
 
 @functools.cache
 def model(problem: Problem) -> Any:
     """Return the NumPyro model with what is fixed by default."""
-    file, data = loading.load(problem.file), default(problem)
+    file, data = model_file(problem.file), default(problem)
     with jax.ensure_compile_time_eval():
         return fix(file.model, dict(file.anchors(data)))
 

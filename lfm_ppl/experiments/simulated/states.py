@@ -24,13 +24,12 @@ from lfm_ppl.experiments.timing import timed_again
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.linearisation.sigma_points import Cubature, GaussHermite
 from lfm_ppl.linearisation.taylor import Taylor
-from lfm_ppl.model.state_space import state_space
 from lfm_ppl.particles.particle_filter import particle_filter
 from lfm_ppl.particles.particle_smoother import TRACING, ParticleSmootherResult, particle_smoother
 
 RULES: dict[str, Rule] = {"cubature": Cubature(), "Taylor": Taylor(), "Gauss-Hermite (5)": GaussHermite(5),
                           "cubature, whole state": Cubature(full_state=True)}
-"""Ways to linearise dynamics, that of the models by default first."""
+"""Ways to linearise dynamics, that of most models first."""
 
 REPORTED = next(iter(RULES))
 
@@ -45,7 +44,7 @@ def gaussian(problem: Problem, task: Task) -> Result:
 
 @functools.cache
 def _programs(problem: Problem, rule: str) -> tuple[Callable, Callable]:
-    """Return filter and smoother with the settings of the likelihood but for its rule, compiled for all data sets."""
+    """Return filter and smoother with the likelihood's steps, iterations and sites, compiled for all data sets."""
     given = copy.copy(true_likelihood(problem))
     given.rule = RULES[rule]
 
@@ -57,10 +56,7 @@ def _programs(problem: Problem, rule: str) -> tuple[Callable, Callable]:
 
 
 def particles(problem: Problem, task: Task) -> Result:
-    """Return what particles find of one data set, see `_judged`.
-
-    There is also through how many ``distinct`` (T,) ones the traced paths pass.
-    """
+    """Return what particles find of one data set, see `_judged`, and how many ``distinct`` ones (T,) the paths pass."""
     given, times = true_likelihood(problem).model, default(problem).times
     filter_key, smoother_key = jax.random.split(task.key)
     options = {"particles": task.settings["particles"], "steps": task.settings["steps"]}
@@ -89,11 +85,11 @@ def _judged(problem: Problem, task: Task, index: int, label: str, filtering: Cal
     """Filter and smooth a data set; what is compiled in the first call with this label takes no time.
 
     Returns:
-        ``filter_rmse``, ``smoother_rmse`` and ``smoother_coverage`` (K,), ``log_likelihood``, CPU times
+        ``filter_rmse``, ``smoother_rmse`` and ``smoother_coverage`` (K,), the filter's ``log_likelihood``, CPU times
         ``filter_seconds`` and ``smoother_seconds``, which has its own filter's in it, ``mean`` and ``sd`` (K, T) of the
         problem's paths; and the result of ``smoothing``, from which ``paths`` takes these.
     """
-    one, label = record(problem, index, task.seed), f"{problem.file}, {label}"
+    one, label = record(problem, index, task.seed), f"{problem}, {label}"
     filter_s, (joint, log_likelihood) = timed_again(f"{label}, filter", lambda: filtering(one.y))
     smoother_s, found = timed_again(f"{label}, smoother", lambda: smoothing(one.y))
     mean, sd = map(np.asarray, paths(found))
@@ -104,7 +100,7 @@ def _judged(problem: Problem, task: Task, index: int, label: str, filtering: Cal
 
 def _filtered(problem: Problem, joint: jax.Array) -> jax.Array:
     """Return filtered means (K, T) of the problem's paths from those (T, n) of the joint state."""
-    model, times = true_likelihood(problem).model, jnp.asarray(default(problem).times)
-    names = (*model.state_names, *model.force_names)
-    inputs = jax.vmap(state_space(model).inputs)(jnp.asarray(joint), times)
+    given = true_likelihood(problem)
+    names = (*given.model.state_names, *given.model.force_names)
+    inputs = jax.vmap(given.ssm.inputs)(jnp.asarray(joint), jnp.asarray(default(problem).times))
     return inputs.T[np.array([names.index(name) for name in problem.paths])]
