@@ -132,6 +132,11 @@ def rows(found: xr.Dataset, dim: str, columns: Mapping[str, Column], label: str 
     return {label.format(one): row(found.sel({dim: one}), columns) for one in found[dim].values}
 
 
+def in_one_row(several: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the cells of several rows, all of different columns, as those of one."""
+    return {name: value for cells in several.values() for name, value in cells.items()}
+
+
 def _split(found: xr.Dataset, name: str) -> list[xr.Dataset]:
     named = _LABEL.search(name)
     if named is None or not found[named[1]].dims:

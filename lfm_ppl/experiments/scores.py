@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 import xarray as xr
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import make_interp_spline
 
 from lfm_ppl import checks
 from lfm_ppl.results import arviz_data
@@ -224,7 +224,7 @@ class GridPosterior:
         possible = np.flatnonzero(relative > _FLOOR)
         for run in np.split(possible, np.flatnonzero(np.diff(possible) > 1) + 1):
             # A spline across the edge of a run would overshoot beside it, by more than the peak is high.
-            spline = CubicSpline(nodes[run], relative[run]) if len(run) > 1 else lambda x, own=relative[run]: own
+            spline = make_interp_spline(nodes[run], relative[run], min(3, len(run) - 1))
             inside = (self.x >= nodes[run[0]]) & (self.x <= nodes[run[-1]])
             log_density[inside] = spline(self.x[inside])
         density = np.exp(log_density - log_density.max())

@@ -61,10 +61,8 @@ def indices(task: Task) -> range:
     They are its setting ``index``, those from ``first`` to ``last``, or ``count`` from ``first`` on.
 
     Example:
-        >>> indices(Task("a", 0, {"index": 2})), indices(Task("b", 0, {"first": 0, "last": 4}))
-        (range(2, 3), range(0, 5))
-        >>> indices(Task("c", 0, {"first": 3, "count": 2}))
-        range(3, 5)
+        >>> [indices(Task("a", 0, of)) for of in ({"index": 2}, {"first": 3, "last": 4}, {"first": 3, "count": 2})]
+        [range(2, 3), range(3, 5), range(3, 5)]
     """
     given = task.settings
     if "index" in given:

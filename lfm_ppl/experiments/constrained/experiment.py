@@ -12,7 +12,7 @@ from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import study
 from lfm_ppl.experiments.constrained import estimators, figures, problem
 from lfm_ppl.experiments.constrained.estimators import BANDS, FULL, METHODS, SMOOTHER
-from lfm_ppl.experiments.datasets import Column, Kind, row, rows
+from lfm_ppl.experiments.datasets import Column, Kind, in_one_row, row, rows
 from lfm_ppl.experiments.scores import SE, rate_of
 from lfm_ppl.experiments.study import Data, Study, Table, setting
 from lfm_ppl.experiments.tasks import blocks, slug
@@ -100,7 +100,7 @@ def by_shape(found: xr.Dataset) -> dict[str, Any]:
     """Return median MSE and coverage of one estimator for each shape of the force."""
     columns: dict[str, Column] = {"median MSE, {shape}": lambda of: of.mse.median(skipna=False),
                                   "coverage, {shape}": "coverage"}
-    return {name: value for own in rows(found, "shape", columns).values() for name, value in own.items()}
+    return in_one_row(rows(found, "shape", columns))
 
 
 def others(data: Data) -> dict[str, Any]:

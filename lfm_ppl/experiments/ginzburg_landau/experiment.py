@@ -11,7 +11,7 @@ import xarray as xr
 from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import study
 from lfm_ppl.experiments.chains import LENGTHS
-from lfm_ppl.experiments.datasets import Column, Kind, rows
+from lfm_ppl.experiments.datasets import Column, Kind, in_one_row, rows
 from lfm_ppl.experiments.ginzburg_landau import figures, parameters, problem, states
 from lfm_ppl.experiments.scores import Estimate
 from lfm_ppl.experiments.study import CHAINS, Data, Study, Table, setting
@@ -125,9 +125,8 @@ def posteriors(data: Data) -> dict[str, Any]:
     """Return posterior means and standard deviations by MCMC, averaged over realisations, and the coverage of each."""
     found = data["mcmc"].assign(coverage=_covered(data["mcmc"]))
     columns = {f"{name} {{parameter}}": name for name in ("mean", "sd", "coverage")}
-    every = rows(found, "sampler", {"divergences": lambda one: one.divergences.mean()})
-    return {label: {name: value for own in rows(found.sel(sampler=label), "parameter", columns).values()
-                    for name, value in own.items()} | divergences for label, divergences in every.items()}
+    return {label: in_one_row(rows(found.sel(sampler=label), "parameter", columns))
+            | {"divergences": float(found.divergences.sel(sampler=label).mean())} for label in parameters.SAMPLERS}
 
 
 def _covered(one: xr.Dataset) -> xr.DataArray:

@@ -83,10 +83,9 @@ def judged(found: Result, truth: np.ndarray) -> Result:
     deviation, for all methods; the band is the mean +- 1.96 standard deviations.
     """
     mean, sd = found["mean"], np.maximum(found["sd"], 1e-12)
-    error = np.sqrt(np.mean((mean - truth) ** 2, axis=1))
-    error = np.where(np.isfinite(error), error, np.inf)
+    error = np.nan_to_num(scores.rmse(mean, truth), nan=np.inf, posinf=np.inf)
     stopped = np.asarray(found.get("stopped", True), bool)
-    return {"rmse": error, "coverage": (np.abs((truth - mean) / sd) <= scores.Z).mean(axis=1),
+    return {"rmse": error, "coverage": scores.covered(*scores.interval(mean, sd), truth),
             "nlpd": -norm.logpdf(truth, mean, sd).mean(axis=1), "diverged": ~(error <= problem.DIVERGED) | ~stopped}
 
 
