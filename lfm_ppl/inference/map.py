@@ -16,7 +16,7 @@ from numpyro.infer import init_to_median, init_to_sample
 
 from lfm_ppl import checks
 from lfm_ppl.inference.bound_model import BoundModel, bind_arguments
-from lfm_ppl.inference.optimise import Minimum, Objective, newton, quasi_newton
+from lfm_ppl.inference.optimise import End, Minimum, Objective, newton, quasi_newton
 
 _HESSIANS = ("autodiff", "finite-differences")
 _ATTEMPTS = 20
@@ -51,6 +51,7 @@ class MAPResult:
             and have no other meaning.
         restart_log_densities: log density reached from each start, (restarts,); -inf where no
             possible starting point was found. Differences above 1e-6 of the value mean several modes.
+        restart_ends: where the search from each start ended, (restarts, d); NaN where there was no start.
         evaluations: number of gradients that were computed.
     """
 
@@ -66,6 +67,7 @@ class MAPResult:
     message: str
     unidentified: tuple[str, ...]
     restart_log_densities: np.ndarray
+    restart_ends: np.ndarray
     evaluations: int
     _factor: np.ndarray = field(repr=False)
     _constrain: Callable = field(repr=False)
@@ -179,11 +181,11 @@ def mode_of(bound: BoundModel, *, init: Any = None, restarts: int = 4, seed: int
     """Return the posterior mode of a bound model; arguments as in `map_estimate`."""
     objective = bound.objective(jacobian, forward_mode, exact_hessian)
     starts = _starts(bound, jax.random.key(seed), objective.value, init, restarts)
-    ends = [quasi_newton(objective, start, max_iterations, options=_SEARCH) for start in starts if start is not None]
-    reached = iter([-end.value for end in ends])
-    densities = np.array([-np.inf if start is None else next(reached) for start in starts])
+    nowhere = End(np.full(bound.size, np.nan), np.inf)
+    ends = [nowhere if start is None else quasi_newton(objective, start, max_iterations, options=_SEARCH)
+            for start in starts]
     minimum = newton(objective, min(ends, key=lambda end: end.value).point)
-    return _result(bound, objective, minimum, densities, jacobian)
+    return _result(bound, objective, minimum, ends, jacobian)
 
 
 def _starts(
@@ -243,7 +245,7 @@ def _init_to_given(values: Mapping[str, Any], site: dict) -> Any:
 
 
 def _result(
-    bound: BoundModel, objective: Objective, minimum: Minimum, densities: np.ndarray, jacobian: bool
+    bound: BoundModel, objective: Objective, minimum: Minimum, ends: list[End], jacobian: bool
 ) -> MAPResult:
     point, curvature, names = minimum.point, minimum.curvature, bound.names
     unconstrained = {k: np.asarray(v) for k, v in bound.unravel(point).items()}
@@ -276,7 +278,8 @@ def _result(
         converged=not message,
         message=message or "converged",
         unidentified=unidentified,
-        restart_log_densities=densities,
+        restart_log_densities=np.array([-end.value for end in ends]),
+        restart_ends=np.stack([end.point for end in ends]),
         evaluations=objective.evaluations,
         _factor=factor,
         _constrain=bound.constrain_draws,
