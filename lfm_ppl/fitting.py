@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import inspect
 import json
+import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -16,7 +17,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.stages import Lowered
 from numpyro.infer import init_to_median, init_to_value
@@ -31,6 +31,13 @@ from lfm_ppl.inference.bound_model import BoundModel, bind
 from lfm_ppl.inference.interruption import was_interrupt
 from lfm_ppl.inference.kernels.options import KERNELS, check_options
 from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalRAM, Tuned
+from lfm_ppl.inference.laplace_start import (
+    MAX_PARAMETERS,
+    Laplace,
+    UnusableModeError,
+    laplace_approximation,
+    starting_points,
+)
 from lfm_ppl.inference.map import MAPResult, check_sites, mode_of
 from lfm_ppl.inference.marginal_likelihood import Panel
 from lfm_ppl.inference.posterior import evenly_spaced, scores, trajectories
@@ -48,6 +55,9 @@ from lfm_ppl.results.files import POSTERIOR
 from lfm_ppl.results.inputs import remember
 from lfm_ppl.results.layout import Labels, checked_truth, lay_out
 
+_WARMUP, _SHORT_WARMUP = 1000, 300
+"""Draws of the warm-up of each chain by default; the short one is that of NUTS from the Laplace approximation."""
+
 _GRID = 200
 """Number of grid points of trajectories where no times are asked for."""
 
@@ -62,7 +72,7 @@ def fit(
     *,
     sampler: str = "nuts",
     chains: int = 4,
-    warmup: int = 1000,
+    warmup: int | None = None,
     samples: int | None = None,
     thin: int | None = None,
     seed: int = 0,
@@ -95,7 +105,7 @@ def fit(
             the likelihood, and the posterior is exact up to its integration steps), or "map" (posterior mode; the draws
             come from its Laplace approximation).
         chains: number of chains.
-        warmup: number of warm-up steps in each.
+        warmup: number of warm-up steps in each; by default 1000, and 300 for NUTS from the Laplace approximation.
         samples: number of draws in each, by default 1000; for "map", in all, by default 400.
         thin: steps of the chain that make one draw, in the warm-up too. By default 1 for NUTS, 5 for each parameter
             for RAM, whose steps are cheap and short, and 2 for each parameter for particle-marginal RAM.
@@ -105,10 +115,12 @@ def fit(
         trajectory_draws: number of posterior draws, spread over the chains, for which trajectories are drawn; 0: none.
         model_kwargs: keyword arguments of the model.
         fixed: parameters that are not learnt: name -> value, ``{"decay": 0.8}`` or ``{"decay[CDKN1A]": 0.8}``.
-        init: starting points: "map" for the posterior mode, "median" for the prior median, or a NumPyro strategy; by
-            default the prior median for NUTS, and draws from the Laplace approximation at the mode for the others. With
-            "map" NUTS begins its warm-up with the covariance at the mode as its (full) inverse mass matrix, which saves
-            most of the warm-up where parameters have narrow posteriors or strong correlations.
+        init: starting points. By default, or with "map", draws about the posterior mode. For NUTS they come from the
+            Laplace approximation N(mode, C) widened to twice its standard deviations, and C, the inverse Hessian, is
+            the (dense) inverse mass matrix with which the warm-up begins and towards which its estimates are
+            regularised. Where the Laplace approximation is not usable (a flat direction, a Hessian that is not positive
+            definite, several modes of similar height, more than 100 parameters) NUTS starts as with "median", the prior
+            median and a unit mass matrix, and one line says why. Or a NumPyro strategy.
         sampler_options: further arguments of NUTS, `RAM` or `ParticleMarginalRAM`, for example
             ``{"target_accept_prob": 0.95}`` or ``{"particles": 500, "delayed": True}``.
         chain_method: "parallel", "vectorized" or "sequential"; by default parallel where there are as many devices as
@@ -238,9 +250,9 @@ def fit(
     return result
 
 
-def _check_sizes(sampler: str, chains: int, warmup: int, samples: int, thin: int | None, paths: int) -> None:
+def _check_sizes(sampler: str, chains: int, warmup: int | None, samples: int, thin: int | None, paths: int) -> None:
     checks.one_of("sampler", sampler, SAMPLERS, likeness=checks.ABBREVIATIONS)
-    for label, value, none in (("chains", chains, ()), ("samples", samples, ()), ("warmup", warmup, (0,)),
+    for label, value, none in (("chains", chains, ()), ("samples", samples, ()), ("warmup", warmup, (None, 0)),
                                ("thin", thin, (None,)), ("trajectory_draws", paths, (0,))):
         if value not in none:
             checks.positive_integer(label, value)
@@ -256,7 +268,7 @@ class _Asked(NamedTuple):
 
     sampler: str
     chains: int
-    warmup: int
+    warmup: int | None
     samples: int
     thin: int | None
     seed: int
@@ -367,16 +379,19 @@ class _Run:
                                                              keeper)
             return
         assert asked.thin is not None
-        warmup = asked.warmup * asked.thin
         setup = keeper.setup if keeper is not None and keeper.started else None
-        from_mode = asked.sampler != "nuts" or asked.init == "map"
-        with waiting(_SEARCH if from_mode else _START, self.progress and setup is None):
-            transition, starts, remarks = _transition(asked.sampler, self.bound, asked.options, asked.init,
-                                                      asked.keys[2], asked.seed, asked.chains, warmup, setup,
-                                                      self._compile_ahead)
+        is_at_mode = asked.init in (None, "map")
+        with waiting(_SEARCH if is_at_mode else _START, self.progress and setup is None):
+            if asked.sampler == "nuts":
+                transition, starts, remarks = _nuts_transition(self.bound, asked, setup, self._compile_ahead)
+            else:
+                transition, starts, remarks = _transition(asked, self.bound, setup, self._compile_ahead)
+        if self.progress and setup is None and _FALLBACK in remarks:
+            print(f"note     {remarks[_FALLBACK]}", file=sys.stderr, flush=True)
+        warmup = remarks["warmup"] * asked.thin
         if keeper is not None:
             if setup is None:
-                keeper.setup = {name: remarks[name] for name in ("particles", "log_likelihood_sd") if name in remarks}
+                keeper.setup = {name: remarks[name] for name in _SETUP if name in remarks}
             keeper.look = self._look
         self.particles = {label: remarks.pop(label, None) for label in _OF_PARTICLES}
         self.remarks = {**remarks, "thin": asked.thin}
@@ -408,15 +423,19 @@ class _Run:
         ready()
         arviz_data.load_arviz()
 
-    def _compile_ahead(self, transition: Transition) -> None:
+    def _compile_ahead(self, transition: Transition, warmup: int) -> None:
         """Compile all programs: while it is found out where the chains start, and then while they run.
+
+        Args:
+            transition: how the chains move.
+            warmup: draws of the warm-up.
 
         When this returns, those that find the starts are compiled: the search would compile them itself. Where the
         density is not finite at the prior median, there may be nowhere to start, and this be told soon: what follows
         the chains is left for later.
         """
         asked, keeper, thin = self.asked, self.keeper, self.asked.thin or 1
-        done, warmup = None if keeper is None else keeper.done, asked.warmup * thin
+        done, warmup = None if keeper is None else keeper.done, warmup * thin
         ready = self.ahead.add(
             lambda: sampling.lower_start(self.bound, transition, asked.chains) if done is None else [])
         if done is None or done < warmup + asked.samples * thin:
@@ -521,6 +540,12 @@ class _Stopped(KeyboardInterrupt):
         self.result = result
 
 
+_FALLBACK = "init_fallback"
+"""Attribute of a result: why NUTS did not start from the Laplace approximation."""
+
+_SETUP = ("particles", "log_likelihood_sd", "warmup", "init", _FALLBACK)
+"""Remarks of the start that a run needs to go on."""
+
 _OF_PARTICLES = ("particle_settings", "particle_steps")
 """What the trajectories of pmmh need to know of its particles."""
 
@@ -619,44 +644,70 @@ def _strategy(init: Any, bound: BoundModel, seed: int) -> Any:
     return init_to_value(values=mode_of(bound, seed=seed).parameters) if isinstance(init, str) else init
 
 
-def _transition(sampler: str, bound: BoundModel, options: Mapping[str, Any] | None, init: Any, key: jax.Array,
-                seed: int, chains: int, warmup: int, setup: Mapping[str, Any] | None,
-                prepare: Callable[[Transition], None]) -> tuple[Transition, np.ndarray | None, dict[str, Any]]:
-    """Return how the chains move, where each of them starts (C, d), and what to remember of it.
+def _nuts_transition(bound: BoundModel, asked: _Asked, setup: Mapping[str, Any] | None,
+                     prepare: Callable[[Transition, int], None]) -> tuple[Transition, np.ndarray | None, dict]:
+    """Return the transition of NUTS, the starting points (C, d), and remarks; see `_transition`."""
+    init, options = asked.init, asked.options
+    _check_init(init)
+    # A mass matrix of the user's is not regularised by another one.
+    is_free = not {"inverse_mass_matrix", "dense_mass"} & options.keys()
+    placeholder = Laplace(np.zeros(bound.size), np.eye(bound.size))
+
+    def transition(laplace: Laplace | None, warmup: int) -> Transition:
+        return sampling.nuts(bound, warmup * (asked.thin or 1), options, laplace if is_free else None)
+
+    def steps(is_laplace: bool) -> int:
+        return asked.warmup if asked.warmup is not None else _SHORT_WARMUP if is_laplace else _WARMUP
+
+    if setup is not None:
+        is_laplace = setup["init"] == "laplace"
+        resumed = transition(placeholder if is_laplace else None, setup["warmup"])
+        prepare(resumed, setup["warmup"])
+        return resumed, None, dict(setup)
+    reason = None
+    if init is None or isinstance(init, str) and init == "map":
+        if bound.size <= MAX_PARAMETERS:
+            prepare(transition(placeholder, steps(True)), steps(True))
+        try:
+            laplace = laplace_approximation(bound, asked.seed)
+        except UnusableModeError as error:
+            reason = f"the chains start at the prior median, with a unit mass matrix: {error}"
+        else:
+            return (transition(laplace, steps(True)), starting_points(asked.keys[2], bound, laplace, asked.chains),
+                    {"warmup": steps(True), "init": "laplace"})
+        init = None
+    chosen = transition(None, steps(False))
+    prepare(chosen, steps(False))
+    points = _starts(asked.keys[2], bound, _strategy(init, bound, asked.seed), asked.chains, chosen.evaluate)
+    remarks = {"warmup": steps(False), "init": "strategy" if callable(init) else "median"}
+    if reason is None:
+        return chosen, points, remarks
+    return chosen._replace(if_slow=""), points, remarks | {_FALLBACK: reason}
+
+
+def _transition(asked: _Asked, bound: BoundModel, setup: Mapping[str, Any] | None,
+                prepare: Callable[[Transition, int], None]) -> tuple[Transition, np.ndarray | None, dict[str, Any]]:
+    """Return how the chains of a random walk move, where each of them starts (C, d), and what to remember of it.
 
     Chains that go on start nowhere: all that their transition needs to know is in ``setup``. ``prepare`` is called as
-    soon as it is known how they move.
+    soon as it is known how they move, with the draws of the warm-up.
     """
+    init, sampler, seed, key, chains = asked.init, asked.sampler, asked.seed, asked.keys[2], asked.chains
     _check_init(init)
-    options = dict(options or {})
-    at_mode = sampler == "nuts" and isinstance(init, str) and init == "map" and "inverse_mass_matrix" not in options
-    if at_mode:
-        options.setdefault("dense_mass", True)
+    options = dict(asked.options)
+    draws = _WARMUP if asked.warmup is None else asked.warmup
+    warmup = draws * (asked.thin or 1)
     if setup is not None:
-        if sampler == "nuts":
-            transition = sampling.nuts(bound, warmup, options)
-            prepare(transition)
-            return transition._replace(if_slow="") if at_mode else transition, None, {}
         kernel = KERNELS[sampler](bound.model, **options)
         if not isinstance(kernel, ParticleMarginalRAM):
             transition = sampling.random_walk(bound, kernel, warmup)
-            prepare(transition)
-            return transition, None, {}
+            prepare(transition, draws)
+            return transition, None, {"warmup": draws}
         kernel.prepare(bound, None, Tuned(int(setup["particles"]), float(setup["log_likelihood_sd"])))
-        return sampling.particle_marginal(bound, kernel, warmup), None, _remarks(kernel)
-    if sampler == "nuts":
-        dense = at_mode and options["dense_mass"] is True
-        transition = sampling.nuts(bound, warmup, options, np.eye(bound.size) if dense else None)
-        prepare(transition)
-        if dense:
-            laplace = mode_of(bound, seed=seed)
-            if not laplace.unidentified and np.all(np.isfinite(laplace.covariance)):
-                transition = transition._replace(extra=jnp.asarray(laplace.covariance))
-            return transition, np.tile(laplace.mode, (chains, 1)), {}
-        return transition, _starts(key, bound, _strategy(init, bound, seed), chains, transition.evaluate), {}
+        return sampling.particle_marginal(bound, kernel, warmup), None, _remarks(kernel) | {"warmup": draws}
     if sampler == "ram":
         # Whatever covariance it begins with, its programs are these.
-        prepare(sampling.random_walk(bound, KERNELS[sampler](bound.model, **options), warmup))
+        prepare(sampling.random_walk(bound, KERNELS[sampler](bound.model, **options), warmup), draws)
     strategy = _strategy(init, bound, seed)
     mode = None
     if "initial_covariance" not in options:
@@ -677,9 +728,9 @@ def _transition(sampler: str, bound: BoundModel, options: Mapping[str, Any] | No
     starts = (_starts(key, bound, strategy, chains, bound.log_density) if mode is None or init is not None
               else _about(key, bound, mode, chains))
     if not isinstance(kernel, ParticleMarginalRAM):
-        return sampling.random_walk(bound, kernel, warmup), starts, {}
+        return sampling.random_walk(bound, kernel, warmup), starts, {"warmup": draws}
     kernel.prepare(bound, starts[0])
-    return sampling.particle_marginal(bound, kernel, warmup), starts, _remarks(kernel)
+    return sampling.particle_marginal(bound, kernel, warmup), starts, _remarks(kernel) | {"warmup": draws}
 
 
 def _remarks(kernel: ParticleMarginalRAM) -> dict[str, Any]:

@@ -120,11 +120,11 @@ def test_a_run_that_is_stopped_goes_on_to_the_same_draws(sampler, whole, tmp_pat
     assert "partial" not in arviz_data.summary(expected)
 
 
-def test_chains_from_the_mode_go_on_to_the_same_draws(whole, tmp_path, stop_after):
-    expected = whole("nuts", init="map")
+def test_chains_from_the_median_go_on_to_the_same_draws(whole, tmp_path, stop_after):
+    expected = whole("nuts", init="median")
     stop_after(3)
-    assert "partial" in arviz_data.attributes(fit("nuts", init="map", checkpoint=tmp_path / "run"))
-    assert_same(fit("nuts", init="map", checkpoint=tmp_path / "run", resume=True), expected)
+    assert "partial" in arviz_data.attributes(fit("nuts", init="median", checkpoint=tmp_path / "run"))
+    assert_same(fit("nuts", init="median", checkpoint=tmp_path / "run", resume=True), expected)
 
 
 @pytest.mark.parametrize("sampler", ["ram", "map"])
@@ -354,7 +354,7 @@ def test_the_time_left_is_that_at_the_pace_of_the_last_minute(capfd, monkeypatch
 
 def test_whoever_waits_for_a_long_warm_up_is_told_once_what_helps(capfd, monkeypatch):
     said = []
-    for seconds, init in ((0.0, None), (1e9, None), (0.0, "map")):
+    for seconds, init in ((0.0, "median"), (1e9, "median"), (0.0, None)):
         monkeypatch.setattr("lfm_ppl.inference.progress.SURE_S", 0.0)
         monkeypatch.setattr("lfm_ppl.inference.progress.LONG_S", seconds)
         with warnings.catch_warnings():
@@ -362,7 +362,7 @@ def test_whoever_waits_for_a_long_warm_up_is_told_once_what_helps(capfd, monkeyp
             lfm.fit(well, TIMES, Y, sampler="nuts", init=init, **SIZES)
         said.append([line for line in capfd.readouterr().err.splitlines() if "this warm-up is slow" in line])
     assert [len(lines) for lines in said] == [1, 0, 0]
-    assert said[0][0].startswith("note     ") and "--init map" in said[0][0]
+    assert said[0][0].startswith("note     ") and "without --init" in said[0][0]
 
 
 def test_what_tells_nothing_itself_is_told_of_as_long_as_it_lasts(capfd, monkeypatch):

@@ -358,7 +358,8 @@ def _add_inference(group: Any) -> None:
         help="default: nuts; pmmh is ram on a particle filter's likelihood, exact and slow",
     )
     group.add_argument("--chains", type=values.whole(1), default=4, help="default: 4")
-    group.add_argument("--warmup", type=values.whole(0), default=1000, help="per chain (default: 1000)")
+    group.add_argument("--warmup", type=values.whole(0),
+                       help="per chain (default: 300 for nuts from the posterior mode, 1000 otherwise)")
     group.add_argument("--samples", type=values.whole(1), metavar="N",
                        help="draws of each chain (default: 1000); with map, in all (default: 400)")
     group.add_argument("--trajectory-draws", type=values.whole(0), default=400, metavar="N",
@@ -370,9 +371,9 @@ def _add_inference(group: Any) -> None:
     )
     group.add_argument("--seed", type=values.whole(0), default=0, help="random seed of the sampler (default: 0)")
     group.add_argument("--init", type=values.one_of("init", ("map", "median")), metavar="map|median",
-                       help="where chains start: at the posterior mode, nuts then with the covariance there, which "
-                       "helps where its first steps are slow; or at the prior median (default: median for nuts, about "
-                       "the mode for the others)")
+                       help="where chains start: about the posterior mode, nuts then with the covariance there as mass "
+                       "matrix, or at the prior median (default: map; nuts takes the median where the mode is of no "
+                       "use, and says so)")
     group.add_argument(
         "--target-accept",
         type=values.fraction,

@@ -273,6 +273,8 @@ def _exact_chains(task: Check, arguments: argparse.Namespace, folder: Path) -> A
     mode = attrs.get("sampler") == "map"
     chains, warmup, samples = ((_CHAINS, _WARMUP, _SAMPLES) if mode else
                                (int(attrs[name]) for name in ("chains", "warmup", "samples")))
+    if attrs.get("init") == "laplace":  # the short warm-up of NUTS is too short for a random walk
+        warmup = max(warmup, _WARMUP)
     at = None
     if arviz_data.has_group(task.posterior, "trajectories"):
         at = arviz_data.group(task.posterior, "trajectories")["at"].values

@@ -217,7 +217,8 @@ def _print_task(
     if observed.note:
         print(f"note     {observed.note}")
     if arguments.sampler != "map":
-        size = f"{arguments.chains} chains of {arguments.warmup} warm-up and {arguments.samples or 1000} kept draws"
+        warmup = "" if arguments.warmup is None else f" {arguments.warmup} warm-up and"
+        size = f"{arguments.chains} chains of{warmup} {arguments.samples or 1000} kept draws"
         print(f"sampler  {arguments.sampler}, {size}")
     sys.stdout.flush()
 

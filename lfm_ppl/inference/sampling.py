@@ -18,6 +18,7 @@ from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jax.stages import Lowered
 from numpyro.infer import NUTS
+from numpyro.infer.hmc import HMCState
 from numpyro.infer.util import ParamInfo
 
 from lfm_ppl import checks
@@ -28,6 +29,7 @@ from lfm_ppl.inference.kernels import robust_metropolis
 from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalRAM, ParticleMarginalState
 from lfm_ppl.inference.kernels.ram import RAM
 from lfm_ppl.inference.kernels.robust_metropolis import RAMState, finite_or_infinity, initial_state
+from lfm_ppl.inference.laplace_start import Laplace
 from lfm_ppl.inference.progress import Progress, Stage
 from lfm_ppl.inference.random_keys import split_keys
 
@@ -43,8 +45,11 @@ _GROWTH = 8
 """Most that a block may be longer than the one before it: steps of the warm-up differ in length."""
 
 
+_PSEUDO_DRAWS = 20
+"""Weight of the Laplace approximation in the estimates of the covariance of a warm-up, in draws."""
+
 _AT_MODE = ("this warm-up is slow, and the time left may still grow. From the posterior mode, with the covariance "
-            "there, steps are often many times longer: Ctrl-C, and again with init=\"map\" (lfm-ppl fit --init map).")
+            "there, steps are often many times longer: Ctrl-C, and again without init (lfm-ppl fit without --init).")
 
 
 class Transition(NamedTuple):
@@ -73,21 +78,58 @@ class Transition(NamedTuple):
     if_slow: str = ""
 
 
-def nuts(bound: BoundModel, warmup: int, options: Mapping[str, Any],
-         covariance: np.ndarray | None = None) -> Transition:
+class LaplaceNUTSState(NamedTuple):
+    """State of a NUTS chain whose mass matrix is regularised by a Laplace approximation.
+
+    Attributes:
+        hmc: NumPyro's state.
+        laplace: the approximation; the same at every step.
+    """
+
+    hmc: HMCState
+    laplace: Laplace
+
+    @property
+    def z(self) -> Any:
+        """Unconstrained parameters by site."""
+        return self.hmc.z
+
+
+def _with_pseudo_draws(state: HMCState, laplace: Laplace) -> HMCState:
+    """Return the state with `_PSEUDO_DRAWS` draws of the approximation in every empty estimate of the covariance.
+
+    NumPyro begins an estimate at the start of each window of the warm-up, and a window may have few draws for d
+    parameters. Welford's algorithm continues from the mean, the sum of squares and the count of the pseudo-draws, so
+    that the inverse mass matrix is (n S + n_0 C) / (n + n_0).
+    """
+
+    def begin(estimate: tuple) -> tuple:
+        mean, sum_of_squares, count = estimate
+        is_empty = count == 0
+        return (jnp.where(is_empty, laplace.mode, mean),
+                jnp.where(is_empty, _PSEUDO_DRAWS * laplace.covariance, sum_of_squares),
+                jnp.where(is_empty, _PSEUDO_DRAWS, count))
+
+    adaptation = state.adapt_state
+    (sites, estimate), = adaptation.mm_state.items()  # one dense block of all sites
+    return state._replace(adapt_state=adaptation._replace(mm_state={sites: begin(estimate)}))
+
+
+def nuts(bound: BoundModel, warmup: int, options: Mapping[str, Any], laplace: Laplace | None = None) -> Transition:
     """Return the transition of NumPyro's NUTS with ``options``.
 
-    A full mass matrix and forward-mode gradients are the default for up to ten parameters.
+    A dense mass matrix and forward-mode gradients are the default for up to ten parameters.
 
     Args:
         bound: the model.
         warmup: steps of each chain.
         options: of NUTS.
-        covariance: (d, d), the inverse mass matrix with which the warm-up begins; None: the identity.
+        laplace: approximation of the posterior; its covariance is the initial inverse mass matrix, which is dense, and
+            regularises those of the warm-up. None: the warm-up begins with the identity.
     """
-    options = {"forward_mode_differentiation": bound.forward_mode, "dense_mass": bound.forward_mode, **options}
+    options = {"forward_mode_differentiation": bound.forward_mode,
+               "dense_mass": laplace is not None or bound.forward_mode, **options}
     forward_mode = bool(options.pop("forward_mode_differentiation"))
-    given = "inverse_mass_matrix" in options
     both = bound.gradient(forward_mode)
     if isinstance(options["dense_mass"], bool):
         # In blocks of named sites, as NUTS itself has it where it knows their names.
@@ -107,23 +149,32 @@ def nuts(bound: BoundModel, warmup: int, options: Mapping[str, Any],
         return NUTS(potential_fn=lambda z: -log_density(ravel_pytree(z)[0]), **options, **more)
 
     def start(key: jax.Array, point: ParamInfo, y: Any, extra: Any) -> Any:
-        begun = {} if extra is None else {"inverse_mass_matrix": extra}
-        return kernel(y, **begun).init(key, warmup, point, (), {})
+        if extra is None:
+            return kernel(y).init(key, warmup, point, (), {})
+        state = kernel(y, inverse_mass_matrix=extra.covariance).init(key, warmup, point, (), {})
+        return LaplaceNUTSState(_with_pseudo_draws(state, extra), extra)
 
     def step(state: Any, y: Any) -> Any:
+        hmc = state if laplace is None else state.hmc
         own = kernel(y)
         # The kernel's functions are made by `init`, whose state is not used and is dropped by the compiler.
-        own.init(state.rng_key, warmup, ParamInfo(state.z, state.potential_energy, state.z_grad), (), {})
-        return own.sample(state, (), {})
+        own.init(hmc.rng_key, warmup, ParamInfo(hmc.z, hmc.potential_energy, hmc.z_grad), (), {})
+        hmc = own.sample(hmc, (), {})
+        return hmc if laplace is None else LaplaceNUTSState(_with_pseudo_draws(hmc, state.laplace), state.laplace)
 
+    def describe(state: Any) -> str:
+        hmc = state if laplace is None else state.hmc
+        return _words(hmc, hmc.adapt_state.step_size)
+
+    prefix = "" if laplace is None else "hmc."
     fields = {"diverging": "diverging", "acceptance_rate": "accept_prob", "n_steps": "num_steps", "energy": "energy",
               "step_size": "adapt_state.step_size", "lp": "potential_energy"}
-    return Transition(("nuts", warmup, forward_mode, signature(dict(options)) or object()), start, step, fields,
+    return Transition(("nuts", warmup, forward_mode, laplace is not None, signature(dict(options)) or object()),
+                      start, step, {name: prefix + path for name, path in fields.items()},
                       lambda z: both(jnp.asarray(z, float), bound.argument),
                       lambda: [bound.lower_gradient(forward_mode)],
-                      None if covariance is None else jnp.asarray(covariance),
-                      lambda state: _words(state, state.adapt_state.step_size),
-                      "" if covariance is not None or given else _AT_MODE)
+                      None if laplace is None else jax.tree_util.tree_map(jnp.asarray, laplace), describe,
+                      _AT_MODE if laplace is None and "inverse_mass_matrix" not in options else "")
 
 
 def random_walk(bound: BoundModel, kernel: RAM, warmup: int) -> Transition:

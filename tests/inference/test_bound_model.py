@@ -16,6 +16,7 @@ from numpyro.infer.util import ParamInfo, potential_energy
 
 import lfm_ppl as lfm
 from lfm_ppl.inference import bound_model, sampling
+from lfm_ppl.inference.laplace_start import Laplace
 from lfm_ppl.results.arviz_data import group
 
 TIMES = np.array([0.0, 0.7, 1.1, 2.0, 3.0])
@@ -218,20 +219,20 @@ def test_chains_from_the_mode_begin_with_the_covariance_there(monkeypatch):
     begun = {}
 
     def sample(key, bound, transition, *rest, **more):
-        begun["covariance"] = transition.extra
+        begun["laplace"] = transition.extra
         return run(key, bound, transition, *rest, **more)
 
     run = sampling.sample
     monkeypatch.setattr(sampling, "sample", sample)
-    lfm.fit(small, TIMES, Y, init="map", chains=1, warmup=2, samples=2, trajectory_draws=0, progress=False)
+    lfm.fit(small, TIMES, Y, chains=1, warmup=2, samples=2, trajectory_draws=0, progress=False)
     bound = lfm.bind(small, TIMES, Y)
     mode = lfm.map_estimate(small, TIMES, Y)
-    np.testing.assert_allclose(begun["covariance"], mode.covariance, rtol=1e-4)
+    np.testing.assert_allclose(begun["laplace"].covariance, mode.covariance, rtol=1e-4)
     value, gradient = bound.log_density_gradient(mode.mode)
     point = ParamInfo(bound.unravel(mode.mode), -value, bound.unravel(-gradient))
-    transition = sampling.nuts(bound, 30, {"dense_mass": True}, mode.covariance)
+    transition = sampling.nuts(bound, 30, {"dense_mass": True}, Laplace(mode.mode, mode.covariance))
     state = transition.start(jax.random.key(5), point, bound.y, transition.extra)
-    (found,) = state.adapt_state.inverse_mass_matrix.values()
+    (found,) = state.hmc.adapt_state.inverse_mass_matrix.values()
     np.testing.assert_allclose(found, mode.covariance)
 
 

@@ -1,0 +1,103 @@
+"""Where NUTS starts: usable Laplace approximations, overdispersed points, regularised mass matrices."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
+from numpy.testing import assert_allclose
+from numpyro.infer.hmc import HMCState
+from numpyro.infer.hmc_util import HMCAdaptState, welford_covariance
+
+from lfm_ppl.inference import sampling
+from lfm_ppl.inference.bound_model import bind_arguments
+from lfm_ppl.inference.laplace_start import (
+    MAX_PARAMETERS,
+    Laplace,
+    UnusableModeError,
+    laplace_approximation,
+    starting_points,
+)
+
+COVARIANCE = np.array([[1.0, 0.9], [0.9, 2.0]])
+
+
+def bound(model):
+    return bind_arguments(model, (), {}, "test")
+
+
+def gaussian():
+    numpyro.sample("x", dist.MultivariateNormal(jnp.array([1.0, -2.0]), jnp.array(COVARIANCE)))
+
+
+def test_the_approximation_of_a_gaussian_is_the_gaussian():
+    laplace = laplace_approximation(bound(gaussian), seed=0)
+    assert_allclose(laplace.mode, [1.0, -2.0], atol=1e-6)
+    assert_allclose(laplace.covariance, COVARIANCE, rtol=1e-5)
+
+
+def two_modes():
+    x = numpyro.sample("x", dist.Normal(0.0, 3.0))
+    numpyro.factor("bumps", jnp.logaddexp(-0.5 * ((x - 4.0) / 0.3) ** 2, 1.0 - 0.5 * ((x + 4.0) / 0.3) ** 2))
+
+
+def flat():
+    x, y = numpyro.sample("x", dist.ImproperUniform(dist.constraints.real, (), ())), numpyro.sample(
+        "y", dist.ImproperUniform(dist.constraints.real, (), ()))
+    numpyro.factor("sum", -0.5 * (x + y) ** 2)
+
+
+def many():
+    numpyro.sample("x", dist.Normal().expand([MAX_PARAMETERS + 1]).to_event(1))
+
+
+@pytest.mark.parametrize("model, reason", [(two_modes, "several modes"), (flat, "flat at its mode along x, y"),
+                                           (many, f"{MAX_PARAMETERS + 1} parameters")])
+def test_a_mode_that_does_not_describe_the_posterior_is_refused(model, reason):
+    with pytest.raises(UnusableModeError, match=reason):
+        laplace_approximation(bound(model), seed=0)
+
+
+def test_starting_points_have_twice_the_standard_deviation():
+    points = starting_points(jax.random.key(0), bound(gaussian), Laplace(np.array([1.0, -2.0]), COVARIANCE), 400)
+    assert_allclose(points.mean(axis=0), [1.0, -2.0], atol=0.3)
+    assert_allclose(np.cov(points.T), 4.0 * COVARIANCE, rtol=0.2)
+
+
+def cliff():
+    x = numpyro.sample("x", dist.Normal())
+    numpyro.factor("edge", jnp.where(x < 0.0, -1e6 * x**2, 0.0) + jnp.where(x > 3.0, -jnp.inf, 0.0))
+
+
+def test_points_beyond_a_cliff_are_pulled_towards_the_mode():
+    model = bound(cliff)
+    points = starting_points(jax.random.key(1), model, Laplace(np.array([0.1]), np.eye(1)), 100)
+    log_density = np.array([float(model.log_density(point)) for point in points])
+    assert np.isfinite(log_density).all()
+    assert log_density.min() > float(model.log_density(np.array([0.1]))) - 20.0
+    assert len(np.unique(points)) > 90
+
+
+def test_mass_matrices_are_means_of_draws_and_approximation():
+    laplace = Laplace(jnp.array([0.5, 0.5]), jnp.array(COVARIANCE))
+    draws = np.random.default_rng(0).normal(size=(30, 2))
+    init, update, _ = welford_covariance(diagonal=False)
+
+    def state(estimate):
+        adaptation = HMCAdaptState(1.0, None, None, None, None, {("x",): estimate}, 0, None)
+        return HMCState(**dict.fromkeys(HMCState._fields) | {"adapt_state": adaptation})
+
+    (estimate,) = sampling._with_pseudo_draws(state(init(2)), laplace).adapt_state.mm_state.values()
+    for draw in draws:
+        estimate = update(jnp.asarray(draw), estimate)
+    mean, sum_of_squares, count = estimate
+    weight = sampling._PSEUDO_DRAWS
+    assert count == 30 + weight
+    assert_allclose(mean, (30 * draws.mean(axis=0) + weight * 0.5) / count)
+    shift = draws.mean(axis=0) - 0.5
+    expected = 29 * np.cov(draws.T) + weight * COVARIANCE + 30 * weight / count * np.outer(shift, shift)
+    assert_allclose(sum_of_squares, expected, rtol=1e-12)
+    # An estimate that has draws is left alone.
+    (again,) = sampling._with_pseudo_draws(state(estimate), laplace).adapt_state.mm_state.values()
+    assert_allclose(again[1], sum_of_squares)
