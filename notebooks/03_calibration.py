@@ -63,7 +63,7 @@ def motif(times, y=None, link=lambda u: u, steps=10):
         observation=lfm.GaussianObservation(lambda x, u, t: x, noise_sd**2 * jnp.ones(1)),
         initial_state=lfm.Gaussian(jnp.zeros(1), jnp.zeros((1, 1))),
     )
-    numpyro.sample("y", lfm.MarginalLikelihood(model, times, steps=steps), obs=y)
+    numpyro.sample("y", lfm.MarginalLikelihood(model, times, steps=steps, iterations=0), obs=y)
 
 
 def softplus(times, y=None):

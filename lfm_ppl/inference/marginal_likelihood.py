@@ -43,6 +43,7 @@ from lfm_ppl.filtering.sites import (
     as_settings,
     assumed_density_filter,
     evidence,
+    is_linear,
     leave_one_out,
 )
 from lfm_ppl.filtering.smoother import (
@@ -65,6 +66,9 @@ from lfm_ppl.model.state_space import StateSpaceModel, check_times, state_space
 SIMULATION_STEPS = 5
 """Steps of the simulator for one integration step of the filter: its paths are rougher than moments."""
 
+DEFAULT_ITERATIONS = 3
+"""Iterations of posterior linearisation of models that are not linear."""
+
 _CANDIDATES = 64
 """Trajectories under constraints of which one is chosen by its weight."""
 
@@ -74,9 +78,9 @@ class MarginalLikelihood(dist.Distribution):
 
         log p(y_1:T | theta) = sum_k log N(y_k; mu_k, S_k),
 
-    with the innovations' moments from the Gaussian filter. It is exact for a linear model, and the Gaussian filter's
-    approximation otherwise; with ``iterations`` > 0 it is the likelihood of the model linearised about the smoothed
-    marginals.
+    with the innovations' moments from the Gaussian filter. It is exact for a linear model with Gaussian noise.
+    Otherwise it is the likelihood of the model linearised about the smoothed marginals, which three iterations of
+    posterior linearisation find by default, and with ``iterations=0`` that of a single pass of the filter.
 
     ``sample`` simulates the real, non-linear model: in NumPyro's ``Predictive`` it gives the prior predictive, and with
     posterior draws of the parameters the predictive of a NEW realisation of the forces. The posterior predictive given
@@ -88,7 +92,8 @@ class MarginalLikelihood(dist.Distribution):
         rule: linearisation rule; `Cubature()` by default.
         steps: integration steps between two consecutive times.
         max_step: longest step; longer intervals get more.
-        iterations: of posterior linearisation; 0 for none.
+        iterations: of posterior linearisation; 0 for none. By default 3 for a model that is not linear, and 0 for a
+            linear model, an observation family, constraints, or with a ``tolerance``.
         damping: largest share of each new iterate that is taken; less where the iterates turn back.
         tolerance: largest error of an integration step, in standard deviations. With it the length of the steps follows
             the moments, for every parameter anew, for stiff models and for posteriors over slow and fast ones; up to
@@ -137,17 +142,17 @@ class MarginalLikelihood(dist.Distribution):
                          "grid", "draws")
 
     def __init__(self, model: LatentForceModel, times: Any, rule: Rule | None = None, steps: int = 10,
-                 max_step: float | None = None, iterations: int = 0, damping: float = 0.7,
+                 max_step: float | None = None, iterations: int | None = None, damping: float = 0.7,
                  tolerance: float | None = None, sites: SiteSettings | str | None = None, *,
                  lower: Mapping[str, Any] | None = None, upper: Mapping[str, Any] | None = None,
                  constraints: Callable[..., Any] | Sequence[Callable[..., Any]] = (), grid: Any = None,
                  draws: int = 256, validate_args: bool | None = None):
         if not isinstance(model, LatentForceModel):
             raise TypeError(f"model must be an lfm.LatentForceModel, got {type(model).__name__}.")
-        check_iterations(iterations, damping, tolerance)
+        check_iterations(iterations or 0, damping, tolerance)
         self.model, self.times = model, times
         self.rule, self.steps, self.max_step = as_rule(rule), steps, max_step
-        self.iterations, self.damping = iterations, damping
+        self.damping = damping
         if tolerance is not None:
             checks.positive("tolerance", tolerance, "It is in standard deviations, 0.001 for example.")
         self.tolerance = None if tolerance is None else float(tolerance)
@@ -156,6 +161,7 @@ class MarginalLikelihood(dist.Distribution):
         self.constraints = (constraints,) if callable(constraints) else tuple(constraints or ())
         self.grid = grid if grid is None or is_count(grid) else tuple(np.atleast_1d(np.asarray(grid, float)).tolist())
         self.draws = draws
+        self.iterations = self._default_iterations() if iterations is None else iterations
         if self.constrained:
             self._check_constraints()
         if sites is not None and not isinstance(model.observation, ObservationFamily):
@@ -178,6 +184,34 @@ class MarginalLikelihood(dist.Distribution):
     def time_grid(self) -> TimeGrid:
         """The time grid of the scan."""
         return build_time_grid(self.ssm, self.times, self.steps, self.max_step, tolerance=self.tolerance)
+
+    def _default_iterations(self) -> int:
+        """Return the number of iterations of posterior linearisation where the user gives none."""
+        is_family = isinstance(self.model.observation, ObservationFamily)
+        if is_family or self.constrained or self.tolerance is not None or self.is_affine:
+            return 0
+        return DEFAULT_ITERATIONS
+
+    @property
+    def is_affine(self) -> bool:
+        """Whether dynamics and observation are affine in states and forces, with noise that does not depend on them."""
+        observation = self.model.observation
+        return is_linear(self.ssm) and not (observation.varies_with_state or observation.angular)
+
+    @property
+    def description(self) -> str:
+        """How the likelihood is computed: exact or by which approximation."""
+        if self.constrained:
+            return f"approximate (constraints by expectation propagation and {self.draws} trajectories)"
+        if isinstance(self.model.observation, ObservationFamily):
+            return f"approximate (sites by {self.sites_in_words})"
+        if self.is_affine:
+            return "exact (the model is linear)"
+        if not self.iterations:
+            return "approximate (a single pass of the filter)"
+        count = {1: "one iteration", 2: "two iterations", 3: "three iterations"}.get(
+            self.iterations, f"{self.iterations} iterations")
+        return f"approximate ({count} of posterior linearisation)"
 
     @property
     def constrained(self) -> bool:
@@ -511,7 +545,7 @@ def repeated(draw: Callable[[jax.Array], jax.Array], key: jax.Array, sample_shap
 
 
 def panel(build: Callable[..., LatentForceModel], parameters: Any, times: Any, rule: Rule | None = None,
-          steps: int = 10, max_step: float | None = None, iterations: int = 0, damping: float = 0.7,
+          steps: int = 10, max_step: float | None = None, iterations: int | None = None, damping: float = 0.7,
           tolerance: float | None = None, sites: SiteSettings | str | None = None) -> Panel:
     """Return many independent series as one distribution, for use inside ``numpyro.plate``.
 
@@ -522,7 +556,7 @@ def panel(build: Callable[..., LatentForceModel], parameters: Any, times: Any, r
         rule: as in `MarginalLikelihood`, and so are the next six.
         steps: integration steps between two consecutive times.
         max_step: longest step.
-        iterations: of posterior linearisation.
+        iterations: of posterior linearisation; by default 3 for models that are not linear, see `MarginalLikelihood`.
         damping: largest share of each new iterate that is taken; less where the iterates turn back.
         tolerance: largest error of an integration step, in standard deviations; None for equal steps.
         sites: of an observation family.

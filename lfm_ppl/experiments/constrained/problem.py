@@ -131,7 +131,7 @@ def learning(kind: str) -> LogPosterior:
         lengthscale = numpyro.sample("lengthscale", dist.LogNormal(0.0, 1.0))
         scale = 1.0 if early else numpyro.sample("scale", dist.LogNormal(0.0, 1.0))
         system = transcription(lengthscale, scale, softplus=softplus)
-        numpyro.sample("y", MarginalLikelihood(system, times, rule, steps=1), obs=y)
+        numpyro.sample("y", MarginalLikelihood(system, times, rule, steps=1, iterations=0), obs=y)
 
     with jax.ensure_compile_time_eval():
         bound = bind(model, TIMES[:count], np.zeros((count, 1)))

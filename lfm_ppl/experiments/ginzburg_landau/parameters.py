@@ -87,7 +87,8 @@ def _likelihoods(method: str, size: int, steps: int, times: tuple[float, ...], n
     def one(theta: jax.Array, y: jax.Array, key: jax.Array) -> jax.Array:
         system = problem.system(theta)
         if method in problem.GAUSSIAN:
-            return MarginalLikelihood(system, np.array(times), problem.GAUSSIAN[method], steps=steps).log_prob(y)
+            return MarginalLikelihood(system, np.array(times), problem.GAUSSIAN[method], steps=steps,
+                                      iterations=0).log_prob(y)
         ssm = state_space(system)
         time_grid = build_time_grid(ssm, np.array(times), steps)
         if method == problem.GRID:
