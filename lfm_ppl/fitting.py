@@ -25,6 +25,7 @@ from lfm_ppl import calendar_time, checks
 from lfm_ppl.data import Data, as_data, model_keywords
 from lfm_ppl.filtering.breakdown import FilterWarning, breakdown
 from lfm_ppl.filtering.time_grid import build_time_grid
+from lfm_ppl.forces.sde import ApproximationWarning
 from lfm_ppl.inference import sampling
 from lfm_ppl.inference.ahead import Ahead
 from lfm_ppl.inference.bound_model import BoundModel, bind
@@ -47,9 +48,11 @@ from lfm_ppl.inference.random_keys import split_keys
 from lfm_ppl.inference.samplers import FILTERED, SAMPLERS
 from lfm_ppl.inference.sampling import Transition
 from lfm_ppl.inference.site_failures import failures_at, paths_worth, site_failures
+from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.progress import waiting
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results import checkpoint as checkpoints
+from lfm_ppl.results.approximation import approximation_warnings
 from lfm_ppl.results.checkpoint import Checkpoint
 from lfm_ppl.results.files import POSTERIOR
 from lfm_ppl.results.inputs import remember
@@ -226,6 +229,8 @@ def fit(
         "model": title, "description": described_by(numpyro_model), "call": call, **asked.described(bound),
         "priors": kept("priors in words", lambda: _priors(bound), None),
         "assumptions": kept("the model in words", lambda: _assumptions(bound), None)}, dict(attributes or {}))
+    if progress:
+        print(f"likelihood: {run.described['likelihood']}", file=sys.stderr, flush=True)
     if checkpoint is not None:
         record = asked.record(bound, fingerprint)
         if resume and (finished := checkpoints.finished(checkpoint, record)) is not None:
@@ -236,7 +241,7 @@ def fit(
             run.sample()
         run.follow()
         result = run.result()
-        found = note_warnings(result)
+        found = note_warnings(result, run.cautions)
         run.store(result)
         if run.keeper is not None and run.partial is None:
             run.keeper.finish()
@@ -246,7 +251,9 @@ def fit(
             raise _Stopped(result, f"stopped with {run.partial}; they are in the attribute `result` of this exception "
                                    "(sys.last_value.result). With a folder, checkpoint=..., fit returns them")
         warnings.warn(f"the run was stopped, and its result is partial: {run.partial}.", stacklevel=2)
-    warn_of_convergence(found)
+    for message in run.cautions:
+        checks.warn(message, ApproximationWarning)
+    warn_of_convergence([message for message in found if message not in run.cautions])
     return result
 
 
@@ -290,6 +297,8 @@ class _Asked(NamedTuple):
         return {
             "rule": example.rule.name, "steps": example.steps, "max_step": example.max_step,
             "iterations": example.iterations, "tolerance": example.tolerance, "sampler": self.sampler,
+            "likelihood": ("estimated without bias (particle filter)" if self.sampler == "pmmh"
+                           else example.description),
             "seed": self.seed, "chains": self.chains, "warmup": self.warmup, "samples": self.samples,
             "fixed": json.dumps({k: np.asarray(v).tolist() for k, v in self.fixed.items()}),
             **({"sites": example.sites_in_words} if example.sites_in_words else {}),
@@ -330,6 +339,7 @@ class _Run:
         particles: what trajectories of "pmmh" need to know of its particles.
         rated: scores of the observations; None where there are none yet.
         drawn: chosen draws, their trajectories, and the times of these.
+        cautions: messages on the likelihood for the attribute ``warnings``.
         partial: what a result that was stopped lacks; None: nothing.
         ahead: compiles the sampler, and what `follow` runs.
         compiled: waits for the sampler's program.
@@ -353,6 +363,7 @@ class _Run:
     particles: dict[str, Any] = field(default_factory=dict)
     rated: Any = None
     drawn: tuple = (None, None, None)
+    cautions: list[str] = field(default_factory=list)
     partial: str | None = None
     ahead: Ahead = field(default_factory=Ahead)
     compiled: Callable[[], None] = lambda: None
@@ -480,6 +491,9 @@ class _Run:
             self.rated = kept("scores of the observations",
                               lambda: scores(self.bound, flat, **watched("scores")), None)
             self.remarks |= self._found_of_sites(flat)
+            if asked.sampler in FILTERED:
+                self.cautions += kept("error of the likelihood", lambda: approximation_warnings(
+                    self.bound, flat, self._log_likelihood()), [])
             self.drawn = kept("trajectories", lambda: draw_paths(
                 asked.keys[3], self.bound, flat, asked.at, asked.trajectory_draws, asked.chains, asked.samples,
                 **{label: self.particles.get(label) for label in _OF_PARTICLES}, **watched("trajectories")), self.drawn)
@@ -487,6 +501,13 @@ class _Run:
             self.partial = _BARE if self.rated is None else "all draws and their scores, without trajectories"
         finally:
             counter.close()
+
+    def _log_likelihood(self) -> np.ndarray | None:
+        """Return the log likelihood (S,) of each draw; None where the scores do not add up to it."""
+        if self.rated is None or isinstance(self.bound.site.example.model.observation, ObservationFamily):
+            return None
+        terms = self.rated["one_step_ahead"]
+        return terms.reshape(len(terms), -1).sum(axis=1)
 
     def _found_of_sites(self, flat: Mapping[str, Any]) -> dict[str, str]:
         """Return attributes that say where sites do not converge, and what the weights of trajectories are worth."""
@@ -571,9 +592,14 @@ def _draws(bound: BoundModel, rows: Mapping[str, np.ndarray], samples: int) -> t
     return draws, _statistics({name: values for name, values in rows.items() if name != "z"})
 
 
-def note_warnings(result: Any) -> list[str]:
-    """Store in a result what is wrong with its draws, in its attribute ``warnings``, and return it."""
-    found = arviz_data.convergence_warnings(result)
+def note_warnings(result: Any, cautions: Sequence[str] = ()) -> list[str]:
+    """Store in a result what is wrong with its draws and its likelihood, in its attribute ``warnings``, and return it.
+
+    Args:
+        result: an ArviZ object.
+        cautions: messages on the likelihood.
+    """
+    found = [*arviz_data.convergence_warnings(result), *cautions]
     result.attrs["warnings"] = json.dumps(found)
     return found
 

@@ -132,12 +132,19 @@ def finer_tolerance(tolerance: float) -> float:
     return tolerance / 16
 
 
+def finer_steps(example: MarginalLikelihood) -> dict[str, Any]:
+    """Return the settings of a likelihood with about twice as many integration steps."""
+    settings: dict[str, Any] = {"steps": 2 * example.steps}
+    if example.max_step is not None:
+        settings["max_step"] = example.max_step / 2
+    if example.tolerance is not None:
+        settings["tolerance"] = finer_tolerance(example.tolerance)
+    return settings
+
+
 def gaussian_with_finer_steps(problem: PosteriorDraws) -> np.ndarray:
     """Return (S,): the log likelihoods of the Gaussian filter with about twice as many integration steps."""
-    example = problem.example
-    finer = problem.bound.approximate(
-        steps=2 * example.steps, max_step=None if example.max_step is None else example.max_step / 2,
-        tolerance=None if example.tolerance is None else finer_tolerance(example.tolerance))
+    finer = problem.bound.approximate(**finer_steps(problem.example))
     return gaussian(problem._replace(bound=finer), "log likelihoods with finer steps")
 
 

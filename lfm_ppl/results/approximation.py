@@ -1,0 +1,114 @@
+"""Numerical error of a fitted likelihood, measured at a few posterior draws.
+
+1. The log likelihood is evaluated at `_DRAWS` draws with more iterations of posterior linearisation and half the
+   integration step, in one program.
+2. A change that is the same at all draws does not move the posterior; its standard deviation over the draws does. Where
+   that is above `LARGEST_CHANGE`, each refinement is evaluated alone.
+3. The message names the refinements that are needed, which are far cheaper than an exact likelihood.
+
+The refined likelihood is not exact either: `lfm_ppl.check_accuracy` compares with an exact one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lfm_ppl.inference.bound_model import BoundModel
+from lfm_ppl.inference.marginal_likelihood import DEFAULT_ITERATIONS, MarginalLikelihood
+from lfm_ppl.inference.posterior import evenly_spaced
+from lfm_ppl.model.observations.family import ObservationFamily
+from lfm_ppl.results import likelihoods
+from lfm_ppl.results.likelihoods import PosteriorDraws
+
+_DRAWS = 20
+"""Posterior draws at which the log likelihood is refined."""
+
+LARGEST_CHANGE = 0.5
+"""Standard deviation over the posterior of a change of the log likelihood that is not worth a warning."""
+
+_MANY_ITERATIONS = 10
+"""Iterations after which the linearisation of most models no longer changes."""
+
+
+class Refinement(NamedTuple):
+    """Settings of a likelihood that is more accurate in one respect.
+
+    Attributes:
+        settings: keyword arguments of the likelihood.
+        change: what they change, in words.
+        remedy: how to fit with them.
+    """
+
+    settings: dict[str, Any]
+    change: str
+    remedy: str
+
+
+def more_iterations(example: MarginalLikelihood) -> Refinement | None:
+    """Return more iterations of posterior linearisation; None where the likelihood takes none."""
+    is_family = isinstance(example.model.observation, ObservationFamily)
+    if is_family or example.constrained or example.is_affine:
+        return None
+    current = example.iterations
+    count = DEFAULT_ITERATIONS if current < DEFAULT_ITERATIONS else max(_MANY_ITERATIONS, 2 * current)
+    return Refinement({"iterations": count}, f"{count} iterations of posterior linearisation instead of {current}",
+                      f"iterations={count} (--iterations {count})")
+
+
+def shorter_steps(example: MarginalLikelihood) -> Refinement | None:
+    """Return half the integration step; None where nothing is integrated, or where constraints fix the steps."""
+    if example.constrained or example.ssm.mean_invariant:
+        return None
+    settings = likelihoods.finer_steps(example)
+    arguments = ", ".join(f"{name}={value:g}" for name, value in settings.items())
+    flags = " ".join(f"--{name.replace('_', '-')} {value:g}" for name, value in settings.items())
+    return Refinement(settings, "half the integration step", f"{arguments} ({flags})")
+
+
+def approximation_warnings(bound: BoundModel, draws: Mapping[str, np.ndarray],
+                           log_likelihood: np.ndarray | None = None) -> list[str]:
+    """Return messages on settings of the likelihood whose refinement would change the posterior.
+
+    Args:
+        bound: the model and its data.
+        draws: site name -> (S, ...), posterior draws.
+        log_likelihood: (S,), the fitted log likelihood at the draws; None: it is computed.
+    """
+    example = bound.site.example
+    # With a tolerance there are no iterations.
+    candidates = (more_iterations(example) if example.tolerance is None else None, shorter_steps(example))
+    refinements = [refinement for refinement in candidates if refinement is not None]
+    if not refinements:
+        return []
+    count = len(next(iter(draws.values())))
+    _, rows = evenly_spaced(1, count, min(_DRAWS, count))
+    problem = PosteriorDraws(bound, draws).at(rows)
+    fitted = likelihoods.gaussian(problem) if log_likelihood is None else log_likelihood[rows]
+
+    def change(*chosen: Refinement) -> float:
+        settings = {name: value for refinement in chosen for name, value in refinement.settings.items()}
+        refined = likelihoods.gaussian(problem._replace(bound=bound.approximate(**settings)))
+        difference = refined - fitted
+        return float(difference.std()) if np.isfinite(difference).all() else np.inf
+
+    total = change(*refinements)
+    if total <= LARGEST_CHANGE:
+        return []
+    changes = [total] if len(refinements) == 1 else [change(refinement) for refinement in refinements]
+    needed = [(refinement, size) for refinement, size in zip(refinements, changes, strict=True)
+              if size > LARGEST_CHANGE]
+    if not needed:  # only both together
+        needed = [(refinement, total) for refinement in refinements]
+    return [_message(refinement, size, len(rows)) for refinement, size in needed]
+
+
+def _message(refinement: Refinement, change: float, draws: int) -> str:
+    if not np.isfinite(change):
+        return (f"with {refinement.change}, the log likelihood is not finite at some of {draws} posterior draws: the "
+                "approximation fails for a part of the posterior. Compare it with an exact one (lfm-ppl check, "
+                "lfm.check_accuracy).")
+    return (f"with {refinement.change}, the log likelihood changes by {change:.1f} (sd over {draws} posterior draws), "
+            f"more than {LARGEST_CHANGE}: the posterior is affected. Fit again with {refinement.remedy}.")
