@@ -114,7 +114,8 @@ def _settled(posterior: Any, arguments: argparse.Namespace) -> Any:
     if not arguments.correct or asked_anew or not arviz_data.has_group(posterior, GROUP):
         return None
     report = AccuracyReport.of(posterior)
-    return report if not report.reliable and report.verdict.command.startswith(CORRECT) else None
+    is_chains = any(remedy.startswith(CORRECT) for remedy in report.verdict.remedies)
+    return report if not report.reliable and is_chains else None
 
 
 def _refuse_other(task: Check) -> None:

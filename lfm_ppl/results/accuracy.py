@@ -19,6 +19,7 @@ from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.results import arviz_data, importance, likelihoods, rebuilding
 from lfm_ppl.results import checkpoint as checkpoints
+from lfm_ppl.results.approximation import more_iterations
 from lfm_ppl.results.likelihoods import PosteriorDraws, Reference
 from lfm_ppl.results.report import EXACT, GROUP, AccuracyReport
 from lfm_ppl.results.scalars import choose, scalar_draws
@@ -125,11 +126,15 @@ def _report(result: Any, problem: PosteriorDraws, chosen: np.ndarray, kind: str,
     rebuilding.check_likelihood(result, likelihoods.recorded(problem, filtered.ravel()).reshape(shape), chosen)
     doubled = likelihoods.gaussian_with_finer_steps(problem).reshape(shape)
     found = _reference(kind, problem, filtered, particles, replicates, steps, seed, progress)
-    return assess(result, chosen, filtered, doubled, found, problem)
+    iterated = None
+    if (refinement := more_iterations(problem.example)) is not None:
+        refined = problem._replace(bound=problem.bound.approximate(**refinement.settings))
+        iterated = likelihoods.gaussian(refined, "log likelihoods with more iterations").reshape(shape)
+    return assess(result, chosen, filtered, doubled, found, problem, iterated)
 
 
 def assess(result: Any, chosen: np.ndarray, filtered: np.ndarray, doubled: np.ndarray, reference: Reference,
-           problem: PosteriorDraws) -> AccuracyReport:
+           problem: PosteriorDraws, iterated: np.ndarray | None = None) -> AccuracyReport:
     """Return the report from log likelihoods at draws.
 
     Args:
@@ -139,6 +144,7 @@ def assess(result: Any, chosen: np.ndarray, filtered: np.ndarray, doubled: np.nd
         doubled: (C, S), with twice as many steps.
         reference: log likelihoods of the reference.
         problem: model and data.
+        iterated: (C, S), with more iterations of posterior linearisation; None where there are none to add.
     """
     posterior = arviz_data.group(result, "posterior")
     averaged = importance.average(reference.estimates.reshape(*filtered.shape, -1))
@@ -159,6 +165,10 @@ def assess(result: Any, chosen: np.ndarray, filtered: np.ndarray, doubled: np.nd
         available=posterior.sizes["chain"] * posterior.sizes["draw"], impossible=int(np.isneginf(ratio).sum()),
         sampler=str(attrs.get("sampler", "")), refit=_refit(attrs), steps=example.steps, max_step=example.max_step,
         tolerance=example.tolerance)
+    if iterated is not None and (refinement := more_iterations(example)) is not None:
+        findings = findings._replace(
+            iterations=refinement.settings["iterations"], ratio_sd=_finite_sd(ratio),
+            iterated_ratio_sd=_finite_sd(averaged.log_mean - iterated))
     verdict = judge(findings)
     sample = ("chain", "draw")
     variables = {
@@ -176,7 +186,13 @@ def assess(result: Any, chosen: np.ndarray, filtered: np.ndarray, doubled: np.nd
         "particles": reference.particles, "particles_limited": int(reference.limited), "noise_sd": noise_sd,
         "noise_share": findings.noise_share, "step_change_mean": float(change.mean()),
         "step_change_sd": findings.step_change_sd, "steps": example.steps, "available_draws": findings.available,
-        "verdict": verdict.word, "reason": verdict.reason, "command": verdict.command}))
+        "verdict": verdict.word, "reason": verdict.reason, "command": verdict.command,
+        "remedies": json.dumps(verdict.remedies)}))
+
+
+def _finite_sd(values: np.ndarray) -> float:
+    """Return the standard deviation; infinite where a value is not finite."""
+    return float(values.std()) if np.isfinite(values).all() else np.inf
 
 
 def noise(averaged: importance.Averaged) -> float:

@@ -55,7 +55,8 @@ _CAPTIONS = {
 _SETTINGS = {
     "sampler": "sampler", "chains": "chains", "warmup": "warm-up steps", "samples": "draws a chain",
     "thin": "steps a draw", "seed": "seed", "rule": "rule", "steps": "integration steps", "max_step": "longest step",
-    "tolerance": "tolerance of a step (sd)", "iterations": "iterations", "sites": "observation family",
+    "tolerance": "tolerance of a step (sd)", "iterations": "iterations", "likelihood": "likelihood",
+    "sites": "observation family",
     "fixed": "fixed", "options": "options",
     "constraints": "constraints",
     "particles": "particles", "log_likelihood_sd": "sd of the log likelihood", "delayed": "delayed acceptance",
@@ -246,11 +247,13 @@ def _accuracy(result: Any, folder: Path) -> str:
         return web_page.paragraph("What the approximation of the likelihood does to this posterior has not been "
                                   "measured yet; lfm-ppl check, or lfm.check_accuracy, measures it.", "note")
     checked = report.AccuracyReport.of(result)
-    word, reason, command = checked.verdict
+    word, reason, command, remedies = checked.verdict
     lines = [("verdict", f"{word}: {reason}")]
-    if command:
-        there = shlex.quote(str(folder)) if (folder / POSTERIOR).is_file() else "RESULT"
-        lines.append(("next", command.replace("RESULT", there)))
+    path = shlex.quote(str(folder)) if (folder / POSTERIOR).is_file() else "RESULT"
+    if len(remedies) > 1:
+        lines += [(f"remedy {number}", remedy.replace("RESULT", path)) for number, remedy in enumerate(remedies, 1)]
+    elif command:
+        lines.append(("next", command.replace("RESULT", path)))
     return web_page.facts([*lines, *checked.numbers()]) + tables.html_table(
         checked.table[list(report.SHOWN)], index_label="parameter")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import textwrap
 from dataclasses import dataclass
@@ -112,8 +113,10 @@ class AccuracyReport:
 
     @property
     def verdict(self) -> Verdict:
-        """The word (trust, corrected, re-run), the reason, and the next command."""
-        return Verdict(*(str(self.dataset.attrs[name]) for name in ("verdict", "reason", "command")))
+        """The word (trust, corrected, re-run), the reason, the next command, and all remedies by cost."""
+        attrs = self.dataset.attrs
+        word, reason, command = (str(attrs[name]) for name in ("verdict", "reason", "command"))
+        return Verdict(word, reason, command, tuple(json.loads(attrs.get("remedies", "[]"))))
 
     def text(self, width: int | None = None, result: str = "RESULT", command: bool = True) -> str:
         """Return the report as text for a terminal.
@@ -125,8 +128,11 @@ class AccuracyReport:
         """
         width = width or shutil.get_terminal_size().columns
         table = tables.text_table(self.table[list(SHOWN)], width=width)
-        word, reason, following = self.verdict
+        word, reason, following, remedies = self.verdict
         after = [("verdict", f"{word}: {reason}")]
+        if len(remedies) > 1:
+            after += [(f"remedy {number}", remedy.replace("RESULT", result))
+                      for number, remedy in enumerate(remedies, start=1)]
         if command and following:
             after.append(("next", following.replace("RESULT", result)))
         return f"{_labelled(self.numbers(), width)}\n\n{table}\n\n{_labelled(after, width)}"

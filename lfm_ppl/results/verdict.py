@@ -29,6 +29,9 @@ CORRECT = "lfm-ppl check RESULT --correct"
 LEAST_DRAWS = 40
 """Fewer draws have no tail to fit a Pareto distribution to."""
 
+_CLOSER = 0.5
+"""Share of the sd of the log ratios that iterations must leave to be recommended."""
+
 _SIGMAS = 2.0
 _NAMED = 4
 
@@ -49,6 +52,8 @@ class Findings(NamedTuple):
         sampler: that made the draws.
         refit: the command that made the result; empty where it is not known.
         steps, max_step, tolerance: of the Gaussian filter.
+        iterations: number of iterations of posterior linearisation that were tried in place of the fit's; zero: none.
+        ratio_sd, iterated_ratio_sd: sd over the draws of the log ratios, of the fit and with these iterations.
     """
 
     table: pd.DataFrame
@@ -67,14 +72,25 @@ class Findings(NamedTuple):
     steps: int
     max_step: float | None
     tolerance: float | None = None
+    iterations: int = 0
+    ratio_sd: float = math.nan
+    iterated_ratio_sd: float = math.nan
 
 
 class Verdict(NamedTuple):
-    """A word (trust, corrected or re-run), the reason, and the command to type next (empty for none)."""
+    """Judgement of a posterior of the Gaussian filter.
+
+    Attributes:
+        word: trust, corrected or re-run.
+        reason: in words.
+        command: the command to type next; empty for none.
+        remedies: all commands that make the posterior right, the cheapest first, each with its cost.
+    """
 
     word: str
     reason: str
     command: str
+    remedies: tuple[str, ...] = ()
 
 
 def judge(found: Findings) -> Verdict:
@@ -87,7 +103,38 @@ def judge(found: Findings) -> Verdict:
     """
     word, reason, command = _judged(found)
     notes = _notes(found)
-    return Verdict(word, " ".join([reason, *notes]), command)
+    remedies = {command: _cost(command)} if command else {}
+    refit = _refit_with_iterations(found)
+    if word == "corrected":
+        remedies |= refit
+    elif command == CORRECT:
+        # A few gradients for each one of the fit are far cheaper than a particle filter at every step of a chain.
+        remedies = refit | remedies
+        command = next(iter(remedies))
+        if refit:
+            reason += (f" With {found.iterations} iterations of posterior linearisation the log likelihood differs "
+                       f"from the exact one by {found.iterated_ratio_sd:.2g} (sd over the draws) in place of "
+                       f"{found.ratio_sd:.2g}.")
+    costs = tuple(f"{line} ({cost})" for line, cost in remedies.items())
+    return Verdict(word, " ".join([reason, *notes]), command, costs)
+
+
+def _cost(command: str) -> str:
+    """Return the cost of a command of a verdict in words."""
+    if command == CORRECT:
+        return "hours: chains with a particle filter's likelihood"
+    if "--correct" in command:
+        return "minutes: draws are weighted, no new chains"
+    return "minutes" if command.startswith("lfm-ppl check") else "a second fit"
+
+
+def _refit_with_iterations(found: Findings) -> dict[str, str]:
+    """Return the command of a fit with more iterations and its cost, where they bring the likelihood closer."""
+    if not found.iterations or not found.iterated_ratio_sd < _CLOSER * found.ratio_sd:
+        return {}
+    command = f"{found.refit} --iterations {found.iterations}" if found.refit else (
+        f"lfm.fit of the model with iterations={found.iterations}")
+    return {command: "a second fit, some four times as long"}
 
 
 def _judged(found: Findings) -> tuple[str, str, str]:

@@ -132,6 +132,10 @@ def findings(**changes):
         ({"k": 0.6}, "re-run", "with 200 draws", "--draws 634"),
         ({"k": 0.6, "available": 200}, "re-run", "too far from the exact one", "check RESULT --correct"),
         ({"k": 0.9}, "re-run", "the likelihood of a particle filter", "check RESULT --correct"),
+        ({"k": 0.9, "iterations": 3, "ratio_sd": 2.0, "iterated_ratio_sd": 0.3}, "re-run",
+         "by 0.3 (sd over the draws) in place of 2", "lfm-ppl fit well --iterations 3"),
+        ({"k": 0.9, "iterations": 3, "ratio_sd": 2.0, "iterated_ratio_sd": 1.5}, "re-run",
+         "the likelihood of a particle filter", "check RESULT --correct"),
         ({"k": 0.9, "noise_share": 0.8, "particles": 500}, "re-run", "80% of the variance", "--particles 2000"),
         ({"k": np.inf, "checked": 10}, "re-run", "10 draws are too few", "--draws 200"),
         ({"step_change_sd": 0.2}, "re-run", "vary by 0.2", "lfm-ppl fit well --steps 20"),
@@ -146,6 +150,16 @@ def test_verdicts(changes, word, reason, command):
     assert verdict.word == word
     assert reason in verdict.reason
     assert command in verdict.command and bool(command) == bool(verdict.command)
+
+
+def test_remedies_are_listed_by_cost():
+    iterated = {"iterations": 3, "ratio_sd": 2.0, "iterated_ratio_sd": 0.3}
+    refit, chains = judge(findings(k=0.9, **iterated)).remedies
+    assert refit.startswith("lfm-ppl fit well --iterations 3 (")
+    assert chains.startswith("lfm-ppl check RESULT --correct (")
+    weights, refit = judge(findings(shift=0.3, shift_se=0.05, **iterated)).remedies
+    assert "--correct" in weights and "--iterations 3" in refit
+    assert judge(findings()).remedies == ()
 
 
 def relaxation(times, y=None):
