@@ -378,8 +378,8 @@ def _add_inference(group: Any) -> None:
         "--target-accept",
         type=values.fraction,
         metavar="P",
-        help="acceptance to aim at (default: the model's own or 0.8 for nuts; for ram 0.234, or 0.44 for one "
-        "parameter; half for pmmh)",
+        help="acceptance to aim at (default: the model's own or 0.9 for nuts, 0.8 from the prior median; for ram "
+        "0.234, or 0.44 for one parameter; half for pmmh)",
     )
     group.add_argument(
         "--particles",
