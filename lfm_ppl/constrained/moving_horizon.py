@@ -18,7 +18,7 @@ from lfm_ppl.constrained.gauss_newton import Dynamics
 from lfm_ppl.constrained.interior_point import Problem
 from lfm_ppl.filtering.filter import check_observations, forward, warn_single_precision
 from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.filtering.time_grid import Intervals, TimeGrid
+from lfm_ppl.filtering.time_grid import TimeGrid, intervals_between
 from lfm_ppl.linearisation.taylor import Taylor
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation_noise import check_noise
@@ -256,7 +256,7 @@ def _grid(setting: _Setting, times: jax.Array, origin: jax.Array) -> TimeGrid:
     """Return an interval up to each of ``times`` (K,), the first one from ``origin``."""
     begin = jnp.concatenate([origin[None], times[:-1]])
     every = jnp.arange(times.shape[0])
-    intervals = Intervals(begin, times - begin, every, jnp.full_like(every, -1), jnp.zeros_like(every))
+    intervals = intervals_between(begin, times, times - begin, every, jnp.full_like(every, -1))
     return TimeGrid(intervals, None, every, every, times, setting.steps, origin)
 
 

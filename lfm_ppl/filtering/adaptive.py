@@ -28,14 +28,13 @@ from lfm_ppl.filtering.predict import (
     compose,
     linearised,
     minimum_sd,
-    same_at_all_times,
     step_on,
     unmoved,
 )
 from lfm_ppl.filtering.transition import LinearPart, integrating_factor
 from lfm_ppl.linalg import matmul
 from lfm_ppl.linearisation.rule import Rule
-from lfm_ppl.model.state_space import StateSpaceModel, just_before
+from lfm_ppl.model.state_space import Span, StateSpaceModel
 
 _FIRST = 1 / 8
 """Length of the first step that is tried, as a share of the interval."""
@@ -71,7 +70,7 @@ class _Position(NamedTuple):
 
 
 def predict_interval_adaptively(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, steps: int, tolerance: float,
-                                start: jax.Array, length: jax.Array, moments: Moments,
+                                span: Span, length: jax.Array, moments: Moments,
                                 with_map: bool = False) -> Prediction:
     """Predict over an interval in Runge-Kutta steps whose errors are below a tolerance.
 
@@ -81,12 +80,12 @@ def predict_interval_adaptively(ssm: StateSpaceModel, rule: Rule, linear: Linear
         linear: its constant linear part.
         steps: a fifth of the steps that are tried at most; the moments are NaN where these do not suffice.
         tolerance: of the error of a step in the mean and the covariance, in standard deviations.
-        start: time at the interval's start.
+        span: the interval's times.
         length: of the interval.
         moments: at its start.
         with_map: whether phi and process_cov of the interval are wanted (for the smoother).
     """
-    min_sd = minimum_sd(ssm, rule, integrating_factor(ssm, linear, length), start, length, moments)
+    min_sd = minimum_sd(ssm, rule, integrating_factor(ssm, linear, length), span.time(), length, moments)
     stop = jax.lax.stop_gradient
 
     def attempt(now: _Position) -> _Position:
@@ -94,11 +93,10 @@ def predict_interval_adaptively(ssm: StateSpaceModel, rule: Rule, linear: Linear
         trial = stop(jnp.minimum(now.length, _STABLE / _fastest_rate(now.stage.jacobian)))
         last = trial >= now.left
         h = jnp.where(last, now.left, trial)
-        t = start + (length - now.left)
+        rest = span.after(length - now.left)
         factor = integrating_factor(ssm, linear, h)
-        one, fourth = step_on(ssm, rule, linear, factor, t, h, now.moments, min_sd, first=now.stage)
-        fifth = linearised(ssm, rule, linear, just_before(t + h, h), one.moments, min_sd)
-        then = fifth if same_at_all_times(ssm) else linearised(ssm, rule, linear, t + h, one.moments, min_sd)
+        one, fourth = step_on(ssm, rule, linear, factor, rest, h, now.moments, min_sd, first=now.stage)
+        fifth = linearised(ssm, rule, linear, rest.time(h), one.moments, min_sd)
         error = stop(_error(h, now.moments, one.moments, fourth, fifth)) / tolerance
         # A step that is not finite is far too long, and is made again.
         error = jnp.where(jnp.isfinite(error), error, jnp.inf)
@@ -106,7 +104,7 @@ def predict_interval_adaptively(ssm: StateSpaceModel, rule: Rule, linear: Linear
         phi, process_cov = now.phi, now.process_cov
         if with_map:
             phi, process_cov = compose((phi, process_cov), (one.phi, one.process_cov))
-        made = _Position(jnp.where(last, 0.0, now.left - h), stop(h * growth), one.moments, phi, process_cov, then)
+        made = _Position(jnp.where(last, 0.0, now.left - h), stop(h * growth), one.moments, phi, process_cov, fifth)
         again = now._replace(length=stop(h * growth))
         accepted = (error <= 1.0) | (jnp.isfinite(error) & (h < _SHORT * length))
         return jax.lax.cond(accepted, lambda: made, lambda: again)
@@ -121,7 +119,7 @@ def predict_interval_adaptively(ssm: StateSpaceModel, rule: Rule, linear: Linear
     # After a breakdown every step would fail.
     possible = jnp.isfinite(moments.mean).all() & jnp.isfinite(moments.covariance).all()
     first = _Position(jnp.where(possible, length, 0.0), stop(_FIRST * length), moments, still.phi, still.process_cov,
-                      linearised(ssm, rule, linear, start, moments, min_sd))
+                      linearised(ssm, rule, linear, span.time(), moments, min_sd))
     body = jax.checkpoint(unless_done(block), prevent_cse=False)
     end, _ = jax.lax.scan(body, first, None, length=-(-_MOST * steps // _BLOCK))
     reached = jax.tree_util.tree_map(lambda a: jnp.where(end.left > 0, jnp.nan, a), end.moments)

@@ -13,7 +13,7 @@ from lfm_ppl import checks
 from lfm_ppl.filtering.filter import Pass, forward
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.sites import FamilyTerms, SiteSettings, refine
-from lfm_ppl.filtering.time_grid import Intervals, TimeGrid
+from lfm_ppl.filtering.time_grid import Intervals, TimeGrid, intervals_between
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel
@@ -104,7 +104,7 @@ def breakdown(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, start: M
     reason = _reason(found, at, largest)
     later = np.flatnonzero(np.asarray(grid.observed) >= row)
     end = grid.observed[later[0]] if later.size else row
-    time = float(rows.start[end] + rows.length[end])
+    time = float(rows.end[end])
     where = f"row {later[0]} (time {time:.6g})" if later.size else f"time {time:.6g}, after the last observation"
     if count > 1 and step is not None:
         where += f", step {step + 1} of {count} from time {one.start[0]:.6g} to {one.start[0] + one.length[0]:.6g}"
@@ -120,8 +120,9 @@ def _in_pieces(grid: TimeGrid, one: Intervals, count: int) -> TimeGrid:
     """Return the grid of a single interval cut into ``count``, each a step of its own but where a tolerance cuts it."""
     index, length = np.arange(count), np.repeat(one.length, count) / count
     at_end = lambda column: np.where(index == count - 1, column, -1)  # noqa: E731
-    intervals = Intervals(one.start + index * length, length, at_end(one.observation), at_end(one.jump),
-                          np.zeros_like(index))
+    start = one.start + index * length
+    intervals = intervals_between(start, np.append(start[1:], one.end), length, at_end(one.observation),
+                                  at_end(one.jump))
     last = np.array([count - 1])
     return grid._replace(intervals=intervals, lengths=None, steps=1 if grid.tolerance is None else grid.steps,
                          observed=last, requested=last, requested_times=one.start, replicated=False)

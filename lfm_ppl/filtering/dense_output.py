@@ -17,7 +17,7 @@ from lfm_ppl.filtering.time_grid import Intervals, TimeGrid, as_arrays
 from lfm_ppl.filtering.transition import linear_part
 from lfm_ppl.linalg import congruence, matmul
 from lfm_ppl.linearisation.rule import Rule
-from lfm_ppl.model.state_space import StateSpaceModel
+from lfm_ppl.model.state_space import Span, StateSpaceModel
 
 
 class Places(NamedTuple):
@@ -26,29 +26,31 @@ class Places(NamedTuple):
     Attributes:
         interval: (K,) the interval that contains the time.
         step: (K,) the integration step of it.
-        time: (K,).
+        offset: (K,) the time, counted from the start of the interval.
         at_end: (K,) whether it is the interval's end.
     """
 
     interval: Any
     step: Any
-    time: Any
+    offset: Any
     at_end: Any
 
 
 def places(grid: TimeGrid, times: Any) -> Places:
     """Find times among the intervals of a time grid that is known before compilation."""
-    times = np.asarray(times, float)
-    begins, lengths = (np.asarray(a) for a in (grid.intervals.start, grid.intervals.length))
+    # Counted from the initial time, so that the origin of time does not matter.
+    times = np.asarray(times, float) - np.asarray(grid.initial_time)
+    begins, lengths = (np.asarray(a) for a in (grid.since, grid.intervals.length))
     ends = np.append(begins[1:], begins[-1] + lengths[-1])
-    tolerance = 1e-13 * (1.0 + np.abs(times))
+    tolerance = 1e-13 * np.abs(times)
     row = np.minimum(np.searchsorted(ends, times - tolerance, side="left"), len(ends) - 1)
     at_end = np.abs(times - ends[row]) <= tolerance
     # Of several intervals that end at this time (replicates), the last.
     last = np.searchsorted(ends, ends[row] + tolerance, side="right") - 1
     row = np.where(at_end, last, row)
-    share = (times - begins[row]) / np.where(lengths[row] > 0, lengths[row], 1.0)
-    return Places(row, np.clip((share * grid.steps).astype(int), 0, grid.steps - 1), times, at_end)
+    offset = times - begins[row]
+    share = offset / np.where(lengths[row] > 0, lengths[row], 1.0)
+    return Places(row, np.clip((share * grid.steps).astype(int), 0, grid.steps - 1), offset, at_end)
 
 
 class Steps(NamedTuple):
@@ -110,20 +112,20 @@ def dense_output(ssm: StateSpaceModel, rule: Rule, given: Branches, start: Momen
     intervals = as_arrays(grid.intervals)
     pieces = grid if steps is None else grid._replace(steps=1)
 
-    def piece(begin: jax.Array, length: jax.Array, moments: Moments, points: Any, with_map: bool) -> Prediction:
+    def piece(span: Span, length: jax.Array, moments: Moments, points: Any, with_map: bool) -> Prediction:
         factor = step_transition(ssm, rule, linear, pieces, length)
-        return integrate(ssm, rule, pieces, linear, factor, begin, length, moments, points, with_map)
+        return integrate(ssm, rule, pieces, linear, factor, span, length, moments, points, with_map)
 
-    def one(index: jax.Array, step: jax.Array, t: jax.Array, exactly: jax.Array) -> Moments:
+    def one(index: jax.Array, step: jax.Array, offset: jax.Array, exactly: jax.Array) -> Moments:
         here: Intervals = _entry(intervals, index)
         first, last = _entry(given.smoothed, index), _entry(given.smoothed, index + 1)
-        origin, begin, whole = _entry(before, index), here.start, here.length
+        origin, begin, whole = _entry(before, index), jnp.zeros(()), here.length
         if steps is not None:
             whole = here.length / grid.steps
-            begin = here.start + step * whole
+            begin = step * whole
             inside = jax.tree_util.tree_map(lambda a: a[index, jnp.maximum(step - 1, 0)], steps.moments)
             origin = jax.tree_util.tree_map(lambda a, b: jnp.where(step > 0, a, b), inside, origin)
-        length = jnp.clip(t - begin, 0.0, whole)
+        length = jnp.clip(offset - begin, 0.0, whole)
         points: tuple[Any, Any] = (None, None)
         if given.linearization_point is not None:
             left, right = (jax.tree_util.tree_map(lambda a: a[index, step + k], given.linearization_point)  # noqa: B023
@@ -132,8 +134,8 @@ def dense_output(ssm: StateSpaceModel, rule: Rule, given: Branches, start: Momen
             middle = jax.tree_util.tree_map(lambda a, b: a + share * (b - a), left, right)
             pair = lambda *ends: jax.tree_util.tree_map(lambda a, b: jnp.stack([a, b]), *ends)  # noqa: E731
             points = pair(left, middle), pair(middle, right)
-        now = piece(begin, length, origin, points[0], False).moments
-        rest = piece(begin + length, whole - length, now, points[1], True)
+        now = piece(here.span.after(begin), length, origin, points[0], False).moments
+        rest = piece(here.span.after(begin + length), whole - length, now, points[1], True)
         if steps is not None:
             rest = _to_end(rest, _entry(given.predicted, index),
                            *jax.tree_util.tree_map(lambda a: a[index, step], steps))
@@ -143,7 +145,7 @@ def dense_output(ssm: StateSpaceModel, rule: Rule, given: Branches, start: Momen
         r, curvature = given.adjoint[0][index], given.adjoint[1][index]
         back = matmul(rest.phi.T, r[:, None])[:, 0], congruence(rest.phi.T, curvature)
         inside = smoothed_moments(now, rest.moments, last, kernel, *back)
-        begins = t - here.start <= 0
+        begins = offset <= 0
         return jax.tree_util.tree_map(
             lambda inside, node, end: jnp.where(exactly, end, jnp.where(begins, node, inside)), inside, first, last)
 

@@ -39,10 +39,13 @@ from lfm_ppl.linearisation.sigma_points import Cubature, SigmaPointRule
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.resolution import check_resolution
-from lfm_ppl.model.state_space import StateSpaceModel, state_space
+from lfm_ppl.model.state_space import Span, StateSpaceModel, state_space
 
 _FEW_LENGTHS = 16
 """Distinct lengths of the intervals up to which it costs nothing to tabulate more of each than is needed."""
+
+_MANY_INTERVALS = 32
+"""Intervals for each distinct length from which it costs little, however many lengths: regular times, rounded."""
 
 _KEPT = jax.checkpoint_policies.save_only_these_names(FLOOR, FAILED, FACTOR)
 """What an interval keeps for its derivative besides its inputs: a few numbers that take many operations."""
@@ -205,7 +208,8 @@ class Preparation(NamedTuple):
 def preparation(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid) -> Preparation:
     """Compute what the intervals of a scan share."""
     linear = linear_part(ssm, jnp.asarray(grid.initial_time, float))
-    few = grid.lengths is not None and len(grid.lengths) <= _FEW_LENGTHS
+    count = np.shape(grid.intervals.length)[0]
+    few = grid.lengths is not None and len(grid.lengths) <= max(_FEW_LENGTHS, count // _MANY_INTERVALS)
     transition = by_length(grid, lambda length: step_transition(ssm, rule, linear, grid, length, few))
     return Preparation(linear, _observation_jacobian(ssm, grid), transition, ssm.stack.jump_table())
 
@@ -264,10 +268,10 @@ def predict(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, prepared: Preparat
     """
     transition = prepared.transition(interval)
     if ssm.time_invariant:
-        one = predict_exact(ssm, transition, grid.steps, interval.start, interval.length, moments)
+        one = predict_exact(ssm, transition, grid.steps, interval.span, interval.length, moments)
     else:
         move = lambda: gathered(integrate(  # noqa: E731
-            ssm, rule, grid, prepared.linear, transition, interval.start, interval.length, moments, nodes, with_map,
+            ssm, rule, grid, prepared.linear, transition, interval.span, interval.length, moments, nodes, with_map,
             each))
 
         def stay() -> Prediction:
@@ -282,14 +286,14 @@ def predict(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, prepared: Preparat
 
 
 def integrate(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, linear: LinearPart, factor: IntegratingFactor | None,
-              start: jax.Array, length: jax.Array, moments: Moments, nodes: Moments | None = None,
+              span: Span, length: jax.Array, moments: Moments, nodes: Moments | None = None,
               with_map: bool = False, each: Callable[[Prediction], Any] | None = None) -> Prediction:
     """Predict over an interval, or a part of one, in the grid's steps; arguments as in `predict_interval`."""
     if grid.tolerance is not None:
-        return predict_interval_adaptively(ssm, rule, linear, grid.steps, grid.tolerance, start, length, moments,
+        return predict_interval_adaptively(ssm, rule, linear, grid.steps, grid.tolerance, span, length, moments,
                                            with_map)
     assert factor is not None
-    return predict_interval(ssm, rule, linear, factor, grid.steps, start, length, moments, nodes, with_map, each)
+    return predict_interval(ssm, rule, linear, factor, grid.steps, span, length, moments, nodes, with_map, each)
 
 
 def transitions_about(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, points: Points | None,
@@ -367,7 +371,7 @@ def forward(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, *, s
         else:
             one = transition.predict(moments)
         centre = one.moments if point is None or point.ends is None else point.ends
-        affine = linearise_observation(ssm, rule, prepared.jacobian, interval.start + interval.length,
+        affine = linearise_observation(ssm, rule, prepared.jacobian, interval.end,
                                        jnp.maximum(interval.observation, 0), centre)
         if centre is not one.moments:
             affine = affine.shifted(one.moments.mean - centre.mean)

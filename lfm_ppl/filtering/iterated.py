@@ -127,12 +127,12 @@ class NodePlaces(NamedTuple):
 
 def node_places(grid: TimeGrid, other: TimeGrid) -> NodePlaces:
     """Find the nodes of a time grid among those of another; both are known before compilation."""
-    begin, length = (np.asarray(a)[:, None] for a in (grid.intervals.start, grid.intervals.length))
+    begin, length = (np.asarray(a)[:, None] for a in (grid.since, grid.intervals.length))
     share = np.linspace(0.0, 1.0, grid.steps + 1)
     time, inward = begin + length * share, length * (0.5 - share)
     # Where two intervals of the other grid meet, the node belongs to the one on its own side: a jump may lie between.
     row = interval_at(time + 1e-6 * inward, other)
-    first, whole = (np.asarray(a)[row] for a in (other.intervals.start, other.intervals.length))
+    first, whole = (np.asarray(a)[row] for a in (other.since, other.intervals.length))
     before = np.clip((time - first) / np.where(whole > 0, whole, 1.0), 0.0, 1.0) * other.steps
     step = np.minimum(before.astype(int), other.steps - 1)
     observation = np.asarray(grid.intervals.observation)

@@ -27,7 +27,7 @@ from lfm_ppl.linalg import congruence, diagonal, matmul, outer_square, safe_sqrt
 from lfm_ppl.linearisation.rule import Inputs, Rule, selection
 from lfm_ppl.linearisation.sigma_points import SigmaPointRule
 from lfm_ppl.linearisation.structure import InputStructure
-from lfm_ppl.model.state_space import StateSpaceModel, just_before
+from lfm_ppl.model.state_space import Span, StateSpaceModel
 
 FLOOR = "lfm_ppl: smallest standard deviation"
 """Under this name `minimum_sd` is kept for the derivative of an interval, and not computed again."""
@@ -102,24 +102,22 @@ def moved(moments: Moments, phi: jax.Array, process_cov: jax.Array) -> Moments:
     return Moments(matmul(phi, moments.mean[:, None])[:, 0], congruence(phi, moments.covariance) + process_cov)
 
 
-def predict_exact(ssm: StateSpaceModel, transition: Exact, steps: int, start: jax.Array, length: jax.Array,
+def predict_exact(ssm: StateSpaceModel, transition: Exact, steps: int, span: Span, length: jax.Array,
                   moments: Moments) -> Prediction:
     """Predict through the exact transition of a linear time-invariant model."""
     phi, process_cov = transition.phi, transition.process_cov
     mean, covariance = moved(moments, phi, process_cov)
-    return Prediction(Moments(mean + exact_offset(ssm, transition, steps, start, length), covariance), phi, process_cov)
+    return Prediction(Moments(mean + exact_offset(ssm, transition, steps, span, length), covariance), phi, process_cov)
 
 
-def exact_offset(ssm: StateSpaceModel, transition: Exact, steps: int, start: jax.Array,
-                 length: jax.Array) -> jax.Array:
-    """Return (n,), what an exact transition adds to phi s over an interval that begins at ``start``."""
+def exact_offset(ssm: StateSpaceModel, transition: Exact, steps: int, span: Span, length: jax.Array) -> jax.Array:
+    """Return (n,), what an exact transition adds to phi s over an interval with the times ``span``."""
     if ssm.mean_invariant or not ssm.physical_dim:
         return transition.offset
-    return _integrated_offset(ssm, transition, steps, start, length / steps)
+    return _integrated_offset(ssm, transition, steps, span, length / steps)
 
 
-def _integrated_offset(ssm: StateSpaceModel, transition: Exact, steps: int, start: jax.Array,
-                       h: jax.Array) -> jax.Array:
+def _integrated_offset(ssm: StateSpaceModel, transition: Exact, steps: int, span: Span, h: jax.Array) -> jax.Array:
     """Integrate E(H - s) c(s) by Simpson's rule, c the additive terms of the mean."""
     size = ssm.physical_dim
 
@@ -127,17 +125,17 @@ def _integrated_offset(ssm: StateSpaceModel, transition: Exact, steps: int, star
         return jnp.zeros((ssm.state_dim, 1)).at[:size, 0].set(ssm.drift(ssm.input_map(t)[1], t))
 
     def step(offset: jax.Array, index: jax.Array) -> tuple[jax.Array, None]:
-        t = start + index * h
-        first = matmul(transition.full, offset + h / 6 * constant(t))
-        last = constant(just_before(t + h, h))
-        return first + h / 6 * (4 * matmul(transition.half, constant(t + 0.5 * h)) + last), None
+        rest = span.after(index * h)
+        first = matmul(transition.full, offset + h / 6 * constant(rest.time()))
+        last = constant(rest.time(h))
+        return first + h / 6 * (4 * matmul(transition.half, constant(rest.time(0.5 * h))) + last), None
 
     offset, _ = jax.lax.scan(step, jnp.zeros((ssm.state_dim, 1)), jnp.arange(steps))
     return offset[:, 0]
 
 
 def predict_interval(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: IntegratingFactor, steps: int,
-                     start: jax.Array, length: jax.Array, moments: Moments, linearization_point: Moments | None = None,
+                     span: Span, length: jax.Array, moments: Moments, linearization_point: Moments | None = None,
                      with_map: bool = False, each: Callable[[Prediction], Any] | None = None) -> Prediction:
     """Predict over an interval in ``steps`` Runge-Kutta steps.
 
@@ -147,7 +145,7 @@ def predict_interval(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, facto
         linear: its constant linear part.
         factor: the integrating factor of one step.
         steps: number of steps.
-        start: time at the interval's start.
+        span: the interval's times.
         length: of the interval.
         moments: at its start.
         linearization_point: linearise about these moments, (steps + 1, ...) at the ends of the steps, and not about the
@@ -156,15 +154,15 @@ def predict_interval(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, facto
         each: what is wanted of each step's prediction.
     """
     h = length / steps
-    min_sd = minimum_sd(ssm, rule, factor, start, h, moments)
+    min_sd = minimum_sd(ssm, rule, factor, span.time(), h, moments)
     if bent_by_forces_only(ssm, rule):
-        return _predict_by_quadrature(ssm, rule, linear, factor, steps, start, h, moments, min_sd, linearization_point,
+        return _predict_by_quadrature(ssm, rule, linear, factor, steps, span, h, moments, min_sd, linearization_point,
                                       with_map, each)
 
     def step(carry: tuple, at: tuple) -> tuple[tuple, Any]:
         now, phi, process_cov = carry
         index, nodes = at
-        one, _ = step_on(ssm, rule, linear, factor, start + index * h, h, now, min_sd, nodes)
+        one, _ = step_on(ssm, rule, linear, factor, span.after(index * h), h, now, min_sd, nodes)
         if with_map:
             phi, process_cov = compose((phi, process_cov), (one.phi, one.process_cov))
         return (one.moments, phi, process_cov), None if each is None else each(one)
@@ -233,10 +231,10 @@ def covariance_of(moments: Moments) -> Any:
     return lambda rows, of_forces: congruence(rows, moments.covariance)
 
 
-def step_on(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: IntegratingFactor, t: jax.Array, h: jax.Array,
+def step_on(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: IntegratingFactor, span: Span, h: jax.Array,
             moments: Moments, min_sd: jax.Array, linearization_point: Moments | None = None,
             first: Stage | None = None) -> tuple[Prediction, LastStage]:
-    """Make one Runge-Kutta step from time ``t`` to ``t + h``.
+    """Make one Runge-Kutta step of length ``h`` from the start of ``span``.
 
     ``linearization_point`` holds the moments (3, ...) at its start, middle and end about which to linearise;
     ``first`` is its first stage where that is known.
@@ -262,18 +260,18 @@ def step_on(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Integr
         state = jnp.concatenate([base[:size] + change, base[size:]])
         return state[:, :-1], state[:, -1]
 
-    one = stage(0, t, m, covariance_of(moments)) if first is None else first
+    one = stage(0, span.time(), m, covariance_of(moments)) if first is None else first
     k1 = increment(one, identity)
     phi2, m2 = node(at_half, 0.5 * h * matmul(half[:size, :size], k1))
     q2 = lambda: _process_cov(factor, 0, phi2[:size][None], _together(one), jnp.reshape(0.5 * h, 1), size)  # noqa: E731
-    two = stage(1, t + 0.5 * h, m2, _propagated(p, phi2, q2, factor.force_cov_half, size))
+    two = stage(1, span.time(0.5 * h), m2, _propagated(p, phi2, q2, factor.force_cov_half, size))
     k2 = increment(two, phi2)
     z2 = 0.5 * h * one.jacobian
 
     phi3, m3 = node(at_half, 0.5 * h * k2)
     transport3 = identity[:size] + matmul(_less(phi3[:size] - half_x, phi3, z2, size), back_half)
     q3 = lambda: _process_cov(factor, 1, transport3[None], _together(two), jnp.reshape(0.5 * h, 1), size)  # noqa: E731
-    three = stage(2, t + 0.5 * h, m3, _propagated(p, phi3, q3, factor.force_cov_half, size))
+    three = stage(2, span.time(0.5 * h), m3, _propagated(p, phi3, q3, factor.force_cov_half, size))
     k3 = increment(three, phi3)
     z3 = _inverse_transition(0.5 * h, z2, back_half, two.jacobian, half, size)
 
@@ -281,7 +279,7 @@ def step_on(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: Integr
     transport4 = half_x + matmul(_less(phi4[:size] - full_x, phi4, z3, size), back_half)
     q4 = lambda: _process_cov(factor, 2, transport4[None], _together(three), jnp.reshape(h, 1), size)  # noqa: E731
     covariance4 = _propagated(p, phi4, q4, factor.force_cov_full, size)
-    four = stage(3, just_before(t + h, h), m4, covariance4)
+    four = stage(3, span.time(h), m4, covariance4)
     k4 = increment(four, phi4)
     z4 = _inverse_transition(h, z3, back_half, three.jacobian, half, size)
 
@@ -347,7 +345,7 @@ def bent_by_forces_only(ssm: StateSpaceModel, rule: Rule) -> bool:
 
 
 def _predict_by_quadrature(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, factor: IntegratingFactor, steps: int,
-                           start: jax.Array, h: jax.Array, moments: Moments, min_sd: jax.Array,
+                           span: Span, h: jax.Array, moments: Moments, min_sd: jax.Array,
                            linearization_point: Moments | None, with_map: bool,
                            each: Callable[[Prediction], Any] | None) -> Prediction:
     """Predict over an interval in which only the forces bend the dynamics, to the numbers of the steps of `step_on`.
@@ -372,9 +370,8 @@ def _predict_by_quadrature(ssm: StateSpaceModel, rule: Rule, linear: LinearPart,
     near = now
     if linearization_point is not None:
         near = jax.tree_util.tree_map(_with_middles, _forces_of(linearization_point, size))
-    begins = start + jnp.arange(steps) * h
-    times = jnp.stack([begins, begins + 0.5 * h], axis=1).ravel()
-    ends = just_before(begins + h, h)
+    before = jnp.arange(steps) * h
+    times = span.time(0.5 * h * jnp.arange(2 * steps + 1))
 
     def node(t: jax.Array, mean: jax.Array, near: Moments) -> Node:
         centre = jnp.concatenate([jnp.zeros(size), near.mean])  # the physical state drops out
@@ -386,10 +383,10 @@ def _predict_by_quadrature(ssm: StateSpaceModel, rule: Rule, linear: LinearPart,
         return Node(jnp.concatenate([jacobian, rest[:, None]], axis=1), one.diffusion)
 
     if same_at_all_times(ssm):
-        nodes = jax.vmap(node)(jnp.append(times, ends[-1]), now.mean, near)
+        nodes = jax.vmap(node)(times, now.mean, near)
         stages = [jax.tree_util.tree_map(lambda a: a[part], nodes) for part in _FIRST_MIDDLE_LAST]  # noqa: B023
     else:
-        times = jnp.stack([begins, begins + 0.5 * h, ends])
+        times = jnp.stack([span.time(before), span.time(before + 0.5 * h), span.time(before + h)])
         by_node = lambda a: jnp.stack([a[part] for part in _FIRST_MIDDLE_LAST])  # noqa: E731
         nodes = jax.vmap(jax.vmap(node))(times, by_node(now.mean), jax.tree_util.tree_map(by_node, near))
         stages = [jax.tree_util.tree_map(lambda a: a[index], nodes) for index in range(3)]  # noqa: B023

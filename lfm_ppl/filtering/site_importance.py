@@ -43,7 +43,7 @@ def importance_weights(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.
     passed, sites = found.passed, found.refined.found.sites
     mean = at_intervals(backward(passed, start, grid).moments.mean[1:], grid.observed)
     errors = at_intervals(smoothing_errors(key, passed, start, draws), grid.observed)
-    ends = at_intervals(jnp.asarray(grid.intervals.start) + jnp.asarray(grid.intervals.length), grid.observed)
+    ends = at_intervals(jnp.asarray(grid.intervals.end), grid.observed)
 
     def log_weight(errors: jax.Array) -> jax.Array:
         f = jax.vmap(lambda s, t: ssm.observe(ssm.inputs(s, t), t))(mean + errors, ends)

@@ -313,7 +313,7 @@ def _steps_as_long(grid: TimeGrid, base: TimeGrid) -> int:
     Many requested times cut the intervals of the data into short ones, of which each would take as many steps as a
     whole one.
     """
-    begin, length = (np.asarray(a) for a in (grid.intervals.start, grid.intervals.length))
+    begin, length = (np.asarray(a) for a in (grid.since, grid.intervals.length))
     step = np.asarray(base.intervals.length)[interval_at(begin + length / 2, base)] / base.steps
     moved = length > 0
     return int(np.clip(np.ceil(length[moved] / step[moved] * (1 - 1e-9)).max(initial=1), 1, grid.steps))

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import checks
-from lfm_ppl.model.state_space import StateSpaceModel, check_times
+from lfm_ppl.model.state_space import Span, StateSpaceModel, check_times, inset
 
 _LARGEST_TABLE = 1024
 """Most interval lengths whose transitions are tabulated ahead of the scan; more are computed interval by interval."""
@@ -29,6 +29,8 @@ class Intervals(NamedTuple):
         observation: (N,) index of the observation at its end, -1 where there is none.
         jump: (N,) index of the jump of the forces at its end, before the observation; -1 where there is none.
         length_index: (N,) index of its length in `TimeGrid.lengths`; zero where that is None.
+        end: (N,) time at which the interval ends; that of its observation to the last digit.
+        inset: (N,) how far inside of the interval functions of time are evaluated at its ends, see `Span`.
     """
 
     start: Any
@@ -36,6 +38,20 @@ class Intervals(NamedTuple):
     observation: Any
     jump: Any
     length_index: Any
+    end: Any
+    inset: Any
+
+    @property
+    def span(self) -> Span:
+        """The times of one interval as functions of time see them."""
+        return Span(self.start, self.start + self.inset, self.end - self.inset)
+
+
+def intervals_between(start: Any, end: Any, length: Any, observation: Any, jump: Any, length_index: Any = None,
+                      scale: Any = 0.0) -> Intervals:
+    """Return intervals; arguments as in `Intervals`, and ``scale`` as in `lfm_ppl.model.state_space.inset`."""
+    length_index = np.zeros(np.shape(length), int) if length_index is None else length_index
+    return Intervals(start, length, observation, jump, length_index, end, inset(start, end, length, scale))
 
 
 class TimeGrid(NamedTuple):
@@ -52,6 +68,8 @@ class TimeGrid(NamedTuple):
         replicated: whether so many intervals have length zero that it pays to branch around their prediction.
         tolerance: of the error of a step, in standard deviations, where their length follows it; None for ``steps``
             of equal length.
+        since: (N,) starts of the intervals, counted from the initial time. Differences of times that are close keep
+            all their digits, which sums of large times do not.
     """
 
     intervals: Intervals
@@ -63,6 +81,7 @@ class TimeGrid(NamedTuple):
     initial_time: Any
     replicated: bool = False
     tolerance: float | None = None
+    since: Any = None
 
 
 def build_time_grid(ssm: StateSpaceModel, times: Any, steps: int, max_step: float | None = None, at: Any = None,
@@ -118,12 +137,15 @@ def _traced(ssm: StateSpaceModel, times: Any, steps: int, max_step: Any, at: Any
     start = jnp.concatenate([origin, times[:-1]])
     pieces = steps if interval_per_step else 1
     width = jnp.repeat((times - start) / pieces, pieces)
-    start = jnp.repeat(start, pieces) + width * np.tile(np.arange(pieces), times.shape[0])
+    before = width * np.tile(np.arange(pieces), times.shape[0])
+    since = jnp.repeat(start - origin, pieces) + before
+    start = jnp.repeat(start, pieces) + before
+    end = jnp.concatenate([start[1:], times[-1:]])
     observation = np.full(times.shape[0] * pieces, -1)
     ends = np.arange(times.shape[0]) * pieces + pieces - 1
     observation[ends] = np.arange(times.shape[0])
-    intervals = Intervals(start, width, observation, np.full(observation.shape, -1), np.zeros_like(observation))
-    return TimeGrid(intervals, None, ends, ends, times, 1 if interval_per_step else steps, origin[0])
+    intervals = intervals_between(start, end, width, observation, np.full(observation.shape, -1))
+    return TimeGrid(intervals, None, ends, ends, times, 1 if interval_per_step else steps, origin[0], since=since)
 
 
 def _traced_origin(times: np.ndarray, origin: Any, jumps: tuple[float, ...], steps: int,
@@ -146,9 +168,9 @@ def _traced_origin(times: np.ndarray, origin: Any, jumps: tuple[float, ...], ste
     time, jump, observation = time[order], jump[order], observation[order]
     end = jnp.where(jump >= 0, jnp.maximum(time, origin), time)
     begin = jnp.concatenate([origin[None], jnp.maximum(end[:-1], origin)])
-    intervals = Intervals(begin, end - begin, observation, jnp.where(time > origin, jump, -1), np.zeros_like(jump))
+    intervals = intervals_between(begin, end, end - begin, observation, jnp.where(time > origin, jump, -1))
     observed = np.flatnonzero(observation >= 0)
-    return TimeGrid(intervals, None, observed, observed, times, steps, origin)
+    return TimeGrid(intervals, None, observed, observed, times, steps, origin, since=begin - origin)
 
 
 def _concrete(times: np.ndarray, origin: float, jumps: tuple[float, ...], steps: int, max_step: float | None,
@@ -184,32 +206,40 @@ def _concrete(times: np.ndarray, origin: float, jumps: tuple[float, ...], steps:
     piece = np.arange(len(event)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
     width = (gap / pieces)[event]
     last = piece == pieces[event] - 1
-    lengths, length_index = _distinct(width, max(abs(time[-1]), abs(origin)))
-    intervals = Intervals(begin[event] + piece * width, width, np.where(last, observation[event], -1),
-                          np.where(last, jump[event], -1), length_index)
+    lengths, length_index = _distinct(width)
+    start = begin[event] + piece * width
+    end = np.where(last, time[event], np.append(start[1:], time[-1]))
+    intervals = intervals_between(start, end, width, np.where(last, observation[event], -1),
+                                  np.where(last, jump[event], -1), length_index)
     row_of_event = np.flatnonzero(last)
     observed = np.empty(len(times), int)
     observed[observation[observation >= 0]] = row_of_event[observation >= 0]
     found = observed if at is None else row_of_event[np.searchsorted(time, requested, side="right") - 1]
     replicated = bool(np.mean(width == 0) >= _REPLICATED)
-    return TimeGrid(intervals, lengths, observed, found, requested, steps, np.asarray(origin), replicated)
+    return TimeGrid(intervals, lengths, observed, found, requested, steps, np.asarray(origin), replicated,
+                    since=(begin - origin)[event] + piece * width)
 
 
 def _requested(at: Any, origin: float) -> np.ndarray:
     return checks.time_vector("at", at, origin, remedy="; set the model's initial_time earlier to look further back")
 
 
-def _distinct(length: np.ndarray, scale: float) -> tuple[np.ndarray | None, np.ndarray]:
-    """Group lengths that differ by the rounding of the times they are differences of."""
-    tolerance = 8 * np.finfo(float).eps * scale
-    order = np.argsort(length, kind="stable")
-    new = np.concatenate([[True], np.diff(length[order]) > tolerance])
-    length_index = np.empty(len(length), int)
-    length_index[order] = np.cumsum(new) - 1
-    lengths = length[order][new]
-    if len(lengths) > _LARGEST_TABLE:
-        return None, np.zeros_like(length_index)
-    return lengths, length_index
+def _distinct(length: np.ndarray) -> tuple[np.ndarray | None, np.ndarray]:
+    """Group lengths that agree to their own rounding, whatever the size of the times.
+
+    Each is compared with the shortest of its group, so that a chain of neighbours is no group. Regular times whose
+    differences are rounded have few distinct lengths, as many as the digits that rounding takes from them.
+    """
+    values, position = np.unique(length, return_inverse=True)
+    following = np.searchsorted(values, values * (1.0 + 8 * np.finfo(float).eps), side="right")
+    firsts = []
+    index = 0
+    while index < len(values):
+        firsts.append(index)
+        index = int(following[index])
+        if len(firsts) > _LARGEST_TABLE:
+            return None, np.zeros(len(length), int)
+    return values[firsts], (np.searchsorted(firsts, position, side="right") - 1).reshape(-1)
 
 
 def as_arrays(intervals: Intervals) -> Intervals:
@@ -252,8 +282,13 @@ def by_length(grid: TimeGrid, make: Callable[[jax.Array], Any]) -> Callable[[Int
 
 
 def interval_at(times: np.ndarray, grid: TimeGrid) -> np.ndarray:
-    """Return the last interval that starts at or before each time, also after the end; the grid is concrete."""
-    return np.searchsorted(np.asarray(grid.intervals.start), times, side="right") - 1
+    """Return the last interval that starts at or before each time, also after the end; the grid is concrete.
+
+    Args:
+        times: counted from the initial time.
+        grid: the time grid.
+    """
+    return np.searchsorted(np.asarray(grid.since), times, side="right") - 1
 
 
 def with_observations(intervals: Intervals, y: Any) -> tuple[Intervals, jax.Array]:

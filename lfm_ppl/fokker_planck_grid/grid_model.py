@@ -97,12 +97,13 @@ def _chains(ssm: StateSpaceModel, time_grid: TimeGrid, grid: Grid, room: int) ->
         return at(jnp.asarray(time_grid.initial_time, float))
     rows = as_arrays(time_grid.intervals)
     middle = (np.arange(time_grid.steps) + 0.5) / time_grid.steps
-    return jax.vmap(jax.vmap(at))(rows.start[:, None] + rows.length[:, None] * middle)
+    times = jax.vmap(lambda row: row.span.time(row.length * middle))(rows)
+    return jax.vmap(jax.vmap(at))(times)
 
 
 def _observations(ssm: StateSpaceModel, time_grid: TimeGrid, grid: Grid, room: int) -> tuple[jax.Array, jax.Array]:
     rows, observed = as_arrays(time_grid.intervals), jnp.asarray(time_grid.observed)
-    times = (rows.start + rows.length)[observed]
+    times = rows.end[observed]
     nodes = _padded(grid.centres, room)[:, None] + 0.5 * grid.width * NODES
     observation = ssm.model.observation
     constant_inputs = ssm.constant_measurement and ssm.constant_mean

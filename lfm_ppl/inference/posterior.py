@@ -365,9 +365,11 @@ def _steps_per_interval(ssm: StateSpaceModel, times: Any, at: Any, steps: int, s
     known = checks.concrete(times)
     if at is None or known is None:
         return steps
-    rows = build_time_grid(ssm, known, 1, None, at).intervals
-    ends = np.asarray(rows.start + rows.length)
-    marks = np.unique(np.append(known, rows.start[0]))
+    grid = build_time_grid(ssm, known, 1, None, at)
+    rows, origin = grid.intervals, np.asarray(grid.initial_time)
+    # Counted from the initial time, so that the origin of time does not matter.
+    ends, since = grid.since + rows.length, since - origin
+    marks = np.unique(np.append(known - origin, 0.0))
     if len(marks) == 1:
         return steps
     gaps = np.diff(marks)

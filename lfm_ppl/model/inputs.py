@@ -84,7 +84,8 @@ def check_reads(functions: Sequence[Traced], first: float, last: float) -> None:
             if outside not in beyond or table.ndim != 1 or table.size < 2:
                 continue
             end = table[-1] + (table[-1] - table[-2] if interpolation == "previous" else 0.0)
-            slack = 1e-9 * max(abs(table[0]), abs(end), abs(first), abs(last))
+            rounding = 4 * np.finfo(float).eps * max(abs(table[0]), abs(end), abs(first), abs(last))
+            slack = 1e-9 * max(end - table[0], last - first) + rounding
             span = (f"the known input {f'{called!r} ' if called else ''}in {function.what}, whose table goes from "
                     f"{named(table[0])} to {named(table[-1])}, is read at")
             if np.min(when) < table[0] - slack:

@@ -13,7 +13,7 @@ from lfm_ppl import checks
 from lfm_ppl.linalg import matmul, semidefinite_root
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation_noise import noisy_observation
-from lfm_ppl.model.state_space import StateSpaceModel, check_times, just_before, state_space
+from lfm_ppl.model.state_space import Span, StateSpaceModel, check_times, state_space
 
 
 class Simulation(NamedTuple):
@@ -132,10 +132,12 @@ def _interval(ssm: StateSpaceModel, steps: int) -> Callable[..., jax.Array]:
         h = (end - begin) / steps
         transition, covariance = ssm.stack.discretise(h)
         root = semidefinite_root(covariance)
+        span = Span.between(begin, end, end - begin)
 
         def step(state: jax.Array, index: jax.Array) -> tuple[jax.Array, None]:
             keys = jax.random.fold_in(row_key, index)
-            state = _simulation_step(ssm, state, begin + index * h, h, transition, root, keys)
+            rest = span.after(index * h)
+            state = _simulation_step(ssm, state, rest, h, transition, root, keys)
             # The last step ends at the row's end to the last bit: a jump there is crossed, and once only.
             until = jnp.where(index == steps - 1, end, begin + (index + 1) * h)
             return _cross_jumps(ssm, jumps, state, begin + index * h, until, keys), None
@@ -145,28 +147,28 @@ def _interval(ssm: StateSpaceModel, steps: int) -> Callable[..., jax.Array]:
     return advance
 
 
-def _simulation_step(ssm: StateSpaceModel, state: jax.Array, t: jax.Array, h: jax.Array, transition: jax.Array,
+def _simulation_step(ssm: StateSpaceModel, state: jax.Array, span: Span, h: jax.Array, transition: jax.Array,
                      root: jax.Array, key: jax.Array) -> jax.Array:
     size = ssm.physical_dim
     force_key, state_key = jax.random.split(key)
     draw = jax.random.normal(force_key, (ssm.force_dim, 1))
     forces = (matmul(transition, state[size:, None]) + matmul(root, draw))[:, 0]
 
-    x = state[:size]
+    x, t = state[:size], span.time()
     now = ssm.inputs(state, t)
     first = ssm.drift(now, t)
     dispersion = ssm.dispersion(now, t)
     kick = jnp.zeros(size)
     if dispersion is not None:
         kick = jnp.sqrt(h) * matmul(dispersion, jax.random.normal(state_key, (dispersion.shape[1], 1)))[:, 0]
-    end = just_before(t + h, h)
+    end = span.time(h)
     halfway = 0.5 * (state[size:] + forces)
 
     def drift(change: jax.Array, z: jax.Array, time: jax.Array) -> jax.Array:
         return ssm.drift(ssm.inputs(jnp.concatenate([x + change, z]), time), time)
 
-    second = drift(0.5 * (h * first + kick), halfway, t + 0.5 * h)
-    third = drift(0.5 * (h * second + kick), halfway, t + 0.5 * h)
+    second = drift(0.5 * (h * first + kick), halfway, span.time(0.5 * h))
+    third = drift(0.5 * (h * second + kick), halfway, span.time(0.5 * h))
     last = drift(h * third + kick, forces, end)
     return jnp.concatenate([x + h / 6 * (first + 2 * second + 2 * third + last) + kick, forces])
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -210,9 +210,54 @@ def _check_declared(function: Callable[[jax.Array], jax.Array], declared: tuple[
                          "nonlinear_inputs at None: the structure is then found automatically.")
 
 
-def just_before(t: jax.Array, step: jax.Array) -> jax.Array:
-    """Return the end ``t`` of a step as its own last node: a known input that jumps there has not jumped yet."""
-    return t - 8 * jnp.finfo(jnp.result_type(float)).eps * (jnp.abs(t) + jnp.abs(step))
+_INSET = 4.0
+"""How far inside of an interval its ends are evaluated, in units of rounding of the times."""
+
+
+class Span(NamedTuple):
+    """The times of an interval, or of the rest of it, as functions of time see them.
+
+    A function of time may jump at either end of an interval. The interval sees the value on its own side, so that times
+    are clipped to ``lower`` and ``upper``, which lie inside of it by some units of rounding.
+
+    Attributes:
+        start: time from which offsets count.
+        lower, upper: first and last time at which functions are evaluated.
+    """
+
+    start: Any
+    lower: Any
+    upper: Any
+
+    @classmethod
+    def between(cls, start: Any, end: Any, length: Any) -> Span:
+        """Return the span of an interval whose ``length`` is known to more digits than ``end - start``."""
+        depth = inset(start, end, length)
+        return cls(start, jax.lax.stop_gradient(start + depth), jax.lax.stop_gradient(end - depth))
+
+    def time(self, offset: Any = 0.0) -> jax.Array:
+        """Return the time at an offset from the start; its derivative is that of the time that is not clipped."""
+        t = self.start + offset
+        return t + jax.lax.stop_gradient(jnp.clip(t, self.lower, self.upper) - t)
+
+    def after(self, offset: Any) -> Span:
+        """Return the rest of the span after an offset from its start."""
+        return self._replace(start=self.start + offset)
+
+
+def inset(start: Any, end: Any, length: Any, scale: Any = 0.0) -> Any:
+    """Return how far inside of intervals (N,) functions of time are evaluated at the ends.
+
+    Args:
+        start: times at their starts.
+        end: times at their ends.
+        length: of the intervals.
+        scale: size of other numbers that functions compare times with, the times of a table for example.
+    """
+    xp = jnp if checks.traced((start, end, length, scale)) else np
+    size = xp.maximum(xp.maximum(xp.abs(start), xp.abs(end)), scale)
+    depth = xp.minimum(_INSET * np.finfo(jnp.result_type(float)).eps * size, 0.5 * xp.asarray(length))
+    return jax.lax.stop_gradient(depth) if xp is jnp else depth
 
 
 def check_times(times: Any, initial_time: Any) -> np.ndarray | None:

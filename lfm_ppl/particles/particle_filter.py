@@ -222,7 +222,7 @@ def _move(moves: Moves, ready: Prepared, row: Intervals, observed: jax.Array, ke
     """Move particles over a row, and score the observation at its end."""
     move_key, jump_key = jax.random.split(key)
     state = moves.across(row, ready, move_key, jump_key, state)
-    end = row.start + row.length
+    end = row.end
     density = jax.vmap(lambda s: log_observation(moves.ssm, s, end, jnp.maximum(row.observation, 0), observed),
                        in_axes=-1)(state)
     possible = jnp.isfinite(state).all(axis=0) & ~jnp.isnan(density)

@@ -247,15 +247,16 @@ def _transition(ssm: StateSpaceModel, scheme: str, row: Intervals, steps: int,
     """Return the means (n, N) of the next state, and the factor of its covariance, (n, n) or (n, n, N)."""
     if scheme == "exact":
         whole = exact(ssm, row.length, steps)
-        offset = exact_offset(ssm, whole, steps, row.start, row.length)
+        offset = exact_offset(ssm, whole, steps, row.span, row.length)
         return matmul(whole.phi, state) + offset[:, None], cholesky(whole.process_cov).chol
     size = ssm.physical_dim
     forces, noise = ssm.stack.discretise(row.length)
 
     def one(s: jax.Array) -> tuple[jax.Array, jax.Array]:
-        w = ssm.inputs(s, row.start)
-        moved = s[:size] + row.length * ssm.drift(w, row.start)
-        dispersion = ssm.dispersion(w, row.start)
+        t = row.span.time()
+        w = ssm.inputs(s, t)
+        moved = s[:size] + row.length * ssm.drift(w, t)
+        dispersion = ssm.dispersion(w, t)
         own = jnp.zeros((0, 0)) if dispersion is None else row.length * matmul(dispersion, dispersion.T)
         covariance = jax.scipy.linalg.block_diag(own, noise)
         return jnp.concatenate([moved, matmul(forces, s[size:, None])[:, 0]]), cholesky(covariance).chol

@@ -20,7 +20,7 @@ from lfm_ppl.filtering.time_grid import Intervals, TimeGrid, by_length
 from lfm_ppl.filtering.transition import Exact, exact
 from lfm_ppl.forces.discretise import discretise
 from lfm_ppl.linalg import matmul, semidefinite_root
-from lfm_ppl.model.state_space import StateSpaceModel, just_before
+from lfm_ppl.model.state_space import Span, StateSpaceModel
 from lfm_ppl.model.structure import pattern
 from lfm_ppl.particles.normals import normals
 
@@ -123,7 +123,7 @@ class Moves(NamedTuple):
         size = self.ssm.physical_dim
 
         def move(state: jax.Array) -> jax.Array:
-            return advance(self.ssm, self.scheme, ready, normals, move_key, state, row.start, row.length,
+            return advance(self.ssm, self.scheme, ready, normals, move_key, state, row.span, row.length,
                            self.grid.steps)
 
         def jump(state: jax.Array) -> jax.Array:
@@ -137,7 +137,7 @@ class Moves(NamedTuple):
 
 
 def advance(ssm: StateSpaceModel, scheme: str, prepared: Prepared, draw: Callable, key: jax.Array, state: jax.Array,
-            start: jax.Array, length: jax.Array, steps: int) -> jax.Array:
+            span: Span, length: jax.Array, steps: int) -> jax.Array:
     """Move particles over a row.
 
     Args:
@@ -147,7 +147,7 @@ def advance(ssm: StateSpaceModel, scheme: str, prepared: Prepared, draw: Callabl
         draw: ``draw(key, count, particles)`` gives standard normal numbers (count, particles).
         key: a JAX random key.
         state: (n, N), a particle in each column.
-        start: time at the row's start.
+        span: the row's times.
         length: of the row.
         steps: of the row.
 
@@ -156,7 +156,7 @@ def advance(ssm: StateSpaceModel, scheme: str, prepared: Prepared, draw: Callabl
     """
     count = state.shape[1]
     if prepared.whole is not None:
-        offset = exact_offset(ssm, prepared.whole, steps, start, length)
+        offset = exact_offset(ssm, prepared.whole, steps, span, length)
         noise = draw(key, ssm.state_dim, count)
         return _columns(prepared.whole.phi, state) + _columns(prepared.root, noise) + offset[:, None]
     step = {"srk": srk, "milstein": milstein, "euler": euler}[scheme]
@@ -167,24 +167,24 @@ def advance(ssm: StateSpaceModel, scheme: str, prepared: Prepared, draw: Callabl
     # Normal numbers come in pairs: an odd number of rows is drawn for two steps at once.
     together = 2 if rows % 2 and steps % 2 == 0 else 1
 
-    def one_step(state: jax.Array, t: jax.Array, noise: jax.Array) -> jax.Array:
+    def one_step(state: jax.Array, rest: Span, noise: jax.Array) -> jax.Array:
         # The forces' state at the end, and their average over the step, before the drift is asked for anything.
         kicked = _columns(prepared.root, noise[used:])
-        one = lambda s, first, second, kick: step(ssm, prepared, h, t, s, (first, second), kick)  # noqa: E731
+        one = lambda s, first, second, kick: step(ssm, prepared, h, rest, s, (first, second), kick)  # noqa: E731
         return jax.vmap(one, in_axes=-1, out_axes=-1)(state, noise[:sources], noise[used - sources:used], kicked)
 
     def body(state: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
         first, step_key = inputs
         noise = draw(step_key, together * rows, count)
         for index in range(together):
-            state = one_step(state, start + (first + index) * h, noise[index * rows:(index + 1) * rows])
+            state = one_step(state, span.after((first + index) * h), noise[index * rows:(index + 1) * rows])
         return state, None
 
     firsts = jnp.arange(0, steps, together)
     return jax.lax.scan(body, state, (firsts, jax.random.split(key, len(firsts))))[0]
 
 
-def srk(ssm: StateSpaceModel, prepared: Prepared, h: jax.Array, t: jax.Array, s: jax.Array,
+def srk(ssm: StateSpaceModel, prepared: Prepared, h: jax.Array, span: Span, s: jax.Array,
         noise: tuple[jax.Array, jax.Array], kick: jax.Array) -> jax.Array:
     r"""Rössler's SRA1, strong order 1.5 for additive noise.
 
@@ -196,22 +196,22 @@ def srk(ssm: StateSpaceModel, prepared: Prepared, h: jax.Array, t: jax.Array, s:
     """
     size = ssm.physical_dim
     x, z = s[:size], s[size:]
-    later, w, second = force_inputs(ssm, prepared, h, t, x, z, kick)
-    first = ssm.drift(w, t)
+    later, w, second = force_inputs(ssm, prepared, h, span, x, z, kick)
+    first = ssm.drift(w, span.time())
     middle = x + 0.75 * h * first
     end = jnp.zeros(size)
     if ssm.model.process_noise is not None:
         change = jnp.sqrt(h) * noise[0]
         mean = 0.5 * change + jnp.sqrt(h / 12.0) * noise[1]
-        now, then = ssm.dispersion(w, t), ssm.dispersion(w, just_before(t + h, h))
+        now, then = ssm.dispersion(w, span.time()), ssm.dispersion(w, span.time(h))
         assert now is not None and then is not None
         middle = middle + 1.5 * _times(now, mean)
         end = _times(then, change - mean) + _times(now, mean)
-    inner = ssm.drift(jnp.concatenate([middle, second]), t + 0.75 * h)
+    inner = ssm.drift(jnp.concatenate([middle, second]), span.time(0.75 * h))
     return jnp.concatenate([x + h / 3.0 * (first + 2.0 * inner) + end, later])
 
 
-def milstein(ssm: StateSpaceModel, prepared: Prepared, h: jax.Array, t: jax.Array, s: jax.Array,
+def milstein(ssm: StateSpaceModel, prepared: Prepared, h: jax.Array, span: Span, s: jax.Array,
              noise: tuple[jax.Array, jax.Array], kick: jax.Array) -> jax.Array:
     """Add half of (dG/dx G) (DeltaB DeltaB' - h I) to Euler's step: strong order 1 for commutative noise.
 
@@ -219,7 +219,8 @@ def milstein(ssm: StateSpaceModel, prepared: Prepared, h: jax.Array, t: jax.Arra
     """
     size = ssm.physical_dim
     x, z = s[:size], s[size:]
-    later, w, _ = force_inputs(ssm, prepared, h, t, x, z, kick)
+    t = span.time()
+    later, w, _ = force_inputs(ssm, prepared, h, span, x, z, kick)
     u = w[size:]
 
     def dispersion(x: jax.Array) -> jax.Array:
@@ -236,12 +237,13 @@ def milstein(ssm: StateSpaceModel, prepared: Prepared, h: jax.Array, t: jax.Arra
     return jnp.concatenate([x + h * ssm.drift(w, t) + shift + 0.5 * along, later])
 
 
-def euler(ssm: StateSpaceModel, prepared: Prepared, h: jax.Array, t: jax.Array, s: jax.Array,
+def euler(ssm: StateSpaceModel, prepared: Prepared, h: jax.Array, span: Span, s: jax.Array,
           noise: tuple[jax.Array, jax.Array], kick: jax.Array) -> jax.Array:
     """Euler and Maruyama's step: strong order 1/2, and 1 for additive noise."""
     size = ssm.physical_dim
     x, z = s[:size], s[size:]
-    later, w, _ = force_inputs(ssm, prepared, h, t, x, z, kick)
+    t = span.time()
+    later, w, _ = force_inputs(ssm, prepared, h, span, x, z, kick)
     moved = x + h * ssm.drift(w, t)
     dispersion = ssm.dispersion(w, t)
     if dispersion is not None:
@@ -249,18 +251,18 @@ def euler(ssm: StateSpaceModel, prepared: Prepared, h: jax.Array, t: jax.Array, 
     return jnp.concatenate([moved, later])
 
 
-def force_inputs(ssm: StateSpaceModel, prepared: Prepared, h: jax.Array, t: jax.Array, x: jax.Array, z: jax.Array,
+def force_inputs(ssm: StateSpaceModel, prepared: Prepared, h: jax.Array, span: Span, x: jax.Array, z: jax.Array,
                  kick: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return z at the end, the inputs w = (x, u) at the start, and u of the second stage of `srk`."""
     if ssm.force_dim == 0:
         return z, x, jnp.zeros(0)
-    size = ssm.force_dim
+    size, t = ssm.force_dim, span.time()
     later = _times(prepared.transition, z) + kick[:size]
     u = _times(ssm.stack.measurement(t), z) + ssm.stack.mean_at(t)
     # At h = 0 the average is the value itself.
     inverse = jnp.where(h > 0, 1.0 / jnp.where(h > 0, h, 1.0), 0.0)
     mean = inverse * (_times(prepared.average, z) + kick[size:])
-    node = t + 0.75 * h
+    node = span.time(0.75 * h)
     if ssm.constant_measurement:
         start = _times(ssm.stack.measurement(t), z)
         second = start + 1.5 * (mean - start)

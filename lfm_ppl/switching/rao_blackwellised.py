@@ -173,7 +173,7 @@ def _run(ssms: tuple[StateSpaceModel, ...], rule: SwitchingRule, grid: TimeGrid,
         particles, log_likelihood = _observe(ssms[0], _move(particles, own, settings.shared), own, observed, settings)
         kept = _summary(particles, own, settings.shared)
         particles = jax.lax.cond(
-            decide, lambda p: _decide(rule, p, own, one.start + one.length, read_key, settings.shared),
+            decide, lambda p: _decide(rule, p, own, one.end, read_key, settings.shared),
             lambda p: p, particles)
         weights = jnp.exp(particles.log_weights)
         ess = effective_sample_size(weights)

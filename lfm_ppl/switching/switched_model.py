@@ -142,7 +142,7 @@ def interval_maps(ssm: StateSpaceModel, rule: SwitchingRule, grid: TimeGrid) -> 
     def make(row: Intervals) -> SwitchedMap:
         # From a state that is zero and known, the mean at the end is the offset.
         one = predict(ssm, Taylor(), grid, prepared, row, nothing, with_map=True)
-        end = row.start + row.length
+        end = row.end
         observe = lambda s: ssm.observe(ssm.inputs(s, end), end)  # noqa: E731
         read = lambda s: rule.reading(*ssm.split(ssm.inputs(s, end)), end)  # noqa: E731
         zero = nothing.mean

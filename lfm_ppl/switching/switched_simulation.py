@@ -101,7 +101,7 @@ def _run(ssms: tuple[StateSpaceModel, ...], schemes: tuple[str, ...], rule: Swit
         state, index = carry
         one, decide, row_key = inputs
         move_key, jump_key, read_key = jax.random.split(row_key, 3)
-        end = one.start + one.length
+        end = one.end
         moved = [move.across(one, move.ready(one), move_key, jump_key, state) for move in moves]
         state = jnp.take_along_axis(jnp.stack(moved), index[None, None, :], axis=0)[0]
         before = index

@@ -10,6 +10,7 @@ import lfm_ppl as lfm
 from lfm_ppl.filtering import predict
 from lfm_ppl.filtering.predict import Moments, interval_factor, predict_interval
 from lfm_ppl.filtering.transition import linear_part
+from lfm_ppl.model.state_space import Span
 
 DECAY = jnp.array([0.4, 0.9, 0.6])
 SENSITIVITY = jnp.array([1.0, 0.5, 0.7])
@@ -80,7 +81,8 @@ def predictions(ssm, rule, steps):
     factor = interval_factor(ssm, rule, linear, jnp.asarray(1.5), steps, tabulated=steps != 3)
 
     def row(moments, about):
-        return predict_interval(ssm, rule, linear, factor, steps, jnp.asarray(0.7), jnp.asarray(1.5), moments, about,
+        span = Span.between(0.7, 2.2, 1.5)
+        return predict_interval(ssm, rule, linear, factor, steps, span, jnp.asarray(1.5), moments, about,
                            with_map=True, each=lambda one: one)
 
     def both(moments):
