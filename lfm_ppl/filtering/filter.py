@@ -468,7 +468,8 @@ def filter(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
         y: (T, D), NaN where missing.
         rule: linearisation rule; `Cubature()` by default.
         steps: integration steps between two consecutive times.
-        max_step: longest step, in units of time; longer intervals get more steps.
+        max_step: longest step, in units of time; longer intervals get more steps. None: twice the median step. A linear
+            model without known inputs is exact, and needs no steps.
         start: the ``state`` of an earlier result, to go on with new observations; times continue from there, and
             nothing need be observed at them (a prediction). The numbers are those of one pass, and as many new times
             as in an earlier call take no new compilation. (An observation covariance for each time holds those of the

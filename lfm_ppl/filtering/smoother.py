@@ -220,7 +220,8 @@ def smooth(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
         y: (T, D), NaN where missing.
         rule: linearisation rule; `Cubature()` by default.
         steps: integration steps between two consecutive times.
-        max_step: longest step; longer intervals get more.
+        max_step: longest step, in units of time; longer intervals get more steps. None: twice the median step. A linear
+            model without known inputs is exact, and needs no steps.
         at: (K,) times at which results are wanted, in any order, also after the last observation (a forecast).
             The observation times by default. They change nothing elsewhere.
         iterations: of posterior linearisation, 0 for none.

@@ -93,7 +93,8 @@ def build_time_grid(ssm: StateSpaceModel, times: Any, steps: int, max_step: floa
         ssm: the model; its forces' jump times become intervals.
         times: (T,) observation times, non-decreasing.
         steps: integration steps between two consecutive times.
-        max_step: longest step; a longer interval gets more steps, in intervals of ``steps`` each.
+        max_step: longest step; a longer interval gets more steps, in intervals of ``steps`` each. None: see
+            `longest_step`.
         at: (K,) further times at which the state is wanted, in any order.
         initial_time: overrides the model's (when the scan starts from a filter's state).
         interval_per_step: give every integration step an interval of its own, so that a particle smoother reaches each.
@@ -109,8 +110,13 @@ def build_time_grid(ssm: StateSpaceModel, times: Any, steps: int, max_step: floa
         checks.positive("max_step", max_step)
     if tolerance is not None:
         checks.positive("tolerance", tolerance)
-        grid = build_time_grid(ssm, times, steps, max_step, at, initial_time, interval_per_step, until=until)
-        return grid._replace(tolerance=float(tolerance))
+    grid = _laid_out(ssm, times, steps, max_step, at, initial_time, interval_per_step, until, tolerance is not None)
+    return grid if tolerance is None else grid._replace(tolerance=float(tolerance))
+
+
+def _laid_out(ssm: StateSpaceModel, times: Any, steps: int, max_step: float | None, at: Any, initial_time: Any,
+              interval_per_step: bool, until: float | None, adaptive: bool) -> TimeGrid:
+    """Return the time grid of `build_time_grid`; the length of ``adaptive`` steps follows the moments."""
     initial_time = ssm.model.initial_time if initial_time is None else initial_time
     known = check_times(times, initial_time)
     start = known[0] if initial_time is None and known is not None else initial_time
@@ -123,7 +129,28 @@ def build_time_grid(ssm: StateSpaceModel, times: Any, steps: int, max_step: floa
         return _traced_origin(known, start, ssm.stack.jump_times, steps, interval_per_step)
     if known is None or origin is None:
         return _traced(ssm, times, steps, max_step, at, initial_time, interval_per_step)
-    return _concrete(known, float(origin), ssm.stack.jump_times, steps, max_step, at, interval_per_step)
+    longest = longest_step(ssm, known, float(origin), steps) if max_step is None and not adaptive else max_step
+    return _concrete(known, float(origin), ssm.stack.jump_times, steps, longest, at, interval_per_step)
+
+
+def longest_step(ssm: StateSpaceModel, times: Any, origin: Any, steps: int) -> float | None:
+    """Return the default longest step, twice the median step; None for an exact model, and for traced times.
+
+    The number of steps is the same between any two times, so that a gap in the data would be crossed in steps that are
+    too long for a force or for the dynamics.
+
+    Args:
+        ssm: the model.
+        times: (T,) observation times.
+        origin: the initial time; the gap from there to the first observation counts as well.
+        steps: integration steps between two consecutive times.
+    """
+    if ssm.mean_invariant or checks.traced((times, origin)):
+        return None
+    gaps = np.diff(np.asarray(times, float), prepend=float(origin))
+    if not (gaps > 0).any():
+        return None
+    return 2.0 * float(np.median(gaps[gaps > 0])) / steps
 
 
 def _traced(ssm: StateSpaceModel, times: Any, steps: int, max_step: Any, at: Any, initial_time: Any,

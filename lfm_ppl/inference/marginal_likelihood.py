@@ -91,7 +91,8 @@ class MarginalLikelihood(dist.Distribution):
         times: (T,), non-decreasing.
         rule: linearisation rule; `Cubature()` by default.
         steps: integration steps between two consecutive times.
-        max_step: longest step; longer intervals get more.
+        max_step: longest step, in units of time; longer intervals get more steps. None: twice the median step. A linear
+            model without known inputs is exact, and needs no steps.
         iterations: of posterior linearisation; 0 for none. By default 3 for a model that is not linear, and 0 for a
             linear model, an observation family, constraints, or with a ``tolerance``.
         damping: largest share of each new iterate that is taken; less where the iterates turn back.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import sys
 from collections.abc import Callable, Hashable, Mapping
 from typing import Any, NamedTuple, Protocol, cast
 
@@ -13,7 +14,7 @@ import numpy as np
 from lfm_ppl import checks
 from lfm_ppl.batching import BATCH_SIZE, mapped, on_cpu, side_by_side, threads
 from lfm_ppl.filtering.smoother import LONGEST_FORECAST, SmootherResult
-from lfm_ppl.filtering.time_grid import build_time_grid
+from lfm_ppl.filtering.time_grid import build_time_grid, longest_step
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.fingerprint import signature
 from lfm_ppl.inference.marginal_likelihood import SIMULATION_STEPS, MarginalLikelihood, Panel
@@ -239,8 +240,11 @@ def _plan(bound: BoundModel, at: np.ndarray | None, simulated: bool, since: floa
     known = bound.times
     gaps = np.diff(known, axis=-1)
     base = example.steps
-    if example.max_step is not None:
-        base = max(base, int(np.ceil(gaps.max(initial=0.0) / example.max_step)))
+    longest = example.max_step
+    if longest is None and known.ndim == 1 and example.tolerance is None:
+        longest = longest_step(example.ssm, known, example.time_grid.initial_time, base)
+    if longest is not None:
+        base = max(base, int(np.ceil(gaps.max(initial=0.0) / longest * (1 - 1e-12))))
     fine = SIMULATION_STEPS * base * (1 if example.tolerance is None else _TRIED)
     rows = np.arange(known.shape[-1])
     if at is None:
@@ -352,7 +356,10 @@ def _particle_path(distribution: MarginalLikelihood, y: jax.Array, at: Any, key:
     to its estimate of the likelihood gives a path of the right one as the number of filters grows, too.
     """
     ssm, times = distribution.ssm, distribution.times
-    grid = build_time_grid(ssm, times, _steps_per_interval(ssm, times, at, steps), distribution.max_step, at)
+    longest = distribution.max_step
+    if longest is None:
+        longest = longest_step(ssm, times, distribution.time_grid.initial_time, steps)
+    grid = build_time_grid(ssm, times, _steps_per_interval(ssm, times, at, steps), longest, at)
     path_keys, choice = jax.random.split(key, _FILTERS + 1)[:-1], jax.random.fold_in(key, _FILTERS)
     states, _, total = jax.lax.map(lambda k: draw_trajectories(ssm, grid, y, k, particles, 1, TRACING), path_keys)
     best = jax.random.categorical(choice, jnp.where(jnp.isneginf(total).all(), 0.0, total))
@@ -365,7 +372,7 @@ def _steps_per_interval(ssm: StateSpaceModel, times: Any, at: Any, steps: int, s
     known = checks.concrete(times)
     if at is None or known is None:
         return steps
-    grid = build_time_grid(ssm, known, 1, None, at)
+    grid = build_time_grid(ssm, known, 1, sys.float_info.max, at)
     rows, origin = grid.intervals, np.asarray(grid.initial_time)
     # Counted from the initial time, so that the origin of time does not matter.
     ends, since = grid.since + rows.length, since - origin
