@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lfm_ppl.inference.handlers.pinned import Pinned
+
 if TYPE_CHECKING:
     from lfm_ppl.model.latent_force_model import LatentForceModel
 
@@ -17,14 +19,32 @@ def prior(distribution: Any) -> str:
     """Return a distribution in words: its name and its arguments.
 
     Example:
-        >>> import numpyro.distributions as dist
+        >>> import jax.numpy as jnp, numpyro.distributions as dist
         >>> prior(dist.LogNormal(0.0, 0.5).expand([3]).to_event(1))
         'LogNormal(0, 0.5)'
+
+        Of a vector with fixed entries, the prior of the free ones, and the values of the others:
+
+        >>> prior(Pinned(dist.LogNormal(jnp.array([0.0, 1.0, 1.0]), 0.5), (0,), jnp.array([0.8]), ("CDKN1A",)))
+        'LogNormal(1, 0.5); fixed: CDKN1A = 0.8'
     """
+    if isinstance(distribution, Pinned):
+        size = distribution.shape()[0]
+        free = np.setdiff1d(np.arange(size), distribution.indices)
+        fixed = ", ".join(f"{label} = {_number(value)}" for label, value in zip(
+            distribution.labels, np.asarray(distribution.values), strict=True))
+        return f"{_in_words(distribution.base, size, free)}; fixed: {fixed}" if free.size else f"fixed: {fixed}"
+    return _in_words(distribution)
+
+
+def _in_words(distribution: Any, size: int | None = None, entries: np.ndarray | None = None) -> str:
+    """Return name and arguments of a distribution, of a vector of this size those of some entries."""
     while hasattr(distribution, "base_dist") and type(distribution).__name__ in (
             "Independent", "ExpandedDistribution", "MaskedDistribution"):
         distribution = distribution.base_dist
     values = [getattr(distribution, name, None) for name in distribution.arg_constraints]
+    if entries is not None:
+        values = [np.asarray(value)[entries] if np.shape(value) == (size,) else value for value in values]
     return f"{type(distribution).__name__}({', '.join(_number(value) for value in values if value is not None)})"
 
 

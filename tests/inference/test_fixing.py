@@ -9,7 +9,8 @@ import pytest
 from numpyro.infer import MCMC, NUTS, Predictive
 from numpyro.infer.util import initialize_model, potential_energy
 
-from lfm_ppl.inference.handlers.fixing import fix
+from lfm_ppl.inference.handlers.fixing import fix, pin
+from lfm_ppl.inference.priors import prior
 
 COVARIANCE = np.array([[1.0, 0.8, 0.3], [0.8, 1.0, 0.5], [0.3, 0.5, 1.0]])
 LABELS = ("a", "b", "c")
@@ -114,3 +115,12 @@ def test_a_whole_vector_is_fixed_by_a_number_or_by_its_values():
 def test_what_cannot_be_fixed(fixed, message):
     with pytest.raises(ValueError, match=message):
         numpyro.handlers.seed(fix(model, fixed, LABELS), 0)()
+
+
+def test_the_prior_of_fixed_elements_in_words():
+    """The free elements' prior and the values of the others; of arguments by element those of the free ones."""
+    trace = numpyro.handlers.trace(numpyro.handlers.seed(fix(model, FIXED, LABELS), 0)).get_trace()
+    assert prior(trace["decay"]["fn"]) == "LogNormal(0, 1); fixed: c = 0.8"
+    assert prior(trace["u"]["fn"]) == "Uniform([0, 2], 5); fixed: 1 = 2, 3 = 4"
+    all_fixed = pin("decay", dist.HalfNormal(jnp.ones(2)), {"0": 0.5, "1": 2.0})
+    assert prior(all_fixed) == "fixed: 0 = 0.5, 1 = 2"

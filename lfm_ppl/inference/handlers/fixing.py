@@ -118,7 +118,8 @@ def pin(
     known = known or [str(index) for index in range(shape[0])]
     indices = {_index(name, label, known): value for label, value in elements.items()}
     order = sorted(indices)
-    pinned = Pinned(base, tuple(order), jnp.array([float(indices[i]) for i in order]))
+    pinned = Pinned(base, tuple(order), jnp.array([float(indices[i]) for i in order]),
+                    tuple(known[index] for index in order))
     _inside(name, base.support, pinned.insert(base.support.feasible_like(jnp.zeros(shape))))
     return pinned
 

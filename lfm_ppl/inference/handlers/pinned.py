@@ -27,15 +27,18 @@ class Pinned(dist.Distribution):
         base: distribution over a vector, as batch or as event, of elementwise support.
         indices: the fixed elements.
         values: their values, shape (len(indices),).
+        labels: what the fixed elements are called; by default their indices.
     """
 
     pytree_data_fields = ("base", "values")
-    pytree_aux_fields = ("indices",)
+    pytree_aux_fields = ("indices", "labels")
 
-    def __init__(self, base: dist.Distribution, indices: tuple[int, ...], values: Any) -> None:
+    def __init__(self, base: dist.Distribution, indices: tuple[int, ...], values: Any,
+                 labels: tuple[str, ...] = ()) -> None:
         self.base = base
         self.indices = indices
         self.values = values
+        self.labels = labels or tuple(str(index) for index in indices)
         super().__init__(base.batch_shape, base.event_shape)
 
     @property
