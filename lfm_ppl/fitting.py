@@ -30,6 +30,7 @@ from lfm_ppl.forces.stretched import Stretched
 from lfm_ppl.inference import sampling
 from lfm_ppl.inference.ahead import Ahead
 from lfm_ppl.inference.bound_model import BoundModel, bind
+from lfm_ppl.inference.degenerate_mode import degenerate_entries
 from lfm_ppl.inference.interruption import was_interrupt
 from lfm_ppl.inference.kernels.options import KERNELS, check_options
 from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalRAM, Tuned
@@ -174,7 +175,8 @@ def fit(
 
     Warns:
         UserWarning: the result is partial.
-        ConvergenceWarning: R-hat above 1.01, fewer than 100 effective draws a chain, divergences; each with a remedy.
+        ConvergenceWarning: R-hat above 1.01, fewer than 100 effective draws a chain, divergences, a degenerate
+            posterior mode; each with a remedy.
         FilterWarning: no point to start from was found (which is an error): where the filter breaks down at the prior
             median, and how.
 
@@ -820,7 +822,10 @@ def _mode(bound: BoundModel, key: jax.Array, samples: int, seed: int, init: Any,
                    "map_log_density": float(mode.log_density), "log_evidence": float(mode.log_evidence),
                    arviz_data.MODE: json.dumps({name: value.tolist() for name, value in
                                                 {**mode.parameters, **mode.deterministic}.items()})}
-        return {"": np.asarray(json.dumps(remarks)), **mode.sample(key, samples)}
+        draws = mode.sample(key, samples)
+        degenerate = kept("check of the mode", lambda: degenerate_entries(bound, mode, draws), {})
+        remarks |= {arviz_data.DEGENERATE: json.dumps(degenerate)} if degenerate else {}
+        return {"": np.asarray(json.dumps(remarks)), **draws}
 
     found = compute() if run is None else run.once(_MODE, compute)
     remarks = json.loads(str(found.pop("")))

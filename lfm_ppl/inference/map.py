@@ -49,6 +49,7 @@ class MAPResult:
         message: how the search ended.
         unidentified: coordinates along which the density is flat; their variances stand for "large"
             and have no other meaning.
+        runaway: coordinates along which the search went on and on, to the edge of the support or to infinity.
         restart_log_densities: log density reached from each start, (restarts,); -inf where no
             possible starting point was found. Differences above 1e-6 of the value mean several modes.
         restart_ends: where the search from each start ended, (restarts, d); NaN where there was no start.
@@ -66,6 +67,7 @@ class MAPResult:
     converged: bool
     message: str
     unidentified: tuple[str, ...]
+    runaway: tuple[str, ...]
     restart_log_densities: np.ndarray
     restart_ends: np.ndarray
     evaluations: int
@@ -278,6 +280,7 @@ def _result(
         converged=not message,
         message=message or "converged",
         unidentified=unidentified,
+        runaway=tuple(np.array(names)[_runaway(minimum)]),
         restart_log_densities=np.array([-end.value for end in ends]),
         restart_ends=np.stack([end.point for end in ends]),
         evaluations=objective.evaluations,
@@ -295,7 +298,7 @@ def _verdict(minimum: Minimum, names: tuple[str, ...]) -> str:
     if np.any(negative):
         where = ", ".join(names[i] for i in curvature.coordinates(negative))
         return f"the search ended at a saddle point, in a direction of {where}."
-    away = np.abs(minimum.step) > 1e-3 * (1.0 + np.abs(minimum.point))
+    away = _runaway(minimum)
     if np.any(away):
         where = ", ".join(np.array(names)[away])
         return f"{where} runs away; the mode may lie at the edge of the support or at infinity."
@@ -304,3 +307,8 @@ def _verdict(minimum: Minimum, names: tuple[str, ...]) -> str:
     if left > tolerance:
         return f"the log density still rises by about {left:.1e} within one step."
     return ""
+
+
+def _runaway(minimum: Minimum) -> np.ndarray:
+    """Return along which coordinates (d,) Newton's step is long where the search ended."""
+    return np.abs(minimum.step) > 1e-3 * (1.0 + np.abs(minimum.point))

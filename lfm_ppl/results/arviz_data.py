@@ -32,6 +32,9 @@ WEIGHTS = "constraint_weights"
 MODE = "mode"
 """Attribute of a result of sampler "map": name -> value at the posterior mode, as JSON."""
 
+DEGENERATE = "degenerate_mode"
+"""Attribute of a result of sampler "map": parameter -> entries at whose mode the density has a spike, as JSON."""
+
 _SMALLEST_TAIL = 5
 """Fewest importance ratios that a Pareto distribution can be fitted to."""
 
@@ -240,8 +243,8 @@ def summary(result: Any) -> pd.DataFrame:
         Columns mean, sd, q2.5, q97.5 (quantiles in percent), mcse_mean, ess_bulk, ess_tail, r_hat;
         rows labelled ``noise_sd`` or ``decay[CDKN1A]``. Resampled draws are no chains: the effective size is that of
         the importance weights, and there is no R-hat. Draws of a Laplace approximation (sampler "map") are independent:
-        the columns are mode, mean, sd, q2.5, q97.5, and there is nothing to diagnose. A run that was stopped has a
-        column more, ``partial``, which says what there is.
+        the columns are mode, mean, sd, q2.5, q97.5, and ``warnings`` where the mode of a parameter is degenerate. A run
+        that was stopped has a column more, ``partial``, which says what there is.
 
     Raises:
         ValueError: the result has no posterior.
@@ -253,7 +256,8 @@ def summary(result: Any) -> pd.DataFrame:
         ['decay']
     """
     draws = scalar_draws(group(result, "posterior"))
-    quantiles = {label: np.quantile(values, (0.025, 0.975)) for label, values in draws.items()}
+    with np.errstate(invalid="ignore"):  # of draws that are not finite
+        quantiles = {label: np.quantile(values, (0.025, 0.975)) for label, values in draws.items()}
     resampled = attributes(result).get("effective_draws")
     moments = {
         "mean": {label: _mean(values) for label, values in draws.items()},
@@ -262,7 +266,10 @@ def summary(result: Any) -> pd.DataFrame:
         "q97.5": {label: high for label, (_, high) in quantiles.items()},
     }
     if of_mode(result):
-        return pd.DataFrame({**_mode(result), **moments}, index=list(draws), dtype=float)
+        table = pd.DataFrame({**_mode(result), **moments}, index=list(draws), dtype=float)
+        if degenerate := _degenerate(result):
+            table["warnings"] = ["degenerate mode" if label in degenerate else "" for label in table.index]
+        return table
     table = pd.DataFrame(
         {
             **moments,
@@ -294,7 +301,8 @@ def convergence_warnings(result: Any, table: pd.DataFrame | None = None) -> list
 
     R-hat above 1.01, bulk or tail effective sample size below 100 per chain, divergences, sites of
     an observation family or of constraints that do not converge, trajectories under constraints that are worth little.
-    Draws from a Laplace approximation (sampler "map") are independent, and give none but the last two.
+    Draws from a Laplace approximation (sampler "map") are independent, and give none but the last two, and that the
+    mode is degenerate.
 
     Args:
         result: an ArviZ object with a posterior, and sample_stats where there are any.
@@ -308,6 +316,10 @@ def convergence_warnings(result: Any, table: pd.DataFrame | None = None) -> list
     of_sites = convergence.of_sites(*json.loads(attrs.get(SITES, "[0, 0, 0]")), constrained=constrained,
                                     from_mode=from_mode)
     of_sites += convergence.of_weights(*json.loads(attrs.get(WEIGHTS, "[0, 0, 0]")))
+    if of_mode(result):
+        rows = summary(result) if table is None else table
+        degenerate = [label for label in _degenerate(result) if label in rows.index]
+        return convergence.of_degenerate_mode(rows.loc[degenerate]) + of_sites
     if from_mode or "effective_draws" in attrs:
         return of_sites if from_mode else []
     sizes = group(result, "posterior").sizes
@@ -367,6 +379,17 @@ def _mode(result: Any) -> dict[str, dict[str, float]]:
     named = {name: (posterior[name].dims[2:], value) for name, value in values.items() if name in posterior}
     modes = xr.Dataset(named, {dim: posterior[dim] for dims, _ in named.values() for dim in dims if dim in posterior})
     return {"mode": scalar_truth(posterior, modes)} if named else {}
+
+
+def _degenerate(result: Any) -> list[str]:
+    """Return the labels of the parameters whose mode is degenerate."""
+    entries = json.loads(str(attributes(result).get(DEGENERATE, "{}")))
+    if not entries:
+        return []
+    posterior = group(result, "posterior")
+    variables = {site.replace("/", "."): indices for site, indices in entries.items()}
+    labels = {name: list(scalar_draws(posterior[[name]])) for name in variables if name in posterior}
+    return [labels[name][index] for name, indices in variables.items() if name in labels for index in indices]
 
 
 def _diagnostic(

@@ -93,6 +93,23 @@ def of_sites(points: int, unconverged: int, impossible: int, *, constrained: boo
             f"{'' if from_mode else ': draws may miss these parameters'}. {remedy}"]
 
 
+def of_degenerate_mode(rows: pd.DataFrame) -> list[str]:
+    """Return what to say of a mode that is a spike of the density; nothing where no parameter is concerned.
+
+    Args:
+        rows: of the summary of a Laplace approximation, of the parameters that are concerned.
+    """
+    if not len(rows):
+        return []
+    values = _with_values(rows["mode"], ".2g") if "mode" in rows else list(rows.index)
+    return [
+        f"the posterior mode is degenerate in {_listed(values)}: the density has a spike there that holds hardly any "
+        "of the posterior, as where the scale of a group goes to zero and its members become equal, so that the draws "
+        'mean nothing. Sample with NUTS (sampler="nuts"), and write a hierarchical model in non-centred form: '
+        "theta = mu + tau * z with z ~ Normal(0, 1), or numpyro.infer.reparam.LocScaleReparam(0)."
+    ]
+
+
 def of_weights(trajectories: int, median: float, least: float) -> list[str]:
     """Return what to say of an evidence under constraints that rests on few of its trajectories.
 

@@ -66,7 +66,7 @@ _SETTINGS = {
 }
 _ELSEWHERE = ("model", "model_file", DESCRIPTION, "data", "note", "versions", "warnings", "partial", "settings", "run",
               "map_converged", arviz_data.MODE, COMMAND, CALL, ORIGIN, PRIORS, MEANINGS, ASSUMPTIONS,
-              "inference_library", "site_failures", "constraint_weights")
+              "inference_library", "site_failures", "constraint_weights", arviz_data.DEGENERATE)
 """Attributes that stand in other sections, or that nobody needs to read."""
 
 _FILES = re.compile(r"(.*\.nc|(summary|accuracy|forecast|scores)\.csv"
