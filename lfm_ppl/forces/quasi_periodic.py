@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -38,6 +39,11 @@ class QuasiPeriodic(Force):
     order 1 and 0.064 for order 0. Rough kernels need more functions, that is a smaller gamma. Functions that keep less
     than ``explained_variance`` of the variance are reported, with the number that would keep it.
 
+    A share of the variance says little of the log likelihood: weights that change slowly are seen through the noise of
+    many cycles, so that 0.005% of the variance can be worth nats. Where data can tell the functions from the whole
+    kernel, `lfm.filter`, `lfm.smooth` and `lfm.MarginalLikelihood` warn, and say how many functions suffice; see
+    `lfm_ppl.model.truncation`.
+
     A stationary kernel has the Fourier series ``sum_j q_j cos(2 pi j t / D)``, whose coefficients are integrals of
     the kernel, so that no eigen-decomposition is needed; each pair turns in its state and the force has constant
     matrices. The eigenfunctions of another kernel are found by Nystrom's method, see `lfm_ppl.forces.basis`. Both can
@@ -52,7 +58,8 @@ class QuasiPeriodic(Force):
         gamma: share of the largest eigenvalue above which one is significant.
         mean: a number, or a function of time.
         points: of Nystrom's method in a cycle, for kernels that are not stationary.
-        explained_variance: share of the kernel's variance that the functions are to keep; 0 where any will do.
+        explained_variance: share of the kernel's variance that the functions are to keep. 0: the functions themselves
+            are the model, and are compared with nothing.
 
     Warns:
         ApproximationWarning: outside of compiled code, where they keep less.
@@ -77,6 +84,7 @@ class QuasiPeriodic(Force):
     evolution: Force
     basis: Basis
     mean: Any
+    explained_variance: float = eqx.field(static=True)
 
     def __init__(self, kernel: Kernel, evolution: Force, functions: int | None = None, gamma: float = 0.01,
                  mean: Any = 0.0, points: int = _POINTS, explained_variance: float = EXPLAINED_VARIANCE):
@@ -91,6 +99,7 @@ class QuasiPeriodic(Force):
         self.kernel, self.evolution, self.mean = kernel, evolution, mean_parameter(mean)
         self.basis = _basis(kernel, functions, gamma, points)
         warn_of_lost_variance(kernel, self.basis, explained_variance, points)
+        self.explained_variance = float(explained_variance)
 
     @property
     def period(self) -> jax.Array:
@@ -214,7 +223,7 @@ class Periodic(QuasiPeriodic):
         gamma: share of the largest eigenvalue above which one is significant.
         mean: a number, or a function of time.
         points: of Nystrom's method in a cycle, for kernels that are not stationary.
-        explained_variance: share of the kernel's variance that the functions are to keep; 0 where any will do.
+        explained_variance: as in `QuasiPeriodic`.
 
     Warns:
         ApproximationWarning: as `QuasiPeriodic`.

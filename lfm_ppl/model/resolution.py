@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from scipy.linalg import expm
 
-from lfm_ppl import checks
-from lfm_ppl.forces.sde import ApproximationWarning, Force, Sum
+from lfm_ppl.forces.sde import ApproximationWarning
 from lfm_ppl.forces.squared_exponential import SquaredExponential
 from lfm_ppl.model.latent_force_model import LatentForceModel
-from lfm_ppl.model.observations.family import ObservationFamily
-
-TOLERANCE = 0.1
-"""Error of the log likelihood above which there is a warning."""
+from lfm_ppl.model.linear_response import (
+    LEAST_NOISE,
+    TOLERANCE,
+    ForceTerm,
+    LinearModel,
+    error_bound,
+    exact_covariance,
+    force_terms,
+    linearize,
+    observed_times,
+    output_responses,
+)
+from lfm_ppl.model.truncation import truncation_message, truncations
 
 _WINDOW = 20.0
 """Lengthscales that are looked at; errors of longer records grow as if their pieces were independent."""
@@ -30,8 +34,6 @@ _ROWS = 150
 """Number of observed values that are looked at, at most; of more, as many with less noise stand for all."""
 _COARSEST = 0.25
 """Longest step, in lengthscales, over which a force is taken to be linear in time."""
-_LEAST_NOISE = 1e-10
-"""Observation noise that is assumed at least, relative to the variance of the signal; K is singular without."""
 
 
 class Resolution(NamedTuple):
@@ -51,9 +53,10 @@ class Resolution(NamedTuple):
 
 
 def check_resolution(model: LatentForceModel, times: Any, y: Any) -> None:
-    """Warn of squared exponential forces whose order is too low for the data.
+    """Warn of forces whose approximation is too coarse for the data.
 
-    It does nothing inside compiled code, or where a parameter is traced. See `resolutions` for what is computed.
+    These are squared exponential forces of too low an order (`resolutions`), and periodic forces of too few functions
+    (`truncations`). Nothing happens inside compiled code, or where a parameter is traced.
 
     Args:
         model: the latent force model.
@@ -66,6 +69,9 @@ def check_resolution(model: LatentForceModel, times: Any, y: Any) -> None:
     for found in resolutions(model, times, y):
         if found.error > TOLERANCE:
             warnings.warn(_message(found), ApproximationWarning, stacklevel=4)
+    for truncation in truncations(model, times, y):
+        if truncation.error > TOLERANCE:
+            warnings.warn(truncation_message(truncation), ApproximationWarning, stacklevel=4)
 
 
 def resolutions(model: LatentForceModel, times: Any, y: Any = None) -> list[Resolution]:
@@ -89,70 +95,27 @@ def resolutions(model: LatentForceModel, times: Any, y: Any = None) -> list[Reso
         One entry for each squared exponential force, also in sums; none where something is traced, where fewer than two
         times are observed, and for a model with process noise, which hides what the estimate does not know.
     """
-    terms = [(name, column, term) for column, (name, force) in enumerate(zip(model.force_names, model.force_list,
-                                                                             strict=True)) for term in _terms(force)]
-    # Only now is anything computed: other models pass at no cost. In compiled code every new array is traced.
-    if not any(isinstance(term, SquaredExponential) for *_, term in terms):
+    terms = force_terms(model)
+    # Only now is anything computed: other models pass at no cost.
+    if not any(isinstance(term.force, SquaredExponential) for term in terms):
         return []
-    if isinstance(model.observation, ObservationFamily):
-        return []
-    if model.process_noise is not None or checks.traced((model, times, y, jnp.zeros(()))):
-        return []
-    known = np.asarray(times, float)
-    if y is not None and known.ndim == 1 and np.shape(y)[:1] == known.shape:
-        known = known[np.isfinite(np.asarray(y, float)).reshape(known.size, -1).any(axis=1)]
-    if known.size < 2:
-        return []
-    linear = _linearised(model, known[0])
-    if linear is None or known.ndim != 1 or not np.all(np.isfinite(known)):
+    observed = observed_times(model, times, y)
+    linear = None if observed is None else linearize(model, observed[0])
+    if observed is None or linear is None:
         return []
     found = []
-    for index, (name, column, term) in enumerate(terms):
-        if isinstance(term, SquaredExponential) and np.ndim(term.lengthscale) == np.ndim(term.scale) == 0:
-            rest = [(other[1], other[2]) for position, other in enumerate(terms) if position != index]
+    for index, (name, column, force) in enumerate(terms):
+        if isinstance(force, SquaredExponential) and np.ndim(force.lengthscale) == np.ndim(force.scale) == 0:
+            others = [other for position, other in enumerate(terms) if position != index]
             with np.errstate(all="ignore"):
-                result = _estimate(linear, known, term, column, rest)
+                result = _estimate(linear, observed, force, column, others)
             if result is not None:
-                found.append(Resolution(name, term, *result))
+                found.append(Resolution(name, force, *result))
     return found
 
 
-class _Linear(NamedTuple):
-    """dx/dt = A x + B u, y = C x + D u + e, e ~ N(0, R), x(t0) ~ N(., P0)."""
-
-    a: np.ndarray
-    b: np.ndarray
-    c: np.ndarray
-    d: np.ndarray
-    noise: np.ndarray
-    initial: np.ndarray
-
-
-def _terms(force: Force) -> tuple[Force, ...]:
-    return force.forces if isinstance(force, Sum) else (force,)
-
-
-def _linearised(model: LatentForceModel, time: float) -> _Linear | None:
-    """The model at the prior mean; None where that is traced or not finite."""
-    t = jnp.asarray(time, float)
-    x = model.initial_state.mean
-    u = jnp.asarray([force.mean_at(t) for force in model.force_list], float)
-    slopes: list[Any] = []
-    for function in (model.dynamics, model.observation.function):
-        differentiate: Callable[..., Any] = jax.jacfwd(lambda x, u, f=function: jnp.asarray(f(x, u, t), float), (0, 1))
-        slopes.extend(differentiate(x, u))
-    covariance = model.observation.covariance
-    noise = (jnp.median(jnp.asarray(covariance), axis=0) if np.ndim(covariance) == 3
-             else model.observation.covariance_at(x, u, t, jnp.asarray(0)))
-    parts = (*slopes, noise, model.initial_state.covariance)
-    if checks.traced(parts):
-        return None
-    linear = _Linear(*(np.asarray(part, float) for part in parts))
-    return linear if all(np.all(np.isfinite(part)) for part in linear) else None
-
-
-def _estimate(linear: _Linear, times: np.ndarray, force: SquaredExponential, column: int,
-              rest: list[tuple[int, Force]]) -> tuple[float, float] | None:
+def _estimate(linear: LinearModel, times: np.ndarray, force: SquaredExponential, column: int,
+              others: list[ForceTerm]) -> tuple[float, float] | None:
     """Return the error and the ratio of signal to noise; None where the numbers overflow."""
     lengthscale, outputs = float(force.lengthscale), len(linear.c)
     spacing = min(np.ptp(times) / max(times.size - 1, 1), _APART * lengthscale)
@@ -164,7 +127,7 @@ def _estimate(linear: _Linear, times: np.ndarray, force: SquaredExponential, col
     window = spacing * (count - 1.0)
     substeps = 1 if points == 1 else max(1, int(np.ceil(window / (points - 1) / (_COARSEST * lengthscale))))
     grid = np.linspace(0.0, window, (points - 1) * substeps + 1)
-    response, initial = _responses(linear, grid, substeps)
+    response, initial = output_responses(linear, grid, substeps)
 
     def mapped(kernel: np.ndarray, source: int) -> np.ndarray:
         return response[:, :, source] @ kernel @ response[:, :, source].T
@@ -173,52 +136,18 @@ def _estimate(linear: _Linear, times: np.ndarray, force: SquaredExponential, col
     signal = mapped(true, column)
     noise = np.kron(np.eye(points), linear.noise * (points / count))
     exact = signal + noise + initial @ initial.T
-    for source, other in rest:
-        exact = exact + mapped(_covariance(other, grid), source)
-    exact = exact + _LEAST_NOISE * signal.diagonal().max() * np.eye(len(exact))
+    for other in others:
+        exact = exact + mapped(exact_covariance(other.force, grid), other.column)
+    exact = exact + LEAST_NOISE * signal.diagonal().max() * np.eye(len(exact))
     try:
         factor, approximate = (np.linalg.cholesky(m) for m in (exact, exact + mapped(of_sde - true, column)))
         ratio = np.linalg.solve(approximate, factor)
         values = np.linalg.eigvalsh(ratio.T @ ratio)
     except np.linalg.LinAlgError:
         return None
-    mean, variance = 0.5 * (values - 1.0 - np.log(values)).sum(), 0.5 * ((values - 1.0) ** 2).sum()
-    error = pieces * mean + 2.0 * np.sqrt(pieces * variance)
+    error = error_bound(values, pieces)
     variances = signal.diagonal() / np.tile(linear.noise.diagonal(), points)
-    return (float(error), float(np.nanmax(variances))) if np.isfinite(error) else None
-
-
-def _responses(linear: _Linear, grid: np.ndarray, substeps: int) -> tuple[np.ndarray, np.ndarray]:
-    """Linear maps from the forces on the grid, (points D, J, R), and from a standard normal, (points D, M), to y."""
-    size, sources = linear.b.shape
-    step = grid[1] if grid.size > 1 else 0.0
-    block = np.zeros((size + sources, size + sources))
-    block[:size, :size], block[:size, size:] = linear.a * step, linear.b * step
-    transition = expm(block)
-    values, vectors = np.linalg.eigh(linear.initial)
-    start = vectors * np.sqrt(np.maximum(values, 0.0))
-    state = np.zeros((size, grid.size, sources))
-    response, initial = [], []
-    for index in range(grid.size):
-        if index:
-            # u is taken as the mean of both ends of the step.
-            state = np.einsum("ij,jkr->ikr", transition[:size, :size], state)
-            state[:, index - 1: index + 1] += 0.5 * transition[:size, None, size:]
-            start = transition[:size, :size] @ start
-        if index % substeps == 0:
-            output = np.einsum("ij,jkr->ikr", linear.c, state)
-            output[:, index] += linear.d
-            response.append(output)
-            initial.append(linear.c @ start)
-    return np.concatenate(response), np.concatenate(initial)
-
-
-def _covariance(force: Force, grid: np.ndarray) -> np.ndarray:
-    """The exact covariance on the grid, zero where there is no closed form."""
-    try:
-        return np.asarray(force.covariance(grid[:, None], grid))
-    except NotImplementedError:
-        return np.zeros((grid.size, grid.size))
+    return (error, float(np.nanmax(variances))) if np.isfinite(error) else None
 
 
 def _message(found: Resolution) -> str:

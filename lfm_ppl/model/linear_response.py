@@ -1,0 +1,159 @@
+"""The outputs of a model, linearised at its prior mean, as linear maps of its forces and its initial state."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.linalg import expm
+
+from lfm_ppl import checks
+from lfm_ppl.forces.sde import Force, Sum
+from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.observations.family import ObservationFamily
+
+TOLERANCE = 0.1
+"""Error of the log likelihood above which there is a warning."""
+
+LEAST_NOISE = 1e-10
+"""Observation noise that is assumed at least, relative to the variance of the signal; K is singular without."""
+
+
+class LinearModel(NamedTuple):
+    """dx/dt = A x + B u, y = C x + D u + e, e ~ N(0, R), x(t0) ~ N(., P0)."""
+
+    a: np.ndarray
+    b: np.ndarray
+    c: np.ndarray
+    d: np.ndarray
+    noise: np.ndarray
+    initial: np.ndarray
+
+
+class ForceTerm(NamedTuple):
+    """A force, or a term of one that is a sum.
+
+    Attributes:
+        name: of the force in the model.
+        column: of the force among the inputs u of the model.
+        force: the force itself, or the term.
+    """
+
+    name: str
+    column: int
+    force: Force
+
+
+def force_terms(model: LatentForceModel) -> list[ForceTerm]:
+    """Return the forces of a model, and the terms of those that are sums."""
+    pairs = zip(model.force_names, model.force_list, strict=True)
+    return [ForceTerm(name, column, term) for column, (name, force) in enumerate(pairs)
+            for term in (force.forces if isinstance(force, Sum) else (force,))]
+
+
+def observed_times(model: LatentForceModel, times: Any, y: Any) -> np.ndarray | None:
+    """Return the times (N,) at which something is observed, where a Gaussian likelihood can be judged by algebra.
+
+    Args:
+        model: the latent force model.
+        times: (T,).
+        y: (T, D), NaN where missing; None: everything is observed.
+
+    Returns:
+        None where something is traced, where fewer than two times are observed, for an observation family, and for a
+        model with process noise, which hides what a linearised model does not know.
+    """
+    if isinstance(model.observation, ObservationFamily) or model.process_noise is not None:
+        return None
+    # In compiled code every new array is traced.
+    if checks.traced((model, times, y, jnp.zeros(()))):
+        return None
+    observed = np.asarray(times, float)
+    if y is not None and observed.ndim == 1 and np.shape(y)[:1] == observed.shape:
+        observed = observed[np.isfinite(np.asarray(y, float)).reshape(observed.size, -1).any(axis=1)]
+    return observed if observed.ndim == 1 and observed.size > 1 and np.all(np.isfinite(observed)) else None
+
+
+def linearize(model: LatentForceModel, time: float) -> LinearModel | None:
+    """Return the model linearised at its prior mean; None where that is traced or not finite."""
+    t = jnp.asarray(time, float)
+    x = model.initial_state.mean
+    u = jnp.asarray([force.mean_at(t) for force in model.force_list], float)
+    slopes: list[Any] = []
+    for function in (model.dynamics, model.observation.function):
+        differentiate: Callable[..., Any] = jax.jacfwd(lambda x, u, f=function: jnp.asarray(f(x, u, t), float), (0, 1))
+        slopes.extend(differentiate(x, u))
+    covariance = model.observation.covariance
+    noise = (jnp.median(jnp.asarray(covariance), axis=0) if np.ndim(covariance) == 3
+             else model.observation.covariance_at(x, u, t, jnp.asarray(0)))
+    parts = (*slopes, noise, model.initial_state.covariance)
+    if checks.traced(parts):
+        return None
+    linear = LinearModel(*(np.asarray(part, float) for part in parts))
+    return linear if all(np.all(np.isfinite(part)) for part in linear) else None
+
+
+def output_responses(linear: LinearModel, grid: np.ndarray, substeps: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return linear maps from the forces on a grid (J,), and from a standard normal variable, to the outputs.
+
+    Args:
+        linear: the linearised model; its initial time is the first of the grid.
+        grid: non-decreasing times; the first and every ``substeps``-th after it is observed.
+        substeps: steps between observations, over each of which a force is taken as linear in time.
+
+    Returns:
+        Arrays (points D, J, R) and (points D, M).
+    """
+    size, sources = linear.b.shape
+    steps, index_of_step = np.unique(np.diff(grid), return_inverse=True)
+    if steps.size and np.ptp(steps) <= 1e-9 * steps.max():
+        # Equal but for rounding: one matrix exponential serves all.
+        steps, index_of_step = steps[-1:], np.zeros_like(index_of_step)
+    block = np.zeros((steps.size, size + sources, size + sources))
+    block[:, :size, :size] = linear.a * steps[:, None, None]
+    block[:, :size, size:] = linear.b * steps[:, None, None]
+    transitions = expm(block)
+    values, vectors = np.linalg.eigh(linear.initial)
+    start = vectors * np.sqrt(np.maximum(values, 0.0))
+    state = np.zeros((size, grid.size, sources))
+    response, initial = [], []
+    for index in range(grid.size):
+        if index:
+            transition = transitions[index_of_step[index - 1]]
+            # u is taken as the mean of both ends of the step.
+            state = np.einsum("ij,jkr->ikr", transition[:size, :size], state)
+            state[:, index - 1: index + 1] += 0.5 * transition[:size, None, size:]
+            start = transition[:size, :size] @ start
+        if index % substeps == 0:
+            output = np.einsum("ij,jkr->ikr", linear.c, state)
+            output[:, index] += linear.d
+            response.append(output)
+            initial.append(linear.c @ start)
+    return np.concatenate(response), np.concatenate(initial)
+
+
+def exact_covariance(force: Force, grid: np.ndarray) -> np.ndarray:
+    """Return the exact covariance (J, J) on a grid, zero where there is no closed form."""
+    try:
+        return np.asarray(force.covariance(grid[:, None], grid))
+    except NotImplementedError:
+        return np.zeros((grid.size, grid.size))
+
+
+def error_bound(eigenvalues: np.ndarray, pieces: float = 1.0) -> float:
+    r"""Return |mean| + 2 standard deviations of the error of a log likelihood, over data sets from the exact process.
+
+    For y ~ N(0, K), whose covariance is K_n under the approximation, and the eigenvalues e_i of K_n^-1 K, the error has
+
+        mean = -sum_i (e_i - 1 - log e_i) / 2,    variance = sum_i (e_i - 1)^2 / 2.
+
+    Args:
+        eigenvalues: e_i.
+        pieces: independent pieces of the data, of which these are the eigenvalues of one.
+    """
+    mean = 0.5 * (eigenvalues - 1.0 - np.log(eigenvalues)).sum()
+    variance = 0.5 * ((eigenvalues - 1.0) ** 2).sum()
+    return float(pieces * mean + 2.0 * np.sqrt(pieces * variance))
