@@ -33,7 +33,7 @@ _INFERRED = (("years", 300 * 86400.0), ("d", 86400.0), ("h", 3600.0), ("min", 60
 
 def is_date(cell: Any) -> bool:
     """Whether a cell of a table holds a date or a time of a calendar, and not a number."""
-    if isinstance(cell, (date, np.datetime64)):
+    if isinstance(cell, (date, np.datetime64)) or hasattr(cell, "to_timestamp"):
         return True
     if not isinstance(cell, str) or not any(mark in cell for mark in "-:"):
         return False  # 20190412 is a number
@@ -50,6 +50,8 @@ def parse(cell: Any) -> datetime:
     Raises:
         ValueError: it stands for none.
     """
+    if hasattr(cell, "to_timestamp"):  # a period of pandas
+        cell = cell.to_timestamp()
     if hasattr(cell, "to_pydatetime"):  # pandas
         cell = cell.to_pydatetime(warn=False)
     if isinstance(cell, np.datetime64):
@@ -61,6 +63,132 @@ def parse(cell: Any) -> datetime:
     if not isinstance(cell, str):
         raise ValueError(f"{cell!r} is no date")
     return datetime.fromisoformat(cell.strip())
+
+
+def holds_dates(values: Any) -> bool:
+    """Whether an array, an index, a sequence or a scalar holds dates or times of a calendar.
+
+    Example:
+        >>> holds_dates(np.array(["2026-01-05"], "M8[D]")), holds_dates(["2026-01-05"]), holds_dates([20260105])
+        (True, True, False)
+    """
+    return is_date(_first_cell(values))
+
+
+def holds_durations(values: Any) -> bool:
+    """Whether an array, an index, a sequence or a scalar holds differences of dates."""
+    return isinstance(_first_cell(values), (timedelta, np.timedelta64))
+
+
+def _first_cell(values: Any) -> Any:
+    """Return the first entry of an array or a sequence, None where it has none or is an array of numbers."""
+    while isinstance(values, (list, tuple)):
+        if not values:
+            return None
+        values = values[0]
+    if not hasattr(values, "dtype") or isinstance(values, (np.datetime64, np.timedelta64)):
+        return values
+    # Arrays of numbers, tracers among them, are left alone; dtypes of polars have no kind.
+    kind = getattr(values.dtype, "kind", "O" if hasattr(values, "to_numpy") else "")
+    if kind not in tuple("MmOU"):
+        return None
+    array = np.asarray(values)
+    return array.flat[0] if array.size else None
+
+
+def dates_of(name: str, values: Any) -> tuple[list[datetime], tuple[int, ...]]:
+    """Return the dates in an array, an index or a sequence in C order, and its shape.
+
+    Args:
+        name: of the argument, for messages.
+        values: for which `holds_dates` is true.
+
+    Raises:
+        ValueError: an entry is missing or no date; some dates have an offset from UTC and others have none.
+    """
+    if isinstance(values, np.ma.MaskedArray):
+        values = np.where(np.ma.getmaskarray(values), np.array("NaT", values.dtype), np.ma.getdata(values))
+    array = np.asarray(values)
+    # NumPy returns numbers for nanoseconds, where datetime has none.
+    cells = (array.astype("M8[us]") if array.dtype.kind == "M" else array).ravel().tolist()
+    stamps = []
+    for index, cell in enumerate(cells):
+        place = f"{name}[{index}]" if array.ndim else name
+        if cell is None or cell != cell:  # NaT
+            raise ValueError(f"{place} is missing (NaT); leave out the rows without a time.")
+        try:
+            stamps.append(parse(cell))
+        except ValueError:
+            raise ValueError(f"{place} must be a date, year first, as the first entry is, got {cell!r}.") from None
+        if (stamps[-1].tzinfo is None) != (stamps[0].tzinfo is None):
+            raise ValueError(f"{name} must have an offset from UTC in all of its dates or in none; {place} is "
+                             f"{cell!s}, and the first is {cells[0]!s}.")
+    return stamps, array.shape
+
+
+def numbers_of(name: str, values: Any, unit: str | None = None) -> tuple[np.ndarray, str, str]:
+    """Return dates as numbers since the midnight before the first of them, in an array of their shape.
+
+    Args:
+        name: of the argument, for messages.
+        values: for which `holds_dates` is true.
+        unit: as in `since_midnight`.
+
+    Returns:
+        times, the origin as ISO 8601 text, and the unit.
+
+    Raises:
+        ValueError: as `dates_of`.
+
+    Example:
+        >>> numbers_of("times", np.array(["2026-01-05T06", "2026-01-05T07"], "M8[h]"))
+        (array([6., 7.]), '2026-01-05T00:00:00', 'h')
+    """
+    stamps, shape = dates_of(name, values)
+    times, origin, unit = since_midnight(stamps, unit)
+    return times.reshape(shape), origin, unit
+
+
+def positions(name: str, values: Any, origin: str | None, unit: str) -> Any:
+    """Return dates as numbers on the axis of times; values that are no dates as they are.
+
+    Args:
+        name: of the argument, for messages.
+        values: an array, an index or a sequence of dates or of numbers.
+        origin: of the axis, as `since_midnight` gives it; None: its times are plain numbers.
+        unit: of the axis.
+
+    Raises:
+        ValueError: dates where the times are plain numbers or have an unknown unit; as `dates_of`; or only one of dates
+            and origin has an offset from UTC, as in `position`.
+
+    Example:
+        >>> positions("at", ["2026-01-06", "2026-01-06T12:00"], "2026-01-05T00:00:00", "h")
+        array([24., 36.])
+    """
+    if not holds_dates(values):
+        return values
+    stamps, shape = dates_of(name, values)
+    if origin is None or unit not in SECONDS:
+        kind = "plain numbers" if origin is None else f"numbers of {unit or 'an unknown unit'}"
+        raise ValueError(f"{name} must be numbers, because the times of the data are {kind}; got the date "
+                         f"{stamps[0].isoformat()}.")
+    start = datetime.fromisoformat(origin)
+    try:
+        seconds = [_seconds_since(start, stamp) for stamp in stamps]
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from None
+    return np.array(seconds).reshape(shape) / SECONDS[unit]
+
+
+def _seconds_since(start: datetime, stamp: datetime) -> float:
+    """Return the seconds from an origin to a date, which is read on the clock of the origin if it has no offset."""
+    if stamp.tzinfo is None:
+        stamp = stamp.replace(tzinfo=start.tzinfo)
+    elif start.tzinfo is None:
+        raise ValueError(f"{stamp.isoformat()!r} has an offset from UTC and the times of the data have none; leave it "
+                         "out.")
+    return (stamp - start).total_seconds()
 
 
 def since_midnight(stamps: Sequence[datetime], unit: str | None = None) -> tuple[np.ndarray, str, str]:
@@ -123,12 +251,7 @@ def position(text: str, origin: str | None, unit: str) -> float:
                          f"{text!r}.") from None
     if origin is None:
         raise ValueError(f"the times of the data are plain numbers, so the date {text!r} means nothing; give a number.")
-    start = datetime.fromisoformat(origin)
-    if stamp.tzinfo is None:
-        stamp = stamp.replace(tzinfo=start.tzinfo)  # the clock of the data
-    elif start.tzinfo is None:
-        raise ValueError(f"{text!r} has an offset from UTC and the times of the data have none; leave it out.")
-    return (stamp - start).total_seconds() / SECONDS[unit]
+    return _seconds_since(datetime.fromisoformat(origin), stamp) / SECONDS[unit]
 
 
 def clock(time: float, origin: str, unit: str, sep: str = " ", digits: int = 0) -> str:

@@ -16,6 +16,8 @@ import jax
 import numpy as np
 from numpyro.util import is_prng_key
 
+from lfm_ppl import calendar_time
+
 _LIKENESS = 0.4
 
 ABBREVIATIONS = 0.6
@@ -23,8 +25,51 @@ ABBREVIATIONS = 0.6
 
 
 def concrete(value: Any) -> np.ndarray | None:
-    """Return ``value`` as a NumPy array, or None where it is (or contains) a tracer."""
-    return None if traced(value) else np.asarray(value)
+    """Return ``value`` as a NumPy array, or None where it is (or contains) a tracer; masked entries are NaN."""
+    return None if traced(value) else np.asarray(unmask(value))
+
+
+def unmask(value: Any) -> Any:
+    """Return an array with NaN for masked entries, also within lists; anything else as it is.
+
+    NumPy's and JAX's ``asarray`` drop a mask and take what lies under it as data.
+
+    Example:
+        >>> unmask(np.ma.masked_array([1, -999], mask=[False, True]))
+        array([ 1., nan])
+    """
+    if isinstance(value, np.ma.MaskedArray):
+        mask, data = np.ma.getmaskarray(value), np.ma.getdata(value)
+        if not mask.any():
+            return data
+        if data.dtype.kind in "mM":
+            return np.where(mask, np.array("NaT", data.dtype), data)
+        return np.where(mask, np.nan, data.astype(float))
+    if isinstance(value, (list, tuple)) and _holds_mask(value):
+        return [unmask(entry) for entry in value]
+    return value
+
+
+def _holds_mask(value: Any) -> bool:
+    if isinstance(value, (list, tuple)):
+        return any(_holds_mask(entry) for entry in value)
+    return isinstance(value, np.ma.MaskedArray)
+
+
+def refuse_dates(name: str, value: Any) -> None:
+    """Raise TypeError where numbers are expected and dates or durations came, whose unit NumPy would choose."""
+    if calendar_time.holds_dates(value):
+        raise TypeError(f"{name} must be numbers in the model's unit of time, got dates. lfm.fit and "
+                        "lfm.Data(times=...) convert dates; elsewhere subtract the origin and divide by the unit, as "
+                        "in (dates - dates[0]) / np.timedelta64(1, 'h').")
+    refuse_durations(name, value)
+
+
+def refuse_durations(name: str, value: Any) -> None:
+    """Raise TypeError where numbers are expected and durations came, whose unit NumPy would choose."""
+    if calendar_time.holds_durations(value):
+        raise TypeError(f"{name} must be numbers in the model's unit of time, got durations (timedelta). Divide them "
+                        "by the unit, as in durations / np.timedelta64(1, 'h').")
 
 
 def traced(tree: Any) -> bool:
@@ -96,6 +141,7 @@ def time_vector(name: str, value: Any, earliest: float | None = None, order: str
     Raises:
         ValueError: they are traced, not a vector, empty, not finite, too early or not in order.
     """
+    refuse_dates(name, value)
     known = concrete(value)
     if known is None:
         raise ValueError(f"{name} must be known before compilation; pass a NumPy array.")
@@ -171,9 +217,11 @@ def covariance_matrix(name: str, value: Any) -> None:
 
 
 def _numeric(name: str, value: Any) -> np.ndarray | None:
+    refuse_dates(name, value)
     array = concrete(value)
     if array is not None and array.dtype.kind not in "biuf":
-        raise TypeError(f"{name} must be numeric, got {value!r} of type {type(value).__name__}.")
+        shown = " ".join(repr(value).split())
+        raise TypeError(f"{name} must be numeric, got {shown} of type {type(value).__name__}.")
     return array
 
 

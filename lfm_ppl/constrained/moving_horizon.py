@@ -153,6 +153,8 @@ class MovingHorizon(eqx.Module):
             ValueError: a time before the last one, or an observation of a wrong shape.
         """
         outputs = len(self.setting.plain.model.output_names)
+        checks.refuse_dates("t", t)
+        y = checks.unmask(y)
         if np.shape(y) != (outputs,):
             raise ValueError(f"y must hold one entry for each of the {outputs} outputs, shape ({outputs},), got "
                              f"{np.shape(y)}.")

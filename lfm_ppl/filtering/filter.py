@@ -433,6 +433,7 @@ def check_observations(y: Any, count: int, outputs: int, empty: bool = False,
     Raises:
         ValueError: a wrong shape, infinite entries, nothing observed at all, or data that the family cannot give.
     """
+    y = checks.unmask(y)
     shape = np.shape(y)
     if shape == (count,) and outputs == 1:
         y, shape = jnp.reshape(jnp.asarray(y), (count, 1)), (count, 1)
@@ -524,6 +525,7 @@ def _check_start(start: Any, times: Any, size: int) -> None:
     if not isinstance(start, FilterState):
         hint = " Pass result.state." if isinstance(start, FilterResult) else ""
         raise TypeError(f"start must be the state of an earlier filter result, got {type(start).__name__}.{hint}")
+    checks.refuse_dates("times", times)
     if np.shape(start.mean) != (size,):
         raise ValueError(f"start has {np.shape(start.mean)[0]} entries, but the joint state of this model has {size}.")
     begin, known = checks.concrete(start.time), checks.concrete(times)

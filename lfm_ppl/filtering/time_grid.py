@@ -106,6 +106,7 @@ def build_time_grid(ssm: StateSpaceModel, times: Any, steps: int, max_step: floa
             time before the initial time; traced times together with what needs them concrete.
     """
     checks.positive_integer("steps", steps, "It is the number of integration steps between two times.")
+    checks.refuse_dates("at", at)
     if max_step is not None:
         checks.positive("max_step", max_step)
     if tolerance is not None:

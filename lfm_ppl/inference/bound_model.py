@@ -388,7 +388,7 @@ class BoundModel:
         if _shapes(y) != _shapes(self.y):
             raise ValueError(f"y must have the shape that was bound, {_shapes(self.y)}, got {_shapes(y)}; bind the "
                              "model again.")
-        y = jax.tree_util.tree_map(lambda new, old: jnp.asarray(new, jnp.result_type(old)), y, self.y)
+        y = jax.tree_util.tree_map(lambda new, old: jnp.asarray(checks.unmask(new), jnp.result_type(old)), y, self.y)
         for leaf in jax.tree_util.tree_leaves(y):
             if (known := checks.concrete(leaf)) is not None and np.isinf(known).any():
                 raise ValueError("y has infinite entries; use NaN for a missing entry.")
@@ -620,6 +620,7 @@ class BoundModel:
             ValueError: the model is a panel, whose series are smoothed one by one.
         """
         self._check_single("smooth")
+        checks.refuse_dates("at", at)
         at = None if at is None else np.atleast_1d(np.asarray(at, float))
         run = self._program.once(("smooth", signature(at)), lambda: eqx.filter_jit(
             lambda z, y: self._run(z, y, "smooth", at)))
@@ -731,8 +732,9 @@ def bind(model: Callable, times: Any, y: Any, **keywords: Any) -> BoundModel:
                         "outside of jit, and pass only y into it.")
     if y is None:
         raise ValueError("y must be the observations, (T, D) or (B, T, D) for a panel, got None.")
-    times = np.array(times, float)
-    given = jnp.asarray(y, float)
+    checks.refuse_dates("times", times)
+    times = np.array(checks.unmask(times), float)
+    given = jnp.asarray(checks.unmask(y), float)
     y = given[:, None] if given.ndim == times.ndim == 1 else given
     bound = bind_arguments(model, (times, y), keywords)
     if bound.site.name in bound.sites:
@@ -844,7 +846,7 @@ def _numeric(value: Any) -> bool:
 
 def _as_data(y: Any) -> Any:
     """Return the data as arrays; whole numbers stay so, for models that are not of this library."""
-    return jax.tree_util.tree_map(jnp.asarray, y)
+    return jax.tree_util.tree_map(lambda leaf: jnp.asarray(checks.unmask(leaf)), y)
 
 
 def _shapes(y: Any) -> Any:

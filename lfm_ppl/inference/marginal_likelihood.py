@@ -286,7 +286,7 @@ class MarginalLikelihood(dist.Distribution):
 
     def log_prob(self, value: Any) -> jax.Array:
         """Return the log marginal likelihood of ``value`` (T, D), NaN where missing; batch dimensions may lead."""
-        value = jnp.asarray(value, float)
+        value = jnp.asarray(checks.unmask(value), float)
         if value.ndim > 2:
             return jax.vmap(self.log_prob)(value)
         check_resolution(self.model, self.times, value)
@@ -502,7 +502,7 @@ class Panel(dist.Distribution):
 
     def log_prob(self, value: Any) -> jax.Array:
         """Return (B,): the log marginal likelihood of each series; zero where a series is all missing."""
-        value = jnp.asarray(value, float)
+        value = jnp.asarray(checks.unmask(value), float)
         if value.ndim > 3:
             return jax.vmap(self.log_prob)(value)
         return self.mapped(lambda one, y: one.log_prob(y), self.checked(value))
@@ -518,6 +518,7 @@ class Panel(dist.Distribution):
 
     def checked(self, value: Any) -> jax.Array:
         """Return ``value`` as an array (B, T, D) after checking it."""
+        value = checks.unmask(value)
         expected = (*self.batch_shape, *self.event_shape)
         if np.shape(value) != expected:
             raise ValueError(f"y must have shape {expected} (series, times, outputs), got {np.shape(value)}; pad a "

@@ -47,7 +47,7 @@ class ParticleLikelihood(dist.Distribution):
 
     def log_prob(self, value: Any) -> jax.Array:
         """Return the log of the estimate; for a panel one for each series."""
-        value = jnp.asarray(value, float)
+        value = jnp.asarray(checks.unmask(value), float)
         if isinstance(self.base, Panel):
             keys = jax.random.split(self.key, self.base.batch_shape[0])
             return self.base.mapped(lambda one, y, key: self._one(one, y, key), value, keys)

@@ -73,7 +73,7 @@ def observed_times(model: LatentForceModel, times: Any, y: Any) -> np.ndarray | 
         return None
     observed = np.asarray(times, float)
     if y is not None and observed.ndim == 1 and np.shape(y)[:1] == observed.shape:
-        observed = observed[np.isfinite(np.asarray(y, float)).reshape(observed.size, -1).any(axis=1)]
+        observed = observed[np.isfinite(np.asarray(checks.unmask(y), float)).reshape(observed.size, -1).any(axis=1)]
     return observed if observed.ndim == 1 and observed.size > 1 and np.all(np.isfinite(observed)) else None
 
 

@@ -81,7 +81,7 @@ def fit_orbit(environment: Environment, times: Any, positions: Any, solar: float
         >>> orbit = fit_orbit(environment, times, positions)  # doctest: +SKIP
         >>> path = propagate(environment, orbit, times)  # doctest: +SKIP
     """
-    times, positions = np.asarray(times, float), np.asarray(positions, float)
+    times, positions = np.asarray(times, float), np.asarray(checks.unmask(positions), float)
     interval = _interval(times)
     start, _, reach = polynomial_state(times, positions)
     if reach > _REACH:

@@ -115,7 +115,7 @@ class Ephemerides:
     def __post_init__(self) -> None:
         """Convert to arrays and check that the shapes fit together."""
         object.__setattr__(self, "epochs", np.asarray(self.epochs, dtype=float))
-        object.__setattr__(self, "positions", np.asarray(self.positions, dtype=float))
+        object.__setattr__(self, "positions", np.asarray(checks.unmask(self.positions), dtype=float))
         object.__setattr__(self, "satellites", tuple(self.satellites))
         expected = (len(self.epochs), len(self.satellites), 3)
         if self.epochs.ndim != 1 or self.positions.shape != expected:

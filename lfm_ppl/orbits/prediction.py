@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import norm
 
+from lfm_ppl import checks
 from lfm_ppl.filtering.filter import FilterState, filter
 from lfm_ppl.filtering.smoother import smooth
 from lfm_ppl.linalg import congruence, matmul
@@ -94,7 +95,7 @@ def predict(arc: Arc, near: Neighbourhood, logarithms: np.ndarray, y: np.ndarray
         logarithms: (K, d) of the magnitudes, over which the moments are averaged.
         y: (T, 3) positions to learn from; None: those of training.
     """
-    y = (arc.learnt() if y is None else y) - np.asarray(near.path[:, :3])
+    y = (arc.learnt() if y is None else checks.unmask(y)) - np.asarray(near.path[:, :3])
     known = np.flatnonzero(np.isfinite(y).any(axis=1))
     if not len(known):
         raise ValueError("every position is missing (NaN); there is nothing to learn from.")

@@ -54,7 +54,7 @@ class Mixture(eqx.Module):
 
         NaN where that is, or where a component has no variance.
         """
-        terms = norm.logpdf(jnp.asarray(value, float)[:, None, :], self.mean, jnp.sqrt(self.variance))
+        terms = norm.logpdf(jnp.asarray(checks.unmask(value), float)[:, None, :], self.mean, jnp.sqrt(self.variance))
         return logsumexp(self.log_weights[:, :, None] + terms, axis=1)
 
     def quantiles(self, p: Any) -> jax.Array:

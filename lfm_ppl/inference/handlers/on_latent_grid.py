@@ -36,7 +36,7 @@ class GridLikelihood(dist.Distribution):
 
     def log_prob(self, value: Any) -> jax.Array:
         """Return log p(value | u, start)."""
-        return self.latent.log_likelihood(self.u, jnp.asarray(value, float), self.start)
+        return self.latent.log_likelihood(self.u, jnp.asarray(checks.unmask(value), float), self.start)
 
     def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
         """Draw observations given the forces: (*sample_shape, T, D)."""

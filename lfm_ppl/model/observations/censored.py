@@ -52,8 +52,7 @@ class CensoredObservation(ObservationFamily):
                  width: Any = 0.0):
         self.function = function
         self.scale = parameter("scale", scale)
-        self.left, self.right = jnp.asarray(left, float), jnp.asarray(right, float)
-        self.width = jnp.asarray(width, float)
+        self.left, self.right, self.width = (jnp.asarray(checks.unmask(value), float) for value in (left, right, width))
         known = [checks.concrete(value) for value in (self.left, self.right, self.width)]
         if known[0] is not None and known[1] is not None and not np.all(known[0] < known[1]):
             raise ValueError(f"left must lie below right, got left={known[0]} and right={known[1]}.")
