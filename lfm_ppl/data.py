@@ -24,8 +24,10 @@ from lfm_ppl.table import Table
 if TYPE_CHECKING:
     from lfm_ppl.model.inputs import Input
 
-MISSING = ("", "na", "nan", "n/a", "null", "nat", "none")
-INTERPOLATIONS = ("previous", "linear")
+MISSING = ("", ".", "na", "nan", "n/a", "null", "nat", "none")
+INTERPOLATIONS = ("previous", "linear", "zero")
+"""How known inputs are read; "zero" is "previous" with blank cells read as zero."""
+
 _DATE_NAMES = ("date", "datetime", "timestamp")
 
 
@@ -56,8 +58,13 @@ class Data:
             ``deterministics`` (name -> (K,)), ``state`` (K, M) and ``parameters`` (name -> array).
         note: what was done to the numbers, to be printed with the results.
         inputs: known inputs: name -> (times, values) or (times, values, "linear"), or an `lfm.Input`; kept as
-            `InputTable`. `known_inputs` gives them as functions of time.
+            `InputTable`. `known_inputs` gives them as functions of time. Missing values are left out, or with "zero"
+            read as zero.
         origin: the calendar time of t = 0 as ISO 8601 text, where the times were dates.
+
+    Times may be dates (``datetime64``, a DatetimeIndex, ...), also those of inputs. They become numbers since the
+    origin, by default the midnight before the first of them, in the unit of ``units["time"]``, by default that of the
+    time between rows.
 
     Raises:
         ValueError: if the shapes do not fit together or the times go back.
@@ -79,10 +86,13 @@ class Data:
 
     def __post_init__(self) -> None:
         """Convert to arrays and check that the shapes fit together."""
-        object.__setattr__(self, "times", np.asarray(self.times, dtype=float))
-        object.__setattr__(self, "y", np.asarray(self.y, dtype=float))
+        if calendar_time.holds_dates(self.times):
+            self._read_dates()
+        checks.refuse_durations("times", self.times)
+        object.__setattr__(self, "times", np.asarray(checks.unmask(self.times), dtype=float))
+        object.__setattr__(self, "y", np.asarray(checks.unmask(self.y), dtype=float))
         object.__setattr__(self, "outputs", tuple(self.outputs))
-        object.__setattr__(self, "inputs", {name: _table_of(name, given) for name, given in self.inputs.items()})
+        object.__setattr__(self, "inputs", {name: self._table_of(name, given) for name, given in self.inputs.items()})
         expected = (len(self.times), len(self.outputs))
         if self.times.ndim != 1 or self.y.shape != expected:
             raise ValueError(
@@ -96,6 +106,43 @@ class Data:
                 f"times must not go back, got {self.times[index]:g} after "
                 f"{self.times[index - 1]:g} at index {index}. Sort the observations by time."
             )
+
+    def _read_dates(self) -> None:
+        """Convert times that are dates, and note their origin and unit."""
+        unit = self.units.get("time")
+        if unit is not None:
+            checks.one_of('units["time"]', unit, calendar_time.SECONDS)
+        times, origin, unit = calendar_time.numbers_of("times", self.times, unit)
+        if self.origin is not None:
+            times, origin = calendar_time.positions("times", self.times, self.origin, unit), self.origin
+        object.__setattr__(self, "times", times)
+        object.__setattr__(self, "origin", origin)
+        object.__setattr__(self, "units", {**self.units, "time": unit})
+
+    def _table_of(self, name: str, given: Any) -> InputTable:
+        """Return a known input as it is kept.
+
+        Raises:
+            TypeError: neither a tuple of times and values nor an `lfm.Input`.
+        """
+        if all(hasattr(given, part) for part in InputTable._fields):  # an Input
+            given = tuple(getattr(given, part) for part in InputTable._fields)
+        if not (isinstance(given, tuple) and 2 <= len(given) <= 3):
+            raise TypeError(f"the known input {name!r} must be (times, values), (times, values, interpolation) or an "
+                            f"lfm.Input, got {type(given).__name__}.")
+        times, values, *way = given
+        label = f"times of the known input {name!r}"
+        checks.refuse_durations(label, times)
+        times = calendar_time.positions(label, times, self.origin, self.units.get("time", ""))
+        times, values = (np.asarray(checks.unmask(part), float) for part in (times, values))
+        interpolation = way[0] if way else "previous"
+        if times.shape == values.shape and times.ndim == 1 and np.isnan(values).any():
+            if interpolation != "zero" and np.isnan(values).all():
+                raise ValueError(f"every value of the known input {name!r} is missing; expected at least one number.")
+            values = _read_blanks(f"the known input {name!r}", f"{name!r}: (times, values, 'zero')", times, values,
+                                  interpolation)
+            times, values = times[~np.isnan(values)], values[~np.isnan(values)]
+        return InputTable(times, values, _kept_interpolation(interpolation))
 
     def known_inputs(self) -> dict[str, Input]:
         """Return the known inputs as functions of time, for the ``inputs`` argument of a model."""
@@ -122,20 +169,26 @@ def read_csv(
             ``time_h``, which also sets the unit of time; else ``date``, ``datetime``, ``timestamp``, or the only
             column that begins with a date.
         inputs: columns of known inputs; or a mapping column -> "previous" (a value holds until the next, the default)
-            or "linear". Empty cells are left out: the input is interpolated over them.
+            or "linear" (values are joined by lines), which interpolate over empty cells and warn of them; or "zero",
+            which is "previous" with empty cells read as zero, as for doses. A row at the time of another row that has
+            a value counts as filled.
         time_unit: unit of times that are dates (ms, s, min, h, d, weeks, years). None: that of the time between rows.
         usual_unit: what None means instead, the unit of a model.
         observed: whether a file without any value of the outputs is an error; known inputs of the future have none.
 
     Returns:
-        The observations; empty cells (and NA, NaN) are NaN. Dates (ISO 8601, with an offset from UTC in each row, or in
-        none) become numbers since the midnight before the first of them, which is the `Data.origin`.
+        The observations; empty cells (and NA, NaN, a single point) are NaN. Dates (ISO 8601, with an offset from UTC in
+        each row, or in none) become numbers since the midnight before the first of them, which is the `Data.origin`.
 
     Raises:
         ValueError: with file, row and column, for a file that is empty or not comma-separated
             text, a missing, ambiguous or repeated column, text in a number column, a time that is
             empty, not finite or goes back, and a file without any value.
         FileNotFoundError: if there is no such file.
+
+    Warns:
+        UserWarning: a number that looks like a code of missing values, such as -9999 or 1e30, lies far from all others
+            of its column; empty cells of a known input.
 
     Example:
         >>> import pathlib, tempfile
@@ -224,10 +277,23 @@ def on_clock_of(data: Data, other: Data) -> Data:
         dated, plain = ("first", "others") if data.origin else ("others", "first")
         raise ValueError(f"the times of two tables cannot be compared: those of the {dated} are dates, those of the "
                          f"{plain} plain numbers.")
-    unit, own = other.units["time"], data.units["time"]
-    ratio = calendar_time.SECONDS[own] / calendar_time.SECONDS[unit]
-    shift = calendar_time.position(data.origin, other.origin, unit)
-    return replace(data, times=data.times * ratio + shift, origin=other.origin, units={**data.units, "time": unit},
+    return at_origin(data, other.origin, other.units["time"])
+
+
+def at_origin(data: Data, origin: str, unit: str) -> Data:
+    """Return data, whose times were dates, with their times counted from another origin, in another unit.
+
+    Raises:
+        ValueError: only one of the origins has an offset from UTC.
+    """
+    assert data.origin is not None
+    ratio = calendar_time.SECONDS[data.units["time"]] / calendar_time.SECONDS[unit]
+    shift = calendar_time.position(data.origin, origin, unit)
+    truth = data.truth
+    if truth is not None and truth.get("times") is not None:
+        truth = {**truth, "times": np.asarray(truth["times"], float) * ratio + shift}
+    return replace(data, times=data.times * ratio + shift, truth=truth, origin=origin,
+                   units={**data.units, "time": unit},
                    inputs={name: table._replace(times=table.times * ratio + shift)
                            for name, table in data.inputs.items()})
 
@@ -378,29 +444,83 @@ def _read(source: Table, outputs: Sequence[str] | None, time_column: str | None,
     names = _find_outputs(source, [name for name in others if name not in wanted], time_name, outputs)
     if both := sorted(set(names) & set(wanted)):
         raise ValueError(f"the column {both[0]!r} is named as an output and as an input; it can be one of them.")
-    times, unit, origin = _times(source, time_name, time_unit, usual_unit)
+    free = [name for name in others if name not in wanted and (outputs is None or name not in names)]
+    times, unit, origin = _times(source, time_name, time_unit, usual_unit, () if part else free)
     y = np.array([[_value(source, row, name) for name in names] for row in range(len(times))])
     if observed and np.all(np.isnan(y)):
         raise ValueError(f"{source.label}: every value of {', '.join(names)}{part} is missing; expected at least one "
                          "number.")
-    _warn_of_codes(source, names, y)
+    for name, column in zip(names, y.T, strict=True):
+        _warn_of_codes(source, name, column)
     return Data(times, y, tuple(names), units={"time": unit} if unit else {}, origin=origin,
                 inputs={name: _input(source, name, way, times) for name, way in wanted.items()})
 
 
-_CODES = np.array([sign * (10.0**digits - 1.0) for digits in (2, 3, 4, 5, 6) for sign in (1, -1)])
-"""Numbers that stand for a missing value in many files: 99, -999..."""
+_INTEGER_LIMITS = tuple(float(sign * (2**bits - shift)) for bits in (15, 16, 31, 32, 63) for sign in (1, -1)
+                        for shift in (0, 1))
+"""Smallest and largest whole numbers of computers, and their neighbours."""
+
+_FAR_RANGES = 5.0
+"""Ranges of the other values from which on a code is far from them, however they are spread."""
+
+_FAR_GAPS = 5.0
+"""Largest gaps within the other values from which on a code that lies a range away, too, is far from them."""
 
 
-def _warn_of_codes(source: Table, names: Sequence[str], y: np.ndarray) -> None:
-    """Warn of outputs (T, D) in which -999 or its like stands far from all other values."""
-    for name, column in zip(names, y.T, strict=True):
-        for code in _CODES[np.isin(_CODES, column)]:
-            rest = column[np.isfinite(column) & (column != code)]
-            if rest.size > 1 and abs(code - np.median(rest)) > 5.0 * np.ptp(rest):
-                place, count = source.place(int(np.argmax(column == code)), name), int((column == code).sum())
-                checks.warn(f"{place}: {code:g}, far from all other values of the column, is taken as a measurement "
-                            f"({count} of them). If it stands for a missing value, leave the cell empty.")
+def _looks_like_code(value: float) -> bool:
+    """Whether a number is of the kind that stands for a missing value: -9, 99, -999.9, -999.25, 7777, 1e30, -32768."""
+    if abs(value) >= 1e30 or value in _INTEGER_LIMITS:
+        return True
+    for digits in (7, 15):  # those of single and of double precision
+        mantissa, _, exponent = f"{abs(value):.{digits}g}".partition("e")
+        if exponent and int(exponent) < 0:
+            return False
+        if mantissa == "1" and int(exponent or 0) >= 10:
+            return True
+        whole, _, decimals = mantissa.partition(".")
+        if set(whole) == {"9"} and set(decimals) <= {"9"}:
+            # 9 and 9.9 are too usual as measurements; -9 and 9.99 are codes of fixed-width formats.
+            return value < 0 or len(whole) > 1 or len(decimals) > 1
+        if whole in ("999", "9999", "99999") and decimals == "25":  # of well logs
+            return True
+        if mantissa in ("777", "888", "7777", "8888", "77777", "88888"):
+            return True
+    return False
+
+
+def _codes(column: np.ndarray) -> list[float]:
+    """Return the codes of missing values in a column (T,): numbers that look like one and lie far from all others.
+
+    Several codes may stand in one column. A number that looks like a code and lies near the others is one of them.
+    """
+    values = np.unique(column[np.isfinite(column)])
+    first, last = 0, len(values)
+    while first < last and _looks_like_code(values[first]):
+        first += 1
+    while first < last and _looks_like_code(values[last - 1]):
+        last -= 1
+    is_candidate = np.ones(len(values), bool)
+    is_candidate[first:last] = False
+    with np.errstate(over="ignore"):  # differences of the largest numbers
+        while is_candidate.any() and not is_candidate.all():
+            rest = values[~is_candidate]
+            reach, gap = np.ptp(rest), np.diff(rest).max(initial=0.0)
+            distance = np.maximum(rest[0] - values, values - rest[-1])
+            is_far = (distance > _FAR_RANGES * reach) | ((distance > reach) & (distance > _FAR_GAPS * gap))
+            if not (is_candidate & ~is_far).any():
+                return values[is_candidate].tolist()
+            is_candidate &= is_far
+    return []
+
+
+def _warn_of_codes(source: Table, name: str, column: np.ndarray) -> None:
+    """Warn of numbers in a column (T,) that seem to stand for missing values."""
+    for code in _codes(column):
+        if np.isfinite(column).sum() - np.sum(column == code) < 2:
+            continue
+        place, count = source.place(int(np.argmax(column == code)), name), int((column == code).sum())
+        checks.warn(f"{place}: {code:g}, far from all other values of the column, is taken as a measurement "
+                    f"({count} of them). If it stands for a missing value, leave the cell empty.")
 
 
 def _find_time(source: Table, time_column: str | None) -> str:
@@ -450,15 +570,24 @@ def _unit_of(time_name: str) -> str | None:
     return unit if stem.lower() == "time" and unit in calendar_time.SECONDS else None
 
 
-def _times(source: Table, name: str, unit: str | None, usual: str | None) -> tuple[np.ndarray, str | None, str | None]:
-    """Return times (T,), their unit and their origin, None where the table does not say."""
+def _times(source: Table, name: str, unit: str | None, usual: str | None,
+           free: Sequence[str]) -> tuple[np.ndarray, str | None, str | None]:
+    """Return times (T,), their unit and their origin, None where the table does not say.
+
+    Args:
+        source: the table.
+        name: of the time column.
+        unit: of times that are dates.
+        usual: what None means instead.
+        free: columns that may hold identifiers of series.
+    """
     cells = source.columns[name]
     if missing := [row for row, cell in enumerate(cells) if _missing(cell)]:
         raise ValueError(f"{source.place(missing[0], name)}: the time is missing.")
     if not calendar_time.is_date(cells[0]):
         wanted = "expected a number, or a date, year first, such as 2026-03-31 in every row, got {}."
         times = np.array([_value(source, row, name, wanted) for row in range(len(cells))])
-        _check_order(source, times, [f"{time:g}" for time in times])
+        _check_order(source, times, [f"{time:g}" for time in times], free)
         own = _unit_of(name)
         if own is not None and unit not in (None, own):
             raise ValueError(f"{source.label}: the column {name!r} says that its unit is {own}, and --time-unit "
@@ -476,7 +605,7 @@ def _times(source: Table, name: str, unit: str | None, usual: str | None) -> tup
                              f"{cells[0]!s} and {cell!s}. Write it in all of them, or in none.")
     back = " A clock that is set back for winter needs offsets from UTC." if stamps[0].tzinfo is None else ""
     times, origin, unit = calendar_time.since_midnight(stamps, unit or _unit_of(name) or usual)
-    _check_order(source, times, [str(cell) for cell in cells], back)
+    _check_order(source, times, [str(cell) for cell in cells], free, back)
     return times, unit, origin
 
 
@@ -489,30 +618,52 @@ def _input(source: Table, name: str, interpolation: str, times: np.ndarray) -> I
     checks.one_of(f"interpolation of {name}", interpolation, INTERPOLATIONS)
     values = np.array([_value(source, row, name) for row in range(len(times))])
     known = np.flatnonzero(np.isfinite(values))
-    if not known.size or times[known[0]] > times[0]:
-        raise ValueError(f"{source.place(0, name)}: the known input has no value at the first time; fill the cell.")
+    if interpolation != "zero" and (not known.size or times[known[0]] > times[0]):
+        raise ValueError(f"{source.place(0, name)}: the known input has no value at the first time; fill the cell, or "
+                         f"read empty cells as zero: {_zero_option(name)}.")
+    _warn_of_codes(source, name, values)
+    values = _read_blanks(f"{source.label}, column {name!r}", _zero_option(name), times, values, interpolation)
+    known = np.flatnonzero(np.isfinite(values))
     kept, first = np.unique(times[known], return_index=True)
     for row in map(int, known):
         before = values[known[first[np.searchsorted(kept, times[row])]]]
         if values[row] != before:
             raise ValueError(f"{source.place(row, name)}: the known input is {values[row]:g} here and {before:g} in "
                              "another row of the same time.")
-    return InputTable(kept, values[known[first]], interpolation)
+    return InputTable(kept, values[known[first]], _kept_interpolation(interpolation))
 
 
-def _table_of(name: str, given: Any) -> InputTable:
-    """Return a known input as it is kept.
+def _zero_option(name: str) -> str:
+    """Return how to say that empty cells of a column are zero."""
+    return f"--inputs {name}:zero (inputs={{{name!r}: 'zero'}})"
 
-    Raises:
-        TypeError: neither a tuple of times and values nor an `lfm.Input`.
+
+def _kept_interpolation(interpolation: str) -> str:
+    """Return how a known input is interpolated once its empty cells have been read."""
+    return "previous" if interpolation == "zero" else interpolation
+
+
+def _read_blanks(label: str, option: str, times: np.ndarray, values: np.ndarray, interpolation: str) -> np.ndarray:
+    """Return the values (K,) of a known input, with zeros for blank ones where that is how they are read.
+
+    Args:
+        label: of the input, for messages.
+        option: how to say that blank values are zero.
+        times: (K,).
+        values: (K,), NaN where blank. A blank value at the time of another row that has one says nothing.
+        interpolation: one of `INTERPOLATIONS`.
+
+    Warns:
+        UserWarning: of blank values over which the input is interpolated.
     """
-    if all(hasattr(given, part) for part in InputTable._fields):  # a table, or an Input
-        given = tuple(getattr(given, part) for part in InputTable._fields)
-    if not (isinstance(given, tuple) and 2 <= len(given) <= 3):
-        raise TypeError(f"the known input {name!r} must be (times, values), (times, values, interpolation) or an "
-                        f"lfm.Input, got {type(given).__name__}.")
-    times, values, *way = given
-    return InputTable(np.asarray(times, float), np.asarray(values, float), *way)
+    is_blank = np.isnan(values) & ~np.isin(times, times[np.isfinite(values)])
+    if interpolation == "zero":
+        return np.where(is_blank, 0.0, values)
+    if is_blank.any():
+        reading = "a line joins the values beside them" if interpolation == "linear" else "the last value holds there"
+        checks.warn(f"{label}: {int(is_blank.sum())} of {len(values)} values of the known input are blank, and "
+                    f"{reading}. If blank means zero, as for a dose, say so: {option}.")
+    return values
 
 
 def _missing(cell: Any) -> bool:
@@ -531,6 +682,8 @@ def _value(source: Table, row: int, name: str, wanted: str = _WANTED) -> float:
     try:
         if _missing(cell):
             return math.nan
+        if isinstance(cell, np.timedelta64):
+            raise TypeError("a duration has no unit as a number")
         value = float(cell)
     except (TypeError, ValueError):  # a TypeError is pandas' NA, or a cell that is no scalar
         if type(cell).__name__ == "NAType":
@@ -559,9 +712,53 @@ def _shown(cell: Any) -> str:
     return text if len(text) <= 60 else f"{text[:50]}... ({len(text)} characters)"
 
 
-def _check_order(source: Table, times: np.ndarray, said: Sequence[str], more: str = "") -> None:
+def _check_order(source: Table, times: np.ndarray, said: Sequence[str], free: Sequence[str], more: str = "") -> None:
+    """Raise ValueError where the time goes back, and name the column of series where there seems to be one.
+
+    Args:
+        source: the table.
+        times: (T,).
+        said: (T,), the times as the user wrote them.
+        free: columns that are neither the time nor named as outputs or inputs.
+        more: to be said besides.
+    """
     back = np.flatnonzero(np.diff(times) < 0)
-    if back.size:
-        k = int(back[0]) + 1
-        raise ValueError(f"{source.label}, row {source.rows[k]}: the time goes back from {said[k - 1]} to {said[k]}. "
-                         f"Sort the rows by time; replicates are rows with the same time.{more}")
+    if not back.size:
+        return
+    k = int(back[0]) + 1
+    place = f"{source.label}, row {source.rows[k]}: the time goes back from {said[k - 1]} to {said[k]}"
+    if (column := _series_column(source, times, free)) is not None:
+        cells = source.columns[column]
+        raise ValueError(f"{place}, where the column {column!r} changes from {cells[k - 1]} to {cells[k]}. If it "
+                         f"names several series, fit each by itself: --series {column} (lfm.data.read_series(path, "
+                         f"{column!r}), or lfm.read_table of each part of a DataFrame).")
+    raise ValueError(f"{place}. Sort the rows by time; replicates are rows with the same time.{more}")
+
+
+_SERIES_NAMES = ("id", "subject", "patient", "series", "individual", "animal", "unit", "group", "name")
+"""Parts of the names of columns that often say which series a row belongs to."""
+
+
+def _series_column(source: Table, times: np.ndarray, free: Sequence[str]) -> str | None:
+    """Return the column that seems to hold identifiers of series, None where there is none.
+
+    Its cells are filled, and the time does not go back among the rows that share a value. Unless its name is that of an
+    identifier, these rows stand together, and a value has two of them or more on average.
+    """
+    fallback = None
+    for name in free:
+        cells = source.columns[name]
+        # Replicates that stand one below the other are one series, to be sorted.
+        if name.lower() == "replicate" or any(_missing(cell) for cell in cells):
+            continue
+        labels, index = np.unique(np.array([str(cell) for cell in cells]), return_inverse=True)
+        order = np.argsort(index, kind="stable")
+        goes_back = (np.diff(times[order]) < 0) & (np.diff(index[order]) == 0)
+        if len(labels) == 1 or goes_back.any():
+            continue
+        if any(part in _SERIES_NAMES for part in re.split(r"[^a-z]+", name.lower())):
+            return name
+        blocks = 1 + np.count_nonzero(np.diff(index))
+        if fallback is None and blocks == len(labels) and 2 * len(labels) <= len(cells):
+            fallback = name
+    return fallback

@@ -10,7 +10,7 @@ and may define, each with a sensible default,
     prepare(data) -> lfm.Data                   turns a user's file into what ``model`` takes
     anchors(data) -> dict                       parameters that are fixed for such data unless freed
     OUTPUTS      names of the outputs; None: any number of them, the columns of the data file
-    INPUTS       known inputs: name -> "previous" or "linear", how they are interpolated
+    INPUTS       known inputs: name -> "previous", "linear" or "zero", how they are read, see `lfm_ppl.read_csv`
     UNITS        name -> unit
     OPTIONS      option -> (default, tuple of choices or a type, help)
     PARAMETERS   name of a sample site -> help, with its unit
@@ -307,7 +307,7 @@ def _checked_options(path: Path, options: Mapping[str, Any]) -> dict[str, tuple[
 def _checked_inputs(path: Path, inputs: Any) -> dict[str, str]:
     valid = isinstance(inputs, Mapping) and all(way in INTERPOLATIONS for way in inputs.values())
     if not valid:
-        raise ValueError(f"{path}: INPUTS must be a mapping of names to {' or '.join(INTERPOLATIONS)}, as in "
+        raise ValueError(f"{path}: INPUTS must be a mapping of names to one of {', '.join(INTERPOLATIONS)}, as in "
                          f'{{"heater": "previous"}}, got {inputs!r}.')
     return dict(inputs)
 

@@ -110,7 +110,7 @@ def from_frame(frame: Any) -> Table:
             frame = frame.collect()
         header, columns = list(frame.columns), [column.to_list() for column in frame.get_columns()]
     elif kind is None:
-        header, columns = [str(name) for name in frame], [np.asarray(column).tolist() for column in frame.values()]
+        header, columns = [str(name) for name in frame], [_cells(column) for column in frame.values()]
     else:
         frame = frame.to_frame() if frame.ndim == 1 else frame
         if frame.index.name is not None or frame.index.dtype.kind == "M":
@@ -123,6 +123,15 @@ def from_frame(frame: Any) -> Table:
         raise ValueError(f"{label} has columns of {' and '.join(map(str, sorted(lengths))) or 0} rows; expected the "
                          "same number in each, and one row per time.")
     return Table(label, dict(zip(header, columns, strict=True)), range(lengths.pop()))
+
+
+def _cells(column: Any) -> list[Any]:
+    """Return the entries of a column; masked ones are None or NaT, which are missing."""
+    array = np.asanyarray(column)
+    if array.dtype.kind not in "mM":
+        return array.tolist()
+    # As numbers nanoseconds would lose their unit.
+    return list(np.where(np.ma.getmaskarray(array), np.array("NaT", array.dtype), np.ma.getdata(array)))
 
 
 def _kind(value: Any) -> str | None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lfm_ppl.data import Data, read_csv, read_truth, write_csv, write_truth
+from lfm_ppl.data import Data, read_csv, read_series, read_table, read_truth, write_csv, write_truth
 
 P53 = """time_h,replicate,DDB2,CDKN1A
 0,1,211.6,5.9
@@ -160,3 +160,69 @@ def test_codes_of_missing_values_are_told(tmp_path):
     with pytest.warns(UserWarning) as said:
         read_csv(path)
     assert sorted(str(one.message).split(": ")[1].split(",")[0] for one in said) == ["-999", "-9999"]
+
+
+USUAL = np.round(np.sin(np.arange(30) / 3), 3)
+
+
+@pytest.mark.parametrize("code", [
+    -9, 99, -99, 999, -99.9, 99.99, -999.25, 9999, -9999, 99999999, -888, 7777, 32767, -32768, -2147483648, 1e20, 1e30,
+    -1e34, 9.96921e36, 9.999e20, 3.4028235e38, 1.7e308, -1.7976931348623157e308,
+])
+@pytest.mark.parametrize("scale", [1.0, 0.01])
+def test_a_number_like_a_code_far_from_all_others_is_told(code, scale):
+    y = np.where(np.isin(np.arange(30), [4, 20]), code, scale * USUAL)
+    with pytest.warns(UserWarning, match=r"row 4, column 'x'.*taken as a measurement \(2 of them\)"):
+        data = read_table({"time": np.arange(30), "x": y})
+    np.testing.assert_array_equal(data.y[:, 0], y)
+
+
+def test_several_codes_in_a_column_are_told():
+    y = np.array([*USUAL, -99.0, -999.0, 9999.0])
+    with pytest.warns(UserWarning) as said:
+        read_table({"time": np.arange(33), "x": y}, inputs=[])
+    assert len(said) == 3
+
+
+@pytest.mark.parametrize("y", [
+    [0, 3, 9, 12, 99, 80, 55, 60], [97, 98, 99, 99.9, 96], [-9, -3, 2, 5, -12, 8], [0.1, 0.99, 0.999, 9, 3],
+    [1, 2, 4, 8, 16, 99, 128, 256, 512, 999], 2.0**np.arange(40), [1e30, 2e30, 3e30, 2.5e30], [990, 1001, 9.9e2, 999],
+    [1, 0, 1, 9], [60, 65, 70, 99, 57.3, 1000.0], [10, 20, 4000.5, 12], np.linspace(0, 99, 50),
+], ids=str)
+def test_usual_numbers_are_no_codes(y, recwarn):
+    read_table({"time": np.arange(len(y)), "x": np.asarray(y, float)})
+    assert not recwarn
+
+
+LONG = "ID,TIME,AMT,DV\n1,0,100,.\n1,24,.,9.2\n1,120,,2.5\n2,0,100,\n2,24,.,8.3\n2,120,,1.4\n"
+
+
+def test_a_point_is_a_missing_value(read, tmp_path):
+    assert read("time,x,dose\n0,.,1\n1, . ,2\n2,3,.\n", outputs=["x"]).y[:, 0].tolist()[2] == 3.0
+    (tmp_path / "pk.csv").write_text(LONG)
+    series = read_series(tmp_path / "pk.csv", "ID", outputs=["DV"])
+    np.testing.assert_array_equal(series["2"].y[:, 0], [np.nan, 8.3, 1.4])
+    with pytest.raises(ValueError, match="row 3, column 'time': the time is missing"):
+        read("time,x\n0,1\n.,2\n")
+
+
+def test_a_long_file_is_to_be_read_series_by_series(read):
+    with pytest.raises(ValueError, match=r"row 5: the time goes back from 120 to 0, .*'ID' changes from 1 to 2.*"
+                                         r"--series ID ") as raised:
+        read(LONG, outputs=["DV"])
+    assert "Sort" not in str(raised.value) and "\n" not in str(raised.value)
+    other = LONG.replace("ID,", "who,").replace("\n1,", "\nanna,").replace("\n2,", "\nbert,")
+    for text, options in ((LONG, {}), (other, {"outputs": ["DV"]}), (other, {"outputs": ["DV"], "inputs": ["AMT"]})):
+        with pytest.raises(ValueError, match=r"--series (ID|who) "):
+            read(text, **options)
+    with pytest.raises(ValueError, match="--series ID "):  # rows of a series need not stand together
+        read("id,time,x\nA,0,1\nB,5,1\nA,3,1\nB,7,1\n".replace("id", "ID"), outputs=["x"])
+
+
+@pytest.mark.parametrize("text", [
+    "time,replicate,x\n0,1,1\n1,1,2\n0,2,1\n1,2,2\n", "time,dose,x\n0,1,1\n1,0,2\n0,1,1\n1,0,2\n",
+    "time,x\n0,1\n2,2\n1,3\n", "ID,time,x\n1,0,1\n1,2,2\n1,1,3\n", "ID,time,x\n1,0,1\n1,2,2\n,1,3\n2,3,3\n",
+], ids=["replicates", "no identifiers", "no other column", "within a series", "a series without a name"])
+def test_times_out_of_order_are_to_be_sorted(read, text):
+    with pytest.raises(ValueError, match="Sort the rows by time"):
+        read(text, outputs=["x"])

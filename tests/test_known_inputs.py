@@ -50,10 +50,49 @@ def arguments(folder, **changed):
 
 
 def test_inputs_hold_or_are_joined_and_skip_empty_cells(folder):
-    data = lfm.read_csv(folder / "house.csv", ["indoor"], inputs={"heater": "previous", "outside": "linear"})
+    with pytest.warns(UserWarning, match="'outside': 1 of 4 values .* a line joins .*--inputs outside:zero"):
+        data = lfm.read_csv(folder / "house.csv", ["indoor"], inputs={"heater": "previous", "outside": "linear"})
     known = data.known_inputs()
     assert [float(known["heater"](t)) for t in (6.0, 6.9, 7.0, 8.5, 9.0)] == [0, 0, 2, 2, 0]
     assert [float(known["outside"](t)) for t in (6.0, 7.0, 8.5)] == [5.0, 4.5, 5.0]
+
+
+DOSES = "time,conc,dose_rate\n0,,100\n1,8.1,\n2,6.6,.\n4,4.5,50\n4,4.4,\n8,2.0,\n"
+
+
+def test_blank_doses_are_told_and_may_be_zero(folder, recwarn):
+    path = folder / "doses.csv"
+    path.write_text(DOSES)
+
+    def rates(inputs):
+        rate = lfm.read_csv(path, ["conc"], inputs=inputs).known_inputs()["dose_rate"]
+        return [float(rate(t)) for t in (0.0, 0.5, 1.0, 3.9, 4.0, 7.9, 8.0)]
+
+    # The cell at t = 4 beside one with a dose is no blank.
+    with pytest.warns(UserWarning, match=r"'dose_rate': 3 of 6 values .*--inputs dose_rate:zero"):
+        assert rates(["dose_rate"]) == [100, 100, 100, 100, 50, 50, 50]
+    recwarn.clear()
+    assert rates({"dose_rate": "zero"}) == [100, 100, 0, 0, 50, 50, 0]
+    path.write_text(DOSES.replace("100", ""))
+    assert rates({"dose_rate": "zero"}) == [0, 0, 0, 0, 50, 50, 0]
+    assert not recwarn
+    with pytest.raises(ValueError, match=r"no value at the first time; .*--inputs dose_rate:zero"):
+        rates(["dose_rate"])
+
+
+def test_the_command_line_reads_blank_cells_as_zero(folder, recwarn):
+    (folder / "doses.csv").write_text(DOSES)
+    (folder / "house.py").write_text(MODEL.replace('"power": "previous", "weather": "linear"', '"power": "zero"'))
+    model = loading.load(str(folder / "house.py"))
+    for inputs in ("dose_rate", "dose_rate:zero"):
+        data = command.read(str(folder / "doses.csv"), model, arguments(folder, outputs="conc", inputs=inputs))
+        assert data.inputs["power"].values.tolist() == [100, 0, 0, 50, 0]
+        assert data.inputs["power"].interpolation == "previous"
+    assert not recwarn
+    with pytest.warns(UserWarning, match="blank"):
+        command.read(str(folder / "doses.csv"), model, arguments(folder, outputs="conc", inputs="dose_rate:previous"))
+    with pytest.raises(ValueError, match="zeros"):
+        command.read(str(folder / "doses.csv"), model, arguments(folder, outputs="conc", inputs="dose_rate:zeros"))
 
 
 def test_the_command_line_maps_columns_to_the_model_s_names(folder):

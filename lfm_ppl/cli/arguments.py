@@ -312,8 +312,8 @@ def _add_forecast(commands: Any) -> None:
                          help="its time column, of numbers or dates (default: time, t or time_h, else one of dates)")
     command.add_argument("--outputs", metavar="A,B,...", help="its columns (default: the outputs of the result)")
     command.add_argument("--inputs", metavar="A,B,...",
-                         help="its columns of known inputs, in the result's order (default: of their names); its "
-                         "outputs may then all be empty")
+                         help="its columns of known inputs, in the result's order, with :zero where blank cells are "
+                         "zero (default: of their names); its outputs may then all be empty")
     command.add_argument("--draws", type=values.whole(1), default=400, metavar="N",
                          help="posterior draws that are propagated (default: 400)")
     command.add_argument("--seed", type=values.whole(0), default=0, help="random seed of paths and noise (default: 0)")
@@ -343,7 +343,8 @@ def _add_data(group: Any) -> None:
     group.add_argument("--outputs", metavar="A,B,...", help="the columns to use (default: those of the model)")
     group.add_argument("--inputs", metavar="A,B:linear,...",
                        help="columns of known inputs, in the model's order; a value holds until the next row, or with "
-                       ":linear is joined to it by a line (default: columns of the names that the model gives)")
+                       ":linear is joined to it by a line; both interpolate over blank cells, and with :zero a blank "
+                       "cell is zero, as of a dose (default: columns of the names that the model gives)")
     group.add_argument("--truth", metavar="FILE", help="the truth, to be drawn in figures: what `simulate` wrote "
                        "beside its data, or a JSON file of your own with \"times\" and \"forces\", \"state\" or "
                        "\"parameters\"")

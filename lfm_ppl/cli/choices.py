@@ -78,7 +78,7 @@ def inputs(given: str | None, model: ModelFile) -> dict[str, tuple[str, str]]:
     """Return the known inputs to read: name -> column of the file, interpolation.
 
     Args:
-        given: ``A,B:linear``, columns in the order of the model's inputs; None: columns of these names.
+        given: ``A,B:linear,C:zero``, columns in the order of the model's inputs; None: columns of these names.
         model: what takes them.
     """
     if given is None:

@@ -126,7 +126,9 @@ def _held_out(arguments: argparse.Namespace, task: check.Check) -> data.Data:
         if len(columns) != len(outputs):
             raise ValueError(f"the result has {checks.counted(len(outputs), 'output')} ({', '.join(outputs)}); "
                              f"--outputs names {checks.counted(len(columns), 'column')}.")
-    known = {name: one.interpolation for name, one in task.observed.inputs.items()}
+    # The result does not say that blank cells were read as zero; the model file may.
+    known = {name: "zero" if task.file.inputs.get(name) == "zero" else one.interpolation
+             for name, one in task.observed.inputs.items()}
     if arguments.inputs is not None and not known:
         raise ValueError("--inputs names columns of known inputs, and the result has no known inputs; leave it out.")
     inputs = choices.inputs(arguments.inputs, dataclasses.replace(task.file, inputs=known)) if known else {}
