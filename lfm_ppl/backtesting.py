@@ -12,9 +12,9 @@ import xarray as xr
 
 from lfm_ppl import checks
 from lfm_ppl.data import as_data, model_keywords
-from lfm_ppl.fitting import ConvergenceWarning, fit
+from lfm_ppl.fitting import ConvergenceWarning, bind_dates, fit
 from lfm_ppl.forecasting import check_possible
-from lfm_ppl.inference.bound_model import BoundModel, bind
+from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.family_scores import log_densities
 from lfm_ppl.results.predictions import GROUP, MEAN, SD, observed_variable
@@ -129,12 +129,12 @@ def backtest(numpyro_model: Callable, times: Any, y: Any = None, *, horizon: int
         checks.positive_integer("season", season)
     if not 0 < level < 1:
         raise ValueError(f"level must lie between 0 and 1, got {level}.")
-    names = None
+    names = data = None
     if y is None:
         data = as_data(times)
         times, y, names = data.times, data.y, data.outputs
-        options["model_kwargs"] = model_keywords(data.inputs, options.get("model_kwargs"))
-    times, y = np.asarray(times, float), np.asarray(y, float)
+    checks.refuse_dates("times", times)
+    times, y = (np.asarray(checks.unmask(value), float) for value in (times, y))
     y = y[:, None] if y.ndim == times.ndim == 1 else y
     if times.ndim != 1 or y.ndim != 2:
         raise ValueError(f"backtest takes one series, times (T,) and y (T, D), got shapes {times.shape} and {y.shape}; "
@@ -145,7 +145,11 @@ def backtest(numpyro_model: Callable, times: Any, y: Any = None, *, horizon: int
                          "season count rows; put replicates into columns, or take their means.")
     origins = _origins(len(times), horizon, every, first)
     options = {"samples": draws if sampler == "map" else 1000, **options}
-    bound = bind(numpyro_model, times, y, **dict(options.get("model_kwargs") or {})).fix(options.get("fixed"))
+    bound, data, _ = bind_dates(numpyro_model, times, y, data, options.get("model_kwargs"))
+    times = bound.times
+    if data is not None:
+        options["model_kwargs"] = model_keywords(data.inputs, options.get("model_kwargs"))
+    bound = bound.fix(options.get("fixed"))
     check_possible(bound, times)
     model = bound.site.example.ssm.model
     angular = np.isin(np.arange(y.shape[1]), model.observation.angular)

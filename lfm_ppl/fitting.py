@@ -22,7 +22,7 @@ from jax.stages import Lowered
 from numpyro.infer import init_to_median, init_to_value
 
 from lfm_ppl import calendar_time, checks
-from lfm_ppl.data import Data, as_data, model_keywords
+from lfm_ppl.data import Data, as_data, at_origin, model_keywords
 from lfm_ppl.filtering.breakdown import FilterWarning, breakdown
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.forces.sde import ApproximationWarning
@@ -105,7 +105,9 @@ def fit(
             ``numpyro.sample(name, lfm.MarginalLikelihood(...), obs=y)``, or a `lfm.panel` in a plate.
         times: (T,), non-decreasing. Or, without ``y``, the whole data: `lfm.Data`, a DataFrame of pandas or polars or
             an xarray Dataset (see `lfm.read_table`); the model then gets the known inputs as its argument ``inputs``.
-        y: (T, D), NaN where missing; (B, T, D) for a panel.
+            Dates (``datetime64``, a DatetimeIndex, ...) become numbers since the midnight before the first of them, in
+            the unit that the model names (``units={"time": "h"}``), else in that of the time between rows.
+        y: (T, D), NaN or masked where missing; (B, T, D) for a panel.
         sampler: "nuts", "ram" (robust adaptive Metropolis), "pmmh" (particle-marginal RAM: a particle filter estimates
             the likelihood, and the posterior is exact up to its integration steps), or "map" (posterior mode; the draws
             come from its Laplace approximation).
@@ -116,7 +118,8 @@ def fit(
             for RAM, whose steps are cheap and short, and 2 for each parameter for particle-marginal RAM.
         seed: of everything random.
         at: times of the trajectories, and of new observations; by default a grid over the data. Times after the last
-            observation are forecasts, see `forecast`.
+            observation are forecasts, see `forecast`. Dates where the times of the data are dates; numbers count in
+            the unit of the `lfm.Data`, or else of the model.
         trajectory_draws: number of posterior draws, spread over the chains, for which trajectories are drawn; 0: none.
         model_kwargs: keyword arguments of the model.
         fixed: parameters that are not learnt: name -> value, ``{"decay": 0.8}`` or ``{"decay[CDKN1A]": 0.8}``.
@@ -203,16 +206,21 @@ def fit(
         raise ValueError("resume goes on with a run that a folder keeps; name the folder, checkpoint=...")
     if checkpoint is not None:
         checkpoints.check_folder(checkpoint, resume, overwrite)
-    data = None
+    data, unit = None, times.units.get("time") if isinstance(times, Data) else None
     if y is None:
         data = as_data(times)
-        times, y, truth = data.times, data.y, data.truth if truth is None else truth
+        times, y = data.times, data.y
         coords = {"output": data.outputs, **(coords or {})}
+    bound, data, clock = bind_dates(numpyro_model, times, y, data, model_kwargs)
+    if data is not None:
+        truth = data.truth if truth is None else truth
         model_kwargs = model_keywords(data.inputs, model_kwargs)
-    values = y.to_numpy(float) if hasattr(y, "to_numpy") else y  # a data frame
-    clock = (None, "") if data is None else (data.origin, data.units.get("time", ""))
+    if calendar_time.holds_dates(at):
+        at = calendar_time.positions("at", at, *clock)
+    elif at is not None and unit is not None and unit != clock[1]:  # numbers in the unit of the data as they were
+        checks.refuse_durations("at", at)
+        at = np.asarray(at, float) * (calendar_time.SECONDS[unit] / calendar_time.SECONDS[clock[1]])
     with calendar_time.in_messages(*clock):
-        bound = _bound(numpyro_model, times, values, dict(model_kwargs or {}))
         check_requested(bound, at)
     labels = Labels.of(bound, dims, coords, y)
     truth = checked_truth(bound, truth, labels)
@@ -228,7 +236,7 @@ def fit(
                    dict(sampler_options or {}), method)
     title = str(name or getattr(numpyro_model, "__name__", "model"))
     call = _call(title, "times, y" if data is None else "data", asked, model_kwargs)
-    run = _Run(bound, asked, labels, data, truth, progress, started, {
+    run = _Run(bound, asked, labels, data, clock, truth, progress, started, {
         "model": title, "description": described_by(numpyro_model), "call": call, **asked.described(bound),
         "priors": kept("priors in words", lambda: _priors(bound), None),
         "assumptions": kept("the model in words", lambda: _assumptions(bound), None)}, dict(attributes or {}))
@@ -330,6 +338,7 @@ class _Run:
         asked: how to sample.
         labels: names of dimensions and entries.
         data: as they were given, with known inputs; None where times and y were.
+        clock: calendar time of t = 0, None where times are plain numbers, and unit of time.
         truth: of simulated data.
         progress: whether to show how far it is.
         started: when it began.
@@ -354,6 +363,7 @@ class _Run:
     asked: _Asked
     labels: Labels
     data: Data | None
+    clock: tuple[str | None, str]
     truth: Mapping[str, Any] | None
     progress: bool
     started: float
@@ -539,7 +549,7 @@ class _Run:
         }  # fmt: skip
         chosen, paths, grid = self.drawn
         groups = lay_out(self.bound, self.draws, self.stats, self.rated, paths, chosen, grid, self.truth, self.labels)
-        attrs |= {} if self.data is None else remember(groups, self.data)
+        attrs |= remember(groups, self.data, *self.clock)
         return arviz_data.build(groups, {k: v for k, v in attrs.items() if v is not None})
 
     def store(self, result: Any) -> None:
@@ -857,6 +867,43 @@ def _paths(bound: BoundModel, at: Any, count: int, chains: int,
         return chosen, rows, np.atleast_1d(np.asarray(at, float))
     origin = float(bound.site.example.time_grid.initial_time)
     return chosen, rows, np.union1d(np.linspace(min(origin, times[0]), times[-1], _GRID), times)
+
+
+def bind_dates(numpyro_model: Callable, times: Any, y: Any, data: Data | None,
+               model_kwargs: Mapping[str, Any] | None) -> tuple[BoundModel, Data | None, tuple[str | None, str]]:
+    """Bind a model to times that may be dates, counted in the unit of time that the model names.
+
+    Args:
+        numpyro_model: the model.
+        times: (T,) or (B, T), numbers or dates.
+        y: the observations, or a data frame of them.
+        data: what times and y were taken from, where they were.
+        model_kwargs: keyword arguments of the model, without the known inputs of ``data``.
+
+    Returns:
+        The bound model; the data, with times in the same unit; the calendar time of t = 0, None where times are plain
+        numbers, and their unit, empty where it is not known.
+    """
+    checks.refuse_durations("times", times)
+    origin, unit = (None, "") if data is None else (data.origin, data.units.get("time", ""))
+    if calendar_time.holds_dates(times):
+        times, origin, unit = calendar_time.numbers_of("times", times)
+    values = y.to_numpy(float) if hasattr(y, "to_numpy") else y  # a data frame
+
+    def bind_in(origin: str | None, unit: str) -> BoundModel:
+        keywords = dict(model_kwargs or {}) if data is None else model_keywords(data.inputs, model_kwargs)
+        with calendar_time.in_messages(origin, unit):
+            return _bound(numpyro_model, times, values, keywords)
+
+    bound = bind_in(origin, unit)
+    # The model names its unit only once it has been built, for which it takes times.
+    model_unit = bound.site.example.ssm.model.units.get("time", "")
+    old, new = (calendar_time.SECONDS.get(name) for name in (unit, model_unit))
+    if origin is None or old is None or new is None or old == new:
+        return bound, data, (origin, unit)
+    times = np.asarray(times) * (old / new)
+    data = None if data is None else at_origin(data, origin, model_unit)
+    return bind_in(origin, model_unit), data, (origin, model_unit)
 
 
 def _bound(numpyro_model: Callable, times: Any, y: Any, model_kwargs: dict[str, Any]) -> BoundModel:

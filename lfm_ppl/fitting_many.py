@@ -281,8 +281,10 @@ def _task(model: Callable, name: str, value: Any, options: dict[str, Any], seed:
         times, y = value.times, value.y
         keywords = model_keywords(value.inputs, keywords)
     else:
+        if isinstance(value, (list, tuple)) and value:  # units that the gaps of data sets decide could differ
+            checks.refuse_dates(f"data set {name!r}: times", value[0])
         try:
-            times, y = (np.asarray(part, float) for part in value)
+            times, y = (np.asarray(checks.unmask(part), float) for part in value)
         except (TypeError, ValueError):
             raise TypeError(f"data set {name!r} must be (times, y) or lfm.Data, got {type(value).__name__}.") from None
     options = {"name": getattr(model, "__name__", "model"), "seed": seed_of(name, seed), **options}

@@ -44,7 +44,7 @@ def forecast(result: Any, numpyro_model: Callable, times: Any, *, inputs: Mappin
     Args:
         result: of `lfm_ppl.fit`, or read by `lfm_ppl.load`.
         numpyro_model: the model that was fitted. A result holds draws and data, but no code.
-        times: (K,) times of the forecast, non-decreasing, from the initial time on.
+        times: (K,) times of the forecast, non-decreasing, from the initial time on; dates where those of the data were.
         inputs: known inputs (`lfm_ppl.Input`) that reach as far as ``times``, and are the same as before at the data:
             those that the result holds, by name, or keyword arguments of the model that replace those of the fit.
         model_kwargs: keyword arguments of the model, as in the fit.
@@ -86,8 +86,9 @@ def forecast(result: Any, numpyro_model: Callable, times: Any, *, inputs: Mappin
     (2019), Applied Stochastic Differential Equations, chapter 9, for Gaussian moments and what they miss.
     """
     checks.positive_integer("draws", draws)
-    times = checks.time_vector("times", times, order="non-decreasing")
-    with calendar_time.in_messages(*known_inputs.clock_of(result)):
+    clock = known_inputs.clock_of(result)
+    times = checks.time_vector("times", calendar_time.positions("times", times, *clock), order="non-decreasing")
+    with calendar_time.in_messages(*clock):
         return _forecast(result, numpyro_model, times, inputs, model_kwargs, draws, seed, progress)
 
 

@@ -2,12 +2,17 @@
 
 from datetime import datetime, timedelta
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+import numpyro
+import numpyro.distributions as dist
 import pandas as pd
 import pytest
 
+import lfm_ppl as lfm
 from lfm_ppl import calendar_time
-from lfm_ppl.data import read_csv
+from lfm_ppl.data import Data, read_csv
 from lfm_ppl.results.plots import style
 
 
@@ -91,3 +96,133 @@ def test_every_span_has_a_few_dates_and_no_complaint(last):
     ticks = style.DateTicks(style.Dates("2026-01-05T00:00:00", "s"), 6)
     shown = [tick for tick in ticks.tick_values(0.0, last) if 0.0 <= tick <= last]
     assert 2 <= len(shown) <= 7, shown
+
+
+DATES = np.array(["2026-01-05T06:00", "2026-01-05T07:30", "2026-01-06T06:00"], "M8[m]")
+FORMS = {
+    "datetime64[m]": DATES, "datetime64[ns]": DATES.astype("M8[ns]"), "DatetimeIndex": pd.DatetimeIndex(DATES),
+    "Series": pd.Series(DATES), "datetime": DATES.tolist(), "text": DATES.astype(str), "tuple of text":
+    tuple(DATES.astype(str).tolist()), "Timestamp": list(pd.DatetimeIndex(DATES)), "periods":
+    pd.PeriodIndex(DATES, freq="min"), "with a zone": pd.DatetimeIndex(DATES, tz="Asia/Tokyo"),
+    "masked": np.ma.masked_array(DATES, mask=False),
+}
+
+
+@pytest.mark.parametrize("dates", FORMS.values(), ids=FORMS)
+def test_dates_in_every_form_are_counted_from_midnight(dates):
+    data = Data(dates, np.zeros((3, 1)), ("x",), units={"time": "h"})
+    np.testing.assert_allclose(data.times, [6.0, 7.5, 30.0], rtol=1e-15)
+    assert data.origin.startswith("2026-01-05T00:00:00")
+    again = Data(dates, np.zeros((3, 1)), ("x",), {"time": "min"}, origin="2026-01-04T00:00:00" + data.origin[19:])
+    np.testing.assert_allclose(again.times, 60 * (data.times + 24.0), rtol=1e-15)
+    np.testing.assert_allclose(calendar_time.positions("at", dates, data.origin, "d"), data.times / 24, rtol=1e-15)
+
+
+def test_inputs_of_data_share_their_clock():
+    data = Data(DATES, np.zeros((3, 1)), ("x",), units={"time": "h"}, inputs={"heat": (DATES[:2], [1.0, 2.0])})
+    assert data.inputs["heat"].times.tolist() == [6.0, 7.5]
+    with pytest.raises(ValueError, match="times of the known input 'heat' must be numbers"):
+        Data(np.arange(3.0), np.zeros((3, 1)), ("x",), inputs={"heat": (DATES, np.zeros(3))})
+
+
+@pytest.mark.parametrize(("dates", "message"), [
+    (np.array(["2026-01-05", "NaT"], "M8[D]"), r"times\[1\] is missing \(NaT\)"),
+    (np.ma.masked_array(DATES[:2], mask=[0, 1]), r"times\[1\] is missing"),
+    (["2026-01-05", "tomorrow"], r"times\[1\] must be a date.*'tomorrow'"),
+    (["2026-01-05T00:00", "2026-01-06T00:00+01:00"], "in all of its dates or in none"),
+])
+def test_dates_that_cannot_be_read_are_named(dates, message):
+    with pytest.raises(ValueError, match=message):
+        Data(dates, np.zeros((2, 1)), ("x",))
+
+
+def system(rate=1.0, **options):
+    return lfm.LatentForceModel(
+        lambda x, u, t: u - rate * x, {"u": lfm.Matern(1.0, 3.0)},
+        lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)), **options)
+
+
+def model(times, y=None, unit=None):
+    rate = numpyro.sample("rate", dist.LogNormal(-1.0, 0.5))
+    likelihood = lfm.MarginalLikelihood(system(rate, units={"time": unit} if unit else None), times)
+    numpyro.sample("y", likelihood, obs=y)
+
+
+OPTIONS = {"sampler": "map", "samples": 20, "trajectory_draws": 5, "progress": False}
+
+
+def test_dates_as_times_are_fitted_as_a_table_of_dates():
+    hours = pd.date_range("2026-01-05 06:00", periods=8, freq="h")
+    y = np.sin(np.arange(8.0) / 5)[:, None]
+    later = pd.date_range("2026-01-05 15:00", periods=2, freq="h")
+    table = lfm.fit(model, pd.DataFrame(y, hours, ["x"]), at=later, **OPTIONS)
+    found = lfm.fit(model, hours, y, at=later.to_pydatetime(), **OPTIONS)
+    plain = lfm.fit(model, np.arange(6.0, 14.0), y, at=[15.0, 16.0], **OPTIONS)
+    for result in (table, found):
+        assert result.attrs["time_origin"] == "2026-01-05T00:00:00"
+        assert result["observed_data"]["time"].attrs["units"] == "h"
+        for group, name in (("posterior", "rate"), ("predictions", "y"), ("observed_data", "time")):
+            np.testing.assert_array_equal(result[group][name], plain[group][name])
+    ahead = lfm.forecast(found, model, later, draws=5, progress=False)
+    expected = lfm.forecast(plain, model, [15.0, 16.0], draws=5, progress=False)
+    np.testing.assert_array_equal(ahead["predictions"]["y"], expected["predictions"]["y"])
+    held_out = Data(later, [[0.5], [0.6]], ("y0",), {"time": "min"})  # on a clock of its own
+    pd.testing.assert_frame_equal(lfm.score(ahead, held_out), lfm.score(expected, [[0.5], [0.6]]))
+    for call in (lambda: lfm.forecast(plain, model, later, draws=5, progress=False),
+                 lambda: lfm.fit(model, np.arange(6.0, 14.0), y, at=later, **OPTIONS)):
+        with pytest.raises(ValueError, match="(times|at) must be numbers, because the times of the data are"):
+            call()
+
+
+def test_dates_are_counted_in_the_unit_that_the_model_names():
+    hours, y = pd.date_range("2026-01-05 06:00", periods=8, freq="h"), np.sin(np.arange(8.0) / 5)[:, None]
+    plain = lfm.fit(model, np.arange(6.0, 14.0) / 24, y, **OPTIONS)
+    in_hours = Data(hours, y, ("x",), {"time": "h"})
+    for data, at in (((hours, y), [13 / 24]), ((pd.DataFrame(y, hours, ["x"]),), hours[-1:]), ((in_hours,), [13.0])):
+        result = lfm.fit(model, *data, at=at, model_kwargs={"unit": "d"}, **OPTIONS)
+        np.testing.assert_allclose(result["observed_data"]["time"], np.arange(6.0, 14.0) / 24, rtol=1e-15)
+        np.testing.assert_allclose(result["posterior"]["rate"], plain["posterior"]["rate"], rtol=1e-8)
+        assert result["trajectories"]["at"].attrs["units"] == "d"
+        np.testing.assert_allclose(result["trajectories"]["at"], [13 / 24], rtol=1e-15)
+
+
+REFUSALS = {
+    "bind": lambda times: lfm.bind(model, times, np.zeros((3, 1))),
+    "filter": lambda times: lfm.filter(system(), times, np.zeros((3, 1))),
+    "smooth": lambda times: lfm.smooth(system(), times, np.zeros((3, 1))),
+    "smooth at": lambda times: lfm.smooth(system(), np.arange(3.0), np.zeros((3, 1)), at=times),
+    "MarginalLikelihood": lambda times: lfm.MarginalLikelihood(system(), times),
+    "panel": lambda times: lfm.panel(lambda level: system(), np.zeros(2), times),
+    "simulate": lambda times: lfm.simulate(jax.random.key(0), system(), times),
+    "Input": lambda times: lfm.Input(times, np.zeros(3)),
+    "full_information": lambda times: lfm.full_information(system(), times, np.zeros((3, 1)), lower={"u": 0.0}),
+    "moving_horizon": lambda times: lfm.moving_horizon(system(), times, np.zeros((3, 1)), 3, lower={"u": 0.0}),
+    "backtest": lambda times: lfm.backtest(model, times, np.zeros((3, 1)), horizon=1),
+    "fit_many": lambda times: lfm.fit_many(model, {"a": (times, np.zeros((3, 1)))}),
+    "initial time": lambda times: system(initial_time=times[0]),
+}
+
+
+@pytest.mark.parametrize("use", REFUSALS.values(), ids=REFUSALS)
+def test_dates_and_durations_are_refused_where_no_unit_is_known(use):
+    for times, kind in ((pd.DatetimeIndex(DATES), "dates"), (DATES - DATES[0], "durations")):
+        with pytest.raises(TypeError, match=rf"(time|at).* must be numbers in .*, got {kind}") as raised:
+            use(times)
+        assert "\n" not in str(raised.value)
+
+
+def test_durations_are_no_times_of_a_fit():
+    for use in (lambda times: lfm.fit(model, times, np.zeros((3, 1)), **OPTIONS),
+                lambda times: Data(times, np.zeros((3, 1)), ("x",))):
+        with pytest.raises(TypeError, match="got durations"):
+            use(DATES - DATES[0])
+
+
+def test_a_mapping_of_columns_keeps_its_dates():
+    for dates in (DATES.astype("M8[ns]"), pd.DatetimeIndex(DATES), np.ma.masked_array(DATES, mask=False)):
+        data = lfm.read_table({"time": dates, "x": np.arange(3.0)}, time_unit="h")
+        np.testing.assert_allclose(data.times, [6.0, 7.5, 30.0], rtol=1e-15)
+    with pytest.raises(ValueError, match="row 1, column 'time': the time is missing"):
+        lfm.read_table({"time": np.ma.masked_array(DATES, mask=[0, 1, 0]), "x": np.arange(3.0)})
+    with pytest.raises(ValueError, match="row 0, column 'time': expected a number"):
+        lfm.read_table({"time": (DATES - DATES[0]).astype("m8[ns]"), "x": np.arange(3.0)})

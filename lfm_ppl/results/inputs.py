@@ -51,19 +51,25 @@ def keywords(result: Any, given: Mapping[str, Any] | None) -> dict[str, Any]:
     return model_keywords(inputs_of(result), given)
 
 
-def remember(groups: dict[str, xr.Dataset], data: Data) -> dict[str, Any]:
+def remember(groups: dict[str, xr.Dataset], data: Data | None, origin: str | None, unit: str) -> dict[str, Any]:
     """Add the known inputs of data to the groups of a result, and the unit of time where the model does not name it.
+
+    Args:
+        groups: of the result.
+        data: with known inputs; None: there are none.
+        origin: calendar time of t = 0; None where times are plain numbers.
+        unit: of time, empty where it is not known.
 
     Returns:
         Attributes of the result.
     """
-    if data.inputs:
+    if data is not None and data.inputs:
         groups[GROUP] = to_dataset(data.inputs, data.units)
     for dataset in groups.values():
         for name in {"time", "at", "at_truth"} & set(dataset.coords):
-            if data.units.get("time") and not dataset[name].attrs.get("units"):
-                dataset[name].attrs["units"] = data.units["time"]
-    return {} if data.origin is None else {ORIGIN: data.origin}
+            if unit and not dataset[name].attrs.get("units"):
+                dataset[name].attrs["units"] = unit
+    return {} if origin is None else {ORIGIN: origin}
 
 
 def time_unit(result: Any) -> str:

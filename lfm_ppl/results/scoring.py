@@ -12,9 +12,10 @@ import xarray as xr
 from scipy import stats
 from scipy.special import logsumexp
 
-from lfm_ppl import checks
-from lfm_ppl.data import Data
+from lfm_ppl import calendar_time, checks
+from lfm_ppl.data import Data, at_origin
 from lfm_ppl.results import arviz_data
+from lfm_ppl.results.inputs import clock_of
 from lfm_ppl.results.predictions import MEAN, SD, observed_variable, of_result, quantiles
 
 ALL = "all"
@@ -65,8 +66,8 @@ def score(result: Any, held_out: Any, level: float = 0.95, *, numpyro_model: Cal
     Args:
         result: what `lfm_ppl.forecast`, or `lfm_ppl.fit` with ``at``, returned; or its dataset ``predictions``.
         held_out: (K, D) (or (K,) for one output; (B, K, D) for a panel), one row for each time of the predictions; or a
-            `lfm_ppl.Data` or a DataArray with coordinates time and output, whose times must be among those predicted.
-            NaN entries are left out.
+            `lfm_ppl.Data` or a DataArray with coordinates time and output, whose times must be among those predicted;
+            dates are counted as those of the result. NaN entries are left out.
         level: of the interval, between 0 and 1.
         numpyro_model: of an observation family, the model that was fitted; without it there is no log score.
         inputs: as in `lfm_ppl.forecast`, and so is the next.
@@ -99,7 +100,8 @@ def score(result: Any, held_out: Any, level: float = 0.95, *, numpyro_model: Cal
     variable = observed_variable(predicted)
     series = [str(dim) for dim in variable.dims if dim not in ("chain", "draw", "time", "output")]
     outputs = [str(name) for name in variable["output"].values]
-    predicted, y = aligned(predicted, variable, held_out, series)
+    clock = (None, "") if isinstance(result, xr.Dataset) else clock_of(result)
+    predicted, y = aligned(predicted, variable, _on_clock(held_out, *clock), series)
     variable = observed_variable(predicted)
     order = ("chain", "draw", *series, "time", "output")
 
@@ -234,7 +236,7 @@ def aligned(predicted: xr.Dataset, variable: xr.DataArray, held_out: Any,
                 raise ValueError(f"held_out: {checks.unknown('output', name, outputs)}")
         predicted = predicted.isel(time=_rows(predicted["time"].values, times)).sel(output=names)
     else:
-        y = np.asarray(held_out, float)
+        y = np.asarray(checks.unmask(held_out), float)
         y = y[..., None] if len(outputs) == 1 and y.ndim == 1 + len(series) else y
         expected = (*(variable.sizes[dim] for dim in series), variable.sizes["time"], len(outputs))
         if y.shape != expected:
@@ -246,6 +248,23 @@ def aligned(predicted: xr.Dataset, variable: xr.DataArray, held_out: Any,
     if not np.isfinite(y).any():
         raise ValueError("held_out has no value to compare with: every entry is missing.")
     return predicted, y
+
+
+def _on_clock(held_out: Any, origin: str | None, unit: str) -> Any:
+    """Return held-out data whose times, if they are dates, are counted as those of a result.
+
+    Args:
+        held_out: as in `score`.
+        origin: calendar time of t = 0 of the result; None: its times are plain numbers.
+        unit: of its times.
+    """
+    if isinstance(held_out, Data) and held_out.origin is not None and origin is not None:
+        return at_origin(held_out, origin, unit)
+    if isinstance(held_out, xr.DataArray) and "time" in held_out.coords:
+        if calendar_time.holds_dates(dates := held_out["time"].values):
+            times = calendar_time.positions("the times of held_out", dates, origin, unit)
+            return held_out.assign_coords(time=("time", times))
+    return held_out
 
 
 def _labelled(held_out: Data | xr.DataArray) -> tuple[np.ndarray, np.ndarray, list[str]]:
