@@ -20,6 +20,7 @@ from lfm_ppl.filtering.filter import check_observations, forward, warn_single_pr
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.time_grid import TimeGrid, intervals_between
 from lfm_ppl.linearisation.taylor import Taylor
+from lfm_ppl.model.inputs import breakpoints_within
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation_noise import check_noise
 from lfm_ppl.model.state_space import StateSpaceModel, check_times, state_space
@@ -219,6 +220,8 @@ def moving_horizon(model: LatentForceModel, times: Any, y: Any, window: int, del
     origin = known[0] if model.initial_time is None else model.initial_time
     model.check_at(origin, len(known))
     y = check_observations(y, len(known), len(model.output_names))
+    if not checks.traced(origin):
+        _warn_of_breakpoints(model, known, float(origin))
     result = _run(setting, jnp.asarray(known), y, jnp.asarray(origin, float))
     if not checks.traced(result) and not bool(result.converged):
         checks.warn("some windows of the moving horizon estimate have not converged: the largest duality gap is "
@@ -252,6 +255,16 @@ def _set_up(model: LatentForceModel, window: int, delay: int | None, lower: Any,
         check_noise(ssm, 0.0 if model.initial_time is None else model.initial_time)
     warn_single_precision()
     return _Setting(ssm, plain, found, linear, int(window), int(delay), int(steps), float(tolerance), max_passes)
+
+
+def _warn_of_breakpoints(model: LatentForceModel, times: np.ndarray, origin: float) -> None:
+    """Warn where a known input jumps between two observations, whose interval a moving window does not divide."""
+    breakpoints, moving = breakpoints_within(model.input_reads(origin, float(times[-1])), origin, float(times[-1]))
+    apart = np.setdiff1d(breakpoints, times)
+    if len(apart) or len(moving):
+        where = f"at time {apart[0]:g}, between two observations" if len(apart) else "at a lag that is traced"
+        checks.warn(f"a known input jumps {where}, and a moving window does not divide its intervals there, so that a "
+                    "short pulse may be stepped over. Add rows at these times with missing observations (NaN).")
 
 
 def _grid(setting: _Setting, times: jax.Array, origin: jax.Array) -> TimeGrid:

@@ -288,7 +288,8 @@ def smoothing_grids(ssm: StateSpaceModel, times: Any, steps: int, max_step: floa
                     iterations: int, tolerance: float | None = None) -> SmoothingGrids:
     """Lay out the time grids of a smoother; a forecast goes on in intervals as long as the data's median interval."""
     joint = build_time_grid(ssm, times, steps, max_step, at, tolerance=tolerance)
-    if at is None or ssm.time_invariant:
+    # Where breakpoints of known inputs are traced, so are the places of requested times: they are nodes of one grid.
+    if at is None or ssm.time_invariant or checks.traced(joint.since):
         return SmoothingGrids(joint, None, None, None, joint.requested_times)
     known = np.asarray(times, float)
     beyond = np.array([])

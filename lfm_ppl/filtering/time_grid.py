@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -11,10 +11,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import checks
+from lfm_ppl.model.inputs import InputRead, breakpoints_within
 from lfm_ppl.model.state_space import Span, StateSpaceModel, check_times, inset
 
 _LARGEST_TABLE = 1024
 """Most interval lengths whose transitions are tabulated ahead of the scan; more are computed interval by interval."""
+
+_OVERHEAD, _OVERHEAD_OF_EXACT = 2.0, 10.0
+"""What an interval costs besides its steps, in steps; those of an exact model integrate known inputs alone."""
+
+_STEPS_OF_PULSE = 4
+"""Steps over a short part of an interval, where breakpoints are few."""
 
 _REPLICATED = 0.2
 """Share of intervals of length zero from which a branch costs less than the predictions that it saves."""
@@ -126,12 +133,108 @@ def _laid_out(ssm: StateSpaceModel, times: Any, steps: int, max_step: float | No
         requested = None if at is None else checks.concrete(at)
         last = known[-1] if requested is None else max(known[-1], requested.max(initial=known[-1]))
         ssm.model.check_inputs(float(origin), float(last if until is None else until))
-    if known is not None and origin is None and ssm.stack.jump_times and max_step is None and at is None:
-        return _traced_origin(known, start, ssm.stack.jump_times, steps, interval_per_step)
     if known is None or origin is None:
-        return _traced(ssm, times, steps, max_step, at, initial_time, interval_per_step)
+        reads = ssm.model.input_reads(*(0.0, 1.0) if known is None else (float(known[0]), float(known[-1])))
+        jumps = ssm.stack.jump_times
+        if known is not None and jumps and max_step is None and at is None:
+            grid = _traced_origin(known, start, jumps, steps, interval_per_step)
+        else:
+            grid = _traced(ssm, times, steps, max_step, at, initial_time, interval_per_step)
+        if not reads:
+            return grid
+        row = grid.intervals
+        grid = grid._replace(intervals=row._replace(inset=inset(row.start, row.end, row.length, _scale(reads))))
+        return _divided(grid, jnp.concatenate([jnp.asarray(read.breakpoints(), float) for read in reads]),
+                        _scale(reads))
+    end = float(known[-1] if at is None else max(known[-1], np.max(np.asarray(at, float), initial=known[-1])))
+    reads = ssm.model.input_reads(float(origin), end)
+    breakpoints, moving = breakpoints_within(reads, float(origin), end)
     longest = longest_step(ssm, known, float(origin), steps) if max_step is None and not adaptive else max_step
-    return _concrete(known, float(origin), ssm.stack.jump_times, steps, longest, at, interval_per_step)
+    overhead = _OVERHEAD_OF_EXACT if ssm.time_invariant else _OVERHEAD
+    cutting = Cutting(steps, longest, interval_per_step, breakpoints, len(moving), overhead, adaptive, _scale(reads))
+    return _divided(_concrete(known, float(origin), ssm.stack.jump_times, at, cutting), moving, _scale(reads))
+
+
+class Cutting(NamedTuple):
+    """How the time between two observations is cut into intervals.
+
+    Attributes:
+        steps: integration steps between two consecutive times.
+        max_step: longest step; None: any.
+        interval_per_step: give every step an interval of its own.
+        breakpoints: times at which known inputs jump or have a kink.
+        moving: number of such times that are traced.
+        overhead: what an interval costs besides its steps, in steps.
+        adaptive: whether the length of steps follows the moments.
+        scale: see `lfm_ppl.model.state_space.inset`.
+    """
+
+    steps: int
+    max_step: float | None
+    interval_per_step: bool
+    breakpoints: np.ndarray
+    moving: int
+    overhead: float
+    adaptive: bool
+    scale: Any
+
+    def steps_of(self, gap: np.ndarray, base: np.ndarray, cuts: np.ndarray) -> np.ndarray:
+        """Return how many steps intervals (N,) take at least.
+
+        Args:
+            gap: (N,) lengths of the intervals.
+            base: (N,) lengths of the intervals without breakpoints that they are parts of.
+            cuts: (N,) numbers of breakpoints in these.
+        """
+        pieces = np.ones(len(gap), int)
+        if self.max_step is not None:
+            pieces = np.maximum(1, np.ceil(base / (self.max_step * self.steps) * (1 - 1e-12)).astype(int))
+        share = gap / np.where(base > 0, base, 1.0)
+        # A short pulse moves the state far; it takes more than one step where few breakpoints make that cheap.
+        least = np.clip(self.steps // (cuts + 1), 1, _STEPS_OF_PULSE)
+        partial = np.maximum(least, np.ceil(share * pieces * self.steps * (1 - 1e-9)).astype(int))
+        return np.where(cuts > 0, partial, pieces * self.steps)
+
+    def steps_per_interval(self, count: np.ndarray) -> int:
+        """Return the number of steps of each interval at which intervals that need ``count`` (N,) steps cost least."""
+        if self.interval_per_step:
+            return 1
+        if self.adaptive or not (len(self.breakpoints) or self.moving):
+            return self.steps
+        cost = [(np.ceil(count / steps).sum() + self.moving) * (steps + self.overhead)
+                for steps in range(1, self.steps + 1)]
+        return int(np.argmin(cost)) + 1
+
+
+def _scale(reads: Sequence[InputRead]) -> Any:
+    """Return the size of the numbers that inputs compare times with."""
+    sizes = [read.scale for read in reads]
+    return sum(sizes) if sizes else 0.0
+
+
+def _divided(grid: TimeGrid, breakpoints: Any, scale: Any) -> TimeGrid:
+    """Return a time grid whose intervals end at traced breakpoints (K,), too.
+
+    Their number is that of all breakpoints, wherever they lie: those outside of the grid's times end intervals of
+    length zero. The sorted times are continuous in the breakpoints, and differentiable but where two meet.
+    """
+    if not np.shape(breakpoints)[0]:
+        return grid
+    row, origin = grid.intervals, jnp.asarray(grid.initial_time, float)
+    ends = jnp.append(jnp.asarray(grid.since)[1:], jnp.asarray(grid.since)[-1] + row.length[-1])
+    within = jnp.clip(breakpoints - origin, 0.0, ends[-1])
+    every = jnp.concatenate([ends, within])
+    order = jnp.argsort(jax.lax.stop_gradient(every), stable=True)
+    position = jnp.argsort(order)
+    since_end = every[order]
+    since = jnp.concatenate([jnp.zeros(1), since_end[:-1]])
+    end = jnp.concatenate([jnp.asarray(row.end), origin + within])[order]
+    start = jnp.concatenate([jnp.reshape(origin, (1,)), end[:-1]])
+    nothing = np.full(np.shape(breakpoints)[0], -1)
+    observation, jump = (jnp.concatenate([jnp.asarray(a), nothing])[order] for a in (row.observation, row.jump))
+    intervals = intervals_between(start, end, since_end - since, observation, jump, scale=scale)
+    return grid._replace(intervals=intervals, lengths=None, observed=position[jnp.asarray(grid.observed)],
+                         requested=position[jnp.asarray(grid.requested)], since=since)
 
 
 def longest_step(ssm: StateSpaceModel, times: Any, origin: Any, steps: int) -> float | None:
@@ -201,8 +304,7 @@ def _traced_origin(times: np.ndarray, origin: Any, jumps: tuple[float, ...], ste
     return TimeGrid(intervals, None, observed, observed, times, steps, origin, since=begin - origin)
 
 
-def _concrete(times: np.ndarray, origin: float, jumps: tuple[float, ...], steps: int, max_step: float | None,
-              at: Any, interval_per_step: bool) -> TimeGrid:
+def _concrete(times: np.ndarray, origin: float, jumps: tuple[float, ...], at: Any, cutting: Cutting) -> TimeGrid:
     requested = times if at is None else _requested(at, origin)
     # An interval ends at each observation, each jump after the origin, and each requested time that is neither.
     extra = np.setdiff1d(requested, times)
@@ -212,7 +314,7 @@ def _concrete(times: np.ndarray, origin: float, jumps: tuple[float, ...], steps:
     jump_time = np.asarray(jumps, float)[jump_index]
     # A particle smoother looks at each step: a jump has an interval of its own, so that the state just before it is a
     # node.
-    before = jump_time if interval_per_step else jump_time[:0]
+    before = jump_time if cutting.interval_per_step else jump_time[:0]
     time = np.concatenate([before, jump_time, times, extra])
     # At equal times a jump comes before an observation.
     rank = np.repeat([0, 1, 2, 3], [len(before), len(jump_time), len(times), len(extra)])
@@ -222,14 +324,18 @@ def _concrete(times: np.ndarray, origin: float, jumps: tuple[float, ...], steps:
     jump[rank == 1] = jump_index
     order = np.lexsort((observation, rank, time))
     time, observation, jump = time[order], observation[order], jump[order]
+    base = np.diff(time, prepend=origin)
+    cuts, added = np.zeros(len(time), int), _apart(cutting.breakpoints, np.append(origin, time), cutting.scale)
+    if len(added):
+        place = np.searchsorted(time, added)
+        cuts = np.bincount(place, minlength=len(time))
+        time, observation, jump, base, cuts = (np.insert(a, place, b) for a, b in (
+            (time, added), (observation, -1), (jump, -1), (base, base[place]), (cuts, cuts[place])))
     begin = np.append(origin, time[:-1])
     gap = time - begin
-    pieces = np.ones(len(time), int)
-    if max_step is not None:
-        pieces = np.maximum(1, np.ceil(gap / (max_step * steps) * (1 - 1e-12)).astype(int))
-    if interval_per_step:
-        pieces = np.where(gap > 0, pieces * steps, 1)
-        steps = 1
+    count = cutting.steps_of(gap, base, cuts)
+    steps = cutting.steps_per_interval(count)
+    pieces = np.where((gap > 0) | (not cutting.interval_per_step), -(-count // steps), 1)
     event = np.repeat(np.arange(len(time)), pieces)
     piece = np.arange(len(event)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
     width = (gap / pieces)[event]
@@ -238,7 +344,7 @@ def _concrete(times: np.ndarray, origin: float, jumps: tuple[float, ...], steps:
     start = begin[event] + piece * width
     end = np.where(last, time[event], np.append(start[1:], time[-1]))
     intervals = intervals_between(start, end, width, np.where(last, observation[event], -1),
-                                  np.where(last, jump[event], -1), length_index)
+                                  np.where(last, jump[event], -1), length_index, cutting.scale)
     row_of_event = np.flatnonzero(last)
     observed = np.empty(len(times), int)
     observed[observation[observation >= 0]] = row_of_event[observation >= 0]
@@ -246,6 +352,19 @@ def _concrete(times: np.ndarray, origin: float, jumps: tuple[float, ...], steps:
     replicated = bool(np.mean(width == 0) >= _REPLICATED)
     return TimeGrid(intervals, lengths, observed, found, requested, steps, np.asarray(origin), replicated,
                     since=(begin - origin)[event] + piece * width)
+
+
+def _apart(breakpoints: np.ndarray, times: np.ndarray, scale: Any) -> np.ndarray:
+    """Return the breakpoints that are not a time, or another breakpoint, up to rounding."""
+    if not len(breakpoints):
+        return breakpoints
+    known = checks.concrete(scale)
+    # No more than that of t + lag: at unix times a short pulse has a width of some units of rounding.
+    rounding = np.finfo(float).eps * max(np.abs(times).max(), 0.0 if known is None else float(known))
+    after = np.searchsorted(times, breakpoints).clip(1, len(times) - 1)
+    near = np.minimum(np.abs(times[after] - breakpoints), np.abs(times[after - 1] - breakpoints)) <= rounding
+    apart = breakpoints[~near]
+    return apart[np.diff(apart, prepend=-np.inf) > rounding]
 
 
 def _requested(at: Any, origin: float) -> np.ndarray:

@@ -175,7 +175,8 @@ def choose_grid(models: LatentForceModel | Sequence[LatentForceModel], times: An
         ssm = _checked(model)
         problems.append(GridProblem(ssm, build_time_grid(ssm, times, steps)))
         if problems[-1].time_grid.lengths is None and checks.concrete(problems[-1].time_grid.intervals.length) is None:
-            raise ValueError("the grid is chosen before compilation: times and initial_time must be known.")
+            raise ValueError("the grid is chosen before compilation: times, initial_time and the lag of a known "
+                             "input must be known.")
     y = checks.unmask(y)
     y = jnp.asarray(y) if np.ndim(y) == 3 else y
     sets = [_observations(problems[0].ssm, problems[0].time_grid, one) for one in (y if np.ndim(y) == 3 else [y])]

@@ -60,7 +60,7 @@ from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation_noise import noisy_observation
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.resolution import check_resolution
-from lfm_ppl.model.simulate import simulate_on
+from lfm_ppl.model.simulate import input_breakpoints, simulate_on
 from lfm_ppl.model.state_space import StateSpaceModel, check_times, state_space
 
 SIMULATION_STEPS = 5
@@ -368,8 +368,9 @@ class MarginalLikelihood(dist.Distribution):
         if self.constrained:
             return repeated(self._constrained_sample, key, sample_shape)
         start = jnp.asarray(self.time_grid.initial_time, float)
+        breakpoints = input_breakpoints(self.model, checks.concrete(self.times), self.time_grid.initial_time)
         run = lambda k: simulate_on(self.ssm, k, jnp.asarray(self.times, float), start,  # noqa: E731
-                                    SIMULATION_STEPS * self.steps).y
+                                    SIMULATION_STEPS * self.steps, breakpoints).y
         return repeated(run, key, sample_shape)
 
     def _constrained_sample(self, key: jax.Array) -> jax.Array:

@@ -22,7 +22,7 @@ from lfm_ppl.inference.random_keys import split_keys
 from lfm_ppl.linalg import semidefinite_root
 from lfm_ppl.model.observation_noise import expected_observation, noisy_observation, with_noise
 from lfm_ppl.model.observations.family import ObservationFamily
-from lfm_ppl.model.simulate import simulate_onwards
+from lfm_ppl.model.simulate import input_breakpoints, simulate_onwards
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.particles.particle_filter import ParticleSettings
 from lfm_ppl.particles.particle_smoother import TRACING, draw_trajectories
@@ -282,7 +282,9 @@ def _onwards(distribution: MarginalLikelihood, states: jax.Array, when: jax.Arra
              key: jax.Array) -> jax.Array:
     """Return the joint states (L, n) with those that are not ``known`` (L,) simulated from the last one that is."""
     order = np.arange(plan.rows) if plan.times is None else np.argsort(plan.times, kind="stable")
-    path = simulate_onwards(distribution.ssm, key, states[order], when[order], known[order], plan.steps)
+    # Nothing is simulated before the first time, and what lies after the last one changes nothing.
+    breakpoints = input_breakpoints(distribution.model, None, None)
+    path = simulate_onwards(distribution.ssm, key, states[order], when[order], known[order], plan.steps, breakpoints)
     return jnp.zeros_like(states).at[order].set(path)
 
 

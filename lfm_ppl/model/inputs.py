@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -38,9 +39,10 @@ class Input(eqx.Module):
         >>> float(heater(1.5)), float(Input([0.0, 1.0], [0.0, 5.0], "linear")(0.5))
         (5.0, 2.5)
 
-    A jump inside an interval lowers the order of the integration there; put the times of jumps among the observation
-    times (with missing observations) where that matters. At such a time the interval before it sees the value before
-    the jump, the interval after it the value after.
+    Jumps of "previous" and kinks of "linear" between two observations divide the integration there, where the dynamics
+    reads the input at ``t``, or at ``t - lag``. The lag may be a parameter: the log likelihood and its derivative with
+    respect to the lag are those of the divided interval. The interval before a jump sees the value before it, the
+    interval after it the value after.
     """
 
     times: jax.Array
@@ -55,8 +57,8 @@ class Input(eqx.Module):
         checks.one_of("outside", outside, _OUTSIDE)
         checks.finite("input times", times)
         checks.finite("input values", values)
-        self.times = jnp.atleast_1d(jnp.asarray(times, float))
-        self.values = jnp.asarray(values, float)
+        # In compiled code jnp.asarray makes tracers of numbers; the time grid needs to know where the table jumps.
+        self.times, self.values = jnp.atleast_1d(_as_array(times)), _as_array(values)
         self.interpolation, self.outside, self.name = interpolation, outside, name
         if self.times.ndim != 1 or self.times.size == 0 or self.values.shape[:1] != self.times.shape:
             raise ValueError(f"input values must have one row a time, and at least one: {self.times.shape} times, "
@@ -69,6 +71,107 @@ class Input(eqx.Module):
     def __call__(self, t: Any) -> jax.Array:
         """Return the input at time ``t``: a scalar, or (C,)."""
         return _reader(self.interpolation, self.outside, self.name)(self.times, self.values, t)
+
+
+def _as_array(values: Any) -> jax.Array:
+    with contextlib.nullcontext() if checks.traced(values) else jax.ensure_compile_time_eval():
+        return jnp.atleast_1d(jnp.asarray(values, float)) if np.ndim(values) else jnp.asarray(values, float)
+
+
+class InputRead(NamedTuple):
+    """A known input that a function reads at the time ``slope * t + offset``.
+
+    Attributes:
+        interpolation: of the input.
+        times, values: its table.
+        slope, offset: a lag is ``-offset``; they may be traced.
+    """
+
+    interpolation: str
+    times: Any
+    values: Any
+    slope: Any
+    offset: Any
+
+    @property
+    def scale(self) -> Any:
+        """The size of the numbers that the model's time is compared with."""
+        xp = jnp if checks.traced((self.times, self.slope, self.offset)) else np
+        return xp.maximum(xp.max(xp.abs(self.times)), xp.max(xp.abs(self.offset))) / xp.abs(self.slope)
+
+    def breakpoints(self) -> Any:
+        """Return the model's times (K,) at which the input jumps or has a kink."""
+        times = self.times
+        values = checks.concrete(self.values)
+        if np.shape(times)[0] < 2:
+            return np.zeros(0)
+        if values is None or checks.traced(times):
+            times = times[1:] if self.interpolation == "previous" else times
+        elif self.interpolation == "previous":
+            times = times[1:][(np.diff(values, axis=0) != 0).reshape(len(times) - 1, -1).any(axis=1)]
+        else:
+            columns = values.reshape(len(times), -1)
+            slopes = np.pad(np.diff(columns, axis=0) / np.diff(times)[:, None], ((1, 1), (0, 0)))
+            rounding = _COLLINEAR * (np.abs(slopes[1:]) + np.abs(slopes[:-1]))
+            times = times[(np.abs(np.diff(slopes, axis=0)) > rounding).any(axis=1)]
+        return (times - self.offset) / self.slope
+
+
+def input_reads(functions: Sequence[Traced], first: float, last: float) -> list[InputRead]:
+    """Return which known inputs functions read, and when.
+
+    Args:
+        functions: of (x, u, t) or of t.
+        first: a time of the model.
+        last: a later one.
+
+    Raises:
+        ValueError: an input is read at a time that depends on a parameter, but not as ``t - lag``.
+
+    Warns:
+        UserWarning: an input is read at another function of time.
+    """
+    found = []
+    generator = np.random.default_rng(0)
+    trials = (0.0, 1.0, first, 0.37 * first + 0.63 * last, last)
+    for function in functions:
+        consts = function.closed.consts
+        # Numbers in the place of tracers tell whether the time is affine in t.
+        tried = [generator.uniform(0.5, 1.5, np.shape(value)).astype(value.dtype)
+                 if isinstance(value, jax.core.Tracer) else value for value in consts]
+        calls = zip(*(function.table_calls(_MARK, t, tried) for t in trials), strict=True)
+        exact = zip(*(function.table_calls(_MARK, t, consts) for t in (0.0, 1.0)), strict=True)
+        for trial, ((name, times, values, at_zero), (*_, at_one)) in zip(calls, exact, strict=True):
+            reads = [call[-1] for call in trial]
+            if times is None or any(read is None for read in (*reads, at_zero, at_one)):
+                continue  # it depends on the state, or on what a loop changes
+            interpolation, _, called = name[name.index(_MARK) + len(_MARK):].split("_", 2)
+            slope = reads[1] - reads[0]
+            error = max(np.max(np.abs(read - reads[0] - slope * t)) for read, t in zip(reads, trials, strict=True))
+            size = max(np.max(np.abs(read)) for read in reads) + np.max(np.abs(slope)) * max(np.abs(trials))
+            if error > 1e-9 * size or np.any(slope == 0):
+                _refuse_read(function.what, called, checks.traced((at_zero, at_one)), bool(np.all(slope == 0)))
+                continue
+            # That of a random parameter is one by no chance.
+            unit = np.all(np.abs(slope - 1.0) < 1e-9)
+            flat = [jnp.ravel(a) if checks.traced(a) else np.ravel(a) for a in (at_zero, at_one)]
+            for index in range(np.size(reads[0])):
+                begin, end = (a[index] for a in flat)
+                found.append(InputRead(interpolation, times, values, 1.0 if unit else end - begin, begin))
+    return found
+
+
+def _refuse_read(what: str, called: str, traced: bool, constant: bool) -> None:
+    """Raise or warn where an input is read at a time that is not t minus a lag."""
+    if constant:
+        return
+    label = f"the known input {f'{called!r} ' if called else ''}in {what}"
+    if traced:
+        raise ValueError(f"{label} is read at a time that depends on a parameter, such as a lag, but not as t - lag: "
+                         "where it jumps, the derivative with respect to the lag would be wrong. Read it at t - lag, "
+                         "or fix the lag.")
+    checks.warn(f"{label} is read at a time that is not t minus a constant, so that its jumps between two observations "
+                "are not found and may be stepped over. Read it at t, with a table over all times of the model.")
 
 
 def check_reads(functions: Sequence[Traced], first: float, last: float) -> None:
@@ -100,6 +203,28 @@ def check_reads(functions: Sequence[Traced], first: float, last: float) -> None:
         checks.warn(f"{'; '.join(sorted(beyond['warn']))}. {remedy}")
 
 
+def breakpoints_within(reads: Sequence[InputRead], first: float, last: float) -> tuple[np.ndarray, Any]:
+    """Return the times at which inputs jump or have a kink.
+
+    Args:
+        reads: of the inputs.
+        first: no breakpoint at or before it is of account.
+        last: none at or after it.
+
+    Returns:
+        Those between both that are known before compilation, in order; and all those (K,) that are traced.
+    """
+    times = [read.breakpoints() for read in reads]
+    known = np.unique(np.concatenate([t for t in times if not checks.traced(t)] or [np.zeros(0)]))
+    moving = [t for t in times if checks.traced(t)]
+    return known[(known > first) & (known < last)], jnp.concatenate(moving) if moving else np.zeros(0)
+
+
+def has_inputs(function: Traced) -> bool:
+    """Whether a function reads a known input."""
+    return function.has(_MARK)
+
+
 def reads_inputs(function: Traced) -> bool:
     """Whether a function reads a known input that does not simply hold beyond its table."""
     return any(function.has(f"{_MARK}{way}_{outside}_") for way in _INTERPOLATIONS for outside in _OUTSIDE
@@ -123,6 +248,9 @@ def _reader(interpolation: str, outside: str, name: str) -> Callable[..., jax.Ar
     read.__name__ = read.__qualname__ = f"{_MARK}{interpolation}_{outside}_{name}"
     return jax.jit(read)
 
+
+_COLLINEAR = 1e-10
+"""Change of a slope, as a share of its size, below which a linear input has no kink."""
 
 _MARK = "known_input_"
 _INTERPOLATIONS = ("previous", "linear")

@@ -13,7 +13,7 @@ import numpy as np
 from lfm_ppl import checks
 from lfm_ppl.forces.sde import Force
 from lfm_ppl.model.gaussian import Gaussian
-from lfm_ppl.model.inputs import check_reads, reads_inputs
+from lfm_ppl.model.inputs import InputRead, check_reads, has_inputs, input_reads, reads_inputs
 from lfm_ppl.model.observation import GaussianObservation
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.user_functions import Traced, trace
@@ -75,6 +75,7 @@ class LatentForceModel(eqx.Module):
     output_names: tuple[str, ...] = eqx.field(static=True)
     unit_items: tuple[tuple[str, str], ...] = eqx.field(static=True)
     _reads_inputs: bool = eqx.field(static=True)
+    _integrates_inputs: bool = eqx.field(static=True)
     _with_roots: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(
@@ -117,6 +118,7 @@ class LatentForceModel(eqx.Module):
             checks.one_of("name in nonlinear_inputs", name, (*self.state_names, *self.force_names))
         self._with_roots = tuple(name for name, function in functions.items() if function.takes_roots)
         self._reads_inputs = any(reads_inputs(function) for function in functions.values())
+        self._integrates_inputs = any(has_inputs(function) for function in _integrated(functions))
         self._check_precision()
         if self.initial_time is not None or not any(
                 function.depends_on_time for name, function in functions.items() if not name.startswith("determin")):
@@ -244,6 +246,10 @@ class LatentForceModel(eqx.Module):
         if self._reads_inputs:
             check_reads(tuple(self._traced().values()), first, last)
 
+    def input_reads(self, first: float, last: float) -> list[InputRead]:
+        """Return which known inputs are integrated, and when they are read; see `lfm_ppl.model.inputs.input_reads`."""
+        return input_reads(_integrated(self._traced()), first, last) if self._integrates_inputs else []
+
     def _check_finite(self, time: Any) -> None:
         """Try the functions at the prior mean, where that is known; ``time`` is None where it does not matter."""
         x = self.initial_state.mean
@@ -288,6 +294,12 @@ class LatentForceModel(eqx.Module):
             checks.warn(f"the derivative of the {label} is not finite {where}: that of the entry for "
                         f"{names[int(np.argmin(finite))]!r}. Likelihood and gradient may not be finite either. Change "
                         "initial_state.mean, or guard the expression (for example jnp.sqrt(jnp.maximum(x, 1e-6))).")
+
+
+def _integrated(functions: Mapping[str, Traced]) -> list[Traced]:
+    """Return the functions that are evaluated between two observations."""
+    return [function for name, function in functions.items()
+            if name in ("dynamics", "process_noise") or name.startswith("mean of ")]
 
 
 def _functions(given: Mapping[str, Callable] | None, taken: set[str]) -> dict[str, Callable]:

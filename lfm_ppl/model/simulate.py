@@ -11,6 +11,7 @@ import numpy as np
 
 from lfm_ppl import checks
 from lfm_ppl.linalg import matmul, semidefinite_root
+from lfm_ppl.model.inputs import breakpoints_within
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation_noise import noisy_observation
 from lfm_ppl.model.state_space import Span, StateSpaceModel, check_times, state_space
@@ -71,24 +72,80 @@ def simulate(key: jax.Array, model: LatentForceModel, times: Any, steps: int = 5
     model.check_at(times[0] if model.initial_time is None else model.initial_time, np.shape(times)[0])
     times = jnp.asarray(times, float)
     start = times[0] if model.initial_time is None else jnp.asarray(model.initial_time, float)
-    run = lambda key, times, start: simulate_on(ssm, key, times, start, steps)  # noqa: E731
-    traced = checks.traced((model, times, key))
+    breakpoints = input_breakpoints(model, known, start)
+    run = lambda key, times, start: simulate_on(ssm, key, times, start, steps, breakpoints)  # noqa: E731
+    traced = checks.traced((model, times, key, breakpoints))
     return (run if traced else jax.jit(run))(key, times, start)
 
 
-def simulate_on(ssm: StateSpaceModel, key: jax.Array, times: jax.Array, start: jax.Array, steps: int) -> Simulation:
-    """The same for a state-space model, without checks; for compiled code."""
+def input_breakpoints(model: LatentForceModel, times: Any, start: Any) -> Any:
+    """Return the times (K,) at which known inputs of a model jump or have a kink.
+
+    Args:
+        model: the latent force model.
+        times: (T,), in order; where they and the start are known, breakpoints outside of them are left out.
+        start: initial time.
+    """
+    if times is None or checks.traced((times, start)):
+        reads = model.input_reads(0.0, 1.0)
+        return jnp.concatenate([jnp.zeros(0), *(jnp.asarray(read.breakpoints(), float) for read in reads)])
+    first, last = float(np.min(start)), float(times[-1])
+    known, moving = breakpoints_within(model.input_reads(first, last), first, last)
+    return jnp.concatenate([known, moving]) if len(moving) else known
+
+
+class _Nodes(NamedTuple):
+    """Times of a simulation, those of the rows among them.
+
+    Attributes:
+        times: (N,), in order.
+        rows: (T,) indices of the rows.
+        origin: (N,) index of each among rows, pieces and breakpoints one after another; a row if below T.
+        steps: integration steps up to each time.
+    """
+
+    times: jax.Array
+    rows: Any
+    origin: Any
+    steps: int
+
+
+def _nodes(start: jax.Array, times: jax.Array, breakpoints: Any, steps: int) -> _Nodes:
+    """Return the rows, and the breakpoints of known inputs between them."""
+    count, extra = times.shape[0], np.shape(breakpoints)[0]
+    if not extra:
+        return _Nodes(times, np.arange(count), np.arange(count), steps)
+    # Rows in a few pieces of fewer steps each make it cheap to divide them at many breakpoints.
+    cost = [(count * -(-steps // part) + extra) * (part + 1) for part in range(1, steps + 1)]
+    part = int(np.argmin(cost)) + 1
+    pieces = -(-steps // part)
+    begin = jnp.concatenate([jnp.reshape(start, (1,)), times[:-1]])
+    share = np.arange(1, pieces) / pieces
+    between = (begin[:, None] + (times - begin)[:, None] * share).ravel()
+    every = jnp.concatenate([times, between, jnp.clip(jnp.asarray(breakpoints), start, times[-1])])
+    order = jnp.argsort(jax.lax.stop_gradient(every), stable=True)
+    return _Nodes(every[order], jnp.argsort(order)[:count], order, part)
+
+
+def simulate_on(ssm: StateSpaceModel, key: jax.Array, times: jax.Array, start: jax.Array, steps: int,
+                breakpoints: Any = ()) -> Simulation:
+    """The same for a state-space model, without checks; for compiled code.
+
+    ``breakpoints`` (K,) are those of `input_breakpoints`.
+    """
     initial, path, noise = jax.random.split(key, 3)
     mean, covariance = ssm.initial()
     first = mean + matmul(semidefinite_root(covariance), jax.random.normal(initial, (ssm.state_dim, 1)))[:, 0]
-    starts = jnp.concatenate([jnp.reshape(start, (1,)), times[:-1]])
-    advance = _interval(ssm, steps)
+    nodes = _nodes(start, times, breakpoints, steps)
+    starts = jnp.concatenate([jnp.reshape(start, (1,)), nodes.times[:-1]])
+    advance = _interval(ssm, nodes.steps)
 
     def row(state: jax.Array, inputs: tuple) -> tuple[jax.Array, jax.Array]:
         state = advance(state, *inputs)
         return state, state
 
-    _, states = jax.lax.scan(row, first, (starts, times, jax.random.split(path, times.shape[0])))
+    _, states = jax.lax.scan(row, first, (starts, nodes.times, jax.random.split(path, nodes.times.shape[0])))
+    states = states[nodes.rows]
     inputs = jax.vmap(ssm.inputs)(states, times)
     y = jax.vmap(lambda w, t, k, index: noisy_observation(ssm, w, t, k, index))(
         inputs, times, jax.random.split(noise, times.shape[0]), jnp.arange(times.shape[0]))
@@ -98,7 +155,7 @@ def simulate_on(ssm: StateSpaceModel, key: jax.Array, times: jax.Array, start: j
 
 
 def simulate_onwards(ssm: StateSpaceModel, key: jax.Array, states: jax.Array, times: jax.Array, known: jax.Array,
-                     steps: int) -> jax.Array:
+                     steps: int, breakpoints: Any = ()) -> jax.Array:
     """Simulate the joint state on from where it is known; for compiled code.
 
     Args:
@@ -108,11 +165,17 @@ def simulate_onwards(ssm: StateSpaceModel, key: jax.Array, states: jax.Array, ti
         times: (K,), non-decreasing.
         known: (K,) Booleans; the first state counts as known.
         steps: integration steps between two consecutive times.
+        breakpoints: of known inputs, see `input_breakpoints`.
 
     Returns:
         (K, n): the known states, and each of the others simulated from the one before it.
     """
-    advance = _interval(ssm, steps)
+    nodes = _nodes(times[0], times, breakpoints, steps)
+    advance = _interval(ssm, nodes.steps)
+    if np.shape(breakpoints)[0]:
+        is_row = nodes.origin < times.shape[0]
+        index = jnp.minimum(nodes.origin, times.shape[0] - 1)
+        states, known, times = states[index], known[index] & is_row, nodes.times
 
     def row(state: jax.Array, inputs: tuple) -> tuple[jax.Array, jax.Array]:
         begin, end, row_key, given, is_known = inputs
@@ -121,7 +184,7 @@ def simulate_onwards(ssm: StateSpaceModel, key: jax.Array, states: jax.Array, ti
 
     keys = jax.random.split(key, times.shape[0] - 1)
     _, rest = jax.lax.scan(row, states[0], (times[:-1], times[1:], keys, states[1:], known[1:]))
-    return jnp.concatenate([states[:1], rest])
+    return jnp.concatenate([states[:1], rest])[nodes.rows]
 
 
 def _interval(ssm: StateSpaceModel, steps: int) -> Callable[..., jax.Array]:

@@ -133,6 +133,21 @@ class Traced(NamedTuple):
             if known[0] is not None and known[1] is not None:
                 yield name, known[0], known[1]
 
+    def table_calls(self, mark: str, t: float, consts: Sequence[Any]) -> Iterator[tuple[str, Any, Any, Any]]:
+        """Yield (name, table times, values, times at which it is read) as `table_reads` does, branches included.
+
+        Args:
+            mark: begins the name of such a function ``(table times, values, t)``.
+            t: the last argument.
+            consts: values of the constants of the jaxpr, tracers too. What is not known is None.
+        """
+        arguments = [*[None] * (len(self.closed.jaxpr.invars) - 1), np.asarray(t, float)]
+        scope = _Scope(self.closed.jaxpr, consts, lambda index: arguments[index], lambda index: index, tracers=True)
+        for inner, equation in scope.equations():
+            name = str(equation.params.get("name", ""))
+            if mark in name:
+                yield name, *(inner.known(operand) for operand in equation.invars[-3:])
+
     def has(self, mark: str) -> bool:
         """Whether a function jitted under a name with ``mark`` is called."""
         scope = _Scope.of(self.closed, [None] * len(self.closed.jaxpr.invars))
@@ -199,11 +214,11 @@ class _Scope:
     """A jaxpr whose values are worked out on demand, from constants and what is known of its arguments."""
 
     def __init__(self, jaxpr: Any, consts: Sequence[Any], outer: Callable[[int], Any],
-                 source: Callable[[int], int | None]):
-        self.jaxpr, self.outer, self.source = jaxpr, outer, source
+                 source: Callable[[int], int | None], tracers: bool = False):
+        self.jaxpr, self.outer, self.source, self.tracers = jaxpr, outer, source, tracers
         self.values: dict[Any, Any] = {}
         for variable, value in zip(jaxpr.constvars, consts, strict=True):
-            self.values[variable] = None if isinstance(value, jax.core.Tracer) else value
+            self.values[variable] = None if isinstance(value, jax.core.Tracer) and not tracers else value
         self.position = {variable: index for index, variable in enumerate(jaxpr.invars)}
         self.producer = {variable: (equation, index) for equation in jaxpr.eqns
                          for index, variable in enumerate(equation.outvars)}
@@ -235,7 +250,7 @@ class _Scope:
         if atom not in self.values:
             self.values[atom] = self._found(atom, depth)
         value = self.values[atom]
-        return None if value is None else np.asarray(value)
+        return value if value is None or isinstance(value, jax.core.Tracer) else np.asarray(value)
 
     def argument(self, atom: Any) -> int | None:
         """Return which argument of the outermost function a variable is, None where it is none."""
@@ -243,10 +258,12 @@ class _Scope:
         return None if position is None else self.source(position)
 
     def _found(self, atom: Any, depth: int) -> Any:
-        if depth > _DEEPEST or math.prod(atom.aval.shape) > _LARGEST:
+        if depth > _DEEPEST:
             return None
         if atom in self.position:
             return self.outer(self.position[atom])
+        if math.prod(atom.aval.shape) > _LARGEST:
+            return None
         if atom not in self.producer:
             return None
         equation, index = self.producer[atom]
@@ -256,6 +273,9 @@ class _Scope:
         operands = [self.known(operand, depth + 1) for operand in equation.invars]
         if any(operand is None for operand in operands):
             return None
+        if any(isinstance(operand, jax.core.Tracer) for operand in operands):
+            value = equation.primitive.bind(*operands, **equation.params)
+            return value[index] if equation.primitive.multiple_results else value
         with jax.ensure_compile_time_eval():
             value = equation.primitive.bind(*operands, **equation.params)
         return np.asarray(value[index] if equation.primitive.multiple_results else value)
@@ -276,7 +296,7 @@ class _Scope:
         operands = equation.invars[skip:]
         return _Scope(getattr(body, "jaxpr", body), getattr(body, "consts", ()),
                       lambda index: self.known(operands[index]) if index < count else None,
-                      lambda index: self.argument(operands[index]) if index < count else None)
+                      lambda index: self.argument(operands[index]) if index < count else None, self.tracers)
 
 
 def _sliced(scope: _Scope, equation: Any) -> tuple[int, int] | None:

@@ -72,6 +72,9 @@ def decision_grid(ssm: StateSpaceModel, times: Any, decisions: Any, start: Filte
     """Return the rows, and which of them (K,) end with a decision."""
     grid = build_time_grid(ssm, times, steps, max_step, at=times if decisions is None else decisions,
                            initial_time=None if start is None else start.time)
+    if checks.traced(grid.since):
+        raise ValueError("a known input is read at t minus a traced value (a lag), but decisions need intervals that "
+                         "are known before compilation; give the lag as a number.")
     decides = np.zeros(len(np.asarray(grid.intervals.observation)), bool)
     decides[grid.requested] = True
     ssm.model.check_at(grid.initial_time, len(grid.observed))
