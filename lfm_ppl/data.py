@@ -478,12 +478,13 @@ def _looks_like_code(value: float) -> bool:
         if mantissa == "1" and int(exponent or 0) >= 10:
             return True
         whole, _, decimals = mantissa.partition(".")
-        if set(whole) == {"9"} and set(decimals) <= {"9"}:
-            # 9 and 9.9 are too usual as measurements; -9 and 9.99 are codes of fixed-width formats.
-            return value < 0 or len(whole) > 1 or len(decimals) > 1
-        if whole in ("999", "9999", "99999") and decimals == "25":  # of well logs
+        figures = set(whole + decimals)
+        # 9 and 9.9 are too usual as measurements; -9 and 9.99 are codes of fixed-width formats.
+        if figures == {"9"} and (value < 0 or len(whole) > 1 or len(decimals) > 1):
             return True
-        if mantissa in ("777", "888", "7777", "8888", "77777", "88888"):
+        if figures in ({"7"}, {"8"}) and len(whole) > (1 if value < 0 else 2):
+            return True
+        if whole in ("999", "9999", "99999") and decimals == "25":  # of well logs
             return True
     return False
 
@@ -507,6 +508,8 @@ def _codes(column: np.ndarray) -> list[float]:
             reach, gap = np.ptp(rest), np.diff(rest).max(initial=0.0)
             distance = np.maximum(rest[0] - values, values - rest[-1])
             is_far = (distance > _FAR_RANGES * reach) | ((distance > reach) & (distance > _FAR_GAPS * gap))
+            # -999 among flows of 0 to 5,000 is less than their range away from them, but negative.
+            is_far |= (values <= -99) & (rest[0] >= 0) & (distance > gap)
             if not (is_candidate & ~is_far).any():
                 return values[is_candidate].tolist()
             is_candidate &= is_far

@@ -166,8 +166,8 @@ USUAL = np.round(np.sin(np.arange(30) / 3), 3)
 
 
 @pytest.mark.parametrize("code", [
-    -9, 99, -99, 999, -99.9, 99.99, -999.25, 9999, -9999, 99999999, -888, 7777, 32767, -32768, -2147483648, 1e20, 1e30,
-    -1e34, 9.96921e36, 9.999e20, 3.4028235e38, 1.7e308, -1.7976931348623157e308,
+    -9, 99, -99, 999, -88.88, -99.9, 99.99, -999.25, 9999, -9999, 99999999, -888, 7777, 32767, -32768, -2147483648,
+    1e20, 1e30, -1e34, 9.96921e36, 9.999e20, 3.4028235e38, 1.7e308, -1.7976931348623157e308,
 ])
 @pytest.mark.parametrize("scale", [1.0, 0.01])
 def test_a_number_like_a_code_far_from_all_others_is_told(code, scale):
@@ -182,6 +182,12 @@ def test_several_codes_in_a_column_are_told():
     with pytest.warns(UserWarning) as said:
         read_table({"time": np.arange(33), "x": y}, inputs=[])
     assert len(said) == 3
+
+
+def test_a_negative_code_among_numbers_that_are_not_is_told():
+    flows = 5000 * np.linspace(0, 1, 40)**3
+    with pytest.warns(UserWarning, match=r"row 40, column 'x': -999, far"):
+        read_table({"time": np.arange(41), "x": np.append(flows, -999.0)})
 
 
 @pytest.mark.parametrize("y", [
