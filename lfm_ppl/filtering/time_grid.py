@@ -97,7 +97,7 @@ def build_time_grid(ssm: StateSpaceModel, times: Any, steps: int, max_step: floa
     """Lay out the intervals of the scan.
 
     Args:
-        ssm: the model; its forces' jump times become intervals.
+        ssm: the model; the jumps of its forces, and the jumps and kinks of its known inputs, end intervals.
         times: (T,) observation times, non-decreasing.
         steps: integration steps between two consecutive times.
         max_step: longest step; a longer interval gets more steps, in intervals of ``steps`` each. None: see
@@ -136,17 +136,18 @@ def _laid_out(ssm: StateSpaceModel, times: Any, steps: int, max_step: float | No
     if known is None or origin is None:
         reads = ssm.model.input_reads(*(0.0, 1.0) if known is None else (float(known[0]), float(known[-1])))
         jumps = ssm.stack.jump_times
+        breakpoints = jnp.concatenate([jnp.zeros(0), *(jnp.asarray(read.breakpoints(), float) for read in reads)])
+        cutting = Cutting(steps, None, interval_per_step, np.zeros(0), len(breakpoints), _OVERHEAD, adaptive,
+                          _scale(reads))
         if known is not None and jumps and max_step is None and at is None:
             grid = _traced_origin(known, start, jumps, steps, interval_per_step)
         else:
-            grid = _traced(ssm, times, steps, max_step, at, initial_time, interval_per_step)
-        if not reads:
-            return grid
+            part = cutting.steps_per_interval(np.full(np.shape(times)[0], steps))
+            grid = _traced(ssm, times, -(-steps // part), part, max_step, at, initial_time)
         row = grid.intervals
-        grid = grid._replace(intervals=row._replace(inset=inset(row.start, row.end, row.length, _scale(reads))))
-        return _divided(grid, jnp.concatenate([jnp.asarray(read.breakpoints(), float) for read in reads]),
-                        _scale(reads))
-    end = float(known[-1] if at is None else max(known[-1], np.max(np.asarray(at, float), initial=known[-1])))
+        grid = grid._replace(intervals=row._replace(inset=inset(row.start, row.end, row.length, cutting.scale)))
+        return _divided(grid, breakpoints, cutting.scale)
+    end = float(known[-1] if at is None else _requested(at, float(origin)).max(initial=known[-1]))
     reads = ssm.model.input_reads(float(origin), end)
     breakpoints, moving = breakpoints_within(reads, float(origin), end)
     longest = longest_step(ssm, known, float(origin), steps) if max_step is None and not adaptive else max_step
@@ -257,8 +258,9 @@ def longest_step(ssm: StateSpaceModel, times: Any, origin: Any, steps: int) -> f
     return 2.0 * float(np.median(gaps[gaps > 0])) / steps
 
 
-def _traced(ssm: StateSpaceModel, times: Any, steps: int, max_step: Any, at: Any, initial_time: Any,
-            interval_per_step: bool) -> TimeGrid:
+def _traced(ssm: StateSpaceModel, times: Any, pieces: int, steps: int, max_step: Any, at: Any,
+            initial_time: Any) -> TimeGrid:
+    """Lay out ``pieces`` intervals of ``steps`` each between two times."""
     if max_step is not None or at is not None or ssm.stack.jump_times:
         raise ValueError("max_step, requested times and forces with jumps need times (the first two also an "
                          "initial_time or `start`) that are known before compilation; pass NumPy arrays rather than "
@@ -266,7 +268,6 @@ def _traced(ssm: StateSpaceModel, times: Any, steps: int, max_step: Any, at: Any
     times = jnp.asarray(times, float)
     origin = times[:1] if initial_time is None else jnp.reshape(jnp.asarray(initial_time, float), (1,))
     start = jnp.concatenate([origin, times[:-1]])
-    pieces = steps if interval_per_step else 1
     width = jnp.repeat((times - start) / pieces, pieces)
     before = width * np.tile(np.arange(pieces), times.shape[0])
     since = jnp.repeat(start - origin, pieces) + before
@@ -276,7 +277,7 @@ def _traced(ssm: StateSpaceModel, times: Any, steps: int, max_step: Any, at: Any
     ends = np.arange(times.shape[0]) * pieces + pieces - 1
     observation[ends] = np.arange(times.shape[0])
     intervals = intervals_between(start, end, width, observation, np.full(observation.shape, -1))
-    return TimeGrid(intervals, None, ends, ends, times, 1 if interval_per_step else steps, origin[0], since=since)
+    return TimeGrid(intervals, None, ends, ends, times, steps, origin[0], since=since)
 
 
 def _traced_origin(times: np.ndarray, origin: Any, jumps: tuple[float, ...], steps: int,

@@ -375,6 +375,8 @@ def _steps_per_interval(ssm: StateSpaceModel, times: Any, at: Any, steps: int, s
     if at is None or known is None:
         return steps
     grid = build_time_grid(ssm, known, 1, sys.float_info.max, at)
+    if checks.traced(grid.since):  # breakpoints of a known input that are read at a lag
+        return steps
     rows, origin = grid.intervals, np.asarray(grid.initial_time)
     # Counted from the initial time, so that the origin of time does not matter.
     ends, since = grid.since + rows.length, since - origin

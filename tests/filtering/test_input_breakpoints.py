@@ -3,6 +3,8 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpyro
+import numpyro.distributions as dist
 import pytest
 from scipy.integrate import solve_ivp
 
@@ -207,3 +209,31 @@ def test_simulations_and_particles_do_not_step_over_pulses():
         process_noise=lambda x, u, t: 1e-8 * (1.0 + jnp.tanh(x) ** 2)[:, None], initial_time=0.0)
     found = lfm.particle_filter(jax.random.key(0), noisy, ROWS, Y[:, None], particles=4, steps=200)
     np.testing.assert_allclose(found.mean[:, 0], exposed(*train, ROWS), rtol=2e-2, atol=1e-2)
+
+
+@pytest.mark.parametrize("keywords", [{}, {"tolerance": 1e-3}, {"steps": 100}, {"max_step": 0.5}], ids=str)
+def test_doses_between_sparse_samples(keywords):
+    """Ten short infusions, two samples; the case of a public bug report."""
+    starts = np.array([0.0, 12.5, 24.5, 37, 48, 60.5, 72.5, 85.3, 96.5, 108.5])
+    amounts, volume, decay, width = np.array([25.0] + [3.5] * 9), 1.4, 0.0068 / 1.4, 0.1
+    rate = lfm.Input(np.ravel([starts, starts + width], "F"), np.ravel([amounts / width, 0 * amounts], "F"),
+                     "previous", "hold")
+    rows = np.array([2.0, 112.5])
+    found = means(system(lambda t: rate(t) / volume, lambda x: decay * x), rows, **keywords)
+    exact = [sum(a / width / volume / decay * -np.expm1(-decay * width) * np.exp(-decay * (t - s - width))
+                 for s, a in zip(starts, amounts, strict=True) if s < t) for t in rows]
+    np.testing.assert_allclose(found, exact, rtol=1e-9)
+
+
+def test_a_lag_is_learnt():
+    def model(times, y=None):
+        lag = numpyro.sample("lag", dist.LogNormal(0.0, 0.5))
+        numpyro.sample("y", lfm.MarginalLikelihood(system(lambda t: INFUSION(t - lag)), times), obs=y)
+
+    posterior = lfm.fit(model, ROWS, Y[:, None], sampler="map", trajectory_draws=0, progress=False)["posterior"]["lag"]
+    lags = np.linspace(1.2, 1.6, 801)
+    weight = np.exp([closed_form(lag) - 0.5 * (np.log(lag) / 0.5) ** 2 - np.log(lag) for lag in lags])
+    weight /= weight.sum()
+    mean = weight @ lags
+    np.testing.assert_allclose(posterior.mean(), mean, atol=5e-3)
+    np.testing.assert_allclose(posterior.std(), np.sqrt(weight @ (lags - mean) ** 2), rtol=0.15)
