@@ -111,4 +111,5 @@ def _measured(cavity: Marginal, y: jax.Array, variance: jax.Array) -> Tilted:
     y = jnp.where(jnp.isfinite(y), y, 0.0)
     total = cavity.variance + variance
     gain = cavity.variance / total
-    return Tilted(norm.logpdf(y, cavity.mean, jnp.sqrt(total)), cavity.mean + gain * (y - cavity.mean), gain * variance)
+    shift = gain * (y - cavity.mean)
+    return Tilted(norm.logpdf(y, cavity.mean, jnp.sqrt(total)), cavity.mean + shift, gain * variance, shift)

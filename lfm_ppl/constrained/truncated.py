@@ -43,7 +43,7 @@ def truncated_moments(cavity: Marginal, width: jax.Array | float = np.inf) -> Ti
     total = density.sum(0)
     mean = (density * x).sum(0) / total
     variance = (density * (x - mean) ** 2).sum(0) / total
-    return Tilted(log_share(cavity, width=jnp.where(bounded, width, jnp.inf)), mode + mean, variance)
+    return Tilted(log_share(cavity, width=jnp.where(bounded, width, jnp.inf)), mode + mean, variance, d + mean)
 
 
 def _bounded(m: jax.Array, width: jax.Array | float) -> tuple[jax.Array, jax.Array]:

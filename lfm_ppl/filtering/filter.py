@@ -62,6 +62,7 @@ class Pass(NamedTuple):
             n), (N, D, D).
         steps: of the integration steps of each interval, predictions (N, J, ...) or `Inside` (N, J, ...).
         site_terms: (N, ...), of updates by sites; these leave no chol and no obs_cov.
+        predictor: (N, D), predicted mean of an observation family's predictor, of updates by sites.
     """
 
     log_likelihood: jax.Array
@@ -77,6 +78,7 @@ class Pass(NamedTuple):
     obs_cov: Any = None
     steps: Any = None
     site_terms: Any = None
+    predictor: Any = None
 
 
 class Inside(NamedTuple):
@@ -383,7 +385,7 @@ def forward(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, *, s
             new = update_by_sites(affine, Sites(*given) if made is None else made.sites, one.moments)
             if made is not None:
                 new = new._replace(log_likelihood=made.log_likelihood)
-        out = Pass(new.log_likelihood)
+        out = Pass(new.log_likelihood, predictor=None if sites is None else affine.value)
         if keep != "likelihood":
             out = out._replace(predicted=one.moments, filtered=new.moments, innovation=new.innovation,
                                present=jnp.isfinite(observed), chol=new.chol, site_terms=new.site_terms)

@@ -40,12 +40,13 @@ class Tilted(NamedTuple):
         log_partition: log Z.
         mean: of f.
         variance: of f.
+        shift: the mean less that of the cavity; a difference of the two means loses it where the cavity is narrow.
     """
 
     log_partition: jax.Array
     mean: jax.Array
     variance: jax.Array
-
+    shift: jax.Array
 
 
 def _rule(count: int = _NODES, stretch: float = _STRETCH) -> tuple[np.ndarray, np.ndarray]:
@@ -86,7 +87,8 @@ def tilted_moments(log_function: Callable[[jax.Array], jax.Array], cavity: Margi
     log_total, middle, spread = (part.reshape(cavity.mean.shape) for part in (
         jnp.where(possible, largest + jnp.log(total), -jnp.inf), middle, second / total - middle**2))
     log_partition = log_total + 0.5 * (jnp.log(near.variance / cavity.variance) - _LOG_2PI)
-    return Tilted(log_partition, near.mean + jnp.sqrt(near.variance) * middle, near.variance * spread)
+    moved = jnp.sqrt(near.variance) * middle
+    return Tilted(log_partition, near.mean + moved, near.variance * spread, (near.mean - cavity.mean) + moved)
 
 
 def _log_masses(log_function: Callable[[jax.Array], jax.Array], cavity: Marginal, near: Marginal,
@@ -94,8 +96,10 @@ def _log_masses(log_function: Callable[[jax.Array], jax.Array], cavity: Marginal
     """Return the nodes x (J,), and the logarithm (J, ...) of the mass of N(f; m, v) p(f) at near.mean + near.sd x."""
     nodes, log_weights = map(jnp.asarray, _rule(_ROUGH_NODES, _ROUGH_STRETCH) if rough else _rule())
     lead = (len(nodes),) + (1,) * jnp.ndim(cavity.mean)
-    f, half = near.mean + jnp.sqrt(near.variance) * nodes.reshape(lead), -0.5 / cavity.variance
-    log_mass = log_weights.reshape(lead) + half * (f - cavity.mean) ** 2 + log_function(f)
+    half, distance = -0.5 / cavity.variance, jnp.sqrt(near.variance) * nodes.reshape(lead)
+    # Rounding a node must not enter its distance from the cavity's mean: a narrow cavity would be rounding errors.
+    log_mass = (log_weights.reshape(lead) + half * ((near.mean - cavity.mean) + distance) ** 2
+                + log_function(near.mean + distance))
     # Not a number is no mass: a link that overflows far out.
     return nodes, jnp.where(jnp.isnan(log_mass), -jnp.inf, log_mass)
 

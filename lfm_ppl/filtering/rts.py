@@ -6,12 +6,17 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from lfm_ppl.filtering.filter import Pass
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.smoothing_kernel import smoothed_moments, smoothing_kernel
 from lfm_ppl.filtering.time_grid import TimeGrid
 from lfm_ppl.linalg import cholesky, congruence, diagonal, log_density, matmul, outer_square, solve_lower, symmetric
+
+_ROUNDING, _LARGE_ROUNDING = 8.0, 1e4
+"""Variances of a sum of states, in units of eps times the states' own, that are rounding errors: in general, and where
+the smoothed variance is not positive."""
 
 
 class Predictor(NamedTuple):
@@ -104,6 +109,9 @@ def _predictor(one: Pass, r: jax.Array, adjoint: jax.Array) -> tuple[Predictor, 
 
     With M = (I + T F)^-1 and r and Lambda of what comes later, the predictor has the mean f + F S^-1 v + M' H P r and
     the covariance F M - M' H P Lambda P H' M: no difference of variances that are larger than the site leaves them.
+
+    A predicted variance that is a rounding error of the sum H P H', as that of a conserved sum of uncertain states, is
+    reported as zero: its sign is chance.
     """
     terms, jacobian = one.site_terms, one.jacobian
     u = terms.score - matmul(one.gain.T, r[:, None])[:, 0]
@@ -111,6 +119,11 @@ def _predictor(one: Pass, r: jax.Array, adjoint: jax.Array) -> tuple[Predictor, 
     through = matmul(terms.shrinkage.T, matmul(jacobian, one.predicted.covariance))
     mean = (terms.value + matmul(terms.variance, terms.score[:, None])[:, 0] + matmul(through, r[:, None])[:, 0])
     covariance = symmetric(matmul(terms.variance, terms.shrinkage)) - congruence(through, adjoint)
+    rounding = jnp.finfo(r.dtype).eps * matmul(jacobian**2, diagonal(one.predicted.covariance)[:, None])[:, 0]
+    predicted = jnp.abs(diagonal(terms.variance))
+    is_rounding = (predicted <= _ROUNDING * rounding) | (
+        (diagonal(covariance) <= 0) & (predicted <= _LARGE_ROUNDING * rounding))
+    covariance = jnp.where(np.eye(len(predicted), dtype=bool) & is_rounding[:, None], 0.0, covariance)
     kept = jnp.eye(r.shape[0]) - matmul(one.gain, jacobian)
     r = matmul(jacobian.T, terms.score[:, None])[:, 0] + matmul(kept.T, r[:, None])[:, 0]
     adjoint = congruence(jacobian.T, terms.precision) + congruence(kept.T, adjoint)

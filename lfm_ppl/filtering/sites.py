@@ -79,6 +79,9 @@ _PATIENCE = 12
 _STUCK = 1e-4
 """Share of a move below which there is no way on."""
 
+_NEARLY_CONSTANT = 1e-13
+"""Relative changes of a cavity's mean, squared, and of its variance, below which its factor is nearly constant."""
+
 _WHOLE = 0.5
 """Share of the marginal's precision from its own site, from which the cavity is taken from leave-one-out terms."""
 
@@ -189,7 +192,7 @@ class Cavity(NamedTuple):
         cavity: without the site (to its power).
         marginal: with it.
         valid: whether both have a positive variance.
-        known: whether the predictor has no variance: it needs no site, and adds log p at its mean.
+        known: whether the predictor is deterministic: it has no site, and adds log p at its mean.
     """
 
     cavity: Marginal
@@ -253,8 +256,8 @@ def cavities(predictor: Predictor, sites: Sites, present: jax.Array, power: floa
     """
     m, v = predictor.mean - sites.centre, diagonal(predictor.covariance)
     nu, tau = sites.nu, sites.tau
-    known = _is_known(predictor.mean, v)
-    v = jnp.where(known, _known(predictor.mean, v).variance, v)
+    known = _is_deterministic(predictor.mean, jnp.abs(v))
+    v = jnp.where(known, _placeholder(predictor.mean), v)
     share = jnp.where(known, 0.0, power * tau * v)
     whole = (share > _WHOLE) & (power == 1.0)
     safe_tau = jnp.where(whole, tau, 1.0)
@@ -281,8 +284,10 @@ def _ep(terms: EntryTerms, sites: Sites, at: Cavity, power: float, rough: Any = 
     usable = found.variance > 1e-13 * at.marginal.variance
     variance, unusable = jnp.where(usable, found.variance, 1.0), jnp.where(usable, 0.0, jnp.nan)
     c, v = at.cavity.mean - sites.centre, at.cavity.variance
-    nu = ((found.mean - sites.centre) / variance - c / v) / power
-    return nu + unusable, (1.0 / variance - 1.0 / v) / power + unusable, found.log_partition
+    tau = 1.0 / variance - 1.0 / v
+    # Both are the same number. A factor that hardly narrows a cavity moves it by less than its mean is rounded by.
+    nu = jnp.where(variance > 0.5 * v, found.shift / variance + c * tau, (found.mean - sites.centre) / variance - c / v)
+    return nu / power + unusable, tau / power + unusable, found.log_partition
 
 
 def _variational(terms: Any, sites: Sites, at: Cavity, power: float, rough: Any = False) -> tuple:
@@ -312,7 +317,11 @@ def new_sites(terms: EntryTerms, sites: Sites, at: Cavity, settings: SiteSetting
     usable = terms.present & at.valid & jnp.isfinite(nu) & jnp.isfinite(tau)
     nu, tau = (jnp.where(usable, new, old) for new, old in ((nu, sites.nu), (tau, sites.tau)))
     v = at.marginal.variance
-    change = jnp.maximum(jnp.abs(nu - sites.nu) * jnp.sqrt(v), jnp.abs(tau - sites.tau) * v)
+    sd, eps = jnp.sqrt(v), jnp.finfo(v.dtype).eps
+    change = jnp.maximum(jnp.abs(nu - sites.nu) * sd, jnp.abs(tau - sites.tau) * v)
+    # A site whose sd is not far above the spacing of numbers at the predictor is known to that spacing only.
+    rounding = 16.0 * eps * jnp.abs(tau) * sd * jnp.abs(at.marginal.mean)
+    change = jnp.where(change > rounding, change, 0.0)
     change = jnp.max(jnp.where(usable | ~terms.present, change, jnp.inf), initial=0.0)
     mix = lambda old, new: old + damping * (new - old)  # noqa: E731
     return sites._replace(nu=mix(sites.nu, nu), tau=mix(sites.tau, tau)), change, log_partition
@@ -408,11 +417,14 @@ def assumed_density(family: ObservationFamily) -> Callable[..., AssumedRow]:
             log_prob = lambda f: row_log_prob(family, row, m.at[index].set(f[0]), y)[index][None]  # noqa: E731
             cavity, found = jax.tree_util.tree_map(
                 lambda a: a[0], assumed_tilted(log_prob, middle[None], spread[None]))
-            known = _is_known(middle, spread)
-            log_partition = jnp.where(known, log_prob(middle[None])[0], found.log_partition)
+            known = _is_deterministic(middle, spread)
+            # A quadrature has the value of a nearly constant factor, but not its slope.
+            flat = ((found.shift**2 < _NEARLY_CONSTANT * cavity.variance)
+                    & (jnp.abs(found.variance - cavity.variance) < _NEARLY_CONSTANT * cavity.variance))
+            log_partition = jnp.where(known | flat, log_prob(middle[None])[0], found.log_partition)
             usable = ~known & jnp.isfinite(y[index]) & jnp.isfinite(log_partition) & (found.variance > 0)
             variance = jnp.where(usable, found.variance, cavity.variance)
-            moved = jnp.where(usable, found.mean - middle, 0.0)
+            moved = jnp.where(usable, found.shift, 0.0)
             tau = 1.0 / variance - 1.0 / cavity.variance
             gain = covariance[:, index] / cavity.variance
             left = m + gain * moved, covariance + jnp.outer(gain, gain) * (variance - cavity.variance)
@@ -430,7 +442,7 @@ def assumed_density(family: ObservationFamily) -> Callable[..., AssumedRow]:
 
 def assumed_tilted(log_prob: Callable, mean: jax.Array, variance: jax.Array) -> tuple[Marginal, Tilted]:
     """Return a prediction of a row's predictor (D,), and the moments of it tilted by log p."""
-    cavity = _known(mean, variance)
+    cavity = _with_variance(mean, variance)
 
     def about(cavity: Marginal) -> Marginal:
         near = _mode(log_prob, cavity)
@@ -551,23 +563,31 @@ def _from_prior(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, family: Observ
                      sites=Sites(nothing, nothing, nothing), transitions=transitions)
     at = passed.site_terms
     mean, variance = at_intervals(at.value, grid.observed), at_intervals(diagonal(at.variance), grid.observed)
-    cavity = _known(mean, variance)
+    cavity = _with_variance(mean, variance)
     terms = FamilyTerms(family, y)
     found = terms.tilted(cavity, _mode(terms.log_prob, cavity), 1.0, rough=True)
-    usable = jnp.isfinite(y) & jnp.isfinite(found.log_partition) & (found.variance > 0) & ~_is_known(mean, variance)
+    usable = (jnp.isfinite(y) & jnp.isfinite(found.log_partition) & (found.variance > 0)
+              & ~_is_deterministic(mean, variance))
     variance = jnp.where(usable, found.variance, 1.0)
     tau = jnp.where(usable, 1.0 / variance - 1.0 / cavity.variance, 0.0)
-    return Sites(mean, jnp.where(usable, (found.mean - mean) / variance, 0.0), tau)
+    return Sites(mean, jnp.where(usable, found.shift / variance, 0.0), tau)
 
 
-def _is_known(mean: jax.Array, variance: jax.Array) -> jax.Array:
-    """Whether a variance is nothing but rounding errors."""
-    return jnp.abs(variance) <= _known(mean, jnp.zeros_like(variance)).variance
+def _is_deterministic(mean: jax.Array, variance: jax.Array) -> jax.Array:
+    """Whether a predictor has no variance, or a standard deviation below the spacing of numbers at its mean."""
+    info = jnp.finfo(variance.dtype)
+    # The derivative of 1 / variance must not overflow.
+    return variance <= (8.0 * info.eps * mean) ** 2 + float(info.tiny) ** (1.0 / 3.0)
 
 
-def _known(mean: jax.Array, variance: jax.Array) -> Marginal:
-    """Return a marginal whose variance is above zero: a predictor that is known has one of rounding errors."""
-    return Marginal(mean, jnp.maximum(variance, 1e-20 * (1e-6 + mean**2)))
+def _placeholder(mean: jax.Array) -> jax.Array:
+    """Return the variance with which a deterministic predictor goes through a quadrature that is not used."""
+    return jax.lax.stop_gradient(1e-20 * (1e-6 + mean**2))
+
+
+def _with_variance(mean: jax.Array, variance: jax.Array) -> Marginal:
+    """Return a marginal whose variance is above zero, a placeholder of a deterministic predictor."""
+    return Marginal(mean, jnp.where(_is_deterministic(mean, variance), _placeholder(mean), variance))
 
 
 def _smoothed(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments,
@@ -695,7 +715,9 @@ def _until_converged(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, settings:
         share = jnp.where(anew, settings.damping, share)
         nu, tau = base + jnp.where(anew, 0.0, jnp.where(good & (change < _NEAR), mixed, share * move))
         # What is left to go after this step, if it shortens the way as the last one did.
-        shortened = jnp.where(forget, 1.0, jnp.clip(change / loop.last, 0.1, 1.0))
+        has_moved = loop.last > 0
+        shortened = jnp.clip(change / jnp.where(has_moved, loop.last, 1.0), 0.1, 1.0)
+        shortened = jnp.where(forget | ~has_moved, 1.0, shortened)
         return _Loop(sites._replace(nu=nu, tau=tau), base, move, share, steps, changes, at, log_partition,
                      shortened * change,
                      jnp.where(good, change, loop.last), loop.sweeps + 1, loop.fine + ~rough)
@@ -774,7 +796,8 @@ def assumed_density_filter(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: 
     """
     passed = forward(ssm, rule, grid, y, start=start, keep="moments", sites=assumed_density(_family(ssm)))
     at = jax.tree_util.tree_map(lambda a: at_intervals(a, grid.observed), passed)
-    return Prequential(at.log_likelihood, passed, _known(at.site_terms.value, diagonal(at.site_terms.variance)))
+    prediction = _with_variance(at.site_terms.value, diagonal(at.site_terms.variance))
+    return Prequential(at.log_likelihood, passed, prediction)
 
 
 def quantile_residuals(family: ObservationFamily, prediction: Marginal, y: jax.Array) -> jax.Array:
@@ -835,6 +858,29 @@ def leave_one_out(predictor: Predictor, sites: Sites, entries: jax.Array) -> jax
     return jax.vmap(row)(predictor.mean, predictor.covariance, sites) + entries.sum(1)
 
 
+def _final_sites(terms: FamilyTerms, converged: Converged, by_moments: bool) -> Sites:
+    """Return the sites without those of deterministic predictors, and with exact ones of nearly deterministic ones.
+
+    Over a small variance v a factor hardly differs from a constant, and moments of the tilted distribution have its
+    slope to eps / sd only. The derivatives of log p at the mean are the slope and the curvature to a share of v.
+
+    Args:
+        terms: the factors of the data.
+        converged: where the sweeps ended.
+        by_moments: whether sites are made from moments, as those of expectation propagation are.
+    """
+    sites, at = converged.sites, converged.cavity
+    nu, tau = sites.nu, sites.tau
+    if by_moments:
+        mean, variance = at.marginal
+        exact_nu, exact_tau, _ = _laplace(terms, sites, at, 1.0)
+        slope = exact_nu - exact_tau * (mean - sites.centre)
+        is_flat = (slope**2 * variance < _NEARLY_CONSTANT) & (jnp.abs(exact_tau) * variance < _NEARLY_CONSTANT)
+        is_flat &= terms.present & at.valid & converged.converged
+        nu, tau = jnp.where(is_flat, exact_nu, nu), jnp.where(is_flat, exact_tau, tau)
+    return sites._replace(nu=jnp.where(at.known, 0.0, nu), tau=jnp.where(at.known, 0.0, tau))
+
+
 class Evidence(NamedTuple):
     """What the evidence is made of.
 
@@ -859,12 +905,22 @@ def evidence(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, ter
     start = Moments(*ssm.initial()) if start is None else start
     refined = refine(ssm, rule, grid, y, terms, settings, start, first)
     found = refined.found
-    sites, at = found.sites, found.cavity
+    at = found.cavity
+    if isinstance(terms, FamilyTerms):
+        by_moments = settings.method == "ep"
+        found = found._replace(sites=_held(lambda found: _final_sites(terms, found, by_moments), found))
+        refined = refined._replace(found=found)
+    sites = found.sites
     if settings.method == "laplace":
         newer, at = _newton_step(ssm, rule, grid, y, terms, settings, start, refined)
         sites = jax.tree_util.tree_map(functools.partial(jnp.where, found.converged), newer, sites)
     passed = forward(ssm, rule, grid, y, start=start, linearization_point=refined.points, keep=keep, sites=sites,
                      transitions=None if keep in ("steps", "inside") else refined.transitions)
     entries = log_evidence_terms(terms, sites, at, settings, found.log_partition)
+    if isinstance(terms, FamilyTerms):
+        predicted = at_intervals(passed.predictor, grid.observed)
+        # Where the predictor is not deterministic, its mean is of no use and must not put NaN into a derivative.
+        mean = jnp.where(at.known, predicted, jax.lax.stop_gradient(at.marginal.mean))
+        entries = jnp.where(at.known, terms.log_prob(mean), entries)
     total = passed.log_likelihood.sum() + entries.sum()
     return Evidence(jnp.where(found.converged, total, refined.assumed), entries, passed, refined)
