@@ -23,7 +23,6 @@ from numpyro.infer import init_to_median, init_to_value
 
 from lfm_ppl import calendar_time, checks
 from lfm_ppl.data import Data, as_data, at_origin, model_keywords
-from lfm_ppl.filtering.breakdown import FilterWarning, breakdown
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.forces.sde import ApproximationWarning
 from lfm_ppl.forces.stretched import Stretched
@@ -42,7 +41,6 @@ from lfm_ppl.inference.laplace_start import (
     starting_points,
 )
 from lfm_ppl.inference.map import MAPResult, check_sites, mode_of
-from lfm_ppl.inference.marginal_likelihood import Panel
 from lfm_ppl.inference.posterior import evenly_spaced, scores, trajectories
 from lfm_ppl.inference.priors import assumptions, prior
 from lfm_ppl.inference.progress import Counter
@@ -50,6 +48,7 @@ from lfm_ppl.inference.random_keys import split_keys
 from lfm_ppl.inference.samplers import FILTERED, SAMPLERS
 from lfm_ppl.inference.sampling import Transition
 from lfm_ppl.inference.site_failures import failures_at, paths_worth, site_failures
+from lfm_ppl.inference.start_failure import start_failure
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.progress import waiting
 from lfm_ppl.results import arviz_data
@@ -172,7 +171,8 @@ def fit(
 
     Raises:
         ValueError, TypeError: unknown sampler, wrong shapes, parameters to fix that do not exist, and so on; a run to
-            go on with that was of something else.
+            go on with that was of something else; no point to start from, with the part of the log density that is
+            not finite at the prior median.
         FileExistsError, FileNotFoundError: the folder holds a result or a run; no run to go on with.
         KeyboardInterrupt: Ctrl-C before there was a draw, without a checkpoint, or for the second time.
 
@@ -180,8 +180,7 @@ def fit(
         UserWarning: the result is partial.
         ConvergenceWarning: R-hat above 1.01, fewer than 100 effective draws a chain, divergences, a degenerate
             posterior mode; each with a remedy.
-        FilterWarning: no point to start from was found (which is an error): where the filter breaks down at the prior
-            median, and how.
+        ApproximationWarning: more iterations, shorter steps or a shorter longest step would move the posterior.
 
     Example:
         >>> import jax.numpy as jnp, numpyro, numpyro.distributions as dist, lfm_ppl as lfm
@@ -646,26 +645,16 @@ def warn_of_convergence(found: Sequence[str]) -> None:
 
 @contextlib.contextmanager
 def _start_explained(bound: BoundModel) -> Iterator[None]:
-    """Where no point to start from is found, say how the filter breaks down at the prior median."""
+    """Where no point to start from is found, add to the error which part of the density fails at the prior median."""
     try:
         yield
     except ValueError as error:
-        if "finite density" in str(error):
-            kept("reason why there is nowhere to start", lambda: _explain_start(bound), None)
-        raise
-
-
-def _explain_start(bound: BoundModel) -> None:
-    distribution = bound.likelihood(bound.draw(jax.random.key(0), init_to_median))
-    several = isinstance(distribution, Panel)
-    for index in range(distribution.batch_shape[0] if several else 1):
-        one = distribution.series(index) if several else distribution
-        said = breakdown(one.ssm, one.rule, one.time_grid,
-                         (bound.y[index] if several else bound.y).reshape(one.event_shape))
-        if said is not None:
-            series = f" of series {index}" if several else ""
-            warnings.warn(f"at the prior median{series}, {said}", FilterWarning, stacklevel=6)
-            return
+        if "finite density" not in str(error):
+            raise
+        reason = kept("reason why there is nowhere to start", lambda: start_failure(bound), None)
+        if reason is None:
+            raise
+        raise ValueError(f"{error} At the prior median, {reason}") from error
 
 
 def kept(what: str, compute: Callable[[], Any], otherwise: Any) -> Any:

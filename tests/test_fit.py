@@ -1,3 +1,4 @@
+import functools
 import json
 import warnings
 
@@ -553,6 +554,60 @@ def steep(times, y=None):
 @pytest.mark.parametrize("sampler", [pytest.param("nuts", marks=pytest.mark.slow), "map"])
 def test_nowhere_to_start_from_is_explained(sampler):
     times = np.array([0.0, 1.0, 2.0])
-    with pytest.warns(lfm.FilterWarning, match=r"at the prior median, the filter breaks down at row 1 \(time 1\)"):
-        with pytest.raises((RuntimeError, ValueError), match="initial parameters|finite density"):
-            lfm.fit(steep, times, np.ones((3, 1)), sampler=sampler, chains=1, warmup=2, samples=2, progress=False)
+    with pytest.raises(ValueError, match=r"finite density.*the prior median, the filter breaks down at row 1 \(time 1"):
+        lfm.fit(steep, times, np.ones((3, 1)), sampler=sampler, chains=1, warmup=2, samples=2, progress=False)
+
+
+def decaying_counts(times, y=None, fault=None):
+    """Counts of a deterministic state, with a fault in one part of the density."""
+    rate = numpyro.sample("rate", dist.LogNormal(jnp.log(0.3), 0.5))
+    if fault == "prior":
+        numpyro.sample("level", dist.Normal(0.0, jnp.inf))
+    if fault == "factor":
+        numpyro.factor("bound", -jnp.inf)
+    slope = jnp.linalg.norm(0.0 * rate) if fault == "gradient" else 0.0
+
+    def predictor(x, u, t):
+        return jnp.log(x - 3.5) if fault == "function" else x
+
+    observation = (lfm.PoissonObservation(predictor, "identity") if fault == "law"
+                   else lfm.PoissonObservation(predictor))
+    model = lfm.LatentForceModel(lambda x, u, t: slope - rate + 0 * x, {}, observation,
+                                 lfm.Gaussian(jnp.array([np.log(100.0)]), jnp.zeros((1, 1))))
+    settings = {"sites": lfm.SiteSettings(sweeps=1)} if fault == "sites" else {}
+    if fault == "sites":
+        model = lfm.LatentForceModel(lambda x, u, t: u - rate * x, {"u": lfm.Matern(1.0, 1.0)}, observation,
+                                     lfm.Gaussian(jnp.array([np.log(100.0)]), jnp.zeros((1, 1))))
+    numpyro.sample("y", lfm.MarginalLikelihood(model, times, **settings), obs=y)
+
+
+DECAYING = np.array([98.0, 80, 50, 44, 28, 25])[:, None]
+
+
+def test_a_deterministic_state_is_fitted():
+    """Against the posterior on a grid."""
+    result = lfm.fit(decaying_counts, np.arange(6.0), DECAYING, chains=1, warmup=100, samples=400, progress=False)
+    rate = np.linspace(0.15, 0.45, 2001)
+    level = np.log(100.0) - rate[:, None] * np.arange(6.0)
+    log_density = (DECAYING[:, 0] * level - np.exp(level)).sum(1) - 0.5 * (np.log(rate / 0.3) / 0.5) ** 2 - np.log(rate)
+    weight = np.exp(log_density - log_density.max())
+    mean = (weight * rate).sum() / weight.sum()
+    sd = np.sqrt((weight * (rate - mean) ** 2).sum() / weight.sum())
+    draws = np.asarray(result["posterior"]["rate"])
+    assert abs(draws.mean() - mean) < 0.4 * sd and 0.7 < draws.std() / sd < 1.4
+
+
+@pytest.mark.parametrize("fault, reason", [
+    ("prior", "'level'"),
+    ("factor", "site 'bound' has the log density -inf"),
+    ("gradient", "log density is finite.*derivative with respect to 'rate'"),
+    ("function", r"observation function gives nan .* at row 4 \(time 4\)"),
+    ("law", r"y\[\d, 0\] = \d+ has the log density -inf"),
+    ("sites", "do not converge in 1 sweeps"),
+])
+def test_the_part_that_fails_is_named_where_there_is_nowhere_to_start(fault, reason):
+    times = 10.0 * np.arange(6.0) if fault == "law" else np.arange(6.0)
+    with pytest.raises(ValueError, match=f"finite density.*At the prior median, .*{reason}") as error:
+        lfm.fit(functools.partial(decaying_counts, fault=fault), times, DECAYING, progress=False, chains=1,
+                sampler="nuts" if fault == "gradient" else "map")
+    assert "\n" not in str(error.value)

@@ -12,7 +12,7 @@ import numpy as np
 from lfm_ppl import checks
 from lfm_ppl.filtering.filter import Pass, forward
 from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.filtering.sites import FamilyTerms, SiteSettings, refine
+from lfm_ppl.filtering.sites import FamilyTerms, SiteSettings, assumed_density, refine, row_log_prob
 from lfm_ppl.filtering.time_grid import Intervals, TimeGrid, intervals_between
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.observations.family import ObservationFamily
@@ -61,13 +61,15 @@ def _site_trouble(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, star
     """Say which sites do not converge, or what else is wrong with a family's log likelihood, ``finite`` or not."""
     remedy = ("Try a smaller share of each new site, sites=lfm.SiteSettings(damping=0.5), half powers, "
               "sites=lfm.SiteSettings(power=0.5), or a tighter prior")
-    if settings is None:
-        return ("the log likelihood of the observation family is -inf: the data are impossible under the prediction, "
-                "or the filter breaks down. Try a tighter prior, or more steps (steps=...).")
     y = jnp.asarray(y, float)
     family = ssm.model.observation
     assert isinstance(family, ObservationFamily)
     begin = Moments(*ssm.initial()) if start is None else start
+    if not finite and (reason := _row_trouble(ssm, rule, grid, y, begin)) is not None:
+        return f"{reason}. The log likelihood is -inf."
+    if settings is None:
+        return ("the log likelihood of the observation family is -inf: the data are impossible under the prediction, "
+                "or the filter breaks down. Try a tighter prior, or more steps (steps=...).")
     found = eqx.filter_jit(refine)(ssm, rule, grid, y, FamilyTerms(family, y), settings, begin).found
     bad = ~np.asarray(found.cavity.valid) | ~np.isfinite(np.asarray(found.sites.tau))
     where = ""
@@ -79,6 +81,47 @@ def _site_trouble(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, star
     return (f"the sites of the observation family do not converge in {int(found.sweeps)} sweeps (the last changes one "
             f"by {float(found.change):.2g}){where}. The log likelihood is "
             f"{'that of assumed density filtering, which is rougher' if finite else '-inf'}. {remedy}.")
+
+
+def family_breakdown(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, settings: SiteSettings) -> str:
+    """Return why the log likelihood of an observation family is not finite. Arguments must be concrete."""
+    return _site_trouble(ssm, rule, grid, y, None, settings, finite=False)
+
+
+def _row_trouble(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments) -> str | None:
+    """Return the first row at which the state, its predictor or the density of the data is not finite, and which."""
+    family = ssm.model.observation
+    passed = _run_assumed(ssm, rule, grid, y, start)
+    at_data = jax.tree_util.tree_map(lambda a: np.asarray(a)[np.asarray(grid.observed)], passed)
+    good = np.isfinite(at_data.predictor).all(1) & np.isfinite(at_data.log_likelihood)
+    good &= np.isfinite(at_data.predicted.mean).all(1) & np.isfinite(at_data.predicted.covariance).all((1, 2))
+    if good.all():
+        return None
+    row = int(np.argmin(good))
+    interval = jax.tree_util.tree_map(lambda a: np.asarray(a)[grid.observed[row]], grid.intervals)
+    place = f"at row {row} (time {float(interval.start + interval.length):.6g})"
+    if not np.isfinite(at_data.predicted.mean[row]).all():
+        return f"the predicted mean of the state is not finite {place}: try more steps (steps=...) or a tighter prior"
+    if not np.isfinite(at_data.predicted.covariance[row]).all():
+        return f"the predicted covariance is not finite {place}: try more steps (steps=...) or a tighter prior"
+    predictor, names = at_data.predictor[row], ssm.model.output_names
+    if not np.isfinite(predictor).all():
+        output = int(np.argmin(np.isfinite(predictor)))
+        return (f"the observation function gives {predictor[output]:g} for the output {names[output]!r} {place}: look "
+                "for a logarithm, a root or a division outside of its domain")
+    density = np.asarray(row_log_prob(family, row, jnp.asarray(predictor), y[row]))
+    if np.isfinite(density).all():
+        return f"the integral of the observation family's density is not finite {place}"
+    output = int(np.argmin(np.isfinite(density)))
+    return (f"y[{row}, {output}] = {float(y[row, output]):g} has the log density {density[output]:g} {place} under the "
+            f"predictor {predictor[output]:g} of the output {names[output]!r}: check the link and the initial state")
+
+
+@eqx.filter_jit
+def _run_assumed(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments) -> Pass:
+    family = ssm.model.observation
+    assert isinstance(family, ObservationFamily)
+    return forward(ssm, rule, grid, y, start=start, keep="moments", sites=assumed_density(family))
 
 
 def breakdown(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, start: Moments | None = None) -> str | None:

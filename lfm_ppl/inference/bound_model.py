@@ -565,7 +565,7 @@ class BoundModel:
             if all(np.all(np.isfinite(one)) for one in found):
                 return z
         raise ValueError(f"found no point of finite density to start from in {attempts} attempts. Give a starting "
-                         "point, or check the model: its log density is -inf or NaN.")
+                         "point, or check the model: its log density or the gradient of it is not finite.")
 
     def trace(self) -> dict[str, Any]:
         """Return NumPyro's trace of the model at the prior medians: its sites with their priors, plates and values."""

@@ -303,7 +303,8 @@ class MarginalLikelihood(dist.Distribution):
         return check_observations(y, count, outputs, model=self.model)
 
     @property
-    def _site_settings(self) -> SiteSettings:
+    def site_settings(self) -> SiteSettings:
+        """How the sites of an observation family are refined."""
         return as_settings(self.sites, self.iterations)
 
     @property
@@ -311,7 +312,7 @@ class MarginalLikelihood(dist.Distribution):
         """How an observation family is approximated; empty where the observation is Gaussian."""
         if not isinstance(self.model.observation, ObservationFamily):
             return ""
-        settings = self._site_settings
+        settings = self.site_settings
         linear = not (self.ssm.drift_structure.points or self.ssm.observation_structure.points)
         return f"{settings.method}" + ("" if linear else f", linearised anew {settings.relinearisations} times at most")
 
@@ -319,7 +320,7 @@ class MarginalLikelihood(dist.Distribution):
         """Return the log evidence of an observation family and what it is made of; ``y`` (T, D) is not checked."""
         assert isinstance(self.model.observation, ObservationFamily)
         terms = FamilyTerms(self.model.observation, y)
-        return evidence(self.ssm, self.rule, self.time_grid, y, terms, self._site_settings)
+        return evidence(self.ssm, self.rule, self.time_grid, y, terms, self.site_settings)
 
     def _evidence_and_convergence(self, y: jax.Array) -> jax.Array:
         found = self.evidence(y)
@@ -331,7 +332,7 @@ class MarginalLikelihood(dist.Distribution):
         Of a family, the filter ``alone`` was run or its sites were refined, which have ``converged`` or not.
         """
         warn_of_breakdown(self.ssm, self.rule, self.time_grid, y, None, log_likelihood,
-                          None if alone else self._site_settings, converged)
+                          None if alone else self.site_settings, converged)
         return log_likelihood
 
     def expand(self, batch_shape: tuple[int, ...]) -> dist.Distribution:
@@ -421,7 +422,7 @@ class MarginalLikelihood(dist.Distribution):
         grids = smoothing_grids(self.ssm, self.times, self.steps, self.max_step, at, self.iterations,
                                 self.tolerance)
         y = self._checked(y)
-        return smooth_on(self.ssm, self.rule, grids, y, self.iterations, self.damping, self._site_settings)
+        return smooth_on(self.ssm, self.rule, grids, y, self.iterations, self.damping, self.site_settings)
 
 
 def _shown(value: Any) -> str:

@@ -1,0 +1,82 @@
+"""The part of a model's log density that is not finite at the prior median, for the error of a failed search."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpyro.infer import init_to_median
+
+from lfm_ppl.filtering.breakdown import breakdown, family_breakdown
+from lfm_ppl.inference.bound_model import BoundModel
+from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
+from lfm_ppl.model.observations.family import ObservationFamily
+
+
+def start_failure(bound: BoundModel) -> str:
+    """Return in one sentence which part of the log density, or of its gradient, is not finite at the prior median."""
+    z = bound.draw(jax.random.key(0), init_to_median)
+    value, gradient = (np.asarray(part) for part in bound.log_density_gradient(z))
+    if np.isfinite(value) and np.isfinite(gradient).all():
+        return (f"the log density ({float(value):g}) and its gradient are finite, so that the starting points that "
+                "`init` draws are the reason: leave out init.")
+    if np.isfinite(value):
+        names = ", ".join(repr(name) for name, slope in zip(bound.names, gradient, strict=True)
+                          if not np.isfinite(slope))
+        return (f"the log density is finite ({float(value):g}), but its derivative with respect to {names} is not: "
+                "look for a square root, a norm or a division at zero in the functions of the model.")
+    return _site_failure(bound) or _likelihood_failure(bound, z) or (
+        f"the log density is {float(value):g}, though the densities of all sites are finite: their sum overflows.")
+
+
+def _site_failure(bound: BoundModel) -> str | None:
+    """Return which prior, factor or further observed site has a log density that is not finite."""
+    for name, site in bound.trace().items():
+        law = site.get("fn")
+        if site["type"] != "sample" or _is_likelihood(law):
+            continue
+        if not site["is_observed"] and not np.isfinite(np.asarray(site["value"], float)).all():
+            return f"the value of {name!r} is not finite ({_shown(site['value'])}): check the parameters of its prior."
+        total = float(jnp.sum(law.log_prob(site["value"])))
+        if not np.isfinite(total):
+            kind = "site" if site["is_observed"] else "prior of"
+            return f"the {kind} {name!r} has the log density {total:g}."
+    return None
+
+
+def _is_likelihood(law: Any) -> bool:
+    while hasattr(law, "base_dist") and not isinstance(law, (MarginalLikelihood, Panel)):
+        law = law.base_dist
+    return isinstance(law, (MarginalLikelihood, Panel))
+
+
+def _shown(value: Any) -> str:
+    return np.array2string(np.asarray(value, float), threshold=5, separator=", ").replace("\n", "")
+
+
+def _likelihood_failure(bound: BoundModel, z: Any) -> str | None:
+    """Return at which row of which series the likelihood fails, and how."""
+    distribution = bound.likelihood(z)
+    is_panel = isinstance(distribution, Panel)
+    for index in range(distribution.batch_shape[0] if is_panel else 1):
+        member = distribution.series(index) if is_panel else distribution
+        y = (bound.y[index] if is_panel else bound.y).reshape(member.event_shape)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the same reasons, as warnings
+            if np.isfinite(member.log_prob(y)):
+                continue
+        return (f"series {index}: " if is_panel else "") + _series_failure(member, y)
+    return None
+
+
+def _series_failure(member: MarginalLikelihood, y: Any) -> str:
+    if member.constrained:
+        return "the likelihood under constraints is not finite: they may be impossible together with the data."
+    if isinstance(member.model.observation, ObservationFamily):
+        return family_breakdown(member.ssm, member.rule, member.time_grid, y, member.site_settings)
+    return breakdown(member.ssm, member.rule, member.time_grid, y) or (
+        "the likelihood is not finite, though the filter does not break down without posterior linearisation: try "
+        "iterations=0.")
