@@ -41,6 +41,7 @@ from lfm_ppl.inference.laplace_start import (
     starting_points,
 )
 from lfm_ppl.inference.map import MAPResult, check_sites, mode_of
+from lfm_ppl.inference.marginal_likelihood import Panel
 from lfm_ppl.inference.posterior import evenly_spaced, scores, trajectories
 from lfm_ppl.inference.priors import assumptions, prior
 from lfm_ppl.inference.progress import Counter
