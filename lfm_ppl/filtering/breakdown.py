@@ -91,6 +91,7 @@ def family_breakdown(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, s
 def _row_trouble(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments) -> str | None:
     """Return the first row at which the state, its predictor or the density of the data is not finite, and which."""
     family = ssm.model.observation
+    assert isinstance(family, ObservationFamily)
     passed = _run_assumed(ssm, rule, grid, y, start)
     at_data = jax.tree_util.tree_map(lambda a: np.asarray(a)[np.asarray(grid.observed)], passed)
     good = np.isfinite(at_data.predictor).all(1) & np.isfinite(at_data.log_likelihood)

@@ -370,7 +370,7 @@ def _predict_by_quadrature(ssm: StateSpaceModel, rule: Rule, linear: LinearPart,
     near = now
     if linearization_point is not None:
         near = jax.tree_util.tree_map(_with_middles, _forces_of(linearization_point, size))
-    before = jnp.arange(steps) * h
+    offsets = jnp.arange(steps) * h
     times = span.time(0.5 * h * jnp.arange(2 * steps + 1))
 
     def node(t: jax.Array, mean: jax.Array, near: Moments) -> Node:
@@ -386,7 +386,7 @@ def _predict_by_quadrature(ssm: StateSpaceModel, rule: Rule, linear: LinearPart,
         nodes = jax.vmap(node)(times, now.mean, near)
         stages = [jax.tree_util.tree_map(lambda a: a[part], nodes) for part in _FIRST_MIDDLE_LAST]  # noqa: B023
     else:
-        times = jnp.stack([span.time(before), span.time(before + 0.5 * h), span.time(before + h)])
+        times = jnp.stack([span.time(offsets), span.time(offsets + 0.5 * h), span.time(offsets + h)])
         by_node = lambda a: jnp.stack([a[part] for part in _FIRST_MIDDLE_LAST])  # noqa: E731
         nodes = jax.vmap(jax.vmap(node))(times, by_node(now.mean), jax.tree_util.tree_map(by_node, near))
         stages = [jax.tree_util.tree_map(lambda a: a[index], nodes) for index in range(3)]  # noqa: B023

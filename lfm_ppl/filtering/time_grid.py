@@ -136,9 +136,8 @@ def _laid_out(ssm: StateSpaceModel, times: Any, steps: int, max_step: float | No
     if known is None or origin is None:
         reads = ssm.model.input_reads(*(0.0, 1.0) if known is None else (float(known[0]), float(known[-1])))
         jumps = ssm.stack.jump_times
-        breakpoints = jnp.concatenate([jnp.zeros(0), *(jnp.asarray(read.breakpoints(), float) for read in reads)])
-        cutting = Cutting(steps, None, interval_per_step, np.zeros(0), len(breakpoints), _OVERHEAD, adaptive,
-                          _scale(reads))
+        moving = jnp.concatenate([jnp.zeros(0), *(jnp.asarray(read.breakpoints(), float) for read in reads)])
+        cutting = Cutting(steps, None, interval_per_step, np.zeros(0), len(moving), _OVERHEAD, adaptive, _scale(reads))
         if known is not None and jumps and max_step is None and at is None:
             grid = _traced_origin(known, start, jumps, steps, interval_per_step)
         else:
@@ -146,7 +145,7 @@ def _laid_out(ssm: StateSpaceModel, times: Any, steps: int, max_step: float | No
             grid = _traced(ssm, times, -(-steps // part), part, max_step, at, initial_time)
         row = grid.intervals
         grid = grid._replace(intervals=row._replace(inset=inset(row.start, row.end, row.length, cutting.scale)))
-        return _divided(grid, breakpoints, cutting.scale)
+        return _divided(grid, moving, cutting.scale)
     end = float(known[-1] if at is None else _requested(at, float(origin)).max(initial=known[-1]))
     reads = ssm.model.input_reads(float(origin), end)
     breakpoints, moving = breakpoints_within(reads, float(origin), end)

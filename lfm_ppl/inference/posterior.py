@@ -379,7 +379,7 @@ def _steps_per_interval(ssm: StateSpaceModel, times: Any, at: Any, steps: int, s
         return steps
     rows, origin = grid.intervals, np.asarray(grid.initial_time)
     # Counted from the initial time, so that the origin of time does not matter.
-    ends, since = grid.since + rows.length, since - origin
+    ends, first = grid.since + rows.length, since - origin
     marks = np.unique(np.append(known - origin, 0.0))
     if len(marks) == 1:
         return steps
@@ -387,7 +387,7 @@ def _steps_per_interval(ssm: StateSpaceModel, times: Any, at: Any, steps: int, s
     # A row after the last observation is measured by the usual distance between two.
     index = np.searchsorted(marks, ends - 1e-12 * np.abs(ends), side="left") - 1
     own = np.where(index < len(gaps), gaps[np.clip(index, 0, len(gaps) - 1)], np.median(gaps))
-    share = (rows.length / own)[ends > since].max(initial=0.0)
+    share = (rows.length / own)[ends > first].max(initial=0.0)
     return max(1, int(np.ceil(steps * min(float(share), 1.0) - 1e-9)))
 
 

@@ -42,7 +42,7 @@ def _in_words(distribution: Any, size: int | None = None, entries: np.ndarray | 
     while hasattr(distribution, "base_dist") and type(distribution).__name__ in (
             "Independent", "ExpandedDistribution", "MaskedDistribution"):
         distribution = distribution.base_dist
-    values = [getattr(distribution, name, None) for name in distribution.arg_constraints]
+    values: list[Any] = [getattr(distribution, name, None) for name in distribution.arg_constraints]
     if entries is not None:
         values = [np.asarray(value)[entries] if np.shape(value) == (size,) else value for value in values]
     return f"{type(distribution).__name__}({', '.join(_number(value) for value in values if value is not None)})"

@@ -146,7 +146,8 @@ class Traced(NamedTuple):
         for inner, equation in scope.equations():
             name = str(equation.params.get("name", ""))
             if mark in name:
-                yield name, *(inner.known(operand) for operand in equation.invars[-3:])
+                times, values, time = (inner.known(operand) for operand in equation.invars[-3:])
+                yield name, times, values, time
 
     def has(self, mark: str) -> bool:
         """Whether a function jitted under a name with ``mark`` is called."""
@@ -243,7 +244,7 @@ class _Scope:
                 if inner is not None:
                     yield from inner.equations(branches)
 
-    def known(self, atom: Any, depth: int = 0) -> np.ndarray | None:
+    def known(self, atom: Any, depth: int = 0) -> Any:
         """Return the value of a variable or a literal, None where it is not known."""
         if isinstance(atom, Literal):
             return np.asarray(atom.val)
