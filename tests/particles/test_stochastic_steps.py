@@ -9,7 +9,7 @@ from systems import double_well, softplus
 
 import lfm_ppl as lfm
 from lfm_ppl.linalg import semidefinite_root
-from lfm_ppl.model.state_space import state_space
+from lfm_ppl.model.state_space import Span, state_space
 from lfm_ppl.particles.stochastic_steps import choose_scheme, euler, milstein, prepare, srk
 
 PATHS, FINEST = 1500, 256
@@ -94,7 +94,8 @@ def ends(ssm, step, noise, start=None):
     def path(first, second, kicks):
         def one(s, inputs):
             index, a, b, kick = inputs
-            return step(ssm, prepared, h, index * h, s, (a, b), kick), None
+            span = Span.between(index * h, (index + 1) * h, h)
+            return step(ssm, prepared, h, span, s, (a, b), kick), None
 
         return jax.lax.scan(one, mean, (jnp.arange(steps), first, second, kicks))[0]
 
@@ -191,7 +192,8 @@ def test_a_step_of_no_length_moves_nothing():
     ssm = pushed(1)
     ready = prepare(ssm, "srk", jnp.zeros(()), 1)
     s = jnp.array([0.3, -0.2, 0.5])
-    moved = srk(ssm, ready, jnp.zeros(()), jnp.ones(()), s, (jnp.ones(1), jnp.ones(1)), jnp.zeros(3))
+    instant = Span.between(jnp.ones(()), jnp.ones(()), jnp.zeros(()))
+    moved = srk(ssm, ready, jnp.zeros(()), instant, s, (jnp.ones(1), jnp.ones(1)), jnp.zeros(3))
     assert np.allclose(moved, s)
     assert np.allclose(semidefinite_root(jnp.zeros((3, 3))), 0.0)
 
