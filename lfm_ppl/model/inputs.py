@@ -58,7 +58,7 @@ class Input(eqx.Module):
         checks.finite("input times", times)
         checks.finite("input values", values)
         # In compiled code jnp.asarray makes tracers of numbers; the time grid needs to know where the table jumps.
-        self.times, self.values = jnp.atleast_1d(_as_array(times)), _as_array(values)
+        self.times, self.values = _as_array(times, least_dim=1), _as_array(values)
         self.interpolation, self.outside, self.name = interpolation, outside, name
         if self.times.ndim != 1 or self.times.size == 0 or self.values.shape[:1] != self.times.shape:
             raise ValueError(f"input values must have one row a time, and at least one: {self.times.shape} times, "
@@ -73,9 +73,11 @@ class Input(eqx.Module):
         return _reader(self.interpolation, self.outside, self.name)(self.times, self.values, t)
 
 
-def _as_array(values: Any) -> jax.Array:
+def _as_array(values: Any, least_dim: int = 0) -> jax.Array:
+    """Return an array that stays a number in compiled code, where ``values`` are numbers."""
     with contextlib.nullcontext() if checks.traced(values) else jax.ensure_compile_time_eval():
-        return jnp.atleast_1d(jnp.asarray(values, float)) if np.ndim(values) else jnp.asarray(values, float)
+        array = jnp.asarray(values, float)
+        return jnp.atleast_1d(array) if array.ndim < least_dim else array
 
 
 class InputRead(NamedTuple):

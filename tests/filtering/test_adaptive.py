@@ -20,7 +20,7 @@ def double_well(parameters, rule=None, tolerance=None, steps=60):
     model = lfm.LatentForceModel(
         systems.DoubleWell(alpha, beta), {}, lfm.GaussianObservation(systems.whole_state, 0.01 * jnp.ones(1)),
         lfm.Gaussian([0.0], [10.0]), process_noise=sigma * jnp.ones((1, 1)))
-    return lfm.MarginalLikelihood(model, TIMES, rule, steps=steps, tolerance=tolerance)
+    return lfm.MarginalLikelihood(model, TIMES, rule, steps=steps, iterations=0, tolerance=tolerance)
 
 
 def expression(parameters=(0.4, 0.8, 1.0), tolerance=None, steps=400, start=0.0, link=jax.nn.softplus, times=TIMES):
@@ -29,7 +29,7 @@ def expression(parameters=(0.4, 0.8, 1.0), tolerance=None, steps=400, start=0.0,
         systems.Motif(jnp.array([1.0, 0.5]) * decay, jnp.array([0.5, 1.0]) * sensitivity, 0.1, link),
         {"u": lfm.Matern(1.0, lengthscale)}, lfm.GaussianObservation(systems.whole_state, 0.01 * jnp.ones(2)),
         lfm.Gaussian([0.2, 0.3], [start, start]), initial_time=0.0)
-    return lfm.MarginalLikelihood(model, times, steps=steps, tolerance=tolerance)
+    return lfm.MarginalLikelihood(model, times, steps=steps, iterations=0, tolerance=tolerance)
 
 
 SLOW_TO_STIFF = jnp.array([[-1.0, 0.1, 2.0], [-0.2, 0.05, 0.7], [-4.0, 0.5, 4.0], [-12.0, 1.2, 5.5]])
@@ -99,7 +99,7 @@ def explicit(input_=None, tolerance=None, steps=2000, force=None, initial_time=0
     model = lfm.LatentForceModel(
         dynamics, forces, lfm.GaussianObservation(systems.whole_state, 0.1 * jnp.ones(1)), lfm.Gaussian([0.0], [1.0]),
         process_noise=jnp.ones((1, 1)) if dispersion is None else dispersion, initial_time=initial_time)
-    return lfm.MarginalLikelihood(model, TIMES, steps=steps, tolerance=tolerance)
+    return lfm.MarginalLikelihood(model, TIMES, steps=steps, iterations=0, tolerance=tolerance)
 
 
 STEPPED = lfm.Input(jnp.array([0.0, 2.0, 4.0, 6.0]), jnp.array([1.0, -2.0, 3.0, -1.0]))
@@ -165,7 +165,7 @@ def test_a_cascade_from_a_known_zero_in_any_units(units):
             Cascade(jnp.asarray(units)), {"u": lfm.Matern(1.0, 2.0)},
             lfm.GaussianObservation(Last(jnp.asarray(units)), 0.01 * jnp.ones(1)),
             lfm.Gaussian(np.zeros(4), np.zeros(4)), initial_time=-2.0)
-        return lfm.MarginalLikelihood(model, TIMES, steps=steps, tolerance=tolerance).log_prob(Y)
+        return lfm.MarginalLikelihood(model, TIMES, steps=steps, iterations=0, tolerance=tolerance).log_prob(Y)
 
     exact = log_prob(None, 400)
     np.testing.assert_allclose(log_prob(1e-3, 30), exact, rtol=2e-2)

@@ -17,6 +17,7 @@ from lfm_ppl.filtering.time_grid import build_time_grid
 
 TIMES = np.array([0.5, 1.0, 9.0, 9.5])
 Y = np.array([0.4, 0.6, 0.5, 0.1])[:, None]
+LONG_STEPS = {"max_step": 1.0}  # ten steps in each interval: the default divides the long gap
 RATES = np.array([0.76, -0.46])
 
 
@@ -25,17 +26,17 @@ def test_the_row_and_the_step_are_named():
     steep = double_well(b=5.0)
     with pytest.warns(lfm.FilterWarning, match=r"row 2 \(time 9\), step \d of 10 from time 1 to 9: the predicted "
                                                r"(mean|covariance) is not finite.*-inf.*steps=.*max_step="):
-        found = lfm.filter(steep, TIMES, Y)
+        found = lfm.filter(steep, TIMES, Y, **LONG_STEPS)
     assert not np.isfinite(found.log_likelihood[2])
     with pytest.warns(lfm.FilterWarning, match=r"row 2 \(time 9\)"):
-        lfm.smooth(steep, TIMES, Y)
+        lfm.smooth(steep, TIMES, Y, **LONG_STEPS)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert np.isfinite(lfm.filter(steep, TIMES, Y, max_step=0.01).log_likelihood).all()
 
 
 def test_the_likelihood_says_it_outside_of_compiled_code():
-    likelihood = lfm.MarginalLikelihood(double_well(b=5.0), TIMES)
+    likelihood = lfm.MarginalLikelihood(double_well(b=5.0), TIMES, iterations=0, **LONG_STEPS)
     with pytest.warns(lfm.FilterWarning, match=r"row 2 \(time 9\), step \d of 10.*-inf.*steps=") as caught:
         assert np.isneginf(likelihood.log_prob(Y))
     assert caught[0].filename == __file__, "the user's line"
@@ -68,7 +69,7 @@ def test_compiled_code_says_nothing():
     y = jnp.asarray(Y)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        found = jax.jit(lambda b: lfm.filter(double_well(b=b), TIMES, y).log_likelihood)(5.0)
+        found = jax.jit(lambda b: lfm.filter(double_well(b=b), TIMES, y, **LONG_STEPS).log_likelihood)(5.0)
     assert not np.isfinite(found).all()
 
 
