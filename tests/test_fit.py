@@ -568,7 +568,7 @@ def decaying_counts(times, y=None, fault=None):
     slope = jnp.linalg.norm(0.0 * rate) if fault == "gradient" else 0.0
 
     def predictor(x, u, t):
-        return jnp.log(x - 3.5) if fault == "function" else x
+        return x + jnp.log(jnp.where(t > 3.5, -1.0, 1.0)) if fault == "function" else x
 
     observation = (lfm.PoissonObservation(predictor, "identity") if fault == "law"
                    else lfm.PoissonObservation(predictor))
