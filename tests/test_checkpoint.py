@@ -315,7 +315,8 @@ def test_a_check_goes_on_where_it_was_stopped(whole, tmp_path, monkeypatch):
         with pytest.raises(KeyboardInterrupt):
             check(checkpoint=tmp_path)
     assert {path.name for path in (tmp_path / "checkpoint").iterdir() if path.is_dir()} == {
-        "log-likelihoods", "log-likelihoods-with-finer-steps", "particle-filter-20-particles"}
+        "log-likelihoods", "log-likelihoods-with-finer-steps", "log-likelihoods-with-more-iterations",
+        "particle-filter-20-particles"}
     put = checkpoints.Parts.put
     again = []
     monkeypatch.setattr(checkpoints.Parts, "put", lambda self, at, part: again.append(at) or put(self, at, part))

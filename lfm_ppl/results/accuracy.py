@@ -125,11 +125,11 @@ def _report(result: Any, problem: PosteriorDraws, chosen: np.ndarray, kind: str,
     filtered = likelihoods.gaussian(problem).reshape(shape)
     rebuilding.check_likelihood(result, likelihoods.recorded(problem, filtered.ravel()).reshape(shape), chosen)
     doubled = likelihoods.gaussian_with_finer_steps(problem).reshape(shape)
-    found = _reference(kind, problem, filtered, particles, replicates, steps, seed, progress)
     iterated = None
     if (refinement := more_iterations(problem.example)) is not None:
         refined = problem._replace(bound=problem.bound.approximate(**refinement.settings))
         iterated = likelihoods.gaussian(refined, "log likelihoods with more iterations").reshape(shape)
+    found = _reference(kind, problem, filtered, particles, replicates, steps, seed, progress)
     return assess(result, chosen, filtered, doubled, found, problem, iterated)
 
 
