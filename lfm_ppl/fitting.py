@@ -25,7 +25,6 @@ from lfm_ppl import calendar_time, checks
 from lfm_ppl.data import Data, as_data, at_origin, model_keywords
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.forces.sde import ApproximationWarning
-from lfm_ppl.forces.stretched import Stretched
 from lfm_ppl.inference import sampling
 from lfm_ppl.inference.ahead import Ahead
 from lfm_ppl.inference.bound_model import BoundModel, bind
@@ -41,7 +40,6 @@ from lfm_ppl.inference.laplace_start import (
     starting_points,
 )
 from lfm_ppl.inference.map import MAPResult, check_sites, mode_of
-from lfm_ppl.inference.marginal_likelihood import Panel
 from lfm_ppl.inference.posterior import evenly_spaced, scores, trajectories
 from lfm_ppl.inference.priors import assumptions, prior
 from lfm_ppl.inference.progress import Counter
@@ -54,7 +52,7 @@ from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.progress import waiting
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results import checkpoint as checkpoints
-from lfm_ppl.results.approximation import approximation_warnings
+from lfm_ppl.results.approximation import approximation_warnings, resolution_warnings
 from lfm_ppl.results.checkpoint import Checkpoint
 from lfm_ppl.results.files import POSTERIOR
 from lfm_ppl.results.inputs import remember
@@ -252,7 +250,6 @@ def fit(
             run.sample()
         run.follow()
         result = run.result()
-        run.cautions += kept("comparison of steps and lengthscales", lambda: _long_steps(bound, result), [])
         found = note_warnings(result, run.cautions)
         run.store(result)
         if run.keeper is not None and run.partial is None:
@@ -505,6 +502,7 @@ class _Run:
             self.rated = kept("scores of the observations",
                               lambda: scores(self.bound, flat, **watched("scores")), None)
             self.remarks |= self._found_of_sites(flat)
+            self.cautions += kept("resolution of the forces", lambda: resolution_warnings(self.bound, flat), [])
             if asked.sampler in FILTERED:
                 self.cautions += kept("error of the likelihood", lambda: approximation_warnings(
                     self.bound, flat, self._log_likelihood()), [])
@@ -604,26 +602,6 @@ def _draws(bound: BoundModel, rows: Mapping[str, np.ndarray], samples: int) -> t
     whole = np.concatenate([z, np.repeat(z[:, -1:], samples - count, axis=1)], axis=1)
     draws = {site: values[:, :count] for site, values in bound.constrain_draws(whole).items()}
     return draws, _statistics({name: values for name, values in rows.items() if name != "z"})
-
-
-def _long_steps(bound: BoundModel, result: Any) -> list[str]:
-    """Return a warning where an integration step is longer than half the posterior median of a lengthscale."""
-    posterior = result["posterior"]
-    medians = {name: np.median(posterior[name].values, axis=(0, 1)) for name in bound.sites if name in posterior}
-    distribution = bound.likelihood(medians)
-    distribution = distribution.first if isinstance(distribution, Panel) else distribution
-    ssm, grid = distribution.ssm, distribution.time_grid
-    length = checks.concrete(grid.intervals.length)
-    lengthscales = [float(force.lengthscale) for force in jax.tree_util.tree_leaves(
-        ssm.model.forces, is_leaf=lambda part: isinstance(part, Stretched)) if isinstance(force, Stretched)]
-    if ssm.time_invariant or distribution.tolerance is not None or length is None or not lengthscales:
-        return []
-    step = float(length.max()) / grid.steps
-    if step <= 0.5 * min(lengthscales):
-        return []
-    return [f"the longest integration step, {step:.3g}, is more than half of the shortest lengthscale of a force, "
-            f"{min(lengthscales):.3g} at the posterior median, so that the force is not resolved. Set "
-            f"max_step={0.5 * min(lengthscales):.2g} (--max-step {0.5 * min(lengthscales):.2g}) or less."]
 
 
 def note_warnings(result: Any, cautions: Sequence[str] = ()) -> list[str]:

@@ -6,20 +6,29 @@
    that is above `LARGEST_CHANGE`, each refinement is evaluated alone.
 3. The message names the refinements that are needed, which are far cheaper than an exact likelihood.
 
+Steps and forces are compared with the posterior medians as well: a step longer than half a lengthscale does not resolve
+the force, and the error of a force whose SDE is an approximation is estimated by algebra.
+
 The refined likelihood is not exact either: `lfm_ppl.check_accuracy` compares with an exact one.
 """
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
+from lfm_ppl import checks
+from lfm_ppl.forces.sde import ApproximationWarning
+from lfm_ppl.forces.stretched import Stretched
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.marginal_likelihood import DEFAULT_ITERATIONS, MarginalLikelihood
+from lfm_ppl.inference.marginal_likelihood import DEFAULT_ITERATIONS, MarginalLikelihood, Panel
 from lfm_ppl.inference.posterior import evenly_spaced
 from lfm_ppl.model.observations.family import ObservationFamily
+from lfm_ppl.model.resolution import check_resolution
 from lfm_ppl.results import likelihoods
 from lfm_ppl.results.likelihoods import PosteriorDraws
 
@@ -103,6 +112,40 @@ def approximation_warnings(bound: BoundModel, draws: Mapping[str, np.ndarray],
     if not needed:  # only both together
         needed = [(refinement, total) for refinement in refinements]
     return [_message(refinement, size, len(rows)) for refinement, size in needed]
+
+
+def resolution_warnings(bound: BoundModel, draws: Mapping[str, np.ndarray]) -> list[str]:
+    """Return messages on steps and forces that are too coarse at the posterior medians of the parameters.
+
+    Args:
+        bound: the model and its data.
+        draws: site name -> (S, ...), posterior draws.
+    """
+    likelihood = bound.likelihood({name: np.median(values, axis=0) for name, values in draws.items()})
+    y = np.asarray(bound.y)
+    if isinstance(likelihood, Panel):
+        likelihood, y = likelihood.first, y[0]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        check_resolution(likelihood.model, likelihood.times, y)
+    coarse = [str(warning.message) for warning in caught if issubclass(warning.category, ApproximationWarning)]
+    return [*_long_steps(likelihood), *coarse]
+
+
+def _long_steps(likelihood: MarginalLikelihood) -> list[str]:
+    """Return a message where an integration step is longer than half the lengthscale of a force."""
+    grid = likelihood.time_grid
+    length = checks.concrete(grid.intervals.length)
+    lengthscales = [float(force.lengthscale) for force in jax.tree_util.tree_leaves(
+        likelihood.model.forces, is_leaf=lambda part: isinstance(part, Stretched)) if isinstance(force, Stretched)]
+    if likelihood.ssm.time_invariant or likelihood.tolerance is not None or length is None or not lengthscales:
+        return []
+    step, longest = float(length.max()) / grid.steps, 0.5 * min(lengthscales)
+    if step <= longest:
+        return []
+    return [f"the longest integration step, {step:.3g}, is more than half of the shortest lengthscale of a force, "
+            f"{min(lengthscales):.3g} at the posterior median, so that the force is not resolved. Set "
+            f"max_step={longest:.2g} (--max-step {longest:.2g}) or less."]
 
 
 def _message(refinement: Refinement, change: float, draws: int) -> str:
