@@ -238,13 +238,13 @@ def fit(
         "model": title, "description": described_by(numpyro_model), "call": call, **asked.described(bound),
         "priors": kept("priors in words", lambda: _priors(bound), None),
         "assumptions": kept("the model in words", lambda: _assumptions(bound), None)}, dict(attributes or {}))
-    if progress:
-        print(f"likelihood: {run.described['likelihood']}", file=sys.stderr, flush=True)
     if checkpoint is not None:
         record = asked.record(bound, fingerprint)
         if resume and (finished := checkpoints.finished(checkpoint, record)) is not None:
             return finished
         run.keeper = checkpoints.begin_or_resume(checkpoint, record, resume)
+    if progress:
+        print(f"likelihood: {run.described['likelihood']}", file=sys.stderr, flush=True)
     with contextlib.closing(run.ahead), checkpoints.closing(run.keeper), calendar_time.in_messages(*clock):
         with _start_explained(bound):
             run.sample()

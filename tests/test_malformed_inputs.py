@@ -646,7 +646,7 @@ def result_of(attrs=None, without=(), panel=False):
                                     {"time": np.arange(4.0), "output": ["x"]}),
     }
     return arviz_data.build({name: group for name, group in groups.items() if name not in without}, {
-        "model": "model", "model_file": "model.py", "rule": "Cubature()", "steps": 1, "iterations": 0,
+        "model": "model", "model_file": "model.py", "rule": "Cubature()", "steps": 1, "iterations": 3,
                 "sampler": "nuts",
         "chains": 2, "warmup": 50, "samples": 50, "seed": 0, "fixed": "{}", "options": "{}",
         "settings": '{"rule": null, "steps": null, "max_step": null, "iterations": null, "tolerance": null}',

@@ -113,7 +113,7 @@ def test_nodes_after_a_known_start_are_those_of_dense_algebra():
     """Five genes that one force moves from a known start: the covariance of their state is nearly singular."""
     model = motif(softplus, genes=5, noise_sd=0.0682)
     ssm = lfm.state_space(model)
-    grid = build_time_grid(ssm, TIMES, 3)
+    grid = build_time_grid(ssm, TIMES, 3, max_step=10.0)
     y = jnp.asarray(observed(5, softplus))
     start = Moments(*ssm.initial())
 
@@ -208,13 +208,13 @@ def test_the_scan_for_draws_repeats_that_of_the_iterations(model):
     """It is linearised about the same moments: at the ends of the same steps the filter is the same."""
     steps, y = 6, observed(2, softplus)
     ssm, start = state_space(model), model.initial_time
-    grid = build_time_grid(ssm, TIMES, steps)
+    grid = build_time_grid(ssm, TIMES, steps, max_step=10.0)
     row_start, length = grid.intervals.start[:, None], grid.intervals.length[:, None]
     ends = np.unique(np.append(row_start + length * np.arange(1, steps) / steps, TIMES))
-    wanted = lfm.smooth(model, TIMES, y, steps=steps, iterations=3)._joint.passed
+    wanted = lfm.smooth(model, TIMES, y, steps=steps, max_step=10.0, iterations=3)._joint.passed
     at = ends[ends > start]
-    rows = smoothing_grids(ssm, TIMES, steps, None, at, 3).joint.observed
-    found = lfm.smooth(model, TIMES, y, steps=steps, iterations=3, at=at)._joint.passed
+    rows = smoothing_grids(ssm, TIMES, steps, 10.0, at, 3).joint.observed
+    found = lfm.smooth(model, TIMES, y, steps=steps, max_step=10.0, iterations=3, at=at)._joint.passed
     np.testing.assert_allclose(found.filtered.covariance[rows], wanted.filtered.covariance[grid.observed], atol=1e-10)
     np.testing.assert_allclose(found.gain[rows], wanted.gain[grid.observed], atol=1e-9)
 
