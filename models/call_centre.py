@@ -275,9 +275,11 @@ def _service(service: Any) -> Any:
 def _check_service(omega: Any) -> None:
     """Raise for a known service rate below zero."""
     values = getattr(omega, "values", 0.0)
-    if not isinstance(values, jax.core.Tracer) and np.min(values) < 0:
-        raise ValueError(f"the service rate must not be negative, got {np.min(values):g} customers/min. Give zero "
-                         "where nobody serves.")
+    if isinstance(values, jax.core.Tracer):
+        return
+    if (lowest := np.asarray(values).min()) < 0:
+        raise ValueError(f"the service rate must not be negative, got {lowest:g} customers/min. Give zero where nobody "
+                         "serves.")
 
 
 def _warn_overload(times: np.ndarray, rates: np.ndarray, service: float) -> None:

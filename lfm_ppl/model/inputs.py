@@ -143,7 +143,8 @@ def input_reads(functions: Sequence[Traced], first: float, last: float) -> list[
                  if isinstance(value, jax.core.Tracer) else value for value in consts]
         calls = zip(*(function.table_calls(_MARK, t, tried) for t in trials), strict=True)
         exact = zip(*(function.table_calls(_MARK, t, consts) for t in (0.0, 1.0)), strict=True)
-        for trial, ((name, times, values, at_zero), (*_, at_one)) in zip(calls, exact, strict=True):
+        pairs = zip(calls, exact, strict=True)
+        for position, (trial, ((name, times, values, at_zero), (*_, at_one))) in enumerate(pairs):
             reads = [call[-1] for call in trial]
             if times is None or any(read is None for read in (*reads, at_zero, at_one)):
                 continue  # it depends on the state, or on what a loop changes
@@ -152,7 +153,10 @@ def input_reads(functions: Sequence[Traced], first: float, last: float) -> list[
             error = max(np.max(np.abs(read - reads[0] - slope * t)) for read, t in zip(reads, trials, strict=True))
             size = max(np.max(np.abs(read)) for read in reads) + np.max(np.abs(slope)) * max(np.abs(trials))
             if error > 1e-9 * size or np.any(slope == 0):
-                _refuse_read(function.what, called, checks.traced((at_zero, at_one)), bool(np.all(slope == 0)))
+                if _is_read_in_place(function, position, first, last):
+                    found.append(InputRead(interpolation, times, values, 1.0, 0.0))
+                else:
+                    _refuse_read(function.what, called, checks.traced((at_zero, at_one)), bool(np.all(slope == 0)))
                 continue
             # That of a random parameter is one by no chance.
             unit = np.all(np.abs(slope - 1.0) < 1e-9)
@@ -161,6 +165,26 @@ def input_reads(functions: Sequence[Traced], first: float, last: float) -> list[
                 begin, end = (a[index] for a in flat)
                 found.append(InputRead(interpolation, times, values, 1.0 if unit else end - begin, begin))
     return found
+
+
+def _is_read_in_place(function: Traced, position: int, first: float, last: float) -> bool:
+    """Return whether an input is read at t, clipped to an interval, so that its breakpoints are in their place.
+
+    Args:
+        function: of (x, u, t) or of t.
+        position: of the input among those that it reads.
+        first: a time of the model.
+        last: a later one.
+    """
+    if checks.traced(function.closed.consts):
+        return False
+    times = np.linspace(first, last, _SAMPLED)
+    reads = [list(function.table_calls(_MARK, t, function.closed.consts))[position][-1] for t in times]
+    if any(np.size(read) != 1 for read in reads if read is not None) or any(read is None for read in reads):
+        return False
+    when = np.ravel(reads)
+    error = np.max(np.abs(when - np.clip(times, when.min(), when.max())))
+    return bool(error <= 1e-9 * max(1.0, np.abs(times).max()))
 
 
 def _refuse_read(what: str, called: str, traced: bool, constant: bool) -> None:
@@ -250,6 +274,9 @@ def _reader(interpolation: str, outside: str, name: str) -> Callable[..., jax.Ar
     read.__name__ = read.__qualname__ = f"{_MARK}{interpolation}_{outside}_{name}"
     return jax.jit(read)
 
+
+_SAMPLED = 50
+"""Times of the model at which the time of a read is compared with a clipped one."""
 
 _COLLINEAR = 1e-10
 """Change of a slope, as a share of its size, below which a linear input has no kink."""
