@@ -94,6 +94,7 @@ def test_all_families_add_their_densities(sites):
     np.testing.assert_allclose(gradient, jax.grad(lambda theta: exact_rows(theta).sum())(THETA), rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_filter_and_smoother_of_deterministic_rows():
     """One-step-ahead terms, leave-one-out terms, moments and draws."""
     model = decay(THETA, all_families(THETA))
@@ -171,6 +172,7 @@ def test_small_variances_lead_to_the_deterministic_limit(name, build):
         np.testing.assert_allclose(gradient, slope, rtol=2e-8, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_deterministic_and_uncertain_outputs_side_by_side():
     """They share no state: densities add, in each row, and so do gradients."""
     y = np.stack([COUNTS, 0.5 * np.sin(TIMES)], axis=1)
