@@ -33,7 +33,8 @@ _INFERRED = (("years", 300 * 86400.0), ("d", 86400.0), ("h", 3600.0), ("min", 60
 
 def is_date(cell: Any) -> bool:
     """Whether a cell of a table holds a date or a time of a calendar, and not a number."""
-    if isinstance(cell, (date, np.datetime64)) or hasattr(cell, "to_timestamp"):
+    # Periods of pandas; its tables and columns have `to_timestamp`, too.
+    if isinstance(cell, (date, np.datetime64)) or hasattr(cell, "to_timestamp") and hasattr(cell, "ordinal"):
         return True
     if not isinstance(cell, str) or not any(mark in cell for mark in "-:"):
         return False  # 20190412 is a number

@@ -678,14 +678,14 @@ def _nuts_transition(bound: BoundModel, asked: _Asked, setup: Mapping[str, Any] 
     init, options = asked.init, asked.options
     _check_init(init)
     # A mass matrix of the user's is not regularised by another one.
-    is_free = not {"inverse_mass_matrix", "dense_mass"} & options.keys()
+    is_free = "inverse_mass_matrix" not in options and options.get("dense_mass", True) is True
     placeholder = Laplace(np.zeros(bound.size), np.eye(bound.size))
 
     def transition(laplace: Laplace | None, warmup: int) -> Transition:
         return sampling.nuts(bound, warmup * (asked.thin or 1), options, laplace if is_free else None)
 
     def steps(is_laplace: bool) -> int:
-        return asked.warmup if asked.warmup is not None else _SHORT_WARMUP if is_laplace else _WARMUP
+        return asked.warmup if asked.warmup is not None else _SHORT_WARMUP if is_laplace and is_free else _WARMUP
 
     if setup is not None:
         is_laplace = setup["init"] == "laplace"
@@ -701,8 +701,9 @@ def _nuts_transition(bound: BoundModel, asked: _Asked, setup: Mapping[str, Any] 
         except UnusableModeError as error:
             reason = f"the chains start at the prior median, with a unit mass matrix: {error}"
         else:
-            return (transition(laplace, steps(True)), starting_points(asked.keys[2], bound, laplace, asked.chains),
-                    {"warmup": steps(True), "init": "laplace"})
+            chosen = transition(laplace, steps(True))._replace(if_slow="")
+            points = starting_points(asked.keys[2], bound, laplace, asked.chains)
+            return chosen, points, {"warmup": steps(True), "init": "laplace"}
         init = None
     chosen = transition(None, steps(False))
     prepare(chosen, steps(False))

@@ -27,6 +27,10 @@ _REPLICATED = 0.2
 """Share of intervals of length zero from which a branch costs less than the predictions that it saves."""
 
 
+_MOST_STEPS = 20.0
+"""Steps, as a multiple of those without a longest step, that the default of the longest step adds at most."""
+
+
 class Intervals(NamedTuple):
     """The intervals of the scan, one entry each: a prediction, perhaps a jump, perhaps an observation.
 
@@ -241,7 +245,8 @@ def longest_step(ssm: StateSpaceModel, times: Any, origin: Any, steps: int) -> f
     """Return the default longest step, twice the median step; None for an exact model, and for traced times.
 
     The number of steps is the same between any two times, so that a gap in the data would be crossed in steps that are
-    too long for a force or for the dynamics.
+    too long for a force or for the dynamics. In bursts of readings with long pauses the median is that of the bursts:
+    the limit is at least a twentieth of the mean step, so that the number of steps stays within about twenty times.
 
     Args:
         ssm: the model.
@@ -252,9 +257,10 @@ def longest_step(ssm: StateSpaceModel, times: Any, origin: Any, steps: int) -> f
     if ssm.mean_invariant or checks.traced((times, origin)):
         return None
     gaps = np.diff(np.asarray(times, float), prepend=float(origin))
-    if not (gaps > 0).any():
+    gaps = gaps[gaps > 0]
+    if not gaps.size:
         return None
-    return 2.0 * float(np.median(gaps[gaps > 0])) / steps
+    return max(2.0 * float(np.median(gaps)), float(np.mean(gaps)) / _MOST_STEPS) / steps
 
 
 def _traced(ssm: StateSpaceModel, times: Any, pieces: int, steps: int, max_step: Any, at: Any,

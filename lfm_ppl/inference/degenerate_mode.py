@@ -50,6 +50,7 @@ def degenerate_entries(bound: BoundModel, mode: MAPResult, draws: Mapping[str, n
     sizes = [np.size(mode.unconstrained[site]) for site in sites]
     offsets = np.concatenate([[0], np.cumsum(sizes)]).astype(int)
     suspected = _spread_without_data(bound, mode)
+    is_below = mode.mode < bound.draw(jax.random.key(0), init_to_median)
     found = {}
     for site, first, last in zip(sites, offsets[:-1], offsets[1:], strict=True):
         distribution = trace[site]["fn"]
@@ -62,7 +63,8 @@ def degenerate_entries(bound: BoundModel, mode: MAPResult, draws: Mapping[str, n
         if entries.size != last - first:
             continue
         impossible = np.any(~np.isfinite(values[:, entries]) | (values[:, entries] <= 0.0), axis=0)
-        runaway = np.array([name in mode.runaway for name in mode.coordinates[first:last]])
+        # To infinity run parameters that the data do not bound, which is no spike.
+        runaway = is_below[first:last] & [name in mode.runaway for name in mode.coordinates[first:last]]
         is_degenerate = impossible | runaway | suspected[first:last]
         if is_degenerate.any():
             found[site] = entries[is_degenerate].tolist()

@@ -240,11 +240,8 @@ def _plan(bound: BoundModel, at: np.ndarray | None, simulated: bool, since: floa
     known = bound.times
     gaps = np.diff(known, axis=-1)
     base = example.steps
-    longest = example.max_step
-    if longest is None and known.ndim == 1 and example.tolerance is None:
-        longest = longest_step(example.ssm, known, example.time_grid.initial_time, base)
-    if longest is not None:
-        base = max(base, int(np.ceil(gaps.max(initial=0.0) / longest * (1 - 1e-12))))
+    if example.max_step is not None:
+        base = max(base, int(np.ceil(gaps.max(initial=0.0) / example.max_step * (1 - 1e-12))))
     fine = SIMULATION_STEPS * base * (1 if example.tolerance is None else _TRIED)
     rows = np.arange(known.shape[-1])
     if at is None:

@@ -143,9 +143,10 @@ def _long_steps(likelihood: MarginalLikelihood) -> list[str]:
     step, longest = float(length.max()) / grid.steps, 0.5 * min(lengthscales)
     if step <= longest:
         return []
+    remedy = f"{0.9 * longest:.2g}"  # rounded, it must not exceed the limit
     return [f"the longest integration step, {step:.3g}, is more than half of the shortest lengthscale of a force, "
             f"{min(lengthscales):.3g} at the posterior median, so that the force is not resolved. Set "
-            f"max_step={longest:.2g} (--max-step {longest:.2g}) or less."]
+            f"max_step={remedy} (--max-step {remedy}) or less."]
 
 
 def _message(refinement: Refinement, change: float, draws: int) -> str:
