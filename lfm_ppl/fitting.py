@@ -262,7 +262,7 @@ def fit(
         warnings.warn(f"the run was stopped, and its result is partial: {run.partial}.", stacklevel=2)
     for message in run.cautions:
         checks.warn(message, ApproximationWarning)
-    warn_of_convergence([message for message in found if message not in run.cautions])
+    warn_of_convergence(found)
     return result
 
 
@@ -605,14 +605,14 @@ def _draws(bound: BoundModel, rows: Mapping[str, np.ndarray], samples: int) -> t
 
 
 def note_warnings(result: Any, cautions: Sequence[str] = ()) -> list[str]:
-    """Store in a result what is wrong with its draws and its likelihood, in its attribute ``warnings``, and return it.
+    """Store warnings of the draws and the likelihood in the attribute ``warnings``; return those of the draws.
 
     Args:
         result: an ArviZ object.
         cautions: messages on the likelihood.
     """
-    found = [*arviz_data.convergence_warnings(result), *cautions]
-    result.attrs["warnings"] = json.dumps(found)
+    found = arviz_data.convergence_warnings(result)
+    result.attrs["warnings"] = json.dumps([*found, *cautions])
     return found
 
 
@@ -693,7 +693,7 @@ def _nuts_transition(bound: BoundModel, asked: _Asked, setup: Mapping[str, Any] 
         prepare(resumed, setup["warmup"])
         return resumed, None, dict(setup)
     reason = None
-    if init is None or isinstance(init, str) and init == "map":
+    if init in (None, "map"):
         if bound.size <= MAX_PARAMETERS:
             prepare(transition(placeholder, steps(True)), steps(True))
         try:

@@ -26,7 +26,6 @@ _STEPS_OF_PULSE = 4
 _REPLICATED = 0.2
 """Share of intervals of length zero from which a branch costs less than the predictions that it saves."""
 
-
 _MOST_STEPS = 20.0
 """Steps, as a multiple of those without a longest step, that the default of the longest step adds at most."""
 

@@ -27,6 +27,7 @@ from lfm_ppl.filtering.filter import (
     FilterResult,
     as_rule,
     at_intervals,
+    bends,
     check_observations,
     filter_on,
     forward,
@@ -196,8 +197,7 @@ class MarginalLikelihood(dist.Distribution):
     @property
     def is_affine(self) -> bool:
         """Whether dynamics and observation are affine in states and forces, with noise that does not depend on them."""
-        observation = self.model.observation
-        return is_linear(self.ssm) and not (observation.varies_with_state or observation.angular)
+        return is_linear(self.ssm) and not bends(self.ssm)
 
     @property
     def description(self) -> str:

@@ -66,12 +66,14 @@ def check_resolution(model: LatentForceModel, times: Any, y: Any) -> None:
     Warns:
         ApproximationWarning: the estimated error of the log likelihood exceeds 0.1.
     """
-    for found in resolutions(model, times, y):
-        if found.error > TOLERANCE:
-            warnings.warn(_message(found), ApproximationWarning, stacklevel=4)
-    for truncation in truncations(model, times, y):
-        if truncation.error > TOLERANCE:
-            warnings.warn(truncation_message(truncation), ApproximationWarning, stacklevel=4)
+    for message in resolution_messages(model, times, y):
+        warnings.warn(message, ApproximationWarning, stacklevel=4)
+
+
+def resolution_messages(model: LatentForceModel, times: Any, y: Any) -> list[str]:
+    """Return the messages of `check_resolution`, one for each force that is too coarse; arguments as there."""
+    return [_message(resolution) for resolution in resolutions(model, times, y) if resolution.error > TOLERANCE] + [
+        truncation_message(truncation) for truncation in truncations(model, times, y) if truncation.error > TOLERANCE]
 
 
 def resolutions(model: LatentForceModel, times: Any, y: Any = None) -> list[Resolution]:

@@ -14,7 +14,6 @@ The refined likelihood is not exact either: `lfm_ppl.check_accuracy` compares wi
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -22,13 +21,12 @@ import jax
 import numpy as np
 
 from lfm_ppl import checks
-from lfm_ppl.forces.sde import ApproximationWarning
 from lfm_ppl.forces.stretched import Stretched
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.marginal_likelihood import DEFAULT_ITERATIONS, MarginalLikelihood, Panel
 from lfm_ppl.inference.posterior import evenly_spaced
 from lfm_ppl.model.observations.family import ObservationFamily
-from lfm_ppl.model.resolution import check_resolution
+from lfm_ppl.model.resolution import resolution_messages
 from lfm_ppl.results import likelihoods
 from lfm_ppl.results.likelihoods import PosteriorDraws
 
@@ -125,11 +123,7 @@ def resolution_warnings(bound: BoundModel, draws: Mapping[str, np.ndarray]) -> l
     y = np.asarray(bound.y)
     if isinstance(likelihood, Panel):
         likelihood, y = likelihood.first, y[0]
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        check_resolution(likelihood.model, likelihood.times, y)
-    coarse = [str(warning.message) for warning in caught if issubclass(warning.category, ApproximationWarning)]
-    return [*_long_steps(likelihood), *coarse]
+    return [*_long_steps(likelihood), *resolution_messages(likelihood.model, likelihood.times, y)]
 
 
 def _long_steps(likelihood: MarginalLikelihood) -> list[str]:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.filtering import site_importance
+from lfm_ppl.filtering.filter import bends
 from lfm_ppl.filtering.sites import as_settings, is_linear
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.fokker_planck_grid import fokker_planck
@@ -93,11 +94,7 @@ class Reference(NamedTuple):
 
 def is_exact(ssm: StateSpaceModel) -> bool:
     """Whether the Gaussian filter computes the exact likelihood: linear dynamics and observation, Gaussian noise."""
-    observation = ssm.model.observation
-    if isinstance(observation, ObservationFamily):
-        return False
-    return (ssm.time_invariant and ssm.observation_structure.linear and not observation.varies_with_state
-            and not observation.angular)
+    return not isinstance(ssm.model.observation, ObservationFamily) and ssm.time_invariant and not bends(ssm)
 
 
 def gaussian(problem: PosteriorDraws, name: str = "log likelihoods") -> np.ndarray:
