@@ -16,9 +16,9 @@ from lfm_ppl.batching import BATCH_SIZE, mapped, on_cpu, side_by_side, threads
 from lfm_ppl.filtering.smoother import LONGEST_FORECAST, SmootherResult
 from lfm_ppl.filtering.time_grid import build_time_grid, longest_step
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.fingerprint import signature
 from lfm_ppl.inference.marginal_likelihood import SIMULATION_STEPS, MarginalLikelihood, Panel
 from lfm_ppl.inference.random_keys import split_keys
+from lfm_ppl.inference.traced_model import signature
 from lfm_ppl.linalg import semidefinite_root
 from lfm_ppl.model.observation_noise import expected_observation, noisy_observation, with_noise
 from lfm_ppl.model.observations.family import ObservationFamily

@@ -23,7 +23,6 @@ from numpyro.infer.util import ParamInfo
 
 from lfm_ppl import checks
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.fingerprint import signature
 from lfm_ppl.inference.interruption import Interruption, was_interrupt
 from lfm_ppl.inference.kernels import robust_metropolis
 from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalRAM, ParticleMarginalState
@@ -32,6 +31,7 @@ from lfm_ppl.inference.kernels.robust_metropolis import RAMState, finite_or_infi
 from lfm_ppl.inference.laplace_start import Laplace
 from lfm_ppl.inference.progress import Progress, Stage
 from lfm_ppl.inference.random_keys import split_keys
+from lfm_ppl.inference.traced_model import signature
 
 CHAIN_METHODS = ("parallel", "vectorized", "sequential")
 
