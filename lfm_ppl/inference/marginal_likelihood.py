@@ -47,12 +47,7 @@ from lfm_ppl.filtering.sites import (
     is_linear,
     leave_one_out,
 )
-from lfm_ppl.filtering.smoother import (
-    SmootherResult,
-    check_iterations,
-    smooth_on,
-    smoothing_grids,
-)
+from lfm_ppl.filtering.smoother import SmootherResult, check_iterations, smooth_on
 from lfm_ppl.filtering.time_grid import TimeGrid, build_time_grid
 from lfm_ppl.filtering.update import Sites
 from lfm_ppl.gradients import finite_or_minus_infinity
@@ -419,10 +414,9 @@ class MarginalLikelihood(dist.Distribution):
 
     def smooth(self, y: Any, at: Any = None) -> SmootherResult:
         """Smooth with this distribution's settings; see `lfm_ppl.smooth`. Constraints are of no account."""
-        grids = smoothing_grids(self.ssm, self.times, self.steps, self.max_step, at, self.iterations,
-                                self.tolerance)
+        grid = build_time_grid(self.ssm, self.times, self.steps, self.max_step, at, tolerance=self.tolerance)
         y = self._checked(y)
-        return smooth_on(self.ssm, self.rule, grids, y, self.iterations, self.damping, self.site_settings)
+        return smooth_on(self.ssm, self.rule, grid, y, self.iterations, self.damping, self.site_settings)
 
 
 def _shown(value: Any) -> str:

@@ -13,8 +13,8 @@ import numpy as np
 
 from lfm_ppl import checks
 from lfm_ppl.batching import BATCH_SIZE, mapped, on_cpu, side_by_side, threads
-from lfm_ppl.filtering.smoother import LONGEST_FORECAST, SmootherResult
-from lfm_ppl.filtering.time_grid import build_time_grid, longest_step
+from lfm_ppl.filtering.smoother import SmootherResult
+from lfm_ppl.filtering.time_grid import LONGEST_FORECAST, build_time_grid
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.marginal_likelihood import SIMULATION_STEPS, MarginalLikelihood, Panel
 from lfm_ppl.inference.random_keys import split_keys
@@ -355,10 +355,7 @@ def _particle_path(distribution: MarginalLikelihood, y: jax.Array, at: Any, key:
     to its estimate of the likelihood gives a path of the right one as the number of filters grows, too.
     """
     ssm, times = distribution.ssm, distribution.times
-    longest = distribution.max_step
-    if longest is None:
-        longest = longest_step(ssm, times, distribution.time_grid.initial_time, steps)
-    grid = build_time_grid(ssm, times, _steps_per_interval(ssm, times, at, steps), longest, at)
+    grid = build_time_grid(ssm, times, steps, distribution.max_step, at)
     path_keys, choice = jax.random.split(key, _FILTERS + 1)[:-1], jax.random.fold_in(key, _FILTERS)
     states, _, total = jax.lax.map(lambda k: draw_trajectories(ssm, grid, y, k, particles, 1, TRACING), path_keys)
     best = jax.random.categorical(choice, jnp.where(jnp.isneginf(total).all(), 0.0, total))
