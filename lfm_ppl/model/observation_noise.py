@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl import checks, linalg
-from lfm_ppl.linalg import cholesky, masked, matmul, semidefinite_root, solve_lower, wrapped
+from lfm_ppl import checks, gaussian_residuals
+from lfm_ppl.gaussian_residuals import masked, wrapped
+from lfm_ppl.linalg import cholesky, matmul, semidefinite_root, solve_lower
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel
 
@@ -39,7 +40,8 @@ def log_density(ssm: StateSpaceModel, w: jax.Array, t: jax.Array, row: jax.Array
     residual, noise = masked(residual, ssm.obs_cov(w, t, row), present)
     factor = cholesky(noise)
     white = solve_lower(factor.chol, residual)
-    return jnp.where(factor.degenerate.any(), -jnp.inf, linalg.log_density(white, factor.chol, present)), white
+    value = gaussian_residuals.log_density(white, factor.chol, present)
+    return jnp.where(factor.degenerate.any(), -jnp.inf, value), white
 
 
 def entry_log_prob(ssm: StateSpaceModel, w: jax.Array, t: jax.Array, row: Any, y: jax.Array) -> jax.Array:
