@@ -334,7 +334,8 @@ class SemidefiniteFactor(NamedTuple):
         """Return the conditional variance of each coordinate relative to its marginal variance, (n,).
 
         The condition is on the coordinates before it. The share is 0 at or below the tolerance, 1 where the marginal
-        variance is zero, -inf where that is negative. The inverse of the least share bounds the growth of rounding errors.
+        variance is zero, -inf where that is negative. Solving amplifies rounding errors by up to the inverse of the
+        least share.
         """
         pivots = diagonal(self.factor.chol) ** 2
         # Sites of negative precision can make a variance negative; callers must not solve with such a matrix.
