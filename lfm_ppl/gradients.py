@@ -62,10 +62,10 @@ def finite_or_minus_infinity(log_density: Callable[..., jax.Array], *arguments: 
         0.0
     """
     converted, closed_over = jax.closure_convert(log_density, *arguments)
-    value = converted(*jax.tree.map(_guarded, arguments), *map(_guarded, closed_over))
+    value = converted(*jax.tree.map(_guard, arguments), *map(_guard, closed_over))
     return _finite_or_minus_infinity(value)
 
 
-def _guarded(x: Any) -> Any:
+def _guard(x: Any) -> Any:
     """Return ``x``, with a cotangent of zero where it is not finite; integers have no cotangent."""
     return _finite_cotangent_p.bind(x) if jnp.issubdtype(jnp.result_type(x), jnp.floating) else x

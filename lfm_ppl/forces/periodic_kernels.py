@@ -222,8 +222,8 @@ class PeriodicKernel(PeriodicCovariance):
 
     function: Callable[..., Any]
     period: jax.Array
-    first: jax.Array
-    repeats: bool = eqx.field(static=True)
+    cycle_start: jax.Array
+    is_stationary: bool = eqx.field(static=True)
     label: str = eqx.field(static=True)
     has_fixed_period: bool = eqx.field(static=True)
 
@@ -232,20 +232,20 @@ class PeriodicKernel(PeriodicCovariance):
             raise TypeError(f"function must be callable as k(t, s), got {type(function).__name__}.")
         self.function = function if isinstance(function, eqx.Module) else jax.tree_util.Partial(function)
         self.period, self.has_fixed_period = positive_parameter("period", period), _is_number(period)
-        self.first = scalar_parameter("start", start)
-        self.repeats = bool(stationary)
+        self.cycle_start = scalar_parameter("start", start)
+        self.is_stationary = bool(stationary)
         self.label = getattr(function, "__name__", type(function).__name__)
         _check_function(self)
 
     @property
     def stationary(self) -> bool:
         """Whether the function was declared stationary."""
-        return self.repeats
+        return self.is_stationary
 
     @property
     def start(self) -> jax.Array:
         """The beginning of a cycle."""
-        return self.first
+        return self.cycle_start
 
     @property
     def name(self) -> str:
@@ -258,7 +258,7 @@ class PeriodicKernel(PeriodicCovariance):
 
     def _in_cycle(self, t: ArrayLike) -> jax.Array:
         t = jnp.asarray(t, float)
-        cycle = jax.lax.stop_gradient(jnp.floor((t - self.first) / self.period))
+        cycle = jax.lax.stop_gradient(jnp.floor((t - self.cycle_start) / self.period))
         return t - cycle * self.period
 
 
@@ -266,7 +266,7 @@ def _check_function(kernel: PeriodicKernel) -> None:
     """Evaluate the function at a few times of a cycle and check the values."""
     # Irregular fractions of a cycle.
     fractions = np.array([0.0, 0.113, 0.331, 0.502, 0.743, 0.958])
-    times = kernel.first + kernel.period * fractions
+    times = kernel.cycle_start + kernel.period * fractions
     value = kernel(times[:, None], times[None, :])
     if value.shape != (6, 6):
         raise ValueError(f"the kernel {kernel.name!r} must work elementwise: for times of shape (6, 1) and (1, 6) it "
@@ -275,12 +275,12 @@ def _check_function(kernel: PeriodicKernel) -> None:
     if gram is None:
         return
     if not np.isfinite(gram).all():
-        raise ValueError(f"the kernel {kernel.name!r} is not finite on the cycle from {float(kernel.first):g}.")
+        raise ValueError(f"the kernel {kernel.name!r} is not finite on the cycle from {float(kernel.cycle_start):g}.")
     tolerance = 1e-8 * np.abs(gram).max()
     if np.abs(gram - gram.T).max() > tolerance:
         raise ValueError(f"the kernel {kernel.name!r} is not symmetric: k(t, s) differs from k(s, t) by "
                          f"{np.abs(gram - gram.T).max():g}.")
-    if kernel.repeats:
+    if kernel.is_stationary:
         shifted_times = times + 0.271 * kernel.period
         shifted = np.asarray(kernel(shifted_times[:, None], shifted_times[None, :]))
         if np.abs(shifted - gram).max() > tolerance:

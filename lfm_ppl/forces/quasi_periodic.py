@@ -149,7 +149,7 @@ class QuasiPeriodic(Force):
 
     def initial_covariance(self) -> jax.Array:
         """Return P0 (n, n)."""
-        return self._weighted(self.evolution.initial_covariance())
+        return self._scaled_by_variances(self.evolution.initial_covariance())
 
     def feedback(self) -> jax.Array:
         """Return F (n, n), the Kronecker sum of the feedbacks of basis and evolution."""
@@ -164,7 +164,7 @@ class QuasiPeriodic(Force):
         """Return transition (n, n) and process noise (n, n) over a step of length dt >= 0."""
         transition, noise = self.evolution.discretise(dt)
         # The covariance of a pair is a multiple of the identity, which its rotation does not change.
-        return jnp.kron(self.basis.transition(dt), transition), self._weighted(noise)
+        return jnp.kron(self.basis.transition(dt), transition), self._scaled_by_variances(noise)
 
     def measurement(self, t: ArrayLike) -> jax.Array:
         """Return H(t) (n,)."""
@@ -218,9 +218,10 @@ class QuasiPeriodic(Force):
     def jump(self, index: int) -> tuple[jax.Array, jax.Array]:
         """Return G (n, n) and Q (n, n): the jump of the evolution, applied to every weight."""
         transition, noise = self.evolution.jump(index)
-        return jnp.kron(np.eye(self.basis.count), transition), self._weighted(noise)
+        return jnp.kron(np.eye(self.basis.count), transition), self._scaled_by_variances(noise)
 
-    def _weighted(self, covariance: jax.Array) -> jax.Array:
+    def _scaled_by_variances(self, covariance: jax.Array) -> jax.Array:
+        """Return the covariance (n, n) of all weights, given that of the evolution."""
         return jnp.kron(jnp.diag(self.basis.variances()), covariance)
 
 

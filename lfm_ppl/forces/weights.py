@@ -125,7 +125,7 @@ class SQM(_StepEvolution):
 
     def __init__(self, lengthscale: Any, change_points: Sequence[float]):
         self.lengthscale = positive_parameter("lengthscale", lengthscale)
-        self.change_points = _increasing(change_points)
+        self.change_points = _increasing_times(change_points)
         self.mean = scalar_parameter("mean", 0.0)
 
     def jump(self, index: int) -> tuple[jax.Array, jax.Array]:
@@ -166,7 +166,7 @@ class WQM(_StepEvolution):
 
     def __init__(self, growth: Any, change_points: Sequence[float]):
         self.growth = standard_deviation_parameter("growth", growth)
-        self.change_points = _increasing(change_points)
+        self.change_points = _increasing_times(change_points)
         self.mean = scalar_parameter("mean", 0.0)
 
     def jump(self, index: int) -> tuple[jax.Array, jax.Array]:
@@ -211,7 +211,7 @@ def change_points(period: float, start: float, stop: float) -> tuple[float, ...]
     return tuple(start + period * index for index in range(1, count + 1))
 
 
-def _increasing(points: Sequence[float]) -> tuple[float, ...]:
+def _increasing_times(points: Sequence[float]) -> tuple[float, ...]:
     if checks.traced(points):
         raise TypeError("change_points must be known before compilation; pass numbers, not traced values.")
     times = np.asarray(points)
