@@ -227,11 +227,11 @@ def check_reads(functions: Sequence[TracedFunction], first: float, last: float) 
     Warns:
         UserWarning: a function reads an input with ``outside="warn"`` beyond its table.
     """
-    beyond: dict[str, set[str]] = {"warn": set(), "error": set()}
+    violations: dict[str, set[str]] = {"warn": set(), "error": set()}
     for function in functions:
         for name, table, read_times in (read for t in (first, last) for read in function.table_reads(_MARK, t)):
             interpolation, policy, input_name = name[name.index(_MARK) + len(_MARK):].split("_", 2)
-            if policy not in beyond or table.ndim != 1 or table.size < 2:
+            if policy not in violations or table.ndim != 1 or table.size < 2:
                 continue
             end = table[-1] + (table[-1] - table[-2] if interpolation == "previous" else 0.0)
             rounding = 4 * np.finfo(float).eps * max(abs(table[0]), abs(end), abs(first), abs(last))
@@ -239,15 +239,15 @@ def check_reads(functions: Sequence[TracedFunction], first: float, last: float) 
             span = (f"the known input {f'{input_name!r} ' if input_name else ''}in {function.label}, whose table goes "
                     f"from {named(table[0])} to {named(table[-1])}, is read at")
             if np.min(read_times) < table[0] - slack:
-                beyond[policy].add(f"{span} time {named(np.min(read_times))}, where its first value holds")
+                violations[policy].add(f"{span} time {named(np.min(read_times))}, where its first value holds")
             if np.max(read_times) > end + slack:
-                beyond[policy].add(f"{span} time {named(np.max(read_times))}, where its last value holds")
+                violations[policy].add(f"{span} time {named(np.max(read_times))}, where its last value holds")
     remedy = ('Give it values for these times, as rows of the data file or with --held-out, or accept the held value '
               'with lfm.Input(..., outside="hold").')
-    if beyond["error"]:
-        raise ValueError(f"{'; '.join(sorted(beyond['error']))}. {remedy}")
-    if beyond["warn"]:
-        checks.warn(f"{'; '.join(sorted(beyond['warn']))}. {remedy}")
+    if violations["error"]:
+        raise ValueError(f"{'; '.join(sorted(violations['error']))}. {remedy}")
+    if violations["warn"]:
+        checks.warn(f"{'; '.join(sorted(violations['warn']))}. {remedy}")
 
 
 def breakpoints_within(reads: Sequence[InputRead], first: float, last: float) -> tuple[np.ndarray, Any]:

@@ -104,7 +104,7 @@ class LatentForceModel(eqx.Module):
         deterministics: Mapping[str, Callable[..., jax.Array]] | None = None,
     ):
         _check_types(dynamics, observation, initial_state)
-        self.force_names, self.forces = _named_forces(forces)
+        self.force_names, self.forces = _forces_by_name(forces)
         self.dynamics, self.initial_state = dynamics, initial_state
         self.observation = self._with_output_sizes(observation)
         if initial_time is not None:
@@ -119,7 +119,7 @@ class LatentForceModel(eqx.Module):
         self.process_noise = process_noise if callable(process_noise) else _dispersion(process_noise, size)
         self.deterministics = _functions(deterministics, {*self.state_names, *self.force_names})
         self.deterministic_names = tuple(self.deterministics)
-        functions = self._traced()
+        functions = self._trace_functions()
         self.output_names = _names("output_names", output_names, functions["observation"].shape.shape[0], "y")
         if isinstance(self.observation, ObservationFamily):
             self.observation.check_shapes(len(self.output_names))
@@ -129,7 +129,7 @@ class LatentForceModel(eqx.Module):
             checks.one_of("name in nonlinear_inputs", name, (*self.state_names, *self.force_names))
         self._functions_with_roots = tuple(name for name, function in functions.items() if function.has_roots)
         self._has_limited_inputs = any(has_limited_inputs(function) for function in functions.values())
-        self._has_integrated_inputs = any(has_inputs(function) for function in _integrated(functions))
+        self._has_integrated_inputs = any(has_inputs(function) for function in _integrated_functions(functions))
         self._check_precision()
         if self.initial_time is not None or not any(
                 function.depends_on_time for name, function in functions.items() if not name.startswith("determin")):
@@ -157,7 +157,7 @@ class LatentForceModel(eqx.Module):
 
         return observation.with_output_sizes(output_size)
 
-    def _traced(self) -> dict[str, TracedFunction]:
+    def _trace_functions(self) -> dict[str, TracedFunction]:
         """Return the traced functions of the model by name, after checks of their shapes and indices."""
         size = self.initial_state.mean.shape[0]
         u = jax.ShapeDtypeStruct((len(self.force_names),), jnp.result_type(float))
@@ -165,9 +165,9 @@ class LatentForceModel(eqx.Module):
         drift = trace("dynamics", "f(x, u, t)", self.dynamics, *arguments)
         if getattr(drift.shape, "shape", None) != (size,):
             raise ValueError(f"dynamics must return one derivative for each of the {size} entries of "
-                             f"initial_state.mean, shape ({size},); it returned {_described(drift.shape)}."
+                             f"initial_state.mean, shape ({size},); it returned {_describe(drift.shape)}."
                              f"{'' if getattr(drift.shape, 'shape', ()) else ' Return jnp.array([...]).'}")
-        functions = {"dynamics": drift, "observation": self._traced_observation(arguments)}
+        functions = {"dynamics": drift, "observation": self._trace_observation(arguments)}
         if callable(self.process_noise):
             noise = trace("process_noise", "(x, u, t)", self.process_noise, *arguments)
             shape: Any = getattr(noise.shape, "shape", ())
@@ -177,7 +177,7 @@ class LatentForceModel(eqx.Module):
         if callable(self.observation.covariance):
             functions["covariance"] = trace("the observation covariance", "(x, u, t)", self.observation.covariance,
                                             *arguments)
-        functions |= self._traced_deterministics(arguments)
+        functions |= self._trace_deterministics(arguments)
         for function in functions.values():
             function.check_indices(("x", "u"))
         for name, force in self.forces.items():
@@ -186,7 +186,7 @@ class LatentForceModel(eqx.Module):
                                                      arguments[-1])
         return functions
 
-    def _traced_deterministics(self, arguments: tuple) -> dict[str, TracedFunction]:
+    def _trace_deterministics(self, arguments: tuple) -> dict[str, TracedFunction]:
         functions = {}
         for name, function in self.deterministics.items():
             label = f"the deterministic {name!r}"
@@ -198,7 +198,7 @@ class LatentForceModel(eqx.Module):
             functions[f"deterministic {name}"] = traced
         return functions
 
-    def _traced_observation(self, arguments: tuple) -> TracedFunction:
+    def _trace_observation(self, arguments: tuple) -> TracedFunction:
         traced = trace("the observation function", "h(x, u, t)", self.observation.function, *arguments)
         outputs = _vector_size(traced.shape)
         covariance = jax.eval_shape(self.observation.covariance_at, *arguments, 0)
@@ -255,11 +255,12 @@ class LatentForceModel(eqx.Module):
             ValueError: an input with ``outside="error"`` is read beyond its table; with "warn" it is a warning.
         """
         if self._has_limited_inputs:
-            check_reads(tuple(self._traced().values()), first, last)
+            check_reads(tuple(self._trace_functions().values()), first, last)
 
     def input_reads(self, first: float, last: float) -> list[InputRead]:
         """Return the reads of known inputs between observations, see `lfm_ppl.model.inputs.input_reads`."""
-        return input_reads(_integrated(self._traced()), first, last) if self._has_integrated_inputs else []
+        functions = _integrated_functions(self._trace_functions()) if self._has_integrated_inputs else []
+        return input_reads(functions, first, last)
 
     def _check_finite(self, time: Any) -> None:
         """Evaluate the functions at the prior mean, if it is concrete; ``time`` is None if it does not matter."""
@@ -280,7 +281,7 @@ class LatentForceModel(eqx.Module):
                 name = names[int(np.argmin(np.isfinite(value)))]
                 raise ValueError(f"the {label} returned {value} {where}: the entry for {name!r} is not finite. "
                                  "Change initial_state.mean, or guard the expression (for example jnp.maximum)."
-                                 + self._traced()[label.split()[0]].not_finite(*map(np.asarray, (x, u, t))))
+                                 + self._trace_functions()[label.split()[0]].not_finite(*map(np.asarray, (x, u, t))))
             if label.split()[0] in self._functions_with_roots:
                 self._check_derivative(label, function, names, (x, u, t), where)
             if value is not None and function is self.observation.function and isinstance(self.observation,
@@ -307,7 +308,7 @@ class LatentForceModel(eqx.Module):
                         "Change initial_state.mean, or guard the expression, as in jnp.sqrt(jnp.maximum(x, 1e-6)).")
 
 
-def _integrated(functions: Mapping[str, TracedFunction]) -> list[TracedFunction]:
+def _integrated_functions(functions: Mapping[str, TracedFunction]) -> list[TracedFunction]:
     """Return the functions that are evaluated between observations."""
     return [function for name, function in functions.items()
             if name in ("dynamics", "process_noise") or name.startswith("mean of ")]
@@ -341,12 +342,12 @@ def _check_types(dynamics: Any, observation: Any, initial_state: Any) -> None:
 def _vector_size(result: Any) -> int:
     """Return the length of the result of an observation function; raise ValueError unless it is a vector."""
     if len(getattr(result, "shape", ())) != 1:
-        raise ValueError(f"the observation function must return a vector (D,), got {_described(result)}. "
+        raise ValueError(f"the observation function must return a vector (D,), got {_describe(result)}. "
                          "For one output, return x[:1] or jnp.array([...]).")
     return result.shape[0]
 
 
-def _described(result: Any) -> str:
+def _describe(result: Any) -> str:
     """Return a description of the result of a function that should have returned a vector."""
     if hasattr(result, "shape"):
         return f"{'an array' if result.shape else 'a number'} of shape {result.shape}"
@@ -355,7 +356,7 @@ def _described(result: Any) -> str:
     return "None, as a function without `return` does" if result is None else type(result).__name__
 
 
-def _named_forces(forces: Any) -> tuple[tuple[str, ...], dict[str, Force]]:
+def _forces_by_name(forces: Any) -> tuple[tuple[str, ...], dict[str, Force]]:
     if isinstance(forces, Force) or not isinstance(forces, Iterable):
         raise TypeError('forces must map names to forces, for example {"p53": lfm.Matern(1.0, 2.0)}, or {} for none; '
                         f"got {type(forces).__name__}.")

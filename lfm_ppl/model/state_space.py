@@ -224,9 +224,9 @@ def _check_declared(function: Callable[[jax.Array], jax.Array], declared: tuple[
         hessian = jax.hessian(lambda v: jnp.stack(jax.core.eval_jaxpr(closed.jaxpr, consts, v))[0])
         curvature = np.max([np.nan_to_num(np.abs(hessian(jnp.asarray(generator.normal(size=total + 1))))).max(axis=0)
                             for _ in range(5)], axis=0)
-    wrong = [(i, j) for i in undeclared for j in undeclared if curvature[i, j] > 1e-12]
-    if wrong:
-        i, j = wrong[0]
+    omitted_pairs = [(i, j) for i in undeclared for j in undeclared if curvature[i, j] > 1e-12]
+    if omitted_pairs:
+        i, j = omitted_pairs[0]
         pair = f"{names[i]!r}" if i == j else f"{names[i]!r} together with {names[j]!r}"
         raise ValueError(f"nonlinear_inputs leaves out {pair}, but the dynamics is not linear in it. Add it, or leave "
                          "nonlinear_inputs at None: the structure is then found automatically.")

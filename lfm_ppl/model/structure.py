@@ -148,22 +148,22 @@ def _fallback(equation: Any, operands: list[_ArrayPattern]) -> list[_ArrayPatter
             for v in equation.outvars]
 
 
-def _aligned(equation: Any, operands: list[_ArrayPattern]) -> list[_ArrayPattern]:
+def _broadcast_operands(equation: Any, operands: list[_ArrayPattern]) -> list[_ArrayPattern]:
     """Return the operands of an elementwise primitive, broadcast to the shape of its output."""
     shape = equation.outvars[0].aval.shape
-    aligned = []
+    broadcast = []
     for variable, operand in zip(equation.invars, operands, strict=True):
         operand_shape = variable.aval.shape
         if operand_shape == shape:
-            aligned.append(operand)
+            broadcast.append(operand)
             continue
         index = np.broadcast_to(np.arange(int(np.prod(operand_shape))).reshape(operand_shape), shape).ravel()
-        aligned.append(_ArrayPattern(operand.jacobian[index], operand.hessian[index]))
-    return aligned
+        broadcast.append(_ArrayPattern(operand.jacobian[index], operand.hessian[index]))
+    return broadcast
 
 
 def _union(equation: Any, operands: list[_ArrayPattern]) -> _ArrayPattern:
-    return _joint(_aligned(equation, operands))
+    return _joint(_broadcast_operands(equation, operands))
 
 
 def _joint(operands: list[_ArrayPattern]) -> _ArrayPattern:
@@ -179,13 +179,13 @@ def _nonlinear(equation: Any, operands: list[_ArrayPattern]) -> _ArrayPattern:
 
 
 def _product(equation: Any, operands: list[_ArrayPattern]) -> _ArrayPattern:
-    a, b = _aligned(equation, operands)
+    a, b = _broadcast_operands(equation, operands)
     joint = _joint([a, b])
     return _ArrayPattern(joint.jacobian, joint.hessian | _outer(a.jacobian, b.jacobian))
 
 
 def _quotient(equation: Any, operands: list[_ArrayPattern]) -> _ArrayPattern:
-    numerator, denominator = _aligned(equation, operands)
+    numerator, denominator = _broadcast_operands(equation, operands)
     joint = _joint([numerator, denominator])
     pairs = _outer(numerator.jacobian, denominator.jacobian) | _outer(denominator.jacobian, denominator.jacobian)
     return _ArrayPattern(joint.jacobian, joint.hessian | pairs)
@@ -197,7 +197,7 @@ def _power(equation: Any, operands: list[_ArrayPattern]) -> _ArrayPattern:
 
 def _select(equation: Any, operands: list[_ArrayPattern]) -> _ArrayPattern:
     """Return the pattern of a choice between cases, which is non-linear in the inputs of the predicate."""
-    predicate, *cases = _aligned(equation, operands)
+    predicate, *cases = _broadcast_operands(equation, operands)
     joint = _joint(cases)
     pairs = _outer(predicate.jacobian, predicate.jacobian | joint.jacobian)
     return _ArrayPattern(joint.jacobian | predicate.jacobian, joint.hessian | pairs)
@@ -219,7 +219,7 @@ def _scatter_add(equation: Any, operands: list[_ArrayPattern]) -> _ArrayPattern 
                          operand.hessian | np.einsum("ou,ukl->okl", targets, updates.hessian))
 
 
-def _relocated(equation: Any, operands: list[_ArrayPattern]) -> list[_ArrayPattern] | None:
+def _relocate(equation: Any, operands: list[_ArrayPattern]) -> list[_ArrayPattern] | None:
     """Return the patterns of a primitive that only moves entries, or None where its indices are not known.
 
     The primitive is applied to the numbers of the entries, counted from one over all operands. Zero marks padding.
@@ -241,16 +241,16 @@ def _relocated(equation: Any, operands: list[_ArrayPattern]) -> list[_ArrayPatte
     if name == "pad":
         arguments[1] = np.zeros(shapes[1])
     with jax.ensure_compile_time_eval():
-        moved = equation.primitive.bind(*arguments, **equation.params)
+        relocated = equation.primitive.bind(*arguments, **equation.params)
     padding = _constant((1,), operands[0].jacobian.shape[-1])
     jacobian = np.concatenate([padding.jacobian, *(operand.jacobian for operand in operands)])
     hessian = np.concatenate([padding.hessian, *(operand.hessian for operand in operands)])
-    outputs = list(moved) if equation.primitive.multiple_results else [moved]
+    outputs = list(relocated) if equation.primitive.multiple_results else [relocated]
     indices = [np.nan_to_num(np.asarray(output)).astype(int).ravel() for output in outputs]
     return [_ArrayPattern(jacobian[index], hessian[index]) for index in indices]
 
 
-def _summed(equation: Any, operands: list[_ArrayPattern]) -> _ArrayPattern:
+def _reduce_sum(equation: Any, operands: list[_ArrayPattern]) -> _ArrayPattern:
     shape, axes = equation.invars[0].aval.shape, tuple(equation.params["axes"])
     (operand,) = operands
     jacobian = operand.jacobian.reshape(*shape, -1).any(axis=axes)
@@ -282,7 +282,7 @@ def _dot(equation: Any, operands: list[_ArrayPattern]) -> _ArrayPattern:
     return _ArrayPattern(jacobian.reshape(-1, inputs), hessian.reshape(-1, inputs, inputs))
 
 
-def _converted(equation: Any, operands: list[_ArrayPattern]) -> _ArrayPattern | list[_ArrayPattern] | None:
+def _convert(equation: Any, operands: list[_ArrayPattern]) -> _ArrayPattern | list[_ArrayPattern] | None:
     """Return the pattern of a type conversion: linear to a floating type, a step function to any other type."""
     is_floating = jnp.issubdtype(equation.params["new_dtype"], jnp.floating)
     return (_union if is_floating else _nonlinear)(equation, operands)
@@ -293,12 +293,12 @@ _RULES: dict[str, Callable[[Any, list[_ArrayPattern]], _ArrayPattern | list[_Arr
                      "reduce_precision"], _union),
     **dict.fromkeys(["reshape", "squeeze", "broadcast_in_dim", "transpose", "rev", "slice", "concatenate", "pad",
                      "stack", "unstack", "split", "tile", "expand_dims", "gather", "dynamic_slice",
-                     "dynamic_update_slice", "scatter"], _relocated),
+                     "dynamic_update_slice", "scatter"], _relocate),
     **dict.fromkeys(["exp", "exp2", "log", "log1p", "expm1", "sin", "cos", "tan", "tanh", "sinh", "cosh", "asin",
                      "acos", "atan", "atan2", "logistic", "sqrt", "rsqrt", "cbrt", "abs", "sign", "erf", "erfc",
                      "pow", "max", "min", "square", "clamp", "lgamma", "digamma", "rem", "floor", "ceil", "round",
                      "is_finite", "gt", "lt", "ge", "le", "eq", "ne", "and", "or", "not"], _nonlinear),
-    "convert_element_type": _converted,
-    "mul": _product, "div": _quotient, "integer_pow": _power, "select_n": _select, "reduce_sum": _summed,
+    "convert_element_type": _convert,
+    "mul": _product, "div": _quotient, "integer_pow": _power, "select_n": _select, "reduce_sum": _reduce_sum,
     "dot_general": _dot, "scatter-add": _scatter_add, "scatter_add": _scatter_add,
 }

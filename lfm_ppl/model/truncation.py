@@ -159,7 +159,7 @@ def _estimate(linear: LinearModel, times: np.ndarray, force: QuasiPeriodic, colu
     rows = _representative_rows(times, force, initial_time, len(linear.c), is_direct)
     if rows is None:
         return None
-    grid = _refined(rows.times, rows.substeps)
+    grid = _with_substeps(rows.times, rows.substeps)
     response, initial = output_responses(linear, grid, rows.substeps)
 
     def output_covariance(kernel: np.ndarray, source: int) -> np.ndarray:
@@ -276,7 +276,7 @@ def _correlation_time(force: QuasiPeriodic, times: np.ndarray, initial_time: flo
     return float(lags[correlated.max()]) if correlated.size else 0.0
 
 
-def _refined(times: np.ndarray, substeps: int) -> np.ndarray:
+def _with_substeps(times: np.ndarray, substeps: int) -> np.ndarray:
     """Return the times with ``substeps`` equal steps between neighbours."""
     fractions = np.arange(substeps) / substeps
     substep_times = times[:-1, None] + np.diff(times)[:, None] * fractions

@@ -77,7 +77,7 @@ class TracedFunction:
     @property
     def has_roots(self) -> bool:
         """Whether the function contains a root or a power with a non-integer exponent."""
-        scope = _Scope.of(self.closed, [None] * len(self.closed.jaxpr.invars))
+        scope = _Scope.from_arguments(self.closed, [None] * len(self.closed.jaxpr.invars))
         return any(equation.primitive.name in ("sqrt", "rsqrt", "cbrt", "pow") for _, equation in scope.equations())
 
     def check_indices(self, names: Sequence[str]) -> None:
@@ -89,7 +89,7 @@ class TracedFunction:
         Raises:
             ValueError: an index is out of range; the message names the array and the range.
         """
-        scope = _Scope.of(self.closed, [None] * len(self.closed.jaxpr.invars))
+        scope = _Scope.from_arguments(self.closed, [None] * len(self.closed.jaxpr.invars))
         outer_equation = None
         for inner, equation in scope.equations():
             # Equations of an inner function follow its call, whose line is that of the user's code.
@@ -113,7 +113,7 @@ class TracedFunction:
 
     def not_finite(self, *arguments: np.ndarray) -> str:
         """Return a sentence with the line of the first non-finite value at ``arguments``, or an empty string."""
-        scope, sentence = _Scope.of(self.closed, arguments), ""
+        scope, sentence = _Scope.from_arguments(self.closed, arguments), ""
 
         def is_non_finite(atom: Any) -> bool:
             try:
@@ -137,7 +137,8 @@ class TracedFunction:
             mark: part of the name of a function ``(table times, values, t)``.
             t: the last argument. Reads that depend on the other arguments, on tracers or on a branch are omitted.
         """
-        scope = _Scope.of(self.closed, [*[None] * (len(self.closed.jaxpr.invars) - 1), np.asarray(t, float)])
+        arguments = [*[None] * (len(self.closed.jaxpr.invars) - 1), np.asarray(t, float)]
+        scope = _Scope.from_arguments(self.closed, arguments)
         for inner, equation in scope.equations(branches=False):
             name = str(equation.params.get("name", ""))
             if mark not in name:
@@ -165,7 +166,7 @@ class TracedFunction:
 
     def has(self, mark: str) -> bool:
         """Return whether the function calls a jitted function whose name contains ``mark``."""
-        scope = _Scope.of(self.closed, [None] * len(self.closed.jaxpr.invars))
+        scope = _Scope.from_arguments(self.closed, [None] * len(self.closed.jaxpr.invars))
         return any(mark in str(equation.params.get("name", "")) for _, equation in scope.equations())
 
 
@@ -257,7 +258,8 @@ class _Scope:
         self.called: dict[int, _Scope] = {}
 
     @classmethod
-    def of(cls, closed: Any, arguments: Sequence[Any]) -> _Scope:
+    def from_arguments(cls, closed: Any, arguments: Sequence[Any]) -> _Scope:
+        """Return the scope of a closed jaxpr with these arguments, None for an unknown one."""
         return cls(closed.jaxpr, closed.consts, lambda index: arguments[index], lambda index: index)
 
     def equations(self, branches: bool = True) -> Iterator[tuple[_Scope, Any]]:

@@ -117,7 +117,7 @@ class ObservationFamily(eqx.Module):
 
     def typical(self) -> ObservationFamily:
         """Return the family with parameters (T, D) averaged over the rows, for times without data."""
-        return _averaged(self)
+        return _average_rows(self)
 
     # Attributes that `GaussianObservation` has as well.
 
@@ -197,7 +197,8 @@ class ObservationFamily(eqx.Module):
                              f"missing entry.{order}")
 
 
-def _averaged(family: ObservationFamily) -> ObservationFamily:
+def _average_rows(family: ObservationFamily) -> ObservationFamily:
+    """Return the family with parameters (T, D) replaced by their means (D,)."""
     rows = {name: jnp.mean(getattr(family, name), axis=0) for name in family.per_entry
             if np.ndim(getattr(family, name)) == 2}
     if not rows:
