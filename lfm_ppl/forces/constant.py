@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -32,6 +32,8 @@ class Constant(Force):
 
     scale: jax.Array
     mean: Any
+
+    state_dim: ClassVar[int] = 1
 
     def __init__(self, scale: Any, mean: Any = 0.0):
         self.scale = positive_parameter("scale", scale)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -36,6 +36,8 @@ class RandomWalk(Force):
     scale: jax.Array
     initial_sd: jax.Array
     mean: Any
+
+    state_dim: ClassVar[int] = 1
 
     def __init__(self, scale: Any, initial_sd: Any = 0.0, mean: Any = 0.0):
         self.scale = positive_parameter("scale", scale)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -56,6 +56,8 @@ class Resonator(Force):
     noise: jax.Array
     damping: jax.Array
     mean: Any
+
+    state_dim: ClassVar[int] = 2
 
     def __init__(self, period: Any, scale: Any, noise: Any = 0.0, damping: Any = 0.0, mean: Any = 0.0):
         self.period = positive_parameter("period", period)

@@ -5,7 +5,7 @@
    `lfm_ppl.forces.discretise`, and forces with a closed form override it.
 3. Some forces jump at given times, ``z <- G z + N(0, Q)``.
 4. `IndependentForces` joins the SDEs of several forces into one block-diagonal SDE.
-5. `Stack` gives each of these forces an output of its own: it is the force block of the joint state-space model.
+5. `Stack` has one output per force: it is the force block of the joint state-space model.
 6. `Sum` adds the outputs, and is a force itself.
 7. `sde_covariance` and `sde_spectral_density` compute the second moments of the state-space form, which tests compare
    with the closed forms.
@@ -54,7 +54,7 @@ class Force(eqx.Module):
 
     @property
     def state_dim(self) -> int:
-        """Number n of states."""
+        """Number n of states. A subclass may state it as a class attribute, which saves tracing ``feedback``."""
         return jax.eval_shape(self.feedback).shape[0]
 
     @property

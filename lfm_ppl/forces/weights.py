@@ -13,7 +13,7 @@ Source: Reece, Ghosh, Rogers, Roberts and Jennings (2014), Journal of Machine Le
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -54,6 +54,8 @@ class _StepEvolution(Force):
 
     change_points: tuple[float, ...] = eqx.field(static=True)
     mean: Any
+
+    state_dim: ClassVar[int] = 1
 
     @property
     def jump_times(self) -> tuple[float, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -46,6 +46,8 @@ class WienerVelocity(Force):
     initial_value_sd: jax.Array
     initial_velocity_sd: jax.Array
     mean: Any
+
+    state_dim: ClassVar[int] = 2
 
     def __init__(
         self,

@@ -5,7 +5,7 @@
 2. `input_reads` finds the reads of each function and evaluates the time of the read at several model times. An affine
    result gives slope and offset, so that the breakpoints of the table translate to times of the model; a lag may be a
    traced parameter.
-3. A time of read that is clipped to an interval keeps its breakpoints. Any other function of time is refused or warned
+3. A read at t, clipped to an interval, keeps its breakpoints. Any other function of time is refused or warned
    of, since its jumps between two observations would be missed.
 4. `breakpoints_within` collects the breakpoints, at which a filter divides its intervals.
 5. `check_reads` compares the times of reads with the range of the table.
