@@ -45,7 +45,8 @@ from lfm_ppl.filtering.filter import Points, Transitions, forward, predict, prep
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.rts import backward
 from lfm_ppl.filtering.time_grid import as_arrays
-from lfm_ppl.linalg import cholesky, masked, matmul, solve_lower, wrapped
+from lfm_ppl.gaussian_residuals import masked, wrapped
+from lfm_ppl.linalg import cholesky, matmul, solve_lower
 from lfm_ppl.linearisation.taylor import Taylor
 
 _HALVINGS = 8

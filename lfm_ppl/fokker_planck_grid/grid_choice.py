@@ -15,7 +15,7 @@ from lfm_ppl.filtering.time_grid import TimeGrid
 from lfm_ppl.fokker_planck_grid.finite_volume import Grid
 from lfm_ppl.fokker_planck_grid.grid_filter import total_and_reach
 from lfm_ppl.fokker_planck_grid.grid_model import Cells, drift_and_diffusion, on_grid
-from lfm_ppl.linalg import wrapped
+from lfm_ppl.gaussian_residuals import wrapped
 from lfm_ppl.model.state_space import StateSpaceModel
 
 _SCOUT = 256

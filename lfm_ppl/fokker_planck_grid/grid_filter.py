@@ -11,7 +11,8 @@ import numpy as np
 from lfm_ppl.filtering.time_grid import Intervals, TimeGrid, as_arrays, with_observations
 from lfm_ppl.fokker_planck_grid.finite_volume import Chain, Grid, propagate, transition
 from lfm_ppl.fokker_planck_grid.grid_model import WEIGHTS, Cells, on_grid
-from lfm_ppl.linalg import cholesky, log_density, masked, solve_lower, wrapped
+from lfm_ppl.gaussian_residuals import log_density, masked, wrapped
+from lfm_ppl.linalg import cholesky, solve_lower
 from lfm_ppl.model.state_space import StateSpaceModel
 
 _LARGEST_TABLE = 2**25

@@ -22,7 +22,7 @@ from lfm_ppl.inference.traced_model import signature
 from lfm_ppl.linalg import semidefinite_root
 from lfm_ppl.model.observation_noise import expected_observation, noisy_observation, with_noise
 from lfm_ppl.model.observations.family import ObservationFamily
-from lfm_ppl.model.simulate import input_breakpoints, simulate_onwards
+from lfm_ppl.model.simulate import input_breakpoints, simulate_missing_states
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.particles.particle_filter import ParticleSettings
 from lfm_ppl.particles.particle_smoother import TRACING, draw_trajectories
@@ -281,7 +281,8 @@ def _onwards(distribution: MarginalLikelihood, states: jax.Array, when: jax.Arra
     order = np.arange(plan.rows) if plan.times is None else np.argsort(plan.times, kind="stable")
     # Nothing is simulated before the first time, and what lies after the last one changes nothing.
     breakpoints = input_breakpoints(distribution.model, None, None)
-    path = simulate_onwards(distribution.ssm, key, states[order], when[order], known[order], plan.steps, breakpoints)
+    path = simulate_missing_states(distribution.ssm, key, states[order], when[order], known[order], plan.steps,
+                                   breakpoints)
     return jnp.zeros_like(states).at[order].set(path)
 
 
@@ -337,7 +338,7 @@ def noise_of_rows(distribution: MarginalLikelihood) -> bool:
     """Whether the law of the noise is given for each row of the data, so that no other row has one."""
     observation = distribution.ssm.model.observation
     if isinstance(observation, ObservationFamily):
-        return observation.of_rows()
+        return observation.has_row_parameters()
     return not observation.varies_with_state and np.ndim(observation.covariance) == 3
 
 

@@ -13,7 +13,8 @@ from lfm_ppl import checks
 from lfm_ppl.filtering.predict import exact_offset
 from lfm_ppl.filtering.time_grid import Intervals, TimeGrid, as_arrays
 from lfm_ppl.filtering.transition import exact
-from lfm_ppl.linalg import cholesky, log_density, matmul, solve_lower
+from lfm_ppl.gaussian_residuals import log_density
+from lfm_ppl.linalg import cholesky, matmul, solve_lower
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.state_space import StateSpaceModel, state_space
 from lfm_ppl.particles.particle_filter import ParticleSettings, Step, check_settings, checked, forward
