@@ -10,7 +10,7 @@ from systems import double_well, softplus
 import lfm_ppl as lfm
 from lfm_ppl.linalg import semidefinite_root
 from lfm_ppl.model.state_space import Span, state_space
-from lfm_ppl.particles.stochastic_steps import choose_scheme, euler, milstein, prepare, srk
+from lfm_ppl.particles.stochastic_steps import choose_scheme, euler, milstein, srk, step_constants
 
 PATHS, FINEST = 1500, 256
 END = 1.0
@@ -56,7 +56,7 @@ def brownian(ssm, seed=0):
     generator = np.random.default_rng(seed)
     change = np.sqrt(h) * generator.standard_normal((PATHS, FINEST, sources))
     integral = 0.5 * h * change + np.sqrt(h**3 / 12) * generator.standard_normal((PATHS, FINEST, sources))
-    root = np.asarray(prepare(ssm, "srk", jnp.asarray(END), FINEST).root)
+    root = np.asarray(step_constants(ssm, "srk", jnp.asarray(END), FINEST).root)
     kicks = generator.standard_normal((PATHS, FINEST, root.shape[0])) @ root.T
     return change, integral, kicks
 
@@ -68,7 +68,8 @@ def coarser(ssm, noise, factor):
     before = np.cumsum(change, axis=2) - change
     size = ssm.force_dim
     if size:
-        transition, average = (np.asarray(a) for a in prepare(ssm, "srk", jnp.asarray(END), FINEST)[:2])
+        constants = step_constants(ssm, "srk", jnp.asarray(END), FINEST)
+        transition, average = np.asarray(constants.transition), np.asarray(constants.integral)
         z, q = np.zeros((*kicks.shape[:2], size)), np.zeros((*kicks.shape[:2], kicks.shape[-1] - size))
         for step in range(factor):
             q = q + z @ average.T + kicks[:, :, step, size:]
@@ -87,7 +88,7 @@ def ends(ssm, step, noise, start=None):
     # What `srk` is given: standard normals from which it forms the increment and the average of the path.
     first = change / jnp.sqrt(h)
     second = (integral / h - 0.5 * change) / jnp.sqrt(h / 12.0)
-    prepared = prepare(ssm, "srk" if step is srk else "euler", jnp.asarray(END), steps)
+    constants = step_constants(ssm, "srk" if step is srk else "euler", jnp.asarray(END), steps)
     mean, _ = ssm.initial()
     mean = mean if start is None else start
 
@@ -95,7 +96,7 @@ def ends(ssm, step, noise, start=None):
         def one(s, inputs):
             index, a, b, kick = inputs
             span = Span.between(index * h, (index + 1) * h, h)
-            return step(ssm, prepared, h, span, s, (a, b), kick), None
+            return step(ssm, constants, h, span, s, (a, b), kick), None
 
         return jax.lax.scan(one, mean, (jnp.arange(steps), first, second, kicks))[0]
 
@@ -175,10 +176,10 @@ def test_force_noise_is_exact():
     force, h = lfm.Matern(1.3, 0.7, 0), 0.4
     ssm = state_space(lfm.LatentForceModel(
         lambda x, u, t: u**2, {"u": force}, OBSERVATION, lfm.Gaussian(jnp.zeros(1), jnp.zeros(1))))
-    ready = prepare(ssm, "srk", jnp.asarray(h), 1)
+    constants = step_constants(ssm, "srk", jnp.asarray(h), 1)
     start = np.asarray(force.initial_covariance())
-    moved = np.concatenate([ready.transition, ready.average])
-    found = moved @ start @ moved.T + np.asarray(ready.root) @ np.asarray(ready.root).T
+    moved = np.concatenate([constants.transition, constants.integral])
+    found = moved @ start @ moved.T + np.asarray(constants.root) @ np.asarray(constants.root).T
     nodes, weights = np.polynomial.legendre.leggauss(40)
     nodes, weights = 0.5 * h * (nodes + 1), 0.5 * h * weights
     # The kernel has a kink where its arguments meet, so the double integral is taken in closed form.
@@ -190,10 +191,10 @@ def test_force_noise_is_exact():
 
 def test_a_step_of_no_length_moves_nothing():
     ssm = pushed(1)
-    ready = prepare(ssm, "srk", jnp.zeros(()), 1)
+    constants = step_constants(ssm, "srk", jnp.zeros(()), 1)
     s = jnp.array([0.3, -0.2, 0.5])
     instant = Span.between(jnp.ones(()), jnp.ones(()), jnp.zeros(()))
-    moved = srk(ssm, ready, jnp.zeros(()), instant, s, (jnp.ones(1), jnp.ones(1)), jnp.zeros(3))
+    moved = srk(ssm, constants, jnp.zeros(()), instant, s, (jnp.ones(1), jnp.ones(1)), jnp.zeros(3))
     assert np.allclose(moved, s)
     assert np.allclose(semidefinite_root(jnp.zeros((3, 3))), 0.0)
 

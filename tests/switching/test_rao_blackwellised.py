@@ -10,7 +10,7 @@ from scipy import stats
 
 import lfm_ppl as lfm
 from lfm_ppl.switching.mixture import Mixture
-from lfm_ppl.switching.switched_model import only_adds
+from lfm_ppl.switching.switched_model import is_input_additive
 
 TIMES = np.arange(0.0, 4.01, 0.25)
 ALPHA, BETA, OUTSIDE, SCALE, LENGTH, NOISE = 0.3, 5.0, 5.0, 1.0, 1.5, 0.04
@@ -86,7 +86,7 @@ def test_simulated_paths_have_the_same_distribution(predicted):
 
 @pytest.mark.slow
 def test_an_input_that_changes_a_rate_has_covariances_of_its_own():
-    assert only_adds(house) and not only_adds(leaky)
+    assert is_input_additive(house) and not is_input_additive(leaky)
     found = lfm.rao_blackwellised(jax.random.key(3), leaky, THERMOSTAT, TIMES, particles=1000)
     assert found.outputs.variance.shape == (len(TIMES), 1000, 1)
     drawn = lfm.simulate_switched(jax.random.key(4), leaky, THERMOSTAT, TIMES, paths=100_000)
@@ -217,7 +217,7 @@ def test_mixtures_against_scipy():
     (lambda: run(threshold=2.0), "threshold must lie in"),
     (lambda: run(decisions=[-1.0]), "lies before the initial time"),
     (lambda: run(build=curved), "not linear in 'x0'.*simulate_switched"),
-    (lambda: run(rule=lfm.Thermostat(20.0, sensor=lambda x, u, t: x[0] ** 2)), "what the rule reads is not linear"),
+    (lambda: run(rule=lfm.Thermostat(20.0, sensor=lambda x, u, t: x[0] ** 2)), "the reading of the rule is not linear"),
     (lambda: run(build=lambda heater: house(heater) if heater else two_rooms()), "other states, outputs"),
     (lambda: run(build=later), "build\\(1\\) has another initial state or time than build\\(0\\)"),
     (lambda: run(start=lfm.FilterState(0.0, jnp.zeros(5), jnp.eye(5))), "start has 5 entries"),
@@ -279,5 +279,5 @@ def test_an_observation_comes_before_the_decision_at_its_time():
 
 def test_a_model_that_asks_for_the_value_in_python_has_a_covariance_for_each_particle():
     rates = {0.0: ALPHA, 1.0: ALPHA}
-    assert not only_adds(lambda heater: house(heater, rates[heater]))
-    assert not only_adds(lambda heater: house(heater, float(np.array([heater])[0])))
+    assert not is_input_additive(lambda heater: house(heater, rates[heater]))
+    assert not is_input_additive(lambda heater: house(heater, float(np.array([heater])[0])))
