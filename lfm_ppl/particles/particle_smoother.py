@@ -189,7 +189,7 @@ def _choose_method(ssm: StateSpaceModel, method: str, scheme: str) -> tuple[str,
     if method == TRACING or reason:
         return TRACING, choose_scheme(ssm, scheme)
     if scheme not in ("auto", "exact", "euler"):
-        raise ValueError(f'backward simulation allows the schemes "exact" and "euler", got {scheme!r}.')
+        raise ValueError(f'backward simulation moves particles by the scheme "exact" or "euler", got {scheme!r}.')
     if scheme == "auto":
         scheme = "exact" if ssm.time_invariant else "euler"
     return BACKWARD, choose_scheme(ssm, scheme)

@@ -163,13 +163,15 @@ class ParticleTransition:
         steps_per_draw = 2 if normals_per_step % 2 and steps % 2 == 0 else 1
 
         def integrate_step(state: jax.Array, step_span: Span, noise: jax.Array) -> jax.Array:
+            increment_noise, integral_noise = noise[:sources], noise[physical - sources:physical]
             force_noise = _small_matmul(constants.root, noise[physical:])
 
-            def integrate_particle(s: jax.Array, first: jax.Array, second: jax.Array, kick: jax.Array) -> jax.Array:
-                return scheme(ssm, constants, h, step_span, s, (first, second), kick)
+            def integrate_particle(s: jax.Array, physical_noise: tuple[jax.Array, jax.Array],
+                                   force_noise: jax.Array) -> jax.Array:
+                return scheme(ssm, constants, h, step_span, s, physical_noise, force_noise)
 
             return jax.vmap(integrate_particle, in_axes=-1, out_axes=-1)(
-                state, noise[:sources], noise[physical - sources:physical], force_noise)
+                state, (increment_noise, integral_noise), force_noise)
 
         def body(state: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
             first_step, step_key = inputs

@@ -16,7 +16,7 @@ from systems import Linear, whole_state
 
 import lfm_ppl as lfm
 from lfm_ppl.cli import main
-from lfm_ppl.constrained.augmented import COARSE, rows
+from lfm_ppl.constrained.augmented import COARSE, build_rows
 from lfm_ppl.inference.site_failures import failures_at, paths_worth
 from lfm_ppl.results import arviz_data, convergence, tables
 
@@ -38,7 +38,7 @@ def bounded(times, y=None, draws=32, grid=None):
 
 
 def held(times, grid=None, **more):
-    found = rows(system(), times, grid, **more)
+    found = build_rows(system(), times, grid, **more)
     return found.times[found.grid]
 
 
@@ -52,7 +52,7 @@ def test_where_constraints_hold():
     np.testing.assert_allclose(held(few, 7), np.linspace(0.0, 3.0, 7))
     # A row at equal distances that rounding puts beside an observation is at its time.
     tenths = np.arange(31) * 0.1
-    assert len(rows(system(), tenths, 31).times) == 31
+    assert len(build_rows(system(), tenths, 31).times) == 31
     assert len(held(few[:1], 5)) == 1
 
 
@@ -109,7 +109,7 @@ def test_unconverged_sites_and_light_weights_are_counted():
     for y in (jnp.asarray(Y), jnp.full_like(Y, jnp.nan)):
         weights = np.exp(problem.log_weights(jax.random.key(0), y, 64))
         by_hand.append(weights.sum() ** 2 / (weights**2).sum())
-    assert float(problem.worth(jnp.asarray(Y), 64)) == pytest.approx(min(by_hand), rel=1e-10)
+    assert float(problem.effective_sample_size(jnp.asarray(Y), 64)) == pytest.approx(min(by_hand), rel=1e-10)
 
 
 @pytest.mark.slow
