@@ -44,17 +44,17 @@ def test_generator_keeps_mass_and_sign(diffusion):
 @pytest.mark.parametrize("length", [0.0, 1e-3, 0.7, 400.0, 1e7])
 def test_transition_is_stochastic_and_exponential(length):
     process = well()
-    found = np.asarray(transition(process, jnp.asarray(length)))
-    assert found.min() >= 0.0
-    np.testing.assert_allclose(found.sum(0), 1.0, atol=1e-12)
+    matrix_exponential = np.asarray(transition(process, jnp.asarray(length)))
+    assert matrix_exponential.min() >= 0.0
+    np.testing.assert_allclose(matrix_exponential.sum(0), 1.0, atol=1e-12)
     if length < 100:
-        np.testing.assert_allclose(found, expm(matrix(process) * length), atol=1e-12)
+        np.testing.assert_allclose(matrix_exponential, expm(matrix(process) * length), atol=1e-12)
     masses = gaussian_masses(GRID, jnp.asarray(0.4), jnp.asarray(0.02))
     moved = np.asarray(propagate(process, jnp.asarray(length), masses))
     assert moved.min() >= 0.0 and abs(moved.sum() - masses.sum()) < 1e-12
-    np.testing.assert_allclose(moved, found @ masses, atol=1e-12)
-    back = propagate(process, jnp.asarray(length), jnp.asarray(GRID.centres), adjoint=True)
-    np.testing.assert_allclose(back, GRID.centres @ found, atol=1e-11)
+    np.testing.assert_allclose(moved, matrix_exponential @ masses, atol=1e-12)
+    expected_centres = propagate(process, jnp.asarray(length), jnp.asarray(GRID.centres), adjoint=True)
+    np.testing.assert_allclose(expected_centres, GRID.centres @ matrix_exponential, atol=1e-11)
 
 
 def test_stationary_masses_of_exponentially_fitted_fluxes():
@@ -79,6 +79,6 @@ def test_gaussian_masses():
     assert abs(float(masses @ GRID.centres) - 0.33) < 1e-9
     tail = gaussian_masses(Grid(6.0, 12.0, 60), jnp.asarray(0.0), jnp.asarray(1.0))
     np.testing.assert_allclose(tail.sum(), 9.865876450376981e-10, rtol=1e-6)
-    known = gaussian_masses(GRID, jnp.asarray(0.33), jnp.asarray(0.0))
-    assert int((known > 0).sum()) == 2
-    assert abs(float(known.sum()) - 1.0) < 1e-12 and abs(float(known @ GRID.centres) - 0.33) < 1e-12
+    point_masses = gaussian_masses(GRID, jnp.asarray(0.33), jnp.asarray(0.0))
+    assert int((point_masses > 0).sum()) == 2
+    assert abs(float(point_masses.sum()) - 1.0) < 1e-12 and abs(float(point_masses @ GRID.centres) - 0.33) < 1e-12
