@@ -17,10 +17,10 @@ from numpyro.primitives import _PYRO_STACK
 
 from lfm_ppl import checks
 from lfm_ppl.batching import mapped
-from lfm_ppl.constrained.augmented import COARSE, is_count, rows, stacked_model, with_times
-from lfm_ppl.constrained.boxes import boxes
+from lfm_ppl.constrained.augmented import COARSE, add_times, build_rows, is_count, stacked_model
+from lfm_ppl.constrained.boxes import build_boxes
 from lfm_ppl.constrained.constraints import build_constraints
-from lfm_ppl.constrained.evidence import Bounded, check_linear, check_variances
+from lfm_ppl.constrained.evidence import TruncatedPosterior, check_linear, check_variances
 from lfm_ppl.constrained.full_information import check_settings
 from lfm_ppl.filtering.breakdown import warn_of_breakdown
 from lfm_ppl.filtering.filter import (
@@ -249,20 +249,20 @@ class MarginalLikelihood(dist.Distribution):
         if checks.concrete(self.times) is not None:
             check_linear(self.bounded(), self.draws)
 
-    def bounded(self, at: Any = None) -> Bounded:
+    def bounded(self, at: Any = None) -> TruncatedPosterior:
         """Return what the log density under constraints is made of.
 
         Args:
             at: (K,) further times for trajectories, at which the constraints need not hold.
         """
-        found = boxes(build_constraints(self.model, self.lower, self.upper, self.constraints))
-        laid_out = rows(self.model, self.times, np.asarray(self.grid) if isinstance(self.grid, tuple) else self.grid,
-                        COARSE)
+        boxes = build_boxes(build_constraints(self.model, self.lower, self.upper, self.constraints))
+        rows = build_rows(self.model, self.times, np.asarray(self.grid) if isinstance(self.grid, tuple) else self.grid,
+                          COARSE)
         if at is not None:
-            laid_out = with_times(laid_out, np.asarray(at, float))
-        ssm = stacked_model(self.model, found)
-        return Bounded(ssm, self.rule, build_time_grid(ssm, laid_out.times, self.steps), laid_out, found,
-                       check_variances(self.model, np.shape(self.times)[0]), SiteSettings())
+            rows = add_times(rows, np.asarray(at, float))
+        ssm = stacked_model(self.model, boxes)
+        return TruncatedPosterior(ssm, self.rule, build_time_grid(ssm, rows.times, self.steps), rows, boxes,
+                                  check_variances(self.model, np.shape(self.times)[0]), SiteSettings())
 
     def with_times(self, times: Any) -> MarginalLikelihood:
         """Return the same distribution for times that are known, where its own were traced."""
@@ -387,8 +387,8 @@ class MarginalLikelihood(dist.Distribution):
             (x, u) (L, M + R), and the times (L,).
         """
         problem = self.bounded(at)
-        passed = problem.proposal(y, problem.propagated(y))._replace(steps=None)
-        path = problem.chosen(key, passed, 1, _CANDIDATES)[..., 0]
+        passed = problem.proposal(y, problem.propagate_expectations(y))._replace(steps=None)
+        path = problem.sample_trajectories(key, passed, 1, _CANDIDATES)[..., 0]
         # The last row of a time is the one at which the constraint holds.
         wanted = np.asarray(self.times if at is None else at, float)
         index = np.searchsorted(problem.rows.times, wanted, side="right") - 1
@@ -397,7 +397,7 @@ class MarginalLikelihood(dist.Distribution):
     def constrained_leave_one_out(self, y: jax.Array) -> jax.Array:
         """Return (T,), log p(y_k | y_-k, c), by expectation propagation."""
         problem = self.bounded()
-        found = problem.propagated(y, "all")
+        found = problem.propagate_expectations(y, "all")
         predictor = backward(found.passed, Moments(*problem.ssm.initial()), problem.grid).predictor
         assert predictor is not None
         data, outputs = jnp.asarray(problem.rows.data), y.shape[1]
