@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from lfm_ppl.data import read_csv as read_csv
     from lfm_ppl.data import read_table as read_table
     from lfm_ppl.filtering.breakdown import FilterWarning as FilterWarning
+    from lfm_ppl.filtering.ep.settings import SiteSettings as SiteSettings
     from lfm_ppl.filtering.filter import FilterState as FilterState
     from lfm_ppl.filtering.filter import filter as filter
-    from lfm_ppl.filtering.sites import SiteSettings as SiteSettings
     from lfm_ppl.filtering.smoother import smooth as smooth
     from lfm_ppl.fitting import ConvergenceWarning as ConvergenceWarning
     from lfm_ppl.fitting import fit as fit
@@ -132,7 +132,7 @@ _NAMES = {
     "data": ("Data", "read_csv", "read_table"),
     "filtering.breakdown": ("FilterWarning",),
     "filtering.filter": ("FilterState", "filter"),
-    "filtering.sites": ("SiteSettings",),
+    "filtering.ep.settings": ("SiteSettings",),
     "filtering.smoother": ("smooth",),
     "forces": (
         "ApproximationWarning", "Constant", "Force", "Matern", "Periodic", "QuasiPeriodic", "Resonator",

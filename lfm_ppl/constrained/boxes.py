@@ -9,7 +9,7 @@ from jax.scipy.stats import norm
 
 from lfm_ppl.constrained.constraints import Constraints
 from lfm_ppl.constrained.truncated import truncated_moments
-from lfm_ppl.filtering.quadrature import Marginal, Tilted
+from lfm_ppl.filtering.ep.quadrature import MeanVariance, TiltedMoments
 
 
 class Boxes(eqx.Module):
@@ -99,22 +99,22 @@ class BoundedTerms(eqx.Module):
         """Whether an entry has a factor, (K, D + B)."""
         return jnp.concatenate([jnp.isfinite(self.y), self.is_constrained], axis=1)
 
-    def tilted(self, cavity: Marginal, near: Marginal, power: float) -> Tilted:
+    def tilted(self, cavity: MeanVariance, near: MeanVariance, power: float) -> TiltedMoments:
         """Return the tilted moments in closed form.
 
         Any power of an indicator is the indicator itself; ``power`` must be 1 for the data. ``near``, a point for
         quadratures of other families, is not used.
         """
         outputs = self.y.shape[1]
-        gaussian = _gaussian_tilted(Marginal(*(a[:, :outputs] for a in cavity)), self.y, self.variance)
-        truncated = truncated_moments(Marginal(*(a[:, outputs:] for a in cavity)), self.widths)
-        return Tilted(*(jnp.concatenate(pair, axis=1) for pair in zip(gaussian, truncated, strict=True)))
+        gaussian = _gaussian_tilted(MeanVariance(*(a[:, :outputs] for a in cavity)), self.y, self.variance)
+        truncated = truncated_moments(MeanVariance(*(a[:, outputs:] for a in cavity)), self.widths)
+        return TiltedMoments(*(jnp.concatenate(pair, axis=1) for pair in zip(gaussian, truncated, strict=True)))
 
 
-def _gaussian_tilted(cavity: Marginal, y: jax.Array, variance: jax.Array) -> Tilted:
+def _gaussian_tilted(cavity: MeanVariance, y: jax.Array, variance: jax.Array) -> TiltedMoments:
     """Return the tilted moments for factors N(y; f, variance)."""
     y = jnp.where(jnp.isfinite(y), y, 0.0)
     total = cavity.variance + variance
     gain = cavity.variance / total
     shift = gain * (y - cavity.mean)
-    return Tilted(norm.logpdf(y, cavity.mean, jnp.sqrt(total)), cavity.mean + shift, gain * variance, shift)
+    return TiltedMoments(norm.logpdf(y, cavity.mean, jnp.sqrt(total)), cavity.mean + shift, gain * variance, shift)

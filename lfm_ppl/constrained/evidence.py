@@ -28,11 +28,13 @@ from lfm_ppl import checks
 from lfm_ppl.constrained.augmented import Rows, augmented_observations
 from lfm_ppl.constrained.boxes import BoundedTerms, Boxes
 from lfm_ppl.constrained.feasible_paths import FeasiblePaths, sample_feasible_paths
-from lfm_ppl.filtering.filter import Pass, forward
-from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.filtering.sites import Evidence, SiteSettings, evidence
+from lfm_ppl.filtering.ep.evidence import Evidence, evidence
+from lfm_ppl.filtering.ep.settings import SiteSettings
+from lfm_ppl.filtering.forward import FilterTrace, forward
+from lfm_ppl.filtering.moments import Record
+from lfm_ppl.filtering.problem import FilterProblem, filter_problem
 from lfm_ppl.filtering.time_grid import TimeGrid
-from lfm_ppl.filtering.update import Sites
+from lfm_ppl.filtering.update import Sites, SiteUpdate
 from lfm_ppl.linalg import matmul
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.latent_force_model import LatentForceModel
@@ -73,13 +75,8 @@ class TruncatedPosterior(eqx.Module):
         """Whether the constraints hold at a row, (K, B)."""
         return jnp.zeros((len(self.rows.times), self.boxes.count), bool).at[self.rows.grid].set(True)
 
-    def _factors(self, y: jax.Array) -> tuple[BoundedTerms, jax.Array, Sites]:
-        """Return the likelihood factors, the observations of the rows, and the exact sites of the data.
-
-        Returns:
-            The factors; observations (K, D + B), NaN for an entry without a factor; sites (K, D + B), zero for the
-            constraints.
-        """
+    def _factors(self, y: jax.Array) -> tuple[BoundedTerms, Sites]:
+        """Return the likelihood factors and the exact sites (K, D + B) of the data, zero for the constraints."""
         entries = augmented_observations(y, jnp.zeros((len(self.rows.grid), self.boxes.count)), self.rows)
         measured = entries[:, : y.shape[1]]
         noise = jnp.ones(measured.shape).at[self.rows.data].set(self.variance)
@@ -87,31 +84,34 @@ class TruncatedPosterior(eqx.Module):
         data_sites = Sites(jnp.concatenate([jnp.where(is_present, measured, 0.0), zeros], axis=1),
                            jnp.zeros_like(entries),
                            jnp.concatenate([jnp.where(is_present, 1.0 / noise, 0.0), zeros], axis=1))
-        return BoundedTerms(measured, noise, self.is_constrained, self.boxes.widths), entries, data_sites
+        return BoundedTerms(measured, noise, self.is_constrained, self.boxes.widths), data_sites
 
-    def propagate_expectations(self, y: jax.Array, keep: str = "likelihood") -> Evidence:
+    @property
+    def problem(self) -> FilterProblem:
+        """The filter problem of the model with the constraints as further outputs."""
+        return filter_problem(self.ssm, self.rule, self.grid)
+
+    def propagate_expectations(self, y: jax.Array, record: Record = Record.LIKELIHOOD) -> Evidence:
         """Run expectation propagation; its log evidence is an approximation of log Z(y, c)."""
-        terms, entries, data_sites = self._factors(y)
-        return evidence(self.ssm, self.rule, self.grid, entries, terms, self.settings, Moments(*self.ssm.initial()),
-                        data_sites, keep)
+        terms, data_sites = self._factors(y)
+        return evidence(self.problem, terms, self.settings, first=data_sites, record=record)
 
-    def proposal(self, y: jax.Array, propagated: Evidence) -> Pass:
+    def proposal(self, y: jax.Array, propagated: Evidence) -> FilterTrace:
         """Return the forward scan for `sample_paths`: exact sites of the data, tempered sites of the constraints."""
-        _, entries, data_sites = self._factors(y)
+        _, data_sites = self._factors(y)
         power = jnp.concatenate([jnp.zeros(y.shape[1]), jnp.full(self.boxes.count, _TEMPERING)])
-        sites = propagated.refined.found.sites
+        sites = propagated.refined.fixed_point.sites
         sites = Sites(jnp.where(power > 0, sites.centre, data_sites.centre), power * sites.nu,
                       jnp.where(power > 0, power * sites.tau, data_sites.tau))
-        return forward(self.ssm, self.rule, self.grid, entries, linearization_point=propagated.refined.points,
-                       keep="all", sites=sites)
+        return forward(self.problem, SiteUpdate(sites), about=propagated.refined.points, record=Record.SMOOTHER)
 
-    def sample_paths(self, key: jax.Array, forward_pass: Pass, count: int) -> FeasiblePaths:
+    def sample_paths(self, key: jax.Array, forward_pass: FilterTrace, count: int) -> FeasiblePaths:
         """Draw weighted trajectories that respect the constraints, from a proposal."""
         is_constrained = jnp.zeros((forward_pass.phi.shape[0], self.boxes.count), bool)
         is_constrained = is_constrained.at[jnp.asarray(self.grid.observed)].set(self.is_constrained)
         return sample_feasible_paths(key, forward_pass, is_constrained, self.boxes.widths, count)
 
-    def sample_trajectories(self, key: jax.Array, forward_pass: Pass, draws: int, candidates: int) -> jax.Array:
+    def sample_trajectories(self, key: jax.Array, forward_pass: FilterTrace, draws: int, candidates: int) -> jax.Array:
         """Draw trajectories (K, M + R, draws) of (x, u) at the rows, each from weighted candidates.
 
         Bounded states and forces are computed from their drawn slacks, and so feasible in floating-point arithmetic.
@@ -142,7 +142,7 @@ class TruncatedPosterior(eqx.Module):
         data = -0.5 * jnp.where(jnp.isfinite(y), _LOG_2PI + jnp.log(variance), 0.0).sum()
         paths = self.sample_paths(key, forward_pass, count)
         weights = forward_pass.log_likelihood.sum() + data + paths.log_weights
-        return jnp.where(propagated.refined.found.converged, weights, -jnp.inf)
+        return jnp.where(propagated.refined.fixed_point.converged, weights, -jnp.inf)
 
     def log_evidence(self, y: jax.Array, draws: int, key: jax.Array | None = None) -> jax.Array:
         """Return log Z(y, c), from ``draws`` weights, or by expectation propagation alone if ``draws`` is 0."""
@@ -161,7 +161,7 @@ class TruncatedPosterior(eqx.Module):
     def converged(self, y: jax.Array) -> jax.Array:
         """Return whether the sites converge with the data and without them."""
         return _with_and_without_data(
-            lambda y: self.propagate_expectations(y).refined.found.converged, y).all()
+            lambda y: self.propagate_expectations(y).refined.fixed_point.converged, y).all()
 
     def effective_sample_size(self, y: jax.Array, draws: int, key: jax.Array | None = None) -> jax.Array:
         """Return the smaller of the effective sample sizes of the weights with the data and without them."""

@@ -26,10 +26,10 @@ import jax
 import jax.numpy as jnp
 
 from lfm_ppl.constrained.truncated import log_share, quantile
-from lfm_ppl.filtering.filter import Pass
-from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.filtering.quadrature import Marginal
-from lfm_ppl.filtering.sites import gaussian_terms
+from lfm_ppl.filtering.ep.quadrature import MeanVariance
+from lfm_ppl.filtering.ep.site_updates import gaussian_terms
+from lfm_ppl.filtering.forward import FilterTrace
+from lfm_ppl.filtering.moments import Moments
 from lfm_ppl.filtering.smoothing_kernel import smoothing_kernel
 from lfm_ppl.filtering.update import Sites
 from lfm_ppl.linalg import congruence, diagonal, matmul, semidefinite_root
@@ -57,7 +57,7 @@ class FeasiblePaths(NamedTuple):
     log_weights: jax.Array
 
 
-def sample_feasible_paths(key: jax.Array, forward_pass: Pass, is_constrained: jax.Array, widths: jax.Array,
+def sample_feasible_paths(key: jax.Array, forward_pass: FilterTrace, is_constrained: jax.Array, widths: jax.Array,
                           count: int) -> FeasiblePaths:
     """Draw trajectories; the second half of them with the mirrored random numbers of the first half.
 
@@ -76,7 +76,7 @@ def sample_feasible_paths(key: jax.Array, forward_pass: Pass, is_constrained: ja
     normals = jax.random.normal(keys[1], (intervals, size, count // 2))
     uniforms = jnp.concatenate([uniforms, 1.0 - uniforms], axis=-1)
     normals = jnp.concatenate([normals, -normals], axis=-1)
-    rows = (forward_pass._replace(steps=None), is_constrained, uniforms, normals)
+    rows = (forward_pass._replace(initial=None), is_constrained, uniforms, normals)
 
     def step_back(carry: tuple, inputs: tuple) -> tuple[tuple, tuple]:
         next_state, total = carry
@@ -117,11 +117,12 @@ def _sample_row(mean: jax.Array, covariance: jax.Array, row: tuple,
     size, count = mean.shape
     number = is_constrained.shape[0]
     initial_variance = diagonal(covariance)
-    terms, outputs = forward_row.site_terms, forward_row.site_terms.value.shape[0] - number
+    terms = forward_row.update.site_terms
+    outputs = terms.value.shape[0] - number
     log_weights, values = jnp.zeros(count), []
     for index in range(number):
         sites = Sites(*(a[outputs + index] for a in terms.sites))
-        h = forward_row.jacobian[outputs + index]
+        h = forward_row.update.jacobian[outputs + index]
         gain = matmul(covariance, h[:, None])[:, 0]
         variance = (h * gain).sum()
         value = terms.value[outputs + index] + matmul(h[None], mean - forward_row.predicted.mean[:, None])[0]
@@ -130,8 +131,8 @@ def _sample_row(mean: jax.Array, covariance: jax.Array, row: tuple,
         safe_variance = jnp.where(is_determined, 1.0, variance)
         # Divide the site out: cavity precision = 1 / variance - tau.
         precision_ratio = jnp.maximum(1.0 - sites.tau * safe_variance, _ROUNDING_VARIANCE)
-        cavity = Marginal(sites.centre + (value - sites.centre - safe_variance * sites.nu) / precision_ratio,
-                          jnp.broadcast_to(safe_variance / precision_ratio, value.shape))
+        cavity = MeanVariance(sites.centre + (value - sites.centre - safe_variance * sites.nu) / precision_ratio,
+                              jnp.broadcast_to(safe_variance / precision_ratio, value.shape))
         log_weight = log_share(cavity, widths[index]) - gaussian_terms(sites, cavity, 1.0)
         # A determined quantity is not drawn: its weight is the indicator over the site, which the proposal contains.
         is_violated = (jnp.maximum(-value, value - widths[index])

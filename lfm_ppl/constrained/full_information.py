@@ -24,8 +24,8 @@ from lfm_ppl.constrained.augmented import augmented_model, build_rows
 from lfm_ppl.constrained.constraints import Constraints, build_constraints
 from lfm_ppl.constrained.gauss_newton import solve_nonlinear
 from lfm_ppl.constrained.interior_point import RESPECTED, ConstrainedProblem, Solution, solve_linear
-from lfm_ppl.filtering.filter import check_observations, warn_single_precision
-from lfm_ppl.filtering.predict import Moments
+from lfm_ppl.filtering.arguments import check_observations, warn_single_precision
+from lfm_ppl.filtering.moments import Moments
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.linalg import matmul
 from lfm_ppl.model.latent_force_model import LatentForceModel

@@ -52,10 +52,12 @@ from lfm_ppl.constrained.interior_point import (
     start_adjoint,
     weighted_noise,
 )
-from lfm_ppl.filtering.filter import Pass, Points, Transitions, forward, predict, preparation
-from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.filtering.rts import Smoothed, backward
+from lfm_ppl.filtering.backward import SmootherTrace, backward
+from lfm_ppl.filtering.forward import FilterTrace, IntervalMaps, LinearizationPoints, forward, predict
+from lfm_ppl.filtering.moments import Moments, Record
+from lfm_ppl.filtering.problem import filter_problem
 from lfm_ppl.filtering.time_grid import as_arrays
+from lfm_ppl.filtering.update import GaussianUpdate
 from lfm_ppl.gaussian_residuals import masked, wrapped
 from lfm_ppl.linalg import cholesky, matmul, solve_lower
 from lfm_ppl.linearisation.taylor import Taylor
@@ -109,21 +111,21 @@ class Dynamics:
 
     def __init__(self, problem: ConstrainedProblem):
         self.problem, self.ssm = problem, problem.ssm
-        self.prepared = preparation(problem.ssm, Taylor(), problem.grid)
+        self.filter_problem = filter_problem(problem.ssm, Taylor(), problem.grid)
         self.intervals = as_arrays(problem.grid.intervals)
 
     def predict(self, interval: Any, state: jax.Array, with_map: bool) -> Any:
         """Return the prediction over an interval from a state (n,) without uncertainty."""
         zero_cov = jnp.zeros((state.shape[0],) * 2)
-        return predict(self.ssm, Taylor(), self.problem.grid, self.prepared, interval, Moments(state, zero_cov),
-                       with_map=with_map)
+        record = Record.SMOOTHER if with_map else Record.LIKELIHOOD
+        return predict(self.filter_problem, interval, Moments(state, zero_cov), record=record)
 
-    def linearise(self, nodes: jax.Array) -> Transitions:
+    def linearise(self, nodes: jax.Array) -> IntervalMaps:
         """Return the maps of all intervals, linearised about a trajectory (N + 1, n)."""
 
-        def linearise_interval(interval: Any, state: jax.Array) -> Transitions:
+        def linearise_interval(interval: Any, state: jax.Array) -> IntervalMaps:
             prediction = self.predict(interval, state, True)
-            return Transitions(state, prediction.moments.mean, prediction.phi, prediction.process_cov)
+            return IntervalMaps(state, prediction.moments.mean, prediction.phi, prediction.process_cov)
 
         return jax.vmap(linearise_interval)(self.intervals, nodes[:-1])
 
@@ -274,7 +276,7 @@ def _step(problem: ConstrainedProblem, dynamics: Dynamics, margins: ConstraintMa
                                 has_converged | ~jnp.isfinite(gap + decrement))
 
 
-def _gauss_newton_pass(problem: ConstrainedProblem, trajectory: Trajectory, maps: Transitions, damping: jax.Array,
+def _gauss_newton_pass(problem: ConstrainedProblem, trajectory: Trajectory, maps: IntervalMaps, damping: jax.Array,
                        targets: jax.Array, variances: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return the disturbances r_0 (n,) and r (N, n) of a damped step, and its weighted pseudo-noise (G, C)."""
     weight = damping / (1.0 + damping)  # of the old disturbances
@@ -284,16 +286,17 @@ def _gauss_newton_pass(problem: ConstrainedProblem, trajectory: Trajectory, maps
     prior = Moments(problem.start.mean + weight * matmul(problem.start.covariance, trajectory.r0[:, None])[:, 0],
                     (1.0 - weight) * problem.start.covariance)
     nodes = Moments(trajectory.nodes[1:], jnp.zeros_like(maps.process_cov))
-    forward_pass = forward(ssm, Taylor(), problem.grid, y, start=prior, keep="all", transitions=maps,
-                           linearization_point=Points(nodes, nodes))
-    smoothed = backward(forward_pass, prior, problem.grid)
+    passes = filter_problem(ssm, Taylor(), problem.grid)
+    forward_pass = forward(passes, GaussianUpdate(y), initial=prior, about=LinearizationPoints(nodes, nodes),
+                           record=Record.SMOOTHER, maps=maps)
+    smoothed = backward(passes, forward_pass)
     noise = problem.at_grid(weighted_noise(forward_pass, smoothed))[:, problem.outputs:]
     return (weight * trajectory.r0 + (1.0 - weight) * start_adjoint(forward_pass, smoothed),
             weight * trajectory.r + (1.0 - weight) * smoothed.adjoint[0], noise)
 
 
-def _initial_trajectory(problem: ConstrainedProblem, dynamics: Dynamics, forward_pass: Pass,
-                        smoothed: Smoothed) -> Trajectory:
+def _initial_trajectory(problem: ConstrainedProblem, dynamics: Dynamics, forward_pass: FilterTrace,
+                        smoothed: SmootherTrace) -> Trajectory:
     """Return the trajectory with the disturbances of the extended Kalman smoother, or without any if it is better."""
     candidates = []
     for scale in (1.0, 0.0):

@@ -29,10 +29,12 @@ import jax
 import jax.numpy as jnp
 
 from lfm_ppl.constrained.augmented import Rows, augmented_observations
-from lfm_ppl.filtering.filter import Pass, Transitions, forward
-from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.filtering.rts import Smoothed, backward
+from lfm_ppl.filtering.backward import SmootherTrace, backward
+from lfm_ppl.filtering.forward import FilterTrace, IntervalMaps, forward
+from lfm_ppl.filtering.moments import Moments, Record
+from lfm_ppl.filtering.problem import filter_problem
 from lfm_ppl.filtering.time_grid import TimeGrid
+from lfm_ppl.filtering.update import GaussianUpdate
 from lfm_ppl.linalg import congruence, diagonal, matmul, safe_sqrt, solve_lower, solve_upper
 from lfm_ppl.linearisation.taylor import Taylor
 from lfm_ppl.model.state_space import StateSpaceModel
@@ -76,7 +78,7 @@ class ConstrainedProblem(eqx.Module):
     y: jax.Array
     start: Moments
     is_constrained: Any = None
-    transitions: Transitions | None = None
+    transitions: IntervalMaps | None = None
 
     @property
     def outputs(self) -> int:
@@ -105,7 +107,7 @@ class ConstrainedProblem(eqx.Module):
 
 
 def smoother_pass(problem: ConstrainedProblem, targets: jax.Array,
-                  variances: jax.Array) -> tuple[Pass, Smoothed, jax.Array]:
+                  variances: jax.Array) -> tuple[FilterTrace, SmootherTrace, jax.Array]:
     """Run the smoother with pseudo-observations (G, C) of the constraints, NaN for none.
 
     Returns:
@@ -113,24 +115,25 @@ def smoother_pass(problem: ConstrainedProblem, targets: jax.Array,
         without a pseudo-observation.
     """
     ssm, y = problem.with_pseudo_observations(targets, variances)
-    forward_pass = forward(ssm, Taylor(), problem.grid, y, start=problem.start, keep="all",
-                           transitions=problem.transitions)
-    smoothed = backward(forward_pass, problem.start, problem.grid)
+    passes = filter_problem(ssm, Taylor(), problem.grid)
+    forward_pass = forward(passes, GaussianUpdate(y), initial=problem.start, record=Record.SMOOTHER,
+                           maps=problem.transitions)
+    smoothed = backward(passes, forward_pass)
     noise = problem.at_grid(weighted_noise(forward_pass, smoothed))[:, problem.outputs:]
     return forward_pass, smoothed, noise
 
 
-def weighted_noise(forward_pass: Pass, smoothed: Smoothed) -> jax.Array:
+def weighted_noise(forward_pass: FilterTrace, smoothed: SmootherTrace) -> jax.Array:
     """Return R^-1 E[noise | all observations] = S^-1 v - K' r (N, D), with the adjoint r of the later observations."""
     r = smoothed.adjoint[0]
     later_adjoint = jnp.concatenate(
         [matmul(jnp.swapaxes(forward_pass.phi[1:], 1, 2), r[1:, :, None])[..., 0], jnp.zeros_like(r[:1])])
     weighted_innovation = jax.vmap(lambda chol, v: solve_upper(chol, solve_lower(chol, v)))(
-        forward_pass.chol, forward_pass.innovation)
-    return weighted_innovation - matmul(jnp.swapaxes(forward_pass.gain, 1, 2), later_adjoint[..., None])[..., 0]
+        forward_pass.update.chol, forward_pass.update.innovation)
+    return weighted_innovation - matmul(jnp.swapaxes(forward_pass.update.gain, 1, 2), later_adjoint[..., None])[..., 0]
 
 
-def start_adjoint(forward_pass: Pass, smoothed: Smoothed) -> jax.Array:
+def start_adjoint(forward_pass: FilterTrace, smoothed: SmootherTrace) -> jax.Array:
     """Return r_0 (n,), with which the smoothed state at the initial time is m_0 + P_0 r_0."""
     return matmul(forward_pass.phi[0].T, smoothed.adjoint[0][0][:, None])[:, 0]
 
@@ -165,7 +168,7 @@ class ConstraintMargins(eqx.Module):
         return self.is_fixed & (value < -VIOLATED * self.largest_sd) & is_constrained
 
 
-def constraint_margins(problem: ConstrainedProblem, smoothed: Smoothed) -> ConstraintMargins:
+def constraint_margins(problem: ConstrainedProblem, smoothed: SmootherTrace) -> ConstraintMargins:
     """Return the constraints at the smoothed means, with their standard deviations."""
     ssm, outputs = problem.ssm, problem.outputs
 
@@ -275,14 +278,14 @@ def iterate_until_finished(step: Callable[[InteriorPointIterate], InteriorPointI
     return jax.lax.while_loop(lambda i: ~i.is_finished & (i.passes < max_passes), step, iterate)
 
 
-def linear_objective(problem: ConstrainedProblem, forward_pass: Pass, smoothed: Smoothed) -> jax.Array:
+def linear_objective(problem: ConstrainedProblem, forward_pass: FilterTrace, smoothed: SmootherTrace) -> jax.Array:
     """Return J at the smoothed trajectory of a linear model, half the sum of the squared smoothed noises.
 
     In terms of the adjoint r the noises are Q r, P_0 r_0 and R (R^-1 E[noise]), so that no matrix is inverted.
     """
     r0, r = start_adjoint(forward_pass, smoothed), smoothed.adjoint[0]
     noise = weighted_noise(forward_pass, smoothed)[:, : problem.outputs]
-    obs_cov = forward_pass.obs_cov[:, : problem.outputs, : problem.outputs]
+    obs_cov = forward_pass.update.obs_cov[:, : problem.outputs, : problem.outputs]
     terms = ((r, forward_pass.process_cov), (r0, problem.start.covariance), (noise, obs_cov))
     return jnp.asarray(0.5 * sum((v * matmul(p, v[..., None])[..., 0]).sum() for v, p in terms))
 

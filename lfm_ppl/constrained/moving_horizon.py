@@ -31,9 +31,12 @@ from lfm_ppl.constrained.constraints import Constraints, build_constraints
 from lfm_ppl.constrained.full_information import ConstrainedEstimate, check_settings, is_linear, solve_problem
 from lfm_ppl.constrained.gauss_newton import Dynamics
 from lfm_ppl.constrained.interior_point import ConstrainedProblem
-from lfm_ppl.filtering.filter import check_observations, forward, warn_single_precision
-from lfm_ppl.filtering.predict import Moments
+from lfm_ppl.filtering.arguments import check_observations, warn_single_precision
+from lfm_ppl.filtering.forward import forward
+from lfm_ppl.filtering.moments import Moments, Record
+from lfm_ppl.filtering.problem import filter_problem
 from lfm_ppl.filtering.time_grid import TimeGrid, intervals_between
+from lfm_ppl.filtering.update import GaussianUpdate
 from lfm_ppl.linearisation.taylor import Taylor
 from lfm_ppl.model.inputs import breakpoints_within
 from lfm_ppl.model.latent_force_model import LatentForceModel
@@ -316,8 +319,9 @@ def _window_grid(settings: HorizonSettings, times: jax.Array, start_time: jax.Ar
 def _advance(settings: HorizonSettings, state: HorizonState, t: jax.Array, y: jax.Array) -> HorizonState:
     """Return the state after an observation: it enters the window, and the first one of a full window leaves it."""
     arrival = Moments(state.mean, state.covariance)
-    filtered = forward(settings.filter_ssm, Taylor(), _window_grid(settings, state.times[:1], state.arrival_time),
-                       state.y[:1], start=arrival, keep="moments").filtered
+    problem = filter_problem(settings.filter_ssm, Taylor(),
+                             _window_grid(settings, state.times[:1], state.arrival_time))
+    filtered = forward(problem, GaussianUpdate(state.y[:1]), initial=arrival, record=Record.MOMENTS).filtered
     is_full = state.seen >= settings.window
     arrival = jax.tree_util.tree_map(lambda new, old: jnp.where(is_full, new[0], old), filtered, arrival)
     return HorizonState(

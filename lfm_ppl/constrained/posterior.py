@@ -29,11 +29,13 @@ from lfm_ppl.constrained.constraints import build_constraints
 from lfm_ppl.constrained.evidence import TruncatedPosterior, check_variances
 from lfm_ppl.constrained.full_information import check_settings
 from lfm_ppl.constrained.truncated import quantile
-from lfm_ppl.filtering.filter import Pass, as_rule, at_intervals, check_observations, warn_single_precision
-from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.filtering.quadrature import Marginal
-from lfm_ppl.filtering.rts import backward
-from lfm_ppl.filtering.sites import SiteSettings
+from lfm_ppl.filtering.arguments import as_rule, check_observations, warn_single_precision
+from lfm_ppl.filtering.backward import backward
+from lfm_ppl.filtering.ep.quadrature import MeanVariance
+from lfm_ppl.filtering.ep.settings import SiteSettings
+from lfm_ppl.filtering.forward import FilterTrace
+from lfm_ppl.filtering.moments import Record
+from lfm_ppl.filtering.problem import at_intervals
 from lfm_ppl.filtering.smoother import Trajectories
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.linalg import congruence, diagonal, matmul, safe_sqrt
@@ -65,10 +67,10 @@ class ConstrainedPosterior(eqx.Module):
     force_sd: jax.Array
     sweeps: jax.Array
     converged: jax.Array
-    _cavity: Marginal
+    _cavity: MeanVariance
     _boxes: Boxes
     _posterior: TruncatedPosterior
-    _proposal: Pass
+    _proposal: FilterTrace
     state_names: tuple[str, ...] = eqx.field(static=True)
     force_names: tuple[str, ...] = eqx.field(static=True)
 
@@ -93,7 +95,7 @@ class ConstrainedPosterior(eqx.Module):
             low, high = (mean + sd * norm.ppf(probability) for probability in probabilities)
             return low, high
         entry, direction, bound = box
-        cavity = Marginal(*(a[:, entry] for a in self._cavity))
+        cavity = MeanVariance(*(a[:, entry] for a in self._cavity))
         low, high = (quantile(cavity, self._boxes.widths[entry], probability) for probability in probabilities)
         return (bound + low, bound + high) if direction > 0 else (bound - high, bound - low)
 
@@ -119,7 +121,7 @@ class ConstrainedPosterior(eqx.Module):
 
 
 @eqx.filter_jit
-def _sample_inputs(posterior: TruncatedPosterior, proposal: Pass, key: jax.Array, draws: int) -> jax.Array:
+def _sample_inputs(posterior: TruncatedPosterior, proposal: FilterTrace, key: jax.Array, draws: int) -> jax.Array:
     """Return trajectories (draws, K, M + R) of (x, u) at the rows of the scan."""
     batch = min(draws, _BATCH)
 
@@ -194,15 +196,15 @@ def constrained_posterior(model: LatentForceModel, times: Any, y: Any, lower: Ma
 
 
 @eqx.filter_jit
-def _approximate(posterior: TruncatedPosterior, y: jax.Array) -> tuple[tuple, Pass]:
+def _approximate(posterior: TruncatedPosterior, y: jax.Array) -> tuple[tuple, FilterTrace]:
     """Run expectation propagation.
 
     Returns:
         The fields of `ConstrainedPosterior` from ``times`` to ``_cavity``, and the proposal of trajectories.
     """
     ssm, rows, outputs = posterior.ssm, posterior.rows, y.shape[1]
-    propagated = posterior.propagate_expectations(y, "all")
-    smoothed = backward(propagated.passed, Moments(*ssm.initial()), posterior.grid)
+    propagated = posterior.propagate_expectations(y, Record.SMOOTHER)
+    smoothed = backward(posterior.problem, propagated.trace)
     grid_rows = jnp.asarray(rows.grid)
     times = jnp.asarray(rows.times)[grid_rows]
     matrix, offset = jax.vmap(ssm.input_map)(times)
@@ -211,8 +213,8 @@ def _approximate(posterior: TruncatedPosterior, y: jax.Array) -> tuple[tuple, Pa
     mean = matmul(matrix, mean[..., None])[..., 0] + offset
     sd = safe_sqrt(jax.vmap(diagonal)(congruence(matrix, covariance)))
     size = ssm.physical_dim
-    fixed_point = propagated.refined.found
-    cavity = Marginal(*(a[grid_rows, outputs:] for a in fixed_point.cavity.cavity))
-    proposal = posterior.proposal(y, propagated)._replace(steps=None)
+    fixed_point = propagated.refined.fixed_point
+    cavity = MeanVariance(*(a[grid_rows, outputs:] for a in fixed_point.cavity.cavity))
+    proposal = posterior.proposal(y, propagated)
     return (times, mean[:, :size], sd[:, :size], mean[:, size:], sd[:, size:], fixed_point.sweeps,
             fixed_point.converged, cavity), proposal

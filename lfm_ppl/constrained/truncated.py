@@ -8,7 +8,7 @@ import numpy as np
 from jax.scipy.special import ndtri
 from jax.scipy.stats import norm
 
-from lfm_ppl.filtering.quadrature import Marginal, Tilted
+from lfm_ppl.filtering.ep.quadrature import MeanVariance, TiltedMoments
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)
 _DEPTH = 40.0
@@ -21,7 +21,7 @@ _NO_LOWER_END = -1e9
 """Finite number for a lower end at minus infinity: its probability is zero, and so are its derivatives."""
 
 
-def truncated_moments(cavity: Marginal, width: jax.Array | float = np.inf) -> Tilted:
+def truncated_moments(cavity: MeanVariance, width: jax.Array | float = np.inf) -> TiltedMoments:
     """Return log P(0 <= f <= width), and the mean and variance of f in this interval, for f ~ N(cavity).
 
     The moments are quadratures about the mode b. With d = b - m, the density of f = b + x is proportional to
@@ -48,7 +48,7 @@ def truncated_moments(cavity: Marginal, width: jax.Array | float = np.inf) -> Ti
     mean = (density * x).sum(0) / total
     variance = (density * (x - mean) ** 2).sum(0) / total
     log_probability = log_share(cavity, width=jnp.where(has_upper_end, width, jnp.inf))
-    return Tilted(log_probability, mode + mean, variance, d + mean)
+    return TiltedMoments(log_probability, mode + mean, variance, d + mean)
 
 
 def _finite_width(m: jax.Array, width: jax.Array | float) -> tuple[jax.Array, jax.Array]:
@@ -58,7 +58,8 @@ def _finite_width(m: jax.Array, width: jax.Array | float) -> tuple[jax.Array, ja
     return has_upper_end, jnp.where(has_upper_end, width, 1.0)
 
 
-def _standardised_ends(cavity: Marginal, width: jax.Array | float) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+def _standardised_ends(cavity: MeanVariance,
+                       width: jax.Array | float) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """Return the ends a < b of the interval in standard deviations, mirrored at zero if a + b > 0.
 
     The normal distribution function is accurate in its lower tail.
@@ -74,7 +75,7 @@ def _standardised_ends(cavity: Marginal, width: jax.Array | float) -> tuple[jax.
     return low, jnp.where(is_mirrored, -a, b), is_mirrored, sd
 
 
-def log_share(cavity: Marginal, width: jax.Array | float = np.inf) -> jax.Array:
+def log_share(cavity: MeanVariance, width: jax.Array | float = np.inf) -> jax.Array:
     """Return log P(0 <= f <= width) for f ~ N(cavity)."""
     low, high, _, _ = _standardised_ends(cavity, width)
     is_half_line = low <= _NO_LOWER_END
@@ -84,7 +85,7 @@ def log_share(cavity: Marginal, width: jax.Array | float = np.inf) -> jax.Array:
     return log_high + jnp.where(is_half_line, 0.0, jnp.log(-jnp.expm1(log_ratio)))
 
 
-def quantile(cavity: Marginal, width: jax.Array | float, share: jax.Array | float) -> jax.Array:
+def quantile(cavity: MeanVariance, width: jax.Array | float, share: jax.Array | float) -> jax.Array:
     """Return the quantile of f ~ N(cavity) given 0 <= f <= width for the probability ``share``.
 
     If the interval is so far in the tail that its probability underflows, the distribution is treated as exponential.

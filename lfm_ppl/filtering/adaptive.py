@@ -1,16 +1,16 @@
-"""Prediction in steps whose length follows the moments: short where these move fast, long where they rest.
+"""Prediction in steps whose length follows the moments, by the usual accept/reject controller.
 
-Where the fifth stage, which is the next step's first, takes the place of the fourth, Runge-Kutta's formula has order
-three. The difference of the two results,
+1. Where the fifth stage, which is the next step's first, replaces the fourth, Runge-Kutta's formula has order three.
+   The difference of the two results, e = h (k_4 - k_5) / 6, estimates the error of a step at no cost, in the mean and
+   in the covariance, in standard deviations.
+2. A step with an error above the tolerance is repeated with a shorter length.
+3. The next length is that at which the error would be a little below the tolerance.
+4. Attempts run in blocks; `jax.lax.cond` skips attempts and blocks after the end of the interval.
 
-    e = h (k_4 - k_5) / 6,
+The choice of lengths is not differentiated: a derivative is that of the integration on the accepted steps, the last of
+which ends with the interval.
 
-therefore estimates the error of a step at no cost. It is taken of the mean and of the covariance, in standard
-deviations. A step whose error is larger than the tolerance is made again with a shorter length; the next one has the
-length at which its error would be a little below it.
-
-How the interval is divided is not differentiated: a derivative is that of the integration on the steps that were made,
-the last of which ends with the interval.
+Source: Hairer, Nørsett and Wanner (1993), Solving Ordinary Differential Equations I, section II.4.
 """
 
 from __future__ import annotations
@@ -20,110 +20,111 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from lfm_ppl.filtering.predict import (
-    LastStage,
-    Moments,
-    Prediction,
-    Stage,
-    compose,
-    linearised,
-    minimum_sd,
-    step_on,
-    unmoved,
-)
-from lfm_ppl.filtering.transition import LinearPart, integrating_factor
+from lfm_ppl.filtering.dynamics import DriftLinearization, Dynamics, covariance_of, linearize_drift, minimum_sd
+from lfm_ppl.filtering.moments import Moments, Prediction, Record, compose
+from lfm_ppl.filtering.predict import identity_prediction
+from lfm_ppl.filtering.runge_kutta import FourthStage, runge_kutta_step
+from lfm_ppl.filtering.transition import integrating_factor
 from lfm_ppl.linalg import matmul
-from lfm_ppl.linearisation.rule import Rule
-from lfm_ppl.model.state_space import Span, StateSpaceModel
+from lfm_ppl.model.state_space import Span
 
-_FIRST = 1 / 8
-"""Length of the first step that is tried, as a share of the interval."""
+_INITIAL_FRACTION = 1 / 8
+"""First trial length, as a fraction of the interval."""
 
-_SAFETY, _SHORTEST, _LONGEST = 0.9, 0.2, 5.0
-"""The next step is this share of the one whose error would be the tolerance, within these factors of the last."""
+_SAFETY, _MIN_GROWTH, _MAX_GROWTH = 0.9, 0.2, 5.0
+"""The next length is this fraction of the one at which the error would be the tolerance, within these factors."""
 
-_STABLE = 10.0
+_STABILITY_LIMIT = 10.0
 """Longest step, in units of one over the fastest rate: Runge-Kutta is unstable from 2.8 on and overflows far above."""
 
-_SHORT = 1e-3
-"""Share of an interval made whatever its error, which of a state that starts from a known zero is never small."""
+_ALWAYS_ACCEPTED = 1e-3
+"""Steps below this fraction of the interval are accepted whatever their error: near zero variance the relative error
+never passes."""
 
-_SHARE_OF_MEAN = 1e-3
-"""Share of the mean below which a standard deviation counts as no smaller: a state that is known has none."""
+_MEAN_FRACTION = 1e-3
+"""Fraction of the mean that bounds the standard deviation in the error from below: a known state has none."""
 
-_MOST = 5
-"""Most steps that are tried, as a multiple of the number of equal ones."""
+_ATTEMPTS_PER_STEP = 5
+"""Largest number of attempts, as a multiple of the number of equal steps."""
 
 _BLOCK = 8
-"""Steps in a block; a block in which nothing is left to do is left out as a whole."""
+"""Attempts in a block."""
 
 
 class _Position(NamedTuple):
-    """Where an integration stands: what is left of the interval, the next length to try, and the affine map so far."""
+    """State of the integration.
 
-    left: jax.Array
-    length: jax.Array
-    moments: Moments
-    phi: jax.Array
-    process_cov: jax.Array
-    stage: Stage
+    Attributes:
+        remaining: length of the interval that is left.
+        trial: length of the next attempt.
+        prediction: up to here.
+        stage: linearised dynamics here, the first stage of the next step.
+    """
+
+    remaining: jax.Array
+    trial: jax.Array
+    prediction: Prediction
+    stage: DriftLinearization
 
 
-def predict_interval_adaptively(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, steps: int, tolerance: float,
-                                span: Span, length: jax.Array, moments: Moments,
-                                with_map: bool = False) -> Prediction:
+def predict_interval_adaptively(dynamics: Dynamics, steps: int, tolerance: float, span: Span, length: jax.Array,
+                                moments: Moments, record: Record = Record.LIKELIHOOD) -> Prediction:
     """Predict over an interval in Runge-Kutta steps whose errors are below a tolerance.
 
     Args:
-        ssm: the model.
-        rule: the linearisation rule.
-        linear: its constant linear part.
-        steps: a fifth of the steps that are tried at most; the moments are NaN where these do not suffice.
+        dynamics: the model and the rule.
+        steps: a fifth of the largest number of attempts; the moments are NaN where these do not suffice.
         tolerance: of the error of a step in the mean and the covariance, in standard deviations.
         span: the interval's times.
-        length: of the interval.
+        length: its length.
         moments: at its start.
-        with_map: whether phi and process_cov of the interval are wanted (for the smoother).
+        record: recorded output; the map of the interval for `Record.SMOOTHER`.
     """
-    min_sd = minimum_sd(ssm, rule, integrating_factor(ssm, linear, length), span.time(), length, moments)
-    stop = jax.lax.stop_gradient
+    ssm, has_map, stop = dynamics.ssm, record is Record.SMOOTHER, jax.lax.stop_gradient
+    min_sd = minimum_sd(dynamics, integrating_factor(ssm, dynamics.linear, length), span.time(), length, moments)
 
-    def attempt(now: _Position) -> _Position:
+    def linearize_at(t: jax.Array, moments: Moments) -> DriftLinearization:
+        return linearize_drift(dynamics, t, moments.mean, covariance_of(moments), min_sd)
+
+    def attempt(position: _Position) -> _Position:
         # Where this is shorter, a rejected step stays finite, and so does its derivative, which is not used.
-        trial = stop(jnp.minimum(now.length, _STABLE / _fastest_rate(now.stage.jacobian)))
-        last = trial >= now.left
-        h = jnp.where(last, now.left, trial)
-        rest = span.after(length - now.left)
-        factor = integrating_factor(ssm, linear, h)
-        one, fourth = step_on(ssm, rule, linear, factor, rest, h, now.moments, min_sd, first=now.stage)
-        fifth = linearised(ssm, rule, linear, rest.time(h), one.moments, min_sd)
-        error = stop(_error(h, now.moments, one.moments, fourth, fifth)) / tolerance
-        # A step that is not finite is far too long, and is made again.
+        trial = stop(jnp.minimum(position.trial, _STABILITY_LIMIT / _fastest_rate(position.stage.jacobian)))
+        is_last = trial >= position.remaining
+        h = jnp.where(is_last, position.remaining, trial)
+        rest_of_span = span.after(length - position.remaining)
+        factor = integrating_factor(ssm, dynamics.linear, h)
+        previous = position.prediction
+        step, stage4 = runge_kutta_step(dynamics, factor, rest_of_span, h, previous.moments, min_sd,
+                                        stage1=position.stage)
+        stage5 = linearize_at(rest_of_span.time(h), step.moments)
+        error = stop(_error(h, previous.moments, step.moments, stage4, stage5)) / tolerance
+        # A step that is not finite is far too long, and is repeated.
         error = jnp.where(jnp.isfinite(error), error, jnp.inf)
-        growth = jnp.clip(_SAFETY * jnp.maximum(error, 1e-12) ** -0.25, _SHORTEST, _LONGEST)
-        phi, process_cov = now.phi, now.process_cov
-        if with_map:
-            phi, process_cov = compose((phi, process_cov), (one.phi, one.process_cov))
-        made = _Position(jnp.where(last, 0.0, now.left - h), stop(h * growth), one.moments, phi, process_cov, fifth)
-        again = now._replace(length=stop(h * growth))
-        accepted = (error <= 1.0) | (jnp.isfinite(error) & (h < _SHORT * length))
-        return jax.lax.cond(accepted, lambda: made, lambda: again)
+        growth = jnp.clip(_SAFETY * jnp.maximum(error, 1e-12) ** -0.25, _MIN_GROWTH, _MAX_GROWTH)
+        phi, process_cov = previous.phi, previous.process_cov
+        if has_map:
+            phi, process_cov = compose((phi, process_cov), (step.phi, step.process_cov))
+        accepted = _Position(jnp.where(is_last, 0.0, position.remaining - h), stop(h * growth),
+                             Prediction(step.moments, phi, process_cov), stage5)
+        rejected = position._replace(trial=stop(h * growth))
+        is_accepted = (error <= 1.0) | (jnp.isfinite(error) & (h < _ALWAYS_ACCEPTED * length))
+        return jax.lax.cond(is_accepted, lambda: accepted, lambda: rejected)
 
-    def unless_done(body):
-        return lambda now, _: (jax.lax.cond(now.left > 0, body, lambda same: same, now), None)
+    def unless_finished(body):
+        return lambda position, _: (jax.lax.cond(position.remaining > 0, body, lambda same: same, position), None)
 
-    def block(now: _Position) -> _Position:
-        return jax.lax.scan(unless_done(attempt), now, None, length=_BLOCK)[0]
+    def block(position: _Position) -> _Position:
+        return jax.lax.scan(unless_finished(attempt), position, None, length=_BLOCK)[0]
 
-    still = unmoved(moments, with_map)
     # After a breakdown every step would fail.
-    possible = jnp.isfinite(moments.mean).all() & jnp.isfinite(moments.covariance).all()
-    first = _Position(jnp.where(possible, length, 0.0), stop(_FIRST * length), moments, still.phi, still.process_cov,
-                      linearised(ssm, rule, linear, span.time(), moments, min_sd))
-    body = jax.checkpoint(unless_done(block), prevent_cse=False)
-    end, _ = jax.lax.scan(body, first, None, length=-(-_MOST * steps // _BLOCK))
-    reached = jax.tree_util.tree_map(lambda a: jnp.where(end.left > 0, jnp.nan, a), end.moments)
-    return Prediction(reached, end.phi, end.process_cov)
+    is_finite = jnp.isfinite(moments.mean).all() & jnp.isfinite(moments.covariance).all()
+    start = _Position(jnp.where(is_finite, length, 0.0), stop(_INITIAL_FRACTION * length),
+                      identity_prediction(dynamics, moments, Record.SMOOTHER if has_map else Record.LIKELIHOOD),
+                      linearize_at(span.time(), moments))
+    body = jax.checkpoint(unless_finished(block), prevent_cse=False)
+    end, _ = jax.lax.scan(body, start, None, length=-(-_ATTEMPTS_PER_STEP * steps // _BLOCK))
+    reached = jax.tree.map(lambda a: jnp.where(end.remaining > 0, jnp.nan, a), end.prediction.moments)
+    return end.prediction._replace(moments=reached)
 
 
 def _fastest_rate(jacobian: jax.Array) -> jax.Array:
@@ -139,15 +140,15 @@ def _fastest_rate(jacobian: jax.Array) -> jax.Array:
     return largest * jnp.maximum(jnp.max(jnp.abs(power), initial=0.0), 1e-100) ** 0.125
 
 
-def _error(h: jax.Array, before: Moments, after: Moments, fourth: LastStage, fifth: Stage) -> jax.Array:
+def _error(h: jax.Array, start: Moments, end: Moments, stage4: FourthStage, stage5: DriftLinearization) -> jax.Array:
     """Return the largest estimated error of the mean and the covariance of a step, in standard deviations."""
-    size = fifth.rest.shape[0]
-    variance = jnp.maximum(jnp.diagonal(before.covariance), jnp.diagonal(after.covariance))
-    sd = jnp.sqrt(jnp.maximum(variance, (_SHARE_OF_MEAN * after.mean) ** 2) + 1e-300)
-    mean = (fourth.stage.rest - fifth.rest) / sd[:size]
-    change = matmul(fourth.stage.jacobian, fourth.covariance) - matmul(fifth.jacobian, after.covariance)
+    size = stage5.remainder.shape[0]
+    variance = jnp.maximum(jnp.diagonal(start.covariance), jnp.diagonal(end.covariance))
+    sd = jnp.sqrt(jnp.maximum(variance, (_MEAN_FRACTION * end.mean) ** 2) + 1e-300)
+    mean = (stage4.drift.remainder - stage5.remainder) / sd[:size]
+    change = matmul(stage4.drift.jacobian, stage4.covariance) - matmul(stage5.jacobian, end.covariance)
     change = change.at[:, :size].add(change[:, :size].T)
-    if fifth.diffusion is not None and fourth.stage.diffusion is not None:
-        change = change.at[:, :size].add(fourth.stage.diffusion - fifth.diffusion)
+    if stage5.diffusion is not None and stage4.drift.diffusion is not None:
+        change = change.at[:, :size].add(stage4.drift.diffusion - stage5.diffusion)
     covariance = change / (sd[:size, None] * sd[None, :])
     return h / 6 * jnp.maximum(jnp.max(jnp.abs(mean)), jnp.max(jnp.abs(covariance)))

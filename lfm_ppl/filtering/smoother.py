@@ -1,4 +1,12 @@
-"""The smoother: the state and the forces given all observations, and draws of their trajectories."""
+"""The smoother: state and forces given all observations, and draws of their trajectories.
+
+1. Observation times and requested times are the nodes of one time grid (`time_grid`).
+2. The model is linearised about the filter's moments, about iterated posterior moments, or about those of the sites of
+   an observation family.
+3. One forward and one backward scan give the smoothed moments at all nodes; draws come from the same forward scan.
+
+Source: Särkkä and Sarmavuori (2013), Signal Processing 93.
+"""
 
 from __future__ import annotations
 
@@ -10,31 +18,21 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import checks
+from lfm_ppl.filtering.arguments import as_rule, check_iterations, check_observations, warn_single_precision
+from lfm_ppl.filtering.backward import SmootherTrace, backward
 from lfm_ppl.filtering.breakdown import warn_of_breakdown
-from lfm_ppl.filtering.filter import (
-    Pass,
-    as_rule,
-    at_intervals,
-    check_observations,
-    forward,
-    preparation,
-    warn_single_precision,
-    whitened_innovations,
-)
-from lfm_ppl.filtering.iterated import Iterated, posterior_linearisation
-from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.filtering.rts import Smoothed, backward
-from lfm_ppl.filtering.simulation_smoother import smoothing_errors
-from lfm_ppl.filtering.sites import (
-    FamilyTerms,
-    SiteSettings,
-    as_settings,
-    assumed_density_filter,
-    leave_one_out,
-    quantile_residuals,
-)
-from lfm_ppl.filtering.sites import evidence as site_evidence
+from lfm_ppl.filtering.ep.evidence import evidence, leave_one_out
+from lfm_ppl.filtering.ep.moment_matching import assumed_density_filter, quantile_residuals
+from lfm_ppl.filtering.ep.settings import SiteSettings, as_settings
+from lfm_ppl.filtering.ep.terms import FamilyTerms
+from lfm_ppl.filtering.filter import whitened_innovations
+from lfm_ppl.filtering.forward import FilterTrace, forward
+from lfm_ppl.filtering.iterated import IterationResult, posterior_linearisation
+from lfm_ppl.filtering.moments import Record, matvec
+from lfm_ppl.filtering.problem import FilterProblem, at_intervals, filter_problem
+from lfm_ppl.filtering.sample import sample_errors
 from lfm_ppl.filtering.time_grid import TimeGrid, build_time_grid
+from lfm_ppl.filtering.update import GaussianUpdate
 from lfm_ppl.linalg import congruence, matmul, safe_sqrt
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.latent_force_model import LatentForceModel
@@ -43,7 +41,7 @@ from lfm_ppl.model.resolution import check_resolution
 from lfm_ppl.model.state_space import StateSpaceModel, state_space
 
 
-class Marginal(NamedTuple):
+class MeanSd(NamedTuple):
     """Mean (K,) and standard deviation (K,) of one force or state at the requested times."""
 
     mean: jax.Array
@@ -65,7 +63,7 @@ class Trajectories(NamedTuple):
 
 
 class SmootherResult(eqx.Module):
-    """The outcome of `smooth`.
+    """Result of `smooth`.
 
     Attributes:
         times: (K,) requested times.
@@ -92,14 +90,13 @@ class SmootherResult(eqx.Module):
     whitened_innovation: jax.Array
     change: jax.Array
     converged: jax.Array
-    _start: Moments
-    _passed: Pass
+    _trace: FilterTrace
     _requested: jax.Array
     _input_map: Any
     state_names: tuple[str, ...] = eqx.field(static=True)
     force_names: tuple[str, ...] = eqx.field(static=True)
 
-    def force(self, name: str) -> Marginal:
+    def force(self, name: str) -> MeanSd:
         """Return mean (K,) and sd (K,) of a force.
 
         Raises:
@@ -107,17 +104,17 @@ class SmootherResult(eqx.Module):
         """
         return self._marginal("force", name, self.force_names, len(self.state_names))
 
-    def state(self, name: str) -> Marginal:
+    def state(self, name: str) -> MeanSd:
         """Return mean (K,) and sd (K,) of a physical state."""
         return self._marginal("state", name, self.state_names, 0)
 
-    def _marginal(self, kind: str, name: str, names: tuple[str, ...], first: int) -> Marginal:
+    def _marginal(self, kind: str, name: str, names: tuple[str, ...], first: int) -> MeanSd:
         checks.one_of(kind, name, names)
         index = first + names.index(name)
-        return Marginal(self.input_mean[:, index], safe_sqrt(self.input_covariance[:, index, index]))
+        return MeanSd(self.input_mean[:, index], safe_sqrt(self.input_covariance[:, index, index]))
 
     def sample(self, key: jax.Array, draws: int = 1) -> Trajectories:
-        """Draw whole trajectories from the joint smoothing distribution, by `smoothing_errors`.
+        """Draw whole trajectories from the joint smoothing distribution, by `sample_errors`.
 
         Draws and moments are of one scan, so that the draws have the mean and covariance of the result at each time.
 
@@ -144,7 +141,7 @@ class SmootherResult(eqx.Module):
 @eqx.filter_jit
 def _joint_draws(result: SmootherResult, key: jax.Array, draws: int) -> jax.Array:
     """Return draws (K, n, draws) of the joint state."""
-    errors = smoothing_errors(key, result._passed, result._start, draws)[result._requested]
+    errors = sample_errors(key, result._trace, draws)[result._requested]
     return result.mean[..., None] + errors
 
 
@@ -155,18 +152,6 @@ def _sample(result: SmootherResult, key: jax.Array, draws: int) -> Trajectories:
     size = len(result.state_names)
     forces = {name: inputs[:, :, size + index] for index, name in enumerate(result.force_names)}
     return Trajectories(result.times, inputs[:, :, :size], forces)
-
-
-def check_iterations(iterations: int, damping: float, tolerance: float | None = None) -> None:
-    """Raise where the iterations are not a whole number >= 0, the damping outside (0, 1], or there is a tolerance."""
-    if iterations != 0:
-        checks.positive_integer("iterations", iterations)
-    if not 0 < damping <= 1:
-        raise ValueError("damping must lie in (0, 1] (the largest share of each new iterate that is taken), "
-                         f"got {damping}.")
-    if iterations and tolerance is not None:
-        raise ValueError("iterations need integration steps of equal length, whose ends all passes share, and with a "
-                         f"tolerance the steps follow the moments; leave out tolerance={tolerance:g} or iterations.")
 
 
 def smooth(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None, steps: int = 10,
@@ -188,7 +173,7 @@ def smooth(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
             The observation times by default. They end intervals of the scan, so that results elsewhere change by the
             error of the integration steps.
         iterations: of posterior linearisation, 0 for none.
-        damping: largest share of each new iterate that is taken, in (0, 1]; less where the iterates turn back.
+        damping: largest fraction of each new iterate that is taken, in (0, 1]; less where the iterates turn back.
         tolerance: largest error of an integration step, in standard deviations, as in `lfm_ppl.MarginalLikelihood`.
         sites: of an observation family, how its sites are refined: "ep" (the default), "variational", "laplace", or
             `lfm_ppl.SiteSettings`.
@@ -222,59 +207,76 @@ def smooth(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
     check_resolution(model, times, y)
     y = check_observations(y, len(grid.observed), ssm.output_dim, model=model)
     warn_single_precision()
-    result = _run_smoother(ssm, rule, grid, y, iterations, damping, settings)
+    result = _compiled_smooth(ssm, rule, grid, y, iterations, damping, settings)
     warn_of_breakdown(ssm, rule, grid, y, None, result.log_likelihood, settings, result.converged)
     return result
+
+
+class FamilyScores(NamedTuple):
+    """Scores of the data of an observation family.
+
+    Attributes:
+        one_step_ahead: (T,), log p(y_k | y_1:k-1).
+        leave_one_out: (T,), log p(y_k | y_-k).
+        residual: (T, D), randomised quantile residuals.
+        converged: whether the sites have converged.
+    """
+
+    one_step_ahead: jax.Array
+    leave_one_out: jax.Array
+    residual: jax.Array
+    converged: jax.Array
 
 
 def smooth_on(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, iterations: int, damping: float,
               settings: SiteSettings) -> SmootherResult:
     """Smooth on the intervals of a time grid, without checks; for compiled code."""
-    start = Moments(*ssm.initial())
-    passed, smoothed, iterated, scores = _smooth_intervals(ssm, rule, grid, y, start, iterations, damping, settings)
+    problem = filter_problem(ssm, rule, grid)
+    scores = None
+    if isinstance(ssm.model.observation, ObservationFamily):
+        trace, smoothed, iterated, scores = _smooth_family(problem, y, settings, ssm.model.observation)
+    else:
+        trace, smoothed, iterated = _smooth_gaussian(problem, y, iterations, damping)
     times = jnp.asarray(grid.requested_times, float)
     requested = jnp.asarray(grid.requested)
     mean, covariance = (a[requested + 1] for a in smoothed.moments)
     matrix, offset = jax.vmap(ssm.input_map)(times)
-    observed = jnp.asarray(grid.observed)
-    at_data = jax.tree.map(lambda a: a[observed], passed)
-    one_step_ahead, left_out, residual, converged = scores or (
-        at_data.log_likelihood, smoothed.leave_one_out[observed], whitened_innovations(at_data, y), jnp.asarray(True))
+    if scores is None:
+        observed = jnp.asarray(grid.observed)
+        at_data = jax.tree.map(lambda a: a[observed], trace._replace(initial=None))
+        scores = FamilyScores(at_data.log_likelihood, smoothed.leave_one_out[observed],
+                              whitened_innovations(at_data, y), jnp.asarray(True))
     return SmootherResult(
-        times, mean, covariance, matmul(matrix, mean[..., None])[..., 0] + offset, congruence(matrix, covariance),
-        one_step_ahead, left_out, residual,
-        jnp.asarray(jnp.nan) if iterated is None else iterated.change, converged, start, passed, requested,
+        times, mean, covariance, matvec(matrix, mean) + offset, congruence(matrix, covariance), *scores[:3],
+        jnp.asarray(jnp.nan) if iterated is None else iterated.change, scores.converged, trace, requested,
         (matrix, offset), ssm.model.state_names, ssm.model.force_names)
 
 
-def _smooth_intervals(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments, iterations: int,
-                      damping: float, settings: SiteSettings) -> tuple[Pass, Smoothed, Iterated | None, tuple | None]:
-    """Return the forward and the backward scan, the iterations, and the terms of an observation family."""
-    if isinstance(ssm.model.observation, ObservationFamily):
-        return _smooth_family(ssm, rule, grid, y, start, settings, ssm.model.observation)
-    iterated, prepared = None, preparation(ssm, rule, grid)
+def _smooth_gaussian(problem: FilterProblem, y: jax.Array, iterations: int,
+                     damping: float) -> tuple[FilterTrace, SmootherTrace, IterationResult | None]:
+    updater, iterated = GaussianUpdate(y), None
     if iterations:
-        iterated = posterior_linearisation(ssm, rule, grid, y, start, iterations, damping, prepared)
-    passed = forward(ssm, rule, grid, y, start=start, linearization_point=None if iterated is None else iterated.points,
-                     keep="all", prepared=prepared)
-    return passed, backward(passed, start, grid), iterated, None
+        iterated = posterior_linearisation(problem, updater, iterations, damping)
+    points = None if iterated is None else iterated.points
+    trace = forward(problem, updater, about=points, record=Record.SMOOTHER)
+    return trace, backward(problem, trace), iterated
 
 
-def _smooth_family(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments,
-                   settings: SiteSettings, family: ObservationFamily) -> tuple[Pass, Smoothed, Iterated | None, tuple]:
-    """Return the scans with the refined sites, and one-step-ahead and leave-one-out terms, residuals, convergence."""
-    evidence = site_evidence(ssm, rule, grid, y, FamilyTerms(family, y), settings, start, keep="all")
-    smoothed = backward(evidence.passed, start, grid)
-    assert smoothed.predictor is not None
-    sites, points = evidence.refined.found, evidence.refined.points
-    predictor = jax.tree.map(lambda a: at_intervals(a, grid.observed), smoothed.predictor)
-    prequential = assumed_density_filter(ssm, rule, grid, y, start)
+def _smooth_family(problem: FilterProblem, y: jax.Array, settings: SiteSettings, family: ObservationFamily
+                   ) -> tuple[FilterTrace, SmootherTrace, IterationResult | None, FamilyScores]:
+    result = evidence(problem, FamilyTerms(family, y), settings, record=Record.SMOOTHER)
+    smoothed = backward(problem, result.trace)
+    fixed_point, points = result.refined.fixed_point, result.refined.points
+    predictor = jax.tree.map(lambda a: at_intervals(a, problem.grid.observed), smoothed.predictor)
+    assert predictor is not None
+    prequential = assumed_density_filter(problem, y)
     fallback = -jnp.inf if points is None else prequential.log_likelihood
-    left_out = leave_one_out(predictor, sites.sites, evidence.entries)
-    scores = (jnp.where(sites.converged, prequential.log_likelihood, fallback),
-              jnp.where(sites.converged, left_out, fallback),
-              quantile_residuals(family, prequential.prediction, y), sites.converged)
-    return evidence.passed, smoothed, None if points is None else Iterated(points, sites.change), scores
+    left_out = leave_one_out(predictor, fixed_point.sites, result.entries)
+    scores = FamilyScores(jnp.where(fixed_point.converged, prequential.log_likelihood, fallback),
+                          jnp.where(fixed_point.converged, left_out, fallback),
+                          quantile_residuals(family, prequential.prediction, y), fixed_point.converged)
+    iterated = None if points is None else IterationResult(points, fixed_point.change)
+    return result.trace, smoothed, iterated, scores
 
 
-_run_smoother = eqx.filter_jit(smooth_on)
+_compiled_smooth = eqx.filter_jit(smooth_on)

@@ -1,14 +1,26 @@
-"""Update: condition the state on one observation."""
+"""Updates: condition the predicted moments on one observation, or multiply them with Gaussian sites.
+
+1. `linearize_observation` gives the observation as an affine map of the state.
+2. An `Updater` turns that map, the row's data and the predicted moments into an `Update`: `GaussianUpdate` conditions
+   on a Gaussian observation, `SiteUpdate` multiplies with given sites, and `ep.moment_matching` makes the sites of a
+   row from its prediction.
+3. Covariances are in Joseph's form. The log likelihood is -inf where the innovation covariance is not positive definite
+   to working precision, or where the filtered moments of an output are rounding errors.
+
+Source: Särkkä (2013), Bayesian Filtering and Smoothing, chapters 4 to 6; Minka (2001) for the sites.
+"""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 
-from lfm_ppl.filtering.predict import Moments, covariance_of, linearise_state
+from lfm_ppl.filtering.dynamics import covariance_of, linearize
+from lfm_ppl.filtering.moments import Moments, matvec
 from lfm_ppl.gaussian_residuals import log_density, masked, wrapped
 from lfm_ppl.linalg import (
     cholesky,
@@ -23,30 +35,34 @@ from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.linearisation.sigma_points import SigmaPointRule
 from lfm_ppl.model.state_space import StateSpaceModel
 
-FAILED, FACTOR = "lfm_ppl: failed", "lfm_ppl: factor of the innovation covariance"
-"""Under these names they are kept for the derivative of a row, and not computed again."""
+if TYPE_CHECKING:
+    from lfm_ppl.filtering.problem import FilterProblem
+
+UPDATE_FAILED = "lfm_ppl: update failed"
+INNOVATION_FACTOR = "lfm_ppl: factor of the innovation covariance"
+"""Names under which quantities of a row are stored for its derivative instead of being computed again."""
 
 _LOST_MEAN, _LOST_VARIANCE = 1e-3, 1e3
 """Errors of a filtered output, in standard deviations and variances of its noise, from which precision is lost."""
 
 _HARMLESS = 1e-6
-"""The same errors as shares of an output's scale (and of its square) that do no harm, however small the noise."""
+"""The same errors as fractions of an output's scale (and of its square) that do no harm, however small the noise."""
 
 
-class Linearised(NamedTuple):
+class LinearizedObservation(NamedTuple):
     """An observation as an affine map of the state: y ~ value + jacobian (s - point) + N(0, obs_cov)."""
 
     value: jax.Array
     jacobian: jax.Array
     obs_cov: jax.Array
 
-    def shifted(self, change: jax.Array) -> Linearised:
+    def shifted(self, change: jax.Array) -> LinearizedObservation:
         """Return the same map with its point moved by ``change`` (n,)."""
-        return self._replace(value=self.value + matmul(self.jacobian, change[:, None])[:, 0])
+        return self._replace(value=self.value + matvec(self.jacobian, change))
 
 
 class Sites(NamedTuple):
-    """Gaussian pseudo-observations of the predictor f, unnormalised: exp(nu (f - c) - tau (f - c)^2 / 2) an entry.
+    """Gaussian sites of the predictor f, unnormalised: exp(nu (f - c) - tau (f - c)^2 / 2) for each entry.
 
     The parameters are natural ones, and tau may be negative. The point c only keeps numbers small.
 
@@ -67,11 +83,11 @@ class SiteTerms(NamedTuple):
     Attributes:
         value: (D,), the predicted mean of f.
         variance: F = H P H' + residual_cov (D, D).
-        residual_cov: (D, D), of what the linearisation leaves out.
+        residual_cov: (D, D), covariance of the linearisation's residual.
         shrinkage: (I + T F)^-1 (D, D), with T = diag(tau).
         precision: (I + T F)^-1 T (D, D), the S^-1 of an observation.
         score: (I + T F)^-1 (nu - T (value - c)) (D,), the S^-1 v of an observation.
-        sites: as they were used.
+        sites: the sites.
     """
 
     value: jax.Array
@@ -84,32 +100,93 @@ class SiteTerms(NamedTuple):
 
 
 class Update(NamedTuple):
-    """The filtered moments and what the smoother and the diagnostics need.
+    """Filtered moments and what the smoother and the diagnostics need.
 
     Attributes:
         moments: given the observation.
         log_likelihood: log density of the observation's present entries, given the past.
         innovation: (D,), zero where missing.
-        chol: (D, D), Cholesky factor of the innovation covariance, the identity where missing.
         gain: (n, D).
         jacobian: (D, n), zero rows where missing.
-        obs_cov: (D, D), covariance of the observation given the state, the identity where missing.
-        site_terms: of an update by sites, which has neither chol nor obs_cov.
+        chol: (D, D), Cholesky factor of the innovation covariance, the identity where missing; None with sites.
+        obs_cov: (D, D), covariance of the observation given the state, the identity where missing; None with sites.
+        present: (D,), whether an entry is present; None with sites.
+        site_terms: of an update by sites; None otherwise.
     """
 
-    moments: Moments
-    log_likelihood: jax.Array
+    moments: Any
+    log_likelihood: Any
     innovation: jax.Array
-    chol: Any
-    gain: jax.Array
-    jacobian: jax.Array
-    obs_cov: Any
+    gain: Any
+    jacobian: Any
+    chol: Any = None
+    obs_cov: Any = None
+    present: Any = None
     site_terms: SiteTerms | None = None
 
 
-def linearise_observation(ssm: StateSpaceModel, rule: Rule, jacobian: jax.Array, t: jax.Array, row: jax.Array,
-                          centre: Moments) -> Linearised:
-    """Linearise the observation about given moments."""
+RowUpdate = Callable[[LinearizedObservation, jax.Array, Any, Moments], Update]
+"""Maps a linearised observation, the row's index, its data and the predicted moments to an `Update`."""
+
+
+class Updater(Protocol):
+    """How observations update the predicted moments."""
+
+    def rows(self) -> Any:
+        """Return the data of all rows, a pytree of arrays (T, ...); intervals without an observation get NaN."""
+
+    def bind(self, problem: FilterProblem, initial: Moments) -> RowUpdate:
+        """Return the update of one row, with what all rows share."""
+
+
+class GaussianUpdate(NamedTuple):
+    """Condition on Gaussian observations.
+
+    Attributes:
+        y: (T, D), NaN where missing.
+    """
+
+    y: jax.Array
+
+    def rows(self) -> jax.Array:
+        """Return the observations."""
+        return jnp.asarray(self.y, float)
+
+    def bind(self, problem: FilterProblem, initial: Moments) -> RowUpdate:
+        """Return the update of one row; the scale of the outputs is that of all data and of the prior."""
+        scale = _output_scale(problem, self.rows(), initial)
+
+        def update(observation: LinearizedObservation, index: jax.Array, y: jax.Array, predicted: Moments) -> Update:
+            return condition(problem.ssm, observation, y, predicted, scale)
+
+        return update
+
+
+class SiteUpdate(NamedTuple):
+    """Multiply with given sites.
+
+    Attributes:
+        sites: (T, D) each.
+    """
+
+    sites: Sites
+
+    def rows(self) -> jax.Array:
+        """Return the sites as one array (T, 3, D)."""
+        return jnp.stack(self.sites, axis=1)
+
+    def bind(self, problem: FilterProblem, initial: Moments) -> RowUpdate:
+        """Return the update of one row."""
+
+        def update(observation: LinearizedObservation, index: jax.Array, row: jax.Array, predicted: Moments) -> Update:
+            return multiply_by_sites(observation, Sites(*jnp.where(jnp.isnan(row), 0.0, row)), predicted)
+
+        return update
+
+
+def linearize_observation(ssm: StateSpaceModel, rule: Rule, jacobian: jax.Array, t: jax.Array, row: jax.Array,
+                          centre: Moments) -> LinearizedObservation:
+    """Linearise the observation of a row at time t about given moments."""
     angular = ssm.model.observation.angular
     if angular:
         middle = jax.lax.stop_gradient(ssm.observe(ssm.inputs(centre.mean, t), t))
@@ -121,37 +198,34 @@ def linearise_observation(ssm: StateSpaceModel, rule: Rule, jacobian: jax.Array,
             value = value.at[index].set(middle[index] + wrapped(value[index] - middle[index]))
         return value, ssm.obs_cov(w, t, row)
 
-    affine = linearise_state(ssm, rule, function, ssm.observation_structure, jacobian, t, centre.mean,
-                             covariance_of(centre), _min_sd(ssm, rule, t, centre))
-    return Linearised(affine.value, affine.jacobian, affine.residual_cov + affine.extra)
+    affine = linearize(ssm, rule, function, ssm.observation_structure, jacobian, t,
+                       (centre.mean, covariance_of(centre)), _minimum_sd(ssm, rule, t, centre))
+    return LinearizedObservation(affine.value, affine.jacobian, affine.residual_cov + affine.extra)
 
 
-def _min_sd(ssm: StateSpaceModel, rule: Rule, t: jax.Array, moments: Moments) -> jax.Array:
-    """As in the prediction: the standard deviation below which a coordinate counts as known."""
+def _minimum_sd(ssm: StateSpaceModel, rule: Rule, t: jax.Array, moments: Moments) -> jax.Array:
+    """Return the standard deviation below which a coordinate counts as known, as in the prediction."""
     if isinstance(rule, SigmaPointRule) and rule.full_state:
         scale = moments.mean
     else:
         scale = ssm.inputs(moments.mean, t)[jnp.asarray(ssm.observation_structure.points, int)]
-    # Next to a state that is exactly zero and known, one unit is as good a scale as any.
+    # For a state that is exactly zero and known, any unit is as good as another.
     return jax.lax.stop_gradient(1e-6 * jnp.where(scale == 0, 1e-3, jnp.abs(scale)))
 
 
-def update(ssm: StateSpaceModel, observation: Linearised, y: jax.Array, present: jax.Array,
-           moments: Moments, scale: jax.Array | None = None) -> Update:
-    """Condition on the present entries of ``y`` (D,), with the covariance in Joseph's form.
-
-    The log likelihood is -inf where the innovation covariance is not positive definite to working precision, or where
-    the filtered moments are lost to rounding: where an unstable model has sent the prediction to infinity, or nearly.
+def condition(ssm: StateSpaceModel, observation: LinearizedObservation, y: jax.Array, predicted: Moments,
+              scale: jax.Array | None = None) -> Update:
+    """Condition on the present entries of ``y``, with the covariance in Joseph's form.
 
     Args:
         ssm: the model.
         observation: its linearisation about the predicted moments.
-        y: (D,).
-        present: (D,), whether an entry is.
-        moments: predicted.
-        scale: (D,), how large the outputs are; None: rounding errors of the filtered moments are not asked for.
+        y: (D,), NaN where missing.
+        predicted: predicted moments.
+        scale: (D,), size of the outputs; None: skip the test for lost precision.
     """
-    mean, covariance = moments
+    mean, covariance = predicted
+    present = jnp.isfinite(y)
     jacobian = jnp.where(present[:, None], observation.jacobian, 0.0)
     residual = jnp.where(present, y, 0.0) - observation.value
     for index in ssm.model.observation.angular:
@@ -159,31 +233,65 @@ def update(ssm: StateSpaceModel, observation: Linearised, y: jax.Array, present:
     innovation, obs_cov = masked(residual, observation.obs_cov, present)
     cross = matmul(covariance, jacobian.T)
     innovation_covariance = matmul(jacobian, cross) + obs_cov
-    # A smaller pivot has no correct digit, and its sign is chance.
+    # A smaller pivot has no correct digit, and its sign is random.
     rounding = 4 * jnp.finfo(y.dtype).eps * jnp.abs(diagonal(innovation_covariance))
-    factor = cholesky(innovation_covariance, jax.lax.stop_gradient(rounding), name=FACTOR)
-    chol = factor.chol
-    # The gain does not see the innovation: it is one for all means that share a covariance.
+    factor = cholesky(innovation_covariance, jax.lax.stop_gradient(rounding), name=INNOVATION_FACTOR)
+    # The gain does not depend on the innovation, so that means with a common covariance share it.
     gain = factor.solve_upper(factor.solve_lower(cross.T)).T
     white = factor.solve_lower(innovation[:, None])
-    kept = jnp.eye(mean.shape[0]) - matmul(gain, jacobian)
-    filtered = Moments(mean + matmul(gain, innovation[:, None])[:, 0],
-                       congruence(kept, covariance) + congruence(gain, obs_cov))
+    i_kh = jnp.eye(mean.shape[0]) - matmul(gain, jacobian)
+    filtered = Moments(mean + matvec(gain, innovation), congruence(i_kh, covariance) + congruence(gain, obs_cov))
     failed = factor.degenerate.any()
     if scale is not None:
-        failed = failed | _precision_lost(ssm, observation, y, present, moments, filtered, obs_cov,
-                                          factor.solve_upper(white)[:, 0], scale)
-    failed = checkpoint_name(failed, FAILED)
-    log_likelihood = jnp.where(failed, -jnp.inf, log_density(white[:, 0], chol, present))
-    return Update(filtered, log_likelihood, innovation, chol, gain, jacobian, obs_cov)
+        weighted = factor.solve_upper(white)[:, 0]
+        error, variance = _output_errors(ssm, observation, y, predicted, filtered, matvec(obs_cov, weighted))
+        failed = failed | (present & _is_precision_lost(error, variance, jnp.abs(diagonal(obs_cov)), scale)).any()
+    failed = checkpoint_name(failed, UPDATE_FAILED)
+    log_likelihood = jnp.where(failed, -jnp.inf, log_density(white[:, 0], factor.chol, present))
+    return Update(filtered, log_likelihood, innovation, gain, jacobian, factor.chol, obs_cov, present)
 
 
-def predictor_variance(observation: Linearised, moments: Moments) -> jax.Array:
+def _output_errors(ssm: StateSpaceModel, observation: LinearizedObservation, y: jax.Array, predicted: Moments,
+                   filtered: Moments, expected: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return the error (D,) of the filtered outputs, whose residual should be ``expected``, and their variance (D,).
+
+    Given the observation, the output has the residual R S^-1 v and the variance R - R S^-1 R <= R. Errors are some
+    1e-16 of the prediction, too large where an unstable model has sent that to infinity, or nearly.
+    """
+    y = jnp.where(jnp.isfinite(y), y, 0.0)
+    change = matvec(observation.jacobian, filtered.mean - predicted.mean)
+    error = y - (observation.value + change) - expected
+    for index in ssm.model.observation.angular:
+        error = error.at[index].set(wrapped(error[index]))
+    return error, jnp.abs((matmul(observation.jacobian, filtered.covariance) * observation.jacobian).sum(1))
+
+
+def _is_precision_lost(error: jax.Array, variance: jax.Array, noise: jax.Array, scale: jax.Array) -> jax.Array:
+    """Return whether the filtered moments of outputs with noise variances ``noise`` are rounding errors, (D,)."""
+    return ((jnp.abs(error) > _LOST_MEAN * safe_sqrt(noise) + _HARMLESS * scale)
+            | (variance > _LOST_VARIANCE * noise + _HARMLESS * scale**2))
+
+
+def _output_scale(problem: FilterProblem, y: jax.Array, initial: Moments) -> jax.Array:
+    """Return the size (D,) of the outputs: their largest observation, or the prior's standard deviation if larger.
+
+    The prior's is that through the constant part of the observation's Jacobian. An angle is at least one radian large.
+    """
+    matrix, _ = problem.ssm.input_map(jnp.asarray(problem.grid.initial_time, float))
+    jacobian = matmul(problem.shared.observation_jacobian, matrix)
+    prior = safe_sqrt(diagonal(congruence(jacobian, initial.covariance)))
+    scale = jnp.maximum(jnp.max(jnp.where(jnp.isfinite(y), jnp.abs(y), 0.0), axis=0), prior)
+    for index in problem.ssm.model.observation.angular:
+        scale = scale.at[index].max(1.0)
+    return jax.lax.stop_gradient(scale)
+
+
+def predictor_variance(observation: LinearizedObservation, moments: Moments) -> jax.Array:
     """Return the covariance F (D, D) of a family's predictor."""
     return congruence(observation.jacobian, moments.covariance) + observation.obs_cov
 
 
-def update_by_sites(observation: Linearised, sites: Sites, moments: Moments) -> Update:
+def multiply_by_sites(observation: LinearizedObservation, sites: Sites, predicted: Moments) -> Update:
     r"""Multiply the predicted moments with Gaussian sites in natural parameters.
 
     With f ~ N(m, F) as predicted and d = f - c,
@@ -195,62 +303,31 @@ def update_by_sites(observation: Linearised, sites: Sites, moments: Moments) -> 
     and K = P H' M T. Nothing is divided by tau, which may be zero (nothing is observed) or negative.
 
     Args:
-        observation: the predictor, linearised about the predicted moments; its ``obs_cov`` is what that leaves out.
+        observation: the predictor, linearised about the predicted moments; ``obs_cov`` is its residual covariance.
         sites: (D,) each.
-        moments: predicted.
+        predicted: predicted moments.
 
     Returns:
         An update whose log likelihood is the integral above.
 
     Source: Minka (2001), Expectation propagation; Rasmussen and Williams (2006), section 3.6.
     """
-    mean, covariance = moments
+    mean, covariance = predicted
     jacobian, residual_cov = observation.jacobian, observation.obs_cov
     cross = matmul(covariance, jacobian.T)
     variance = symmetric(matmul(jacobian, cross)) + residual_cov
-    away = observation.value - sites.centre
-    shrinkage, log_det = inverse_and_log_det(jnp.eye(away.shape[0]) + sites.tau[:, None] * variance)
+    offset = observation.value - sites.centre
+    shrinkage, log_det = inverse_and_log_det(jnp.eye(offset.shape[0]) + sites.tau[:, None] * variance)
     precision = symmetric(shrinkage * sites.tau[None, :])
-    pull = sites.nu - sites.tau * away
-    score = matmul(shrinkage, pull[:, None])[:, 0]
+    slope = sites.nu - sites.tau * offset
+    score = matvec(shrinkage, slope)
     gain = matmul(cross, precision)
-    kept = jnp.eye(mean.shape[0]) - matmul(gain, jacobian)
-    through = matmul(cross, shrinkage)
-    filtered = Moments(mean + matmul(cross, score[:, None])[:, 0],
-                       congruence(kept, covariance) + symmetric(matmul(through * sites.tau, through.T))
+    i_kh = jnp.eye(mean.shape[0]) - matmul(gain, jacobian)
+    gain_factor = matmul(cross, shrinkage)
+    filtered = Moments(mean + matvec(cross, score),
+                       congruence(i_kh, covariance) + symmetric(matmul(gain_factor * sites.tau, gain_factor.T))
                        + congruence(gain, residual_cov))
-    log_integral = ((sites.nu - 0.5 * sites.tau * away) * away).sum() - 0.5 * log_det + 0.5 * (
-        pull * matmul(variance, score[:, None])[:, 0]).sum()
+    log_integral = ((sites.nu - 0.5 * sites.tau * offset) * offset).sum() - 0.5 * log_det + 0.5 * (
+        slope * matvec(variance, score)).sum()
     terms = SiteTerms(observation.value, variance, residual_cov, shrinkage, precision, score, sites)
-    return Update(filtered, log_integral, pull, None, gain, jacobian, None, terms)
-
-
-def _precision_lost(ssm: StateSpaceModel, observation: Linearised, y: jax.Array, present: jax.Array,
-                    predicted: Moments, filtered: Moments, obs_cov: jax.Array, weighted: jax.Array,
-                    scale: jax.Array) -> jax.Array:
-    """Whether the filtered moments of an observed output are nothing but rounding errors.
-
-    Given the observation, the output has the residual R S^-1 v and the variance R - R S^-1 R <= R. Errors are some
-    1e-16 of the prediction, too large where an unstable model has sent that to infinity, or nearly.
-
-    Args:
-        ssm: the model.
-        observation: its linearisation about the predicted moments.
-        y: (D,).
-        present: (D,), whether an entry is.
-        predicted: moments before the observation.
-        filtered: moments after it.
-        obs_cov: R (D, D).
-        weighted: (D,), S^-1 v.
-        scale: (D,), of the outputs.
-    """
-    y = jnp.where(present, y, 0.0)
-    moved = matmul(observation.jacobian, (filtered.mean - predicted.mean)[:, None])[:, 0]
-    error = y - (observation.value + moved) - matmul(obs_cov, weighted[:, None])[:, 0]
-    for index in ssm.model.observation.angular:
-        error = error.at[index].set(wrapped(error[index]))
-    variance = jnp.abs((matmul(observation.jacobian, filtered.covariance) * observation.jacobian).sum(1))
-    own = jnp.abs(diagonal(obs_cov))
-    lost = ((jnp.abs(error) > _LOST_MEAN * safe_sqrt(own) + _HARMLESS * scale)
-            | (variance > _LOST_VARIANCE * own + _HARMLESS * scale**2))
-    return (present & lost).any()
+    return Update(filtered, log_integral, slope, gain, jacobian, site_terms=terms)

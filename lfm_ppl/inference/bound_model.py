@@ -18,7 +18,8 @@ import numpy as np
 from numpyro.infer import init_to_median
 
 from lfm_ppl import checks
-from lfm_ppl.filtering.filter import FilterResult, check_observations
+from lfm_ppl.filtering.arguments import check_observations
+from lfm_ppl.filtering.filter import FilterResult
 from lfm_ppl.filtering.smoother import SmootherResult
 from lfm_ppl.inference.handlers.fixing import fix
 from lfm_ppl.inference.handlers.settings import approximate

@@ -22,34 +22,21 @@ from lfm_ppl.constrained.boxes import build_boxes
 from lfm_ppl.constrained.constraints import build_constraints
 from lfm_ppl.constrained.evidence import TruncatedPosterior, check_linear, check_variances
 from lfm_ppl.constrained.full_information import check_settings
+from lfm_ppl.filtering.arguments import as_rule, check_iterations, check_observations, warn_single_precision
+from lfm_ppl.filtering.backward import backward
 from lfm_ppl.filtering.breakdown import warn_of_breakdown
-from lfm_ppl.filtering.filter import (
-    FilterResult,
-    as_rule,
-    at_intervals,
-    bends,
-    check_observations,
-    filter_on,
-    forward,
-    preparation,
-    warn_single_precision,
-)
+from lfm_ppl.filtering.ep.evidence import Evidence, evidence, leave_one_out
+from lfm_ppl.filtering.ep.moment_matching import assumed_density_filter
+from lfm_ppl.filtering.ep.settings import SiteSettings, as_settings
+from lfm_ppl.filtering.ep.terms import FamilyTerms
+from lfm_ppl.filtering.filter import FilterResult, filter_on
+from lfm_ppl.filtering.forward import forward
 from lfm_ppl.filtering.iterated import posterior_linearisation
-from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.filtering.rts import backward
-from lfm_ppl.filtering.sites import (
-    Evidence,
-    FamilyTerms,
-    SiteSettings,
-    as_settings,
-    assumed_density_filter,
-    evidence,
-    is_linear,
-    leave_one_out,
-)
-from lfm_ppl.filtering.smoother import SmootherResult, check_iterations, smooth_on
+from lfm_ppl.filtering.moments import Record
+from lfm_ppl.filtering.problem import FilterProblem, at_intervals, filter_problem, is_linear, is_observation_nonlinear
+from lfm_ppl.filtering.smoother import SmootherResult, smooth_on
 from lfm_ppl.filtering.time_grid import TimeGrid, build_time_grid
-from lfm_ppl.filtering.update import Sites
+from lfm_ppl.filtering.update import GaussianUpdate, Sites
 from lfm_ppl.gradients import finite_or_minus_infinity
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.latent_force_model import LatentForceModel
@@ -182,6 +169,11 @@ class MarginalLikelihood(dist.Distribution):
         """The time grid of the scan."""
         return build_time_grid(self.ssm, self.times, self.steps, self.max_step, tolerance=self.tolerance)
 
+    @property
+    def problem(self) -> FilterProblem:
+        """The filter problem: model, rule and time grid, with what all intervals share."""
+        return filter_problem(self.ssm, self.rule, self.time_grid)
+
     def _default_iterations(self) -> int:
         """Return the number of iterations of posterior linearisation where the user gives none."""
         is_family = isinstance(self.model.observation, ObservationFamily)
@@ -192,7 +184,7 @@ class MarginalLikelihood(dist.Distribution):
     @property
     def is_affine(self) -> bool:
         """Whether dynamics and observation are affine in states and forces, with noise that does not depend on them."""
-        return is_linear(self.ssm) and not bends(self.ssm)
+        return is_linear(self.ssm) and not is_observation_nonlinear(self.ssm)
 
     @property
     def description(self) -> str:
@@ -312,14 +304,15 @@ class MarginalLikelihood(dist.Distribution):
         return f"{settings.method}" + ("" if linear else f", linearised anew {settings.relinearisations} times at most")
 
     def evidence(self, y: jax.Array) -> Evidence:
-        """Return the log evidence of an observation family and what it is made of; ``y`` (T, D) is not checked."""
+        """Return the log evidence of an observation family and its parts; ``y`` (T, D) is not checked."""
         assert isinstance(self.model.observation, ObservationFamily)
         terms = FamilyTerms(self.model.observation, y)
-        return evidence(self.ssm, self.rule, self.time_grid, y, terms, self.site_settings)
+        return evidence(self.problem, terms, self.site_settings)
 
     def _evidence_and_convergence(self, y: jax.Array) -> jax.Array:
-        found = self.evidence(y)
-        return jnp.stack([found.log_evidence, found.refined.found.converged.astype(found.log_evidence.dtype)])
+        result = self.evidence(y)
+        converged = result.refined.fixed_point.converged
+        return jnp.stack([result.log_evidence, converged.astype(result.log_evidence.dtype)])
 
     def _said(self, y: jax.Array, log_likelihood: jax.Array, converged: Any = True, alone: bool = False) -> jax.Array:
         """Return the log likelihood; outside of compiled code say what breaks down if something does.
@@ -344,16 +337,12 @@ class MarginalLikelihood(dist.Distribution):
         return super().expand(batch_shape)
 
     def _one_step_ahead(self, y: jax.Array) -> jax.Array:
-        start = Moments(*self.ssm.initial())
+        problem, updater, points = self.problem, GaussianUpdate(y), None
         if isinstance(self.model.observation, ObservationFamily):
-            return assumed_density_filter(self.ssm, self.rule, self.time_grid, y, start).log_likelihood
-        point, prepared = None, preparation(self.ssm, self.rule, self.time_grid)
+            return assumed_density_filter(problem, y).log_likelihood
         if self.iterations:
-            point = posterior_linearisation(self.ssm, self.rule, self.time_grid, y, start, self.iterations,
-                                            self.damping, prepared).points
-        passed = forward(self.ssm, self.rule, self.time_grid, y, start=start, linearization_point=point,
-                         prepared=prepared)
-        return at_intervals(passed.log_likelihood, self.time_grid.observed)
+            points = posterior_linearisation(problem, updater, self.iterations, self.damping).points
+        return at_intervals(forward(problem, updater, about=points).log_likelihood, self.time_grid.observed)
 
     def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
         """Simulate the real model: (*sample_shape, T, D).
@@ -387,8 +376,8 @@ class MarginalLikelihood(dist.Distribution):
             (x, u) (L, M + R), and the times (L,).
         """
         problem = self.bounded(at)
-        passed = problem.proposal(y, problem.propagate_expectations(y))._replace(steps=None)
-        path = problem.sample_trajectories(key, passed, 1, _CANDIDATES)[..., 0]
+        proposal = problem.proposal(y, problem.propagate_expectations(y))
+        path = problem.sample_trajectories(key, proposal, 1, _CANDIDATES)[..., 0]
         # The last row of a time is the one at which the constraint holds.
         wanted = np.asarray(self.times if at is None else at, float)
         index = np.searchsorted(problem.rows.times, wanted, side="right") - 1
@@ -397,15 +386,17 @@ class MarginalLikelihood(dist.Distribution):
     def constrained_leave_one_out(self, y: jax.Array) -> jax.Array:
         """Return (T,), log p(y_k | y_-k, c), by expectation propagation."""
         problem = self.bounded()
-        found = problem.propagate_expectations(y, "all")
-        predictor = backward(found.passed, Moments(*problem.ssm.initial()), problem.grid).predictor
+        propagated = problem.propagate_expectations(y, Record.SMOOTHER)
+        predictor = backward(problem.problem, propagated.trace).predictor
         assert predictor is not None
         data, outputs = jnp.asarray(problem.rows.data), y.shape[1]
-        at = jax.tree_util.tree_map(lambda a: at_intervals(a, problem.grid.observed)[data], predictor)
-        at = at._replace(mean=at.mean[:, :outputs], covariance=at.covariance[:, :outputs, :outputs])
-        sites = Sites(*(a[data, :outputs] for a in found.refined.found.sites))
-        value = leave_one_out(at, sites, found.entries[data, :outputs])
-        return jnp.where(found.refined.found.converged, value, -jnp.inf)
+        at_data = jax.tree.map(lambda a: at_intervals(a, problem.grid.observed)[data], predictor)
+        at_data = at_data._replace(mean=at_data.mean[:, :outputs],
+                                   covariance=at_data.covariance[:, :outputs, :outputs])
+        fixed_point = propagated.refined.fixed_point
+        sites = Sites(*(a[data, :outputs] for a in fixed_point.sites))
+        value = leave_one_out(at_data, sites, propagated.entries[data, :outputs])
+        return jnp.where(fixed_point.converged, value, -jnp.inf)
 
     def filter(self, y: Any) -> FilterResult:
         """Filter with this distribution's rule and steps; see `lfm_ppl.filter`. Constraints are of no account."""

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import checks
-from lfm_ppl.filtering.filter import check_observations, warn_single_precision
+from lfm_ppl.filtering.arguments import check_observations, warn_single_precision
 from lfm_ppl.filtering.transition import linear_part
 from lfm_ppl.forces.sde import Force
 from lfm_ppl.latent_grid.quadrature_weights import (

@@ -22,9 +22,11 @@ import numpy as np
 from jax.scipy.linalg import solve_triangular
 
 from lfm_ppl import gaussian_residuals
-from lfm_ppl.filtering.filter import forward
-from lfm_ppl.filtering.predict import compose
+from lfm_ppl.filtering.forward import forward
+from lfm_ppl.filtering.moments import Record, compose
+from lfm_ppl.filtering.problem import filter_problem
 from lfm_ppl.filtering.time_grid import build_time_grid
+from lfm_ppl.filtering.update import GaussianUpdate
 from lfm_ppl.forces import Force, RandomWalk, Resonator
 from lfm_ppl.forces.sde import Sum
 from lfm_ppl.gaussian_residuals import masked
@@ -191,7 +193,8 @@ def _position_covariances(system: LatentForceModel, times: np.ndarray) -> tuple[
     """Return the response (3 T, n) of all positions to the first state, and their covariance (3 T, 3 T) by noise."""
     ssm = state_space(system)
     grid = build_time_grid(ssm, times, steps_of(times), None)
-    passed = forward(ssm, Taylor(), grid, jnp.full((len(times), 3), jnp.nan), keep="all")
+    nothing_observed = GaussianUpdate(jnp.full((len(times), 3), jnp.nan))
+    trace = forward(filter_problem(ssm, Taylor(), grid), nothing_observed, record=Record.SMOOTHER)
     size, count = ssm.state_dim, len(times)
 
     def step(carry: tuple, row: tuple) -> tuple[tuple, tuple]:
@@ -202,7 +205,7 @@ def _position_covariances(system: LatentForceModel, times: np.ndarray) -> tuple[
         return (phi_so_far, covariance, cross), (phi_so_far[:3], cross[:3])
 
     first = (jnp.eye(size), jnp.zeros((size, size)), jnp.zeros((size, count, 3)))
-    _, (response, lower) = jax.lax.scan(step, first, (passed.phi, passed.process_cov, jnp.arange(count)))
+    _, (response, lower) = jax.lax.scan(step, first, (trace.phi, trace.process_cov, jnp.arange(count)))
     lower = lower.reshape(3 * count, 3 * count)  # zero above the diagonal blocks, which are whole
     late = np.repeat(np.arange(count), 3)
     return response.reshape(3 * count, size), jnp.where(late[:, None] >= late[None, :], lower, lower.T)

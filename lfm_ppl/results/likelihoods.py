@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.filtering import site_importance
-from lfm_ppl.filtering.filter import bends
-from lfm_ppl.filtering.sites import as_settings, is_linear
+from lfm_ppl.filtering.ep import importance
+from lfm_ppl.filtering.ep.settings import as_settings
+from lfm_ppl.filtering.problem import filter_problem, is_linear, is_observation_nonlinear
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.fokker_planck_grid import fokker_planck
 from lfm_ppl.inference.bound_model import BoundModel
@@ -94,7 +94,8 @@ class Reference(NamedTuple):
 
 def is_exact(ssm: StateSpaceModel) -> bool:
     """Whether the Gaussian filter computes the exact likelihood: linear dynamics and observation, Gaussian noise."""
-    return not isinstance(ssm.model.observation, ObservationFamily) and ssm.time_invariant and not bends(ssm)
+    is_family = isinstance(ssm.model.observation, ObservationFamily)
+    return ssm.time_invariant and not is_family and not is_observation_nonlinear(ssm)
 
 
 def gaussian(problem: PosteriorDraws, name: str = "log likelihoods") -> np.ndarray:
@@ -228,8 +229,8 @@ def _particle_run(problem: PosteriorDraws, particles: int, replicates: int, step
         time_grid = build_time_grid(distribution.ssm, distribution.times, steps or distribution.steps,
                                     distribution.max_step)
         if takes_smoother_draws(distribution.ssm):
-            return site_importance.log_likelihood(distribution.ssm, distribution.rule, time_grid, y, key, particles,
-                                                  as_settings(distribution.sites))
+            filtering = filter_problem(distribution.ssm, distribution.rule, time_grid)
+            return importance.log_likelihood(filtering, y, key, particles, as_settings(distribution.sites))
         return particle_filter.log_likelihood(distribution.ssm, time_grid, y, key, settings)
 
     bound, series = problem.bound, problem.series

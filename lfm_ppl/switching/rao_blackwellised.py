@@ -30,10 +30,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import checks
-from lfm_ppl.filtering.filter import FilterState, check_observations, warn_single_precision
-from lfm_ppl.filtering.predict import Moments
+from lfm_ppl.filtering.arguments import check_observations, warn_single_precision
+from lfm_ppl.filtering.filter import FilterState
+from lfm_ppl.filtering.moments import Moments
 from lfm_ppl.filtering.time_grid import Intervals, with_observations
-from lfm_ppl.filtering.update import Linearised, Update, update
+from lfm_ppl.filtering.update import LinearizedObservation, Update, condition
 from lfm_ppl.linalg import congruence, matmul, semidefinite_root, solve_semidefinite
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.particles.normals import normals
@@ -236,9 +237,9 @@ def _update(ssm: StateSpaceModel, particles: _Particles, maps: SwitchedMap, y_ro
 
     def update_particle(value: jax.Array, jacobian: jax.Array, obs_cov: jax.Array, mean: jax.Array,
                         covariance: jax.Array) -> Update:
-        return update(ssm, Linearised(value, jacobian, obs_cov), y_row, jnp.isfinite(y_row), Moments(mean, covariance))
+        return condition(ssm, LinearizedObservation(value, jacobian, obs_cov), y_row, Moments(mean, covariance))
 
-    out_axes = Update(Moments(0, axis), 0, 0, axis, axis, axis, axis)  # type: ignore[arg-type]
+    out_axes = Update(Moments(0, axis), 0, 0, axis, axis, axis, axis, None)  # type: ignore[arg-type]
     updated = jax.vmap(update_particle, (0, axis, axis, 0, axis), out_axes)(
         predicted, maps.jacobian, maps.obs_cov, particles.mean, particles.covariance)
     log_weights, total = reweight(particles.log_weights, updated.log_likelihood, particles.log_weights)
@@ -254,7 +255,7 @@ def _decide(rule: SwitchingRule, particles: _Particles, maps: SwitchedMap, t: ja
     predicted = _matvec(maps.reading_jacobian, particles.mean, shared) + maps.reading_offset
     reading_cov = jnp.diag(rule.variance())
 
-    def condition(jacobian: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def condition_on_reading(jacobian: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         cross_cov = matmul(covariance, jacobian.T)
         innovation_cov = matmul(jacobian, cross_cov) + reading_cov
         gain = solve_semidefinite(innovation_cov, cross_cov.T).T
@@ -263,7 +264,7 @@ def _decide(rule: SwitchingRule, particles: _Particles, maps: SwitchedMap, t: ja
         covariance = congruence(eye_minus_kh, covariance) + congruence(gain, reading_cov)
         return semidefinite_root(innovation_cov), gain, covariance
 
-    root, gain, covariance = (condition if shared else jax.vmap(condition))(
+    root, gain, covariance = (condition_on_reading if shared else jax.vmap(condition_on_reading))(
         maps.reading_jacobian, particles.covariance)
     innovation = _matvec(root, normals(key, predicted.shape[1], predicted.shape[0]).T, shared)
     input_index = jax.vmap(lambda d, r: rule.decide(d, r, t))(particles.input_index, predicted + innovation)

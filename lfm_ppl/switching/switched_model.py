@@ -20,8 +20,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import checks
-from lfm_ppl.filtering.filter import FilterState, predict, preparation
-from lfm_ppl.filtering.predict import Moments
+from lfm_ppl.filtering.filter import FilterState
+from lfm_ppl.filtering.forward import predict
+from lfm_ppl.filtering.moments import Moments, Record
+from lfm_ppl.filtering.problem import filter_problem
 from lfm_ppl.filtering.time_grid import Intervals, TimeGrid, build_time_grid
 from lfm_ppl.linearisation.taylor import Taylor
 from lfm_ppl.model.latent_force_model import LatentForceModel
@@ -174,11 +176,11 @@ def make_interval_map(ssm: StateSpaceModel, rule: SwitchingRule,
     """Return a traceable function from a row to the affine maps of a linear model."""
     size = ssm.state_dim
     origin = Moments(jnp.zeros(size), jnp.zeros((size, size)))
-    prepared = preparation(ssm, Taylor(), grid)
+    problem = filter_problem(ssm, Taylor(), grid)
 
     def interval_map(interval: Intervals) -> SwitchedMap:
         # The predicted mean is the offset, because the prediction starts from the known state zero.
-        prediction = predict(ssm, Taylor(), grid, prepared, interval, origin, with_map=True)
+        prediction = predict(problem, interval, origin, record=Record.SMOOTHER)
         end, zero = interval.end, origin.mean
 
         def observe(s: jax.Array) -> jax.Array:

@@ -13,7 +13,7 @@ from systems import Linear, whole_state
 
 import lfm_ppl as lfm
 from lfm_ppl.constrained.truncated import log_share, quantile, truncated_moments
-from lfm_ppl.filtering.quadrature import Marginal
+from lfm_ppl.filtering.ep.quadrature import MeanVariance
 
 TIMES = np.linspace(0.0, 5.0, 8)
 Y = np.array([[0.0], [0.25], [0.13], [-0.03], [0.02], [-0.05], [0.21], [0.05]])
@@ -78,7 +78,7 @@ def test_without_active_constraints_it_is_the_smoother():
 def test_moments_of_a_truncated_normal():
     """From far above the bound to far below it, where one minus nearly one loses all digits."""
     mean = np.array([8.0, 1.0, 0.0, -3.0, -12.0, -29.9, -30.1, -200.0])
-    tilted = truncated_moments(Marginal(jnp.asarray(2.0 * mean), jnp.full(8, 4.0)))
+    tilted = truncated_moments(MeanVariance(jnp.asarray(2.0 * mean), jnp.full(8, 4.0)))
     np.testing.assert_allclose(tilted.log_partition, norm.logcdf(mean), rtol=1e-12, atol=1e-15)
     expected = truncnorm(-mean[:5], np.inf, 2.0 * mean[:5], 2.0)
     np.testing.assert_allclose(tilted.mean[:5], expected.mean(), rtol=1e-8)
@@ -133,7 +133,7 @@ def test_a_box_far_from_the_mean_and_a_narrow_one(mean, width):
 
     total = integral(0, high)
     first, second = integral(1, high) / total, integral(2, high) / total
-    cavity = Marginal(jnp.asarray(mean), jnp.asarray(1.0))
+    cavity = MeanVariance(jnp.asarray(mean), jnp.asarray(1.0))
     tilted = truncated_moments(cavity, width)
     np.testing.assert_allclose(tilted.log_partition, np.log(total) + norm.logpdf(mode, mean), rtol=1e-9)
     np.testing.assert_allclose(tilted.mean, mode + first, rtol=1e-9)
@@ -147,5 +147,5 @@ def test_a_box_far_from_the_mean_and_a_narrow_one(mean, width):
 
 @pytest.mark.parametrize("mean", [0.5, 37.0, 39.0, 50.0])
 def test_the_probability_far_inside_a_bound_has_a_derivative(mean):
-    slope = jax.grad(lambda m: log_share(Marginal(m, jnp.asarray(1.0))))(mean)
+    slope = jax.grad(lambda m: log_share(MeanVariance(m, jnp.asarray(1.0))))(mean)
     np.testing.assert_allclose(slope, np.exp(norm.logpdf(mean) - norm.logcdf(mean)), atol=1e-300)

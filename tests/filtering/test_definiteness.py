@@ -11,11 +11,13 @@ from references import LinearLFM, Regression, matern
 from systems import Linear, Oscillator, Outputs, double_well, first_state, identity, motif, softplus
 
 import lfm_ppl as lfm
-from lfm_ppl.filtering.filter import forward
-from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.filtering.rts import at_start, backward
+from lfm_ppl.filtering.backward import at_interval_starts, backward
+from lfm_ppl.filtering.forward import forward
+from lfm_ppl.filtering.moments import Record
+from lfm_ppl.filtering.problem import filter_problem
 from lfm_ppl.filtering.smoothing_kernel import smoothing_kernel
 from lfm_ppl.filtering.time_grid import build_time_grid
+from lfm_ppl.filtering.update import GaussianUpdate
 
 TIMES = np.array([0.0, 0.01, 0.5, 0.5, 1.2, 2.0])
 Y = np.array([0.4, 0.40002, 0.43, 0.43, np.nan, 0.3])[:, None]
@@ -43,13 +45,13 @@ def passes(model, variance, noise):
                         (variance * jnp.eye(len(model.state_names)), noise * jnp.ones(1)))
     ssm = lfm.state_space(model)
     grid = build_time_grid(ssm, TIMES, 1)
-    passed = forward(ssm, lfm.Cubature(), grid, jnp.asarray(Y), keep="all")
-    start = Moments(*ssm.initial())
-    smoothed = backward(passed, start, grid)
-    kernel = jax.vmap(smoothing_kernel)(at_start(passed.filtered, start), passed.predicted, passed.phi,
-                                        passed.process_cov)
-    return (passed.predicted.covariance, passed.filtered.covariance, passed.process_cov, smoothed.moments.covariance,
-            kernel.conditional), passed.log_likelihood, smoothed.leave_one_out
+    problem = filter_problem(ssm, lfm.Cubature(), grid)
+    trace = forward(problem, GaussianUpdate(jnp.asarray(Y)), record=Record.SMOOTHER)
+    smoothed = backward(problem, trace)
+    kernel = jax.vmap(smoothing_kernel)(at_interval_starts(trace.filtered, trace.initial), trace.predicted, trace.phi,
+                                        trace.process_cov)
+    return (trace.predicted.covariance, trace.filtered.covariance, trace.process_cov, smoothed.moments.covariance,
+            kernel.conditional), trace.log_likelihood, smoothed.leave_one_out
 
 
 @pytest.mark.parametrize("linear", [True, False], ids=["linear", "non-linear"])

@@ -9,7 +9,7 @@ import pytest
 from systems import double_well, motif
 
 import lfm_ppl as lfm
-from lfm_ppl.filtering import filter as filtering
+from lfm_ppl.filtering import arguments
 
 MODEL = double_well()
 TIMES, Y = np.array([1.0, 2.0, 3.0]), np.ones((3, 1))
@@ -119,9 +119,9 @@ def test_nothing_raises_inside_compiled_code():
 
 
 def test_single_precision_warns_once(monkeypatch):
-    monkeypatch.setattr(filtering, "_warned", False)
-    monkeypatch.setattr(filtering.jnp, "result_type", lambda *args: jnp.float32)
+    monkeypatch.setattr(arguments, "_has_warned", False)
+    monkeypatch.setattr(arguments.jnp, "result_type", lambda *args: jnp.float32)
     with pytest.warns(UserWarning, match='jax.config.update\\("jax_enable_x64", True\\)'):
-        filtering.warn_single_precision()
-    filtering.warn_single_precision()  # the second time it is silent; pytest would show a warning as such
-    assert filtering._warned
+        arguments.warn_single_precision()
+    arguments.warn_single_precision()  # the second time it is silent; pytest would show a warning as such
+    assert arguments._has_warned

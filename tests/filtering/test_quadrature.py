@@ -8,7 +8,9 @@ from systems import whole_state
 
 import lfm_ppl as lfm
 from lfm_ppl.filtering import predict
-from lfm_ppl.filtering.predict import Moments, interval_factor, predict_interval
+from lfm_ppl.filtering.dynamics import Dynamics, is_nonlinear_in_forces_only
+from lfm_ppl.filtering.moments import Moments, Record
+from lfm_ppl.filtering.predict import interval_factor, predict_interval
 from lfm_ppl.filtering.transition import linear_part
 from lfm_ppl.model.state_space import Span
 
@@ -78,12 +80,12 @@ def nodes(ssm, steps):
 def predictions(ssm, rule, steps):
     """Of a row from all starts, about the filter's own moments and about given ones."""
     linear = linear_part(ssm, jnp.zeros(()))
-    factor = interval_factor(ssm, rule, linear, jnp.asarray(1.5), steps, tabulated=steps != 3)
+    factor = interval_factor(ssm, rule, linear, jnp.asarray(1.5), steps, is_tabulated=steps != 3)
 
     def row(moments, about):
         span = Span.between(0.7, 2.2, 1.5)
-        return predict_interval(ssm, rule, linear, factor, steps, span, jnp.asarray(1.5), moments, about,
-                           with_map=True, each=lambda one: one)
+        return [predict_interval(Dynamics(ssm, rule, linear), factor, steps, span, jnp.asarray(1.5), moments, about,
+                                 record) for record in (Record.SMOOTHER, Record.LINEARIZATION)]
 
     def both(moments):
         return row(moments, None), row(moments, nodes(ssm, steps))
@@ -100,12 +102,12 @@ QUICK = {("softplus", 3), ("exp, time", 1)}
 def test_simpson_gives_the_numbers_of_runge_kutta(name, steps, monkeypatch):
     ssm = case(name)
     rule = RULES["taylor" if name == "softplus" and steps == 3 else "cubature"]
-    assert predict.bent_by_forces_only(ssm, rule)
+    assert is_nonlinear_in_forces_only(ssm, rule)
     found = predictions(ssm, rule, steps)
-    monkeypatch.setattr(predict, "bent_by_forces_only", lambda *_: False)
+    monkeypatch.setattr(predict, "is_nonlinear_in_forces_only", lambda *_: False)
     expected = predictions(ssm, rule, steps)
     for one, other in zip(*map(jax.tree_util.tree_leaves, (found, expected)), strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12 * np.abs(other).max())
+        np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12 * np.abs(other).max(initial=0.0))
 
 
 @pytest.mark.parametrize("dynamics", [
@@ -115,16 +117,16 @@ def test_other_structures_keep_runge_kutta(dynamics):
     model = lfm.LatentForceModel(dynamics, {"u": lfm.Matern(1.0, 1.0)},
                                  lfm.GaussianObservation(whole_state, jnp.ones(1)),
                                  lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
-    assert not predict.bent_by_forces_only(lfm.state_space(model), lfm.Cubature())
+    assert not is_nonlinear_in_forces_only(lfm.state_space(model), lfm.Cubature())
 
 
 def test_points_in_the_whole_state_keep_runge_kutta():
-    assert not predict.bent_by_forces_only(case("softplus"), lfm.Cubature(full_state=True))
+    assert not is_nonlinear_in_forces_only(case("softplus"), lfm.Cubature(full_state=True))
     noisy = lfm.LatentForceModel(one_force(1, jnp.exp), {"u": lfm.Matern(1.0, 1.0)},
                                  lfm.GaussianObservation(whole_state, jnp.ones(1)),
                                  lfm.Gaussian(jnp.zeros(1), jnp.eye(1)),
                                  process_noise=lambda x, u, t: x[None])
-    assert not predict.bent_by_forces_only(lfm.state_space(noisy), lfm.Cubature())
+    assert not is_nonlinear_in_forces_only(lfm.state_space(noisy), lfm.Cubature())
 
 
 def test_without_forces(monkeypatch):
@@ -135,7 +137,7 @@ def test_without_forces(monkeypatch):
             lfm.Gaussian(jnp.ones(1), jnp.eye(1)), process_noise=lambda x, u, t: (1.0 + t) * jnp.ones((1, 1)))
 
     model, same = varying(), varying()  # of functions of their own, in which nothing is compiled yet
-    assert predict.bent_by_forces_only(lfm.state_space(model), lfm.Cubature())
+    assert is_nonlinear_in_forces_only(lfm.state_space(model), lfm.Cubature())
 
     def log_likelihoods(model):
         return [lfm.MarginalLikelihood(model, np.arange(4.0), steps=3, iterations=count).log_prob(jnp.ones((4, 1)))
@@ -144,6 +146,6 @@ def test_without_forces(monkeypatch):
     found = log_likelihoods(model)
     assert lfm.smooth(model, np.arange(4.0), np.ones((4, 1)), at=[0.5, 3.5], steps=3, iterations=2).mean.shape == (2, 1)
     asked = []
-    monkeypatch.setattr(predict, "bent_by_forces_only", lambda *_: bool(asked.append(None)))
+    monkeypatch.setattr(predict, "is_nonlinear_in_forces_only", lambda *_: bool(asked.append(None)))
     np.testing.assert_allclose(found, log_likelihoods(same), rtol=1e-12)
     assert asked, "compiled anew, without Simpson's rule"

@@ -12,20 +12,19 @@ from references import matern
 from scipy import stats
 
 import lfm_ppl as lfm
-from lfm_ppl.filtering.filter import as_rule, forward
-from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.filtering.rts import backward
-from lfm_ppl.filtering.site_importance import importance_weights
-from lfm_ppl.filtering.sites import (
-    FamilyTerms,
-    SiteSettings,
-    assumed_density,
-    cavities,
-    log_evidence_terms,
-    new_sites,
-)
+from lfm_ppl.filtering.arguments import as_rule
+from lfm_ppl.filtering.backward import backward
+from lfm_ppl.filtering.ep.cavities import cavities
+from lfm_ppl.filtering.ep.importance import importance_weights
+from lfm_ppl.filtering.ep.moment_matching import MomentMatchingUpdate
+from lfm_ppl.filtering.ep.settings import SiteSettings
+from lfm_ppl.filtering.ep.site_updates import log_evidence_terms, new_sites
+from lfm_ppl.filtering.ep.terms import FamilyTerms
+from lfm_ppl.filtering.forward import forward
+from lfm_ppl.filtering.moments import Moments, Record
+from lfm_ppl.filtering.problem import filter_problem
 from lfm_ppl.filtering.time_grid import build_time_grid
-from lfm_ppl.filtering.update import Linearised, Sites, update_by_sites
+from lfm_ppl.filtering.update import LinearizedObservation, Sites, SiteUpdate, multiply_by_sites
 
 TIMES = np.linspace(0.0, 8.0, 20)
 THETA = jnp.array([0.1, 0.05, -0.1])
@@ -208,22 +207,22 @@ def test_gradient_is_that_of_all_sweeps():
     def unrolled(theta):
         distribution = likelihood("Poisson", theta)
         ssm, rule = distribution.ssm, as_rule(None)
-        grid, start = build_time_grid(ssm, TIMES, 1), Moments(*ssm.initial())
+        problem = filter_problem(ssm, rule, build_time_grid(ssm, TIMES, 1))
         terms = FamilyTerms(distribution.model.observation, y)
-        first = forward(ssm, rule, grid, y, start=start, keep="moments", sites=assumed_density(terms.family))
+        first = forward(problem, MomentMatchingUpdate(terms.family, y), record=Record.MOMENTS)
 
         def sweep(carry, _):
             sites = carry[0]
-            passed = forward(ssm, rule, grid, y, start=start, keep="all", sites=sites)
-            at = cavities(backward(passed, start, grid).predictor, sites, terms.present, 1.0)
+            trace = forward(problem, SiteUpdate(sites), record=Record.SMOOTHER)
+            at = cavities(backward(problem, trace).predictor, sites, terms.present, 1.0)
             return (new_sites(terms, sites, at, settings, 1.0)[0], at), None
 
-        sites = first.site_terms.sites
+        sites = first.update.site_terms.sites
         at = jax.eval_shape(lambda s: sweep((s, None), None)[0][1], sites)
         blank = jax.tree_util.tree_map(lambda a: jnp.ones(a.shape, a.dtype), at)
         (sites, at), _ = jax.lax.scan(sweep, (sites, blank), None, length=25)
-        passed = forward(ssm, rule, grid, y, start=start, sites=sites)
-        return passed.log_likelihood.sum() + log_evidence_terms(terms, sites, at, settings).sum()
+        trace = forward(problem, SiteUpdate(sites))
+        return trace.log_likelihood.sum() + log_evidence_terms(terms, sites, at, settings).sum()
 
     value, gradient = jax.jit(jax.value_and_grad(unrolled))(THETA)
     expected, held = jax.jit(jax.value_and_grad(lambda th: likelihood("Poisson", th).log_prob(y)))(THETA)
@@ -265,8 +264,8 @@ def test_update_in_natural_parameters_against_dense_algebra():
     precision = np.linalg.inv(prior) + both.T @ np.diag(tau) @ both
     posterior = np.linalg.inv(precision)
     shift = both.T @ (nu - tau * (value - centre))
-    found = update_by_sites(Linearised(jnp.asarray(value), jnp.asarray(h), jnp.asarray(omega)),
-                            Sites(*map(jnp.asarray, (centre, nu, tau))), Moments(jnp.asarray(m), jnp.asarray(p)))
+    found = multiply_by_sites(LinearizedObservation(jnp.asarray(value), jnp.asarray(h), jnp.asarray(omega)),
+                              Sites(*map(jnp.asarray, (centre, nu, tau))), Moments(jnp.asarray(m), jnp.asarray(p)))
     np.testing.assert_allclose(found.moments.mean, m + (posterior @ shift)[:4], rtol=1e-8)
     np.testing.assert_allclose(found.moments.covariance, posterior[:4, :4], rtol=1e-8)
     away = value - centre

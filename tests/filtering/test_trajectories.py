@@ -13,10 +13,12 @@ from systems import identity, motif, softplus
 
 import lfm_ppl as lfm
 from lfm_ppl import loading
-from lfm_ppl.filtering.filter import forward, preparation
+from lfm_ppl.filtering.forward import forward
 from lfm_ppl.filtering.iterated import posterior_linearisation
-from lfm_ppl.filtering.predict import Moments
+from lfm_ppl.filtering.moments import Moments, Record
+from lfm_ppl.filtering.problem import filter_problem
 from lfm_ppl.filtering.time_grid import build_time_grid
+from lfm_ppl.filtering.update import GaussianUpdate
 from lfm_ppl.model.state_space import state_space
 
 TIMES = np.array([0.0, 0.0, 2.0, 4.0, 4.0, 6.0, 12.0, 14.0])  # replicates and a gap
@@ -121,33 +123,33 @@ def test_nodes_after_a_known_start_are_those_of_dense_algebra():
 
     @jax.jit
     def run(y):
-        passed = forward(ssm, lfm.Cubature(), grid, y, start=start, keep="all")
-        prepared = preparation(ssm, lfm.Cubature(), grid)
-        return passed, posterior_linearisation(ssm, lfm.Cubature(), grid, y, start, 1, 1.0, prepared).points.nodes
+        problem, updater = filter_problem(ssm, lfm.Cubature(), grid), GaussianUpdate(y)
+        trace = forward(problem, updater, record=Record.SMOOTHER)
+        return trace, posterior_linearisation(problem, updater, 1, 1.0).points.nodes
 
-    passed, nodes = jax.tree.map(np.asarray, run(y))
-    size, count, force = start.mean.shape[0], len(passed.phi), 5
+    trace, nodes = jax.tree.map(np.asarray, run(y))
+    size, count, force = start.mean.shape[0], len(trace.phi), 5
     # prior[k]: covariance at the end of interval k; the joint prior follows from the affine maps of the intervals.
     prior, covariance = [], np.asarray(start.covariance)
-    for phi, noise in zip(passed.phi, passed.process_cov, strict=True):
+    for phi, noise in zip(trace.phi, trace.process_cov, strict=True):
         covariance = phi @ covariance @ phi.T + noise
         prior.append(covariance)
     transition = np.zeros((count, count, size, size))
     for first in range(count):
         transition[first, first] = np.eye(size)
         for later in range(first + 1, count):
-            transition[later, first] = passed.phi[later] @ transition[later - 1, first]
+            transition[later, first] = trace.phi[later] @ transition[later - 1, first]
     joint = np.zeros((count, count, size, size))
     for first in range(count):
         for later in range(first, count):
             joint[later, first] = transition[later, first] @ prior[first]
             joint[first, later] = joint[later, first].T
     rows = np.asarray(grid.observed)
-    slope = passed.jacobian[rows]
+    slope = trace.update.jacobian[rows]
     cross = np.einsum("kiab,icb->kaic", joint[:, rows], slope)[:, force].reshape(count, -1)
     gram = np.einsum("iax,ijxy,jby->iajb", slope, joint[np.ix_(rows, rows)], slope).reshape((5 * len(rows),) * 2)
     for index, row in enumerate(rows):
-        gram[5 * index:5 * index + 5, 5 * index:5 * index + 5] += passed.obs_cov[row]
+        gram[5 * index:5 * index + 5, 5 * index:5 * index + 5] += trace.update.obs_cov[row]
     reduction = np.einsum("ij,ij->i", cross, np.linalg.solve(gram, cross.T).T)
     expected = np.array([covariance[force, force] for covariance in prior]) - reduction
     np.testing.assert_allclose(nodes.covariance[:, -1, 0, 0], expected, rtol=1e-9)

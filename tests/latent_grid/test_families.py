@@ -98,7 +98,7 @@ def test_coal_has_the_evidence_of_bayesnewton():
         value = float(jax.jit(lfm.MarginalLikelihood(model, times, sites=sites).log_prob)(jnp.asarray(y, float)))
         print(sites, value)
         assert value == pytest.approx(expected, abs=1e-7)
-    gaussian = lfm.MarginalLikelihood(model, times, sites=lfm.SiteSettings(linear_response=False))
+    gaussian = lfm.MarginalLikelihood(model, times)
     mean, sd = map(np.asarray, gaussian.smooth(y).force(model.force_names[0]))
     np.testing.assert_allclose(mean[[0, 50, 100]], [0.73549481, -0.3167189, -0.81036701], atol=5e-7)
     np.testing.assert_allclose(sd[[0, 50, 100]], [0.24480603, 0.22654376, 0.27578656], atol=5e-7)

@@ -14,10 +14,12 @@ import lfm_ppl as lfm
 from lfm_ppl.constrained.augmented import augmented_model, build_rows
 from lfm_ppl.constrained.constraints import build_constraints
 from lfm_ppl.constrained.interior_point import ConstrainedProblem, smoother_pass, solve_linear
-from lfm_ppl.filtering.filter import forward
-from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.filtering.rts import backward
+from lfm_ppl.filtering.backward import backward
+from lfm_ppl.filtering.forward import forward
+from lfm_ppl.filtering.moments import Moments, Record
+from lfm_ppl.filtering.problem import filter_problem
 from lfm_ppl.filtering.time_grid import build_time_grid
+from lfm_ppl.filtering.update import GaussianUpdate
 from lfm_ppl.linearisation.taylor import Taylor
 
 pytestmark = pytest.mark.performance
@@ -82,8 +84,8 @@ def test_a_pass_takes_at_most_one_and_a_half_smoother_passes():
 
     @eqx.filter_jit
     def smoother(ssm, grid, y):
-        start = Moments(*ssm.initial())
-        return backward(forward(ssm, Taylor(), grid, y, start=start, keep="all"), start, grid)
+        problem = filter_problem(ssm, Taylor(), grid)
+        return backward(problem, forward(problem, GaussianUpdate(y), record=Record.SMOOTHER))
 
     solve = eqx.filter_jit(solve_linear)
     passes = int(solve(given, 1e-10, 100).passes)

@@ -14,7 +14,7 @@ import xarray as xr
 from scipy import special, stats
 
 import lfm_ppl as lfm
-from lfm_ppl.filtering.sites import SiteSettings
+from lfm_ppl.filtering.ep.settings import SiteSettings
 from lfm_ppl.inference.site_failures import site_failures
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.family_scores import log_densities

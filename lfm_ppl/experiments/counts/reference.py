@@ -11,8 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import cho_solve, solve_triangular
 
-from lfm_ppl.filtering.filter import as_rule
-from lfm_ppl.filtering.sites import FamilyTerms, SiteSettings, evidence
+from lfm_ppl.filtering.arguments import as_rule
+from lfm_ppl.filtering.ep.evidence import evidence
+from lfm_ppl.filtering.ep.settings import SiteSettings
+from lfm_ppl.filtering.ep.terms import FamilyTerms
+from lfm_ppl.filtering.problem import filter_problem
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.kernels.elliptical_slice import SliceState, elliptical_slice_step
 from lfm_ppl.latent_grid.latent_grid import JITTER
@@ -53,8 +56,8 @@ class Reference:
     @partial(jax.jit, static_argnums=0)
     def proposal(self, y: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return a (T,) and the factor R of P = R R' given data (T, 1)."""
-        terms, grid = FamilyTerms(self.family, y), build_time_grid(self.ssm, self.times, 1)
-        sites = evidence(self.ssm, as_rule(None), grid, y, terms, self.settings).refined.found.sites
+        problem = filter_problem(self.ssm, as_rule(None), build_time_grid(self.ssm, self.times, 1))
+        sites = evidence(problem, FamilyTerms(self.family, y), self.settings).refined.fixed_point.sites
         nu, tau = (jnp.where(jnp.isfinite(y), a, 0.0)[:, 0] for a in (sites.nu, sites.tau))
         root = jnp.linalg.cholesky(jnp.eye(len(y)) + self.root.T @ (tau[:, None] * self.root))
         return cho_solve((root, True), self.root.T @ (nu + tau * (sites.centre[:, 0] - self.mean))), root

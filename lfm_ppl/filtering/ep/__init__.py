@@ -1,0 +1,1 @@
+"""Expectation propagation: Gaussian sites of observations and constraints that are not Gaussian."""

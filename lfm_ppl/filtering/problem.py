@@ -1,0 +1,108 @@
+"""The problem that all passes of a filter share: a model, a rule, a time grid, and what is computed once for all.
+
+`filter_problem` tabulates the transitions of the linear part for the distinct lengths of the intervals, where these are
+few, and takes the constant parts of the Jacobians. Passes of one problem (iterations, sweeps of expectation
+propagation) share them, so that their derivatives are taken once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lfm_ppl.filtering.dynamics import Dynamics
+from lfm_ppl.filtering.moments import Moments
+from lfm_ppl.filtering.predict import interval_factor
+from lfm_ppl.filtering.time_grid import Intervals, TimeGrid, by_length
+from lfm_ppl.filtering.transition import LinearPart, constant_jacobian, exact, linear_part
+from lfm_ppl.linearisation.rule import Rule
+from lfm_ppl.model.state_space import StateSpaceModel
+
+_FEW_LENGTHS = 16
+"""Number of distinct interval lengths up to which tables with all nodes cost nothing."""
+
+_INTERVALS_PER_LENGTH = 32
+"""Intervals for each distinct length from which such tables cost little: regular times, rounded."""
+
+
+class SharedTransitions(NamedTuple):
+    """Quantities that all intervals share.
+
+    Attributes:
+        linear: the constant linear part of the dynamics.
+        observation_jacobian: (D, M + R), the constant part of the observation's Jacobian.
+        transition: maps an interval to its exact transition, or to the integrating factor of its steps; to None where
+            the steps follow a tolerance.
+        jumps: G and Q of the forces' jumps; None without any.
+    """
+
+    linear: LinearPart
+    observation_jacobian: jax.Array
+    transition: Callable[[Intervals], Any]
+    jumps: tuple[jax.Array, jax.Array] | None
+
+
+class FilterProblem(NamedTuple):
+    """A model, a rule and a time grid, with what all intervals share."""
+
+    ssm: StateSpaceModel
+    rule: Rule
+    grid: TimeGrid
+    shared: SharedTransitions
+
+    @property
+    def dynamics(self) -> Dynamics:
+        """Model, rule and linear part, as a prediction needs them."""
+        return Dynamics(self.ssm, self.rule, self.shared.linear)
+
+    def initial(self, initial: Moments | None = None) -> Moments:
+        """Return moments at the initial time, by default the model's."""
+        return Moments(*self.ssm.initial()) if initial is None else initial
+
+
+def filter_problem(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid) -> FilterProblem:
+    """Compute what all intervals share."""
+    linear = linear_part(ssm, jnp.asarray(grid.initial_time, float))
+    count = np.shape(grid.intervals.length)[0]
+    is_tabulated = grid.lengths is not None and len(grid.lengths) <= max(_FEW_LENGTHS, count // _INTERVALS_PER_LENGTH)
+
+    def transition(length: jax.Array) -> Any:
+        if ssm.time_invariant:
+            return exact(ssm, length, grid.steps, linear)
+        if grid.tolerance is not None:
+            return None
+        return interval_factor(ssm, rule, linear, length, grid.steps, is_tabulated)
+
+    shared = SharedTransitions(linear, _observation_jacobian(ssm, grid), by_length(grid, transition),
+                               ssm.stack.jump_table())
+    return FilterProblem(ssm, rule, grid, shared)
+
+
+def _observation_jacobian(ssm: StateSpaceModel, grid: TimeGrid) -> jax.Array:
+    """Return the constant part of the observation's Jacobian, the same at every point and time."""
+    t = jnp.asarray(grid.initial_time, float)
+    w = ssm.inputs(ssm.initial()[0], t)
+    return constant_jacobian(lambda v: (ssm.observe(v, t), ()), w, ssm.observation_structure, ssm.output_dim)
+
+
+def is_observation_nonlinear(ssm: StateSpaceModel) -> bool:
+    """Return whether the linearisation of an observation depends on the moments about which it is made."""
+    observation = ssm.model.observation
+    return bool(not ssm.observation_structure.linear or observation.angular or observation.varies_with_state)
+
+
+def is_linear(ssm: StateSpaceModel) -> bool:
+    """Return whether no pass depends on the moments about which the model is linearised."""
+    return (ssm.drift_structure.linear and ssm.observation_structure.linear
+            and not callable(ssm.model.process_noise))
+
+
+def at_intervals(a: jax.Array, intervals: Any) -> jax.Array:
+    """Return the entries of ``a`` (N, ...) at intervals; all of them without a gather, a scatter in reverse mode."""
+    if isinstance(intervals, np.ndarray) and np.array_equal(intervals, np.arange(a.shape[0])):
+        return a
+    return a[jnp.asarray(intervals)]

@@ -1,0 +1,163 @@
+r"""Prediction over an interval in which the dynamics is non-linear in the forces only.
+
+1. The forces obey a linear SDE, so that their moments at all nodes of the interval follow from its start.
+2. Linearise the dynamics at all nodes at once; no stage changes the moments that another stage is linearised about.
+3. The Runge-Kutta method is then Simpson's rule. With the exponential E of the linear part and the Jacobians K,
+
+       Phi = E(h) + h / 6 (E(h) K_1 + 4 E(h/2) K_2 E(h/2) + K_3 E(h)).
+
+4. Compose the maps of the steps in one scan. The numbers are those of `runge_kutta_step`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lfm_ppl.filtering.dynamics import DriftLinearization, Dynamics, is_autonomous, linearize_drift
+from lfm_ppl.filtering.moments import Moments, Prediction, matvec, transform
+from lfm_ppl.filtering.runge_kutta import WEIGHTS, process_cov_at, stack_diffusions
+from lfm_ppl.filtering.transition import IntegratingFactor
+from lfm_ppl.forces.sde import block_diagonal
+from lfm_ppl.linalg import congruence, matmul
+from lfm_ppl.model.state_space import Span
+
+_FIRST_MIDDLE_LAST = slice(None, -2, 2), slice(1, None, 2), slice(2, None, 2)
+"""First, middle and last node of each of J steps, among the 2 J + 1 nodes."""
+
+
+class _Node(NamedTuple):
+    """The dynamics at a node, as a function of the forces.
+
+    Attributes:
+        remainder: (M, nz + 1), Jacobian in the forces' states, and the remainder of the drift as the last column.
+        diffusion: (M, M), expectation of G G'; None without process noise.
+    """
+
+    remainder: jax.Array
+    diffusion: jax.Array | None
+
+
+class StepMap(NamedTuple):
+    """The affine map of one step: s -> phi s + (offset, 0) + N(0, process_cov); offset is (M,)."""
+
+    phi: jax.Array
+    offset: jax.Array
+    process_cov: jax.Array
+
+
+def step_maps(dynamics: Dynamics, factor: IntegratingFactor, steps: int, span: Span, h: jax.Array, moments: Moments,
+              min_sd: jax.Array, about: Moments | None) -> StepMap:
+    """Return the maps (J, ...) of the steps of an interval.
+
+    Args:
+        dynamics: the model and the rule.
+        factor: the integrating factor of a step.
+        steps: J.
+        span: the interval's times.
+        h: length of a step.
+        moments: at the interval's start.
+        min_sd: see `lfm_ppl.filtering.dynamics.minimum_sd`.
+        about: moments (J + 1, ...) at the ends of the steps to linearise about; None: those of the filter.
+    """
+    ssm = dynamics.ssm
+    size = ssm.physical_dim
+    forces = _force_moments(factor, steps, _forces_of(moments, size), size)
+    point = forces if about is None else jax.tree.map(insert_midpoints, _forces_of(about, size))
+
+    def linearize_node(t: jax.Array, mean: jax.Array, point: Moments) -> _Node:
+        centre = jnp.concatenate([jnp.zeros(size), point.mean])  # the physical state drops out
+
+        def covariance(rows: jax.Array, reads_forces_only: bool) -> jax.Array:
+            return congruence(rows[:, size:], point.covariance)
+
+        drift: DriftLinearization = linearize_drift(dynamics, t, centre, covariance, min_sd)
+        jacobian, remainder = drift.jacobian[:, size:], drift.remainder
+        if about is not None:
+            remainder = remainder + matvec(jacobian, mean - point.mean)
+        return _Node(jnp.concatenate([jacobian, remainder[:, None]], axis=1), drift.diffusion)
+
+    if is_autonomous(ssm):
+        times = span.time(0.5 * h * jnp.arange(2 * steps + 1))
+        nodes = jax.vmap(linearize_node)(times, forces.mean, point)
+        first_middle_last = [jax.tree.map(lambda a, part=part: a[part], nodes) for part in _FIRST_MIDDLE_LAST]
+    else:
+        # The last node of a step and the first of the next one are at different sides of a jump of an input.
+        offsets = jnp.arange(steps) * h
+        times = jnp.stack([span.time(offsets), span.time(offsets + 0.5 * h), span.time(offsets + h)])
+        nodes = jax.vmap(jax.vmap(linearize_node))(times, _by_node(forces.mean), jax.tree.map(_by_node, point))
+        first_middle_last = [jax.tree.map(lambda a, index=index: a[index], nodes) for index in range(3)]
+    # All steps at once: a loop would store its intermediate results step by step for the derivative.
+    return jax.vmap(lambda *nodes: _simpson_step(factor, h, nodes, size))(*first_middle_last)
+
+
+def apply_step_map(moments: Moments, step_map: StepMap, full: jax.Array) -> Prediction:
+    """Return the prediction over one step; ``full`` is E(h), the transition of the linear part."""
+    size = step_map.offset.shape[0]
+    mean = matvec(full, moments.mean)
+    mean = jnp.concatenate([mean[:size] + step_map.offset, mean[size:]])
+    covariance = congruence(step_map.phi, moments.covariance) + step_map.process_cov
+    return Prediction(Moments(mean, covariance), step_map.phi, step_map.process_cov)
+
+
+def _force_moments(factor: IntegratingFactor, steps: int, start: Moments, size: int) -> Moments:
+    """Return the moments (2 J + 1, ...) of the forces' states at the nodes."""
+    if factor.halves is not None:
+        transitions, covariances = factor.halves
+        return Moments(matvec(transitions, start.mean), congruence(transitions, start.covariance) + covariances)
+    half = factor.half[size:, size:]
+
+    def half_step(moments: Moments, _: None) -> tuple[Moments, Moments]:
+        return transform(moments, half, factor.force_cov_half), moments
+
+    last, previous = jax.lax.scan(half_step, start, None, length=2 * steps)
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), previous, last)
+
+
+def _forces_of(moments: Moments, size: int) -> Moments:
+    """Return the moments of the forces' states, which follow ``size`` physical ones."""
+    return Moments(moments.mean[..., size:], moments.covariance[..., size:, size:])
+
+
+def _by_node(a: jax.Array) -> jax.Array:
+    return jnp.stack([a[part] for part in _FIRST_MIDDLE_LAST])
+
+
+def insert_midpoints(ends: jax.Array) -> jax.Array:
+    """Return the ends (J + 1, ...) of steps with their midpoints in between, (2 J + 1, ...)."""
+    middles = 0.5 * (ends[:-1] + ends[1:])
+    pairs = jnp.stack([ends[:-1], middles], axis=1)
+    return jnp.concatenate([pairs.reshape(2 * len(middles), *ends.shape[1:]), ends[-1:]])
+
+
+def _simpson_step(factor: IntegratingFactor, h: jax.Array, nodes: tuple[_Node, ...], size: int) -> StepMap:
+    """Return the map of a step from its first, middle and last node.
+
+    The middle node is both the second and the third Runge-Kutta stage; their Z, where Psi~ = I - Z is the inverse
+    transition to a stage's node, differ.
+    """
+    half, full = factor.half, factor.full
+    half_x, full_x = half[:size, :size], full[:size, :size]
+
+    # The remainder of the drift is one more column, which the forces' transition leaves alone.
+    def with_remainder(transition: jax.Array) -> jax.Array:
+        return block_diagonal([transition, np.eye(1)])
+
+    first, second, third = (node.remainder for node in nodes)
+    middle = matmul(second, with_remainder(half[size:, size:]))
+    last = matmul(third, with_remainder(full[size:, size:]))
+    increment = h / 6 * (matmul(full_x, first) + 4.0 * matmul(half_x, middle) + last)
+    jacobian, offset = increment[:, :-1], increment[:, -1]
+    pulled = matmul(factor.back_half[:size, :size], middle[:, :-1])
+    inverse = h * jnp.stack([0.5 * first[:, :-1], 0.5 * pulled, pulled])
+    linear = jnp.stack([full[:size], half[:size], half[:size], jnp.eye(size, full.shape[0])])
+    back = jnp.stack([factor.back_half, factor.back_half, factor.back_full])[:, size:, size:]
+    nonlinear = jnp.concatenate([jacobian[None], matmul(jacobian - matmul(full_x, inverse), back)])
+    transports = jnp.concatenate([linear[:, :, :size], linear[:, :, size:] + nonlinear], axis=2)
+    stages = [DriftLinearization(node.remainder, node.remainder, node.diffusion) for node in nodes]
+    diffusions = stack_diffusions(stages[0], stages[1], stages[1], stages[2])
+    process_cov = process_cov_at(factor, -1, transports, diffusions, h * WEIGHTS, size)
+    return StepMap(jnp.concatenate([transports[0], full[size:]]), offset, process_cov)
