@@ -31,9 +31,9 @@ from lfm_ppl.constrained.feasible_paths import FeasiblePaths, sample_feasible_pa
 from lfm_ppl.filtering.ep.evidence import Evidence, evidence
 from lfm_ppl.filtering.ep.settings import SiteSettings
 from lfm_ppl.filtering.forward import FilterTrace, forward
+from lfm_ppl.filtering.intervals import TimeGrid
 from lfm_ppl.filtering.moments import Record
 from lfm_ppl.filtering.problem import FilterProblem, filter_problem
-from lfm_ppl.filtering.time_grid import TimeGrid
 from lfm_ppl.filtering.update import Sites, SiteUpdate
 from lfm_ppl.linalg import matmul
 from lfm_ppl.linearisation.rule import Rule

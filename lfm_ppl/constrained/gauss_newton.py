@@ -54,9 +54,9 @@ from lfm_ppl.constrained.interior_point import (
 )
 from lfm_ppl.filtering.backward import SmootherTrace, backward
 from lfm_ppl.filtering.forward import FilterTrace, IntervalMaps, LinearizationPoints, forward, predict
+from lfm_ppl.filtering.intervals import as_arrays
 from lfm_ppl.filtering.moments import Moments, Record
 from lfm_ppl.filtering.problem import filter_problem
-from lfm_ppl.filtering.time_grid import as_arrays
 from lfm_ppl.filtering.update import GaussianUpdate
 from lfm_ppl.gaussian_residuals import masked, wrapped
 from lfm_ppl.linalg import cholesky, matmul, solve_lower

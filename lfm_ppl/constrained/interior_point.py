@@ -31,9 +31,9 @@ import jax.numpy as jnp
 from lfm_ppl.constrained.augmented import Rows, augmented_observations
 from lfm_ppl.filtering.backward import SmootherTrace, backward
 from lfm_ppl.filtering.forward import FilterTrace, IntervalMaps, forward
+from lfm_ppl.filtering.intervals import TimeGrid
 from lfm_ppl.filtering.moments import Moments, Record
 from lfm_ppl.filtering.problem import filter_problem
-from lfm_ppl.filtering.time_grid import TimeGrid
 from lfm_ppl.filtering.update import GaussianUpdate
 from lfm_ppl.linalg import congruence, diagonal, matmul, safe_sqrt, solve_lower, solve_upper
 from lfm_ppl.linearisation.taylor import Taylor

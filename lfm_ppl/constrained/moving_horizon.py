@@ -33,9 +33,9 @@ from lfm_ppl.constrained.gauss_newton import Dynamics
 from lfm_ppl.constrained.interior_point import ConstrainedProblem
 from lfm_ppl.filtering.arguments import check_observations, warn_single_precision
 from lfm_ppl.filtering.forward import forward
+from lfm_ppl.filtering.intervals import TimeGrid, intervals_between
 from lfm_ppl.filtering.moments import Moments, Record
 from lfm_ppl.filtering.problem import filter_problem
-from lfm_ppl.filtering.time_grid import TimeGrid, intervals_between
 from lfm_ppl.filtering.update import GaussianUpdate
 from lfm_ppl.linearisation.taylor import Taylor
 from lfm_ppl.model.inputs import breakpoints_within

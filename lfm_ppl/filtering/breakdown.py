@@ -16,9 +16,9 @@ from lfm_ppl.filtering.ep.moment_matching import assumed_density_filter
 from lfm_ppl.filtering.ep.settings import SiteSettings
 from lfm_ppl.filtering.ep.terms import FamilyTerms, row_log_prob
 from lfm_ppl.filtering.forward import FilterTrace, forward
+from lfm_ppl.filtering.intervals import Intervals, TimeGrid, intervals_between
 from lfm_ppl.filtering.moments import Moments, Record
 from lfm_ppl.filtering.problem import filter_problem
-from lfm_ppl.filtering.time_grid import Intervals, TimeGrid, intervals_between
 from lfm_ppl.filtering.update import GaussianUpdate
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.observations.family import ObservationFamily
@@ -78,14 +78,14 @@ def _explain_sites(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, sta
                 "or the filter breaks down. Try a tighter prior, or more steps (steps=...).")
     fixed_point = _run_refine(ssm, rule, grid, FamilyTerms(family, y), settings, initial)
     is_bad = ~np.asarray(fixed_point.cavity.valid) | ~np.isfinite(np.asarray(fixed_point.sites.tau))
-    location = ""
+    where = ""
     if is_bad.any():
         row, column = np.argwhere(is_bad)[0]
-        location = f"; the first without a cavity is y[{row}, {column}]"
+        where = f"; the first without a cavity is y[{row}, {column}]"
     if bool(fixed_point.converged):
         return f"the log likelihood of the observation family is not finite, although its sites converge. {remedy}."
     return (f"the sites of the observation family do not converge in {int(fixed_point.sweeps)} sweeps (the last "
-            f"changes a site by {float(fixed_point.change):.2g}){location}. The log likelihood is "
+            f"changes a site by {float(fixed_point.change):.2g}){where}. The log likelihood is "
             f"{'that of assumed density filtering, which is rougher' if is_finite else '-inf'}. {remedy}.")
 
 
@@ -106,21 +106,21 @@ def _explain_row(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array,
         return None
     row = int(np.argmin(is_good))
     interval = jax.tree_util.tree_map(lambda a: np.asarray(a)[grid.observed[row]], grid.intervals)
-    place = f"at row {row} (time {float(interval.start + interval.length):.6g})"
+    where = f"at row {row} (time {float(interval.start + interval.length):.6g})"
     if not np.isfinite(at_data.predicted.mean[row]).all():
-        return f"the predicted mean of the state is not finite {place}: try more steps (steps=...) or a tighter prior"
+        return f"the predicted mean of the state is not finite {where}: try more steps (steps=...) or a tighter prior"
     if not np.isfinite(at_data.predicted.covariance[row]).all():
-        return f"the predicted covariance is not finite {place}: try more steps (steps=...) or a tighter prior"
+        return f"the predicted covariance is not finite {where}: try more steps (steps=...) or a tighter prior"
     predictor, names = at_data.predictor[row], ssm.model.output_names
     if not np.isfinite(predictor).all():
         output = int(np.argmin(np.isfinite(predictor)))
-        return (f"the observation function gives {predictor[output]:g} for the output {names[output]!r} {place}: look "
+        return (f"the observation function gives {predictor[output]:g} for the output {names[output]!r} {where}: look "
                 "for a logarithm, a root or a division outside of its domain")
     density = np.asarray(row_log_prob(family, row, jnp.asarray(predictor), y[row]))
     if np.isfinite(density).all():
-        return f"the integral of the observation family's density is not finite {place}"
+        return f"the integral of the observation family's density is not finite {where}"
     output = int(np.argmin(np.isfinite(density)))
-    return (f"y[{row}, {output}] = {float(y[row, output]):g} has the log density {density[output]:g} {place} under the "
+    return (f"y[{row}, {output}] = {float(y[row, output]):g} has the log density {density[output]:g} {where} under the "
             f"predictor {predictor[output]:g} of the output {names[output]!r}: check the link and the initial state")
 
 
@@ -159,15 +159,15 @@ def breakdown(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, start: M
     later = np.flatnonzero(np.asarray(grid.observed) >= row)
     end = grid.observed[later[0]] if later.size else row
     time = float(rows.end[end])
-    location = f"row {later[0]} (time {time:.6g})" if later.size else f"time {time:.6g}, after the last observation"
+    where = f"row {later[0]} (time {time:.6g})" if later.size else f"time {time:.6g}, after the last observation"
     if count > 1 and step is not None:
-        location += f", step {step + 1} of {count} from time {interval.start[0]:.6g} to {interval.end[0]:.6g}"
+        where += f", step {step + 1} of {count} from time {interval.start[0]:.6g} to {interval.end[0]:.6g}"
     remedy = ("Try a tighter prior, an observation noise that is not so small, or other units" if ssm.time_invariant
               else "Try more steps (up to five times their number are tried), a larger tolerance, another rule, or a "
               "tighter prior" if grid.tolerance is not None
               else "Try more steps (steps=...), a longest step (max_step=...), steps that follow a tolerance "
               "(tolerance=1e-3), another rule, or a tighter prior")
-    return f"the filter breaks down at {location}: {reason}. The log likelihood is -inf. {remedy}."
+    return f"the filter breaks down at {where}: {reason}. The log likelihood is -inf. {remedy}."
 
 
 def _divide_interval(grid: TimeGrid, interval: Intervals, count: int) -> TimeGrid:

@@ -117,7 +117,7 @@ def linearize_drift(dynamics: Dynamics, t: jax.Array, mean: jax.Array, covarianc
         mean: (n,), of the filter at the node.
         covariance: of the filter at the node.
         min_sd: see `minimum_sd`.
-        about: moments to linearise about; None: those of the filter.
+        about: moments to linearise about; None: the filter's moments.
     """
     ssm, rule, linear = dynamics
 
@@ -164,7 +164,7 @@ def linearization_indices(ssm: StateSpaceModel, rule: Rule) -> np.ndarray:
 
 
 def embed_in_state(ssm: StateSpaceModel, rule: Rule, moments: Moments) -> Moments:
-    """Return moments (..., n), (..., n, n) of the joint state from those of the linearised states; others are zero."""
+    """Return moments (..., n), (..., n, n) of the joint state from the linearised states; others are zero."""
     indices = linearization_indices(ssm, rule)
     if is_contiguous(indices):
         first = int(indices[0]) if indices.size else 0

@@ -14,9 +14,10 @@ from lfm_ppl.filtering.arguments import as_rule, check_observations, warn_single
 from lfm_ppl.filtering.breakdown import warn_of_breakdown
 from lfm_ppl.filtering.ep.moment_matching import assumed_density_filter, quantile_residuals
 from lfm_ppl.filtering.forward import FilterTrace, forward
+from lfm_ppl.filtering.intervals import TimeGrid
 from lfm_ppl.filtering.moments import Moments, Record
 from lfm_ppl.filtering.problem import at_intervals, filter_problem
-from lfm_ppl.filtering.time_grid import TimeGrid, build_time_grid
+from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.filtering.update import GaussianUpdate
 from lfm_ppl.linalg import solve_lower
 from lfm_ppl.linearisation.rule import Rule
@@ -63,8 +64,8 @@ def filter(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
     """Run the continuous-discrete Gaussian filter.
 
     Between observations the moments obey dm/dt = E[f], dP/dt = A P + P A' + E[G G'] with the rule's A; at an
-    observation they are conditioned on it. Of an observation family the moments of the predictor given an observation
-    are those of its tilted prediction (assumed density filtering).
+    observation they are conditioned on it. For an observation family, the predictor given an observation has the
+    moments of its tilted prediction (assumed density filtering).
 
     Args:
         model: the latent force model.
@@ -74,10 +75,9 @@ def filter(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None
         steps: integration steps between two consecutive times.
         max_step: longest step, in units of time; longer intervals get more steps. None: twice the median step. A linear
             model without known inputs is exact, and needs no steps.
-        start: the ``state`` of an earlier result, to go on with new observations; times continue from there, and
-            nothing need be observed at them (a prediction). The numbers are those of one pass, and as many new times
-            as in an earlier call take no new compilation. (An observation covariance for each time holds those of the
-            new times.)
+        start: the ``state`` of an earlier result, to continue with new observations at later times; all of them may be
+            missing (a prediction). Results equal a single pass over all times, and calls with equally many new times
+            share one compilation. An observation covariance for each time has the entries of the new times.
         tolerance: largest error of an integration step, in standard deviations, as in `lfm_ppl.MarginalLikelihood`.
 
     Returns:

@@ -23,6 +23,7 @@ import jax.numpy as jnp
 
 from lfm_ppl.filtering.adaptive import predict_interval_adaptively
 from lfm_ppl.filtering.dynamics import MINIMUM_SD, columns, embed_in_state, linearization_indices
+from lfm_ppl.filtering.intervals import Intervals, as_arrays, with_observations
 from lfm_ppl.filtering.moments import Moments, Prediction, Record
 from lfm_ppl.filtering.predict import (
     StepRecord,
@@ -34,7 +35,6 @@ from lfm_ppl.filtering.predict import (
     predict_interval,
 )
 from lfm_ppl.filtering.problem import FilterProblem
-from lfm_ppl.filtering.time_grid import Intervals, as_arrays, with_observations
 from lfm_ppl.filtering.update import (
     INNOVATION_FACTOR,
     UPDATE_FAILED,
@@ -54,11 +54,11 @@ class LinearizationPoints(NamedTuple):
     Attributes:
         nodes: (N, J + 1, k), (N, J + 1, k, k) of the linearised states (`linearization_indices`) at the ends of the
             steps of each interval, before a jump.
-        ends: (N, n), (N, n, n) at the intervals' ends, after a jump; None unless the observation is non-linear.
+        end_moments: (N, n), (N, n, n) at the intervals' ends, after a jump; None unless the observation is non-linear.
     """
 
     nodes: Moments
-    ends: Moments | None
+    end_moments: Moments | None
 
 
 class NodeRecord(NamedTuple):
@@ -121,9 +121,9 @@ def forward(problem: FilterProblem, updater: Updater, *, initial: Moments | None
         problem: the model, the rule and the time grid.
         updater: how observations update the moments.
         initial: moments at the initial time; None: the model's.
-        about: moments to linearise about; None: those of the filter.
+        about: moments to linearise about; None: the filter's moments.
         record: recorded output.
-        maps: affine maps of the intervals, where they are known; of ``about`` only the ends are used then.
+        maps: affine maps of the intervals, where they are known; of ``about`` only the ``end_moments`` are used then.
     """
     ssm, rule, grid, shared = problem
     start = problem.initial(initial)
@@ -138,7 +138,7 @@ def forward(problem: FilterProblem, updater: Updater, *, initial: Moments | None
         else:
             prediction = predict_by_map(moments, interval_map.phi, interval_map.process_cov, interval_map.point,
                                         interval_map.mean)
-        centre = prediction.moments if points is None or points.ends is None else points.ends
+        centre = prediction.moments if points is None or points.end_moments is None else points.end_moments
         index = jnp.maximum(interval.observation, 0)
         observation = linearize_observation(ssm, rule, shared.observation_jacobian, interval.end, index, centre)
         if centre is not prediction.moments:
@@ -175,7 +175,7 @@ def predict(problem: FilterProblem, interval: Intervals, moments: Moments, about
         problem: the model, the rule and the time grid.
         interval: one interval.
         moments: at its start.
-        about: moments (J + 1, ...) at the ends of its steps to linearise about; None: those of the filter.
+        about: moments (J + 1, ...) at the ends of its steps to linearise about; None: the filter's moments.
         record: recorded output; ``nodes`` of the result is a `NodeRecord` for `Record.LINEARIZATION`.
     """
     ssm, _, grid, shared = problem

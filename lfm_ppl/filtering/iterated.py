@@ -89,9 +89,9 @@ def posterior_linearisation(problem: FilterProblem, updater: Updater, iterations
 
 
 def _points_of(iterates: list[_Iterate | None]) -> LinearizationPoints:
-    nodes, ends = (None if iterate is None else iterate.moments for iterate in iterates)
+    nodes, end_moments = (None if iterate is None else iterate.moments for iterate in iterates)
     assert nodes is not None
-    return LinearizationPoints(nodes, ends)
+    return LinearizationPoints(nodes, end_moments)
 
 
 def _damped_update(old: _Iterate, smoothed: Moments, damping: float) -> _Iterate:
@@ -133,9 +133,9 @@ def smoothed_points(problem: FilterProblem, trace: FilterTrace, smoothed: Smooth
     def smooth_row(moments: Moments, cross: jax.Array, r: jax.Array, adjoint: jax.Array) -> Moments:
         return Moments(moments.mean + matvec(cross, r), moments.covariance - congruence(cross, adjoint))
 
-    ends = None
+    end_moments = None
     if is_observation_nonlinear(ssm):
-        ends = jax.vmap(smooth_row)(trace.predicted, trace.predicted.covariance, r, adjoint)
+        end_moments = jax.vmap(smooth_row)(trace.predicted, trace.predicted.covariance, r, adjoint)
 
     def marginal(moments: Moments) -> tuple[Moments, jax.Array]:
         cross = columns(moments.covariance, indices).mT
@@ -149,7 +149,7 @@ def smoothed_points(problem: FilterProblem, trace: FilterTrace, smoothed: Smooth
     if nodes is None or not indices.size:
         inner = jax.tree.map(lambda a: jnp.broadcast_to(a[:, None], (len(a), grid.steps, *a.shape[1:])), after_jump)
     else:
-        # Interval by interval: XLA fuses the operations of one interval, but not those of all intervals at once.
+        # Interval by interval: XLA fuses the operations of one interval, but not operations on all intervals.
         inner = jax.lax.map(lambda row: smooth_row(*row), (*nodes, r, adjoint))
         if not has_jumps:
             after_jump = jax.tree.map(lambda a: a[:, -1], inner)
@@ -158,4 +158,4 @@ def smoothed_points(problem: FilterProblem, trace: FilterTrace, smoothed: Smooth
         starts = jnp.concatenate([first[None], after_jump[:-1]])
         return jnp.concatenate([starts[:, None], inner], axis=1)
 
-    return LinearizationPoints(jax.tree.map(join, first, after_jump, inner), ends)
+    return LinearizationPoints(jax.tree.map(join, first, after_jump, inner), end_moments)

@@ -97,7 +97,7 @@ def predict_interval(dynamics: Dynamics, factor: IntegratingFactor, steps: int, 
         span: the interval's times.
         length: its length.
         moments: at its start.
-        about: moments (J + 1, ...) at the ends of the steps to linearise about; None: those of the filter.
+        about: moments (J + 1, ...) at the ends of the steps to linearise about; None: the filter's moments.
         record: recorded output; ``nodes`` of the result is a `StepRecord` for `Record.LINEARIZATION`.
     """
     h = length / steps
@@ -123,7 +123,7 @@ def predict_interval(dynamics: Dynamics, factor: IntegratingFactor, steps: int, 
         step, _ = runge_kutta_step(dynamics, factor, span.after(index * h), h, previous.moments, min_sd, points)
         return advance(previous, step)
 
-    points = jax.tree.map(lambda ends: _by_steps(insert_midpoints(ends)), about)
+    points = jax.tree.map(lambda nodes: _by_steps(insert_midpoints(nodes)), about)
     last, nodes = jax.lax.scan(jax.checkpoint(runge_kutta, prevent_cse=False), initial, (jnp.arange(steps), points))
     return last._replace(nodes=nodes)
 

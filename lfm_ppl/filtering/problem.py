@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.filtering.dynamics import Dynamics
+from lfm_ppl.filtering.intervals import Intervals, TimeGrid, by_length
 from lfm_ppl.filtering.moments import Moments
 from lfm_ppl.filtering.predict import interval_factor
-from lfm_ppl.filtering.time_grid import Intervals, TimeGrid, by_length
 from lfm_ppl.filtering.transition import LinearPart, constant_jacobian, exact, linear_part
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.state_space import StateSpaceModel

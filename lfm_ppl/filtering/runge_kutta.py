@@ -53,7 +53,7 @@ def runge_kutta_step(dynamics: Dynamics, factor: IntegratingFactor, span: Span, 
         h: length of the step.
         moments: at the start of the step.
         min_sd: see `lfm_ppl.filtering.dynamics.minimum_sd`.
-        about: moments (3, ...) at start, middle and end of the step to linearise about; None: those of the filter.
+        about: moments (3, ...) at start, middle and end of the step to linearise about; None: the filter's moments.
         stage1: the first stage, where it is known from the step before.
     """
     m, p = moments
@@ -149,10 +149,10 @@ def _increment_after(change: jax.Array, phi: jax.Array, inverse: jax.Array, size
     return change - matmul(phi[:size, :size], inverse)
 
 
-def _inverse_transition(scale: jax.Array, previous: jax.Array, back: jax.Array, jacobian: jax.Array, half: jax.Array,
-                        size: int) -> jax.Array:
+def _inverse_transition(scale: jax.Array, previous: jax.Array, backward: jax.Array, jacobian: jax.Array,
+                        half: jax.Array, size: int) -> jax.Array:
     """Return the next stage of Z, where Psi~ = I - Z is the inverse transition in the interaction picture."""
-    pulled = matmul(back[:size, :size], matmul(jacobian, half))
+    pulled = matmul(backward[:size, :size], matmul(jacobian, half))
     return scale * (pulled - matmul(previous[:, :size], pulled))
 
 

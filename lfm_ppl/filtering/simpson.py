@@ -6,7 +6,7 @@ r"""Prediction over an interval in which the dynamics is non-linear in the force
 
        Phi = E(h) + h / 6 (E(h) K_1 + 4 E(h/2) K_2 E(h/2) + K_3 E(h)).
 
-4. Compose the maps of the steps in one scan. The numbers are those of `runge_kutta_step`.
+4. Compose the maps of the steps in one scan. The result equals that of `runge_kutta_step`.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def step_maps(dynamics: Dynamics, factor: IntegratingFactor, steps: int, span: S
         h: length of a step.
         moments: at the interval's start.
         min_sd: see `lfm_ppl.filtering.dynamics.minimum_sd`.
-        about: moments (J + 1, ...) at the ends of the steps to linearise about; None: those of the filter.
+        about: moments (J + 1, ...) at the ends of the steps to linearise about; None: the filter's moments.
     """
     ssm = dynamics.ssm
     size = ssm.physical_dim
@@ -126,11 +126,11 @@ def _by_node(a: jax.Array) -> jax.Array:
     return jnp.stack([a[part] for part in _FIRST_MIDDLE_LAST])
 
 
-def insert_midpoints(ends: jax.Array) -> jax.Array:
+def insert_midpoints(step_ends: jax.Array) -> jax.Array:
     """Return the ends (J + 1, ...) of steps with their midpoints in between, (2 J + 1, ...)."""
-    middles = 0.5 * (ends[:-1] + ends[1:])
-    pairs = jnp.stack([ends[:-1], middles], axis=1)
-    return jnp.concatenate([pairs.reshape(2 * len(middles), *ends.shape[1:]), ends[-1:]])
+    middles = 0.5 * (step_ends[:-1] + step_ends[1:])
+    pairs = jnp.stack([step_ends[:-1], middles], axis=1)
+    return jnp.concatenate([pairs.reshape(2 * len(middles), *step_ends.shape[1:]), step_ends[-1:]])
 
 
 def _simpson_step(factor: IntegratingFactor, h: jax.Array, nodes: tuple[_Node, ...], size: int) -> StepMap:
@@ -154,8 +154,8 @@ def _simpson_step(factor: IntegratingFactor, h: jax.Array, nodes: tuple[_Node, .
     pulled = matmul(factor.back_half[:size, :size], middle[:, :-1])
     inverse = h * jnp.stack([0.5 * first[:, :-1], 0.5 * pulled, pulled])
     linear = jnp.stack([full[:size], half[:size], half[:size], jnp.eye(size, full.shape[0])])
-    back = jnp.stack([factor.back_half, factor.back_half, factor.back_full])[:, size:, size:]
-    nonlinear = jnp.concatenate([jacobian[None], matmul(jacobian - matmul(full_x, inverse), back)])
+    backward = jnp.stack([factor.back_half, factor.back_half, factor.back_full])[:, size:, size:]
+    nonlinear = jnp.concatenate([jacobian[None], matmul(jacobian - matmul(full_x, inverse), backward)])
     transports = jnp.concatenate([linear[:, :, :size], linear[:, :, size:] + nonlinear], axis=2)
     stages = [DriftLinearization(node.remainder, node.remainder, node.diffusion) for node in nodes]
     diffusions = stack_diffusions(stages[0], stages[1], stages[1], stages[2])

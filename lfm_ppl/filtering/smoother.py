@@ -1,8 +1,8 @@
 """The smoother: state and forces given all observations, and draws of their trajectories.
 
 1. Observation times and requested times are the nodes of one time grid (`time_grid`).
-2. The model is linearised about the filter's moments, about iterated posterior moments, or about those of the sites of
-   an observation family.
+2. The model is linearised about the filter's moments, about iterated posterior moments, or about the moments that
+   the sites of an observation family give.
 3. One forward and one backward scan give the smoothed moments at all nodes; draws come from the same forward scan.
 
 Source: Särkkä and Sarmavuori (2013), Signal Processing 93.
@@ -27,11 +27,12 @@ from lfm_ppl.filtering.ep.settings import SiteSettings, as_settings
 from lfm_ppl.filtering.ep.terms import FamilyTerms
 from lfm_ppl.filtering.filter import whitened_innovations
 from lfm_ppl.filtering.forward import FilterTrace, forward
+from lfm_ppl.filtering.intervals import TimeGrid
 from lfm_ppl.filtering.iterated import IterationResult, posterior_linearisation
 from lfm_ppl.filtering.moments import Record, matvec
 from lfm_ppl.filtering.problem import FilterProblem, at_intervals, filter_problem
 from lfm_ppl.filtering.sample import sample_errors
-from lfm_ppl.filtering.time_grid import TimeGrid, build_time_grid
+from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.filtering.update import GaussianUpdate
 from lfm_ppl.linalg import congruence, matmul, safe_sqrt
 from lfm_ppl.linearisation.rule import Rule

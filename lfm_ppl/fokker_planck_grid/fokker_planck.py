@@ -24,7 +24,8 @@ import numpy as np
 
 from lfm_ppl import checks
 from lfm_ppl.filtering.arguments import check_observations, warn_single_precision
-from lfm_ppl.filtering.time_grid import TimeGrid, build_time_grid
+from lfm_ppl.filtering.intervals import TimeGrid
+from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.fokker_planck_grid.finite_volume import Grid
 from lfm_ppl.fokker_planck_grid.grid_choice import PADDED_CELLS, GridProblem, choose, half_grid, second_order_error
 from lfm_ppl.fokker_planck_grid.grid_filter import backward, build_transition, forward, log_likelihood

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.filtering.time_grid import TimeGrid
+from lfm_ppl.filtering.intervals import TimeGrid
 from lfm_ppl.fokker_planck_grid.finite_volume import Grid
 from lfm_ppl.fokker_planck_grid.grid_filter import log_likelihood_and_reach
 from lfm_ppl.fokker_planck_grid.grid_model import Cells, drift_and_diffusion, on_grid

@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.filtering.time_grid import Intervals, TimeGrid, as_arrays, with_observations
+from lfm_ppl.filtering.intervals import Intervals, TimeGrid, as_arrays, with_observations
 from lfm_ppl.fokker_planck_grid.finite_volume import BirthDeathProcess, Grid, propagate, transition
 from lfm_ppl.fokker_planck_grid.grid_model import WEIGHTS, Cells, on_grid
 from lfm_ppl.gaussian_residuals import log_density, masked, wrapped

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.filtering.time_grid import TimeGrid, as_arrays
+from lfm_ppl.filtering.intervals import TimeGrid, as_arrays
 from lfm_ppl.fokker_planck_grid.finite_volume import BirthDeathProcess, Grid, birth_death_process, gaussian_masses
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.model.structure import pattern

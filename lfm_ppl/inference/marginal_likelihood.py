@@ -31,11 +31,12 @@ from lfm_ppl.filtering.ep.settings import SiteSettings, as_settings
 from lfm_ppl.filtering.ep.terms import FamilyTerms
 from lfm_ppl.filtering.filter import FilterResult, filter_on
 from lfm_ppl.filtering.forward import forward
+from lfm_ppl.filtering.intervals import TimeGrid
 from lfm_ppl.filtering.iterated import posterior_linearisation
 from lfm_ppl.filtering.moments import Record
 from lfm_ppl.filtering.problem import FilterProblem, at_intervals, filter_problem, is_linear, is_observation_nonlinear
 from lfm_ppl.filtering.smoother import SmootherResult, smooth_on
-from lfm_ppl.filtering.time_grid import TimeGrid, build_time_grid
+from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.filtering.update import GaussianUpdate, Sites
 from lfm_ppl.gradients import finite_or_minus_infinity
 from lfm_ppl.linearisation.rule import Rule

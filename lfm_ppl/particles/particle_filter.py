@@ -24,7 +24,8 @@ import numpy as np
 
 from lfm_ppl import checks
 from lfm_ppl.filtering.arguments import check_observations, warn_single_precision
-from lfm_ppl.filtering.time_grid import Intervals, TimeGrid, build_time_grid, with_observations
+from lfm_ppl.filtering.intervals import Intervals, TimeGrid, with_observations
+from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation_noise import check_noise, log_density
 from lfm_ppl.model.state_space import StateSpaceModel, state_space

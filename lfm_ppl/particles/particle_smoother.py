@@ -22,8 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import checks
+from lfm_ppl.filtering.intervals import Intervals, TimeGrid, as_arrays
 from lfm_ppl.filtering.predict import exact_offset
-from lfm_ppl.filtering.time_grid import Intervals, TimeGrid, as_arrays
 from lfm_ppl.filtering.transition import exact
 from lfm_ppl.gaussian_residuals import log_density
 from lfm_ppl.linalg import cholesky, matmul, solve_lower

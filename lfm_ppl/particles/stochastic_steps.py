@@ -26,8 +26,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import checks
+from lfm_ppl.filtering.intervals import Intervals, TimeGrid, by_length
 from lfm_ppl.filtering.predict import exact_offset
-from lfm_ppl.filtering.time_grid import Intervals, TimeGrid, by_length
 from lfm_ppl.filtering.transition import Exact, exact
 from lfm_ppl.forces.discretise import discretise
 from lfm_ppl.linalg import matmul, semidefinite_root

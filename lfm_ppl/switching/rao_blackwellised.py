@@ -32,8 +32,8 @@ import numpy as np
 from lfm_ppl import checks
 from lfm_ppl.filtering.arguments import check_observations, warn_single_precision
 from lfm_ppl.filtering.filter import FilterState
+from lfm_ppl.filtering.intervals import Intervals, with_observations
 from lfm_ppl.filtering.moments import Moments
-from lfm_ppl.filtering.time_grid import Intervals, with_observations
 from lfm_ppl.filtering.update import LinearizedObservation, Update, condition
 from lfm_ppl.linalg import congruence, matmul, semidefinite_root, solve_semidefinite
 from lfm_ppl.model.state_space import StateSpaceModel

@@ -22,9 +22,10 @@ import numpy as np
 from lfm_ppl import checks
 from lfm_ppl.filtering.filter import FilterState
 from lfm_ppl.filtering.forward import predict
+from lfm_ppl.filtering.intervals import Intervals, TimeGrid
 from lfm_ppl.filtering.moments import Moments, Record
 from lfm_ppl.filtering.problem import filter_problem
-from lfm_ppl.filtering.time_grid import Intervals, TimeGrid, build_time_grid
+from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.linearisation.taylor import Taylor
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation_noise import require_gaussian

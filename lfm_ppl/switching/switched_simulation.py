@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from lfm_ppl import checks
 from lfm_ppl.filtering.filter import FilterState
-from lfm_ppl.filtering.time_grid import Intervals, as_arrays
+from lfm_ppl.filtering.intervals import Intervals, as_arrays
 from lfm_ppl.linalg import semidefinite_root
 from lfm_ppl.model.observation_noise import noisy_observation
 from lfm_ppl.particles.normals import normals

@@ -16,8 +16,8 @@ _DOMINANT_SITE = 0.5
 """Share of the marginal's precision from its own site, above which the cavity is taken from leave-one-out terms."""
 
 
-class Cavity(NamedTuple):
-    """Marginals of the predictor (T, D), with and without an entry's own site.
+class SiteMarginals(NamedTuple):
+    """Marginals of the predictor (T, D), with and without an entry's site.
 
     Attributes:
         cavity: without the site (to its power).
@@ -32,7 +32,7 @@ class Cavity(NamedTuple):
     deterministic: jax.Array
 
 
-def cavities(predictor: SmoothedPredictor, sites: Sites, present: jax.Array, power: float) -> Cavity:
+def cavities(predictor: SmoothedPredictor, sites: Sites, present: jax.Array, power: float) -> SiteMarginals:
     """Remove an entry's own site, to a power, from its marginal.
 
     With s = 1 - a tau v the cavity has the variance v / s and, from c, the mean (m - a v nu) / s. Where a site
@@ -60,7 +60,7 @@ def cavities(predictor: SmoothedPredictor, sites: Sites, present: jax.Array, pow
     v = jnp.where(valid, v, 1.0)
     marginal = MeanVariance(jnp.where(valid, predictor.mean, 0.0), v)
     cavity = MeanVariance(jnp.where(valid, sites.centre + mean, 0.0), v / remaining)
-    return Cavity(cavity, marginal, valid | ~present, deterministic)
+    return SiteMarginals(cavity, marginal, valid | ~present, deterministic)
 
 
 def is_deterministic(mean: jax.Array, variance: jax.Array) -> jax.Array:
@@ -80,7 +80,7 @@ def with_positive_variance(mean: jax.Array, variance: jax.Array) -> MeanVariance
     return MeanVariance(mean, jnp.where(is_deterministic(mean, variance), placeholder_variance(mean), variance))
 
 
-def is_valid(predictor: SmoothedPredictor, cavity: Cavity) -> jax.Array:
+def is_valid(predictor: SmoothedPredictor, cavity: SiteMarginals) -> jax.Array:
     """Return whether a sweep is finite and every entry has a cavity."""
     return jnp.isfinite(predictor.mean).all() & jnp.isfinite(predictor.covariance).all() & cavity.valid.all()
 

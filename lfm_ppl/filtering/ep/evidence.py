@@ -31,7 +31,7 @@ import jax.numpy as jnp
 
 from lfm_ppl.filtering.backward import SmoothedPredictor, SmootherTrace, backward
 from lfm_ppl.filtering.ep.cavities import (
-    Cavity,
+    SiteMarginals,
     cavities,
     clip_to_proper,
     is_deterministic,
@@ -131,8 +131,8 @@ def refine(problem: FilterProblem, terms: EntryTerms, settings: SiteSettings, in
            first: Sites | None = None) -> RefinedSites:
     """Refine sites until they do not change; arguments as in `evidence`.
 
-    Where the sites of a non-linear model go on changing, they are those of assumed density filtering, except for
-    negative precisions: a variance could be negative about other points.
+    Where the sites of a non-linear model do not converge, the result has the sites of assumed density filtering,
+    without negative precisions: with them a variance could be negative about other points.
     """
     if is_linear(problem.ssm):
         maps = maps_about(problem, None)
@@ -243,7 +243,7 @@ def _sweep_until_converged(problem: FilterProblem, terms: EntryTerms, settings: 
 
 
 def _newton_step(problem: FilterProblem, terms: EntryTerms, settings: SiteSettings, initial: Moments,
-                 refined: RefinedSites) -> tuple[Sites, Cavity]:
+                 refined: RefinedSites) -> tuple[Sites, SiteMarginals]:
     """Make one more step to the mode, whose derivative is that of the mode.
 
     Laplace's evidence is not stationary in its sites. A Newton step from the mode leads back to it and, to first order,
@@ -258,7 +258,7 @@ def _newton_step(problem: FilterProblem, terms: EntryTerms, settings: SiteSettin
 
 
 def _final_sites(terms: FamilyTerms, fixed_point: FixedPoint, uses_moments: bool) -> Sites:
-    """Return the sites without those of deterministic predictors, and with exact ones of nearly deterministic ones.
+    """Return the sites with empty sites for deterministic predictors and exact sites for nearly deterministic ones.
 
     Over a small variance v a factor hardly differs from a constant, and moments of the tilted distribution have its
     slope to eps / sd only. The derivatives of log p at the mean are the slope and the curvature to a relative error v.
@@ -266,7 +266,7 @@ def _final_sites(terms: FamilyTerms, fixed_point: FixedPoint, uses_moments: bool
     Args:
         terms: the factors of the data.
         fixed_point: result of the sweeps.
-        uses_moments: whether sites are made from moments, as those of expectation propagation are.
+        uses_moments: whether the sites come from moments, as in expectation propagation.
     """
     sites, cavity = fixed_point.sites, fixed_point.cavity
     nu, tau = sites.nu, sites.tau

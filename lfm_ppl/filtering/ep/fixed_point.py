@@ -18,7 +18,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from lfm_ppl.filtering.ep.cavities import Cavity, clip_to_proper
+from lfm_ppl.filtering.ep.cavities import SiteMarginals, clip_to_proper
 from lfm_ppl.filtering.ep.quadrature import MeanVariance
 from lfm_ppl.filtering.ep.settings import FixedPointOptions
 from lfm_ppl.filtering.update import Sites
@@ -38,7 +38,7 @@ class Sweep(NamedTuple):
     """
 
     sites: Sites
-    cavity: Cavity
+    cavity: SiteMarginals
     log_partition: jax.Array
     change: jax.Array
 
@@ -56,7 +56,7 @@ class FixedPoint(NamedTuple):
     """
 
     sites: Sites
-    cavity: Cavity
+    cavity: SiteMarginals
     log_partition: jax.Array
     change: jax.Array
     sweeps: jax.Array
@@ -86,7 +86,7 @@ class _State(NamedTuple):
     fraction: jax.Array
     steps: jax.Array
     changes: jax.Array
-    cavity: Cavity
+    cavity: SiteMarginals
     log_partition: jax.Array
     change: jax.Array
     last_change: jax.Array
@@ -133,7 +133,7 @@ def iterate_sites(sweep: Callable[[Sites, jax.Array], Sweep], start: Sites, damp
         steps, changes = jax.lax.optimization_barrier((steps, changes))
         accelerated = _accelerated_step(move, steps, changes, fraction, cavity.marginal.variance)
         base, move = (jnp.where(is_valid, new, old) for new, old in ((position, state.base), (move, state.move)))
-        # First sites that are far off are replaced by those of a sweep from empty sites.
+        # First sites that are far off are replaced by the result of a sweep from empty sites.
         is_reset = ~is_valid & jnp.isinf(state.last_change) & (state.sweeps == options.sweeps_without_cavity)
         fraction = jnp.where(is_reset, damping, fraction)
         step = jnp.where(is_reset, 0.0, jnp.where(is_valid & is_near, accelerated, fraction * move))
@@ -154,7 +154,7 @@ def iterate_sites(sweep: Callable[[Sites, jax.Array], Sweep], start: Sites, damp
     move = jnp.stack([proper.nu, proper.tau])
     memory = jnp.zeros((options.memory, *move.shape))
     zero, infinite, count = jnp.zeros_like(start.nu), jnp.full((), jnp.inf), jnp.zeros((), int)
-    no_cavity = Cavity(MeanVariance(zero, zero), MeanVariance(zero, zero), zero > 0, zero > 0)
+    no_cavity = SiteMarginals(MeanVariance(zero, zero), MeanVariance(zero, zero), zero > 0, zero > 0)
     state = _State(start, jnp.zeros_like(move), move, jnp.asarray(damping), memory, memory, no_cavity, zero, infinite,
                    infinite, count, count)
     state = jax.lax.while_loop(not_converged, advance, state)

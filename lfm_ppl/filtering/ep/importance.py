@@ -39,10 +39,10 @@ def importance_weights(problem: FilterProblem, y: jax.Array, key: jax.Array, dra
     sites = fixed_point.sites
     mean = at_intervals(backward(problem, trace).moments.mean[1:], grid.observed)
     errors = at_intervals(sample_errors(key, trace, draws), grid.observed)
-    ends = at_intervals(jnp.asarray(grid.intervals.end), grid.observed)
+    end_times = at_intervals(jnp.asarray(grid.intervals.end), grid.observed)
 
     def log_weight(errors: jax.Array) -> jax.Array:
-        f = jax.vmap(lambda s, t: ssm.observe(ssm.inputs(s, t), t))(mean + errors, ends)
+        f = jax.vmap(lambda s, t: ssm.observe(ssm.inputs(s, t), t))(mean + errors, end_times)
         offset = f - sites.centre
         log_site = (sites.nu - 0.5 * sites.tau * offset) * offset
         return jnp.where(terms.present, terms.log_prob(f) - log_site, 0.0).sum()

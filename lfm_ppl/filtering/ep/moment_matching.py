@@ -2,7 +2,7 @@
 
 1. The entries of a row are taken one after the other, each with the prediction given the earlier ones as its cavity.
 2. The mode of the tilted distribution, by a safeguarded Newton search, locates the nodes of a quadrature, whose moments
-   locate those of a second one.
+   locate the nodes of a second quadrature.
 3. The site is the ratio of the Gaussian of the tilted moments and the cavity. Prediction times sites has the moments of
    the last tilted distribution: a positive definite covariance, whatever the signs of the precisions.
 4. The product of the entries' Z is a density of the row, given the rows before.

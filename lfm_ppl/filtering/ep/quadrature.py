@@ -107,7 +107,7 @@ def expectations(function: Callable[[jax.Array], jax.Array],
                  gaussian: MeanVariance) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return E g under f ~ N(m, v), and its derivatives by the mean and by the variance.
 
-    The derivatives are those of the quadrature itself.
+    They are derivatives of the quadrature itself.
     """
     value, pullback = jax.vjp(lambda m, v: expectation(function, MeanVariance(m, v)), *gaussian)
     return value, *pullback(jnp.ones_like(value))

@@ -4,7 +4,7 @@ With the smoothed marginal q of an entry, its cavity q_-i = q / t_i^a and its fa
 
     expectation propagation   t_i^a = (Gaussian of the moments of q_-i p_i^a) / q_-i,
     variational               nu, tau from the derivatives of E_q log p_i by the mean and the variance of q,
-    Laplace                   nu, tau from those of log p_i at the mean of q.
+    Laplace                   nu, tau from the derivatives of log p_i at the mean of q.
 
 Source: Minka (2001), A family of algorithms for approximate Bayesian inference; Khan and Lin (2017), AISTATS.
 """
@@ -19,26 +19,26 @@ import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 
-from lfm_ppl.filtering.ep.cavities import Cavity
+from lfm_ppl.filtering.ep.cavities import SiteMarginals
 from lfm_ppl.filtering.ep.quadrature import MeanVariance, expectations
 from lfm_ppl.filtering.ep.settings import SiteSettings
 from lfm_ppl.filtering.ep.terms import EntryTerms, FamilyTerms
 from lfm_ppl.filtering.update import Sites
 
 
-def ep_sites(terms: EntryTerms, sites: Sites, at: Cavity, power: float, is_coarse: Any = False) -> tuple:
+def ep_sites(terms: EntryTerms, sites: Sites, marginals: SiteMarginals, power: float, is_coarse: Any = False) -> tuple:
     """Return nu, tau and log Z_i of expectation propagation; NaN where the tilted variance is rounding error."""
     if not isinstance(terms, FamilyTerms):
-        tilted = terms.tilted(at.cavity, at.marginal, power)
+        tilted = terms.tilted(marginals.cavity, marginals.marginal, power)
     elif isinstance(is_coarse, bool):
-        tilted = terms.tilted(at.cavity, at.marginal, power, is_coarse)
+        tilted = terms.tilted(marginals.cavity, marginals.marginal, power, is_coarse)
     else:
-        tilted = jax.lax.cond(is_coarse, lambda at: terms.tilted(at.cavity, at.marginal, power, True),
-                              lambda at: terms.tilted(at.cavity, at.marginal, power), at)
+        tilted = jax.lax.cond(is_coarse, lambda m: terms.tilted(m.cavity, m.marginal, power, True),
+                              lambda m: terms.tilted(m.cavity, m.marginal, power), marginals)
     # Where one node holds all the mass the variance is a rounding error, and gives no new site.
-    usable = tilted.variance > 1e-13 * at.marginal.variance
+    usable = tilted.variance > 1e-13 * marginals.marginal.variance
     variance, nan_if_unusable = jnp.where(usable, tilted.variance, 1.0), jnp.where(usable, 0.0, jnp.nan)
-    c, v = at.cavity.mean - sites.centre, at.cavity.variance
+    c, v = marginals.cavity.mean - sites.centre, marginals.cavity.variance
     tau = 1.0 / variance - 1.0 / v
     # Both are the same number. A factor that hardly narrows a cavity moves it by less than its mean is rounded by.
     nu = jnp.where(variance > 0.5 * v, tilted.shift / variance + c * tau,
@@ -46,16 +46,17 @@ def ep_sites(terms: EntryTerms, sites: Sites, at: Cavity, power: float, is_coars
     return nu / power + nan_if_unusable, tau / power + nan_if_unusable, tilted.log_partition
 
 
-def variational_sites(terms: Any, sites: Sites, at: Cavity, power: float, is_coarse: Any = False) -> tuple:
+def variational_sites(terms: Any, sites: Sites, marginals: SiteMarginals, power: float,
+                      is_coarse: Any = False) -> tuple:
     """Return nu and tau of the variational update, and zeros."""
-    _, by_mean, by_variance = expectations(terms.log_prob, at.marginal)
+    _, by_mean, by_variance = expectations(terms.log_prob, marginals.marginal)
     tau = -2.0 * by_variance
-    return by_mean + tau * (at.marginal.mean - sites.centre), tau, jnp.zeros_like(tau)
+    return by_mean + tau * (marginals.marginal.mean - sites.centre), tau, jnp.zeros_like(tau)
 
 
-def laplace_sites(terms: Any, sites: Sites, at: Cavity, power: float, is_coarse: Any = False) -> tuple:
+def laplace_sites(terms: Any, sites: Sites, marginals: SiteMarginals, power: float, is_coarse: Any = False) -> tuple:
     """Return nu and tau of a Newton step at the marginal means, and zeros."""
-    m = at.marginal.mean
+    m = marginals.marginal.mean
     slope_at = jax.grad(lambda f: terms.log_prob(f).sum())
     slope, curvature = jax.jvp(slope_at, (m,), (jnp.ones_like(m),))
     return slope - curvature * (m - sites.centre), -curvature, jnp.zeros_like(m)
@@ -64,27 +65,27 @@ def laplace_sites(terms: Any, sites: Sites, at: Cavity, power: float, is_coarse:
 _NEW_SITES: dict[str, Callable] = {"ep": ep_sites, "variational": variational_sites, "laplace": laplace_sites}
 
 
-def new_sites(terms: EntryTerms, sites: Sites, at: Cavity, settings: SiteSettings,
+def new_sites(terms: EntryTerms, sites: Sites, marginals: SiteMarginals, settings: SiteSettings,
               damping: Any, is_coarse: Any = False) -> tuple[Sites, jax.Array, jax.Array]:
     """Return damped new sites, their largest change, and log Z_i of EP; a site without a cavity does not change.
 
     Args:
         terms: factors that the sites approximate.
         sites: present sites, (T, D) each.
-        at: their cavities.
+        marginals: their marginals and cavities.
         settings: method and power.
         damping: fraction of the new sites that is taken.
         is_coarse: whether EP uses the coarse quadrature.
     """
-    nu, tau, log_partition = _NEW_SITES[settings.method](terms, sites, at, settings.power, is_coarse)
-    nu, tau = (jnp.where(at.deterministic, 0.0, new) for new in (nu, tau))
-    usable = terms.present & at.valid & jnp.isfinite(nu) & jnp.isfinite(tau)
+    nu, tau, log_partition = _NEW_SITES[settings.method](terms, sites, marginals, settings.power, is_coarse)
+    nu, tau = (jnp.where(marginals.deterministic, 0.0, new) for new in (nu, tau))
+    usable = terms.present & marginals.valid & jnp.isfinite(nu) & jnp.isfinite(tau)
     nu, tau = (jnp.where(usable, new, old) for new, old in ((nu, sites.nu), (tau, sites.tau)))
-    v = at.marginal.variance
+    v = marginals.marginal.variance
     sd, eps = jnp.sqrt(v), jnp.finfo(v.dtype).eps
     change = jnp.maximum(jnp.abs(nu - sites.nu) * sd, jnp.abs(tau - sites.tau) * v)
     # A site whose sd is not far above the spacing of numbers at the predictor is accurate to that spacing only.
-    rounding = 16.0 * eps * jnp.abs(tau) * sd * jnp.abs(at.marginal.mean)
+    rounding = 16.0 * eps * jnp.abs(tau) * sd * jnp.abs(marginals.marginal.mean)
     change = jnp.where(change > rounding, change, 0.0)
     change = jnp.max(jnp.where(usable | ~terms.present, change, jnp.inf), initial=0.0)
     damped = sites._replace(nu=sites.nu + damping * (nu - sites.nu), tau=sites.tau + damping * (tau - sites.tau))
@@ -99,14 +100,14 @@ def gaussian_terms(sites: Sites, cavity: MeanVariance, power: float) -> jax.Arra
     return ((nu - 0.5 * tau * offset) * offset - 0.5 * jnp.log(growth) + 0.5 * (nu - tau * offset) ** 2 * v / growth)
 
 
-def log_evidence_terms(terms: Any, sites: Sites, at: Cavity, settings: SiteSettings,
+def log_evidence_terms(terms: Any, sites: Sites, marginals: SiteMarginals, settings: SiteSettings,
                        log_partition: jax.Array | None = None) -> jax.Array:
     """Return the term of each entry (T, D) in the log evidence besides the integral of all sites, zero where missing.
 
     Args:
         terms: factors that the sites approximate.
         sites: (T, D) each.
-        at: their cavities, which have no derivative where ``log_partition`` is given.
+        marginals: their marginals and cavities, which have no derivative where ``log_partition`` is given.
         settings: of the sites.
         log_partition: (T, D), that of EP's cavities where it is known.
     """
@@ -115,16 +116,16 @@ def log_evidence_terms(terms: Any, sites: Sites, at: Cavity, settings: SiteSetti
         power = settings.power
 
         def integral() -> jax.Array:
-            return terms.tilted(at.cavity, at.marginal, power).log_partition
+            return terms.tilted(marginals.cavity, marginals.marginal, power).log_partition
 
         log_z = integral() if log_partition is None else with_known_primal(integral, log_partition)
-        value = (log_z - gaussian_terms(sites, at.cavity, power)) / power
+        value = (log_z - gaussian_terms(sites, marginals.cavity, power)) / power
     else:
-        m, v = at.marginal
+        m, v = marginals.marginal
         offset = m - sites.centre
         gaussian = (nu - 0.5 * tau * offset) * offset
         if settings.method == "variational":
-            value = expectations(terms.log_prob, at.marginal)[0] - gaussian + 0.5 * tau * v
+            value = expectations(terms.log_prob, marginals.marginal)[0] - gaussian + 0.5 * tau * v
         else:
             value = terms.log_prob(m) - gaussian
     return jnp.where(terms.present, value, 0.0)
@@ -135,10 +136,10 @@ def with_known_primal(function: Callable[[], jax.Array], value: jax.Array) -> ja
     converted, closed_over = jax.closure_convert(function)
 
     @jax.custom_jvp
-    def known(value: jax.Array, *closed_over: Any) -> jax.Array:
+    def value_of(value: jax.Array, *closed_over: Any) -> jax.Array:
         return value
 
-    @functools.partial(known.defjvp, symbolic_zeros=True)
+    @functools.partial(value_of.defjvp, symbolic_zeros=True)
     def _jvp(primals: tuple, tangents: tuple) -> tuple[jax.Array, jax.Array]:
         active = [i for i, tangent in enumerate(tangents[1:]) if not isinstance(tangent, SymbolicZero)]
         if not active:
@@ -153,4 +154,4 @@ def with_known_primal(function: Callable[[], jax.Array], value: jax.Array) -> ja
         active_primals, active_tangents = (tuple(values[1 + i] for i in active) for values in (primals, tangents))
         return primals[0], jax.jvp(of_active, active_primals, active_tangents)[1]
 
-    return known(value, *closed_over)
+    return value_of(value, *closed_over)

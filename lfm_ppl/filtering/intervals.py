@@ -1,0 +1,124 @@
+"""Intervals of the scans, and quantities that are tabulated by the length of the interval."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lfm_ppl.model.state_space import Span, inset
+
+
+class Intervals(NamedTuple):
+    """The intervals of the scan, one entry each: a prediction, perhaps a jump, perhaps an observation.
+
+    Attributes:
+        start: (N,) time at which the interval starts.
+        length: (N,) its length, >= 0.
+        observation: (N,) index of the observation at its end, -1 where there is none.
+        jump: (N,) index of the jump of the forces at its end, before the observation; -1 where there is none.
+        length_index: (N,) index of its length in `TimeGrid.lengths`; zero where that is None.
+        end: (N,) time at which the interval ends, exactly the time of its observation.
+        inset: (N,) how far inside of the interval functions of time are evaluated at its ends, see `Span`.
+    """
+
+    start: Any
+    length: Any
+    observation: Any
+    jump: Any
+    length_index: Any
+    end: Any
+    inset: Any
+
+    @property
+    def span(self) -> Span:
+        """Times of one interval at which functions of time are evaluated."""
+        return Span(self.start, self.start + self.inset, self.end - self.inset)
+
+
+def intervals_between(start: Any, end: Any, length: Any, observation: Any, jump: Any, length_index: Any = None,
+                      scale: Any = 0.0) -> Intervals:
+    """Return intervals; arguments as in `Intervals`, and ``scale`` as in `lfm_ppl.model.state_space.inset`."""
+    length_index = np.zeros(np.shape(length), int) if length_index is None else length_index
+    return Intervals(start, length, observation, jump, length_index, end, inset(start, end, length, scale))
+
+
+class TimeGrid(NamedTuple):
+    """The intervals, and the indices of results among them.
+
+    Attributes:
+        intervals: the scan's intervals.
+        lengths: (U,) distinct lengths, None where there are too many or they are traced.
+        observed: (T,) interval of each observation.
+        requested: (K,) interval of each requested time.
+        requested_times: (K,).
+        steps: integration steps in each interval.
+        initial_time: start of the scan.
+        replicated: whether intervals of length zero are so many that a branch around their prediction is faster.
+        tolerance: of the error of an adaptive step, in standard deviations; None for ``steps`` equal steps.
+        since: (N,) starts of the intervals, counted from the initial time, so that small differences of large times
+            keep all their digits.
+    """
+
+    intervals: Intervals
+    lengths: Any
+    observed: Any
+    requested: Any
+    requested_times: Any
+    steps: int
+    initial_time: Any
+    replicated: bool = False
+    tolerance: float | None = None
+    since: Any = None
+
+
+def as_arrays(intervals: Intervals) -> Intervals:
+    """Return the intervals as JAX arrays, which a scan can run over."""
+    return jax.tree.map(jnp.asarray, intervals)
+
+
+class _LengthTable:
+    """Table of a function of the interval length; the arrays of its result are one row for each length.
+
+    One row is read at once, and written at once in reverse mode; array by array that took many more operations to
+    compile.
+
+    Args:
+        function: of a length, a scalar, to a pytree of arrays.
+        lengths: (U,).
+    """
+
+    def __init__(self, function: Callable[[jax.Array], Any], lengths: jax.Array) -> None:
+        leaves, self._tree = jax.tree.flatten(jax.vmap(function)(lengths))
+        self._shapes = [leaf.shape[1:] for leaf in leaves]
+        self._rows = jnp.concatenate([leaf.reshape(len(lengths), -1) for leaf in leaves], axis=1) if leaves else None
+
+    def value(self, index: jax.Array) -> Any:
+        """Return the value of the function for the length with this index."""
+        if self._rows is None:
+            return jax.tree.unflatten(self._tree, [])
+        row = jax.lax.dynamic_index_in_dim(self._rows, index, keepdims=False)
+        parts = jnp.split(row, np.cumsum([math.prod(shape) for shape in self._shapes])[:-1])
+        return jax.tree.unflatten(
+            self._tree, [part.reshape(shape) for part, shape in zip(parts, self._shapes, strict=True)])
+
+
+def by_length(grid: TimeGrid, make: Callable[[jax.Array], Any]) -> Callable[[Intervals], Any]:
+    """Return the function interval -> ``make(length)``, tabulated for the distinct lengths where these are few."""
+    if grid.lengths is None:
+        return lambda interval: make(interval.length)
+    table = _LengthTable(make, jnp.asarray(grid.lengths))
+    return lambda interval: table.value(interval.length_index)
+
+
+def with_observations(intervals: Intervals, y: Any) -> tuple[Intervals, jax.Array]:
+    """Return the intervals as JAX arrays, and the entry of ``y`` (T, ...) at the end of each, NaN where it has none."""
+    y = jnp.asarray(y, float)
+    # The index -1 of an interval without an observation is that of the last entry.
+    padded = jnp.concatenate([y, jnp.full((1, *y.shape[1:]), jnp.nan)])
+    intervals = as_arrays(intervals)
+    return intervals, padded[intervals.observation]
