@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jax.stages import Lowered
 from numpyro.infer import init_to_median, init_to_value
 
 from lfm_ppl import calendar_time, checks
@@ -26,14 +25,12 @@ from lfm_ppl.data import Data, as_data, at_origin, model_keywords
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.forces.sde import ApproximationWarning
 from lfm_ppl.inference import sampling
-from lfm_ppl.inference.ahead import Ahead
 from lfm_ppl.inference.bound_model import BoundModel, bind
 from lfm_ppl.inference.degenerate_mode import degenerate_entries
 from lfm_ppl.inference.interruption import was_interrupt
 from lfm_ppl.inference.kernels.options import KERNELS, check_options
 from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalRAM, Tuned
 from lfm_ppl.inference.laplace_start import (
-    MAX_PARAMETERS,
     Laplace,
     UnusableModeError,
     laplace_approximation,
@@ -245,7 +242,7 @@ def fit(
         run.keeper = checkpoints.begin_or_resume(checkpoint, record, resume)
     if progress:
         print(f"likelihood: {run.described['likelihood']}", file=sys.stderr, flush=True)
-    with contextlib.closing(run.ahead), checkpoints.closing(run.keeper), calendar_time.in_messages(*clock):
+    with checkpoints.closing(run.keeper), calendar_time.in_messages(*clock):
         with _start_explained(bound):
             run.sample()
         run.follow()
@@ -351,9 +348,6 @@ class _Run:
         drawn: chosen draws, their trajectories, and the times of these.
         cautions: messages on the likelihood for the attribute ``warnings``.
         partial: what a result that was stopped lacks; None: nothing.
-        ahead: compiles the sampler, and what `follow` runs.
-        compiled: waits for the sampler's program.
-        followed: waits for those of `follow`, and all before.
     """
 
     bound: BoundModel
@@ -376,9 +370,6 @@ class _Run:
     drawn: tuple = (None, None, None)
     cautions: list[str] = field(default_factory=list)
     partial: str | None = None
-    ahead: Ahead = field(default_factory=Ahead)
-    compiled: Callable[[], None] = lambda: None
-    followed: Callable[[], None] = lambda: None
 
     def sample(self) -> None:
         """Draw parameters, or find the mode; after Ctrl-C, as far as it came.
@@ -395,8 +386,6 @@ class _Run:
                 _check_init(asked.init)
             known = keeper is not None and keeper.holds(_MODE)
             with waiting(_SEARCH, self.progress and not known):
-                if not known:
-                    self._compile_ahead_of_search()
                 self.draws, self.stats, self.remarks = _mode(self.bound, key, asked.samples, asked.seed, asked.init,
                                                              keeper)
             return
@@ -405,9 +394,9 @@ class _Run:
         is_at_mode = asked.init in (None, "map")
         with waiting(_SEARCH if is_at_mode else _START, self.progress and setup is None):
             if asked.sampler == "nuts":
-                transition, starts, remarks = _nuts_transition(self.bound, asked, setup, self._compile_ahead)
+                transition, starts, remarks = _nuts_transition(self.bound, asked, setup)
             else:
-                transition, starts, remarks = _transition(asked, self.bound, setup, self._compile_ahead)
+                transition, starts, remarks = _transition(asked, self.bound, setup)
         if self.progress and setup is None and _FALLBACK in remarks:
             print(f"note     {remarks[_FALLBACK]}", file=sys.stderr, flush=True)
         warmup = remarks["warmup"] * asked.thin
@@ -418,8 +407,7 @@ class _Run:
         self.particles = {label: remarks.pop(label, None) for label in _OF_PARTICLES}
         self.remarks = {**remarks, "thin": asked.thin}
         collected = sampling.sample(key, self.bound, transition, starts, warmup=warmup, samples=asked.samples,
-                                    thin=asked.thin, chain_method=asked.method, progress=self.progress, keeper=keeper,
-                                    compiled=self.compiled)
+                                    thin=asked.thin, chain_method=asked.method, progress=self.progress, keeper=keeper)
         count = collected.z.shape[1]
         if count == 0:
             raise KeyboardInterrupt(f"stopped in the warm-up, after {collected.done:,} of {collected.total:,} steps; "
@@ -428,61 +416,6 @@ class _Run:
             self.partial = _some(count, asked.samples)
         self.z = collected.z
         self.draws, self.stats = _draws(self.bound, {"z": collected.z, **collected.statistics}, asked.samples)
-
-    def _compile_ahead_of_search(self) -> None:
-        """Compile the gradient, and while the mode is sought the programs of `follow`.
-
-        The latter are left for later where the density is not finite at the prior median, as in `_compile_ahead`.
-        """
-        bound = self.bound
-        ready = self.ahead.add(lambda: [bound.lower_gradient(bound.forward_mode)])
-
-        def wanted() -> bool:
-            ready()
-            return bool(np.isfinite(bound.log_density_gradient(bound.draw(self.asked.keys[2]))[0]))
-
-        self.followed = self.ahead.add(self._programs, wanted)
-        ready()
-        arviz_data.load_arviz()
-
-    def _compile_ahead(self, transition: Transition, warmup: int) -> None:
-        """Compile all programs: while it is found out where the chains start, and then while they run.
-
-        Args:
-            transition: how the chains move.
-            warmup: draws of the warm-up.
-
-        When this returns, those that find the starts are compiled: the search would compile them itself. Where the
-        density is not finite at the prior median, there may be nowhere to start, and this be told soon: what follows
-        the chains is left for later.
-        """
-        asked, keeper, thin = self.asked, self.keeper, self.asked.thin or 1
-        done, warmup = None if keeper is None else keeper.done, warmup * thin
-        ready = self.ahead.add(
-            lambda: sampling.lower_start(self.bound, transition, asked.chains) if done is None else [])
-        if done is None or done < warmup + asked.samples * thin:
-            self.compiled = self.ahead.add(lambda: sampling.lower_block(
-                self.bound, transition, chains=asked.chains, warmup=warmup, samples=asked.samples, thin=thin,
-                chain_method=asked.method))
-        ready()
-        if done is None and not np.isfinite(transition.evaluate(self.bound.draw(asked.keys[2]))[0]):
-            return
-        self.followed = self.ahead.add(self._programs)
-        arviz_data.load_arviz()  # takes a second or two, which the compilation takes, too
-
-    def _programs(self) -> list[Lowered]:
-        """Return what computes parameters from the chains, and the programs of `follow`, for draws of any values."""
-        asked = self.asked
-        shapes = jax.eval_shape(self.bound.constrain, jax.ShapeDtypeStruct((self.bound.size,), float))
-        flat = {site: np.zeros((asked.chains * asked.samples, *shapes[site].shape), shapes[site].dtype)
-                for site in self.bound.sites}
-        _, rows, grid = _paths(self.bound, asked.at, asked.trajectory_draws, asked.chains, asked.samples)
-        found = [self.bound.lower_constrain_draws(asked.chains * asked.samples),
-                 scores(self.bound, flat, lower=True)]
-        if len(rows):
-            subset = {site: value[rows] for site, value in flat.items()}
-            found.append(trajectories(asked.keys[3], self.bound, subset, grid, lower=True))
-        return found
 
     def follow(self) -> None:
         """Compute what follows from the draws, scores of the observations and trajectories; after Ctrl-C, less."""
@@ -498,7 +431,6 @@ class _Run:
             return {"show": counter.of(what), "parts": None if keeper is None else keeper.parts(what)}
 
         try:
-            self.followed()
             self.rated = kept("scores of the observations",
                               lambda: scores(self.bound, flat, **watched("scores")), None)
             self.remarks |= self._found_of_sites(flat)
@@ -672,14 +604,13 @@ def _strategy(init: Any, bound: BoundModel, seed: int) -> Any:
     return init_to_value(values=mode_of(bound, seed=seed).parameters) if isinstance(init, str) else init
 
 
-def _nuts_transition(bound: BoundModel, asked: _Asked, setup: Mapping[str, Any] | None,
-                     prepare: Callable[[Transition, int], None]) -> tuple[Transition, np.ndarray | None, dict]:
+def _nuts_transition(bound: BoundModel, asked: _Asked, setup: Mapping[str, Any] | None
+                     ) -> tuple[Transition, np.ndarray | None, dict]:
     """Return the transition of NUTS, the starting points (C, d), and remarks; see `_transition`."""
     init, options = asked.init, asked.options
     _check_init(init)
     # A mass matrix of the user's is not regularised by another one.
     is_free = "inverse_mass_matrix" not in options and options.get("dense_mass", True) is True
-    placeholder = Laplace(np.zeros(bound.size), np.eye(bound.size))
 
     def transition(laplace: Laplace | None, warmup: int) -> Transition:
         return sampling.nuts(bound, warmup * (asked.thin or 1), options, laplace if is_free else None)
@@ -689,13 +620,10 @@ def _nuts_transition(bound: BoundModel, asked: _Asked, setup: Mapping[str, Any] 
 
     if setup is not None:
         is_laplace = setup["init"] == "laplace"
-        resumed = transition(placeholder if is_laplace else None, setup["warmup"])
-        prepare(resumed, setup["warmup"])
-        return resumed, None, dict(setup)
+        placeholder = Laplace(np.zeros(bound.size), np.eye(bound.size)) if is_laplace else None
+        return transition(placeholder, setup["warmup"]), None, dict(setup)
     reason = None
     if init in (None, "map"):
-        if bound.size <= MAX_PARAMETERS:
-            prepare(transition(placeholder, steps(True)), steps(True))
         try:
             laplace = laplace_approximation(bound, asked.seed)
         except UnusableModeError as error:
@@ -706,7 +634,6 @@ def _nuts_transition(bound: BoundModel, asked: _Asked, setup: Mapping[str, Any] 
             return chosen, points, {"warmup": steps(True), "init": "laplace"}
         init = None
     chosen = transition(None, steps(False))
-    prepare(chosen, steps(False))
     points = _starts(asked.keys[2], bound, _strategy(init, bound, asked.seed), asked.chains, chosen.evaluate)
     remarks = {"warmup": steps(False), "init": "strategy" if callable(init) else "median"}
     if reason is None:
@@ -714,12 +641,11 @@ def _nuts_transition(bound: BoundModel, asked: _Asked, setup: Mapping[str, Any] 
     return chosen._replace(if_slow=""), points, remarks | {_FALLBACK: reason}
 
 
-def _transition(asked: _Asked, bound: BoundModel, setup: Mapping[str, Any] | None,
-                prepare: Callable[[Transition, int], None]) -> tuple[Transition, np.ndarray | None, dict[str, Any]]:
+def _transition(asked: _Asked, bound: BoundModel, setup: Mapping[str, Any] | None
+                ) -> tuple[Transition, np.ndarray | None, dict[str, Any]]:
     """Return how the chains of a random walk move, where each of them starts (C, d), and what to remember of it.
 
-    Chains that go on start nowhere: all that their transition needs to know is in ``setup``. ``prepare`` is called as
-    soon as it is known how they move, with the draws of the warm-up.
+    Chains that go on start nowhere: all that their transition needs to know is in ``setup``.
     """
     init, sampler, seed, key, chains = asked.init, asked.sampler, asked.seed, asked.keys[2], asked.chains
     _check_init(init)
@@ -729,14 +655,9 @@ def _transition(asked: _Asked, bound: BoundModel, setup: Mapping[str, Any] | Non
     if setup is not None:
         kernel = KERNELS[sampler](bound.model, **options)
         if not isinstance(kernel, ParticleMarginalRAM):
-            transition = sampling.random_walk(bound, kernel, warmup)
-            prepare(transition, draws)
-            return transition, None, {"warmup": draws}
+            return sampling.random_walk(bound, kernel, warmup), None, {"warmup": draws}
         kernel.prepare(bound, None, Tuned(int(setup["particles"]), float(setup["log_likelihood_sd"])))
         return sampling.particle_marginal(bound, kernel, warmup), None, _remarks(kernel) | {"warmup": draws}
-    if sampler == "ram":
-        # Whatever covariance it begins with, its programs are these.
-        prepare(sampling.random_walk(bound, KERNELS[sampler](bound.model, **options), warmup), draws)
     strategy = _strategy(init, bound, seed)
     mode = None
     if "initial_covariance" not in options:

@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import jaxpr_as_fun
 from jax.flatten_util import ravel_pytree
-from jax.stages import Lowered
 from numpyro import handlers
 from numpyro.distributions import biject_to
 from numpyro.infer import init_to_median, init_to_sample
@@ -425,10 +424,6 @@ class BoundModel:
         return self._program.once(("gradient", jacobian, forward_mode),
                                   lambda: _traced_once(value_and_gradient(target, forward_mode), *example))
 
-    def lower_gradient(self, forward_mode: bool) -> Lowered:
-        """Return the program of `gradient`; as long as it lives, it is compiled once."""
-        return self.gradient(forward_mode).lower(jnp.zeros(self.size), self.argument)
-
     def log_likelihood(self, z: Any, y: Any = None) -> jax.Array:
         """Return log p(y | T(z)), summed over the series of a panel; arguments as `log_density`."""
         def log_likelihood(z: jax.Array, y: Any) -> jax.Array:
@@ -500,17 +495,10 @@ class BoundModel:
 
     def constrain_draws(self, z: Any) -> dict[str, np.ndarray]:
         """Return site name -> values (..., *shape) at draws z (..., d)."""
-        lead = np.shape(z)[:-1]
-        found = self._constrain_draws()(jnp.asarray(z, float).reshape(-1, self.size), self.argument)
-        return {name: np.asarray(value).reshape(*lead, *value.shape[1:]) for name, value in found.items()}
-
-    def lower_constrain_draws(self, count: int) -> Lowered:
-        """Return the program of `constrain_draws` for so many draws; as long as it lives, it is compiled once."""
-        return self._constrain_draws().lower(jnp.zeros((count, self.size)), self.argument)
-
-    def _constrain_draws(self) -> Any:
-        program = self._program
-        return program.once("constrain draws", lambda: jax.jit(jax.vmap(program.constrain, in_axes=(0, None))))
+        program, lead = self._program, np.shape(z)[:-1]
+        constrain = program.once("constrain draws", lambda: jax.jit(jax.vmap(program.constrain, in_axes=(0, None))))
+        sites = constrain(jnp.asarray(z, float).reshape(-1, self.size), self.argument)
+        return {name: np.asarray(value).reshape(*lead, *value.shape[1:]) for name, value in sites.items()}
 
     def unconstrain(self, values: Mapping[str, Any]) -> jax.Array:
         """Return z (d,) where every latent site has its value.

@@ -9,14 +9,13 @@ import time
 import warnings
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from operator import attrgetter
-from typing import Any, NamedTuple, Protocol, cast
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jax.stages import Lowered
 from numpyro.infer import NUTS
 from numpyro.infer.hmc import HMCState
 from numpyro.infer.util import ParamInfo
@@ -65,7 +64,6 @@ class Transition(NamedTuple):
         step: ``(state, y) -> state``.
         fields: name of a statistic -> attribute of the state, dots for nested ones.
         evaluate: from z (d,) to the log density and, where the sampler needs it, the gradient (d,), zero elsewhere.
-        lower: returns the programs that ``evaluate`` runs; none where they are not to be compiled ahead.
         extra: further arrays that the chain starts from; an argument of the compiled function.
         describe: from a state of all chains to a few words for the progress bar.
         if_slow: what to tell whoever waits for a long warm-up; empty where there is nothing to do about it.
@@ -76,7 +74,6 @@ class Transition(NamedTuple):
     step: Callable[[Any, Any], Any]
     fields: Mapping[str, str]
     evaluate: Callable[[Any], tuple[Any, Any]]
-    lower: Callable[[], list[Lowered]] = list
     extra: Any = None
     describe: Callable[[Any], str] = lambda state: ""
     if_slow: str = ""
@@ -178,7 +175,6 @@ def nuts(bound: BoundModel, warmup: int, options: Mapping[str, Any], laplace: La
     return Transition(("nuts", warmup, forward_mode, laplace is not None, signature(dict(options)) or object()),
                       start, step, {name: prefix + path for name, path in fields.items()},
                       lambda z: both(jnp.asarray(z, float), bound.argument),
-                      lambda: [bound.lower_gradient(forward_mode)],
                       None if laplace is None else jax.tree_util.tree_map(jnp.asarray, laplace), describe,
                       _AT_MODE if laplace is None and "inverse_mass_matrix" not in options else "")
 
@@ -280,7 +276,7 @@ class Keeper(Protocol):
 
 def sample(key: jax.Array, bound: BoundModel, transition: Transition, starts: np.ndarray | None, *, warmup: int,
            samples: int, thin: int = 1, chain_method: str | None = None, progress: bool = False,
-           keeper: Keeper | None = None, compiled: Callable[[], None] = lambda: None) -> Draws:
+           keeper: Keeper | None = None) -> Draws:
     """Run chains; the same seed gives the same draws whatever the blocks, the progress bar, and stops on the way.
 
     Warm-up and sampling are one program, in which the data are an argument: another data set compiles nothing. It is
@@ -298,7 +294,6 @@ def sample(key: jax.Array, bound: BoundModel, transition: Transition, starts: np
             enough devices, sequential otherwise.
         progress: show on standard error how far it is.
         keeper: keeps the state of the chains and their draws, and knows those of an earlier run.
-        compiled: waits for the program of `lower_block`, where it is compiled ahead.
 
     Raises:
         KeyboardInterrupt: the second Ctrl-C.
@@ -324,7 +319,6 @@ def sample(key: jax.Array, bound: BoundModel, transition: Transition, starts: np
 
     with Progress(total, saved.done, progress, warmup, transition.if_slow) as shown, Interruption() as stop:
         try:
-            compiled()
             while now[-1] < total and not stop.requests:
                 state, store, lower = now
                 upper, began = min(lower + pace.steps, total), time.perf_counter()
@@ -344,22 +338,6 @@ def sample(key: jax.Array, bound: BoundModel, transition: Transition, starts: np
             keep(*now)
     _, store, done = now
     return _draws(jax.tree_util.tree_map(np.asarray, store), drawn(done), done, total)
-
-
-def lower_start(bound: BoundModel, transition: Transition, chains: int) -> list[Lowered]:
-    """Return the programs that find where chains start; of the transition's ``extra`` only the shape matters."""
-    keys, points = split_keys(jax.random.key(0), chains)(slice(None)), np.zeros((chains, bound.size))
-    return [*transition.lower(), _beginning(bound, transition).lower(keys, points, np.zeros(chains), points,
-                                                                     bound.argument, transition.extra)]
-
-
-def lower_block(bound: BoundModel, transition: Transition, *, chains: int, warmup: int, samples: int, thin: int = 1,
-                chain_method: str | None = None) -> list[Lowered]:
-    """Return the program that advances the chains; arguments as in `sample`."""
-    block = _Block(bound, transition, chains, available_method(chain_method, chains))
-    leaves = [np.zeros(leaf.shape, leaf.dtype) for leaf in map(_as_data, jax.tree_util.tree_leaves(block.like))]
-    nothing = Saved(0, leaves, _rows(transition, block.like, samples))
-    return [block.lower(*block.placed(nothing), 0, 1, warmup, thin)]
 
 
 class _Pace:
@@ -414,11 +392,6 @@ def _like(bound: BoundModel, transition: Transition, chains: int) -> Any:
 def _on_host(state: Any) -> list[np.ndarray]:
     return [np.asarray(jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf)
             for leaf in jax.tree_util.tree_leaves(state)]
-
-
-def _as_data(leaf: jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
-    """Return shape and type of what `_on_host` makes of an array."""
-    return jax.eval_shape(jax.random.key_data, leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
 
 
 def _on_device(leaves: Sequence[np.ndarray], like: Any, layout: NamedSharding | None) -> Any:
@@ -485,11 +458,6 @@ class _Block:
         """Return the state of all chains, and their draws, on the devices."""
         return (_on_device(saved.leaves, self.like, self._layout),
                 {name: jax.device_put(rows, self._layout) for name, rows in saved.rows.items()})
-
-    def lower(self, state: Any, store: Any, *rest: Any) -> Lowered:
-        """Return the program that a call with such arguments compiles."""
-        return cast(Any, self._function).lower(*(self._one(state, store, 0) if self._one_by_one else (state, store)),
-                                               *rest, self._argument)
 
     def __call__(self, state: Any, store: Any, *rest: Any) -> tuple[Any, Any]:
         """Return the state and the draws after steps; ``rest``: the first step, the last, the warm-up, and thinning."""
