@@ -26,6 +26,7 @@ from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.forces.sde import ApproximationWarning
 from lfm_ppl.inference import sampling
 from lfm_ppl.inference.bound_model import BoundModel, bind
+from lfm_ppl.inference.bound_samplers import BoundSampler, nuts_sampler, particle_marginal_sampler, ram_sampler
 from lfm_ppl.inference.degenerate_mode import degenerate_entries
 from lfm_ppl.inference.interruption import was_interrupt
 from lfm_ppl.inference.kernels.options import KERNELS, check_options
@@ -42,7 +43,7 @@ from lfm_ppl.inference.priors import assumptions, prior
 from lfm_ppl.inference.progress import Counter
 from lfm_ppl.inference.random_keys import split_keys
 from lfm_ppl.inference.samplers import FILTERED, SAMPLERS
-from lfm_ppl.inference.sampling import Transition
+from lfm_ppl.inference.schedule import Schedule
 from lfm_ppl.inference.site_failures import failures_at, paths_worth, site_failures
 from lfm_ppl.inference.start_failure import start_failure
 from lfm_ppl.model.observations.family import ObservationFamily
@@ -394,9 +395,9 @@ class _Run:
         is_at_mode = asked.init in (None, "map")
         with waiting(_SEARCH if is_at_mode else _START, self.progress and setup is None):
             if asked.sampler == "nuts":
-                transition, starts, remarks = _nuts_transition(self.bound, asked, setup)
+                sampler, starts, remarks = _nuts_sampler(self.bound, asked, setup)
             else:
-                transition, starts, remarks = _transition(asked, self.bound, setup)
+                sampler, starts, remarks = _random_walk_sampler(asked, self.bound, setup)
         if self.progress and setup is None and _FALLBACK in remarks:
             print(f"note     {remarks[_FALLBACK]}", file=sys.stderr, flush=True)
         warmup = remarks["warmup"] * asked.thin
@@ -406,8 +407,8 @@ class _Run:
             keeper.look = self._look
         self.particles = {label: remarks.pop(label, None) for label in _OF_PARTICLES}
         self.remarks = {**remarks, "thin": asked.thin}
-        collected = sampling.sample(key, self.bound, transition, starts, warmup=warmup, samples=asked.samples,
-                                    thin=asked.thin, chain_method=asked.method, progress=self.progress, keeper=keeper)
+        schedule = Schedule(warmup, asked.samples, asked.thin, asked.method)
+        collected = sampling.run_chains(key, sampler, starts, schedule, keeper, self.progress)
         count = collected.z.shape[1]
         if count == 0:
             raise KeyboardInterrupt(f"stopped in the warm-up, after {collected.done:,} of {collected.total:,} steps; "
@@ -425,10 +426,10 @@ class _Run:
         if keeper is not None:  # the draws are safe, whatever comes
             self.store(self.result(_BARE))
         flat = {site: self.draws[site].reshape(-1, *self.draws[site].shape[2:]) for site in self.bound.sites}
-        counter = Counter(shown=self.progress)
+        counter = Counter(is_shown=self.progress)
 
         def watched(what: str) -> dict[str, Any]:
-            return {"show": counter.of(what), "parts": None if keeper is None else keeper.parts(what)}
+            return {"show": counter.restart(what), "parts": None if keeper is None else keeper.parts(what)}
 
         try:
             self.rated = kept("scores of the observations",
@@ -604,16 +605,16 @@ def _strategy(init: Any, bound: BoundModel, seed: int) -> Any:
     return init_to_value(values=mode_of(bound, seed=seed).parameters) if isinstance(init, str) else init
 
 
-def _nuts_transition(bound: BoundModel, asked: _Asked, setup: Mapping[str, Any] | None
-                     ) -> tuple[Transition, np.ndarray | None, dict]:
-    """Return the transition of NUTS, the starting points (C, d), and remarks; see `_transition`."""
+def _nuts_sampler(bound: BoundModel, asked: _Asked, setup: Mapping[str, Any] | None
+                  ) -> tuple[BoundSampler, np.ndarray | None, dict]:
+    """Return NUTS, the starting points (C, d), and attributes of the result; see `_random_walk_sampler`."""
     init, options = asked.init, asked.options
     _check_init(init)
     # A mass matrix of the user's is not regularised by another one.
     is_free = "inverse_mass_matrix" not in options and options.get("dense_mass", True) is True
 
-    def transition(laplace: Laplace | None, warmup: int) -> Transition:
-        return sampling.nuts(bound, warmup * (asked.thin or 1), options, laplace if is_free else None)
+    def sampler(laplace: Laplace | None, warmup: int) -> BoundSampler:
+        return nuts_sampler(bound, warmup * (asked.thin or 1), options, laplace if is_free else None)
 
     def steps(is_laplace: bool) -> int:
         return asked.warmup if asked.warmup is not None else _SHORT_WARMUP if is_laplace and is_free else _WARMUP
@@ -621,7 +622,7 @@ def _nuts_transition(bound: BoundModel, asked: _Asked, setup: Mapping[str, Any] 
     if setup is not None:
         is_laplace = setup["init"] == "laplace"
         placeholder = Laplace(np.zeros(bound.size), np.eye(bound.size)) if is_laplace else None
-        return transition(placeholder, setup["warmup"]), None, dict(setup)
+        return sampler(placeholder, setup["warmup"]), None, dict(setup)
     reason = None
     if init in (None, "map"):
         try:
@@ -629,20 +630,20 @@ def _nuts_transition(bound: BoundModel, asked: _Asked, setup: Mapping[str, Any] 
         except UnusableModeError as error:
             reason = f"the chains start at the prior median, with a unit mass matrix: {error}"
         else:
-            chosen = transition(laplace, steps(True))._replace(if_slow="")
+            chosen = dataclasses.replace(sampler(laplace, steps(True)), slow_warmup_hint="")
             points = starting_points(asked.keys[2], bound, laplace, asked.chains)
             return chosen, points, {"warmup": steps(True), "init": "laplace"}
         init = None
-    chosen = transition(None, steps(False))
+    chosen = sampler(None, steps(False))
     points = _starts(asked.keys[2], bound, _strategy(init, bound, asked.seed), asked.chains, chosen.evaluate)
     remarks = {"warmup": steps(False), "init": "strategy" if callable(init) else "median"}
     if reason is None:
         return chosen, points, remarks
-    return chosen._replace(if_slow=""), points, remarks | {_FALLBACK: reason}
+    return dataclasses.replace(chosen, slow_warmup_hint=""), points, remarks | {_FALLBACK: reason}
 
 
-def _transition(asked: _Asked, bound: BoundModel, setup: Mapping[str, Any] | None
-                ) -> tuple[Transition, np.ndarray | None, dict[str, Any]]:
+def _random_walk_sampler(asked: _Asked, bound: BoundModel, setup: Mapping[str, Any] | None
+                         ) -> tuple[BoundSampler, np.ndarray | None, dict[str, Any]]:
     """Return how the chains of a random walk move, where each of them starts (C, d), and what to remember of it.
 
     Chains that go on start nowhere: all that their transition needs to know is in ``setup``.
@@ -655,9 +656,9 @@ def _transition(asked: _Asked, bound: BoundModel, setup: Mapping[str, Any] | Non
     if setup is not None:
         kernel = KERNELS[sampler](bound.model, **options)
         if not isinstance(kernel, ParticleMarginalRAM):
-            return sampling.random_walk(bound, kernel, warmup), None, {"warmup": draws}
+            return ram_sampler(bound, warmup, kernel), None, {"warmup": draws}
         kernel.prepare(bound, None, Tuned(int(setup["particles"]), float(setup["log_likelihood_sd"])))
-        return sampling.particle_marginal(bound, kernel, warmup), None, _remarks(kernel) | {"warmup": draws}
+        return particle_marginal_sampler(bound, warmup, kernel), None, _remarks(kernel) | {"warmup": draws}
     strategy = _strategy(init, bound, seed)
     mode = None
     if "initial_covariance" not in options:
@@ -678,9 +679,9 @@ def _transition(asked: _Asked, bound: BoundModel, setup: Mapping[str, Any] | Non
     starts = (_starts(key, bound, strategy, chains, bound.log_density) if mode is None or init is not None
               else _about(key, bound, mode, chains))
     if not isinstance(kernel, ParticleMarginalRAM):
-        return sampling.random_walk(bound, kernel, warmup), starts, {"warmup": draws}
+        return ram_sampler(bound, warmup, kernel), starts, {"warmup": draws}
     kernel.prepare(bound, starts[0])
-    return sampling.particle_marginal(bound, kernel, warmup), starts, _remarks(kernel) | {"warmup": draws}
+    return particle_marginal_sampler(bound, warmup, kernel), starts, _remarks(kernel) | {"warmup": draws}
 
 
 def _remarks(kernel: ParticleMarginalRAM) -> dict[str, Any]:

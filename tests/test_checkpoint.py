@@ -26,8 +26,9 @@ from lfm_ppl.cli.interruption import watched
 from lfm_ppl.inference import progress, sampling
 from lfm_ppl.inference.handlers.settings import approximate
 from lfm_ppl.inference.posterior import scores
-from lfm_ppl.inference.progress import Progress, Stage
+from lfm_ppl.inference.progress import ChainProgress
 from lfm_ppl.inference.samplers import SAMPLERS
+from lfm_ppl.inference.schedule import Schedule
 from lfm_ppl.progress import waiting
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results import checkpoint as checkpoints
@@ -148,16 +149,16 @@ def test_a_stop_after_sampling_costs_no_draw(sampler, whole, tmp_path, monkeypat
 
 def test_a_run_that_nothing_keeps_gives_what_it_has(whole, monkeypatch):
     monkeypatch.setattr(signal, "default_int_handler", signal.getsignal(signal.SIGINT))
-    took = sampling._Pace.took
+    adapt = sampling._BlockLength.adapt
     calls = []
 
     def stopping(self, seconds):
-        took(self, seconds)
+        adapt(self, seconds)
         calls.append(seconds)
         if len(calls) == 11:
             signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(sampling._Pace, "took", stopping)
+    monkeypatch.setattr(sampling._BlockLength, "adapt", stopping)
     with pytest.raises(KeyboardInterrupt, match="stopped with 3 of 6 draws a chain.*sys.last_value.result") as raised:
         fit("nuts")
     assert arviz_data.attributes(raised.value.result)["partial"].startswith("3 of 6 draws a chain")
@@ -169,12 +170,12 @@ def test_a_second_request_ends_at_once(monkeypatch):
     monkeypatch.setattr(signal, "default_int_handler", signal.getsignal(signal.SIGINT))
 
     def twice(self, seconds):
-        if self._compiled:
+        if self._is_compiled:
             signal.raise_signal(signal.SIGINT)
             signal.raise_signal(signal.SIGINT)
-        self._compiled = True
+        self._is_compiled = True
 
-    monkeypatch.setattr(sampling._Pace, "took", twice)
+    monkeypatch.setattr(sampling._BlockLength, "adapt", twice)
     with pytest.raises(KeyboardInterrupt):
         fit("ram")
 
@@ -343,10 +344,10 @@ def test_the_time_left_is_that_at_the_pace_of_the_last_minute(capfd, monkeypatch
     clock = [0.0]
     monkeypatch.setattr("time.perf_counter", lambda: clock[0])
     monkeypatch.setattr("lfm_ppl.progress.EVERY_S", 0.0)
-    with Progress(1000, 0, shown=True, warmup=100) as shown:
+    with ChainProgress(Schedule(100, 900), 0, is_shown=True) as display:
         for done in range(1, 1001):
             clock[0] += 10.0 if done <= 100 else 1.0
-            shown.advance(done, lambda: Stage(0, 0, 0, "words"))
+            display.advance(done, lambda: "words")
     lines = capfd.readouterr().err.splitlines()
     assert lines[0].endswith("words")  # the first step comes with the compilation, and says nothing of the pace
     assert lines[99 - 1].endswith("; about 2.5 h left at the pace of the warm-up so far")  # 901 steps of 10 s
