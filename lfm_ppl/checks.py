@@ -1,7 +1,12 @@
-"""Eager checks of what a user passes in.
+"""Eager checks of user input.
 
-They look at concrete values only. Inside a compiled program a value is a tracer and cannot raise; there, a bad value
-gives a log likelihood of minus infinity instead.
+1. `concrete` converts a value to NumPy; tracers of compiled code have no value, and no check applies to them. There, an
+   invalid value gives a log likelihood of minus infinity instead.
+2. Each check names the argument, what was expected, what was passed and what to do.
+3. `refuse_dates`, `refuse_durations`, `positive`, `positive_integer`, `sizes`, `finite`, `random_key`, `time_vector`
+   and `covariance_matrix` check numbers, shapes and order.
+4. `one_of` checks names; `unknown` and `nearest` suggest similar names.
+5. `warn` attributes a warning to the first line outside of the library.
 """
 
 from __future__ import annotations
@@ -19,20 +24,21 @@ from numpyro.util import is_prng_key
 from lfm_ppl import calendar_time
 
 _LIKENESS = 0.4
+"""Default similarity above which `unknown` suggests a name, on the scale of difflib from 0 to 1."""
 
 ABBREVIATIONS = 0.6
-"""The likeness for `unknown` of names that are abbreviations, or not alike to begin with."""
+"""The similarity to pass to `unknown` for abbreviations, which share letters by chance."""
 
 
 def concrete(value: Any) -> np.ndarray | None:
-    """Return ``value`` as a NumPy array, or None where it is (or contains) a tracer; masked entries are NaN."""
+    """Return ``value`` as a NumPy array with NaN for masked entries, or None if it contains a tracer."""
     return None if traced(value) else np.asarray(unmask(value))
 
 
 def unmask(value: Any) -> Any:
-    """Return an array with NaN for masked entries, also within lists; anything else as it is.
+    """Return an array with NaN for masked entries, also within lists; other values are unchanged.
 
-    NumPy's and JAX's ``asarray`` drop a mask and take what lies under it as data.
+    NumPy's and JAX's ``asarray`` drop the mask and use the masked values as data.
 
     Example:
         >>> unmask(np.ma.masked_array([1, -999], mask=[False, True]))
@@ -57,7 +63,7 @@ def _holds_mask(value: Any) -> bool:
 
 
 def refuse_dates(name: str, value: Any) -> None:
-    """Raise TypeError where numbers are expected and dates or durations came, whose unit NumPy would choose."""
+    """Raise TypeError for dates or durations in place of numbers: NumPy would choose their unit."""
     if calendar_time.holds_dates(value):
         raise TypeError(f"{name} must be numbers in the model's unit of time, got dates. lfm.fit and "
                         "lfm.Data(times=...) convert dates; elsewhere subtract the origin and divide by the unit, as "
@@ -66,22 +72,22 @@ def refuse_dates(name: str, value: Any) -> None:
 
 
 def refuse_durations(name: str, value: Any) -> None:
-    """Raise TypeError where numbers are expected and durations came, whose unit NumPy would choose."""
+    """Raise TypeError for durations in place of numbers: NumPy would choose their unit."""
     if calendar_time.holds_durations(value):
         raise TypeError(f"{name} must be numbers in the model's unit of time, got durations (timedelta). Divide them "
                         "by the unit, as in durations / np.timedelta64(1, 'h').")
 
 
 def traced(tree: Any) -> bool:
-    """Whether a leaf of ``tree`` is a tracer."""
+    """Return whether a leaf of ``tree`` is a tracer."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree_util.tree_leaves(tree))
 
 
 def warn(message: str, category: type[Warning] = UserWarning) -> None:
-    """Warn at the user's line, the innermost one outside of the library."""
+    """Warn at the innermost line outside of the library and the frameworks that call it."""
     level, frame = 2, sys._getframe(1)
-    inside = ("lfm_ppl.", "equinox.", "jax.", "functools", "numpyro.")
-    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith(inside):
+    internal_modules = ("lfm_ppl.", "equinox.", "jax.", "functools", "numpyro.")
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith(internal_modules):
         level, frame = level + 1, frame.f_back
     warnings.warn(message, category, stacklevel=level)
 
@@ -94,7 +100,7 @@ def positive(name: str, value: Any, remedy: str = "") -> None:
 
 
 def positive_integer(name: str, value: Any, remedy: str = "") -> None:
-    """Raise unless ``value`` is a whole number of at least one."""
+    """Raise TypeError or ValueError unless ``value`` is a whole number of at least one."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
         raise TypeError(f"{name} must be a whole number, got {value!r}. {remedy}".strip())
     if value < 1:
@@ -111,16 +117,16 @@ def random_key(key: Any) -> None:
 
 
 def sizes(name: str, value: Any, meaning: Sequence[str]) -> None:
-    """Raise unless ``value`` is a tuple of whole numbers of at least one, one for each of ``meaning``."""
+    """Raise unless ``value`` is a tuple of whole numbers of at least one, described by ``meaning`` in order."""
     if not isinstance(value, tuple) or len(value) != len(meaning):
         expected = f"{', '.join(meaning[:-1])} and {meaning[-1]}"
         raise ValueError(f"{name} must be {expected}, got {value!r}.")
-    for what, count in zip(meaning, value, strict=True):
-        positive_integer(f"{name}: {what}", count)
+    for description, count in zip(meaning, value, strict=True):
+        positive_integer(f"{name}: {description}", count)
 
 
 def finite(name: str, value: Any, remedy: str = "") -> None:
-    """Raise ValueError where an entry of ``value`` is NaN or infinite, and name the entry."""
+    """Raise ValueError that names the first entry of ``value`` that is NaN or infinite."""
     array = _numeric(name, value)
     if array is not None and not np.all(np.isfinite(array)):
         row = np.argwhere(~np.isfinite(array))[0].tolist()
@@ -129,68 +135,68 @@ def finite(name: str, value: Any, remedy: str = "") -> None:
 
 
 def time_vector(name: str, value: Any, earliest: float | None = None, order: str = "", remedy: str = "") -> np.ndarray:
-    """Return times (K,) as float64, K >= 1; a number is one time.
+    """Return times (K,) as float64, K >= 1; a number becomes a vector of one time.
 
     Args:
-        name: of the argument, for messages.
-        value: the times, which must be known, not traced.
-        earliest: the initial time, before which there is nothing.
-        order: "non-decreasing" or "increasing"; empty: any.
-        remedy: what to do about a time before ``earliest``.
+        name: name of the argument, for messages.
+        value: the times; they must be concrete.
+        earliest: the initial time, before which no time is allowed; None: any time is allowed.
+        order: "non-decreasing" or "increasing"; empty: any order.
+        remedy: end of the message for a time before ``earliest``.
 
     Raises:
-        ValueError: they are traced, not a vector, empty, not finite, too early or not in order.
+        ValueError: the times are traced, not a vector, empty, not finite, too early or not in order.
     """
     refuse_dates(name, value)
-    known = concrete(value)
-    if known is None:
+    concrete_times = concrete(value)
+    if concrete_times is None:
         raise ValueError(f"{name} must be known before compilation; pass a NumPy array.")
-    known = np.atleast_1d(known).astype(float)
-    if known.ndim != 1 or known.size == 0:
-        raise ValueError(f"{name} must be a vector (K,) of at least one time, got shape {known.shape}.")
-    finite(name, known)
+    times = np.atleast_1d(concrete_times).astype(float)
+    if times.ndim != 1 or times.size == 0:
+        raise ValueError(f"{name} must be a vector (K,) of at least one time, got shape {times.shape}.")
+    finite(name, times)
     if order:
-        gaps = np.diff(known)
-        wrong = np.flatnonzero(gaps < 0 if order == "non-decreasing" else gaps <= 0)
-        if wrong.size:
-            row = int(wrong[0]) + 1
+        gaps = np.diff(times)
+        disordered = np.flatnonzero(gaps < 0 if order == "non-decreasing" else gaps <= 0)
+        if disordered.size:
+            row = int(disordered[0]) + 1
             rule = "must not go back" if order == "non-decreasing" else "must increase"
-            raise ValueError(f"{name} {rule}: entry {row} is {known[row]:g} after {known[row - 1]:g}. Sort them.")
-    if earliest is not None and known.min() < earliest:
-        raise ValueError(f"{name}[{int(known.argmin())}] = {known.min():g} lies before the initial time {earliest:g}"
+            raise ValueError(f"{name} {rule}: entry {row} is {times[row]:g} after {times[row - 1]:g}. Sort them.")
+    if earliest is not None and times.min() < earliest:
+        raise ValueError(f"{name}[{int(times.argmin())}] = {times.min():g} lies before the initial time {earliest:g}"
                          f"{remedy}.")
-    return known
+    return times
 
 
 def one_of(name: str, value: str, choices: Iterable[str], likeness: float = _LIKENESS) -> None:
-    """Raise ValueError unless ``value`` is among ``choices``; name the nearest ones, see `unknown`."""
+    """Raise ValueError unless ``value`` is among ``choices``; the message suggests similar names, see `unknown`."""
     choices = list(choices)
     if value not in choices:
         raise ValueError(unknown(name, value, choices, likeness))
 
 
 def unknown(kind: str, value: str, choices: Iterable[str], likeness: float = _LIKENESS) -> str:
-    """Return the message for an unknown name, with the nearest known ones.
+    """Return the message for an unknown name, with suggestions of similar names.
 
     Args:
-        kind: what was asked for.
+        kind: kind of the named object, for the message.
         value: the unknown name.
-        choices: the known ones.
-        likeness: from 0 to 1, how alike two names must be for one to be taken for a misspelling of the other. More
-            is needed where names are abbreviations, which share letters by chance ("mcmc" and "pmmh").
+        choices: the valid names.
+        likeness: least similarity, from 0 to 1, of a suggested name. Abbreviations need a higher value, since they
+            share letters by chance ("mcmc" and "pmmh").
     """
     choices = list(choices)
     return f"unknown {kind} {value!r}.{nearest(value, choices, likeness)} Known: {', '.join(choices) or 'none'}."
 
 
 def nearest(value: str, choices: Sequence[str], likeness: float = _LIKENESS) -> str:
-    """Return " Did you mean ...?" of the choices that are most like a value; empty where none is, see `unknown`."""
-    near = difflib.get_close_matches(str(value), choices, n=3, cutoff=likeness)
-    return f" Did you mean {' or '.join(repr(n) for n in near)}?" if near else ""
+    """Return " Did you mean ...?" with the most similar choices, or an empty string; see `unknown`."""
+    suggestions = difflib.get_close_matches(str(value), choices, n=3, cutoff=likeness)
+    return f" Did you mean {' or '.join(map(repr, suggestions))}?" if suggestions else ""
 
 
 def counted(number: int, noun: str) -> str:
-    """Return a number with its noun: "1 column", "2 columns"."""
+    """Return a number with its noun, in the singular or plural: "1 column", "2 columns"."""
     return f"{number} {noun}{'s' * (number != 1)}"
 
 
@@ -220,8 +226,8 @@ def _numeric(name: str, value: Any) -> np.ndarray | None:
     refuse_dates(name, value)
     array = concrete(value)
     if array is not None and array.dtype.kind not in "biuf":
-        shown = " ".join(repr(value).split())
-        raise TypeError(f"{name} must be numeric, got {shown} of type {type(value).__name__}.")
+        text = " ".join(repr(value).split())
+        raise TypeError(f"{name} must be numeric, got {text} of type {type(value).__name__}.")
     return array
 
 

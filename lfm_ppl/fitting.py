@@ -38,6 +38,7 @@ from lfm_ppl.inference.laplace_start import (
     starting_points,
 )
 from lfm_ppl.inference.map import MAPResult, check_sites, mode_of
+from lfm_ppl.inference.model_digest import model_digest
 from lfm_ppl.inference.posterior import evenly_spaced, scores, trajectories
 from lfm_ppl.inference.priors import assumptions, prior
 from lfm_ppl.inference.progress import Counter
@@ -220,8 +221,7 @@ def fit(
         check_requested(bound, at)
     labels = Labels.of(bound, dims, coords, y)
     truth = checked_truth(bound, truth, labels)
-    # Traces the model once more, for the record of a run that is kept.
-    fingerprint = None if checkpoint is None else bound.fingerprint
+    digest = None if checkpoint is None else model_digest(bound)
     bound = bound.fix(fixed)
     if sampler == "map":
         chains, warmup, thin, method = 1, 0, None, None
@@ -237,7 +237,7 @@ def fit(
         "priors": kept("priors in words", lambda: _priors(bound), None),
         "assumptions": kept("the model in words", lambda: _assumptions(bound), None)}, dict(attributes or {}))
     if checkpoint is not None:
-        record = asked.record(bound, fingerprint)
+        record = asked.record(bound, digest)
         if resume and (finished := checkpoints.finished(checkpoint, record)) is not None:
             return finished
         run.keeper = checkpoints.begin_or_resume(checkpoint, record, resume)
@@ -312,12 +312,12 @@ class _Asked(NamedTuple):
             **({"constraints": example.constraints_in_words} if example.constrained else {}),
         }  # fmt: skip
 
-    def record(self, bound: BoundModel, fingerprint: Any) -> dict[str, Any]:
+    def record(self, bound: BoundModel, digest: Any) -> dict[str, Any]:
         """Return all that a run must share with one that it goes on with."""
         return {
             **self.described(bound), "thin": self.thin, "chain_method": self.method, "init": self.init,
             "sampler_options": self.options, "trajectory_draws": self.trajectory_draws, "parameters": bound.names,
-            "model": checkpoints.digest(fingerprint), "times": checkpoints.digest(bound.times),
+            "model": checkpoints.digest(digest), "times": checkpoints.digest(bound.times),
             "data": checkpoints.digest(bound.y),
             "times of the trajectories": None if self.at is None else checkpoints.digest(np.asarray(self.at, float)),
             "versions": checkpoints.versions(),

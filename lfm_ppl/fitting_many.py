@@ -24,6 +24,7 @@ from lfm_ppl.engine.run import Reporter, outcomes
 from lfm_ppl.engine.task import Task, check_distinct
 from lfm_ppl.fitting import fit
 from lfm_ppl.inference.bound_model import bind
+from lfm_ppl.inference.model_digest import model_digest
 from lfm_ppl.results import arviz_data, tables
 from lfm_ppl.results.checkpoint import digest
 
@@ -289,7 +290,7 @@ def _task(model: Callable, name: str, value: Any, options: dict[str, Any], seed:
             raise TypeError(f"data set {name!r} must be (times, y) or lfm.Data, got {type(value).__name__}.") from None
     options = {"name": getattr(model, "__name__", "model"), "seed": seed_of(name, seed), **options}
     named = {key: one for key, one in options.items() if key not in ("truth", "name", "seed", "model_kwargs")}
-    settings = {"data": digest(times, y), "model": _fingerprint(model, times, y, keywords, digests),
+    settings = {"data": digest(times, y), "model": _model_digest(model, times, y, keywords, digests),
                 "options": _plain({**named, "model_kwargs": keywords})}
     if isinstance(value, Data):
         settings["named"] = _plain({"outputs": value.outputs, "units": dict(value.units), "origin": value.origin})
@@ -297,12 +298,12 @@ def _task(model: Callable, name: str, value: Any, options: dict[str, Any], seed:
     return Task(file_name(name), seed, settings, (*data, options))
 
 
-def _fingerprint(model: Callable, times: np.ndarray, y: np.ndarray, keywords: Any, digests: dict[Any, str]) -> str:
+def _model_digest(model: Callable, times: np.ndarray, y: np.ndarray, keywords: Any, digests: dict[Any, str]) -> str:
     """Return a short text that another model, or the same one after its code has changed, does not have."""
     key = (times.tobytes(), y.shape, json.dumps(_plain(dict(keywords or {}))))
     if key not in digests:
         try:
-            digests[key] = bind(model, times, y, **dict(keywords or {})).fingerprint or "unknown"
+            digests[key] = model_digest(bind(model, times, y, **dict(keywords or {}))) or "unknown"
         except Exception:  # what is wrong with this data set is told when its turn comes
             return "none"
     return digests[key]

@@ -1,9 +1,9 @@
-"""Failure as a number: a log density that breaks down is minus infinity, with zero gradients.
+"""Log densities that return minus infinity, with zero gradients, where their computation fails.
 
-A parameter value may send an explicit integration to infinity. The log likelihood is then minus infinity, which a
-sampler rejects. Reverse-mode differentiation, however, multiplies the zero cotangent of that branch with infinite
-Jacobians, and 0 * inf = NaN. Here the cotangents are cleaned where they leave the computation, so that no operation
-inside needs to be guarded.
+At some parameter values an explicit integration diverges. The log likelihood is then minus infinity, and a sampler
+rejects the value. Reverse-mode differentiation, however, multiplies the zero cotangent of this branch by infinite
+Jacobians, and 0 * inf = NaN. This module replaces NaN cotangents by zero where they leave the computation, so that no
+operation inside needs a guard.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import jax.numpy as jnp
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-# The identity, linear, whose transpose replaces entries that are not finite by zero. A primitive of its own, because
-# custom_vjp has no forward mode, which is the faster one for a handful of parameters, and linear_call has no vmap.
+# The identity as a linear function, whose transpose replaces non-finite entries by zero. It must be a primitive:
+# custom_vjp does not support forward mode, which is faster for a few parameters, and linear_call does not support vmap.
 _finite_cotangent_p = Primitive("finite_cotangent")
 _finite_cotangent_p.def_impl(lambda x: x)
 _finite_cotangent_p.def_abstract_eval(lambda x: x)
@@ -46,10 +46,10 @@ def _finite_or_minus_infinity_jvp(primals: tuple, tangents: tuple) -> tuple:
 
 
 def finite_or_minus_infinity(log_density: Callable[..., jax.Array], *arguments: Any) -> jax.Array:
-    """Return ``log_density(*arguments)`` with failures turned into -inf that have zero gradients.
+    """Return ``log_density(*arguments)``, or -inf with zero gradients where it is not finite.
 
     Args:
-        log_density: a function of ``arguments`` and of any traced values that it closes over, returning an array.
+        log_density: a function that returns an array; it may close over traced values.
         *arguments: pytrees of arrays.
 
     Returns:
@@ -62,10 +62,10 @@ def finite_or_minus_infinity(log_density: Callable[..., jax.Array], *arguments: 
         0.0
     """
     converted, closed_over = jax.closure_convert(log_density, *arguments)
-    guard = lambda x: _guarded(x)  # noqa: E731
-    value = converted(*jax.tree_util.tree_map(guard, arguments), *map(guard, closed_over))
+    value = converted(*jax.tree.map(_guard, arguments), *map(_guard, closed_over))
     return _finite_or_minus_infinity(value)
 
 
-def _guarded(x: Any) -> Any:
+def _guard(x: Any) -> Any:
+    """Return ``x``, with a cotangent of zero where it is not finite; integers have no cotangent."""
     return _finite_cotangent_p.bind(x) if jnp.issubdtype(jnp.result_type(x), jnp.floating) else x

@@ -1,4 +1,4 @@
-"""Ballistic target on reentry, decelerated by drag and pushed by an unseen force.
+"""Ballistic target on reentry, decelerated by drag and driven by an unknown force.
 
 A target falls towards the ground. Its altitude r (m) and its speed downwards v (m/s) follow
 
@@ -7,17 +7,17 @@ A target falls towards the ground. Its altitude r (m) and its speed downwards v 
     y_k = sqrt(s_x^2 + (s_y - r(t_k))^2) + e_k,    e_k ~ N(0, noise_sd^2),
 
 where the drag grows with the density of the air, gamma = 1.49e-4 per metre, g = 9.8 m/s^2, and u is an
-unknown acceleration, a Gaussian process with a Matern-5/2 covariance. A radar at (s_x, s_y), 30 km aside
-and 30 m above the ground, measures the distance alone. Dynamics and measurement are both non-linear.
+unknown acceleration, a Gaussian process with a Matern-5/2 covariance. A radar at (s_x, s_y), at a horizontal
+distance of 30 km and 30 m above the ground, measures the distance only. Dynamics and measurement are non-linear.
 
 Unknown are the drag alpha and the force's scale and lengthscale. The levels of the noise, q_r, q_v and
-noise_sd, are known in the source and fixed at its values unless they are freed, as in
+noise_sd, are known in the source and fixed at its values unless they are freed, for example by
 
     lfm-ppl fit ballistic --set noise_sd=free
 
 The target is at about 65 km at the first time and falls at about 3 km/s: r ~ N(65000, 500^2),
-v ~ N(3000, 100^2). With the option `df` the errors e_k are noise_sd times Student's t of that many degrees of freedom,
-which the radar's gross errors do not move far. The default data start at the means, and have 120 distances in 30 s.
+v ~ N(3000, 100^2). With the option `df` the errors e_k are noise_sd times Student's t with that many degrees of
+freedom, which makes the estimates robust against outliers. The default data start at the means: 120 distances in 30 s.
 
 Sources: J. Hartikainen, M. Seppanen and S. Sarkka, State-space inference for non-linear latent force
 models (ICML 2012), section 5.2; X. R. Li and V. P. Jilkov, Survey of maneuvering target tracking: II.
@@ -63,8 +63,8 @@ TRUTH = {"alpha": 4.49e-4, "scale": 50.0, "lengthscale": 5.0, **KNOWN}
 AIR, GRAVITY = 1.49e-4, 9.8
 START = (65_000.0, 3_000.0)
 START_SD = (500.0, 100.0)
-GRID = np.linspace(0.0, 30.0, 1191)  # ten cells between two of 120 measurements
-LONGEST_STEP = 0.26  # seconds: one step between two of 120 measurements; likelihoods are exact to 0.1%
+GRID = np.linspace(0.0, 30.0, 1191)  # ten intervals between neighbours of 120 measurements
+LONGEST_STEP = 0.26  # seconds: one step between neighbours of 120 measurements; likelihoods are exact to 0.1%
 
 
 def build(
@@ -74,7 +74,7 @@ def build(
     """Return the target with these parameters.
 
     Args:
-        alpha: see PARAMETERS; so are all before `aside`.
+        alpha: see PARAMETERS.
         scale: see PARAMETERS.
         lengthscale: see PARAMETERS.
         q_r: see PARAMETERS.
@@ -123,15 +123,15 @@ def model(times, y=None, aside: float = 30_000.0, height: float = 30.0, df: floa
     lengthscale = numpyro.sample("lengthscale", dist.LogNormal(jnp.log(5.0), 0.7))
     q_r, q_v, noise_sd = (numpyro.sample(name, dist.LogNormal(jnp.log(value), 0.7)) for name, value in KNOWN.items())
     system = build(alpha, scale, lengthscale, q_r, q_v, noise_sd, aside, height, units, df=df)
-    # Three iterations change the log likelihood by 0.02 (sd over the posterior), less than the error of either, and
-    # cost four times as much.
+    # Three iterations change the log likelihood by 0.02 (sd over the posterior), less than its error with or without
+    # them, and cost four times as much.
     numpyro.sample(
         "y", lfm.MarginalLikelihood(system, times, steps=1, max_step=LONGEST_STEP, iterations=0), obs=y
     )
 
 
 def anchors(data: lfm.Data) -> dict[str, float]:
-    """Return what is known unless it is freed: the levels of the noise."""
+    """Return the levels of the noise, which are fixed at known values unless they are freed."""
     return dict(KNOWN)
 
 
@@ -139,19 +139,19 @@ def simulate(seed: int = 0, aside: float = 30_000.0, height: float = 30.0, df: f
     """Simulate 30 s of the source's target, measured 120 times.
 
     Args:
-        seed: of force, path and noise.
+        seed: random seed of force, path and noise.
         aside: horizontal distance of the radar (m).
         height: of the radar (m).
         df: degrees of freedom of Student's t errors; 0: Gaussian errors.
     """
-    drawn = _simulator(float(aside), float(height), float(df))(jax.random.key(seed))
+    simulation = _simulator(float(aside), float(height), float(df))(jax.random.key(seed))
     observed = np.arange(0, len(GRID), 10)
     return lfm.Data(
         times=GRID[observed],
-        y=np.asarray(drawn.y)[observed],
+        y=np.asarray(simulation.y)[observed],
         outputs=OUTPUTS,
         units=UNITS,
-        truth={"times": GRID, "forces": drawn.forces, "state": drawn.state, "parameters": TRUTH},
+        truth={"times": GRID, "forces": simulation.forces, "state": simulation.state, "parameters": TRUTH},
     )
 
 

@@ -10,10 +10,10 @@ With position p = (east, north, up) in metres, the radar at the origin, and velo
 where gamma = 1.49e-4 per metre, g = 9.8 m/s^2, and u is an unknown acceleration: in each direction a Gaussian
 process with a Matern-5/2 covariance, the three with one scale and one lengthscale. The ground is flat. Azimuth
 counts from the radar's axis, which is turned from east towards north by `bearing`, and lies in [-pi, pi): the
-default target crosses the direction where it jumps, so that its residuals are taken on the circle.
+default target crosses the direction where it jumps by 2 pi, so that residuals are reduced to [-pi, pi].
 
 Unknown are the drag alpha and the force's scale and lengthscale. The levels of the noise are known unless they are
-freed, as in
+freed, for example by
 
     lfm-ppl fit ballistic-3d --set angle_sd=free
 
@@ -67,7 +67,7 @@ TRUTH = {"alpha": 4.49e-4, "scale": 50.0, "lengthscale": 5.0, **KNOWN}
 AIR, GRAVITY = 1.49e-4, 9.8
 START = (-50_000.0, -15_000.0, 65_000.0, 600.0, 1_000.0, -2_700.0)
 START_SD = (500.0,) * 3 + (100.0,) * 3
-GRID = np.linspace(0.0, 30.0, 591)  # ten cells between two of 60 measurements
+GRID = np.linspace(0.0, 30.0, 591)  # ten intervals between neighbours of 60 measurements
 LONGEST_STEP = 0.26  # seconds
 
 
@@ -77,7 +77,7 @@ def build(
     """Return the target with these parameters.
 
     Args:
-        alpha: see PARAMETERS; so are all before `bearing`.
+        alpha: see PARAMETERS.
         scale: see PARAMETERS.
         lengthscale: see PARAMETERS.
         q_r: see PARAMETERS.
@@ -96,9 +96,9 @@ def build(
 
     def radar(x, u, t):
         east, north, up = x[:3]
-        across = jnp.sqrt(east**2 + north**2)
+        ground_distance = jnp.sqrt(east**2 + north**2)
         azimuth = _on_circle(jnp.arctan2(north, east) - bearing)
-        return jnp.stack([jnp.sqrt(across**2 + up**2), azimuth, jnp.arctan2(up, across)])
+        return jnp.stack([jnp.sqrt(ground_distance**2 + up**2), azimuth, jnp.arctan2(up, ground_distance)])
 
     return lfm.LatentForceModel(
         dynamics=dynamics,
@@ -128,15 +128,15 @@ def model(times, y=None, bearing: float = 0.0, units=None) -> None:
     lengthscale = numpyro.sample("lengthscale", dist.LogNormal(jnp.log(5.0), 0.7))
     noise = {name: numpyro.sample(name, dist.LogNormal(jnp.log(value), 0.7)) for name, value in KNOWN.items()}
     system = build(alpha, scale, lengthscale, **noise, bearing=bearing, units=units)
-    # Three iterations change the log likelihood by 0.02 (sd over the posterior), less than the error of either, and
-    # cost four times as much.
+    # Three iterations change the log likelihood by 0.02 (sd over the posterior), less than its error with or without
+    # them, and cost four times as much.
     numpyro.sample(
         "y", lfm.MarginalLikelihood(system, times, steps=1, max_step=LONGEST_STEP, iterations=0), obs=y
     )
 
 
 def anchors(data: lfm.Data) -> dict[str, float]:
-    """Return what is known unless it is freed: the levels of the noise."""
+    """Return the levels of the noise, which are fixed at known values unless they are freed."""
     return dict(KNOWN)
 
 
@@ -144,19 +144,19 @@ def simulate(seed: int = 0, bearing: float = 0.0) -> lfm.Data:
     """Simulate 30 s of a target, measured 60 times.
 
     Args:
-        seed: of forces, path and noise.
+        seed: random seed of forces, path and noise.
         bearing: direction of the radar's axis (rad).
     """
-    drawn = _simulator(float(bearing))(jax.random.key(seed))
+    simulation = _simulator(float(bearing))(jax.random.key(seed))
     observed = np.arange(0, len(GRID), 10)
-    y = np.array(drawn.y)[observed]
-    y[:, 1] = _on_circle(y[:, 1])  # a radar tells no angle beyond the circle, whatever its noise
+    y = np.array(simulation.y)[observed]
+    y[:, 1] = _on_circle(y[:, 1])  # a radar reports angles in [-pi, pi), also with noise
     return lfm.Data(
         times=GRID[observed],
         y=y,
         outputs=OUTPUTS,
         units=UNITS,
-        truth={"times": GRID, "forces": drawn.forces, "state": drawn.state, "parameters": TRUTH},
+        truth={"times": GRID, "forces": simulation.forces, "state": simulation.state, "parameters": TRUTH},
     )
 
 

@@ -1,16 +1,16 @@
-"""Counts of events whose rate nobody measured: a log-Gaussian Cox process.
+"""Counts of events with an unknown rate: a log-Gaussian Cox process.
 
 The number of events in a bin of width w about the time t_k is
 
     rate(t) = exp(level + u(t)),    y_k ~ Poisson(w rate(t_k)),
 
 with u a Gaussian process of mean zero, Matern-5/2 covariance, standard deviation `scale` and lengthscale `lengthscale`.
-Nothing is integrated: the forces are what is observed. The likelihood is that of expectation propagation, whose sites
-stand for the counts in the filter.
+The model has no dynamics: the observation depends on the force alone. The likelihood is approximated by expectation
+propagation.
 
-Times are the middles of the bins, and all bins are as wide as the median distance between them, or `width`. Dates of
-events become counts by `count`. The default data are simulated: 112 years in one-year bins, of some two events each at
-first and fewer later, as in the disasters in British coal mines with ten deaths or more.
+Times are the midpoints of the bins. All bins have the width `width`, by default the median distance between times. The
+function `count` converts dates of events to counts. The default data are simulated: 112 one-year bins, with about two
+events per year at first and fewer later, like the disasters in British coal mines with ten deaths or more.
 
 Sources: R. G. Jarrett, A note on the intervals between coal-mining disasters, Biometrika 66 (1979); J. Moller,
 A. R. Syversveen and R. P. Waagepetersen, Log Gaussian Cox processes, Scandinavian Journal of Statistics 25 (1998).
@@ -41,20 +41,20 @@ def count(dates, first: float, last: float, bins: int) -> tuple[np.ndarray, np.n
     """Count events in bins of equal width.
 
     Args:
-        dates: of the events (years).
-        first: where the first bin begins.
-        last: where the last bin ends.
+        dates: dates of the events (years).
+        first: start of the first bin.
+        last: end of the last bin.
         bins: number of bins.
 
     Returns:
-        Middles of the bins (bins,), and counts (bins, 1).
+        Midpoints of the bins (bins,), and counts (bins, 1).
     """
     counts, edges = np.histogram(np.asarray(dates, float), bins, (first, last))
     return 0.5 * (edges[:-1] + edges[1:]), counts[:, None].astype(float)
 
 
 def build(level, scale, lengthscale, width, units=None) -> lfm.LatentForceModel:
-    """Return the process with these parameters, for bins of a width (a number, or one a row (T, 1))."""
+    """Return the process with these parameters, for bins of a common width, or of widths (T, 1)."""
     return lfm.LatentForceModel(
         dynamics=lambda x, u, t: jnp.zeros(0),
         forces={"log rate": lfm.Matern(scale=scale, lengthscale=lengthscale, order=2)},
@@ -66,7 +66,7 @@ def build(level, scale, lengthscale, width, units=None) -> lfm.LatentForceModel:
 
 
 def _usual_distance(times) -> float:
-    """Return the median distance between two different times; 1 where there are none."""
+    """Return the median distance between different times; 1 if there is only one time."""
     gaps = np.diff(times)
     return float(np.median(gaps[gaps > 0])) if (gaps > 0).any() else 1.0
 
@@ -75,9 +75,9 @@ def model(times, y=None, width: float = 0.0, units=None) -> None:
     """Sample the parameters of the rate, and score the counts.
 
     Args:
-        times: middles of the bins, shape (T,).
+        times: midpoints of the bins, shape (T,).
         y: counts, shape (T, 1); NaN is missing, None draws from the prior predictive.
-        width: of the bins; 0: the median distance between two times.
+        width: width of the bins; 0: the median distance between times.
         units: name -> unit, for plots.
     """
     if width < 0:
@@ -93,11 +93,11 @@ def simulate(seed: int = 0, width: float = 0.0) -> lfm.Data:
     """Simulate counts of 112 bins of a year, from 1851 on."""
     width = width or 1.0
     times = 1851.0 + width * (0.5 + np.arange(112))
-    drawn = lfm.simulate(jax.random.key(seed), build(**TRUTH, width=width), times)
+    simulation = lfm.simulate(jax.random.key(seed), build(**TRUTH, width=width), times)
     return lfm.Data(
         times=times,
-        y=np.asarray(drawn.y),
+        y=np.asarray(simulation.y),
         outputs=OUTPUTS,
         units=UNITS,
-        truth={"times": times, "forces": drawn.forces, "state": drawn.state, "parameters": TRUTH},
+        truth={"times": times, "forces": simulation.forces, "state": simulation.state, "parameters": TRUTH},
     )

@@ -1,6 +1,6 @@
-"""Reported cases of an epidemic whose transmission rate nobody measured.
+"""Reported cases of an epidemic with an unknown transmission rate.
 
-Of a population of N, the share s can still be infected and the share i infects. With the transmission rate
+In a population of N, the share s is susceptible and the share i infectious. With the transmission rate
 beta(t) = r0 recovery exp(u(t)),
 
     d log s / dt = -beta(t) i,
@@ -8,19 +8,19 @@ beta(t) = r0 recovery exp(u(t)),
     y_k ~ NB(reporting N beta(t_k) s(t_k) i(t_k) w, concentration),
 
 with u a Gaussian process of mean zero, Matern-3/2 covariance, standard deviation `scale` and lengthscale
-`lengthscale`: contacts, weather, masks. It is the SIR model in the logarithms of its shares, so that no Gaussian
-approximation makes one negative, and the logarithm of the expected reports is linear in states and force. NB is the
-negative binomial, of variance mu + mu^2 / concentration; w is the time that a report covers, and the rate that of its
-middle.
+`lengthscale`, which represents contacts, weather, masks. This is the SIR model in the logarithms of the shares, so that
+Gaussian approximations keep the shares positive, and the logarithm of the expected reports is linear in states and
+force. NB is the negative binomial distribution with variance mu + mu^2 / concentration; w is the time that a report
+covers, and the rate is evaluated at its middle.
 
-The share that infects at first is exp of N(log(start / N), 1). Reports alone do not tell what share of cases is
-reported from the size of the population, nor the rate of recovery from that of transmission: `reporting` and
-`recovery` are fixed at 0.5 and 0.2 per day unless they are set otherwise or freed, as in
+The logarithm of the initial infectious share is N(log(start / N), 1). Reports alone do not identify the share of
+reported cases and the size of the population, or the rates of recovery and transmission: `reporting` and `recovery`
+are fixed at 0.5 and 0.2 per day unless they are set otherwise or freed, for example by
 
     lfm-ppl fit epidemic --set recovery=free
 
-Times are the middles of what the reports cover, which is the median distance between them, or `width`. The default data
-are simulated: 60 daily reports.
+Times are the midpoints of the reports. A report covers the time `width`, by default the median distance between times.
+The default data are simulated: 60 daily reports.
 
 Sources: W. O. Kermack and A. G. McKendrick, A contribution to the mathematical theory of epidemics, Proc. R. Soc. A 115
 (1927); J. Dureau, K. Kalogeropoulos and M. Baguelin, Capturing the time-varying drivers of an epidemic using stochastic
@@ -44,14 +44,14 @@ OUTPUTS = ("cases",)
 UNITS = {"time": "day"}
 OPTIONS = {
     "population": (100_000.0, float, "size N of the population (persons)"),
-    "start": (30.0, float, "persons who infect at the first time, to a factor of some three"),
-    "width": (0.0, float, "time that a report covers (day); 0: the median distance between two times"),
+    "start": (30.0, float, "infectious persons at the first time, known up to a factor of about three"),
+    "width": (0.0, float, "time that a report covers (day); 0: the median distance between times"),
 }
 PARAMETERS = {
-    "r0": "infections by one person among susceptible ones, at the mean transmission (1)",
+    "r0": "infections by one person in a susceptible population, at the mean transmission (1)",
     "scale": "standard deviation of the logarithm of the transmission rate (1)",
     "lengthscale": "lengthscale of the logarithm of the transmission rate (day)",
-    "concentration": "of the reports: their variance is mu + mu^2 / concentration (1)",
+    "concentration": "concentration of the reports, whose variance is mu + mu^2 / concentration (1)",
     "recovery": "rate at which infection ends (1/day)",
     "reporting": "share of cases that is reported (1)",
 }
@@ -61,7 +61,7 @@ FORCE = "log transmission"
 START_SD = 1.0
 DAYS = 60
 STEPS = 1
-SITES = lfm.SiteSettings(relinearisations=2)  # log likelihood within 0.01 of that of 8, and of shorter steps
+SITES = lfm.SiteSettings(relinearisations=2)  # log likelihood within 0.01 of 8 relinearisations or shorter steps
 
 
 def build(r0, scale, lengthscale, concentration, recovery, reporting, population=100_000.0, start=30.0, width=1.0,
@@ -69,18 +69,18 @@ def build(r0, scale, lengthscale, concentration, recovery, reporting, population
     """Return the epidemic with these parameters.
 
     Args:
-        r0: see PARAMETERS; so are all before `population`.
+        r0: see PARAMETERS.
         scale: see PARAMETERS.
         lengthscale: see PARAMETERS.
         concentration: see PARAMETERS.
         recovery: see PARAMETERS.
         reporting: see PARAMETERS.
         population: N.
-        start: persons who infect at the first time.
+        start: infectious persons at the first time.
         width: time that a report covers (day).
         units: name -> unit.
-        observe: the observation made of the function for the logarithm of the expected reports; None: negative
-            binomial counts.
+        observe: function that maps the function for the logarithm of the expected reports to an observation; None:
+            negative binomial counts.
     """
     def dynamics(x, u, t):
         log_s, log_i = x
@@ -118,7 +118,7 @@ def parameters() -> dict[str, jax.Array]:
 
 
 def _usual_distance(times) -> float:
-    """Return the median distance between two different times; 1 where there are none."""
+    """Return the median distance between different times; 1 if there is only one time."""
     gaps = np.diff(times)
     return float(np.median(gaps[gaps > 0])) if (gaps > 0).any() else 1.0
 
@@ -133,11 +133,11 @@ def model(times, y=None, population: float = 100_000.0, start: float = 30.0, wid
     """Sample the parameters of the epidemic, and score the reports.
 
     Args:
-        times: middles of what the reports cover (day), shape (T,).
+        times: midpoints of the reports (day), shape (T,).
         y: reported cases, shape (T, 1); NaN is missing, None draws from the prior predictive.
         population: N.
-        start: persons who infect at the first time, to a factor of some three.
-        width: time that a report covers; 0: the median distance between two times.
+        start: infectious persons at the first time, known up to a factor of about three.
+        width: time that a report covers; 0: the median distance between times.
         units: name -> unit, for plots.
     """
     _check(population, start, width)
@@ -147,7 +147,7 @@ def model(times, y=None, population: float = 100_000.0, start: float = 30.0, wid
 
 
 def anchors(data: lfm.Data) -> dict[str, float]:
-    """Return what is known unless it is freed: the rate of recovery, and the share of cases that is reported."""
+    """Return the rate of recovery and the share of reported cases, which are fixed unless they are freed."""
     return dict(KNOWN)
 
 
@@ -155,21 +155,21 @@ def simulate(seed: int = 0, population: float = 100_000.0, start: float = 30.0, 
     """Simulate 60 reports.
 
     Args:
-        seed: of the force, the start and the reports.
+        seed: random seed of force, initial state and reports.
         population: N.
-        start: persons who infect at the first time, to a factor of some three.
+        start: infectious persons at the first time, known up to a factor of about three.
         width: time that a report covers (day); 0: one day.
     """
     _check(population, start, width)
     width = width or 1.0
     times = width * np.arange(DAYS)
-    drawn = _simulator(float(population), float(start), float(width))(jax.random.key(seed))
+    simulation = _simulator(float(population), float(start), float(width))(jax.random.key(seed))
     return lfm.Data(
         times=times,
-        y=np.asarray(drawn.y),
+        y=np.asarray(simulation.y),
         outputs=OUTPUTS,
         units=UNITS,
-        truth={"times": times, "forces": drawn.forces, "state": drawn.state, "parameters": TRUTH},
+        truth={"times": times, "forces": simulation.forces, "state": simulation.state, "parameters": TRUTH},
     )
 
 

@@ -10,13 +10,13 @@ observation noise is known, as in the source. The default data are simulated wit
 beta = 0.1 and sigma = 2: the state starts in the right well, at 3.16, is observed every 2 units of
 time, and jumps between the wells.
 
-What is sampled is sigma, linear = alpha / sigma^2 and cubic = beta / sigma^2; alpha and beta follow.
-The stationary density is proportional to exp(-linear x^2 - cubic x^4 / 2), so that linear and cubic
-are its shape and sigma the speed of time. Observations far apart are independent draws from this
-density: they tell its shape, and of the speed only that it is fast, so that it is the prior of sigma
-which ends the posterior there: 0.92 to 2.97 with probability 0.95. (Where the diffusion is fast, the
-Gaussian filter changes its mind about the wells from one parameter to the next, and NUTS diverges.)
-The priors are for states of a few units and observations a few units of time apart; rescale others.
+The sampled parameters are sigma, linear = alpha / sigma^2 and cubic = beta / sigma^2; alpha and beta
+follow from them. The stationary density is proportional to exp(-linear x^2 - cubic x^4 / 2), so that
+linear and cubic determine its shape, and sigma the time scale. Distant observations are independent
+draws from this density: they determine its shape, but give no upper bound on sigma. The prior of
+sigma gives this bound: 0.92 to 2.97 with probability 0.95. (For fast diffusions the Gaussian filter
+assigns states to wells differently at neighbouring parameters, and NUTS diverges.) The priors are
+for states of a few units and observations a few units of time apart; rescale other data.
 
 The prior of the state at the first observation is N(0, 10), the width of the stationary density.
 
@@ -48,9 +48,9 @@ PARAMETERS = {
 }
 TRUTH = {"alpha": -1.0, "beta": 0.1, "sigma": 2.0}
 GRID = np.linspace(0.0, 50.0, 501)
-TARGET_ACCEPT = 0.95  # of fast diffusions in deep wells the Gaussian filter's likelihood falls off as from a cliff
-TOLERANCE = 5e-3  # of an integration step, in sds: the posterior holds slow diffusions and very fast, stiff ones
-STEPS = 60  # equal ones, where steps cannot follow a tolerance: simulation, particles, iterations
+TARGET_ACCEPT = 0.95  # the Gaussian filter's likelihood falls abruptly for fast diffusions in deep wells
+TOLERANCE = 5e-3  # of an integration step, in sds: the posterior includes slow and very fast, stiff diffusions
+STEPS = 60  # equal steps, for methods without a tolerance: simulation, particles, iterations
 
 
 def build(alpha, beta, sigma, noise_sd, units=None, start=None) -> lfm.LatentForceModel:
@@ -62,15 +62,15 @@ def build(alpha, beta, sigma, noise_sd, units=None, start=None) -> lfm.LatentFor
         sigma: dispersion (x/sqrt(time)).
         noise_sd: standard deviation of the observation noise.
         units: name -> unit.
-        start: the initial state where it is known; None: N(0, 10).
+        start: the initial state if it is known; None: N(0, 10).
     """
-    unknown = start is None
+    is_unknown = start is None
     return lfm.LatentForceModel(
         dynamics=lambda x, u, t: -(alpha * x + beta * x**3),
         forces={},
         process_noise=sigma * jnp.ones((1, 1)),
         observation=lfm.GaussianObservation(lambda x, u, t: x, noise_sd**2 * jnp.ones(1)),
-        initial_state=lfm.Gaussian([0.0 if unknown else start], [10.0 if unknown else 0.0]),
+        initial_state=lfm.Gaussian([0.0 if is_unknown else start], [10.0 if is_unknown else 0.0]),
         state_names=("x",),
         output_names=OUTPUTS,
         units=units,
@@ -99,17 +99,17 @@ def simulate(seed: int = 2, noise_sd: float = 0.1) -> lfm.Data:
     """Simulate t in [0, 50] with the source's parameters, observed every 2 units of time.
 
     Args:
-        seed: of the path and the noise; with the default one it visits both wells several times.
+        seed: random seed of path and noise; with the default seed the path visits both wells several times.
         noise_sd: standard deviation of the observation noise.
     """
-    drawn = _simulator(float(noise_sd))(jax.random.key(seed))
+    simulation = _simulator(float(noise_sd))(jax.random.key(seed))
     observed = np.arange(0, 501, 20)
     return lfm.Data(
         times=GRID[observed],
-        y=np.asarray(drawn.y)[observed],
+        y=np.asarray(simulation.y)[observed],
         outputs=OUTPUTS,
         units=UNITS,
-        truth={"times": GRID, "forces": {}, "state": drawn.state, "parameters": _true_parameters()},
+        truth={"times": GRID, "forces": {}, "state": simulation.state, "parameters": _true_parameters()},
     )
 
 

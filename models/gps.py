@@ -1,4 +1,4 @@
-"""Orbit of a GPS satellite, pushed by small forces that nobody measured.
+"""Orbit of a GPS satellite, driven by small unmeasured forces.
 
 Position r and velocity v follow
 
@@ -10,7 +10,7 @@ the pressure of sunlight with the Earth's shadow, and the small forces u are qua
 
     u(t) = b(t) + sum_n c_n(t),    db = drift dbeta,    c_n'' = -(2 pi n f)^2 c_n + white noise.
 
-The option `axes` chooses where they act. DYB: along the direction to the Sun (D, together with the sunlight), the
+The option `axes` chooses their axes. DYB: along the direction to the Sun (D, together with the sunlight), the
 axis of the solar panels (Y) and the third axis (B), in sunlight only, f that of the orbit. RTN: radial, tangential
 and normal as in the source, f half of that. All are in nm/s^2, distances in km, times in hours.
 
@@ -18,8 +18,8 @@ Positions are in axes that do not turn (GCRS). A data file has the columns time_
 after the option `epoch`, which is in seconds of GPS time; `lfm_ppl.orbits.read_sp3` and `Environment.celestial`
 make them from SP3 files, and `lfm-ppl compare gps --data FOLDER` runs the whole experiment on such files.
 
-Published positions are smoothed by a model of their own, so their scatter says nothing of the forces: noise_sd is
-fixed at 5 cm unless it is freed.
+Published positions are smoothed by another model, so that their scatter carries no information on the forces:
+noise_sd is fixed at 5 cm unless it is freed.
 
 Sources: J. Hartikainen, M. Seppanen and S. Sarkka, State-space inference for non-linear latent force
 models (ICML 2012), section 6; G. Beutler and others, Extended orbit modeling techniques at the CODE
@@ -53,8 +53,8 @@ OPTIONS = {
 }
 PARAMETERS = {
     "amplitude": "standard deviation of the oscillation at the base frequency (nm/s^2)",
-    "wander": "what that oscillation gains with time (nm/s^2/sqrt(h))",
-    "drift": "what the levels of the forces gain with time (nm/s^2/sqrt(h))",
+    "wander": "dispersion of that oscillation (nm/s^2/sqrt(h))",
+    "drift": "dispersion of the levels of the forces (nm/s^2/sqrt(h))",
     "white": "dispersion of white noise on the acceleration (nm/s^2 sqrt(h))",
     "noise_sd": "standard deviation of a coordinate's error (km)",
 }
@@ -71,14 +71,14 @@ def build(
     """Return the satellite with these parameters.
 
     Args:
-        amplitude: see PARAMETERS; so are all before `environment`.
+        amplitude: see PARAMETERS.
         wander: see PARAMETERS.
         drift: see PARAMETERS.
         white: see PARAMETERS.
         noise_sd: see PARAMETERS.
         environment: Earth, Moon and Sun, a `lfm.orbits.Environment`.
         start: position and velocity at the first time, a `lfm.Gaussian`.
-        axes: of the small forces.
+        axes: axes of the small forces.
         units: name -> unit.
     """
     period = lfm.orbits.period_of(start.mean[None])
@@ -92,7 +92,7 @@ def model(times, y=None, axes: str = "DYB", epoch: float = EPOCH, units=None) ->
     Args:
         times: hours after the epoch, shape (T,).
         y: positions in axes that do not turn (km), shape (T, 3); NaN is missing, None draws from the prior predictive.
-        axes: of the small forces, DYB or RTN.
+        axes: axes of the small forces, DYB or RTN.
         epoch: seconds of GPS time at time zero.
         units: name -> unit, for plots.
     """
@@ -111,38 +111,38 @@ def model(times, y=None, axes: str = "DYB", epoch: float = EPOCH, units=None) ->
 
 
 def anchors(data: lfm.Data) -> dict[str, float]:
-    """Return what is known unless it is freed: the error of published positions."""
+    """Return the error of published positions, which is fixed unless it is freed."""
     return dict(KNOWN)
 
 
 def simulate(seed: int = 0, axes: str = "DYB", epoch: float = EPOCH) -> lfm.Data:
-    """Simulate two days of a satellite with hidden quasi-periodic forces, a position every quarter of an hour.
+    """Simulate two days of a satellite with quasi-periodic forces, with a position every quarter of an hour.
 
     Args:
-        seed: of forces and errors.
-        axes: of the small forces, DYB or RTN.
+        seed: random seed of forces and errors.
+        axes: axes of the small forces, DYB or RTN.
         epoch: seconds of GPS time at time zero.
     """
-    drawn = _simulator(axes, float(epoch))(jax.random.key(seed))
+    simulation = _simulator(axes, float(epoch))(jax.random.key(seed))
     return lfm.Data(
         times=GRID,
-        y=np.asarray(drawn.y),
+        y=np.asarray(simulation.y),
         outputs=OUTPUTS,
         units=UNITS,
-        truth={"times": GRID, "forces": drawn.forces, "state": drawn.state, "parameters": TRUTH},
+        truth={"times": GRID, "forces": simulation.forces, "state": simulation.state, "parameters": TRUTH},
     )
 
 
 @functools.cache
 def _simulator(axes: str, epoch: float) -> Callable[[jax.Array], lfm.Simulation]:
     """Return the simulator, compiled once for all seeds."""
-    known = lfm.Gaussian(jnp.array(START), jnp.zeros((6, 6)))
-    system = build(**TRUTH, environment=_environment(epoch, GRID), start=known, axes=axes)
+    start = lfm.Gaussian(jnp.array(START), jnp.zeros((6, 6)))
+    system = build(**TRUTH, environment=_environment(epoch, GRID), start=start, axes=axes)
     return jax.jit(lambda key: lfm.simulate(key, system, GRID, steps=STEPS))
 
 
 def _environment(epoch: float, times) -> lfm.orbits.Environment:
-    """Return what surrounds the satellite, tabulated once for whole days."""
+    """Return Earth, Moon and Sun for the satellite, tabulated once for whole days."""
     return _tabulated(float(epoch), float(24 * np.ceil((np.max(np.asarray(times)) + 1e-9) / 24)))
 
 

@@ -1,4 +1,4 @@
-"""Temperature of a heated home, with a residual heat that nearly repeats every day.
+"""Temperature of a heated home, with an unknown residual heat that nearly repeats every day.
 
 The temperature T inside (degC) follows, with one store of heat or with the walls T_w as a second one,
 
@@ -7,25 +7,25 @@ The temperature T inside (degC) follows, with one store of heat or with the wall
     y_k = (T(t_k), T_out(t_k)) + e_k,    e_k ~ N(0, diag(noise_sd^2, 0.1^2)),
 
 where E is the heater, a known input, T_out the temperature outside, a Gaussian process with a Matern-3/2
-covariance that is measured too, and R the heat of sun and people and whatever the equation leaves out. The
-option `residual` says what R is, a day being 24 h:
+covariance that is measured too, and R the heat of sun, people and everything else that the equation omits. The
+option `residual` defines R, with a day of 24 h:
 
     SQM, CQM, WQM   quasi-periodic: a periodic Matern-1/2 force whose weights change with each midnight (SQM,
-                    WQM) or all the time (CQM)
-    periodic        the same day after day         matern   a Matern-1/2 force that knows nothing of days
+                    WQM) or continuously (CQM)
+    periodic        identical every day            matern   a Matern-1/2 force without a period
     resonator       oscillations of a day and its harmonics, with damping and noise         none   no residual
 
-`memory` is the number of days after which R has changed by itself: of SQM and CQM the lengthscale, of WQM the
-variance gained in a day is 1/memory of the first day's. `lengthscale` is that of the periodic kernel as a share
-of its chord, at 1 about a third of a day; of `matern` it is in hours. With the envelope there are two more sites,
-`gamma` and `psi`; some residuals have fewer sites or, the resonator, others.
+`memory` is the number of days over which the shape of R changes: the lengthscale of SQM and CQM; for WQM the variance
+gained in a day is 1/memory of the first day's variance. `lengthscale` is relative to the chord of the periodic kernel,
+at 1 about a third of a day; for `matern` it is in hours. With the envelope there are two more sites, `gamma` and
+`psi`; some residuals have fewer sites, and the resonator has different ones.
 
 A data file has a time column (dates, or time_h with midnight a multiple of 24), the outputs indoor and outdoor, and
-the known input heater: its power from that time to the next, in any unit, as a share of full power, say. Outdoor mean,
-scale and lengthscale are taken from the outdoor column unless they are freed.
+the known input heater: its power from that time to the next, in any unit, such as the share of full power. Outdoor
+mean, scale and lengthscale are estimated from the outdoor column unless they are freed.
 
-The default data are four days of hourly measurements under a thermostat that decides every ten minutes; the heater
-is the share of each hour that it was on.
+The default data are four days of hourly measurements under a thermostat that switches every ten minutes; the heater
+column is the share of each hour in which it was on.
 
 Sources: S. Reece and others, Efficient state-space inference of periodic latent force models, Journal of Machine
 Learning Research 15 (2014), section 9; P. Bacher and H. Madsen, Identifying suitable models for the heat dynamics of
@@ -55,11 +55,11 @@ OPTIONS = {
     "functions": (5, int, "eigenfunctions of the periodic kernel, an odd number"),
 }
 PARAMETERS = {
-    "alpha": "rate at which the air takes the temperature outside, or that of the walls (1/h)",
+    "alpha": "rate at which the air approaches the temperature outside, or of the walls (1/h)",
     "beta": "warming by the heater at full power (K/h)",
     "scale": "standard deviation of the residual (K/h)",
-    "lengthscale": "lengthscale of the residual within a day, as a share of the chord (1)",
-    "memory": "days after which the residual has changed (1)",
+    "lengthscale": "lengthscale of the residual within a day, relative to the chord (1)",
+    "memory": "days over which the shape of the residual changes (1)",
     "noise_sd": "standard deviation of a measurement inside (degC)",
     "outdoor_mean": "mean of the temperature outside (degC)",
     "outdoor_scale": "its standard deviation (degC)",
@@ -80,22 +80,22 @@ def residual_force(kind, scale, lengthscale, memory, functions, midnights, perio
 
     Args:
         kind: one of RESIDUALS but none.
-        scale: see PARAMETERS; so are the next two.
+        scale: see PARAMETERS.
         lengthscale: of the kernel; of `matern` in hours.
         memory: days.
         functions: number of eigenfunctions.
         midnights: times at which the weights of SQM and WQM change.
-        period: of the resonator (h).
-        noise: of the resonator (K/h/sqrt(h)).
-        damping: of the resonator (1/h).
+        period: period of the resonator (h).
+        noise: noise of the resonator (K/h/sqrt(h)).
+        damping: damping of the resonator (1/h).
 
     Raises:
-        ValueError: an unknown kind.
+        ValueError: the kind is unknown.
     """
     if kind == "matern":
         return lfm.Matern(scale, lengthscale, order=0)
     if kind == "resonator":
-        # Higher harmonics are weaker, as those of a force with kinks.
+        # Harmonics weaken with their number, like the harmonics of a force with kinks.
         waves = [lfm.Resonator(period / k, scale / k, noise / k, damping) for k in range(1, HARMONICS + 1)]
         return sum(waves, lfm.Constant(scale))
     if kind not in RESIDUALS:
@@ -117,27 +117,27 @@ def build(heater, residual, alpha, beta, noise_sd, outdoor, gamma=None, psi=None
     Args:
         heater: the known input, a function of time.
         residual: the force R, or None.
-        alpha: see PARAMETERS; so are the next two.
+        alpha: see PARAMETERS.
         beta: see PARAMETERS.
         noise_sd: see PARAMETERS.
         outdoor: mean, scale and lengthscale of the temperature outside.
-        gamma: rate at which the walls take the temperature of the air (1/h); None: no walls.
-        psi: rate at which they take that outside (1/h).
+        gamma: rate at which the walls approach the temperature of the air (1/h); None: no walls.
+        psi: rate at which the walls approach the temperature outside (1/h).
         units: name -> unit.
     """
-    walls = gamma is not None
+    has_walls = gamma is not None
 
     def dynamics(x, u, t):
-        rest = u[1] if residual is not None else 0.0
-        if not walls:
-            return jnp.stack([alpha * (u[0] - x[0]) + beta * heater(t) + rest])
+        residual_heat = u[1] if residual is not None else 0.0
+        if not has_walls:
+            return jnp.stack([alpha * (u[0] - x[0]) + beta * heater(t) + residual_heat])
         return jnp.stack([
-            alpha * (x[1] - x[0]) + beta * heater(t) + rest,
+            alpha * (x[1] - x[0]) + beta * heater(t) + residual_heat,
             gamma * (x[0] - x[1]) + psi * (u[0] - x[1]),
         ])
 
     mean, scale, lengthscale = outdoor
-    size = 2 if walls else 1
+    size = 2 if has_walls else 1
     return lfm.LatentForceModel(
         dynamics=dynamics,
         forces={"weather": lfm.Matern(scale, lengthscale, order=1, mean=mean),
@@ -171,14 +171,14 @@ def model(times, y=None, inputs=None, residual: str = "SQM", envelope: bool = Fa
     def positive(name, median, spread):
         return numpyro.sample(name, dist.LogNormal(jnp.log(median), spread))
 
-    repeats = residual in ("SQM", "CQM", "WQM", "periodic")
+    is_periodic = residual in ("SQM", "CQM", "WQM", "periodic")
     rates = {"alpha": positive("alpha", 0.1, 1.0), "beta": positive("beta", 1.0, 1.0)}
     if envelope:
         rates |= {"gamma": positive("gamma", 0.05, 1.0), "psi": positive("psi", 0.03, 1.0)}
     hyper = {"scale": 0.0, "lengthscale": 0.0, "memory": 0.0}
     if residual != "none":
         hyper["scale"] = positive("scale", 0.3, 1.0)
-    if repeats:
+    if is_periodic:
         hyper["lengthscale"] = positive("lengthscale", 0.5, 0.7)
     if residual in ("SQM", "CQM", "WQM"):
         hyper["memory"] = positive("memory", 5.0, 1.0)
@@ -198,18 +198,18 @@ def model(times, y=None, inputs=None, residual: str = "SQM", envelope: bool = Fa
 
 
 def anchors(data: lfm.Data) -> dict[str, float]:
-    """Return what is taken from the temperature outside: mean, standard deviation and lengthscale.
+    """Return mean, standard deviation and lengthscale of the temperature outside, as estimated from the data.
 
     The slope of a Matern-3/2 process has the variance 3 scale^2 / lengthscale^2.
     """
-    known = np.isfinite(data.y[:, 1])
-    if known.sum() < 3:
+    observed = np.isfinite(data.y[:, 1])
+    if observed.sum() < 3:
         return {}
-    times, outside = data.times[known], data.y[known, 1]
-    scale = max(float(outside.std()), 0.1)
+    times, temperature = data.times[observed], data.y[observed, 1]
+    scale = max(float(temperature.std()), 0.1)
     gap = np.diff(times)
-    slope = np.diff(outside)[gap > 0] / gap[gap > 0]
-    return {"outdoor_mean": float(outside.mean()), "outdoor_scale": scale,
+    slope = np.diff(temperature)[gap > 0] / gap[gap > 0]
+    return {"outdoor_mean": float(temperature.mean()), "outdoor_scale": scale,
             "outdoor_lengthscale": float(np.sqrt(3.0) * scale / max(np.sqrt(np.mean(slope**2)), 1e-2 * scale))}
 
 
@@ -217,12 +217,12 @@ def prepare(data: lfm.Data) -> lfm.Data:
     """Check the heater of a data file.
 
     Raises:
-        ValueError: no heating at all.
+        ValueError: the heater is constant.
     """
     heater = data.inputs["heater"].values
     if not np.any(heater != heater[0]):
-        raise ValueError(f"the heater is {heater[0]:g} all the time, so that nothing can be said of it; expected the "
-                         "power of a heater that is switched.")
+        raise ValueError(f"the heater is {heater[0]:g} all the time, so that its effect cannot be estimated; expected "
+                         "the power of a heater that is switched.")
     return data
 
 
@@ -240,48 +240,50 @@ def simulate(seed: int = 0, residual: str = "SQM", envelope: bool = False, funct
     """Simulate four days of a home under its thermostat.
 
     Args:
-        seed: of forces, paths and errors.
+        seed: random seed of forces, paths and errors.
         residual: the force R, one of RESIDUALS.
         envelope: whether the walls are a second store of heat.
         functions: eigenfunctions of the periodic kernel.
     """
-    fine = np.arange(DAYS * 24 * DECISIONS + 1) / DECISIONS
-    drawn = _simulator(residual, envelope, functions)(jax.random.key(seed))
+    grid = np.arange(DAYS * 24 * DECISIONS + 1) / DECISIONS
+    simulation = _simulator(residual, envelope, functions)(jax.random.key(seed))
     hourly = slice(None, None, DECISIONS)
-    on = np.asarray(drawn.inputs[:, 0])
-    # From each hour to the next; nothing follows the last one.
-    share = np.append(on[:-1].reshape(-1, DECISIONS).mean(axis=1), on[-1])
-    extra = {"gamma": 0.05, "psi": 0.05} if envelope else {}
+    heater = np.asarray(simulation.inputs[:, 0])
+    # The share of each hour in which the heater is on; the last time has no following hour.
+    share = np.append(heater[:-1].reshape(-1, DECISIONS).mean(axis=1), heater[-1])
+    wall_rates = {"gamma": 0.05, "psi": 0.05} if envelope else {}
     return lfm.Data(
-        times=fine[hourly], y=np.asarray(drawn.y)[hourly, 0], outputs=OUTPUTS, units=UNITS,
-        inputs={"heater": (fine[hourly], share, "previous")},
-        truth={"times": fine, "state": drawn.state[:, 0],
-               "forces": {name: path[:, 0] for name, path in drawn.forces.items()}, "parameters": TRUTH | extra})
+        times=grid[hourly], y=np.asarray(simulation.y)[hourly, 0], outputs=OUTPUTS, units=UNITS,
+        inputs={"heater": (grid[hourly], share, "previous")},
+        truth={"times": grid, "state": simulation.state[:, 0],
+               "forces": {name: path[:, 0] for name, path in simulation.forces.items()},
+               "parameters": TRUTH | wall_rates})
 
 
 @functools.cache
 def _simulator(residual: str, envelope: bool, functions: int):
     """Return the simulator, compiled once for all seeds."""
-    fine = np.arange(DAYS * 24 * DECISIONS + 1) / DECISIONS
+    grid = np.arange(DAYS * 24 * DECISIONS + 1) / DECISIONS
     values = TRUTH | {"lengthscale": 5.0} if residual == "matern" else TRUTH
     force = None if residual == "none" else residual_force(
-        residual, values["scale"], values["lengthscale"], values["memory"], functions, _midnights(fine, residual),
+        residual, values["scale"], values["lengthscale"], values["memory"], functions, _midnights(grid, residual),
         noise=0.02, damping=0.005)
-    walls = {"gamma": 0.05, "psi": 0.05} if envelope else {}
+    wall_rates = {"gamma": 0.05, "psi": 0.05} if envelope else {}
     outdoor = (TRUTH["outdoor_mean"], TRUTH["outdoor_scale"], TRUTH["outdoor_lengthscale"])
 
     def home(heater):
-        return build(lambda t: heater, force, TRUTH["alpha"], TRUTH["beta"], TRUTH["noise_sd"], outdoor, **walls)
+        return build(lambda t: heater, force, TRUTH["alpha"], TRUTH["beta"], TRUTH["noise_sd"], outdoor,
+                     **wall_rates)
 
-    return jax.jit(lambda key: lfm.simulate_switched(key, home, thermostat(), fine, steps=1))
+    return jax.jit(lambda key: lfm.simulate_switched(key, home, thermostat(), grid, steps=1))
 
 
 def _midnights(times, residual: str) -> tuple[float, ...]:
-    """Return the midnights after the first of the times, and so far beyond the last that a forecast has them, too."""
+    """Return the midnights after the first time, up to the end of a forecast as long as the data."""
     if residual not in ("SQM", "WQM"):
         return ()
     times = np.asarray(times)
-    last = 2 * times[-1] - times[0]  # of a forecast as long as the data; what lies beyond the last time does nothing
+    last = 2 * times[-1] - times[0]  # end of the forecast; midnights after the last time have no effect
     return tuple(DAY * np.arange(np.floor(times[0] / DAY) + 1, np.floor(last / DAY) + 1))
 
 

@@ -1,4 +1,4 @@
-"""Two masses on springs, pushed by one unseen force: a linear latent force model.
+"""Two masses on springs, driven by one unobserved force: a linear latent force model.
 
 Each output d = 1, 2 is the position of a damped oscillator of unit mass,
 
@@ -86,11 +86,11 @@ def simulate(seed: int = 0) -> lfm.Data:
     """Simulate t in [0, 20], observed every half unit of time."""
     grid = np.linspace(0.0, 20.0, 401)
     observed = np.arange(0, 401, 10)
-    drawn = lfm.simulate(jax.random.key(seed), build(**TRUTH), grid)
+    simulation = lfm.simulate(jax.random.key(seed), build(**TRUTH), grid)
     return lfm.Data(
         times=grid[observed],
-        y=np.asarray(drawn.y)[observed],
+        y=np.asarray(simulation.y)[observed],
         outputs=OUTPUTS,
         units=UNITS,
-        truth={"times": grid, "forces": drawn.forces, "state": drawn.state, "parameters": TRUTH},
+        truth={"times": grid, "forces": simulation.forces, "state": simulation.state, "parameters": TRUTH},
     )

@@ -1,7 +1,7 @@
-"""Pituitary and thyroid, driven by a hormone of the hypothalamus that nobody can measure.
+"""Pituitary and thyroid, driven by an unmeasured hormone of the hypothalamus.
 
-TRH, released in the hypothalamus, makes the pituitary secrete TSH, which makes the thyroid secrete T4; T4 is turned
-into T3, and the T3 of the pituitary holds TSH back. With th = GT TSH / (TSH + DT), the thyroid's secretion of T4,
+TRH, released in the hypothalamus, makes the pituitary secrete TSH, which makes the thyroid secrete T4; T4 is converted
+to T3, and the T3 of the pituitary inhibits TSH. With th = GT TSH / (TSH + DT), the thyroid's secretion of T4,
 
     dT4/dt  = aT th - bT T4,
     dT3/dt  = a31 [GD1 FT4 / (FT4 + KM1) + GD2 FT4 / (FT4 + KM2) + GT3 TSH / (TSH + DT)
@@ -10,19 +10,19 @@ into T3, and the T3 of the pituitary holds TSH back. With th = GT TSH / (TSH + D
     dTSH/dt = aS GH TRH / [(TRH + DH) (1 + SS z / (z + DS)) (1 + LS T3R)] - bS TSH.
 
 T3c is the T3 within the pituitary, which binds to its receptor as T3R = T3N / (T3N + DR), T3N = T3c / (1 + K31 IBS).
-z is the TSH within the pituitary, which holds its own secretion back and follows at a rate of 140 per second; it is at
+z is the TSH within the pituitary, which inhibits its own secretion and relaxes at a rate of 140 per second; it is at
 its steady state, the positive root of (1 + SS) z^2 + (DS - c) z - c DS = 0 with c = aS2 GH TRH / [bS2 (TRH + DH)
 (1 + LS T3R)]. The secretion of TSH then is aS bS2 / aS2 z. The delays of the sources (2 to 60 minutes) are left out.
 
-Measured, once an hour, are TSH and the free hormones FT3 = T3 / (1 + K30 TBG) and FT4 = T4 / (1 + K41 TBG + K42 TBPA),
-each with an error of the same percentage. TRH is a Gaussian process with a Matern-3/2 covariance about its level. A
-concentration cannot be negative: `lfm.full_information` and `lfm.constrained_posterior` take `lower={"TRH": 0.0}`.
+TSH and the free hormones FT3 = T3 / (1 + K30 TBG) and FT4 = T4 / (1 + K41 TBG + K42 TBPA) are measured once an hour,
+with the same relative error. TRH is a Gaussian process with a Matern-3/2 covariance about its level. A concentration
+cannot be negative: `lfm.full_information` and `lfm.constrained_posterior` take `lower={"TRH": 0.0}`.
 
-Constants are those of Berberich et al. (2018) as public implementations have them. For the production of T3 these
-disagree: with GD1 = 22 nmol/s and GT3 = 394 fmol/s, taken here, the steady state at TRH = 6.9 nmol/l is the published
-one in all printed digits, T4 122.02, T3 3.1615, T3c 11.701 nmol/l, TSH 1.8157 mU/l; with GD1 = 23.527 nmol/s and GT3 =
-188.82 fmol/s, T3 is 3.0804 nmol/l. The table of the paper itself was not compared. The default data are a day of a
-simulated patient, who starts at midnight near that state, with TRH that is highest at 5 h and comes in pulses.
+The constants of Berberich et al. (2018) are taken from public implementations. For the production of T3 these disagree:
+with GD1 = 22 nmol/s and GT3 = 394 fmol/s, used here, the steady state at TRH = 6.9 nmol/l agrees with the published
+state in all printed digits, T4 122.02, T3 3.1615, T3c 11.701 nmol/l, TSH 1.8157 mU/l; with GD1 = 23.527 nmol/s and
+GT3 = 188.82 fmol/s, T3 is 3.0804 nmol/l. The table of the paper itself was not compared. The default data are a day of
+a simulated patient, who starts at midnight near that state, with pulsatile TRH that is highest at 5 h.
 
 Sources: J. Berberich, J. W. Dietrich, R. Hoermann and M. A. Mueller, Mathematical modeling of the pituitary-thyroid
 feedback loop: role of a TSH-T3-shunt and sensitivity analysis, Frontiers in Endocrinology 9 (2018); J. W. Dietrich,
@@ -56,11 +56,11 @@ UNITS = {
 }
 PARAMETERS = {
     "level": "mean of TRH (nmol/l)",
-    "scale": "standard deviation of TRH about it (nmol/l)",
+    "scale": "standard deviation of TRH about its mean (nmol/l)",
     "lengthscale": "lengthscale of TRH (h)",
     "variation": "coefficient of variation of the assays (1)",
 }
-# TRH of the default data is no draw of a Gaussian process; scale and lengthscale are those that suit it.
+# TRH of the default data is not a draw of a Gaussian process; scale and lengthscale approximate its variation.
 TRUTH = {"level": 6.9, "scale": 3.5, "lengthscale": 1.0, "variation": 0.03}
 
 # mol, mU, l and s; the states are in nmol/l and mU/l, and times in hours.
@@ -85,14 +85,14 @@ PULSES, WIDTH = 10, 0.6  # of TRH in a day; their standard deviation in hours
 def axis(x, trh) -> jax.Array:
     """Return the rates of T4, T3, T3c (nmol/l/h) and TSH (mU/l/h) at states (4,) and TRH (nmol/l).
 
-    Where TRH < 0, which a Gaussian force allows, the secretion of TSH goes on as the line that touches it at zero.
+    For TRH < 0, which a Gaussian force allows, the secretion of TSH is continued by its tangent at zero.
     """
     t4, t3, t3c, tsh = x
     ft4 = t4 * NANO / BOUND_T4
     th = G_T * tsh / (tsh + D_T)
     q = th * tsh / (tsh + SHUNT)
-    made = G_D1 * (ft4 / (ft4 + K_M1) + q / (q + K_M1)) + G_D2 * (ft4 / (ft4 + K_M2) + q / (q + K_M2))
-    made = made + G_T3 * tsh / (tsh + D_T)
+    t3_production = G_D1 * (ft4 / (ft4 + K_M1) + q / (q + K_M1)) + G_D2 * (ft4 / (ft4 + K_M2) + q / (q + K_M2))
+    t3_production = t3_production + G_T3 * tsh / (tsh + D_T)
     t3n = t3c * NANO / BOUND_T3N
     stimulus = trh * NANO / (jnp.maximum(trh, 0.0) * NANO + D_H)
     c = A_S2 * G_H / B_S2 * stimulus / (1.0 + L_S * t3n / (t3n + D_R))
@@ -101,7 +101,7 @@ def axis(x, trh) -> jax.Array:
     z = jnp.where(c > 0.0, 2.0 * positive * D_S / (D_S - positive + root), c)
     return HOUR * jnp.stack([
         A_T * th / NANO - B_T * t4,
-        A_31 * made / NANO - B_31 * t3,
+        A_31 * t3_production / NANO - B_31 * t3,
         A_32 * G_D2 / NANO * ft4 / (ft4 + K_M2) - B_32 * t3c,
         A_S * B_S2 / A_S2 * z - B_S * tsh,
     ])
@@ -116,11 +116,11 @@ def build(level, scale, lengthscale, variation, trh=None, start_sd=START_SD, uni
     """Return the axis with these parameters.
 
     Args:
-        level: see PARAMETERS; so are all before `trh`.
+        level: see PARAMETERS.
         scale: see PARAMETERS.
         lengthscale: see PARAMETERS.
-        variation: see PARAMETERS; of the steady state's concentrations.
-        trh: function of time in place of the latent force; None: the force.
+        variation: see PARAMETERS; relative to the concentrations of the steady state.
+        trh: function of time that replaces the latent force; None: the force.
         start_sd: standard deviations of the states at the first time (4,).
         units: name -> unit.
     """
@@ -154,14 +154,14 @@ def model(times, y=None, units=None) -> None:
 
 def simulate(seed: int = 0) -> lfm.Data:
     """Simulate a day of a patient, measured every hour."""
-    trh, drawn = _simulator()(jax.random.key(seed))
+    trh, simulation = _simulator()(jax.random.key(seed))
     observed = np.arange(0, len(GRID), 10)
     return lfm.Data(
         times=GRID[observed],
-        y=np.asarray(drawn.y)[observed],
+        y=np.asarray(simulation.y)[observed],
         outputs=OUTPUTS,
         units=UNITS,
-        truth={"times": GRID, "forces": {"TRH": np.asarray(trh)}, "state": drawn.state, "parameters": TRUTH},
+        truth={"times": GRID, "forces": {"TRH": np.asarray(trh)}, "state": simulation.state, "parameters": TRUTH},
     )
 
 
@@ -171,13 +171,13 @@ def _simulator() -> Callable[[jax.Array], tuple[jax.Array, lfm.Simulation]]:
 
     def run(key: jax.Array) -> tuple[jax.Array, lfm.Simulation]:
         keys = jax.random.split(key, 3)
-        # One pulse in each tenth of the day; three tenths of TRH, on average, come in pulses.
-        place = (jnp.arange(PULSES) + jax.random.uniform(keys[0], (PULSES,))) * GRID[-1] / PULSES
+        # One pulse in each tenth of the day; pulses carry three tenths of TRH on average.
+        pulse_times = (jnp.arange(PULSES) + jax.random.uniform(keys[0], (PULSES,))) * GRID[-1] / PULSES
         height = jax.random.exponential(keys[1], (PULSES,)) * GRID[-1] / (PULSES * WIDTH * np.sqrt(2.0 * np.pi))
 
         def trh(t):
             circadian = 1.0 + 0.6 * jnp.cos(2.0 * np.pi * t / 24.0 - 5.0 * np.pi / 12.0)
-            pulses = (height * jnp.exp(-0.5 * ((t - place) / WIDTH) ** 2)).sum()
+            pulses = (height * jnp.exp(-0.5 * ((t - pulse_times) / WIDTH) ** 2)).sum()
             return TRUTH["level"] * circadian * (0.7 + 0.3 * pulses)
 
         return jax.vmap(trh)(jnp.asarray(GRID)), lfm.simulate(keys[2], build(**TRUTH, trh=trh), GRID, steps=2)

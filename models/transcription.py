@@ -1,4 +1,4 @@
-"""Gene expression driven by an unseen transcription factor.
+"""Gene expression driven by an unobserved transcription factor.
 
 The expression x_j of each target gene j follows
 
@@ -14,12 +14,12 @@ covariance. The option `link` chooses g:
 
 Expression starts near the resting level, x_j(0) ~ N(basal_j / decay_j, 0.1^2).
 
-Where the link is not linear, a single pass of the filter biases the posterior, on the p53 data by up to half a
-posterior standard deviation. So the likelihood is that of three iterations of posterior linearisation, whose log
-evidence is within 0.03 there. `--iterations 0` is the single pass, four times as fast: for a first look.
+If the link is not linear, a single pass of the filter biases the posterior, on the p53 data by up to half a posterior
+standard deviation. The likelihood therefore uses three iterations of posterior linearisation, whose log evidence is
+exact to 0.03 there. `--iterations 0` is the single pass: four times as fast, for a first look.
 
-With the option `df` the errors e_jk are noise_sd_j times Student's t of that many degrees of freedom, so that
-a few gross errors move the rates little; the noise_sd of their gene grows. As in
+With the option `df` the errors e_jk are noise_sd_j times Student's t with that many degrees of freedom, which makes
+the rates robust against a few outliers; the noise_sd of their gene grows. For example:
 
     lfm-ppl fit transcription --data p53.csv --option df=4
 
@@ -77,10 +77,10 @@ def activity(u: jax.Array, link: str, gamma: float) -> jax.Array:
     """Return g(u), the activity of the factor.
 
     Raises:
-        ValueError: an unknown link, or a saturation constant that is not positive.
+        ValueError: the link is unknown, or the saturation constant is not positive.
     """
-    known = not isinstance(gamma, jax.core.Tracer)
-    if link in ("saturation", "repression") and known and not np.all(np.asarray(gamma) > 0):
+    is_concrete = not isinstance(gamma, jax.core.Tracer)
+    if link in ("saturation", "repression") and is_concrete and not np.all(np.asarray(gamma) > 0):
         raise ValueError(f"gamma, the saturation constant, must be positive, got {gamma}.")
     if link == "linear":
         return u
@@ -112,28 +112,28 @@ def build(
     """Return the model of the genes `outputs`.
 
     Args:
-        basal: rates, shape (N,); so are sensitivity, decay and noise_sd.
+        basal: see PARAMETERS, shape (N,), like sensitivity, decay and noise_sd.
         sensitivity: see PARAMETERS.
         decay: see PARAMETERS.
         scale: standard deviation of the force.
-        lengthscale: of the force.
+        lengthscale: lengthscale of the force.
         noise_sd: see PARAMETERS.
         outputs: names of the N genes.
         link: the activity of the factor.
         gamma: saturation constant.
         units: name -> unit.
-        start: initial expression (N,) where it is known; None: near rest.
+        start: initial expression (N,) if it is known; None: near the resting level.
         df: degrees of freedom of Student's t errors; 0: Gaussian errors.
     """
     size = len(outputs)
     noise_sd = jnp.broadcast_to(jnp.asarray(noise_sd), (size,))
-    rest = lfm.Gaussian(basal / decay, START_SD**2 * jnp.eye(size))
+    resting_state = lfm.Gaussian(basal / decay, START_SD**2 * jnp.eye(size))
     return lfm.LatentForceModel(
         dynamics=lambda x, u, t: basal + sensitivity * activity(u[0], link, gamma) - decay * x,
         forces={FACTOR: lfm.Matern(scale=scale, lengthscale=lengthscale, order=1)},
         observation=(lfm.StudentTObservation(lambda x, u, t: x, df, noise_sd) if df
                      else lfm.GaussianObservation(lambda x, u, t: x, noise_sd**2)),
-        initial_state=rest if start is None else lfm.Gaussian(start, jnp.zeros((size, size))),
+        initial_state=resting_state if start is None else lfm.Gaussian(start, jnp.zeros((size, size))),
         state_names=outputs,
         output_names=outputs,
         units=units,
@@ -172,7 +172,7 @@ def model(times, y=None, outputs=None, units=None, link="softplus", gamma=0.5, d
     lengthscale = numpyro.sample("lengthscale", dist.LogNormal(jnp.log(2.0 / rate), 0.5))
     noise_sd = per_gene("noise_sd", 0.1, 0.7)
     system = build(basal, sensitivity, decay, scale, lengthscale, noise_sd, outputs, link, gamma, units, df=df)
-    # A linear model needs no iterations, and Student-t errors have their own.
+    # A linear model needs no iterations; Student-t errors have iterations of expectation propagation.
     iterations = 0 if link == "linear" or df else ITERATIONS
     numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=STEPS, iterations=iterations, damping=1.0), obs=y)
 
@@ -197,21 +197,21 @@ def simulate(seed: int = 0, link: str = "softplus", gamma: float = 0.5, df: floa
     system = build(**truth, outputs=outputs, link=link, gamma=gamma, start=start, df=df)
     grid = np.linspace(0.0, 15.0, 361)
     observed = np.arange(0, 361, 30)
-    drawn = lfm.simulate(jax.random.key(seed), system, grid)
+    simulation = lfm.simulate(jax.random.key(seed), system, grid)
     return lfm.Data(
         times=grid[observed],
-        y=np.asarray(drawn.y)[observed],
+        y=np.asarray(simulation.y)[observed],
         outputs=outputs,
         units=UNITS,
-        truth={"times": grid, "forces": drawn.forces, "state": drawn.state, "parameters": truth},
+        truth={"times": grid, "forces": simulation.forces, "state": simulation.state, "parameters": truth},
     )
 
 
 def prepare(data: lfm.Data) -> lfm.Data:
-    """Divide each gene, and what is known of its truth, by its largest value.
+    """Divide each gene, and its true values if they are known, by its largest value.
 
     Raises:
-        ValueError: for a gene without a positive value.
+        ValueError: a gene has no positive value.
     """
     largest = np.max(np.where(np.isnan(data.y), -np.inf, data.y), axis=0)
     for gene, value in zip(data.outputs, largest, strict=True):
@@ -241,7 +241,7 @@ def _scaled(truth, largest):
 
 
 def anchors(data: lfm.Data) -> dict[str, float]:
-    """Return what the literature knows: the decay of CDKN1A per hour, its sensitivity as unit."""
+    """Return the decay of CDKN1A per hour from the literature, and its sensitivity as the unit."""
     hours = data.units.get("time") in ("h", "hr", "hour", "hours")
     if "CDKN1A" in data.outputs and hours:
         return {"sensitivity[CDKN1A]": 1.0, "decay[CDKN1A]": 0.8}

@@ -16,7 +16,8 @@ PACKAGE = ROOT / "lfm_ppl"
 # Lower layers first. A module belongs to the longest name here that is a prefix of its own, and may
 # import from its own layer and from the layers below.
 LAYERS = (
-    ("checks", "compilation", "batching", "linalg", "gradients", "calendar_time", "table", "progress"),
+    ("checks", "compilation", "batching", "linalg", "gaussian_residuals", "selection_matrices", "gradients",
+     "calendar_time", "table", "progress"),
     ("forces",),
     ("linearisation",),
     ("model",),

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from lfm_ppl.gaussian_residuals import log_density, masked
 from lfm_ppl.linalg import (
     cholesky,
     congruence,
-    log_density,
-    masked,
     matmul,
     outer_square,
     pivoted_root,

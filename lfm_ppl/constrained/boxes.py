@@ -1,4 +1,4 @@
-"""Constraints as boxes: 0 <= c <= width, one for each bounded quantity, and the factors of a model under them."""
+"""Constraints as boxes 0 <= c <= width, one for each bounded quantity, and the likelihood factors of data and boxes."""
 
 from __future__ import annotations
 
@@ -13,101 +13,106 @@ from lfm_ppl.filtering.quadrature import Marginal, Tilted
 
 
 class Boxes(eqx.Module):
-    """The constraints with both bounds of a quantity as one: 0 <= c(x, u, t) <= width.
+    """The constraints with both bounds of a quantity as one box 0 <= c(x, u, t) <= width.
 
-    Two half lines as two sites of expectation propagation answer each other, and their evidence is off by .2; the
-    moments of a normal distribution between two bounds are known.
+    Expectation propagation with two half lines as two sites has an error of 0.2 in the log evidence, because the sites
+    are correlated. A box is one site, whose truncated normal moments have a closed form.
 
     Attributes:
-        constraints: c >= 0.
-        widths: (B,), the upper bound less the lower one, infinity where a quantity has one bound.
-        kept: those of the constraints that are left.
+        constraints: the constraints c >= 0.
+        widths: (B,), upper minus lower bound; infinity for a quantity with one bound.
+        indices: B indices of constraints, the first bound of each box.
     """
 
     constraints: Constraints
     widths: jax.Array
-    kept: tuple[int, ...] = eqx.field(static=True)
+    indices: tuple[int, ...] = eqx.field(static=True)
 
     def __call__(self, x: jax.Array, u: jax.Array, t: jax.Array) -> jax.Array:
-        """Return (B,), the distance of each quantity from its lower bound, or from the upper where it has no other."""
+        """Return the distance (B,) of each quantity from its lower bound, or from its upper bound if it is the only."""
         values = self.constraints(x, u, t)
-        return jnp.stack([values[index] for index in self.kept]) if self.kept else values[:0]
+        return jnp.stack([values[index] for index in self.indices]) if self.indices else values[:0]
 
     @property
     def count(self) -> int:
-        """B, the number of boxes at a time."""
-        return len(self.kept)
+        """Number of boxes B at a time."""
+        return len(self.indices)
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Of the boxes, by their first bound."""
-        return tuple(self.constraints.labels[index] for index in self.kept)
+        """Labels of the boxes, each the label of its first bound."""
+        return tuple(self.constraints.labels[index] for index in self.indices)
 
     def slacks(self, values: jax.Array) -> jax.Array:
         """Return the slacks (..., C) of all constraints from the values (..., B) of the boxes."""
-        given, below = self.constraints, len(self.constraints.lower_indices)
-        slack = jnp.zeros((*values.shape[:-1], given.count))
-        slack = slack.at[..., list(self.kept)].set(values)
-        for i, index in enumerate(given.upper_indices):
-            if index in given.lower_indices:
-                j = given.lower_indices.index(index)
-                slack = slack.at[..., below + i].set(self.widths[self.kept.index(j)] - values[..., self.kept.index(j)])
+        constraints, lower_count = self.constraints, len(self.constraints.lower_indices)
+        slack = jnp.zeros((*values.shape[:-1], constraints.count))
+        slack = slack.at[..., list(self.indices)].set(values)
+        for i, index in enumerate(constraints.upper_indices):
+            if index in constraints.lower_indices:
+                box = self.indices.index(constraints.lower_indices.index(index))
+                slack = slack.at[..., lower_count + i].set(self.widths[box] - values[..., box])
         return slack
 
     def box_of(self, index: int) -> tuple[int, float, jax.Array] | None:
-        """Return the box of an entry of (x, u, y), the sign of its direction and the bound it starts at, if any."""
-        given, below = self.constraints, len(self.constraints.lower_indices)
-        if index in given.lower_indices:
-            i = given.lower_indices.index(index)
-            return self.kept.index(i), 1.0, given.lower[i]
-        if index in given.upper_indices:
-            i = given.upper_indices.index(index)
-            return self.kept.index(below + i), -1.0, given.upper[i]
+        """Return the box of an entry of (x, u, y), its direction (1 or -1) and its first bound; None without a box."""
+        constraints, lower_count = self.constraints, len(self.constraints.lower_indices)
+        if index in constraints.lower_indices:
+            i = constraints.lower_indices.index(index)
+            return self.indices.index(i), 1.0, constraints.lower[i]
+        if index in constraints.upper_indices:
+            i = constraints.upper_indices.index(index)
+            return self.indices.index(lower_count + i), -1.0, constraints.upper[i]
         return None
 
 
-def boxes(constraints: Constraints) -> Boxes:
-    """Put both bounds of a quantity together."""
-    below, above = constraints.lower_indices, constraints.upper_indices
-    kept = [*range(len(below)), *(len(below) + i for i, index in enumerate(above) if index not in below),
-            *range(len(below) + len(above), constraints.count)]
+def build_boxes(constraints: Constraints) -> Boxes:
+    """Combine both bounds of a quantity into one box."""
+    lower, upper = constraints.lower_indices, constraints.upper_indices
+    indices = [*range(len(lower)), *(len(lower) + i for i, index in enumerate(upper) if index not in lower),
+               *range(len(lower) + len(upper), constraints.count)]
     widths = jnp.full(constraints.count, jnp.inf)
-    for i, index in enumerate(above):
-        if index in below:
-            j = below.index(index)
+    for i, index in enumerate(upper):
+        if index in lower:
+            j = lower.index(index)
             widths = widths.at[j].set(constraints.upper[i] - constraints.lower[j])
-    return Boxes(constraints, widths[jnp.asarray(kept, int)], tuple(kept))
+    return Boxes(constraints, widths[jnp.asarray(indices, int)], tuple(indices))
 
 
 class BoundedTerms(eqx.Module):
-    """Factors N(y; f, R) of the data, and 1(0 <= f <= width) of the constraints.
+    """Likelihood factors N(y; f, R) of the data, and 1(0 <= f <= width) of the constraints.
 
     Attributes:
         y: (K, D), NaN where missing.
-        variance: (K, D), R.
-        held: (K, B), whether the constraint holds at the row.
-        widths: (B,).
+        variance: (K, D), noise variances R.
+        is_constrained: (K, B), whether the constraint holds at the row.
+        widths: (B,), widths of the boxes.
     """
 
     y: jax.Array
     variance: jax.Array
-    held: jax.Array
+    is_constrained: jax.Array
     widths: jax.Array
 
     @property
     def present(self) -> jax.Array:
-        """(K, D + B), whether an entry has a factor."""
-        return jnp.concatenate([jnp.isfinite(self.y), self.held], axis=1)
+        """Whether an entry has a factor, (K, D + B)."""
+        return jnp.concatenate([jnp.isfinite(self.y), self.is_constrained], axis=1)
 
     def tilted(self, cavity: Marginal, near: Marginal, power: float) -> Tilted:
-        """Return the tilted moments in closed form; the power of an indicator is itself, that of the data must be 1."""
-        data = self.y.shape[1]
-        measured = _measured(Marginal(*(a[:, :data] for a in cavity)), self.y, self.variance)
-        truncated = truncated_moments(Marginal(*(a[:, data:] for a in cavity)), self.widths)
-        return Tilted(*(jnp.concatenate(pair, axis=1) for pair in zip(measured, truncated, strict=True)))
+        """Return the tilted moments in closed form.
+
+        Any power of an indicator is the indicator itself; ``power`` must be 1 for the data. ``near``, a point for
+        quadratures of other families, is not used.
+        """
+        outputs = self.y.shape[1]
+        gaussian = _gaussian_tilted(Marginal(*(a[:, :outputs] for a in cavity)), self.y, self.variance)
+        truncated = truncated_moments(Marginal(*(a[:, outputs:] for a in cavity)), self.widths)
+        return Tilted(*(jnp.concatenate(pair, axis=1) for pair in zip(gaussian, truncated, strict=True)))
 
 
-def _measured(cavity: Marginal, y: jax.Array, variance: jax.Array) -> Tilted:
+def _gaussian_tilted(cavity: Marginal, y: jax.Array, variance: jax.Array) -> Tilted:
+    """Return the tilted moments for factors N(y; f, variance)."""
     y = jnp.where(jnp.isfinite(y), y, 0.0)
     total = cavity.variance + variance
     gain = cavity.variance / total

@@ -1,4 +1,11 @@
-"""Constraints c(x, u, t) >= 0: bounds by name and functions, as one function with its labels."""
+"""Constraints c(x, u, t) >= 0, given as bounds by name and as functions, in one function with labels.
+
+1. `build_constraints` checks the bounds of states, forces and outputs, and the functions.
+2. The constraints are, in this order: lower bounds ``quantity - lower``, upper bounds ``upper - quantity``, and the
+   values of the functions. `Constraints` evaluates them at (x, u, t).
+3. The values of the bounds may be traced. Which quantities are bounded is static.
+4. `Constraints.impose_bounds` computes bounded quantities from bound and slack, so that no rounding violates a bound.
+"""
 
 from __future__ import annotations
 
@@ -18,14 +25,14 @@ from lfm_ppl.model.user_functions import trace
 class Constraints(eqx.Module):
     """All constraints of a problem as one function c(x, u, t) -> (C,), feasible where >= 0.
 
-    The values of the bounds are arguments of a compiled program; which quantities they bound is not.
+    The values of the bounds are arguments of a compiled program; the indices of the bounded quantities are static.
 
     Attributes:
         observe: the observation function, whose outputs may be bounded.
         lower, upper: values of the bounds, in the order of ``lower_indices`` and ``upper_indices``.
-        functions: further constraints.
-        lower_indices, upper_indices: of the bounded quantities in (x, u, y).
-        inputs: M + R, the number of entries of (x, u).
+        functions: constraint functions of (x, u, t).
+        lower_indices, upper_indices: indices of the bounded quantities in (x, u, y).
+        inputs: number of entries of (x, u), M + R.
         labels: C labels such as "factor >= lower".
     """
 
@@ -39,7 +46,7 @@ class Constraints(eqx.Module):
     labels: tuple[str, ...] = eqx.field(static=True)
 
     def __call__(self, x: jax.Array, u: jax.Array, t: jax.Array) -> jax.Array:
-        """Return (C,), how far each constraint is from its bound."""
+        """Return the values (C,) of the constraints."""
         quantities = [*(x[i] for i in range(x.shape[0])), *(u[i] for i in range(u.shape[0]))]
         if any(index >= self.inputs for index in (*self.lower_indices, *self.upper_indices)):
             y = jnp.asarray(self.observe(x, u, t), float)
@@ -51,34 +58,35 @@ class Constraints(eqx.Module):
 
     @property
     def count(self) -> int:
-        """C, the number of constraints at a time."""
+        """Number of constraints C at a time."""
         return len(self.labels)
 
-    def respected(self, quantities: jax.Array, slack: jax.Array) -> jax.Array:
-        """Return quantities (..., M + R) = (x, u) with the bounded ones where their slacks (..., C) put them.
+    def impose_bounds(self, quantities: jax.Array, slack: jax.Array) -> jax.Array:
+        """Return quantities (..., M + R) = (x, u) with the bounded ones computed from their slacks (..., C).
 
-        ``lower + s`` with ``s >= 0`` is never below ``lower``, whatever the rounding.
+        ``lower + s`` with ``s >= 0`` is never below ``lower`` in floating-point arithmetic.
         """
-        below = len(self.lower_indices)
+        lower_count = len(self.lower_indices)
         for i, index in enumerate(self.lower_indices):
             if index < self.inputs:
                 quantities = quantities.at[..., index].set(self.lower[i] + slack[..., i])
         for i, index in enumerate(self.upper_indices):
             if index >= self.inputs:
                 continue
-            value = self.upper[i] - slack[..., below + i]
+            value = self.upper[i] - slack[..., lower_count + i]
             if index in self.lower_indices:
-                # Of two bounds the nearer one knows the distance better.
+                # The smaller of two slacks has the smaller rounding error.
                 j = self.lower_indices.index(index)
-                nearer = slack[..., below + i] < slack[..., j]
-                value = jnp.clip(jnp.where(nearer, value, quantities[..., index]), self.lower[j], self.upper[i])
+                is_upper_nearer = slack[..., lower_count + i] < slack[..., j]
+                value = jnp.clip(jnp.where(is_upper_nearer, value, quantities[..., index]), self.lower[j],
+                                 self.upper[i])
             quantities = quantities.at[..., index].set(value)
         return quantities
 
 
 def build_constraints(model: LatentForceModel, lower: Mapping[str, Any] | None, upper: Mapping[str, Any] | None,
                       functions: Any) -> Constraints:
-    """Check what a user gives as constraints and put it into one function.
+    """Check bounds and constraint functions, and combine them into one function.
 
     Args:
         model: the latent force model.
@@ -88,51 +96,53 @@ def build_constraints(model: LatentForceModel, lower: Mapping[str, Any] | None, 
 
     Raises:
         ValueError, TypeError: an unknown name, a bound that is not one finite number, bounds that contradict each
-            other, a known initial state outside of its bounds.
+            other, an initial state without variance outside of its bounds.
     """
     names = (*model.state_names, *model.force_names, *model.output_names)
-    bounds = [_checked(kind, given, names) for kind, given in (("lower", lower), ("upper", upper))]
-    for name in bounds[0].keys() & bounds[1].keys():
-        low, high = (checks.concrete(bound[name]) for bound in bounds)
+    lower, upper = (_checked_bounds(kind, bounds, names) for kind, bounds in (("lower", lower), ("upper", upper)))
+    for name in lower.keys() & upper.keys():
+        low, high = (checks.concrete(bounds[name]) for bounds in (lower, upper))
         if low is not None and high is not None and low >= high:
             raise ValueError(f"the bounds of {name!r} leave nothing between them: lower={low:g}, upper={high:g}. The "
                              "lower bound must be below the upper one; for a known quantity give a precise "
                              "observation.")
-    _check_initial_state(model, *bounds)
+    _check_initial_state(model, lower, upper)
     if callable(functions):
         functions = (functions,)
     functions = tuple(functions or ())
-    # Without the bounds' values, which are arguments of a compiled program.
-    labels = [*(f"{name} >= lower" for name in bounds[0]), *(f"{name} <= upper" for name in bounds[1])]
+    # Labels lack the values of the bounds, which may be traced.
+    labels = [*(f"{name} >= lower" for name in lower), *(f"{name} <= upper" for name in upper)]
     for number, function in enumerate(functions):
-        size = _size(model, number, function)
+        size = _output_size(model, number, function)
         name = getattr(function, "__name__", "<lambda>")
         if name == "<lambda>" or any(label.startswith((f"{name} ", f"{name}[")) for label in labels):
             name = f"constraints[{number}]"
         labels += [f"{name} >= 0"] if size == 1 else [f"{name}[{i}] >= 0" for i in range(size)]
-    values = [jnp.asarray([jnp.asarray(bound, float) for bound in given.values()], float) for given in bounds]
-    below, above = (tuple(names.index(name) for name in given) for given in bounds)
-    return Constraints(model.observation.function, values[0], values[1], functions, below, above,
-                       len(model.state_names) + len(model.force_names), tuple(labels))
+    lower_values, upper_values = (jnp.asarray([jnp.asarray(bound, float) for bound in bounds.values()], float)
+                                  for bounds in (lower, upper))
+    lower_indices, upper_indices = (tuple(names.index(name) for name in bounds) for bounds in (lower, upper))
+    return Constraints(model.observation.function, lower_values, upper_values, functions, lower_indices,
+                       upper_indices, len(model.state_names) + len(model.force_names), tuple(labels))
 
 
-def _checked(kind: str, given: Mapping[str, Any] | None, names: Sequence[str]) -> dict[str, Any]:
-    if given is None:
+def _checked_bounds(kind: str, bounds: Mapping[str, Any] | None, names: Sequence[str]) -> dict[str, Any]:
+    """Check the names and values of ``kind`` ("lower" or "upper") bounds."""
+    if bounds is None:
         return {}
-    if not isinstance(given, Mapping):
+    if not isinstance(bounds, Mapping):
         raise TypeError(f'{kind} must map names to bounds, for example {{"{names[0]}": 0.0}}; got '
-                        f"{type(given).__name__}.")
-    for name, bound in given.items():
+                        f"{type(bounds).__name__}.")
+    for name, bound in bounds.items():
         checks.one_of(f"name in {kind}", name, tuple(dict.fromkeys(names)))
         if np.ndim(bound):
             raise ValueError(f"{kind}[{name!r}] must be one number, got shape {np.shape(bound)}. For a bound that "
                              "changes with time give a function: constraints=lambda x, u, t: x[0] - bound(t).")
         checks.finite(f"{kind}[{name!r}]", bound, "Leave a quantity without a bound out.")
-    return dict(given)
+    return dict(bounds)
 
 
 def _check_initial_state(model: LatentForceModel, lower: dict[str, Any], upper: dict[str, Any]) -> None:
-    """Raise where the initial state is known and lies outside of its bounds."""
+    """Raise ValueError if an initial state without variance lies outside of its bounds."""
     prior = model.initial_state
     mean, covariance = checks.concrete(prior.mean), checks.concrete(prior.covariance)
     if mean is None or covariance is None:
@@ -140,14 +150,15 @@ def _check_initial_state(model: LatentForceModel, lower: dict[str, Any], upper: 
     for index, name in enumerate(model.state_names):
         if covariance[index, index] > 0:
             continue
-        for kind, given, sign in (("below its lower", lower, -1.0), ("above its upper", upper, 1.0)):
-            bound = checks.concrete(given.get(name, np.nan))
+        for kind, bounds, sign in (("below its lower", lower, -1.0), ("above its upper", upper, 1.0)):
+            bound = checks.concrete(bounds.get(name, np.nan))
             if bound is not None and sign * (mean[index] - bound) > 0:
                 raise ValueError(f"the initial state {name!r} is known to be {mean[index]:g}, {kind} bound {bound:g}. "
-                                 "Change the bound or initial_state.mean, or give the state a variance there.")
+                                 "Change the bound or initial_state.mean, or give the initial state a variance.")
 
 
-def _size(model: LatentForceModel, number: int, function: Any) -> int:
+def _output_size(model: LatentForceModel, number: int, function: Any) -> int:
+    """Return the number of constraints that a function returns."""
     if not callable(function):
         raise TypeError("constraints must be a function c(x, u, t), or several, each feasible where >= 0; entry "
                         f"{number} is {type(function).__name__}. A number belongs to lower or upper.")

@@ -1,26 +1,33 @@
-r"""The evidence of data under constraints, Z(y, c) / Z(c), and what it is made of.
+r"""The evidence of data under constraints, Z(y, c) / Z(c).
 
-Z(y, c) is the probability density of the data and of the constraints being respected, Z(c) the prior probability of
-the latter. Without the denominator the prior of the parameters would be tilted towards values under which the
-constraints are respected by themselves.
+Z(y, c) is the joint density of the data and of the event that all constraints hold, Z(c) the prior probability of this
+event. Without the denominator the prior of the parameters would favour values for which the constraints hold anyway.
 
-Both are found by expectation propagation with a box a bounded quantity (`lfm_ppl.constrained.boxes`), and made right
-by importance sampling with trajectories that respect all constraints (`lfm_ppl.constrained.feasible_paths`).
+1. Expectation propagation with one site for each box and row (`lfm_ppl.constrained.boxes`) and exact sites of the data
+   gives a Gaussian approximation, and an approximate log Z.
+2. A forward scan with the data and tempered sites of the constraints is the proposal of trajectories.
+3. Trajectories that respect all constraints are drawn backwards, each with a weight
+   (`lfm_ppl.constrained.feasible_paths`). The mean weight is an unbiased estimate of Z.
+4. Steps 1 to 3 with all data missing give Z(c). The same random numbers in both reduce the variance of the ratio.
+
+Source: Cunningham, Hennig and Lacoste-Julien (2011), Gaussian probabilities and expectation propagation; Geweke (1991)
+and Keane (1994) for step 3.
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
-from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import checks
-from lfm_ppl.constrained.augmented import Rows, with_rows
+from lfm_ppl.constrained.augmented import Rows, augmented_observations
 from lfm_ppl.constrained.boxes import BoundedTerms, Boxes
-from lfm_ppl.constrained.feasible_paths import Paths, feasible_paths
+from lfm_ppl.constrained.feasible_paths import FeasiblePaths, sample_feasible_paths
 from lfm_ppl.filtering.filter import Pass, forward
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.sites import Evidence, SiteSettings, evidence
@@ -34,22 +41,23 @@ from lfm_ppl.model.structure import pattern
 
 _LOG_2PI = 1.8378770664093453
 
-_TEMPER = 0.7
-"""Share of the converged sites that draws look ahead by. On dense grids the sites of all rows together say more than
-their constraints do, and 1/2 to 4/5 has the smallest variance; on coarse grids 1 has, and less than 4/5 is worse."""
+_TEMPERING = 0.7
+"""Power of the converged sites in the proposal. On dense grids the product of all sites is narrower than the
+constraints, and powers from 1/2 to 4/5 give the smallest variance of the weights; on coarse grids power 1 does, and
+powers below 4/5 are worse."""
 
 
-class Bounded(NamedTuple):
-    """A model under constraints, laid out.
+class TruncatedPosterior(eqx.Module):
+    """The posterior of a model under constraints: its evidence and its trajectories.
 
     Attributes:
-        ssm: with the outputs (h, c).
+        ssm: the model with outputs (h, c).
         rule: the linearisation rule.
-        grid: of the scan.
-        rows: which rows hold observations, and which constraints.
+        grid: time grid of the scan.
+        rows: rows of the observations and of the constraints.
         boxes: the constraints.
-        variance: (T, D), of the observations' noise.
-        settings: of the sites.
+        variance: (T, D), noise variances of the observations.
+        settings: settings of expectation propagation.
     """
 
     ssm: StateSpaceModel
@@ -61,115 +69,126 @@ class Bounded(NamedTuple):
     settings: SiteSettings
 
     @property
-    def held(self) -> jax.Array:
-        """(K, B), at which rows the constraints hold."""
+    def is_constrained(self) -> jax.Array:
+        """Whether the constraints hold at a row, (K, B)."""
         return jnp.zeros((len(self.rows.times), self.boxes.count), bool).at[self.rows.grid].set(True)
 
-    def _data(self, y: jax.Array) -> tuple[BoundedTerms, jax.Array, Sites]:
-        """Return the factors, entries (K, D + B) that are NaN where there is none, and exact sites of the data."""
-        whole = with_rows(y, jnp.zeros((len(self.rows.grid), self.boxes.count)), self.rows)
-        measured = whole[:, : y.shape[1]]
+    def _factors(self, y: jax.Array) -> tuple[BoundedTerms, jax.Array, Sites]:
+        """Return the likelihood factors, the observations of the rows, and the exact sites of the data.
+
+        Returns:
+            The factors; observations (K, D + B), NaN for an entry without a factor; sites (K, D + B), zero for the
+            constraints.
+        """
+        entries = augmented_observations(y, jnp.zeros((len(self.rows.grid), self.boxes.count)), self.rows)
+        measured = entries[:, : y.shape[1]]
         noise = jnp.ones(measured.shape).at[self.rows.data].set(self.variance)
-        present, nothing = jnp.isfinite(measured), jnp.zeros((len(whole), self.boxes.count))
-        first = Sites(jnp.concatenate([jnp.where(present, measured, 0.0), nothing], axis=1), jnp.zeros_like(whole),
-                      jnp.concatenate([jnp.where(present, 1.0 / noise, 0.0), nothing], axis=1))
-        return BoundedTerms(measured, noise, self.held, self.boxes.widths), whole, first
+        is_present, zeros = jnp.isfinite(measured), jnp.zeros((len(entries), self.boxes.count))
+        data_sites = Sites(jnp.concatenate([jnp.where(is_present, measured, 0.0), zeros], axis=1),
+                           jnp.zeros_like(entries),
+                           jnp.concatenate([jnp.where(is_present, 1.0 / noise, 0.0), zeros], axis=1))
+        return BoundedTerms(measured, noise, self.is_constrained, self.boxes.widths), entries, data_sites
 
-    def propagated(self, y: jax.Array, keep: str = "likelihood") -> Evidence:
-        """Run expectation propagation; its log evidence is that of data and constraints."""
-        terms, whole, first = self._data(y)
-        return evidence(self.ssm, self.rule, self.grid, whole, terms, self.settings, Moments(*self.ssm.initial()),
-                        first, keep)
+    def propagate_expectations(self, y: jax.Array, keep: str = "likelihood") -> Evidence:
+        """Run expectation propagation; its log evidence is an approximation of log Z(y, c)."""
+        terms, entries, data_sites = self._factors(y)
+        return evidence(self.ssm, self.rule, self.grid, entries, terms, self.settings, Moments(*self.ssm.initial()),
+                        data_sites, keep)
 
-    def proposal(self, y: jax.Array, found: Evidence) -> Pass:
-        """Return the forward scan that draws go back over: exact sites of the data, tempered ones of constraints."""
-        _, whole, first = self._data(y)
-        share = jnp.concatenate([jnp.zeros(y.shape[1]), jnp.full(self.boxes.count, _TEMPER)])
-        sites = found.refined.found.sites
-        mixed = Sites(jnp.where(share > 0, sites.centre, first.centre), share * sites.nu,
-                      jnp.where(share > 0, share * sites.tau, first.tau))
-        return forward(self.ssm, self.rule, self.grid, whole, linearization_point=found.refined.points, keep="all",
-                       sites=mixed)
+    def proposal(self, y: jax.Array, propagated: Evidence) -> Pass:
+        """Return the forward scan for `sample_paths`: exact sites of the data, tempered sites of the constraints."""
+        _, entries, data_sites = self._factors(y)
+        power = jnp.concatenate([jnp.zeros(y.shape[1]), jnp.full(self.boxes.count, _TEMPERING)])
+        sites = propagated.refined.found.sites
+        sites = Sites(jnp.where(power > 0, sites.centre, data_sites.centre), power * sites.nu,
+                      jnp.where(power > 0, power * sites.tau, data_sites.tau))
+        return forward(self.ssm, self.rule, self.grid, entries, linearization_point=propagated.refined.points,
+                       keep="all", sites=sites)
 
-    def paths(self, key: jax.Array, passed: Pass, count: int) -> Paths:
-        """Draw trajectories that respect the constraints."""
-        held = jnp.zeros((passed.phi.shape[0], self.boxes.count), bool).at[jnp.asarray(self.grid.observed)].set(
-            self.held)
-        return feasible_paths(key, passed, held, self.boxes.widths, count)
+    def sample_paths(self, key: jax.Array, forward_pass: Pass, count: int) -> FeasiblePaths:
+        """Draw weighted trajectories that respect the constraints, from a proposal."""
+        is_constrained = jnp.zeros((forward_pass.phi.shape[0], self.boxes.count), bool)
+        is_constrained = is_constrained.at[jnp.asarray(self.grid.observed)].set(self.is_constrained)
+        return sample_feasible_paths(key, forward_pass, is_constrained, self.boxes.widths, count)
 
-    def chosen(self, key: jax.Array, passed: Pass, draws: int, candidates: int) -> jax.Array:
-        """Return trajectories (K, M + R, draws) of (x, u) at the rows, each one of some by their weights.
+    def sample_trajectories(self, key: jax.Array, forward_pass: Pass, draws: int, candidates: int) -> jax.Array:
+        """Draw trajectories (K, M + R, draws) of (x, u) at the rows, each from weighted candidates.
 
-        Bounded states and forces are what was drawn for them, and so feasible to the last bit.
+        Bounded states and forces are computed from their drawn slacks, and so feasible in floating-point arithmetic.
         """
         keys = jax.random.split(key)
-        found = self.paths(keys[0], passed, draws * candidates)
-        # Trajectories with mirrored random numbers are not to stand beside each other.
+        paths = self.sample_paths(keys[0], forward_pass, draws * candidates)
+        # The second half of the paths mirrors the first: this order spreads mirrored pairs over different draws.
         order = jnp.arange(draws * candidates).reshape(candidates, draws).T
-        index = jax.random.categorical(keys[1], found.log_weights[order], axis=1)
-        picked = jnp.take_along_axis(order, index[:, None], axis=1)[:, 0]
-        at = jnp.asarray(self.grid.observed)
-        possible = jnp.isfinite(jnp.take_along_axis(found.log_weights, picked, axis=0))
-        states, values = (jnp.where(possible, a[at][..., picked], jnp.nan) for a in (found.states, found.values))
+        candidate = jax.random.categorical(keys[1], paths.log_weights[order], axis=1)
+        index = jnp.take_along_axis(order, candidate[:, None], axis=1)[:, 0]
+        observed = jnp.asarray(self.grid.observed)
+        is_possible = jnp.isfinite(jnp.take_along_axis(paths.log_weights, index, axis=0))
+        states, values = (jnp.where(is_possible, a[observed][..., index], jnp.nan)
+                          for a in (paths.states, paths.values))
         matrix, offset = jax.vmap(self.ssm.input_map)(jnp.asarray(self.rows.times))
         inputs = matmul(matrix, states) + offset[..., None]
-        # (K, S, ...): the bounded ones where the constraints hold.
-        inputs, values = (jnp.moveaxis(a, 1, -1) for a in (inputs, values))
-        exact = self.boxes.constraints.respected(inputs, self.boxes.slacks(values))
-        held = jnp.zeros(len(self.rows.times), bool).at[self.rows.grid].set(True)
-        return jnp.moveaxis(jnp.where(held[:, None, None], exact, inputs), -1, 1)
+        inputs, values = (jnp.moveaxis(a, 1, -1) for a in (inputs, values))  # (K, S, ...)
+        feasible = self.boxes.constraints.impose_bounds(inputs, self.boxes.slacks(values))
+        is_constrained = jnp.zeros(len(self.rows.times), bool).at[self.rows.grid].set(True)
+        return jnp.moveaxis(jnp.where(is_constrained[:, None, None], feasible, inputs), -1, 1)
 
     def log_weights(self, key: jax.Array, y: jax.Array, count: int) -> jax.Array:
-        """Return log weights (count,) whose exponentials have the evidence of data and constraints as their mean."""
-        found = self.propagated(y)
-        passed = self.proposal(y, found)
+        """Return log weights (count,) of paths; the expectation of a weight is Z(y, c)."""
+        propagated = self.propagate_expectations(y)
+        forward_pass = self.proposal(y, propagated)
         variance = jnp.broadcast_to(self.variance, y.shape)
+        # The sites of the data lack the normalising constants of its likelihood.
         data = -0.5 * jnp.where(jnp.isfinite(y), _LOG_2PI + jnp.log(variance), 0.0).sum()
-        weights = passed.log_likelihood.sum() + data + self.paths(key, passed, count).log_weights
-        return jnp.where(found.refined.found.converged, weights, -jnp.inf)
+        paths = self.sample_paths(key, forward_pass, count)
+        weights = forward_pass.log_likelihood.sum() + data + paths.log_weights
+        return jnp.where(propagated.refined.found.converged, weights, -jnp.inf)
 
     def log_evidence(self, y: jax.Array, draws: int, key: jax.Array | None = None) -> jax.Array:
-        """Return log Z(y, c); by expectation propagation alone where ``draws`` is 0."""
+        """Return log Z(y, c), from ``draws`` weights, or by expectation propagation alone if ``draws`` is 0."""
         if not draws:
-            return self.propagated(y).log_evidence
-        weights = self.log_weights(_key(key), y, draws)
+            return self.propagate_expectations(y).log_evidence
+        weights = self.log_weights(_fixed_key(key), y, draws)
         largest = jax.lax.stop_gradient(jnp.max(weights))
         safe = jnp.where(jnp.isfinite(largest), largest, 0.0)
         return jax.scipy.special.logsumexp(weights - safe) + safe - jnp.log(draws)
 
     def log_likelihood(self, y: jax.Array, draws: int, key: jax.Array | None = None) -> jax.Array:
         """Return log Z(y, c) - log Z(c), with the same random numbers in both."""
-        both = _with_and_without(lambda one: self.log_evidence(one, draws, key), y)
-        return both[0] - both[1]
+        joint, prior = _with_and_without_data(lambda y: self.log_evidence(y, draws, key), y)
+        return joint - prior
 
     def converged(self, y: jax.Array) -> jax.Array:
-        """Whether the sites converge, with the data and without them."""
-        return _with_and_without(lambda one: self.propagated(one).refined.found.converged, y).all()
+        """Return whether the sites converge with the data and without them."""
+        return _with_and_without_data(
+            lambda y: self.propagate_expectations(y).refined.found.converged, y).all()
 
-    def worth(self, y: jax.Array, draws: int, key: jax.Array | None = None) -> jax.Array:
-        """Return how many of the weighted trajectories count, with the data or without them, whichever is fewer."""
-        return _with_and_without(lambda one: effective_number(self.log_weights(_key(key), one, draws)), y).min()
+    def effective_sample_size(self, y: jax.Array, draws: int, key: jax.Array | None = None) -> jax.Array:
+        """Return the smaller of the effective sample sizes of the weights with the data and without them."""
+        return _with_and_without_data(
+            lambda y: effective_sample_size(self.log_weights(_fixed_key(key), y, draws)), y).min()
 
 
-def _with_and_without(function: Callable[[jax.Array], jax.Array], y: jax.Array) -> jax.Array:
-    """Return ``function`` of the data and of none, compiled once, (2,)."""
+def _with_and_without_data(function: Callable[[jax.Array], jax.Array], y: jax.Array) -> jax.Array:
+    """Return the values (2,) of ``function`` for the data and for missing data, compiled once."""
     return jax.vmap(function)(jnp.stack([y, jnp.full_like(y, jnp.nan)]))
 
 
-def _key(key: jax.Array | None) -> jax.Array:
+def _fixed_key(key: jax.Array | None) -> jax.Array:
+    """Return the key, by default a constant one, for which a likelihood is a deterministic function."""
     return jax.random.key(0) if key is None else key
 
 
-def effective_number(log_weights: jax.Array) -> jax.Array:
-    """Return (sum w)^2 / sum w^2 of weights (N,), zero where all are."""
+def effective_sample_size(log_weights: jax.Array) -> jax.Array:
+    """Return (sum w)^2 / sum w^2 of weights (N,); zero if all weights are zero."""
     largest = log_weights.max()
-    possible = jnp.isfinite(largest)
-    weights = jnp.where(possible, jnp.exp(log_weights - jnp.where(possible, largest, 0.0)), 1.0)
-    return jnp.where(possible, weights.sum() ** 2 / (weights**2).sum(), 0.0)
+    is_positive = jnp.isfinite(largest)
+    weights = jnp.where(is_positive, jnp.exp(log_weights - jnp.where(is_positive, largest, 0.0)), 1.0)
+    return jnp.where(is_positive, weights.sum() ** 2 / (weights**2).sum(), 0.0)
 
 
 def check_variances(model: LatentForceModel, count: int) -> jax.Array:
-    """Return the noise variances (T, D), after checking that there is nothing else."""
+    """Check that the observation noise is independent between outputs, and return its variances (count, D)."""
     if model.observation.angular:
         raise ValueError("the posterior under constraints takes no angular outputs; observe their sine and cosine, or "
                          "take lfm.full_information.")
@@ -179,8 +198,8 @@ def check_variances(model: LatentForceModel, count: int) -> jax.Array:
                          "function of (x, u, t).")
     value = jnp.asarray(covariance, float)
     if value.ndim > 1:
-        known = checks.concrete(value)
-        if known is not None and np.any(known * (1.0 - np.eye(known.shape[-1]))):
+        concrete = checks.concrete(value)
+        if concrete is not None and np.any(concrete * (1.0 - np.eye(concrete.shape[-1]))):
             raise ValueError("the posterior under constraints takes outputs with independent noise; the observation "
                              "covariance has entries off its diagonal.")
         value = jnp.diagonal(value, axis1=-2, axis2=-1)
@@ -188,14 +207,17 @@ def check_variances(model: LatentForceModel, count: int) -> jax.Array:
     return jnp.broadcast_to(value, (count, value.shape[-1]))
 
 
-def check_linear(problem: Bounded, draws: int) -> None:
-    """Raise where constraints are not linear in states and forces, and trajectories are to be drawn."""
+def check_linear(posterior: TruncatedPosterior, draws: int) -> None:
+    """Raise ValueError if trajectories are to be drawn and a constraint is not linear in states and forces."""
     if not draws:
         return
-    ssm, t = problem.ssm, jnp.asarray(problem.grid.initial_time, float)
-    first = ssm.output_dim - problem.boxes.count
-    for number, label in enumerate(problem.boxes.labels, first):
-        one = lambda w, n=number: ssm.observe(w, t)[n : n + 1]  # noqa: E731
-        if pattern(one, ssm.input_dim).hessian.any():
+    ssm, t = posterior.ssm, jnp.asarray(posterior.grid.initial_time, float)
+    outputs = ssm.output_dim - posterior.boxes.count
+
+    def constraint(w: jax.Array, index: int) -> jax.Array:
+        return ssm.observe(w, t)[index : index + 1]
+
+    for index, label in enumerate(posterior.boxes.labels, outputs):
+        if pattern(functools.partial(constraint, index=index), ssm.input_dim).hessian.any():
             raise ValueError(f"the constraint {label!r} is not linear in states and forces, and draws={draws} "
                              "trajectories take linear ones. Set draws=0, for expectation propagation alone.")

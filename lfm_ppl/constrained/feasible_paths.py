@@ -1,14 +1,18 @@
 r"""Trajectories that respect all constraints, each with a weight whose mean is the evidence.
 
-Backwards, from the last row to the first: the state at a row given the next one is Gaussian in a linear model with
-Gaussian sites. Constraint by constraint its own site is taken out, the constrained quantity c drawn from the truncated
-normal distribution that is left, N(c; m, v) 1(0 <= c <= w), and the rest of the state given c. With I the integral of
-all sites t the weight of a trajectory is
+Backwards, from the last row to the first:
 
-    I prod_i  P(0 <= c_i <= w; m_i, v_i) / int N(c; m_i, v_i) t_i(c) dc,
+1. In a linear model with Gaussian sites t, the state at a row given the state at the next row is Gaussian.
+2. For each constraint i of the row, in turn: divide out its site, which leaves N(c; m_i, v_i) for the constrained
+   quantity c; draw c from the truncated normal distribution N(c; m_i, v_i) 1(0 <= c <= w); condition the state on c.
+3. Draw the remaining components of the state.
 
-and its mean is the integral without sites, whatever these are. They look ahead: a draw knows of the constraints at
-earlier rows by their sites. Covariances are the same for all trajectories, which therefore cost as much as their means.
+With the integral I of all sites, the weight of a trajectory is
+
+    I prod_i  P(0 <= c_i <= w; m_i, v_i) / int N(c; m_i, v_i) t_i(c) dc.
+
+For any sites, its expectation is the probability of the constraints. Good sites reduce its variance: they inform a draw
+about the constraints at earlier rows. All trajectories share their covariances, so that each costs only its mean.
 
 Source: Geweke (1991), Keane (1994), Econometrica 62, and Hajivassiliou, McFadden and Ruud (1996), Journal of
 Econometrics 72, for the simulator; Carter and Kohn (1994), Biometrika 81, for backward sampling.
@@ -30,20 +34,22 @@ from lfm_ppl.filtering.smoothing_kernel import smoothing_kernel
 from lfm_ppl.filtering.update import Sites
 from lfm_ppl.linalg import congruence, diagonal, matmul, semidefinite_root
 
-_KNOWN = 1e-13
-"""Share of the predicted variance of a quantity, and of a state's before it is drawn, below which it is known."""
+_ROUNDING_VARIANCE = 1e-13
+"""Variances below this multiple of the predicted variance (of a state: of its variance before the draws of its row) are
+rounding errors; the quantity is determined by what was drawn before."""
 
-_RESPECTED = 1e-6
-"""Distance in predicted standard deviations by which a known quantity may lie outside."""
+_TOLERATED_VIOLATION = 1e-6
+"""Tolerated violation of a constraint by a determined quantity, in predicted standard deviations."""
 
 
-class Paths(NamedTuple):
-    """Trajectories and their weights.
+class FeasiblePaths(NamedTuple):
+    """Weighted trajectories.
 
     Attributes:
-        states: (N, n, S) at the intervals' ends.
-        values: (N, B, S) of the constrained quantities, between 0 and their width where a constraint holds.
-        log_weights: (S,), logarithms of what has the mean P / I: the integral of the factors over that of the sites.
+        states: (N, n, S), states at the ends of the intervals.
+        values: (N, B, S), constrained quantities, between 0 and their width where a constraint holds.
+        log_weights: (S,), logarithms of weights with the expectation P / I, where P is the integral of the likelihood
+            factors, and I the integral of the sites.
     """
 
     states: jax.Array
@@ -51,75 +57,98 @@ class Paths(NamedTuple):
     log_weights: jax.Array
 
 
-def feasible_paths(key: jax.Array, passed: Pass, held: jax.Array, widths: jax.Array, count: int) -> Paths:
-    """Draw trajectories; half of them with the random numbers of the other half mirrored.
+def sample_feasible_paths(key: jax.Array, forward_pass: Pass, is_constrained: jax.Array, widths: jax.Array,
+                          count: int) -> FeasiblePaths:
+    """Draw trajectories; the second half of them with the mirrored random numbers of the first half.
 
     Args:
         key: a JAX random key.
-        passed: a forward scan with sites, everything kept; the last B entries are the constraints.
-        held: (N, B), whether a constraint holds at the interval's end.
-        widths: (B,).
-        count: S, an even number.
+        forward_pass: a complete forward scan with sites; the last B entries of its observations are the constraints.
+        is_constrained: (N, B), whether a constraint holds at the end of an interval.
+        widths: (B,), widths of the boxes.
+        count: number of trajectories S, even.
     """
-    rows, size = passed.phi.shape[:2]
-    number = held.shape[1]
+    intervals, size = forward_pass.phi.shape[:2]
     keys = jax.random.split(key)
-    # Not zero and not one, whose quantiles may be infinite.
-    shares = jax.random.uniform(keys[0], (rows, number, count // 2), minval=1e-12, maxval=1.0 - 1e-12)
-    normals = jax.random.normal(keys[1], (rows, size, count // 2))
-    shares = jnp.concatenate([shares, 1.0 - shares], axis=-1)
+    # The quantiles of zero and one may be infinite.
+    uniforms = jax.random.uniform(keys[0], (intervals, is_constrained.shape[1], count // 2), minval=1e-12,
+                                  maxval=1.0 - 1e-12)
+    normals = jax.random.normal(keys[1], (intervals, size, count // 2))
+    uniforms = jnp.concatenate([uniforms, 1.0 - uniforms], axis=-1)
     normals = jnp.concatenate([normals, -normals], axis=-1)
+    rows = (forward_pass._replace(steps=None), is_constrained, uniforms, normals)
 
-    def at_row(mean: jax.Array, covariance: jax.Array, row: tuple) -> tuple[jax.Array, jax.Array, jax.Array]:
-        one, held, shares, normals = row
-        before = diagonal(covariance)
-        terms, first = one.site_terms, one.site_terms.value.shape[0] - number
-        log_weights, values = jnp.zeros(count), []
-        for index in range(number):
-            sites = Sites(*(a[first + index] for a in terms.sites))
-            h = one.jacobian[first + index]
-            gain = matmul(covariance, h[:, None])[:, 0]
-            variance = (h * gain).sum()
-            now = terms.value[first + index] + matmul(h[None], mean - one.predicted.mean[:, None])[0]
-            largest = terms.variance[first + index, first + index]
-            known = ~(variance > _KNOWN * largest)
-            safe = jnp.where(known, 1.0, variance)
-            left = jnp.maximum(1.0 - sites.tau * safe, _KNOWN)
-            cavity = Marginal(sites.centre + (now - sites.centre - safe * sites.nu) / left,
-                              jnp.broadcast_to(safe / left, now.shape))
-            outside = jnp.maximum(-now, now - widths[index]) > _RESPECTED * jnp.sqrt(jnp.maximum(largest, 1e-300))
-            term = log_share(cavity, widths[index]) - gaussian_terms(sites, cavity, 1.0)
-            # What is determined already is as it is: its site, which the proposal holds, is divided out there.
-            away = now - sites.centre
-            term = jnp.where(known, jnp.where(outside, -jnp.inf, (0.5 * sites.tau * away - sites.nu) * away), term)
-            drawn = jnp.where(known, jnp.clip(now, 0.0, widths[index]), quantile(cavity, widths[index], shares[index]))
-            take = held[index] & ~known
-            log_weights = log_weights + jnp.where(held[index], term, 0.0)
-            values.append(jnp.where(held[index], drawn, now))
-            gain = jnp.where(take, gain / safe, 0.0)
-            mean = mean + gain[:, None] * (drawn - now)
-            covariance = congruence(jnp.eye(size) - gain[:, None] * h, covariance)
-            # What is drawn has no variance but for rounding, of which no square root must be taken.
-            gone = diagonal(covariance) <= _KNOWN * before
-            covariance = jnp.where(gone[:, None] | gone[None, :], 0.0, covariance)
-        state = mean + matmul(semidefinite_root(covariance), normals)
-        return state, jnp.stack(values) if values else jnp.zeros((0, count)), log_weights
-
-    def step(carry: tuple, inputs: tuple) -> tuple[tuple, tuple]:
-        later, total = carry
+    def step_back(carry: tuple, inputs: tuple) -> tuple[tuple, tuple]:
+        next_state, total = carry
         row, predicted, phi, process_cov = inputs
         filtered = row[0].filtered
-        gain, conditional, _ = smoothing_kernel(filtered, predicted, phi, process_cov)
-        mean = filtered.mean[:, None] + matmul(gain, later - predicted.mean[:, None])
-        state, values, more = at_row(mean, conditional, row)
-        return (state, total + more), (state, values)
+        gain, conditional_cov, _ = smoothing_kernel(filtered, predicted, phi, process_cov)
+        mean = filtered.mean[:, None] + matmul(gain, next_state - predicted.mean[:, None])
+        state, values, log_weights = _sample_row(mean, conditional_cov, row, widths)
+        return (state, total + log_weights), (state, values)
 
-    tree = jax.tree_util.tree_map
-    every = (passed._replace(steps=None), held, shares, normals)
-    end = tree(lambda a: a[-1], every)
-    last = Moments(*end[0].filtered)
-    state, values, total = at_row(jnp.broadcast_to(last.mean[:, None], (size, count)), last.covariance, end)
-    later = tree(lambda a: a[1:], (passed.predicted, passed.phi, passed.process_cov))
-    (_, total), (states, inside) = jax.lax.scan(
-        jax.checkpoint(step), (state, total), (tree(lambda a: a[:-1], every), *later), reverse=True)
-    return Paths(jnp.concatenate([states, state[None]]), jnp.concatenate([inside, values[None]]), total)
+    tree_map = jax.tree_util.tree_map
+    last_row = tree_map(lambda a: a[-1], rows)
+    last = Moments(*last_row[0].filtered)
+    state, values, total = _sample_row(jnp.broadcast_to(last.mean[:, None], (size, count)), last.covariance, last_row,
+                                       widths)
+    earlier_rows = tree_map(lambda a: a[:-1], rows)
+    transitions = tree_map(lambda a: a[1:], (forward_pass.predicted, forward_pass.phi, forward_pass.process_cov))
+    (_, total), (earlier_states, earlier_values) = jax.lax.scan(
+        jax.checkpoint(step_back), (state, total), (earlier_rows, *transitions), reverse=True)
+    return FeasiblePaths(jnp.concatenate([earlier_states, state[None]]),
+                         jnp.concatenate([earlier_values, values[None]]), total)
+
+
+def _sample_row(mean: jax.Array, covariance: jax.Array, row: tuple,
+                widths: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Draw the state at a row, with its constrained quantities.
+
+    Args:
+        mean: (n, S), of the state given the state at the next row.
+        covariance: (n, n).
+        row: the forward scan, whether constraints hold (B,), uniforms (B, S) and normals (n, S) of the row.
+        widths: (B,).
+
+    Returns:
+        States (n, S), constrained quantities (B, S), and log weights (S,).
+    """
+    forward_row, is_constrained, uniforms, normals = row
+    size, count = mean.shape
+    number = is_constrained.shape[0]
+    initial_variance = diagonal(covariance)
+    terms, outputs = forward_row.site_terms, forward_row.site_terms.value.shape[0] - number
+    log_weights, values = jnp.zeros(count), []
+    for index in range(number):
+        sites = Sites(*(a[outputs + index] for a in terms.sites))
+        h = forward_row.jacobian[outputs + index]
+        gain = matmul(covariance, h[:, None])[:, 0]
+        variance = (h * gain).sum()
+        value = terms.value[outputs + index] + matmul(h[None], mean - forward_row.predicted.mean[:, None])[0]
+        predicted_variance = terms.variance[outputs + index, outputs + index]
+        is_determined = ~(variance > _ROUNDING_VARIANCE * predicted_variance)
+        safe_variance = jnp.where(is_determined, 1.0, variance)
+        # Divide the site out: cavity precision = 1 / variance - tau.
+        precision_ratio = jnp.maximum(1.0 - sites.tau * safe_variance, _ROUNDING_VARIANCE)
+        cavity = Marginal(sites.centre + (value - sites.centre - safe_variance * sites.nu) / precision_ratio,
+                          jnp.broadcast_to(safe_variance / precision_ratio, value.shape))
+        log_weight = log_share(cavity, widths[index]) - gaussian_terms(sites, cavity, 1.0)
+        # A determined quantity is not drawn: its weight is the indicator over the site, which the proposal contains.
+        is_violated = (jnp.maximum(-value, value - widths[index])
+                       > _TOLERATED_VIOLATION * jnp.sqrt(jnp.maximum(predicted_variance, 1e-300)))
+        distance = value - sites.centre
+        log_weight = jnp.where(
+            is_determined, jnp.where(is_violated, -jnp.inf, (0.5 * sites.tau * distance - sites.nu) * distance),
+            log_weight)
+        draw = jnp.where(is_determined, jnp.clip(value, 0.0, widths[index]),
+                         quantile(cavity, widths[index], uniforms[index]))
+        log_weights = log_weights + jnp.where(is_constrained[index], log_weight, 0.0)
+        values.append(jnp.where(is_constrained[index], draw, value))
+        gain = jnp.where(is_constrained[index] & ~is_determined, gain / safe_variance, 0.0)
+        mean = mean + gain[:, None] * (draw - value)
+        covariance = congruence(jnp.eye(size) - gain[:, None] * h, covariance)
+        # The variance of what is drawn is a rounding error, whose square root must not be taken.
+        is_rounding = diagonal(covariance) <= _ROUNDING_VARIANCE * initial_variance
+        covariance = jnp.where(is_rounding[:, None] | is_rounding[None, :], 0.0, covariance)
+    state = mean + matmul(semidefinite_root(covariance), normals)
+    return state, jnp.stack(values) if values else jnp.zeros((0, count)), log_weights

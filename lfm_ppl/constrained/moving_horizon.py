@@ -1,7 +1,22 @@
-"""Moving horizon estimation: the constrained problem over a window of the latest observations, from an arrival cost."""
+"""Moving horizon estimation: the constrained problem over a window of the last observations, with an arrival cost.
+
+1. The state of the estimator (`HorizonState`) holds the last W observations and the arrival moments, the Gaussian of
+   the joint state given all observations before the window, without the constraints.
+2. A new observation enters the window (`_advance`). If the window is full, its first observation leaves it, and a step
+   of the filter over this observation advances the arrival moments.
+3. The MAP problem of the window, with the arrival moments as its prior, is solved by an interior point
+   (`_solve_window`).
+4. The estimate is the state ``delay`` observations before the last one.
+5. `MovingHorizon.update` does this for one observation. `moving_horizon` starts with the first full window and scans
+   over the other observations of a record.
+
+Source: Wolff, Lopez, Müller and Beckers, section 3.3; Rawlings, Mayne and Diehl (2017), Model predictive control,
+chapter 4.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -11,11 +26,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl import checks
-from lfm_ppl.constrained.augmented import Rows, augmented
+from lfm_ppl.constrained.augmented import Rows, augmented_model
 from lfm_ppl.constrained.constraints import Constraints, build_constraints
-from lfm_ppl.constrained.full_information import ConstrainedEstimate, check_settings, estimate_on, is_linear
+from lfm_ppl.constrained.full_information import ConstrainedEstimate, check_settings, is_linear, solve_problem
 from lfm_ppl.constrained.gauss_newton import Dynamics
-from lfm_ppl.constrained.interior_point import Problem
+from lfm_ppl.constrained.interior_point import ConstrainedProblem
 from lfm_ppl.filtering.filter import check_observations, forward, warn_single_precision
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.time_grid import TimeGrid, intervals_between
@@ -27,14 +42,14 @@ from lfm_ppl.model.state_space import StateSpaceModel, check_times, state_space
 
 
 class HorizonState(NamedTuple):
-    """Where a moving horizon estimator stands: arrays, which can be saved and passed on.
+    """State of a moving horizon estimator: a tuple of arrays, which can be saved.
 
     Attributes:
-        times: (W,), of the observations in the window; the initial time where there is none yet.
-        y: (W, D), these, NaN where there is none.
+        times: (W,), times of the observations in the window; the initial time for an empty place.
+        y: (W, D), observations in the window; NaN for an empty place.
         seen: number of observations so far.
-        arrival_time: when the moments below hold.
-        mean, covariance: (n,), (n, n), of the joint state given all observations before the window.
+        arrival_time: time of the arrival moments.
+        mean, covariance: (n,), (n, n), arrival moments: of the joint state given all observations before the window.
     """
 
     times: jax.Array
@@ -46,14 +61,14 @@ class HorizonState(NamedTuple):
 
 
 class HorizonEstimate(NamedTuple):
-    """The estimate that a window leaves.
+    """Estimate of one window.
 
     Attributes:
-        time: that it is of; NaN as long as fewer than ``delay`` observations came after the first.
-        state_mean: (M,).
-        force_mean: (R,).
+        time: time of the estimate; NaN as long as there are not more than ``delay`` observations.
+        state_mean: (M,), physical state.
+        force_mean: (R,), forces.
         converged: whether the window's problem was solved.
-        passes: smoother passes that it took.
+        passes: number of smoother passes.
     """
 
     time: jax.Array
@@ -63,46 +78,63 @@ class HorizonEstimate(NamedTuple):
     passes: jax.Array
 
 
-class _Setting(NamedTuple):
-    """Everything about an estimator that does not change from window to window."""
+class HorizonSettings(eqx.Module):
+    """Model, constraints and settings of a moving horizon estimator.
+
+    Attributes:
+        ssm: the model with the constraints as further outputs.
+        filter_ssm: the model without constraints, for the arrival moments.
+        constraints: the constraints.
+        linear: whether model and constraints are linear.
+        window: number of observations W in the window.
+        delay: number of observations after the one that is estimated.
+        steps: integration steps between two observations.
+        tolerance: tolerance of the duality gap.
+        max_passes: largest number of smoother passes for a window.
+    """
 
     ssm: StateSpaceModel
-    plain: StateSpaceModel
+    filter_ssm: StateSpaceModel
     constraints: Constraints
     linear: bool
     window: int
     delay: int
     steps: int
     tolerance: float
-    most: int
+    max_passes: int
+
+    @property
+    def estimated_row(self) -> int:
+        """Row of the window that is estimated."""
+        return self.window - 1 - self.delay
 
 
 class MovingHorizon(eqx.Module):
-    r"""A moving horizon estimator, fed one observation at a time.
+    r"""A moving horizon estimator, which processes one observation at a time.
 
-    At each observation it finds the most probable trajectory of the last W observations,
+    For each observation it finds the most probable trajectory over the last W observations,
 
         minimise  (s - m)' P^-1 (s - m) / 2 + (the costs of `lfm_ppl.full_information` within the window)
 
-    subject to the constraints at the observations' times (not at the initial time), and gives the estimate ``delay``
-    observations before the last: 0 is the present, W // 2 the middle of the window. The arrival cost, m and P, is the
-    filter's: the Gaussian of the state given all observations before the window, constraints aside. Without active
-    constraints the estimates of a linear model are those of the Kalman filter (delay 0) and of the fixed-lag smoother.
+    subject to the constraints at the observation times (not at the initial time), and returns the estimate ``delay``
+    observations before the last one: 0 is the present, W // 2 the middle of the window. The arrival moments m and P
+    come from the filter: the Gaussian of the state given all observations before the window, without constraints. If no
+    constraint is active, the estimates for a linear model equal the Kalman filter (delay 0) or the fixed-lag smoother.
 
     Args:
         model: the latent force model, with an ``initial_time``.
-        window: W, number of observations in the window.
+        window: number of observations W in the window.
         delay: number of observations after the one that is estimated, less than W; W // 2 by default.
-        lower: bounds by name, as in `lfm_ppl.full_information`.
-        upper: the same.
-        constraints: functions c(x, u, t), as there.
-        steps: integration steps between two observations; of no account for a linear model.
-        tolerance: of the duality gap, in units of the log density.
-        max_passes: number of smoother passes for a window, at most.
+        lower: lower bounds by name, as in `lfm_ppl.full_information`.
+        upper: upper bounds by name.
+        constraints: functions c(x, u, t), as in `lfm_ppl.full_information`.
+        steps: integration steps between two observations; without effect for a linear model.
+        tolerance: tolerance of the duality gap, in units of the log density.
+        max_passes: largest number of smoother passes for a window.
 
     Raises:
-        ValueError, TypeError: a window shorter than two observations, a delay outside of it, and what
-            `lfm_ppl.full_information` raises of the model and the constraints.
+        ValueError, TypeError: a window shorter than two observations, a delay outside of the window, and as
+            `lfm_ppl.full_information` for the model and the constraints.
 
     Example:
         >>> import jax.numpy as jnp, lfm_ppl as lfm
@@ -120,49 +152,52 @@ class MovingHorizon(eqx.Module):
     chapter 4.
     """
 
-    setting: _Setting
+    settings: HorizonSettings
 
     def __init__(self, model: LatentForceModel, window: int, delay: int | None = None,
                  lower: Mapping[str, Any] | None = None, upper: Mapping[str, Any] | None = None,
                  constraints: Callable[..., Any] | Sequence[Callable[..., Any]] = (), steps: int = 10,
                  tolerance: float = 1e-10, max_passes: int = 100):
         if model.initial_time is None:
-            raise ValueError("a moving horizon estimator needs a model with an initial_time, when its initial state "
-                             "holds; pass initial_time to lfm.LatentForceModel.")
-        self.setting = _set_up(model, window, delay, lower, upper, constraints, steps, tolerance, max_passes)
+            raise ValueError("a moving horizon estimator needs a model with an initial_time, the time of its initial "
+                             "state; pass initial_time to lfm.LatentForceModel.")
+        check_settings(model, tolerance, max_passes)
+        self.settings = _build_settings(model, build_constraints(model, lower, upper, constraints), window, delay,
+                                        steps, tolerance, max_passes)
 
     def start(self) -> HorizonState:
         """Return the state before the first observation."""
-        window, outputs = self.setting.window, len(self.setting.plain.model.output_names)
-        origin = jnp.asarray(self.setting.plain.model.initial_time, float)
-        # Types as after an update, for one program: a Python number would be a weaker one.
-        return HorizonState(jnp.full(window, origin), jnp.full((window, outputs), jnp.nan, float),
-                            jnp.asarray(0, int), origin, *self.setting.plain.initial())
+        window, ssm = self.settings.window, self.settings.filter_ssm
+        initial_time = jnp.asarray(ssm.model.initial_time, float)
+        # The types are those after an update, so that one program serves all: a Python number would be weakly typed.
+        return HorizonState(jnp.full(window, initial_time),
+                            jnp.full((window, len(ssm.model.output_names)), jnp.nan, float), jnp.asarray(0, int),
+                            initial_time, *ssm.initial())
 
     def update(self, state: HorizonState, t: Any, y: Any) -> tuple[HorizonState, HorizonEstimate]:
-        """Take one observation.
+        """Process one observation.
 
         Args:
-            state: where the estimator stands.
+            state: state of the estimator.
             t: time of the observation, not before the last one.
             y: (D,), NaN where missing.
 
         Returns:
-            The new state and the estimate. After two calls nothing is compiled any more.
+            The new state and the estimate. Nothing is compiled after the second call.
 
         Raises:
-            ValueError: a time before the last one, or an observation of a wrong shape.
+            ValueError: a time before the last one, or an observation of the wrong shape.
         """
-        outputs = len(self.setting.plain.model.output_names)
+        outputs = len(self.settings.filter_ssm.model.output_names)
         checks.refuse_dates("t", t)
         y = checks.unmask(y)
         if np.shape(y) != (outputs,):
             raise ValueError(f"y must hold one entry for each of the {outputs} outputs, shape ({outputs},), got "
                              f"{np.shape(y)}.")
-        known, last = checks.concrete(t), checks.concrete(state.times[-1])
-        if known is not None and last is not None and not known >= last:
-            raise ValueError(f"t = {float(known):g} lies before {float(last):g}, the time of the last observation.")
-        return _update(self.setting, state, jnp.asarray(t, float), jnp.asarray(y, float))
+        time, last_time = checks.concrete(t), checks.concrete(state.times[-1])
+        if time is not None and last_time is not None and not time >= last_time:
+            raise ValueError(f"t = {float(time):g} lies before {float(last_time):g}, the time of the last observation.")
+        return _update(self.settings, state, jnp.asarray(t, float), jnp.asarray(y, float))
 
 
 def moving_horizon(model: LatentForceModel, times: Any, y: Any, window: int, delay: int | None = None,
@@ -171,30 +206,30 @@ def moving_horizon(model: LatentForceModel, times: Any, y: Any, window: int, del
                    tolerance: float = 1e-10, max_passes: int = 100) -> ConstrainedEstimate:
     """Run a moving horizon estimator over a record.
 
-    Row k is estimated from the window that ends ``delay`` observations later; the first rows come from the first whole
-    window, and the last from the last one. See `lfm_ppl.MovingHorizon`, which does the same one observation at a time.
-    A window as long as the record is `lfm_ppl.full_information` with ``grid=times``.
+    Row k is estimated from the window that ends ``delay`` observations later; the first rows come from the first full
+    window, and the last rows from the last window. `lfm_ppl.MovingHorizon` does the same one observation at a time. A
+    window as long as the record is equivalent to `lfm_ppl.full_information` with ``grid=times``.
 
     Args:
         model: the latent force model.
         times: (T,), non-decreasing.
         y: (T, D), NaN where missing.
-        window: W, number of observations in the window, from 2 to T.
+        window: number of observations W in the window, from 2 to T.
         delay: number of observations after the one that is estimated, less than W; W // 2 by default.
-        lower: bounds by name, as in `lfm_ppl.full_information`; they hold at ``times``.
-        upper: the same.
-        constraints: functions c(x, u, t), as there.
-        steps: integration steps between two observations; of no account for a linear model.
-        tolerance: of the duality gap, in units of the log density.
-        max_passes: number of smoother passes for a window, at most.
+        lower: lower bounds by name, as in `lfm_ppl.full_information`; they hold at ``times``.
+        upper: upper bounds by name.
+        constraints: functions c(x, u, t), as in `lfm_ppl.full_information`.
+        steps: integration steps between two observations; without effect for a linear model.
+        tolerance: tolerance of the duality gap, in units of the log density.
+        max_passes: largest number of smoother passes for a window.
 
     Returns:
-        Trajectories at ``times``. Gap, passes and violations are the largest of all windows; ``converged`` is whether
-        all have; the objective is that of the last window.
+        Trajectories at ``times``. Gap and passes are the largest of all windows; ``converged`` is whether all windows
+        have converged; the objective is that of the last window.
 
     Raises:
-        ValueError, TypeError: a window longer than the record or shorter than two observations, a delay outside of it,
-            and what `lfm_ppl.full_information` raises.
+        ValueError, TypeError: a window longer than the record or shorter than two observations, a delay outside of the
+            window, and as `lfm_ppl.full_information`.
 
     Warns:
         UserWarning: not all windows have converged.
@@ -210,19 +245,21 @@ def moving_horizon(model: LatentForceModel, times: Any, y: Any, window: int, del
 
     Source: Wolff, Lopez, Müller and Beckers, equations 13 to 17.
     """
-    known = check_times(times, model.initial_time)
-    if known is None:
+    row_times = check_times(times, model.initial_time)
+    if row_times is None:
         raise ValueError("times must be known before compilation; pass a NumPy array.")
-    setting = _set_up(model, window, delay, lower, upper, constraints, steps, tolerance, max_passes)
-    if window > len(known):
-        raise ValueError(f"the window holds {window} observations, but there are {len(known)}. Take a window of at "
+    check_settings(model, tolerance, max_passes)
+    settings = _build_settings(model, build_constraints(model, lower, upper, constraints), window, delay, steps,
+                               tolerance, max_passes)
+    if window > len(row_times):
+        raise ValueError(f"the window holds {window} observations, but there are {len(row_times)}. Take a window of at "
                          "most their number (of exactly it: lfm.full_information).")
-    origin = known[0] if model.initial_time is None else model.initial_time
-    model.check_at(origin, len(known))
-    y = check_observations(y, len(known), len(model.output_names))
-    if not checks.traced(origin):
-        _warn_of_breakpoints(model, known, float(origin))
-    result = _run(setting, jnp.asarray(known), y, jnp.asarray(origin, float))
+    initial_time = row_times[0] if model.initial_time is None else model.initial_time
+    model.check_at(initial_time, len(row_times))
+    y = check_observations(y, len(row_times), len(model.output_names))
+    if not checks.traced(initial_time):
+        _warn_of_breakpoints(model, row_times, float(initial_time))
+    result = _estimate_record(settings, jnp.asarray(row_times), y, jnp.asarray(initial_time, float))
     if not checks.traced(result) and not bool(result.converged):
         checks.warn("some windows of the moving horizon estimate have not converged: the largest duality gap is "
                     f"{float(result.gap):.2g}, the largest violation of a constraint "
@@ -231,9 +268,9 @@ def moving_horizon(model: LatentForceModel, times: Any, y: Any, window: int, del
     return result
 
 
-def _set_up(model: LatentForceModel, window: int, delay: int | None, lower: Any, upper: Any, constraints: Any,
-            steps: int, tolerance: float, max_passes: int) -> _Setting:
-    check_settings(model, tolerance, max_passes)
+def _build_settings(model: LatentForceModel, constraints: Constraints, window: int, delay: int | None, steps: int,
+                    tolerance: float, max_passes: int) -> HorizonSettings:
+    """Check the settings of an estimator, and return them with its models."""
     checks.positive_integer("window", window, "It is the number of observations in the window.")
     checks.positive_integer("steps", steps)
     if window < 2:
@@ -244,98 +281,106 @@ def _set_up(model: LatentForceModel, window: int, delay: int | None, lower: Any,
     if np.ndim(model.observation.covariance) == 3:
         raise ValueError("a moving horizon estimator takes one observation covariance, or a function of (x, u, t); "
                          "the model has one matrix for each row.")
-    plain = state_space(model)
-    if plain.stack.jump_times:
-        raise ValueError("forces that jump at given times cannot be had in a moving window; leave out their jumps.")
-    found = build_constraints(model, lower, upper, constraints)
-    every = np.arange(window)
-    ssm = augmented(model, found, Rows(every, every, every, np.zeros(window, int)))
+    filter_ssm = state_space(model)
+    if filter_ssm.stack.jump_times:
+        raise ValueError("a moving window does not support forces that jump at given times; leave out their jumps.")
+    index = np.arange(window)
+    ssm = augmented_model(model, constraints, Rows(index, index, index, np.zeros(window, int)))
     linear = is_linear(ssm)
     if not linear:
         check_noise(ssm, 0.0 if model.initial_time is None else model.initial_time)
     warn_single_precision()
-    return _Setting(ssm, plain, found, linear, int(window), int(delay), int(steps), float(tolerance), max_passes)
+    return HorizonSettings(ssm, filter_ssm, constraints, linear, int(window), int(delay), int(steps), float(tolerance),
+                           max_passes)
 
 
-def _warn_of_breakpoints(model: LatentForceModel, times: np.ndarray, origin: float) -> None:
-    """Warn where a known input jumps between two observations, whose interval a moving window does not divide."""
-    breakpoints, moving = breakpoints_within(model.input_reads(origin, float(times[-1])), origin, float(times[-1]))
-    apart = np.setdiff1d(breakpoints, times)
-    if len(apart) or len(moving):
-        where = f"at time {apart[0]:g}, between two observations" if len(apart) else "at a lag that is traced"
+def _warn_of_breakpoints(model: LatentForceModel, times: np.ndarray, initial_time: float) -> None:
+    """Warn if a known input jumps between two observations, whose interval a moving window does not divide."""
+    breakpoints, traced_breakpoints = breakpoints_within(model.input_reads(initial_time, float(times[-1])),
+                                                         initial_time, float(times[-1]))
+    between = np.setdiff1d(breakpoints, times)
+    if len(between) or len(traced_breakpoints):
+        where = f"at time {between[0]:g}, between two observations" if len(between) else "at a lag that is traced"
         checks.warn(f"a known input jumps {where}, and a moving window does not divide its intervals there, so that a "
                     "short pulse may be stepped over. Add rows at these times with missing observations (NaN).")
 
 
-def _grid(setting: _Setting, times: jax.Array, origin: jax.Array) -> TimeGrid:
-    """Return an interval up to each of ``times`` (K,), the first one from ``origin``."""
-    begin = jnp.concatenate([origin[None], times[:-1]])
-    every = jnp.arange(times.shape[0])
-    intervals = intervals_between(begin, times, times - begin, every, jnp.full_like(every, -1))
-    return TimeGrid(intervals, None, every, every, times, setting.steps, origin)
+def _window_grid(settings: HorizonSettings, times: jax.Array, start_time: jax.Array) -> TimeGrid:
+    """Return a time grid with an interval up to each of ``times`` (K,), the first one from ``start_time``."""
+    starts = jnp.concatenate([start_time[None], times[:-1]])
+    index = jnp.arange(times.shape[0])
+    intervals = intervals_between(starts, times, times - starts, index, jnp.full_like(index, -1))
+    return TimeGrid(intervals, None, index, index, times, settings.steps, start_time)
 
 
-def _solved(setting: _Setting, times: jax.Array, y: jax.Array, held: jax.Array | None, origin: jax.Array,
-            start: Moments) -> ConstrainedEstimate:
-    """Solve the problem of one window (W,), (W, D)."""
-    every = jnp.arange(setting.window)
-    laid_out = Rows(times, every, every, jnp.zeros_like(every))  # type: ignore[arg-type]
-    problem = Problem(setting.ssm, _grid(setting, times, origin), laid_out, y, start, held)
-    if setting.linear:
-        nodes = jnp.zeros((setting.window + 1, setting.ssm.state_dim))
-        problem = problem._replace(transitions=Dynamics(problem).linearised(nodes))
-    return estimate_on(setting.ssm, setting.constraints, problem, setting.tolerance, setting.most, setting.linear)[0]
-
-
-def _filtered(setting: _Setting, times: jax.Array, y: jax.Array, origin: jax.Array, start: Moments) -> Moments:
-    """Return the filtered moments (K, ...) at ``times``."""
-    return forward(setting.plain, Taylor(), _grid(setting, times, origin), y, start=start, keep="moments").filtered
-
-
-@eqx.filter_jit
-def _update(setting: _Setting, state: HorizonState, t: jax.Array, y: jax.Array) -> tuple[HorizonState, HorizonEstimate]:
+def _advance(settings: HorizonSettings, state: HorizonState, t: jax.Array, y: jax.Array) -> HorizonState:
+    """Return the state after an observation: it enters the window, and the first one of a full window leaves it."""
     arrival = Moments(state.mean, state.covariance)
-    passed = jax.tree_util.tree_map(
-        lambda a: a[0], _filtered(setting, state.times[:1], state.y[:1], state.arrival_time, arrival))
-    full = state.seen >= setting.window
-    arrival = jax.tree_util.tree_map(lambda new, old: jnp.where(full, new, old), passed, arrival)
-    new = HorizonState(
+    filtered = forward(settings.filter_ssm, Taylor(), _window_grid(settings, state.times[:1], state.arrival_time),
+                       state.y[:1], start=arrival, keep="moments").filtered
+    is_full = state.seen >= settings.window
+    arrival = jax.tree_util.tree_map(lambda new, old: jnp.where(is_full, new[0], old), filtered, arrival)
+    return HorizonState(
         jnp.append(state.times[1:], t), jnp.concatenate([state.y[1:], y[None]]), state.seen + 1,
-        jnp.where(full, state.times[0], state.arrival_time), *arrival)
-    held = jnp.arange(setting.window) >= setting.window - new.seen
-    found = _solved(setting, new.times, new.y, held, new.arrival_time, arrival)
-    row = setting.window - 1 - setting.delay
-    time = jnp.where(held[row], new.times[row], jnp.nan)
-    return new, HorizonEstimate(time, found.state_mean[row], found.force_mean[row], found.converged, found.passes)
+        jnp.where(is_full, state.times[0], state.arrival_time), *arrival)
+
+
+def _solve_window(settings: HorizonSettings, state: HorizonState) -> tuple[ConstrainedEstimate, jax.Array]:
+    """Solve the problem of the window.
+
+    Returns:
+        The estimate at the W rows of the window, and whether a row holds an observation (W,).
+    """
+    is_observed = jnp.arange(settings.window) >= settings.window - state.seen
+    index = jnp.arange(settings.window)
+    rows = Rows(state.times, index, index, jnp.zeros_like(index))  # type: ignore[arg-type]
+    problem = ConstrainedProblem(settings.ssm, _window_grid(settings, state.times, state.arrival_time), rows, state.y,
+                                 Moments(state.mean, state.covariance), is_observed)
+    if settings.linear:
+        # The maps of a linear model do not depend on the trajectory: they are computed once for all passes.
+        nodes = jnp.zeros((settings.window + 1, settings.ssm.state_dim))
+        problem = dataclasses.replace(problem, transitions=Dynamics(problem).linearise(nodes))
+    estimate, _ = solve_problem(problem, settings.constraints, settings.tolerance, settings.max_passes,
+                                settings.linear)
+    return estimate, is_observed
 
 
 @eqx.filter_jit
-def _run(setting: _Setting, times: jax.Array, y: jax.Array, origin: jax.Array) -> ConstrainedEstimate:
-    window, row = setting.window, setting.window - 1 - setting.delay
-    first = Moments(*setting.plain.initial())
-    before = jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a[None], b]), first,
-                                    _filtered(setting, times, y, origin, first))
-    since = jnp.append(origin, times)
+def _update(settings: HorizonSettings, state: HorizonState, t: jax.Array,
+            y: jax.Array) -> tuple[HorizonState, HorizonEstimate]:
+    """Advance the state by one observation, and estimate from the new window."""
+    state = _advance(settings, state, t, y)
+    estimate, is_observed = _solve_window(settings, state)
+    row = settings.estimated_row
+    time = jnp.where(is_observed[row], state.times[row], jnp.nan)
+    return state, HorizonEstimate(time, estimate.state_mean[row], estimate.force_mean[row], estimate.converged,
+                                  estimate.passes)
 
-    def solved(begin: jax.Array) -> ConstrainedEstimate:
-        part = lambda a: jax.lax.dynamic_slice_in_dim(a, begin, window)  # noqa: E731
-        return _solved(setting, part(times), part(y), None, since[begin],
-                       jax.tree_util.tree_map(lambda a: a[begin], before))
 
-    def kept(begin: jax.Array) -> tuple:
-        one = solved(begin)
-        return tuple(getattr(one, name)[row] for name in _BY_ROW), (one.gap, one.passes, one.converged)
+_ROW_FIELDS = ("times", "state_mean", "force_mean", "slack", "multiplier", "violation", "scale")
+"""Fields of `ConstrainedEstimate` with one entry for each row."""
 
-    count = times.shape[0] - window + 1
-    middle, (gap, passes, converged) = jax.lax.map(kept, jnp.arange(count))
-    ends = solved(jnp.asarray(0)), solved(jnp.asarray(count - 1))
+
+@eqx.filter_jit
+def _estimate_record(settings: HorizonSettings, times: jax.Array, y: jax.Array,
+                     initial_time: jax.Array) -> ConstrainedEstimate:
+    """Estimate all rows of a record, from its first full window to its last."""
+    window, row = settings.window, settings.estimated_row
+    state = HorizonState(times[:window], y[:window], jnp.asarray(window, int), initial_time,
+                         *settings.filter_ssm.initial())
+    first, _ = _solve_window(settings, state)
+
+    def step(carry: tuple, observation: tuple[jax.Array, jax.Array]) -> tuple[tuple, tuple]:
+        state = _advance(settings, carry[0], *observation)
+        estimate, _ = _solve_window(settings, state)
+        estimated_row = tuple(getattr(estimate, name)[row] for name in _ROW_FIELDS)
+        return (state, estimate), (estimated_row, estimate.gap, estimate.passes, estimate.converged)
+
+    (_, last), (rows, gap, passes, converged) = jax.lax.scan(step, (state, first), (times[window:], y[window:]))
     trajectories = {
-        name: jnp.concatenate([getattr(ends[0], name)[:row], inside, getattr(ends[1], name)[row + 1:]])
-        for name, inside in zip(_BY_ROW, middle, strict=True)}
-    last = ends[1]
+        name: jnp.concatenate([getattr(first, name)[: row + 1], values, getattr(last, name)[row + 1:]])
+        for name, values in zip(_ROW_FIELDS, rows, strict=True)}
     return ConstrainedEstimate(
-        **trajectories, gap=gap.max(), objective=last.objective, passes=passes.max(), converged=converged.all(),
+        **trajectories, gap=jnp.append(gap, first.gap).max(), objective=last.objective,
+        passes=jnp.append(passes, first.passes).max(), converged=converged.all() & first.converged,
         labels=last.labels, state_names=last.state_names, force_names=last.force_names)
-
-
-_BY_ROW = ("times", "state_mean", "force_mean", "slack", "multiplier", "violation", "scale")

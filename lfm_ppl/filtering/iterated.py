@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from lfm_ppl.filtering.filter import Pass, Points, Preparation, bends, columns, forward, needed
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.rts import Smoothed, backward
-from lfm_ppl.filtering.time_grid import TimeGrid, interval_at
+from lfm_ppl.filtering.time_grid import TimeGrid
 from lfm_ppl.linalg import congruence, matmul, safe_sqrt
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.state_space import StateSpaceModel
@@ -106,48 +105,6 @@ def _moved(now: _Iterate, new: Moments, damping: float) -> _Iterate:
     by = lambda a: share.reshape(share.shape + (1,) * (a.ndim - share.ndim))  # noqa: E731
     moments = jax.tree_util.tree_map(lambda a, b: a + by(a) * (b - a), now.moments, new)
     return _Iterate(moments, step, share, jnp.max(jnp.abs(step) * safe_sqrt(precision), initial=0.0))
-
-
-class NodePlaces(NamedTuple):
-    """Where the nodes of one time grid lie among those of another that spans the same time.
-
-    Attributes:
-        interval: (N, J + 1) interval of the other grid in which a node lies.
-        step: (N, J + 1) step of that interval.
-        share: (N, J + 1) share of that step before the node.
-        end: (N,) interval of the other grid that ends with the same observation; where there is none, the one in which
-            the end lies.
-    """
-
-    interval: Any
-    step: Any
-    share: Any
-    end: Any
-
-
-def node_places(grid: TimeGrid, other: TimeGrid) -> NodePlaces:
-    """Find the nodes of a time grid among those of another; both are known before compilation."""
-    begin, length = (np.asarray(a)[:, None] for a in (grid.since, grid.intervals.length))
-    share = np.linspace(0.0, 1.0, grid.steps + 1)
-    time, inward = begin + length * share, length * (0.5 - share)
-    # Where two intervals of the other grid meet, the node belongs to the one on its own side: a jump may lie between.
-    row = interval_at(time + 1e-6 * inward, other)
-    first, whole = (np.asarray(a)[row] for a in (other.since, other.intervals.length))
-    before = np.clip((time - first) / np.where(whole > 0, whole, 1.0), 0.0, 1.0) * other.steps
-    step = np.minimum(before.astype(int), other.steps - 1)
-    observation = np.asarray(grid.intervals.observation)
-    end = np.where(observation >= 0, np.asarray(other.observed)[observation], row[:, -1])
-    return NodePlaces(row, step, before - step, end)
-
-
-def interpolated(points: Points, where: NodePlaces) -> Points:
-    """Return the moments about which a pass over another time grid is linearised: linear in time within each step."""
-    def at_nodes(nodes: jax.Array) -> jax.Array:
-        left, right = nodes[where.interval, where.step], nodes[where.interval, where.step + 1]
-        return left + where.share.reshape(where.share.shape + (1,) * (left.ndim - 2)) * (right - left)
-
-    tree = jax.tree_util.tree_map
-    return Points(tree(at_nodes, points.nodes), tree(lambda a: a[where.end], points.ends))
 
 
 def smoothed_points(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, passed: Pass, smoothed: Smoothed,

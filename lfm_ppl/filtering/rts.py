@@ -12,7 +12,8 @@ from lfm_ppl.filtering.filter import Pass
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.smoothing_kernel import smoothed_moments, smoothing_kernel
 from lfm_ppl.filtering.time_grid import TimeGrid
-from lfm_ppl.linalg import cholesky, congruence, diagonal, log_density, matmul, outer_square, solve_lower, symmetric
+from lfm_ppl.gaussian_residuals import log_density
+from lfm_ppl.linalg import cholesky, congruence, diagonal, matmul, outer_square, solve_lower, symmetric
 
 _ROUNDING, _LARGE_ROUNDING = 8.0, 1e4
 """Variances of a sum of states, in units of eps times the states' own, that are rounding errors: in general, and where

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 from lfm_ppl.filtering.filter import Pass
 from lfm_ppl.filtering.predict import Moments
 from lfm_ppl.filtering.smoothing_kernel import smoothing_kernel
+from lfm_ppl.gaussian_residuals import masked
 from lfm_ppl.linalg import (
     cholesky,
     congruence,
-    masked,
     matmul,
     pivoted_root,
     solve_lower,

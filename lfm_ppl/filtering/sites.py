@@ -96,8 +96,6 @@ class SiteSettings(NamedTuple):
         sweeps: most sweeps.
         relinearisations: sweeps in which the sites and the points of linearisation are refined together, before the
             points are held fixed; for models that are not linear.
-        linear_response: whether smoothed covariances of EP are those of its linear response, in a linear model of at
-            most 8 joint states; at times at which no variance changes by more than a factor of four.
     """
 
     method: str = "ep"
@@ -105,7 +103,6 @@ class SiteSettings(NamedTuple):
     damping: float = 1.0
     sweeps: int = 200
     relinearisations: int = 8
-    linear_response: bool = True
 
 
 def as_settings(sites: Any, iterations: int = 0) -> SiteSettings:

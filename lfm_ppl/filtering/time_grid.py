@@ -26,6 +26,9 @@ _STEPS_OF_PULSE = 4
 _REPLICATED = 0.2
 """Share of intervals of length zero from which a branch costs less than the predictions that it saves."""
 
+LONGEST_FORECAST = 10_000
+"""Largest number of intervals of a forecast, each as long as the usual distance of two observations."""
+
 _MOST_STEPS = 20.0
 """Steps, as a multiple of those without a longest step, that the default of the longest step adds at most."""
 
@@ -140,7 +143,8 @@ def _laid_out(ssm: StateSpaceModel, times: Any, steps: int, max_step: float | No
         reads = ssm.model.input_reads(*(0.0, 1.0) if known is None else (float(known[0]), float(known[-1])))
         jumps = ssm.stack.jump_times
         moving = jnp.concatenate([jnp.zeros(0), *(jnp.asarray(read.breakpoints(), float) for read in reads)])
-        cutting = Cutting(steps, None, interval_per_step, np.zeros(0), len(moving), _OVERHEAD, adaptive, _scale(reads))
+        cutting = Cutting(steps, None, interval_per_step, np.zeros(0), len(moving), _OVERHEAD, adaptive, False,
+                          _scale(reads))
         if known is not None and jumps and max_step is None and at is None:
             grid = _traced_origin(known, start, jumps, steps, interval_per_step)
         else:
@@ -154,7 +158,9 @@ def _laid_out(ssm: StateSpaceModel, times: Any, steps: int, max_step: float | No
     breakpoints, moving = breakpoints_within(reads, float(origin), end)
     longest = longest_step(ssm, known, float(origin), steps) if max_step is None and not adaptive else max_step
     overhead = _OVERHEAD_OF_EXACT if ssm.time_invariant else _OVERHEAD
-    cutting = Cutting(steps, longest, interval_per_step, breakpoints, len(moving), overhead, adaptive, _scale(reads))
+    is_exact = ssm.mean_invariant and longest is None and not interval_per_step
+    cutting = Cutting(steps, longest, interval_per_step, breakpoints, len(moving), overhead, adaptive, is_exact,
+                      _scale(reads))
     return _divided(_concrete(known, float(origin), ssm.stack.jump_times, at, cutting), moving, _scale(reads))
 
 
@@ -167,8 +173,9 @@ class Cutting(NamedTuple):
         interval_per_step: give every step an interval of its own.
         breakpoints: times at which known inputs jump or have a kink.
         moving: number of such times that are traced.
-        overhead: what an interval costs besides its steps, in steps.
+        overhead: cost of an interval besides its steps, in steps.
         adaptive: whether the length of steps follows the moments.
+        is_exact: whether the transition over any interval is exact, so that one interval needs no steps.
         scale: see `lfm_ppl.model.state_space.inset`.
     """
 
@@ -179,16 +186,21 @@ class Cutting(NamedTuple):
     moving: int
     overhead: float
     adaptive: bool
+    is_exact: bool
     scale: Any
 
     def steps_of(self, gap: np.ndarray, base: np.ndarray, cuts: np.ndarray) -> np.ndarray:
         """Return how many steps intervals (N,) take at least.
 
+        An interval between two breakpoints or requested times takes its share of the steps of the whole interval.
+
         Args:
             gap: (N,) lengths of the intervals.
-            base: (N,) lengths of the intervals without breakpoints that they are parts of.
-            cuts: (N,) numbers of breakpoints in these.
+            base: (N,) lengths of the intervals between observations that they are parts of.
+            cuts: (N,) numbers of breakpoints and requested times in these.
         """
+        if self.is_exact:
+            return np.full(len(gap), self.steps)
         pieces = np.ones(len(gap), int)
         if self.max_step is not None:
             pieces = np.maximum(1, np.ceil(base / (self.max_step * self.steps) * (1 - 1e-12)).astype(int))
@@ -202,7 +214,7 @@ class Cutting(NamedTuple):
         """Return the number of steps of each interval at which intervals that need ``count`` (N,) steps cost least."""
         if self.interval_per_step:
             return 1
-        if self.adaptive or not (len(self.breakpoints) or self.moving):
+        if self.adaptive or self.is_exact or not (self.moving or np.any(count % self.steps)):
             return self.steps
         cost = [(np.ceil(count / steps).sum() + self.moving) * (steps + self.overhead)
                 for steps in range(1, self.steps + 1)]
@@ -310,19 +322,24 @@ def _traced_origin(times: np.ndarray, origin: Any, jumps: tuple[float, ...], ste
 
 
 def _concrete(times: np.ndarray, origin: float, jumps: tuple[float, ...], at: Any, cutting: Cutting) -> TimeGrid:
+    """Lay out the intervals for times that are known before compilation.
+
+    1. An interval ends at each observation and at each jump of a force after the initial time.
+    2. Breakpoints of known inputs and requested times divide these intervals, and their steps with them.
+    3. Each part gets as many intervals of equal length as its steps need.
+    """
     requested = times if at is None else _requested(at, origin)
-    # An interval ends at each observation, each jump after the origin, and each requested time that is neither.
     extra = np.setdiff1d(requested, times)
     end = max(times[-1], requested.max(initial=-np.inf))
     jump_index = [index for index, jump in enumerate(jumps) if origin < jump <= end]
-    extra = np.setdiff1d(extra, [jumps[index] for index in jump_index])
     jump_time = np.asarray(jumps, float)[jump_index]
+    extra = np.setdiff1d(extra, jump_time)
     # A particle smoother looks at each step: a jump has an interval of its own, so that the state just before it is a
     # node.
-    before = jump_time if cutting.interval_per_step else jump_time[:0]
-    time = np.concatenate([before, jump_time, times, extra])
+    before_jump = jump_time if cutting.interval_per_step else jump_time[:0]
+    time = np.concatenate([before_jump, jump_time, times])
     # At equal times a jump comes before an observation.
-    rank = np.repeat([0, 1, 2, 3], [len(before), len(jump_time), len(times), len(extra)])
+    rank = np.repeat([0, 1, 2], [len(before_jump), len(jump_time), len(times)])
     observation = np.full(len(time), -1)
     observation[rank == 2] = np.arange(len(times))
     jump = np.full(len(time), -1)
@@ -330,12 +347,17 @@ def _concrete(times: np.ndarray, origin: float, jumps: tuple[float, ...], at: An
     order = np.lexsort((observation, rank, time))
     time, observation, jump = time[order], observation[order], jump[order]
     base = np.diff(time, prepend=origin)
-    cuts, added = np.zeros(len(time), int), _apart(cutting.breakpoints, np.append(origin, time), cutting.scale)
-    if len(added):
-        place = np.searchsorted(time, added)
-        cuts = np.bincount(place, minlength=len(time))
+    apart = _apart(cutting.breakpoints, np.sort(np.concatenate([[origin], time, extra])), cutting.scale)
+    cut = np.union1d(apart, extra)
+    cuts = np.zeros(len(time), int)
+    if len(cut):
+        place = np.searchsorted(time, cut)
+        cuts = np.bincount(place, minlength=len(time) + 1)
+        # Beyond the last interval a whole one is as long as the usual distance of two observations.
+        base = np.append(base, _forecast_interval(times, float(cut[-1] - time[-1])))
         time, observation, jump, base, cuts = (np.insert(a, place, b) for a, b in (
-            (time, added), (observation, -1), (jump, -1), (base, base[place]), (cuts, cuts[place])))
+            (time, cut), (observation, -1), (jump, -1), (base, base[place]), (cuts, cuts[place])))
+        base, cuts = base[:len(time)], cuts[:len(time)]
     begin = np.append(origin, time[:-1])
     gap = time - begin
     count = cutting.steps_of(gap, base, cuts)
@@ -353,10 +375,17 @@ def _concrete(times: np.ndarray, origin: float, jumps: tuple[float, ...], at: An
     row_of_event = np.flatnonzero(last)
     observed = np.empty(len(times), int)
     observed[observation[observation >= 0]] = row_of_event[observation >= 0]
-    found = observed if at is None else row_of_event[np.searchsorted(time, requested, side="right") - 1]
+    interval = observed if at is None else row_of_event[np.searchsorted(time, requested, side="right") - 1]
     replicated = bool(np.mean(width == 0) >= _REPLICATED)
-    return TimeGrid(intervals, lengths, observed, found, requested, steps, np.asarray(origin), replicated,
+    return TimeGrid(intervals, lengths, observed, interval, requested, steps, np.asarray(origin), replicated,
                     since=(begin - origin)[event] + piece * width)
+
+
+def _forecast_interval(times: np.ndarray, length: float) -> float:
+    """Return the length of an interval after the last observation, for a forecast over ``length``."""
+    gaps = np.diff(times)
+    usual = float(np.median(gaps[gaps > 0])) if np.any(gaps > 0) else length
+    return max(usual, length / LONGEST_FORECAST)
 
 
 def _apart(breakpoints: np.ndarray, times: np.ndarray, scale: Any) -> np.ndarray:
@@ -431,16 +460,6 @@ def by_length(grid: TimeGrid, make: Callable[[jax.Array], Any]) -> Callable[[Int
         return lambda row: make(row.length)
     table = _Table(make, jnp.asarray(grid.lengths))
     return lambda row: table.at(row.length_index)
-
-
-def interval_at(times: np.ndarray, grid: TimeGrid) -> np.ndarray:
-    """Return the last interval that starts at or before each time, also after the end; the grid is concrete.
-
-    Args:
-        times: counted from the initial time.
-        grid: the time grid.
-    """
-    return np.searchsorted(np.asarray(grid.since), times, side="right") - 1
 
 
 def with_observations(intervals: Intervals, y: Any) -> tuple[Intervals, jax.Array]:

@@ -9,17 +9,15 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 
 from lfm_ppl.filtering.predict import Moments, covariance_of, linearise_state
+from lfm_ppl.gaussian_residuals import log_density, masked, wrapped
 from lfm_ppl.linalg import (
     cholesky,
     congruence,
     diagonal,
     inverse_and_log_det,
-    log_density,
-    masked,
     matmul,
     safe_sqrt,
     symmetric,
-    wrapped,
 )
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.linearisation.sigma_points import SigmaPointRule

@@ -1,9 +1,16 @@
 """Finite volumes for a one-dimensional Fokker-Planck equation: a Markov chain on the cells of a uniform grid.
 
-    dp/dt = -d/ds [(b - D') p - D dp/ds],    D = g^2 / 2,
+1. The equation dp/dt = -d/ds [(b - D') p - D dp/ds] with D = g^2 / 2 becomes a master equation dm/dt = A m for the
+   masses m of the cells. Its rates come from exponentially fitted fluxes and are never negative. No flux crosses the
+   ends. Hence the total mass is constant, and every mass stays non-negative (`birth_death_process`).
+2. Over an interval h the masses are exp(A h) m. By uniformisation, exp(A h) is a Poisson mixture of powers of a
+   stochastic matrix, a series of non-negative terms without cancellation.
+3. `transition` sums the series for a short interval and squares the matrix; `propagate` applies the series to masses
+   without a matrix, unless the matrix is faster.
+4. `gaussian_masses` integrates a Gaussian over the cells, for initial distributions and jumps.
 
-becomes a master equation for the masses of the cells. Its rates come from exponentially fitted fluxes, so that they
-are never negative, and no flux crosses the ends: the chain keeps the mass, and every mass stays non-negative.
+Source: Scharfetter and Gummel (1969), IEEE Trans. Electron Devices 16; Chang and Cooper (1970), J. Comput. Phys. 6;
+Stewart (1994), Introduction to the Numerical Solution of Markov Chains, section 8.2.
 """
 
 from __future__ import annotations
@@ -15,16 +22,16 @@ import jax.numpy as jnp
 import numpy as np
 
 _BASE = 4.0
-"""Largest rate times length of the series of the exponential, before squaring."""
+"""Largest expected number of events in the series of a matrix exponential, before squaring."""
 
 _TERMS = 36
-"""Terms of that series; the Poisson(4) probability of more is below 1e-21."""
+"""Terms of this series; the Poisson(4) probability of more events is below 1e-21."""
 
-_PIECE = 400.0
-"""Largest rate times length of one series for the action on masses; exp(-400) does not underflow."""
+_EVENTS_PER_SERIES = 400.0
+"""Largest expected number of events of one series for the action on masses; exp(-400) does not underflow."""
 
 _SMALLEST = 1e-280
-"""Transition probabilities below it count as zero: arithmetic with subnormal numbers is slow."""
+"""Smaller transition probabilities are set to zero, because arithmetic with subnormal numbers is slow."""
 
 
 class Grid(NamedTuple):
@@ -33,7 +40,7 @@ class Grid(NamedTuple):
     Attributes:
         low: lower end, in the units of the state.
         high: upper end.
-        cells: number N of cells.
+        cells: number of cells N.
 
     Example:
         >>> Grid(0.0, 1.0, 4).centres.tolist()
@@ -51,55 +58,47 @@ class Grid(NamedTuple):
 
     @property
     def edges(self) -> np.ndarray:
-        """The ends of the cells, (N + 1,)."""
+        """Edges of the cells, (N + 1,)."""
         return np.linspace(self.low, self.high, self.cells + 1)
 
     @property
     def centres(self) -> np.ndarray:
-        """The middles of the cells, (N,)."""
+        """Centres of the cells, (N,)."""
         return self.low + self.width * (np.arange(self.cells) + 0.5)
 
 
-class Chain(NamedTuple):
-    """A birth-death process on the cells.
+class BirthDeathProcess(NamedTuple):
+    """Birth-death process on the cells, with generator A.
 
     Attributes:
-        up: (N,) rate of moving to the next cell, zero in the last one (1/time).
-        down: (N,) rate of moving to the previous cell, zero in the first one.
+        up: (N,), rate of moving to the next cell (1/time); zero in the last cell.
+        down: (N,), rate of moving to the previous cell (1/time); zero in the first cell.
     """
 
     up: jax.Array
     down: jax.Array
 
-    def apply(self, masses: jax.Array, adjoint: bool = False) -> jax.Array:
-        """Return A m (..., N) for masses, dm/dt = A m, or A' m for functions of the cell."""
-        if adjoint:
-            above = jnp.roll(masses, -1, axis=-1) - masses
-            return self.up * above + self.down * (jnp.roll(masses, 1, axis=-1) - masses)
-        gained = jnp.roll(self.up * masses, 1, axis=-1) + jnp.roll(self.down * masses, -1, axis=-1)
-        return gained - (self.up + self.down) * masses
-
 
 def bernoulli(z: jax.Array) -> jax.Array:
-    """Return B(z) = z / (exp(z) - 1), for any z: 1 - z/2 + ... near zero, -z far below, 0 far above."""
+    """Return the Bernoulli function B(z) = z / (exp(z) - 1), accurate for any z."""
     small = jnp.abs(z) < 1e-3
     safe = jnp.where(small, 1.0, jnp.clip(z, -1e300, 700.0))
     return jnp.where(small, 1.0 - z / 2.0 + z**2 / 12.0 - z**4 / 720.0, safe / jnp.expm1(safe))
 
 
 @jax.jit
-def chain(velocity: jax.Array, diffusion: jax.Array, width: jax.Array | float) -> Chain:
-    """Return the chain with exponentially fitted fluxes.
+def birth_death_process(velocity: jax.Array, diffusion: jax.Array, width: jax.Array | float) -> BirthDeathProcess:
+    """Return the birth-death process with exponentially fitted fluxes.
 
-        J = D / width (B(-q) m_left - B(q) m_right) / width,    q = velocity width / D,
+        J = D / width (B(-q) m_left - B(q) m_right) / width,    q = velocity width / D.
 
-    which is second order in the width, exact for the stationary flux of constant coefficients, and upwind where the
-    diffusion vanishes.
+    The fluxes are of second order in the width, exact for the stationary flux of constant coefficients, and upwind
+    where the diffusion vanishes.
 
     Args:
-        velocity: (N - 1,) b - D' at the faces between the cells.
-        diffusion: (N - 1,) D = g^2 / 2 there, >= 0.
-        width: of a cell.
+        velocity: (N - 1,), b - D' at the faces between the cells.
+        diffusion: (N - 1,), D = g^2 / 2 at the faces, >= 0.
+        width: width of a cell.
 
     Returns:
         Rates (N,) up and down.
@@ -108,37 +107,38 @@ def chain(velocity: jax.Array, diffusion: jax.Array, width: jax.Array | float) -
     """
     floor = 1e-12 * jnp.abs(velocity) * width + 1e-290
     diffusivity = jnp.maximum(diffusion, floor)
-    # NaN must stay NaN: it is how a failure in compiled code is known.
+    # NaN must stay NaN: it marks a failure in compiled code.
     diffusivity = jnp.where(jnp.isnan(diffusion), diffusion, diffusivity)
     ratio = velocity * width / diffusivity
-    end = jnp.zeros((*velocity.shape[:-1], 1))
-    up = jnp.concatenate([diffusivity / width**2 * bernoulli(-ratio), end], axis=-1)
-    down = jnp.concatenate([end, diffusivity / width**2 * bernoulli(ratio)], axis=-1)
-    return Chain(up, down)
+    boundary = jnp.zeros((*velocity.shape[:-1], 1))
+    up = jnp.concatenate([diffusivity / width**2 * bernoulli(-ratio), boundary], axis=-1)
+    down = jnp.concatenate([boundary, diffusivity / width**2 * bernoulli(ratio)], axis=-1)
+    return BirthDeathProcess(up, down)
 
 
-def transition(walk: Chain, length: jax.Array) -> jax.Array:
+def transition(process: BirthDeathProcess, length: jax.Array) -> jax.Array:
     """Return exp(A length) (N, N): column j holds the probabilities of the cells, starting from cell j.
 
     Uniformisation: with lam the largest rate of leaving a cell and P = I + A / lam,
 
         exp(A h) = exp(-lam h) sum_k (lam h)^k / k! P^k,    exp(A length) = exp(A h)^(2^s),    h = length / 2^s.
 
-    All terms are non-negative, so nothing cancels; columns are rescaled to sum to one after each squaring. It has
-    forward-mode derivatives; the number of squarings depends on the values, which reverse mode does not allow.
+    All terms are non-negative, so that nothing cancels. Columns are rescaled to sum to one after each squaring. Only
+    forward-mode derivatives exist: the number of squarings depends on the values, which reverse mode does not allow.
 
     Source: Jensen (1953), Skand. Aktuarietidskrift 36; Stewart (1994), Introduction to the Numerical Solution of
     Markov Chains, section 8.2.
     """
-    size = walk.up.shape[-1]
-    fastest = jnp.max(walk.up + walk.down)
-    whole = fastest * length
-    squarings = _count(jnp.log2(jnp.maximum(whole / _BASE, 1.0)), 60)
-    theta = whole / 2.0**squarings
-    up, down, stay = _probabilities(walk, fastest)
+    size = process.up.shape[-1]
+    fastest_rate = jnp.max(process.up + process.down)
+    events = fastest_rate * length
+    squarings = _count(jnp.log2(jnp.maximum(events / _BASE, 1.0)), 60)
+    theta = events / 2.0**squarings
+    up, down, stay = _event_probabilities(process, fastest_rate)
     index = np.arange(_TERMS + 1)
-    logarithm = np.append(0.0, np.cumsum(np.log(index[1:])))
-    weights = jnp.exp(index * jnp.log(jnp.where(theta > 0, theta, 1.0)) - logarithm - theta)
+    log_factorial = np.append(0.0, np.cumsum(np.log(index[1:])))
+    # Poisson probabilities; the double where keeps derivatives finite at theta = 0, and NaN a NaN.
+    weights = jnp.exp(index * jnp.log(jnp.where(theta > 0, theta, 1.0)) - log_factorial - theta)
     weights = jnp.where(theta > 0, weights, jnp.where(theta == 0, 1.0 * (index == 0), theta))
     identity = jnp.eye(size)
 
@@ -147,100 +147,110 @@ def transition(walk: Chain, length: jax.Array) -> jax.Array:
         above = jnp.roll(down[:, None] * total, -1, axis=0)
         return stay[:, None] * total + below + above + weights[_TERMS - 1 - k] * identity
 
+    def square(_: jax.Array, matrix: jax.Array) -> jax.Array:
+        return _normalise_columns(matrix @ matrix)
+
     base = jax.lax.fori_loop(0, _TERMS, term, weights[_TERMS] * identity)
-    square = lambda _, a: _stochastic(a @ a)  # noqa: E731
-    return jax.lax.fori_loop(0, squarings, square, _stochastic(base))
+    return jax.lax.fori_loop(0, squarings, square, _normalise_columns(base))
 
 
-def propagate(walk: Chain, length: jax.Array, masses: jax.Array, adjoint: bool = False) -> jax.Array:
-    """Return exp(A length) m (..., N), or exp(A' length) m, by the same series without the matrix.
+def propagate(process: BirthDeathProcess, length: jax.Array, masses: jax.Array, adjoint: bool = False) -> jax.Array:
+    """Return exp(A length) m (..., N), or exp(A' length) m, by the series of `transition` without the matrix.
 
-    Where the series would take longer than the matrix, the matrix is made after all.
+    If the series would take longer than the matrix, the matrix is computed after all.
 
     Args:
-        walk: the chain.
-        length: of the interval, >= 0.
+        process: the birth-death process.
+        length: length of the interval, >= 0.
         masses: (..., N), >= 0.
         adjoint: propagate a function of the cell backwards instead.
     """
-    whole = jnp.max(walk.up + walk.down) * length
-    # Events of the series that take as long as the matrix: measured, near 6000 for 200 cells and 55,000 for 500.
-    many = whole > 6000.0 * (walk.up.shape[-1] / 200.0) ** 2.4
+    events = jnp.max(process.up + process.down) * length
+    # Number of events for which the series takes as long as the matrix: measured 6000 for 200 cells, 55,000 for 500.
+    use_matrix = events > 6000.0 * (process.up.shape[-1] / 200.0) ** 2.4
 
     def by_matrix(m: jax.Array) -> jax.Array:
-        matrix = transition(walk, length)
+        matrix = transition(process, length)
         return m @ (matrix if adjoint else matrix.T)
 
-    # Under vmap both branches run; the one that is not taken should then end at once.
-    short = lambda m: _series(walk, jnp.where(many, 0.0, length), m, adjoint)  # noqa: E731
-    return jnp.where(jnp.isnan(whole), jnp.nan, jax.lax.cond(many, by_matrix, short, masses))
+    def by_series(m: jax.Array) -> jax.Array:
+        # Under vmap both branches run: with length zero the series ends at once if the matrix is used.
+        return _apply_series(process, jnp.where(use_matrix, 0.0, length), m, adjoint)
+
+    return jnp.where(jnp.isnan(events), jnp.nan, jax.lax.cond(use_matrix, by_matrix, by_series, masses))
 
 
-def _series(walk: Chain, length: jax.Array, masses: jax.Array, adjoint: bool) -> jax.Array:
-    fastest = jnp.max(walk.up + walk.down)
-    whole = fastest * length
-    pieces = _count(whole / _PIECE, 10**9)
-    theta = whole / jnp.maximum(pieces, 1)
+def _apply_series(process: BirthDeathProcess, length: jax.Array, masses: jax.Array, adjoint: bool) -> jax.Array:
+    """Apply the series to masses, in sub-intervals of at most `_EVENTS_PER_SERIES` expected events."""
+    fastest_rate = jnp.max(process.up + process.down)
+    events = fastest_rate * length
+    substeps = _count(events / _EVENTS_PER_SERIES, 10**9)
+    theta = events / jnp.maximum(substeps, 1)
+    # Nine standard deviations above the mean of the Poisson distribution.
     terms = _count(theta + 9.0 * jnp.sqrt(theta) + 20.0, 10**4)
-    up, down, stay = _probabilities(walk, fastest)
+    up, down, stay = _event_probabilities(process, fastest_rate)
 
-    def once(m: jax.Array) -> jax.Array:
+    def apply_event(m: jax.Array) -> jax.Array:
         if adjoint:
             return stay * m + up * jnp.roll(m, -1, axis=-1) + down * jnp.roll(m, 1, axis=-1)
         return stay * m + jnp.roll(up * m, 1, axis=-1) + jnp.roll(down * m, -1, axis=-1)
 
-    def term(k: jax.Array, carry: tuple) -> tuple:
+    def add_term(k: jax.Array, carry: tuple) -> tuple:
         power, total, weight, sum_of_weights = carry
         factor = theta / (k + 1.0)
-        power, weight = once(power) * factor, weight * factor
+        power, weight = apply_event(power) * factor, weight * factor
         return power, total + power, weight, sum_of_weights + weight
 
-    def piece(_: jax.Array, m: jax.Array) -> jax.Array:
+    def apply_substep(_: jax.Array, m: jax.Array) -> jax.Array:
         weight = jnp.exp(-theta)
-        _, total, _, sum_of_weights = jax.lax.fori_loop(0, terms, term, (weight * m, weight * m, weight, weight))
+        _, total, _, sum_of_weights = jax.lax.fori_loop(0, terms, add_term, (weight * m, weight * m, weight, weight))
         if adjoint:
             return total / sum_of_weights
-        before, after = m.sum(-1, keepdims=True), total.sum(-1, keepdims=True)
-        return total * jnp.where(after > 0, before / jnp.where(after > 0, after, 1.0), after)
+        # The series is truncated: rescaling restores the total mass.
+        mass, truncated_mass = m.sum(-1, keepdims=True), total.sum(-1, keepdims=True)
+        has_mass = truncated_mass > 0
+        return total * jnp.where(has_mass, mass / jnp.where(has_mass, truncated_mass, 1.0), truncated_mass)
 
-    # XLA's code for shifting a vector is four times as fast as for shifting a row of one.
-    single = masses.size == masses.shape[-1]
-    return jax.lax.fori_loop(0, pieces, piece, masses.ravel() if single else masses).reshape(masses.shape)
+    # XLA shifts a vector four times as fast as a matrix with one row.
+    is_vector = masses.size == masses.shape[-1]
+    return jax.lax.fori_loop(0, substeps, apply_substep, masses.ravel() if is_vector else masses).reshape(masses.shape)
 
 
 def gaussian_masses(grid: Grid, mean: jax.Array, variance: jax.Array) -> jax.Array:
-    """Return the masses (N,) of N(mean, variance) in the cells; what lies outside the grid is left out.
+    """Return the masses (N,) of N(mean, variance) in the cells, without the probability outside of the grid.
 
-    A known state, of variance zero, is split between the two centres next to it, which keeps its mean.
+    For variance zero the mass is split between the two nearest centres such that the mean is preserved.
     """
     return _gaussian_masses(jnp.asarray(grid.edges), mean, variance)
 
 
 @jax.jit
 def _gaussian_masses(edges: jax.Array, mean: jax.Array, variance: jax.Array) -> jax.Array:
-    known = variance <= 0
-    sd = jnp.sqrt(jnp.where(known, 1.0, variance))
+    is_point = variance <= 0
+    sd = jnp.sqrt(jnp.where(is_point, 1.0, variance))
     below, above = edges[:-1] - mean, edges[1:] - mean
-    # In the upper tail the difference of the complements keeps its digits.
+    # In the upper tail the difference of the complementary probabilities avoids cancellation.
     lower = jnp.where(below > 0, -above, below) / sd
     upper = jnp.where(below > 0, -below, above) / sd
     mass = jax.scipy.stats.norm.cdf(upper) - jax.scipy.stats.norm.cdf(lower)
     tent = jnp.maximum(1.0 - jnp.abs(0.5 * (below + above)) / (above - below), 0.0)
-    return jnp.where(known, tent, jnp.maximum(mass, 0.0))
+    return jnp.where(is_point, tent, jnp.maximum(mass, 0.0))
 
 
-def _probabilities(walk: Chain, fastest: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Of moving up, down and staying, in one event of the uniformised chain."""
-    rate = jnp.where(fastest > 0, fastest, jnp.where(jnp.isnan(fastest), fastest, 1.0))
-    up, down = walk.up / rate, walk.down / rate
+def _event_probabilities(process: BirthDeathProcess,
+                         fastest_rate: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return the probabilities (N,) of moving up, down and staying in one event of the uniformised process."""
+    rate = jnp.where(fastest_rate > 0, fastest_rate, jnp.where(jnp.isnan(fastest_rate), fastest_rate, 1.0))
+    up, down = process.up / rate, process.down / rate
     return up, down, jnp.maximum(1.0 - up - down, 0.0)
 
 
-def _stochastic(a: jax.Array) -> jax.Array:
-    a = jnp.where(a < _SMALLEST, 0.0, a)
-    return a / a.sum(axis=0)
+def _normalise_columns(matrix: jax.Array) -> jax.Array:
+    """Set tiny entries to zero, and rescale the columns to sum to one."""
+    matrix = jnp.where(matrix < _SMALLEST, 0.0, matrix)
+    return matrix / matrix.sum(axis=0)
 
 
-def _count(value: jax.Array, most: int) -> jax.Array:
-    """Round up to a whole number of repetitions; none where the value is not finite."""
-    return jnp.clip(jnp.nan_to_num(jnp.ceil(value), nan=0.0, posinf=0.0), 0, most).astype(int)
+def _count(value: jax.Array, largest: int) -> jax.Array:
+    """Round up to a number of repetitions between 0 and ``largest``; 0 for a value that is not finite."""
+    return jnp.clip(jnp.nan_to_num(jnp.ceil(value), nan=0.0, posinf=0.0), 0, largest).astype(int)

@@ -1,33 +1,48 @@
-"""Filter and smoother for the masses of a one-dimensional state on a grid: a hidden Markov model on its cells."""
+"""Filter and smoother for the masses of a one-dimensional state on a grid: a hidden Markov model on its cells.
+
+1. Put the model on the cells: rates, jump matrices, initial masses, likelihood nodes (`on_grid`).
+2. Tabulate the transition matrix of each distinct interval length, if that is cheaper than to propagate the masses row
+   by row (`build_transition`).
+3. Forward, row by row: propagate the masses over the row and its jump, multiply them with the likelihood averaged over
+   each cell, and normalise. The logarithm of the normalising constant is log p(y_k | y_1:k-1).
+4. Backward, row by row, with the filtered masses f and the predicted masses p:
+
+       s_k-1(i) = f_k-1(i) sum_j P(i -> j) s_k(j) / p_k(j).
+
+Source: Kitagawa (1987), J. Am. Stat. Assoc. 82.
+"""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.filtering.time_grid import Intervals, TimeGrid, as_arrays, with_observations
-from lfm_ppl.fokker_planck_grid.finite_volume import Chain, Grid, propagate, transition
+from lfm_ppl.fokker_planck_grid.finite_volume import BirthDeathProcess, Grid, propagate, transition
 from lfm_ppl.fokker_planck_grid.grid_model import WEIGHTS, Cells, on_grid
-from lfm_ppl.linalg import cholesky, log_density, masked, solve_lower, wrapped
+from lfm_ppl.gaussian_residuals import log_density, masked, wrapped
+from lfm_ppl.linalg import cholesky, solve_lower
 from lfm_ppl.model.state_space import StateSpaceModel
 
 _LARGEST_TABLE = 2**25
-"""Most entries of the tabulated transition matrices, 256 MiB; beyond it the masses are propagated row by row."""
+"""Largest number of entries of the tabulated transition matrices (256 MiB); without a table, the masses are propagated
+row by row."""
 
 _MATRIX_COST = 6.0
-"""A transition matrix takes about as long as this many propagations of one vector of masses."""
+"""Cost of a transition matrix in units of the propagation of one vector of masses."""
 
 
-class Densities(NamedTuple):
-    """What a forward pass leaves; one entry a row, None where it was not asked for.
+class FilteredMasses(eqx.Module):
+    """Result of a forward pass.
 
     Attributes:
-        log_likelihood: (rows, B), zero where nothing is observed.
-        predicted, filtered: (rows, B, N) masses before and after the observation.
-        reach: (N,) the largest mass of each cell that was propagated, predicted or filtered.
+        log_likelihood: (rows, B), zero without an observation.
+        predicted, filtered: (rows, B, N), masses before and after the observation; None unless kept.
+        reach: (N,), largest mass of each cell among all initial, predicted and filtered masses.
     """
 
     log_likelihood: jax.Array
@@ -37,7 +52,7 @@ class Densities(NamedTuple):
 
 
 def _log_likelihood_of_cells(cells: Cells, index: jax.Array, y: jax.Array) -> jax.Array:
-    """Return (B, N): the log of the likelihood of y (B, D), averaged over each cell; zero where all is missing."""
+    """Return the logarithm (B, N) of the likelihood of y (B, D), averaged over each cell; zero if y is missing."""
     index = jnp.maximum(index, 0)
     value, noise = (a[jnp.where(a.shape[0] > 1, index, 0)] for a in (cells.value, cells.noise))
     present = jnp.isfinite(y)[:, None, None, :]
@@ -48,33 +63,49 @@ def _log_likelihood_of_cells(cells: Cells, index: jax.Array, y: jax.Array) -> ja
 
 
 def _log_density(residual: jax.Array, noise: jax.Array, present: jax.Array) -> jax.Array:
-    """Return the log density of the present entries of a residual (D,); NaN where the noise has none."""
+    """Return the log density of the present entries of a residual (D,); NaN for singular noise."""
     residual, noise = masked(residual, noise, present)
     factor = cholesky(noise)
     value = log_density(solve_lower(factor.chol, residual), factor.chol, present)
     return jnp.where(factor.degenerate.any(), jnp.nan, value)
 
 
-class Moves(NamedTuple):
-    """How masses cross a row: a table of transition matrices, or the chain itself where that is None."""
+class GridTransition(eqx.Module):
+    """Transition of masses over the rows of a time grid.
+
+    Attributes:
+        cells: the model on the grid.
+        table: (lengths, N, N), transition matrices of the distinct interval lengths; None: propagate the masses.
+    """
 
     cells: Cells
     table: Any
 
-    def across(self, masses: jax.Array, row: Intervals, walk: Chain | None, adjoint: bool = False) -> jax.Array:
-        """Move masses (B, N) over a row and its jump, or a function of the cell back over them."""
+    def move(self, masses: jax.Array, interval: Intervals, process: BirthDeathProcess | None,
+             adjoint: bool = False) -> jax.Array:
+        """Move masses (B, N) over a row and the jump at its end, or a function of the cell back over both.
+
+        Args:
+            masses: (B, N).
+            interval: the row.
+            process: rates (steps, N) of the row if they depend on time; else None.
+            adjoint: move backwards.
+        """
         if adjoint:
-            masses = self._jump(masses, row.jump, True)
+            masses = self._jump(masses, interval.jump, True)
         if self.table is not None:
-            matrix = self.table[row.length_index]
+            matrix = self.table[interval.length_index]
             masses = masses @ (matrix if adjoint else matrix.T)
-        elif walk is None:
-            masses = propagate(self.cells.chain, row.length, masses, adjoint)
+        elif process is None:
+            masses = propagate(self.cells.process, interval.length, masses, adjoint)
         else:
-            part = row.length / walk.up.shape[0]
-            step = lambda m, one: (propagate(one, part, m, adjoint), None)  # noqa: E731
-            masses, _ = jax.lax.scan(step, masses, walk, reverse=adjoint)
-        return masses if adjoint else self._jump(masses, row.jump, False)
+            step_size = interval.length / process.up.shape[0]
+
+            def step(masses: jax.Array, step_process: BirthDeathProcess) -> tuple[jax.Array, None]:
+                return propagate(step_process, step_size, masses, adjoint), None
+
+            masses, _ = jax.lax.scan(step, masses, process, reverse=adjoint)
+        return masses if adjoint else self._jump(masses, interval.jump, False)
 
     def _jump(self, masses: jax.Array, index: jax.Array, adjoint: bool) -> jax.Array:
         if self.cells.jumps is None:
@@ -83,85 +114,83 @@ class Moves(NamedTuple):
         return jnp.where(index >= 0, masses @ (matrix if adjoint else matrix.T), masses)
 
 
-def moves(cells: Cells, time_grid: TimeGrid, batch: int) -> Moves:
-    """Tabulate the transition matrices where that pays."""
+def build_transition(cells: Cells, time_grid: TimeGrid, batch: int) -> GridTransition:
+    """Return the transition for ``batch`` data sets, with a table of matrices if it is the cheaper form."""
     size = cells.initial.shape[0]
-    if time_grid.lengths is None or cells.chain.up.ndim > 1:
-        return Moves(cells, None)
+    if time_grid.lengths is None or cells.process.up.ndim > 1:
+        return GridTransition(cells, None)
     count, rows = np.shape(time_grid.lengths)[0], np.shape(time_grid.intervals.length)[0]
     if count * size**2 > _LARGEST_TABLE or count * _MATRIX_COST > rows * (1.0 + batch / 4.0):
-        return Moves(cells, None)
-    return Moves(cells, jax.lax.map(lambda length: transition(cells.chain, length), jnp.asarray(time_grid.lengths)))
+        return GridTransition(cells, None)
+    table = jax.lax.map(lambda length: transition(cells.process, length), jnp.asarray(time_grid.lengths))
+    return GridTransition(cells, table)
 
 
-def forward(moving: Moves, time_grid: TimeGrid, y: jax.Array, keep: bool = False) -> Densities:
+def forward(transition: GridTransition, time_grid: TimeGrid, y: jax.Array, keep_masses: bool = False) -> FilteredMasses:
     """Run the filter.
 
     Args:
-        moving: the model on the grid.
+        transition: of the model on the grid.
         time_grid: the time grid.
         y: (B, T, D), NaN where missing; all B data sets have the same times.
-        keep: whether to keep the masses.
+        keep_masses: whether the result holds the masses of all rows.
     """
-    cells = moving.cells
-    rows, by_row = with_observations(time_grid.intervals, jnp.moveaxis(y, 1, 0))
-    walks = cells.chain if cells.chain.up.ndim > 1 else None
+    cells = transition.cells
+    rows, y_rows = with_observations(time_grid.intervals, jnp.moveaxis(y, 1, 0))
+    processes = cells.process if cells.process.up.ndim > 1 else None
     start = jnp.broadcast_to(cells.initial, (y.shape[0], cells.initial.shape[0]))
 
     def step(carry: tuple, inputs: tuple) -> tuple[tuple, tuple]:
         masses, reach = carry
-        row, walk, observed = inputs
-        predicted = moving.across(masses, row, walk)
-        with_observation = jnp.log(predicted) + _log_likelihood_of_cells(cells, row.observation, observed)
-        total = jax.scipy.special.logsumexp(with_observation, axis=-1)
-        # An observation that no cell can explain leaves nothing to normalise.
-        possible = jnp.where(jnp.isneginf(total), jnp.nan, total)
-        any_present = jnp.isfinite(observed).any(-1)
-        filtered = jnp.where(any_present[:, None], jnp.exp(with_observation - possible[:, None]), predicted)
-        moved = (row.length > 0) | (row.jump >= 0)
-        reach = jnp.maximum(reach, jnp.where(moved, jnp.maximum(masses, predicted).max(0), 0.0))
-        out = (jnp.where(any_present, total, 0.0), *((predicted, filtered) if keep else (None, None)))
+        interval, process, y_row = inputs
+        predicted = transition.move(masses, interval, process)
+        log_joint = jnp.log(predicted) + _log_likelihood_of_cells(cells, interval.observation, y_row)
+        total = jax.scipy.special.logsumexp(log_joint, axis=-1)
+        # An observation with likelihood zero in all cells leaves no mass to normalise: NaN marks the failure.
+        normaliser = jnp.where(jnp.isneginf(total), jnp.nan, total)
+        is_observed = jnp.isfinite(y_row).any(-1)
+        filtered = jnp.where(is_observed[:, None], jnp.exp(log_joint - normaliser[:, None]), predicted)
+        has_moved = (interval.length > 0) | (interval.jump >= 0)
+        reach = jnp.maximum(reach, jnp.where(has_moved, jnp.maximum(masses, predicted).max(0), 0.0))
+        out = (jnp.where(is_observed, total, 0.0), *((predicted, filtered) if keep_masses else (None, None)))
         return (filtered, jnp.maximum(reach, filtered.max(0))), out
 
     carry = start, jnp.zeros(start.shape[1])
-    (_, reach), (log, predicted, filtered) = jax.lax.scan(step, carry, (rows, walks, by_row))
-    return Densities(log, predicted, filtered, reach)
+    (_, reach), (log_likelihood, predicted, filtered) = jax.lax.scan(step, carry, (rows, processes, y_rows))
+    return FilteredMasses(log_likelihood, predicted, filtered, reach)
 
 
-def backward(moving: Moves, time_grid: TimeGrid, passed: Densities) -> jax.Array:
-    """Run the smoother; return masses (rows, B, N) at the rows' ends.
+def backward(transition: GridTransition, time_grid: TimeGrid, forward_pass: FilteredMasses) -> jax.Array:
+    """Run the smoother on a forward pass with its masses; return masses (rows, B, N) at the rows' ends."""
+    cells, rows = transition.cells, as_arrays(time_grid.intervals)
+    processes = cells.process if cells.process.up.ndim > 1 else None
+    start = jnp.broadcast_to(cells.initial, forward_pass.filtered.shape[1:])[None]
+    filtered_at_start = jnp.concatenate([start, forward_pass.filtered[:-1]])
 
-        s_k-1(i) = f_k-1(i) sum_j P(i -> j) s_k(j) / p_k(j)
-
-    with the filtered masses f and the predicted ones p.
-    """
-    cells, rows = moving.cells, as_arrays(time_grid.intervals)
-    walks = cells.chain if cells.chain.up.ndim > 1 else None
-    start = jnp.broadcast_to(cells.initial, passed.filtered.shape[1:])[None]
-    before = jnp.concatenate([start, passed.filtered[:-1]])
-
-    def step(later: jax.Array, inputs: tuple) -> tuple[jax.Array, jax.Array]:
-        row, walk, predicted, at_start = inputs
-        live = predicted > 1e-290
-        ratio = jnp.where(live, later / jnp.where(live, predicted, 1.0), 0.0)
-        smoothed = at_start * moving.across(ratio, row, walk, adjoint=True)
+    def step(smoothed_at_end: jax.Array, inputs: tuple) -> tuple[jax.Array, jax.Array]:
+        interval, process, predicted, filtered = inputs
+        # Smaller masses would overflow the ratio.
+        is_positive = predicted > 1e-290
+        ratio = jnp.where(is_positive, smoothed_at_end / jnp.where(is_positive, predicted, 1.0), 0.0)
+        smoothed = filtered * transition.move(ratio, interval, process, adjoint=True)
         smoothed = smoothed / smoothed.sum(-1, keepdims=True)
-        return smoothed, later
+        return smoothed, smoothed_at_end
 
-    _, ends = jax.lax.scan(step, passed.filtered[-1], (rows, walks, passed.predicted, before), reverse=True)
-    return ends
+    _, smoothed = jax.lax.scan(step, forward_pass.filtered[-1],
+                               (rows, processes, forward_pass.predicted, filtered_at_start), reverse=True)
+    return smoothed
 
 
 def log_likelihood(ssm: StateSpaceModel, time_grid: TimeGrid, y: jax.Array, grid: Grid) -> jax.Array:
     """Return the log likelihood on the grid; for compiled code.
 
-    The transition matrices are computed once for all data sets. A failure is minus infinity. Derivatives are to be
-    had in forward mode (`jax.jacfwd`), not in reverse mode.
+    The transition matrices are computed once for all data sets. A failure is minus infinity. Derivatives exist in
+    forward mode (`jax.jacfwd`) only.
 
     Args:
         ssm: the state-space model, of state dimension one; it may hold traced parameters, also under `jax.vmap`.
-        time_grid: from `lfm_ppl.filtering.time_grid.build_time_grid(ssm, times, steps)`; its ``steps`` matter only
-            where drift or dispersion depend on time: the generator is frozen at the middle of each of them.
+        time_grid: from `lfm_ppl.filtering.time_grid.build_time_grid(ssm, times, steps)`. Its ``steps`` matter only if
+            drift or dispersion depend on time: the generator is frozen at the middle of each step.
         y: (T, D), or (B, T, D) for B data sets with the same times; NaN where missing.
         grid: the cells, from `choose_grid`.
 
@@ -179,18 +208,13 @@ def log_likelihood(ssm: StateSpaceModel, time_grid: TimeGrid, y: jax.Array, grid
         (5,)
     """
     y = jnp.asarray(y, float)
-    sets = y if y.ndim == 3 else y[None]
-    total = total_log_likelihood(on_grid(ssm, time_grid, grid), time_grid, sets)
+    data_sets = y if y.ndim == 3 else y[None]
+    total, _ = log_likelihood_and_reach(on_grid(ssm, time_grid, grid), time_grid, data_sets)
     return total if y.ndim == 3 else total[0]
 
 
-def total_log_likelihood(cells: Cells, time_grid: TimeGrid, y: jax.Array) -> jax.Array:
-    """Return log p(y) (B,) of data sets y (B, T, D) for a model that is on the grid already."""
-    return total_and_reach(cells, time_grid, y)[0]
-
-
-def total_and_reach(cells: Cells, time_grid: TimeGrid, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return besides the largest mass (N,) that any cell had; see `Densities`."""
-    passed = forward(moves(cells, time_grid, y.shape[0]), time_grid, y)
-    total = passed.log_likelihood.sum(0)
-    return jnp.where(jnp.isfinite(total), total, -jnp.inf), passed.reach
+def log_likelihood_and_reach(cells: Cells, time_grid: TimeGrid, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return log p(y) (B,) of data sets y (B, T, D), and the largest mass (N,) of each cell, `FilteredMasses.reach`."""
+    forward_pass = forward(build_transition(cells, time_grid, y.shape[0]), time_grid, y)
+    total = forward_pass.log_likelihood.sum(0)
+    return jnp.where(jnp.isfinite(total), total, -jnp.inf), forward_pass.reach

@@ -1,13 +1,13 @@
-"""Forces: Gaussian process priors in state-space form, one a module; `sde` says what a force has to be.
+"""Forces: Gaussian process priors in state-space form, one per module; `sde` defines the protocol.
 
-All that is public is exported here, as `lfm_ppl.forces.NAME`; what most models take is also `lfm_ppl.NAME`.
+The public names are exported here as `lfm_ppl.forces.NAME`; the most common ones are also `lfm_ppl.NAME`.
 """
 
 from lfm_ppl.forces.constant import Constant
 from lfm_ppl.forces.matern import Matern
 from lfm_ppl.forces.periodic_kernels import (
-    Kernel,
     ModeratedPeriodicMatern,
+    PeriodicCovariance,
     PeriodicKernel,
     PeriodicMatern,
     PeriodicSquaredExponential,
@@ -27,10 +27,10 @@ __all__ = [
     "CQM",
     "Constant",
     "Force",
-    "Kernel",
     "Matern",
     "ModeratedPeriodicMatern",
     "Periodic",
+    "PeriodicCovariance",
     "PeriodicKernel",
     "PeriodicMatern",
     "PeriodicSquaredExponential",

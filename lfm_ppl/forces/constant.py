@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ class Constant(Force):
         mean: a number, or a function of time.
 
     Raises:
-        ValueError: for a scale that is not positive.
+        ValueError: the scale is not positive.
 
     Example:
         >>> force = Constant(scale=2.0, mean=1.0)
@@ -33,19 +33,11 @@ class Constant(Force):
     scale: jax.Array
     mean: Any
 
+    state_dim: ClassVar[int] = 1
+
     def __init__(self, scale: Any, mean: Any = 0.0):
         self.scale = positive_parameter("scale", scale)
         self.mean = mean_parameter(mean)
-
-    @property
-    def state_dim(self) -> int:
-        """One state, the level."""
-        return 1
-
-    @property
-    def noise_dim(self) -> int:
-        """No noise."""
-        return 0
 
     @property
     def stationary(self) -> bool:
@@ -73,12 +65,12 @@ class Constant(Force):
         return self.scale**2 * jnp.ones(jnp.broadcast_shapes(jnp.shape(t), jnp.shape(s)))
 
     def spectral_density(self, omega: ArrayLike) -> jax.Array:
-        """Raise NotImplementedError: all the power sits at frequency zero."""
+        """Raise NotImplementedError: the spectrum is a line at frequency zero."""
         raise NotImplementedError(
             "a Constant force has all its power at frequency zero, so its spectral density is "
             "not a function; use `covariance`."
         )
 
     def sde_spectral_density(self, omega: ArrayLike) -> jax.Array:
-        """Raise NotImplementedError, as `spectral_density` does."""
+        """Raise NotImplementedError like `spectral_density`."""
         return self.spectral_density(omega)

@@ -1,4 +1,17 @@
-"""Exact discretisation of a linear SDE, without eigendecomposition, for any step length."""
+"""Exact discretisation of a linear SDE, without eigendecomposition, for any step length.
+
+1. Divide the step dt by 2^s, so that F h with h = dt / 2^s has at most the size `SUBSTEP`.
+2. Compute the terms (F h)^k / k! of the power series of exp(F h); their number makes the series exact to rounding.
+3. Compute the process noise of the substep, the integral of exp(F s) D exp(F s)', by Gauss-Legendre quadrature. The
+   powers of the nodes times the terms of step 2 give exp(F s) at all nodes without further matrix products.
+4. Double s times: Q <- Q + Phi Q Phi', Phi <- Phi Phi. Sums of congruences keep Q positive semi-definite.
+5. The loop over doublings has a static length; unused iterations change nothing, so that s may be traced.
+
+No eigendecomposition is involved, so that repeated eigenvalues, nilpotent F and gradients need no special treatment.
+
+Source: Van Loan (1978), IEEE Transactions on Automatic Control 23(3), section II; Al-Mohy and Higham (2009), SIAM J.
+Matrix Anal. Appl. 31(3).
+"""
 
 from __future__ import annotations
 
@@ -12,7 +25,7 @@ from jax.typing import ArrayLike
 from lfm_ppl.linalg import matmul
 
 SUBSTEP = 0.5
-"""Largest size of F h at which the power series starts; 13 terms of it are exact to rounding."""
+"""Largest size of F h on a substep; 13 terms of the power series are then exact to rounding."""
 
 
 @functools.partial(jax.jit, static_argnames="max_doublings")
@@ -25,22 +38,19 @@ def discretise(
 
         Phi = exp(F dt),    Q = int_0^dt exp(F s) D exp(F s)' ds.
 
-    Both are computed on a substep ``h = dt / 2^s`` (power series, Gauss-Legendre nodes) and then
-    doubled s times, ``Q <- Q + Phi Q Phi'`` and ``Phi <- Phi Phi``. ``Q`` is a sum of congruences
-    of ``D``, so it is positive semi-definite by construction and its tiny entries are accurate
-    relative to themselves; nothing grows with dt when F is stable. Repeated roots and nilpotent
-    ``F`` are ordinary cases. The gradient is finite everywhere, dt = 0 included.
+    ``Q`` is a sum of congruences of ``D``: it is positive semi-definite by construction and its small entries have
+    full relative accuracy. No intermediate grows with dt where F is stable. The gradient is finite everywhere, also
+    at dt = 0.
 
     Args:
         feedback: ``F`` of shape (n, n), in 1/time.
         diffusion: ``D`` of shape (n, n), symmetric positive semi-definite.
         dt: length of the step, a scalar >= 0.
         max_doublings: static bound on s. Each doubling doubles the admissible size of ``F dt``;
-            32 reach 2e9. Lower it where the steps are known to be short: the cost is linear in it.
+            32 allow 2e9. The cost is linear in it: choose a smaller bound where all steps are short.
 
     Returns:
-        ``Phi`` (n, n) and ``Q`` (n, n). Both are NaN where ``F dt`` exceeds what `max_doublings`
-        reach.
+        ``Phi`` (n, n) and ``Q`` (n, n). Both are NaN where ``F dt`` needs more than `max_doublings` doublings.
 
     Example:
         >>> import jax.numpy as jnp
@@ -53,7 +63,7 @@ def discretise(
         of Q; Al-Mohy and Higham (2009), SIAM J. Matrix Anal. Appl. 31(3), for the choice of s.
     """
     feedback, diffusion, dt = _as_arrays(feedback, diffusion, dt)
-    series, step, doublings = _start(feedback, dt)
+    series, step, doublings = _substep_series(feedback, dt)
     nodes, weights = _quadrature(series)
     transition = (powers(nodes, len(series))[:, :, None, None] * series).sum(1)
     integrand = matmul(matmul(transition, diffusion), transition.mT)
@@ -65,9 +75,9 @@ def discretise(
 def discretise_dispersion(
     feedback: jax.Array, dispersion: jax.Array, dt: ArrayLike, max_doublings: int = 32
 ) -> tuple[jax.Array, jax.Array]:
-    """Return the same as `discretise`, from the dispersion ``L`` in place of ``D = L L'``.
+    """Return transition matrix and process noise as `discretise` does, given ``L`` instead of ``D = L L'``.
 
-    It is cheaper when there are few noise inputs: only the columns ``exp(F s) L`` are formed.
+    It is cheaper for few noise inputs, since only the columns ``exp(F s) L`` are formed.
 
     Args:
         feedback: ``F`` of shape (n, n), in 1/time.
@@ -85,7 +95,7 @@ def discretise_dispersion(
         3.0
     """
     feedback, dispersion, dt = _as_arrays(feedback, dispersion, dt)
-    series, step, doublings = _start(feedback, dt)
+    series, step, doublings = _substep_series(feedback, dt)
     return discretise_series(series, dispersion, step, doublings, max_doublings)
 
 
@@ -97,14 +107,14 @@ def discretise_series(
     doublings: jax.Array,
     max_doublings: int,
 ) -> tuple[jax.Array, jax.Array]:
-    """Return transition and noise over ``2^doublings`` steps, from the power series of one.
+    """Return transition and noise over ``2^doublings`` substeps, given the power series of one substep.
 
     Args:
         series: terms ``(F h)^k / k!`` for k = 0, 1, ..., of shape (K, n, n), on the short step h.
         dispersion: ``L`` (n, S).
         step: h, a scalar.
-        doublings: how often to double, a whole number that may be traced.
-        max_doublings: static bound on it.
+        doublings: number s of doublings, a whole number that may be traced.
+        max_doublings: static bound on s.
 
     Returns:
         ``Phi`` (n, n) and ``Q`` (n, n) of the long step.
@@ -121,13 +131,13 @@ def discretise_series(
 def double(
     transition: jax.Array, noise: jax.Array, doublings: jax.Array, max_doublings: int
 ) -> tuple[jax.Array, jax.Array]:
-    """Return transition and noise over a step that is ``2^doublings`` times as long.
+    """Return transition and noise over a step ``2^doublings`` times as long.
 
     Args:
         transition: ``Phi`` (n, n) of the short step.
         noise: ``Q`` (n, n) of the short step.
-        doublings: how often to double, a whole number that may be traced.
-        max_doublings: static length of the loop; more doublings than this give NaN.
+        doublings: number of doublings, a whole number that may be traced.
+        max_doublings: static length of the loop; the result is NaN for more doublings.
 
     Returns:
         ``Phi`` (n, n) and ``Q`` (n, n) of the long step.
@@ -135,21 +145,21 @@ def double(
 
     def body(index, carry):
         phi, q = carry
-        active = index < doublings
-        q_twice = q + matmul(matmul(phi, q), phi.mT)
-        return jnp.where(active, matmul(phi, phi), phi), jnp.where(active, q_twice, q)
+        is_active = index < doublings
+        q_doubled = q + matmul(matmul(phi, q), phi.mT)
+        return jnp.where(is_active, matmul(phi, phi), phi), jnp.where(is_active, q_doubled, q)
 
     phi, q = jax.lax.fori_loop(0, max_doublings, body, (transition, noise))
-    reached = doublings <= max_doublings
-    return jnp.where(reached, phi, jnp.nan), jnp.where(reached, 0.5 * (q + q.mT), jnp.nan)
+    is_complete = doublings <= max_doublings
+    return jnp.where(is_complete, phi, jnp.nan), jnp.where(is_complete, 0.5 * (q + q.mT), jnp.nan)
 
 
 def step_tangent(
     feedback: ArrayLike, dispersion: ArrayLike, transition: jax.Array, tangent: ArrayLike
 ) -> tuple[jax.Array, jax.Array]:
-    """Return the derivatives ``F Phi`` and ``Phi L L' Phi'`` in dt, times ``tangent``.
+    """Return the derivatives ``F Phi`` and ``Phi L L' Phi'`` of transition and noise in dt, times ``tangent``.
 
-    They are exact and much cheaper than to differentiate the way in which Phi and Q are computed.
+    They are exact, and much cheaper than differentiating the computation of Phi and Q.
     """
     column = matmul(transition, jnp.asarray(dispersion))
     rate = jnp.asarray(tangent)
@@ -171,7 +181,7 @@ def gauss_legendre(count: int) -> tuple[np.ndarray, np.ndarray]:
 def powers(base: ArrayLike, count: int) -> jax.Array:
     """Return ``base^k`` for k = 0, ..., count - 1 in a new last axis.
 
-    By multiplication, so that every derivative at zero is finite.
+    They are products rather than calls of ``**``, so that every derivative at zero is finite.
     """
     base = jnp.asarray(base)
     columns = [jnp.ones_like(base)]
@@ -181,10 +191,10 @@ def powers(base: ArrayLike, count: int) -> jax.Array:
 
 
 def term_count(state_dim: int) -> int:
-    """Return how many terms of the power series reach rounding level on a short step.
+    """Return the number of terms after which the power series of a substep is exact to rounding.
 
-    A chain of n integrators has entries of order h^(n-1); the terms that follow the leading one,
-    of every entry, must reach rounding level too.
+    A chain of n integrators has entries whose leading term is of order h^(n-1). The series must be exact relative to
+    the leading term of every entry.
     """
     return 1 + max(13, min(state_dim, 8) + 9)
 
@@ -194,8 +204,8 @@ def _as_arrays(*values):
     return tuple(jnp.asarray(value, dtype) for value in values)
 
 
-def _start(feedback, dt):
-    """Terms ``(F h)^k / k!`` of the power series on the substep h, h itself, and s."""
+def _substep_series(feedback, dt):
+    """Return the terms ``(F h)^k / k!`` of the power series on the substep, the substep h and the doublings s."""
     doublings = doublings_for(_growth(jax.lax.stop_gradient(feedback * dt)))
     step = dt * jnp.exp2(-doublings)
     scaled = feedback * step
@@ -211,9 +221,9 @@ def _start(feedback, dt):
 def _growth(matrix):
     """Return the larger of ``||X^3||^(1/3)`` and ``||X^4||^(1/4)``.
 
-    It bounds the terms of order 6 and more of the power series as the norm of X does, and is much
-    smaller where coordinates have different units, and zero for short chains of integrators: fewer
-    doublings, and less rounding.
+    Like the norm of X it bounds the terms of order 6 and higher of the power series, but it is much smaller where
+    coordinates have different units, and zero for short chains of integrators. A smaller bound means fewer doublings
+    and less rounding error.
     """
     norm = _norm(matrix)
     unit = matrix / jnp.where(norm > 0.0, norm, 1.0)
@@ -227,6 +237,6 @@ def _norm(matrix):
 
 
 def _quadrature(series):
-    # m nodes are exact to degree 2m - 1; a chain of n states has an integrand of order s^(2n-2).
+    # m nodes are exact to degree 2m - 1; a chain of n integrators has an integrand of order s^(2n-2).
     rule = gauss_legendre(min(max(6, series.shape[-1] + 3), 12))
-    return tuple(jnp.asarray(part, series.dtype) for part in rule)
+    return tuple(jnp.asarray(array, series.dtype) for array in rule)

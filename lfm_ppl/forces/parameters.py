@@ -42,7 +42,7 @@ def standard_deviation_parameter(name: str, value: Any) -> jax.Array:
 
 
 def static_order(order: Any, allowed: Sequence[int]) -> int:
-    """Return ``order`` after checking that it is a Python int among those allowed."""
+    """Return ``order`` after checking that it is a Python int in ``allowed``."""
     choices = ", ".join(str(value) for value in allowed)
     if isinstance(order, bool) or not isinstance(order, (int, np.integer)):
         raise TypeError(

@@ -1,4 +1,14 @@
-"""Covariance functions that repeat after a period, to be made into forces."""
+"""Periodic covariance functions, from which periodic and quasi-periodic forces are built.
+
+1. `PeriodicCovariance` is the protocol: k(t, s) with a period D, elementwise in both times.
+2. `PeriodicMatern` and `PeriodicSquaredExponential` apply an ordinary kernel to the chord |sin(pi (t - s) / D)|; they
+   are stationary.
+3. `ModeratedPeriodicMatern` multiplies the periodic Matern kernel by a decay from the start of each cycle.
+4. `PeriodicKernel` repeats any user-defined covariance function of one cycle; it is checked at a few times when it is
+   constructed (shape, finiteness, symmetry, stationarity if claimed).
+
+Source: Reece, Ghosh, Rogers, Roberts and Jennings (2014), Journal of Machine Learning Research 15.
+"""
 
 from __future__ import annotations
 
@@ -16,19 +26,20 @@ from lfm_ppl.forces.matern import Matern
 from lfm_ppl.forces.parameters import positive_parameter, scalar_parameter, standard_deviation_parameter, static_order
 
 
-class Kernel(eqx.Module):
+class PeriodicCovariance(eqx.Module):
     """A covariance function k(t, s) with ``k(t + D, s) = k(t, s)``, D the period.
 
-    It is a pytree whose parameters are its leaves. A subclass says ``__call__``, elementwise in both times.
+    It is a pytree whose parameters are its leaves. A subclass implements ``__call__``, elementwise in both times.
 
     Attributes:
         period: D, in units of time.
         stationary: whether k depends on t - s alone.
-        given: whether the period was given as a number. One that is sampled comes as an array, and may be anything.
+        has_fixed_period: whether the period is a Python or NumPy number. A sampled period is a JAX array, which no
+            check may reject.
     """
 
     period: eqx.AbstractVar[jax.Array]
-    given: eqx.AbstractVar[bool]
+    has_fixed_period: eqx.AbstractVar[bool]
 
     @property
     def stationary(self) -> bool:
@@ -37,12 +48,12 @@ class Kernel(eqx.Module):
 
     @property
     def start(self) -> jax.Array:
-        """Where the cycle begins that its eigenfunctions are computed on."""
+        """The beginning of the cycle on which eigenfunctions are computed."""
         return jnp.zeros(())
 
     @property
     def name(self) -> str:
-        """How messages call it."""
+        """The name of the kernel in messages."""
         return type(self).__name__
 
     def __call__(self, t: ArrayLike, s: ArrayLike = 0.0) -> jax.Array:
@@ -50,7 +61,7 @@ class Kernel(eqx.Module):
         raise NotImplementedError
 
     def chord(self, t: ArrayLike, s: ArrayLike) -> jax.Array:
-        """Return ``|sin(pi (t - s) / D)|``, elementwise: from 0 to 1 and back within a period."""
+        """Return ``|sin(pi (t - s) / D)|``, elementwise, which goes from 0 to 1 and back to 0 within a period."""
         return jnp.abs(jnp.sin(np.pi * (jnp.asarray(t) - s) / self.period))
 
 
@@ -58,18 +69,18 @@ def _is_number(value: Any) -> bool:
     return not isinstance(value, jax.Array)
 
 
-class PeriodicMatern(Kernel):
+class PeriodicMatern(PeriodicCovariance):
     """The Matern kernel of the chord: ``k(t, s) = Matern(|sin(pi (t - s) / D)|)``, nu = order + 1/2.
 
     Args:
         scale: standard deviation, in the units of the force; > 0.
-        lengthscale: as a share of the chord, without unit: at about 1 neighbouring halves of a cycle are alike, a
-            small one makes many wiggles a cycle; > 0.
+        lengthscale: relative to the chord, without unit; > 0. At about 1, the two halves of a cycle are similar; a
+            small lengthscale gives many oscillations per cycle.
         period: D, in units of time; > 0.
-        order: a Python int from 0 to 5. The number of functions that are needed grows as it falls.
+        order: a Python int from 0 to 5. Lower orders need more eigenfunctions.
 
     Raises:
-        ValueError: for a parameter that is not positive, or an order out of range.
+        ValueError: a parameter is not positive, or the order is out of range.
 
     Example:
         >>> kernel = PeriodicMatern(scale=2.0, lengthscale=0.5, period=24.0)
@@ -83,12 +94,12 @@ class PeriodicMatern(Kernel):
     lengthscale: jax.Array
     period: jax.Array
     order: int = eqx.field(static=True)
-    given: bool = eqx.field(static=True)
+    has_fixed_period: bool = eqx.field(static=True)
 
     def __init__(self, scale: Any, lengthscale: Any, period: Any, order: int = 1):
         self.scale = positive_parameter("scale", scale)
         self.lengthscale = positive_parameter("lengthscale", lengthscale)
-        self.period, self.given = positive_parameter("period", period), _is_number(period)
+        self.period, self.has_fixed_period = positive_parameter("period", period), _is_number(period)
         self.order = static_order(order, Matern.orders)
 
     def __call__(self, t: ArrayLike, s: ArrayLike = 0.0) -> jax.Array:
@@ -96,16 +107,16 @@ class PeriodicMatern(Kernel):
         return Matern(self.scale, self.lengthscale, self.order).covariance(self.chord(t, s))
 
 
-class PeriodicSquaredExponential(Kernel):
+class PeriodicSquaredExponential(PeriodicCovariance):
     """The squared exponential of the chord: ``k(t, s) = scale^2 exp(-sin^2(pi (t - s) / D) / lengthscale^2)``.
 
     Args:
         scale: standard deviation, in the units of the force; > 0.
-        lengthscale: as a share of the chord, without unit; > 0.
+        lengthscale: relative to the chord, without unit; > 0.
         period: D, in units of time; > 0.
 
     Raises:
-        ValueError: for a parameter that is not positive.
+        ValueError: a parameter is not positive.
 
     Example:
         >>> kernel = PeriodicSquaredExponential(scale=1.0, lengthscale=1.0, period=10.0)
@@ -118,20 +129,20 @@ class PeriodicSquaredExponential(Kernel):
     scale: jax.Array
     lengthscale: jax.Array
     period: jax.Array
-    given: bool = eqx.field(static=True)
+    has_fixed_period: bool = eqx.field(static=True)
 
     def __init__(self, scale: Any, lengthscale: Any, period: Any):
         self.scale = positive_parameter("scale", scale)
         self.lengthscale = positive_parameter("lengthscale", lengthscale)
-        self.period, self.given = positive_parameter("period", period), _is_number(period)
+        self.period, self.has_fixed_period = positive_parameter("period", period), _is_number(period)
 
     def __call__(self, t: ArrayLike, s: ArrayLike = 0.0) -> jax.Array:
         """Return k(t, s), elementwise."""
         return self.scale**2 * jnp.exp(-((self.chord(t, s) / self.lengthscale) ** 2))
 
 
-class ModeratedPeriodicMatern(Kernel):
-    """A periodic Matern kernel that fades away from the beginnings of cycles, and so is not stationary.
+class ModeratedPeriodicMatern(PeriodicCovariance):
+    """A periodic Matern kernel that decays with the distance from the beginning of a cycle; it is not stationary.
 
         k(t, s) = Matern(|sin(pi (t - s) / D)|) exp(-decay (|t| + |s|)),
 
@@ -139,13 +150,13 @@ class ModeratedPeriodicMatern(Kernel):
 
     Args:
         scale: standard deviation at t = 0, in the units of the force; > 0.
-        lengthscale: as a share of the chord, without unit; > 0.
+        lengthscale: relative to the chord, without unit; > 0.
         period: D, in units of time; > 0.
-        decay: per unit of time; >= 0.
+        decay: rate of decay, per unit of time; >= 0.
         order: as in `PeriodicMatern`.
 
     Raises:
-        ValueError: for a parameter that is not positive, or a negative decay.
+        ValueError: a parameter is not positive, or the decay is negative.
 
     Example:
         >>> kernel = ModeratedPeriodicMatern(scale=1.0, lengthscale=1.0, period=10.0, decay=0.5)
@@ -160,12 +171,12 @@ class ModeratedPeriodicMatern(Kernel):
     period: jax.Array
     decay: jax.Array
     order: int = eqx.field(static=True)
-    given: bool = eqx.field(static=True)
+    has_fixed_period: bool = eqx.field(static=True)
 
     def __init__(self, scale: Any, lengthscale: Any, period: Any, decay: Any = 1.0, order: int = 1):
         self.scale = positive_parameter("scale", scale)
         self.lengthscale = positive_parameter("lengthscale", lengthscale)
-        self.period, self.given = positive_parameter("period", period), _is_number(period)
+        self.period, self.has_fixed_period = positive_parameter("period", period), _is_number(period)
         self.decay = standard_deviation_parameter("decay", decay)
         self.order = static_order(order, Matern.orders)
 
@@ -184,23 +195,23 @@ class ModeratedPeriodicMatern(Kernel):
         return jnp.abs(t - self.period * jax.lax.stop_gradient(jnp.round(t / self.period)))
 
 
-class PeriodicKernel(Kernel):
-    """Any covariance function, taken on one cycle and repeated.
+class PeriodicKernel(PeriodicCovariance):
+    """The periodic repetition of any covariance function of one cycle.
 
-        k(t, s) = function(t', s'),    t' = t less as many periods as brings it into [start, start + D), s' likewise.
+        k(t, s) = function(t', s'),    t' = start + (t - start) mod D,  s' = start + (s - start) mod D.
 
     Args:
-        function: k(t, s), elementwise, made of JAX operations. An Equinox module keeps its parameters as leaves.
+        function: k(t, s), elementwise, in JAX operations. An Equinox module keeps its parameters as leaves.
         period: D, in units of time; > 0.
-        stationary: whether the function depends on t - s alone, and repeats by itself. Its eigenfunctions are then
-            sines and cosines, in closed form.
+        stationary: whether the function depends on t - s alone and is periodic itself. Its eigenfunctions are then
+            sines and cosines in closed form.
         start: the beginning of a cycle.
 
     Raises:
-        ValueError: for a period that is not positive; for a function that is not symmetric or not finite, or said to be
-            stationary and not so. Whether it is positive definite is seen by the force that is made of it, where the
-            function's parameters are known; in compiled code a stationary one that is not gives NaN, and so a log
-            likelihood of -inf, and another one is taken for what is left of it.
+        ValueError: the period is not positive; the function is not elementwise, not finite, not symmetric, or is
+            declared stationary and is not. Positive definiteness is checked by the force, where the function's
+            parameters are concrete. In compiled code a stationary kernel that is not positive definite gives NaN, and
+            thus a log likelihood of -inf; any other kernel loses its negative eigenvalues.
 
     Example:
         >>> import jax.numpy as jnp
@@ -211,30 +222,30 @@ class PeriodicKernel(Kernel):
 
     function: Callable[..., Any]
     period: jax.Array
-    first: jax.Array
-    repeats: bool = eqx.field(static=True)
+    cycle_start: jax.Array
+    is_stationary: bool = eqx.field(static=True)
     label: str = eqx.field(static=True)
-    given: bool = eqx.field(static=True)
+    has_fixed_period: bool = eqx.field(static=True)
 
     def __init__(self, function: Callable[..., Any], period: Any, stationary: bool = False, start: Any = 0.0):
         if not callable(function):
             raise TypeError(f"function must be callable as k(t, s), got {type(function).__name__}.")
         self.function = function if isinstance(function, eqx.Module) else jax.tree_util.Partial(function)
-        self.period, self.given = positive_parameter("period", period), _is_number(period)
-        self.first = scalar_parameter("start", start)
-        self.repeats = bool(stationary)
+        self.period, self.has_fixed_period = positive_parameter("period", period), _is_number(period)
+        self.cycle_start = scalar_parameter("start", start)
+        self.is_stationary = bool(stationary)
         self.label = getattr(function, "__name__", type(function).__name__)
         _check_function(self)
 
     @property
     def stationary(self) -> bool:
-        """What was said of the function."""
-        return self.repeats
+        """Whether the function was declared stationary."""
+        return self.is_stationary
 
     @property
     def start(self) -> jax.Array:
         """The beginning of a cycle."""
-        return self.first
+        return self.cycle_start
 
     @property
     def name(self) -> str:
@@ -247,32 +258,33 @@ class PeriodicKernel(Kernel):
 
     def _in_cycle(self, t: ArrayLike) -> jax.Array:
         t = jnp.asarray(t, float)
-        cycle = jax.lax.stop_gradient(jnp.floor((t - self.first) / self.period))
+        cycle = jax.lax.stop_gradient(jnp.floor((t - self.cycle_start) / self.period))
         return t - cycle * self.period
 
 
 def _check_function(kernel: PeriodicKernel) -> None:
-    """Try the function at a few times of a cycle."""
-    # Shares of a cycle without any pattern.
-    share = np.array([0.0, 0.113, 0.331, 0.502, 0.743, 0.958])
-    at = kernel.first + kernel.period * share
-    value = kernel(at[:, None], at[None, :])
+    """Evaluate the function at a few times of a cycle and check the values."""
+    # Irregular fractions of a cycle.
+    fractions = np.array([0.0, 0.113, 0.331, 0.502, 0.743, 0.958])
+    times = kernel.cycle_start + kernel.period * fractions
+    value = kernel(times[:, None], times[None, :])
     if value.shape != (6, 6):
         raise ValueError(f"the kernel {kernel.name!r} must work elementwise: for times of shape (6, 1) and (1, 6) it "
                          f"must return (6, 6), it returned {value.shape}.")
-    known = checks.concrete(value)
-    if known is None:
+    gram = checks.concrete(value)
+    if gram is None:
         return
-    if not np.isfinite(known).all():
-        raise ValueError(f"the kernel {kernel.name!r} is not finite on the cycle from {float(kernel.first):g}.")
-    tolerance = 1e-8 * np.abs(known).max()
-    if np.abs(known - known.T).max() > tolerance:
+    if not np.isfinite(gram).all():
+        raise ValueError(f"the kernel {kernel.name!r} is not finite on the cycle from {float(kernel.cycle_start):g}.")
+    tolerance = 1e-8 * np.abs(gram).max()
+    if np.abs(gram - gram.T).max() > tolerance:
         raise ValueError(f"the kernel {kernel.name!r} is not symmetric: k(t, s) differs from k(s, t) by "
-                         f"{np.abs(known - known.T).max():g}.")
-    if kernel.repeats:
-        moved = np.asarray(kernel(at[:, None] + 0.271 * kernel.period, at[None, :] + 0.271 * kernel.period))
-        if np.abs(moved - known).max() > tolerance:
-            raise ValueError(f"the kernel {kernel.name!r} was said to be stationary with period "
-                             f"{float(kernel.period):g}, but is not: moved by part of a period it differs by "
-                             f"{np.abs(moved - known).max():g}. Leave stationary=False, or write it with a function of "
+                         f"{np.abs(gram - gram.T).max():g}.")
+    if kernel.is_stationary:
+        shifted_times = times + 0.271 * kernel.period
+        shifted = np.asarray(kernel(shifted_times[:, None], shifted_times[None, :]))
+        if np.abs(shifted - gram).max() > tolerance:
+            raise ValueError(f"the kernel {kernel.name!r} is declared stationary with period {float(kernel.period):g}, "
+                             "but is not: shifting both times by a fraction of a period changes it by "
+                             f"{np.abs(shifted - gram).max():g}. Set stationary=False, or write it as a function of "
                              "jnp.sin(pi * (t - s) / period).")

@@ -1,8 +1,8 @@
-"""Brownian motion: a level that wanders."""
+"""Brownian motion as a force."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -20,12 +20,12 @@ class RandomWalk(Force):
         cov(u(t), u(s)) = initial_sd^2 + scale^2 s.
 
     Args:
-        scale: standard deviation gained, in force units / time^(1/2); > 0.
+        scale: square root of the rate at which the variance grows, in force units / time^(1/2); > 0.
         initial_sd: standard deviation of u at the initial time; >= 0.
         mean: a number, or a function of time.
 
     Raises:
-        ValueError: for a scale that is not positive, or a negative standard deviation.
+        ValueError: the scale is not positive, or the initial standard deviation is negative.
 
     Example:
         >>> force = RandomWalk(scale=2.0, initial_sd=1.0)
@@ -37,20 +37,12 @@ class RandomWalk(Force):
     initial_sd: jax.Array
     mean: Any
 
+    state_dim: ClassVar[int] = 1
+
     def __init__(self, scale: Any, initial_sd: Any = 0.0, mean: Any = 0.0):
         self.scale = positive_parameter("scale", scale)
         self.initial_sd = standard_deviation_parameter("initial_sd", initial_sd)
         self.mean = mean_parameter(mean)
-
-    @property
-    def state_dim(self) -> int:
-        """One state, the level."""
-        return 1
-
-    @property
-    def noise_dim(self) -> int:
-        """One Brownian motion."""
-        return 1
 
     def initial_covariance(self) -> jax.Array:
         """Return the covariance (1, 1) at the model's initial time."""
@@ -69,7 +61,7 @@ class RandomWalk(Force):
         return jnp.ones((1, 1)), jnp.reshape(self.scale**2 * dt, (1, 1))
 
     def covariance(self, t: ArrayLike, s: ArrayLike = 0.0) -> jax.Array:
-        """Return the covariance of u(t) and u(s), both counted from the initial time."""
+        """Return the covariance of u(t) and u(s), with times counted from the initial time."""
         return self.initial_sd**2 + self.scale**2 * jnp.minimum(t, s)
 
     def spectral_density(self, omega: ArrayLike) -> jax.Array:

@@ -1,4 +1,4 @@
-"""Resonators that carry the prior of a periodic kernel."""
+"""A sum of resonators whose prior is that of a periodic kernel."""
 
 from __future__ import annotations
 
@@ -10,38 +10,37 @@ from lfm_ppl import checks
 from lfm_ppl.forces.basis import Waves
 from lfm_ppl.forces.constant import Constant
 from lfm_ppl.forces.parameters import standard_deviation_parameter
-from lfm_ppl.forces.periodic_kernels import Kernel
+from lfm_ppl.forces.periodic_kernels import PeriodicCovariance
 from lfm_ppl.forces.quasi_periodic import EXPLAINED_VARIANCE, stationary_basis, warn_of_lost_variance
 from lfm_ppl.forces.resonator import Resonator
 from lfm_ppl.forces.sde import Sum
 from lfm_ppl.linalg import safe_sqrt
 
 
-def resonators(kernel: Kernel, functions: int | None = None, gamma: float = 0.01, noise: Any = 0.0, damping: Any = 0.0,
-               mean: Any = 0.0, explained_variance: float = EXPLAINED_VARIANCE) -> Sum:
-    """Return a level and resonators whose prior is a stationary periodic kernel.
+def resonators(kernel: PeriodicCovariance, functions: int | None = None, gamma: float = 0.01, noise: Any = 0.0,
+               damping: Any = 0.0, mean: Any = 0.0, explained_variance: float = EXPLAINED_VARIANCE) -> Sum:
+    """Return the sum of a level and resonators that has a stationary periodic kernel as its prior.
 
     The leading eigenfunctions of such a kernel are a constant and pairs of cosine and sine, of frequencies j/D and
     variances q_j, its Fourier coefficients; a resonator of period D/j and scale sqrt(q_j) is the j-th pair. Without
-    noise and damping the sum has the covariance of `Periodic` with as many functions; with them, each resonator may
-    change its amplitude and phase with time, where a `QuasiPeriodic` force has one process for all.
+    noise and damping the sum has the covariance of `Periodic` with as many functions. With noise, amplitude and phase
+    of each resonator change with time independently, whereas a `QuasiPeriodic` force has one process for all weights.
 
     Args:
         kernel: a stationary periodic kernel.
         functions: 1 + 2 times the number of resonators; as in `QuasiPeriodic`.
-        gamma: share of the largest eigenvalue above which one counts.
-        noise: of each resonator, as a share of its scale, per time^(1/2); >= 0.
-        damping: of each resonator, per unit of time; >= 0.
-        mean: a number, or a function of time: the bias.
-        explained_variance: share of the kernel's variance that the resonators are to keep; 0 where any will do.
+        gamma: share of the largest eigenvalue above which an eigenvalue is significant.
+        noise: noise of each resonator relative to its scale, per time^(1/2); >= 0.
+        damping: damping of each resonator, per unit of time; >= 0.
+        mean: mean of the force: a number, or a function of time.
+        explained_variance: least share of the kernel's variance that the resonators must explain; 0: no warning.
 
     Warns:
-        ApproximationWarning: as `QuasiPeriodic`.
+        ApproximationWarning: as in `QuasiPeriodic`.
 
     Raises:
-        ValueError: a kernel that is not stationary: its eigenfunctions are no oscillations of one frequency, and as
-            resonators would need a frequency that is not finite where they are zero; a negative noise or damping; and
-            as `QuasiPeriodic`.
+        ValueError: the kernel is not stationary, so that its eigenfunctions are not oscillations of one frequency;
+            noise or damping is negative; and as in `QuasiPeriodic`.
 
     Example:
         >>> from lfm_ppl.forces import PeriodicMatern
@@ -56,9 +55,9 @@ def resonators(kernel: Kernel, functions: int | None = None, gamma: float = 0.01
     basis: Waves = stationary_basis(kernel, functions, gamma)
     warn_of_lost_variance(kernel, basis, explained_variance)
     scales = safe_sqrt(basis.powers)
-    found = [Resonator(kernel.period / (index + 1), scale, noise * scale, damping)
+    terms = [Resonator(kernel.period / (index + 1), scale, noise * scale, damping)
              for index, scale in enumerate(scales)]
     level = checks.concrete(basis.level)
-    # A kernel may have no level at all, but its mean needs a place.
-    spread = safe_sqrt(basis.level) if level is None or level > 0 else jnp.asarray(1e-150)
-    return Sum((Constant(spread, mean), *found))
+    # A kernel may have no level, but the level's force carries the mean. A tiny scale stands for zero.
+    level_scale = safe_sqrt(basis.level) if level is None or level > 0 else jnp.asarray(1e-150)
+    return Sum((Constant(level_scale, mean), *terms))

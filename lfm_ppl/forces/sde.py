@@ -1,4 +1,17 @@
-"""The force protocol: a Gaussian process prior written as a linear SDE; several side by side, or added."""
+"""The force protocol: a Gaussian process prior written as a linear SDE.
+
+1. `Force` is one process u(t): the matrices F, L and P0 of its SDE, its measurement H(t) and its mean.
+2. `Force.discretise` gives the exact transition and process noise of one step; the default is
+   `lfm_ppl.forces.discretise`, and forces with a closed form override it.
+3. Some forces jump at given times, ``z <- G z + N(0, Q)``.
+4. `IndependentForces` joins the SDEs of several forces into one block-diagonal SDE.
+5. `Stack` has one output per force: it is the force block of the joint state-space model.
+6. `Sum` adds the outputs, and is a force itself.
+7. `sde_covariance` and `sde_spectral_density` compute the second moments of the state-space form, which tests compare
+   with the closed forms.
+
+Source: Hartikainen, Seppanen and Sarkka (2012), ICML, section 3.
+"""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -16,7 +29,7 @@ from lfm_ppl.linalg import semidefinite_root
 
 
 class ApproximationWarning(UserWarning):
-    """The SDE of a force differs from the process that it stands for, by more than can be left unsaid."""
+    """The SDE of a force differs noticeably from the process that it approximates."""
 
 
 class Force(eqx.Module):
@@ -24,11 +37,11 @@ class Force(eqx.Module):
 
         u(t) = mean(t) + H(t) z(t),    dz = F z dt + L dbeta,    z(t0) ~ N(0, P0),
 
-    with a standard Brownian motion ``beta``. A subclass says ``initial_covariance`` (P0),
-    ``feedback`` (F), ``dispersion`` (L, spectral density folded in) and its dimensions, and has a
-    field ``mean``; everything else has a default. It says whether it is ``stationary`` (not, by
-    default), and may replace ``discretise`` by a closed form, the measurement by one that depends
-    on time, and add jumps of the state at given times. `lfm_ppl.forces.parameters` checks arguments.
+    with a standard Brownian motion ``beta``. A subclass implements ``initial_covariance`` (P0), ``feedback`` (F) and
+    ``dispersion`` (L, which includes the spectral density of the noise), and has a field ``mean``. All other methods
+    have defaults. A subclass may override ``stationary`` (False by default), ``discretise`` by a closed form and
+    ``measurement`` by a time-dependent row, and may add jumps of the state at given times. The functions of
+    `lfm_ppl.forces.parameters` check constructor arguments.
 
     A force is a pytree: parameters are its array leaves, so that it passes through ``jax.jit``,
     ``jax.vmap`` and ``jax.grad``. Constructors check concrete parameters and let tracers pass.
@@ -41,13 +54,13 @@ class Force(eqx.Module):
 
     @property
     def state_dim(self) -> int:
-        """Number n of states."""
-        raise NotImplementedError
+        """Number n of states. A subclass may state it as a class attribute, which saves tracing ``feedback``."""
+        return jax.eval_shape(self.feedback).shape[0]
 
     @property
     def noise_dim(self) -> int:
         """Number S of independent Brownian motions that drive the states."""
-        raise NotImplementedError
+        return jax.eval_shape(self.dispersion).shape[1]
 
     @property
     def stationary(self) -> bool:
@@ -79,7 +92,10 @@ class Force(eqx.Module):
         return self.discretise(dt)[1]
 
     def measurement(self, t: ArrayLike) -> jax.Array | np.ndarray:
-        """Return H(t) (n,); the first state by default. A constant one is best a NumPy array."""
+        """Return H(t) (n,), by default the row that reads the first state.
+
+        Return a NumPy array where H is constant: products with it then become slices, see `lfm_ppl.linalg.matmul`.
+        """
         return np.eye(self.state_dim)[0]
 
     def mean_at(self, t: ArrayLike) -> jax.Array:
@@ -92,11 +108,11 @@ class Force(eqx.Module):
     def covariance(self, t: ArrayLike, s: ArrayLike = 0.0) -> jax.Array:
         """Return the closed-form covariance of u(t) and u(s), elementwise.
 
-        For a stationary force only ``t - s`` matters, so that ``covariance(lag)`` is its kernel.
+        For a stationary force it depends on ``t - s`` alone, so that ``covariance(lag)`` is its kernel.
         Forces that are not stationary count both times from the model's initial time.
 
         Raises:
-            NotImplementedError: where no closed form is known.
+            NotImplementedError: no closed form is known.
         """
         raise NotImplementedError(
             f"{type(self).__name__} has no closed-form covariance; `sde_covariance` computes it "
@@ -109,7 +125,7 @@ class Force(eqx.Module):
         It is two-sided in angular frequency: ``covariance(0) = 1/(2 pi) int S(omega) domega``.
 
         Raises:
-            NotImplementedError: where no closed form is known or no spectral density exists.
+            NotImplementedError: no closed form is known, or the process has no spectral density.
         """
         raise NotImplementedError(
             f"{type(self).__name__} has no closed-form spectral density; for a stationary force "
@@ -117,13 +133,13 @@ class Force(eqx.Module):
         )
 
     def sde_covariance(self, t: ArrayLike, s: ArrayLike = 0.0) -> jax.Array:
-        """Return the covariance of u(t) and u(s) that the state-space form has, elementwise.
+        """Return the covariance of u(t) and u(s) under the state-space form, elementwise.
 
-        ``H(t) exp(F (t - s)) P(s) H(s)'`` for t >= s. It equals ``covariance`` for an exact form
-        and shows the approximation otherwise. Times as in ``covariance``.
+        ``H(t) exp(F (t - s)) P(s) H(s)'`` for t >= s. It equals ``covariance`` where the state-space form is exact.
+        Times are counted as in ``covariance``.
 
         Raises:
-            NotImplementedError: for a force with jumps.
+            NotImplementedError: the force has jumps.
         """
         if self.jump_times:
             raise NotImplementedError(
@@ -135,11 +151,11 @@ class Force(eqx.Module):
     def covariance_in_model(self, t: ArrayLike, s: ArrayLike, initial_time: ArrayLike) -> jax.Array:
         """Return the covariance of u(t) and u(s) in a model that starts at ``initial_time``, elementwise.
 
-        It is the closed form, or that of the state-space form where there is none, with both times counted from
-        ``initial_time``. A force whose covariance depends on the time itself replaces it.
+        The default is the closed form, or ``sde_covariance`` where there is none, with both times counted from
+        ``initial_time``. A force whose covariance depends on absolute time overrides this method.
 
         Raises:
-            NotImplementedError: for a force with jumps that does not replace it.
+            NotImplementedError: the force has jumps and does not override this method.
         """
         if self.jump_times:
             raise NotImplementedError(f"{type(self).__name__} jumps, and has no covariance between arbitrary times.")
@@ -153,7 +169,7 @@ class Force(eqx.Module):
         """Return the spectral density ``|H (i omega - F)^-1 L|^2`` of the state-space form.
 
         Raises:
-            NotImplementedError: for a force that is not stationary.
+            NotImplementedError: the force is not stationary.
         """
         if not self.stationary:
             raise NotImplementedError(
@@ -164,48 +180,42 @@ class Force(eqx.Module):
 
     @property
     def jump_times(self) -> tuple[float, ...]:
-        """Increasing times at which the state jumps; none by default. They are static."""
+        """Increasing times at which the state jumps, as static Python numbers; none by default."""
         return ()
 
     def jump(self, index: int) -> tuple[jax.Array, jax.Array]:
         """Return G (n, n) and Q (n, n) of the jump ``z <- G z + N(0, Q)`` at ``jump_times[index]``.
 
         Args:
-            index: a Python int, so that each jump may have matrices of its own making.
+            index: a Python int, so that each jump may compute its matrices differently.
 
         Raises:
-            IndexError: where there is no such jump.
+            IndexError: there is no jump with this index.
         """
         count = len(self.jump_times)
-        raise IndexError(f"{type(self).__name__} has {count} jumps, so none at index {index}.")
+        raise IndexError(f"{type(self).__name__} has {count} jumps, so there is no jump at index {index}.")
 
     def check_span(self, name: str, first: float, last: float) -> None:
-        """Check the force against data from ``first`` to ``last``; all is well by default.
+        """Check the force against data that span ``first`` to ``last``; the default accepts any span.
 
         Raises:
-            ValueError: nothing can be learned from such data, for example about a period longer than they are.
+            ValueError: the data carry no information on the force, for example on a period longer than their span.
         """
 
-    def __add__(self, other: "Force") -> "Force":
-        """Return the force that is the sum of two independent forces."""
-        return Sum((self, other)) if isinstance(other, Force) else NotImplemented
+    def __add__(self, term: "Force") -> "Force":
+        """Return the sum of two independent forces."""
+        return Sum((self, term)) if isinstance(term, Force) else NotImplemented
 
-    def __radd__(self, other: Any) -> "Force":
-        """Return the force itself for 0 + force, with which ``sum(forces)`` begins."""
-        return self if isinstance(other, int) and other == 0 else NotImplemented
+    def __radd__(self, term: Any) -> "Force":
+        """Return the force itself for 0 + force, the first addition of ``sum(forces)``."""
+        return self if isinstance(term, int) and term == 0 else NotImplemented
 
 
-class Stack(eqx.Module):
-    """Several independent forces side by side: one block-diagonal SDE with a vector output.
+class IndependentForces(eqx.Module):
+    """The block-diagonal SDE of several independent forces; base of `Stack` and `Sum`.
 
     Attributes:
-        forces: R forces; none is legal. The states are in their order.
-
-    Example:
-        >>> from lfm_ppl.forces import Constant, Matern
-        >>> stack = Stack((Matern(1.0, 2.0, order=1), Constant(3.0)))
-        >>> stack.measurement(0.0).shape
-        (2, 3)
+        forces: R forces. The states are in their order.
     """
 
     forces: tuple[Force, ...]
@@ -214,11 +224,6 @@ class Stack(eqx.Module):
     def state_dim(self) -> int:
         """Number n of states of all forces."""
         return sum(force.state_dim for force in self.forces)
-
-    @property
-    def noise_dim(self) -> int:
-        """Number S of Brownian motions of all forces."""
-        return sum(force.noise_dim for force in self.forces)
 
     def initial_covariance(self) -> jax.Array:
         """Return P0 (n, n)."""
@@ -237,6 +242,28 @@ class Stack(eqx.Module):
         pairs = [force.discretise(dt) for force in self.forces]
         return block_diagonal([p[0] for p in pairs]), block_diagonal([p[1] for p in pairs])
 
+    @property
+    def jump_times(self) -> tuple[float, ...]:
+        """Distinct times at which a force jumps, increasing."""
+        return tuple(sorted({time for force in self.forces for time in force.jump_times}))
+
+    def jump(self, index: int) -> tuple[jax.Array, jax.Array]:
+        """Return G (n, n) and Q (n, n) at ``jump_times[index]``; forces without a jump there are unchanged."""
+        time = self.jump_times[index]
+        pairs = [_jump_at(force, time) for force in self.forces]
+        return block_diagonal([p[0] for p in pairs]), block_diagonal([p[1] for p in pairs])
+
+
+class Stack(IndependentForces):
+    """Several independent forces, perhaps none, as one block-diagonal SDE with a vector output.
+
+    Example:
+        >>> from lfm_ppl.forces import Constant, Matern
+        >>> stack = Stack((Matern(1.0, 2.0, order=1), Constant(3.0)))
+        >>> stack.measurement(0.0).shape
+        (2, 3)
+    """
+
     def measurement(self, t: ArrayLike) -> Any:
         """Return H(t) (R, n), one row for each force."""
         rows = [force.measurement(t)[None, :] for force in self.forces]
@@ -246,43 +273,35 @@ class Stack(eqx.Module):
         """Return the means (R,) at time t."""
         return jnp.asarray([force.mean_at(t) for force in self.forces], dtype=float)
 
-    @property
-    def jump_times(self) -> tuple[float, ...]:
-        """All times at which a force jumps, increasing, each once."""
-        return tuple(sorted({time for force in self.forces for time in force.jump_times}))
-
-    def jump(self, index: int) -> tuple[jax.Array, jax.Array]:
-        """Return G (n, n) and Q (n, n) at ``jump_times[index]``; the other forces stay."""
-        time = self.jump_times[index]
-        pairs = [_jump_at(force, time) for force in self.forces]
-        return block_diagonal([p[0] for p in pairs]), block_diagonal([p[1] for p in pairs])
-
     def jump_table(self) -> tuple[jax.Array, jax.Array] | None:
-        """Return G and Q (K + 1, n, n) of all K jumps, the last entry (index -1) for no jump; None without any."""
+        """Return G and Q (K + 1, n, n) of all K jumps, or None without jumps.
+
+        The last entry (index -1) is the identity without noise, for rows of a time grid without a jump.
+        """
         if not self.jump_times:
             return None
-        nothing = (jnp.eye(self.state_dim), jnp.zeros((self.state_dim, self.state_dim)))
-        pairs = [*(self.jump(index) for index in range(len(self.jump_times))), nothing]
+        identity = (jnp.eye(self.state_dim), jnp.zeros((self.state_dim, self.state_dim)))
+        pairs = [*(self.jump(index) for index in range(len(self.jump_times))), identity]
         return jnp.stack([pair[0] for pair in pairs]), jnp.stack([pair[1] for pair in pairs])
 
     def jump_roots(self) -> tuple[jax.Array, jax.Array] | None:
-        """Return the same with a factor of Q, for draws: ``z <- G z + root N(0, I)``."""
+        """Return `jump_table` with a square root of Q in place of Q, for draws ``z <- G z + root N(0, I)``."""
         table = self.jump_table()
         return None if table is None else (table[0], jax.vmap(semidefinite_root)(table[1]))
 
 
-class Sum(Force):
+class Sum(IndependentForces, Force):
     """The sum of independent forces, itself a force: ``u(t) = sum_r u_r(t)``.
 
-    States stack, measurements concatenate; means, covariances and spectral densities add, and
-    jumps merge. ``force + force`` is the usual way to write it.
+    States are stacked and measurements concatenated; means, covariances and spectral densities are added, and jumps
+    are merged. ``force + force`` is the usual way to write it.
 
     Args:
         forces: at least one force; sums among them are flattened.
 
     Raises:
-        TypeError: where an entry is not a force.
-        ValueError: where there is none.
+        TypeError: an entry is not a force.
+        ValueError: there are no forces.
 
     Example:
         >>> from lfm_ppl.forces import Constant, Matern
@@ -291,22 +310,15 @@ class Sum(Force):
         10.0
     """
 
-    stack: Stack
-
     def __init__(self, forces: tuple[Force, ...]):
-        flat: list[Force] = []
+        terms: list[Force] = []
         for force in forces:
             if not isinstance(force, Force):
                 raise TypeError(f"forces must contain forces only, got {force!r}.")
-            flat.extend(force.forces if isinstance(force, Sum) else (force,))
-        if not flat:
+            terms.extend(force.forces if isinstance(force, Sum) else (force,))
+        if not terms:
             raise ValueError("forces must contain at least one force, got none.")
-        self.stack = Stack(tuple(flat))
-
-    @property
-    def forces(self) -> tuple[Force, ...]:
-        """The forces that are added."""
-        return self.stack.forces
+        self.forces = tuple(terms)
 
     @property  # type: ignore[misc]  # Equinox lets a property fill in an abstract field
     def mean(self) -> Callable[[ArrayLike], jax.Array]:
@@ -314,50 +326,24 @@ class Sum(Force):
         return self.mean_at
 
     @property
-    def state_dim(self) -> int:
-        """Number n of states of all terms."""
-        return self.stack.state_dim
-
-    @property
-    def noise_dim(self) -> int:
-        """Number S of Brownian motions of all terms."""
-        return self.stack.noise_dim
-
-    @property
     def stationary(self) -> bool:
         """Whether every term is stationary."""
         return all(force.stationary for force in self.forces)
 
-    def initial_covariance(self) -> jax.Array:
-        """Return P0 (n, n), block-diagonal."""
-        return self.stack.initial_covariance()
-
-    def feedback(self) -> jax.Array:
-        """Return F (n, n), block-diagonal."""
-        return self.stack.feedback()
-
-    def dispersion(self) -> jax.Array:
-        """Return L (n, S), block-diagonal."""
-        return self.stack.dispersion()
-
-    def discretise(self, dt: ArrayLike) -> tuple[jax.Array, jax.Array]:
-        """Return transition (n, n) and process noise (n, n), block-diagonal."""
-        return self.stack.discretise(dt)
-
     def measurement(self, t: ArrayLike) -> jax.Array | np.ndarray:
-        """Return H(t) (n,), the measurements of the terms one after the other."""
-        return self.stack.measurement(t).sum(0)
+        """Return H(t) (n,), the concatenated measurements of the terms."""
+        return Stack(self.forces).measurement(t).sum(0)
 
     def mean_at(self, t: ArrayLike) -> jax.Array:
         """Return the sum of the means at time t."""
-        return self.stack.mean_at(t).sum()
+        return Stack(self.forces).mean_at(t).sum()
 
     def covariance(self, t: ArrayLike, s: ArrayLike = 0.0) -> jax.Array:
         """Return the sum of the closed-form covariances."""
         return functools.reduce(jnp.add, [force.covariance(t, s) for force in self.forces])
 
     def sde_covariance(self, t: ArrayLike, s: ArrayLike = 0.0) -> jax.Array:
-        """Return the sum of the covariances that the terms have in state space."""
+        """Return the sum of the state-space covariances of the terms."""
         return functools.reduce(jnp.add, [force.sde_covariance(t, s) for force in self.forces])
 
     def covariance_in_model(self, t: ArrayLike, s: ArrayLike, initial_time: ArrayLike) -> jax.Array:
@@ -373,18 +359,9 @@ class Sum(Force):
         for force in self.forces:
             force.check_span(name, first, last)
 
-    @property
-    def jump_times(self) -> tuple[float, ...]:
-        """All times at which a term jumps."""
-        return self.stack.jump_times
-
-    def jump(self, index: int) -> tuple[jax.Array, jax.Array]:
-        """Return G (n, n) and Q (n, n), block-diagonal, at ``jump_times[index]``."""
-        return self.stack.jump(index)
-
 
 def block_diagonal(blocks: Sequence[jax.Array | np.ndarray]) -> Any:
-    """Return the matrix with ``blocks`` (r_i, c_i) on its diagonal, in NumPy if all are; (0, 0) without any."""
+    """Return the block-diagonal matrix of ``blocks`` (r_i, c_i), in NumPy if all are NumPy; (0, 0) without blocks."""
     if blocks and all(isinstance(block, np.ndarray) for block in blocks):
         return scipy.linalg.block_diag(*blocks)
     return jax.scipy.linalg.block_diag(*blocks) if blocks else jnp.zeros((0, 0))
@@ -398,7 +375,7 @@ def _jump_at(force, time):
 
 @eqx.filter_jit
 def _covariance(force, t, s):
-    def between(t, s):
+    def covariance_of_pair(t, s):
         late, early = jnp.maximum(t, s), jnp.minimum(t, s)
         variance = force.initial_covariance()
         if not force.stationary:
@@ -407,7 +384,7 @@ def _covariance(force, t, s):
         row = force.measurement(late) @ force.transition(late - early)
         return row @ variance @ force.measurement(early)
 
-    return jnp.vectorize(between)(t, s)
+    return jnp.vectorize(covariance_of_pair)(t, s)
 
 
 @eqx.filter_jit

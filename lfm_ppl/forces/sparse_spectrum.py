@@ -1,4 +1,4 @@
-"""The sparse spectrum approximation: oscillations of random frequencies, to compare other forces with."""
+"""The sparse spectrum approximation: oscillations of random frequencies, for comparison with other forces."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lfm_ppl import checks
 from lfm_ppl.forces.basis import Waves, fourier_coefficients
 from lfm_ppl.forces.matern import Matern
 from lfm_ppl.forces.parameters import mean_parameter, positive_parameter
-from lfm_ppl.forces.periodic_kernels import Kernel
+from lfm_ppl.forces.periodic_kernels import PeriodicCovariance
 from lfm_ppl.forces.sde import Force
 from lfm_ppl.forces.squared_exponential import SquaredExponential
 
@@ -21,14 +21,14 @@ _HARMONICS = 512
 
 
 class SparseSpectrum(Force):
-    r"""A force made of S oscillations: what random frequencies leave of a stationary Gaussian process.
+    r"""A sum of S oscillations that approximates a stationary Gaussian process by random frequencies.
 
         u(t) = sum_i a_i cos(w_i t) + b_i sin(w_i t),    a_i, b_i ~ N(0, scale^2 / S),
         k(t, s) = scale^2 / S sum_i cos(w_i (t - s)).
 
-    With frequencies drawn from the spectral density of a kernel this is its unbiased estimate, off by about
-    ``scale^2 / sqrt(2 S)`` at long lags. It is meant for comparisons; `Matern` and `SquaredExponential` forces are
-    better and cheaper, and `Periodic` ones where the kernel is periodic.
+    With frequencies drawn from the spectral density of a kernel it is an unbiased estimate of the kernel, with an
+    error of about ``scale^2 / sqrt(2 S)`` at long lags. It is meant for comparisons; `Matern`, `SquaredExponential`
+    and, for periodic kernels, `Periodic` forces are more accurate and cheaper.
 
     Args:
         scale: standard deviation of u, in the units of the force; > 0.
@@ -36,7 +36,7 @@ class SparseSpectrum(Force):
         mean: a number, or a function of time.
 
     Raises:
-        ValueError: for a scale that is not positive, or frequencies that are not a vector of finite numbers.
+        ValueError: the scale is not positive, or the frequencies are not a vector of finite numbers.
 
     Example:
         >>> import numpy as np
@@ -63,16 +63,6 @@ class SparseSpectrum(Force):
     def _waves(self) -> Waves:
         count = self.frequencies.shape[0]
         return Waves(None, self.frequencies, self.scale**2 / count * jnp.ones(count))
-
-    @property
-    def state_dim(self) -> int:
-        """Two states for each frequency."""
-        return 2 * self.frequencies.shape[0]
-
-    @property
-    def noise_dim(self) -> int:
-        """No noise."""
-        return 0
 
     @property
     def stationary(self) -> bool:
@@ -105,27 +95,27 @@ class SparseSpectrum(Force):
         return self.scale**2 * jnp.cos(lag[..., None] * self.frequencies).mean(-1)
 
     def spectral_density(self, omega: ArrayLike) -> jax.Array:
-        """Raise NotImplementedError: all the power sits at single frequencies."""
+        """Raise NotImplementedError: the spectrum consists of lines."""
         raise NotImplementedError("a SparseSpectrum force has all its power at single frequencies, so its spectral "
                                   "density is not a function; use `covariance`.")
 
     def sde_spectral_density(self, omega: ArrayLike) -> jax.Array:
-        """Raise NotImplementedError, as `spectral_density` does."""
+        """Raise NotImplementedError like `spectral_density`."""
         return self.spectral_density(omega)
 
 
-def random_frequencies(key: jax.Array, prior: Force | Kernel, count: int) -> jax.Array:
+def random_frequencies(key: jax.Array, prior: Force | PeriodicCovariance, count: int) -> jax.Array:
     """Draw frequencies (count,) from the spectral density of a stationary kernel, in radians per unit of time.
 
     Args:
         key: JAX random key.
-        prior: a `Matern` or `SquaredExponential` force, or a stationary periodic kernel, whose power sits at multiples
-            of its frequency.
-        count: S.
+        prior: a `Matern` or `SquaredExponential` force, or a stationary periodic kernel, whose spectrum consists of
+            lines at multiples of its frequency.
+        count: S, the number of frequencies.
 
     Raises:
-        TypeError: another prior, or a key that is none.
-        ValueError: a kernel that is not stationary.
+        TypeError: the prior is of another type, or the key is not a random key.
+        ValueError: the kernel is not stationary.
 
     Example:
         >>> import jax
@@ -143,7 +133,7 @@ def random_frequencies(key: jax.Array, prior: Force | Kernel, count: int) -> jax
         return prior.rate / np.sqrt(freedom) * jax.random.t(key, freedom, (count,))
     if isinstance(prior, SquaredExponential):
         return jax.random.normal(key, (count,)) / prior.lengthscale
-    if not isinstance(prior, Kernel):
+    if not isinstance(prior, PeriodicCovariance):
         raise TypeError("prior must be a lfm.Matern or lfm.SquaredExponential force or a stationary periodic kernel, "
                         f"got {type(prior).__name__}.")
     if not prior.stationary:

@@ -1,4 +1,4 @@
-"""What forces share whose lengthscale only stretches time: one set of matrices for each order."""
+"""Base of stationary forces whose lengthscale only rescales time: one set of matrices for each order."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ class Stretched(Force):
     """A stationary force with P0 = scale^2 P_1, F = lam F_1 and L = scale sqrt(lam) L_1.
 
     The state is ``(v, v'/lam, v''/lam^2, ...)`` with a rate lam proportional to 1/lengthscale, so that the matrices of
-    the unit process depend on the order alone. v is u itself, unless a subclass replaces ``measurement``. A subclass
-    says ``unit`` and ``rate``.
+    the unit process depend on the order alone. v equals u, unless a subclass overrides ``measurement``. A subclass
+    implements ``unit`` and ``rate``.
 
     Args:
         scale: standard deviation of u, in the units of the force; > 0.
@@ -68,9 +68,9 @@ class Stretched(Force):
         raise NotImplementedError
 
     @property
-    def noise_dim(self) -> int:
-        """One Brownian motion."""
-        return 1
+    def state_dim(self) -> int:
+        """Number n of states."""
+        return len(self.unit.feedback)
 
     @property
     def stationary(self) -> bool:

@@ -1,9 +1,19 @@
-"""How the weights of a periodic force change from cycle to cycle, as processes of unit variance."""
+"""Evolutions of the weights of a quasi-periodic force, as processes of unit variance.
+
+1. `CQM` changes the weights continuously: a Matern process of order 0.
+2. `SQM` and `WQM` change them at change points only, by a jump ``a <- G a + N(0, Q)``; between change points the
+   weights are constant.
+3. The covariance of two times depends on the number of change points up to each of them (`cycle`).
+4. `change_points` gives the ends of the cycles of a known period. Change points are static, since they set the time
+   grid of a filter.
+
+Source: Reece, Ghosh, Rogers, Roberts and Jennings (2014), Journal of Machine Learning Research 15, section 6.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -26,7 +36,7 @@ class CQM(Matern):
         lengthscale: in units of time; > 0.
 
     Raises:
-        ValueError: for a lengthscale that is not positive.
+        ValueError: the lengthscale is not positive.
 
     Example:
         >>> round(float(CQM(lengthscale=10.0).covariance(10.0)), 6)
@@ -39,21 +49,13 @@ class CQM(Matern):
         super().__init__(1.0, lengthscale, order=0)
 
 
-class _Steps(Force):
-    """A weight that stands still but for jumps ``a <- G a + N(0, Q)`` at change points; at first a ~ N(0, 1)."""
+class _StepEvolution(Force):
+    """A weight a ~ N(0, 1) that is constant except for jumps ``a <- G a + N(0, Q)`` at change points."""
 
     change_points: tuple[float, ...] = eqx.field(static=True)
     mean: Any
 
-    @property
-    def state_dim(self) -> int:
-        """One state."""
-        return 1
-
-    @property
-    def noise_dim(self) -> int:
-        """No noise between change points."""
-        return 0
+    state_dim: ClassVar[int] = 1
 
     @property
     def jump_times(self) -> tuple[float, ...]:
@@ -77,30 +79,30 @@ class _Steps(Force):
         return jnp.ones((1, 1)), jnp.zeros((1, 1))
 
     def sde_covariance(self, t: ArrayLike, s: ArrayLike = 0.0) -> jax.Array:
-        """Return the same as `covariance`, which is exact."""
+        """Return `covariance`, which is exact."""
         return self.covariance(t, s)
 
     def covariance(self, t: ArrayLike, s: ArrayLike = 0.0) -> jax.Array:
-        """Return k(t, s), elementwise; the times are the model's."""
+        """Return k(t, s), elementwise, for times of the model."""
         return self.between_cycles(self.cycle(t), self.cycle(s))
 
     def covariance_in_model(self, t: ArrayLike, s: ArrayLike, initial_time: ArrayLike) -> jax.Array:
-        """Return k(t, s) in a model that starts at ``initial_time``: no change point before it counts."""
-        before = self.cycle(initial_time)
-        return self.between_cycles(self.cycle(t) - before, self.cycle(s) - before)
+        """Return k(t, s) in a model that starts at ``initial_time``, which ignores earlier change points."""
+        first_cycle = self.cycle(initial_time)
+        return self.between_cycles(self.cycle(t) - first_cycle, self.cycle(s) - first_cycle)
 
-    def between_cycles(self, one: jax.Array, other: jax.Array) -> jax.Array:
-        """Return the covariance of the weights in two cycles, elementwise; the first cycle is number 0."""
+    def between_cycles(self, i: jax.Array, j: jax.Array) -> jax.Array:
+        """Return the covariance of the weights in cycles i and j, elementwise; the first cycle is number 0."""
         raise NotImplementedError
 
     def cycle(self, t: ArrayLike) -> jax.Array:
-        """Return the number of change points up to t, elementwise; one at t itself counts."""
+        """Return the number of change points at or before t, elementwise."""
         points = np.asarray(self.change_points, float)
         return (jnp.asarray(t, float)[..., None] >= points).sum(-1)
 
 
-class SQM(_Steps):
-    """Weights that step at change points and keep their variance (step quasi model).
+class SQM(_StepEvolution):
+    """Weights that jump at change points and keep their variance (step quasi model).
 
         k(t, s) = exp(-|C(t) - C(s)| / lengthscale),    C(t) the number of change points up to t.
 
@@ -108,10 +110,10 @@ class SQM(_Steps):
 
     Args:
         lengthscale: in cycles, without unit; > 0.
-        change_points: increasing times, known before compilation. Those up to a model's initial time do nothing.
+        change_points: increasing times, known before compilation. A model ignores change points up to its initial time.
 
     Raises:
-        ValueError: for a lengthscale that is not positive, or change points that do not increase.
+        ValueError: the lengthscale is not positive, or the change points do not increase.
 
     Example:
         >>> steps = SQM(lengthscale=2.0, change_points=(24.0, 48.0))
@@ -125,7 +127,7 @@ class SQM(_Steps):
 
     def __init__(self, lengthscale: Any, change_points: Sequence[float]):
         self.lengthscale = positive_parameter("lengthscale", lengthscale)
-        self.change_points = _increasing(change_points)
+        self.change_points = _increasing_times(change_points)
         self.mean = scalar_parameter("mean", 0.0)
 
     def jump(self, index: int) -> tuple[jax.Array, jax.Array]:
@@ -134,25 +136,25 @@ class SQM(_Steps):
             return super().jump(index)
         return jnp.exp(-jnp.ones((1, 1)) / self.lengthscale), -jnp.expm1(-2.0 * jnp.ones((1, 1)) / self.lengthscale)
 
-    def between_cycles(self, one: jax.Array, other: jax.Array) -> jax.Array:
-        """Return ``exp(-|one - other| / lengthscale)``."""
-        return jnp.exp(-jnp.abs(one - other) / self.lengthscale)
+    def between_cycles(self, i: jax.Array, j: jax.Array) -> jax.Array:
+        """Return ``exp(-|i - j| / lengthscale)``."""
+        return jnp.exp(-jnp.abs(i - j) / self.lengthscale)
 
 
-class WQM(_Steps):
-    """Weights that step at change points and spread (Wiener-step quasi model).
+class WQM(_StepEvolution):
+    """Weights that jump at change points and gain variance (Wiener-step quasi model).
 
         k(t, s) = 1 + growth min(C(t), C(s)),    C(t) the number of change points up to t.
 
     At a change point ``a <- a + N(0, growth)``.
 
     Args:
-        growth: variance gained at a change point, as a share of the first cycle's; >= 0.
-        change_points: increasing times, known before compilation. Those up to a model's initial time do nothing, but
-            count in `covariance`.
+        growth: variance gained at a change point, relative to the variance of the first cycle; >= 0.
+        change_points: increasing times, known before compilation. A model ignores change points up to its initial
+            time; `covariance` counts them.
 
     Raises:
-        ValueError: for a negative growth, or change points that do not increase.
+        ValueError: the growth is negative, or the change points do not increase.
 
     Example:
         >>> steps = WQM(growth=0.25, change_points=(24.0, 48.0))
@@ -166,7 +168,7 @@ class WQM(_Steps):
 
     def __init__(self, growth: Any, change_points: Sequence[float]):
         self.growth = standard_deviation_parameter("growth", growth)
-        self.change_points = _increasing(change_points)
+        self.change_points = _increasing_times(change_points)
         self.mean = scalar_parameter("mean", 0.0)
 
     def jump(self, index: int) -> tuple[jax.Array, jax.Array]:
@@ -175,22 +177,22 @@ class WQM(_Steps):
             return super().jump(index)
         return jnp.ones((1, 1)), jnp.reshape(self.growth, (1, 1))
 
-    def between_cycles(self, one: jax.Array, other: jax.Array) -> jax.Array:
-        """Return ``1 + growth min(one, other)``."""
-        return 1.0 + self.growth * jnp.minimum(one, other)
+    def between_cycles(self, i: jax.Array, j: jax.Array) -> jax.Array:
+        """Return ``1 + growth min(i, j)``."""
+        return 1.0 + self.growth * jnp.minimum(i, j)
 
 
 def change_points(period: float, start: float, stop: float) -> tuple[float, ...]:
-    """Return the ends of the cycles that begin at ``start``, up to ``stop``: start + D, start + 2 D, ...
+    """Return the ends of the cycles from ``start`` to ``stop``: start + D, start + 2 D, ...
 
     Args:
-        period: D, in units of time; a number that is known before compilation, since the times of jumps are static.
-        start: where the first cycle begins.
+        period: D, in units of time; known before compilation, since jump times are static.
+        start: beginning of the first cycle.
         stop: the last time of interest.
 
     Raises:
-        ValueError: a period that is not positive, or longer than the time between start and stop.
-        TypeError: a traced period.
+        ValueError: the period is not positive, or longer than the time from start to stop.
+        TypeError: the period is traced.
 
     Example:
         >>> change_points(24.0, start=0.0, stop=72.0)
@@ -199,7 +201,7 @@ def change_points(period: float, start: float, stop: float) -> tuple[float, ...]
     if checks.traced((period, start, stop)):
         raise TypeError("period, start and stop must be known before compilation, since change points are static; "
                         "pass numbers, and keep the change points fixed where the period is a parameter.")
-    # As NumPy numbers: inside compiled code jnp would make tracers of them.
+    # NumPy arithmetic: inside compiled code, jnp functions turn numbers into tracers.
     for name, value in (("period", period), ("start", start), ("stop", stop)):
         checks.finite(name, value)
     checks.positive("period", period)
@@ -211,16 +213,16 @@ def change_points(period: float, start: float, stop: float) -> tuple[float, ...]
     return tuple(start + period * index for index in range(1, count + 1))
 
 
-def _increasing(points: Sequence[float]) -> tuple[float, ...]:
+def _increasing_times(points: Sequence[float]) -> tuple[float, ...]:
     if checks.traced(points):
         raise TypeError("change_points must be known before compilation; pass numbers, not traced values.")
-    known = np.asarray(points)
-    if known.dtype.kind not in "biuf" or known.ndim != 1:
+    times = np.asarray(points)
+    if times.dtype.kind not in "biuf" or times.ndim != 1:
         raise TypeError(f"change_points must be a sequence of times, got {points!r}.")
-    checks.finite("change_points", known)
-    back = np.flatnonzero(np.diff(known) <= 0)
-    if back.size:
-        index = int(back[0]) + 1
-        raise ValueError(f"change_points must increase: entry {index} is {known[index]:g} after {known[index - 1]:g}. "
-                         "Sort them, each once.")
-    return tuple(float(point) for point in known)
+    checks.finite("change_points", times)
+    disordered = np.flatnonzero(np.diff(times) <= 0)
+    if disordered.size:
+        index = int(disordered[0]) + 1
+        raise ValueError(f"change_points must increase: entry {index} is {times[index]:g} after {times[index - 1]:g}. "
+                         "Sort them and remove repeated entries.")
+    return tuple(float(time) for time in times)

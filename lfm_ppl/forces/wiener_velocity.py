@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ from lfm_ppl.forces.sde import Force
 
 
 class WienerVelocity(Force):
-    """Integrated Brownian motion, ``d(du/dt) = scale dbeta``: smooth and without a lengthscale.
+    """Integrated Brownian motion, ``d(du/dt) = scale dbeta``: a smooth force without a lengthscale.
 
     The state is ``(u, u')``. With independent ``u(t0) ~ N(0, initial_value_sd^2)`` and
     ``u'(t0) ~ N(0, initial_velocity_sd^2)``, and with times t >= s counted from the model's
@@ -27,14 +27,14 @@ class WienerVelocity(Force):
     initial variance its posterior mean is a cubic spline.
 
     Args:
-        scale: standard deviation that the velocity gains, in force units / time^(3/2); > 0.
+        scale: square root of the rate at which the variance of the velocity grows, in force units / time^(3/2); > 0.
         initial_value_sd: standard deviation of u at the initial time; >= 0.
         initial_velocity_sd: standard deviation of u' at the initial time, in force units / time;
             >= 0.
         mean: a number, or a function of time.
 
     Raises:
-        ValueError: for a scale that is not positive, or a negative standard deviation.
+        ValueError: the scale is not positive, or an initial standard deviation is negative.
 
     Example:
         >>> force = WienerVelocity(scale=1.0, initial_value_sd=2.0)
@@ -47,6 +47,8 @@ class WienerVelocity(Force):
     initial_velocity_sd: jax.Array
     mean: Any
 
+    state_dim: ClassVar[int] = 2
+
     def __init__(
         self,
         scale: Any,
@@ -58,16 +60,6 @@ class WienerVelocity(Force):
         self.initial_value_sd = standard_deviation_parameter("initial_value_sd", initial_value_sd)
         self.initial_velocity_sd = standard_deviation_parameter("initial_velocity_sd", initial_velocity_sd)
         self.mean = mean_parameter(mean)
-
-    @property
-    def state_dim(self) -> int:
-        """Two states, value and velocity."""
-        return 2
-
-    @property
-    def noise_dim(self) -> int:
-        """One Brownian motion."""
-        return 1
 
     def initial_covariance(self) -> jax.Array:
         """Return the covariance (2, 2) at the model's initial time."""
@@ -89,11 +81,11 @@ class WienerVelocity(Force):
         return transition, self.scale**2 * noise
 
     def covariance(self, t: ArrayLike, s: ArrayLike = 0.0) -> jax.Array:
-        """Return the covariance of u(t) and u(s), both counted from the initial time."""
+        """Return the covariance of u(t) and u(s), with times counted from the initial time."""
         late, early = jnp.maximum(t, s), jnp.minimum(t, s)
-        driven = early**3 / 3.0 + early**2 * (late - early) / 2.0
+        integrated_noise = early**3 / 3.0 + early**2 * (late - early) / 2.0
         initial = self.initial_value_sd**2 + self.initial_velocity_sd**2 * late * early
-        return initial + self.scale**2 * driven
+        return initial + self.scale**2 * integrated_noise
 
     def spectral_density(self, omega: ArrayLike) -> jax.Array:
         """Raise NotImplementedError: integrated Brownian motion is not stationary."""

@@ -12,13 +12,13 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.fingerprint import signature
 from lfm_ppl.inference.kernels.algorithm import SamplingAlgorithm
 from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalRAM, particle_marginal
 from lfm_ppl.inference.kernels.ram import RAM
 from lfm_ppl.inference.kernels.robust_metropolis import robust_metropolis
 from lfm_ppl.inference.laplace_start import Laplace
 from lfm_ppl.inference.nuts import NUTSState, nuts, nuts_options
+from lfm_ppl.inference.traced_model import signature
 
 _SLOW_WARMUP_HINT = (
     "this warm-up is slow, and the time left may still grow. From the posterior mode, with the covariance "

@@ -17,10 +17,10 @@ from numpyro.primitives import _PYRO_STACK
 
 from lfm_ppl import checks
 from lfm_ppl.batching import mapped
-from lfm_ppl.constrained.augmented import COARSE, is_count, rows, stacked_model, with_times
-from lfm_ppl.constrained.boxes import boxes
+from lfm_ppl.constrained.augmented import COARSE, add_times, build_rows, is_count, stacked_model
+from lfm_ppl.constrained.boxes import build_boxes
 from lfm_ppl.constrained.constraints import build_constraints
-from lfm_ppl.constrained.evidence import Bounded, check_linear, check_variances
+from lfm_ppl.constrained.evidence import TruncatedPosterior, check_linear, check_variances
 from lfm_ppl.constrained.full_information import check_settings
 from lfm_ppl.filtering.breakdown import warn_of_breakdown
 from lfm_ppl.filtering.filter import (
@@ -47,12 +47,7 @@ from lfm_ppl.filtering.sites import (
     is_linear,
     leave_one_out,
 )
-from lfm_ppl.filtering.smoother import (
-    SmootherResult,
-    check_iterations,
-    smooth_on,
-    smoothing_grids,
-)
+from lfm_ppl.filtering.smoother import SmootherResult, check_iterations, smooth_on
 from lfm_ppl.filtering.time_grid import TimeGrid, build_time_grid
 from lfm_ppl.filtering.update import Sites
 from lfm_ppl.gradients import finite_or_minus_infinity
@@ -254,20 +249,20 @@ class MarginalLikelihood(dist.Distribution):
         if checks.concrete(self.times) is not None:
             check_linear(self.bounded(), self.draws)
 
-    def bounded(self, at: Any = None) -> Bounded:
+    def bounded(self, at: Any = None) -> TruncatedPosterior:
         """Return what the log density under constraints is made of.
 
         Args:
             at: (K,) further times for trajectories, at which the constraints need not hold.
         """
-        found = boxes(build_constraints(self.model, self.lower, self.upper, self.constraints))
-        laid_out = rows(self.model, self.times, np.asarray(self.grid) if isinstance(self.grid, tuple) else self.grid,
-                        COARSE)
+        boxes = build_boxes(build_constraints(self.model, self.lower, self.upper, self.constraints))
+        rows = build_rows(self.model, self.times, np.asarray(self.grid) if isinstance(self.grid, tuple) else self.grid,
+                          COARSE)
         if at is not None:
-            laid_out = with_times(laid_out, np.asarray(at, float))
-        ssm = stacked_model(self.model, found)
-        return Bounded(ssm, self.rule, build_time_grid(ssm, laid_out.times, self.steps), laid_out, found,
-                       check_variances(self.model, np.shape(self.times)[0]), SiteSettings())
+            rows = add_times(rows, np.asarray(at, float))
+        ssm = stacked_model(self.model, boxes)
+        return TruncatedPosterior(ssm, self.rule, build_time_grid(ssm, rows.times, self.steps), rows, boxes,
+                                  check_variances(self.model, np.shape(self.times)[0]), SiteSettings())
 
     def with_times(self, times: Any) -> MarginalLikelihood:
         """Return the same distribution for times that are known, where its own were traced."""
@@ -392,8 +387,8 @@ class MarginalLikelihood(dist.Distribution):
             (x, u) (L, M + R), and the times (L,).
         """
         problem = self.bounded(at)
-        passed = problem.proposal(y, problem.propagated(y))._replace(steps=None)
-        path = problem.chosen(key, passed, 1, _CANDIDATES)[..., 0]
+        passed = problem.proposal(y, problem.propagate_expectations(y))._replace(steps=None)
+        path = problem.sample_trajectories(key, passed, 1, _CANDIDATES)[..., 0]
         # The last row of a time is the one at which the constraint holds.
         wanted = np.asarray(self.times if at is None else at, float)
         index = np.searchsorted(problem.rows.times, wanted, side="right") - 1
@@ -402,7 +397,7 @@ class MarginalLikelihood(dist.Distribution):
     def constrained_leave_one_out(self, y: jax.Array) -> jax.Array:
         """Return (T,), log p(y_k | y_-k, c), by expectation propagation."""
         problem = self.bounded()
-        found = problem.propagated(y, "all")
+        found = problem.propagate_expectations(y, "all")
         predictor = backward(found.passed, Moments(*problem.ssm.initial()), problem.grid).predictor
         assert predictor is not None
         data, outputs = jnp.asarray(problem.rows.data), y.shape[1]
@@ -419,10 +414,9 @@ class MarginalLikelihood(dist.Distribution):
 
     def smooth(self, y: Any, at: Any = None) -> SmootherResult:
         """Smooth with this distribution's settings; see `lfm_ppl.smooth`. Constraints are of no account."""
-        grids = smoothing_grids(self.ssm, self.times, self.steps, self.max_step, at, self.iterations,
-                                self.tolerance)
+        grid = build_time_grid(self.ssm, self.times, self.steps, self.max_step, at, tolerance=self.tolerance)
         y = self._checked(y)
-        return smooth_on(self.ssm, self.rule, grids, y, self.iterations, self.damping, self.site_settings)
+        return smooth_on(self.ssm, self.rule, grid, y, self.iterations, self.damping, self.site_settings)
 
 
 def _shown(value: Any) -> str:

@@ -13,16 +13,16 @@ import numpy as np
 
 from lfm_ppl import checks
 from lfm_ppl.batching import BATCH_SIZE, mapped, on_cpu, side_by_side, threads
-from lfm_ppl.filtering.smoother import LONGEST_FORECAST, SmootherResult
-from lfm_ppl.filtering.time_grid import build_time_grid, longest_step
+from lfm_ppl.filtering.smoother import SmootherResult
+from lfm_ppl.filtering.time_grid import LONGEST_FORECAST, build_time_grid
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.fingerprint import signature
 from lfm_ppl.inference.marginal_likelihood import SIMULATION_STEPS, MarginalLikelihood, Panel
 from lfm_ppl.inference.random_keys import split_keys
+from lfm_ppl.inference.traced_model import signature
 from lfm_ppl.linalg import semidefinite_root
 from lfm_ppl.model.observation_noise import expected_observation, noisy_observation, with_noise
 from lfm_ppl.model.observations.family import ObservationFamily
-from lfm_ppl.model.simulate import input_breakpoints, simulate_onwards
+from lfm_ppl.model.simulate import input_breakpoints, simulate_missing_states
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.particles.particle_filter import ParticleSettings
 from lfm_ppl.particles.particle_smoother import TRACING, draw_trajectories
@@ -280,7 +280,8 @@ def _onwards(distribution: MarginalLikelihood, states: jax.Array, when: jax.Arra
     order = np.arange(plan.rows) if plan.times is None else np.argsort(plan.times, kind="stable")
     # Nothing is simulated before the first time, and what lies after the last one changes nothing.
     breakpoints = input_breakpoints(distribution.model, None, None)
-    path = simulate_onwards(distribution.ssm, key, states[order], when[order], known[order], plan.steps, breakpoints)
+    path = simulate_missing_states(distribution.ssm, key, states[order], when[order], known[order], plan.steps,
+                                   breakpoints)
     return jnp.zeros_like(states).at[order].set(path)
 
 
@@ -336,7 +337,7 @@ def noise_of_rows(distribution: MarginalLikelihood) -> bool:
     """Whether the law of the noise is given for each row of the data, so that no other row has one."""
     observation = distribution.ssm.model.observation
     if isinstance(observation, ObservationFamily):
-        return observation.of_rows()
+        return observation.has_row_parameters()
     return not observation.varies_with_state and np.ndim(observation.covariance) == 3
 
 
@@ -354,10 +355,7 @@ def _particle_path(distribution: MarginalLikelihood, y: jax.Array, at: Any, key:
     to its estimate of the likelihood gives a path of the right one as the number of filters grows, too.
     """
     ssm, times = distribution.ssm, distribution.times
-    longest = distribution.max_step
-    if longest is None:
-        longest = longest_step(ssm, times, distribution.time_grid.initial_time, steps)
-    grid = build_time_grid(ssm, times, _steps_per_interval(ssm, times, at, steps), longest, at)
+    grid = build_time_grid(ssm, times, steps, distribution.max_step, at)
     path_keys, choice = jax.random.split(key, _FILTERS + 1)[:-1], jax.random.fold_in(key, _FILTERS)
     states, _, total = jax.lax.map(lambda k: draw_trajectories(ssm, grid, y, k, particles, 1, TRACING), path_keys)
     best = jax.random.categorical(choice, jnp.where(jnp.isneginf(total).all(), 0.0, total))

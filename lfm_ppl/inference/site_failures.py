@@ -108,7 +108,7 @@ def paths_worth(bound: BoundModel, values: Mapping[str, Any], most: int = _OF_WE
 
     def per_draw(values: Any, key: jax.Array, y: Any) -> jax.Array:
         distribution = bound.likelihood(values, y)
-        return distribution.bounded().worth(bound.data(y), distribution.draws)
+        return distribution.bounded().effective_sample_size(bound.data(y), distribution.draws)
 
     found = over_draws(bound, "weights of trajectories", per_draw, _spread(values, most), jax.random.key(0),
                        bound.times.size)

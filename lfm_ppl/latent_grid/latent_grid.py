@@ -1,14 +1,22 @@
-"""The forces on a grid of times: the physical state as an explicit function of them, and the exact posterior's density.
+"""Forces on a grid of times: the physical state as an explicit function of them, and the exact posterior density.
 
-Where the dynamics are linear in the state with constant coefficients, dx/dt = A x + p(u, t), the state follows from
-the forces by an integral, and the integral from their values on a grid by a rule. That is the model on which Laplace's
-approximation, elliptical slice sampling and Hamiltonian Monte Carlo over the force itself work.
+The dynamics must be linear in the state with constant coefficients, dx/dt = A x + p(u, t), without process noise.
+
+1. The forces u are Gaussian: their values on the grid are u = m + L v with independent standard normal numbers v.
+2. The production p is evaluated at the grid points.
+3. The state at the observation times is an integral of p, which a quadrature rule turns into a weighted sum over the
+   grid points since the previous observation (`lfm_ppl.latent_grid.quadrature_weights`).
+4. The states are accumulated over the observations by the transitions e^(A (t_k - t_(k-1))).
+5. log p(y | u) follows from states and forces at the observation times.
+
+Laplace's approximation, elliptical slice sampling and Hamiltonian Monte Carlo work on this model.
+
+Source: Lawrence, Sanguinetti and Rattray (2006), NIPS 19.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -19,6 +27,13 @@ from lfm_ppl import checks
 from lfm_ppl.filtering.filter import check_observations, warn_single_precision
 from lfm_ppl.filtering.transition import linear_part
 from lfm_ppl.forces.sde import Force
+from lfm_ppl.latent_grid.quadrature_weights import (
+    cut_cells,
+    map_distinct,
+    matrix_integrals,
+    quadrature_weights,
+    scalar_integrals,
+)
 from lfm_ppl.linalg import semidefinite_root
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation_noise import check_noise, log_density, noisy_observation
@@ -28,15 +43,14 @@ from lfm_ppl.model.state_space import StateSpaceModel, check_times, state_space
 RULES = ("riemann", "trapezoid", "linear")
 
 JITTER = 1e-10
-"""Share of a force's variance that is added to the diagonal of its covariance on the grid, so that it has a factor."""
-
+"""Multiple of a force's largest variance that is added to the diagonal of its covariance, for a Cholesky factor."""
 
 FEW = 64
-"""Observations up to which each is treated by itself, without a loop over them."""
+"""Number of observations up to which they are processed together, without a scan."""
 
 
 class LatentGrid(eqx.Module):
-    r"""A latent force model whose forces are their values on a grid.
+    r"""A latent force model whose forces are represented by their values on a grid.
 
     With s_0 < ... < s_G-1 the grid, and cell i cut to [a_i, b_i] by the observations at t_(k-1) and t_k,
 
@@ -48,41 +62,43 @@ class LatentGrid(eqx.Module):
         trapezoid:  (b_i - a_i) times the mean of the integrand at a_i and b_i, where p is interpolated,
         linear:     exact for p linear in time within the cell.
 
-    The first has an error of the order of the cells' width, the others of its square; the last stays accurate where a
-    decay is fast compared with the cells.
+    The error of the first is proportional to the width of the cells, that of the others to its square. The last stays
+    accurate if a decay is fast compared with the cells.
 
     Args:
-        model: the latent force model: dynamics linear in the state with constant coefficients, any use of the forces,
-            no process noise. A Gaussian initial state is legal; of an observation family there need be no state, where
-            the forces are what is observed: between the points they are interpolated, so put the observations on these.
-        times: (T,) of the observations, non-decreasing.
-        points: number of equally spaced points from the initial time to the last observation, or the grid itself (G,),
-            increasing, which starts at the initial time.
-        rule: "riemann", "trapezoid" or "linear".
+        model: the latent force model, with dynamics that are linear in the state with constant coefficients, any
+            function of the forces, and no process noise. The initial state may be Gaussian. With an observation
+            family the model may lack states and observe the forces; they are interpolated between the grid points,
+            so choose a grid with points at the observation times.
+        times: (T,), observation times, non-decreasing.
+        points: number of equally spaced points from the initial time to the last observation, or the grid (G,),
+            increasing from the initial time.
+        rule: quadrature rule "riemann", "trapezoid" or "linear".
 
-    Each observation needs the points since the one before it only. Where the states are coupled their weights take a
-    matrix exponential for each distinct distance: few if the observations lie on the grid or regularly beside it.
+    Each observation depends on the points since the previous observation. For coupled states the weights need a matrix
+    exponential for each distinct distance; their number is small if the observations lie on the grid or at regular
+    distances from its points.
 
     Attributes:
         ssm: the model in state-space form.
-        times: (T,).
-        grid: (G,).
-        interpolation: (T, G), the forces at the observation times as combinations of those on the grid.
-        weights: (M, T, K) of p_j at the K points that an observation needs, where A is diagonal; else (M, M, T, K), the
-            first index for the state.
-        transition: e^(A (t_k - t_(k-1))), its diagonal (T, M) where A is diagonal, else (T, M, M).
-        transitions: (M, T, T), e^(A_j (t_k - t_l)) for l <= k, else 0, where A is diagonal and the observations are
-            few; else None.
-        mean: (R, G), the forces' prior mean.
+        times: (T,), observation times.
+        grid: (G,), times of the points.
+        interpolation: (T, G), weights of the grid points in the forces at the observation times.
+        weights: weights of the production at the K points that an observation needs, (M, T, K) if A is diagonal, else
+            (M, M, T, K) with the index of the state first.
+        transition: e^(A (t_k - t_(k-1))), its diagonal (T, M) if A is diagonal, else (T, M, M).
+        transitions: (M, T, T), e^(A_j (t_k - t_l)) for l <= k, else 0, if A is diagonal and there are at most `FEW`
+            observations; else None.
+        mean: (R, G), prior mean of the forces.
         root: (R, G, G), lower triangular factor of their prior covariance.
-        rule: as given.
-        first: T numbers, each the first of the points that an observation needs.
+        rule: quadrature rule.
+        first: T indices, of the first grid point that each observation needs.
 
     Raises:
-        TypeError: ``model`` is something else.
+        TypeError: ``model`` is not a latent force model.
         ValueError: the dynamics are not linear in the state with constant coefficients; there is process noise; there
             are no forces, or no states; a force jumps; the grid does not cover the data; the dynamics are not finite
-            at ordinary forces; observation noise without a density; traced times.
+            for forces within three prior standard deviations; singular observation noise; traced times.
 
     Example:
         >>> import jax.numpy as jnp, lfm_ppl as lfm
@@ -116,33 +132,39 @@ class LatentGrid(eqx.Module):
         ssm = state_space(model)
         checks.one_of("rule", rule, RULES)
         _check_model(ssm)
-        known = check_times(times, model.initial_time)
-        if known is None:
+        concrete_times = check_times(times, model.initial_time)
+        if concrete_times is None:
             raise ValueError("times must be known when the grid is built, but they are traced.")
-        initial = float(known[0] if model.initial_time is None else model.initial_time)
-        check_noise(ssm, initial)
-        self.ssm, self.times, self.rule = ssm, known, rule
-        self.grid = _grid(points, initial, known)
-        self.interpolation = np.stack([np.interp(known, self.grid, one) for one in np.eye(len(self.grid))], axis=1)
-        decay = linear_part(ssm, jnp.zeros(())).jacobian[:, : ssm.physical_dim]
-        first, pieces = _pieces(self.grid, known)
-        self.first = tuple(first.tolist())
-        gaps = np.diff(known, prepend=self.grid[0])
-        if _diagonal(ssm):
-            rates = jnp.diagonal(decay)
-            transition = lambda lengths: jnp.exp(rates * jnp.asarray(lengths)[..., None])  # noqa: E731
-            self.weights = _weights(pieces, transition, lambda h: _integrals(rates * h[..., None]), 1, rule)
-            self.transition, self.transitions = transition(gaps), None
-            if len(known) <= FEW:
-                elapsed = np.maximum(known[:, None] - known, 0.0)
-                self.transitions = jnp.moveaxis(transition(elapsed), -1, 0) * np.tri(len(known))
-        else:
-            transition = lambda lengths: _distinct(lambda h: _transition(decay, h)[0], lengths)  # noqa: E731
-            integrals = lambda lengths: _distinct(lambda h: _transition(decay, h)[1:], lengths)  # noqa: E731
-            self.weights = _weights(pieces, transition, integrals, 2, rule)
-            self.transition, self.transitions = transition(gaps), None
+        initial_time = float(concrete_times[0] if model.initial_time is None else model.initial_time)
+        check_noise(ssm, initial_time)
+        self.ssm, self.times, self.rule = ssm, concrete_times, rule
+        self.grid = _build_grid(points, initial_time, self.times)
+        # Interpolation is linear in the values: its matrix consists of the interpolated unit vectors.
+        self.interpolation = np.stack([np.interp(self.times, self.grid, unit) for unit in np.eye(len(self.grid))],
+                                      axis=1)
+        jacobian = linear_part(ssm, jnp.zeros(())).jacobian[:, : ssm.physical_dim]
+        cells = cut_cells(self.grid, self.times)
+        self.first = tuple(cells.first.tolist())
+        is_diagonal = _is_diagonal(ssm)
+        rates = jnp.diagonal(jacobian)
+
+        def transition(lengths: Any) -> jax.Array:
+            if is_diagonal:
+                return jnp.exp(rates * jnp.asarray(lengths)[..., None])
+            return map_distinct(lambda h: matrix_integrals(jacobian, h)[0], lengths)
+
+        def integrals(lengths: Any) -> tuple[jax.Array, jax.Array]:
+            if is_diagonal:
+                return scalar_integrals(rates * lengths[..., None])
+            return map_distinct(lambda h: matrix_integrals(jacobian, h)[1:], lengths)
+
+        self.weights = quadrature_weights(cells, transition, integrals, 1 if is_diagonal else 2, rule)
+        self.transition, self.transitions = transition(np.diff(self.times, prepend=self.grid[0])), None
+        if is_diagonal and len(self.times) <= FEW:
+            elapsed = np.maximum(self.times[:, None] - self.times, 0.0)
+            self.transitions = jnp.moveaxis(transition(elapsed), -1, 0) * np.tri(len(self.times))
         self.mean = jax.vmap(ssm.stack.mean_at)(jnp.asarray(self.grid)).T
-        self.root = jnp.stack([_root(force, self.grid) for force in ssm.stack.forces])
+        self.root = jnp.stack([_covariance_factor(force, self.grid) for force in ssm.stack.forces])
         _check_factor(self)
         _check_production(self)
 
@@ -169,47 +191,55 @@ class LatentGrid(eqx.Module):
             u: (R, G), the forces on the grid.
             start: (M,), the state at the initial time; None: its prior mean.
         """
-        first = self.ssm.model.initial_state.mean if start is None else start
+        initial_state = self.ssm.model.initial_state.mean if start is None else start
         _check_shape("u", "(R, G)", u, self.mean.shape)
-        _check_shape("start", "(M,)", first, self.ssm.model.initial_state.mean.shape)
-        gained = self._gained(u)
+        _check_shape("start", "(M,)", initial_state, self.ssm.model.initial_state.mean.shape)
+        increments = self._increments(u)
         if self.transitions is not None:
-            return jnp.einsum("jkl,lj->kj", self.transitions, gained.at[0].add(self.transition[0] * first))
-        after = jnp.multiply if self.transition.ndim == 2 else jnp.matmul
-        return jax.lax.scan(lambda x, row: (after(row[0], x) + row[1],) * 2, first, (self.transition, gained))[1]
+            return jnp.einsum("jkl,lj->kj", self.transitions,
+                              increments.at[0].add(self.transition[0] * initial_state))
+        multiply = jnp.multiply if self.transition.ndim == 2 else jnp.matmul
 
-    def _gained(self, u: jax.Array) -> jax.Array:
-        """Return what the production since the observation before adds to the state (T, M)."""
+        def step(x: jax.Array, row: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+            transition, increment = row
+            x = multiply(transition, x) + increment
+            return x, x
+
+        return jax.lax.scan(step, initial_state, (self.transition, increments))[1]
+
+    def _increments(self, u: jax.Array) -> jax.Array:
+        """Return the contribution (T, M) of the production since the previous observation to the state."""
         count, size = len(self.first), self.weights.shape[-1]
-        at_times = jax.vmap(self._production, in_axes=(1, 0))
+        production_at = jax.vmap(self._production, in_axes=(1, 0))
         grid = jnp.asarray(self.grid)
         if count * size > 2 * len(self.grid):
-            made = jnp.moveaxis(self._window(at_times(u, grid).T), 0, -1)
-        else:  # a few forces cost less to cut out than as many states
-            made = jax.vmap(at_times, in_axes=(1, 0))(self._window(u), self._window(grid[None])[0])
-        kind = "jkg,kgj->kj" if self.weights.ndim == 3 else "ijkg,kgj->ki"
-        return jnp.einsum(kind, self.weights, made)
+            production = jnp.moveaxis(self._window(production_at(u, grid).T), 0, -1)
+        else:  # windows of a few forces are cheaper than windows of as many states
+            production = jax.vmap(production_at, in_axes=(1, 0))(self._window(u), self._window(grid[None])[0])
+        subscripts = "jkg,kgj->kj" if self.weights.ndim == 3 else "ijkg,kgj->ki"
+        return jnp.einsum(subscripts, self.weights, production)
 
     def _window(self, values: jax.Array) -> jax.Array:
         """Return values (R, G) at the points that each observation needs, (R, T, K)."""
         size = self.weights.shape[-1]
         if len(self.first) > FEW:
             return values[:, np.asarray(self.first)[:, None] + np.arange(size)]
-        # Slices are copied twice as fast as elements that are gathered, but each takes its time to compile.
+        # Slices are twice as fast as a gather, but each adds to the compilation time.
         return jnp.stack([values[:, start:start + size] for start in self.first], axis=1)
 
     def log_likelihood(self, u: jax.Array, y: jax.Array, start: jax.Array | None = None) -> jax.Array:
-        """Return log p(y | u, start); missing entries are left out, and what is not finite counts as impossible.
+        """Return log p(y | u, start) of the entries that are present; NaN becomes -inf.
 
         Args:
             u: (R, G).
             y: (T, D), NaN where missing.
             start: as in `state`.
         """
-        return self.scored(u, y, start)[0]
+        return self.log_likelihood_and_residuals(u, y, start)[0]
 
-    def scored(self, u: jax.Array, y: jax.Array, start: jax.Array | None = None) -> tuple[jax.Array, jax.Array]:
-        """Return log p(y | u, start) and the residuals (T, D) in units of the noise, zero where y is missing."""
+    def log_likelihood_and_residuals(self, u: jax.Array, y: jax.Array,
+                                     start: jax.Array | None = None) -> tuple[jax.Array, jax.Array]:
+        """Return log p(y | u, start) and the whitened residuals (T, D), zero where y is missing."""
         _check_shape("y", "(T, D)", y, (len(self.times), self.ssm.output_dim))
         rows = jnp.arange(len(self.times))
         value, white = jax.vmap(lambda w, t, row, y: log_density(self.ssm, w, t, row, y))(
@@ -225,7 +255,7 @@ class LatentGrid(eqx.Module):
             self._inputs(u, start), jnp.asarray(self.times), keys, rows)
 
     def _inputs(self, u: jax.Array, start: jax.Array | None) -> jax.Array:
-        """Return w (T, M + R) at the observation times; the forces are zero where no observation asks for them."""
+        """Return w (T, M + R) at the observation times, with zeros for the forces if no observation depends on them."""
         state = self.state(u, start)
         uses_forces = self.ssm.model.observation.varies_with_state or any(
             any(row[self.ssm.physical_dim:]) for row in self.ssm.observation_structure.jacobian)
@@ -237,33 +267,35 @@ class LatentGrid(eqx.Module):
         return check_observations(y, len(self.times), self.ssm.output_dim, model=self.ssm.model)
 
     def _production(self, u: jax.Array, t: jax.Array) -> jax.Array:
-        """Return p (M,): the dynamics without the state."""
+        """Return the production p (M,), the dynamics at state zero."""
         return self.ssm.drift(jnp.concatenate([jnp.zeros(self.ssm.physical_dim), u]), t)
 
 
-def _check_shape(name: str, what: str, value: Any, expected: tuple[int, ...]) -> None:
+def _check_shape(name: str, label: str, value: Any, expected: tuple[int, ...]) -> None:
     if np.shape(value) != expected:
-        raise ValueError(f"{name} must have shape {what} = {expected}, got {np.shape(value)}.")
+        raise ValueError(f"{name} must have shape {label} = {expected}, got {np.shape(value)}.")
 
 
 def _check_factor(latent: LatentGrid) -> None:
+    """Raise ValueError if the Cholesky factor of a force's covariance is not finite."""
     for name, root in zip(latent.force_names, latent.root, strict=True):
-        known = checks.concrete(root)
-        if known is not None and not np.isfinite(known).all():
+        concrete = checks.concrete(root)
+        if concrete is not None and not np.isfinite(concrete).all():
             raise ValueError(f"the covariance of the force {name!r} on the grid has no Cholesky factor. Use double "
                              'precision, jax.config.update("jax_enable_x64", True), or fewer points.')
 
 
 def _check_model(ssm: StateSpaceModel) -> None:
+    """Raise ValueError unless the state is an explicit function of the forces, as `LatentGrid` requires."""
     model = ssm.model
     if not model.state_names and not isinstance(model.observation, ObservationFamily):
-        raise ValueError("the model has no physical state; its forces are what is observed, so that lfm.filter and "
-                         "lfm.smooth serve it.")
+        raise ValueError("the model has no physical state and observes its forces directly; use lfm.filter and "
+                         "lfm.smooth.")
     if not model.force_names:
         raise ValueError("the model has no forces: there is nothing to put on a grid.")
     noise = model.process_noise
-    known = None if callable(noise) or noise is None else checks.concrete(noise)
-    if noise is not None and (known is None or known.any()):
+    concrete = None if callable(noise) or noise is None else checks.concrete(noise)
+    if noise is not None and (concrete is None or concrete.any()):
         raise ValueError("the state is a function of the forces only without process_noise; use the particle "
                          "smoother, lfm.particle_smoother, instead.")
     varying = [name for index, name in enumerate(model.state_names)
@@ -273,7 +305,8 @@ def _check_model(ssm: StateSpaceModel) -> None:
                          f"in {', '.join(varying)} varies; use the particle smoother, lfm.particle_smoother, instead.")
 
 
-def _grid(points: Any, initial: float, times: np.ndarray) -> np.ndarray:
+def _build_grid(points: Any, initial: float, times: np.ndarray) -> np.ndarray:
+    """Return the grid (G,) from a number of points, or check a given one."""
     last = float(times[-1])
     if np.ndim(points) == 0:
         checks.positive_integer("points", points)
@@ -285,120 +318,24 @@ def _grid(points: Any, initial: float, times: np.ndarray) -> np.ndarray:
     if grid.ndim != 1 or grid.size < 2 or not np.isfinite(grid).all() or (np.diff(grid) <= 0).any():
         raise ValueError("points must be a number of points, or at least two finite times that increase; got shape "
                          f"{grid.shape}.")
-    slack = 1e-9 * (last - initial)
-    if abs(grid[0] - initial) > slack:
+    rounding = 1e-9 * (last - initial)
+    if abs(grid[0] - initial) > rounding:
         raise ValueError(f"the grid must start at the initial time {initial:g}, but starts at {grid[0]:g}.")
-    if grid[-1] < last - slack:
+    if grid[-1] < last - rounding:
         raise ValueError(f"the grid ends at {grid[-1]:g}, before the last observation at {last:g}; it has to cover "
                          "the data.")
     return grid
 
 
-def _diagonal(ssm: StateSpaceModel) -> bool:
+def _is_diagonal(ssm: StateSpaceModel) -> bool:
+    """Return whether no state enters the drift of another one."""
     size = ssm.physical_dim
     pattern = np.asarray(ssm.drift_structure.jacobian, bool).reshape(size, ssm.input_dim)[:, :size]
     return not (pattern & ~np.eye(size, dtype=bool)).any()
 
 
-class _Pieces(NamedTuple):
-    """Cells as the observations cut them, (T, C): those that observation k needs, with [a, b] in (t_(k-1), t_k].
-
-    Attributes:
-        length: b - a, zero for a cell that has no part in it.
-        left, right: a and b as shares of the cell, from its first point on.
-        since_point: t_k - s_i, at least 0.
-        since_left, since_right: t_k - a and t_k - b.
-    """
-
-    length: np.ndarray
-    left: np.ndarray
-    right: np.ndarray
-    since_point: np.ndarray
-    since_left: np.ndarray
-    since_right: np.ndarray
-
-
-def _pieces(grid: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, _Pieces]:
-    """Return the first point that each observation needs (T,), and the cells from there on."""
-    before = np.concatenate([grid[:1], times[:-1]])
-    cells = len(grid) - 1
-    first = np.clip(np.searchsorted(grid, before, side="right") - 1, 0, cells - 1)
-    last = np.clip(np.searchsorted(grid, times, side="left") - 1, first, cells - 1)
-    count = int((last - first).max()) + 1
-    first = np.minimum(first, cells - count)
-    cell = first[:, None] + np.arange(count)
-    start, end, t = grid[cell], grid[cell + 1], times[:, None]
-    a, b = np.clip(start, before[:, None], t), np.clip(end, before[:, None], t)
-    wide = end - start
-    since = np.maximum(t - start, 0.0)
-    return first, _Pieces(b - a, (a - start) / wide, (b - start) / wide, since, t - a, t - b)
-
-
-def _weights(pieces: _Pieces, transition: Callable, integrals: Callable, rank: int, rule: str) -> jax.Array:
-    """Return the weights of the points, (M, T, C + 1) or (M, M, T, C + 1), from functions of arrays of lengths.
-
-    Args:
-        pieces: the cells.
-        transition: e^(A h).
-        integrals: 1/h int_0^h e^(A (h - s)) ds and 1/h int_0^h e^(A (h - s)) s/h ds.
-        rank: of a transition: 1 for the diagonal of one, 2 for a matrix.
-        rule: of integration.
-    """
-    def of(a: np.ndarray) -> jax.Array:
-        return jnp.asarray(a).reshape(*a.shape, *[1] * rank)
-
-    after = jnp.multiply if rank == 1 else jnp.matmul
-    length = of(pieces.length)
-    if rule == "riemann":
-        at_point, at_next = length * transition(pieces.since_point), jnp.zeros(())
-    else:
-        if rule == "trapezoid":
-            at_left = 0.5 * length * transition(pieces.since_left)
-            at_right = 0.5 * length * transition(pieces.since_right)
-        else:
-            whole, rising = integrals(pieces.length)
-            back = transition(pieces.since_right)
-            at_left, at_right = length * after(back, whole - rising), length * after(back, rising)
-        at_next = of(pieces.left) * at_left + of(pieces.right) * at_right
-        at_point = at_left + at_right - at_next
-    width = [(0, 0)] * at_point.ndim
-    width[1] = (0, 1)
-    weights = jnp.pad(at_point, width)
-    return jnp.moveaxis(weights.at[:, 1:].add(at_next), (0, 1), (-2, -1))
-
-
-def _integrals(z: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return (e^z - 1)/z and (e^z - 1 - z)/z^2, by their series near zero."""
-    near = jnp.abs(z) < 0.5
-    safe = jnp.where(near, 1.0, z)
-    small = jnp.where(near, z, 0.0)
-    second = jnp.ones_like(z)
-    for order in range(15, 2, -1):
-        second = 1.0 + small * second / order
-    second = 0.5 * second
-    far = (jnp.expm1(safe) - safe) / safe**2
-    second = jnp.where(near, second, far)
-    return 1.0 + z * second, second
-
-
-def _transition(jacobian: jax.Array, length: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return e^(A h), 1/h int_0^h e^(A (h - s)) ds and 1/h int_0^h e^(A (h - s)) s/h ds, from one exponential."""
-    size = jacobian.shape[0]
-    eye, zero = jnp.eye(size), jnp.zeros((size, size))
-    block = jnp.block([[jacobian * length, eye, zero], [zero, zero, eye], [zero, zero, zero]])
-    found = jax.scipy.linalg.expm(block)
-    return found[:size, :size], found[:size, size:2 * size], found[:size, 2 * size:]
-
-
-def _distinct(function: Any, lengths: np.ndarray) -> Any:
-    """Return ``function`` of every length, computed once for lengths that are equal up to rounding."""
-    scale = max(float(np.max(lengths, initial=0.0)), np.finfo(float).tiny)
-    _, first, inverse = np.unique(np.round(lengths / scale, 12), return_index=True, return_inverse=True)
-    found = jax.vmap(function)(jnp.asarray(np.ravel(lengths)[first]))
-    return jax.tree_util.tree_map(lambda a: a[inverse.reshape(np.shape(lengths))], found)
-
-
-def _root(force: Force, grid: np.ndarray) -> jax.Array:
+def _covariance_factor(force: Force, grid: np.ndarray) -> jax.Array:
+    """Return the Cholesky factor (G, G) of a force's covariance on the grid."""
     t, s = jnp.asarray(grid)[:, None], jnp.asarray(grid)[None, :]
     try:
         covariance = force.covariance_in_model(t, s, grid[0])
@@ -410,14 +347,17 @@ def _root(force: Force, grid: np.ndarray) -> jax.Array:
 
 
 def _check_production(latent: LatentGrid) -> None:
-    """Raise where the dynamics are not finite at forces that the prior deems ordinary."""
+    """Raise ValueError if the dynamics are not finite for forces within three prior standard deviations."""
     if checks.traced(latent):
         return
     sd = np.sqrt((np.asarray(latent.root) ** 2).sum(axis=2))
-    for sign in (0.0, -3.0, 3.0):
-        made = np.asarray(jax.vmap(latent._production)(latent.mean.T + sign * sd.T, jnp.asarray(latent.grid)))
-        if not np.isfinite(made).all():
-            where = int(np.flatnonzero(~np.isfinite(made).all(axis=1))[0])
-            what = "the forces' prior mean" if sign == 0 else f"{abs(sign):g} prior standard deviations from their mean"
-            raise ValueError(f"the dynamics are not finite at {what} (at t = {latent.grid[where]:g}): check the "
+    for distance in (0.0, -3.0, 3.0):
+        production = np.asarray(jax.vmap(latent._production)(latent.mean.T + distance * sd.T,
+                                                             jnp.asarray(latent.grid)))
+        is_finite = np.isfinite(production).all(axis=1)
+        if not is_finite.all():
+            index = int(np.flatnonzero(~is_finite)[0])
+            forces = ("the forces' prior mean" if distance == 0
+                      else f"{abs(distance):g} prior standard deviations from their mean")
+            raise ValueError(f"the dynamics are not finite at {forces} (at t = {latent.grid[index]:g}): check the "
                              "function of the forces.")

@@ -1,5 +1,5 @@
-"""Rules that turn a function and a Gaussian into an affine map.
+"""Linearisation rules: they approximate a function by an affine map, given a Gaussian distribution of its inputs.
 
-`rule` says what a rule has to be, `sigma_points` has those with points, `taylor` the one without; `structure` says in
-which inputs a function is not linear. Public rules are `lfm_ppl.NAME`.
+`rule` defines the protocol, `sigma_points` contains the sigma-point rules, `taylor` the Taylor expansion; `structure`
+describes the inputs in which a function is non-linear. Public rules are `lfm_ppl.NAME`.
 """

@@ -1,4 +1,4 @@
-"""The one abstraction of every Gaussian filter: a function and a Gaussian give an affine map."""
+"""The protocol of linearisation rules: a function and a Gaussian give an affine map."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ import numpy as np
 from lfm_ppl.linearisation.structure import InputStructure
 
 Function = Callable[[jax.Array], tuple[jax.Array, Any]]
-"""Maps inputs (N,) to a value (D,) and a pytree of arrays of which only the expectation is asked."""
+"""Maps inputs (N,) to a value (D,) and a pytree of arrays, for which a rule returns the expectation only."""
 
 
 class AffineMap(NamedTuple):
     """An affine approximation ``f(v) ~ value + jacobian (v - mean)`` with residual covariance.
 
     Attributes:
-        value: (D,), E[f].
-        jacobian: (D, N), ``A`` with ``A P = Cov(f, v)``; the Jacobian in directions without variance.
+        value: (D,), ``E[f]``.
+        jacobian: (D, N), ``A`` with ``A P = Cov(f, v)``; in directions without variance, the Jacobian of f.
         residual_cov: (D, D), ``Omega = Cov(f) - A P A'``.
         extra: expectation of the second output of the function.
     """
@@ -37,9 +37,10 @@ class Inputs(NamedTuple):
 
     Attributes:
         mean: (N,).
-        covariance: (a + r, a + r), of the points' and the averaged coordinates, in this order.
-        min_sd: (a,), the smallest standard deviation that counts as one, for the points' coordinates. A rule
-            differentiates over at least this distance where the variance is zero.
+        covariance: (a + r, a + r), covariance of the non-linear (``points``) and then the ``averaged`` coordinates of
+            `InputStructure`.
+        min_sd: (a,), lower bound on the standard deviation of the non-linear coordinates. Where the variance is zero, a
+            rule takes differences over this distance.
     """
 
     mean: jax.Array
@@ -57,8 +58,8 @@ class Rule(eqx.Module):
         Args:
             function: maps (N,) to (D,) and extra arrays.
             inputs: the Gaussian.
-            structure: which inputs take points, which are linear given the points, which are linear.
-            jacobian: (D, N), the Jacobian in the constant inputs, zero elsewhere.
+            structure: the division of the inputs into non-linear, averaged and constant ones.
+            jacobian: (D, N), the Jacobian in the constant inputs, zero in the others.
 
         Returns:
             The affine approximation.
@@ -67,20 +68,23 @@ class Rule(eqx.Module):
 
     @property
     def name(self) -> str:
-        """The name of the rule, with its settings, as results record it."""
+        """The name of the rule with its settings, for results and messages."""
         settings = ", ".join(f"{key}={value}" for key, value in vars(self).items() if value is not False)
         return f"{type(self).__name__}({settings})"
 
 
 def selection(indices: tuple[int, ...], size: int) -> np.ndarray:
-    """Return the (size, len(indices)) matrix that puts entries at ``indices``."""
+    """Return the (size, len(indices)) selection matrix: its product with v places the entries of v at ``indices``."""
     matrix = np.zeros((size, len(indices)))
     matrix[list(indices), np.arange(len(indices))] = 1.0
     return matrix
 
 
 def partial_jacobian(function: Function, point: jax.Array, indices: tuple[int, ...]) -> jax.Array:
-    """Return the Jacobian (D, len(indices)) in some of the inputs."""
+    """Return the Jacobian (D, len(indices)) in the inputs ``indices``."""
     directions = jnp.asarray(selection(indices, point.shape[0]).T)
-    push = lambda direction: jax.jvp(lambda v: function(v)[0], (point,), (direction,))[1]  # noqa: E731
-    return jax.vmap(push, out_axes=1)(directions)
+
+    def directional_derivative(direction: jax.Array) -> jax.Array:
+        return jax.jvp(lambda v: function(v)[0], (point,), (direction,))[1]
+
+    return jax.vmap(directional_derivative, out_axes=1)(directions)

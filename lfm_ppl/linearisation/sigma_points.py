@@ -1,4 +1,23 @@
-"""Sigma-point rules: statistical linear regression on a handful of points."""
+"""Sigma-point rules: statistical linear regression on a few points.
+
+`SigmaPointRule.linearise` approximates f(v) for v ~ N(m, P):
+
+1. Split the inputs (`InputStructure`) into non-linear ones, in which the points vary, averaged ones, which are linear
+   given these, and constant ones, whose Jacobian is known.
+2. Factorise the covariance of the non-linear inputs, P_aa = L L', with a floor for inputs without variance.
+3. Place the points v_i = m + L xi_i, xi_i the nodes of a unit Gaussian. Averaged inputs take their conditional mean.
+4. Average the values: b = sum w_i f(v_i).
+5. For the averaged inputs, average the Jacobians at the points (Stein's lemma).
+6. For the non-linear inputs, regress the values on the nodes, or average the Jacobians; subtract the part of the
+   regression that the averaged inputs explain.
+7. The residual covariance is that of the regression errors, plus the variance of the Jacobians of the averaged inputs
+   times their conditional covariance.
+
+Each rule is a choice of nodes and weights (`UnitPoints`).
+
+Source: Särkkä (2013), Bayesian Filtering and Smoothing, chapters 5 and 6; García-Fernández, Svensson, Morelande and
+Särkkä (2015), IEEE Transactions on Signal Processing 63(20), for statistical linear regression.
+"""
 
 from __future__ import annotations
 
@@ -17,13 +36,13 @@ from lfm_ppl.linearisation.structure import InputStructure
 
 
 class UnitPoints(NamedTuple):
-    """Points of a rule for N(0, I) in ``dim`` dimensions.
+    """Nodes and weights of a rule for N(0, I) in ``dim`` dimensions.
 
     Attributes:
-        nodes: (p, dim).
-        weights: (p,), for expectations and for the regression on the nodes: their sum is 1, that of ``w xi`` is 0, that
-            of ``w xi xi'`` is I.
-        residual_weights: (p, p), symmetric: the residual covariance is E' W E for residuals E (p, D).
+        nodes: (p, dim), the nodes ``xi``.
+        weights: (p,), weights ``w`` of expectations and regression, with ``sum w = 1``, ``sum w xi = 0`` and
+            ``sum w xi xi' = I``.
+        residual_weights: (p, p), symmetric ``W``; the residual covariance is ``E' W E`` for residuals E (p, D).
     """
 
     nodes: np.ndarray
@@ -32,31 +51,31 @@ class UnitPoints(NamedTuple):
 
 
 class SigmaPointRule(Rule):
-    """Base of the rules with points.
+    """Base of the sigma-point rules.
 
     With nodes ``xi_i`` and weights ``w_i`` of the standard Gaussian and ``P = L L'``, at ``v_i = m + L xi_i``,
 
         b = sum w_i f(v_i),    A = (sum w_i f(v_i) xi_i') L^-1,    Omega = Cov(f) - A P A'.
 
-    The points lie in the non-linear inputs alone. Inputs that are linear given these follow them by their conditional
-    mean, and their Jacobian is the expectation of the Jacobian (Stein's lemma).
+    The points vary the non-linear inputs only. Inputs that are linear given these take their conditional mean, and
+    their slope is the expectation of the Jacobian (Stein's lemma).
 
     Attributes:
-        full_state: whether the points lie in the whole joint state, as in the papers, and not in the non-linear
+        full_state: whether the points vary the full joint state, as in the original papers, instead of the non-linear
             inputs only.
     """
 
     full_state: bool = eqx.field(static=True, default=False, kw_only=True)
 
-    regresses: ClassVar[bool] = True
-    """Whether the Jacobian in the points' coordinates is the regression on the nodes, or the average of Jacobians.
-    The two agree in expectation (Stein's lemma), but a regression on nodes that are correlated beyond second order
-    divides their sampling error by the standard deviation of the input, however small that is."""
+    is_regression: ClassVar[bool] = True
+    """Whether the slope in the non-linear inputs is the regression on the nodes, instead of the average Jacobian.
+    Both agree in expectation (Stein's lemma), but the regression divides the sampling error of the nodes' higher
+    moments by the standard deviation of the input, which may be arbitrarily small."""
 
     def points(self, dim: int) -> UnitPoints:
         """Return nodes and weights for ``dim`` >= 1 dimensions.
 
-        Nodes whose third moments are not zero, such as those of a simplex, need ``regresses = False``.
+        Nodes with non-zero third moments, such as the vertices of a simplex, need ``is_regression = False``.
         """
         raise NotImplementedError
 
@@ -64,52 +83,54 @@ class SigmaPointRule(Rule):
                   jacobian: jax.Array) -> AffineMap:
         """See `Rule.linearise`."""
         if not structure.points:
-            return _without_points(function, inputs, structure, jacobian)
+            return _linearise_without_points(function, inputs, structure, jacobian)
         unit = self.points(len(structure.points))
         nodes, weights = jnp.asarray(unit.nodes), jnp.asarray(unit.weights)
         count, size = len(structure.points), inputs.mean.shape[0]
         factor = cholesky(inputs.covariance[:count, :count], inputs.min_sd**2)
         chol = factor.chol
-        # Averaged coordinates given the points: rho = m_rho + gain xi, gain = P_rho,alpha L^-T.
+        # Conditional mean of the averaged inputs given the node xi: m_r + gain xi with gain = P_ra L^-T.
         gain = _times_inverse_transpose(factor, inputs.covariance[count:, :count])
         root = jnp.concatenate([chol, gain]) if structure.averaged else chol
-        place = selection((*structure.points, *structure.averaged), size)
-        root_of_inputs = matmul(place, root)
-        at = inputs.mean + matmul(nodes, root_of_inputs.T)
-        values, extras = jax.vmap(function)(at)
+        input_root = matmul(selection((*structure.points, *structure.averaged), size), root)
+        sigma_points = inputs.mean + matmul(nodes, input_root.T)
+        values, extras = jax.vmap(function)(sigma_points)
         value = (weights[:, None] * values).sum(0)
         if structure.averaged:
-            jacobians, average = _average_jacobian(function, at, weights, structure.averaged)
-            jacobian = jacobian + matmul(average, selection(structure.averaged, size).T)
-            through_averaged = matmul(average, gain)
+            jacobians, mean_jacobian = _average_jacobian(function, sigma_points, weights, structure.averaged)
+            jacobian = jacobian + matmul(mean_jacobian, selection(structure.averaged, size).T)
+            averaged_regression = matmul(mean_jacobian, gain)
         else:
-            jacobians, average, through_averaged = None, None, jnp.zeros(())
-        if self.regresses:
+            jacobians, mean_jacobian, averaged_regression = None, None, jnp.zeros(())
+        # The regression of the values on the nodes is (slope L + mean_jacobian gain): both kinds of inputs follow xi.
+        if self.is_regression:
             regression = matmul((weights[:, None] * values).T, nodes)
-            on_points = _times_inverse(factor, regression - through_averaged)
+            slope = _times_inverse(factor, regression - averaged_regression)
         else:
-            _, on_points = _average_jacobian(function, at, weights, structure.points)
-            regression = matmul(on_points, chol) + through_averaged
-        jacobian = jacobian + matmul(on_points, selection(structure.points, size).T)
+            _, slope = _average_jacobian(function, sigma_points, weights, structure.points)
+            regression = matmul(slope, chol) + averaged_regression
+        jacobian = jacobian + matmul(slope, selection(structure.points, size).T)
         errors = values - value - matmul(nodes, regression.T)
         residual = matmul(matmul(errors.T, jnp.asarray(unit.residual_weights)), errors)
         if jacobians is not None:
-            rest = inputs.covariance[count:, count:] - outer_square(gain)
-            deviations = jax.vmap(lambda j: congruence(j - average, rest))(jacobians)
+            # Given xi, the averaged inputs vary by their conditional covariance; a varying Jacobian makes this part of
+            # the output deviate from the affine map.
+            conditional_cov = inputs.covariance[count:, count:] - outer_square(gain)
+            deviations = jax.vmap(lambda j: congruence(j - mean_jacobian, conditional_cov))(jacobians)
             residual = residual + (weights[:, None, None] * deviations).sum(0)
         return AffineMap(value, jacobian, residual, self._expectation(function, inputs, weights, unit, extras))
 
     def _expectation(self, function: Function, inputs: Inputs, weights: jax.Array, unit: UnitPoints, extras):
-        # With a negative weight the average of covariances need not be one: take the value at the mean.
+        # With a negative weight, an average of covariance matrices may be indefinite: use the value at the mean.
         if np.all(unit.weights >= 0):
-            return jax.tree_util.tree_map(lambda e: jnp.tensordot(weights, e, axes=1), extras)
+            return jax.tree.map(lambda e: jnp.tensordot(weights, e, axes=1), extras)
         return function(inputs.mean)[1]
 
 
-def _average_jacobian(function: Function, at: jax.Array, weights: jax.Array,
+def _average_jacobian(function: Function, sigma_points: jax.Array, weights: jax.Array,
                       indices: tuple[int, ...]) -> tuple[jax.Array, jax.Array]:
-    """Return the Jacobians (p, D, len(indices)) at the points and their average."""
-    jacobians = jax.vmap(lambda v: partial_jacobian(function, v, indices))(at)
+    """Return the Jacobians (p, D, len(indices)) at the sigma points, and their weighted average."""
+    jacobians = jax.vmap(lambda v: partial_jacobian(function, v, indices))(sigma_points)
     return jacobians, (weights[:, None, None] * jacobians).sum(0)
 
 
@@ -123,12 +144,13 @@ def _times_inverse(factor: CholeskyFactor, b: jax.Array) -> jax.Array:
     return factor.solve_upper(b.T).T
 
 
-def _without_points(function: Function, inputs: Inputs, structure: InputStructure, jacobian: jax.Array) -> AffineMap:
-    """A function that is linear at every time: exact."""
+def _linearise_without_points(function: Function, inputs: Inputs, structure: InputStructure,
+                              jacobian: jax.Array) -> AffineMap:
+    """Return the exact affine map of a function that is linear at every time."""
     value, extra = function(inputs.mean)
     if structure.averaged:
-        part = partial_jacobian(function, inputs.mean, structure.averaged)
-        jacobian = jacobian + matmul(part, selection(structure.averaged, inputs.mean.shape[0]).T)
+        varying_jacobian = partial_jacobian(function, inputs.mean, structure.averaged)
+        jacobian = jacobian + matmul(varying_jacobian, selection(structure.averaged, inputs.mean.shape[0]).T)
     return AffineMap(value, jacobian, jnp.zeros((value.shape[0],) * 2), extra)
 
 
@@ -142,7 +164,7 @@ class Unscented(SigmaPointRule):
         alpha: spread of the points, > 0.
         beta: weight of the centre in the covariance; 2 suits a Gaussian.
         kappa: second spread parameter, > -a for a inputs.
-        full_state: points in the whole state.
+        full_state: vary the full state instead of the non-linear inputs only.
 
     Example:
         >>> Unscented(1.0, 0.0, 0.0).points(1).weights.tolist()
@@ -177,7 +199,7 @@ class Cubature(SigmaPointRule):
     """The spherical cubature rule of degree 3: ``m +- sqrt(a) L_i``, equal weights.
 
     Args:
-        full_state: points in the whole state, as in the paper.
+        full_state: vary the full state, as in the paper, instead of the non-linear inputs only.
 
     Example:
         >>> Cubature().points(2).weights.tolist()
@@ -185,7 +207,6 @@ class Cubature(SigmaPointRule):
 
     Source: Arasaratnam, Haykin and Hurd (2010), IEEE Transactions on Signal Processing 58(10).
     """
-
 
     def points(self, dim: int) -> UnitPoints:
         """See `SigmaPointRule.points`."""
@@ -195,11 +216,11 @@ class Cubature(SigmaPointRule):
 
 
 class GaussHermite(SigmaPointRule):
-    """Tensor product of Gauss-Hermite rules: ``order`` points an input, exact to degree ``2 order - 1``.
+    """Tensor product of Gauss-Hermite rules with ``order`` points per input, exact to degree ``2 order - 1``.
 
     Args:
-        order: points in each non-linear input, at least 2. There are ``order^a`` points for ``a`` inputs.
-        full_state: points in the whole state.
+        order: points per non-linear input, at least 2; ``a`` inputs take ``order^a`` points.
+        full_state: vary the full state instead of the non-linear inputs only.
 
     Example:
         >>> GaussHermite(3).points(1).nodes.ravel().round(4).tolist()
@@ -213,27 +234,28 @@ class GaussHermite(SigmaPointRule):
     def __check_init__(self):
         checks.positive_integer("order", self.order)
         if self.order < 2:
-            raise ValueError("order must be at least 2: one point gives no slope; lfm.Taylor() is the rule with one.")
+            raise ValueError("order must be at least 2: one point determines no slope. lfm.Taylor() uses one point.")
 
     def points(self, dim: int) -> UnitPoints:
         """See `SigmaPointRule.points`."""
         if self.order**dim > 200_000:
             raise ValueError(f"GaussHermite({self.order}) in {dim} dimensions has {self.order}^{dim} points; use "
                              "lfm.Cubature() or lfm.Unscented(), whose number of points is linear in the dimension.")
-        line, mass = np.polynomial.hermite_e.hermegauss(self.order)
-        nodes = np.array(list(itertools.product(line, repeat=dim)))
-        weights = np.prod(list(itertools.product(mass / mass.sum(), repeat=dim)), axis=1)
+        nodes_1d, weights_1d = np.polynomial.hermite_e.hermegauss(self.order)
+        nodes = np.array(list(itertools.product(nodes_1d, repeat=dim)))
+        weights = np.prod(list(itertools.product(weights_1d / weights_1d.sum(), repeat=dim)), axis=1)
         return UnitPoints(nodes, weights, np.diag(weights))
 
 
 class CentralDifference(SigmaPointRule):
     """Stirling's interpolation to second order: the central difference (divided difference) filter.
 
-    Derivatives are replaced by central differences over ``step`` standard deviations.
+    Central differences over ``step`` standard deviations replace derivatives.
 
     Args:
-        step: in standard deviations, at least 1; sqrt(3) matches the fourth moment of a Gaussian.
-        full_state: points in the whole state.
+        step: half-width of the differences in standard deviations, at least 1; sqrt(3) matches the fourth moment of a
+            Gaussian.
+        full_state: vary the full state instead of the non-linear inputs only.
 
     Example:
         >>> CentralDifference(2.0).points(1).weights.tolist()
@@ -257,31 +279,32 @@ class CentralDifference(SigmaPointRule):
         weights = np.full(2 * dim + 1, 0.5 / square)
         weights[0] = (square - dim) / square
         # Cov(f) = sum_i (f+ - f-)^2 / 4 h^2 + (h^2 - 1)(f+ + f- - 2 f0)^2 / 4 h^4; the first term is A P A'.
-        second = np.zeros((dim, 2 * dim + 1))
-        second[:, 0] = -2.0
-        second[np.arange(dim), 1 + np.arange(dim)] = 1.0
-        second[np.arange(dim), 1 + dim + np.arange(dim)] = 1.0
-        return UnitPoints(nodes, weights, (square - 1.0) / (4.0 * square**2) * second.T @ second)
+        second_differences = np.zeros((dim, 2 * dim + 1))
+        second_differences[:, 0] = -2.0
+        second_differences[np.arange(dim), 1 + np.arange(dim)] = 1.0
+        second_differences[np.arange(dim), 1 + dim + np.arange(dim)] = 1.0
+        scale = (square - 1.0) / (4.0 * square**2)
+        return UnitPoints(nodes, weights, scale * second_differences.T @ second_differences)
 
 
 class MonteCarlo(SigmaPointRule):
-    """Random points, drawn once: the Monte Carlo Kalman filter.
+    """Fixed random points: the Monte Carlo Kalman filter.
 
-    The draws are antithetic and whitened, so that their mean is zero and their covariance the identity: a linear
-    function is treated exactly. The Jacobian is the average Jacobian over the draws, so that a known or nearly known
-    state does no harm. The likelihood is a smooth, deterministic function of the parameters.
+    The draws are antithetic and whitened, so that their mean is zero and their covariance the identity: the rule is
+    exact for linear functions. The slope is the average Jacobian over the draws, which is accurate also for a known or
+    nearly known state. The seed is fixed, so that the likelihood is a smooth, deterministic function of the parameters.
 
     Args:
-        samples: number of points, even, above twice the number of non-linear inputs.
-        seed: of the draws.
-        full_state: points in the whole state.
+        samples: number of points, even, larger than twice the number of non-linear inputs.
+        seed: random seed of the draws.
+        full_state: vary the full state instead of the non-linear inputs only.
 
     Example:
         >>> MonteCarlo(100, seed=1).points(2).nodes.shape
         (100, 2)
     """
 
-    regresses: ClassVar[bool] = False
+    is_regression: ClassVar[bool] = False
 
     samples: int = eqx.field(static=True, default=1000)
     seed: int = eqx.field(static=True, default=0)

@@ -1,19 +1,21 @@
-"""How a function uses its inputs: what a rule needs to know before it places points."""
+"""The structure of a function: which of its inputs are non-linear."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 
-class InputStructure(NamedTuple):
-    """How a function uses its inputs w = (x, u), as static index tuples.
+@dataclass(frozen=True)
+class InputStructure:
+    """The use that a function makes of its inputs w = (x, u), as static index tuples.
 
     Attributes:
-        points: non-linear inputs; a rule places its points in them.
-        averaged: linear given the points, with a Jacobian that depends on the points or on time.
-        constant: linear, with a constant Jacobian.
-        jacobian: (D, M + R) Booleans, which output depends on which input.
-        offset_varies: whether the function depends on time other than through its inputs' Jacobian.
+        points: non-linear inputs, in which a rule places its points.
+        averaged: inputs that are linear given the points, with a Jacobian that depends on the points or on time; a
+            rule averages it.
+        constant: linear inputs with a constant Jacobian.
+        jacobian: (D, M + R) Booleans, whether an output depends on an input.
+        offset_varies: whether the function depends explicitly on time.
     """
 
     points: tuple[int, ...]

@@ -11,10 +11,10 @@ from lfm_ppl.linearisation.structure import InputStructure
 
 
 class Taylor(Rule):
-    """Value and Jacobian at the mean: the extended Kalman filter.
+    """First-order Taylor expansion about the mean: the extended Kalman filter.
 
-    ``E[f] ~ f(m)``, ``A = f'(m)``, ``Omega = 0``. It ignores the spread of the state, and so underestimates the
-    variance where the function bends within it.
+    ``E[f] ~ f(m)``, ``A = f'(m)``, ``Omega = 0``. The rule neglects the curvature of f over the distribution of the
+    state, and underestimates the variance where the curvature is large.
 
     Example:
         >>> Taylor().name
@@ -29,6 +29,6 @@ class Taylor(Rule):
         value, extra = function(inputs.mean)
         varying = (*structure.points, *structure.averaged)
         if varying:
-            part = partial_jacobian(function, inputs.mean, varying)
-            jacobian = jacobian + matmul(part, selection(varying, inputs.mean.shape[0]).T)
+            varying_jacobian = partial_jacobian(function, inputs.mean, varying)
+            jacobian = jacobian + matmul(varying_jacobian, selection(varying, inputs.mean.shape[0]).T)
         return AffineMap(value, jacobian, jnp.zeros((value.shape[0],) * 2), extra)

@@ -1,4 +1,15 @@
-"""The latent force model as its user writes it."""
+"""The latent force model in the form in which users write it.
+
+`LatentForceModel` holds dynamics, forces, observation and initial state. Its constructor
+
+1. checks types, names and shapes of the arguments,
+2. traces every function once (`lfm_ppl.model.user_functions`), and checks the shape of its result and its indices,
+3. refuses numbers made in single precision where JAX computes in double precision,
+4. evaluates every function at the prior mean, outside of compiled code; the results must be finite. Functions of time
+   wait for the initial time (`check_at`).
+
+Source: Hartikainen, Seppänen and Särkkä (2012), ICML, section 3.
+"""
 
 from __future__ import annotations
 
@@ -13,14 +24,14 @@ import numpy as np
 from lfm_ppl import checks
 from lfm_ppl.forces.sde import Force
 from lfm_ppl.model.gaussian import Gaussian
-from lfm_ppl.model.inputs import InputRead, check_reads, has_inputs, input_reads, reads_inputs
+from lfm_ppl.model.inputs import InputRead, check_reads, has_inputs, has_limited_inputs, input_reads
 from lfm_ppl.model.observation import GaussianObservation
 from lfm_ppl.model.observations.family import ObservationFamily
-from lfm_ppl.model.user_functions import Traced, trace
+from lfm_ppl.model.user_functions import TracedFunction, trace
 
 
 class LatentForceModel(eqx.Module):
-    r"""A mechanistic model pushed by unobserved forces.
+    r"""A mechanistic model driven by unobserved forces.
 
         dx = f(x, u(t), t) dt + G(x, u(t), t) dB,    u_r(t) ~ GP,    y_k = h(x, u, t_k) + r_k.
 
@@ -28,23 +39,23 @@ class LatentForceModel(eqx.Module):
         dynamics: ``f(x, u, t) -> (M,)``; a function or an Equinox module. ``x`` is (M,), ``u`` is (R,) in the order
             of ``forces``.
         forces: name -> force; empty is legal. A sequence of (name, force) pairs is accepted too.
-        observation: what is measured.
+        observation: a Gaussian observation or an observation family.
         initial_state: distribution of x at the initial time; zero covariance is legal.
         process_noise: the dispersion G (M, S) of a unit Brownian motion on x, or a function ``(x, u, t) -> (M, S)``.
-        initial_time: when the initial state holds; None: the first time of the data.
-        nonlinear_inputs: names of the states and forces that enter f non-linearly. None: found from f itself.
+        initial_time: time of the initial state; None: the first time of the data.
+        nonlinear_inputs: names of the states and forces that enter f non-linearly. None: they are detected from f.
         state_names: M names, for results and plots.
         output_names: D names of the components of y.
-        units: unit of "time", of states, outputs, forces and deterministics, by name.
-        deterministics: name -> ``(x, u, t) -> ()``, what follows from state and forces: a rate ``softplus(u)`` where
-            the dynamics use it, a flow, a reproduction number. Drawn along every trajectory, as
-            ``numpyro.deterministic`` is of the parameters, with a figure of its own; it changes no likelihood.
+        units: units of "time", states, outputs, forces and deterministics, by name.
+        deterministics: name -> ``(x, u, t) -> ()``, functions of state and forces, such as a rate ``softplus(u)``, a
+            flow or a reproduction number. Results contain their trajectories and plot them, like
+            ``numpyro.deterministic`` for parameters; they do not change the likelihood.
 
     Raises:
         ValueError, TypeError: f returns a wrong shape; a function takes an entry out of range, or is not made of JAX
-            operations; names repeat or are of a wrong number; the process noise has a wrong shape; a force was made in
-            single precision. Outside of compiled code also: a function is not finite at the prior mean. (One that
-            depends on time is tried where the initial time is known, here or with the data.)
+            operations; names repeat or their number is wrong; the process noise has a wrong shape; a force was
+            constructed in single precision. Outside of compiled code also: a function is not finite at the prior mean.
+            (A function of time is evaluated once the initial time is known, here or with the data.)
 
     Example:
         >>> import jax.numpy as jnp
@@ -74,9 +85,9 @@ class LatentForceModel(eqx.Module):
     state_names: tuple[str, ...] = eqx.field(static=True)
     output_names: tuple[str, ...] = eqx.field(static=True)
     unit_items: tuple[tuple[str, str], ...] = eqx.field(static=True)
-    _reads_inputs: bool = eqx.field(static=True)
-    _integrates_inputs: bool = eqx.field(static=True)
-    _with_roots: tuple[str, ...] = eqx.field(static=True)
+    _has_limited_inputs: bool = eqx.field(static=True)
+    _has_integrated_inputs: bool = eqx.field(static=True)
+    _functions_with_roots: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(
         self,
@@ -93,14 +104,14 @@ class LatentForceModel(eqx.Module):
         deterministics: Mapping[str, Callable[..., jax.Array]] | None = None,
     ):
         _check_types(dynamics, observation, initial_state)
-        self.force_names, self.forces = _named_forces(forces)
+        self.force_names, self.forces = _forces_by_name(forces)
         self.dynamics, self.initial_state = dynamics, initial_state
-        self.observation = self._resolved(observation)
+        self.observation = self._with_output_sizes(observation)
         if initial_time is not None:
             checks.finite("initial_time", initial_time)
-        # Kept as NumPy where it is known: inside jit jnp.asarray would make a tracer of it, too late to plan rows by.
-        known = None if initial_time is None else checks.concrete(initial_time)
-        self.initial_time = initial_time if known is None else known.astype(float)
+        # A concrete time stays a NumPy array: inside jit jnp.asarray returns a tracer, but time grids need the number.
+        concrete_time = None if initial_time is None else checks.concrete(initial_time)
+        self.initial_time = initial_time if concrete_time is None else concrete_time.astype(float)
         size = initial_state.mean.shape[0]
         self.state_names = _names("state_names", state_names, size, "x")
         if overlap := set(self.state_names) & set(self.force_names):
@@ -108,7 +119,7 @@ class LatentForceModel(eqx.Module):
         self.process_noise = process_noise if callable(process_noise) else _dispersion(process_noise, size)
         self.deterministics = _functions(deterministics, {*self.state_names, *self.force_names})
         self.deterministic_names = tuple(self.deterministics)
-        functions = self._traced()
+        functions = self._trace_functions()
         self.output_names = _names("output_names", output_names, functions["observation"].shape.shape[0], "y")
         if isinstance(self.observation, ObservationFamily):
             self.observation.check_shapes(len(self.output_names))
@@ -116,9 +127,9 @@ class LatentForceModel(eqx.Module):
         self.nonlinear_inputs = None if nonlinear_inputs is None else tuple(nonlinear_inputs)
         for name in self.nonlinear_inputs or ():
             checks.one_of("name in nonlinear_inputs", name, (*self.state_names, *self.force_names))
-        self._with_roots = tuple(name for name, function in functions.items() if function.takes_roots)
-        self._reads_inputs = any(reads_inputs(function) for function in functions.values())
-        self._integrates_inputs = any(has_inputs(function) for function in _integrated(functions))
+        self._functions_with_roots = tuple(name for name, function in functions.items() if function.has_roots)
+        self._has_limited_inputs = any(has_limited_inputs(function) for function in functions.values())
+        self._has_integrated_inputs = any(has_inputs(function) for function in _integrated_functions(functions))
         self._check_precision()
         if self.initial_time is not None or not any(
                 function.depends_on_time for name, function in functions.items() if not name.startswith("determin")):
@@ -134,40 +145,39 @@ class LatentForceModel(eqx.Module):
         """The forces in their order."""
         return tuple(self.forces[name] for name in self.force_names)
 
-    def _resolved(self, observation: Any) -> GaussianObservation | ObservationFamily:
-        """Return the observation, a family told the number of its outputs."""
+    def _with_output_sizes(self, observation: Any) -> GaussianObservation | ObservationFamily:
+        """Return the observation; a family gets the number of its outputs."""
         if not isinstance(observation, ObservationFamily):
             return observation
         u = jax.ShapeDtypeStruct((len(self.force_names),), jnp.result_type(float))
+        arguments = (self.initial_state.mean, u, jnp.zeros(()))
 
-        def size(function: Callable) -> int:
-            traced = trace("the observation function", "h(x, u, t)", function, self.initial_state.mean, u,
-                           jnp.zeros(()))
-            return _vector_size(traced.shape)
+        def output_size(function: Callable) -> int:
+            return _vector_size(trace("the observation function", "h(x, u, t)", function, *arguments).shape)
 
-        return observation.resolved(size)
+        return observation.with_output_sizes(output_size)
 
-    def _traced(self) -> dict[str, Traced]:
-        """Trace every function of the model, and check what is seen so; means of forces stand under their names."""
+    def _trace_functions(self) -> dict[str, TracedFunction]:
+        """Return the traced functions of the model by name, after checks of their shapes and indices."""
         size = self.initial_state.mean.shape[0]
         u = jax.ShapeDtypeStruct((len(self.force_names),), jnp.result_type(float))
         arguments = (self.initial_state.mean, u, jnp.zeros(()))
         drift = trace("dynamics", "f(x, u, t)", self.dynamics, *arguments)
         if getattr(drift.shape, "shape", None) != (size,):
             raise ValueError(f"dynamics must return one derivative for each of the {size} entries of "
-                             f"initial_state.mean, shape ({size},); it returned {_returned(drift.shape)}."
+                             f"initial_state.mean, shape ({size},); it returned {_describe(drift.shape)}."
                              f"{'' if getattr(drift.shape, 'shape', ()) else ' Return jnp.array([...]).'}")
-        functions = {"dynamics": drift, "observation": self._traced_observation(arguments)}
+        functions = {"dynamics": drift, "observation": self._trace_observation(arguments)}
         if callable(self.process_noise):
             noise = trace("process_noise", "(x, u, t)", self.process_noise, *arguments)
-            found: Any = getattr(noise.shape, "shape", ())
-            if len(found) != 2 or found[0] != size:
-                raise ValueError(f"process_noise must return a dispersion matrix ({size}, S), got {found}.")
+            shape: Any = getattr(noise.shape, "shape", ())
+            if len(shape) != 2 or shape[0] != size:
+                raise ValueError(f"process_noise must return a dispersion matrix ({size}, S), got {shape}.")
             functions["process_noise"] = noise
         if callable(self.observation.covariance):
             functions["covariance"] = trace("the observation covariance", "(x, u, t)", self.observation.covariance,
                                             *arguments)
-        functions |= {f"deterministic {name}": found for name, found in self._traced_deterministics(arguments).items()}
+        functions |= self._trace_deterministics(arguments)
         for function in functions.values():
             function.check_indices(("x", "u"))
         for name, force in self.forces.items():
@@ -176,18 +186,19 @@ class LatentForceModel(eqx.Module):
                                                      arguments[-1])
         return functions
 
-    def _traced_deterministics(self, arguments: tuple) -> dict[str, Traced]:
-        found = {}
+    def _trace_deterministics(self, arguments: tuple) -> dict[str, TracedFunction]:
+        functions = {}
         for name, function in self.deterministics.items():
             label = f"the deterministic {name!r}"
-            found[name] = trace(label, "(x, u, t)", function, *arguments)
-            shape = getattr(found[name].shape, "shape", found[name].shape)
+            traced = trace(label, "(x, u, t)", function, *arguments)
+            shape = getattr(traced.shape, "shape", traced.shape)
             if shape != ():
                 raise ValueError(f"{label} must return one number, shape (); it returned {shape}. The entry of a "
                                  "vector is x[0], u[0].")
-        return found
+            functions[f"deterministic {name}"] = traced
+        return functions
 
-    def _traced_observation(self, arguments: tuple) -> Traced:
+    def _trace_observation(self, arguments: tuple) -> TracedFunction:
         traced = trace("the observation function", "h(x, u, t)", self.observation.function, *arguments)
         outputs = _vector_size(traced.shape)
         covariance = jax.eval_shape(self.observation.covariance_at, *arguments, 0)
@@ -199,34 +210,34 @@ class LatentForceModel(eqx.Module):
         return traced
 
     def _check_precision(self) -> None:
-        """Raise where a force or the model was made in single precision, and JAX runs in double precision now."""
-        wanted = jnp.result_type(float)
+        """Raise ValueError if a part of the model has single precision while JAX computes in double precision."""
+        precision = jnp.result_type(float)
         parts = {**{f"the force {name!r}": force for name, force in self.forces.items()},
                  "initial_state": self.initial_state, "the observation covariance": self.observation.covariance,
                  "process_noise": self.process_noise}
         for name, part in parts.items():
             for leaf in jax.tree_util.tree_leaves(part):
-                found = getattr(leaf, "dtype", wanted)
-                if jnp.issubdtype(found, jnp.floating) and jnp.finfo(found).bits < jnp.finfo(wanted).bits:
-                    raise ValueError(f"{name} holds numbers in {found}, made before JAX was told to compute in "
-                                     f"{wanted}; seven digits of them are right. Call "
+                dtype = getattr(leaf, "dtype", precision)
+                if jnp.issubdtype(dtype, jnp.floating) and jnp.finfo(dtype).bits < jnp.finfo(precision).bits:
+                    raise ValueError(f"{name} holds numbers in {dtype}, made before JAX was switched to {precision}; "
+                                     "only seven digits of them are right. Call "
                                      'jax.config.update("jax_enable_x64", True) first, and make it after that.')
 
     def check_span(self, first: float, last: float) -> None:
-        """Check the forces against data from ``first`` to ``last``; raise ValueError where one does not suit them."""
+        """Check the forces against data that span ``first`` to ``last``, see `lfm_ppl.Force.check_span`."""
         for name, force in self.forces.items():
             force.check_span(name, first, last)
 
     def check_at(self, time: Any, rows: int) -> None:
-        """Check what depends on where and how often the model is observed.
+        """Check the functions at a time, and the parameters of the observation against the number of rows.
 
         Args:
-            time: at which the functions are tried, at the prior mean.
+            time: time at which the functions are evaluated, at the prior mean.
             rows: number of observations.
 
         Raises:
-            ValueError: a function is not finite there, the observation covariance is no covariance, or there is not
-                one matrix for each observation.
+            ValueError: a function is not finite, the observation covariance is not a covariance matrix, or the number
+                of matrices differs from the number of observations.
         """
         if isinstance(self.observation, ObservationFamily):
             self.observation.check_rows(rows)
@@ -238,22 +249,23 @@ class LatentForceModel(eqx.Module):
         self._check_finite(time)
 
     def check_inputs(self, first: float, last: float) -> None:
-        """Check that no known input ends before the model's times, from ``first`` to ``last``.
+        """Check that the tables of known inputs cover the times of the model from ``first`` to ``last``.
 
         Raises:
-            ValueError: an input with ``outside="error"`` does; with "warn" it is a warning, with "hold" nothing.
+            ValueError: an input with ``outside="error"`` is read beyond its table; with "warn" it is a warning.
         """
-        if self._reads_inputs:
-            check_reads(tuple(self._traced().values()), first, last)
+        if self._has_limited_inputs:
+            check_reads(tuple(self._trace_functions().values()), first, last)
 
     def input_reads(self, first: float, last: float) -> list[InputRead]:
-        """Return which known inputs are integrated, and when they are read; see `lfm_ppl.model.inputs.input_reads`."""
-        return input_reads(_integrated(self._traced()), first, last) if self._integrates_inputs else []
+        """Return the reads of known inputs between observations, see `lfm_ppl.model.inputs.input_reads`."""
+        functions = _integrated_functions(self._trace_functions()) if self._has_integrated_inputs else []
+        return input_reads(functions, first, last)
 
     def _check_finite(self, time: Any) -> None:
-        """Try the functions at the prior mean, where that is known; ``time`` is None where it does not matter."""
+        """Evaluate the functions at the prior mean, if it is concrete; ``time`` is None if it does not matter."""
         x = self.initial_state.mean
-        # Inside compiled code this is a tracer, whatever is known.
+        # Inside compiled code the result of this addition is a tracer, even for a concrete time.
         t = jnp.asarray(0.0 if time is None else time, float) + 0.0
         if checks.traced((self, t)):
             return
@@ -269,8 +281,8 @@ class LatentForceModel(eqx.Module):
                 name = names[int(np.argmin(np.isfinite(value)))]
                 raise ValueError(f"the {label} returned {value} {where}: the entry for {name!r} is not finite. "
                                  "Change initial_state.mean, or guard the expression (for example jnp.maximum)."
-                                 + self._traced()[label.split()[0]].not_finite(*map(np.asarray, (x, u, t))))
-            if label.split()[0] in self._with_roots:
+                                 + self._trace_functions()[label.split()[0]].not_finite(*map(np.asarray, (x, u, t))))
+            if label.split()[0] in self._functions_with_roots:
                 self._check_derivative(label, function, names, (x, u, t), where)
             if value is not None and function is self.observation.function and isinstance(self.observation,
                                                                                            ObservationFamily):
@@ -285,33 +297,35 @@ class LatentForceModel(eqx.Module):
                 checks.covariance_matrix(f"the observation covariance {where}", noise)
 
     @staticmethod
-    def _check_derivative(label: str, function: Callable, names: Sequence[str], at: tuple, where: str) -> None:
-        """Warn: a square root has a value at zero, but no derivative there, and none below."""
-        x, u, t = at
+    def _check_derivative(label: str, function: Callable, names: Sequence[str], arguments: tuple, where: str) -> None:
+        """Warn if the derivative is not finite, such as that of a square root at zero, which has a finite value."""
+        x, u, t = arguments
         derivative = checks.concrete(jax.jacfwd(lambda w: function(w[:len(x)], w[len(x):], t))(jnp.concatenate([x, u])))
         if derivative is not None and not np.all(np.isfinite(derivative)):
-            finite = np.isfinite(np.asarray(derivative)).reshape(len(names), -1).all(axis=1)
+            is_finite = np.isfinite(np.asarray(derivative)).reshape(len(names), -1).all(axis=1)
             checks.warn(f"the derivative of the {label} is not finite {where}: that of the entry for "
-                        f"{names[int(np.argmin(finite))]!r}. Likelihood and gradient may not be finite either. Change "
-                        "initial_state.mean, or guard the expression (for example jnp.sqrt(jnp.maximum(x, 1e-6))).")
+                        f"{names[int(np.argmin(is_finite))]!r}. Likelihood and gradient may not be finite either. "
+                        "Change initial_state.mean, or guard the expression, as in jnp.sqrt(jnp.maximum(x, 1e-6)).")
 
 
-def _integrated(functions: Mapping[str, Traced]) -> list[Traced]:
-    """Return the functions that are evaluated between two observations."""
+def _integrated_functions(functions: Mapping[str, TracedFunction]) -> list[TracedFunction]:
+    """Return the functions that are evaluated between observations."""
     return [function for name, function in functions.items()
             if name in ("dynamics", "process_noise") or name.startswith("mean of ")]
 
 
-def _functions(given: Mapping[str, Callable] | None, taken: set[str]) -> dict[str, Callable]:
-    """Return the deterministics, checked."""
-    if given is not None and not isinstance(given, Mapping):
-        raise TypeError(f"deterministics must be a mapping, name -> function (x, u, t), got {type(given).__name__}.")
-    for name, function in (given or {}).items():
+def _functions(deterministics: Mapping[str, Callable] | None, used_names: set[str]) -> dict[str, Callable]:
+    """Return the deterministics after checks of their types and names."""
+    deterministics = {} if deterministics is None else deterministics
+    if not isinstance(deterministics, Mapping):
+        raise TypeError("deterministics must be a mapping, name -> function (x, u, t), got "
+                        f"{type(deterministics).__name__}.")
+    for name, function in deterministics.items():
         if not callable(function):
             raise TypeError(f"the deterministic {name!r} must be a function (x, u, t), got {type(function).__name__}.")
-        if name in taken:
+        if name in used_names:
             raise ValueError(f"the name {name!r} of a deterministic is used for a state or a force; rename one.")
-    return {str(name): function for name, function in (given or {}).items()}
+    return {str(name): function for name, function in deterministics.items()}
 
 
 def _check_types(dynamics: Any, observation: Any, initial_state: Any) -> None:
@@ -325,23 +339,24 @@ def _check_types(dynamics: Any, observation: Any, initial_state: Any) -> None:
         raise TypeError(f"initial_state must be an lfm.Gaussian, got {type(initial_state).__name__}.")
 
 
-def _vector_size(found: Any) -> int:
-    if len(getattr(found, "shape", ())) != 1:
-        raise ValueError(f"the observation function must return a vector (D,), got {_returned(found)}. "
+def _vector_size(result: Any) -> int:
+    """Return the length of the result of an observation function; raise ValueError unless it is a vector."""
+    if len(getattr(result, "shape", ())) != 1:
+        raise ValueError(f"the observation function must return a vector (D,), got {_describe(result)}. "
                          "For one output, return x[:1] or jnp.array([...]).")
-    return found.shape[0]
+    return result.shape[0]
 
 
-def _returned(found: Any) -> str:
-    """Return in words what a function returned that should have returned a vector."""
-    if hasattr(found, "shape"):
-        return f"{'an array' if found.shape else 'a number'} of shape {found.shape}"
-    if isinstance(found, (list, tuple)):
-        return f"a {type(found).__name__} of {len(found)}, which is no array"
-    return "None, as a function without `return` does" if found is None else type(found).__name__
+def _describe(result: Any) -> str:
+    """Return a description of the result of a function that should have returned a vector."""
+    if hasattr(result, "shape"):
+        return f"{'an array' if result.shape else 'a number'} of shape {result.shape}"
+    if isinstance(result, (list, tuple)):
+        return f"a {type(result).__name__} of {len(result)}, which is not an array"
+    return "None, as a function without `return` does" if result is None else type(result).__name__
 
 
-def _named_forces(forces: Any) -> tuple[tuple[str, ...], dict[str, Force]]:
+def _forces_by_name(forces: Any) -> tuple[tuple[str, ...], dict[str, Force]]:
     if isinstance(forces, Force) or not isinstance(forces, Iterable):
         raise TypeError('forces must map names to forces, for example {"p53": lfm.Matern(1.0, 2.0)}, or {} for none; '
                         f"got {type(forces).__name__}.")
@@ -355,22 +370,23 @@ def _named_forces(forces: Any) -> tuple[tuple[str, ...], dict[str, Force]]:
     names = tuple(name for name, _ in items)
     for name in names:
         if names.count(name) > 1:
-            raise ValueError(f"the force name {name!r} repeats; every force needs a name of its own.")
+            raise ValueError(f"the force name {name!r} repeats; every force needs a different name.")
     return names, dict(items)
 
 
-def _names(argument: str, given: Sequence[str] | None, size: int, prefix: str) -> tuple[str, ...]:
-    if given is None:
+def _names(argument: str, names: Sequence[str] | None, size: int, prefix: str) -> tuple[str, ...]:
+    """Return ``size`` names after a check of their number; None: ``prefix`` with numbers."""
+    if names is None:
         return tuple(f"{prefix}{index}" for index in range(size))
-    if isinstance(given, str) or len(given) != size:
-        names = (given,) if isinstance(given, str) else tuple(given)
-        what = {"output_names": "the observation returns", "state_names": "initial_state.mean has"}.get(argument)
-        why = f": {what} {size} {'entry' if size == 1 else 'entries'}" if what else ""
-        raise ValueError(f"{argument} must hold {size} {'name' if size == 1 else 'names'}{why}. It holds "
+    if isinstance(names, str) or len(names) != size:
+        names = (names,) if isinstance(names, str) else tuple(names)
+        source = {"output_names": "the observation returns", "state_names": "initial_state.mean has"}.get(argument)
+        reason = f": {source} {size} {'entry' if size == 1 else 'entries'}" if source else ""
+        raise ValueError(f"{argument} must hold {size} {'name' if size == 1 else 'names'}{reason}. It holds "
                          f"{', '.join(map(repr, names)) or 'none'}.")
-    if len(set(given)) != size:
-        raise ValueError(f"{argument} must not repeat, got {tuple(given)}.")
-    return tuple(str(name) for name in given)
+    if len(set(names)) != size:
+        raise ValueError(f"{argument} must not repeat, got {tuple(names)}.")
+    return tuple(str(name) for name in names)
 
 
 def _dispersion(value: Any, size: int) -> jax.Array | None:

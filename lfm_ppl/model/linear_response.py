@@ -1,4 +1,17 @@
-"""The outputs of a model, linearised at its prior mean, as linear maps of its forces and its initial state."""
+"""The outputs of a linearised model as linear maps of its forces and its initial state.
+
+`lfm_ppl.model.resolution` and `lfm_ppl.model.truncation` estimate with it the error of the log likelihood due to the
+approximation of a force:
+
+1. Linearise the model at its prior mean (`linearize`).
+2. On a time grid, over each step of which a force is taken as linear in time, compute the response of the outputs to
+   the forces by one matrix exponential per distinct step (`output_responses`).
+3. The covariance of the outputs follows from covariances of the forces on the grid (`exact_covariance`), the initial
+   state and the noise.
+4. `error_bound` gives the error of the log likelihood from the eigenvalues of the approximate and exact covariances.
+
+Source: Whittle (1953), Arkiv för Matematik 2, for the likelihood of an approximate covariance.
+"""
 
 from __future__ import annotations
 
@@ -16,55 +29,45 @@ from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observations.family import ObservationFamily
 
 TOLERANCE = 0.1
-"""Error of the log likelihood above which there is a warning."""
+"""Error of the log likelihood above which a warning is given."""
 
 LEAST_NOISE = 1e-10
-"""Observation noise that is assumed at least, relative to the variance of the signal; K is singular without."""
+"""Lower bound on the observation noise, relative to the variance of the signal; it keeps K non-singular."""
 
 
 class LinearModel(NamedTuple):
-    """dx/dt = A x + B u, y = C x + D u + e, e ~ N(0, R), x(t0) ~ N(., P0)."""
+    """The linear model dx/dt = A x + B u, y = C x + D u + e, e ~ N(0, R), x(t0) ~ N(., P0)."""
 
-    a: np.ndarray
-    b: np.ndarray
-    c: np.ndarray
-    d: np.ndarray
-    noise: np.ndarray
-    initial: np.ndarray
+    a: np.ndarray  # A (M, M)
+    b: np.ndarray  # B (M, R)
+    c: np.ndarray  # C (D, M)
+    d: np.ndarray  # D (D, R)
+    noise: np.ndarray  # R (D, D)
+    initial: np.ndarray  # P0 (M, M)
 
 
-class ForceTerm(NamedTuple):
-    """A force, or a term of one that is a sum.
-
-    Attributes:
-        name: of the force in the model.
-        column: of the force among the inputs u of the model.
-        force: the force itself, or the term.
-    """
-
-    name: str
-    column: int
-    force: Force
+ForceTerm = tuple[str, int, Force]
+"""A force that is not a sum, or a term of a sum: the name in the model, the column in the inputs u, the force."""
 
 
 def force_terms(model: LatentForceModel) -> list[ForceTerm]:
-    """Return the forces of a model, and the terms of those that are sums."""
+    """Return the forces of a model, with sums replaced by their terms."""
     pairs = zip(model.force_names, model.force_list, strict=True)
-    return [ForceTerm(name, column, term) for column, (name, force) in enumerate(pairs)
+    return [(name, column, term) for column, (name, force) in enumerate(pairs)
             for term in (force.forces if isinstance(force, Sum) else (force,))]
 
 
 def observed_times(model: LatentForceModel, times: Any, y: Any) -> np.ndarray | None:
-    """Return the times (N,) at which something is observed, where a Gaussian likelihood can be judged by algebra.
+    """Return the times (N,) with observed entries, where the linearised model describes the likelihood.
 
     Args:
         model: the latent force model.
         times: (T,).
-        y: (T, D), NaN where missing; None: everything is observed.
+        y: (T, D), NaN where missing; None: all entries are observed.
 
     Returns:
-        None where something is traced, where fewer than two times are observed, for an observation family, and for a
-        model with process noise, which hides what a linearised model does not know.
+        The times; None if an argument is traced, if fewer than two times are observed, for an observation family, and
+        for a model with process noise, which the linearised model does not include.
     """
     if isinstance(model.observation, ObservationFamily) or model.process_noise is not None:
         return None
@@ -78,7 +81,7 @@ def observed_times(model: LatentForceModel, times: Any, y: Any) -> np.ndarray | 
 
 
 def linearize(model: LatentForceModel, time: float) -> LinearModel | None:
-    """Return the model linearised at its prior mean; None where that is traced or not finite."""
+    """Return the model linearised at its prior mean; None if a coefficient is traced or not finite."""
     t = jnp.asarray(time, float)
     x = model.initial_state.mean
     u = jnp.asarray([force.mean_at(t) for force in model.force_list], float)
@@ -89,20 +92,20 @@ def linearize(model: LatentForceModel, time: float) -> LinearModel | None:
     covariance = model.observation.covariance
     noise = (jnp.median(jnp.asarray(covariance), axis=0) if np.ndim(covariance) == 3
              else model.observation.covariance_at(x, u, t, jnp.asarray(0)))
-    parts = (*slopes, noise, model.initial_state.covariance)
-    if checks.traced(parts):
+    coefficients = (*slopes, noise, model.initial_state.covariance)
+    if checks.traced(coefficients):
         return None
-    linear = LinearModel(*(np.asarray(part, float) for part in parts))
-    return linear if all(np.all(np.isfinite(part)) for part in linear) else None
+    linear = LinearModel(*(np.asarray(coefficient, float) for coefficient in coefficients))
+    return linear if all(np.all(np.isfinite(coefficient)) for coefficient in linear) else None
 
 
 def output_responses(linear: LinearModel, grid: np.ndarray, substeps: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return linear maps from the forces on a grid (J,), and from a standard normal variable, to the outputs.
+    """Return the linear maps from the forces on a grid (J,) and from a standard normal initial state to the outputs.
 
     Args:
-        linear: the linearised model; its initial time is the first of the grid.
-        grid: non-decreasing times; the first and every ``substeps``-th after it is observed.
-        substeps: steps between observations, over each of which a force is taken as linear in time.
+        linear: the linearised model; its initial time is the first time of the grid.
+        grid: non-decreasing times; the first and then every ``substeps``-th time is observed.
+        substeps: steps between observations; forces are taken as linear in time over a step.
 
     Returns:
         Arrays (points D, J, R) and (points D, M).
@@ -110,7 +113,7 @@ def output_responses(linear: LinearModel, grid: np.ndarray, substeps: int) -> tu
     size, sources = linear.b.shape
     steps, index_of_step = np.unique(np.diff(grid), return_inverse=True)
     if steps.size and np.ptp(steps) <= 1e-9 * steps.max():
-        # Equal but for rounding: one matrix exponential serves all.
+        # Steps that differ by rounding only share one matrix exponential.
         steps, index_of_step = steps[-1:], np.zeros_like(index_of_step)
     block = np.zeros((steps.size, size + sources, size + sources))
     block[:, :size, :size] = linear.a * steps[:, None, None]
@@ -123,7 +126,7 @@ def output_responses(linear: LinearModel, grid: np.ndarray, substeps: int) -> tu
     for index in range(grid.size):
         if index:
             transition = transitions[index_of_step[index - 1]]
-            # u is taken as the mean of both ends of the step.
+            # The mean of the values of u at both ends of a step drives the step.
             state = np.einsum("ij,jkr->ikr", transition[:size, :size], state)
             state[:, index - 1: index + 1] += 0.5 * transition[:size, None, size:]
             start = transition[:size, :size] @ start
@@ -136,7 +139,7 @@ def output_responses(linear: LinearModel, grid: np.ndarray, substeps: int) -> tu
 
 
 def exact_covariance(force: Force, grid: np.ndarray) -> np.ndarray:
-    """Return the exact covariance (J, J) on a grid, zero where there is no closed form."""
+    """Return the exact covariance (J, J) of a force on a grid, zero if there is no closed form."""
     try:
         return np.asarray(force.covariance(grid[:, None], grid))
     except NotImplementedError:
@@ -152,7 +155,7 @@ def error_bound(eigenvalues: np.ndarray, pieces: float = 1.0) -> float:
 
     Args:
         eigenvalues: e_i.
-        pieces: independent pieces of the data, of which these are the eigenvalues of one.
+        pieces: number of independent pieces of the data; the eigenvalues describe one piece.
     """
     mean = 0.5 * (eigenvalues - 1.0 - np.log(eigenvalues)).sum()
     variance = 0.5 * ((eigenvalues - 1.0) ** 2).sum()

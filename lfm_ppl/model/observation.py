@@ -1,4 +1,4 @@
-"""What is measured: y_k = h(x(t_k), u(t_k), t_k) + r_k with Gaussian noise r_k."""
+"""Gaussian observations: y_k = h(x(t_k), u(t_k), t_k) + r_k with Gaussian noise r_k."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from lfm_ppl import checks
 
 
 class GaussianObservation(eqx.Module):
-    """Gaussian measurements of the joint state.
+    """Measurements of states and forces with Gaussian noise.
 
     ``y_k = h(x, u, t_k) + r_k``,  ``r_k ~ N(0, R_k)``.
 
     Args:
         function: ``h(x, u, t) -> (D,)``; ``x`` (M,), ``u`` (R,) in the order of the forces.
-        covariance: ``R``: variances (D,), a matrix (D, D), one matrix an observation (T, D, D), or a function
+        covariance: ``R``: variances (D,), a matrix (D, D), one matrix per observation (T, D, D), or a function
             ``(x, u, t)`` that returns (D,) or (D, D).
-        angular: indices of components that are angles in radians; their residual is taken on the circle.
+        angular: indices of components that are angles in radians; their residuals are reduced to [-pi, pi].
 
     Raises:
         ValueError: the covariance is not symmetric, not positive semi-definite, or of a wrong shape.

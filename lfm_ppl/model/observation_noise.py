@@ -1,4 +1,4 @@
-"""The density of an observation given the state, and what it asks of the noise."""
+"""The density of an observation given the state, draws from it, and checks of its noise."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl import checks, linalg
-from lfm_ppl.linalg import cholesky, masked, matmul, semidefinite_root, solve_lower, wrapped
+from lfm_ppl import checks, gaussian_residuals
+from lfm_ppl.gaussian_residuals import masked, wrapped
+from lfm_ppl.linalg import cholesky, matmul, semidefinite_root, solve_lower
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel
 
 
 def log_density(ssm: StateSpaceModel, w: jax.Array, t: jax.Array, row: jax.Array,
                 y: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Score the present entries of an observation.
+    """Return the log density of the observed entries of y given state and forces, and their whitened residual.
 
     Args:
-        ssm: the model.
+        ssm: the state-space model.
         w: (M + R,), state and forces.
         t: the time.
-        row: of the observation, where each has a noise covariance of its own.
+        row: index of the observation, which selects its noise covariance or family parameters.
         y: (D,), NaN where missing.
 
     Returns:
-        log p(y | w), zero where all entries are missing; the residual (D,) in units of the noise, NaN for a family,
-        which has no such unit.
+        log p(y | w), zero where all entries are missing; the whitened residual (D,), NaN for an observation family.
     """
     present = jnp.isfinite(y)
     family = ssm.model.observation
@@ -39,21 +39,22 @@ def log_density(ssm: StateSpaceModel, w: jax.Array, t: jax.Array, row: jax.Array
     residual, noise = masked(residual, ssm.obs_cov(w, t, row), present)
     factor = cholesky(noise)
     white = solve_lower(factor.chol, residual)
-    return jnp.where(factor.degenerate.any(), -jnp.inf, linalg.log_density(white, factor.chol, present)), white
+    value = gaussian_residuals.log_density(white, factor.chol, present)
+    return jnp.where(factor.degenerate.any(), -jnp.inf, value), white
 
 
 def entry_log_prob(ssm: StateSpaceModel, w: jax.Array, t: jax.Array, row: Any, y: jax.Array) -> jax.Array:
-    """Return log p(y_d | w) (D,) of a family's entries, zero where missing; arguments as in `log_density`."""
+    """Return log p(y_d | w) (D,) of the entries of a family, zero where missing; arguments as in `log_density`."""
     family, present = ssm.model.observation, jnp.isfinite(y)
     assert isinstance(family, ObservationFamily)
     predictor = ssm.observe(w, t)
-    # A missing entry must not put NaN into a derivative; any value in the support does.
+    # The masked branch must have a finite derivative, too: replace a missing entry by a value in the support.
     value = family.at(row).log_prob(predictor, jnp.where(present, y, family.possible(predictor)))
     return jnp.where(present, value, 0.0)
 
 
 def noisy_observation(ssm: StateSpaceModel, w: jax.Array, t: jax.Array, key: jax.Array, row: Any) -> jax.Array:
-    """Draw the observation (D,) of a row (None: of none of the data) at the inputs w (M + R,) and time t."""
+    """Draw an observation (D,) at inputs w (M + R,) and time t, with the noise of a row (None: of no row)."""
     family, predictor = ssm.model.observation, ssm.observe(w, t)
     if isinstance(family, ObservationFamily):
         return (family.typical() if row is None else family.at(row)).sample(key, predictor)
@@ -68,25 +69,25 @@ def with_noise(key: jax.Array, mean: jax.Array, covariance: jax.Array) -> jax.Ar
 
 
 def expected_observation(ssm: StateSpaceModel, w: jax.Array, t: jax.Array) -> jax.Array:
-    """Return what is observed on average (D,) at inputs w (M + R,) and a time: free of noise, on the data's scale."""
+    """Return the expected observation (D,) at inputs w (M + R,) and time t, on the scale of the data."""
     family, predictor = ssm.model.observation, ssm.observe(w, t)
     return family.typical().mean(predictor) if isinstance(family, ObservationFamily) else predictor
 
 
-def require_gaussian(ssm: StateSpaceModel, method: str, instead: str) -> None:
-    """Raise ValueError for an observation family, where a method is one of Gaussian observations."""
+def require_gaussian(ssm: StateSpaceModel, method: str, alternative: str) -> None:
+    """Raise ValueError for an observation family, where ``method`` is restricted to Gaussian observations."""
     if isinstance(ssm.model.observation, ObservationFamily):
-        raise ValueError(f"{method} takes an lfm.GaussianObservation, and the observation of this model is of the "
-                         f"family {type(ssm.model.observation).__name__}. Use {instead} instead.")
+        raise ValueError(f"{method} needs an lfm.GaussianObservation, but the observation of this model is of the "
+                         f"family {type(ssm.model.observation).__name__}. Use {alternative} instead.")
 
 
 def check_noise(ssm: StateSpaceModel, time: Any) -> None:
-    """Raise ValueError where the observation noise has no density at the prior mean (where that is known)."""
+    """Raise ValueError if the observation noise has no density at the prior mean; traced values pass."""
     if isinstance(ssm.model.observation, ObservationFamily):
         return
     w = jnp.concatenate([ssm.model.initial_state.mean, ssm.stack.mean_at(time)])
-    own = ssm.model.observation.covariance
-    rows = jnp.arange(1 if callable(own) or jnp.ndim(own) < 3 else own.shape[0])
+    noise = ssm.model.observation.covariance
+    rows = jnp.arange(1 if callable(noise) or jnp.ndim(noise) < 3 else noise.shape[0])
     covariance = checks.concrete(jax.vmap(lambda row: ssm.obs_cov(w, jnp.asarray(time, float), row))(rows))
     if covariance is None:
         return

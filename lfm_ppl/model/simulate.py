@@ -1,4 +1,16 @@
-"""Simulation of the real, non-linear model."""
+"""Simulation of the exact, non-linear model.
+
+1. Draw the joint state at the initial time, physical states and forces.
+2. Between two rows, take ``steps`` steps; where known inputs jump or have a kink between rows, divide the interval at
+   these breakpoints (`_time_nodes`).
+3. Each step draws the forces at its end from their exact transition and process noise.
+4. The physical state follows by the classical Runge-Kutta method, with the forces linear in time over the step.
+5. Process noise enters with the dispersion at the start of the step (Ito), spread evenly over the step.
+6. At the end of a step that crosses a jump of a force, draw the jump.
+7. Draw the observations at the rows from the noise or the observation family.
+
+Source: Kloeden and Platen (1992), Numerical Solution of Stochastic Differential Equations, section 9.1.
+"""
 
 from __future__ import annotations
 
@@ -36,15 +48,14 @@ class Simulation(NamedTuple):
 def simulate(key: jax.Array, model: LatentForceModel, times: Any, steps: int = 50) -> Simulation:
     """Simulate a latent force model.
 
-    The forces are exact at every integration step, and linear between two of them. The state follows by the classical
-    Runge-Kutta method along this path. Process noise enters each step with the dispersion at its start, as Ito's
-    integral has it, spread evenly over the step: the scheme is then of strong order 1 for additive noise, 1/2
-    otherwise.
+    The forces are exact at the ends of integration steps and linear in between. The state follows by the classical
+    Runge-Kutta method along this path. Process noise enters each step with the dispersion at the start of the step
+    (Ito), spread evenly over the step: the strong order is 1 for additive noise and 1/2 otherwise.
 
     Args:
         key: a JAX random key.
         model: the latent force model.
-        times: (T,), non-decreasing; equal times get the same state and independent observations.
+        times: (T,), non-decreasing; equal times have the same state and independent observations.
         steps: integration steps between two consecutive times.
 
     Returns:
@@ -66,16 +77,20 @@ def simulate(key: jax.Array, model: LatentForceModel, times: Any, steps: int = 5
     checks.random_key(key)
     checks.positive_integer("steps", steps)
     ssm = state_space(model)
-    known = check_times(times, model.initial_time)
-    if known is not None and not checks.traced(model.initial_time):
-        model.check_inputs(float(known[0] if model.initial_time is None else model.initial_time), float(known[-1]))
+    concrete_times = check_times(times, model.initial_time)
+    if concrete_times is not None and not checks.traced(model.initial_time):
+        first = concrete_times[0] if model.initial_time is None else model.initial_time
+        model.check_inputs(float(first), float(concrete_times[-1]))
     model.check_at(times[0] if model.initial_time is None else model.initial_time, np.shape(times)[0])
     times = jnp.asarray(times, float)
     start = times[0] if model.initial_time is None else jnp.asarray(model.initial_time, float)
-    breakpoints = input_breakpoints(model, known, start)
-    run = lambda key, times, start: simulate_on(ssm, key, times, start, steps, breakpoints)  # noqa: E731
-    traced = checks.traced((model, times, key, breakpoints))
-    return (run if traced else jax.jit(run))(key, times, start)
+    breakpoints = input_breakpoints(model, concrete_times, start)
+
+    def run(key: jax.Array, times: jax.Array, start: jax.Array) -> Simulation:
+        return simulate_on(ssm, key, times, start, steps, breakpoints)
+
+    is_traced = checks.traced((model, times, key, breakpoints))
+    return (run if is_traced else jax.jit(run))(key, times, start)
 
 
 def input_breakpoints(model: LatentForceModel, times: Any, start: Any) -> Any:
@@ -83,25 +98,25 @@ def input_breakpoints(model: LatentForceModel, times: Any, start: Any) -> Any:
 
     Args:
         model: the latent force model.
-        times: (T,), in order; where they and the start are known, breakpoints outside of them are left out.
+        times: (T,), in order, or None. If times and start are concrete, breakpoints outside of them are omitted.
         start: initial time.
     """
     if times is None or checks.traced((times, start)):
         reads = model.input_reads(0.0, 1.0)
         return jnp.concatenate([jnp.zeros(0), *(jnp.asarray(read.breakpoints(), float) for read in reads)])
     first, last = float(np.min(start)), float(times[-1])
-    known, moving = breakpoints_within(model.input_reads(first, last), first, last)
-    return jnp.concatenate([known, moving]) if len(moving) else known
+    fixed, traced = breakpoints_within(model.input_reads(first, last), first, last)
+    return jnp.concatenate([fixed, traced]) if len(traced) else fixed
 
 
-class _Nodes(NamedTuple):
-    """Times of a simulation, those of the rows among them.
+class TimeNodes(NamedTuple):
+    """Times at which the integration of a simulation is divided, including the rows.
 
     Attributes:
         times: (N,), in order.
-        rows: (T,) indices of the rows.
-        origin: (N,) index of each among rows, pieces and breakpoints one after another; a row if below T.
-        steps: integration steps up to each time.
+        rows: (T,), indices of the rows among the nodes.
+        origin: (N,), index of each node in the concatenation of rows, subdivisions and breakpoints; a row if below T.
+        steps: integration steps between neighbouring nodes.
     """
 
     times: jax.Array
@@ -110,149 +125,161 @@ class _Nodes(NamedTuple):
     steps: int
 
 
-def _nodes(start: jax.Array, times: jax.Array, breakpoints: Any, steps: int) -> _Nodes:
-    """Return the rows, and the breakpoints of known inputs between them."""
-    count, extra = times.shape[0], np.shape(breakpoints)[0]
-    if not extra:
-        return _Nodes(times, np.arange(count), np.arange(count), steps)
-    # Rows in a few pieces of fewer steps each make it cheap to divide them at many breakpoints.
-    cost = [(count * -(-steps // part) + extra) * (part + 1) for part in range(1, steps + 1)]
-    part = int(np.argmin(cost)) + 1
-    pieces = -(-steps // part)
-    begin = jnp.concatenate([jnp.reshape(start, (1,)), times[:-1]])
-    share = np.arange(1, pieces) / pieces
-    between = (begin[:, None] + (times - begin)[:, None] * share).ravel()
-    every = jnp.concatenate([times, between, jnp.clip(jnp.asarray(breakpoints), start, times[-1])])
-    order = jnp.argsort(jax.lax.stop_gradient(every), stable=True)
-    return _Nodes(every[order], jnp.argsort(order)[:count], order, part)
+def _time_nodes(start: jax.Array, times: jax.Array, breakpoints: Any, steps: int) -> TimeNodes:
+    """Return the rows and the breakpoints of known inputs as nodes."""
+    count, breakpoint_count = times.shape[0], np.shape(breakpoints)[0]
+    if not breakpoint_count:
+        return TimeNodes(times, np.arange(count), np.arange(count), steps)
+    # Every interval between nodes takes the same number of steps, also one that a breakpoint has divided. Subdividing
+    # the intervals between rows into several pieces of fewer steps makes many breakpoints cheaper.
+    cost = [(count * -(-steps // part) + breakpoint_count) * (part + 1) for part in range(1, steps + 1)]
+    steps_per_piece = int(np.argmin(cost)) + 1
+    pieces = -(-steps // steps_per_piece)
+    interval_starts = jnp.concatenate([jnp.reshape(start, (1,)), times[:-1]])
+    fractions = np.arange(1, pieces) / pieces
+    subdivisions = (interval_starts[:, None] + (times - interval_starts)[:, None] * fractions).ravel()
+    nodes = jnp.concatenate([times, subdivisions, jnp.clip(jnp.asarray(breakpoints), start, times[-1])])
+    order = jnp.argsort(jax.lax.stop_gradient(nodes), stable=True)
+    return TimeNodes(nodes[order], jnp.argsort(order)[:count], order, steps_per_piece)
 
 
 def simulate_on(ssm: StateSpaceModel, key: jax.Array, times: jax.Array, start: jax.Array, steps: int,
                 breakpoints: Any = ()) -> Simulation:
-    """The same for a state-space model, without checks; for compiled code.
+    """Simulate a state-space model without checks, for compiled code; arguments as in `simulate`.
 
-    ``breakpoints`` (K,) are those of `input_breakpoints`.
+    ``breakpoints`` (K,) is the result of `input_breakpoints`.
     """
-    initial, path, noise = jax.random.split(key, 3)
+    initial_key, path_key, noise_key = jax.random.split(key, 3)
     mean, covariance = ssm.initial()
-    first = mean + matmul(semidefinite_root(covariance), jax.random.normal(initial, (ssm.state_dim, 1)))[:, 0]
-    nodes = _nodes(start, times, breakpoints, steps)
+    first = mean + matmul(semidefinite_root(covariance), jax.random.normal(initial_key, (ssm.state_dim, 1)))[:, 0]
+    nodes = _time_nodes(start, times, breakpoints, steps)
     starts = jnp.concatenate([jnp.reshape(start, (1,)), nodes.times[:-1]])
-    advance = _interval(ssm, nodes.steps)
+    integrate = _interval_integrator(ssm, nodes.steps)
 
-    def row(state: jax.Array, inputs: tuple) -> tuple[jax.Array, jax.Array]:
-        state = advance(state, *inputs)
+    def integrate_to_node(state: jax.Array, interval: tuple) -> tuple[jax.Array, jax.Array]:
+        state = integrate(state, *interval)
         return state, state
 
-    _, states = jax.lax.scan(row, first, (starts, nodes.times, jax.random.split(path, nodes.times.shape[0])))
+    keys = jax.random.split(path_key, nodes.times.shape[0])
+    _, states = jax.lax.scan(integrate_to_node, first, (starts, nodes.times, keys))
     states = states[nodes.rows]
     inputs = jax.vmap(ssm.inputs)(states, times)
     y = jax.vmap(lambda w, t, k, index: noisy_observation(ssm, w, t, k, index))(
-        inputs, times, jax.random.split(noise, times.shape[0]), jnp.arange(times.shape[0]))
+        inputs, times, jax.random.split(noise_key, times.shape[0]), jnp.arange(times.shape[0]))
     size = ssm.physical_dim
     forces = {name: inputs[:, size + index] for index, name in enumerate(ssm.model.force_names)}
     return Simulation(times, inputs[:, :size], forces, y)
 
 
-def simulate_onwards(ssm: StateSpaceModel, key: jax.Array, states: jax.Array, times: jax.Array, known: jax.Array,
-                     steps: int, breakpoints: Any = ()) -> jax.Array:
-    """Simulate the joint state on from where it is known; for compiled code.
+def simulate_missing_states(ssm: StateSpaceModel, key: jax.Array, states: jax.Array, times: jax.Array,
+                            is_given: jax.Array, steps: int, breakpoints: Any = ()) -> jax.Array:
+    """Simulate the joint state at times without a given state, from the last given state; for compiled code.
 
     Args:
         ssm: the state-space model.
         key: a JAX random key.
-        states: (K, n) joint states, of which those that are known are used.
+        states: (K, n), joint states; only the given ones are used.
         times: (K,), non-decreasing.
-        known: (K,) Booleans; the first state counts as known.
+        is_given: (K,), whether the state at a time is given; the first state always is.
         steps: integration steps between two consecutive times.
-        breakpoints: of known inputs, see `input_breakpoints`.
+        breakpoints: breakpoints of known inputs, see `input_breakpoints`.
 
     Returns:
-        (K, n): the known states, and each of the others simulated from the one before it.
+        (K, n), the given states; every other state is simulated from its predecessor.
     """
-    nodes = _nodes(times[0], times, breakpoints, steps)
-    advance = _interval(ssm, nodes.steps)
+    nodes = _time_nodes(times[0], times, breakpoints, steps)
+    integrate = _interval_integrator(ssm, nodes.steps)
     if np.shape(breakpoints)[0]:
         is_row = nodes.origin < times.shape[0]
         index = jnp.minimum(nodes.origin, times.shape[0] - 1)
-        states, known, times = states[index], known[index] & is_row, nodes.times
+        states, is_given, times = states[index], is_given[index] & is_row, nodes.times
 
-    def row(state: jax.Array, inputs: tuple) -> tuple[jax.Array, jax.Array]:
-        begin, end, row_key, given, is_known = inputs
-        state = jax.lax.cond(is_known, lambda: given, lambda: advance(state, begin, end, row_key))
+    def state_at_node(state: jax.Array, interval: tuple) -> tuple[jax.Array, jax.Array]:
+        start, end, interval_key, given_state, has_state = interval
+        state = jax.lax.cond(has_state, lambda: given_state, lambda: integrate(state, start, end, interval_key))
         return state, state
 
     keys = jax.random.split(key, times.shape[0] - 1)
-    _, rest = jax.lax.scan(row, states[0], (times[:-1], times[1:], keys, states[1:], known[1:]))
-    return jnp.concatenate([states[:1], rest])[nodes.rows]
+    _, later_states = jax.lax.scan(state_at_node, states[0], (times[:-1], times[1:], keys, states[1:], is_given[1:]))
+    return jnp.concatenate([states[:1], later_states])[nodes.rows]
 
 
-def _interval(ssm: StateSpaceModel, steps: int) -> Callable[..., jax.Array]:
-    """Return the map of a joint state, the interval's begin and end, and a key, to the state at the end."""
+def _interval_integrator(ssm: StateSpaceModel, steps: int) -> Callable[..., jax.Array]:
+    """Return the function from a joint state, the start and end of an interval and a key to the state at the end."""
     jumps = ssm.stack.jump_roots()
 
-    def advance(state: jax.Array, begin: jax.Array, end: jax.Array, row_key: jax.Array) -> jax.Array:
-        h = (end - begin) / steps
+    def integrate(state: jax.Array, start: jax.Array, end: jax.Array, interval_key: jax.Array) -> jax.Array:
+        h = (end - start) / steps
         transition, covariance = ssm.stack.discretise(h)
         root = semidefinite_root(covariance)
-        span = Span.between(begin, end, end - begin)
+        span = Span.between(start, end, end - start)
 
         def step(state: jax.Array, index: jax.Array) -> tuple[jax.Array, None]:
-            keys = jax.random.fold_in(row_key, index)
-            rest = span.after(index * h)
-            state = _simulation_step(ssm, state, rest, h, transition, root, keys)
-            # The last step ends at the row's end to the last bit: a jump there is crossed, and once only.
-            until = jnp.where(index == steps - 1, end, begin + (index + 1) * h)
-            return _cross_jumps(ssm, jumps, state, begin + index * h, until, keys), None
+            step_key = jax.random.fold_in(interval_key, index)
+            state = _simulation_step(ssm, state, span.after(index * h), h, transition, root, step_key)
+            # The last step must end exactly at the end of the interval, so that a jump there is crossed once.
+            step_end = jnp.where(index == steps - 1, end, start + (index + 1) * h)
+            return _cross_jumps(ssm, jumps, state, start + index * h, step_end, step_key), None
 
         return jax.lax.scan(step, state, jnp.arange(steps))[0]
 
-    return advance
+    return integrate
 
 
 def _simulation_step(ssm: StateSpaceModel, state: jax.Array, span: Span, h: jax.Array, transition: jax.Array,
                      root: jax.Array, key: jax.Array) -> jax.Array:
+    """Return the joint state (n,) after one integration step of length h.
+
+    Args:
+        ssm: the state-space model.
+        state: (n,), the joint state at the start of the step.
+        span: the remaining span of the interval, which starts at the start of the step.
+        h: step length.
+        transition: of the forces over the step.
+        root: square root of the process noise of the forces over the step.
+        key: random key of the step.
+    """
     size = ssm.physical_dim
     force_key, state_key = jax.random.split(key)
-    draw = jax.random.normal(force_key, (ssm.force_dim, 1))
-    forces = (matmul(transition, state[size:, None]) + matmul(root, draw))[:, 0]
+    white_noise = jax.random.normal(force_key, (ssm.force_dim, 1))
+    forces = (matmul(transition, state[size:, None]) + matmul(root, white_noise))[:, 0]
 
     x, t = state[:size], span.time()
-    now = ssm.inputs(state, t)
-    first = ssm.drift(now, t)
-    dispersion = ssm.dispersion(now, t)
-    kick = jnp.zeros(size)
+    inputs = ssm.inputs(state, t)
+    stage1 = ssm.drift(inputs, t)
+    dispersion = ssm.dispersion(inputs, t)
+    noise = jnp.zeros(size)
     if dispersion is not None:
-        kick = jnp.sqrt(h) * matmul(dispersion, jax.random.normal(state_key, (dispersion.shape[1], 1)))[:, 0]
+        noise = jnp.sqrt(h) * matmul(dispersion, jax.random.normal(state_key, (dispersion.shape[1], 1)))[:, 0]
     end = span.time(h)
-    halfway = 0.5 * (state[size:] + forces)
+    midpoint_forces = 0.5 * (state[size:] + forces)
 
     def drift(change: jax.Array, z: jax.Array, time: jax.Array) -> jax.Array:
         return ssm.drift(ssm.inputs(jnp.concatenate([x + change, z]), time), time)
 
-    second = drift(0.5 * (h * first + kick), halfway, span.time(0.5 * h))
-    third = drift(0.5 * (h * second + kick), halfway, span.time(0.5 * h))
-    last = drift(h * third + kick, forces, end)
-    return jnp.concatenate([x + h / 6 * (first + 2 * second + 2 * third + last) + kick, forces])
+    stage2 = drift(0.5 * (h * stage1 + noise), midpoint_forces, span.time(0.5 * h))
+    stage3 = drift(0.5 * (h * stage2 + noise), midpoint_forces, span.time(0.5 * h))
+    stage4 = drift(h * stage3 + noise, forces, end)
+    return jnp.concatenate([x + h / 6 * (stage1 + 2 * stage2 + 2 * stage3 + stage4) + noise, forces])
 
 
-def _cross_jumps(ssm: StateSpaceModel, jumps: Any, state: jax.Array, begin: jax.Array, end: jax.Array,
+def _cross_jumps(ssm: StateSpaceModel, jumps: Any, state: jax.Array, start: jax.Array, end: jax.Array,
                  key: jax.Array) -> jax.Array:
-    """Apply the forces' jumps that fall into (begin, end], at the step's end."""
+    """Apply the jumps of the forces in (start, end] to the state at the end of the step."""
     if jumps is None:
         return state
     size = ssm.physical_dim
     times = jnp.asarray(ssm.stack.jump_times, float)
-    crossed = (times > begin) & (times <= end)
+    crossed = (times > start) & (times <= end)
 
-    def one(forces: jax.Array, jump: tuple) -> tuple[jax.Array, None]:
-        here, index, transition, root = jump
-        draw = jax.random.normal(jax.random.fold_in(key, index + 1), (ssm.force_dim, 1))
-        jumped = (matmul(transition, forces[:, None]) + matmul(root, draw))[:, 0]
-        return jnp.where(here, jumped, forces), None
+    def apply_jump(forces: jax.Array, jump: tuple) -> tuple[jax.Array, None]:
+        is_crossed, index, transition, root = jump
+        white_noise = jax.random.normal(jax.random.fold_in(key, index + 1), (ssm.force_dim, 1))
+        jumped = (matmul(transition, forces[:, None]) + matmul(root, white_noise))[:, 0]
+        return jnp.where(is_crossed, jumped, forces), None
 
-    def all_crossed(forces: jax.Array) -> jax.Array:
-        return jax.lax.scan(one, forces, (crossed, jnp.arange(len(times)), *(a[:-1] for a in jumps)))[0]
+    def apply_jumps(forces: jax.Array) -> jax.Array:
+        return jax.lax.scan(apply_jump, forces, (crossed, jnp.arange(len(times)), *(a[:-1] for a in jumps)))[0]
 
-    forces = jax.lax.cond(crossed.any(), all_crossed, lambda forces: forces, state[size:])
+    forces = jax.lax.cond(crossed.any(), apply_jumps, lambda forces: forces, state[size:])
     return jnp.concatenate([state[:size], forces])

@@ -1,4 +1,16 @@
-"""Latent force model -> state-space model: forces become linear SDEs, stacked under the physical state."""
+"""Conversion of a latent force model to a state-space model.
+
+1. Each force is a linear SDE. The joint state s = (x, z) stacks the physical state x and the states z of all forces.
+2. The functions f and h of the model take the inputs w = (x, u) = K(t) s + k(t), where K contains the measurement rows
+   and k the means of the forces.
+3. `state_space` detects the structure of f and h from their jaxprs (`lfm_ppl.model.structure`). An input is a point if
+   f is non-linear in it, averaged if its Jacobian varies, and constant otherwise.
+4. Where several inputs enter through products only, a greedy choice leaves as few of them as possible to the points.
+5. `Span` evaluates functions of time on the inner side of an interval's ends, where they may jump.
+6. `check_times` checks the observation times.
+
+Source: Hartikainen, Seppänen and Särkkä (2012), ICML, section 3.
+"""
 
 from __future__ import annotations
 
@@ -19,16 +31,16 @@ from lfm_ppl.model.structure import Pattern, pattern
 
 
 class StateSpaceModel(eqx.Module):
-    """The joint state s = (x, z) of physical state and forces, as the filters see it.
+    """The state-space form of a latent force model, with the joint state s = (x, z) of physical state and forces.
 
         dx = f(w, t) dt + G(w, t) dB,   dz = F z dt + L dbeta,   w = (x, u) = K(t) s + k(t),
         y_k = h(w(t_k), t_k) + r_k.
 
     Attributes:
         model: the latent force model.
-        stack: its forces side by side.
-        drift_structure: how f uses w.
-        observation_structure: how h uses w.
+        stack: its forces as one block-diagonal SDE.
+        drift_structure: structure of f as a function of w.
+        observation_structure: structure of h as a function of w.
         constant_measurement: whether K does not depend on time.
         constant_mean: whether k does not depend on time.
     """
@@ -92,7 +104,7 @@ class StateSpaceModel(eqx.Module):
         return jnp.asarray(self.model.dynamics(x, u, t), float)
 
     def dispersion(self, w: jax.Array, t: Any) -> jax.Array | None:
-        """Return G (M, S), None where there is no process noise."""
+        """Return G (M, S), or None without process noise."""
         noise = self.model.process_noise
         return noise(*self.split(w), t) if callable(noise) else noise
 
@@ -105,8 +117,8 @@ class StateSpaceModel(eqx.Module):
         """Return the values (Q,) of the deterministics of the model."""
         x, u = self.split(w)
         model = self.model
-        found = [jnp.asarray(model.deterministics[name](x, u, t), float) for name in model.deterministic_names]
-        return jnp.stack(found) if found else jnp.zeros(0)
+        values = [jnp.asarray(model.deterministics[name](x, u, t), float) for name in model.deterministic_names]
+        return jnp.stack(values) if values else jnp.zeros(0)
 
     def obs_cov(self, w: jax.Array, t: Any, row: Any) -> jax.Array:
         """Return R (D, D)."""
@@ -115,22 +127,22 @@ class StateSpaceModel(eqx.Module):
 
     @property
     def time_invariant(self) -> bool:
-        """Whether the model is linear with constant coefficients, apart from additive terms in the mean."""
+        """Whether the model is linear with constant coefficients, except for additive terms in the mean."""
         uses_forces = any(any(row[self.physical_dim:]) for row in self.drift_structure.jacobian)
-        constant = self.constant_measurement or not uses_forces
-        return self.drift_structure.linear and constant and not callable(self.model.process_noise)
+        has_constant_inputs = self.constant_measurement or not uses_forces
+        return self.drift_structure.linear and has_constant_inputs and not callable(self.model.process_noise)
 
     @property
     def mean_invariant(self) -> bool:
-        """Whether, besides, the additive terms of the mean are constant."""
+        """Whether the model is time-invariant and the additive terms of the mean are constant, too."""
         return self.time_invariant and not self.drift_structure.offset_varies and self.constant_mean
 
 
 def state_space(model: LatentForceModel) -> StateSpaceModel:
-    """Convert a latent force model; its structure is read off its functions.
+    """Return the state-space model of a latent force model, with the structure of its functions.
 
     Raises:
-        ValueError: ``nonlinear_inputs`` leaves out an input that enters non-linearly; the message names it.
+        ValueError: ``nonlinear_inputs`` omits an input that enters non-linearly; the message names it.
     """
     stack = Stack(model.force_list)
     size, total = len(model.state_names), len(model.state_names) + len(stack.forces)
@@ -159,40 +171,50 @@ def state_space(model: LatentForceModel) -> StateSpaceModel:
 
 
 def _dependence(function: Callable[[jax.Array], jax.Array], total: int) -> tuple[int, ...]:
-    found = np.asarray(pattern(function, total + 1).jacobian.any(axis=0))
-    return tuple(int(index) for index in np.flatnonzero(found[:total]))
+    """Return the indices of the inputs, without time, on which a function depends."""
+    depends = np.asarray(pattern(function, total + 1).jacobian.any(axis=0))
+    return tuple(int(index) for index in np.flatnonzero(depends[:total]))
 
 
-def _classify(found: Pattern, extra: tuple[int, ...], declared: tuple[int, ...] | None) -> InputStructure:
-    """Split the inputs into points, averaged and constant ones. The last input of the pattern is time."""
-    total = found.hessian.shape[0] - 1
-    curved = found.hessian[:total, :total]
+def _classify(sparsity: Pattern, extra: tuple[int, ...], declared: tuple[int, ...] | None) -> InputStructure:
+    """Split the inputs into points, averaged and constant ones.
+
+    Args:
+        sparsity: pattern of the function; its last input is time.
+        extra: further inputs that must be points, since a noise covariance depends on them.
+        declared: inputs declared non-linear by the user, instead of the detected ones; None: detect them.
+    """
+    total = sparsity.hessian.shape[0] - 1
+    curved = sparsity.hessian[:total, :total]
     nonlinear = [j for j in range(total) if curved[j].any()]
     if declared is not None:
         points = sorted(set(declared) | set(extra))
     else:
-        # Inputs without a curved pair among themselves are linear given the others. Taken greedily, fewest pairs
-        # first, later inputs (the forces) first among equals: that leaves few coordinates for the points.
+        # A set of inputs without a curved pair among themselves is linear given the other inputs. A greedy choice, by
+        # the fewest pairs and then the latest index (forces), makes this set large and leaves few inputs to the points.
         linear_given: list[int] = []
         for j in sorted(nonlinear, key=lambda j: (curved[j].sum(), -j)):
             if j not in extra and not curved[j, [*linear_given, j]].any():
                 linear_given.append(j)
         points = sorted((set(nonlinear) - set(linear_given)) | set(extra))
-    others = [j for j in range(total) if j not in points]
-    averaged = tuple(j for j in others if found.hessian[j].any())
+    linear_inputs = [j for j in range(total) if j not in points]
+    averaged = tuple(j for j in linear_inputs if sparsity.hessian[j].any())
     return InputStructure(
-        tuple(points), averaged, tuple(j for j in others if j not in averaged),
-        tuple(tuple(bool(v) for v in row[:total]) for row in found.jacobian),
-        bool(found.jacobian[:, total].any()),
+        tuple(points), averaged, tuple(j for j in linear_inputs if j not in averaged),
+        tuple(tuple(bool(v) for v in row[:total]) for row in sparsity.jacobian),
+        bool(sparsity.jacobian[:, total].any()),
     )
 
 
 def _check_declared(function: Callable[[jax.Array], jax.Array], declared: tuple[int, ...], names: tuple[str, ...],
-                    found: Pattern) -> None:
-    """Compare a declaration with second derivatives at random inputs (tracers take random values too)."""
+                    sparsity: Pattern) -> None:
+    """Raise ValueError if an undeclared input has a second derivative at random inputs.
+
+    Traced parameters are replaced by random numbers.
+    """
     total = len(names)
     undeclared = [j for j in range(total) if j not in declared]
-    if not found.hessian[np.ix_(undeclared, undeclared)].any():
+    if not sparsity.hessian[np.ix_(undeclared, undeclared)].any():
         return
     closed = jax.make_jaxpr(function)(jnp.zeros(total + 1))
     generator = np.random.default_rng(0)
@@ -202,26 +224,26 @@ def _check_declared(function: Callable[[jax.Array], jax.Array], declared: tuple[
         hessian = jax.hessian(lambda v: jnp.stack(jax.core.eval_jaxpr(closed.jaxpr, consts, v))[0])
         curvature = np.max([np.nan_to_num(np.abs(hessian(jnp.asarray(generator.normal(size=total + 1))))).max(axis=0)
                             for _ in range(5)], axis=0)
-    wrong = [(i, j) for i in undeclared for j in undeclared if curvature[i, j] > 1e-12]
-    if wrong:
-        i, j = wrong[0]
+    omitted_pairs = [(i, j) for i in undeclared for j in undeclared if curvature[i, j] > 1e-12]
+    if omitted_pairs:
+        i, j = omitted_pairs[0]
         pair = f"{names[i]!r}" if i == j else f"{names[i]!r} together with {names[j]!r}"
         raise ValueError(f"nonlinear_inputs leaves out {pair}, but the dynamics is not linear in it. Add it, or leave "
                          "nonlinear_inputs at None: the structure is then found automatically.")
 
 
 _INSET = 4.0
-"""How far inside of an interval its ends are evaluated, in units of rounding of the times."""
+"""Distance from the end of an interval at which functions are evaluated, in units of rounding of the times."""
 
 
 class Span(NamedTuple):
-    """The times of an interval, or of the rest of it, as functions of time see them.
+    """The times of an interval, or of its end after some offset, at which functions of time are evaluated.
 
-    A function of time may jump at either end of an interval. The interval sees the value on its own side, so that times
-    are clipped to ``lower`` and ``upper``, which lie inside of it by some units of rounding.
+    A function of time may jump at either end of an interval, where the interval needs the value on its inner side.
+    Times are therefore clipped to ``lower`` and ``upper``, which lie inside of the interval by a few units of rounding.
 
     Attributes:
-        start: time from which offsets count.
+        start: origin of time offsets.
         lower, upper: first and last time at which functions are evaluated.
     """
 
@@ -236,23 +258,23 @@ class Span(NamedTuple):
         return cls(start, jax.lax.stop_gradient(start + depth), jax.lax.stop_gradient(end - depth))
 
     def time(self, offset: Any = 0.0) -> jax.Array:
-        """Return the time at an offset from the start; its derivative is that of the time that is not clipped."""
+        """Return the clipped time at an offset from the start, with the derivative of the unclipped time."""
         t = self.start + offset
         return t + jax.lax.stop_gradient(jnp.clip(t, self.lower, self.upper) - t)
 
     def after(self, offset: Any) -> Span:
-        """Return the rest of the span after an offset from its start."""
+        """Return the span that starts at an offset from the start of this one."""
         return self._replace(start=self.start + offset)
 
 
 def inset(start: Any, end: Any, length: Any, scale: Any = 0.0) -> Any:
-    """Return how far inside of intervals (N,) functions of time are evaluated at the ends.
+    """Return the distances (N,) from the ends of intervals at which functions of time are evaluated.
 
     Args:
-        start: times at their starts.
-        end: times at their ends.
-        length: of the intervals.
-        scale: size of other numbers that functions compare times with, the times of a table for example.
+        start: start times of the intervals.
+        end: end times of the intervals.
+        length: lengths of the intervals.
+        scale: magnitude of other numbers with which functions compare times, such as the times of a table.
     """
     xp = jnp if checks.traced((start, end, length, scale)) else np
     size = xp.maximum(xp.maximum(xp.abs(start), xp.abs(end)), scale)
@@ -261,24 +283,26 @@ def inset(start: Any, end: Any, length: Any, scale: Any = 0.0) -> Any:
 
 
 def check_times(times: Any, initial_time: Any) -> np.ndarray | None:
-    """Check observation times; return them as NumPy, or None where they are traced.
+    """Check observation times; return them as a NumPy array, or None if they are traced.
 
     Raises:
-        ValueError: not a vector, empty, not finite, not sorted, or before the initial time; the message names the row.
+        ValueError: the times are not a vector, empty, not finite, not sorted, or before the initial time; the message
+            names the row.
     """
     if np.ndim(times) != 1 or np.shape(times)[0] == 0:
         raise ValueError(f"times must be a vector (T,) with at least one entry, got shape {np.shape(times)}.")
     checks.finite("times", times)
-    known = checks.concrete(times)
-    if known is None:
+    concrete_times = checks.concrete(times)
+    if concrete_times is None:
         return None
-    back = np.flatnonzero(np.diff(known) < 0)
-    if back.size:
-        row = int(back[0]) + 1
-        raise ValueError(f"times must not go back: row {row} is {known[row]:g} after {known[row - 1]:g}. Sort the "
-                         "rows by time; equal times are replicates and are fine.")
+    disordered = np.flatnonzero(np.diff(concrete_times) < 0)
+    if disordered.size:
+        row = int(disordered[0]) + 1
+        raise ValueError(f"times must not go back: row {row} is {concrete_times[row]:g} after "
+                         f"{concrete_times[row - 1]:g}. Sort the rows by time; equal times are replicates and are "
+                         "allowed.")
     start = None if initial_time is None else checks.concrete(initial_time)
-    if start is not None and known[0] < start:
-        raise ValueError(f"times[0] = {known[0]:g} lies before the model's initial_time = {float(start):g}; set "
-                         "initial_time to the first time or earlier.")
-    return known.astype(float)
+    if start is not None and concrete_times[0] < start:
+        raise ValueError(f"times[0] = {concrete_times[0]:g} lies before the model's initial_time = {float(start):g}; "
+                         "set initial_time to the first time or earlier.")
+    return concrete_times.astype(float)

@@ -1,15 +1,28 @@
-"""Which inputs of a function are non-linear: read off its jaxpr.
+"""Detection of the non-linear inputs of a function from its jaxpr.
 
-Every intermediate value carries two Boolean patterns: on which inputs its entries depend, and for which pairs of
-inputs a second derivative may be non-zero. Linear primitives unite the patterns, products and non-linear primitives
-add pairs, and whatever is unknown counts as non-linear in everything that it depends on. The pattern is therefore
-never too small: a linear input may be taken for a non-linear one (which costs time), never the reverse.
+1. Trace the function once, without numbers.
+2. Give every intermediate array two Boolean patterns for each of its entries: the inputs on which it depends
+   (``jacobian``), and the pairs of inputs for which a hessian derivative may be non-zero (``hessian``).
+3. The argument starts with the identity and no pairs; constants start with empty patterns.
+4. Interpret the equations in order with one rule per primitive: linear primitives unite the patterns of their
+   operands, products add the pairs of their factors, non-linear primitives add all pairs of inputs of their operand,
+   and primitives that only move entries move the patterns.
+5. Calls of inner functions are interpreted recursively. Equations of constants are evaluated, so that computed indices
+   are known.
+6. An unknown primitive counts as non-linear in all inputs on which its operands depend.
+
+The pattern is therefore an upper bound: a linear input may be classified as non-linear, which costs time, but never
+the reverse.
+
+Source: Walther (2008), Computing sparse Hessians with automatic differentiation, ACM Transactions on Mathematical
+Software 34(1).
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
@@ -22,31 +35,38 @@ class Pattern(NamedTuple):
     """Sparsity of a function of ``K`` scalar inputs with ``D`` scalar outputs.
 
     Attributes:
-        jacobian: (D, K), whether an output depends on an input at all.
-        hessian: (K, K), whether any output has a second derivative in a pair of inputs.
+        jacobian: (D, K), whether an output depends on an input.
+        hessian: (K, K), whether any output may have a non-zero hessian derivative in a pair of inputs.
     """
 
     jacobian: np.ndarray
     hessian: np.ndarray
 
 
-class _Value(NamedTuple):
-    """Patterns of one array: first (size, K), second (size, K, K); ``known`` its value where it is a constant."""
+@dataclass(frozen=True)
+class _ArrayPattern:
+    """The patterns of the entries of one intermediate array.
 
-    first: np.ndarray
-    second: np.ndarray
-    known: Any = None
+    Attributes:
+        jacobian: (size, K), whether an entry depends on an input.
+        hessian: (size, K, K), whether an entry may have a non-zero hessian derivative in a pair of inputs.
+        value: the array, where it is a concrete constant.
+    """
+
+    jacobian: np.ndarray
+    hessian: np.ndarray
+    value: Any = None
 
     @property
-    def constant(self) -> bool:
-        return not self.first.any()
+    def is_constant(self) -> bool:
+        return not self.jacobian.any()
 
 
 def pattern(function: Callable[[jax.Array], jax.Array], inputs: int) -> Pattern:
-    """Find the sparsity of ``function``, which maps an array (inputs,) to an array (D,).
+    """Return the sparsity of ``function``, which maps an array (inputs,) to an array (D,).
 
-    The function may close over tracers; these count as constants. Nothing is evaluated at a point, so the pattern
-    holds everywhere.
+    Tracers over which the function closes count as constants. The function is not evaluated at a point, so that the
+    pattern holds everywhere.
 
     Example:
         >>> import jax.numpy as jnp
@@ -54,27 +74,27 @@ def pattern(function: Callable[[jax.Array], jax.Array], inputs: int) -> Pattern:
         [True, True, False]
     """
     jaxpr = jax.make_jaxpr(function)(jax.ShapeDtypeStruct((inputs,), jnp.result_type(float)))
-    argument = _Value(np.eye(inputs, dtype=bool), np.zeros((inputs, inputs, inputs), bool))
+    argument = _ArrayPattern(np.eye(inputs, dtype=bool), np.zeros((inputs, inputs, inputs), bool))
     (output,) = _propagate(jaxpr.jaxpr, jaxpr.consts, [argument], inputs)
-    return Pattern(output.first, np.asarray(output.second.any(axis=0)))
+    return Pattern(output.jacobian, np.asarray(output.hessian.any(axis=0)))
 
 
-def _constant(shape: tuple[int, ...], inputs: int, known: Any = None) -> _Value:
+def _constant(shape: tuple[int, ...], inputs: int, value: Any = None) -> _ArrayPattern:
     size = int(np.prod(shape))
-    return _Value(np.zeros((size, inputs), bool), np.zeros((size, inputs, inputs), bool), known)
+    return _ArrayPattern(np.zeros((size, inputs), bool), np.zeros((size, inputs, inputs), bool), value)
 
 
-def _propagate(jaxpr: Any, consts: list, arguments: list[_Value], inputs: int) -> list[_Value]:
-    environment: dict[Any, _Value] = {}
+def _propagate(jaxpr: Any, consts: list, arguments: list[_ArrayPattern], inputs: int) -> list[_ArrayPattern]:
+    environment: dict[Any, _ArrayPattern] = {}
 
-    def read(atom: Any) -> _Value:
+    def read(atom: Any) -> _ArrayPattern:
         if isinstance(atom, Literal):
             return _constant(np.shape(atom.val), inputs, np.asarray(atom.val))
         return environment[atom]
 
     for variable, value in zip(jaxpr.constvars, consts, strict=True):
-        known = None if isinstance(value, jax.core.Tracer) else value
-        environment[variable] = _constant(np.shape(value), inputs, known)
+        concrete = None if isinstance(value, jax.core.Tracer) else value
+        environment[variable] = _constant(np.shape(value), inputs, concrete)
     environment.update(zip(jaxpr.invars, arguments, strict=True))
     for equation in jaxpr.eqns:
         operands = [read(atom) for atom in equation.invars]
@@ -82,9 +102,10 @@ def _propagate(jaxpr: Any, consts: list, arguments: list[_Value], inputs: int) -
     return [read(atom) for atom in jaxpr.outvars]
 
 
-def _apply(equation: Any, operands: list[_Value], inputs: int) -> list[_Value]:
+def _apply(equation: Any, operands: list[_ArrayPattern], inputs: int) -> list[_ArrayPattern]:
+    """Return the patterns of the outputs of one equation."""
     name = equation.primitive.name
-    if all(operand.constant for operand in operands):
+    if all(operand.is_constant for operand in operands):
         return _evaluate(equation, operands, inputs)
     inner = next((equation.params[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr")
                   if key in equation.params), None)
@@ -103,14 +124,14 @@ _CALLS = {"pjit", "jit", "closed_call", "core_call", "custom_jvp_call", "custom_
           "remat", "checkpoint", "remat2"}
 
 
-def _evaluate(equation: Any, operands: list[_Value], inputs: int) -> list[_Value]:
+def _evaluate(equation: Any, operands: list[_ArrayPattern], inputs: int) -> list[_ArrayPattern]:
     shapes = [variable.aval.shape for variable in equation.outvars]
     values: list[Any] = [None] * len(shapes)
-    small = all(np.prod(shape) <= 4096 for shape in shapes)
-    if small and equation.primitive.name not in _CALLS and all(o.known is not None for o in operands):
+    is_small = all(np.prod(shape) <= 4096 for shape in shapes)
+    if is_small and equation.primitive.name not in _CALLS and all(o.value is not None for o in operands):
         with jax.ensure_compile_time_eval():
-            found = equation.primitive.bind(*[o.known for o in operands], **equation.params)
-        values = list(found) if equation.primitive.multiple_results else [found]
+            result = equation.primitive.bind(*[o.value for o in operands], **equation.params)
+        values = list(result) if equation.primitive.multiple_results else [result]
     return [_constant(shape, inputs, value) for shape, value in zip(shapes, values, strict=True)]
 
 
@@ -119,159 +140,165 @@ def _outer(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return product | np.swapaxes(product, -1, -2)
 
 
-def _fallback(equation: Any, operands: list[_Value]) -> list[_Value]:
-    first = np.any([operand.first.any(axis=0) for operand in operands], axis=0)
-    second = _outer(first, first)
-    return [_Value(np.broadcast_to(first, (int(np.prod(v.aval.shape)), *first.shape)),
-                   np.broadcast_to(second, (int(np.prod(v.aval.shape)), *second.shape)))
+def _fallback(equation: Any, operands: list[_ArrayPattern]) -> list[_ArrayPattern]:
+    jacobian = np.any([operand.jacobian.any(axis=0) for operand in operands], axis=0)
+    hessian = _outer(jacobian, jacobian)
+    return [_ArrayPattern(np.broadcast_to(jacobian, (int(np.prod(v.aval.shape)), *jacobian.shape)),
+                          np.broadcast_to(hessian, (int(np.prod(v.aval.shape)), *hessian.shape)))
             for v in equation.outvars]
 
 
-def _aligned(equation: Any, operands: list[_Value]) -> list[_Value]:
-    """Operands of an elementwise primitive, broadcast to its output: scalars and axes of length one are repeated."""
+def _broadcast_operands(equation: Any, operands: list[_ArrayPattern]) -> list[_ArrayPattern]:
+    """Return the operands of an elementwise primitive, broadcast to the shape of its output."""
     shape = equation.outvars[0].aval.shape
-    aligned = []
+    broadcast = []
     for variable, operand in zip(equation.invars, operands, strict=True):
-        own = variable.aval.shape
-        if own == shape:
-            aligned.append(operand)
+        operand_shape = variable.aval.shape
+        if operand_shape == shape:
+            broadcast.append(operand)
             continue
-        index = np.broadcast_to(np.arange(int(np.prod(own))).reshape(own), shape).ravel()
-        aligned.append(_Value(operand.first[index], operand.second[index]))
-    return aligned
+        index = np.broadcast_to(np.arange(int(np.prod(operand_shape))).reshape(operand_shape), shape).ravel()
+        broadcast.append(_ArrayPattern(operand.jacobian[index], operand.hessian[index]))
+    return broadcast
 
 
-def _union(equation: Any, operands: list[_Value]) -> _Value:
-    return _joint(_aligned(equation, operands))
+def _union(equation: Any, operands: list[_ArrayPattern]) -> _ArrayPattern:
+    return _joint(_broadcast_operands(equation, operands))
 
 
-def _joint(operands: list[_Value]) -> _Value:
-    first, second = operands[0].first, operands[0].second
+def _joint(operands: list[_ArrayPattern]) -> _ArrayPattern:
+    jacobian, hessian = operands[0].jacobian, operands[0].hessian
     for operand in operands[1:]:
-        first, second = first | operand.first, second | operand.second
-    return _Value(first, second)
+        jacobian, hessian = jacobian | operand.jacobian, hessian | operand.hessian
+    return _ArrayPattern(jacobian, hessian)
 
 
-def _nonlinear(equation: Any, operands: list[_Value]) -> _Value:
+def _nonlinear(equation: Any, operands: list[_ArrayPattern]) -> _ArrayPattern:
     joint = _union(equation, operands)
-    return _Value(joint.first, joint.second | _outer(joint.first, joint.first))
+    return _ArrayPattern(joint.jacobian, joint.hessian | _outer(joint.jacobian, joint.jacobian))
 
 
-def _product(equation: Any, operands: list[_Value]) -> _Value:
-    left, right = _aligned(equation, operands)
-    joint = _joint([left, right])
-    return _Value(joint.first, joint.second | _outer(left.first, right.first))
+def _product(equation: Any, operands: list[_ArrayPattern]) -> _ArrayPattern:
+    a, b = _broadcast_operands(equation, operands)
+    joint = _joint([a, b])
+    return _ArrayPattern(joint.jacobian, joint.hessian | _outer(a.jacobian, b.jacobian))
 
 
-def _quotient(equation: Any, operands: list[_Value]) -> _Value:
-    numerator, denominator = _aligned(equation, operands)
+def _quotient(equation: Any, operands: list[_ArrayPattern]) -> _ArrayPattern:
+    numerator, denominator = _broadcast_operands(equation, operands)
     joint = _joint([numerator, denominator])
-    pairs = _outer(numerator.first, denominator.first) | _outer(denominator.first, denominator.first)
-    return _Value(joint.first, joint.second | pairs)
+    pairs = _outer(numerator.jacobian, denominator.jacobian) | _outer(denominator.jacobian, denominator.jacobian)
+    return _ArrayPattern(joint.jacobian, joint.hessian | pairs)
 
 
-def _power(equation: Any, operands: list[_Value]) -> _Value:
+def _power(equation: Any, operands: list[_ArrayPattern]) -> _ArrayPattern:
     return _union(equation, operands) if equation.params["y"] == 1 else _nonlinear(equation, operands)
 
 
-def _select(equation: Any, operands: list[_Value]) -> _Value:
-    """A choice between cases: each keeps its own pattern, and bends where the predicate changes."""
-    predicate, *cases = _aligned(equation, operands)
+def _select(equation: Any, operands: list[_ArrayPattern]) -> _ArrayPattern:
+    """Return the pattern of a choice between cases, which is non-linear in the inputs of the predicate."""
+    predicate, *cases = _broadcast_operands(equation, operands)
     joint = _joint(cases)
-    pairs = _outer(predicate.first, predicate.first | joint.first)
-    return _Value(joint.first | predicate.first, joint.second | pairs)
+    pairs = _outer(predicate.jacobian, predicate.jacobian | joint.jacobian)
+    return _ArrayPattern(joint.jacobian | predicate.jacobian, joint.hessian | pairs)
 
 
-def _scatter_add(equation: Any, operands: list[_Value]) -> _Value | None:
-    """The operand plus the updates, each where its index says."""
+def _scatter_add(equation: Any, operands: list[_ArrayPattern]) -> _ArrayPattern | None:
+    """Return the pattern of the operand plus the updates at their indices; None where the indices are not known."""
     operand, indices, updates = operands
-    if indices.known is None:
+    if indices.value is None:
         return None
     shapes = [variable.aval.shape for variable in equation.invars]
     with jax.ensure_compile_time_eval():
-        place = lambda u: equation.primitive.bind(jnp.zeros(shapes[0]), indices.known, u, **equation.params)  # noqa: E731
-        landed = np.asarray(jax.jacfwd(place)(jnp.zeros(shapes[2]))) != 0
-    landed = landed.reshape(operand.first.shape[0], updates.first.shape[0])
-    return _Value(operand.first | np.einsum("ou,uk->ok", landed, updates.first),
-                  operand.second | np.einsum("ou,ukl->okl", landed, updates.second))
+        def scatter(values: jax.Array) -> jax.Array:
+            return equation.primitive.bind(jnp.zeros(shapes[0]), indices.value, values, **equation.params)
+
+        targets = np.asarray(jax.jacfwd(scatter)(jnp.zeros(shapes[2]))) != 0
+    targets = targets.reshape(operand.jacobian.shape[0], updates.jacobian.shape[0])
+    return _ArrayPattern(operand.jacobian | np.einsum("ou,uk->ok", targets, updates.jacobian),
+                         operand.hessian | np.einsum("ou,ukl->okl", targets, updates.hessian))
 
 
-def _moved(equation: Any, operands: list[_Value]) -> list[_Value] | None:
-    """Primitives that only move entries: run them on the entries' numbers. Zero marks padding."""
+def _relocate(equation: Any, operands: list[_ArrayPattern]) -> list[_ArrayPattern] | None:
+    """Return the patterns of a primitive that only moves entries, or None where its indices are not known.
+
+    The primitive is applied to the numbers of the entries, counted from one over all operands. Zero marks padding.
+    """
     shapes = [variable.aval.shape for variable in equation.invars]
     offsets = np.cumsum([1] + [int(np.prod(shape)) for shape in shapes])
-    movable = equation.primitive.name
+    name = equation.primitive.name
     arguments: list[Any] = []
     for position, (shape, operand) in enumerate(zip(shapes, operands, strict=True)):
-        is_index = (movable in ("gather", "dynamic_slice") and position > 0) or (movable == "scatter" and position == 1)
-        if is_index or (movable == "dynamic_update_slice" and position > 1):
-            if operand.known is None:
+        is_index = ((name in ("gather", "dynamic_slice") and position > 0) or (name == "scatter" and position == 1)
+                    or (name == "dynamic_update_slice" and position > 1))
+        if is_index:
+            if operand.value is None:
                 return None
-            arguments.append(operand.known)
+            arguments.append(operand.value)
         else:
             start = int(offsets[position])
             arguments.append(np.arange(start, start + int(np.prod(shape)), dtype=float).reshape(shape))
-    if movable == "pad":
+    if name == "pad":
         arguments[1] = np.zeros(shapes[1])
     with jax.ensure_compile_time_eval():
-        moved = equation.primitive.bind(*arguments, **equation.params)
-    blank = _constant((1,), operands[0].first.shape[-1])
-    first = np.concatenate([blank.first, *(operand.first for operand in operands)])
-    second = np.concatenate([blank.second, *(operand.second for operand in operands)])
-    outputs = list(moved) if equation.primitive.multiple_results else [moved]
+        relocated = equation.primitive.bind(*arguments, **equation.params)
+    padding = _constant((1,), operands[0].jacobian.shape[-1])
+    jacobian = np.concatenate([padding.jacobian, *(operand.jacobian for operand in operands)])
+    hessian = np.concatenate([padding.hessian, *(operand.hessian for operand in operands)])
+    outputs = list(relocated) if equation.primitive.multiple_results else [relocated]
     indices = [np.nan_to_num(np.asarray(output)).astype(int).ravel() for output in outputs]
-    return [_Value(first[index], second[index]) for index in indices]
+    return [_ArrayPattern(jacobian[index], hessian[index]) for index in indices]
 
 
-def _summed(equation: Any, operands: list[_Value]) -> _Value:
+def _reduce_sum(equation: Any, operands: list[_ArrayPattern]) -> _ArrayPattern:
     shape, axes = equation.invars[0].aval.shape, tuple(equation.params["axes"])
     (operand,) = operands
-    first = operand.first.reshape(*shape, -1).any(axis=axes)
-    second = operand.second.reshape(*shape, *operand.second.shape[1:]).any(axis=axes)
-    return _Value(first.reshape(-1, first.shape[-1]), second.reshape(-1, *second.shape[-2:]))
+    jacobian = operand.jacobian.reshape(*shape, -1).any(axis=axes)
+    hessian = operand.hessian.reshape(*shape, *operand.hessian.shape[1:]).any(axis=axes)
+    return _ArrayPattern(jacobian.reshape(-1, jacobian.shape[-1]), hessian.reshape(-1, *hessian.shape[-2:]))
 
 
-def _dot(equation: Any, operands: list[_Value]) -> _Value:
+def _dot(equation: Any, operands: list[_ArrayPattern]) -> _ArrayPattern:
     (contract_a, contract_b), (batch_a, batch_b) = equation.params["dimension_numbers"]
-    inputs = operands[0].first.shape[-1]
+    inputs = operands[0].jacobian.shape[-1]
 
-    def arrange(operand: _Value, shape: tuple, batch: tuple, contract: tuple) -> tuple[np.ndarray, np.ndarray]:
+    def arrange(operand: _ArrayPattern, shape: tuple, batch: tuple, contract: tuple) -> tuple[np.ndarray, np.ndarray]:
         free = [axis for axis in range(len(shape)) if axis not in (*batch, *contract)]
         order = [*batch, *free, *contract]
         sizes = [int(np.prod([shape[axis] for axis in axes])) for axes in (batch, free, contract)]
-        first = operand.first.reshape(*shape, inputs).transpose(*order, -1).reshape(*sizes, inputs)
-        second = operand.second.reshape(*shape, inputs, inputs).transpose(*order, len(shape), len(shape) + 1)
-        return first, second.reshape(*sizes, inputs, inputs)
+        jacobian = operand.jacobian.reshape(*shape, inputs).transpose(*order, -1).reshape(*sizes, inputs)
+        hessian = operand.hessian.reshape(*shape, inputs, inputs).transpose(*order, len(shape), len(shape) + 1)
+        return jacobian, hessian.reshape(*sizes, inputs, inputs)
 
-    first_a, second_a = arrange(operands[0], equation.invars[0].aval.shape, batch_a, contract_a)
-    first_b, second_b = arrange(operands[1], equation.invars[1].aval.shape, batch_b, contract_b)
-    batches, free_a, free_b = first_a.shape[0], first_a.shape[1], first_b.shape[1]
-    first = np.zeros((batches, free_a, free_b, inputs), bool)
-    second = np.zeros((batches, free_a, free_b, inputs, inputs), bool)
+    jacobian_a, hessian_a = arrange(operands[0], equation.invars[0].aval.shape, batch_a, contract_a)
+    jacobian_b, hessian_b = arrange(operands[1], equation.invars[1].aval.shape, batch_b, contract_b)
+    batches, free_a, free_b = jacobian_a.shape[0], jacobian_a.shape[1], jacobian_b.shape[1]
+    jacobian = np.zeros((batches, free_a, free_b, inputs), bool)
+    hessian = np.zeros((batches, free_a, free_b, inputs, inputs), bool)
     for batch, i, j in itertools.product(range(batches), range(free_a), range(free_b)):
-        a, b = first_a[batch, i], first_b[batch, j]
-        first[batch, i, j] = (a | b).any(axis=0)
-        second[batch, i, j] = (second_a[batch, i] | second_b[batch, j] | _outer(a, b)).any(axis=0)
-    return _Value(first.reshape(-1, inputs), second.reshape(-1, inputs, inputs))
+        a, b = jacobian_a[batch, i], jacobian_b[batch, j]
+        jacobian[batch, i, j] = (a | b).any(axis=0)
+        hessian[batch, i, j] = (hessian_a[batch, i] | hessian_b[batch, j] | _outer(a, b)).any(axis=0)
+    return _ArrayPattern(jacobian.reshape(-1, inputs), hessian.reshape(-1, inputs, inputs))
 
 
-def _converted(equation: Any, operands: list[_Value]) -> _Value | list[_Value] | None:
-    """Between floating types nothing happens; to whole numbers or truth values is a step function."""
-    floating = jnp.issubdtype(equation.params["new_dtype"], jnp.floating)
-    return (_union if floating else _nonlinear)(equation, operands)
+def _convert(equation: Any, operands: list[_ArrayPattern]) -> _ArrayPattern | list[_ArrayPattern] | None:
+    """Return the pattern of a type conversion: linear to a floating type, a step function to any other type."""
+    is_floating = jnp.issubdtype(equation.params["new_dtype"], jnp.floating)
+    return (_union if is_floating else _nonlinear)(equation, operands)
 
 
-_RULES: dict[str, Callable[[Any, list[_Value]], _Value | list[_Value] | None]] = {
+_RULES: dict[str, Callable[[Any, list[_ArrayPattern]], _ArrayPattern | list[_ArrayPattern] | None]] = {
     **dict.fromkeys(["add", "sub", "add_any", "neg", "copy", "copy_p", "real",
                      "reduce_precision"], _union),
     **dict.fromkeys(["reshape", "squeeze", "broadcast_in_dim", "transpose", "rev", "slice", "concatenate", "pad",
                      "stack", "unstack", "split", "tile", "expand_dims", "gather", "dynamic_slice",
-                     "dynamic_update_slice", "scatter"], _moved),
+                     "dynamic_update_slice", "scatter"], _relocate),
     **dict.fromkeys(["exp", "exp2", "log", "log1p", "expm1", "sin", "cos", "tan", "tanh", "sinh", "cosh", "asin",
                      "acos", "atan", "atan2", "logistic", "sqrt", "rsqrt", "cbrt", "abs", "sign", "erf", "erfc",
                      "pow", "max", "min", "square", "clamp", "lgamma", "digamma", "rem", "floor", "ceil", "round",
                      "is_finite", "gt", "lt", "ge", "le", "eq", "ne", "and", "or", "not"], _nonlinear),
-    "convert_element_type": _converted,
-    "mul": _product, "div": _quotient, "integer_pow": _power, "select_n": _select, "reduce_sum": _summed,
+    "convert_element_type": _convert,
+    "mul": _product, "div": _quotient, "integer_pow": _power, "select_n": _select, "reduce_sum": _reduce_sum,
     "dot_general": _dot, "scatter-add": _scatter_add, "scatter_add": _scatter_add,
 }

@@ -1,23 +1,28 @@
-r"""Whether data can tell a periodic force of a few functions from the whole periodic kernel.
+r"""Estimates of the error of the log likelihood due to the truncation of a periodic kernel to J functions.
 
-The covariance of the force is k_J(t, s) = sum_{j <= J} mu_j phi_j(t) phi_j(s) k_evolution(t, s), in the place of
-k(t, s) = k_periodic(t, s) k_evolution(t, s). The share of the variance that is left out says little: a weight that
-stays the same for many cycles is seen through the noise of all of them. What counts is the error of the log likelihood:
+The force has the covariance k_J(t, s) = sum_{j <= J} mu_j phi_j(t) phi_j(s) k_evolution(t, s) instead of
+k(t, s) = k_periodic(t, s) k_evolution(t, s). The lost share of the variance does not determine the error of the log
+likelihood: data of many cycles together determine slowly changing weights precisely. For each periodic force:
 
-1. The model is linearised at its prior mean, y = sum_r G_r u_r + G_0 x(t0) + e, see `linear_response`.
-2. Of a long record some rows, taken at random, stand for all: the noise stays as it is, and the variance of the
-   periodic force is multiplied by the number of rows for which one stands, so that as much is known of each weight.
-3. A record much longer than the correlation time of the weights is made of independent pieces. Where the dynamics see
-   the force, and the grid of a piece would be too long, it is shortened to a few cycles, in which the weights change
-   as much faster.
-4. With K, the covariance of the rows, and L L' = K, the matrix W = L^-1 (K - K_J) L^-T has the eigenvalues w_i, and
-   K_J^-1 K has e_i = 1 / (1 - w_i). `error_bound` gives the error.
-5. L serves all J, so that the least J that keeps the error within the tolerance is found by bisection.
+1. Linearise the model at its prior mean, y = sum_r G_r u_r + G_0 x(t0) + e, see `linear_response`.
+2. Represent a long record by some of its rows, chosen at random. The noise is unchanged, and the variance of the
+   periodic force is multiplied by the number of rows that each of them represents, which keeps the information on
+   each weight.
+3. Treat a record much longer than the correlation time of the weights as independent pieces. If the force enters the
+   dynamics and the time grid of a piece would be too long, shorten the piece to a few cycles, in which the weights
+   change faster by the same factor.
+4. With the covariance K = L L' of the rows, W = L^-1 (K - K_J) L^-T has the eigenvalues w_i, and K_J^-1 K has the
+   eigenvalues e_i = 1 / (1 - w_i). `error_bound` gives the error.
+5. L does not depend on J. Bisection finds the least J whose error is within the tolerance.
+
+Source: Whittle (1953), Arkiv för Matematik 2, for the likelihood of an approximate covariance; Reece et al. (2014),
+Journal of Machine Learning Research 15, for the truncated kernels.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -40,35 +45,37 @@ from lfm_ppl.model.linear_response import (
     output_responses,
 )
 
-_VALUES = 480
-"""Observed values that are looked at, at most."""
-_GRID = 2000
-"""Grid points at which the forces are evaluated, at most."""
+_MOST_VALUES = 480
+"""Largest number of observed values in the estimate."""
+_MOST_GRID_POINTS = 2000
+"""Largest number of grid points at which the forces are evaluated."""
 _LEAST_ROWS = 8
+"""Least number of rows in the estimate."""
 _WINDOW = 10.0
-"""Correlation times of the weights after which another, independent piece of the record begins."""
-_CYCLES = 6.0
-"""Cycles of such a piece, at least."""
+"""Length of an independent piece of the record, in correlation times of the weights."""
+_LEAST_CYCLES = 6.0
+"""Least number of cycles in a piece."""
 _POINTS_PER_WAVE = 8
-"""Grid points in a period of the first harmonic that is left out, where the dynamics see the force."""
+"""Grid points per period of the first omitted harmonic, where the force enters the dynamics."""
 _CORRELATION = 0.6
 """Correlation of the weights after a correlation time: about that of a squared exponential at one lengthscale."""
 _HARMONICS = 256
-"""Harmonics of a stationary kernel that are looked at, at most."""
-_LARGEST = 1.0 - 1e-15
-"""Largest w_i; without it a singular K_J would give an infinite error."""
+"""Number of harmonics of a stationary kernel in the estimate."""
+_LARGEST_EIGENVALUE = 1.0 - 1e-15
+"""Bound on w_i, which keeps the error finite for a singular K_J."""
 
 
-class Truncation(NamedTuple):
-    """What the number of functions of a periodic force does to the log likelihood.
+@dataclass(frozen=True)
+class Truncation:
+    """The effect of the truncation of one periodic force.
 
     Attributes:
-        name: of the force in the model.
-        force: the periodic force, a term of a sum perhaps.
-        error: of the log likelihood, estimated: |mean| + 2 standard deviations over data sets from the whole kernel;
-            where a bound on it is within the tolerance, that bound.
-        functions: least number of functions with an error within the tolerance; None where it is beyond those that
-            the estimate can tell apart.
+        name: name of the force in the model.
+        force: the periodic force, perhaps a term of a sum.
+        error: estimated error of the log likelihood: |mean| + 2 standard deviations over data sets from the full
+            kernel; or a bound on it that is within the tolerance.
+        functions: least number of functions with an error within the tolerance; None if it is larger than the number
+            of functions in the estimate.
     """
 
     name: str
@@ -77,15 +84,15 @@ class Truncation(NamedTuple):
     functions: int | None
 
 
-class _Rows(NamedTuple):
-    """Rows that stand for a record.
+class RepresentativeRows(NamedTuple):
+    """A few rows that represent a record.
 
     Attributes:
-        times: (N,) of the rows, which give the phases.
-        speed: c, how much faster the evolution goes.
-        weight: rows of the record for which each of them stands.
-        pieces: independent pieces of the record, for one of which they stand.
-        substeps: steps between rows.
+        times: (N,), times of the rows, which determine the phases.
+        speed: factor by which the evolution of the weights is accelerated.
+        weight: number of rows of the record that each row represents.
+        pieces: number of independent pieces of the record, one of which the rows represent.
+        substeps: integration steps between rows.
     """
 
     times: np.ndarray
@@ -96,77 +103,78 @@ class _Rows(NamedTuple):
 
 
 def truncations(model: LatentForceModel, times: Any, y: Any = None) -> list[Truncation]:
-    """Estimate what the number of functions of each periodic force does to the log likelihood of data at ``times``.
+    """Estimate the error of the log likelihood of data at ``times`` due to the truncation of each periodic force.
 
     Args:
         model: the latent force model.
         times: (T,).
-        y: (T, D), NaN where missing; everything is observed by default.
+        y: (T, D), NaN where missing; None: all entries are observed.
 
     Returns:
-        One entry for each `Periodic` or `QuasiPeriodic` force, also in sums. None where something is traced, where
-        fewer than two times are observed, for an observation family or process noise, and for a force that was made
-        with ``explained_variance=0``: there the functions are the model.
+        One entry for each `Periodic` or `QuasiPeriodic` force, also in sums, except those with
+        ``explained_variance=0``, whose functions are the model. The list is empty if a value is traced, if fewer than
+        two times are observed, and for an observation family or process noise.
     """
     terms = force_terms(model)
-    if not any(_is_checked(term.force) for term in terms):
+    if not any(_is_checked(force) for _, _, force in terms):
         return []
     observed = observed_times(model, times, y)
     linear = None if observed is None else linearize(model, observed[0])
     if observed is None or linear is None:
         return []
     initial_time = observed[0] if model.initial_time is None else float(model.initial_time)
-    found = []
+    results = []
     for index, (name, column, force) in enumerate(terms):
         if isinstance(force, QuasiPeriodic) and _is_checked(force):
-            others = [other for position, other in enumerate(terms) if position != index]
+            other_terms = terms[:index] + terms[index + 1:]
             with np.errstate(all="ignore"):
-                result = _estimate(linear, observed, force, column, others, initial_time)
-            if result is not None:
-                found.append(Truncation(name, force, *result))
-    return found
+                estimate = _estimate(linear, observed, force, column, other_terms, initial_time)
+            if estimate is not None:
+                results.append(Truncation(name, force, *estimate))
+    return results
 
 
 def truncation_message(truncation: Truncation) -> str:
-    """Return what the warning says."""
+    """Return the text of the warning."""
     force = truncation.force
-    remedy = (f"Take functions={truncation.functions}" if truncation.functions is not None else
-              "Take many more functions, or a smoother kernel")
-    return (f"the data can tell the {force.functions} functions of the periodic force {truncation.name!r} from the "
-            f"whole kernel {force.kernel.name}: the error of the log likelihood is estimated at "
+    remedy = (f"Use functions={truncation.functions}" if truncation.functions is not None else
+              "Use many more functions, or a smoother kernel")
+    return (f"the data can distinguish the {force.functions} functions of the periodic force {truncation.name!r} from "
+            f"the full kernel {force.kernel.name}: the error of the log likelihood is estimated at "
             f"{truncation.error:.2g}, above {TOLERANCE:g}. {remedy}, or explained_variance=0 if the {force.functions} "
-            "functions are the model that you mean.")
+            "functions are the intended model.")
 
 
 def _is_checked(force: Force) -> bool:
+    """Return whether a force is truncated by approximation, and not by definition of the model."""
     return isinstance(force, QuasiPeriodic) and force.explained_variance > 0.0 and np.ndim(force.period) == 0
 
 
-def _estimate(linear: LinearModel, times: np.ndarray, force: QuasiPeriodic, column: int, others: list[ForceTerm],
-              initial_time: float) -> tuple[float, int | None] | None:
-    """Return the error and the number of functions that suffices; None where the numbers overflow."""
+def _estimate(linear: LinearModel, times: np.ndarray, force: QuasiPeriodic, column: int,
+              other_terms: list[ForceTerm], initial_time: float) -> tuple[float, int | None] | None:
+    """Return the error and the sufficient number of functions; None if the numbers overflow."""
     is_direct = not (np.any(linear.c) and np.any(linear.b))
     if is_direct and (bound := _trace_bound(linear, times, force, column, initial_time)) <= TOLERANCE:
         return bound, force.functions
     rows = _representative_rows(times, force, initial_time, len(linear.c), is_direct)
     if rows is None:
         return None
-    grid = _refined(rows.times, rows.substeps)
+    grid = _with_substeps(rows.times, rows.substeps)
     response, initial = output_responses(linear, grid, rows.substeps)
 
-    def mapped(kernel: np.ndarray, source: int) -> np.ndarray:
+    def output_covariance(kernel: np.ndarray, source: int) -> np.ndarray:
         if is_direct:
             return np.kron(kernel, np.outer(linear.d[:, source], linear.d[:, source]))
         return response[:, :, source] @ kernel @ response[:, :, source].T
 
-    slow = grid[0] + rows.speed * (grid - grid[0])
-    evolution = rows.weight * _covariance(force.evolution, slow, initial_time)
+    evolution_times = grid[0] + rows.speed * (grid - grid[0])
+    evolution = rows.weight * _covariance(force.evolution, evolution_times, initial_time)
     periodic = np.asarray(force.kernel(jnp.asarray(grid)[:, None], jnp.asarray(grid)[None, :]))
     features = _features(force, grid)
-    signal = mapped(periodic * evolution, column)
+    signal = output_covariance(periodic * evolution, column)
     exact = signal + np.kron(np.eye(rows.times.size), linear.noise) + initial @ initial.T
-    for other in others:
-        exact = exact + mapped(_covariance(other.force, grid, initial_time), other.column)
+    for _, other_column, other_force in other_terms:
+        exact = exact + output_covariance(_covariance(other_force, grid, initial_time), other_column)
     exact = exact + LEAST_NOISE * signal.diagonal().max() * np.eye(len(exact))
     if not np.all(np.isfinite(exact)):
         return None
@@ -177,8 +185,8 @@ def _estimate(linear: LinearModel, times: np.ndarray, force: QuasiPeriodic, colu
 
     def whitened(functions: int) -> np.ndarray:
         """Return W."""
-        left_out = (periodic - features[:, :functions] @ features[:, :functions].T) * evolution
-        half = solve_triangular(factor, mapped(left_out, column), lower=True)
+        omitted = (periodic - features[:, :functions] @ features[:, :functions].T) * evolution
+        half = solve_triangular(factor, output_covariance(omitted, column), lower=True)
         return solve_triangular(factor, half.T, lower=True)
 
     def second_order_error(functions: int) -> float:
@@ -189,95 +197,94 @@ def _estimate(linear: LinearModel, times: np.ndarray, force: QuasiPeriodic, colu
         return None
     if error <= TOLERANCE:
         return error, force.functions
-    values = np.minimum(np.linalg.eigvalsh(whitened(force.functions)), _LARGEST)
+    values = np.minimum(np.linalg.eigvalsh(whitened(force.functions)), _LARGEST_EIGENVALUE)
     return (error_bound(1.0 / (1.0 - values), rows.pieces),
             _least_functions(lambda functions: second_order_error(functions) <= TOLERANCE, force, features.shape[1]))
 
 
 def _second_order_error(square: float) -> float:
-    """Return the error for small w_i from the sum of their squares: eigenvalues take much more time."""
+    """Return the error for small w_i from the sum of their squares, which is much cheaper than the eigenvalues."""
     return 0.25 * square + 2.0 * float(np.sqrt(0.5 * square))
 
 
 def _trace_bound(linear: LinearModel, times: np.ndarray, force: QuasiPeriodic, column: int,
                  initial_time: float) -> float:
-    """Return a bound on the error of a force that is observed itself, at no cost; infinite where there is none.
+    """Return a cheap bound on the error for a force that is observed directly; infinite if there is no bound.
 
-    K is at least the noise, so that sum_i |w_i| is at most the trace of what is left out, relative to the noise.
+    K is at least the noise covariance, so that sum_i |w_i| is at most the trace of K - K_J relative to the noise.
     """
     if not force.kernel.stationary:
         return np.inf
     start = force.kernel.start
-    left_out = max(float(force.kernel(start, start)) - float(force.eigenvalues().sum()), 0.0)
-    ends = _covariance(force.evolution, times[[0, -1]], initial_time).diagonal()
+    omitted_variance = max(float(force.kernel(start, start)) - float(force.eigenvalues().sum()), 0.0)
+    evolution_variances = _covariance(force.evolution, times[[0, -1]], initial_time).diagonal()
     gain = linear.d[:, column]
     try:
         signal_to_noise = float(gain @ np.linalg.solve(linear.noise, gain))
     except np.linalg.LinAlgError:
         return np.inf
-    trace = times.size * left_out * ends.max() * signal_to_noise
+    trace = times.size * omitted_variance * evolution_variances.max() * signal_to_noise
     return _second_order_error(trace**2) if np.isfinite(trace) else np.inf
 
 
-def _least_functions(is_enough: Callable[[int], bool], force: QuasiPeriodic, most: int) -> int | None:
-    """Return the least number of functions above that of the force that is enough, None above ``most``."""
+def _least_functions(is_sufficient: Callable[[int], bool], force: QuasiPeriodic, most: int) -> int | None:
+    """Return the least sufficient number of functions above that of the force, None above ``most``."""
     stride = 2 if force.kernel.stationary else 1
-    low, high = 0, 1  # multiples of the stride beyond the functions of the force
-    while not is_enough(min(force.functions + stride * high, most)):
+    low, high = 0, 1  # additional functions in units of the stride: insufficient, sufficient
+    while not is_sufficient(min(force.functions + stride * high, most)):
         if force.functions + stride * high >= most:
             return None
         low, high = high, 2 * high
     while high - low > 1:
         middle = (low + high) // 2
-        low, high = (low, middle) if is_enough(force.functions + stride * middle) else (middle, high)
+        low, high = (low, middle) if is_sufficient(force.functions + stride * middle) else (middle, high)
     return force.functions + stride * high
 
 
 def _representative_rows(times: np.ndarray, force: QuasiPeriodic, initial_time: float, outputs: int,
-                         is_direct: bool) -> _Rows | None:
-    """Choose the rows; None where the period is not a positive number."""
+                         is_direct: bool) -> RepresentativeRows | None:
+    """Return the rows of the estimate; None if the period is not a positive number."""
     period, count = float(force.period), times.size
     if not (np.isfinite(period) and period > 0.0):
         return None
     cycles = max(np.ptp(times) / period, 1e-9)
     waves = 0.0 if is_direct else _POINTS_PER_WAVE * (force.functions // 2 + 1.0)  # grid points in a cycle
-    values = max(_LEAST_ROWS, _VALUES // outputs)
-    if count <= values and waves * cycles <= _GRID:
-        return _Rows(times, 1.0, 1.0, 1.0, max(1, int(np.ceil(waves * cycles / count))))
-    correlated = _correlation_time(force, times, initial_time) / period
-    window = min(cycles, max(_WINDOW * correlated, _CYCLES))
-    kept_cycles = window if is_direct else min(window, _GRID / waves)
-    rows = times[:max(_LEAST_ROWS, int(np.ceil(count * kept_cycles / cycles)))]
-    substeps = max(1, int(np.ceil(waves * kept_cycles / min(values, rows.size))))
-    most = max(_LEAST_ROWS, min(values, _GRID // substeps))
-    if rows.size > most:
-        # One row of each block, at random: rows at equal distances could all lie in the same few phases.
-        edges = np.linspace(0, rows.size, most + 1).astype(int)
+    most_rows = max(_LEAST_ROWS, _MOST_VALUES // outputs)
+    if count <= most_rows and waves * cycles <= _MOST_GRID_POINTS:
+        return RepresentativeRows(times, 1.0, 1.0, 1.0, max(1, int(np.ceil(waves * cycles / count))))
+    correlation_cycles = _correlation_time(force, times, initial_time) / period
+    window = min(cycles, max(_WINDOW * correlation_cycles, _LEAST_CYCLES))
+    grid_cycles = window if is_direct else min(window, _MOST_GRID_POINTS / waves)
+    rows = times[:max(_LEAST_ROWS, int(np.ceil(count * grid_cycles / cycles)))]
+    substeps = max(1, int(np.ceil(waves * grid_cycles / min(most_rows, rows.size))))
+    most_rows = max(_LEAST_ROWS, min(most_rows, _MOST_GRID_POINTS // substeps))
+    if rows.size > most_rows:
+        # Choose one row of each block at random: equidistant rows could fall on a few phases only.
+        edges = np.linspace(0, rows.size, most_rows + 1).astype(int)
         rows = rows[np.random.default_rng(0).integers(edges[:-1], edges[1:])]
     pieces = cycles / window
-    return _Rows(rows, window / kept_cycles, count / (rows.size * pieces), pieces, substeps)
+    return RepresentativeRows(rows, window / grid_cycles, count / (rows.size * pieces), pieces, substeps)
 
 
 def _correlation_time(force: QuasiPeriodic, times: np.ndarray, initial_time: float) -> float:
-    """Return the longest lag over which the weights keep a correlation of 0.6, counted from the first time."""
+    """Return the longest lag from the first time at which the weights have a correlation of at least 0.6."""
     lags = np.concatenate([[0.0], np.geomspace(0.01 * float(force.period), max(np.ptp(times), 1e-300), 60)])
-    at = times[0] + lags
-    covariance = _covariance(force.evolution, at, initial_time)
+    covariance = _covariance(force.evolution, times[0] + lags, initial_time)
     deviations = np.sqrt(covariance.diagonal())
     correlation = covariance[0] / (deviations[0] * deviations)
-    alike = np.flatnonzero(correlation >= _CORRELATION)
-    return float(lags[alike.max()]) if alike.size else 0.0
+    correlated = np.flatnonzero(correlation >= _CORRELATION)
+    return float(lags[correlated.max()]) if correlated.size else 0.0
 
 
-def _refined(times: np.ndarray, substeps: int) -> np.ndarray:
-    """Return the times with ``substeps`` equal steps from each to the next."""
-    shares = np.arange(substeps) / substeps
-    inner = times[:-1, None] + np.diff(times)[:, None] * shares
-    return np.append(inner.ravel(), times[-1])
+def _with_substeps(times: np.ndarray, substeps: int) -> np.ndarray:
+    """Return the times with ``substeps`` equal steps between neighbours."""
+    fractions = np.arange(substeps) / substeps
+    substep_times = times[:-1, None] + np.diff(times)[:, None] * fractions
+    return np.append(substep_times.ravel(), times[-1])
 
 
 def _covariance(force: Force, grid: np.ndarray, initial_time: float) -> np.ndarray:
-    """Return the covariance (J, J) in a model that starts at ``initial_time``, zero where none is known."""
+    """Return the covariance (J, J) in a model that starts at ``initial_time``, zero if it has no closed form."""
     try:
         return np.asarray(force.covariance_in_model(grid[:, None], grid[None, :], initial_time))
     except NotImplementedError:
@@ -285,7 +292,7 @@ def _covariance(force: Force, grid: np.ndarray, initial_time: float) -> np.ndarr
 
 
 def _features(force: QuasiPeriodic, grid: np.ndarray) -> np.ndarray:
-    """Return sqrt(mu_j) phi_j on a grid, (J, functions), falling, for as many functions as can be told apart."""
+    """Return sqrt(mu_j) phi_j on a grid, (points, functions), for all functions of the estimate, by falling mu_j."""
     kernel = force.kernel
     if kernel.stationary:
         harmonics = max(_HARMONICS, force.functions // 2)

@@ -21,13 +21,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import solve_triangular
 
-from lfm_ppl import linalg
+from lfm_ppl import gaussian_residuals
 from lfm_ppl.filtering.filter import forward
 from lfm_ppl.filtering.predict import compose
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.forces import Force, RandomWalk, Resonator
 from lfm_ppl.forces.sde import Sum
-from lfm_ppl.linalg import masked, matmul, solve_lower
+from lfm_ppl.gaussian_residuals import masked
+from lfm_ppl.linalg import matmul, solve_lower
 from lfm_ppl.linearisation.taylor import Taylor
 from lfm_ppl.model.gaussian import Gaussian
 from lfm_ppl.model.latent_force_model import LatentForceModel
@@ -256,8 +257,8 @@ def log_likelihood(logarithms: jax.Array, data: Regression, axes: str) -> jax.Ar
     root, found = _root(jnp.eye(start.shape[1]) + white.start.T @ white.start)
     state = solve_triangular(root, solve_triangular(root, white.start.T @ white.y, lower=True), lower=True, trans=1)
     left = white.y - white.start @ state
-    value = (linalg.log_density(left, white.chol, white.present)
-             + linalg.log_density(state, root, jnp.zeros(state.shape)))
+    value = (gaussian_residuals.log_density(left, white.chol, white.present)
+             + gaussian_residuals.log_density(state, root, jnp.zeros(state.shape)))
     return jnp.where(usable & white.usable & found, value, -jnp.inf)
 
 
@@ -294,7 +295,7 @@ def held_out(logarithms: jax.Array, data: Regression, axes: str) -> jax.Array:
 def log_density(error: jax.Array, covariance: jax.Array) -> jax.Array:
     """Return the log density (T,) of errors (T, 3) whose covariance is (T, 3, 3) and that of the positions."""
     chol = jnp.linalg.cholesky(covariance + NOISE**2 * jnp.eye(3))
-    return linalg.log_density(jax.vmap(solve_lower)(chol, error), chol)
+    return gaussian_residuals.log_density(jax.vmap(solve_lower)(chol, error), chol)
 
 
 slope_of_log_likelihood: Any = functools.partial(jax.jit, static_argnums=(2,))(jax.value_and_grad(log_likelihood))

@@ -1,4 +1,4 @@
-"""Many standard normal numbers, fast: half of a particle filter's work is to draw them."""
+"""Fast standard normal numbers for the particle filter, which spends half of its time on drawing them."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ def normals(key: jax.Array, count: int, size: int) -> jax.Array:
 
         z_1 = sqrt(-2 log u) cos(2 pi v),    z_2 = sqrt(-2 log u) sin(2 pi v),
 
-    with u uniform on 2^31 points and v on 2^32, so that numbers up to 6.7 occur. One block of JAX's counter-based
-    generator gives both. Sine, cosine and logarithm are polynomials, exact to 1e-12 in double precision, so that XLA
-    fuses all of it into one loop over the particles, which takes a tenth of the time of ``jax.random.normal``.
+    with u uniform on 2^31 points and v on 2^32, so that absolute values reach 6.7. One block of JAX's counter-based
+    generator gives both. Sine, cosine and logarithm are polynomials, accurate to 1e-12 in double precision. XLA fuses
+    the computation into one loop over the particles, which takes a tenth of the time of ``jax.random.normal``.
 
     Args:
         key: a JAX random key.
@@ -38,13 +38,13 @@ def normals(key: jax.Array, count: int, size: int) -> jax.Array:
     """
     if count == 0 or size == 0:
         return jnp.zeros((count, size))
-    # Pairs fill two rows where the rows are even in number, else two halves of each row.
+    # The two numbers of a pair go to two rows if the number of rows is even, else to the two halves of one row.
     shape = (count // 2, size) if count % 2 == 0 else (count, (size + 1) // 2)
-    first, second = _words(key, shape)
-    # In single precision rounding makes the smallest of them negative.
+    first, second = _random_words(key, shape)
+    # In single precision, rounding can make the smallest values negative.
     radius = jnp.sqrt(jnp.maximum(2.0 * _minus_log(first), 0.0))
     quadrant = second >> 30
-    # Turns from the middle of the quadrant, within an eighth on either side.
+    # Angle in turns, measured from the middle of the quadrant: between -1/8 and 1/8, where the series converge fast.
     turn = (second & 0x3FFFFFFF).astype(float) * 2.0**-32 + (2.0**-33 - 0.125)
     sine, cosine = turn * _polynomial(_SINE, turn * turn), _polynomial(_COSINE, turn * turn)
     swap = (quadrant & 1) == 1
@@ -53,14 +53,14 @@ def normals(key: jax.Array, count: int, size: int) -> jax.Array:
     return jnp.concatenate(pairs) if count % 2 == 0 else jnp.concatenate(pairs, axis=1)[:, :size]
 
 
-def _words(key: jax.Array, shape: tuple[int, ...]) -> tuple[jax.Array, jax.Array]:
-    """Return two arrays of 32 random bits."""
+def _random_words(key: jax.Array, shape: tuple[int, ...]) -> tuple[jax.Array, jax.Array]:
+    """Return two arrays of random 32-bit words."""
     if jnp.result_type(float) != jnp.float64:
-        both = jax.random.bits(key, (2, *shape), jnp.uint32)
-        return both[0], both[1]
-    # Words of 64 bits use all that the generator makes; of each pair of words of 32 bits it throws one away.
-    both = jax.random.bits(key, shape, jnp.uint64)
-    return (both >> 32).astype(jnp.uint32), both.astype(jnp.uint32)
+        words = jax.random.bits(key, (2, *shape), jnp.uint32)
+        return words[0], words[1]
+    # For 32-bit output JAX discards one half of each 64-bit block of the generator; 64-bit words use both halves.
+    words = jax.random.bits(key, shape, jnp.uint64)
+    return (words >> 32).astype(jnp.uint32), words.astype(jnp.uint32)
 
 
 def _minus_log(bits: jax.Array) -> jax.Array:

@@ -1,8 +1,20 @@
-"""Smoothing with particles: trajectories drawn from their distribution given all observations."""
+"""Particle smoother: draws of trajectories from their distribution given all observations.
+
+1. Run the particle filter, and keep the particles, weights and ancestors of every row.
+2. Draw S particles of the last row by their weights: the ends of the trajectories.
+3. Go back row by row. For a trajectory at s_k+1, choose a particle of row k
+   - by backward simulation: particle i with probability proportional to W_i p(s_k+1 | s_i), where p is the transition
+     density of the exact discretisation or of Euler's step;
+   - by ancestor tracing: the ancestor of the particle at k + 1 in the filter.
+   Between equal times the transition has no density, and backward simulation takes the ancestor, too.
+4. Return the trajectories at the requested times, and the number of different particles in each row.
+
+Source: Godsill, Doucet and West (2004), JASA 99(465); Kitagawa (1996), J. Comput. Graph. Statist. 5(1).
+"""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -13,24 +25,36 @@ from lfm_ppl import checks
 from lfm_ppl.filtering.predict import exact_offset
 from lfm_ppl.filtering.time_grid import Intervals, TimeGrid, as_arrays
 from lfm_ppl.filtering.transition import exact
-from lfm_ppl.linalg import cholesky, log_density, matmul, solve_lower
+from lfm_ppl.gaussian_residuals import log_density
+from lfm_ppl.linalg import cholesky, matmul, solve_lower
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.state_space import StateSpaceModel, state_space
-from lfm_ppl.particles.particle_filter import ParticleSettings, Step, check_settings, checked, forward
+from lfm_ppl.particles.particle_filter import (
+    FilterStep,
+    ParticleSettings,
+    check_inputs,
+    check_settings,
+    filter_particles,
+)
 from lfm_ppl.particles.stochastic_steps import choose_scheme
 
 BACKWARD, TRACING = "backward simulation", "ancestor tracing"
 METHODS = (BACKWARD, TRACING)
 
 _LARGEST_HISTORY = 2**32
-"""Bytes that the particles of all rows may take."""
+"""Largest memory of the particles of all rows, in bytes."""
 
 _BLOCK = 4_000_000
-"""Transition densities that are computed at a time."""
+"""Number of transition densities that are computed at a time."""
 
 
-class Paths(NamedTuple):
-    """Trajectories of one force or state: draws (S, K), and their mean and standard deviation (K,)."""
+class SampledTrajectories(eqx.Module):
+    """Trajectories of one force or state.
+
+    Attributes:
+        draws: (S, K).
+        mean, sd: (K,), moments of the draws.
+    """
 
     draws: jax.Array
     mean: jax.Array
@@ -38,14 +62,15 @@ class Paths(NamedTuple):
 
 
 class ParticleSmootherResult(eqx.Module):
-    """Trajectories given all observations.
+    """Result of `particle_smoother`.
 
     Attributes:
-        times: (K,).
-        draws: (S, K, n), of the joint state.
-        distinct: (K,), how many different particles the trajectories pass through.
+        times: (K,), requested times.
+        draws: (S, K, n), trajectories of the joint state.
+        distinct: (K,), number of different particles among the trajectories at each time.
+        ssm: the model in state-space form.
         method: "backward simulation" or "ancestor tracing".
-        scheme: of the steps.
+        scheme: integration scheme.
     """
 
     times: jax.Array
@@ -57,16 +82,16 @@ class ParticleSmootherResult(eqx.Module):
 
     @property
     def mean(self) -> jax.Array:
-        """(K, n)."""
+        """Mean (K, n) of the draws."""
         return self.draws.mean(axis=0)
 
     @property
     def covariance(self) -> jax.Array:
-        """(K, n, n)."""
+        """Covariance (K, n, n) of the draws."""
         centred = self.draws - self.mean
         return jnp.einsum("ski,skj->kij", centred, centred) / (self.draws.shape[0] - 1)
 
-    def force(self, name: str) -> Paths:
+    def force(self, name: str) -> SampledTrajectories:
         """Return the trajectories of a force.
 
         Raises:
@@ -75,7 +100,7 @@ class ParticleSmootherResult(eqx.Module):
         checks.one_of("force", name, self.ssm.model.force_names)
         return self._paths(self.ssm.physical_dim + self.ssm.model.force_names.index(name))
 
-    def state(self, name: str) -> Paths:
+    def state(self, name: str) -> SampledTrajectories:
         """Return the trajectories of a physical state.
 
         Raises:
@@ -84,10 +109,10 @@ class ParticleSmootherResult(eqx.Module):
         checks.one_of("state", name, self.ssm.model.state_names)
         return self._paths(self.ssm.model.state_names.index(name))
 
-    def _paths(self, index: int) -> Paths:
+    def _paths(self, index: int) -> SampledTrajectories:
         matrix, offset = jax.vmap(self.ssm.input_map)(self.times)
         draws = jnp.einsum("kn,skn->sk", matrix[:, index], self.draws) + offset[:, index]
-        return Paths(draws, draws.mean(axis=0), draws.std(axis=0, ddof=1))
+        return SampledTrajectories(draws, draws.mean(axis=0), draws.std(axis=0, ddof=1))
 
 
 def particle_smoother(key: jax.Array, model: LatentForceModel, times: Any, y: Any, *, particles: int = 2_000,
@@ -96,30 +121,31 @@ def particle_smoother(key: jax.Array, model: LatentForceModel, times: Any, y: An
                       scheme: str = "auto") -> ParticleSmootherResult:
     """Draw trajectories of the joint state given all observations.
 
-    Backward simulation draws the last state from the filter's particles, and then, going back, particle i with
-    probability proportional to W_i p(s_k+1 | s_i). It needs the transition density: that of the exact transition for
-    linear time-invariant models, else of Euler's step, with which the particles move then, too, one step to a row; in
-    both cases every state must have noise of its own. Ancestor tracing needs no density: it follows the ancestors of
-    the last particles. All its trajectories meet in few particles when going back far, see ``distinct``.
+    Backward simulation draws the last state from the filter's particles. Then it goes back in time and chooses
+    particle i with probability proportional to W_i p(s_k+1 | s_i). It needs the transition density, which is that of
+    the exact transition for linear time-invariant models, and that of Euler's step otherwise. In the second case the
+    particles, too, move by Euler's method, with one step for each row. In both cases every state must have noise.
+    Ancestor tracing needs no density: it follows the ancestors of the last particles. Far back, all its trajectories
+    pass through few particles; see ``distinct``.
 
     Args:
         key: a JAX random key.
         model: the latent force model.
         times: (T,), non-decreasing.
         y: (T, D), NaN where missing.
-        particles: N.
-        draws: S, number of trajectories. (At least two, for their covariance.)
-        at: (K,) times of the trajectories, between the initial time and any time after the data; by default ``times``.
-        method: "backward simulation", "ancestor tracing", or "auto" for the first where the model allows it.
+        particles: number of particles N.
+        draws: number of trajectories S, at least two for their covariance.
+        at: (K,) times of the trajectories, at or after the initial time, also after the data; by default ``times``.
+        method: "backward simulation", "ancestor tracing", or "auto": the first of these that the model allows.
         steps: integration steps between two consecutive times; Euler's method needs more than the others.
         max_step: longest step.
-        resampling: as in `particle_filter`, and so is the next one.
-        threshold: of the effective sample size.
-        scheme: of the steps, as in `particle_filter`; backward simulation takes "exact" or "euler" alone.
+        resampling: as in `particle_filter`.
+        threshold: as in `particle_filter`.
+        scheme: integration scheme as in `particle_filter`; backward simulation allows "exact" and "euler" only.
 
     Returns:
-        The trajectories. Cost and memory are proportional to particles times integration steps, and for backward
-        simulation the cost to the draws, too.
+        The trajectories. Memory is proportional to particles times integration steps. Cost is proportional to the
+        same product, for backward simulation also to the number of draws.
 
     Raises:
         ValueError, TypeError: as `particle_filter`; a method that the model does not allow; more than 4 GiB of
@@ -141,23 +167,23 @@ def particle_smoother(key: jax.Array, model: LatentForceModel, times: Any, y: An
     checks.positive_integer("draws", draws)
     checks.one_of("method", method, ("auto", *METHODS))
     ssm = state_space(model)
-    chosen, scheme = _method(ssm, method, scheme)
-    per_step = chosen == BACKWARD and scheme == "euler"
-    grid, y = checked(ssm, times, y, steps, max_step, at, interval_per_step=per_step)
+    method, scheme = _choose_method(ssm, method, scheme)
+    interval_per_step = method == BACKWARD and scheme == "euler"
+    grid, y = check_inputs(ssm, times, y, steps, max_step, at, interval_per_step=interval_per_step)
     settings = check_settings(ssm, ParticleSettings(particles, resampling, threshold, scheme))
     rows = len(grid.intervals.observation)
-    if (needed := 8 * rows * particles * (ssm.state_dim + 2)) > _LARGEST_HISTORY:
-        raise ValueError(f"the particles of {rows} rows would take {needed / 2**30:.1f} GiB; smoothing keeps all of "
-                         f"them. Take at most {particles * _LARGEST_HISTORY // needed} particles, or fewer steps.")
-    states, index, _ = eqx.filter_jit(draw_trajectories)(ssm, grid, y, key, settings, draws, chosen)
-    distinct = np.array([len(np.unique(row)) for row in np.asarray(index)])
+    if (size := 8 * rows * particles * (ssm.state_dim + 2)) > _LARGEST_HISTORY:
+        raise ValueError(f"the particles of {rows} rows would take {size / 2**30:.1f} GiB; smoothing keeps all of "
+                         f"them. Take at most {particles * _LARGEST_HISTORY // size} particles, or fewer steps.")
+    states, indices, _ = eqx.filter_jit(draw_trajectories)(ssm, grid, y, key, settings, draws, method)
+    distinct = np.array([len(np.unique(row)) for row in np.asarray(indices)])
     return ParticleSmootherResult(jnp.asarray(grid.requested_times, float), jnp.moveaxis(states, 0, 1),
-                                  jnp.asarray(distinct), ssm, chosen, settings.scheme)
+                                  jnp.asarray(distinct), ssm, method, settings.scheme)
 
 
-def _method(ssm: StateSpaceModel, method: str, scheme: str) -> tuple[str, str]:
-    """Return the method and the scheme that are wanted, or that the model allows."""
-    reason = _obstacle(ssm)
+def _choose_method(ssm: StateSpaceModel, method: str, scheme: str) -> tuple[str, str]:
+    """Return the method and the integration scheme, with "auto" replaced."""
+    reason = _missing_density_reason(ssm)
     if method == BACKWARD and reason:
         raise ValueError(f"backward simulation needs the transition density, but {reason}. Use "
                          f'method="{TRACING}" (or "auto").')
@@ -165,114 +191,127 @@ def _method(ssm: StateSpaceModel, method: str, scheme: str) -> tuple[str, str]:
         return TRACING, choose_scheme(ssm, scheme)
     if scheme not in ("auto", "exact", "euler"):
         raise ValueError(f'backward simulation moves particles by the scheme "exact" or "euler", got {scheme!r}.')
-    return BACKWARD, choose_scheme(ssm, scheme if scheme != "auto" else "exact" if ssm.time_invariant else "euler")
+    if scheme == "auto":
+        scheme = "exact" if ssm.time_invariant else "euler"
+    return BACKWARD, choose_scheme(ssm, scheme)
 
 
-def _obstacle(ssm: StateSpaceModel) -> str:
-    """Return why a transition over a short time has no density; empty where it has."""
+def _missing_density_reason(ssm: StateSpaceModel) -> str:
+    """Return why the transition over a short time has no density; the empty string if it has one."""
     if ssm.stack.jump_times:
         return "a force jumps"
     if ssm.time_invariant:
         noise = exact(ssm, jnp.ones(()), 1).process_cov
-        return "" if _regular(noise) else "not every state of this linear model has noise"
+        return "" if _is_regular(noise) else "not every state of this linear model has noise"
     time = 0.0 if ssm.model.initial_time is None else ssm.model.initial_time
     w = jnp.concatenate([ssm.model.initial_state.mean, ssm.stack.mean_at(time)])
     dispersion = ssm.dispersion(w, time)
-    if ssm.physical_dim and (dispersion is None or not _regular(matmul(dispersion, dispersion.T))):
+    if ssm.physical_dim and (dispersion is None or not _is_regular(matmul(dispersion, dispersion.T))):
         return "not every physical state has process noise"
-    if ssm.force_dim and not _regular(ssm.stack.discretise(1.0)[1]):
+    if ssm.force_dim and not _is_regular(ssm.stack.discretise(1.0)[1]):
         return "a force has states without noise"
     return ""
 
 
-def _regular(covariance: jax.Array) -> bool:
-    known = checks.concrete(covariance)
-    if known is None:
+def _is_regular(covariance: jax.Array) -> bool:
+    """Return whether a covariance is concrete and its correlation matrix is numerically positive definite."""
+    value = checks.concrete(covariance)
+    if value is None:
         return False
-    scale = np.sqrt(np.maximum(np.diag(known), 0.0))
-    return bool((scale > 0).all() and np.linalg.eigvalsh(known / np.outer(scale, scale)).min() > 1e-10)
+    sd = np.sqrt(np.maximum(np.diag(value), 0.0))
+    return bool((sd > 0).all() and np.linalg.eigvalsh(value / np.outer(sd, sd)).min() > 1e-10)
 
 
 def draw_trajectories(ssm: StateSpaceModel, grid: TimeGrid, y: jax.Array, key: jax.Array, settings: ParticleSettings,
                       draws: int, method: str) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return trajectories (K, S, n), the particles (K, S) that they pass through, and the log likelihood estimate.
+    """Return trajectories (K, S, n), their particle indices (K, S), and the log likelihood estimate.
 
     For compiled code.
     """
-    filter_key, last_key, back_key = jax.random.split(key, 3)
-    steps: Step = forward(ssm, grid, y, filter_key, settings, lambda step: step)
-    last = _choose(last_key, jnp.broadcast_to(steps.log_weights[-1], (draws, settings.particles)))
+    filter_key, last_key, backward_key = jax.random.split(key, 3)
+    steps: FilterStep = filter_particles(ssm, grid, y, filter_key, settings, lambda step: step)
+    last_index = _sample_indices(last_key, jnp.broadcast_to(steps.log_weights[-1], (draws, settings.particles)))
     rows = as_arrays(grid.intervals)
-    before = jax.tree_util.tree_map(lambda a: a[:-1], (steps.state, steps.log_weights, steps.ancestors))
-    after = Intervals(*(a[1:] for a in rows))
-    keys = jax.random.split(back_key, rows.start.shape[0])[1:]
+    particles = jax.tree_util.tree_map(lambda a: a[:-1], (steps.state, steps.log_weights, steps.ancestors))
+    intervals = Intervals(*(a[1:] for a in rows))
+    keys = jax.random.split(backward_key, rows.start.shape[0])[1:]
 
-    def back(carry: tuple[jax.Array, jax.Array], inputs: tuple) -> tuple[tuple, tuple]:
-        (state, log_weights, ancestors), row, row_key = inputs
-        later, index = carry
-        traced = ancestors[index]
+    def step_back(carry: tuple[jax.Array, jax.Array], inputs: tuple) -> tuple[tuple, tuple]:
+        (state, log_weights, ancestors), interval, row_key = inputs
+        next_state, next_index = carry
+        index = ancestors[next_index]
         if method == BACKWARD:
-            drawn = lambda: _drawn_back(ssm, settings, grid, row, state, log_weights, later, row_key)  # noqa: E731
-            index = jax.lax.cond(row.length > 0, drawn, lambda: traced)
-        else:
-            index = traced
-        found = state[:, index].T
-        return (found, index), (found, index)
+            def draw_index() -> jax.Array:
+                mean, chol = _transition_moments(ssm, settings.scheme, interval, grid.steps, state)
+                return _draw_origins(row_key, mean, chol, log_weights, next_state)
 
-    first = (steps.state[-1][:, last].T, last)
-    _, (states, indices) = jax.lax.scan(back, first, (before, after, keys), reverse=True)
-    states = jnp.concatenate([states, first[0][None]])
-    indices = jnp.concatenate([indices, last[None]])
+            ancestor_index = index
+            index = jax.lax.cond(interval.length > 0, draw_index, lambda: ancestor_index)
+        trajectories = state[:, index].T
+        return (trajectories, index), (trajectories, index)
+
+    last = (steps.state[-1][:, last_index].T, last_index)
+    _, (states, indices) = jax.lax.scan(step_back, last, (particles, intervals, keys), reverse=True)
+    states = jnp.concatenate([states, last[0][None]])
+    indices = jnp.concatenate([indices, last_index[None]])
     requested = jnp.asarray(grid.requested)
     return states[requested], indices[requested], steps.log_likelihood.sum()
 
 
-def _drawn_back(ssm: StateSpaceModel, settings: ParticleSettings, grid: TimeGrid, row: Intervals, state: jax.Array,
-                log_weights: jax.Array, later: jax.Array, key: jax.Array) -> jax.Array:
-    """Draw, for each later state (S, n), the particle that it comes from."""
-    mean, chol = _transition(ssm, settings.scheme, row, grid.steps, state)
+def _draw_origins(key: jax.Array, mean: jax.Array, chol: jax.Array, log_weights: jax.Array,
+                  next_state: jax.Array) -> jax.Array:
+    """Draw the particle (S,) from which each of the next states (S, n) originates.
 
-    def one(pair: tuple[jax.Array, jax.Array]) -> jax.Array:
-        following, uniform = pair
-        density = jax.vmap(lambda m, c: log_density(solve_lower(c, following - m), c),
+    Args:
+        key: a JAX random key.
+        mean: (n, N), mean of the next state given each particle.
+        chol: (n, n) or (n, n, N), Cholesky factor of its covariance.
+        log_weights: (N,), of the particles.
+        next_state: (S, n).
+    """
+    def draw_origin(state_and_uniform: tuple[jax.Array, jax.Array]) -> jax.Array:
+        state, uniform = state_and_uniform
+        density = jax.vmap(lambda m, c: log_density(solve_lower(c, state - m), c),
                            in_axes=(-1, -1 if chol.ndim == 3 else None))(mean, chol)
-        return _choose_at(uniform, log_weights + jnp.where(jnp.isnan(density), -jnp.inf, density))
+        return _quantile_index(uniform, log_weights + jnp.where(jnp.isnan(density), -jnp.inf, density))
 
-    size = max(1, min(later.shape[0], _BLOCK // state.shape[1]))
-    return jax.lax.map(one, (later, jax.random.uniform(key, later.shape[:1])), batch_size=size)
+    batch_size = max(1, min(next_state.shape[0], _BLOCK // mean.shape[1]))
+    uniforms = jax.random.uniform(key, next_state.shape[:1])
+    return jax.lax.map(draw_origin, (next_state, uniforms), batch_size=batch_size)
 
 
-def _transition(ssm: StateSpaceModel, scheme: str, row: Intervals, steps: int,
-                state: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _transition_moments(ssm: StateSpaceModel, scheme: str, interval: Intervals, steps: int,
+                        state: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return the means (n, N) of the next state, and the factor of its covariance, (n, n) or (n, n, N)."""
     if scheme == "exact":
-        whole = exact(ssm, row.length, steps)
-        offset = exact_offset(ssm, whole, steps, row.span, row.length)
-        return matmul(whole.phi, state) + offset[:, None], cholesky(whole.process_cov).chol
-    size = ssm.physical_dim
-    forces, noise = ssm.stack.discretise(row.length)
+        transition = exact(ssm, interval.length, steps)
+        offset = exact_offset(ssm, transition, steps, interval.span, interval.length)
+        return matmul(transition.phi, state) + offset[:, None], cholesky(transition.process_cov).chol
+    size, length = ssm.physical_dim, interval.length
+    force_transition, force_noise = ssm.stack.discretise(length)
 
-    def one(s: jax.Array) -> tuple[jax.Array, jax.Array]:
-        t = row.span.time()
+    def euler_moments(s: jax.Array) -> tuple[jax.Array, jax.Array]:
+        t = interval.span.time()
         w = ssm.inputs(s, t)
-        moved = s[:size] + row.length * ssm.drift(w, t)
+        physical_mean = s[:size] + length * ssm.drift(w, t)
         dispersion = ssm.dispersion(w, t)
-        own = jnp.zeros((0, 0)) if dispersion is None else row.length * matmul(dispersion, dispersion.T)
-        covariance = jax.scipy.linalg.block_diag(own, noise)
-        return jnp.concatenate([moved, matmul(forces, s[size:, None])[:, 0]]), cholesky(covariance).chol
+        physical_noise = jnp.zeros((0, 0)) if dispersion is None else length * matmul(dispersion, dispersion.T)
+        covariance = jax.scipy.linalg.block_diag(physical_noise, force_noise)
+        mean = jnp.concatenate([physical_mean, matmul(force_transition, s[size:, None])[:, 0]])
+        return mean, cholesky(covariance).chol
 
-    if callable(ssm.model.process_noise):
-        return jax.vmap(one, in_axes=-1, out_axes=(-1, -1))(state)
-    return jax.vmap(one, in_axes=-1, out_axes=(-1, None))(state)
-
-
-def _choose(key: jax.Array, log_weights: jax.Array) -> jax.Array:
-    """Draw an index (S,) for each row of weights (S, N)."""
-    return jax.vmap(_choose_at)(jax.random.uniform(key, log_weights.shape[:1]), log_weights)
+    # One factor serves all particles unless the noise depends on the state.
+    factor_axis = -1 if callable(ssm.model.process_noise) else None
+    return jax.vmap(euler_moments, in_axes=-1, out_axes=(-1, factor_axis))(state)
 
 
-def _choose_at(uniform: jax.Array, log_weights: jax.Array) -> jax.Array:
-    """Return the ``uniform`` quantile of the weights (N,)."""
+def _sample_indices(key: jax.Array, log_weights: jax.Array) -> jax.Array:
+    """Draw one index for each row of log weights (S, N); return them, (S,)."""
+    return jax.vmap(_quantile_index)(jax.random.uniform(key, log_weights.shape[:1]), log_weights)
+
+
+def _quantile_index(uniform: jax.Array, log_weights: jax.Array) -> jax.Array:
+    """Return the index of the quantile ``uniform`` in [0, 1) of the distribution with weights (N,)."""
     cumulative = jnp.cumsum(jnp.exp(log_weights - log_weights.max()))
-    found = jnp.searchsorted(cumulative, uniform * cumulative[-1], side="right")
-    return jnp.minimum(found, log_weights.shape[0] - 1).astype(int)
+    index = jnp.searchsorted(cumulative, uniform * cumulative[-1], side="right")
+    return jnp.minimum(index, log_weights.shape[0] - 1).astype(int)

@@ -1,4 +1,4 @@
-"""Resampling: from weighted particles to equally weighted ones, without bias."""
+"""Unbiased resampling: replace weighted particles by equally weighted ones."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ RESAMPLING = ("systematic", "stratified", "multinomial")
 
 
 def resample(key: jax.Array, weights: jax.Array, scheme: str) -> jax.Array:
-    """Draw ancestors so that particle i is chosen N W_i times on average.
+    """Draw the ancestors of N new particles, particle i N W_i times on average.
 
     The ancestors are the quantiles of the weights at N points of [0, 1): ``(i + u)/N`` with one uniform u
-    (systematic), ``(i + u_i)/N`` (stratified), or N uniforms in order (multinomial). Systematic resampling adds the
-    least variance, as a rule; of the other two it is known that the variance is at most that of multinomial.
+    (systematic), ``(i + u_i)/N`` (stratified), or N sorted uniforms (multinomial). Systematic resampling usually adds
+    the least variance; stratified resampling provably adds no more than multinomial.
 
     Args:
         key: a JAX random key.
@@ -41,22 +41,27 @@ def resample(key: jax.Array, weights: jax.Array, scheme: str) -> jax.Array:
         sums = jnp.cumsum(jax.random.exponential(key, (size + 1,)))
         points = sums[:-1] / sums[-1]
     cumulative = jnp.cumsum(weights)
-    # Side "right" never picks a particle of weight zero, whose value equals its predecessor's.
-    found = jnp.searchsorted(cumulative, points * cumulative[-1], side="right")
+    # Side "right" never picks a particle of weight zero, whose cumulative weight equals that of its predecessor.
+    ancestors = jnp.searchsorted(cumulative, points * cumulative[-1], side="right")
     last = size - 1 - jnp.argmax(weights[::-1] > 0)
-    return jnp.minimum(found, last).astype(int)
+    return jnp.minimum(ancestors, last).astype(int)
 
 
-def reweighted(log_weights: jax.Array, log_density: jax.Array, otherwise: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Multiply normalised weights (N,) by densities (N,); return the new weights, normalised, and the log of their sum.
+def reweight(log_weights: jax.Array, log_density: jax.Array, fallback: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Multiply normalised weights by densities and normalise the products.
 
-    Where no particle explains what was seen the estimate is zero for good, and the particles go on with the weights
-    ``otherwise``.
+    Args:
+        log_weights: (N,), logarithms of normalised weights.
+        log_density: (N,), log density of the observation given each particle.
+        fallback: (N,), log weights with which the particles continue where the density of all of them is zero.
+
+    Returns:
+        The new log weights (N,), and the logarithm of the sum before normalisation.
     """
     joint = log_weights + log_density
     total = logsumexp(joint)
-    alive = jnp.isfinite(total)
-    return jnp.where(alive, joint - jnp.where(alive, total, 0.0), otherwise), total
+    is_possible = jnp.isfinite(total)
+    return jnp.where(is_possible, joint - jnp.where(is_possible, total, 0.0), fallback), total
 
 
 def effective_sample_size(weights: jax.Array) -> jax.Array:

@@ -13,6 +13,7 @@ import numpy as np
 import xarray as xr
 
 from lfm_ppl import checks
+from lfm_ppl.inference.model_digest import model_digest
 from lfm_ppl.inference.posterior import evenly_spaced
 from lfm_ppl.inference.samplers import FILTERED, SAMPLERS
 from lfm_ppl.model.observations.family import ObservationFamily
@@ -108,7 +109,7 @@ def check_accuracy(result: Any, numpyro_model: Callable, times: Any = None, y: A
     if checkpoint is not None:
         kept = checkpoints.begin_or_resume(checkpoint, {
             "reference": reference, "draws": draws, "particles": particles, "replicates": replicates, "steps": steps,
-            "seed": seed, "model": checkpoints.digest(whole.bound.fingerprint), "data": checkpoints.digest(whole.y),
+            "seed": seed, "model": checkpoints.digest(model_digest(whole.bound)), "data": checkpoints.digest(whole.y),
             "draws of the result": checkpoints.digest(*whole.draws.values()), "versions": checkpoints.versions(),
         }, resume)  # fmt: skip
     with checkpoints.closing(kept):

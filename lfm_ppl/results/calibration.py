@@ -17,7 +17,8 @@ from lfm_ppl import checks
 from lfm_ppl.engine.cluster import Workers
 from lfm_ppl.engine.run import Reporter, run_tasks
 from lfm_ppl.engine.task import Task
-from lfm_ppl.inference.bound_model import bind, likelihood_site
+from lfm_ppl.inference.bound_model import bind
+from lfm_ppl.inference.likelihood_site import likelihood_site
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.results.files import writing

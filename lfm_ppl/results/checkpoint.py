@@ -298,7 +298,7 @@ def digest(*values: Any) -> str:
 _DIGEST = "sha256:"
 
 _OF_MODEL = ("rule", "steps", "max_step", "iterations", "tolerance", "constraints", "sites", "fixed")
-"""What is recorded by itself, and a part of the model's fingerprint, too."""
+"""Entries of a record that the digest of the model depends on, too."""
 
 
 def versions() -> dict[str, str]:
@@ -317,7 +317,7 @@ def check_same(folder: str | Path, kept: Mapping[str, Any], record: Mapping[str,
     record = _plain(record)
     differences = list(_differences(kept, record))
     if any(part.partition(" ")[0] in _OF_MODEL for part in differences):
-        # The fingerprint of a model follows from these, too.
+        # The digest of the model depends on these, too.
         differences = [part for part in differences if part != "model differs"]
     if differences:
         more = [f"and {len(differences) - _SHOWN} more"] if len(differences) > _SHOWN else []

@@ -1,18 +1,23 @@
-"""Rao-Blackwellised particles: a linear model with a discrete input that follows a known rule.
+"""Rao-Blackwellised particle filter for a linear model with a discrete input that follows a known rule.
 
-Given the path of the discrete input and what its rule has read, a model that is linear in state and forces is Gaussian,
-and one step of the Gaussian filter gives its moments exactly. So a particle carries the input and these moments. At a
-decision it draws the reading r_k from its Gaussian, is conditioned on that draw, and gets the input that the rule
-makes of it:
+Given the path of the discrete input and the readings of its rule, the state of a linear model is Gaussian. A particle
+carries the input d and the mean m and covariance P of the joint state. For each row of the time grid:
 
-    r_k ~ N(G m + g, G P G' + V),    (m, P) <- (m, P) given r_k,    d_k = decide(d_k-1, r_k, t_k).
+1. Predict m and P over the row with the model of the particle's input.
+2. If there is an observation, update m and P, and multiply the particle's weight by the exact density of the
+   observation given the particle.
+3. If the row ends with a decision, draw the reading r_k, condition m and P on it, and apply the rule:
 
-That is a factorisation of the joint distribution itself: the pairs (r_1:k, d_1:k) are draws from their distribution,
-each with the exact distribution of the state given them. Averages over the particles are therefore unbiased, whatever
-the number of particles, and vary no more than those of particles that draw the whole state. Observations weight the
-particles by their exact density, as in any Rao-Blackwellised particle filter.
+       r_k ~ N(G m + g, G P G' + V),    (m, P) <- (m, P) given r_k,    d_k = decide(d_k-1, r_k, t_k).
 
-Where the input only adds to the dynamics, all particles share one covariance and differ in their means alone.
+4. If the effective sample size is below the threshold, resample.
+
+The pairs (r_1:k, d_1:k) are exact draws, and the state given them has its exact distribution. Averages over the
+particles are therefore unbiased for any number of particles, and their variance is at most that of averages over
+particles that draw the whole state. If the input only adds to the dynamics, all particles share one covariance.
+
+Source: Doucet, de Freitas, Murphy and Russell (2000), Rao-Blackwellised particle filtering for dynamic Bayesian
+networks; Reece et al. (2014), Efficient state-space inference of periodic latent force models, section 9.
 """
 
 from __future__ import annotations
@@ -27,36 +32,37 @@ import numpy as np
 from lfm_ppl import checks
 from lfm_ppl.filtering.filter import FilterState, check_observations, warn_single_precision
 from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.filtering.time_grid import Intervals, TimeGrid, with_observations
+from lfm_ppl.filtering.time_grid import Intervals, with_observations
 from lfm_ppl.filtering.update import Linearised, Update, update
 from lfm_ppl.linalg import congruence, matmul, semidefinite_root, solve_semidefinite
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.particles.normals import normals
-from lfm_ppl.particles.resampling import RESAMPLING, effective_sample_size, resample, reweighted
+from lfm_ppl.particles.resampling import RESAMPLING, effective_sample_size, resample, reweight
 from lfm_ppl.switching.mixture import Mixture
 from lfm_ppl.switching.rule import SwitchingRule
 from lfm_ppl.switching.switched_model import (
     Build,
     SwitchedMap,
-    check_initial,
+    SwitchedProblem,
+    build_models,
     check_linear,
     decision_grid,
-    first_moments,
-    interval_maps,
-    only_adds,
-    switched,
+    initial_indices,
+    initial_moments,
+    is_input_additive,
+    make_interval_map,
 )
 
 
 class RaoBlackwellisedResult(eqx.Module):
-    """The outcome of `rao_blackwellised`.
+    """Result of `rao_blackwellised`.
 
     Attributes:
-        times: (T,).
-        log_likelihood: (T,), logarithms of the estimates of p(y_k | y_1:k-1); zero where nothing is observed.
-        mean, covariance: (T, n), (T, n, n), moments of the joint state given the observations so far.
-        outputs: the outputs without noise, at each time a mixture of one Gaussian a particle.
-        observed: the outputs with their observation noise.
+        times: (T,), observation or prediction times.
+        log_likelihood: (T,), logarithms of the estimates of p(y_k | y_1:k-1); zero without an observation.
+        mean, covariance: (T, n), (T, n, n), moments of the joint state given the observations up to each time.
+        outputs: distributions of the outputs without noise, mixtures of one Gaussian for each particle.
+        observed: distributions of the outputs with their observation noise.
         inputs: (T, N), values of the discrete input after each time.
         ess: (T,), effective sample size of the weights.
     """
@@ -72,24 +78,24 @@ class RaoBlackwellisedResult(eqx.Module):
 
     @property
     def input_mean(self) -> jax.Array:
-        """(T,), the mean of the discrete input; for a heater, the probability that it is on."""
+        """Mean (T,) of the discrete input; for a heater, the probability that it is on."""
         return (jnp.exp(self.outputs.log_weights) * self.inputs).sum(1)
 
 
 class _Particles(NamedTuple):
-    """Means (N, n), covariances (N, n, n), or (n, n) where shared, indices of the input (N,), log weights (N,)."""
+    """Rao-Blackwellised particles.
+
+    Attributes:
+        mean: (N, n).
+        covariance: (N, n, n), or (n, n) if all particles share it.
+        input_index: (N,), index of the discrete input.
+        log_weights: (N,), normalised.
+    """
 
     mean: jax.Array
     covariance: jax.Array
-    choice: jax.Array
+    input_index: jax.Array
     log_weights: jax.Array
-
-
-class _Settings(NamedTuple):
-    particles: int
-    resampling: str
-    threshold: float
-    shared: bool
 
 
 def rao_blackwellised(key: jax.Array, build: Build, rule: SwitchingRule, times: Any, *, y: Any = None,
@@ -98,22 +104,22 @@ def rao_blackwellised(key: jax.Array, build: Build, rule: SwitchingRule, times: 
                       resampling: str = "systematic", threshold: float = 0.5) -> RaoBlackwellisedResult:
     """Predict, or filter, a linear latent force model with a discrete input that follows a known rule.
 
-    What a particle draws is what the rule reads, and nothing else; see the module. Within ``jax.jit`` the times must be
-    known, and one compilation serves all values of everything else. Outside of it each call compiles anew, since
-    ``build`` makes new functions: compile what is called repeatedly.
+    A particle draws only the readings of the rule; see the module `lfm_ppl.switching.rao_blackwellised`. Within
+    ``jax.jit`` the times must be known, and one compilation serves all values of the other arguments. Outside of it
+    each call compiles, because ``build`` returns new functions: put repeated calls under ``jax.jit``.
 
     Args:
         key: a JAX random key.
-        build: from a value of the input to the `LatentForceModel` that holds while it has that value.
-        rule: of the input, such as `lfm.Thermostat`.
-        times: (T,), non-decreasing, at which the state is wanted or observed.
-        y: (T, D), NaN where missing; None: nothing is observed, a prediction.
-        start: the ``state`` of a filter's result, to go on from there; None: the model's initial state.
+        build: function from a value of the input to the `LatentForceModel` that holds while the input has this value.
+        rule: rule of the input, such as `lfm.Thermostat`.
+        times: (T,), non-decreasing, times of observations or predictions.
+        y: (T, D), NaN where missing; None: no observations, a prediction.
+        start: the ``state`` of a filter's result, from which to continue; None: the model's initial state.
         initial: index in ``rule.values`` of the input at the start, or (N,), one for each particle.
         decisions: times at which the rule is applied, after an observation at the same time; None: ``times``.
-        particles: N.
+        particles: number of particles N.
         steps: integration steps between two consecutive times; a time-invariant model is exact with any number.
-        max_step: longest step; longer intervals get more.
+        max_step: longest step; a longer interval gets more steps.
         resampling: "systematic", "stratified" or "multinomial".
         threshold: resample where the effective sample size is below this share of N.
 
@@ -121,8 +127,8 @@ def rao_blackwellised(key: jax.Array, build: Build, rule: SwitchingRule, times: 
         Moments, mixtures of the outputs, and the input of every particle, at ``times``.
 
     Raises:
-        ValueError: a model or a reading that is not linear, an ``initial`` that is no index, and as `lfm_ppl.filter`.
-        TypeError: ``rule`` or ``key`` is something else.
+        ValueError: a model or a reading that is not linear, an invalid index ``initial``, and as `lfm_ppl.filter`.
+        TypeError: ``rule`` is not a rule, or ``key`` is not a random key.
 
     Example:
         >>> import jax, jax.numpy as jnp, lfm_ppl as lfm
@@ -131,8 +137,8 @@ def rao_blackwellised(key: jax.Array, build: Build, rule: SwitchingRule, times: 
         ...         lambda x, u, t: 0.1 * (5.0 - x) + 2.0 * heater + u, {"rest": lfm.Matern(0.3, 2.0)},
         ...         lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.01])),
         ...         lfm.Gaussian(jnp.array([18.0]), jnp.eye(1)))
-        >>> found = rao_blackwellised(jax.random.key(0), house, lfm.Thermostat(20.0), jnp.arange(0.0, 24.0))
-        >>> mean, sd = found.outputs.moments()
+        >>> result = rao_blackwellised(jax.random.key(0), house, lfm.Thermostat(20.0), jnp.arange(0.0, 24.0))
+        >>> mean, sd = result.outputs.moments()
         >>> mean.shape, bool(abs(mean[-1, 0] - 20.0) < 2.0)
         ((24, 1), True)
 
@@ -144,124 +150,147 @@ def rao_blackwellised(key: jax.Array, build: Build, rule: SwitchingRule, times: 
     checks.one_of("resampling", resampling, RESAMPLING)
     if not 0.0 <= threshold <= 1.0:
         raise ValueError(f"threshold must lie in [0, 1], a share of the particles, got {threshold}.")
-    ssms = switched(build, rule)
+    ssms = build_models(build, rule)
     for ssm in ssms:
         check_linear(ssm, rule)
-    grid, decides = decision_grid(ssms[0], times, decisions, start, steps, max_step)
+    grid, is_decision = decision_grid(ssms[0], times, decisions, start, steps, max_step)
     warn_single_precision()
     shape = (len(grid.observed), ssms[0].output_dim)
     y = jnp.full(shape, jnp.nan) if y is None else check_observations(y, *shape, empty=True)
-    settings = _Settings(particles, resampling, threshold, only_adds(build))
-    return _run(ssms, rule, grid, jnp.asarray(decides), y, jnp.asarray(times, float), first_moments(ssms[0], start),
-                check_initial(initial, rule, particles), key, settings)
+    problem = SwitchedProblem(ssms, rule, grid, jnp.asarray(is_decision), initial_moments(ssms[0], start),
+                              initial_indices(initial, rule, particles))
+    return _filter(problem, jnp.asarray(times, float), y, key, resampling, threshold, is_input_additive(build))
 
 
 @eqx.filter_jit
-def _run(ssms: tuple[StateSpaceModel, ...], rule: SwitchingRule, grid: TimeGrid, decides: jax.Array, y: jax.Array,
-         times: jax.Array, begin: Moments, initial: jax.Array, key: jax.Array,
-         settings: _Settings) -> RaoBlackwellisedResult:
-    size = settings.particles
-    maps = [interval_maps(ssm, rule, grid) for ssm in ssms]
-    equal = jnp.full(size, -np.log(size))
+def _filter(problem: SwitchedProblem, times: jax.Array, y: jax.Array, key: jax.Array, resampling: str,
+            threshold: float, shared: bool) -> RaoBlackwellisedResult:
+    """Run the filter; ``shared``: all particles have the same covariance."""
+    ssm, rule, grid = problem.ssms[0], problem.rule, problem.grid
+    count = problem.initial_index.shape[0]
+    interval_maps = [make_interval_map(ssm, rule, grid) for ssm in problem.ssms]
+    equal = jnp.full(count, -np.log(count))
 
-    def row(particles: _Particles,
-            inputs: tuple[Intervals, jax.Array, jax.Array, jax.Array]) -> tuple[_Particles, tuple]:
-        one, observed, decide, row_key = inputs
-        read_key, resample_key = jax.random.split(row_key)
-        under = jax.tree_util.tree_map(lambda *parts: jnp.stack(parts), *(make(one) for make in maps))
-        own = _of_particles(under, particles.choice, settings.shared)
-        particles, log_likelihood = _observe(ssms[0], _move(particles, own, settings.shared), own, observed, settings)
-        kept = _summary(particles, own, settings.shared)
+    def step(particles: _Particles,
+             inputs: tuple[Intervals, jax.Array, jax.Array, jax.Array]) -> tuple[_Particles, tuple]:
+        interval, y_row, is_decision, row_key = inputs
+        reading_key, resampling_key = jax.random.split(row_key)
+        maps = jax.tree_util.tree_map(lambda *leaves: jnp.stack(leaves),
+                                      *(interval_map(interval) for interval_map in interval_maps))
+        maps = _select_maps(maps, particles.input_index, shared)
+        particles = _predict(particles, maps, shared)
+        particles, log_likelihood = _update(ssm, particles, maps, y_row, shared)
+        summary = _summarize(particles, maps, shared)
         particles = jax.lax.cond(
-            decide, lambda p: _decide(rule, p, own, one.end, read_key, settings.shared),
+            is_decision, lambda p: _decide(rule, p, maps, interval.end, reading_key, shared),
             lambda p: p, particles)
         weights = jnp.exp(particles.log_weights)
         ess = effective_sample_size(weights)
-        kept = (*kept, jnp.asarray(rule.values)[particles.choice], ess, log_likelihood)
-        needed = jnp.isfinite(observed).any() & (ess < settings.threshold * size)
-        ancestors = jax.lax.cond(needed, lambda: resample(resample_key, weights, settings.resampling),
-                                 lambda: jnp.arange(size))
-        covariance = particles.covariance if settings.shared else particles.covariance[ancestors]
-        return _Particles(particles.mean[ancestors], covariance, particles.choice[ancestors],
-                          jnp.where(needed, equal, particles.log_weights)), kept
+        summary = (*summary, jnp.asarray(rule.values)[particles.input_index], ess, log_likelihood)
+        is_resampled = jnp.isfinite(y_row).any() & (ess < threshold * count)
+        ancestors = jax.lax.cond(is_resampled, lambda: resample(resampling_key, weights, resampling),
+                                 lambda: jnp.arange(count))
+        covariance = particles.covariance if shared else particles.covariance[ancestors]
+        return _Particles(particles.mean[ancestors], covariance, particles.input_index[ancestors],
+                          jnp.where(is_resampled, equal, particles.log_weights)), summary
 
-    covariance = begin.covariance
-    first = _Particles(jnp.broadcast_to(begin.mean, (size, *begin.mean.shape)),
-                       covariance if settings.shared else jnp.broadcast_to(covariance, (size, *covariance.shape)),
-                       initial, equal)
-    keys = jax.random.split(key, decides.shape[0])
-    _, kept = jax.lax.scan(row, first, (*with_observations(grid.intervals, y), decides, keys))
-    at = tuple(part[jnp.asarray(grid.observed)] for part in kept)
-    mean, covariance, middle, variance, noise, log_weights, inputs, ess, log_likelihood = at
-    return RaoBlackwellisedResult(times, log_likelihood, mean, covariance, Mixture(middle, variance, log_weights),
-                                  Mixture(middle, variance + noise, log_weights), inputs, ess)
-
-
-def _of_particles(under: SwitchedMap, choice: jax.Array, shared: bool) -> SwitchedMap:
-    """Return the map of each particle; matrices that all share stay one matrix."""
-    own = jax.tree_util.tree_map(lambda part: part[0] if shared else part[choice], under)
-    return own._replace(offset=under.offset[choice], shift=under.shift[choice], read_shift=under.read_shift[choice])
+    mean, covariance = problem.start.mean, problem.start.covariance
+    first = _Particles(jnp.broadcast_to(mean, (count, *mean.shape)),
+                       covariance if shared else jnp.broadcast_to(covariance, (count, *covariance.shape)),
+                       problem.initial_index, equal)
+    keys = jax.random.split(key, problem.is_decision.shape[0])
+    _, summaries = jax.lax.scan(step, first, (*with_observations(grid.intervals, y), problem.is_decision, keys))
+    mean, covariance, output, variance, noise, log_weights, inputs, ess, log_likelihood = (
+        summary[jnp.asarray(grid.observed)] for summary in summaries)
+    return RaoBlackwellisedResult(times, log_likelihood, mean, covariance, Mixture(output, variance, log_weights),
+                                  Mixture(output, variance + noise, log_weights), inputs, ess)
 
 
-def _move(particles: _Particles, own: SwitchedMap, shared: bool) -> _Particles:
-    move = lambda phi, p, q: congruence(phi, p) + q  # noqa: E731
-    covariance = (move if shared else jax.vmap(move))(own.phi, particles.covariance, own.noise)
-    return particles._replace(mean=_times(own.phi, particles.mean, shared) + own.offset, covariance=covariance)
+def _select_maps(maps: SwitchedMap, input_index: jax.Array, shared: bool) -> SwitchedMap:
+    """Return the map of each particle from the maps of all inputs; shared matrices stay one matrix."""
+    selected = jax.tree_util.tree_map(lambda leaf: leaf[0] if shared else leaf[input_index], maps)
+    return selected._replace(offset=maps.offset[input_index],
+                             observation_offset=maps.observation_offset[input_index],
+                             reading_offset=maps.reading_offset[input_index])
 
 
-def _observe(ssm: StateSpaceModel, particles: _Particles, own: SwitchedMap, observed: jax.Array,
-             settings: _Settings) -> tuple[_Particles, jax.Array]:
-    """Condition each particle on an observation, and weight it by that observation's density."""
-    at = None if settings.shared else 0
-    value = _times(own.jacobian, particles.mean, settings.shared) + own.shift
+def _predict(particles: _Particles, maps: SwitchedMap, shared: bool) -> _Particles:
+    """Predict the moments of each particle over the row."""
+    def predict_covariance(phi: jax.Array, covariance: jax.Array, process_cov: jax.Array) -> jax.Array:
+        return congruence(phi, covariance) + process_cov
 
-    def one(value: jax.Array, jacobian: jax.Array, noise: jax.Array, mean: jax.Array, covariance: jax.Array) -> Update:
-        return update(ssm, Linearised(value, jacobian, noise), observed, jnp.isfinite(observed),
-                      Moments(mean, covariance))
-
-    new = jax.vmap(one, (0, at, at, 0, at), Update(Moments(0, at), 0, 0, at, at, at, at))(  # type: ignore[arg-type]
-        value, own.jacobian, own.variance, particles.mean, particles.covariance)
-    log_weights, total = reweighted(particles.log_weights, new.log_likelihood, particles.log_weights)
-    seen = jnp.isfinite(observed).any()
-    return (particles._replace(mean=new.moments.mean, covariance=new.moments.covariance, log_weights=log_weights),
-            jnp.where(seen, jnp.where(jnp.isnan(total), -jnp.inf, total), 0.0))
+    covariance = (predict_covariance if shared else jax.vmap(predict_covariance))(
+        maps.phi, particles.covariance, maps.process_cov)
+    return particles._replace(mean=_matvec(maps.phi, particles.mean, shared) + maps.offset, covariance=covariance)
 
 
-def _decide(rule: SwitchingRule, particles: _Particles, own: SwitchedMap, t: jax.Array, key: jax.Array,
+def _update(ssm: StateSpaceModel, particles: _Particles, maps: SwitchedMap, y_row: jax.Array,
+            shared: bool) -> tuple[_Particles, jax.Array]:
+    """Condition each particle on an observation, and multiply its weight by the density of the observation.
+
+    Returns:
+        The particles, and the logarithm of the weighted mean density; zero without an observation.
+    """
+    axis = None if shared else 0
+    predicted = _matvec(maps.jacobian, particles.mean, shared) + maps.observation_offset
+
+    def update_particle(value: jax.Array, jacobian: jax.Array, obs_cov: jax.Array, mean: jax.Array,
+                        covariance: jax.Array) -> Update:
+        return update(ssm, Linearised(value, jacobian, obs_cov), y_row, jnp.isfinite(y_row), Moments(mean, covariance))
+
+    out_axes = Update(Moments(0, axis), 0, 0, axis, axis, axis, axis)  # type: ignore[arg-type]
+    updated = jax.vmap(update_particle, (0, axis, axis, 0, axis), out_axes)(
+        predicted, maps.jacobian, maps.obs_cov, particles.mean, particles.covariance)
+    log_weights, total = reweight(particles.log_weights, updated.log_likelihood, particles.log_weights)
+    is_observed = jnp.isfinite(y_row).any()
+    particles = particles._replace(mean=updated.moments.mean, covariance=updated.moments.covariance,
+                                   log_weights=log_weights)
+    return particles, jnp.where(is_observed, jnp.where(jnp.isnan(total), -jnp.inf, total), 0.0)
+
+
+def _decide(rule: SwitchingRule, particles: _Particles, maps: SwitchedMap, t: jax.Array, key: jax.Array,
             shared: bool) -> _Particles:
     """Draw the reading of each particle, condition the particle on it, and apply the rule."""
-    middle = _times(own.reads, particles.mean, shared) + own.read_shift
-    error = jnp.diag(rule.variance())
+    predicted = _matvec(maps.reading_jacobian, particles.mean, shared) + maps.reading_offset
+    reading_cov = jnp.diag(rule.variance())
 
-    def condition(reads: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        cross = matmul(covariance, reads.T)
-        innovation_cov = matmul(reads, cross) + error
-        gain = solve_semidefinite(innovation_cov, cross.T).T
-        kept = jnp.eye(covariance.shape[0]) - matmul(gain, reads)
-        return semidefinite_root(innovation_cov), gain, congruence(kept, covariance) + congruence(gain, error)
+    def condition(jacobian: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        cross_cov = matmul(covariance, jacobian.T)
+        innovation_cov = matmul(jacobian, cross_cov) + reading_cov
+        gain = solve_semidefinite(innovation_cov, cross_cov.T).T
+        # Joseph form: positive semi-definite in spite of rounding.
+        eye_minus_kh = jnp.eye(covariance.shape[0]) - matmul(gain, jacobian)
+        covariance = congruence(eye_minus_kh, covariance) + congruence(gain, reading_cov)
+        return semidefinite_root(innovation_cov), gain, covariance
 
-    root, gain, covariance = (condition if shared else jax.vmap(condition))(own.reads, particles.covariance)
-    away = _times(root, normals(key, middle.shape[1], middle.shape[0]).T, shared)
-    choice = jax.vmap(lambda d, r: rule.decide(d, r, t))(particles.choice, middle + away)
-    return particles._replace(mean=particles.mean + _times(gain, away, shared), covariance=covariance,
-                              choice=choice.astype(particles.choice.dtype))
+    root, gain, covariance = (condition if shared else jax.vmap(condition))(
+        maps.reading_jacobian, particles.covariance)
+    innovation = _matvec(root, normals(key, predicted.shape[1], predicted.shape[0]).T, shared)
+    input_index = jax.vmap(lambda d, r: rule.decide(d, r, t))(particles.input_index, predicted + innovation)
+    return particles._replace(mean=particles.mean + _matvec(gain, innovation, shared), covariance=covariance,
+                              input_index=input_index.astype(particles.input_index.dtype))
 
 
-def _summary(particles: _Particles, own: SwitchedMap, shared: bool) -> tuple[jax.Array, ...]:
-    """Return moments of the joint state, and the mixture of the outputs with its noise."""
-    mean, covariance, _, log_weights = particles
+def _summarize(particles: _Particles, maps: SwitchedMap, shared: bool) -> tuple[jax.Array, ...]:
+    """Return the moments of the joint state, and the mixture of the outputs.
+
+    Returns:
+        Mean (n,) and covariance (n, n) of the joint state; means, variances and noise variances (N, D) of the outputs,
+        variances (1, D) if shared; log weights (N,).
+    """
+    component_mean, component_cov, _, log_weights = particles
     weights = jnp.exp(log_weights)
-    whole = weights @ mean
-    centred = mean - whole
-    within = covariance if shared else jnp.tensordot(weights, covariance, 1)
-    innovation_cov = (congruence if shared else jax.vmap(congruence))(own.jacobian, covariance)
-    variance, noise = (jnp.diagonal(part, axis1=-2, axis2=-1) for part in (innovation_cov, own.variance))
+    mean = weights @ component_mean
+    centred = component_mean - mean
+    within = component_cov if shared else jnp.tensordot(weights, component_cov, 1)
+    output_cov = (congruence if shared else jax.vmap(congruence))(maps.jacobian, component_cov)
+    variance, noise = (jnp.diagonal(matrix, axis1=-2, axis2=-1) for matrix in (output_cov, maps.obs_cov))
     if shared:
         variance, noise = variance[None], noise[None]
-    return (whole, within + (centred * weights[:, None]).T @ centred,
-            _times(own.jacobian, mean, shared) + own.shift, variance, noise, log_weights)
+    output = _matvec(maps.jacobian, component_mean, shared) + maps.observation_offset
+    return mean, within + (centred * weights[:, None]).T @ centred, output, variance, noise, log_weights
 
 
-def _times(matrix: jax.Array, vectors: jax.Array, shared: bool) -> jax.Array:
-    """Return the product of one matrix, or one for each particle, with the particles' vectors (N, k)."""
+def _matvec(matrix: jax.Array, vectors: jax.Array, shared: bool) -> jax.Array:
+    """Return the products of the particles' vectors (N, k) with one shared matrix, or with one for each particle."""
     return vectors @ matrix.T if shared else jnp.einsum("nij,nj->ni", matrix, vectors)

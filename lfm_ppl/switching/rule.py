@@ -14,20 +14,21 @@ from lfm_ppl import checks
 
 
 class SwitchingRule(eqx.Module):
-    """The rule by which a discrete input changes: from its own value and a reading of the state.
+    """Rule by which a discrete input changes: a function of its value and a reading of the state.
 
         r_k = g(x(t_k), u(t_k), t_k) + N(0, diag(variance)),    d_k = decide(d_k-1, r_k, t_k),
 
-    at the times t_k of the decisions; in between the input keeps its value. A subclass says all four.
+    at the decision times t_k; the input is constant between them. A subclass defines ``values``, ``reading`` (the
+    function g), ``variance`` and ``decide``.
 
     Attributes:
-        values: the V values of the input; the rule speaks of them by their index.
+        values: the V values of the input; d_k is an index in them.
     """
 
     values: eqx.AbstractVar[tuple[float, ...]]
 
     def reading(self, x: jax.Array, u: jax.Array, t: Any) -> jax.Array:
-        """Return what the rule reads (p,), without its error."""
+        """Return the reading (p,) without its error."""
         raise NotImplementedError
 
     def variance(self) -> jax.Array:
@@ -35,27 +36,28 @@ class SwitchingRule(eqx.Module):
         raise NotImplementedError
 
     def decide(self, index: jax.Array, reading: jax.Array, t: Any) -> jax.Array:
-        """Return the index of the new value from that of the old one and a reading (p,)."""
+        """Return the index of the next value, given the index of the current one and a reading (p,)."""
         raise NotImplementedError
 
 
 class Thermostat(SwitchingRule):
-    """A heater that is on below the set point and off above it.
+    """Thermostat of a heater, which is on below the set point and off above it.
 
-        d_k = 1 where r_k < s(t_k) - b/2,    0 where r_k > s(t_k) + b/2,    d_k-1 in between,
+        d_k = 1 if r_k < s(t_k) - b/2,    0 if r_k > s(t_k) + b/2,    d_k-1 otherwise,
 
-    with the temperature r_k that the thermostat reads, the set point s and the width b of the hysteresis. Without
-    hysteresis the heater is on wherever the temperature is below the set point, as in the source.
+    with the measured temperature r_k, the set point s and the width b of the hysteresis. Without hysteresis the heater
+    is on whenever the temperature is below the set point, as in the source.
 
     Args:
         set_point: a number, or a function of time such as `lfm.Input`.
         hysteresis: b >= 0, in the unit of the reading.
-        sensor: ``sensor(x, u, t)`` -> the temperature that is read, a number linear in x and u; None: the first state.
-        sensor_sd: standard deviation of the sensor's error; >= 0.
+        sensor: ``sensor(x, u, t)`` -> the measured temperature, a scalar that is linear in x and u; None: the first
+            state.
+        sensor_sd: standard deviation of the sensor's error, >= 0.
 
     Raises:
-        ValueError: there is no set point, or it is not finite; a negative hysteresis or sensor_sd.
-        TypeError: the set point is neither a number nor a function; an array of widths or errors.
+        ValueError: a missing or non-finite set point; a negative hysteresis or sensor_sd.
+        TypeError: the set point is neither a number nor a function; hysteresis or sensor_sd is an array.
 
     Example:
         >>> import jax.numpy as jnp, lfm_ppl as lfm
@@ -77,8 +79,8 @@ class Thermostat(SwitchingRule):
                  sensor_sd: Any = 0.0):
         if set_point is None or (not callable(set_point) and np.size(set_point) == 0):
             raise ValueError("a thermostat needs a set point, got none: give a temperature, or a function of time such "
-                             "as lfm.Input(times, set_points). A house whose set points nobody recorded is predicted "
-                             "with its heating as a known input, lfm.Input(times, power).")
+                             "as lfm.Input(times, set_points). For a house without recorded set points, use the "
+                             "heating power as a known input, lfm.Input(times, power).")
         if not callable(set_point):
             if np.ndim(set_point):
                 raise TypeError("set_point must be one number or a function of time, got an array of shape "
@@ -87,12 +89,12 @@ class Thermostat(SwitchingRule):
             set_point = jnp.asarray(set_point, float)
         self.set_point = set_point
         for name, value in (("hysteresis", hysteresis), ("sensor_sd", sensor_sd)):
-            known = checks.concrete(value)
+            concrete = checks.concrete(value)
             checks.finite(name, value)
             if np.ndim(value):
                 raise TypeError(f"{name} must be one number, got an array of shape {np.shape(value)}.")
-            if known is not None and np.any(known < 0):
-                raise ValueError(f"{name} must not be negative, got {float(known):g}.")
+            if concrete is not None and np.any(concrete < 0):
+                raise ValueError(f"{name} must not be negative, got {float(concrete):g}.")
         self.hysteresis, self.sensor_sd = jnp.asarray(hysteresis, float), jnp.asarray(sensor_sd, float)
         self.sensor = sensor
         self.values = (0.0, 1.0)
@@ -102,7 +104,7 @@ class Thermostat(SwitchingRule):
         return self.set_point(t) if callable(self.set_point) else self.set_point
 
     def reading(self, x: jax.Array, u: jax.Array, t: Any) -> jax.Array:
-        """Return the temperature (1,) that is read."""
+        """Return the measured temperature (1,) without its error."""
         return x[:1] if self.sensor is None else jnp.reshape(self.sensor(x, u, t), (1,))
 
     def variance(self) -> jax.Array:
@@ -111,7 +113,7 @@ class Thermostat(SwitchingRule):
 
     def decide(self, index: jax.Array, reading: jax.Array, t: Any) -> jax.Array:
         """Return 1 for on, 0 for off."""
-        above = reading[0] - self.set_point_at(t)
-        # At the set point itself a heater without hysteresis is off.
-        inside = (self.hysteresis > 0) & (jnp.abs(above) <= 0.5 * self.hysteresis)
-        return jnp.where(inside, index, (above < 0).astype(jnp.result_type(index)))
+        excess = reading[0] - self.set_point_at(t)
+        # Exactly at the set point a heater without hysteresis is off.
+        is_in_band = (self.hysteresis > 0) & (jnp.abs(excess) <= 0.5 * self.hysteresis)
+        return jnp.where(is_in_band, index, (excess < 0).astype(jnp.result_type(index)))

@@ -1,10 +1,20 @@
-"""A latent force model under each value of a discrete input, and the affine maps that it then is."""
+"""A latent force model for each value of a discrete input, and the affine maps of linear ones.
+
+1. `build_models`: one state-space model for each value of the input; only coefficients may differ between them.
+2. `decision_grid`: rows of the scan between observations and decisions, and which rows end with a decision.
+3. `initial_moments`, `initial_indices`: state and input at the start.
+4. `make_interval_map`: for linear models, the map s -> Phi s + offset + N(0, Q) over a row, and the affine functions
+   that give observation and reading at its end.
+5. `is_input_additive`: whether the input only adds to dynamics and outputs. Then Phi, Q and all covariances are equal
+   for all values of the input, and particles share them.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,68 +31,90 @@ from lfm_ppl.model.structure import pattern
 from lfm_ppl.switching.rule import SwitchingRule
 
 Build = Callable[[Any], LatentForceModel]
+"""Function from a value of the discrete input to the model that holds while the input has this value."""
+
+
+class SwitchedProblem(eqx.Module):
+    """Models, rule, time grid and initial values of a filter or a simulation.
+
+    Attributes:
+        ssms: the model for each value of the input.
+        rule: the rule of the input.
+        grid: the time grid.
+        is_decision: (K,), whether a row ends with a decision.
+        start: moments of the joint state at the initial time.
+        initial_index: (N,), index of the input of each particle at the initial time.
+    """
+
+    ssms: tuple[StateSpaceModel, ...]
+    rule: SwitchingRule
+    grid: TimeGrid
+    is_decision: jax.Array
+    start: Moments
+    initial_index: jax.Array
 
 
 class SwitchedMap(NamedTuple):
-    """A row under one value of the input: s -> phi s + offset + N(0, noise), and what is seen and read at its end.
+    """Affine maps of one row for one value of the input.
 
     Attributes:
-        phi, offset, noise: (n, n), (n,), (n, n).
-        jacobian, shift, variance: (D, n), (D,), (D, D) of the observation, y = jacobian s + shift + N(0, variance).
-        reads, read_shift: (p, n), (p,) of the reading of the rule, without its error.
+        phi, offset, process_cov: (n, n), (n,), (n, n), of the transition s -> phi s + offset + N(0, process_cov).
+        jacobian, observation_offset, obs_cov: (D, n), (D,), (D, D), of the observation at the end of the row,
+            y = jacobian s + observation_offset + N(0, obs_cov).
+        reading_jacobian, reading_offset: (p, n), (p,), of the rule's reading without its error.
     """
 
     phi: jax.Array
     offset: jax.Array
-    noise: jax.Array
+    process_cov: jax.Array
     jacobian: jax.Array
-    shift: jax.Array
-    variance: jax.Array
-    reads: jax.Array
-    read_shift: jax.Array
+    observation_offset: jax.Array
+    obs_cov: jax.Array
+    reading_jacobian: jax.Array
+    reading_offset: jax.Array
 
 
-def switched(build: Build, rule: SwitchingRule) -> tuple[StateSpaceModel, ...]:
-    """Return the model under each value of the input.
+def build_models(build: Build, rule: SwitchingRule) -> tuple[StateSpaceModel, ...]:
+    """Return the model for each value of the input.
 
     Raises:
-        TypeError: ``rule`` is no rule.
-        ValueError: the input changes what states, outputs or jumps there are, or the initial state.
+        TypeError: ``rule`` is not a rule.
+        ValueError: the models differ in their states, outputs, jump times or initial state.
     """
     if not isinstance(rule, SwitchingRule):
         raise TypeError(f"rule must be an lfm.SwitchingRule such as lfm.Thermostat(20.0), got {type(rule).__name__}.")
     ssms = tuple(state_space(build(value)) for value in rule.values)
-    kinds = [(ssm.model.state_names, ssm.model.force_names, ssm.model.output_names, ssm.state_dim,
-              ssm.stack.jump_times) for ssm in ssms]
-    for value, kind in zip(rule.values, kinds, strict=True):
-        if kind != kinds[0]:
+    structures = [(ssm.model.state_names, ssm.model.force_names, ssm.model.output_names, ssm.state_dim,
+                   ssm.stack.jump_times) for ssm in ssms]
+    for value, structure in zip(rule.values, structures, strict=True):
+        if structure != structures[0]:
             raise ValueError(f"build({value:g}) has other states, outputs or jump times than build({rule.values[0]:g});"
                              " the discrete input may change coefficients only.")
-    starts = [[checks.concrete(part) for part in (*ssm.initial(), ssm.model.initial_time)] for ssm in ssms]
+    starts = [[checks.concrete(entry) for entry in (*ssm.initial(), ssm.model.initial_time)] for ssm in ssms]
     for value, start in zip(rule.values, starts, strict=True):
         pairs = zip(start, starts[0], strict=True)
         if any(a is not None and b is not None and not np.array_equal(a, b) for a, b in pairs):
-            raise ValueError(f"build({value:g}) has another initial state or time than build({rule.values[0]:g}); what "
-                             "the input does begins there, so both must be alike.")
+            raise ValueError(f"build({value:g}) has another initial state or time than build({rule.values[0]:g}); the "
+                             "input acts from the initial time on, so both models must start alike.")
     return ssms
 
 
 def decision_grid(ssm: StateSpaceModel, times: Any, decisions: Any, start: FilterState | None, steps: int,
                   max_step: float | None) -> tuple[TimeGrid, np.ndarray]:
-    """Return the rows, and which of them (K,) end with a decision."""
+    """Return the time grid, and whether each of its K rows ends with a decision, (K,)."""
     grid = build_time_grid(ssm, times, steps, max_step, at=times if decisions is None else decisions,
                            initial_time=None if start is None else start.time)
     if checks.traced(grid.since):
         raise ValueError("a known input is read at t minus a traced value (a lag), but decisions need intervals that "
                          "are known before compilation; give the lag as a number.")
-    decides = np.zeros(len(np.asarray(grid.intervals.observation)), bool)
-    decides[grid.requested] = True
+    is_decision = np.zeros(len(np.asarray(grid.intervals.observation)), bool)
+    is_decision[grid.requested] = True
     ssm.model.check_at(grid.initial_time, len(grid.observed))
-    return grid, decides
+    return grid, is_decision
 
 
-def first_moments(ssm: StateSpaceModel, start: FilterState | None) -> Moments:
-    """Return the moments at the start, the model's own or those of a filter's state."""
+def initial_moments(ssm: StateSpaceModel, start: FilterState | None) -> Moments:
+    """Return the moments of the joint state at the start: of ``start`` if given, else of the model."""
     if start is None:
         return Moments(*ssm.initial())
     if np.shape(start.mean) != (ssm.state_dim,):
@@ -91,14 +123,14 @@ def first_moments(ssm: StateSpaceModel, start: FilterState | None) -> Moments:
     return Moments(start.mean, start.covariance)
 
 
-def check_initial(initial: Any, rule: SwitchingRule, particles: int) -> jax.Array:
-    """Return the index of the input at the start, (N,), after checking it."""
+def initial_indices(initial: Any, rule: SwitchingRule, particles: int) -> jax.Array:
+    """Check the index of the input at the start, one or one for each particle, and return it as (N,)."""
     if np.shape(initial) not in ((), (particles,)):
         raise ValueError(f"initial must be one index or one for each of the {particles} particles, got shape "
                          f"{np.shape(initial)}.")
-    known = checks.concrete(initial)
+    index = checks.concrete(initial)
     last = len(rule.values) - 1
-    if known is not None and (known.dtype.kind not in "biu" or np.any((known < 0) | (known > last))):
+    if index is not None and (index.dtype.kind not in "biu" or np.any((index < 0) | (index > last))):
         raise ValueError(f"initial must be an index in rule.values = {rule.values}, 0 to {last}, got {initial!r}.")
     return jnp.broadcast_to(jnp.asarray(initial, int), (particles,))
 
@@ -107,50 +139,56 @@ def check_linear(ssm: StateSpaceModel, rule: SwitchingRule) -> None:
     """Raise ValueError unless model and reading are linear in states and forces."""
     require_gaussian(ssm, "the Rao-Blackwellised particle filter", "lfm.particle_filter")
     names = (*ssm.model.state_names, *ssm.model.force_names)
-    for what, structure in (("dynamics", ssm.drift_structure), ("observation", ssm.observation_structure)):
+    for label, structure in (("dynamics", ssm.drift_structure), ("observation", ssm.observation_structure)):
         if structure.points:
-            raise ValueError(f"the {what} is not linear in {names[structure.points[0]]!r}, so that the state is not "
+            raise ValueError(f"the {label} is not linear in {names[structure.points[0]]!r}, so that the state is not "
                              "Gaussian given the discrete input. Use lfm.simulate_switched, which draws whole states.")
-    total = len(names)
-    curved = pattern(lambda v: rule.reading(*ssm.split(v[:total]), v[total]), total + 1).hessian[:total, :total]
-    if curved.any():
-        raise ValueError(f"what the rule reads is not linear in {names[int(np.argmax(curved.any(axis=1)))]!r}. Use "
-                         "lfm.simulate_switched, which draws whole states.")
+    size = len(names)
+    hessian = pattern(lambda v: rule.reading(*ssm.split(v[:size]), v[size]), size + 1).hessian[:size, :size]
+    if hessian.any():
+        raise ValueError(f"the reading of the rule is not linear in {names[int(np.argmax(hessian.any(axis=1)))]!r}. "
+                         "Use lfm.simulate_switched, which draws whole states.")
 
 
-def only_adds(build: Build) -> bool:
+def is_input_additive(build: Build) -> bool:
     """Return whether the input only adds to dynamics and outputs, so that no covariance depends on it."""
 
     def coefficients(v: jax.Array) -> jax.Array:
         ssm, t = state_space(build(v[0])), v[1]
         w, stack = jnp.zeros(ssm.input_dim), ssm.stack
-        parts = [jax.jacfwd(lambda w: ssm.drift(w, t))(w), jax.jacfwd(lambda w: ssm.observe(w, t))(w),
-                 ssm.obs_cov(w, t, 0), ssm.dispersion(w, t), stack.feedback(), stack.dispersion(),
-                 stack.measurement(t), *(part for index in range(len(stack.jump_times)) for part in stack.jump(index))]
-        return jnp.concatenate([jnp.ravel(part) for part in parts if part is not None])
+        matrices = [jax.jacfwd(lambda w: ssm.drift(w, t))(w), jax.jacfwd(lambda w: ssm.observe(w, t))(w),
+                    ssm.obs_cov(w, t, 0), ssm.dispersion(w, t), stack.feedback(), stack.dispersion(),
+                    stack.measurement(t),
+                    *(matrix for index in range(len(stack.jump_times)) for matrix in stack.jump(index))]
+        return jnp.concatenate([jnp.ravel(matrix) for matrix in matrices if matrix is not None])
 
     try:
         return not pattern(coefficients, 2).jacobian[:, 0].any()
     except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError,
             jax.errors.TracerIntegerConversionError, TypeError):
-        return False  # build asks in Python for the value of the input: it may do anything
+        return False  # build branches in Python on the value of the input, so that anything may depend on it
 
 
-def interval_maps(ssm: StateSpaceModel, rule: SwitchingRule, grid: TimeGrid) -> Callable[[Intervals], SwitchedMap]:
-    """Return what makes the affine maps of a row, for a model that is linear; traceable."""
-    total = ssm.state_dim
-    nothing = Moments(jnp.zeros(total), jnp.zeros((total, total)))
+def make_interval_map(ssm: StateSpaceModel, rule: SwitchingRule,
+                      grid: TimeGrid) -> Callable[[Intervals], SwitchedMap]:
+    """Return a traceable function from a row to the affine maps of a linear model."""
+    size = ssm.state_dim
+    origin = Moments(jnp.zeros(size), jnp.zeros((size, size)))
     prepared = preparation(ssm, Taylor(), grid)
 
-    def make(row: Intervals) -> SwitchedMap:
-        # From a state that is zero and known, the mean at the end is the offset.
-        one = predict(ssm, Taylor(), grid, prepared, row, nothing, with_map=True)
-        end = row.end
-        observe = lambda s: ssm.observe(ssm.inputs(s, end), end)  # noqa: E731
-        read = lambda s: rule.reading(*ssm.split(ssm.inputs(s, end)), end)  # noqa: E731
-        zero = nothing.mean
-        variance = ssm.obs_cov(ssm.inputs(zero, end), end, jnp.maximum(row.observation, 0))
-        return SwitchedMap(one.phi, one.moments.mean, one.process_cov, jax.jacfwd(observe)(zero), observe(zero),
-                           variance, jax.jacfwd(read)(zero), read(zero))
+    def interval_map(interval: Intervals) -> SwitchedMap:
+        # The predicted mean is the offset, because the prediction starts from the known state zero.
+        prediction = predict(ssm, Taylor(), grid, prepared, interval, origin, with_map=True)
+        end, zero = interval.end, origin.mean
 
-    return make
+        def observe(s: jax.Array) -> jax.Array:
+            return ssm.observe(ssm.inputs(s, end), end)
+
+        def read(s: jax.Array) -> jax.Array:
+            return rule.reading(*ssm.split(ssm.inputs(s, end)), end)
+
+        obs_cov = ssm.obs_cov(ssm.inputs(zero, end), end, jnp.maximum(interval.observation, 0))
+        return SwitchedMap(prediction.phi, prediction.moments.mean, prediction.process_cov,
+                           jax.jacfwd(observe)(zero), observe(zero), obs_cov, jax.jacfwd(read)(zero), read(zero))
+
+    return interval_map

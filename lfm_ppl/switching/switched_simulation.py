@@ -1,8 +1,8 @@
-"""Simulation of models with a discrete input that follows a known rule: particles that draw the whole state."""
+"""Simulation of models with a discrete input that follows a known rule."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,22 +10,27 @@ import jax.numpy as jnp
 
 from lfm_ppl import checks
 from lfm_ppl.filtering.filter import FilterState
-from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.filtering.time_grid import Intervals, TimeGrid, as_arrays
+from lfm_ppl.filtering.time_grid import Intervals, as_arrays
 from lfm_ppl.linalg import semidefinite_root
 from lfm_ppl.model.observation_noise import noisy_observation
-from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.particles.normals import normals
-from lfm_ppl.particles.stochastic_steps import Moves, choose_scheme, first_particles
+from lfm_ppl.particles.stochastic_steps import ParticleTransition, choose_scheme, initial_particles
 from lfm_ppl.switching.rule import SwitchingRule
-from lfm_ppl.switching.switched_model import Build, check_initial, decision_grid, first_moments, switched
+from lfm_ppl.switching.switched_model import (
+    Build,
+    SwitchedProblem,
+    build_models,
+    decision_grid,
+    initial_indices,
+    initial_moments,
+)
 
 
-class SwitchedSimulation(NamedTuple):
+class SwitchedSimulation(eqx.Module):
     """Paths of a model with a discrete input.
 
     Attributes:
-        times: (T,).
+        times: (T,), times of the observations.
         state: (T, N, M), the physical state.
         forces: name -> (T, N).
         inputs: (T, N), values of the discrete input after each time.
@@ -42,30 +47,30 @@ class SwitchedSimulation(NamedTuple):
 def simulate_switched(key: jax.Array, build: Build, rule: SwitchingRule, times: Any, *, paths: int = 1,
                       start: FilterState | None = None, initial: Any = 0, decisions: Any = None, steps: int = 10,
                       max_step: float | None = None, scheme: str = "auto") -> SwitchedSimulation:
-    """Draw whole paths of a latent force model with a discrete input that follows a known rule.
+    """Draw paths of a latent force model with a discrete input that follows a known rule.
 
-    Averages over many paths are a plain particle prediction, of which `lfm_ppl.rao_blackwellised` is the version with
-    less variance for linear models. The model may be non-linear here. Each call outside ``jax.jit`` compiles anew,
-    since ``build`` makes new functions: compile what is called repeatedly.
+    The model may be non-linear. For linear models, the averages of `lfm_ppl.rao_blackwellised` have less variance than
+    averages over paths. Outside of ``jax.jit`` each call compiles, because ``build`` returns new functions: put
+    repeated calls under ``jax.jit``.
 
     Args:
         key: a JAX random key.
-        build: from a value of the input to the `LatentForceModel` that holds while it has that value.
-        rule: of the input, such as `lfm.Thermostat`.
+        build: function from a value of the input to the `LatentForceModel` that holds while the input has this value.
+        rule: rule of the input, such as `lfm.Thermostat`.
         times: (T,), non-decreasing.
-        paths: N.
-        start: the ``state`` of a filter's result, to go on from there; None: the model's initial state.
+        paths: number of paths N.
+        start: the ``state`` of a filter's result, from which to continue; None: the model's initial state.
         initial: index in ``rule.values`` of the input at the start, or (N,), one for each path.
         decisions: times at which the rule is applied; None: ``times``.
         steps: integration steps between two consecutive times.
-        max_step: longest step; longer intervals get more.
-        scheme: of the steps, as in `lfm_ppl.particle_filter`.
+        max_step: longest step; a longer interval gets more steps.
+        scheme: integration scheme, as in `lfm_ppl.particle_filter`.
 
     Returns:
         States, forces, inputs and observations at ``times``.
 
     Raises:
-        ValueError, TypeError: as `lfm_ppl.rao_blackwellised`, but for models that are not linear.
+        ValueError, TypeError: as `lfm_ppl.rao_blackwellised`; non-linear models are allowed.
 
     Example:
         >>> import jax, jax.numpy as jnp, lfm_ppl as lfm
@@ -79,53 +84,57 @@ def simulate_switched(key: jax.Array, build: Build, rule: SwitchingRule, times: 
     """
     checks.random_key(key)
     checks.positive_integer("paths", paths)
-    ssms = switched(build, rule)
+    ssms = build_models(build, rule)
     schemes = tuple(choose_scheme(ssm, scheme) for ssm in ssms)
-    grid, decides = decision_grid(ssms[0], times, decisions, start, steps, max_step)
-    return _run(ssms, schemes, rule, grid, jnp.asarray(decides), jnp.asarray(times, float),
-                first_moments(ssms[0], start), check_initial(initial, rule, paths), key)
+    grid, is_decision = decision_grid(ssms[0], times, decisions, start, steps, max_step)
+    problem = SwitchedProblem(ssms, rule, grid, jnp.asarray(is_decision), initial_moments(ssms[0], start),
+                              initial_indices(initial, rule, paths))
+    return _simulate(problem, schemes, jnp.asarray(times, float), key)
 
 
 @eqx.filter_jit
-def _run(ssms: tuple[StateSpaceModel, ...], schemes: tuple[str, ...], rule: SwitchingRule, grid: TimeGrid,
-         decides: jax.Array, times: jax.Array, begin: Moments, initial: jax.Array,
-         key: jax.Array) -> SwitchedSimulation:
-    ssm, paths = ssms[0], initial.shape[0]
-    size = ssm.physical_dim
-    first_key, rows_key, noise_key = jax.random.split(key, 3)
-    first = first_particles(first_key, *begin, paths)
-    error = semidefinite_root(jnp.diag(rule.variance()))
-    moves = [Moves.over(own, scheme, grid) for own, scheme in zip(ssms, schemes, strict=True)]
+def _simulate(problem: SwitchedProblem, schemes: tuple[str, ...], times: jax.Array,
+              key: jax.Array) -> SwitchedSimulation:
+    """Simulate all paths; ``schemes`` are the integration schemes of the models."""
+    ssms, rule, grid = problem.ssms, problem.rule, problem.grid
+    paths, size = problem.initial_index.shape[0], ssms[0].physical_dim
+    initial_key, rows_key, noise_key = jax.random.split(key, 3)
+    initial_state = initial_particles(initial_key, problem.start.mean, problem.start.covariance, paths)
+    reading_root = semidefinite_root(jnp.diag(rule.variance()))
+    transitions = [ParticleTransition(ssm, scheme, grid) for ssm, scheme in zip(ssms, schemes, strict=True)]
 
-    def row(carry: tuple[jax.Array, jax.Array], inputs: tuple[Intervals, jax.Array, jax.Array]) -> tuple[tuple, tuple]:
+    def step(carry: tuple[jax.Array, jax.Array], inputs: tuple[Intervals, jax.Array, jax.Array]) -> tuple[tuple, tuple]:
         state, index = carry
-        one, decide, row_key = inputs
-        move_key, jump_key, read_key = jax.random.split(row_key, 3)
-        end = one.end
-        moved = [move.across(one, move.ready(one), move_key, jump_key, state) for move in moves]
-        state = jnp.take_along_axis(jnp.stack(moved), index[None, None, :], axis=0)[0]
-        before = index
+        interval, is_decision, row_key = inputs
+        move_key, jump_key, reading_key = jax.random.split(row_key, 3)
+        end = interval.end
+        # All models move all paths, with the same random numbers; each path takes the result for its input.
+        next_states = [transition.move(interval, transition.step_constants(interval), move_key, jump_key, state)
+                       for transition in transitions]
+        state = jnp.take_along_axis(jnp.stack(next_states), index[None, None, :], axis=0)[0]
 
-        def reading(s: jax.Array, index: jax.Array) -> jax.Array:
-            return jnp.stack([rule.reading(*own.split(own.inputs(s, end)), end) for own in ssms])[index]
+        def reading_of(s: jax.Array, index: jax.Array) -> jax.Array:
+            return jnp.stack([rule.reading(*ssm.split(ssm.inputs(s, end)), end) for ssm in ssms])[index]
 
-        read = jax.vmap(reading, in_axes=(1, 0))(state, index)
-        read = read + normals(read_key, read.shape[1], paths).T @ error.T
-        chosen = jax.vmap(lambda d, r: rule.decide(d, r, end))(index, read).astype(index.dtype)
-        index = jnp.where(decide, chosen, index)
-        return (state, index), (state, before, index)
+        reading = jax.vmap(reading_of, in_axes=(1, 0))(state, index)
+        reading = reading + normals(reading_key, reading.shape[1], paths).T @ reading_root.T
+        decision = jax.vmap(lambda d, r: rule.decide(d, r, end))(index, reading).astype(index.dtype)
+        next_index = jnp.where(is_decision, decision, index)
+        return (state, next_index), (state, index, next_index)
 
     rows = as_arrays(grid.intervals)
-    keys = jax.random.split(rows_key, decides.shape[0])
-    _, kept = jax.lax.scan(row, (first, initial), (rows, decides, keys))
-    states, before, indices = (part[jnp.asarray(grid.observed)] for part in kept)
+    keys = jax.random.split(rows_key, problem.is_decision.shape[0])
+    _, row_results = jax.lax.scan(step, (initial_state, problem.initial_index), (rows, problem.is_decision, keys))
+    states, observed_indices, next_indices = (result[jnp.asarray(grid.observed)] for result in row_results)
 
     def observe(s: jax.Array, t: jax.Array, index: jax.Array, key: jax.Array, row: jax.Array) -> tuple:
-        inputs = [own.inputs(s, t) for own in ssms]
-        y = [noisy_observation(own, w, t, key, row) for own, w in zip(ssms, inputs, strict=True)]
+        inputs = [ssm.inputs(s, t) for ssm in ssms]
+        y = [noisy_observation(ssm, w, t, key, row) for ssm, w in zip(ssms, inputs, strict=True)]
         return jnp.stack(inputs)[index], jnp.stack(y)[index]
 
     keys = jax.random.split(noise_key, (times.shape[0], paths))
-    w, y = jax.vmap(jax.vmap(observe, (1, None, 0, 0, None)))(states, times, before, keys, jnp.arange(times.shape[0]))
-    forces = {name: w[:, :, size + number] for number, name in enumerate(ssm.model.force_names)}
-    return SwitchedSimulation(times, w[:, :, :size], forces, jnp.asarray(rule.values)[indices], y)
+    # Observations precede the decision at the same time, and depend on the input before it.
+    w, y = jax.vmap(jax.vmap(observe, (1, None, 0, 0, None)))(states, times, observed_indices, keys,
+                                                             jnp.arange(times.shape[0]))
+    forces = {name: w[:, :, size + number] for number, name in enumerate(ssms[0].model.force_names)}
+    return SwitchedSimulation(times, w[:, :, :size], forces, jnp.asarray(rule.values)[next_indices], y)

@@ -70,10 +70,10 @@ def test_data_are_simulated_from_the_constrained_prior():
 
 @pytest.mark.slow
 def test_nuts_is_calibrated_over_100_data_sets(tmp_path):
-    found = calibration.calibrate(jax.random.key(5), transcription, TIMES, NUTS, data_sets=100, draws=15, thin=3,
-                                  warmup=100, batch=1, folder=tmp_path)
-    assert set(found.ranks) == {"lengthscale", "decay", "log likelihood"}
-    values = {name: calibration.p_values(rank, found.draws, bins=8) for name, rank in found.ranks.items()}
+    result = calibration.calibrate(jax.random.key(5), transcription, TIMES, NUTS, data_sets=100, draws=15, thin=3,
+                                   warmup=100, batch=1, folder=tmp_path)
+    assert set(result.ranks) == {"lengthscale", "decay", "log likelihood"}
+    values = {name: calibration.p_values(rank, result.draws, bins=8) for name, rank in result.ranks.items()}
     print(values)
     assert min(min(pair.values()) for pair in values.values()) > 0.001, values
 
@@ -91,7 +91,7 @@ def test_bands_cover_forces_of_the_constrained_prior():
                                               grid=TIMES).interval("factor")
         return (path[:, 2] >= low) & (path[:, 2] <= high)
 
-    inside = np.asarray(jax.lax.map(covered, jax.random.split(jax.random.key(1), 400)))
-    print(inside.mean(axis=0))
+    is_covered = np.asarray(jax.lax.map(covered, jax.random.split(jax.random.key(1), 400)))
+    print(is_covered.mean(axis=0))
     error = 3.0 * np.sqrt(0.95 * 0.05 / 400)
-    assert abs(inside.mean() - 0.95) < error and inside.mean(axis=0).min() > 0.95 - error
+    assert abs(is_covered.mean() - 0.95) < error and is_covered.mean(axis=0).min() > 0.95 - error

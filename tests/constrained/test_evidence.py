@@ -62,10 +62,10 @@ CASES = {
 def evidence(case, draws):
     count, span, lower, upper = CASES[case]
     times, y = data(count, span)
-    ends = [np.array([bounds.get(name, none) for name in ("x", "factor")])
-            for bounds, none in ((lower, -np.inf), (upper, np.inf))]
-    found = lfm.MarginalLikelihood(model(), times, lower=lower, upper=upper, grid=times, draws=draws)
-    return float(jax.jit(found.log_prob)(y)), reference(times, y, *ends)
+    bounds_by_side = [np.array([bounds.get(name, none) for name in ("x", "factor")])
+                      for bounds, none in ((lower, -np.inf), (upper, np.inf))]
+    likelihood = lfm.MarginalLikelihood(model(), times, lower=lower, upper=upper, grid=times, draws=draws)
+    return float(jax.jit(likelihood.log_prob)(y)), reference(times, y, *bounds_by_side)
 
 
 @pytest.mark.parametrize("case", [
@@ -112,10 +112,10 @@ def test_nothing_observed_has_probability_one():
 def test_the_derivative_is_that_of_differences():
     """Sites are held fixed in it; the random numbers' part of their dependence is all that is left out."""
     log_prob, y = small()
-    found = jax.jit(jax.grad(log_prob, argnums=(1, 2)))(y, 0.8, 0.1)
+    gradient = jax.jit(jax.grad(log_prob, argnums=(1, 2)))(y, 0.8, 0.1)
     for index, step in enumerate(np.eye(2) * 1e-4):
         difference = (log_prob(y, 0.8 + step[0], 0.1 + step[1]) - log_prob(y, 0.8 - step[0], 0.1 - step[1])) / 2e-4
-        np.testing.assert_allclose(found[index], difference, rtol=0.02, atol=0.02)
+        np.testing.assert_allclose(gradient[index], difference, rtol=0.02, atol=0.02)
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ from systems import Linear, whole_state
 
 import lfm_ppl as lfm
 from lfm_ppl.cli import main
-from lfm_ppl.constrained.augmented import COARSE, rows
+from lfm_ppl.constrained.augmented import COARSE, build_rows
 from lfm_ppl.inference.site_failures import failures_at, paths_worth
 from lfm_ppl.results import arviz_data, convergence, tables
 
@@ -38,8 +38,8 @@ def bounded(times, y=None, draws=32, grid=None):
 
 
 def held(times, grid=None, **more):
-    found = rows(system(), times, grid, **more)
-    return found.times[found.grid]
+    rows = build_rows(system(), times, grid, **more)
+    return rows.times[rows.grid]
 
 
 def test_where_constraints_hold():
@@ -52,7 +52,7 @@ def test_where_constraints_hold():
     np.testing.assert_allclose(held(few, 7), np.linspace(0.0, 3.0, 7))
     # A row at equal distances that rounding puts beside an observation is at its time.
     tenths = np.arange(31) * 0.1
-    assert len(rows(system(), tenths, 31).times) == 31
+    assert len(build_rows(system(), tenths, 31).times) == 31
     assert len(held(few[:1], 5)) == 1
 
 
@@ -75,8 +75,8 @@ def test_what_a_result_under_constraints_says(sampler):
     assert "the 256 weighted trajectories" in weights
     assert "worth 3 at half of the draws, and 1.2 at the worst" in weights
     assert "off by about 0.6" in weights and "draws of lfm.MarginalLikelihood" in weights
-    for said in tables.annotated(arviz_data.summary(bad), bad)["warnings"]:
-        assert sites in said and weights in said
+    for warning in tables.annotated(arviz_data.summary(bad), bad)["warnings"]:
+        assert sites in warning and weights in warning
     (few,) = arviz_data.convergence_warnings(result(**base, constraint_weights="[2, 2.0, 2.0]"))
     assert "off by more than so few can tell" in few
     (nothing,) = arviz_data.convergence_warnings(result(**base, constraint_weights="[256, 0.0, 0.0]"))
@@ -87,11 +87,11 @@ def test_the_error_of_an_evidence_is_that_of_its_logarithm_over_many_sets_of_wei
     """Of 32 log-normal weights, 5,000 times; the standard deviation of 5,000 has an error of 1%."""
     weights = np.exp(0.6 * np.random.default_rng(0).normal(size=(5000, 32)))
     worth = weights.sum(axis=1) ** 2 / (weights**2).sum(axis=1)
-    said = [convergence.log_mean_error(one, 32) for one in worth]
-    assert np.sqrt(np.mean(np.square(said))) == pytest.approx(np.log(weights.mean(axis=1)).std(), rel=0.04)
+    errors = [convergence.log_mean_error(ess, 32) for ess in worth]
+    assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(np.log(weights.mean(axis=1)).std(), rel=0.04)
     assert convergence.log_mean_error(32.0, 32) == 0.0
     # Without the share of all: sqrt(1 / worth) would be more than twice as much.
-    assert np.mean(said) < 0.6 * np.mean(worth**-0.5)
+    assert np.mean(errors) < 0.6 * np.mean(worth**-0.5)
 
 
 @pytest.mark.slow
@@ -109,17 +109,17 @@ def test_unconverged_sites_and_light_weights_are_counted():
     for y in (jnp.asarray(Y), jnp.full_like(Y, jnp.nan)):
         weights = np.exp(problem.log_weights(jax.random.key(0), y, 64))
         by_hand.append(weights.sum() ** 2 / (weights**2).sum())
-    assert float(problem.worth(jnp.asarray(Y), 64)) == pytest.approx(min(by_hand), rel=1e-10)
+    assert float(problem.effective_sample_size(jnp.asarray(Y), 64)) == pytest.approx(min(by_hand), rel=1e-10)
 
 
 @pytest.mark.slow
 def test_a_fit_stores_and_says_it(tmp_path):
     with pytest.warns(lfm.ConvergenceWarning, match="the 16 weighted trajectories .* off by about 0.[23]"):
-        found = lfm.fit(lambda times, y=None: bounded(times, y, 16, 31), TIMES, Y, sampler="ram", chains=2, warmup=50,
-                        samples=50, trajectory_draws=0, progress=False)
-    attrs = arviz_data.attributes(found)
+        result = lfm.fit(lambda times, y=None: bounded(times, y, 16, 31), TIMES, Y, sampler="ram", chains=2, warmup=50,
+                         samples=50, trajectory_draws=0, progress=False)
+    attrs = arviz_data.attributes(result)
     assert attrs["constraints"] == "factor >= 0 at 31 times" and json.loads(attrs["site_failures"])[0] == 100
-    assert any("weighted trajectories" in said for said in json.loads(attrs["warnings"]))
+    assert any("weighted trajectories" in warning for warning in json.loads(attrs["warnings"]))
 
 
 MODEL = '''"""A gene."""
@@ -149,10 +149,10 @@ def test_the_command_line_chooses_the_times(tmp_path, monkeypatch, capsys):
     assert main(["fit", "gene.py", "--data", "d.csv", "--lower", "factor=0", "--grid", "7", "--sampler", "map",
                  "--samples", "40", "--out", "out", "--quiet", "--no-cache"]) == 0
     assert "bound    factor >= 0 at 7 times" in capsys.readouterr().out
-    found = lfm.load("out")
-    attrs = arviz_data.attributes(found)
+    result = lfm.load("out")
+    attrs = arviz_data.attributes(result)
     assert attrs["constraints"] == "factor >= 0 at 7 times" and json.loads(attrs["site_failures"]) == [40, 0, 0]
     trajectories, median, _ = json.loads(attrs["constraint_weights"])
-    assert trajectories == 256 and median > 10 and not arviz_data.convergence_warnings(found)
+    assert trajectories == 256 and median > 10 and not arviz_data.convergence_warnings(result)
     # The forecast goes on with the same times.
     assert main(["forecast", "out", "--until", "4", "--no-cache"]) == 0

@@ -63,15 +63,15 @@ def test_without_active_constraints_it_is_the_smoother():
     smoothed = lfm.smooth(MODEL, TIMES, y)
     free = lfm.full_information(MODEL, TIMES, y, grid=TIMES)
     loose = lfm.full_information(MODEL, TIMES, y, lower={"factor": -10.0}, upper={"x0": 5.0}, grid=TIMES)
-    for found in (free, loose):
-        assert found.converged and found.passes == 1 and found.gap == 0.0 and not found.multiplier.any()
-        np.testing.assert_allclose(found.force("factor"), smoothed.force("factor").mean, atol=1e-10)
-        np.testing.assert_allclose(found.state("x0"), smoothed.state("x0").mean, atol=1e-10)
+    for estimate in (free, loose):
+        assert estimate.converged and estimate.passes == 1 and estimate.gap == 0.0 and not estimate.multiplier.any()
+        np.testing.assert_allclose(estimate.force("factor"), smoothed.force("factor").mean, atol=1e-10)
+        np.testing.assert_allclose(estimate.state("x0"), smoothed.state("x0").mean, atol=1e-10)
     np.testing.assert_allclose(loose.slack[:, 0], smoothed.force("factor").mean + 10.0, atol=1e-10)
 
 
 def test_with_active_constraints_it_is_the_dense_quadratic_program(bounded):
-    y, found = bounded
+    y, estimate = bounded
     mean, covariance = posterior(y)
     rows = np.arange(len(TIMES))
     pick = np.eye(mean.size)
@@ -79,46 +79,46 @@ def test_with_active_constraints_it_is_the_dense_quadratic_program(bounded):
     matrix = np.concatenate([u, -x, -u])
     offset = np.repeat([0.0, 0.12, 0.8], len(TIMES))
     w, multipliers, excess = quadratic_program(mean, covariance, matrix, offset)
-    assert found.converged and found.gap <= 1e-10
-    active = np.asarray(found.active)
+    assert estimate.converged and estimate.gap <= 1e-10
+    active = np.asarray(estimate.active)
     assert (active.sum(axis=0) >= [3, 3, 0]).all()
-    np.testing.assert_allclose(found.state("x0"), w[0::2], atol=1e-6)
-    np.testing.assert_allclose(found.force("factor"), w[1::2], atol=1e-6)
-    np.testing.assert_allclose(np.asarray(found.multiplier).T.ravel(), multipliers, atol=1e-5 * multipliers.max())
+    np.testing.assert_allclose(estimate.state("x0"), w[0::2], atol=1e-6)
+    np.testing.assert_allclose(estimate.force("factor"), w[1::2], atol=1e-6)
+    np.testing.assert_allclose(np.asarray(estimate.multiplier).T.ravel(), multipliers, atol=1e-5 * multipliers.max())
     free = lfm.full_information(MODEL, TIMES, y, grid=TIMES)
-    assert np.isclose(found.objective - free.objective, excess, rtol=1e-7)
+    assert np.isclose(estimate.objective - free.objective, excess, rtol=1e-7)
 
 
 def test_what_is_returned_is_feasible_to_the_last_bit(bounded):
-    _, found = bounded
-    assert found.force_mean.min() >= 0.0 and found.force_mean.max() <= 0.8 and found.state_mean.max() <= 0.12
-    assert (found.slack >= 0.0).all() and (found.multiplier >= 0.0).all()
-    assert found.violation.max() < 1e-9
-    assert found.labels == ("factor >= lower", "x0 <= upper", "factor <= upper")
+    _, estimate = bounded
+    assert estimate.force_mean.min() >= 0.0 and estimate.force_mean.max() <= 0.8 and estimate.state_mean.max() <= 0.12
+    assert (estimate.slack >= 0.0).all() and (estimate.multiplier >= 0.0).all()
+    assert estimate.violation.max() < 1e-9
+    assert estimate.labels == ("factor >= lower", "x0 <= upper", "factor <= upper")
 
 
 def test_outputs_and_functions_are_bounded_like_names(bounded):
     """The output here is the state, and functions say the same as bounds; also in units of their own."""
-    y, found = bounded
+    y, estimate = bounded
     model = eqx.tree_at(lambda m: m.initial_state.mean, MODEL, jnp.zeros(1))
-    again = lfm.full_information(model, TIMES, y, upper={"y0": 0.12}, grid=TIMES,
-                                 constraints=lambda x, u, t: 1e3 * jnp.array([u[0], 0.8 - u[0]]))
-    np.testing.assert_allclose(again.force_mean, found.force_mean, atol=1e-7)
-    np.testing.assert_allclose(again.state_mean, found.state_mean, atol=1e-7)
-    assert again.labels == ("y0 <= upper", "constraints[0][0] >= 0", "constraints[0][1] >= 0")
+    with_functions = lfm.full_information(model, TIMES, y, upper={"y0": 0.12}, grid=TIMES,
+                                          constraints=lambda x, u, t: 1e3 * jnp.array([u[0], 0.8 - u[0]]))
+    np.testing.assert_allclose(with_functions.force_mean, estimate.force_mean, atol=1e-7)
+    np.testing.assert_allclose(with_functions.state_mean, estimate.state_mean, atol=1e-7)
+    assert with_functions.labels == ("y0 <= upper", "constraints[0][0] >= 0", "constraints[0][1] >= 0")
 
 
 def test_bounds_may_change_with_time():
-    found = lfm.full_information(MODEL, TIMES, data(1), grid=TIMES,
-                                 constraints=[lambda x, u, t: u[0] + 0.2 * t, lambda x, u, t: 1.0 - u])
-    assert found.converged and (found.force("factor") >= -0.2 * TIMES - 1e-9).all()
+    estimate = lfm.full_information(MODEL, TIMES, data(1), grid=TIMES,
+                                    constraints=[lambda x, u, t: u[0] + 0.2 * t, lambda x, u, t: 1.0 - u])
+    assert estimate.converged and (estimate.force("factor") >= -0.2 * TIMES - 1e-9).all()
 
 
 def test_by_default_the_constraints_hold_between_the_observations():
     times = TIMES[::6]
-    found = lfm.full_information(MODEL, times, data(1, pushed, times), lower={"factor": 0.0})
-    assert found.times.shape == (201,) and np.isin(times, found.times).all()
-    assert found.converged and found.force_mean.min() >= 0.0
+    estimate = lfm.full_information(MODEL, times, data(1, pushed, times), lower={"factor": 0.0})
+    assert estimate.times.shape == (201,) and np.isin(times, estimate.times).all()
+    assert estimate.converged and estimate.force_mean.min() >= 0.0
 
 
 def test_replicates_and_missing_rows():
@@ -136,18 +136,18 @@ def test_replicates_and_missing_rows():
 
 def test_a_known_start_on_its_bound():
     model = transcription(variance=0.0)
-    found = lfm.full_information(model, TIMES, data(2), lower={"x0": 0.0, "factor": 0.0}, grid=TIMES)
-    assert found.converged and found.state("x0")[0] == 0.0 and found.state_mean.min() >= 0.0
+    estimate = lfm.full_information(model, TIMES, data(2), lower={"x0": 0.0, "factor": 0.0}, grid=TIMES)
+    assert estimate.converged and estimate.state("x0")[0] == 0.0 and estimate.state_mean.min() >= 0.0
 
 
 def test_another_data_set_and_other_bounds_compile_nothing(bounded, caplog):
     y = data(3, pushed)
     lfm.full_information(MODEL, TIMES, y, lower={"factor": 0.0}, upper={"x0": 0.12, "factor": 0.8}, grid=TIMES)
     with jax.log_compiles(), caplog.at_level("DEBUG"):
-        found = lfm.full_information(MODEL, TIMES, 0.9 * y, lower={"factor": 0.05}, upper={"x0": 0.11, "factor": 0.7},
-                                     grid=TIMES)
-    assert not [record for record in caplog.records if "ompil" in record.message and "estimate_on" in record.message]
-    assert found.converged and found.force_mean.min() >= 0.05
+        estimate = lfm.full_information(MODEL, TIMES, 0.9 * y, lower={"factor": 0.05},
+                                        upper={"x0": 0.11, "factor": 0.7}, grid=TIMES)
+    assert not [record for record in caplog.records if "ompil" in record.message and "solve_problem" in record.message]
+    assert estimate.converged and estimate.force_mean.min() >= 0.05
 
 
 # --- models that bend
@@ -176,18 +176,18 @@ def test_ballistic_target_against_ipopt():
     model, times = ballistic(), np.linspace(0.0, 25.0, 26)
     y = lfm.simulate(jax.random.key(3), model, times).y
     for lower in ({"u": -0.005, "x1": 0.9}, {}):
-        found = lfm.full_information(model, times, y, lower=lower, grid=times, steps=8)
-        assert found.converged and (not lower or np.asarray(found.active).any(axis=0).all())
+        estimate = lfm.full_information(model, times, y, lower=lower, grid=times, steps=8)
+        assert estimate.converged and (not lower or np.asarray(estimate.active).any(axis=0).all())
         bounds = [(2, 1.0, -0.005), (1, 1.0, 0.9)] if lower else []
         reference = Transcribed(
             lambda x, u: [-x[1], -449.0e-3 * casadi.exp(-0.149 * x[0]) * x[1] ** 2 + 9.8e-3 + u],
             lambda x: [(30.0**2 + (0.03 - x[0]) ** 2) ** 0.5], (0.05, 5.0, 2), np.diag([50e-6, 10e-6]),
             np.array([64.0, 2.9]), np.diag([1.0, 0.04]), [9e-4], bounds)
-        guess = np.concatenate([found.state_mean, found.force_mean, np.zeros((26, 2))], axis=1)
+        guess = np.concatenate([estimate.state_mean, estimate.force_mean, np.zeros((26, 2))], axis=1)
         nodes, objective = reference.solve(times, np.asarray(y), guess + 0.01)
-        assert np.isclose(found.objective, objective, rtol=0, atol=1e-4)
-        np.testing.assert_allclose(found.force("u"), nodes[:, 2], atol=1e-5)
-        np.testing.assert_allclose(found.state_mean, nodes[:, :2], atol=1e-4)
+        assert np.isclose(estimate.objective, objective, rtol=0, atol=1e-4)
+        np.testing.assert_allclose(estimate.force("u"), nodes[:, 2], atol=1e-5)
+        np.testing.assert_allclose(estimate.state_mean, nodes[:, :2], atol=1e-4)
 
 
 class Exponential(eqx.Module):
@@ -205,16 +205,16 @@ def test_an_exponential_link_against_ipopt(lower):
         Exponential(), {"u": lfm.Matern(1.0, 1.0)}, lfm.GaussianObservation(whole_state, jnp.array([0.05**2])),
         lfm.Gaussian(jnp.array([0.8]), jnp.array([[0.1]])), process_noise=0.03 * jnp.eye(1), initial_time=0.0)
     y = lfm.simulate(jax.random.key(0), model, TIMES).y
-    found = lfm.full_information(model, TIMES, y, lower=lower, grid=TIMES, steps=32)
-    assert found.converged and bool(lower) == np.asarray(found.active).any()
+    estimate = lfm.full_information(model, TIMES, y, lower=lower, grid=TIMES, steps=32)
+    assert estimate.converged and bool(lower) == np.asarray(estimate.active).any()
     reference = Transcribed(
         lambda x, u: [0.5 * casadi.exp(u) - 0.6 * x[0]], lambda x: [x[0]], (1.0, 1.0, 1), np.array([[0.03**2]]),
         np.array([0.8]), np.array([[0.1]]), [0.05**2], [(1, 1.0, -0.3)] if lower else [])
     # From the prior mean, and not from our own solution.
     nodes, objective = reference.solve(TIMES, np.asarray(y), np.tile([0.8, 0.0, 0.0], (25, 1)), rounds=8)
-    assert np.isclose(found.objective, objective, rtol=0, atol=1e-4)
-    np.testing.assert_allclose(found.force("u"), nodes[:, 1], atol=1e-5)
-    np.testing.assert_allclose(found.state("x0"), nodes[:, 0], atol=1e-5)
+    assert np.isclose(estimate.objective, objective, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(estimate.force("u"), nodes[:, 1], atol=1e-5)
+    np.testing.assert_allclose(estimate.state("x0"), nodes[:, 0], atol=1e-5)
 
 
 # --- errors

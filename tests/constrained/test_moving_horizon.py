@@ -28,31 +28,31 @@ MODEL = linear()
 
 
 def test_without_constraints_it_is_the_kalman_filter():
-    found = lfm.moving_horizon(MODEL, TIMES, Y, window=WINDOW, delay=0)
+    estimate = lfm.moving_horizon(MODEL, TIMES, Y, window=WINDOW, delay=0)
     filtered = lfm.filter(MODEL, TIMES, Y)
     rows = slice(WINDOW - 1, None)
-    np.testing.assert_allclose(found.state_mean[rows, 0], filtered.filtered_mean[rows, 0], atol=1e-9)
-    np.testing.assert_allclose(found.force_mean[rows, 0], filtered.filtered_mean[rows, 1], atol=1e-9)
+    np.testing.assert_allclose(estimate.state_mean[rows, 0], filtered.filtered_mean[rows, 0], atol=1e-9)
+    np.testing.assert_allclose(estimate.force_mean[rows, 0], filtered.filtered_mean[rows, 1], atol=1e-9)
 
 
 @pytest.mark.slow
 def test_with_a_delay_it_is_the_fixed_lag_smoother():
-    found = lfm.moving_horizon(MODEL, TIMES, Y, window=WINDOW, delay=2)
+    estimate = lfm.moving_horizon(MODEL, TIMES, Y, window=WINDOW, delay=2)
     for last in (WINDOW - 1, 8, 11):
         y = np.where(np.arange(12)[:, None] <= last, Y, np.nan)
         smoothed = lfm.smooth(MODEL, TIMES, y)
         rows = slice(0 if last == WINDOW - 1 else last - 2, None if last == 11 else last - 1)
-        np.testing.assert_allclose(found.force_mean[rows, 0], smoothed.force("factor").mean[rows], atol=1e-9)
+        np.testing.assert_allclose(estimate.force_mean[rows, 0], smoothed.force("factor").mean[rows], atol=1e-9)
 
 
 @pytest.mark.parametrize("delay", [0, pytest.param(6, marks=pytest.mark.slow)])
 def test_a_window_that_holds_everything_is_full_information(delay):
-    whole = lfm.full_information(MODEL, TIMES, Y, lower={"factor": 0.0}, grid=np.unique(TIMES))
-    found = lfm.moving_horizon(MODEL, TIMES, Y, window=12, delay=delay, lower={"factor": 0.0})
-    assert found.converged and np.asarray(whole.active).any()
+    full = lfm.full_information(MODEL, TIMES, Y, lower={"factor": 0.0}, grid=np.unique(TIMES))
+    estimate = lfm.moving_horizon(MODEL, TIMES, Y, window=12, delay=delay, lower={"factor": 0.0})
+    assert estimate.converged and np.asarray(full.active).any()
     distinct = np.r_[0:5, 6:12]
-    np.testing.assert_allclose(found.force_mean[distinct], whole.force_mean, atol=1e-7)
-    np.testing.assert_allclose(found.state_mean[distinct], whole.state_mean, atol=1e-7)
+    np.testing.assert_allclose(estimate.force_mean[distinct], full.force_mean, atol=1e-7)
+    np.testing.assert_allclose(estimate.state_mean[distinct], full.state_mean, atol=1e-7)
 
 
 def test_one_observation_at_a_time(tmp_path, caplog):
@@ -87,12 +87,12 @@ def test_a_model_that_bends():
         initial_time=0.0)
     times = np.linspace(0.5, 5.0, 10)
     y = lfm.simulate(jax.random.key(2), model, times).y
-    whole = lfm.full_information(model, times, y, lower={"u": -0.3}, grid=times, steps=2)
-    same = lfm.moving_horizon(model, times, y, window=10, lower={"u": -0.3}, steps=2)
-    np.testing.assert_allclose(same.force_mean, whole.force_mean, atol=1e-5)
-    moving = lfm.moving_horizon(model, times, y, window=6, lower={"u": -0.3}, steps=2)
-    assert moving.converged and moving.force_mean.min() >= -0.3
-    assert np.abs(moving.force_mean - whole.force_mean).max() < 0.5
+    full = lfm.full_information(model, times, y, lower={"u": -0.3}, grid=times, steps=2)
+    longest_window = lfm.moving_horizon(model, times, y, window=10, lower={"u": -0.3}, steps=2)
+    np.testing.assert_allclose(longest_window.force_mean, full.force_mean, atol=1e-5)
+    short_window = lfm.moving_horizon(model, times, y, window=6, lower={"u": -0.3}, steps=2)
+    assert short_window.converged and short_window.force_mean.min() >= -0.3
+    assert np.abs(short_window.force_mean - full.force_mean).max() < 0.5
 
 
 @pytest.mark.parametrize("arguments, message", [

@@ -16,7 +16,6 @@ from lfm_ppl import loading
 from lfm_ppl.filtering.filter import forward, preparation
 from lfm_ppl.filtering.iterated import posterior_linearisation
 from lfm_ppl.filtering.predict import Moments
-from lfm_ppl.filtering.smoother import smoothing_grids
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.model.state_space import state_space
 
@@ -113,125 +112,87 @@ def test_nodes_after_a_known_start_are_those_of_dense_algebra():
     """Five genes that one force moves from a known start: the covariance of their state is nearly singular."""
     model = motif(softplus, genes=5, noise_sd=0.0682)
     ssm = lfm.state_space(model)
-    grid = build_time_grid(ssm, TIMES, 3, max_step=10.0)
+    distinct = np.unique(TIMES)
+    ends = (distinct[:-1, None] + np.diff(distinct)[:, None] * np.array([1.0, 2.0, 3.0]) / 3).ravel()
+    grid = build_time_grid(ssm, TIMES, 3, max_step=10.0, at=ends)
+    assert grid.steps == 1
     y = jnp.asarray(observed(5, softplus))
     start = Moments(*ssm.initial())
 
     @jax.jit
     def run(y):
-        passed = forward(ssm, lfm.Cubature(), grid, y, start=start, keep="steps")
+        passed = forward(ssm, lfm.Cubature(), grid, y, start=start, keep="all")
         prepared = preparation(ssm, lfm.Cubature(), grid)
         return passed, posterior_linearisation(ssm, lfm.Cubature(), grid, y, start, 1, 1.0, prepared).points.nodes
 
-    passed, nodes = jax.tree_util.tree_map(np.asarray, run(y))
-    force = 5
-    # The joint prior of the force at all nodes and of all observations' errors, by the steps' affine maps.
-    current = np.asarray(start.covariance)
-    size = current.shape[0]
-    blocks, slopes, noises = [], [], []
-    before = []  # the transposed transition from each earlier node to now, times its prior covariance
-    for row in range(len(TIMES)):
-        for step in range(3):
-            phi, noise = passed.steps.phi[row, step], passed.steps.process_cov[row, step]
-            current = phi @ current @ phi.T + noise
-            before = [phi @ one for one in before] + [current]
-        blocks.append(list(before))
-        slopes.append(passed.jacobian[row])
-        noises.append(passed.obs_cov[row])
-    count = 3 * len(TIMES)
-    gram = np.zeros((5 * len(TIMES),) * 2)
-    cross = np.zeros((count, 5 * len(TIMES)))
-    for j in range(len(TIMES)):
-        at = slice(5 * j, 5 * j + 5)
-        for node in range(count):
-            if node <= 3 * j + 2:  # Cov(observation j, node) = H_j Phi(node -> j) P(node)
-                cross[node, at] = (slopes[j] @ blocks[j][node])[:, force]
-        for i in range(j + 1):
-            part = slopes[j] @ blocks[j][3 * i + 2] @ slopes[i].T
-            gram[at, 5 * i:5 * i + 5] = part
-            gram[5 * i:5 * i + 5, at] = part.T
-        gram[at, at] += noises[j]
-    # Nodes after an observation: Cov(node, observation i) = (Phi(i -> node) P(i))[force] H_i'.
-    transitions = [np.eye(size)]
-    for node in range(count):
-        transitions.append(passed.steps.phi[node // 3, node % 3])
-    marginal = [np.asarray(start.covariance)]
-    for node in range(count):
-        own = passed.steps.process_cov[node // 3, node % 3]
-        marginal.append(transitions[node + 1] @ marginal[-1] @ transitions[node + 1].T + own)
-    for i in range(len(TIMES)):
-        moved = marginal[3 * i + 3]
-        for node in range(3 * i + 3, count):
-            moved = transitions[node + 1] @ moved
-            cross[node, 5 * i:5 * i + 5] = moved[force] @ slopes[i].T
-    variance = np.array([marginal[node + 1][force, force] for node in range(count)])
-    expected = variance - np.einsum("ij,ij->i", cross, np.linalg.solve(gram, cross.T).T)
-    np.testing.assert_allclose(nodes.covariance[:, 1:, 0, 0].ravel(), expected, rtol=1e-9)
+    passed, nodes = jax.tree.map(np.asarray, run(y))
+    size, count, force = start.mean.shape[0], len(passed.phi), 5
+    # prior[k]: covariance at the end of interval k; the joint prior follows from the affine maps of the intervals.
+    prior, covariance = [], np.asarray(start.covariance)
+    for phi, noise in zip(passed.phi, passed.process_cov, strict=True):
+        covariance = phi @ covariance @ phi.T + noise
+        prior.append(covariance)
+    transition = np.zeros((count, count, size, size))
+    for first in range(count):
+        transition[first, first] = np.eye(size)
+        for later in range(first + 1, count):
+            transition[later, first] = passed.phi[later] @ transition[later - 1, first]
+    joint = np.zeros((count, count, size, size))
+    for first in range(count):
+        for later in range(first, count):
+            joint[later, first] = transition[later, first] @ prior[first]
+            joint[first, later] = joint[later, first].T
+    rows = np.asarray(grid.observed)
+    slope = passed.jacobian[rows]
+    cross = np.einsum("kiab,icb->kaic", joint[:, rows], slope)[:, force].reshape(count, -1)
+    gram = np.einsum("iax,ijxy,jby->iajb", slope, joint[np.ix_(rows, rows)], slope).reshape((5 * len(rows),) * 2)
+    for index, row in enumerate(rows):
+        gram[5 * index:5 * index + 5, 5 * index:5 * index + 5] += passed.obs_cov[row]
+    reduction = np.einsum("ij,ij->i", cross, np.linalg.solve(gram, cross.T).T)
+    expected = np.array([covariance[force, force] for covariance in prior]) - reduction
+    np.testing.assert_allclose(nodes.covariance[:, -1, 0, 0], expected, rtol=1e-9)
 
 
-def test_many_requested_times_share_the_steps_of_an_interval():
-    """The scan for draws integrates in steps as short as the data's, however many times are asked for."""
-    def grids(at, max_step=None):
-        return smoothing_grids(state_space(motif(softplus)), TIMES, 12, max_step, at, 0)
+def test_requested_times_share_the_steps_of_an_interval():
+    ssm = state_space(motif(softplus))
 
-    assert grids(np.linspace(0.0, 14.0, 141)).joint.steps == 1  # 0.1 of the gap of 2, whose steps take a sixth
-    assert grids(np.linspace(0.0, 14.0, 29)).joint.steps == 3
-    assert grids(np.array([1.0])).joint.steps == 12  # other gaps are whole
-    # Gaps of 2 are cut into four pieces of 12 steps by max_step, and each of these in halves by the requested times.
-    assert grids(np.linspace(0.0, 14.0, 57), max_step=0.05).joint.steps == 6
-    assert grids(np.linspace(0.0, 300.0, 31)).joint.steps == 12, "a forecast takes no more than before"
-    model, y = motif(softplus, genes=2), observed(2, softplus)
-    many = lfm.smooth(model, TIMES, y, steps=12, at=np.linspace(0.0, 14.0, 141))
-    assert_draws_have_the_moments_of(many)
+    def steps_at(at, max_step=None):
+        grid = build_time_grid(ssm, TIMES, 12, max_step, at)
+        return len(grid.intervals.length) * grid.steps, np.max(grid.intervals.length) / grid.steps
 
-
-def bent(x, u, t):
-    return softplus(x)
+    whole, longest = steps_at(None)
+    for at in (np.linspace(0.0, 14.0, 141), np.linspace(0.0, 14.0, 29), np.array([1.0])):
+        count, step = steps_at(at)
+        assert step <= longest * (1 + 1e-12) and count <= 2 * whole + 13 * len(at)
+    assert steps_at(np.linspace(0.0, 14.0, 57), max_step=0.05)[1] <= 0.05 * (1 + 1e-12)
+    assert steps_at(np.array([300.0]))[1] <= longest, "a forecast takes steps of the usual length"
 
 
-def jumping(functions=7):
-    kernel = lfm.forces.PeriodicSquaredExponential(1.0, 1.5, 3.0)
-    return {"u": lfm.QuasiPeriodic(kernel, lfm.forces.SQM(1.5, (3.0, 4.0, 13.0)), functions=functions)}
+@pytest.mark.parametrize(("genes", "variance", "steps"), [
+    (5, 0.0, 24), (1, 1e-10, 1), *(pytest.param(genes, variance, steps, marks=pytest.mark.slow)
+                                   for genes in (1, 5) for variance in (0.0, 1e-10, 1e6)
+                                   for steps in (1, 2, 5, 10, 22, 24, 26, 40, 60))])
+def test_draws_between_and_after_the_data_have_the_marginal_sd(genes, variance, steps):
+    model = motif(softplus, genes=genes, variance=variance, noise_sd=0.0682)
+    result = lfm.smooth(model, TIMES, observed(genes, softplus), steps=steps, at=np.arange(0.0, 18.0))
+    drawn = result.sample(jax.random.key(1), DRAWS)
+    sd = np.sqrt(np.diagonal(np.asarray(result.input_covariance), axis1=1, axis2=2))
+    drawn_sd = np.concatenate([np.asarray(drawn.state), np.asarray(drawn.forces["u"])[..., None]], axis=2).std(axis=0)
+    np.testing.assert_allclose(drawn_sd, sd, rtol=0.02, atol=1e-9)
 
 
-def genes_with(forces=None, observe=None, initial_time=0.0):
-    genes = motif(softplus, noise_sd=0.0682)
-    noise = genes.observation if observe is None else lfm.GaussianObservation(observe, 0.0682**2 * jnp.ones(2))
-    return lfm.LatentForceModel(genes.dynamics, forces or genes.forces, noise, genes.initial_state,
-                                initial_time=initial_time)
+@pytest.mark.parametrize("iterations", [0, 3])
+def test_requested_times_move_the_moments_by_the_integration_error(iterations):
+    """The error of an interval that is divided is that of its steps, of fourth order."""
+    model, y, at = motif(softplus, genes=2, noise_sd=0.0682), observed(2, softplus), np.array([0.5, 3.1, 9.3])
 
+    def difference(steps):
+        plain = lfm.smooth(model, TIMES, y, steps=steps, iterations=iterations)
+        divided = lfm.smooth(model, TIMES, y, steps=steps, iterations=iterations, at=np.append(at, TIMES))
+        sd = np.sqrt(np.diagonal(plain.covariance, axis1=1, axis2=2))
+        change = np.abs(divided.mean[len(at):] - plain.mean)
+        assert change[sd < 1e-9].max(initial=0.0) < 1e-9
+        return (change[sd > 1e-9] / sd[sd > 1e-9]).max()
 
-@pytest.mark.parametrize("model", [
-    genes_with(observe=bent), pytest.param(genes_with(initial_time=-1.0), marks=pytest.mark.slow),
-    pytest.param(genes_with(jumping(5), bent), marks=pytest.mark.slow)], ids=["plain", "early start", "jumps"])
-def test_the_scan_for_draws_repeats_that_of_the_iterations(model):
-    """It is linearised about the same moments: at the ends of the same steps the filter is the same."""
-    steps, y = 6, observed(2, softplus)
-    ssm, start = state_space(model), model.initial_time
-    grid = build_time_grid(ssm, TIMES, steps, max_step=10.0)
-    row_start, length = grid.intervals.start[:, None], grid.intervals.length[:, None]
-    ends = np.unique(np.append(row_start + length * np.arange(1, steps) / steps, TIMES))
-    wanted = lfm.smooth(model, TIMES, y, steps=steps, max_step=10.0, iterations=3)._joint.passed
-    at = ends[ends > start]
-    rows = smoothing_grids(ssm, TIMES, steps, 10.0, at, 3).joint.observed
-    found = lfm.smooth(model, TIMES, y, steps=steps, max_step=10.0, iterations=3, at=at)._joint.passed
-    np.testing.assert_allclose(found.filtered.covariance[rows], wanted.filtered.covariance[grid.observed], atol=1e-10)
-    np.testing.assert_allclose(found.gain[rows], wanted.gain[grid.observed], atol=1e-9)
-
-
-@pytest.mark.parametrize("max_step", [None, 0.05])
-def test_nodes_of_the_scan_for_draws_are_found_on_that_of_the_marginals(max_step):
-    ssm = state_space(genes_with(jumping()))
-    base, joint, _, at, _ = smoothing_grids(ssm, TIMES, 6, max_step, np.append(AT, 2.5), 3)
-    times = joint.intervals.start[:, None] + joint.intervals.length[:, None] * np.linspace(0, 1, joint.steps + 1)
-    length = base.intervals.length[at.interval]
-    found = base.intervals.start[at.interval] + length * (at.step + at.share) / base.steps
-    np.testing.assert_allclose(found, times, atol=1e-12)
-    assert at.step.max() == base.steps - 1 and (at.share >= 0).all() and (at.share <= 1).all()
-    np.testing.assert_array_equal(at.end[joint.observed], base.observed)
-    # Just before a jump a node lies in the interval that ends with it, just after it in the next.
-    ends = np.flatnonzero(joint.intervals.jump >= 0)
-    assert len(ends) == 3
-    np.testing.assert_array_equal(base.intervals.jump[at.interval[ends, -1]], joint.intervals.jump[ends])
-    after = ends + 1 + (joint.intervals.length[ends + 1] == 0)
-    assert (at.interval[after, 0] > at.interval[ends, -1]).all()
+    default, fine = difference(10), difference(20)
+    assert default < 2e-3 and fine < default / 6

@@ -25,7 +25,7 @@ def forced(x, u, t):
     return jnp.sin(2.0 * t) - x
 
 
-def still(x, u, t):
+def zero_drift(x, u, t):
     return jnp.zeros_like(x)
 
 
@@ -61,7 +61,7 @@ class Jumping(Force):
 
 
 def only(force):
-    return lfm.LatentForceModel(still, {"u": force}, lfm.GaussianObservation(force_alone, jnp.array([0.3])),
+    return lfm.LatentForceModel(zero_drift, {"u": force}, lfm.GaussianObservation(force_alone, jnp.array([0.3])),
                                 lfm.Gaussian(jnp.zeros(0), jnp.zeros((0, 0))), initial_time=0.0)
 
 
@@ -95,9 +95,9 @@ def test_it_equals_the_kalman_filter_and_smoother(name):
     np.testing.assert_allclose(result.sd, np.sqrt(exact.filtered_covariance[:, 0, 0]), atol=1e-4)
     np.testing.assert_array_equal(result.smoothed_times, AT)
     # A known start is one cell wide on a grid.
-    known = (AT == 0) & (name == "known start")
+    is_point = (AT == 0) & (name == "known start")
     np.testing.assert_allclose(result.smoothed_mean, smooth.mean[:, 0], atol=1e-4)
-    np.testing.assert_allclose(result.smoothed_sd[~known], np.sqrt(smooth.covariance[:, 0, 0])[~known], atol=1e-4)
+    np.testing.assert_allclose(result.smoothed_sd[~is_point], np.sqrt(smooth.covariance[:, 0, 0])[~is_point], atol=1e-4)
     for densities in (result.predicted, result.filtered, result.smoothed):
         np.testing.assert_allclose(densities.sum(1) * result.width, 1.0, atol=1e-9)
         assert densities.min() >= 0.0
@@ -168,7 +168,7 @@ def rising(x, u, t):
 
 @pytest.mark.slow
 def test_dispersion_that_depends_on_time():
-    model = lfm.LatentForceModel(still, {}, lfm.GaussianObservation(whole_state, jnp.array([0.1])),
+    model = lfm.LatentForceModel(zero_drift, {}, lfm.GaussianObservation(whole_state, jnp.array([0.1])),
                                  lfm.Gaussian([0.2], [0.1]), process_noise=rising, initial_time=0.0)
     result = fokker_planck(model, [1.0], [[0.0]], at=[1.0], cells=600, bounds=(-9.0, 9.0), steps=20)
     masses = result.predicted[0] * result.width
@@ -178,7 +178,7 @@ def test_dispersion_that_depends_on_time():
     assert abs(float(masses @ (result.x - 0.2) ** 2) - expected) < 1.0 / (12 * 20**2) + result.width**2 / 4
 
 
-def both(x, u, t):
+def state_and_angle(x, u, t):
     return jnp.concatenate([x, 2.0 * x + x**2])
 
 
@@ -190,7 +190,7 @@ def widening(x, u, t):
 @pytest.mark.parametrize("angular", [(), (1,)])
 def test_likelihood_of_several_outputs_against_quadrature(y, angular):
     y = np.array(y)
-    model = lfm.LatentForceModel(still, {}, lfm.GaussianObservation(both, widening, angular),
+    model = lfm.LatentForceModel(zero_drift, {}, lfm.GaussianObservation(state_and_angle, widening, angular),
                                  lfm.Gaussian([0.8], [0.3]), process_noise=jnp.eye(1))
     result = fokker_planck(model, [0.0, 1.0], [y, [np.nan, np.nan]], cells=600, bounds=(-5.0, 6.5), tolerance=0.1)
     x = np.linspace(-4.0, 5.6, 4001)
@@ -213,10 +213,10 @@ def test_a_likelihood_as_narrow_as_a_cell_is_integrated():
         model = ornstein_uhlenbeck(noise=sd**2, variance=1.0)
         ssm = lfm.state_space(model)
         for y in (0.0, 0.05, 0.13):
-            found = log_likelihood(ssm, build_time_grid(ssm, [0.0], 1), [[y]], grid)
+            value = log_likelihood(ssm, build_time_grid(ssm, [0.0], 1), [[y]], grid)
             exact = -0.5 * (y - 0.5) ** 2 / (1.0 + sd**2) - 0.5 * np.log(2 * np.pi * (1.0 + sd**2))
             # Within half a cell the density changes by at most |y - 0.5| 0.05; quadrature adds a percent.
-            assert abs(float(found) - exact) < 0.035
+            assert abs(float(value) - exact) < 0.035
 
 
 def test_an_outlier_keeps_its_likelihood():
@@ -226,9 +226,9 @@ def test_an_outlier_keeps_its_likelihood():
     exact = lfm.filter(model, times, y)
     assert np.isfinite(fine.smoothed).all()
     # Where the density falls by a factor within a cell the error is visible, but still of second order.
-    for found, at_half, expected in ((fine.log_likelihood, coarse.log_likelihood, exact.log_likelihood),
-                                     (fine.mean, coarse.mean, exact.filtered_mean[:, 0])):
-        np.testing.assert_allclose((4.0 * found - at_half) / 3.0, expected, rtol=1e-3)
+    for fine_value, at_half, expected in ((fine.log_likelihood, coarse.log_likelihood, exact.log_likelihood),
+                                          (fine.mean, coarse.mean, exact.filtered_mean[:, 0])):
+        np.testing.assert_allclose((4.0 * fine_value - at_half) / 3.0, expected, rtol=1e-3)
 
 
 def parameters(theta):
@@ -244,23 +244,24 @@ def test_batches_and_vmap_equal_loops(times):
     sets = np.stack([WELL_Y, WELL_Y[::-1], 0.5 * WELL_Y])
     run = jax.jit(lambda y: log_likelihood(ssm, time_grid, y, grid))
     np.testing.assert_allclose(run(sets), [run(y) for y in sets], rtol=1e-12)
-    one = jax.jit(lambda theta: log_likelihood(lfm.state_space(parameters(theta)), time_grid, jnp.asarray(WELL_Y),
-                                               grid))
+    log_density = jax.jit(lambda theta: log_likelihood(lfm.state_space(parameters(theta)), time_grid,
+                                                       jnp.asarray(WELL_Y), grid))
     thetas = jnp.array([[1.5, 0.8], [0.7, 1.1], [2.0, 0.3]])
-    loop = [one(theta) for theta in thetas]
-    np.testing.assert_allclose(jax.jit(jax.vmap(one))(thetas), loop, rtol=1e-12)
-    np.testing.assert_allclose(jax.jit(lambda t: jax.lax.map(one, t))(thetas), loop, rtol=1e-12)
+    loop = [log_density(theta) for theta in thetas]
+    np.testing.assert_allclose(jax.jit(jax.vmap(log_density))(thetas), loop, rtol=1e-12)
+    np.testing.assert_allclose(jax.jit(lambda t: jax.lax.map(log_density, t))(thetas), loop, rtol=1e-12)
 
 
 def test_derivatives_in_forward_mode():
     ssm, grid = lfm.state_space(WELL), Grid(-3.0, 3.0, 60)
     time_grid = build_time_grid(ssm, WELL_TIMES, 1)
-    one = jax.jit(lambda theta: log_likelihood(lfm.state_space(parameters(theta)), time_grid, jnp.asarray(WELL_Y),
-                                               grid))
+    log_density = jax.jit(lambda theta: log_likelihood(lfm.state_space(parameters(theta)), time_grid,
+                                                       jnp.asarray(WELL_Y), grid))
     theta = jnp.array([1.5, 0.8])
-    slope = jax.jit(jax.jacfwd(one))(theta)
+    slope = jax.jit(jax.jacfwd(log_density))(theta)
     for index, step in enumerate(1e-5 * np.eye(2)):
-        np.testing.assert_allclose(slope[index], (one(theta + step) - one(theta - step)) / 2e-5, rtol=1e-5)
+        difference = log_density(theta + step) - log_density(theta - step)
+        np.testing.assert_allclose(slope[index], difference / 2e-5, rtol=1e-5)
 
 
 def test_failure_in_compiled_code_is_minus_infinity():
@@ -280,11 +281,11 @@ def test_the_chosen_grid_is_as_accurate_as_asked():
     ssm = lfm.state_space(WELL)
     time_grid = build_time_grid(ssm, WELL_TIMES, 1)
     wide = Grid(grid.low - 0.5, grid.high + 0.5, int(3 * grid.cells * (1 + 1 / (grid.high - grid.low))))
-    found, better = (float(log_likelihood(ssm, time_grid, WELL_Y, g)) for g in (grid, wide))
-    assert abs(found - better) < tolerance
+    value, better = (float(log_likelihood(ssm, time_grid, WELL_Y, g)) for g in (grid, wide))
+    assert abs(value - better) < tolerance
     result = fokker_planck(WELL, WELL_TIMES, WELL_Y, tolerance=tolerance)
     assert result.grid == grid and result.error < tolerance
-    assert abs(found - better) < 2.0 * result.error
+    assert abs(value - better) < 2.0 * result.error
     filtered = np.asarray(result.filtered * result.width)
     assert filtered[:, :3].max() < 1e-10 and filtered[:, -3:].max() < 1e-10
 
@@ -319,7 +320,7 @@ def root(x, u, t):
     return jnp.reshape(jnp.sqrt(x), (1, 1))
 
 
-def away(x, u, t):
+def exploding(x, u, t):
     return x**3
 
 
@@ -376,7 +377,7 @@ def test_models_without_a_density(model, message):
 
 @pytest.mark.slow
 def test_a_state_that_runs_away_has_no_bounds():
-    model = simple(away, start=0.0, variance=1.0, process_noise=jnp.eye(1), noise=jnp.array([1e4]))
+    model = simple(exploding, start=0.0, variance=1.0, process_noise=jnp.eye(1), noise=jnp.array([1e4]))
     with pytest.raises(ValueError, match="no bounds hold the density|not finite near|filter failed"):
         fokker_planck(model, [0.0, 5.0], np.ones((2, 1)))
 

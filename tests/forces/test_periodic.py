@@ -299,7 +299,7 @@ def test_resonators_carry_the_kernel():
      "'ModeratedPeriodicMatern' is not stationary"),
     (lambda: forces.PeriodicKernel(lambda t, s: t - s, 5.0), "not symmetric"),
     (lambda: forces.PeriodicKernel(lambda t, s: jnp.exp(-((t - s) ** 2)), 5.0, stationary=True),
-     "said to be stationary"),
+     "declared stationary"),
     (lambda: forces.PeriodicKernel(lambda t, s: 1.0, 5.0), "must work elementwise"),
     (lambda: forces.SparseSpectrum(1.0, np.ones((2, 2))), "frequencies must be a vector"),
 ])
@@ -318,7 +318,7 @@ def test_bad_arguments_are_named(make, message):
      "5 functions; functions=7 would keep"),
     (lambda: lfm.Periodic(forces.ModeratedPeriodicMatern(1.0, 1.0, 10.0, 0.5), functions=2), "functions=5 would keep"),
     (lambda: lfm.Periodic(forces.PeriodicMatern(1.0, 0.001, 24.0, 0), functions=3),
-     "no number of functions up to 2049 keeps 99%: take a smoother kernel or a longer lengthscale"),
+     "no number of functions up to 2049 keeps 99%: use a smoother kernel or a longer lengthscale"),
 ])
 def test_functions_that_keep_too_little_of_the_variance(make, message):
     with pytest.warns(lfm.ApproximationWarning, match=message):
@@ -353,7 +353,7 @@ def test_a_kernel_that_is_not_positive_definite_is_named():
 
 
 def test_traced_parameters_need_a_number_of_functions():
-    with pytest.raises(ValueError, match="traced parameters. Give functions=J; lfm.forces.significant_functions"):
+    with pytest.raises(ValueError, match="traced parameters. Pass functions=J; lfm.forces.significant_functions"):
         jax.jit(lambda p: lfm.Periodic(forces.PeriodicMatern(1.0, 1.0, p)).eigenvalues())(24.0)
     with pytest.raises(TypeError, match="kernel must be a periodic kernel"):
         lfm.Periodic(lfm.Matern(1.0, 1.0))

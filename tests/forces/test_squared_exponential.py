@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 from scipy.optimize import least_squares
 
 import lfm_ppl as lfm
-from lfm_ppl.forces.squared_exponential import _FITS, _constants
+from lfm_ppl.forces.squared_exponential import _FITS, _unit_process
 
 ORDERS = (2, 4, 6, 7, 8)
 DEFAULT = lfm.SquaredExponential(1.0, 1.0).order
@@ -137,7 +137,7 @@ def test_errors_are_as_documented(order, covariance_error, density_error):
 
 @pytest.mark.parametrize("order", ORDERS)
 def test_matrices_are_well_conditioned_in_the_basis_of_derivatives(order):
-    unit, least = _constants(order), {2: 0.2, 4: 5e-3, 6: 1e-4, 7: 2e-5, 8: 5e-6}[order]
+    unit, least = _unit_process(order), {2: 0.2, 4: 5e-3, 6: 1e-4, 7: 2e-5, 8: 5e-6}[order]
     force = lfm.SquaredExponential(1.0, 1.0, order)
     steps = np.logspace(-6, 4, 41)
     for covariance in [unit.covariance, *np.asarray(jax.vmap(force.process_noise)(steps))]:

@@ -49,7 +49,7 @@ def test_a_sum_takes_forces_only():
 
 def test_a_stack_keeps_its_outputs_apart():
     stack = Stack((Matern(1.3, 0.7, 1, mean=2.0), Constant(3.0) + WienerVelocity(1.0)))
-    assert (stack.state_dim, stack.noise_dim) == (5, 2)
+    assert stack.state_dim == 5
     assert_array_equal(stack.measurement(0.0), [[1, 0, 0, 0, 0], [0, 0, 1, 1, 0]])
     assert_allclose(stack.mean_at(1.0), [2.0, 0.0])
     assert stack.initial_covariance().shape == stack.feedback().shape == (5, 5)
@@ -58,7 +58,7 @@ def test_a_stack_keeps_its_outputs_apart():
 
 def test_a_stack_may_be_empty():
     stack = Stack(())
-    assert (stack.state_dim, stack.noise_dim, stack.jump_times) == (0, 0, ())
+    assert (stack.state_dim, stack.jump_times) == (0, ())
     assert stack.measurement(0.0).shape == (0, 0)
     assert stack.mean_at(0.0).shape == (0,)
     assert [m.shape for m in stack.discretise(0.1)] == [(0, 0), (0, 0)]

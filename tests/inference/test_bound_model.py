@@ -2,7 +2,7 @@
 
 import contextlib
 import logging
-from concurrent.futures import ThreadPoolExecutor
+from unittest.mock import Mock
 
 import jax
 import jax.numpy as jnp
@@ -15,9 +15,10 @@ from numpyro.infer import NUTS
 from numpyro.infer.util import ParamInfo, potential_energy
 
 import lfm_ppl as lfm
-from lfm_ppl.inference import bound_model, sampling
+from lfm_ppl.inference import bound_model, sampling, traced_model
 from lfm_ppl.inference.bound_samplers import nuts_sampler, ram_sampler
 from lfm_ppl.inference.laplace_start import Laplace
+from lfm_ppl.inference.model_digest import model_digest
 from lfm_ppl.inference.schedule import Schedule
 from lfm_ppl.results.arviz_data import group
 
@@ -125,23 +126,22 @@ def test_filter_and_smoother_at_a_draw_are_the_librarys(bound):
 
 
 def test_a_model_is_traced_once_whatever_the_data():
-    runs = []
+    run = Mock(side_effect=model)
 
     def counted(times, y=None):
-        runs.append(y)
-        return model(times, y)
+        run(times, y)
 
     first = lfm.bind(counted, TIMES, Y)
     z = first.unconstrain(VALUES)
     first.log_density_gradient(z)
     first.log_density(z)
-    before = len(runs)
+    count = run.call_count
     with compilations() as compiled:
         second = lfm.bind(counted, TIMES.copy(), OTHER)
         second.log_density_gradient(z)
         second.log_density(z)
         first.with_data(OTHER).log_density(z)
-    assert compiled == [] and len(runs) == before + 1  # a look at what it computes now, without the filter
+    assert compiled == [] and run.call_count == count
     assert float(second.log_density(z)) != float(first.log_density(z))
 
 
@@ -262,7 +262,7 @@ def test_fixed_parameters_and_settings(bound):
     assert float(fixed.constrain(np.zeros(2))["noise_sd"][1]) == pytest.approx(0.2)
     finer = bound.approximate(steps=9)
     assert finer.site.example.steps == 9 and bound.site.example.steps == 2
-    assert bound.approximate(steps=9)._program is finer._program
+    assert bound.approximate(steps=9).traced is finer.traced
 
 
 @pytest.mark.slow
@@ -275,7 +275,7 @@ def test_a_model_that_asks_its_data_for_values():
     found = lfm.bind(looks, TIMES, Y)
     expected = -float(potential_energy(looks, (TIMES, Y), {}, {"decay": jnp.array(0.1)}))
     assert float(found.log_density(np.array([0.1]))) == pytest.approx(expected, rel=1e-12)
-    with pytest.raises(ValueError, match="asks its data for values.*with_data"):
+    with pytest.raises(ValueError, match="needs the values of its data.*with_data"):
         found.log_density(np.array([0.1]), OTHER)
     result = lfm.fit(looks, TIMES, Y, sampler="map", samples=5, trajectory_draws=2, progress=False)
     assert group(result, "log_likelihood")["y"].shape == (1, 5, 5) and "forces" in group(result, "trajectories")
@@ -310,52 +310,54 @@ def test_a_panel():
         found.smooth(z)
 
 
-def _density_of(change, **start):
-    """Log densities of one model function before and after a variable that it reads has changed."""
-    state = {"power": 1.0, "noise": 0.1, "prior": 0.3, "steps": 2, "table": np.array([1.0, 2.0]), **start}
+def _bound_before_and_after(change):
+    """Return bound model, log density and digest of a model function before and after a closure variable changes."""
+    state = {"power": 1.0, "prior": 0.3, "table": np.array([1.0, 2.0])}
 
     def reads(times, y=None):
         decay = numpyro.sample("decay", dist.LogNormal(0.0, state["prior"]))
-        power, table = state["power"], state["table"]
         system = lfm.LatentForceModel(
-            lambda x, u, t: jax.nn.softplus(u) * jnp.asarray(table) - decay * x**power, {"u": lfm.Matern(1.0, 1.0)},
-            lfm.GaussianObservation(lambda x, u, t: x, state["noise"] * jnp.ones(2)),
+            lambda x, u, t: jax.nn.softplus(u) * jnp.asarray(state["table"]) - decay * x ** state["power"],
+            {"u": lfm.Matern(1.0, 1.0)}, lfm.GaussianObservation(lambda x, u, t: x, 0.1 * jnp.ones(2)),
             lfm.Gaussian(jnp.ones(2), 0.1 * jnp.eye(2)))
-        numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=state["steps"]), obs=y)
+        numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=2, iterations=0), obs=y)
 
-    z, found = np.array([0.1]), []
+    results = []
     for update in ({}, change):
         state.update(update)
-        found.append((lfm.bind(reads, TIMES, Y), -float(potential_energy(reads, (TIMES, Y), {}, {"decay": z[0]}))))
-    return z, found
+        bound = lfm.bind(reads, TIMES, Y)
+        results.append((bound, float(bound.log_density(np.array([0.1]))), model_digest(bound)))
+        expected = -float(potential_energy(reads, (TIMES, Y), {}, {"decay": 0.1}))
+        assert results[-1][1] == pytest.approx(expected, rel=1e-12)
+    return results
 
 
-@pytest.mark.parametrize("change", [
-    {"power": 2.0}, *(pytest.param(change, marks=pytest.mark.slow) for change in (
-        {"prior": 0.5}, {"table": np.array([1.0, 2.1])}, {"noise": 0.2}, {"steps": 3}))], ids=str)
-def test_a_variable_that_a_model_reads_may_change(change):
-    z, ((first, before), (second, after)) = _density_of(change)
-    assert second._program is not first._program and before != after
-    assert float(second.log_density(z)) == pytest.approx(after, rel=1e-12)
+@pytest.mark.parametrize("change", [{"power": 2.0}, {"prior": 0.5}, {"table": np.array([1.0, 2.1])}], ids=str)
+def test_a_model_with_changed_variables_is_another_model(change):
+    before, after = _bound_before_and_after(change)
+    assert before[0].traced is not after[0].traced
+    assert before[1] != after[1] and before[2] != after[2]
 
 
-def test_a_table_that_is_read_later_may_change():
-    """Nothing at the first time, or at any single point, tells the two models apart."""
-    table = {"values": np.array([0.0, 0.0, 0.0])}
+def test_a_model_with_equal_variables_is_traced_once():
+    before, after = _bound_before_and_after({"table": np.array([1.0, 2.0])})
+    assert before[0].traced is after[0].traced and before[1:] == after[1:]
 
+
+POWER = 1.0
+
+
+def test_global_variables_of_nested_functions_are_compared(monkeypatch):
     def driven(times, y=None):
         decay = numpyro.sample("decay", dist.LogNormal(0.0, 0.3))
-        known = lfm.Input(np.array([0.0, 1.5, 2.5]), table["values"], outside="hold")
         system = lfm.LatentForceModel(
-            lambda x, u, t: u + known(t) - decay * x, {"u": lfm.Matern(1.0, 1.0)},
+            lambda x, u, t: POWER * u - decay * x, {"u": lfm.Matern(1.0, 1.0)},
             lfm.GaussianObservation(lambda x, u, t: x, 0.1 * jnp.ones(1)), lfm.Gaussian(jnp.ones(1), 0.1 * jnp.eye(1)))
-        numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=2), obs=y)
+        numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
 
-    y, z = Y[:, :1], np.array([0.1])
-    for values in (table["values"], np.array([0.0, 0.0, 2.0])):
-        table["values"] = values
-        expected = -potential_energy(driven, (TIMES, y), {}, {"decay": z[0]})
-        assert float(lfm.bind(driven, TIMES, y).log_density(z)) == pytest.approx(float(expected), rel=1e-12)
+    first = lfm.bind(driven, TIMES, Y[:, :1]).log_density(np.array([0.1]))
+    monkeypatch.setitem(driven.__globals__, "POWER", 2.0)
+    assert float(lfm.bind(driven, TIMES, Y[:, :1]).log_density(np.array([0.1]))) != float(first)
 
 
 def test_times_may_follow_from_parameters_or_data():
@@ -381,36 +383,17 @@ def test_times_may_follow_from_parameters_or_data():
         assert float(found) == pytest.approx(float(expected), rel=1e-12)
 
 
-def test_a_model_whose_variables_stay_is_bound_once():
-    _, ((first, _), (second, _)) = _density_of({"power": 1.0})
-    assert second._program is first._program
-
-
-def test_binding_runs_a_model_as_often_as_it_must():
-    """With numbers and with tracers when it is new, with tracers to see that it is still the same."""
-    runs = []
+def test_binding_runs_a_model_with_numbers_and_with_tracers():
+    run = Mock()
 
     def counted(times, y=None):
-        runs.append(None)
+        run()
         decay = numpyro.sample("decay", dist.LogNormal(0.0, 0.3))
         numpyro.sample("y", lfm.MarginalLikelihood(systems.motif(decay=decay), times, steps=2), obs=y)
 
     first = lfm.bind(counted, TIMES, Y)
-    assert first.site.name == "y" and len(runs) == 2
-    second = lfm.bind(counted, TIMES, OTHER)
-    assert second._program is first._program and second.site.example.steps == 2 and len(runs) == 3
-
-
-def test_threads_share_what_is_compiled():
-    def threaded(times, y=None):
-        decay = numpyro.sample("decay", dist.LogNormal(0.0, 0.3))
-        numpyro.sample("y", lfm.MarginalLikelihood(systems.motif(decay=decay), times, steps=2), obs=y)
-
-    bound, made = lfm.bind(threaded, TIMES, Y), []
-    with ThreadPoolExecutor(4) as pool:
-        found = list(pool.map(lambda _: bound.compiled("mine", lambda: made.append(None) or jnp.sin), range(8)))
-        others = list(pool.map(lambda y: float(lfm.bind(threaded, TIMES, y).log_density(np.array([0.1]))), [Y] * 4))
-    assert len(made) == 1 and set(found) == {jnp.sin} and len(set(others)) == 1
+    assert first.site.name == "y" and run.call_count == 2
+    assert lfm.bind(counted, TIMES, OTHER).traced is first.traced and run.call_count == 2
 
 
 def test_a_model_may_be_bound_first_in_compiled_code():
@@ -424,12 +407,12 @@ def test_a_model_may_be_bound_first_in_compiled_code():
     np.testing.assert_allclose([inside, with_data], outside, rtol=1e-12)
 
 
-def test_programs_of_few_models_are_kept(monkeypatch):
-    monkeypatch.setattr(bound_model, "_MOST_PROGRAMS", 2)
-    bound_model._programs.clear()
+def test_the_latest_models_are_kept(monkeypatch):
+    monkeypatch.setattr(traced_model, "_CACHED_MODELS", 2)
+    traced_model._models.clear()
     for order in (0, 1, 2):
         lfm.bind(model, TIMES, Y, order=order)
-    assert len(bound_model._programs) == 2
+    assert len(traced_model._models) == 2
 
 
 def no_site(times, y=None):

@@ -77,15 +77,15 @@ def test_moments_are_those_of_elliptical_slices(name):
     """Means within 0.05 sd and sds within 3%, each beyond four of its own Monte Carlo errors."""
     model, times, y = problem(name)
     mean, sd = map(np.asarray, lfm.MarginalLikelihood(model, times).smooth(y).force(model.force_names[0]))
-    drawn = slices(model, times, y)
-    exact, spread = drawn.mean((0, 1)), drawn.std((0, 1))
-    of_mean = 1.0 / np.sqrt(effective_sample_size(drawn))
-    of_sd = 1.0 / np.sqrt(2.0 * effective_sample_size((drawn - exact) ** 2))
-    away, wider = np.abs(mean - exact) / spread, np.abs(sd / spread - 1.0)
-    print(f"{name}: means {away.max():.3f} sd at most (rms {np.sqrt((away**2).mean()):.3f}, Monte Carlo "
+    samples = slices(model, times, y)
+    exact, spread = samples.mean((0, 1)), samples.std((0, 1))
+    of_mean = 1.0 / np.sqrt(effective_sample_size(samples))
+    of_sd = 1.0 / np.sqrt(2.0 * effective_sample_size((samples - exact) ** 2))
+    mean_error, wider = np.abs(mean - exact) / spread, np.abs(sd / spread - 1.0)
+    print(f"{name}: means {mean_error.max():.3f} sd at most (rms {np.sqrt((mean_error**2).mean()):.3f}, Monte Carlo "
           f"{of_mean.max():.3f}), sds {wider.max():.3f} (rms {np.sqrt((wider**2).mean()):.3f}, {of_sd.max():.3f})")
     assert of_mean.max() < 0.05 and of_sd.max() < 0.05
-    assert np.all(away < 0.05 + 4 * of_mean) and np.all(wider < 0.03 + 4 * of_sd)
+    assert np.all(mean_error < 0.05 + 4 * of_mean) and np.all(wider < 0.03 + 4 * of_sd)
 
 
 @pytest.mark.slow
@@ -95,9 +95,9 @@ def test_coal_has_the_evidence_of_bayesnewton():
     theirs = {"ep": -175.2304464105596, lfm.SiteSettings(power=0.5): -175.2314237700023,
               "variational": -175.2324063924814}
     for sites, expected in theirs.items():
-        found = float(jax.jit(lfm.MarginalLikelihood(model, times, sites=sites).log_prob)(jnp.asarray(y, float)))
-        print(sites, found)
-        assert found == pytest.approx(expected, abs=1e-7)
+        value = float(jax.jit(lfm.MarginalLikelihood(model, times, sites=sites).log_prob)(jnp.asarray(y, float)))
+        print(sites, value)
+        assert value == pytest.approx(expected, abs=1e-7)
     gaussian = lfm.MarginalLikelihood(model, times, sites=lfm.SiteSettings(linear_response=False))
     mean, sd = map(np.asarray, gaussian.smooth(y).force(model.force_names[0]))
     np.testing.assert_allclose(mean[[0, 50, 100]], [0.73549481, -0.3167189, -0.81036701], atol=5e-7)

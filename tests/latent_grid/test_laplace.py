@@ -35,7 +35,7 @@ def test_it_is_exact_for_a_linear_model(method, variance):
     model = genes(lambda u: u, variance)
     y = observed(model)
     latent = LatentGrid(model, TIMES, 61)
-    found = laplace(latent, y, method)
+    result = laplace(latent, y, method)
     by_force, by_start = (np.asarray(part).reshape(y.size, -1) for part in jax.jit(jax.jacobian(
         latent.state, argnums=(0, 1)))(latent.mean, jnp.zeros(2)))
     present = np.isfinite(y).ravel()
@@ -44,17 +44,17 @@ def test_it_is_exact_for_a_linear_model(method, variance):
     residual = y.ravel()[present] - np.asarray(latent.state(latent.mean)).ravel()[present]
     covariance = a @ prior @ a.T + variance * b @ b.T + 0.01 * np.eye(len(a))
     gain = prior @ a.T @ np.linalg.inv(covariance)
-    assert np.allclose(found.mode[0], gain @ residual, atol=1e-8)
-    assert np.allclose(found.start, np.array([0.2, 0.1]) + variance * b.T @ np.linalg.solve(covariance, residual),
+    assert np.allclose(result.mode[0], gain @ residual, atol=1e-8)
+    assert np.allclose(result.start, np.array([0.2, 0.1]) + variance * b.T @ np.linalg.solve(covariance, residual),
                        atol=1e-8)
-    assert np.allclose(found.root @ found.root.T, prior - gain @ a @ prior, atol=1e-8)
+    assert np.allclose(result.root @ result.root.T, prior - gain @ a @ prior, atol=1e-8)
     log_marginal = -0.5 * (residual @ np.linalg.solve(covariance, residual) + np.linalg.slogdet(covariance)[1]
                            + len(a) * np.log(2 * np.pi))
-    assert np.isclose(found.log_marginal, log_marginal, atol=1e-8)
-    assert bool(found.converged) and int(found.iterations) <= 3
-    draws = np.asarray(found.sample(jax.random.key(0), 20_000))[:, 0]
-    assert np.all(np.abs(draws.mean(axis=0) - found.mode[0]) < 5 * found.sd[0] / np.sqrt(20_000))
-    assert np.allclose(draws.std(axis=0), found.sd[0], rtol=5 / np.sqrt(2 * 20_000))
+    assert np.isclose(result.log_marginal, log_marginal, atol=1e-8)
+    assert bool(result.converged) and int(result.iterations) <= 3
+    draws = np.asarray(result.sample(jax.random.key(0), 20_000))[:, 0]
+    assert np.all(np.abs(draws.mean(axis=0) - result.mode[0]) < 5 * result.sd[0] / np.sqrt(20_000))
+    assert np.allclose(draws.std(axis=0), result.sd[0], rtol=5 / np.sqrt(2 * 20_000))
 
 
 @pytest.mark.parametrize("link", [
@@ -66,7 +66,7 @@ def test_the_mode_is_that_of_a_general_optimiser(link):
     model = genes(link)
     y = observed(model, 1)
     latent = LatentGrid(model, TIMES, 25)
-    found = laplace(latent, y)
+    result = laplace(latent, y)
 
     @jax.jit
     def energy(white):
@@ -74,13 +74,13 @@ def test_the_mode_is_that_of_a_general_optimiser(link):
 
     slope = jax.jit(jax.grad(energy))
     best = minimize(energy, np.zeros(25), jac=slope, method="BFGS", options={"gtol": 1e-9, "maxiter": 5000})
-    assert bool(found.converged) and -float(found.log_joint) <= best.fun + 1e-7
-    assert np.allclose(found.mode, latent.force(jnp.asarray(best.x)[None]), atol=1e-4)
+    assert bool(result.converged) and -float(result.log_joint) <= best.fun + 1e-7
+    assert np.allclose(result.mode, latent.force(jnp.asarray(best.x)[None]), atol=1e-4)
     numeric = np.stack([(np.asarray(slope(best.x + step)) - np.asarray(slope(best.x - step))) / 2e-5
                         for step in 1e-5 * np.eye(25)])
     root = np.asarray(latent.root[0])
-    assert np.allclose(found.root @ found.root.T, root @ np.linalg.inv(numeric) @ root.T, atol=1e-4)
-    assert np.isclose(found.log_marginal, -best.fun - 0.5 * np.linalg.slogdet(numeric)[1], atol=1e-3)
+    assert np.allclose(result.root @ result.root.T, root @ np.linalg.inv(numeric) @ root.T, atol=1e-4)
+    assert np.isclose(result.log_marginal, -best.fun - 0.5 * np.linalg.slogdet(numeric)[1], atol=1e-3)
 
 
 def test_newton_may_end_at_no_mode_and_says_so():
@@ -108,6 +108,6 @@ def test_newton_may_end_at_no_mode_and_says_so():
     ({"latent": genes(jnp.exp)}, TypeError, "latent must be a lfm.LatentGrid"),
 ])
 def test_errors(change, error, message):
-    given = {"latent": LatentGrid(genes(jnp.exp), TIMES, 11), "y": np.zeros((7, 2))} | change
+    arguments = {"latent": LatentGrid(genes(jnp.exp), TIMES, 11), "y": np.zeros((7, 2))} | change
     with pytest.raises(error, match=message):
-        laplace(given.pop("latent"), given.pop("y"), **given)
+        laplace(arguments.pop("latent"), arguments.pop("y"), **arguments)

@@ -25,24 +25,24 @@ def link(u):
 
 def genes(initial_variance=0.0, noise=0.01, function=link, **changes):
     """Three decays, one of them none and one fast compared with the cells."""
-    given = {
+    arguments = {
         "dynamics": lambda x, u, t: 0.3 + jnp.array([1.0, 0.5, 20.0]) * function(u[0]) * (1 + 0.1 * t) - DECAY * x,
         "forces": {"u": lfm.Matern(1.0, 1.5, order=1)},
         "observation": lfm.GaussianObservation(lambda x, u, t: x, noise * jnp.ones(3)),
         "initial_state": lfm.Gaussian(jnp.array([0.2, 0.1, 0.5]), initial_variance * jnp.eye(3)),
     } | changes
-    return lfm.LatentForceModel(**given)
+    return lfm.LatentForceModel(**arguments)
 
 
 def oscillator(**changes):
     """Two coupled states pushed by two forces."""
-    given = {
+    arguments = {
         "dynamics": lambda x, u, t: jnp.asarray(COUPLED) @ x + jnp.array([0.0, 1.0]) * (link(u[0]) + jnp.tanh(u[1])),
         "forces": {"u": lfm.Matern(1.0, 1.5, order=1), "v": lfm.Matern(0.5, 0.7, order=0, mean=0.2)},
         "observation": lfm.GaussianObservation(lambda x, u, t: x[:1] ** 2 + u[1], jnp.array([0.1])),
         "initial_state": lfm.Gaussian(jnp.array([1.0, 0.0]), jnp.zeros(2)),
     } | changes
-    return lfm.LatentForceModel(**given)
+    return lfm.LatentForceModel(**arguments)
 
 
 def state(latent, u):
@@ -60,9 +60,9 @@ def solved(model, forces, start):
     def slope(t, x):
         return np.asarray(dynamics(x, np.array([float(f(t)) for f in forces]), t))
 
-    found = solve_ivp(slope, (TIMES[0], TIMES[-1]), start, t_eval=np.unique(TIMES), rtol=1e-10, atol=1e-12,
-                      method="LSODA")
-    return found.y.T[np.searchsorted(np.unique(TIMES), TIMES)]
+    solution = solve_ivp(slope, (TIMES[0], TIMES[-1]), start, t_eval=np.unique(TIMES), rtol=1e-10, atol=1e-12,
+                         method="LSODA")
+    return solution.y.T[np.searchsorted(np.unique(TIMES), TIMES)]
 
 
 @pytest.mark.parametrize("build, forces, rule, order", [
@@ -78,8 +78,8 @@ def test_the_state_converges_to_that_of_an_ode_solver(build, forces, rule, order
     for points in (174, 347, 693):
         grid = np.linspace(TIMES[0], TIMES[-1], points)
         u = np.stack([np.broadcast_to(f(grid), grid.shape) for f in forces])
-        found = jax.jit(lambda u, grid=grid: LatentGrid(model, TIMES, grid, rule).state(u))(u)
-        errors.append(np.abs(np.asarray(found) - exact)[1:].max(axis=0))
+        state = jax.jit(lambda u, grid=grid: LatentGrid(model, TIMES, grid, rule).state(u))(u)
+        errors.append(np.abs(np.asarray(state) - exact)[1:].max(axis=0))
     slowest = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))[-1]
     assert np.all(slowest > order - 0.15), (errors, slowest)
     # The fast decay of 30 on cells of 4/692: half of 30 h in the first order, (30 h)^2 / 12 in the second.
@@ -96,18 +96,18 @@ def test_the_linear_rule_is_exact_for_a_production_linear_in_each_cell(build, fo
     grid = np.array([0.0, 0.4, 1.1, 2.0, 4.2])
     values = np.random.default_rng(0).normal(size=(forces, 5))
     latent = LatentGrid(model, TIMES, grid, "linear")
-    given = [lambda t, row=row: np.interp(t, grid, row) for row in values]
+    force_functions = [lambda t, row=row: np.interp(t, grid, row) for row in values]
     start = np.array([0.7, -0.2, 0.4])[: model.initial_state.mean.shape[0]]
-    found = np.asarray(latent.state(jnp.asarray(values), jnp.asarray(start)))
+    state_at_times = np.asarray(latent.state(jnp.asarray(values), jnp.asarray(start)))
     # From kink to kink, so that the solver keeps its order.
     breaks = np.unique(np.concatenate([grid[:-1], TIMES]))
-    state, at = start, {0.0: start}
-    for left, right in zip(breaks[:-1], breaks[1:], strict=True):
+    state, states = start, {0.0: start}
+    for start_time, end_time in zip(breaks[:-1], breaks[1:], strict=True):
         def slope(t, x):
-            return np.asarray(model.dynamics(jnp.asarray(x), jnp.asarray([f(t) for f in given]), t))
-        state = solve_ivp(slope, (left, right), state, rtol=1e-11, atol=1e-13, method="LSODA").y[:, -1]
-        at[right] = state
-    assert np.allclose(found, [at[t] for t in TIMES], rtol=1e-7, atol=1e-8)
+            return np.asarray(model.dynamics(jnp.asarray(x), jnp.asarray([f(t) for f in force_functions]), t))
+        state = solve_ivp(slope, (start_time, end_time), state, rtol=1e-11, atol=1e-13, method="LSODA").y[:, -1]
+        states[end_time] = state
+    assert np.allclose(state_at_times, [states[t] for t in TIMES], rtol=1e-7, atol=1e-8)
 
 
 def test_a_linear_link_has_the_posterior_of_the_kalman_smoother():
@@ -121,8 +121,8 @@ def test_a_linear_link_has_the_posterior_of_the_kalman_smoother():
     jacobian, by_start = (np.asarray(part).reshape(y.size, -1) for part in jax.jit(jax.jacobian(
         latent.state, argnums=(0, 1)))(latent.mean, jnp.zeros(3)))
     prior = np.asarray(latent.root)[0] @ np.asarray(latent.root)[0].T
-    rest = np.asarray(latent.state(latent.mean, latent.ssm.model.initial_state.mean)).ravel()
-    a, residual = jacobian[present], (y.ravel() - rest)[present]
+    mean_state = np.asarray(latent.state(latent.mean, latent.ssm.model.initial_state.mean)).ravel()
+    a, residual = jacobian[present], (y.ravel() - mean_state)[present]
     covariance = a @ prior @ a.T + by_start[present] @ by_start[present].T * 0.04 + 0.01 * np.eye(present.sum())
     gain = prior @ a.T @ np.linalg.inv(covariance)
     mean, sd = gain @ residual, np.sqrt(np.diag(prior - gain @ a @ prior))
@@ -145,8 +145,8 @@ def test_the_likelihood_leaves_out_what_is_missing_and_wraps_angles():
     assert np.isclose(latent.log_likelihood(u, jnp.asarray(y)), expected, rtol=1e-12)
     turned = LatentGrid(oscillator(observation=lfm.GaussianObservation(
         lambda x, u, t: x[:1] ** 2 + u[1] + 4 * jnp.pi, jnp.array([0.1]), angular=(0,))), TIMES, 61)
-    near = jnp.asarray(predicted + 0.1)
-    assert np.isclose(turned.log_likelihood(u, near), latent.log_likelihood(u, near), rtol=1e-10)
+    shifted = jnp.asarray(predicted + 0.1)
+    assert np.isclose(turned.log_likelihood(u, shifted), latent.log_likelihood(u, shifted), rtol=1e-10)
 
 
 def test_forces_have_their_covariance_and_mean():
@@ -196,9 +196,9 @@ def test_gradients_in_the_parameters_are_those_of_finite_differences():
      "no physical state"),
 ])
 def test_errors(change, message):
-    given = {"model": genes(), "times": TIMES, "points": 31} | change
+    arguments = {"model": genes(), "times": TIMES, "points": 31} | change
     with pytest.raises(ValueError, match=message):
-        LatentGrid(given.pop("model"), given.pop("times"), given.pop("points"), **given)
+        LatentGrid(arguments.pop("model"), arguments.pop("times"), arguments.pop("points"), **arguments)
 
 
 def test_wrong_shapes_are_named():

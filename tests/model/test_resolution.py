@@ -1,4 +1,4 @@
-"""The warning that data can tell the SDE of a squared exponential force from the process."""
+"""The warning that data can distinguish the SDE of a squared exponential force from the exact process."""
 
 import warnings
 

@@ -1,4 +1,4 @@
-"""The warning that data can tell the functions of a periodic force from its whole kernel, against dense algebra."""
+"""The warning that data can distinguish the functions of a periodic force from the full kernel, by dense algebra."""
 
 import warnings
 
@@ -92,7 +92,7 @@ def test_the_loss_of_a_trend_and_a_season():
     lost = exact - truncated
     assert lost.mean() > 1.0
     assert (np.abs(lost) < found.error).mean() >= 0.93 and np.abs(lost).max() > 0.5 * found.error
-    with pytest.warns(lfm.ApproximationWarning, match=r"the 7 functions .*'season'.*Take functions=(11|13), or expl"):
+    with pytest.warns(lfm.ApproximationWarning, match=r"the 7 functions .*'season'.*Use functions=(11|13), or expl"):
         of_filter = lfm.MarginalLikelihood(model(season, 0.3, trend), WEEKLY).log_prob(y[:, 0, None])
     np.testing.assert_allclose(of_filter, truncated[0], atol=1e-3)
     with warnings.catch_warnings():

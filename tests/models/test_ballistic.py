@@ -9,7 +9,7 @@ import pytest
 
 import lfm_ppl as lfm
 from lfm_ppl import loading
-from lfm_ppl.inference.bound_model import likelihood_site
+from lfm_ppl.inference.likelihood_site import likelihood_site
 
 
 def module(name):

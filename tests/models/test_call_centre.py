@@ -11,7 +11,7 @@ from scipy import integrate
 
 import lfm_ppl as lfm
 from lfm_ppl import loading
-from lfm_ppl.inference.bound_model import likelihood_site
+from lfm_ppl.inference.likelihood_site import likelihood_site
 
 
 def own():

@@ -15,7 +15,7 @@ from numpyro.infer.util import log_density
 from lfm_ppl import loading
 from lfm_ppl.data import Data, read_csv, write_csv
 from lfm_ppl.filtering.filter import check_observations
-from lfm_ppl.inference.bound_model import likelihood_site
+from lfm_ppl.inference.likelihood_site import likelihood_site
 
 MODELS = sorted(loading.available())
 

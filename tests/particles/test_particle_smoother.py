@@ -25,37 +25,37 @@ def linear(force=None):
         lfm.GaussianObservation(first_state, jnp.array([0.05])), lfm.Gaussian(jnp.zeros(1), jnp.array([0.5])))
 
 
-def assert_close(found, mean, sd, draws, share=0.1):
+def assert_close(result, mean, sd, draws, share=0.1):
     """Means within five standard errors of ``draws`` independent trajectories, standard deviations within a share."""
-    assert np.all(np.abs(found.mean - mean) < 5.0 * sd / np.sqrt(draws))
-    assert np.allclose(np.sqrt(np.asarray(found.covariance)[:, 0, 0]), sd[:, 0], rtol=share)
+    assert np.all(np.abs(result.mean - mean) < 5.0 * sd / np.sqrt(draws))
+    assert np.allclose(np.sqrt(np.asarray(result.covariance)[:, 0, 0]), sd[:, 0], rtol=share)
 
 
 @pytest.mark.slow
 def test_backward_simulation_of_a_linear_model():
     """Against the Rauch-Tung-Striebel smoother, before, between and after the observations."""
     exact = lfm.smooth(linear(), TIMES, Y, at=AT)
-    found = lfm.particle_smoother(jax.random.key(0), linear(), TIMES, Y, particles=3000, draws=1500, at=AT)
-    assert (found.method, found.scheme) == ("backward simulation", "exact")
+    result = lfm.particle_smoother(jax.random.key(0), linear(), TIMES, Y, particles=3000, draws=1500, at=AT)
+    assert (result.method, result.scheme) == ("backward simulation", "exact")
     sd = np.sqrt(np.asarray(exact.covariance)[:, [0, 1], [0, 1]])
-    assert_close(found, exact.mean, sd, 1500 / 2)
-    force = found.force("u")
-    assert np.allclose(force.mean, found.mean[:, 1]) and force.draws.shape == (1500, 6)
+    assert_close(result, exact.mean, sd, 1500 / 2)
+    force = result.force("u")
+    assert np.allclose(force.mean, result.mean[:, 1]) and force.draws.shape == (1500, 6)
     assert np.all(np.abs(force.mean - exact.force("u").mean) < 5.0 * exact.force("u").sd / np.sqrt(750))
     # Two states of one trajectory: the covariance of the exact joint distribution, too.
-    drawn = exact.sample(jax.random.key(1), 4000).state[:, :, 0]
-    ours = np.corrcoef(np.asarray(found.draws)[:, :, 0].T)
-    assert np.abs(ours - np.corrcoef(np.asarray(drawn).T)).max() < 5.0 / np.sqrt(750)
+    exact_draws = exact.sample(jax.random.key(1), 4000).state[:, :, 0]
+    ours = np.corrcoef(np.asarray(result.draws)[:, :, 0].T)
+    assert np.abs(ours - np.corrcoef(np.asarray(exact_draws).T)).max() < 5.0 / np.sqrt(750)
 
 
 def test_ancestor_tracing_of_a_linear_model():
     exact = lfm.smooth(linear(), TIMES, Y)
-    found = lfm.particle_smoother(jax.random.key(0), linear(), TIMES, Y, particles=20_000, draws=4000,
-                                  method="ancestor tracing")
-    assert found.method == "ancestor tracing"
-    assert np.all(np.diff(found.distinct) >= 0)  # going back, trajectories meet
+    result = lfm.particle_smoother(jax.random.key(0), linear(), TIMES, Y, particles=20_000, draws=4000,
+                                   method="ancestor tracing")
+    assert result.method == "ancestor tracing"
+    assert np.all(np.diff(result.distinct) >= 0)  # going back, trajectories meet
     sd = np.sqrt(np.asarray(exact.covariance)[:, [0, 1], [0, 1]])
-    assert_close(found, exact.mean, sd, float(found.distinct.min()) / 4)
+    assert_close(result, exact.mean, sd, float(result.distinct.min()) / 4)
 
 
 @pytest.mark.slow
@@ -66,19 +66,19 @@ def test_the_double_well_agrees_with_the_grid():
     at = np.array([0.75, 1.5, 2.25, 4.0])
     exact = fokker_planck(model, times, y, at=at)
     for method, particles, draws in (("backward simulation", 3000, 1000), ("ancestor tracing", 40_000, 4000)):
-        found = lfm.particle_smoother(jax.random.key(2), model, times, y, particles=particles, draws=draws, at=at,
-                                      steps=75, method=method)
-        assert found.method == method
-        count = draws / 2 if method.startswith("back") else float(found.distinct.min()) / 4
-        assert_close(found, np.asarray(exact.smoothed_mean)[:, None], np.asarray(exact.smoothed_sd)[:, None], count)
+        result = lfm.particle_smoother(jax.random.key(2), model, times, y, particles=particles, draws=draws, at=at,
+                                       steps=75, method=method)
+        assert result.method == method
+        count = draws / 2 if method.startswith("back") else float(result.distinct.min()) / 4
+        assert_close(result, np.asarray(exact.smoothed_mean)[:, None], np.asarray(exact.smoothed_sd)[:, None], count)
 
 
 @pytest.mark.slow
 def test_replicates_share_the_state():
     """Between observations at one time nothing moves: a trajectory has one value there."""
-    found = lfm.particle_smoother(jax.random.key(0), double_well(), TIMES, Y, particles=200, draws=50, steps=5)
-    assert found.method == "backward simulation" and found.scheme == "euler"
-    assert np.array_equal(found.draws[:, 1], found.draws[:, 2])
+    result = lfm.particle_smoother(jax.random.key(0), double_well(), TIMES, Y, particles=200, draws=50, steps=5)
+    assert result.method == "backward simulation" and result.scheme == "euler"
+    assert np.array_equal(result.draws[:, 1], result.draws[:, 2])
 
 
 @pytest.mark.slow
@@ -95,8 +95,8 @@ def test_replicates_share_the_state():
 def test_models_without_a_transition_density_are_traced(model, reason):
     with pytest.raises(ValueError, match=reason):
         lfm.particle_smoother(jax.random.key(0), model, TIMES, Y, method="backward simulation")
-    found = lfm.particle_smoother(jax.random.key(0), model, TIMES, Y, particles=50, draws=10, steps=3)
-    assert found.method == "ancestor tracing" and np.all(np.isfinite(found.draws))
+    result = lfm.particle_smoother(jax.random.key(0), model, TIMES, Y, particles=50, draws=10, steps=3)
+    assert result.method == "ancestor tracing" and np.all(np.isfinite(result.draws))
 
 
 @pytest.mark.parametrize("change, message", [
@@ -113,9 +113,9 @@ def test_errors(change, message):
 
 
 def test_an_unknown_force_is_named():
-    found = lfm.particle_smoother(jax.random.key(0), linear(), TIMES, Y, particles=20, draws=5)
+    result = lfm.particle_smoother(jax.random.key(0), linear(), TIMES, Y, particles=20, draws=5)
     with pytest.raises(ValueError, match="unknown force 'v'"):
-        found.force("v")
+        result.force("v")
     with pytest.raises(ValueError, match="unknown state 'y'"):
-        found.state("y")
-    assert np.array_equal(found.state("x0").draws, found.draws[:, :, 0])
+        result.state("y")
+    assert np.array_equal(result.state("x0").draws, result.draws[:, :, 0])

@@ -10,7 +10,7 @@ from systems import double_well, softplus
 import lfm_ppl as lfm
 from lfm_ppl.linalg import semidefinite_root
 from lfm_ppl.model.state_space import Span, state_space
-from lfm_ppl.particles.stochastic_steps import choose_scheme, euler, milstein, prepare, srk
+from lfm_ppl.particles.stochastic_steps import choose_scheme, euler, milstein, srk, step_constants
 
 PATHS, FINEST = 1500, 256
 END = 1.0
@@ -56,7 +56,7 @@ def brownian(ssm, seed=0):
     generator = np.random.default_rng(seed)
     change = np.sqrt(h) * generator.standard_normal((PATHS, FINEST, sources))
     integral = 0.5 * h * change + np.sqrt(h**3 / 12) * generator.standard_normal((PATHS, FINEST, sources))
-    root = np.asarray(prepare(ssm, "srk", jnp.asarray(END), FINEST).root)
+    root = np.asarray(step_constants(ssm, "srk", jnp.asarray(END), FINEST).root)
     kicks = generator.standard_normal((PATHS, FINEST, root.shape[0])) @ root.T
     return change, integral, kicks
 
@@ -65,10 +65,11 @@ def coarser(ssm, noise, factor):
     """The same path on steps that are ``factor`` times as long."""
     change, integral, kicks = (a.reshape(PATHS, FINEST // factor, factor, a.shape[-1]) for a in noise)
     h = END / FINEST
-    before = np.cumsum(change, axis=2) - change
+    path = np.cumsum(change, axis=2) - change
     size = ssm.force_dim
     if size:
-        transition, average = (np.asarray(a) for a in prepare(ssm, "srk", jnp.asarray(END), FINEST)[:2])
+        constants = step_constants(ssm, "srk", jnp.asarray(END), FINEST)
+        transition, average = np.asarray(constants.transition), np.asarray(constants.integral)
         z, q = np.zeros((*kicks.shape[:2], size)), np.zeros((*kicks.shape[:2], kicks.shape[-1] - size))
         for step in range(factor):
             q = q + z @ average.T + kicks[:, :, step, size:]
@@ -76,10 +77,10 @@ def coarser(ssm, noise, factor):
         kicks = np.concatenate([z, q], axis=-1)
     else:
         kicks = kicks[:, :, 0]
-    return change.sum(axis=2), (integral + h * before).sum(axis=2), kicks
+    return change.sum(axis=2), (integral + h * path).sum(axis=2), kicks
 
 
-def ends(ssm, step, noise, start=None):
+def final_states(ssm, step, noise, start=None):
     """The states (paths, n) at the end."""
     change, integral, kicks = (jnp.asarray(a) for a in noise)
     steps = change.shape[1]
@@ -87,17 +88,17 @@ def ends(ssm, step, noise, start=None):
     # What `srk` is given: standard normals from which it forms the increment and the average of the path.
     first = change / jnp.sqrt(h)
     second = (integral / h - 0.5 * change) / jnp.sqrt(h / 12.0)
-    prepared = prepare(ssm, "srk" if step is srk else "euler", jnp.asarray(END), steps)
+    constants = step_constants(ssm, "srk" if step is srk else "euler", jnp.asarray(END), steps)
     mean, _ = ssm.initial()
     mean = mean if start is None else start
 
     def path(first, second, kicks):
-        def one(s, inputs):
+        def take_step(s, inputs):
             index, a, b, kick = inputs
             span = Span.between(index * h, (index + 1) * h, h)
-            return step(ssm, prepared, h, span, s, (a, b), kick), None
+            return step(ssm, constants, h, span, s, (a, b), kick), None
 
-        return jax.lax.scan(one, mean, (jnp.arange(steps), first, second, kicks))[0]
+        return jax.lax.scan(take_step, mean, (jnp.arange(steps), first, second, kicks))[0]
 
     return np.asarray(jax.jit(jax.vmap(path))(first, second, kicks))
 
@@ -105,8 +106,8 @@ def ends(ssm, step, noise, start=None):
 def observed_order(ssm, step, reference=None, factors=(8, 32)):
     """The slope of the root mean square error between two step lengths."""
     noise = brownian(ssm)
-    exact = ends(ssm, srk, noise) if reference is None else reference(noise)
-    errors = [np.sqrt(np.mean((ends(ssm, step, coarser(ssm, noise, f)) - exact)[:, :ssm.physical_dim] ** 2))
+    exact = final_states(ssm, srk, noise) if reference is None else reference(noise)
+    errors = [np.sqrt(np.mean((final_states(ssm, step, coarser(ssm, noise, f)) - exact)[:, :ssm.physical_dim] ** 2))
               for f in factors]
     return np.log(errors[1] / errors[0]) / np.log(factors[1] / factors[0])
 
@@ -152,12 +153,14 @@ def test_milstein_with_several_sources():
 def test_agreement_with_diffrax(solver, order_of_error):
     """The same Brownian paths: to rounding with the same scheme, to its error with another of the same order."""
     steps, h = 64, END / 64
-    tree = lambda key: diffrax.VirtualBrownianTree(  # noqa: E731
-        0.0, END, tol=h / 4, shape=(1,), key=key, levy_area=diffrax.SpaceTimeLevyArea)
     grid = h * np.arange(steps)
 
-    def both(key):
-        path = tree(key)
+    def brownian_path(key):
+        return diffrax.VirtualBrownianTree(0.0, END, tol=h / 4, shape=(1,), key=key,
+                                           levy_area=diffrax.SpaceTimeLevyArea)
+
+    def reference_solution(key):
+        path = brownian_path(key)
         terms = diffrax.MultiTerm(diffrax.ODETerm(lambda t, x, a: x - x**3),
                                   diffrax.ControlTerm(lambda t, x, a: jnp.array([[0.7]]), path))
         theirs = diffrax.diffeqsolve(terms, solver, 0.0, END, None, jnp.array([0.3]),
@@ -165,8 +168,8 @@ def test_agreement_with_diffrax(solver, order_of_error):
         area = jax.vmap(lambda t: path.evaluate(t, t + h, use_levy=True))(grid)
         return theirs, area.W, h * (0.5 * area.W + area.H)
 
-    theirs, change, integral = jax.jit(jax.vmap(both))(jax.random.split(jax.random.key(0), 50))
-    ours = ends(well(), srk, (change, integral, np.zeros((50, steps, 0))))
+    theirs, change, integral = jax.jit(jax.vmap(reference_solution))(jax.random.split(jax.random.key(0), 50))
+    ours = final_states(well(), srk, (change, integral, np.zeros((50, steps, 0))))
     assert np.sqrt(np.mean((ours - theirs) ** 2)) < order_of_error
 
 
@@ -175,25 +178,25 @@ def test_force_noise_is_exact():
     force, h = lfm.Matern(1.3, 0.7, 0), 0.4
     ssm = state_space(lfm.LatentForceModel(
         lambda x, u, t: u**2, {"u": force}, OBSERVATION, lfm.Gaussian(jnp.zeros(1), jnp.zeros(1))))
-    ready = prepare(ssm, "srk", jnp.asarray(h), 1)
+    constants = step_constants(ssm, "srk", jnp.asarray(h), 1)
     start = np.asarray(force.initial_covariance())
-    moved = np.concatenate([ready.transition, ready.average])
-    found = moved @ start @ moved.T + np.asarray(ready.root) @ np.asarray(ready.root).T
+    moved = np.concatenate([constants.transition, constants.integral])
+    joint_cov = moved @ start @ moved.T + np.asarray(constants.root) @ np.asarray(constants.root).T
     nodes, weights = np.polynomial.legendre.leggauss(40)
     nodes, weights = 0.5 * h * (nodes + 1), 0.5 * h * weights
     # The kernel has a kink where its arguments meet, so the double integral is taken in closed form.
     rate = 1 / 0.7
     double = 2 * 1.69 * (h / rate - (1 - np.exp(-rate * h)) / rate**2)
     cross = (weights * np.asarray(force.covariance(h - nodes))).sum()
-    assert np.allclose(found, [[1.69, cross], [cross, double]], rtol=1e-10)
+    assert np.allclose(joint_cov, [[1.69, cross], [cross, double]], rtol=1e-10)
 
 
 def test_a_step_of_no_length_moves_nothing():
     ssm = pushed(1)
-    ready = prepare(ssm, "srk", jnp.zeros(()), 1)
+    constants = step_constants(ssm, "srk", jnp.zeros(()), 1)
     s = jnp.array([0.3, -0.2, 0.5])
     instant = Span.between(jnp.ones(()), jnp.ones(()), jnp.zeros(()))
-    moved = srk(ssm, ready, jnp.zeros(()), instant, s, (jnp.ones(1), jnp.ones(1)), jnp.zeros(3))
+    moved = srk(ssm, constants, jnp.zeros(()), instant, s, (jnp.ones(1), jnp.ones(1)), jnp.zeros(3))
     assert np.allclose(moved, s)
     assert np.allclose(semidefinite_root(jnp.zeros((3, 3))), 0.0)
 

@@ -10,7 +10,7 @@ from scipy import stats
 
 import lfm_ppl as lfm
 from lfm_ppl.switching.mixture import Mixture
-from lfm_ppl.switching.switched_model import only_adds
+from lfm_ppl.switching.switched_model import is_input_additive
 
 TIMES = np.arange(0.0, 4.01, 0.25)
 ALPHA, BETA, OUTSIDE, SCALE, LENGTH, NOISE = 0.3, 5.0, 5.0, 1.0, 1.5, 0.04
@@ -54,16 +54,16 @@ def by_hand(generator, count):
     return np.array(temperatures), np.array(heaters)
 
 
-def agree(found, paths, inputs):
+def agree(result, paths, inputs):
     """Means of temperature and heater within four standard errors of the difference, at every time."""
-    mean, sd = found.outputs.moments()
-    error = np.hypot(found.outputs.error()[:, 0], paths.std(axis=1) / np.sqrt(paths.shape[1]))
+    mean, sd = result.outputs.moments()
+    error = np.hypot(result.outputs.error()[:, 0], paths.std(axis=1) / np.sqrt(paths.shape[1]))
     np.testing.assert_array_less(np.abs(mean[:, 0] - paths.mean(axis=1)), 4.0 * error + 1e-12)
     # A standard deviation of N draws has a relative error of at least 1/sqrt(2 N).
-    np.testing.assert_allclose(sd[:, 0], paths.std(axis=1), rtol=4.0 / np.sqrt(2 * found.inputs.shape[1]))
+    np.testing.assert_allclose(sd[:, 0], paths.std(axis=1), rtol=4.0 / np.sqrt(2 * result.inputs.shape[1]))
     p = inputs.mean(axis=1)
-    error = np.sqrt(p * (1 - p) * (1 / found.inputs.shape[1] + 1 / inputs.shape[1]))
-    np.testing.assert_array_less(np.abs(found.input_mean - p), 4.0 * error + 1e-12)
+    error = np.sqrt(p * (1 - p) * (1 / result.inputs.shape[1] + 1 / inputs.shape[1]))
+    np.testing.assert_array_less(np.abs(result.input_mean - p), 4.0 * error + 1e-12)
 
 
 @pytest.fixture(scope="module")
@@ -78,28 +78,29 @@ def test_the_prediction_is_that_of_a_hundred_times_the_plain_particles(predicted
 
 @pytest.mark.slow
 def test_simulated_paths_have_the_same_distribution(predicted):
-    drawn = lfm.simulate_switched(jax.random.key(2), house, THERMOSTAT, TIMES, paths=100_000)
-    agree(predicted, np.asarray(drawn.state[:, :, 0]), np.asarray(drawn.inputs))
-    residual = np.asarray(drawn.y[:, :, 0] - drawn.state[:, :, 0])
+    simulation = lfm.simulate_switched(jax.random.key(2), house, THERMOSTAT, TIMES, paths=100_000)
+    agree(predicted, np.asarray(simulation.state[:, :, 0]), np.asarray(simulation.inputs))
+    residual = np.asarray(simulation.y[:, :, 0] - simulation.state[:, :, 0])
     assert residual.var() == pytest.approx(NOISE, rel=0.02)
 
 
 @pytest.mark.slow
 def test_an_input_that_changes_a_rate_has_covariances_of_its_own():
-    assert only_adds(house) and not only_adds(leaky)
-    found = lfm.rao_blackwellised(jax.random.key(3), leaky, THERMOSTAT, TIMES, particles=1000)
-    assert found.outputs.variance.shape == (len(TIMES), 1000, 1)
-    drawn = lfm.simulate_switched(jax.random.key(4), leaky, THERMOSTAT, TIMES, paths=100_000)
-    agree(found, np.asarray(drawn.state[:, :, 0]), np.asarray(drawn.inputs))
+    assert is_input_additive(house) and not is_input_additive(leaky)
+    result = lfm.rao_blackwellised(jax.random.key(3), leaky, THERMOSTAT, TIMES, particles=1000)
+    assert result.outputs.variance.shape == (len(TIMES), 1000, 1)
+    simulation = lfm.simulate_switched(jax.random.key(4), leaky, THERMOSTAT, TIMES, paths=100_000)
+    agree(result, np.asarray(simulation.state[:, :, 0]), np.asarray(simulation.inputs))
 
 
 @pytest.mark.slow
 def test_between_decisions_nothing_is_drawn():
-    """With one decision at the start, later moments are those of two Gaussians, and vary less than plain particles."""
-    found = lfm.rao_blackwellised(jax.random.key(5), house, THERMOSTAT, TIMES, particles=400, decisions=TIMES[:1])
-    drawn = lfm.simulate_switched(jax.random.key(6), house, THERMOSTAT, TIMES, paths=40_000, decisions=TIMES[:1])
-    agree(found, np.asarray(drawn.state[:, :, 0]), np.asarray(drawn.inputs))
-    assert (found.inputs == found.inputs[0]).all()
+    """With one decision at the start, later moments are exact for two Gaussians, and vary less than plain particles."""
+    result = lfm.rao_blackwellised(jax.random.key(5), house, THERMOSTAT, TIMES, particles=400, decisions=TIMES[:1])
+    simulation = lfm.simulate_switched(jax.random.key(6), house, THERMOSTAT, TIMES, paths=40_000,
+                                       decisions=TIMES[:1])
+    agree(result, np.asarray(simulation.state[:, :, 0]), np.asarray(simulation.inputs))
+    assert (result.inputs == result.inputs[0]).all()
     heated = lfm.rao_blackwellised(jax.random.key(5), house, lfm.Thermostat(100.0), TIMES, particles=400,
                                    decisions=TIMES[:1])
     plain = heated.outputs.moments()[1][-1, 0] / np.sqrt(400)
@@ -113,11 +114,11 @@ def test_an_input_that_never_changes_is_the_filter(build):
     y = 17.0 + np.sin(3 * TIMES)[:, None]
     y[[2, 3, 9]] = np.nan
     always = lfm.Thermostat(1e12, sensor_sd=1e9)  # so inaccurate a sensor says nothing of the state
-    found = lfm.rao_blackwellised(jax.random.key(0), build, always, TIMES, y=y, initial=1, particles=3)
+    result = lfm.rao_blackwellised(jax.random.key(0), build, always, TIMES, y=y, initial=1, particles=3)
     expected = lfm.filter(build(1.0), TIMES, y)
-    np.testing.assert_allclose(found.log_likelihood, expected.log_likelihood, rtol=1e-8, atol=1e-10)
-    np.testing.assert_allclose(found.mean, expected.filtered_mean, rtol=1e-7, atol=1e-7)
-    np.testing.assert_allclose(found.covariance, expected.filtered_covariance, rtol=1e-7, atol=1e-8)
+    np.testing.assert_allclose(result.log_likelihood, expected.log_likelihood, rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(result.mean, expected.filtered_mean, rtol=1e-7, atol=1e-7)
+    np.testing.assert_allclose(result.covariance, expected.filtered_covariance, rtol=1e-7, atol=1e-8)
     went_on = lfm.rao_blackwellised(jax.random.key(0), build, always, TIMES[5:], y=y[5:], initial=1, particles=3,
                                     start=lfm.filter(build(1.0), TIMES[:5], y[:5]).state)
     np.testing.assert_allclose(went_on.mean[-1], expected.filtered_mean[-1], rtol=1e-7, atol=1e-7)
@@ -127,18 +128,18 @@ def test_the_likelihood_is_that_of_weighted_paths():
     times = TIMES[:7]
     y = np.full((7, 1), np.nan)
     y[[2, 4, 6], 0] = [17.5, 18.2, 18.0]
-    found = lfm.rao_blackwellised(jax.random.key(7), house, THERMOSTAT, times, y=y, particles=4000)
-    drawn = lfm.simulate_switched(jax.random.key(8), house, THERMOSTAT, times, paths=200_000)
-    path = np.asarray(drawn.state[:, :, 0])
+    result = lfm.rao_blackwellised(jax.random.key(7), house, THERMOSTAT, times, y=y, particles=4000)
+    simulation = lfm.simulate_switched(jax.random.key(8), house, THERMOSTAT, times, paths=200_000)
+    path = np.asarray(simulation.state[:, :, 0])
     weight = np.exp(sum(stats.norm(path[k], np.sqrt(NOISE)).logpdf(y[k, 0]) for k in (2, 4, 6)))
     error = weight.std() / np.sqrt(weight.size)
     # The variance of the logarithm of the filter's own estimate is at most of order 1/ess of its weights.
-    own = weight.mean() * np.sqrt(3.0 / float(found.ess.min()))
-    assert abs(float(jnp.exp(found.log_likelihood.sum())) - weight.mean()) < 4 * np.hypot(error, own)
+    standard_error = weight.mean() * np.sqrt(3.0 / float(result.ess.min()))
+    assert abs(float(jnp.exp(result.log_likelihood.sum())) - weight.mean()) < 4 * np.hypot(error, standard_error)
     mean = (weight * path[6]).sum() / weight.sum()
     spread = np.sqrt((weight * (path[6] - mean) ** 2).sum() / weight.sum())
     size = weight.sum() ** 2 / (weight**2).sum()
-    assert abs(float(found.mean[6, 0]) - mean) < 4 * spread * np.sqrt(1 / size + 3.0 / float(found.ess.min()))
+    assert abs(float(result.mean[6, 0]) - mean) < 4 * spread * np.sqrt(1 / size + 3.0 / float(result.ess.min()))
 
 
 @pytest.mark.slow
@@ -156,9 +157,9 @@ def test_forces_that_jump_are_followed():
         return lfm.LatentForceModel(model.dynamics, {"rest": Kicked(SCALE, LENGTH, order=0)}, model.observation,
                                     model.initial_state)
 
-    found = lfm.rao_blackwellised(jax.random.key(9), kicked, THERMOSTAT, TIMES, particles=1000)
-    drawn = lfm.simulate_switched(jax.random.key(10), kicked, THERMOSTAT, TIMES, paths=100_000)
-    agree(found, np.asarray(drawn.state[:, :, 0]), np.asarray(drawn.inputs))
+    result = lfm.rao_blackwellised(jax.random.key(9), kicked, THERMOSTAT, TIMES, particles=1000)
+    simulation = lfm.simulate_switched(jax.random.key(10), kicked, THERMOSTAT, TIMES, paths=100_000)
+    agree(result, np.asarray(simulation.state[:, :, 0]), np.asarray(simulation.inputs))
 
 
 def test_one_compilation_serves_all_values():
@@ -186,8 +187,8 @@ def test_thermostat_with_and_without_hysteresis():
     assert [[int(wide.decide(d, jnp.array([r]), 0.0)) for r in readings] for d in (0, 1)] == [
         [1, 0, 0, 0, 0], [1, 1, 1, 1, 0]]
     assert [int(sharp.decide(1, jnp.array([r]), 0.0)) for r in readings] == [1, 1, 0, 0, 0]
-    other = lfm.Thermostat(20.0, sensor=lambda x, u, t: 0.5 * (x[0] + x[1]))
-    assert other.reading(jnp.array([18.0, 20.0]), jnp.zeros(0), 0.0).tolist() == [19.0]
+    thermostat = lfm.Thermostat(20.0, sensor=lambda x, u, t: 0.5 * (x[0] + x[1]))
+    assert thermostat.reading(jnp.array([18.0, 20.0]), jnp.zeros(0), 0.0).tolist() == [19.0]
 
 
 def test_mixtures_against_scipy():
@@ -199,10 +200,10 @@ def test_mixtures_against_scipy():
     np.testing.assert_allclose([float(part[0, 0]) for part in mixture.moments()], [expected, np.sqrt(variance)])
     assert float(mixture.log_density([[1.3]])[0, 0]) == pytest.approx(np.log((weight[0] * parts.pdf(1.3)).sum()))
     shares = np.array([0.01, 0.5, 0.975])
-    found = np.asarray(mixture.quantiles(shares))[:, 0, 0]
-    np.testing.assert_allclose([(weight[0] * parts.cdf(x)).sum() for x in found], shares, rtol=1e-10)
-    known = Mixture(jnp.array([[[3.0], [5.0]]]), jnp.zeros((1, 1, 1)), jnp.log(jnp.full((1, 2), 0.5)))
-    np.testing.assert_allclose(np.asarray(known.quantiles([0.25, 0.75]))[:, 0, 0], [3.0, 5.0], rtol=1e-12)
+    quantiles = np.asarray(mixture.quantiles(shares))[:, 0, 0]
+    np.testing.assert_allclose([(weight[0] * parts.cdf(x)).sum() for x in quantiles], shares, rtol=1e-10)
+    point_mixture = Mixture(jnp.array([[[3.0], [5.0]]]), jnp.zeros((1, 1, 1)), jnp.log(jnp.full((1, 2), 0.5)))
+    np.testing.assert_allclose(np.asarray(point_mixture.quantiles([0.25, 0.75]))[:, 0, 0], [3.0, 5.0], rtol=1e-12)
 
 
 @pytest.mark.parametrize(("make", "message"), [
@@ -217,7 +218,7 @@ def test_mixtures_against_scipy():
     (lambda: run(threshold=2.0), "threshold must lie in"),
     (lambda: run(decisions=[-1.0]), "lies before the initial time"),
     (lambda: run(build=curved), "not linear in 'x0'.*simulate_switched"),
-    (lambda: run(rule=lfm.Thermostat(20.0, sensor=lambda x, u, t: x[0] ** 2)), "what the rule reads is not linear"),
+    (lambda: run(rule=lfm.Thermostat(20.0, sensor=lambda x, u, t: x[0] ** 2)), "the reading of the rule is not linear"),
     (lambda: run(build=lambda heater: house(heater) if heater else two_rooms()), "other states, outputs"),
     (lambda: run(build=later), "build\\(1\\) has another initial state or time than build\\(0\\)"),
     (lambda: run(start=lfm.FilterState(0.0, jnp.zeros(5), jnp.eye(5))), "start has 5 entries"),
@@ -269,15 +270,16 @@ def test_an_observation_comes_before_the_decision_at_its_time():
             lfm.Gaussian(jnp.array([17.0]), 1e-4 * jnp.eye(1)))
 
     times, key = np.arange(3.0), jax.random.key(0)
-    drawn = lfm.simulate_switched(key, lamp, lfm.Thermostat(1000.0), times, steps=1)
-    np.testing.assert_allclose(drawn.y[:, 0, 0], [17.0, 117.0, 117.0], atol=0.1)
-    np.testing.assert_array_equal(drawn.inputs[:, 0], [1.0, 1.0, 1.0])
-    found = lfm.rao_blackwellised(key, lamp, lfm.Thermostat(1000.0), times, y=drawn.y[:, 0], particles=10, steps=1)
-    np.testing.assert_allclose(found.outputs.moments()[0][:, 0], [17.0, 117.0, 117.0], atol=0.1)
-    assert np.isfinite(found.log_likelihood).all() and found.log_likelihood[0] > 0.0
+    simulation = lfm.simulate_switched(key, lamp, lfm.Thermostat(1000.0), times, steps=1)
+    np.testing.assert_allclose(simulation.y[:, 0, 0], [17.0, 117.0, 117.0], atol=0.1)
+    np.testing.assert_array_equal(simulation.inputs[:, 0], [1.0, 1.0, 1.0])
+    result = lfm.rao_blackwellised(key, lamp, lfm.Thermostat(1000.0), times, y=simulation.y[:, 0], particles=10,
+                                   steps=1)
+    np.testing.assert_allclose(result.outputs.moments()[0][:, 0], [17.0, 117.0, 117.0], atol=0.1)
+    assert np.isfinite(result.log_likelihood).all() and result.log_likelihood[0] > 0.0
 
 
 def test_a_model_that_asks_for_the_value_in_python_has_a_covariance_for_each_particle():
     rates = {0.0: ALPHA, 1.0: ALPHA}
-    assert not only_adds(lambda heater: house(heater, rates[heater]))
-    assert not only_adds(lambda heater: house(heater, float(np.array([heater])[0])))
+    assert not is_input_additive(lambda heater: house(heater, rates[heater]))
+    assert not is_input_additive(lambda heater: house(heater, float(np.array([heater])[0])))

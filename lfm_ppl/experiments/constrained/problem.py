@@ -15,7 +15,8 @@ from scipy.signal import lfilter
 
 from lfm_ppl import loading
 from lfm_ppl.forces import Matern
-from lfm_ppl.inference.bound_model import bind, likelihood_site
+from lfm_ppl.inference.bound_model import bind
+from lfm_ppl.inference.likelihood_site import likelihood_site
 from lfm_ppl.inference.log_posterior import LogPosterior
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.linearisation.sigma_points import Cubature, GaussHermite

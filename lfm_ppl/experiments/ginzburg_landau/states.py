@@ -89,9 +89,9 @@ def solved(method: str, theta: jax.Array, sparse: jax.Array, fine: np.ndarray, s
                 (smoothed.mean[:, 0], smoothed.covariance[:, 0, 0]), ())
     ssm, cells = state_space(system), cells_of(size)
     time_grid = build_time_grid(ssm, fine, 1)
-    moving = grid_filter.moves(grid_filter.on_grid(ssm, time_grid, cells), time_grid, 1)
-    passed = grid_filter.forward(moving, time_grid, sparse[None], keep=True)
-    masses = passed.filtered[:, 0], grid_filter.backward(moving, time_grid, passed)[:, 0]
+    transition = grid_filter.build_transition(grid_filter.on_grid(ssm, time_grid, cells), time_grid, 1)
+    passed = grid_filter.forward(transition, time_grid, sparse[None], keep_masses=True)
+    masses = passed.filtered[:, 0], grid_filter.backward(transition, time_grid, passed)[:, 0]
     means = [mass @ cells.centres for mass in masses]
     variances = [(mass * (cells.centres - mean[:, None]) ** 2).sum(axis=1)
                  for mass, mean in zip(masses, means, strict=True)]

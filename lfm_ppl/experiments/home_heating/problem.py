@@ -15,8 +15,8 @@ from numpyro import handlers
 
 from lfm_ppl import loading
 from lfm_ppl.data import Data
-from lfm_ppl.inference.bound_model import likelihood_site
 from lfm_ppl.inference.handlers.fixing import fix
+from lfm_ppl.inference.likelihood_site import likelihood_site
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.model.inputs import Input
 from lfm_ppl.model.latent_force_model import LatentForceModel

@@ -15,7 +15,7 @@ from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.periodic_kernels import problem
 from lfm_ppl.experiments.periodic_kernels.problem import MEASURED, PREDICTED
 from lfm_ppl.experiments.tasks import stacked
-from lfm_ppl.forces import Force, Kernel, random_frequencies
+from lfm_ppl.forces import Force, PeriodicCovariance, random_frequencies
 
 EIGENFUNCTIONS, RESONATORS, RANDOM = METHODS = ("eigenfunctions", "resonators", "sparse spectrum")
 """Whose covariance functions are compared, by the number of functions."""
@@ -73,12 +73,12 @@ def quadrature_errors(task: Task) -> Result:
     return found
 
 
-def fitting(kernel: Kernel, count: int) -> int:
+def fitting(kernel: PeriodicCovariance, count: int) -> int:
     """Return the number of functions; of a stationary kernel, which has pairs, one less if even."""
     return count - (count + 1) % 2 if kernel.stationary else count
 
 
-def eigenfunctions(kernel: Kernel, count: int, points: int = 200) -> forces.Periodic:
+def eigenfunctions(kernel: PeriodicCovariance, count: int, points: int = 200) -> forces.Periodic:
     """Return the force of so many eigenfunctions, as far as the kernel has them."""
     return forces.Periodic(kernel, functions=fitting(kernel, count), points=points, explained_variance=0.0)
 

@@ -1,5 +1,6 @@
-"""Observation families: how counts, yes or no, heavy-tailed and censored values come from a predictor; one a file.
+"""Observation families: distributions of counts, binary, heavy-tailed and censored data given a predictor.
 
-`family` says what a family has to be, `links` has the maps from predictors to rates and probabilities. Gaussian
-observations are no family, but `lfm_ppl.model.observation`. Public families are `lfm_ppl.NAME`.
+There is one family per module. `family` defines the protocol, `links` the maps from predictors to rates and
+probabilities. Gaussian observations are not a family, see `lfm_ppl.model.observation`. Public families are
+`lfm_ppl.NAME`.
 """

@@ -1,4 +1,4 @@
-"""How many of a known number."""
+"""Numbers of successes among known numbers of trials."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import betainc, gammaln
 
-from lfm_ppl.model.observations.family import ObservationFamily, not_counts, parameter
-from lfm_ppl.model.observations.links import PROBABILITIES, checked
+from lfm_ppl.model.observations.family import ObservationFamily, as_parameter, is_not_count
+from lfm_ppl.model.observations.links import PROBABILITIES, link_name
 
 
 class BinomialObservation(ObservationFamily):
@@ -22,11 +22,11 @@ class BinomialObservation(ObservationFamily):
 
     Args:
         function: ``h(x, u, t) -> (D,)``, the predictor f.
-        total_count: n: a number, (D,) or (T, D).
+        total_count: number of trials n: a number, (D,) or (T, D).
         link: g: "logit", "probit" or "identity" (the predictor is then the probability itself).
 
     Raises:
-        ValueError: an unknown link; a number of trials that is not positive.
+        ValueError: the link is unknown, or the number of trials is not positive.
 
     Example:
         >>> import jax.numpy as jnp
@@ -40,39 +40,41 @@ class BinomialObservation(ObservationFamily):
 
     def __init__(self, function: Callable[..., jax.Array], total_count: Any, link: str = "logit"):
         self.function = function
-        self.total_count = parameter("total_count", total_count)
-        self.link = checked(link, PROBABILITIES)
+        self.total_count = as_parameter("total_count", total_count)
+        self.link = link_name(link, PROBABILITIES)
 
     def log_prob(self, predictor: jax.Array, y: jax.Array) -> jax.Array:
         """Return log C(n, y) + y log p + (n - y) log(1 - p), (D,)."""
-        link, n = PROBABILITIES[self.link], self.total_count
-        ways = gammaln(n + 1.0) - gammaln(y + 1.0) - gammaln(n - y + 1.0)
-        return ways + _times(y, link.log_probability(predictor)) + _times(n - y, link.log_complement(predictor))
+        (log_probability, log_complement), n = PROBABILITIES[self.link], self.total_count
+        log_coefficient = gammaln(n + 1.0) - gammaln(y + 1.0) - gammaln(n - y + 1.0)
+        return (log_coefficient + _log_power(log_probability(predictor), y)
+                + _log_power(log_complement(predictor), n - y))
 
     def sample(self, key: jax.Array, predictor: jax.Array) -> jax.Array:
         """Draw counts (D,)."""
-        probability = jnp.exp(PROBABILITIES[self.link].log_probability(predictor))
+        probability = jnp.exp(PROBABILITIES[self.link][0](predictor))
         return jax.random.binomial(key, self.total_count, probability, predictor.shape).astype(predictor.dtype)
 
     def cumulative(self, predictor: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return P(data < y) and P(data <= y), (D,) each."""
-        n, share = self.total_count, jnp.exp(PROBABILITIES[self.link].log_complement(predictor))
-        below = jnp.where(y > 0, betainc(n - y + 1.0, jnp.where(y > 0, y, 1.0), share), 0.0)
-        return below, jnp.where(y < n, betainc(jnp.where(y < n, n - y, 1.0), y + 1.0, share), 1.0)
+        _, log_complement = PROBABILITIES[self.link]
+        n, complement = self.total_count, jnp.exp(log_complement(predictor))
+        below = jnp.where(y > 0, betainc(n - y + 1.0, jnp.where(y > 0, y, 1.0), complement), 0.0)
+        return below, jnp.where(y < n, betainc(jnp.where(y < n, n - y, 1.0), y + 1.0, complement), 1.0)
 
     def mean(self, predictor: jax.Array) -> jax.Array:
         """Return the expected counts (D,)."""
-        return self.total_count * jnp.exp(PROBABILITIES[self.link].log_probability(predictor))
+        return self.total_count * jnp.exp(PROBABILITIES[self.link][0](predictor))
 
     def problem(self, y: np.ndarray) -> tuple[np.ndarray, str]:
-        """Counts are whole numbers from zero to the number of trials."""
-        return not_counts(y) | (y > np.asarray(self.total_count)), "counts: whole numbers from zero to total_count"
+        """Return which data are not counts up to the number of trials, and the requirement."""
+        return is_not_count(y) | (y > np.asarray(self.total_count)), "counts: whole numbers from zero to total_count"
 
     def overflows(self, predictor: np.ndarray) -> np.ndarray:
-        """Say where the predictor is no number, or no probability."""
+        """Return whether the predictor is not finite, or is not a probability under the identity link, (D,)."""
         return ~np.isfinite(predictor) | ((self.link == "identity") & ((predictor <= 0) | (predictor >= 1)))
 
 
-def _times(count: jax.Array, log_probability: jax.Array) -> jax.Array:
-    """Return count * log p, zero for a count of zero whatever p is."""
+def _log_power(log_probability: jax.Array, count: jax.Array) -> jax.Array:
+    """Return count * log p, zero for a count of zero also where log p is infinite."""
     return jnp.where(count == 0, 0.0, count * log_probability)

@@ -1,4 +1,4 @@
-"""Measurements of which only a limit or an interval is known."""
+"""Censored measurements, of which only a limit or an interval is reported."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import numpy as np
 from jax.scipy.stats import norm
 
 from lfm_ppl import checks
-from lfm_ppl.model.observations.family import ObservationFamily, parameter
+from lfm_ppl.model.observations.family import ObservationFamily, as_parameter
 
 
 class CensoredObservation(ObservationFamily):
     r"""Gaussian measurements with censoring.
 
-    The measurement ``f + s e``, ``e ~ N(0, 1)``, is not always seen:
+    The measurement ``f + s e``, ``e ~ N(0, 1)``, may be reported incompletely:
 
     - left: a value at or below ``left`` is reported as ``left`` (a detection limit);
     - right: a value at or above ``right`` is reported as ``right`` (a saturated instrument);
@@ -26,12 +26,12 @@ class CensoredObservation(ObservationFamily):
     Args:
         function: ``h(x, u, t) -> (D,)``, f.
         scale: s > 0: a number, (D,) or (T, D); it may be sampled.
-        left: lower limit; -inf for none. A number, (D,) or (T, D), and so are the next two.
-        right: upper limit; inf for none.
-        width: of the bins; 0 where values are reported as they are.
+        left: lower limit, -inf for none: a number, (D,) or (T, D).
+        right: upper limit, inf for none; shapes as for ``left``.
+        width: width of the bins, 0 where values are reported exactly; shapes as for ``left``.
 
     Raises:
-        ValueError: a scale that is not positive, a negative width, a lower limit that is not below the upper one.
+        ValueError: the scale is not positive, the width is negative, or the lower limit is not below the upper limit.
 
     Example:
         >>> import jax.numpy as jnp
@@ -51,44 +51,44 @@ class CensoredObservation(ObservationFamily):
     def __init__(self, function: Callable[..., jax.Array], scale: Any, left: Any = -np.inf, right: Any = np.inf,
                  width: Any = 0.0):
         self.function = function
-        self.scale = parameter("scale", scale)
+        self.scale = as_parameter("scale", scale)
         self.left, self.right, self.width = (jnp.asarray(checks.unmask(value), float) for value in (left, right, width))
-        known = [checks.concrete(value) for value in (self.left, self.right, self.width)]
-        if known[0] is not None and known[1] is not None and not np.all(known[0] < known[1]):
-            raise ValueError(f"left must lie below right, got left={known[0]} and right={known[1]}.")
-        if known[2] is not None and not np.all(known[2] >= 0):
-            raise ValueError(f"width must be at least zero, got {known[2]}.")
+        lower, upper, bin_width = (checks.concrete(value) for value in (self.left, self.right, self.width))
+        if lower is not None and upper is not None and not np.all(lower < upper):
+            raise ValueError(f"left must lie below right, got left={lower} and right={upper}.")
+        if bin_width is not None and not np.all(bin_width >= 0):
+            raise ValueError(f"width must be at least zero, got {bin_width}.")
 
     def log_prob(self, predictor: jax.Array, y: jax.Array) -> jax.Array:
-        """Return the log density of what is seen, the log probability of what is censored, (D,)."""
+        """Return the log density of exact values, the log probability of limits and bins, (D,)."""
         s = self.scale
         half = 0.5 * jnp.where(self.width > 0, self.width, s)
         error = (y - predictor) / s
-        seen = jnp.where(self.width > 0, _log_probability_between(error - half / s, error + half / s),
-                         norm.logpdf(error) - jnp.log(s))
+        uncensored = jnp.where(self.width > 0, _log_probability_between(error - half / s, error + half / s),
+                               norm.logpdf(error) - jnp.log(s))
         low, high = self._limits(y)
         below, above = norm.logcdf((low - predictor) / s), norm.logcdf((predictor - high) / s)
-        return jnp.where(y <= self.left, below, jnp.where(y >= self.right, above, seen))
+        return jnp.where(y <= self.left, below, jnp.where(y >= self.right, above, uncensored))
 
     def _limits(self, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return below and above which values are reported as a limit; y where there is no limit."""
+        """Return the values below and above which a measurement is reported as a limit; y where there is no limit."""
         finite_left = jnp.where(jnp.isfinite(self.left), self.left, y)
         finite_right = jnp.where(jnp.isfinite(self.right), self.right, y)
-        # Of values in bins those are reported as a limit whose bin's middle lies at it or beyond.
+        # A binned value is reported as a limit if the middle of its bin lies at the limit or beyond.
         width = jnp.where(self.width > 0, self.width, 1.0)
         low = jnp.where(self.width > 0, (jnp.floor(finite_left / width) + 0.5) * width, finite_left)
         return low, jnp.where(self.width > 0, (jnp.ceil(finite_right / width) - 0.5) * width, finite_right)
 
     def cumulative(self, predictor: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return P(data < y) and P(data <= y), (D,) each: those of a limit, of a bin, or of a value."""
+        """Return P(data < y) and P(data <= y), (D,) each, for a limit, a bin or an exact value."""
         low, high = self._limits(y)
         half = 0.5 * self.width
-        from_, to = jnp.where(y >= self.right, high, y - half), jnp.where(y <= self.left, low, y + half)
-        below, up_to = norm.cdf((from_ - predictor) / self.scale), norm.cdf((to - predictor) / self.scale)
+        lower, upper = jnp.where(y >= self.right, high, y - half), jnp.where(y <= self.left, low, y + half)
+        below, up_to = norm.cdf((lower - predictor) / self.scale), norm.cdf((upper - predictor) / self.scale)
         return jnp.where(y <= self.left, 0.0, below), jnp.where(y >= self.right, 1.0, up_to)
 
     def sample(self, key: jax.Array, predictor: jax.Array) -> jax.Array:
-        """Draw measurements (D,) and report them as the instrument does."""
+        """Draw measurements (D,), binned and limited as the data are."""
         value = predictor + self.scale * jax.random.normal(key, predictor.shape)
         width = jnp.where(self.width > 0, self.width, 1.0)
         value = jnp.where(self.width > 0, jnp.round(value / width) * width, value)
@@ -96,8 +96,11 @@ class CensoredObservation(ObservationFamily):
 
 
 def _log_probability_between(low: jax.Array, high: jax.Array) -> jax.Array:
-    """Return log(Phi(high) - Phi(low)) for low < high, in the tail in which both probabilities are small."""
-    mirrored = low > 0
-    low, high = jnp.where(mirrored, -high, low), jnp.where(mirrored, -low, high)
-    outer, inner = norm.logcdf(high), norm.logcdf(low)
-    return outer + jnp.log1p(-jnp.exp(jnp.minimum(inner - outer, -1e-300)))
+    """Return log(Phi(high) - Phi(low)) for low < high, without cancellation.
+
+    The interval is reflected to the lower tail, where the difference of probabilities keeps its relative accuracy.
+    """
+    is_reflected = low > 0
+    low, high = jnp.where(is_reflected, -high, low), jnp.where(is_reflected, -low, high)
+    log_upper, log_lower = norm.logcdf(high), norm.logcdf(low)
+    return log_upper + jnp.log1p(-jnp.exp(jnp.minimum(log_lower - log_upper, -1e-300)))

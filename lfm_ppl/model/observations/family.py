@@ -1,4 +1,16 @@
-"""What an observation family is: a predictor h(x, u, t), and the law of the data given it, entry by entry."""
+"""The protocol of observation families: a predictor h(x, u, t), and the distribution of each entry of y given it.
+
+1. A family holds the function h and its parameters, and implements `log_prob` and `sample` entry by entry.
+2. Optional methods serve plots and checks: `cumulative` for residuals, `mean` for predictions, `problem` for impossible
+   data, `overflows` for impossible predictors, `possible` for placeholders of missing entries.
+3. Parameters named in ``per_entry`` may have one value per row of the data; `at` selects a row, and `typical` averages
+   the rows for times without data.
+4. The properties of Gaussian observations (``covariance``, ``angular``, ...) exist with trivial values, so that a model
+   can treat both kinds of observations alike.
+5. `check_shapes`, `check_rows`, `check_predictor` and `check_data` raise errors that name the entry.
+
+Source: Rasmussen and Williams (2006), Gaussian Processes for Machine Learning, chapter 3.
+"""
 
 from __future__ import annotations
 
@@ -15,16 +27,16 @@ from lfm_ppl import checks
 
 
 class ObservationFamily(eqx.Module):
-    r"""Observations whose entries are independent given a predictor, from a family beyond the Gaussian.
+    r"""Non-Gaussian observations whose entries are independent given a predictor.
 
         f_k = h(x, u, t_k) (D,),    y_kd ~ p(. | f_kd).
 
-    A family of one's own holds ``function`` and its parameters, and implements `log_prob` and `sample`; the parameters
-    named in ``per_entry`` may be scalars, (D,), or (T, D) with a value for each entry of the data.
+    A user-defined family has the field ``function`` and fields for its parameters, and implements `log_prob` and
+    `sample`. Parameters named in ``per_entry`` may be scalars, (D,), or (T, D) with a value for each entry of the data.
 
     Attributes:
         function: ``h(x, u, t) -> (D,)``.
-        per_entry: names of the fields that hold such parameters.
+        per_entry: names of the fields whose parameters may differ between entries of the data.
 
     Example:
         >>> import jax, jax.numpy as jnp
@@ -41,7 +53,7 @@ class ObservationFamily(eqx.Module):
     per_entry: ClassVar[tuple[str, ...]] = ()
 
     def __check_init__(self) -> None:
-        """Raise TypeError where the function cannot be called."""
+        """Raise TypeError if the function is not callable."""
         if not callable(self.function):
             raise TypeError("observation function must be callable as h(x, u, t), got "
                             f"{type(self.function).__name__}.")
@@ -55,74 +67,82 @@ class ObservationFamily(eqx.Module):
         """Draw entries (D,) under ``predictor`` (D,)."""
 
     def cumulative(self, predictor: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return P(data < y) and P(data <= y), (D,) each, for residuals; NaN where they are not known: there are none.
+        """Return P(data < y) and P(data <= y), (D,) each, for residuals.
 
-        The two are the same but where a single value has a probability, as counts and limits of detection have.
+        They differ where a single value has a positive probability, as for counts and detection limits. The default is
+        NaN: the family then has no residuals.
         """
-        unknown = jnp.full(jnp.broadcast_shapes(predictor.shape, y.shape), jnp.nan)
-        return unknown, unknown
+        undefined = jnp.full(jnp.broadcast_shapes(predictor.shape, y.shape), jnp.nan)
+        return undefined, undefined
 
     def mean(self, predictor: jax.Array) -> jax.Array:
-        """Return what the entries (D,) are on average under ``predictor``, for plots: here the predictor itself."""
+        """Return the expected entries (D,) under ``predictor``, for plots; by default the predictor itself."""
         return predictor
 
     def possible(self, predictor: jax.Array) -> jax.Array:
-        """Return entries (D,) inside the support, to stand where one is missing."""
+        """Return entries (D,) inside the support, as placeholders for missing entries."""
         return jnp.ones_like(predictor)
 
     def problem(self, y: np.ndarray) -> tuple[np.ndarray, str] | None:
-        """Say what data (T, D) cannot be: where (T, D), and what they must be. Of missing entries nothing is asked."""
+        """Return which data (T, D) are impossible, and the requirement as text; None: any data are possible.
+
+        Missing entries are ignored.
+        """
         return None
 
     def overflows(self, predictor: np.ndarray) -> np.ndarray:
-        """Say for which entries (D,) of a predictor the law of the data is not finite."""
+        """Return for which entries (D,) of a predictor the distribution of the data is not finite."""
         return ~np.isfinite(predictor)
 
-    def resolved(self, size: Callable[[Callable], int]) -> ObservationFamily:
-        """Return the same family told the number of its outputs, where it needs that; ``size`` gives a function's."""
+    def with_output_sizes(self, output_size: Callable[[Callable], int]) -> ObservationFamily:
+        """Return the family with its numbers of outputs; ``output_size`` maps a predictor function to its number."""
         return self
 
     def at(self, row: Any) -> ObservationFamily:
-        """Return the family of one row of the data: parameters (T, D) become (D,)."""
+        """Return the family for one row of the data: parameters (T, D) become (D,)."""
         rows = {name: getattr(self, name)[row] for name in self.per_entry if np.ndim(getattr(self, name)) == 2}
         if not rows:
             return self
         names = list(rows)
         return eqx.tree_at(lambda family: [getattr(family, name) for name in names], self, list(rows.values()))
 
-    def of_rows(self) -> bool:
-        """Whether a parameter differs from row to row of the data, so that no other row has a law."""
-        given = (getattr(self, name) for name in self.per_entry if np.ndim(getattr(self, name)) == 2)
-        return any((known := checks.concrete(one)) is None or bool((known != known[:1]).any()) for one in given)
+    def has_row_parameters(self) -> bool:
+        """Return whether a parameter differs between rows, so that times without data have no distribution."""
+        for name in self.per_entry:
+            if np.ndim(getattr(self, name)) == 2:
+                values = checks.concrete(getattr(self, name))
+                if values is None or bool((values != values[:1]).any()):
+                    return True
+        return False
 
     def typical(self) -> ObservationFamily:
-        """Return the family with parameters (T, D) averaged over the rows, for times that are no row of the data."""
-        return _averaged(self)
+        """Return the family with parameters (T, D) averaged over the rows, for times without data."""
+        return _average_rows(self)
 
-    # What the rest of the library asks of any observation.
+    # Attributes that `GaussianObservation` has as well.
 
     @property
     def angular(self) -> tuple[int, ...]:
-        """No entry is an angle."""
+        """Indices of angles: none."""
         return ()
 
     @property
     def covariance(self) -> Any:
-        """There is no covariance: sites have precisions of their own."""
+        """None: there is no noise covariance."""
         return None
 
     @property
     def varies_with_state(self) -> bool:
-        """Whether a covariance is a function of (x, u, t)."""
+        """Whether the covariance is a function of (x, u, t): False."""
         return False
 
     def covariance_at(self, x: jax.Array, u: jax.Array, t: jax.Array, row: Any) -> jax.Array:
-        """Return zeros (D, D): the predictor itself has no noise."""
+        """Return zeros (D, D): the predictor has no noise."""
         size = jax.eval_shape(self.function, x, u, t).shape[0]
         return jnp.zeros((size, size))
 
     def check_shapes(self, outputs: int) -> None:
-        """Raise ValueError where a parameter fits neither an entry, nor a row, nor the data."""
+        """Raise ValueError if a parameter is neither a scalar, nor (D,), nor (T, D)."""
         for name in self.per_entry:
             shape = np.shape(getattr(self, name))
             if len(shape) > 2 or (shape and shape[-1] not in (1, outputs)):
@@ -130,7 +150,7 @@ class ObservationFamily(eqx.Module):
                                  f"(T, {outputs}) for all entries of the data; it has shape {shape}.")
 
     def check_rows(self, rows: int) -> None:
-        """Raise ValueError where a parameter for each entry of the data has another number of rows."""
+        """Raise ValueError if a parameter (T, D) has another number of rows than the data."""
         for name in self.per_entry:
             shape = np.shape(getattr(self, name))
             if len(shape) == 2 and shape[0] != rows:
@@ -138,60 +158,61 @@ class ObservationFamily(eqx.Module):
                                  f"are {rows} times.")
 
     def check_predictor(self, predictor: np.ndarray, where: str, names: Sequence[str]) -> None:
-        """Raise ValueError where the link overflows at a predictor (D,)."""
-        wrong = np.atleast_1d(self.at(0).overflows(predictor))
-        if wrong.any():
-            index = int(np.argmax(wrong))
+        """Raise ValueError if the distribution of an entry is not finite at a predictor (D,)."""
+        overflow = np.atleast_1d(self.at(0).overflows(predictor))
+        if overflow.any():
+            index = int(np.argmax(overflow))
             raise ValueError(f"the law of the output {names[index]!r} is not finite {where}, where its predictor is "
-                             f"{predictor[index]:g}. Change initial_state.mean or the units of the predictor, or take "
+                             f"{predictor[index]:g}. Change initial_state.mean or the units of the predictor, or use "
                              "another link, such as link='softplus'.")
 
     def check_data(self, y: Any, first_column: int = 0, names: Sequence[str] = ()) -> None:
-        """Raise ValueError for data (T, D) that the family cannot give; the message names row and column.
+        """Raise ValueError for data (T, D) that are impossible under the family; the message names row and column.
 
         Args:
             y: (T, D), NaN where missing.
-            first_column: which column of all data the first of these is, for the message.
-            names: of all outputs, for the message.
+            first_column: index of the first of these columns among all columns of the data, for the message.
+            names: names of all outputs, for the message.
         """
-        known = checks.concrete(y)
-        if known is None or checks.traced(self):
+        data = checks.concrete(y)
+        if data is None or checks.traced(self):
             return
         with np.errstate(invalid="ignore"):
-            found = self.problem(known)
-        if found is None:
+            problem = self.problem(data)
+        if problem is None:
             return
-        wrong, expected = found
-        self._refuse(wrong, known, f"{type(self).__name__} needs {expected}", first_column, names)
+        impossible, requirement = problem
+        self._refuse(impossible, data, f"{type(self).__name__} needs {requirement}", first_column, names)
 
-    def _refuse(self, wrong: np.ndarray, known: np.ndarray, needs: str, first_column: int,
+    def _refuse(self, impossible: np.ndarray, data: np.ndarray, requirement: str, first_column: int,
                 names: Sequence[str]) -> None:
-        """Raise ValueError where an entry that is there is ``wrong``."""
-        wrong = wrong & np.isfinite(known)
-        if wrong.any():
-            row, column = np.argwhere(wrong)[0]
-            place = int(column) + first_column
-            of = f" ({names[place]}, row {row + 1} of the data)" if len(names) > place else ""
+        """Raise ValueError if an observed entry is ``impossible``."""
+        impossible = impossible & np.isfinite(data)
+        if impossible.any():
+            row, column = np.argwhere(impossible)[0]
+            index = int(column) + first_column
+            label = f" ({names[index]}, row {row + 1} of the data)" if len(names) > index else ""
             order = f" Outputs are in the order {', '.join(names)}." if len(names) > 1 else ""
-            raise ValueError(f"y[{row}, {place}]{of} is {known[row, column]:g}, but {needs}; use NaN for a "
+            raise ValueError(f"y[{row}, {index}]{label} is {data[row, column]:g}, but {requirement}; use NaN for a "
                              f"missing entry.{order}")
 
 
-def _averaged(family: ObservationFamily) -> ObservationFamily:
+def _average_rows(family: ObservationFamily) -> ObservationFamily:
+    """Return the family with parameters (T, D) replaced by their means (D,)."""
     rows = {name: jnp.mean(getattr(family, name), axis=0) for name in family.per_entry
             if np.ndim(getattr(family, name)) == 2}
     if not rows:
         return family
     names = list(rows)
-    return eqx.tree_at(lambda one: [getattr(one, name) for name in names], family, list(rows.values()))
+    return eqx.tree_at(lambda member: [getattr(member, name) for name in names], family, list(rows.values()))
 
 
-def parameter(name: str, value: Any, positive: bool = True) -> jax.Array:
-    """Return a parameter of a family as an array; raise ValueError where it is not finite (and positive)."""
+def as_parameter(name: str, value: Any, positive: bool = True) -> jax.Array:
+    """Return a parameter of a family as an array; raise ValueError if it is not finite (and positive)."""
     (checks.positive if positive else checks.finite)(name, value)
     return jnp.asarray(value, float)
 
 
-def not_counts(y: np.ndarray) -> np.ndarray:
-    """Say which entries are no counts."""
+def is_not_count(y: np.ndarray) -> np.ndarray:
+    """Return which entries are not counts."""
     return (y < 0) | (y != np.round(y))

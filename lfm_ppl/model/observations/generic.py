@@ -21,8 +21,8 @@ class Observation(ObservationFamily):
 
     Args:
         function: ``h(x, u, t) -> (D,)``, the predictor f.
-        make: from a predictor (D,) to a NumPyro distribution of batch shape (D,), whose entry d depends on entry d of
-            the predictor alone. It may close over parameters that are sampled.
+        make: function from a predictor (D,) to a NumPyro distribution of batch shape (D,), whose entry d depends on
+            entry d of the predictor alone. It may close over sampled parameters.
 
     Raises:
         TypeError: ``make`` is not callable, or does not return a NumPyro distribution.
@@ -45,16 +45,17 @@ class Observation(ObservationFamily):
         self.function, self.make = function, make
 
     def check_shapes(self, outputs: int) -> None:
-        """Raise where ``make`` does not give a distribution of as many independent numbers as there are outputs."""
-        found: list[Any] = []
-        jax.eval_shape(lambda f: found.append(self.make(f)), jnp.zeros(outputs))
-        if not isinstance(found[0], dist.Distribution):
+        """Raise unless ``make`` returns a distribution of independent numbers, one for each output."""
+        results: list[Any] = []
+        jax.eval_shape(lambda f: results.append(self.make(f)), jnp.zeros(outputs))  # the trace leaks the distribution
+        (distribution,) = results
+        if not isinstance(distribution, dist.Distribution):
             raise TypeError("make must return a NumPyro distribution, such as dist.Poisson(jnp.exp(f)); it returned "
-                            f"{type(found[0]).__name__}.")
-        if found[0].event_shape or found[0].batch_shape != (outputs,):
+                            f"{type(distribution).__name__}.")
+        if distribution.event_shape or distribution.batch_shape != (outputs,):
             raise ValueError(f"make must return a distribution of {outputs} independent numbers, batch shape "
-                             f"({outputs},) and event shape (); it has {found[0].batch_shape} and "
-                             f"{found[0].event_shape}. Its parameters follow from the predictor, entry by entry.")
+                             f"({outputs},) and event shape (); it has {distribution.batch_shape} and "
+                             f"{distribution.event_shape}. Compute its parameters from the predictor entry by entry.")
 
     def log_prob(self, predictor: jax.Array, y: jax.Array) -> jax.Array:
         """Return the log densities (D,)."""
@@ -65,11 +66,11 @@ class Observation(ObservationFamily):
         return self.make(predictor).sample(key).astype(predictor.dtype)
 
     def cumulative(self, predictor: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return P(data < y) and P(data <= y), (D,) each, where NumPyro knows them."""
-        law = self.make(predictor)
+        """Return P(data < y) and P(data <= y), (D,) each; NaN where NumPyro does not implement them."""
+        distribution = self.make(predictor)
         try:
-            found = law.cdf(y)
-            return (law.cdf(y - 1.0) if law.is_discrete else found), found
+            up_to = distribution.cdf(y)
+            return (distribution.cdf(y - 1.0) if distribution.is_discrete else up_to), up_to
         except NotImplementedError:
             return super().cumulative(predictor, y)
 
@@ -83,13 +84,13 @@ class Observation(ObservationFamily):
         return jnp.asarray(self.make(predictor).mean, float)
 
     def check_data(self, y: Any, first_column: int = 0, names: Sequence[str] = ()) -> None:
-        """Raise ValueError where an entry lies outside of the distribution's support."""
-        known = checks.concrete(y)
-        if known is None:
+        """Raise ValueError if an entry lies outside of the distribution's support."""
+        data = checks.concrete(y)
+        if data is None:
             return
-        support = self.make(jnp.zeros(known.shape[1])).support
-        found = checks.concrete(support(jnp.asarray(known)))
-        if found is None:  # within compiled code
+        support = self.make(jnp.zeros(data.shape[1])).support
+        is_possible = checks.concrete(support(jnp.asarray(data)))
+        if is_possible is None:  # compiled code: every result is traced
             return
-        inside = np.broadcast_to(found, known.shape)
-        self._refuse(~inside, known, f"the distribution needs {support}", first_column, names)
+        self._refuse(~np.broadcast_to(is_possible, data.shape), data, f"the distribution needs {support}", first_column,
+                     names)

@@ -1,4 +1,4 @@
-"""Counts whose variance is more than their mean."""
+"""Overdispersed counts: negative binomial."""
 
 from __future__ import annotations
 
@@ -11,24 +11,27 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import betainc, gammaln
 
-from lfm_ppl.model.observations.family import ObservationFamily, not_counts, parameter
-from lfm_ppl.model.observations.links import RATES, checked
+from lfm_ppl.model.observations.family import ObservationFamily, as_parameter, is_not_count
+from lfm_ppl.model.observations.links import RATES, link_name
 from lfm_ppl.model.observations.poisson import poisson_cumulative
+
+_POISSON_LIMIT = 1e8
+"""Concentration above which the distribution is Poisson to eight digits."""
 
 
 class NegativeBinomialObservation(ObservationFamily):
-    r"""Counts from a negative binomial distribution: a Poisson whose rate is gamma distributed.
+    r"""Counts from a negative binomial distribution: Poisson counts with a gamma-distributed rate.
 
         E y = mu = E g(f),    Var y = mu + mu^2 / c,    f_k = h(x, u, t_k).
 
     Args:
         function: ``h(x, u, t) -> (D,)``, the predictor f.
-        concentration: c > 0, infinite for a Poisson: a number, (D,) or (T, D); it may be sampled.
+        concentration: c > 0, with the Poisson distribution as the limit: a number, (D,) or (T, D); it may be sampled.
         link: g: "exp", "softplus" or "identity".
-        exposure: E: a number, (D,) or (T, D).
+        exposure: E, as in `PoissonObservation`: a number, (D,) or (T, D).
 
     Raises:
-        ValueError: an unknown link; a concentration or an exposure that is not positive.
+        ValueError: the link is unknown, or the concentration or the exposure is not positive.
 
     Example:
         >>> import jax.numpy as jnp
@@ -44,53 +47,53 @@ class NegativeBinomialObservation(ObservationFamily):
     def __init__(self, function: Callable[..., jax.Array], concentration: Any, link: str = "exp",
                  exposure: Any = 1.0):
         self.function = function
-        self.concentration = parameter("concentration", concentration)
-        self.link = checked(link, RATES)
-        self.exposure = parameter("exposure", exposure)
+        self.concentration = as_parameter("concentration", concentration)
+        self.link = link_name(link, RATES)
+        self.exposure = as_parameter("exposure", exposure)
 
     def log_prob(self, predictor: jax.Array, y: jax.Array) -> jax.Array:
         """Return the log probabilities (D,) of counts."""
-        c, log_mean = self.concentration, RATES[self.link].log_rate(predictor) + jnp.log(self.exposure)
+        _, log_rate = RATES[self.link]
+        c, log_mean = self.concentration, log_rate(predictor) + jnp.log(self.exposure)
         log_odds = log_mean - jnp.log(c)
-        total = jax.nn.softplus(log_odds)  # log(1 + mu / c)
-        # Gamma(y + c) / (Gamma(c) c^y): differences of large numbers where c is large; Stirling's series there.
-        large = c > 1e3
-        small_c, large_c = jnp.where(large, 1.0, c), jnp.where(large, c, 1e3)
-        rising = jnp.where(
-            large, (y + large_c - 0.5) * jnp.log1p(y / large_c) - y - y / (12.0 * large_c * (y + large_c)),
+        log_total = jax.nn.softplus(log_odds)  # log(1 + mu / c)
+        # log Gamma(y + c) / (Gamma(c) c^y) is a difference of large numbers where c is large: use Stirling's series.
+        is_large = c > 1e3
+        small_c, large_c = jnp.where(is_large, 1.0, c), jnp.where(is_large, c, 1e3)
+        log_rising_factorial = jnp.where(
+            is_large, (y + large_c - 0.5) * jnp.log1p(y / large_c) - y - y / (12.0 * large_c * (y + large_c)),
             gammaln(y + small_c) - gammaln(small_c) - y * jnp.log(small_c))
-        value = rising - gammaln(y + 1.0) - c * total + y * (log_mean - total)
+        value = log_rising_factorial - gammaln(y + 1.0) - c * log_total + y * (log_mean - log_total)
         return jnp.where(jnp.isneginf(log_mean), -jnp.inf, value) if self.link == "identity" else value
 
     def sample(self, key: jax.Array, predictor: jax.Array) -> jax.Array:
         """Draw counts (D,)."""
         rate_key, count_key = jax.random.split(key)
         c = jnp.broadcast_to(self.concentration, predictor.shape)
-        rate = self.exposure * RATES[self.link].rate(predictor) * jax.random.gamma(rate_key, c) / c
+        rate = self.mean(predictor) * jax.random.gamma(rate_key, c) / c
         return jax.random.poisson(count_key, rate, predictor.shape).astype(predictor.dtype)
 
     def cumulative(self, predictor: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return P(data < y) and P(data <= y), (D,) each."""
-        mean, small = self.mean(predictor), self.concentration < _POISSON
-        c = jnp.where(small, self.concentration, 1.0)
-        share = c / (c + mean)
-        below = jnp.where(y > 0, betainc(c, jnp.where(y > 0, y, 1.0), share), 0.0)
-        limit = poisson_cumulative(mean, y)
-        return jnp.where(small, below, limit[0]), jnp.where(small, betainc(c, y + 1.0, share), limit[1])
+        mean, is_overdispersed = self.mean(predictor), self.concentration < _POISSON_LIMIT
+        c = jnp.where(is_overdispersed, self.concentration, 1.0)
+        probability = c / (c + mean)
+        below = jnp.where(y > 0, betainc(c, jnp.where(y > 0, y, 1.0), probability), 0.0)
+        up_to = betainc(c, y + 1.0, probability)
+        poisson_below, poisson_up_to = poisson_cumulative(mean, y)
+        return jnp.where(is_overdispersed, below, poisson_below), jnp.where(is_overdispersed, up_to, poisson_up_to)
 
     def mean(self, predictor: jax.Array) -> jax.Array:
         """Return the expected counts (D,)."""
-        return self.exposure * RATES[self.link].rate(predictor)
+        rate, _ = RATES[self.link]
+        return self.exposure * rate(predictor)
 
     def problem(self, y: np.ndarray) -> tuple[np.ndarray, str]:
-        """Counts are whole numbers >= 0."""
-        return not_counts(y), "counts: whole numbers of at least zero"
+        """Return which data are not counts, and the requirement."""
+        return is_not_count(y), "counts: whole numbers of at least zero"
 
     def overflows(self, predictor: np.ndarray) -> np.ndarray:
-        """Say where the mean is not finite, or not positive."""
-        mean = np.asarray(self.exposure * RATES[self.link].rate(jnp.asarray(predictor, float)))
+        """Return whether the mean is not finite, or not positive under the identity link, (D,)."""
+        mean = np.asarray(self.mean(jnp.asarray(predictor, float)))
         return ~np.isfinite(mean) | ((mean <= 0) & (self.link == "identity"))
 
-
-_POISSON = 1e8
-"""Concentration from which on counts are those of a Poisson to eight digits."""

@@ -1,4 +1,4 @@
-"""Counts whose variance is their mean."""
+"""Poisson counts."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import gammaincc, gammaln
 
-from lfm_ppl.model.observations.family import ObservationFamily, not_counts, parameter
-from lfm_ppl.model.observations.links import RATES, checked
+from lfm_ppl.model.observations.family import ObservationFamily, as_parameter, is_not_count
+from lfm_ppl.model.observations.links import RATES, link_name
 
 
 class PoissonObservation(ObservationFamily):
@@ -23,10 +23,10 @@ class PoissonObservation(ObservationFamily):
     Args:
         function: ``h(x, u, t) -> (D,)``, the predictor f.
         link: g: "exp", "softplus" or "identity" (the predictor is then the rate itself, and must be positive).
-        exposure: E, what a rate of one is counted over (a length of time, a population): a number, (D,) or (T, D).
+        exposure: E, the length of time, population or similar to which the rate refers: a number, (D,) or (T, D).
 
     Raises:
-        ValueError: an unknown link; an exposure that is not positive.
+        ValueError: the link is unknown, or the exposure is not positive.
 
     Example:
         >>> import jax.numpy as jnp
@@ -42,20 +42,19 @@ class PoissonObservation(ObservationFamily):
 
     def __init__(self, function: Callable[..., jax.Array], link: str = "exp", exposure: Any = 1.0):
         self.function = function
-        self.link = checked(link, RATES)
-        self.exposure = parameter("exposure", exposure)
+        self.link = link_name(link, RATES)
+        self.exposure = as_parameter("exposure", exposure)
 
     def log_prob(self, predictor: jax.Array, y: jax.Array) -> jax.Array:
         """Return y log(E g) - E g - log y!, (D,)."""
-        link = RATES[self.link]
-        log_rate = link.log_rate(predictor) + jnp.log(self.exposure)
-        value = y * log_rate - self.exposure * link.rate(predictor) - gammaln(y + 1.0)
-        return jnp.where(jnp.isneginf(log_rate), -jnp.inf, value) if self.link == "identity" else value
+        rate, log_rate = RATES[self.link]
+        log_mean = log_rate(predictor) + jnp.log(self.exposure)
+        value = y * log_mean - self.exposure * rate(predictor) - gammaln(y + 1.0)
+        return jnp.where(jnp.isneginf(log_mean), -jnp.inf, value) if self.link == "identity" else value
 
     def sample(self, key: jax.Array, predictor: jax.Array) -> jax.Array:
         """Draw counts (D,)."""
-        rate = self.exposure * RATES[self.link].rate(predictor)
-        return jax.random.poisson(key, rate, predictor.shape).astype(predictor.dtype)
+        return jax.random.poisson(key, self.mean(predictor), predictor.shape).astype(predictor.dtype)
 
     def cumulative(self, predictor: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return P(data < y) and P(data <= y), (D,) each."""
@@ -63,19 +62,20 @@ class PoissonObservation(ObservationFamily):
 
     def mean(self, predictor: jax.Array) -> jax.Array:
         """Return the expected counts (D,)."""
-        return self.exposure * RATES[self.link].rate(predictor)
+        rate, _ = RATES[self.link]
+        return self.exposure * rate(predictor)
 
     def problem(self, y: np.ndarray) -> tuple[np.ndarray, str]:
-        """Counts are whole numbers >= 0."""
-        return not_counts(y), "counts: whole numbers of at least zero"
+        """Return which data are not counts, and the requirement."""
+        return is_not_count(y), "counts: whole numbers of at least zero"
 
     def overflows(self, predictor: np.ndarray) -> np.ndarray:
-        """Say where the rate is not finite, or not positive."""
-        rate = np.asarray(self.exposure * RATES[self.link].rate(jnp.asarray(predictor, float)))
-        return ~np.isfinite(rate) | ((rate <= 0) & (self.link == "identity"))
+        """Return whether the mean is not finite, or not positive under the identity link, (D,)."""
+        mean = np.asarray(self.mean(jnp.asarray(predictor, float)))
+        return ~np.isfinite(mean) | ((mean <= 0) & (self.link == "identity"))
 
 
 def poisson_cumulative(rate: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return P(count < y) and P(count <= y) at a rate."""
+    """Return P(count < y) and P(count <= y) of Poisson counts with this rate."""
     below = jnp.where(y > 0, gammaincc(jnp.where(y > 0, y, 1.0), rate), 0.0)
     return below, gammaincc(y + 1.0, rate)

@@ -1,4 +1,12 @@
-"""Several families side by side, for the outputs of one model."""
+"""Several observation families for different outputs of one model.
+
+1. `Observations` concatenates parts: the first columns of y and entries of the predictor belong to the first part, the
+   next ones to the second part, and so on.
+2. A `GaussianObservation` with constant variances is converted to a family, so that all parts are families.
+3. A model tells the numbers of outputs of the parts by `with_output_sizes`; only then are the columns of each part
+   known.
+4. Every other method splits its arguments by columns, calls the parts and concatenates their results.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +25,7 @@ from lfm_ppl.model.observations.family import ObservationFamily
 
 
 class _GaussianFamily(ObservationFamily):
-    """Gaussian measurements, entry by entry, as a family among others."""
+    """Gaussian measurements with independent entries, as an observation family."""
 
     variance: jax.Array
     per_entry: ClassVar[tuple[str, ...]] = ("variance",)
@@ -26,23 +34,24 @@ class _GaussianFamily(ObservationFamily):
         return norm.logpdf(y, predictor, jnp.sqrt(self.variance))
 
     def cumulative(self, predictor: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-        found = norm.cdf(y, predictor, jnp.sqrt(self.variance))
-        return found, found
+        probability = norm.cdf(y, predictor, jnp.sqrt(self.variance))
+        return probability, probability
 
     def sample(self, key: jax.Array, predictor: jax.Array) -> jax.Array:
         return predictor + jnp.sqrt(self.variance) * jax.random.normal(key, predictor.shape)
 
 
 class Observations(ObservationFamily):
-    r"""Families side by side: the entries of one part after those of another.
+    r"""Observations of several families: their entries are concatenated.
 
     Args:
-        *parts: observation families, a `lfm_ppl.GaussianObservation` with variances (D,) among them; the columns of y
-            are those of the first part, then those of the second, and so on.
+        *parts: observation families; a `lfm_ppl.GaussianObservation` with variances (D,) is allowed. The columns of y
+            belong to the first part, then to the second part, and so on.
 
     Raises:
-        TypeError: a part is no observation.
-        ValueError: no parts; a Gaussian part whose covariance is a full matrix or a function, or that has angles.
+        TypeError: a part is not an observation.
+        ValueError: there are no parts; or a Gaussian part has angles, or a covariance that is a full matrix or a
+            function.
 
     Example:
         >>> import jax.numpy as jnp, lfm_ppl as lfm
@@ -61,60 +70,62 @@ class Observations(ObservationFamily):
         if not parts:
             raise ValueError("Observations needs at least one observation, such as lfm.PoissonObservation(function).")
         self.parts = tuple(_as_family(index, part) for index, part in enumerate(parts))
-        self.function = _Stacked(tuple(part.function for part in self.parts))
+        self.function = StackedPredictor(tuple(part.function for part in self.parts))
         self.sizes = None
 
-    def resolved(self, size: Callable[[Callable], int]) -> Observations:
-        """Return the same families told their numbers of outputs."""
-        sizes = tuple(size(part.function) for part in self.parts)
-        other = object.__new__(Observations)
+    def with_output_sizes(self, output_size: Callable[[Callable], int]) -> Observations:
+        """Return the observations with the number of outputs of each part."""
+        sizes = tuple(output_size(part.function) for part in self.parts)
+        # Equinox modules are frozen and the constructor takes parts only; `sizes` is static, so tree_at cannot set it.
+        observations = object.__new__(Observations)
         for name, value in (("parts", self.parts), ("function", self.function), ("sizes", sizes)):
-            object.__setattr__(other, name, value)
-        return other
+            object.__setattr__(observations, name, value)
+        return observations
 
     def _columns(self) -> list[slice]:
         if self.sizes is None:
-            raise ValueError("Observations knows which columns belong to which part as a part of a model; take "
+            raise ValueError("the columns of the parts of Observations are known within a model only; use "
                              "model.observation.")
-        ends = np.cumsum(self.sizes)
-        return [slice(int(end) - size, int(end)) for end, size in zip(ends, self.sizes, strict=True)]
+        stops = np.cumsum(self.sizes)
+        return [slice(int(stop) - size, int(stop)) for stop, size in zip(stops, self.sizes, strict=True)]
 
-    def _each(self) -> Any:
+    def _parts_and_columns(self) -> Any:
         return zip(self.parts, self._columns(), strict=True)
 
     def log_prob(self, predictor: jax.Array, y: jax.Array) -> jax.Array:
         """Return the log densities (D,)."""
-        return jnp.concatenate([part.log_prob(predictor[columns], y[columns]) for part, columns in self._each()])
+        return jnp.concatenate([part.log_prob(predictor[columns], y[columns])
+                                for part, columns in self._parts_and_columns()])
 
     def sample(self, key: jax.Array, predictor: jax.Array) -> jax.Array:
         """Draw entries (D,)."""
         keys = jax.random.split(key, len(self.parts))
-        return jnp.concatenate([part.sample(one, predictor[columns])
-                                for one, (part, columns) in zip(keys, self._each(), strict=True)])
+        return jnp.concatenate([part.sample(part_key, predictor[columns])
+                                for part_key, (part, columns) in zip(keys, self._parts_and_columns(), strict=True)])
 
     def cumulative(self, predictor: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return P(data < y) and P(data <= y), (D,) each."""
-        found = [part.cumulative(predictor[columns], y[columns]) for part, columns in self._each()]
-        return jnp.concatenate([low for low, _ in found]), jnp.concatenate([high for _, high in found])
+        pairs = [part.cumulative(predictor[columns], y[columns]) for part, columns in self._parts_and_columns()]
+        return jnp.concatenate([below for below, _ in pairs]), jnp.concatenate([up_to for _, up_to in pairs])
 
     def possible(self, predictor: jax.Array) -> jax.Array:
         """Return entries (D,) inside the supports."""
-        return jnp.concatenate([part.possible(predictor[columns]) for part, columns in self._each()])
+        return jnp.concatenate([part.possible(predictor[columns]) for part, columns in self._parts_and_columns()])
 
     def mean(self, predictor: jax.Array) -> jax.Array:
-        """Return what the entries are on average (D,)."""
-        return jnp.concatenate([part.mean(predictor[columns]) for part, columns in self._each()])
+        """Return the expected entries (D,)."""
+        return jnp.concatenate([part.mean(predictor[columns]) for part, columns in self._parts_and_columns()])
 
-    def of_rows(self) -> bool:
-        """Whether a parameter of a part differs from row to row of the data."""
-        return any(part.of_rows() for part in self.parts)
+    def has_row_parameters(self) -> bool:
+        """Return whether a parameter of a part differs between rows of the data."""
+        return any(part.has_row_parameters() for part in self.parts)
 
     def typical(self) -> Observations:
-        """Return the families with parameters averaged over the rows."""
+        """Return the observations with parameters averaged over the rows."""
         return eqx.tree_at(lambda family: family.parts, self, tuple(part.typical() for part in self.parts))
 
     def at(self, row: Any) -> Observations:
-        """Return the families of one row of the data."""
+        """Return the observations for one row of the data."""
         return eqx.tree_at(lambda family: family.parts, self, tuple(part.at(row) for part in self.parts))
 
     def check_shapes(self, outputs: int) -> None:
@@ -128,24 +139,25 @@ class Observations(ObservationFamily):
             part.check_rows(rows)
 
     def overflows(self, predictor: np.ndarray) -> np.ndarray:
-        """Say for which entries the law of the data is not finite."""
-        return np.concatenate([part.overflows(predictor[columns]) for part, columns in self._each()])
+        """Return for which entries the distribution of the data is not finite."""
+        return np.concatenate([part.overflows(predictor[columns]) for part, columns in self._parts_and_columns()])
 
     def check_data(self, y: Any, first_column: int = 0, names: Sequence[str] = ()) -> None:
         """Check the columns of each part."""
-        known = checks.concrete(y)
-        if known is None:
+        data = checks.concrete(y)
+        if data is None:
             return
-        for part, columns in self._each():
-            part.check_data(known[:, columns], first_column + columns.start, names)
+        for part, columns in self._parts_and_columns():
+            part.check_data(data[:, columns], first_column + columns.start, names)
 
 
-class _Stacked(eqx.Module):
-    """The predictors of all parts, one after the other."""
+class StackedPredictor(eqx.Module):
+    """The concatenated predictors of all parts."""
 
     functions: tuple[Callable[..., jax.Array], ...]
 
     def __call__(self, x: jax.Array, u: jax.Array, t: jax.Array) -> jax.Array:
+        """Return the predictors (D,) of all outputs."""
         return jnp.concatenate([jnp.asarray(function(x, u, t), float) for function in self.functions])
 
 
@@ -156,6 +168,6 @@ def _as_family(index: int, part: Any) -> ObservationFamily:
         raise TypeError(f"part {index} of Observations must be an observation, such as lfm.PoissonObservation("
                         f"function), got {type(part).__name__}.")
     if part.varies_with_state or part.covariance.ndim != 1 or part.angular:
-        raise ValueError(f"part {index} of Observations is Gaussian, and there needs variances (D,) that are numbers, "
-                         "and no angles: entries are independent given the predictor.")
+        raise ValueError(f"part {index} of Observations is Gaussian and needs variances (D,) that are numbers, and no "
+                         "angles, since entries are independent given the predictor.")
     return _GaussianFamily(part.function, part.covariance)

@@ -1,4 +1,4 @@
-"""Measurements with gross errors."""
+"""Measurements with heavy-tailed errors: Student's t."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 from jax.scipy.special import betainc, gammaln
 
-from lfm_ppl.model.observations.family import ObservationFamily, parameter
+from lfm_ppl.model.observations.family import ObservationFamily, as_parameter
 
 
 class StudentTObservation(ObservationFamily):
-    r"""Measurements with Student's t errors, which gross errors do not move far.
+    r"""Measurements with Student's t errors, robust against outliers.
 
         y_kd = f_kd + s e,    e ~ t_v,    f_k = h(x, u, t_k).
 
@@ -39,8 +39,8 @@ class StudentTObservation(ObservationFamily):
 
     def __init__(self, function: Callable[..., jax.Array], df: Any, scale: Any):
         self.function = function
-        self.df = parameter("df", df)
-        self.scale = parameter("scale", scale)
+        self.df = as_parameter("df", df)
+        self.scale = as_parameter("scale", scale)
 
     def log_prob(self, predictor: jax.Array, y: jax.Array) -> jax.Array:
         """Return the log densities (D,)."""
@@ -49,11 +49,11 @@ class StudentTObservation(ObservationFamily):
         return constant - 0.5 * (v + 1.0) * jnp.log1p(((y - predictor) / s) ** 2 / v)
 
     def cumulative(self, predictor: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return P(data <= y) twice, (D,) each: no single value has a probability."""
+        """Return P(data < y) and P(data <= y), (D,) each, which are equal for a continuous distribution."""
         error = (y - predictor) / self.scale
         tail = 0.5 * betainc(0.5 * self.df, 0.5, self.df / (self.df + error**2))
-        found = jnp.where(error < 0, tail, 1.0 - tail)
-        return found, found
+        probability = jnp.where(error < 0, tail, 1.0 - tail)
+        return probability, probability
 
     def sample(self, key: jax.Array, predictor: jax.Array) -> jax.Array:
         """Draw measurements (D,)."""

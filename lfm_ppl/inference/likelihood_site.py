@@ -1,0 +1,107 @@
+"""The likelihood site of a NumPyro model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+from numpyro import handlers
+
+from lfm_ppl import checks
+from lfm_ppl.inference.handlers.likelihood_handler import LikelihoodHandler
+from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
+
+
+class LikelihoodSite(NamedTuple):
+    """The likelihood site of a NumPyro model.
+
+    Attributes:
+        name: name of the site.
+        distribution: the `MarginalLikelihood` or the panel.
+        observed: its observations, (T, D) or (B, T, D); None where they are left open.
+    """
+
+    name: str
+    distribution: MarginalLikelihood | Panel
+    observed: Any = None
+
+    @property
+    def example(self) -> MarginalLikelihood:
+        """The distribution of one series."""
+        if isinstance(self.distribution, Panel):
+            return self.distribution.first
+        return self.distribution
+
+
+def likelihood_site(model: Callable, arguments: tuple, keywords: Mapping[str, Any], key: jax.Array,
+                    parameters: Mapping[str, Any] | None = None) -> LikelihoodSite:
+    """Run a NumPyro model and return its likelihood site.
+
+    Raises:
+        ValueError: the model has no such site, or several.
+    """
+    seeded = handlers.seed(handlers.substitute(model, data=dict(parameters or {})), key)
+    return single_site(likelihood_sites(handlers.trace(seeded).get_trace(*arguments, **keywords)))
+
+
+def likelihood_sites(trace: Mapping[str, Any]) -> list[LikelihoodSite]:
+    """Return the likelihood sites of a NumPyro trace."""
+    sites = []
+    for name, site in trace.items():
+        distribution = site.get("fn")
+        # Masks and expansions wrap the distribution.
+        while hasattr(distribution, "base_dist") and not isinstance(distribution, (MarginalLikelihood, Panel)):
+            distribution = distribution.base_dist
+        if isinstance(distribution, (MarginalLikelihood, Panel)):
+            sites.append(LikelihoodSite(name, distribution, site["value"]))
+    return sites
+
+
+def single_site(sites: list[LikelihoodSite]) -> LikelihoodSite:
+    """Return the only likelihood site.
+
+    Raises:
+        ValueError: there are none, or several.
+    """
+    if len(sites) != 1:
+        names = ", ".join(site.name for site in sites) or "none"
+        raise ValueError("the model must have exactly one site numpyro.sample(name, lfm.MarginalLikelihood(...), "
+                         f"obs=y) (or lfm.panel); found {names}.")
+    return sites[0]
+
+
+class replace_times(LikelihoodHandler):  # noqa: N801 (an effect handler, named as NumPyro names its handlers)
+    """Effect handler that gives the likelihood concrete times where the model's arithmetic made them tracers.
+
+    Args:
+        fn: a NumPyro model.
+        times: concrete times of the likelihood.
+    """
+
+    def __init__(self, fn: Callable[..., Any], times: Any) -> None:
+        self.times = times
+        super().__init__(fn)
+
+    def replacement(self, likelihood: MarginalLikelihood | Panel, site: dict[str, Any]) -> Any:
+        """Return the likelihood at the concrete times."""
+        return likelihood.with_times(self.times) if checks.traced(likelihood.times) else likelihood
+
+
+class remove_likelihood(LikelihoodHandler):  # noqa: N801 (an effect handler, see above)
+    """Effect handler that removes the likelihood, so that the density is that of the prior."""
+
+    def missing(self) -> str:
+        """Return the error of a likelihood inside a wrapper."""
+        return "the likelihood is inside a mask or an expansion, so that it cannot be separated from the prior."
+
+
+class record_times(LikelihoodHandler):  # noqa: N801 (an effect handler, see above)
+    """Effect handler that removes the likelihood and stores its times in ``times``."""
+
+    times: Any = None
+
+    def replacement(self, likelihood: MarginalLikelihood | Panel, site: dict[str, Any]) -> Any:
+        """Store the times of the likelihood and return an improper distribution."""
+        self.times = likelihood.times
+        return super().replacement(likelihood, site)

@@ -1,0 +1,101 @@
+"""A digest of a NumPyro model, equal in all processes, by which a stored run recognizes its model."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpyro.infer.util import potential_energy
+
+from lfm_ppl.inference.bound_model import BoundModel
+from lfm_ppl.inference.handlers.likelihood_handler import LikelihoodHandler
+from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
+from lfm_ppl.model.observations.family import ObservationFamily
+
+_TIMES = 16
+"""Number of times at which the functions of a model are evaluated."""
+
+_SHIFT = 0.1
+"""Distance of the second point from the prior's medians, in each unconstrained coordinate."""
+
+
+def model_digest(bound: BoundModel) -> str | None:
+    """Return a digest of the values of prior, dynamics and observation, and of the settings of the likelihood.
+
+    They are evaluated at the prior's medians and at one other point, at 16 times and one state, without the filter. The
+    digest is None for a model that needs the values of its data.
+    """
+    if bound.argument is None:
+        return None
+    medians = jnp.asarray(bound.draw(jax.random.key(0)))
+    times = np.unique(bound.times)
+    selection = np.unique(np.linspace(0, len(times) - 1, _TIMES).round().astype(int))
+    recorder = _record_values(bound.model, jnp.asarray(times[selection]))
+
+    @jax.jit
+    def evaluate(z: jax.Array, y: Any) -> tuple[jax.Array, list[Any]]:
+        prior = potential_energy(recorder, bound.traced.call(y), bound.traced.keywords, bound.unravel(z))
+        return prior, recorder.values
+
+    digest = hashlib.sha256(repr((bound.names, bound.size)).encode())
+    for z in (medians, medians + _SHIFT):
+        for leaf in jax.tree.leaves(evaluate(z, bound.argument)):
+            is_key = jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+            array = np.asarray(jax.random.key_data(leaf) if is_key else leaf)
+            digest.update(f"{array.shape}{array.dtype}".encode() + array.tobytes())
+    digest.update(re.sub(r"0x[0-9a-f]+", "", recorder.settings).encode())  # addresses differ between processes
+    return digest.hexdigest()
+
+
+class _record_values(LikelihoodHandler):  # noqa: N801 (an effect handler, named as NumPyro names its handlers)
+    """Effect handler that evaluates the functions of the likelihood's model instead of the filter.
+
+    Attributes:
+        values: arrays of the likelihood and values of its functions.
+        settings: settings of the likelihood that are no arrays.
+    """
+
+    def __init__(self, model: Any, times: jax.Array) -> None:
+        self.times = times
+        self.values: list[Any] = []
+        self.settings = ""
+        super().__init__(model)
+
+    def begin(self) -> None:
+        """Forget the previous run."""
+        super().begin()
+        self.values, self.settings = [], ""
+
+    def replacement(self, likelihood: MarginalLikelihood | Panel, site: dict[str, Any]) -> Any:
+        """Evaluate the model of the likelihood, of its first series for a panel."""
+        distribution = likelihood.first if isinstance(likelihood, Panel) else likelihood
+        ssm, model = distribution.ssm, distribution.model
+        w = 0.3 + 0.1 * jnp.arange(ssm.input_dim)
+
+        def functions(t: jax.Array) -> list[Any]:
+            values = [ssm.drift(w, t), ssm.dispersion(w, t), ssm.observe(w, t), ssm.obs_cov(w, t, 0), ssm.input_map(t),
+                      ssm.deterministics(w, t)]
+            if isinstance(model.observation, ObservationFamily):
+                f = ssm.observe(w, t)
+                values.append(model.observation.at(0).log_prob(f, f))
+            return values
+
+        arrays = [jnp.asarray(leaf) for leaf in jax.tree.leaves((likelihood, distribution.rule))
+                  if eqx.is_array_like(leaf)]
+        self.values += [*arrays, ssm.initial(), ssm.stack.feedback(), ssm.stack.dispersion(),
+                        ssm.stack.jump_table(), jax.vmap(functions)(self.times)]
+        self.settings += repr((
+            site["name"], distribution.rule, distribution.steps, distribution.max_step, distribution.iterations,
+            distribution.damping, distribution.tolerance, distribution.sites, model.state_names, model.output_names,
+            model.force_names, model.units, model.nonlinear_inputs, model.observation.angular,
+            model.deterministic_names, ssm.stack.jump_times))
+        if distribution.constrained:
+            problem = distribution.bounded()
+            self.values.append(problem.boxes(*ssm.split(w), self.times[0]))
+            self.settings += repr((problem.boxes.constraints.labels, distribution.grid, distribution.draws))
+        return super().replacement(likelihood, site)
