@@ -136,14 +136,14 @@ def test_a_stop_after_sampling_costs_no_draw(sampler, whole, tmp_path, monkeypat
         raise ValueError("what cannot be compiled ahead changes nothing")
 
     with monkeypatch.context() as patch:
-        patch.setattr("lfm_ppl.fitting.trajectories", stop)
+        patch.setattr("lfm_ppl.fit_results.trajectories", stop)
         partial = fit(sampler, checkpoint=tmp_path)
     said = arviz_data.attributes(partial)["partial"]
     assert said == "all draws and their scores, without trajectories"
     assert "log_likelihood" in arviz_data.groups(partial) and "trajectories" not in arviz_data.groups(partial)
     xr.testing.assert_identical(arviz_data.group(partial, "posterior"), arviz_data.group(whole(sampler), "posterior"))
-    monkeypatch.setattr("lfm_ppl.inference.map.mode_of", stop)  # nothing is searched or sampled again
-    monkeypatch.setattr("lfm_ppl.fitting.mode_of", stop)
+    for module in ("fitting", "fit_starts", "inference.laplace_start"):  # nothing is searched or sampled again
+        monkeypatch.setattr(f"lfm_ppl.{module}.mode_of", stop)
     assert_same(fit(sampler, checkpoint=tmp_path, resume=True), whole(sampler))
 
 
@@ -253,7 +253,7 @@ def test_a_finished_run_is_read(whole, tmp_path, monkeypatch):
 
 
 def test_folders_that_cannot_be_used(unfinished, tmp_path):
-    with pytest.raises(ValueError, match="resume goes on with a run that a folder keeps; name the folder, checkpoint="):
+    with pytest.raises(ValueError, match="resume continues a run that is stored in a folder; name the folder"):
         fit("ram", resume=True)
     with pytest.raises(FileExistsError, match="holds an unfinished run, which is kept. Go on with it with resume=True"):
         fit("ram", checkpoint=unfinished)
@@ -269,7 +269,7 @@ def test_nothing_is_left_where_nothing_was_sampled(tmp_path, monkeypatch):
     def stop(*arguments, **keywords):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("lfm_ppl.fitting.mode_of", stop)
+    monkeypatch.setattr("lfm_ppl.fit_starts.mode_of", stop)
     with pytest.raises(KeyboardInterrupt):
         fit("ram", checkpoint=tmp_path)
     assert not list(tmp_path.iterdir())
