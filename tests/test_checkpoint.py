@@ -243,7 +243,7 @@ def test_a_finished_run_is_read(whole, tmp_path, monkeypatch):
     expected = whole("ram")
     fit("ram", checkpoint=tmp_path)
     before = (tmp_path / "posterior.nc").stat()
-    monkeypatch.setattr(sampling, "sample", lambda *arguments, **keywords: pytest.fail("it was sampled"))
+    monkeypatch.setattr(sampling, "run_chains", lambda *arguments: pytest.fail("it was sampled"))
     assert_same(fit("ram", checkpoint=tmp_path, resume=True), expected)
     assert (tmp_path / "posterior.nc").stat().st_mtime_ns == before.st_mtime_ns
     with pytest.raises(ValueError, match="seed was 0 and is 1"):
@@ -464,15 +464,15 @@ def test_ctrl_c_leaves_a_usable_result(tmp_path, monkeypatch, capsys):
     assert main(["plot", "run"]) == 0
     assert "wrote run/trace.png" in capsys.readouterr().out
 
-    def gone_on_with(*arguments, keeper, **keywords):
-        raise KeyboardInterrupt(f"{keeper.restore().done} steps are known")
+    def report_stored_steps(key, sampler, starts, schedule, store, show_progress):
+        raise KeyboardInterrupt(f"{store.restore().done} steps are stored")
 
     # This process orders its sets in another way, and takes the model for the same.
-    monkeypatch.setattr(sampling, "sample", gone_on_with)
+    monkeypatch.setattr(sampling, "run_chains", report_stored_steps)
     monkeypatch.setattr(sampling, "available_method", lambda *asked: "parallel")  # as with the devices there
     assert main([*process.args[3:], "--resume"]) == 130
-    known = re.search(r"(\d+) steps are known", capsys.readouterr().err)
-    assert known is not None and int(known[1]) // 50 == count + 10
+    stored = re.search(r"(\d+) steps are stored", capsys.readouterr().err)
+    assert stored is not None and int(stored[1]) // 50 == count + 10
 
 
 def test_the_process_ends_though_compiled_code_runs_on():

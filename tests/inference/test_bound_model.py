@@ -204,7 +204,7 @@ def test_a_step_is_that_of_numpyros_nuts(model):
     step, expected = jax.jit(algorithm.step), jax.jit(lambda state: kernel.sample(state, (TIMES, Y), {}))
     moved = 0
     for _ in range(32):  # the whole warm-up, in which the mass matrix is learnt, and two steps more
-        mine, theirs = step(state, bound.y), expected(state)
+        mine, theirs = step(state, bound.y), expected(state.hmc)
         assert int(mine.hmc.num_steps) == int(theirs.num_steps)
         moved += int(mine.hmc.num_steps) > 1 and not np.array_equal(mine.z["decay"], state.z["decay"])
         for name in mine.z:
