@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from lfm_ppl.filtering.filter import FilterState as FilterState
     from lfm_ppl.filtering.filter import filter as filter
     from lfm_ppl.filtering.smoother import smooth as smooth
-    from lfm_ppl.fitting import ConvergenceWarning as ConvergenceWarning
+    from lfm_ppl.fit_results import ConvergenceWarning as ConvergenceWarning
     from lfm_ppl.fitting import fit as fit
     from lfm_ppl.fitting_many import fit_many as fit_many
     from lfm_ppl.fokker_planck_grid.fokker_planck import fokker_planck as fokker_planck
@@ -143,7 +143,8 @@ _NAMES = {
     "constrained.posterior": ("constrained_posterior",),
     "inference.bound_model": ("BoundModel", "bind"),
     "backtesting": ("Backtest", "backtest"),
-    "fitting": ("ConvergenceWarning", "fit"),
+    "fit_results": ("ConvergenceWarning",),
+    "fitting": ("fit",),
     "fitting_many": ("fit_many",),
     "forecasting": ("forecast",),
     "inference.handlers.fixing": ("fix",),

@@ -12,7 +12,9 @@ import xarray as xr
 
 from lfm_ppl import checks
 from lfm_ppl.data import as_data, model_keywords
-from lfm_ppl.fitting import ConvergenceWarning, bind_dates, fit
+from lfm_ppl.data_binding import bind_dates
+from lfm_ppl.fit_results import ConvergenceWarning
+from lfm_ppl.fitting import fit
 from lfm_ppl.forecasting import check_possible
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.results import arviz_data

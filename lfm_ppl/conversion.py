@@ -11,15 +11,9 @@ import jax
 import numpy as np
 
 from lfm_ppl import checks
-from lfm_ppl.fitting import (
-    check_requested,
-    described_by,
-    draw_paths,
-    kept,
-    note_warnings,
-    versions,
-    warn_of_convergence,
-)
+from lfm_ppl.data_binding import check_requested_times
+from lfm_ppl.fit_options import model_docstring, versions
+from lfm_ppl.fit_results import best_effort, draw_paths, note_warnings, warn_of_convergence
 from lfm_ppl.inference.bound_model import BoundModel, bind
 from lfm_ppl.inference.posterior import scores
 from lfm_ppl.results import arviz_data
@@ -92,20 +86,20 @@ def to_arviz(mcmc: Any, numpyro_model: Callable, times: Any, y: Any, *, at: Any 
     draws, stats = _collected(mcmc)
     values = y.to_numpy(float) if hasattr(y, "to_numpy") else y  # a data frame
     bound = bind(numpyro_model, times, values, **dict(model_kwargs or {}))
-    check_requested(bound, at)
+    check_requested_times(bound, at)
     draws = _checked(bound, draws)
     labels = Labels.of(bound, dims, coords, y)
     truth = checked_truth(bound, truth, labels)
     chains, samples = next(iter(draws.values())).shape[:2]
     flat = {site: draws[site].reshape(-1, *draws[site].shape[2:]) for site in bound.sites}
-    rated = kept("scores of the observations", lambda: scores(bound, flat), None)
-    chosen, paths, grid = kept("trajectories", lambda: draw_paths(
-        jax.random.key(seed), bound, flat, at, trajectory_draws, chains, samples, None, None), (None, None, None))
+    rated = best_effort("scores of the observations", lambda: scores(bound, flat), None)
+    chosen, paths, grid = best_effort("trajectories", lambda: draw_paths(
+        jax.random.key(seed), bound, draws, at, trajectory_draws), (None, None, None))
     groups = lay_out(bound, draws, stats, rated, paths, chosen, grid, truth, labels)
     example = bound.site.example
     kernel = getattr(mcmc, "sampler", None)
     attrs = {
-        "model": name or getattr(numpyro_model, "__name__", "model"), "description": described_by(numpyro_model),
+        "model": name or getattr(numpyro_model, "__name__", "model"), "description": model_docstring(numpyro_model),
         "rule": example.rule.name,
         "steps": example.steps, "max_step": example.max_step, "iterations": example.iterations,
         "tolerance": example.tolerance, "sampler": "draws" if kernel is None else type(kernel).__name__.lower(),

@@ -1,72 +1,71 @@
-"""From a NumPyro model and data to a posterior: one call."""
+"""From a NumPyro model and data to a posterior in one call.
+
+1. Bind the model to its data, and check every argument.
+2. Find the sampler and the starting points (`lfm_ppl.fit_starts`).
+3. Run the chains (`lfm_ppl.inference.sampling`), or find the posterior mode and draw from its Laplace approximation.
+4. Compute scores, diagnostics and trajectories from the draws (`lfm_ppl.fit_results`).
+5. Build the result, store it, and raise its warnings.
+
+With a folder, a `Checkpoint` stores the chains after each second and the batches of step 4, so that a stopped run can
+be resumed.
+"""
 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
-import inspect
 import json
 import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from datetime import UTC, datetime
-from importlib import metadata
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import jax
 import numpy as np
-from jax.stages import Lowered
-from numpyro.infer import init_to_median, init_to_value
 
 from lfm_ppl import calendar_time, checks
-from lfm_ppl.data import Data, as_data, at_origin, model_keywords
-from lfm_ppl.filtering.time_grid import build_time_grid
+from lfm_ppl.data import Data, as_data, model_keywords
+from lfm_ppl.data_binding import bind_dates, check_requested_times
+from lfm_ppl.fit_options import (
+    FitOptions,
+    check_sizes,
+    describe_assumptions,
+    describe_priors,
+    model_docstring,
+)
+from lfm_ppl.fit_results import (
+    FitProblem,
+    PosteriorDraws,
+    PostProcessing,
+    best_effort,
+    build_result,
+    note_warnings,
+    post_process,
+    warn_of_convergence,
+    write_result,
+)
+from lfm_ppl.fit_starts import FALLBACK, check_init, find_start
 from lfm_ppl.forces.sde import ApproximationWarning
 from lfm_ppl.inference import sampling
-from lfm_ppl.inference.ahead import Ahead
-from lfm_ppl.inference.bound_model import BoundModel, bind
+from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.degenerate_mode import degenerate_entries
-from lfm_ppl.inference.interruption import was_interrupt
-from lfm_ppl.inference.kernels.options import KERNELS, check_options
-from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalRAM, Tuned
-from lfm_ppl.inference.laplace_start import (
-    MAX_PARAMETERS,
-    Laplace,
-    UnusableModeError,
-    laplace_approximation,
-    starting_points,
-)
-from lfm_ppl.inference.map import MAPResult, check_sites, mode_of
+from lfm_ppl.inference.kernels.options import check_options
+from lfm_ppl.inference.map import check_sites, mode_of
 from lfm_ppl.inference.model_digest import model_digest
-from lfm_ppl.inference.posterior import evenly_spaced, scores, trajectories
-from lfm_ppl.inference.priors import assumptions, prior
-from lfm_ppl.inference.progress import Counter
-from lfm_ppl.inference.random_keys import split_keys
-from lfm_ppl.inference.samplers import FILTERED, SAMPLERS
-from lfm_ppl.inference.sampling import Transition
-from lfm_ppl.inference.site_failures import failures_at, paths_worth, site_failures
+from lfm_ppl.inference.samplers import SAMPLERS
+from lfm_ppl.inference.schedule import Schedule
 from lfm_ppl.inference.start_failure import start_failure
-from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.progress import waiting
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results import checkpoint as checkpoints
-from lfm_ppl.results.approximation import approximation_warnings, resolution_warnings
 from lfm_ppl.results.checkpoint import Checkpoint
-from lfm_ppl.results.files import POSTERIOR
-from lfm_ppl.results.inputs import remember
-from lfm_ppl.results.layout import Labels, checked_truth, lay_out
+from lfm_ppl.results.layout import Labels, checked_truth
 
-_WARMUP, _SHORT_WARMUP = 1000, 300
-"""Draws of the warm-up of each chain by default; the short one is that of NUTS from the Laplace approximation."""
+_MODE = "mode"
+"""Name of the mode and its draws in the folder of a run."""
 
-_GRID = 200
-"""Number of grid points of trajectories where no times are asked for."""
-
-class ConvergenceWarning(UserWarning):
-    """A diagnostic says that the draws do not represent the posterior yet."""
+_MODE_SEARCH = "posterior mode: compiling and searching"
+_START_SEARCH = "start: compiling, and looking for where chains begin"
 
 
 def fit(
@@ -196,13 +195,13 @@ def fit(
         >>> result["posterior"]["rate"].shape
         (1, 50)
     """
-    started = time.perf_counter()
+    start_time = time.perf_counter()
     if samples is None:
         samples = 400 if sampler == "map" else 1000
-    _check_sizes(sampler, chains, warmup, samples, thin, trajectory_draws)
+    check_sizes(sampler, chains, warmup, samples, thin, trajectory_draws)
     check_options(sampler, sampler_options)
     if checkpoint is None and resume:
-        raise ValueError("resume goes on with a run that a folder keeps; name the folder, checkpoint=...")
+        raise ValueError("resume continues a run that is stored in a folder; name the folder, checkpoint=...")
     if checkpoint is not None:
         checkpoints.check_folder(checkpoint, resume, overwrite)
     data, unit = None, times.units.get("time") if isinstance(times, Data) else None
@@ -216,709 +215,169 @@ def fit(
         model_kwargs = model_keywords(data.inputs, model_kwargs)
     if calendar_time.holds_dates(at):
         at = calendar_time.positions("at", at, *clock)
-    elif at is not None and unit is not None and unit != clock[1]:  # numbers in the unit of the data as they were
+    elif at is not None and unit is not None and unit != clock[1]:  # numbers in the unit of the user's data
         checks.refuse_durations("at", at)
         at = np.asarray(at, float) * (calendar_time.SECONDS[unit] / calendar_time.SECONDS[clock[1]])
     with calendar_time.in_messages(*clock):
-        check_requested(bound, at)
+        check_requested_times(bound, at)
     labels = Labels.of(bound, dims, coords, y)
     truth = checked_truth(bound, truth, labels)
     digest = None if checkpoint is None else model_digest(bound)
     bound = bound.fix(fixed)
     if sampler == "map":
-        chains, warmup, thin, method = 1, 0, None, None
+        chains, warmup, thin, chain_method = 1, 0, None, None
     else:
         thin = thin or SAMPLERS[sampler].steps_a_draw * bound.size or 1
-        method = sampling.available_method(chain_method, chains)
-    asked = _Asked(sampler, chains, warmup, samples, thin, seed, dict(fixed or {}), at, trajectory_draws, init,
-                   dict(sampler_options or {}), method)
+        chain_method = sampling.available_method(chain_method, chains)
+    options = FitOptions(sampler, chains, warmup, samples, thin, seed, dict(fixed or {}), at, trajectory_draws, init,
+                         dict(sampler_options or {}), chain_method)
     title = str(name or getattr(numpyro_model, "__name__", "model"))
-    call = _call(title, "times, y" if data is None else "data", asked, model_kwargs)
-    run = _Run(bound, asked, labels, data, clock, truth, progress, started, {
-        "model": title, "description": described_by(numpyro_model), "call": call, **asked.described(bound),
-        "priors": kept("priors in words", lambda: _priors(bound), None),
-        "assumptions": kept("the model in words", lambda: _assumptions(bound), None)}, dict(attributes or {}))
+    description = {
+        "model": title, "description": model_docstring(numpyro_model),
+        "call": options.call(title, "times, y" if data is None else "data", model_kwargs),
+        **options.description(bound),
+        "priors": best_effort("priors in words", lambda: describe_priors(bound), None),
+        "assumptions": best_effort("the model in words", lambda: describe_assumptions(bound), None)}
+    problem = FitProblem(bound, options, labels, data, clock, truth, description, dict(attributes or {}), start_time)
+    store = None
     if checkpoint is not None:
-        record = asked.record(bound, digest)
+        record = options.record(bound, digest)
         if resume and (finished := checkpoints.finished(checkpoint, record)) is not None:
             return finished
-        run.keeper = checkpoints.begin_or_resume(checkpoint, record, resume)
+        store = checkpoints.begin_or_resume(checkpoint, record, resume)
     if progress:
-        print(f"likelihood: {run.described['likelihood']}", file=sys.stderr, flush=True)
-    with contextlib.closing(run.ahead), checkpoints.closing(run.keeper), calendar_time.in_messages(*clock):
-        with _start_explained(bound):
-            run.sample()
-        run.follow()
-        result = run.result()
-        found = note_warnings(result, run.cautions)
-        run.store(result)
-        if run.keeper is not None and run.partial is None:
-            run.keeper.finish()
-    if run.partial is not None:
-        if run.keeper is None:
-            # Who runs one fit after another wants them all to end, and takes none for whole that is not.
-            raise _Stopped(result, f"stopped with {run.partial}; they are in the attribute `result` of this exception "
-                                   "(sys.last_value.result). With a folder, checkpoint=..., fit returns them")
-        warnings.warn(f"the run was stopped, and its result is partial: {run.partial}.", stacklevel=2)
-    for message in run.cautions:
+        print(f"likelihood: {description['likelihood']}", file=sys.stderr, flush=True)
+    with checkpoints.closing(store), calendar_time.in_messages(*clock):
+        with _explain_start_failure(bound):
+            draws = (_draw_about_mode if sampler == "map" else _sample)(problem, store, progress)
+        processed = post_process(problem, draws, store, progress)
+        partial = draws.partial or processed.partial
+        result = build_result(problem, draws, processed, store, partial)
+        convergence_warnings = note_warnings(result, processed.warnings)
+        if store is not None:
+            write_result(store, result)
+            if partial is None:
+                store.finish()
+    if partial is not None:
+        if store is None:
+            # In a loop of fits Ctrl-C must end the loop, and a partial result must not pass for a complete one.
+            raise _StoppedError(result, f"stopped with {partial}; they are in the attribute `result` of this exception "
+                                        "(sys.last_value.result). With a folder, checkpoint=..., fit returns them")
+        warnings.warn(f"the run was stopped, and its result is partial: {partial}.", stacklevel=2)
+    for message in processed.warnings:
         checks.warn(message, ApproximationWarning)
-    warn_of_convergence(found)
+    warn_of_convergence(convergence_warnings)
     return result
 
 
-def _check_sizes(sampler: str, chains: int, warmup: int | None, samples: int, thin: int | None, paths: int) -> None:
-    checks.one_of("sampler", sampler, SAMPLERS, likeness=checks.ABBREVIATIONS)
-    for label, value, none in (("chains", chains, ()), ("samples", samples, ()), ("warmup", warmup, (None, 0)),
-                               ("thin", thin, (None,)), ("trajectory_draws", paths, (0,))):
-        if value not in none:
-            checks.positive_integer(label, value)
-
-
-class _Asked(NamedTuple):
-    """How to sample, as `fit` was asked; its arguments are described there.
+class _StoppedError(KeyboardInterrupt):
+    """Ctrl-C with a partial result.
 
     Attributes:
-        thin: steps of a draw; None for "map".
-        method: how the chains run side by side.
+        result: the partial result.
     """
-
-    sampler: str
-    chains: int
-    warmup: int | None
-    samples: int
-    thin: int | None
-    seed: int
-    fixed: dict[str, Any]
-    at: Any
-    trajectory_draws: int
-    init: Any
-    options: dict[str, Any]
-    method: str | None
-
-    @property
-    def keys(self) -> jax.Array:
-        """Random keys: of the chains, their starts, and the trajectories, among others."""
-        return jax.random.split(jax.random.key(self.seed), 5)
-
-    def described(self, bound: BoundModel) -> dict[str, Any]:
-        """Return what the attributes of the result say of the approximation and the sampler."""
-        example = bound.site.example
-        return {
-            "rule": example.rule.name, "steps": example.steps, "max_step": example.max_step,
-            "iterations": example.iterations, "tolerance": example.tolerance, "sampler": self.sampler,
-            "likelihood": ("estimated without bias (particle filter)" if self.sampler == "pmmh"
-                           else example.description),
-            "seed": self.seed, "chains": self.chains, "warmup": self.warmup, "samples": self.samples,
-            "fixed": json.dumps({k: np.asarray(v).tolist() for k, v in self.fixed.items()}),
-            **({"sites": example.sites_in_words} if example.sites_in_words else {}),
-            **({"constraints": example.constraints_in_words} if example.constrained else {}),
-        }  # fmt: skip
-
-    def record(self, bound: BoundModel, digest: Any) -> dict[str, Any]:
-        """Return all that a run must share with one that it goes on with."""
-        return {
-            **self.described(bound), "thin": self.thin, "chain_method": self.method, "init": self.init,
-            "sampler_options": self.options, "trajectory_draws": self.trajectory_draws, "parameters": bound.names,
-            "model": checkpoints.digest(digest), "times": checkpoints.digest(bound.times),
-            "data": checkpoints.digest(bound.y),
-            "times of the trajectories": None if self.at is None else checkpoints.digest(np.asarray(self.at, float)),
-            "versions": checkpoints.versions(),
-        }  # fmt: skip
-
-
-@dataclass
-class _Run:
-    """A run of `fit`: what it is of, how far it is, and where it is kept.
-
-    Attributes:
-        bound: the model with its data, without the parameters that are fixed.
-        asked: how to sample.
-        labels: names of dimensions and entries.
-        data: as they were given, with known inputs; None where times and y were.
-        clock: calendar time of t = 0, None where times are plain numbers, and unit of time.
-        truth: of simulated data.
-        progress: whether to show how far it is.
-        started: when it began.
-        described: attributes of the result, but for those that come of sampling.
-        attributes: those that the user wants besides.
-        keeper: what keeps it in a folder; None: nothing does.
-        z: (C, N, d), unconstrained draws of the chains; None for "map".
-        draws: site -> (C, N, ...), so far.
-        stats: statistics of the sampler, (C, N) each.
-        remarks: attributes that come of sampling.
-        particles: what trajectories of "pmmh" need to know of its particles.
-        rated: scores of the observations; None where there are none yet.
-        drawn: chosen draws, their trajectories, and the times of these.
-        cautions: messages on the likelihood for the attribute ``warnings``.
-        partial: what a result that was stopped lacks; None: nothing.
-        ahead: compiles the sampler, and what `follow` runs.
-        compiled: waits for the sampler's program.
-        followed: waits for those of `follow`, and all before.
-    """
-
-    bound: BoundModel
-    asked: _Asked
-    labels: Labels
-    data: Data | None
-    clock: tuple[str | None, str]
-    truth: Mapping[str, Any] | None
-    progress: bool
-    started: float
-    described: dict[str, Any]
-    attributes: dict[str, Any]
-    keeper: Checkpoint | None = None
-    z: np.ndarray | None = None
-    draws: dict[str, np.ndarray] = field(default_factory=dict)
-    stats: dict[str, np.ndarray] = field(default_factory=dict)
-    remarks: dict[str, Any] = field(default_factory=dict)
-    particles: dict[str, Any] = field(default_factory=dict)
-    rated: Any = None
-    drawn: tuple = (None, None, None)
-    cautions: list[str] = field(default_factory=list)
-    partial: str | None = None
-    ahead: Ahead = field(default_factory=Ahead)
-    compiled: Callable[[], None] = lambda: None
-    followed: Callable[[], None] = lambda: None
-
-    def sample(self) -> None:
-        """Draw parameters, or find the mode; after Ctrl-C, as far as it came.
-
-        Raises:
-            KeyboardInterrupt: there are no draws.
-        """
-        asked, keeper = self.asked, self.keeper
-        key = asked.keys[1]
-        if asked.sampler == "map":
-            if isinstance(asked.init, Mapping):
-                check_sites(self.bound, asked.init)
-            else:
-                _check_init(asked.init)
-            known = keeper is not None and keeper.holds(_MODE)
-            with waiting(_SEARCH, self.progress and not known):
-                if not known:
-                    self._compile_ahead_of_search()
-                self.draws, self.stats, self.remarks = _mode(self.bound, key, asked.samples, asked.seed, asked.init,
-                                                             keeper)
-            return
-        assert asked.thin is not None
-        setup = keeper.setup if keeper is not None and keeper.started else None
-        is_at_mode = asked.init in (None, "map")
-        with waiting(_SEARCH if is_at_mode else _START, self.progress and setup is None):
-            if asked.sampler == "nuts":
-                transition, starts, remarks = _nuts_transition(self.bound, asked, setup, self._compile_ahead)
-            else:
-                transition, starts, remarks = _transition(asked, self.bound, setup, self._compile_ahead)
-        if self.progress and setup is None and _FALLBACK in remarks:
-            print(f"note     {remarks[_FALLBACK]}", file=sys.stderr, flush=True)
-        warmup = remarks["warmup"] * asked.thin
-        if keeper is not None:
-            if setup is None:
-                keeper.setup = {name: remarks[name] for name in _SETUP if name in remarks}
-            keeper.look = self._look
-        self.particles = {label: remarks.pop(label, None) for label in _OF_PARTICLES}
-        self.remarks = {**remarks, "thin": asked.thin}
-        collected = sampling.sample(key, self.bound, transition, starts, warmup=warmup, samples=asked.samples,
-                                    thin=asked.thin, chain_method=asked.method, progress=self.progress, keeper=keeper,
-                                    compiled=self.compiled)
-        count = collected.z.shape[1]
-        if count == 0:
-            raise KeyboardInterrupt(f"stopped in the warm-up, after {collected.done:,} of {collected.total:,} steps; "
-                                    "there are no draws yet")
-        if collected.done < collected.total:
-            self.partial = _some(count, asked.samples)
-        self.z = collected.z
-        self.draws, self.stats = _draws(self.bound, {"z": collected.z, **collected.statistics}, asked.samples)
-
-    def _compile_ahead_of_search(self) -> None:
-        """Compile the gradient, and while the mode is sought the programs of `follow`.
-
-        The latter are left for later where the density is not finite at the prior median, as in `_compile_ahead`.
-        """
-        bound = self.bound
-        ready = self.ahead.add(lambda: [bound.lower_gradient(bound.forward_mode)])
-
-        def wanted() -> bool:
-            ready()
-            return bool(np.isfinite(bound.log_density_gradient(bound.draw(self.asked.keys[2]))[0]))
-
-        self.followed = self.ahead.add(self._programs, wanted)
-        ready()
-        arviz_data.load_arviz()
-
-    def _compile_ahead(self, transition: Transition, warmup: int) -> None:
-        """Compile all programs: while it is found out where the chains start, and then while they run.
-
-        Args:
-            transition: how the chains move.
-            warmup: draws of the warm-up.
-
-        When this returns, those that find the starts are compiled: the search would compile them itself. Where the
-        density is not finite at the prior median, there may be nowhere to start, and this be told soon: what follows
-        the chains is left for later.
-        """
-        asked, keeper, thin = self.asked, self.keeper, self.asked.thin or 1
-        done, warmup = None if keeper is None else keeper.done, warmup * thin
-        ready = self.ahead.add(
-            lambda: sampling.lower_start(self.bound, transition, asked.chains) if done is None else [])
-        if done is None or done < warmup + asked.samples * thin:
-            self.compiled = self.ahead.add(lambda: sampling.lower_block(
-                self.bound, transition, chains=asked.chains, warmup=warmup, samples=asked.samples, thin=thin,
-                chain_method=asked.method))
-        ready()
-        if done is None and not np.isfinite(transition.evaluate(self.bound.draw(asked.keys[2]))[0]):
-            return
-        self.followed = self.ahead.add(self._programs)
-        arviz_data.load_arviz()  # takes a second or two, which the compilation takes, too
-
-    def _programs(self) -> list[Lowered]:
-        """Return what computes parameters from the chains, and the programs of `follow`, for draws of any values."""
-        asked = self.asked
-        shapes = jax.eval_shape(self.bound.constrain, jax.ShapeDtypeStruct((self.bound.size,), float))
-        flat = {site: np.zeros((asked.chains * asked.samples, *shapes[site].shape), shapes[site].dtype)
-                for site in self.bound.sites}
-        _, rows, grid = _paths(self.bound, asked.at, asked.trajectory_draws, asked.chains, asked.samples)
-        found = [self.bound.lower_constrain_draws(asked.chains * asked.samples),
-                 scores(self.bound, flat, lower=True)]
-        if len(rows):
-            subset = {site: value[rows] for site, value in flat.items()}
-            found.append(trajectories(asked.keys[3], self.bound, subset, grid, lower=True))
-        return found
-
-    def follow(self) -> None:
-        """Compute what follows from the draws, scores of the observations and trajectories; after Ctrl-C, less."""
-        if self.partial is not None:
-            return
-        asked, keeper = self.asked, self.keeper
-        if keeper is not None:  # the draws are safe, whatever comes
-            self.store(self.result(_BARE))
-        flat = {site: self.draws[site].reshape(-1, *self.draws[site].shape[2:]) for site in self.bound.sites}
-        counter = Counter(shown=self.progress)
-
-        def watched(what: str) -> dict[str, Any]:
-            return {"show": counter.of(what), "parts": None if keeper is None else keeper.parts(what)}
-
-        try:
-            self.followed()
-            self.rated = kept("scores of the observations",
-                              lambda: scores(self.bound, flat, **watched("scores")), None)
-            self.remarks |= self._found_of_sites(flat)
-            self.cautions += kept("resolution of the forces", lambda: resolution_warnings(self.bound, flat), [])
-            if asked.sampler in FILTERED:
-                self.cautions += kept("error of the likelihood", lambda: approximation_warnings(
-                    self.bound, flat, self._log_likelihood()), [])
-            self.drawn = kept("trajectories", lambda: draw_paths(
-                asked.keys[3], self.bound, flat, asked.at, asked.trajectory_draws, asked.chains, asked.samples,
-                **{label: self.particles.get(label) for label in _OF_PARTICLES}, **watched("trajectories")), self.drawn)
-        except KeyboardInterrupt:
-            self.partial = _BARE if self.rated is None else "all draws and their scores, without trajectories"
-        finally:
-            counter.close()
-
-    def _log_likelihood(self) -> np.ndarray | None:
-        """Return the log likelihood (S,) of each draw; None where the scores do not add up to it."""
-        if self.rated is None or isinstance(self.bound.site.example.model.observation, ObservationFamily):
-            return None
-        terms = self.rated["one_step_ahead"]
-        return terms.reshape(len(terms), -1).sum(axis=1)
-
-    def _found_of_sites(self, flat: Mapping[str, Any]) -> dict[str, str]:
-        """Return attributes that say where sites do not converge, and what the weights of trajectories are worth."""
-        asked, found, z = self.asked, {}, self.z
-        if asked.sampler in FILTERED and z is not None:
-            found[arviz_data.SITES] = kept("convergence of the sites",
-                                           lambda: site_failures(self.bound, z, asked.seed), None)
-        elif asked.sampler == "map" and self.bound.site.example.constrained:
-            found[arviz_data.SITES] = kept("convergence of the sites", lambda: failures_at(self.bound, flat), None)
-        found[arviz_data.WEIGHTS] = kept("weights under the constraints", lambda: paths_worth(self.bound, flat), None)
-        return {name: json.dumps(value) for name, value in found.items() if value is not None}
-
-    def result(self, partial: str | None = None) -> Any:
-        """Return an ArviZ object of what there is.
-
-        Args:
-            partial: what it lacks; None: what the run says.
-        """
-        seconds = time.perf_counter() - self.started if self.keeper is None else self.keeper.seconds
-        attrs = {
-            **self.described, "wall_time_s": round(seconds, 3), "versions": json.dumps(versions()),
-            "created_at": datetime.now(UTC).isoformat(timespec="seconds"), **self.remarks,
-            "partial": partial or self.partial, "run": None if self.keeper is None else self.keeper.record,
-            **self.attributes,
-        }  # fmt: skip
-        chosen, paths, grid = self.drawn
-        groups = lay_out(self.bound, self.draws, self.stats, self.rated, paths, chosen, grid, self.truth, self.labels)
-        attrs |= remember(groups, self.data, *self.clock)
-        return arviz_data.build(groups, {k: v for k, v in attrs.items() if v is not None})
-
-    def store(self, result: Any) -> None:
-        """Write a result into the folder, where there is one."""
-        if self.keeper is not None:
-            arviz_data.save(result, self.keeper.folder / POSTERIOR, overwrite=True)
-
-    def _look(self, rows: Mapping[str, np.ndarray]) -> None:
-        """Write a partial result of rows that the chains have left so far."""
-        def write() -> None:
-            draws, stats = _draws(self.bound, rows, self.asked.samples)
-            so_far = dataclasses.replace(self, draws=draws, stats=stats)
-            self.store(so_far.result(_some(rows["z"].shape[1], self.asked.samples)))
-
-        kept("partial result", write, None)
-
-
-class _Stopped(KeyboardInterrupt):
-    """Ctrl-C, with what there is: ``result``."""
 
     def __init__(self, result: Any, message: str) -> None:
         super().__init__(message)
         self.result = result
 
 
-_FALLBACK = "init_fallback"
-"""Attribute of a result: why NUTS did not start from the Laplace approximation."""
-
-_SETUP = ("particles", "log_likelihood_sd", "warmup", "init", _FALLBACK)
-"""Remarks of the start that a run needs to go on."""
-
-_OF_PARTICLES = ("particle_settings", "particle_steps")
-"""What the trajectories of pmmh need to know of its particles."""
-
-_MODE = "mode"
-"""Name under which a run keeps the mode and the draws about it."""
-
-_SEARCH, _START = "posterior mode: compiling and searching", "start: compiling, and looking for where chains begin"
-
-_BARE = "all draws, without scores and trajectories"
-
-
-def _some(draws: int, samples: int) -> str:
-    return f"{draws} of {samples} draws a chain, without scores and trajectories"
-
-
-def _draws(bound: BoundModel, rows: Mapping[str, np.ndarray], samples: int) -> tuple[dict, dict]:
-    """Return site name -> draws, and the statistics, of rows that the chains left."""
-    z = rows["z"]
-    count = z.shape[1]
-    # As many rows as there will be: compiled once, whatever their number.
-    whole = np.concatenate([z, np.repeat(z[:, -1:], samples - count, axis=1)], axis=1)
-    draws = {site: values[:, :count] for site, values in bound.constrain_draws(whole).items()}
-    return draws, _statistics({name: values for name, values in rows.items() if name != "z"})
-
-
-def note_warnings(result: Any, cautions: Sequence[str] = ()) -> list[str]:
-    """Store warnings of the draws and the likelihood in the attribute ``warnings``; return those of the draws.
-
-    Args:
-        result: an ArviZ object.
-        cautions: messages on the likelihood.
-    """
-    found = arviz_data.convergence_warnings(result)
-    result.attrs["warnings"] = json.dumps([*found, *cautions])
-    return found
-
-
-def warn_of_convergence(found: Sequence[str]) -> None:
-    """Warn of what `note_warnings` found."""
-    for message in found:
-        checks.warn(message, ConvergenceWarning)
-
-
 @contextlib.contextmanager
-def _start_explained(bound: BoundModel) -> Iterator[None]:
-    """Where no point to start from is found, add to the error which part of the density fails at the prior median."""
+def _explain_start_failure(bound: BoundModel) -> Iterator[None]:
+    """Add the part of the density that fails at the prior median to the error of a failed search for a start."""
     try:
         yield
     except ValueError as error:
         if "finite density" not in str(error):
             raise
-        reason = kept("reason why there is nowhere to start", lambda: start_failure(bound), None)
+        reason = best_effort("reason why there is nowhere to start", lambda: start_failure(bound), None)
         if reason is None:
             raise
         raise ValueError(f"{error} At the prior median, {reason}") from error
 
 
-def kept(what: str, compute: Callable[[], Any], otherwise: Any) -> Any:
-    """Compute something from the draws; a failure must not lose the draws, which took the time."""
-    try:
-        return compute()
-    except Exception as error:
-        if was_interrupt(error):
-            raise KeyboardInterrupt from error
-        reason = f"{type(error).__name__}: {error}"
-        warnings.warn(f"the {what} could not be computed and are left out of the result: {reason}", stacklevel=3)
-        return otherwise
+def _sample(problem: FitProblem, store: Checkpoint | None, show_progress: bool) -> PosteriorDraws:
+    """Find the start and run the chains; after Ctrl-C, return the finished draws.
 
-
-def check_requested(bound: BoundModel, at: Any) -> None:
-    """Raise before sampling what would stop the trajectories after it."""
-    if at is None:
-        return
-    if bound.times.ndim != 1:
-        raise ValueError("`at` needs one vector of times for all series; this panel has times of its own for each.")
-    example = bound.site.example
-    build_time_grid(example.ssm, bound.times, example.steps, example.max_step, at, tolerance=example.tolerance)
-
-
-def _check_init(init: Any) -> None:
-    if isinstance(init, str):
-        checks.one_of("init", init, ("map", "median"))
-    elif init is not None and not callable(init):
-        raise TypeError('init must be None, "map", "median" or a NumPyro strategy such as '
-                        f"numpyro.infer.init_to_uniform, got {init!r}.")
-
-
-def _strategy(init: Any, bound: BoundModel, seed: int) -> Any:
-    if init is None or isinstance(init, str) and init == "median":
-        return init_to_median
-    return init_to_value(values=mode_of(bound, seed=seed).parameters) if isinstance(init, str) else init
-
-
-def _nuts_transition(bound: BoundModel, asked: _Asked, setup: Mapping[str, Any] | None,
-                     prepare: Callable[[Transition, int], None]) -> tuple[Transition, np.ndarray | None, dict]:
-    """Return the transition of NUTS, the starting points (C, d), and remarks; see `_transition`."""
-    init, options = asked.init, asked.options
-    _check_init(init)
-    # A mass matrix of the user's is not regularised by another one.
-    is_free = "inverse_mass_matrix" not in options and options.get("dense_mass", True) is True
-    placeholder = Laplace(np.zeros(bound.size), np.eye(bound.size))
-
-    def transition(laplace: Laplace | None, warmup: int) -> Transition:
-        return sampling.nuts(bound, warmup * (asked.thin or 1), options, laplace if is_free else None)
-
-    def steps(is_laplace: bool) -> int:
-        return asked.warmup if asked.warmup is not None else _SHORT_WARMUP if is_laplace and is_free else _WARMUP
-
-    if setup is not None:
-        is_laplace = setup["init"] == "laplace"
-        resumed = transition(placeholder if is_laplace else None, setup["warmup"])
-        prepare(resumed, setup["warmup"])
-        return resumed, None, dict(setup)
-    reason = None
-    if init in (None, "map"):
-        if bound.size <= MAX_PARAMETERS:
-            prepare(transition(placeholder, steps(True)), steps(True))
-        try:
-            laplace = laplace_approximation(bound, asked.seed)
-        except UnusableModeError as error:
-            reason = f"the chains start at the prior median, with a unit mass matrix: {error}"
-        else:
-            chosen = transition(laplace, steps(True))._replace(if_slow="")
-            points = starting_points(asked.keys[2], bound, laplace, asked.chains)
-            return chosen, points, {"warmup": steps(True), "init": "laplace"}
-        init = None
-    chosen = transition(None, steps(False))
-    prepare(chosen, steps(False))
-    points = _starts(asked.keys[2], bound, _strategy(init, bound, asked.seed), asked.chains, chosen.evaluate)
-    remarks = {"warmup": steps(False), "init": "strategy" if callable(init) else "median"}
-    if reason is None:
-        return chosen, points, remarks
-    return chosen._replace(if_slow=""), points, remarks | {_FALLBACK: reason}
-
-
-def _transition(asked: _Asked, bound: BoundModel, setup: Mapping[str, Any] | None,
-                prepare: Callable[[Transition, int], None]) -> tuple[Transition, np.ndarray | None, dict[str, Any]]:
-    """Return how the chains of a random walk move, where each of them starts (C, d), and what to remember of it.
-
-    Chains that go on start nowhere: all that their transition needs to know is in ``setup``. ``prepare`` is called as
-    soon as it is known how they move, with the draws of the warm-up.
+    Raises:
+        KeyboardInterrupt: there are no draws.
     """
-    init, sampler, seed, key, chains = asked.init, asked.sampler, asked.seed, asked.keys[2], asked.chains
-    _check_init(init)
-    options = dict(asked.options)
-    draws = _WARMUP if asked.warmup is None else asked.warmup
-    warmup = draws * (asked.thin or 1)
-    if setup is not None:
-        kernel = KERNELS[sampler](bound.model, **options)
-        if not isinstance(kernel, ParticleMarginalRAM):
-            transition = sampling.random_walk(bound, kernel, warmup)
-            prepare(transition, draws)
-            return transition, None, {"warmup": draws}
-        kernel.prepare(bound, None, Tuned(int(setup["particles"]), float(setup["log_likelihood_sd"])))
-        return sampling.particle_marginal(bound, kernel, warmup), None, _remarks(kernel) | {"warmup": draws}
-    if sampler == "ram":
-        # Whatever covariance it begins with, its programs are these.
-        prepare(sampling.random_walk(bound, KERNELS[sampler](bound.model, **options), warmup), draws)
-    strategy = _strategy(init, bound, seed)
-    mode = None
-    if "initial_covariance" not in options:
-        # A random walk that starts with the shape of the posterior needs no gradient afterwards, but learning that
-        # shape by rejection takes thousands of steps. The mode gives it; chains start at draws from its Laplace
-        # approximation.
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            mode = mode_of(bound, seed=seed, restarts=2)
-        if mode.unidentified or not np.all(np.isfinite(mode.covariance)):
-            mode = None
-    if mode is not None:
-        options["initial_covariance"] = mode.covariance
-        if sampler == "pmmh":
-            # At the mode, because a chain's own start may be a poor place to judge the estimate by.
-            options.setdefault("tune_at", bound.unravel(mode.mode))
-    kernel = KERNELS[sampler](bound.model, **options)
-    starts = (_starts(key, bound, strategy, chains, bound.log_density) if mode is None or init is not None
-              else _about(key, bound, mode, chains))
-    if not isinstance(kernel, ParticleMarginalRAM):
-        return sampling.random_walk(bound, kernel, warmup), starts, {"warmup": draws}
-    kernel.prepare(bound, starts[0])
-    return sampling.particle_marginal(bound, kernel, warmup), starts, _remarks(kernel) | {"warmup": draws}
+    bound, options = problem.bound, problem.options
+    assert options.thin is not None
+    setup = store.setup if store is not None and store.started else None
+    text = _MODE_SEARCH if options.init in (None, "map") else _START_SEARCH
+    with waiting(text, show_progress and setup is None):
+        start = find_start(bound, options, setup)
+    if show_progress and setup is None and FALLBACK in start.attributes:
+        print(f"note     {start.attributes[FALLBACK]}", file=sys.stderr, flush=True)
+    attributes = {**start.attributes, "thin": options.thin}
+    if store is not None:
+        if setup is None:
+            store.setup = start.setup
+        store.look = _partial_result_writer(problem, attributes, store)
+    schedule = Schedule(start.attributes["warmup"] * options.thin, options.samples, options.thin, options.chain_method)
+    chains = sampling.run_chains(options.chain_key, start.sampler, start.points, schedule, store, show_progress)
+    count = chains.z.shape[1]
+    if count == 0:
+        raise KeyboardInterrupt(f"stopped in the warm-up, after {chains.done:,} of {chains.total:,} steps; there are "
+                                "no draws yet")
+    partial = _number_of_draws(count, options.samples) if chains.done < chains.total else None
+    values, statistics = _constrained_draws(bound, {"z": chains.z, **chains.statistics}, options.samples)
+    return PosteriorDraws(values, statistics, chains.z, attributes, start.particle_options, partial)
 
 
-def _remarks(kernel: ParticleMarginalRAM) -> dict[str, Any]:
-    assert kernel.tuned is not None
-    return {"particles": kernel.tuned.particles, "log_likelihood_sd": kernel.tuned.sd, "delayed": int(kernel.delayed),
-            "particle_settings": kernel.settings, "particle_steps": kernel.particle_steps}
+def _partial_result_writer(problem: FitProblem, attributes: dict[str, Any],
+                           store: Checkpoint) -> Callable[[Mapping[str, np.ndarray]], None]:
+    """Return the function that writes a result of the first draws during the run."""
+    samples = problem.options.samples
+
+    def write(rows: Mapping[str, np.ndarray]) -> None:
+        values, statistics = _constrained_draws(problem.bound, rows, samples)
+        draws = PosteriorDraws(values, statistics, None, attributes)
+        partial = _number_of_draws(rows["z"].shape[1], samples)
+        write_result(store, build_result(problem, draws, PostProcessing(), store, partial))
+
+    return lambda rows: best_effort("partial result", lambda: write(rows), None)
 
 
-def _starts(key: jax.Array, bound: BoundModel, strategy: Any, chains: int, evaluate: Any) -> np.ndarray:
-    """Return a point (C, d) for each chain, by a NumPyro strategy, where what ``evaluate`` gives is finite."""
-    keys = split_keys(key, chains)
-    return np.stack([bound.start(keys(chain), strategy, evaluate=evaluate) for chain in range(chains)])
+def _number_of_draws(count: int, samples: int) -> str:
+    return f"{count} of {samples} draws a chain, without scores and trajectories"
 
 
-def _about(key: jax.Array, bound: BoundModel, mode: MAPResult, chains: int) -> np.ndarray:
-    """Return draws (C, d) of the Laplace approximation, the mode itself where the density of a draw is zero."""
-    root = np.linalg.cholesky(mode.covariance)
-    points = mode.mode + np.asarray(jax.random.normal(key, (chains, bound.size))) @ root.T
-    possible = [bool(np.isfinite(bound.log_density_gradient(point)[0])) for point in points]
-    return np.where(np.array(possible)[:, None], points, mode.mode)
+def _constrained_draws(bound: BoundModel, rows: Mapping[str, np.ndarray], samples: int) -> tuple[dict, dict]:
+    """Return site name -> draws, and the statistics, from the rows that the chains recorded."""
+    z = rows["z"]
+    count = z.shape[1]
+    # Padded to the full number of draws, so that one program serves every number.
+    padded = np.concatenate([z, np.repeat(z[:, -1:], samples - count, axis=1)], axis=1)
+    values = {site: draws[:, :count] for site, draws in bound.constrain_draws(padded).items()}
+    statistics = {name: row for name, row in rows.items() if name != "z"} | {"lp": -rows["lp"]}
+    if "n_steps" in statistics:
+        statistics["tree_depth"] = np.ceil(np.log2(statistics["n_steps"] + 1)).astype(int)
+    return values, statistics
 
 
-def _statistics(collected: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    stats = {**collected, "lp": -collected["lp"]}
-    if "n_steps" in stats:
-        stats["tree_depth"] = np.ceil(np.log2(stats["n_steps"] + 1)).astype(int)
-    return stats
-
-
-def _mode(bound: BoundModel, key: jax.Array, samples: int, seed: int, init: Any,
-          run: Checkpoint | None) -> tuple[dict, dict, dict]:
-    if isinstance(init, str):
-        init = None
+def _draw_about_mode(problem: FitProblem, store: Checkpoint | None, show_progress: bool) -> PosteriorDraws:
+    """Return draws from the Laplace approximation at the posterior mode."""
+    bound, options = problem.bound, problem.options
+    if isinstance(options.init, Mapping):
+        check_sites(bound, options.init)
+    else:
+        check_init(options.init)
 
     def compute() -> dict[str, Any]:
-        # Second derivatives take longer to compile than everything else here takes to run.
-        mode = mode_of(bound, seed=seed, init=init)
-        remarks = {"map_converged": int(mode.converged), "map_message": mode.message,
-                   "map_log_density": float(mode.log_density), "log_evidence": float(mode.log_evidence),
-                   arviz_data.MODE: json.dumps({name: value.tolist() for name, value in
-                                                {**mode.parameters, **mode.deterministic}.items()})}
-        draws = mode.sample(key, samples)
-        degenerate = kept("check of the mode", lambda: degenerate_entries(bound, mode, draws), {})
-        remarks |= {arviz_data.DEGENERATE: json.dumps(degenerate)} if degenerate else {}
-        return {"": np.asarray(json.dumps(remarks)), **draws}
+        mode = mode_of(bound, seed=options.seed, init=None if isinstance(options.init, str) else options.init)
+        attributes = {"map_converged": int(mode.converged), "map_message": mode.message,
+                      "map_log_density": float(mode.log_density), "log_evidence": float(mode.log_evidence),
+                      arviz_data.MODE: json.dumps({name: value.tolist() for name, value in
+                                                   {**mode.parameters, **mode.deterministic}.items()})}
+        draws = mode.sample(options.chain_key, options.samples)
+        degenerate = best_effort("check of the mode", lambda: degenerate_entries(bound, mode, draws), {})
+        attributes |= {arviz_data.DEGENERATE: json.dumps(degenerate)} if degenerate else {}
+        return {"": np.asarray(json.dumps(attributes)), **draws}
 
-    found = compute() if run is None else run.once(_MODE, compute)
-    remarks = json.loads(str(found.pop("")))
-    return {label: np.asarray(value)[None] for label, value in found.items()}, {}, remarks
-
-
-def draw_paths(key: jax.Array, bound: BoundModel, draws: dict, at: Any, count: int, chains: int, samples: int,
-               particle_settings: Any, particle_steps: int | None,
-               **more: Any) -> tuple[np.ndarray, dict | None, np.ndarray | None]:
-    """Draw trajectories for draws that are spread evenly over each chain."""
-    chosen, rows, grid = _paths(bound, at, count, chains, samples)
-    if not len(rows):
-        return chosen, None, None
-    subset = {site: value[rows] for site, value in draws.items()}
-    paths = trajectories(key, bound, subset, grid, particle_settings, particle_steps, **more)
-    if at is None:
-        paths.pop("prediction", None)  # stored where they were asked for
-    return chosen, {k: v.reshape(chains, len(chosen), *v.shape[1:]) for k, v in paths.items()}, grid
-
-
-def _paths(bound: BoundModel, at: Any, count: int, chains: int,
-           samples: int) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Return which draws of each chain have a trajectory, their rows among all draws, and its times."""
-    chosen, rows = evenly_spaced(chains, samples, count)
-    times = bound.times
-    if times.ndim > 1:
-        return chosen, rows, None
-    if at is not None:
-        return chosen, rows, np.atleast_1d(np.asarray(at, float))
-    origin = float(bound.site.example.time_grid.initial_time)
-    return chosen, rows, np.union1d(np.linspace(min(origin, times[0]), times[-1], _GRID), times)
-
-
-def bind_dates(numpyro_model: Callable, times: Any, y: Any, data: Data | None,
-               model_kwargs: Mapping[str, Any] | None) -> tuple[BoundModel, Data | None, tuple[str | None, str]]:
-    """Bind a model to times that may be dates, counted in the unit of time that the model names.
-
-    Args:
-        numpyro_model: the model.
-        times: (T,) or (B, T), numbers or dates.
-        y: the observations, or a data frame of them.
-        data: what times and y were taken from, where they were.
-        model_kwargs: keyword arguments of the model, without the known inputs of ``data``.
-
-    Returns:
-        The bound model; the data, with times in the same unit; the calendar time of t = 0, None where times are plain
-        numbers, and their unit, empty where it is not known.
-    """
-    checks.refuse_durations("times", times)
-    origin, unit = (None, "") if data is None else (data.origin, data.units.get("time", ""))
-    if calendar_time.holds_dates(times):
-        times, origin, unit = calendar_time.numbers_of("times", times)
-    values = y.to_numpy(float) if hasattr(y, "to_numpy") else y  # a data frame
-
-    def bind_in(origin: str | None, unit: str) -> BoundModel:
-        keywords = dict(model_kwargs or {}) if data is None else model_keywords(data.inputs, model_kwargs)
-        with calendar_time.in_messages(origin, unit):
-            return _bound(numpyro_model, times, values, keywords)
-
-    bound = bind_in(origin, unit)
-    # The model names its unit only once it has been built, for which it takes times.
-    model_unit = bound.site.example.ssm.model.units.get("time", "")
-    old, new = (calendar_time.SECONDS.get(name) for name in (unit, model_unit))
-    if origin is None or old is None or new is None or old == new:
-        return bound, data, (origin, unit)
-    times = np.asarray(times) * (old / new)
-    data = None if data is None else at_origin(data, origin, model_unit)
-    return bind_in(origin, model_unit), data, (origin, model_unit)
-
-
-def _bound(numpyro_model: Callable, times: Any, y: Any, model_kwargs: dict[str, Any]) -> BoundModel:
-    try:
-        return bind(numpyro_model, times, y, **model_kwargs)
-    except TypeError as error:
-        if "'NoneType'" not in str(error) or "inputs" in model_kwargs or (
-                "inputs" not in inspect.signature(numpyro_model).parameters):
-            raise
-        raise TypeError("the model has an argument `inputs`, and there are none. Name their columns, "
-                        "lfm.read_table(frame, inputs=[...]), or give lfm.Data(..., inputs={...}).") from error
-
-
-def _priors(bound: BoundModel) -> str:
-    """Return name -> prior in words, as JSON."""
-    trace = bound.trace()
-    return json.dumps({name: prior(trace[name]["fn"]) for name in bound.sites})
-
-
-def _assumptions(bound: BoundModel) -> str:
-    """Return what the model says of observations, forces and initial state, with numbers typical of the prior."""
-    return json.dumps(assumptions(bound.site.example.ssm.model))
-
-
-def described_by(numpyro_model: Any) -> str | None:
-    """Return the docstring of a model, under handlers and partial applications; None where there is none."""
-    while (inner := getattr(numpyro_model, "fn", getattr(numpyro_model, "func", None))) is not None:
-        numpyro_model = inner
-    return inspect.getdoc(numpyro_model) if inspect.isroutine(numpyro_model) else None
-
-
-def _call(model: str, data: str, asked: _Asked, model_kwargs: Mapping[str, Any] | None) -> str:
-    """Return the call of `fit` as text, in which objects that text cannot hold are named where they were given."""
-    arguments = {
-        "sampler": asked.sampler, "chains": asked.chains, "warmup": asked.warmup, "samples": asked.samples,
-        "thin": asked.thin, "seed": asked.seed, "trajectory_draws": asked.trajectory_draws,
-        "chain_method": asked.method, "init": asked.init, "sampler_options": asked.options,
-        "fixed": {name: np.asarray(value).tolist() for name, value in asked.fixed.items()},
-    }  # fmt: skip
-    given = [f"{label}={value!r}" if isinstance(value, (str, int, float, dict)) else f"{label}={label}"
-             for label, value in arguments.items() if value is not None and value != {}]
-    named = [f"{label}={label}" for label, value in (("at", asked.at), ("model_kwargs", model_kwargs))
-             if value is not None]
-    return f"lfm.fit({', '.join([model, data, *given, *named])})"
-
-
-def versions() -> dict[str, str]:
-    """Return the versions of what a result was made with."""
-    return checkpoints.versions() | {"arviz": metadata.version("arviz")}
+    with waiting(_MODE_SEARCH, show_progress and not (store is not None and store.holds(_MODE))):
+        arrays = compute() if store is None else store.once(_MODE, compute)
+    attributes = json.loads(str(arrays.pop("")))
+    values = {name: np.asarray(value)[None] for name, value in arrays.items()}
+    return PosteriorDraws(values, {}, None, attributes)

@@ -105,7 +105,7 @@ def _forecast(result: Any, numpyro_model: Callable, times: np.ndarray, inputs: M
     settings = None
     if str(attrs.get("sampler", "")).startswith("pmmh") and "particles" in attrs:
         settings = ParticleSettings(int(attrs["particles"]))
-    counter = Counter("forecast", shown=progress, at_once=True)
+    counter = Counter("forecast", is_shown=progress, at_once=True)
     # That of an observation family, by its sites, depends on the times of the forecast in its last digits.
     known = not isinstance(bound.site.example.ssm.model.observation, ObservationFamily)
     try:

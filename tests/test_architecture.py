@@ -28,7 +28,7 @@ LAYERS = (
     ("inference",),
     ("orbits.training", "orbits.learning", "orbits.prediction"),
     ("results", "engine"),
-    ("fitting", "forecasting"),
+    ("data_binding", "fit_options", "fit_starts", "fit_results", "fitting", "forecasting"),
     ("backtesting", "conversion", "fitting_many"),
     ("loading",),
     ("experiments",),

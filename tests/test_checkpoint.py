@@ -26,8 +26,9 @@ from lfm_ppl.cli.interruption import watched
 from lfm_ppl.inference import progress, sampling
 from lfm_ppl.inference.handlers.settings import approximate
 from lfm_ppl.inference.posterior import scores
-from lfm_ppl.inference.progress import Progress, Stage
+from lfm_ppl.inference.progress import ChainProgress
 from lfm_ppl.inference.samplers import SAMPLERS
+from lfm_ppl.inference.schedule import Schedule
 from lfm_ppl.progress import waiting
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results import checkpoint as checkpoints
@@ -135,29 +136,29 @@ def test_a_stop_after_sampling_costs_no_draw(sampler, whole, tmp_path, monkeypat
         raise ValueError("what cannot be compiled ahead changes nothing")
 
     with monkeypatch.context() as patch:
-        patch.setattr("lfm_ppl.fitting.trajectories", stop)
+        patch.setattr("lfm_ppl.fit_results.trajectories", stop)
         partial = fit(sampler, checkpoint=tmp_path)
     said = arviz_data.attributes(partial)["partial"]
     assert said == "all draws and their scores, without trajectories"
     assert "log_likelihood" in arviz_data.groups(partial) and "trajectories" not in arviz_data.groups(partial)
     xr.testing.assert_identical(arviz_data.group(partial, "posterior"), arviz_data.group(whole(sampler), "posterior"))
-    monkeypatch.setattr("lfm_ppl.inference.map.mode_of", stop)  # nothing is searched or sampled again
-    monkeypatch.setattr("lfm_ppl.fitting.mode_of", stop)
+    for module in ("fitting", "fit_starts", "inference.laplace_start"):  # nothing is searched or sampled again
+        monkeypatch.setattr(f"lfm_ppl.{module}.mode_of", stop)
     assert_same(fit(sampler, checkpoint=tmp_path, resume=True), whole(sampler))
 
 
 def test_a_run_that_nothing_keeps_gives_what_it_has(whole, monkeypatch):
     monkeypatch.setattr(signal, "default_int_handler", signal.getsignal(signal.SIGINT))
-    took = sampling._Pace.took
+    adapt = sampling._BlockLength.adapt
     calls = []
 
     def stopping(self, seconds):
-        took(self, seconds)
+        adapt(self, seconds)
         calls.append(seconds)
         if len(calls) == 11:
             signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(sampling._Pace, "took", stopping)
+    monkeypatch.setattr(sampling._BlockLength, "adapt", stopping)
     with pytest.raises(KeyboardInterrupt, match="stopped with 3 of 6 draws a chain.*sys.last_value.result") as raised:
         fit("nuts")
     assert arviz_data.attributes(raised.value.result)["partial"].startswith("3 of 6 draws a chain")
@@ -169,12 +170,12 @@ def test_a_second_request_ends_at_once(monkeypatch):
     monkeypatch.setattr(signal, "default_int_handler", signal.getsignal(signal.SIGINT))
 
     def twice(self, seconds):
-        if self._compiled:
+        if self._is_compiled:
             signal.raise_signal(signal.SIGINT)
             signal.raise_signal(signal.SIGINT)
-        self._compiled = True
+        self._is_compiled = True
 
-    monkeypatch.setattr(sampling._Pace, "took", twice)
+    monkeypatch.setattr(sampling._BlockLength, "adapt", twice)
     with pytest.raises(KeyboardInterrupt):
         fit("ram")
 
@@ -242,7 +243,7 @@ def test_a_finished_run_is_read(whole, tmp_path, monkeypatch):
     expected = whole("ram")
     fit("ram", checkpoint=tmp_path)
     before = (tmp_path / "posterior.nc").stat()
-    monkeypatch.setattr(sampling, "sample", lambda *arguments, **keywords: pytest.fail("it was sampled"))
+    monkeypatch.setattr(sampling, "run_chains", lambda *arguments: pytest.fail("it was sampled"))
     assert_same(fit("ram", checkpoint=tmp_path, resume=True), expected)
     assert (tmp_path / "posterior.nc").stat().st_mtime_ns == before.st_mtime_ns
     with pytest.raises(ValueError, match="seed was 0 and is 1"):
@@ -252,7 +253,7 @@ def test_a_finished_run_is_read(whole, tmp_path, monkeypatch):
 
 
 def test_folders_that_cannot_be_used(unfinished, tmp_path):
-    with pytest.raises(ValueError, match="resume goes on with a run that a folder keeps; name the folder, checkpoint="):
+    with pytest.raises(ValueError, match="resume continues a run that is stored in a folder; name the folder"):
         fit("ram", resume=True)
     with pytest.raises(FileExistsError, match="holds an unfinished run, which is kept. Go on with it with resume=True"):
         fit("ram", checkpoint=unfinished)
@@ -268,7 +269,7 @@ def test_nothing_is_left_where_nothing_was_sampled(tmp_path, monkeypatch):
     def stop(*arguments, **keywords):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("lfm_ppl.fitting.mode_of", stop)
+    monkeypatch.setattr("lfm_ppl.fit_starts.mode_of", stop)
     with pytest.raises(KeyboardInterrupt):
         fit("ram", checkpoint=tmp_path)
     assert not list(tmp_path.iterdir())
@@ -343,10 +344,10 @@ def test_the_time_left_is_that_at_the_pace_of_the_last_minute(capfd, monkeypatch
     clock = [0.0]
     monkeypatch.setattr("time.perf_counter", lambda: clock[0])
     monkeypatch.setattr("lfm_ppl.progress.EVERY_S", 0.0)
-    with Progress(1000, 0, shown=True, warmup=100) as shown:
+    with ChainProgress(Schedule(100, 900), 0, is_shown=True) as display:
         for done in range(1, 1001):
             clock[0] += 10.0 if done <= 100 else 1.0
-            shown.advance(done, lambda: Stage(0, 0, 0, "words"))
+            display.advance(done, lambda: "words")
     lines = capfd.readouterr().err.splitlines()
     assert lines[0].endswith("words")  # the first step comes with the compilation, and says nothing of the pace
     assert lines[99 - 1].endswith("; about 2.5 h left at the pace of the warm-up so far")  # 901 steps of 10 s
@@ -463,15 +464,15 @@ def test_ctrl_c_leaves_a_usable_result(tmp_path, monkeypatch, capsys):
     assert main(["plot", "run"]) == 0
     assert "wrote run/trace.png" in capsys.readouterr().out
 
-    def gone_on_with(*arguments, keeper, **keywords):
-        raise KeyboardInterrupt(f"{keeper.restore().done} steps are known")
+    def report_stored_steps(key, sampler, starts, schedule, store, show_progress):
+        raise KeyboardInterrupt(f"{store.restore().done} steps are stored")
 
     # This process orders its sets in another way, and takes the model for the same.
-    monkeypatch.setattr(sampling, "sample", gone_on_with)
+    monkeypatch.setattr(sampling, "run_chains", report_stored_steps)
     monkeypatch.setattr(sampling, "available_method", lambda *asked: "parallel")  # as with the devices there
     assert main([*process.args[3:], "--resume"]) == 130
-    known = re.search(r"(\d+) steps are known", capsys.readouterr().err)
-    assert known is not None and int(known[1]) // 50 == count + 10
+    stored = re.search(r"(\d+) steps are stored", capsys.readouterr().err)
+    assert stored is not None and int(stored[1]) // 50 == count + 10
 
 
 def test_the_process_ends_though_compiled_code_runs_on():

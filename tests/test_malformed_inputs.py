@@ -693,9 +693,10 @@ def there(tmp_path, monkeypatch, result_file):
     def compute(*arguments, **keywords):
         raise AssertionError("it has begun to compute")
 
-    monkeypatch.setattr("lfm_ppl.inference.sampling.sample", compute)
+    monkeypatch.setattr("lfm_ppl.inference.sampling.run_chains", compute)
     monkeypatch.setattr("lfm_ppl.fitting.mode_of", compute)
-    monkeypatch.setattr("lfm_ppl.fitting.draw_paths", compute)
+    monkeypatch.setattr("lfm_ppl.fit_starts.mode_of", compute)
+    monkeypatch.setattr("lfm_ppl.fit_results.draw_paths", compute)
     return tmp_path
 
 

@@ -15,8 +15,8 @@ warm-up); Gelman and Rubin (1992), Statistical Science 7, 457-472 (overdispersed
 from __future__ import annotations
 
 import warnings
-from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
 
@@ -39,7 +39,7 @@ _PULLS = 6
 """Number of times that the distance of a starting point to the mode is halved before the mode itself is taken."""
 
 
-class Laplace(NamedTuple):
+class Laplace(eqx.Module):
     """Gaussian approximation of the posterior of the unconstrained parameters.
 
     Attributes:

@@ -62,7 +62,7 @@ class Parts(Protocol):
         """Keep all that was put, now."""
 
 
-def scores(bound: BoundModel, draws: Mapping[str, Any], *, lower: bool = False,
+def scores(bound: BoundModel, draws: Mapping[str, Any], *,
            show: Callable[[int, int], None] = lambda done, count: None, parts: Parts | None = None) -> Any:
     """Score the observations under each draw, site name -> (S, ...); the rest is as in `over_draws`.
 
@@ -80,12 +80,12 @@ def scores(bound: BoundModel, draws: Mapping[str, Any], *, lower: bool = False,
     def per_draw(values: Any, key: jax.Array, y: Any) -> dict[str, jax.Array]:
         return each(bound.likelihood(values, y), one, bound.data(y))
 
-    return over_draws(bound, "scores", per_draw, draws, jax.random.key(0), bound.times.size, show, parts, lower)
+    return over_draws(bound, "scores", per_draw, draws, jax.random.key(0), bound.times.size, show, parts)
 
 
 def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at: Any,
                  particles: ParticleSettings | None = None, particle_steps: int | None = None, *,
-                 log_likelihood: bool = False, lower: bool = False,
+                 log_likelihood: bool = False,
                  show: Callable[[int, int], None] = lambda done, count: None, parts: Parts | None = None) -> Any:
     """Draw one trajectory for each draw of the parameters, given the data, and new data along it.
 
@@ -100,9 +100,8 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
         particles: draw the trajectories with the particle smoother; None: with the Gaussian one.
         particle_steps: integration steps of the particles between two observations; None: the model's.
         log_likelihood: whether to return that of the Gaussian filter, (S, ...), unless there are particles.
-        lower: as in `over_draws`, and so are the next.
-        show: of the batches.
-        parts: keeps batches.
+        show: as in `over_draws`.
+        parts: as in `over_draws`.
 
     Returns:
         ``state`` (S, ..., K, M), ``force`` (S, ..., K, R), ``deterministic`` (S, ..., K, Q), ``output`` (S, ..., K, D)
@@ -191,7 +190,7 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
     rows = plan.rows
     width = 1 if particles is None else particles.particles
     name = ("trajectories", signature(at), particles, particle_steps, after, log_likelihood)
-    return over_draws(bound, name, per_draw, draws, key, rows * width, show, parts, lower)
+    return over_draws(bound, name, per_draw, draws, key, rows * width, show, parts)
 
 
 def _of_family(ssm: StateSpaceModel, key: jax.Array, w: jax.Array, when: jax.Array,
@@ -395,7 +394,7 @@ def each(distribution: MarginalLikelihood | Panel, function: Callable, *argument
 
 def over_draws(bound: BoundModel, name: Hashable, per_draw: Callable, draws: Mapping[str, Any], key: jax.Array,
                rows: int | None = None, show: Callable[[int, int], None] = lambda done, count: None,
-               parts: Parts | None = None, lower: bool = False) -> Any:
+               parts: Parts | None = None) -> Any:
     """Return ``per_draw(values, key, y)`` for all draws (S, ...), some at a time, with one compilation for any number.
 
     Args:
@@ -408,8 +407,6 @@ def over_draws(bound: BoundModel, name: Hashable, per_draw: Callable, draws: Map
             after another, as always with steps that follow a tolerance, of which each would make as many as are tried.
         show: is told before each batch how many draws of how many are done.
         parts: keeps the batches, and knows those of an earlier run.
-        lower: return the program of a batch (`jax.stages.Lowered`), whatever the draws' values. As long as it lives,
-            what it compiles to need not be compiled again.
     """
     draws = {site: np.asarray(value) for site, value in draws.items()}
     count = next(iter(draws.values())).shape[0]
@@ -438,8 +435,6 @@ def over_draws(bound: BoundModel, name: Hashable, per_draw: Callable, draws: Map
         index = np.minimum(np.arange(start, start + batch), count - 1)  # full batches: one shape
         return {site: value[index] for site, value in draws.items()}, keys(index), bound.argument
 
-    if lower:
-        return cast(Any, run).lower(*some(0))
     starts = range(0, count, batch)
     kept = {start: None if parts is None else parts.get(start) for start in starts}
     # Those that were kept by batches of another length are of no use.

@@ -253,7 +253,7 @@ def _particle_run(problem: PosteriorDraws, particles: int, replicates: int, step
 def _one_by_one(problem: PosteriorDraws, key: jax.Array, name: Hashable, per_draw: Callable, label: str,
                 progress: bool) -> np.ndarray:
     """Map over draws, one after another, and say how far that is."""
-    counter = Counter(label, shown=progress, at_once=True)
+    counter = Counter(label, is_shown=progress, at_once=True)
     try:
         return over_draws(problem.bound, name, per_draw, problem.draws, key, show=counter, parts=problem.kept(label))
     finally:

@@ -16,8 +16,10 @@ from numpyro.infer.util import ParamInfo, potential_energy
 
 import lfm_ppl as lfm
 from lfm_ppl.inference import bound_model, sampling, traced_model
+from lfm_ppl.inference.bound_samplers import nuts_sampler, ram_sampler
 from lfm_ppl.inference.laplace_start import Laplace
 from lfm_ppl.inference.model_digest import model_digest
+from lfm_ppl.inference.schedule import Schedule
 from lfm_ppl.results.arviz_data import group
 
 TIMES = np.array([0.0, 0.7, 1.1, 2.0, 3.0])
@@ -195,45 +197,45 @@ def test_a_step_is_that_of_numpyros_nuts(model):
     z = bound.unconstrain({"decay": VALUES["decay"]} if model is small else VALUES)
     value, gradient = bound.log_density_gradient(z)
     point = ParamInfo(bound.unravel(z), -value, bound.unravel(-gradient))
-    transition = sampling.nuts(bound, 30, {})
-    state = transition.start(jax.random.key(5), point, bound.y, None)
+    algorithm = nuts_sampler(bound, 30, {}).algorithm
+    state = algorithm.init(jax.random.key(5), point, bound.y, None)
     kernel = NUTS(model, forward_mode_differentiation=True, dense_mass=True)
     kernel.init(jax.random.key(5), 30, point.z, (TIMES, Y), {})
-    step, expected = jax.jit(transition.step), jax.jit(lambda state: kernel.sample(state, (TIMES, Y), {}))
+    step, expected = jax.jit(algorithm.step), jax.jit(lambda state: kernel.sample(state, (TIMES, Y), {}))
     moved = 0
     for _ in range(32):  # the whole warm-up, in which the mass matrix is learnt, and two steps more
-        mine, theirs = step(state, bound.y), expected(state)
-        assert int(mine.num_steps) == int(theirs.num_steps)
-        moved += int(mine.num_steps) > 1 and not np.array_equal(mine.z["decay"], state.z["decay"])
+        mine, theirs = step(state, bound.y), expected(state.hmc)
+        assert int(mine.hmc.num_steps) == int(theirs.num_steps)
+        moved += int(mine.hmc.num_steps) > 1 and not np.array_equal(mine.z["decay"], state.z["decay"])
         for name in mine.z:
             np.testing.assert_allclose(mine.z[name], theirs.z[name], rtol=1e-6)
-        for one, other in zip(jax.tree.leaves(mine.adapt_state.inverse_mass_matrix),
+        for one, other in zip(jax.tree.leaves(mine.hmc.adapt_state.inverse_mass_matrix),
                               jax.tree.leaves(theirs.adapt_state.inverse_mass_matrix), strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-6)
-        np.testing.assert_allclose(mine.adapt_state.step_size, theirs.adapt_state.step_size, rtol=1e-6)
+        np.testing.assert_allclose(mine.hmc.adapt_state.step_size, theirs.adapt_state.step_size, rtol=1e-6)
         state = mine
     assert moved >= 3
 
 
 def test_chains_from_the_mode_begin_with_the_covariance_there(monkeypatch):
-    begun = {}
+    tuning = []
 
-    def sample(key, bound, transition, *rest, **more):
-        begun["laplace"] = transition.extra
-        return run(key, bound, transition, *rest, **more)
+    def run_chains(key, sampler, *arguments):
+        tuning.append(sampler.tuning)
+        return run(key, sampler, *arguments)
 
-    run = sampling.sample
-    monkeypatch.setattr(sampling, "sample", sample)
+    run = sampling.run_chains
+    monkeypatch.setattr(sampling, "run_chains", run_chains)
     lfm.fit(small, TIMES, Y, chains=1, warmup=2, samples=2, trajectory_draws=0, progress=False)
     bound = lfm.bind(small, TIMES, Y)
     mode = lfm.map_estimate(small, TIMES, Y)
-    np.testing.assert_allclose(begun["laplace"].covariance, mode.covariance, rtol=1e-4)
+    np.testing.assert_allclose(tuning[0].covariance, mode.covariance, rtol=1e-4)
     value, gradient = bound.log_density_gradient(mode.mode)
     point = ParamInfo(bound.unravel(mode.mode), -value, bound.unravel(-gradient))
-    transition = sampling.nuts(bound, 30, {"dense_mass": True}, Laplace(mode.mode, mode.covariance))
-    state = transition.start(jax.random.key(5), point, bound.y, transition.extra)
-    (found,) = state.hmc.adapt_state.inverse_mass_matrix.values()
-    np.testing.assert_allclose(found, mode.covariance)
+    sampler = nuts_sampler(bound, 30, {"dense_mass": True}, Laplace(mode.mode, mode.covariance))
+    state = sampler.algorithm.init(jax.random.key(5), point, bound.y, sampler.tuning)
+    (inverse_mass_matrix,) = state.hmc.adapt_state.inverse_mass_matrix.values()
+    np.testing.assert_allclose(inverse_mass_matrix, mode.covariance)
 
 
 def test_thinning_and_blocks_keep_the_last_step_of_each_draw(capfd, monkeypatch):
@@ -241,12 +243,16 @@ def test_thinning_and_blocks_keep_the_last_step_of_each_draw(capfd, monkeypatch)
     bound = lfm.bind(small, TIMES, Y)
     kernel = lfm.RAM(small, initial_scale=0.1)
     starts = np.stack([bound.unconstrain({"decay": 0.8})] * 2)
-    run = lambda **more: sampling.sample(  # noqa: E731
-        jax.random.key(0), bound, sampling.random_walk(bound, kernel, 7), starts, warmup=7, **more).z
-    every = run(samples=30, chain_method="sequential")
-    np.testing.assert_allclose(run(samples=10, thin=3, chain_method="sequential"), every[:, 2::3], rtol=1e-12)
-    np.testing.assert_allclose(run(samples=30, chain_method="vectorized"), every, rtol=1e-8)
-    np.testing.assert_array_equal(run(samples=30, chain_method="sequential", progress=True), every)
+
+    def run(samples, thin=1, chain_method="sequential", show_progress=False):
+        schedule = Schedule(7, samples, thin, chain_method)
+        sampler = ram_sampler(bound, 7, kernel)
+        return sampling.run_chains(jax.random.key(0), sampler, starts, schedule, show_progress=show_progress).z
+
+    unthinned = run(30)
+    np.testing.assert_allclose(run(10, thin=3), unthinned[:, 2::3], rtol=1e-12)
+    np.testing.assert_allclose(run(30, chain_method="vectorized"), unthinned, rtol=1e-8)
+    np.testing.assert_array_equal(run(30, show_progress=True), unthinned)
     assert "acceptance" in capfd.readouterr().err
 
 

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from numpyro.infer.hmc import HMCState
 from numpyro.infer.hmc_util import HMCAdaptState, welford_covariance
 
-from lfm_ppl.inference import sampling
+from lfm_ppl.inference import nuts
 from lfm_ppl.inference.bound_model import bind_arguments
 from lfm_ppl.inference.laplace_start import (
     MAX_PARAMETERS,
@@ -88,16 +88,16 @@ def test_mass_matrices_are_means_of_draws_and_approximation():
         adaptation = HMCAdaptState(1.0, None, None, None, None, {("x",): estimate}, 0, None)
         return HMCState(**dict.fromkeys(HMCState._fields) | {"adapt_state": adaptation})
 
-    (estimate,) = sampling._with_pseudo_draws(state(init(2)), laplace).adapt_state.mm_state.values()
+    (estimate,) = nuts._with_pseudo_draws(state(init(2)), laplace).adapt_state.mm_state.values()
     for draw in draws:
         estimate = update(jnp.asarray(draw), estimate)
     mean, sum_of_squares, count = estimate
-    weight = sampling._PSEUDO_DRAWS
+    weight = nuts._PSEUDO_DRAWS
     assert count == 30 + weight
     assert_allclose(mean, (30 * draws.mean(axis=0) + weight * 0.5) / count)
     shift = draws.mean(axis=0) - 0.5
     expected = 29 * np.cov(draws.T) + weight * COVARIANCE + 30 * weight / count * np.outer(shift, shift)
     assert_allclose(sum_of_squares, expected, rtol=1e-12)
     # An estimate that has draws is left alone.
-    (again,) = sampling._with_pseudo_draws(state(estimate), laplace).adapt_state.mm_state.values()
+    (again,) = nuts._with_pseudo_draws(state(estimate), laplace).adapt_state.mm_state.values()
     assert_allclose(again[1], sum_of_squares)

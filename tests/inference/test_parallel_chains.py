@@ -23,7 +23,7 @@ for method in ("sequential", "parallel"):
                         thin=1, trajectory_draws=0, progress=False, chain_method=method,
                         sampler_options={"initial_covariance": 0.1 * np.eye(4)})
     draws[method] = np.asarray(lfm.results.arviz_data.group(found, "posterior")["decay"])
-blocks = [name for name in compiled if "jit(own)" in name]
+blocks = [name for name in compiled if "jit(advance_on_device)" in name]
 assert len(blocks) == 1, blocks
 np.testing.assert_allclose(draws["parallel"], draws["sequential"], rtol=1e-6)
 assert np.std(draws["parallel"], axis=1).min() > 0

@@ -1,9 +1,19 @@
-"""Particle-marginal robust adaptive Metropolis: an exact chain from an unbiased likelihood estimate."""
+"""Particle-marginal robust adaptive Metropolis: an exact chain from an unbiased likelihood estimate.
+
+One step:
+1. Propose ``x' = x + S U``, as robust adaptive Metropolis does.
+2. With delayed acceptance, in half of the steps, accept x' first with the Gaussian filter's likelihood.
+3. Estimate the likelihood at x' with a particle filter, and accept with the ratio of the estimates (and the inverse
+   ratio of step 2). The estimate at an accepted point is kept, never drawn again.
+4. In the warm-up, adapt S to half of the acceptance probability of an exact likelihood.
+
+Source: Andrieu, Doucet and Holenstein (2010), JRSS B 72(3); Golightly, Henderson and Sherlock (2015), Statistics and
+Computing 25.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -11,38 +21,43 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from numpyro.infer import init_to_median
+from numpyro.infer.util import ParamInfo
 from numpyro.util import is_prng_key
 
 from lfm_ppl import checks
 from lfm_ppl.inference.bound_model import BoundModel, bind_arguments
-from lfm_ppl.inference.kernels.kernel import of_chains
+from lfm_ppl.inference.kernels.algorithm import SamplingAlgorithm
 from lfm_ppl.inference.kernels.ram import RAM
 from lfm_ppl.inference.kernels.robust_metropolis import (
     RAMState,
     acceptance,
-    adapted,
+    adapt_proposal,
     choose,
     finite_or_infinity,
+    initial_state,
     propose,
+    summary,
 )
 from lfm_ppl.inference.particle_likelihood import ParticlePotential, Tuned
 from lfm_ppl.particles.particle_filter import ParticleSettings
 
 _TARGET, _TARGET_ONE = 0.12, 0.21
-"""Half of what RAM aims at: noise of sd one in the log likelihood halves the acceptance at any scale."""
+"""Target acceptance in several dimensions and in one: half of RAM's, since noise of sd one in the log likelihood halves
+the acceptance at any scale."""
 
 _DELAYED = 0.5
-"""Share of the steps with delayed acceptance, where it is asked for; the others ask the particle filter at once."""
+"""Share of the steps with delayed acceptance, if it is on; the other steps run the particle filter at once."""
 
 
 class ParticleMarginalState(NamedTuple):
-    """What the chain carries: the state of RAM, whose fields can be read as its own, and more.
+    """State of a chain: that of RAM, whose fields are also attributes of this object, and three fields more.
 
     Attributes:
-        ram: its ``potential_energy`` is minus the log of the ESTIMATED density at ``z``, from when ``z`` was proposed.
+        ram: state of RAM; ``potential_energy`` is minus the log of the ESTIMATED density at ``z``, drawn when ``z`` was
+            proposed.
         surrogate_energy: minus the log density at ``z`` with the Gaussian filter's likelihood; zero if not used.
         estimated: whether the last proposal reached the particle filter.
-        rng_key: random key of the next step, in the place of RAM's; ``MCMC`` replaces it after a warm-up.
+        rng_key: random key of the next step; RAM's is not used. ``MCMC`` replaces it after a warm-up.
     """
 
     ram: RAMState
@@ -62,32 +77,32 @@ class ParticleMarginalRAM(RAM):
 
         min(1, p(x') Z' / (p(x) Z)),
 
-    where Z is the estimate with which x was accepted: it is carried along and never drawn again, which makes the
-    posterior of the parameters the chain's invariant distribution whatever the number of particles. With ``delayed``
-    acceptance, in every other step at random, a proposal first has to pass the test with the Gaussian filter's
-    likelihood L; the particle filter runs only then, and the second test, with ``min(1, Z' L / (Z L'))``, makes up for
-    the first. It saves estimates where the filter is nearly right. Where L is far too small in a part of the posterior,
-    such steps hardly ever reach it or leave it again; the steps between, which do without L, keep the chain moving.
+    where Z is the estimate with which x was accepted. It is kept and never drawn again, so that the posterior of the
+    parameters is the invariant distribution of the chain for any number of particles. With ``delayed`` acceptance, in
+    half of the steps at random, a proposal must first be accepted with the Gaussian filter's likelihood L. The particle
+    filter runs only then, and the second acceptance, with ``min(1, Z' L / (Z L'))``, corrects for the first. This saves
+    estimates where the filter is accurate. Where L is far too small in a part of the posterior, such steps hardly ever
+    enter or leave it; the other steps, which do not use L, keep the chain moving.
 
     Args:
         model: a NumPyro model with one likelihood site, ``lfm.MarginalLikelihood`` or ``lfm.panel``.
         particles: N; None: chosen so that the log likelihood has a standard deviation near 1.
-        tune_at: unconstrained parameters at which N is chosen; None: where the first chain starts.
-        delayed: two-stage acceptance in half of the steps. Vectorised chains compute every estimate all the same.
+        tune_at: unconstrained parameters at which N is chosen; None: the starting point of the first chain.
+        delayed: two-stage acceptance in half of the steps. Vectorised chains compute every estimate nevertheless.
         particle_steps: integration steps of the particles between two times; None: the model's ``steps``.
-        resampling: as in `lfm_ppl.particle_filter`, and so are the next two.
-        threshold: of the effective sample size.
-        scheme: of the steps.
+        resampling: resampling scheme, as in `lfm_ppl.particle_filter`.
+        threshold: effective sample size below which particles are resampled, as in `lfm_ppl.particle_filter`.
+        scheme: integration scheme of the particles, as in `lfm_ppl.particle_filter`.
         target_accept_prob: by default 0.12, and 0.21 in one dimension.
-        initial_scale: as in `RAM`, and so are all that follow.
-        initial_covariance: of the proposal.
-        adapt: "warmup" or "throughout".
-        exponent: of the adaptation.
+        initial_scale: factor of the first proposal, as in `RAM`.
+        initial_covariance: covariance of the first proposal, as in `RAM`.
+        adapt: "warmup" or "throughout", as in `RAM`.
+        exponent: exponent of the adaptation, as in `RAM`.
         init_strategy: a NumPyro strategy for the first point of each chain.
 
     Attributes:
         delayed: whether acceptance is delayed.
-        particle_steps: as given.
+        particle_steps: integration steps of the particles between two times.
         estimate: after the start, the estimated potential energy.
         tuned: after the start, the number of particles and the standard deviation of the log likelihood estimate
             (NaN where the data were traced).
@@ -142,34 +157,28 @@ class ParticleMarginalRAM(RAM):
         self.particle_steps = particle_steps
         self._particles = particles
         self.estimate: ParticlePotential | None = None
-        self._tuned_for: Any = None
+        self._tuned_observations: bytes | None = None
         self.tuned: Tuned | None = None
 
-    def init(
-        self,
-        rng_key: jax.Array,
-        num_warmup: int,
-        init_params: Any = None,
-        model_args: tuple = (),
-        model_kwargs: dict | None = None,
-    ) -> ParticleMarginalState:
-        """Return the state before the first step; arguments as in `RAM`."""
-        start: RAMState = super().init(rng_key, num_warmup, init_params, model_args, model_kwargs)
-        single = is_prng_key(rng_key)
-        first_key = rng_key if single else rng_key[0]
-        first = start.z if single else jax.tree_util.tree_map(lambda leaf: leaf[0], start.z)
-        self._prepare(first, model_args, model_kwargs or {})
-        estimate_key = jax.random.fold_in(first_key, 1)
-        y = model_args[-1] if model_args else None
-        estimate = jax.jit(partial(self._energy, y))
-        if single:
-            energy = estimate(start.z, estimate_key)
-        else:
-            energy = jax.lax.map(lambda pair: estimate(*pair), (start.z, jax.random.split(estimate_key, len(rng_key))))
-        energy = finite_or_infinity(energy)
-        surrogate = start.potential_energy if self.delayed else jnp.zeros_like(energy)
-        return ParticleMarginalState(start._replace(potential_energy=energy), surrogate,
-                                     jnp.zeros(np.shape(energy), bool), start.rng_key)
+    def starting_point(self, key: jax.Array, init_params: Any, args: tuple,
+                       kwargs: dict) -> tuple[ParamInfo, jax.Array]:
+        """Return the starting point of RAM; choose the number of particles there."""
+        point, factor = super().starting_point(key, init_params, args, kwargs)
+        first_z = point.z if is_prng_key(key) else jax.tree_util.tree_map(lambda leaf: leaf[0], point.z)
+        assert self.model is not None
+        with jax.ensure_compile_time_eval():  # parallel chains are initialised within a trace
+            bound = bind_arguments(self.model, args, kwargs, "ParticleMarginalRAM")
+            self.prepare(bound, ravel_pytree(first_z)[0])
+        return point, factor
+
+    def algorithm(self, num_warmup: int = 0) -> SamplingAlgorithm:
+        """Return the algorithm; the observations are the last positional argument of the model."""
+
+        def estimate_at(data: tuple[tuple, dict]) -> Callable[[Any, jax.Array], jax.Array]:
+            args, _ = data
+            return self.estimate_at(args[-1] if args else None)
+
+        return particle_marginal(estimate_at, self._potential_at if self.delayed else None, self.adaptation, num_warmup)
 
     @property
     def settings(self) -> ParticleSettings:
@@ -178,28 +187,28 @@ class ParticleMarginalRAM(RAM):
         return self.estimate.settings._replace(particles=self.tuned.particles)
 
     def prepare(self, bound: BoundModel, start: Any, tuned: Tuned | None = None) -> None:
-        """Check the filter and choose the number of particles: with numbers, since it decides what is compiled.
+        """Check the filter and choose the number of particles, outside of compiled code, since shapes depend on it.
 
         Args:
             bound: the model and its data.
-            start: (d,), where the number is chosen unless ``tune_at`` says otherwise.
-            tuned: what was chosen before; None: choose.
+            start: (d,), where the number is chosen, unless ``tune_at`` is set.
+            tuned: the number of an earlier run; None: choose it.
         """
         self.estimate = ParticlePotential(bound, self._settings, self.particle_steps)
         if tuned is not None:
             self.tuned = tuned
             return
         if checks.traced(bound.y):
-            # Data that are arguments of a compiled program: there is nothing to choose the number by.
+            # The data are arguments of a compiled program, so that no estimate can be computed here.
             if self._particles is None:
                 raise ValueError("the number of particles is chosen by the data, which are not known here; give "
                                  "particles, or run with numbers (jit_model_args=False).")
             self.tuned = Tuned(self._particles, float("nan"))
             return
-        data = np.asarray(bound.y).tobytes()
-        if self.tuned is not None and data == self._tuned_for:
+        observations = np.asarray(bound.y).tobytes()
+        if self.tuned is not None and observations == self._tuned_observations:
             return
-        self._tuned_for = data
+        self._tuned_observations = observations
         key = jax.random.key(0)
         z = start if self._tune_at is None else ravel_pytree(self._tune_at)[0]
         if checks.traced(z):
@@ -209,25 +218,46 @@ class ParticleMarginalRAM(RAM):
         else:
             self.tuned = Tuned(self._particles, self.estimate.sd_of_estimates(z, key, self._particles))
 
-    def _prepare(self, start: Any, args: tuple, kwargs: dict) -> None:
-        assert self.model is not None
-        with jax.ensure_compile_time_eval():  # chains that run in parallel are initialised within a trace
-            self.prepare(bind_arguments(self.model, args, kwargs, "ParticleMarginalRAM"), ravel_pytree(start)[0])
-
-    def sample(self, state: ParticleMarginalState, model_args: tuple,  # type: ignore[override]
-               model_kwargs: dict | None) -> ParticleMarginalState:
-        """Return the state after one step of every chain in ``state``."""
-        surrogate = self._potential(model_args, model_kwargs or {}) if self.delayed else None
-        one_chain = self.step(partial(self._energy, model_args[-1] if model_args else None), surrogate)
-        return of_chains(one_chain, state.rng_key)(state)
-
-    def step(self, estimate: Callable, surrogate: Callable | None) -> Callable:
-        """Return the step of one chain; arguments as in `particle_marginal_step`."""
-        return partial(particle_marginal_step, estimate, surrogate, *self.adaptation)
-
-    def _energy(self, y: Any, z: Any, key: jax.Array) -> jax.Array:
+    def estimate_at(self, y: Any) -> Callable[[Any, jax.Array], jax.Array]:
+        """Return the function from a position and a key to the estimated potential energy, given observations."""
         assert self.estimate is not None and self.tuned is not None, "init must be called before sample."
-        return self.estimate(ravel_pytree(z)[0], key, self.tuned.particles, y)
+        potential, particles = self.estimate, self.tuned.particles
+
+        def estimate(z: Any, key: jax.Array) -> jax.Array:
+            return potential(ravel_pytree(z)[0], key, particles, y)
+
+        return estimate
+
+
+def particle_marginal(
+    estimate_at: Callable[[Any], Callable[[Any, jax.Array], jax.Array]],
+    surrogate_at: Callable[[Any], Callable[[Any], jax.Array]] | None,
+    adaptation: tuple[float | None, float, bool],
+    num_warmup: int,
+) -> SamplingAlgorithm:
+    """Return particle-marginal RAM; its tuning is the first proposal factor (d, d).
+
+    Args:
+        estimate_at: from the data to the estimated potential energy, a function of position and key.
+        surrogate_at: from the data to the potential energy that accepts first; None: there is none.
+        adaptation: ``(alpha*, gamma, throughout)``, see `particle_marginal_step`.
+        num_warmup: number of steps that adapt the proposal.
+    """
+
+    def init(key: jax.Array, point: ParamInfo, data: Any, factor: jax.Array) -> ParticleMarginalState:
+        energy = finite_or_infinity(jax.jit(estimate_at(data))(point.z, jax.random.fold_in(key, 1)))
+        surrogate_energy = jnp.zeros_like(energy) if surrogate_at is None else point.potential_energy
+        ram = initial_state(point.z, energy, key, factor, num_warmup)
+        return ParticleMarginalState(ram, surrogate_energy, jnp.array(False), key)
+
+    def step(state: ParticleMarginalState, data: Any) -> ParticleMarginalState:
+        surrogate = None if surrogate_at is None else surrogate_at(data)
+        return particle_marginal_step(estimate_at(data), surrogate, *adaptation, state)
+
+    def summary_with_estimates(state: ParticleMarginalState) -> dict[str, jax.Array]:
+        return {**summary(state), "estimated": state.estimated}
+
+    return SamplingAlgorithm(init, step, summary_with_estimates)
 
 
 def particle_marginal_step(
@@ -242,7 +272,7 @@ def particle_marginal_step(
 
     Args:
         estimate: ``(z, key)`` -> minus the log of an unbiased estimate of the density. NaN or an infinity rejects.
-        surrogate: minus the log of a cheap density that has to accept first; None: there is none.
+        surrogate: minus the log of a cheap density that accepts first; None: there is none.
         target_accept_prob: of the RAM adaptation; None for the default.
         exponent: of the adaptation steps.
         throughout: adapt after the warm-up as well.
@@ -253,22 +283,23 @@ def particle_marginal_step(
     """
     rng_key, key_noise, key_accept, key_particles, key_first = jax.random.split(state.rng_key, 5)
     proposal, noise = propose(state.ram, key_noise)
-    first = gain = jnp.zeros_like(state.surrogate_energy)
-    passed = jnp.array(True)
+    surrogate_energy = log_ratio = jnp.zeros_like(state.surrogate_energy)
+    is_estimated = jnp.array(True)
     if surrogate is not None:
-        first = finite_or_infinity(surrogate(proposal))
-        mixed, uniform = jax.random.uniform(key_first, (2,))
-        gain = jnp.where(mixed < _DELAYED, state.surrogate_energy - first, 0.0)
-        passed = uniform < acceptance(gain)
-    energy = jax.lax.cond(passed, lambda: finite_or_infinity(estimate(proposal, key_particles)),
+        surrogate_energy = finite_or_infinity(surrogate(proposal))
+        branch_uniform, uniform = jax.random.uniform(key_first, (2,))
+        log_ratio = jnp.where(branch_uniform < _DELAYED, state.surrogate_energy - surrogate_energy, 0.0)
+        is_estimated = uniform < acceptance(log_ratio)
+    energy = jax.lax.cond(is_estimated, lambda: finite_or_infinity(estimate(proposal, key_particles)),
                           lambda: jnp.full_like(state.potential_energy, jnp.inf))
-    accept_prob = passed * acceptance(state.potential_energy - energy - gain)
+    accept_prob = is_estimated * acceptance(state.potential_energy - energy - log_ratio)
     accepted = jax.random.uniform(key_accept) < accept_prob
-    moved = state.ram._replace(
+    ram = state.ram._replace(
         z=choose(accepted, proposal, state.z),
         potential_energy=jnp.where(accepted, energy, state.potential_energy),
         accepted=accepted,
     )
     target = target_accept_prob or (_TARGET_ONE if noise.size == 1 else _TARGET)
-    moved = adapted(moved, noise, accept_prob, target, exponent, throughout)
-    return ParticleMarginalState(moved, jnp.where(accepted, first, state.surrogate_energy), passed, rng_key)
+    ram = adapt_proposal(ram, noise, accept_prob, target, exponent, throughout)
+    surrogate_energy = jnp.where(accepted, surrogate_energy, state.surrogate_energy)
+    return ParticleMarginalState(ram, surrogate_energy, is_estimated, rng_key)

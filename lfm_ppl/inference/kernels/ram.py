@@ -4,24 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from numpyro.infer import init_to_median
-from numpyro.infer.util import initialize_model
+from numpyro.infer.util import ParamInfo, initialize_model
 from numpyro.util import identity, is_prng_key
 
 from lfm_ppl import checks
-from lfm_ppl.inference.kernels.kernel import Kernel, check_start, floating, of_chains
-from lfm_ppl.inference.kernels.robust_metropolis import RAMState, finite_or_infinity, initial_state, step
+from lfm_ppl.inference.kernels.algorithm import SamplingAlgorithm
+from lfm_ppl.inference.kernels.kernel import Kernel, as_floating_point, check_start, map_chains
+from lfm_ppl.inference.kernels.robust_metropolis import RAMState, finite_or_infinity, robust_metropolis
 from lfm_ppl.inference.unconstrained import check_latent_sites
 
 _ADAPTATIONS = ("warmup", "throughout")
 _OPTIMAL_SCALE = 2.38
-"""Scale of the best Gaussian random walk on a Gaussian target of covariance I, times sqrt(d)."""
+"""Optimal scale of a Gaussian random walk on a Gaussian target of covariance I, times sqrt(d)."""
 
 
 class RAM(Kernel):
@@ -86,9 +86,9 @@ class RAM(Kernel):
         init_strategy: Callable = init_to_median,
     ) -> None:
         if (model is None) == (potential_fn is None):
-            given = "neither" if model is None else "both"
+            count = "neither" if model is None else "both"
             raise ValueError(
-                f"RAM needs exactly one of model and potential_fn, got {given}. Pass a NumPyro "
+                f"RAM needs exactly one of model and potential_fn, got {count}. Pass a NumPyro "
                 "model, or minus the log density as potential_fn."
             )
         if target_accept_prob is not None and not 0.0 < target_accept_prob < 1.0:
@@ -117,7 +117,7 @@ class RAM(Kernel):
 
     @property
     def adaptation(self) -> tuple[float | None, float, bool]:
-        """Acceptance to aim at, exponent of the adaptation, and whether it goes on after the warm-up."""
+        """Target acceptance probability, exponent, and whether the adaptation continues after the warm-up."""
         return self._target_accept_prob, self._exponent, self._adapt_throughout
 
     def get_diagnostics_str(self, state: RAMState) -> str:
@@ -130,41 +130,38 @@ class RAM(Kernel):
             return identity
         return self._postprocess_fn(*args, **kwargs)
 
-    def begin(self, rng_key: jax.Array, model_key: jax.Array, num_warmup: int, init_params: Any, args: tuple,
-              kwargs: dict) -> RAMState:
-        """Return the state before the first step; ``init_params`` are unconstrained."""
-        z, potential_energy = self._starting_point(model_key, init_params, args, kwargs)
-        single = is_prng_key(rng_key)
-        shapes = [leaf.shape if single else leaf.shape[1:] for leaf in jax.tree_util.tree_leaves(z)]
-        chol = jnp.asarray(self.initial_factor(sum(math.prod(shape) for shape in shapes)))
-        start = partial(initial_state, chol=chol, num_warmup=num_warmup)
-        return of_chains(start, rng_key)(z, potential_energy, rng_key)
+    def algorithm(self, num_warmup: int = 0) -> SamplingAlgorithm:
+        """Return robust adaptive Metropolis on the model, or on the potential function."""
+        return robust_metropolis(self._potential_at, self.adaptation, num_warmup)
 
-    def sample(self, state: RAMState, model_args: tuple, model_kwargs: dict | None) -> RAMState:
-        """Return the state after one step of every chain in ``state``."""
-        one_chain = partial(step, self._potential(model_args, model_kwargs or {}), *self.adaptation)
-        return of_chains(one_chain, state.rng_key)(state)
-
-    def _potential(self, model_args: tuple, model_kwargs: dict) -> Callable:
+    def _potential_at(self, data: tuple[tuple, dict]) -> Callable[[Any], jax.Array]:
         if self._model is None:
             assert self._potential_fn is not None
             return self._potential_fn
         assert self._potential_fn_gen is not None, "init must be called before sample."
-        return self._potential_fn_gen(*model_args, **model_kwargs)
+        args, kwargs = data
+        return self._potential_fn_gen(*args, **kwargs)
 
-    def _starting_point(
-        self, rng_key: jax.Array, init_params: Any, model_args: tuple, model_kwargs: dict
-    ) -> tuple[Any, jax.Array]:
+    def starting_point(self, key: jax.Array, init_params: Any, args: tuple,
+                       kwargs: dict) -> tuple[ParamInfo, jax.Array]:
+        """Return the unconstrained position with its potential energy, and the first proposal factor."""
+        z, energy = self._starting_position(key, init_params, args, kwargs)
+        chain_axes = 0 if is_prng_key(key) else 1
+        dimension = sum(math.prod(leaf.shape[chain_axes:]) for leaf in jax.tree_util.tree_leaves(z))
+        return ParamInfo(z, energy, None), jnp.asarray(self.initial_factor(dimension))
+
+    def _starting_position(self, key: jax.Array, init_params: Any, args: tuple,
+                           kwargs: dict) -> tuple[Any, jax.Array]:
         if self._model is not None:
-            first_key = rng_key if is_prng_key(rng_key) else rng_key[0]
-            check_latent_sites(self._model, model_args, model_kwargs, first_key, "RAM")
+            first_key = key if is_prng_key(key) else key[0]
+            check_latent_sites(self._model, args, kwargs, first_key, "RAM")
             info, self._potential_fn_gen, self._postprocess_fn, _ = initialize_model(
-                rng_key,
+                key,
                 self._model,
                 init_strategy=self._init_strategy,
                 dynamic_args=True,
-                model_args=model_args,
-                model_kwargs=model_kwargs,
+                model_args=args,
+                model_kwargs=kwargs,
                 validate_grad=False,
             )
             if init_params is None:
@@ -174,14 +171,14 @@ class RAM(Kernel):
                 "RAM with potential_fn does not know where to start. Pass MCMC.run(..., "
                 "init_params=point), with a leading axis of num_chains if there are several chains."
             )
-        z = floating(init_params)
-        energy = of_chains(self._potential(model_args, model_kwargs), rng_key)(z)
+        z = as_floating_point(init_params)
+        energy = map_chains(self._potential_at((args, kwargs)), key)(z)
         check_start(energy, "init_params has potential energy {}, which must be finite. Start from another point, for "
                             "example from lfm.map_estimate(...).unconstrained.")
         return z, finite_or_infinity(energy)
 
     def initial_factor(self, dimension: int) -> np.ndarray:
-        """Return the first Cholesky factor of the proposal, (d, d), for d unconstrained parameters."""
+        """Return the first Cholesky factor (d, d) of the proposal covariance for d unconstrained parameters."""
         if dimension == 0:
             raise ValueError("RAM needs at least one parameter, but init_params holds none.")
         if self._initial_chol is None:

@@ -1,4 +1,14 @@
-"""One step of robust adaptive Metropolis, as a pure function of its state."""
+"""Robust adaptive Metropolis as pure functions of the state.
+
+One step:
+1. Propose ``x + S_n U`` with ``U ~ N(0, I)``.
+2. Accept with probability ``alpha_n = min(1, pi(x + S_n U) / pi(x))``.
+3. In the warm-up, update the Cholesky factor ``S_n`` of the proposal covariance so that the mean of ``alpha_n``
+   approaches the target ``alpha*``.
+
+Source: Vihola (2012), Robust adaptive Metropolis algorithm with coerced acceptance rate, Statistics and Computing 22,
+997-1008.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +19,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
+from numpyro.infer.util import ParamInfo
+
+from lfm_ppl.inference.kernels.algorithm import SamplingAlgorithm
 
 
 class RAMState(NamedTuple):
-    """What the chain carries. Every field can be collected with ``extra_fields`` of ``MCMC.run``.
+    """State of a chain. Every field can be collected with ``extra_fields`` of ``MCMC.run``.
 
     Attributes:
         i: number of steps taken, warm-up included.
@@ -39,6 +52,34 @@ class RAMState(NamedTuple):
     rng_key: jax.Array
 
 
+def robust_metropolis(
+    potential_at: Callable[[Any], Callable[[Any], jax.Array]],
+    adaptation: tuple[float | None, float, bool],
+    num_warmup: int,
+) -> SamplingAlgorithm:
+    """Return robust adaptive Metropolis; its tuning is the first proposal factor (d, d).
+
+    Args:
+        potential_at: from the data to minus the log density, a function of the position.
+        adaptation: ``(alpha*, gamma, throughout)``, see `robust_metropolis_step`.
+        num_warmup: number of steps that adapt the proposal.
+    """
+
+    def init(key: jax.Array, point: ParamInfo, data: Any, factor: jax.Array) -> RAMState:
+        return initial_state(point.z, point.potential_energy, key, factor, num_warmup)
+
+    def step(state: RAMState, data: Any) -> RAMState:
+        return robust_metropolis_step(potential_at(data), *adaptation, state)
+
+    return SamplingAlgorithm(init, step, summary)
+
+
+def summary(state: Any) -> dict[str, jax.Array]:
+    """Return the flat position and the statistics of the last step of a random walk."""
+    return {"z": ravel_pytree(state.z)[0], "acceptance_rate": state.accept_prob, "accepted": state.accepted,
+            "lp": state.potential_energy}
+
+
 def initial_state(
     z: Any, potential_energy: jax.Array, rng_key: jax.Array, chol: jax.Array, num_warmup: int
 ) -> RAMState:
@@ -60,7 +101,7 @@ def initial_state(
     )
 
 
-def step(
+def robust_metropolis_step(
     potential: Callable[[Any], jax.Array],
     target_accept_prob: float | None,
     exponent: float,
@@ -84,13 +125,13 @@ def step(
     energy = finite_or_infinity(potential(proposal))
     accept_prob = acceptance(state.potential_energy - energy)
     accepted = jax.random.uniform(key_accept, (), noise.dtype) < accept_prob
-    moved = state._replace(
+    new_state = state._replace(
         z=choose(accepted, proposal, state.z),
         potential_energy=jnp.where(accepted, energy, state.potential_energy),
         accepted=accepted,
         rng_key=rng_key,
     )
-    return adapted(moved, noise, accept_prob, target_accept_prob, exponent, throughout)
+    return adapt_proposal(new_state, noise, accept_prob, target_accept_prob, exponent, throughout)
 
 
 def propose(state: RAMState, key: jax.Array) -> tuple[Any, jax.Array]:
@@ -101,22 +142,22 @@ def propose(state: RAMState, key: jax.Array) -> tuple[Any, jax.Array]:
 
 
 def finite_or_infinity(energy: jax.Array) -> jax.Array:
-    """Return the potential energy; a NaN or minus infinity, which no chain may accept, as infinity."""
+    """Replace NaN and minus infinity by infinity, which no chain accepts."""
     return jnp.where(jnp.isfinite(energy), energy, jnp.inf)
 
 
 def acceptance(log_ratio: jax.Array) -> jax.Array:
-    """Return ``min(1, exp(log_ratio))``; inf - inf, where both points are impossible, counts as a rejection."""
+    """Return ``min(1, exp(log_ratio))``; zero for NaN, as of inf - inf where both points are impossible."""
     ratio = jnp.exp(jnp.minimum(log_ratio, 0.0))
     return jnp.where(jnp.isnan(ratio), 0.0, ratio)
 
 
 def choose(accepted: jax.Array, proposal: Any, present: Any) -> Any:
-    """Return the proposal where it is accepted, leaf by leaf."""
+    """Return the proposal if it is accepted, else the present position."""
     return jax.tree_util.tree_map(partial(jnp.where, accepted), proposal, present)
 
 
-def adapted(
+def adapt_proposal(
     state: RAMState,
     noise: jax.Array,
     accept_prob: jax.Array,
@@ -124,14 +165,14 @@ def adapted(
     exponent: float,
     throughout: bool,
 ) -> RAMState:
-    """Count the step that led to ``state``, and adapt its proposal.
+    """Count a step and adapt the proposal.
 
     Args:
-        state: position and energy after the step, everything else as before it.
+        state: the state after the step in position and energy, and before it in the other fields.
         noise: the draw ``U`` (d,) of the proposal.
         accept_prob: ``alpha_n``.
-        target_accept_prob: as in ``step``, and so are the next two.
-        exponent: ``gamma``.
+        target_accept_prob: ``alpha*``; None for 0.44 in one dimension and 0.234 otherwise.
+        exponent: ``gamma`` of the adaptation steps ``min(1, d n^-gamma)``.
         throughout: adapt after the warm-up as well.
     """
     accept_prob = accept_prob.astype(noise.dtype)
@@ -156,8 +197,8 @@ def adapt(chol: jax.Array, noise: jax.Array, weight: jax.Array) -> jax.Array:
 
         S_{n+1} S_{n+1}' = S_n (I + w U U' / |U|^2) S_n',    w = eta_n (alpha_n - alpha*)
 
-    A step that would overflow or underflow the factor (on a flat or a collapsed target) is left
-    out, so that the factor is always finite with a positive diagonal.
+    A step that would overflow or underflow the factor, on a flat or a collapsed target, is skipped, so that the
+    factor is always finite with a positive diagonal.
 
     Args:
         chol: factor ``S_n`` of shape (d, d); the proposal was ``x + S_n U``.

@@ -1,0 +1,72 @@
+"""Binding of a model to times that may be dates, counted in the unit of time that the model names."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from lfm_ppl import calendar_time, checks
+from lfm_ppl.data import Data, at_origin, model_keywords
+from lfm_ppl.filtering.time_grid import build_time_grid
+from lfm_ppl.inference.bound_model import BoundModel, bind
+
+
+def bind_dates(numpyro_model: Callable, times: Any, y: Any, data: Data | None,
+               model_kwargs: Mapping[str, Any] | None) -> tuple[BoundModel, Data | None, tuple[str | None, str]]:
+    """Bind a model to its data.
+
+    Args:
+        numpyro_model: the model.
+        times: (T,) or (B, T), numbers or dates.
+        y: the observations, or a data frame of them.
+        data: the object that holds times and y; None where they were passed themselves.
+        model_kwargs: keyword arguments of the model, without the known inputs of ``data``.
+
+    Returns:
+        The bound model; the data, with times in the unit of the model; the calendar time of t = 0 (None where times
+        are plain numbers) with the unit of time (empty where it is unknown).
+    """
+    checks.refuse_durations("times", times)
+    origin, unit = (None, "") if data is None else (data.origin, data.units.get("time", ""))
+    if calendar_time.holds_dates(times):
+        times, origin, unit = calendar_time.numbers_of("times", times)
+    values = y.to_numpy(float) if hasattr(y, "to_numpy") else y  # a data frame
+
+    def bind_in(origin: str | None, unit: str) -> BoundModel:
+        keywords = dict(model_kwargs or {}) if data is None else model_keywords(data.inputs, model_kwargs)
+        with calendar_time.in_messages(origin, unit):
+            return _bind(numpyro_model, times, values, keywords)
+
+    bound = bind_in(origin, unit)
+    # The model names its unit only once it has been built, which needs times.
+    model_unit = bound.site.example.ssm.model.units.get("time", "")
+    data_seconds, model_seconds = (calendar_time.SECONDS.get(name) for name in (unit, model_unit))
+    if origin is None or data_seconds is None or model_seconds is None or data_seconds == model_seconds:
+        return bound, data, (origin, unit)
+    times = np.asarray(times) * (data_seconds / model_seconds)
+    data = None if data is None else at_origin(data, origin, model_unit)
+    return bind_in(origin, model_unit), data, (origin, model_unit)
+
+
+def _bind(numpyro_model: Callable, times: Any, y: Any, model_kwargs: dict[str, Any]) -> BoundModel:
+    try:
+        return bind(numpyro_model, times, y, **model_kwargs)
+    except TypeError as error:
+        if "'NoneType'" not in str(error) or "inputs" in model_kwargs or (
+                "inputs" not in inspect.signature(numpyro_model).parameters):
+            raise
+        raise TypeError("the model has an argument `inputs`, and there are none. Name their columns, "
+                        "lfm.read_table(frame, inputs=[...]), or give lfm.Data(..., inputs={...}).") from error
+
+
+def check_requested_times(bound: BoundModel, times: Any) -> None:
+    """Check the times of the trajectories before sampling; None: a grid over the data."""
+    if times is None:
+        return
+    if bound.times.ndim != 1:
+        raise ValueError("`at` needs one vector of times for all series; this panel has times of its own for each.")
+    example = bound.site.example
+    build_time_grid(example.ssm, bound.times, example.steps, example.max_step, times, tolerance=example.tolerance)

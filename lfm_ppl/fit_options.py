@@ -1,0 +1,144 @@
+"""The options of `lfm_ppl.fit`, and the record of a run for its result and for its resumption."""
+
+from __future__ import annotations
+
+import inspect
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import metadata
+from typing import Any
+
+import jax
+import numpy as np
+
+from lfm_ppl import checks
+from lfm_ppl.inference.bound_model import BoundModel
+from lfm_ppl.inference.priors import assumptions, prior
+from lfm_ppl.inference.samplers import SAMPLERS
+from lfm_ppl.results import checkpoint as checkpoints
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """Options of `lfm_ppl.fit`, where they are described.
+
+    Attributes:
+        sampler: name of the sampler.
+        chains: number of chains.
+        warmup: warm-up draws of each chain; None: the default of the starting point.
+        samples: draws of each chain.
+        thin: steps of one draw; None for "map".
+        seed: of all random numbers.
+        fixed: name -> value of the fixed parameters.
+        requested_times: times of the trajectories, the argument ``at``; None: a grid over the data.
+        trajectory_draws: number of draws with a trajectory.
+        init: starting points.
+        sampler_options: arguments of the sampler's kernel.
+        chain_method: "parallel", "vectorized" or "sequential"; None for "map".
+    """
+
+    sampler: str
+    chains: int
+    warmup: int | None
+    samples: int
+    thin: int | None
+    seed: int
+    fixed: dict[str, Any]
+    requested_times: Any
+    trajectory_draws: int
+    init: Any
+    sampler_options: dict[str, Any]
+    chain_method: str | None
+
+    def _key(self, index: int) -> jax.Array:
+        return jax.random.split(jax.random.key(self.seed), 5)[index]
+
+    @property
+    def chain_key(self) -> jax.Array:
+        """Random key of the chains."""
+        return self._key(1)
+
+    @property
+    def start_key(self) -> jax.Array:
+        """Random key of the starting points."""
+        return self._key(2)
+
+    @property
+    def trajectory_key(self) -> jax.Array:
+        """Random key of the trajectories."""
+        return self._key(3)
+
+    def description(self, bound: BoundModel) -> dict[str, Any]:
+        """Return the attributes of the result on the likelihood and the sampler."""
+        example = bound.site.example
+        return {
+            "rule": example.rule.name, "steps": example.steps, "max_step": example.max_step,
+            "iterations": example.iterations, "tolerance": example.tolerance, "sampler": self.sampler,
+            "likelihood": ("estimated without bias (particle filter)" if self.sampler == "pmmh"
+                           else example.description),
+            "seed": self.seed, "chains": self.chains, "warmup": self.warmup, "samples": self.samples,
+            "fixed": json.dumps({k: np.asarray(v).tolist() for k, v in self.fixed.items()}),
+            **({"sites": example.sites_in_words} if example.sites_in_words else {}),
+            **({"constraints": example.constraints_in_words} if example.constrained else {}),
+        }  # fmt: skip
+
+    def record(self, bound: BoundModel, model_digest: Any) -> dict[str, Any]:
+        """Return the settings that a run must share with the run that it resumes."""
+        times = self.requested_times
+        return {
+            **self.description(bound), "thin": self.thin, "chain_method": self.chain_method, "init": self.init,
+            "sampler_options": self.sampler_options, "trajectory_draws": self.trajectory_draws,
+            "parameters": bound.names, "model": checkpoints.digest(model_digest),
+            "times": checkpoints.digest(bound.times), "data": checkpoints.digest(bound.y),
+            "times of the trajectories": None if times is None else checkpoints.digest(np.asarray(times, float)),
+            "versions": checkpoints.versions(),
+        }  # fmt: skip
+
+    def call(self, model: str, data: str, model_kwargs: Mapping[str, Any] | None) -> str:
+        """Return the call of `lfm_ppl.fit` as text; an argument that is not plain data appears as its own name."""
+        arguments = {
+            "sampler": self.sampler, "chains": self.chains, "warmup": self.warmup, "samples": self.samples,
+            "thin": self.thin, "seed": self.seed, "trajectory_draws": self.trajectory_draws,
+            "chain_method": self.chain_method, "init": self.init, "sampler_options": self.sampler_options,
+            "fixed": {name: np.asarray(value).tolist() for name, value in self.fixed.items()},
+        }  # fmt: skip
+        values = [f"{name}={value!r}" if isinstance(value, (str, int, float, dict)) else f"{name}={name}"
+                  for name, value in arguments.items() if value is not None and value != {}]
+        objects = [f"{name}={name}" for name, value in (("at", self.requested_times), ("model_kwargs", model_kwargs))
+                   if value is not None]
+        return f"lfm.fit({', '.join([model, data, *values, *objects])})"
+
+
+def check_sizes(sampler: str, chains: int, warmup: int | None, samples: int, thin: int | None,
+                trajectory_draws: int) -> None:
+    """Check the name of the sampler and the numbers of chains, draws and steps."""
+    checks.one_of("sampler", sampler, SAMPLERS, likeness=checks.ABBREVIATIONS)
+    for name, value, special_values in (
+            ("chains", chains, ()), ("samples", samples, ()), ("warmup", warmup, (None, 0)), ("thin", thin, (None,)),
+            ("trajectory_draws", trajectory_draws, (0,))):
+        if value not in special_values:
+            checks.positive_integer(name, value)
+
+
+def describe_priors(bound: BoundModel) -> str:
+    """Return name -> prior in words, as JSON."""
+    trace = bound.trace()
+    return json.dumps({name: prior(trace[name]["fn"]) for name in bound.sites})
+
+
+def describe_assumptions(bound: BoundModel) -> str:
+    """Return the model's observations, forces and initial state in words, with typical numbers, as JSON."""
+    return json.dumps(assumptions(bound.site.example.ssm.model))
+
+
+def model_docstring(numpyro_model: Any) -> str | None:
+    """Return the docstring of a model, without its handlers and partial applications; None where there is none."""
+    while (inner := getattr(numpyro_model, "fn", getattr(numpyro_model, "func", None))) is not None:
+        numpyro_model = inner
+    return inspect.getdoc(numpyro_model) if inspect.isroutine(numpyro_model) else None
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of the packages that produced a result."""
+    return checkpoints.versions() | {"arviz": metadata.version("arviz")}

@@ -1,0 +1,262 @@
+"""Post-processing of the draws of `lfm_ppl.fit`, and the result.
+
+1. Score the observations under every draw.
+2. Diagnose the likelihood: convergence of the sites, weights under constraints, resolution of the forces, and the error
+   of the Gaussian approximation.
+3. Draw a trajectory for some draws of each chain.
+4. Lay out parameters, statistics, scores and trajectories as an ArviZ object with the attributes of the run.
+
+A failure in steps 1 to 3 is a warning and leaves its group out: the draws took the time, and are never lost. Ctrl-C in
+these steps leaves out the rest.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import Any
+
+import jax
+import numpy as np
+
+from lfm_ppl import checks
+from lfm_ppl.data import Data
+from lfm_ppl.fit_options import FitOptions, versions
+from lfm_ppl.inference.bound_model import BoundModel
+from lfm_ppl.inference.interruption import was_interrupt
+from lfm_ppl.inference.posterior import evenly_spaced, scores, trajectories
+from lfm_ppl.inference.progress import Counter
+from lfm_ppl.inference.samplers import FILTERED
+from lfm_ppl.inference.site_failures import failures_at, paths_worth, site_failures
+from lfm_ppl.model.observations.family import ObservationFamily
+from lfm_ppl.results import arviz_data
+from lfm_ppl.results.approximation import approximation_warnings, resolution_warnings
+from lfm_ppl.results.checkpoint import Checkpoint
+from lfm_ppl.results.files import POSTERIOR
+from lfm_ppl.results.inputs import remember
+from lfm_ppl.results.layout import Labels, lay_out
+
+ONLY_DRAWS = "all draws, without scores and trajectories"
+"""Attribute ``partial`` of a result without any post-processing."""
+
+_GRID_POINTS = 200
+"""Number of grid points of trajectories where no times are requested."""
+
+
+class ConvergenceWarning(UserWarning):
+    """A diagnostic shows that the draws do not represent the posterior yet."""
+
+
+@dataclass(frozen=True)
+class FitProblem:
+    """A model with its data, and the options and labels of its fit.
+
+    Attributes:
+        bound: the model with its data, without the fixed parameters.
+        options: of the fit.
+        labels: names of dimensions and entries.
+        data: the data with known inputs; None where times and observations were passed themselves.
+        clock: calendar time of t = 0 (None where times are plain numbers), and unit of time.
+        truth: of simulated data.
+        description: attributes of the result that do not depend on the draws.
+        user_attributes: further attributes, which replace those of the same name.
+        start_time: of `time.perf_counter`.
+    """
+
+    bound: BoundModel
+    options: FitOptions
+    labels: Labels
+    data: Data | None
+    clock: tuple[str | None, str]
+    truth: Mapping[str, Any] | None
+    description: dict[str, Any]
+    user_attributes: dict[str, Any]
+    start_time: float
+
+
+@dataclass(frozen=True)
+class PosteriorDraws:
+    """Draws of the parameters.
+
+    Attributes:
+        values: site -> (C, N, ...).
+        statistics: statistic of the sampler -> (C, N).
+        z: (C, N, d), unconstrained draws of the chains; None for "map".
+        attributes: of the result, from the sampler.
+        particle_options: keyword arguments of the particle smoother; empty for other samplers.
+        partial: the number of draws where the run was stopped; None: all draws.
+    """
+
+    values: dict[str, np.ndarray]
+    statistics: dict[str, np.ndarray]
+    z: np.ndarray | None
+    attributes: dict[str, Any]
+    particle_options: dict[str, Any] = field(default_factory=dict)
+    partial: str | None = None
+
+
+@dataclass
+class PostProcessing:
+    """Quantities that are computed from the draws.
+
+    Attributes:
+        scores: of the observations; None where they are not computed.
+        trajectories: chosen draws, their trajectories, and the times of these; see `draw_paths`.
+        attributes: of the result.
+        warnings: on the likelihood.
+        partial: the groups that a result has after Ctrl-C; None: all.
+    """
+
+    scores: Any = None
+    trajectories: tuple = (None, None, None)
+    attributes: dict[str, Any] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+    partial: str | None = None
+
+
+def post_process(problem: FitProblem, draws: PosteriorDraws, store: Checkpoint | None,
+                 show_progress: bool) -> PostProcessing:
+    """Compute scores, diagnostics and trajectories; nothing for partial draws."""
+    processed = PostProcessing()
+    if draws.partial is not None:
+        return processed
+    if store is not None:  # the draws are safe, whatever happens below
+        write_result(store, build_result(problem, draws, processed, store, ONLY_DRAWS))
+    bound, options = problem.bound, problem.options
+    values = {site: draws.values[site].reshape(-1, *draws.values[site].shape[2:]) for site in bound.sites}
+    counter = Counter(is_shown=show_progress)
+
+    def batch_options(name: str) -> dict[str, Any]:
+        return {"show": counter.restart(name), "parts": None if store is None else store.parts(name)}
+
+    try:
+        processed.scores = best_effort(
+            "scores of the observations", lambda: scores(bound, values, **batch_options("scores")), None)
+        processed.attributes = _site_attributes(bound, draws, values, options)
+        processed.warnings += best_effort("resolution of the forces", lambda: resolution_warnings(bound, values), [])
+        if options.sampler in FILTERED:
+            processed.warnings += best_effort("error of the likelihood", lambda: approximation_warnings(
+                bound, values, _log_likelihood(bound, processed.scores)), [])
+        processed.trajectories = best_effort("trajectories", lambda: draw_paths(
+            options.trajectory_key, bound, draws.values, options.requested_times, options.trajectory_draws,
+            **draws.particle_options, **batch_options("trajectories")), processed.trajectories)
+    except KeyboardInterrupt:
+        processed.partial = (ONLY_DRAWS if processed.scores is None
+                             else "all draws and their scores, without trajectories")
+    finally:
+        counter.close()
+    return processed
+
+
+def _log_likelihood(bound: BoundModel, scores: Any) -> np.ndarray | None:
+    """Return the log likelihood (S,) of each draw; None where it is not the sum of the scores."""
+    if scores is None or isinstance(bound.site.example.model.observation, ObservationFamily):
+        return None
+    terms = scores["one_step_ahead"]
+    return terms.reshape(len(terms), -1).sum(axis=1)
+
+
+def _site_attributes(bound: BoundModel, draws: PosteriorDraws, values: Mapping[str, Any],
+                     options: FitOptions) -> dict[str, str]:
+    """Return attributes on the convergence of the sites and on the weights of constrained trajectories."""
+    reports, z = {}, draws.z
+    if options.sampler in FILTERED and z is not None:
+        reports[arviz_data.SITES] = best_effort(
+            "convergence of the sites", lambda: site_failures(bound, z, options.seed), None)
+    elif options.sampler == "map" and bound.site.example.constrained:
+        reports[arviz_data.SITES] = best_effort("convergence of the sites", lambda: failures_at(bound, values), None)
+    reports[arviz_data.WEIGHTS] = best_effort(
+        "weights under the constraints", lambda: paths_worth(bound, values), None)
+    return {name: json.dumps(report) for name, report in reports.items() if report is not None}
+
+
+def draw_paths(key: jax.Array, bound: BoundModel, values: Mapping[str, np.ndarray], requested_times: Any, count: int,
+               particle_settings: Any = None, particle_steps: int | None = None,
+               **batch_options: Any) -> tuple[np.ndarray, dict | None, np.ndarray | None]:
+    """Draw trajectories for draws that are spread evenly over each chain.
+
+    Args:
+        key: a JAX random key.
+        bound: the model and its data.
+        values: site -> draws of all chains (C, N, ...).
+        requested_times: times of the trajectories; None: a grid over the data.
+        count: number of trajectories.
+        particle_settings: of the particle smoother; None: the Gaussian smoother.
+        particle_steps: integration steps of the particles.
+        **batch_options: ``show`` and ``parts`` of `lfm_ppl.inference.posterior.trajectories`.
+
+    Returns:
+        The chosen draws of each chain; their trajectories (C, S, ...), None if there are none; the times, None for
+        those of the data.
+    """
+    chains, samples = values[bound.sites[0]].shape[:2]
+    draw_indices, rows = evenly_spaced(chains, samples, count)
+    if not len(rows):
+        return draw_indices, None, None
+    times = _trajectory_times(bound, requested_times)
+    subset = {site: values[site].reshape(-1, *values[site].shape[2:])[rows] for site in bound.sites}
+    paths = trajectories(key, bound, subset, times, particle_settings, particle_steps, **batch_options)
+    if requested_times is None:
+        paths.pop("prediction", None)  # stored at requested times only
+    by_chain = {name: path.reshape(chains, len(draw_indices), *path.shape[1:]) for name, path in paths.items()}
+    return draw_indices, by_chain, times
+
+
+def _trajectory_times(bound: BoundModel, requested_times: Any) -> np.ndarray | None:
+    times = bound.times
+    if times.ndim > 1:
+        return None
+    if requested_times is not None:
+        return np.atleast_1d(np.asarray(requested_times, float))
+    origin = float(bound.site.example.time_grid.initial_time)
+    return np.union1d(np.linspace(min(origin, times[0]), times[-1], _GRID_POINTS), times)
+
+
+def build_result(problem: FitProblem, draws: PosteriorDraws, processed: PostProcessing, store: Checkpoint | None,
+                 partial: str | None) -> Any:
+    """Return the ArviZ object; ``partial`` describes what an incomplete result holds, None for a complete one."""
+    seconds = time.perf_counter() - problem.start_time if store is None else store.seconds
+    attributes = {
+        **problem.description, "wall_time_s": round(seconds, 3), "versions": json.dumps(versions()),
+        "created_at": datetime.now(UTC).isoformat(timespec="seconds"), **draws.attributes, **processed.attributes,
+        "partial": partial, "run": None if store is None else store.record, **problem.user_attributes,
+    }  # fmt: skip
+    draw_indices, paths, times = processed.trajectories
+    groups = lay_out(problem.bound, draws.values, draws.statistics, processed.scores, paths, draw_indices, times,
+                     problem.truth, problem.labels)
+    attributes |= remember(groups, problem.data, *problem.clock)
+    return arviz_data.build(groups, {name: value for name, value in attributes.items() if value is not None})
+
+
+def write_result(store: Checkpoint, result: Any) -> None:
+    """Write a result into the folder of the run."""
+    arviz_data.save(result, store.folder / POSTERIOR, overwrite=True)
+
+
+def best_effort(name: str, compute: Callable[[], Any], default: Any) -> Any:
+    """Return ``compute()``; a failure is a warning and returns the default, so that the draws are not lost."""
+    try:
+        return compute()
+    except Exception as error:
+        if was_interrupt(error):
+            raise KeyboardInterrupt from error
+        reason = f"{type(error).__name__}: {error}"
+        warnings.warn(f"the {name} could not be computed and are left out of the result: {reason}", stacklevel=3)
+        return default
+
+
+def note_warnings(result: Any, likelihood_warnings: Sequence[str] = ()) -> list[str]:
+    """Store the warnings on convergence and likelihood in the attribute ``warnings``; return those on convergence."""
+    convergence_warnings = arviz_data.convergence_warnings(result)
+    result.attrs["warnings"] = json.dumps([*convergence_warnings, *likelihood_warnings])
+    return convergence_warnings
+
+
+def warn_of_convergence(messages: Sequence[str]) -> None:
+    """Raise each message as a `ConvergenceWarning`."""
+    for message in messages:
+        checks.warn(message, ConvergenceWarning)

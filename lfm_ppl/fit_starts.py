@@ -1,0 +1,187 @@
+"""The starting points of the chains of `lfm_ppl.fit`, and the sampler that moves them.
+
+1. NUTS starts at draws from the widened Laplace approximation, whose covariance is its first inverse mass matrix. Where
+   the approximation is not usable, it starts at the prior median with a unit mass matrix.
+2. A random walk needs no gradient, but to learn the shape of the posterior by rejection takes thousands of steps. Its
+   first proposal covariance is that of the Laplace approximation, and its chains start at draws from it.
+3. Particle-marginal RAM also chooses the number of particles, by default at the mode.
+4. A resumed run finds nothing anew: its setup holds the numbers that were chosen before the first step.
+
+Source: `lfm_ppl.inference.laplace_start`; Vihola (2012), Statistics and Computing 22, 997-1008.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import numpy as np
+from numpyro.infer import init_to_median, init_to_value
+
+from lfm_ppl import checks
+from lfm_ppl.fit_options import FitOptions
+from lfm_ppl.inference.bound_model import BoundModel
+from lfm_ppl.inference.bound_samplers import BoundSampler, nuts_sampler, particle_marginal_sampler, ram_sampler
+from lfm_ppl.inference.kernels.options import KERNELS
+from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalRAM, Tuned
+from lfm_ppl.inference.kernels.ram import RAM
+from lfm_ppl.inference.laplace_start import Laplace, UnusableModeError, laplace_approximation, starting_points
+from lfm_ppl.inference.map import MAPResult, mode_of
+from lfm_ppl.inference.random_keys import split_keys
+
+FALLBACK = "init_fallback"
+"""Attribute of a result: the reason why NUTS did not start from the Laplace approximation."""
+
+_WARMUP, _SHORT_WARMUP = 1000, 300
+"""Default warm-up draws of each chain; the short one is that of NUTS from the Laplace approximation."""
+
+_SETUP = ("particles", "log_likelihood_sd", "warmup", "init", FALLBACK)
+"""Attributes that a resumed run needs."""
+
+
+@dataclass(frozen=True)
+class ChainStart:
+    """The sampler and the starting points of all chains.
+
+    Attributes:
+        sampler: the sampler on the bound model.
+        points: (C, d) starting points; None in a resumed run.
+        attributes: of the result, with ``warmup``, the number of warm-up draws.
+        particle_options: keyword arguments of the particle smoother; empty for other samplers.
+    """
+
+    sampler: BoundSampler
+    points: np.ndarray | None
+    attributes: dict[str, Any]
+    particle_options: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def setup(self) -> dict[str, Any]:
+        """Numbers that a resumed run needs."""
+        return {name: self.attributes[name] for name in _SETUP if name in self.attributes}
+
+
+def find_start(bound: BoundModel, options: FitOptions, setup: Mapping[str, Any] | None) -> ChainStart:
+    """Return the sampler and the starting points.
+
+    Args:
+        bound: the model and its data.
+        options: of the fit.
+        setup: that of the run which is resumed; None: a new run.
+    """
+    check_init(options.init)
+    find = _find_nuts_start if options.sampler == "nuts" else _find_random_walk_start
+    return find(bound, options, setup)
+
+
+def check_init(init: Any) -> None:
+    """Check the argument ``init``."""
+    if isinstance(init, str):
+        checks.one_of("init", init, ("map", "median"))
+    elif init is not None and not callable(init):
+        raise TypeError('init must be None, "map", "median" or a NumPyro strategy such as '
+                        f"numpyro.infer.init_to_uniform, got {init!r}.")
+
+
+def _find_nuts_start(bound: BoundModel, options: FitOptions, setup: Mapping[str, Any] | None) -> ChainStart:
+    sampler_options = options.sampler_options
+    # The Laplace approximation does not regularise a mass matrix of the user.
+    is_regularized = "inverse_mass_matrix" not in sampler_options and sampler_options.get("dense_mass", True) is True
+
+    def sampler(laplace: Laplace | None, warmup: int) -> BoundSampler:
+        num_warmup = warmup * (options.thin or 1)
+        return nuts_sampler(bound, num_warmup, sampler_options, laplace if is_regularized else None)
+
+    if setup is not None:
+        # The stored state holds the approximation; the program needs its shapes only.
+        shapes = Laplace(np.zeros(bound.size), np.eye(bound.size)) if setup["init"] == "laplace" else None
+        return ChainStart(sampler(shapes, setup["warmup"]), None, dict(setup))
+    laplace, fallback = None, {}
+    is_at_mode = options.init in (None, "map")
+    if is_at_mode:
+        try:
+            laplace = laplace_approximation(bound, options.seed)
+        except UnusableModeError as error:
+            fallback = {FALLBACK: f"the chains start at the prior median, with a unit mass matrix: {error}"}
+    default_warmup = _SHORT_WARMUP if laplace is not None and is_regularized else _WARMUP
+    warmup = default_warmup if options.warmup is None else options.warmup
+    nuts = sampler(laplace, warmup)
+    if is_at_mode:  # the advice for a slow warm-up is to start there
+        nuts = dataclasses.replace(nuts, slow_warmup_hint="")
+    if laplace is not None:
+        points = starting_points(options.start_key, bound, laplace, options.chains)
+        return ChainStart(nuts, points, {"warmup": warmup, "init": "laplace"})
+    strategy = init_to_median if is_at_mode else _strategy(bound, options)
+    points = _starting_points(bound, options, strategy, nuts.evaluate)
+    init = "strategy" if callable(options.init) else "median"
+    return ChainStart(nuts, points, {"warmup": warmup, "init": init, **fallback})
+
+
+def _find_random_walk_start(bound: BoundModel, options: FitOptions, setup: Mapping[str, Any] | None) -> ChainStart:
+    kernel_type, sampler_options = KERNELS[options.sampler], dict(options.sampler_options)
+    if setup is not None:
+        kernel = kernel_type(bound.model, **sampler_options)
+        if isinstance(kernel, ParticleMarginalRAM):
+            kernel.prepare(bound, None, Tuned(int(setup["particles"]), float(setup["log_likelihood_sd"])))
+        return _random_walk_start(bound, options, kernel, None)
+    strategy = _strategy(bound, options)
+    mode = None
+    if "initial_covariance" not in sampler_options:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            mode = mode_of(bound, seed=options.seed, restarts=2)
+        if mode.unidentified or not np.all(np.isfinite(mode.covariance)):
+            mode = None
+    if mode is not None:
+        sampler_options["initial_covariance"] = mode.covariance
+        if options.sampler == "pmmh":
+            # The start of a chain may be far from the posterior, where the variance of the estimate is another one.
+            sampler_options.setdefault("tune_at", bound.unravel(mode.mode))
+    kernel = kernel_type(bound.model, **sampler_options)
+    if mode is None or options.init is not None:
+        points = _starting_points(bound, options, strategy, bound.log_density)
+    else:
+        points = _draws_about_mode(bound, options, mode)
+    if isinstance(kernel, ParticleMarginalRAM):
+        kernel.prepare(bound, points[0])
+    return _random_walk_start(bound, options, kernel, points)
+
+
+def _random_walk_start(bound: BoundModel, options: FitOptions, kernel: RAM, points: np.ndarray | None) -> ChainStart:
+    warmup = _WARMUP if options.warmup is None else options.warmup
+    num_warmup = warmup * (options.thin or 1)
+    if not isinstance(kernel, ParticleMarginalRAM):
+        return ChainStart(ram_sampler(bound, num_warmup, kernel), points, {"warmup": warmup})
+    assert kernel.tuned is not None
+    attributes = {"particles": kernel.tuned.particles, "log_likelihood_sd": kernel.tuned.sd,
+                  "delayed": int(kernel.delayed), "warmup": warmup}
+    particle_options = {"particle_settings": kernel.settings, "particle_steps": kernel.particle_steps}
+    return ChainStart(particle_marginal_sampler(bound, num_warmup, kernel), points, attributes, particle_options)
+
+
+def _strategy(bound: BoundModel, options: FitOptions) -> Callable:
+    """Return the NumPyro strategy of ``init``."""
+    if options.init is None or isinstance(options.init, str) and options.init == "median":
+        return init_to_median
+    if isinstance(options.init, str):
+        return init_to_value(values=mode_of(bound, seed=options.seed).parameters)
+    return options.init
+
+
+def _starting_points(bound: BoundModel, options: FitOptions, strategy: Callable, evaluate: Callable) -> np.ndarray:
+    """Return one point (C, d) for each chain, by a NumPyro strategy, where ``evaluate`` returns finite values."""
+    keys = split_keys(options.start_key, options.chains)
+    return np.stack([bound.start(keys(chain), strategy, evaluate=evaluate) for chain in range(options.chains)])
+
+
+def _draws_about_mode(bound: BoundModel, options: FitOptions, mode: MAPResult) -> np.ndarray:
+    """Return draws (C, d) from the Laplace approximation; the mode itself where the density of a draw is zero."""
+    root = np.linalg.cholesky(mode.covariance)
+    normals = np.asarray(jax.random.normal(options.start_key, (options.chains, bound.size)))
+    points = mode.mode + normals @ root.T
+    is_possible = [bool(np.isfinite(bound.log_density_gradient(point)[0])) for point in points]
+    return np.where(np.array(is_possible)[:, None], points, mode.mode)
