@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from lfm_ppl.cli import values
 
 if TYPE_CHECKING:  # experiments, which take seconds to import
-    from lfm_ppl.experiments.study import Option, Settings
+    from lfm_ppl.experiments.study import Option, StudySettings
 
 _DESTINATION = "study setting "
 
@@ -30,7 +30,7 @@ def name_in(line: Sequence[str], common: argparse.ArgumentParser, known: Sequenc
     return next((word for word in free if word.replace("_", "-") in known), next(iter(free), None))
 
 
-def add(command: Any, settings: type[Settings], name: str) -> None:
+def add(command: Any, settings: type[StudySettings], name: str) -> None:
     """Add an option for each setting of a study."""
     from lfm_ppl.experiments.study import options
 

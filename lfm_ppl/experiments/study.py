@@ -2,7 +2,7 @@
 
 What a study adds to its problem is a module ``experiment.py`` in a folder of its own, with
 
-- a frozen dataclass of `Settings`, each field made by `setting`, which are checked, and are the options of
+- a frozen subclass of `StudySettings`, each field made by `setting`, which are checked, and are the options of
   ``lfm-ppl compare NAME``;
 - a function of the settings that returns the `lfm_ppl.engine.task.Task` objects;
 - for each kind of task how one is computed and which dimensions its results have (`Kind`): all of them become one
@@ -15,23 +15,23 @@ computes what its folder does not hold yet, writes every table as CSV and Markdo
 command line prints the tables and puts them on one page.
 
     @dataclass(frozen=True)
-    class Settings(study.Settings):
+    class TrackingSettings(StudySettings):
         runs: int = setting(500, "simulated targets", quick=4, aliases=study.REALISATIONS)
 
-    def tasks(settings: Settings) -> list[Task]:
+    def tasks(settings: TrackingSettings) -> list[Task]:
         made = Tasks("made-up", settings.seed)
         return in_order(one for rule in ("EKF", "CKF") for one in made.each(f"track/{rule}", settings.runs, rule=rule))
 
     def compute(task: Task) -> Result:
         return {"rmse": ...}
 
-    def tables(settings: Settings, data: Data) -> dict[str, Table]:
+    def tables(settings: TrackingSettings, data: Data) -> dict[str, Table]:
         return {"errors": Table.of("Errors", rows(data["track"], "rule", {"RMSE": "rmse"}))}
 
-    def figures(settings: Settings, data: Data) -> dict[str, Figure]:
+    def figures(settings: TrackingSettings, data: Data) -> dict[str, Figure]:
         return {"errors": plot_errors(data["track"])}
 
-    STUDY = Study(Settings, tasks, {"track": Kind(compute, {"dataset": "rmse"}, by=("rule",))}, tables, figures)
+    STUDY = Study(TrackingSettings, tasks, {"track": Kind(compute, {"dataset": "rmse"}, by=("rule",))}, tables, figures)
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ class Declared(NamedTuple):
 
 
 def setting(default: Any, help: str, **about: Any) -> Any:
-    """Return a field of a study's `Settings`: its value, a tuple for several, and what else is `Declared` of it."""
+    """Return a field of `StudySettings`: its value, a tuple for several, and what else is `Declared` of it."""
     return dataclasses.field(default=default, metadata={"declared": Declared(help, **about)})
 
 
@@ -172,7 +172,7 @@ class Option(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Settings:
+class StudySettings:
     """How much is computed; the fields of a study's own subclass follow."""
 
     seed: int = dataclasses.field(default=0, kw_only=True, metadata={
@@ -195,7 +195,7 @@ class Settings:
         return cls.quick(**given) if quick else cls(**given)
 
 
-def options(settings: type[Settings]) -> tuple[Option, ...]:
+def options(settings: type[StudySettings]) -> tuple[Option, ...]:
     """Return what a user can give, in the order of the fields."""
     hints, found = typing.get_type_hints(settings), []
     for one in dataclasses.fields(settings):
@@ -279,7 +279,7 @@ class Study:
         what: from a task to its kind; by default its setting ``what``, or what its name begins with.
     """
 
-    settings: type[Settings]
+    settings: type[StudySettings]
     tasks: Callable[[Any], list[Task]]
     kinds: Mapping[str, Kind]
     tables: Callable[[Any, Data], dict[str, Table]]

@@ -32,19 +32,19 @@ def test_the_data_are_counted_as_they_are():
 
 def test_settings_are_checked_and_it_is_in_the_catalogue():
     with pytest.raises(ValueError, match="Did you mean 'coal'"):
-        experiment.Settings(problems=("coals",))
+        experiment.CountsSettings(problems=("coals",))
     with pytest.raises(ValueError, match="draws"):
-        experiment.Settings(draws=0)
+        experiment.CountsSettings(draws=0)
     with pytest.raises(FileNotFoundError, match="nowhere"):
         problem.problem(problem.CALLS[0], problem.Size(), 0, "nowhere")
     assert catalogue.experiment("counts").study is experiment.STUDY
     learnt = {f"{name}/parameters": {} for name in problem.NAMES}
-    assert len(experiment.comparing(experiment.Settings(), learnt)) == 7 * 4
+    assert len(experiment.comparing(experiment.CountsSettings(), learnt)) == 7 * 4
 
 
 def made_up(monkeypatch):
     """Settings of one problem, and results whose errors are known."""
-    settings = experiment.Settings(problems=("student-t",), size=problem.Size(rows=4))
+    settings = experiment.CountsSettings(problems=("student-t",), size=problem.Size(rows=4))
     truth = np.array([0.0, 0.1, 5.0, 0.0])
     one = problem.Problem(np.arange(4.0), truth[:, None], np.zeros(4, int), lambda: None, {}, {}, truth)
     monkeypatch.setattr(problem, "problem", lambda *arguments: one)

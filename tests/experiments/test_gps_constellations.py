@@ -82,7 +82,7 @@ def test_days_of_other_constellations_are_predicted_within_a_tenth_of_the_determ
         letter, radius, inclination, period, monkeypatch):
     data = constellation(letter, 6, radius, inclination)
     monkeypatch.setattr(problem, "arcs", lambda folder, seed=0: data)
-    settings = experiment.Settings(alternatives=0)
+    settings = experiment.GpsSettings(alternatives=0)
     results = {task.name: compute(task) for task in experiment.plan(settings)}
     for task in experiment.plan_predictions(settings, results):
         results[task.name] = compute(task)

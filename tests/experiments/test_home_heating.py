@@ -14,8 +14,8 @@ from lfm_ppl.experiments.home_heating import experiment, figures, prediction, pr
 from lfm_ppl.experiments.home_heating.problem import Model
 
 REAL = problem.data_folder()
-SMALL = experiment.Settings(homes=2, methods=("SQM", "none", "matern"), stores=("one store",), functions=3,
-                            particles=50)
+SMALL = experiment.HomeHeatingSettings(homes=2, methods=("SQM", "none", "matern"), stores=("one store",), functions=3,
+                                       particles=50)
 
 
 @pytest.fixture(scope="module")
@@ -162,7 +162,7 @@ def test_tables_of_simulated_homes(window):
 
 @pytest.mark.skipif(REAL is None, reason="needs ../shared/data/house")
 def test_tables_and_figures_with_the_real_house(window, tmp_path):
-    settings = experiment.Settings(data=str(REAL), homes=2, windows=3, methods=SMALL.methods, every=2)
+    settings = experiment.HomeHeatingSettings(data=str(REAL), homes=2, windows=3, methods=SMALL.methods, every=2)
     found = experiment.STUDY.found(settings, made_up(settings))
     assert list(found.tables) == ["house-one-store", "homes-one-store", "posterior", "house-envelope",
                                   "homes-envelope"]
@@ -186,7 +186,7 @@ def test_tables_and_figures_with_the_real_house(window, tmp_path):
                                    {"integrated": "WQM", "methods": ("SQM",)}])
 def test_bad_settings(given):
     with pytest.raises(ValueError):
-        experiment.Settings(**given)
+        experiment.HomeHeatingSettings(**given)
 
 
 def test_a_residual_that_is_not_in_the_published_figure_is_drawn():
@@ -197,7 +197,8 @@ def test_a_residual_that_is_not_in_the_published_figure_is_drawn():
 
 @pytest.mark.slow
 def test_the_quick_version_runs_and_goes_on(tmp_path):
-    settings = experiment.Settings.quick(data=None if REAL is None else str(REAL), methods=("SQM", "none"), homes=1)
+    settings = experiment.HomeHeatingSettings.quick(
+        data=None if REAL is None else str(REAL), methods=("SQM", "none"), homes=1)
     first = experiment.STUDY.run(settings, tmp_path)
     lines: list[str] = []
     again = experiment.STUDY.run(settings, tmp_path, report=lines.append)

@@ -16,7 +16,7 @@ from lfm_ppl.results.plots import style
 
 
 @dataclass(frozen=True)
-class Settings(study.Settings):
+class ExampleSettings(study.StudySettings):
     """One field of each kind."""
 
     runs: int = setting(5, "numbers", quick=2, aliases=study.REALISATIONS, per_seed=100)
@@ -58,7 +58,7 @@ def plot(*, width="column"):
 
 
 STUDY = Study(
-    Settings, tasks, {
+    ExampleSettings, tasks, {
         "square": Kind(lambda task: {"value": task.settings["number"] ** 2}, {"dataset": "value"}),
         "sum": Kind(lambda task: {"value": sum(task.settings["of"])}, {"": "value"})},
     tabulated, lambda settings, data: {"squares": plot()}, {"number": ("dataset", range(4))}, then=later,
@@ -66,7 +66,7 @@ STUDY = Study(
 
 
 def test_a_run_computes_tabulates_and_draws_and_goes_on(tmp_path):
-    found = STUDY.run(Settings.quick(runs=4), tmp_path)
+    found = STUDY.run(ExampleSettings.quick(runs=4), tmp_path)
     assert found.tables["squares"].loc["all", ["mean", "sum"]].tolist() == [3.5, 14.0]
     assert list(found.tables) == ["squares", "hidden"] and list(found.printed) == ["Squares", "Left out"]
     assert found.printed["Squares"].loc["all", "mean"] == "3.5 (2.0)"  # of 0, 1, 4 and 9
@@ -76,11 +76,11 @@ def test_a_run_computes_tabulates_and_draws_and_goes_on(tmp_path):
     written = STUDY.save(found, tmp_path)
     assert [path.name for path in written] == ["squares.csv", "squares.md", "hidden.csv", "hidden.md", "squares.png"]
     lines = []
-    again = STUDY.run(Settings.quick(runs=4), tmp_path, report=lines.append)
+    again = STUDY.run(ExampleSettings.quick(runs=4), tmp_path, report=lines.append)
     assert lines == ["4 of 4 tasks are stored already", "1 of 1 tasks are stored already"]
     assert again.tables["squares"].equals(found.tables["squares"])
     with pytest.raises(ValueError, match="seed is 0 there and 1 now"):
-        STUDY.run(Settings.quick(runs=4, seed=1), tmp_path)
+        STUDY.run(ExampleSettings.quick(runs=4, seed=1), tmp_path)
 
 
 def test_what_is_checked_first_is_told_before_anything_is_computed(tmp_path):
@@ -88,18 +88,19 @@ def test_what_is_checked_first_is_told_before_anything_is_computed(tmp_path):
         raise FileNotFoundError("there are no data")
 
     with pytest.raises(FileNotFoundError, match="no data"):
-        dataclasses.replace(STUDY, check=check).run(Settings(), tmp_path)
+        dataclasses.replace(STUDY, check=check).run(ExampleSettings(), tmp_path)
     assert not list(tmp_path.iterdir())
 
 
 def test_the_quick_version_keeps_what_is_given():
-    assert Settings.quick() == Settings(runs=2, counts=(2,), size=2j)
-    assert Settings.quick(runs=7, seed=3) == Settings(runs=7, counts=(2,), size=2j, seed=3)
-    assert Settings.chosen(None, True, runs=7) == Settings.quick(runs=7) and Settings.chosen(None) == Settings()
+    assert ExampleSettings.quick() == ExampleSettings(runs=2, counts=(2,), size=2j)
+    assert ExampleSettings.quick(runs=7, seed=3) == ExampleSettings(runs=7, counts=(2,), size=2j, seed=3)
+    assert ExampleSettings.chosen(None, True, runs=7) == ExampleSettings.quick(runs=7)
+    assert ExampleSettings.chosen(None) == ExampleSettings()
 
 
 def test_the_options_are_the_fields():
-    found = {one.name: one for one in study.options(Settings)}
+    found = {one.name: one for one in study.options(ExampleSettings)}
     assert list(found) == ["runs", "left_out", "scale", "kind", "most", "names", "counts", "nuts", "data", "seed"]
     assert found["runs"].flags == ["--runs", "--realisations", "--datasets"]
     assert found["left_out"].flags == ["--left-out"]
@@ -119,13 +120,13 @@ def test_the_options_are_the_fields():
     ({"seed": -1}, "seed must be at least 0")])
 def test_settings_say_what_is_wrong(wrong, message):
     with pytest.raises(ValueError, match=message):
-        Settings(**wrong)
+        ExampleSettings(**wrong)
 
 
 @pytest.mark.parametrize("wrong", [{"runs": 2.5}, {"runs": "2"}, {"left_out": 0.5}, {"counts": (1.5,)}])
 def test_what_is_no_whole_number_is_refused(wrong):
     with pytest.raises(TypeError, match="must be a whole number"):
-        Settings(**wrong)
+        ExampleSettings(**wrong)
 
 
 def test_what_is_compiled_at_the_first_call_is_not_timed():

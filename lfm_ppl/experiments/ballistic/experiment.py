@@ -28,7 +28,7 @@ ERRORS = {"RMSE {path} ({unit})": "rmse", "coverage {path}": "coverage", "CPU s"
 
 
 @dataclass(frozen=True)
-class Settings(study.Settings):
+class BallisticSettings(study.StudySettings):
     """How much is computed."""
 
     runs: int = setting(500, "simulated targets", quick=4, aliases=study.REALISATIONS, per_seed=MOST)
@@ -51,7 +51,7 @@ class Settings(study.Settings):
             raise ValueError(f"rules must hold {states.REPORTED!r}, got {self.rules!r}.")
 
 
-def all_tasks(settings: Settings) -> list[Task]:
+def all_tasks(settings: BallisticSettings) -> list[Task]:
     """Return every task."""
     few, chained = (min(settings.runs, count) for count in (settings.particle_runs, settings.chain_runs))
     tasks, weighted = Tasks("ballistic", settings.seed), {"draws": settings.draws, "paths": settings.paths}
@@ -68,7 +68,7 @@ def all_tasks(settings: Settings) -> list[Task]:
     return in_order(found)
 
 
-def tables(settings: Settings, data: Data) -> dict[str, Table]:
+def tables(settings: BallisticSettings, data: Data) -> dict[str, Table]:
     """Return the tables."""
     few, chained = (data[what].sizes["dataset"] for what in ("particles", "chains"))
     return {"tracking": Table.of(f"Means over {settings.runs} targets (standard errors)", tracked(data)),
@@ -158,7 +158,7 @@ def agreement(data: Data) -> dict[str, Any]:
 
 
 STUDY = Study(
-    Settings, all_tasks,
+    BallisticSettings, all_tasks,
     {"tracking": Kind(partial(states.gaussian, TARGETS), {
         "dataset path": "filter_rmse, smoother_rmse, smoother_coverage", "path time": "mean, sd",
         "dataset": "log_likelihood, filter_seconds, smoother_seconds"}, ("method",)),

@@ -27,7 +27,7 @@ PUBLISHED = {
 
 
 @dataclass(frozen=True)
-class Settings(study.Settings):
+class CallCentreSettings(study.StudySettings):
     """How much is computed."""
 
     days: int = setting(11, "test days, from the fourth day of the weekday on", quick=2, aliases=study.REALISATIONS)
@@ -50,7 +50,7 @@ class Settings(study.Settings):
             raise ValueError(f"--integrated must be among --methods ({', '.join(self.methods)}), got {other[0]!r}.")
 
 
-def all_tasks(settings: Settings) -> list[Task]:
+def all_tasks(settings: CallCentreSettings) -> list[Task]:
     """Return every task: what is compiled for a method serves all windows, but for the chains."""
     shared = {"experiment": "call-centre", "link": settings.link, "functions": settings.functions,
               "starts": len(learning.STARTS), "data": settings.data and str(Path(settings.data).resolve()),
@@ -67,7 +67,7 @@ def all_tasks(settings: Settings) -> list[Task]:
               for index in range(min(settings.nuts_days, settings.days)))]
 
 
-def check(settings: Settings, report: Reporter | None) -> None:
+def check(settings: CallCentreSettings, report: Reporter | None) -> None:
     """Check that there are counts of so many days, and say what they are; errors as of `problem.days`.
 
     An `OverloadWarning` says on how many test days more customers come than are served, for hours.
@@ -88,7 +88,7 @@ def check(settings: Settings, report: Reporter | None) -> None:
                           counts.OverloadWarning, stacklevel=3)
 
 
-def tables(settings: Settings, data: Data) -> dict[str, Table]:
+def tables(settings: CallCentreSettings, data: Data) -> dict[str, Table]:
     """Return the tables."""
     source = "simulated counts" if settings.data is None else f"counts in {settings.data}"
     days, chained = f"{settings.days} test days, {source}", data["nuts"].sizes["first"]
@@ -166,7 +166,7 @@ def agreement(data: Data) -> dict[str, Any]:
     return rows
 
 
-def learnt(settings: Settings, data: Data) -> dict[str, Any]:
+def learnt(settings: CallCentreSettings, data: Data) -> dict[str, Any]:
     """Return the most likely parameters: medians over windows, the log likelihood, and what a window took.
 
     Evaluations and CPU seconds are those of all its searches.
@@ -181,7 +181,7 @@ def learnt(settings: Settings, data: Data) -> dict[str, Any]:
     return rows
 
 
-def notes(settings: Settings, data: Data) -> tuple[str, ...]:
+def notes(settings: CallCentreSettings, data: Data) -> tuple[str, ...]:
     """Return how the errors of the queue compare with the published ones, of Thursdays and the linear link."""
     real = settings.data is not None and settings.weekday == "Thursday" and settings.link == "linear"
     if not real or settings.days < published.FEWEST:
@@ -196,7 +196,7 @@ SCORES = ", ".join(f"{test}_{score}" for test in problem.TESTED for score in (
 TRACKED = ", ".join(f"{test}_{name}" for test in problem.TESTED for name in tracking.Tracked._fields)
 
 STUDY = Study(
-    Settings, all_tasks,
+    CallCentreSettings, all_tasks,
     {"track": Kind(tracking.most_likely, {
         "dataset": f"log_likelihood, evaluations, seconds, {SCORES}", "dataset parameter": "z", "time": TRACKED},
                    ("method",)),

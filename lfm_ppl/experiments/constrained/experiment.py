@@ -20,7 +20,7 @@ from lfm_ppl.results.importance import LARGEST_K
 
 
 @dataclass(frozen=True)
-class Settings(study.Settings):
+class ConstrainedSettings(study.StudySettings):
     """How much is computed."""
 
     runs: int = setting(100, "records of each shape of the transcription factor", quick=2,
@@ -43,7 +43,7 @@ class Settings(study.Settings):
                                  f"{', '.join(self.methods)}.")
 
 
-def all_tasks(settings: Settings) -> list[Task]:
+def all_tasks(settings: ConstrainedSettings) -> list[Task]:
     """Return a task for each block of records of a shape, of targets and of patients."""
     kinds: list[tuple[str, str, int, dict[str, Any]]] = [
         ("ballistic", "", settings.targets, {}),
@@ -70,7 +70,7 @@ class ByMethod(Kind):
         return super().gathered(each, found)
 
 
-def tables(settings: Settings, data: Data) -> dict[str, Table]:
+def tables(settings: ConstrainedSettings, data: Data) -> dict[str, Table]:
     """Return the tables."""
     found = data["transcription"]
     return {"transcription": Table.of(
@@ -115,7 +115,7 @@ def others(data: Data) -> dict[str, Any]:
 
 
 STUDY = Study(
-    Settings, all_tasks,
+    ConstrainedSettings, all_tasks,
     {"transcription": ByMethod(estimators.transcription, {
         "dataset": "mse, minimum, coverage, failed, lengthscale", "curve time": "first", "time": "truth"},
         ("shape", "method")),

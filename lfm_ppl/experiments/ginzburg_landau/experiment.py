@@ -19,7 +19,7 @@ from lfm_ppl.experiments.tasks import Tasks, in_order, slug
 
 
 @dataclass(frozen=True)
-class Settings(study.Settings):
+class GinzburgLandauSettings(study.StudySettings):
     """How much is computed."""
 
     realisations: int = setting(20, "for states and for MCMC", quick=2, aliases=study.REALISATIONS,
@@ -48,7 +48,7 @@ class Settings(study.Settings):
         return problem.DEFAULT if min(self.realisations, self.conditional) > problem.DEFAULT else 0
 
 
-def all_tasks(settings: Settings) -> list[Task]:
+def all_tasks(settings: GinzburgLandauSettings) -> list[Task]:
     """Return every task: all methods on the first realisations, then on the next.
 
     The figure of the conditional posteriors has a task of its own, with as many particles as the source.
@@ -79,7 +79,7 @@ def all_tasks(settings: Settings) -> list[Task]:
     return in_order(found)
 
 
-def tables(settings: Settings, data: Data) -> dict[str, Table]:
+def tables(settings: GinzburgLandauSettings, data: Data) -> dict[str, Table]:
     """Return the tables."""
     some, many = (f"{count} realisations" for count in (settings.realisations, settings.conditional))
     return {"comparison": Table.of(f"Means over {some} (standard errors)", comparison(data)),
@@ -134,7 +134,7 @@ def _covered(one: xr.Dataset) -> xr.DataArray:
 
 
 STUDY = Study(
-    Settings, all_tasks,
+    GinzburgLandauSettings, all_tasks,
     {"state": Kind(states.compute, {
         "dataset": "filter_rmse, filter_coverage, smoother_rmse, smoother_coverage, log_likelihood, seconds",
         "dataset time": "filter_mean, filter_low, filter_high, smoother_mean, smoother_low, smoother_high",

@@ -32,7 +32,7 @@ _PRINTED = {"eclipsed": "{}", "fit": "{:.2f}", "deterministic": "{:.1f}", "lates
 
 
 @dataclass(frozen=True)
-class Settings(study.Settings):
+class GpsSettings(study.StudySettings):
     """What is asked of the comparison."""
 
     data: str | None = setting(None, "folder of SP3 files (default: simulated satellites)", metavar="FOLDER")
@@ -43,7 +43,7 @@ class Settings(study.Settings):
     most: int | None = setting(None, "satellites where none are named (default: all)", quick=2)
 
 
-def plan(settings: Settings) -> list[Task]:
+def plan(settings: GpsSettings) -> list[Task]:
     """Return the first tasks: each satellite is learnt by itself.
 
     Raises:
@@ -66,7 +66,7 @@ def plan(settings: Settings) -> list[Task]:
     return tasks
 
 
-def plan_predictions(settings: Settings, results: Results) -> list[Task]:
+def plan_predictions(settings: GpsSettings, results: Results) -> list[Task]:
     """Return the tasks that follow: the predictions, and the ways to learn on the first satellites.
 
     Raises:
@@ -109,7 +109,7 @@ def _none_left(results: Results) -> ValueError:
 class SatelliteStudy(Study):
     """A study of the satellites that can be predicted; its data say what groups have in common, and who is left out."""
 
-    def gathered(self, settings: Settings, results: Results, tasks: Sequence[Task] | None = None) -> Data:
+    def gathered(self, settings: GpsSettings, results: Results, tasks: Sequence[Task] | None = None) -> Data:
         """Return the results by satellite, without those refused, the ``prior`` of each group, and who is ``left out``.
 
         Raises:
@@ -134,7 +134,7 @@ class SatelliteStudy(Study):
         return data
 
 
-def tables(settings: Settings, data: Data) -> dict[str, Table]:
+def tables(settings: GpsSettings, data: Data) -> dict[str, Table]:
     """Return the tables."""
     each = satellites(data)
     found = {"pooled": Table.of("Errors after training (m), pooled over satellites, and 95% coverage",
@@ -207,7 +207,7 @@ def magnitudes_of(data: Data) -> pd.DataFrame:
 
 _BY = ("satellite",)
 STUDY = SatelliteStudy(
-    Settings, plan,
+    GpsSettings, plan,
     {"learn": Kind(partial(attempt, satellite.learn), {
         "element": "orbit", "magnitude": "logarithms", "": "cpu_s"}, _BY),
      "predict": Kind(partial(attempt, satellite.predict), {

@@ -42,7 +42,7 @@ REFERENCES = ("none", "matern")
 
 
 @dataclass(frozen=True)
-class Settings(study.Settings):
+class HomeHeatingSettings(study.StudySettings):
     """How much is computed."""
 
     data: str | None = setting(None, f"folder of {problem.FILE} (default: $LFM_DATA/house or ../shared/data/house; "
@@ -75,7 +75,7 @@ class Settings(study.Settings):
         return super().chosen(report, quick, data=None if folder is None else str(folder), **given)
 
 
-def tasks(settings: Settings) -> list[Task]:
+def tasks(settings: HomeHeatingSettings) -> list[Task]:
     """Return every task, those of a residual together, since they share what is compiled."""
     found = []
     for store, method in ((store, method) for store in settings.stores for method in settings.methods):
@@ -93,7 +93,7 @@ def tasks(settings: Settings) -> list[Task]:
     return found
 
 
-def tables(settings: Settings, data: Data) -> dict[str, Table]:
+def tables(settings: HomeHeatingSettings, data: Data) -> dict[str, Table]:
     """Return the tables."""
     found = {}
     for store in settings.stores:
@@ -164,7 +164,7 @@ def marginalised(found: xr.Dataset) -> dict[str, Any]:
 
 _BY = ("store", "method")
 STUDY = Study(
-    Settings, tasks,
+    HomeHeatingSettings, tasks,
     {"house": Kind(prediction.compute, {
         "dataset": "ahead_rmse, ahead_ell, ahead_inside, track_rmse, track_ell, track_inside, blind_rmse, blind_ell, "
                    "blind_inside, density", "dataset parameter": "z", "dataset hour": "mean, sd",

@@ -20,7 +20,7 @@ PUBLISHED = {SPARSE: (0.36, 3.03, -6.9e4), SPARSE_4: (0.23, 2.74, -1.2e4), KPCA:
 
 
 @dataclass(frozen=True)
-class Settings(study.Settings):
+class PeriodicKernelSettings(study.StudySettings):
     """How much is computed."""
 
     runs: int = setting(500, "functions that are drawn and predicted", quick=10, aliases=study.REALISATIONS)
@@ -37,7 +37,7 @@ class Settings(study.Settings):
             raise ValueError(f"functions must be at most 200, got {self.functions[-1]}.")
 
 
-def all_tasks(settings: Settings) -> list[Task]:
+def all_tasks(settings: PeriodicKernelSettings) -> list[Task]:
     """Return one task for each kernel, one for the quadrature grid, and one for each method of prediction."""
     def task(name: str, what: str, **given: Any) -> Task:
         return Task(name.replace(" ", "_").replace(",", ""), settings.seed, {"what": what, **given})
@@ -48,7 +48,7 @@ def all_tasks(settings: Settings) -> list[Task]:
             *(task(f"regression/{name}", "regression", method=name, runs=settings.runs) for name in methods.PREDICTING)]
 
 
-def tables(settings: Settings, data: Data) -> dict[str, Table]:
+def tables(settings: PeriodicKernelSettings, data: Data) -> dict[str, Table]:
     """Return the tables."""
     return {"covariance": Table.of("Largest error of the covariance, by the number of functions",
                                    covariances(settings, data)),
@@ -56,7 +56,7 @@ def tables(settings: Settings, data: Data) -> dict[str, Table]:
             "regression": Table.of(f"Means over {settings.runs} functions (standard errors)", predictions(data))}
 
 
-def covariances(settings: Settings, data: Data) -> dict[str, Any]:
+def covariances(settings: PeriodicKernelSettings, data: Data) -> dict[str, Any]:
     """Return the largest error of the covariance for each kernel and method, in a column for each number of functions.
 
     The row ``left out`` is the mean variance that the eigenfunctions miss. ``significant`` is the number at the default
@@ -73,7 +73,7 @@ def covariances(settings: Settings, data: Data) -> dict[str, Any]:
     return every
 
 
-def published(settings: Settings, data: Data) -> dict[str, Any]:
+def published(settings: PeriodicKernelSettings, data: Data) -> dict[str, Any]:
     """Return the errors of 22 eigenfunctions by their quadrature points, and of random frequencies.
 
     ``error`` is that of the covariance, for random frequencies the mean over 100 draws, ``least`` of them, and
@@ -106,7 +106,7 @@ def predictions(data: Data) -> dict[str, Any]:
 
 
 STUDY = Study(
-    Settings, all_tasks,
+    PeriodicKernelSettings, all_tasks,
     {"covariance": Kind(methods.covariance_errors, {"functions": ", ".join((*methods.METHODS, "left out")),
                                              "": "significant, at default"}, ("kernel",)),
      "quadrature": Kind(methods.quadrature_errors, {"points": "error", "draw": "sparse 22, sparse 88"}),

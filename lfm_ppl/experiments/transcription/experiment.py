@@ -36,7 +36,7 @@ _LABELS = tuple(one.label for one in problem.CONFIGURATIONS)
 
 
 @dataclass(frozen=True)
-class Settings(study.Settings):
+class TranscriptionSettings(study.StudySettings):
     """How much is computed."""
 
     datasets: int = setting(100, "for each configuration", quick=2, aliases=study.REALISATIONS)
@@ -52,7 +52,7 @@ class Settings(study.Settings):
             raise ValueError(f"burn_in must lie in [0, draws) = [0, {self.draws}), got {self.burn_in}.")
 
 
-def all_tasks(settings: Settings) -> list[Task]:
+def all_tasks(settings: TranscriptionSettings) -> list[Task]:
     """Return every task: all methods on the first data sets, then on the next, so that the time left can be told."""
     sampling = {"draws": settings.draws, "burn_in": settings.burn_in}
     return [Task(f"{problem.slug(configuration.label)}/{problem.slug(method)}/{first:03d}-{last:03d}", settings.seed,
@@ -163,7 +163,7 @@ def against_slices(data: Data) -> dict[str, Any]:
     return rows
 
 
-def tables(settings: Settings, data: Data) -> dict[str, Table]:
+def tables(settings: TranscriptionSettings, data: Data) -> dict[str, Table]:
     """Return the tables."""
     count = settings.datasets
     return {"published": Table.of(f"RMSE of the force and divergences, {count} data sets, beside the published table",
@@ -172,7 +172,7 @@ def tables(settings: Settings, data: Data) -> dict[str, Table]:
             "paired": Table.of("Against elliptical slice sampling on the same data sets", against_slices(data))}
 
 
-def notes(settings: Settings, data: Data) -> tuple[str, ...]:
+def notes(settings: TranscriptionSettings, data: Data) -> tuple[str, ...]:
     """Return how many cells are consistent with the published table, and why lower ones are trusted."""
     verdicts = [Verdict(z) for cells in beside_published(data).values() for name, z in cells.items()
                 if name.endswith(" z")]
@@ -182,5 +182,5 @@ def notes(settings: Settings, data: Data) -> tuple[str, ...]:
 KIND = Kind(compute, {
     "dataset time": "mean, sd, low, high", "dataset": "rmse, coverage, nlpd, diverged, seconds, stopped, converged, "
     "iterations, change, r_hat, r_hat_first, ess, draws, seconds_more"}, ("method",))
-STUDY = Study(Settings, all_tasks, dict.fromkeys(_LABELS, KIND), tables, figures.draw, notes=notes,
+STUDY = Study(TranscriptionSettings, all_tasks, dict.fromkeys(_LABELS, KIND), tables, figures.draw, notes=notes,
               what=lambda task: problem.configuration(task).label)

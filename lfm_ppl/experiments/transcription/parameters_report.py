@@ -18,7 +18,7 @@ from lfm_ppl.experiments.transcription.parameters import LINKS, REFERENCE, SAMPL
 
 
 @dataclass(frozen=True)
-class Settings(study.Settings):
+class TranscriptionParametersSettings(study.StudySettings):
     """How much is computed."""
 
     datasets: int = setting(2, "for each link", quick=1, aliases=study.REALISATIONS)
@@ -31,7 +31,7 @@ class Settings(study.Settings):
     links: tuple[str, ...] = setting(tuple(LINKS), "how the factor acts", quick=("softplus",), choices=tuple(LINKS))
 
 
-def tasks(settings: Settings) -> list[Task]:
+def tasks(settings: TranscriptionParametersSettings) -> list[Task]:
     """Return one task for each link, data set and sampler."""
     def task(index: int, link: str, label: str, sampler: parameters.Sampler) -> Task:
         lengths = getattr(settings, "latent" if sampler.latent else sampler.kernel.lower())
@@ -52,7 +52,7 @@ COLUMNS: dict[str, Column] = {
     "divergences": lambda found: found.divergences.mean()}
 
 
-def agreement(settings: Settings, data: Data) -> dict[str, Any]:
+def agreement(settings: TranscriptionParametersSettings, data: Data) -> dict[str, Any]:
     """Return one row for each link and sampler.
 
     ``shift`` and ``sd ratio`` from the reference with their Monte Carlo errors, see `chains.agreement`; ``coverage`` of
@@ -73,13 +73,13 @@ def agreement(settings: Settings, data: Data) -> dict[str, Any]:
     return rows
 
 
-def tables(settings: Settings, data: Data) -> dict[str, Table]:
+def tables(settings: TranscriptionParametersSettings, data: Data) -> dict[str, Table]:
     """Return the table."""
     title = f"Against {REFERENCE}, {settings.datasets} data set{'s' if settings.datasets > 1 else ''}"
     return {"agreement": Table.of(title, agreement(settings, data))}
 
 
-def draw(settings: Settings, data: Data) -> dict[str, Figure]:
+def draw(settings: TranscriptionParametersSettings, data: Data) -> dict[str, Figure]:
     """Return a figure of the first data set of each link."""
     return {f"posteriors-{problem.slug(link)}": figures.plot_posteriors(
         data[link], problem.data_set(LINKS[link], 0, settings.seed)) for link in settings.links}
@@ -88,5 +88,6 @@ def draw(settings: Settings, data: Data) -> dict[str, Figure]:
 KIND = Kind(parameters.compute, {
     "dataset parameter": "mean, sd, low, high, truth, ess, r_hat", "dataset parameter chain draw": "draws",
     "dataset time": "force_mean, force_sd", "dataset": "rmse, coverage, seconds, divergences, k"}, ("sampler",))
-STUDY = Study(Settings, tasks, dict.fromkeys(LINKS, KIND), tables, draw, {"parameter": ("parameter", parameters.NAMES)},
+STUDY = Study(TranscriptionParametersSettings, tasks, dict.fromkeys(LINKS, KIND), tables, draw,
+              {"parameter": ("parameter", parameters.NAMES)},
               what=lambda task: problem.configuration(task).label)
