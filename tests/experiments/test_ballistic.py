@@ -150,7 +150,7 @@ MADE = experiment.BallisticSettings(runs=100, particle_runs=3, particles=(500, 1
 
 
 def data_of(settings):
-    return experiment.STUDY.gathered(settings, made_up(settings))
+    return experiment.STUDY.collect(settings, made_up(settings))
 
 
 def test_the_tables_hold_what_was_found():
@@ -186,7 +186,7 @@ def test_a_chain_that_stands_still_shows():
     still = next(task.name for task in tasks_of("chains", MADE) if task.settings["sampler"] == "RAM")
     for name, value in (("ess", np.nan), ("r_hat", np.nan), ("sd", 0.0)):
         results[still][name][1] = value
-    row = experiment.agreement(experiment.STUDY.gathered(MADE, results))["RAM"]
+    row = experiment.agreement(experiment.STUDY.collect(MADE, results))["RAM"]
     assert row["least ESS"] == 0 and row["R-hat"] == np.inf and row["sd ratio"] == 0
 
 

@@ -282,7 +282,7 @@ def test_scores_are_those_of_the_log_normal_distribution():
 
 
 def data_of(settings):
-    return experiment.STUDY.gathered(settings, made_up(settings))
+    return experiment.STUDY.collect(settings, made_up(settings))
 
 
 def test_the_tables_hold_what_was_found():

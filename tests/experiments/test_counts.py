@@ -61,7 +61,7 @@ def made_up(monkeypatch):
 def test_tables_measure_against_the_reference(monkeypatch):
     """From results that are made up, and errors that are known."""
     settings, results = made_up(monkeypatch)
-    tables = experiment.tables(settings, experiment.STUDY.gathered(settings, results))
+    tables = experiment.tables(settings, experiment.STUDY.collect(settings, results))
     row = tables["accuracy"].frame.loc["student-t, EP"]
     assert row[["less reference", "mean", "sd", "covered"]].tolist() == pytest.approx([-0.5, 0.2, 0.1, 0.75])
     assert row["less reference se"] == 0.01 and np.isnan(row["log Z se"])
@@ -77,7 +77,7 @@ def test_sites_that_did_not_converge_show_and_shorter_data_do_not(monkeypatch):
     """Both are NaN; data of four rows stand beside those of another problem with six."""
     settings, results = made_up(monkeypatch)
     results["student-t/laplace"] |= {"mean": np.array([0.0, np.nan, 0.2, 0.0])}
-    data = dict(experiment.STUDY.gathered(settings, results))
+    data = dict(experiment.STUDY.collect(settings, results))
     data["comparison"] = data["comparison"].pad(dataset=(0, 2))
     table = experiment.tables(settings, data)["accuracy"].frame
     assert np.isnan(table.loc["student-t, Laplace", "mean"]) and table.loc["student-t, Laplace", "covered"] == 0.5

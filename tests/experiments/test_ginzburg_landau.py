@@ -50,7 +50,7 @@ def test_every_method_has_conditional_posteriors(method):
     result = parameters.conditional(computed)
     values = result["log_likelihood"]
     assert values.shape == (2, 3, 5) and np.isfinite(values).mean() > 0.8
-    gathered = experiment.STUDY.kinds["conditional"].gathered([computed], {computed.name: result})
+    gathered = experiment.STUDY.kinds["conditional"].collect([computed], {computed.name: result})
     found = parameters.outcomes(gathered).sel({"method": method})
     assert found["outside"].shape == (2, 3)
     np.testing.assert_array_equal(found["outside"], np.abs(found["below"] - 0.5) > 0.495)
@@ -87,7 +87,7 @@ def test_the_law_of_total_variance():
 
 def test_draws_are_spread_over_all_chains():
     draws = np.arange(24.0).reshape(3, 2, 4)
-    chosen = scores.spread(draws, 2)
+    chosen = scores.thin_draws(draws, 2)
     np.testing.assert_array_equal(chosen, [[0.0, 8.0, 16.0], [7.0, 15.0, 23.0]])
 
 
@@ -148,7 +148,7 @@ MADE = experiment.GinzburgLandauSettings(realisations=3, conditional=12, nodes=4
 
 
 def data_of(settings):
-    return experiment.STUDY.gathered(settings, made_up(settings))
+    return experiment.STUDY.collect(settings, made_up(settings))
 
 
 def test_the_tables_count_what_was_found():

@@ -9,7 +9,7 @@ import pytest
 
 from lfm_ppl import orbits
 from lfm_ppl.experiments.gps import experiment, figures, problem, ways
-from lfm_ppl.experiments.study import Found
+from lfm_ppl.experiments.study import StudyResult
 from lfm_ppl.orbits import magnitudes, prediction
 from lfm_ppl.orbits.arc import Unusable
 
@@ -38,7 +38,7 @@ def learnt(value=0.0, orbit=range(8)):
 
 
 def compute(task):
-    return experiment.STUDY.kinds[experiment.STUDY.what(task)].compute(task)
+    return experiment.STUDY.kinds[experiment.STUDY.task_kind(task)].compute(task)
 
 
 @pytest.fixture
@@ -50,7 +50,7 @@ def gather(monkeypatch):
         settings = experiment.GpsSettings(alternatives=sum(name.startswith("ways/") for name in others))
         results = {f"learn/{name}": learnt() for name in predicted}
         results |= {f"predict/{name}": one for name, one in predicted.items()}
-        return settings, experiment.STUDY.gathered(settings, results | others)
+        return settings, experiment.STUDY.collect(settings, results | others)
 
     return gather
 
@@ -203,7 +203,7 @@ def test_what_is_refused_is_left_out_and_said(gather):
 def test_tables_are_written_with_their_text(gather, tmp_path):
     settings, data = gather({"G01": result(10.0), "G02": result(20.0, eclipsed=True)})
     plain = dataclasses.replace(experiment.STUDY, figures=lambda settings, data: {})
-    plain.save(Found(settings, {}, data, experiment.tables(settings, data)), tmp_path)
+    plain.save(StudyResult(settings, {}, data, experiment.tables(settings, data)), tmp_path)
     assert "| yes " in (tmp_path / "satellites.md").read_text() and ",no," in (tmp_path / "satellites.csv").read_text()
 
 

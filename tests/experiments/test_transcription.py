@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 from lfm_ppl.engine.store import write
 from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import scores
-from lfm_ppl.experiments.published import Verdict
+from lfm_ppl.experiments.published import PublishedComparison
 from lfm_ppl.experiments.study import TASKS
 from lfm_ppl.experiments.transcription import experiment, figures, problem, slices
 from lfm_ppl.latent_grid.laplace import laplace
@@ -198,7 +198,7 @@ def made_up(settings):
 
 
 def data_of(settings):
-    return experiment.STUDY.gathered(settings, made_up(settings))
+    return experiment.STUDY.collect(settings, made_up(settings))
 
 
 def test_the_tables_count_what_was_found():
@@ -227,9 +227,9 @@ def test_the_tables_count_what_was_found():
     (-4.3, "lower than published (z = -4.3)", True), (-31.0, "lower than published (z = -31.0)", True),
     (4.3, "higher than published (z = 4.3)", False), (np.nan, "-", False)])
 def test_a_verdict_is_two_sided_and_lower_is_consistent(z, text, consistent):
-    one = Verdict(z)
-    assert str(one) == text and one.consistent is consistent
-    assert one.lower == text.startswith("lower") and one.higher == text.startswith("higher")
+    one = PublishedComparison(z)
+    assert str(one) == text and one.is_consistent is consistent
+    assert one.is_lower == text.startswith("lower") and one.is_higher == text.startswith("higher")
 
 
 def test_each_published_cell_has_its_verdict():

@@ -63,7 +63,7 @@ def made_up(settings):
 
 def found_in(results, settings):
     """The comparison of made-up results."""
-    return parameters_report.STUDY.found(settings, results)
+    return parameters_report.STUDY.tabulate(settings, results)
 
 
 def test_the_table_measures_in_standard_deviations_of_the_reference():
@@ -92,7 +92,7 @@ def test_a_chain_that_stands_still_shows():
 
 
 def test_the_figures_are_labelled():
-    figures = parameters_report.draw(FEW, parameters_report.STUDY.gathered(FEW, made_up(FEW)))
+    figures = parameters_report.draw(FEW, parameters_report.STUDY.collect(FEW, made_up(FEW)))
     assert set(figures) == {"posteriors-softplus", "posteriors-saturation-0.5"}
     for figure in figures.values():
         upper, lower = figure.axes

@@ -12,9 +12,9 @@ from lfm_ppl.engine.run import Reporter
 from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import study
 from lfm_ppl.experiments.counts import figures, methods, problem
-from lfm_ppl.experiments.datasets import Column, Kind, row
+from lfm_ppl.experiments.datasets import Column, TaskKind, row
 from lfm_ppl.experiments.scores import Estimate
-from lfm_ppl.experiments.study import Data, Results, Study, Table, setting
+from lfm_ppl.experiments.study import Data, Results, Study, StudyTable, setting
 
 
 @dataclass(frozen=True)
@@ -49,12 +49,12 @@ def check(settings: CountsSettings, report: Reporter | None) -> None:
         problem.problem(name, settings.size, settings.seed, settings.data)
 
 
-def tables(settings: CountsSettings, data: Data) -> dict[str, Table]:
+def tables(settings: CountsSettings, data: Data) -> dict[str, StudyTable]:
     """Return the tables."""
     every = {name: methods.compared(settings, data, name) for name in settings.problems}
-    return {"accuracy": Table.of("Posterior of the predictor (mean: largest error in sds; sd: largest relative error)",
-                                 rows(every, ACCURACY)),
-            "prediction": Table.of(f"Held-out data, {settings.size.folds} folds", rows(every, PREDICTION))}
+    accuracy = "Posterior of the predictor (mean: largest error in sds; sd: largest relative error)"
+    return {"accuracy": StudyTable.from_rows(accuracy, rows(every, ACCURACY)),
+            "prediction": StudyTable.from_rows(f"Held-out data, {settings.size.folds} folds", rows(every, PREDICTION))}
 
 
 ACCURACY: dict[str, Column] = {
@@ -92,10 +92,10 @@ def notes(settings: CountsSettings, data: Data) -> tuple[str, ...]:
 
 STUDY = Study(
     CountsSettings, learning,
-    {"parameters": Kind(methods.learn, {"": "level, scale, lengthscale, daily_scale, daily_lengthscale, concentration, "
-                                            "noise"}, ("problem",)),
-     "comparison": Kind(methods.compute, {
+    {"parameters": TaskKind(methods.learn, {
+        "": "level, scale, lengthscale, daily_scale, daily_lengthscale, concentration, noise"}, ("problem",)),
+     "comparison": TaskKind(methods.compute, {
          "dataset": "mean, sd, log density, low, high",
          "": "log evidence, log evidence error, share, ess, r_hat, seconds"}, ("problem", "method"))},
-    tables, figures.draw, notes=notes, then=comparing, check=check,
-    what=lambda task: "comparison" if "method" in task.settings else "parameters")
+    tables, figures.draw, notes=notes, follow_up_tasks=comparing, check=check,
+    task_kind=lambda task: "comparison" if "method" in task.settings else "parameters")

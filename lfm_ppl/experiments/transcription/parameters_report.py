@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 
 from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import chains, study
-from lfm_ppl.experiments.datasets import Column, Kind, number, row
-from lfm_ppl.experiments.scores import pair
-from lfm_ppl.experiments.study import Data, Study, Table, setting
+from lfm_ppl.experiments.datasets import Column, TaskKind, number, row
+from lfm_ppl.experiments.scores import estimate_cells
+from lfm_ppl.experiments.study import Data, Study, StudyTable, setting
 from lfm_ppl.experiments.transcription import figures, parameters, problem
 from lfm_ppl.experiments.transcription.parameters import LINKS, REFERENCE, SAMPLERS
 
@@ -69,14 +69,15 @@ def agreement(settings: TranscriptionParametersSettings, data: Data) -> dict[str
             shift, ratio = chains.agreement(found, reference)
             if sampler == REFERENCE:  # it is no estimate how it agrees with itself
                 shift, ratio = shift._replace(error=np.nan), ratio._replace(error=np.nan)
-            rows[f"{link}: {sampler}"] = pair("shift", shift) | pair("sd ratio", ratio) | row(found, COLUMNS)
+            rows[f"{link}: {sampler}"] = {**estimate_cells("shift", shift), **estimate_cells("sd ratio", ratio),
+                                          **row(found, COLUMNS)}
     return rows
 
 
-def tables(settings: TranscriptionParametersSettings, data: Data) -> dict[str, Table]:
+def tables(settings: TranscriptionParametersSettings, data: Data) -> dict[str, StudyTable]:
     """Return the table."""
     title = f"Against {REFERENCE}, {settings.datasets} data set{'s' if settings.datasets > 1 else ''}"
-    return {"agreement": Table.of(title, agreement(settings, data))}
+    return {"agreement": StudyTable.from_rows(title, agreement(settings, data))}
 
 
 def draw(settings: TranscriptionParametersSettings, data: Data) -> dict[str, Figure]:
@@ -85,9 +86,9 @@ def draw(settings: TranscriptionParametersSettings, data: Data) -> dict[str, Fig
         data[link], problem.data_set(LINKS[link], 0, settings.seed)) for link in settings.links}
 
 
-KIND = Kind(parameters.compute, {
+KIND = TaskKind(parameters.compute, {
     "dataset parameter": "mean, sd, low, high, truth, ess, r_hat", "dataset parameter chain draw": "draws",
     "dataset time": "force_mean, force_sd", "dataset": "rmse, coverage, seconds, divergences, k"}, ("sampler",))
 STUDY = Study(TranscriptionParametersSettings, tasks, dict.fromkeys(LINKS, KIND), tables, draw,
               {"parameter": ("parameter", parameters.NAMES)},
-              what=lambda task: problem.configuration(task).label)
+              task_kind=lambda task: problem.configuration(task).label)
