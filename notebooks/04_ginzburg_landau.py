@@ -43,7 +43,9 @@ from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.ginzburg_landau import experiment, figures, problem
 
 quick = bool(os.environ.get("LFM_QUICK"))
-settings = experiment.Settings.quick(realisations=1, conditional=2) if quick else experiment.Settings()
+settings = experiment.GinzburgLandauSettings()
+if quick:
+    settings = settings.quick(realisations=1, conditional=2)
 # The folder of an earlier run of `lfm-ppl compare ginzburg-landau`; without one everything is computed here.
 folder = Path(os.environ.get("LFM_COMPARE", "double-well"))
 found = experiment.STUDY.run(settings, folder)

@@ -48,7 +48,9 @@ from lfm_ppl.experiments.transcription import experiment, figures, parameters, p
 
 quick = bool(os.environ.get("LFM_QUICK"))
 pd.set_option("display.width", 160, "display.max_columns", 30)
-settings = experiment.Settings.quick(datasets=1, configurations=("exponential",)) if quick else experiment.Settings()
+settings = experiment.TranscriptionSettings()
+if quick:
+    settings = settings.quick(datasets=1, configurations=("exponential",))
 # The folder of an earlier run of `lfm-ppl compare transcription`; without one everything is computed here.
 folder = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/transcription"))
 found = experiment.STUDY.run(settings, folder)
@@ -112,7 +114,9 @@ scores.readable(found.tables["paired"])
 #     lfm-ppl compare transcription-parameters
 
 # %%
-chosen = parameters_report.Settings.quick() if quick else parameters_report.Settings()
+chosen = parameters_report.TranscriptionParametersSettings()
+if quick:
+    chosen = chosen.quick()
 posteriors = parameters_report.STUDY.run(chosen, folder.parent / "transcription-parameters")
 scores.readable(posteriors.tables["agreement"])
 

@@ -44,7 +44,7 @@ from lfm_ppl.inference.bound_model import likelihood_site
 
 quick = bool(os.environ.get("LFM_QUICK"))
 pd.set_option("display.width", 160, "display.max_columns", 30)
-settings = experiment.Settings.quick(runs=2) if quick else experiment.Settings()
+settings = experiment.BallisticSettings.quick(runs=2) if quick else experiment.BallisticSettings()
 # The folder of an earlier run of `lfm-ppl compare ballistic`; without one everything is computed here.
 folder = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/ballistic"))
 found = experiment.STUDY.run(settings, folder)

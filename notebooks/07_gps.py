@@ -62,9 +62,9 @@ else:
 
 # %%
 if quick:
-    settings = experiment.Settings(satellites=problem.SIMULATED[:1], alternatives=0, train_days=1.0)
+    settings = experiment.GpsSettings(satellites=problem.SIMULATED[:1], alternatives=0, train_days=1.0)
 else:
-    settings = experiment.Settings(data=str(shared) if real else None)
+    settings = experiment.GpsSettings(data=str(shared) if real else None)
 # The folder of an earlier run of `lfm-ppl compare gps`; without one everything is computed here.
 folder = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/gps"))
 found = experiment.STUDY.run(settings, folder)

@@ -42,7 +42,7 @@ from lfm_ppl.experiments.periodic_kernels import experiment, figures
 
 quick = bool(os.environ.get("LFM_QUICK"))
 pd.set_option("display.width", 160, "display.max_columns", 30)
-settings = experiment.Settings.quick() if quick else experiment.Settings()
+settings = experiment.PeriodicKernelSettings.quick() if quick else experiment.PeriodicKernelSettings()
 # The folder of an earlier run of `lfm-ppl compare periodic-kernels`; without one everything is computed here.
 folder = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/periodic-kernels"))
 found = experiment.STUDY.run(settings, folder)

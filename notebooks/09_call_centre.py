@@ -48,7 +48,7 @@ quick = bool(os.environ.get("LFM_QUICK"))
 pd.set_option("display.width", 160, "display.max_columns", 30)
 shared = Path(os.environ.get("LFM_DATA", "../shared/data")) / "calls"
 data = str(shared) if shared.is_dir() and not quick else None
-settings = experiment.Settings.quick(days=1) if quick else experiment.Settings(data=data)
+settings = experiment.CallCentreSettings.quick(days=1) if quick else experiment.CallCentreSettings(data=data)
 # The folder of an earlier run of `lfm-ppl compare call-centre`; without one everything is computed here.
 folder = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/call-centre"))
 with warnings.catch_warnings():

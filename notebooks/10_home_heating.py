@@ -91,7 +91,7 @@ pd.DataFrame({
 # %%
 folder = problem.data_folder()
 print("real house and simulated homes" if folder else f"no {problem.FILE}: simulated homes only")
-make = experiment.Settings.quick if quick else experiment.Settings
+make = experiment.HomeHeatingSettings.quick if quick else experiment.HomeHeatingSettings
 settings = make(data=None if folder is None else str(folder))
 kept = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/home-heating"))
 found = experiment.STUDY.run(settings, kept)

@@ -117,7 +117,7 @@ pd.Series({"a state, Q constant": float(np.sqrt(3.0) / states.state("rate")[0]),
 # one would leave out a force that is exactly zero.
 
 # %%
-settings = experiment.Settings()
+settings = experiment.ConstrainedSettings()
 # The folder of an earlier run of `lfm-ppl compare constrained`; without one everything is computed here.
 folder = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/constrained"))
 # Quick mode leaves the study out, which compiles for minutes; `lfm-ppl compare constrained --quick` is a little of it.

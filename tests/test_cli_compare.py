@@ -9,7 +9,7 @@ import pytest
 
 from lfm_ppl.cli import main
 from lfm_ppl.experiments import catalogue
-from lfm_ppl.experiments.study import Found, Study, Table, options
+from lfm_ppl.experiments.study import Study, StudyResult, StudyTable, options
 
 
 @pytest.fixture
@@ -42,13 +42,14 @@ def wanted(monkeypatch):
             if report:
                 report("1/1 task")
             rates = pd.DataFrame({"rate": [0.5]}, ["EKF"])
-            return Found(settings, {}, {}, {"rates": Table("Rates", rates, rates)}, ("1 of 1 cell is consistent.",))
+            table = StudyTable("Rates", rates, rates)
+            return StudyResult(settings, {}, {}, {"rates": table}, ("1 of 1 cell is consistent.",))
 
         def save(self, found, folder):
             return [folder / "rates.csv"]
 
-    real = catalogue.Entry.study.fget
-    monkeypatch.setattr(catalogue.Entry, "study", property(
+    real = catalogue.CatalogueEntry.study.fget
+    monkeypatch.setattr(catalogue.CatalogueEntry, "study", property(
         lambda entry: Fake(**{one.name: getattr(real(entry), one.name) for one in dataclasses.fields(Study)})))
     return asked
 

@@ -13,8 +13,8 @@ from lfm_ppl.cli import choices, page, results, study_options
 from lfm_ppl.experiments import catalogue
 
 if TYPE_CHECKING:  # experiments, which take seconds to import
-    from lfm_ppl.experiments.catalogue import Entry
-    from lfm_ppl.experiments.study import Found
+    from lfm_ppl.experiments.catalogue import CatalogueEntry
+    from lfm_ppl.experiments.study import StudyResult
 
 PAGE = "index.html"
 
@@ -31,7 +31,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     report = None if arguments.quiet else Console()
     workers, study = choices.workers(arguments.jobs, arguments.scheduler), chosen.study
-    settings = study.settings.chosen(report, arguments.quick, **study_options.given(arguments))
+    settings = study.settings.from_command_line(report, arguments.quick, **study_options.given(arguments))
     default = Path("lfm-results") / "compare" / (f"{chosen.name}-quick" if arguments.quick else chosen.name)
     with results.lasting(default, arguments.out) as folder:
         web_page.refuse_foreign(folder / PAGE, arguments.overwrite)
@@ -49,7 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
     return page.attempted(lambda: _index(folder, chosen, found, written, page.command_line(arguments)))
 
 
-def _index(folder: Path, chosen: Entry, found: Found, written: list[Path], command: str) -> Path:
+def _index(folder: Path, chosen: CatalogueEntry, found: StudyResult, written: list[Path], command: str) -> Path:
     """Write the tables and figures of an experiment as one page."""
     from lfm_ppl.results import tables, web_page
     from lfm_ppl.results.web_page import Section

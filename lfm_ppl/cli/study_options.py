@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from lfm_ppl.cli import values
 
 if TYPE_CHECKING:  # experiments, which take seconds to import
-    from lfm_ppl.experiments.study import Option, Settings
+    from lfm_ppl.experiments.study import SettingOption, StudySettings
 
 _DESTINATION = "study setting "
 
@@ -30,17 +30,17 @@ def name_in(line: Sequence[str], common: argparse.ArgumentParser, known: Sequenc
     return next((word for word in free if word.replace("_", "-") in known), next(iter(free), None))
 
 
-def add(command: Any, settings: type[Settings], name: str) -> None:
+def add(command: Any, settings: type[StudySettings], name: str) -> None:
     """Add an option for each setting of a study."""
     from lfm_ppl.experiments.study import options
 
     group = command.add_argument_group(f"options of {name}")
     for one in options(settings):
-        about, kind = one.declared, _converter(one)
-        shown: dict[str, Any] = {"metavar": about.metavar or ("N" if one.kind is int else one.name.upper())}
+        about, kind = one.declaration, _converter(one)
+        shown: dict[str, Any] = {"metavar": about.metavar or ("N" if one.value_type is int else one.name.upper())}
         if about.parts:
             shown = {"nargs": len(about.parts), "metavar": tuple(part.upper() for part in about.parts)}
-        elif one.many:
+        elif one.is_sequence:
             shown["nargs"] = "+"
         elif about.choices:
             shown["metavar"] = "|".join(about.choices)
@@ -54,18 +54,19 @@ def given(arguments: argparse.Namespace) -> dict[str, Any]:
             for name, value in vars(arguments).items() if name.startswith(_DESTINATION)}
 
 
-def _converter(one: Option) -> Callable[[str], Any]:
-    if one.kind is int:
-        return values.whole(one.declared.least)
-    if one.kind is float:
+def _converter(one: SettingOption) -> Callable[[str], Any]:
+    if one.value_type is int:
+        return values.whole(one.declaration.least)
+    if one.value_type is float:
         return values.positive
-    return values.one_of("value", one.declared.choices) if one.declared.choices else str
+    return values.one_of("value", one.declaration.choices) if one.declaration.choices else str
 
 
-def _default(one: Option) -> str:
-    if one.default is None or "default:" in one.declared.help:
+def _default(one: SettingOption) -> str:
+    if one.default is None or "default:" in one.declaration.help:
         return ""
     several = one.default if isinstance(one.default, tuple) else (one.default,)
-    every = one.many and one.declared.choices is not None and several == tuple(one.declared.choices)
-    also = f"; any of: {shlex.join(one.declared.choices)}" if one.many and one.declared.choices and not every else ""
+    choices = one.declaration.choices
+    every = one.is_sequence and choices is not None and several == tuple(choices)
+    also = f"; any of: {shlex.join(choices)}" if one.is_sequence and choices and not every else ""
     return f" (default: {shlex.join(map(str, several))}{also})"

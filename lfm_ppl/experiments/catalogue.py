@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from lfm_ppl import checks
 
-if TYPE_CHECKING:  # which takes a second to import
+if TYPE_CHECKING:  # the import takes a second
     from lfm_ppl.experiments.study import Study
 
 _STUDIES = {
@@ -32,15 +32,15 @@ _STUDIES = {
     "counts": ("counts.experiment",
                "counts, gross errors, yes and no: EP, variational and Laplace against exact draws"),
 }
-"""Name -> module with the study, and one line on it: the list of them imports none."""
+"""Name -> module and summary; texts, since the modules take seconds to import."""
 
 
-class Entry(NamedTuple):
-    """What the list has of a study.
+class CatalogueEntry(NamedTuple):
+    """Entry of the catalogue for a study.
 
     Attributes:
-        name: on the command line.
-        summary: one line.
+        name: name on the command line.
+        summary: summary in one line.
     """
 
     name: str
@@ -48,7 +48,7 @@ class Entry(NamedTuple):
 
     @property
     def study(self) -> Study:
-        """The study."""
+        """The study; its module is imported at the first access."""
         return importlib.import_module(f"lfm_ppl.experiments.{_STUDIES[self.name][0]}").STUDY
 
 
@@ -57,17 +57,17 @@ def names() -> tuple[str, ...]:
     return tuple(_STUDIES)
 
 
-def experiment(name: str) -> Entry:
-    """Return a study by name, with dashes or underscores.
+def experiment(name: str) -> CatalogueEntry:
+    """Return the catalogue entry of a study by name, with dashes or underscores.
 
     Raises:
-        ValueError: there is none of this name; the message has the nearest ones.
+        ValueError: no study has this name; the message suggests the most similar ones.
 
     Example:
         >>> experiment("ginzburg_landau").name
         'ginzburg-landau'
     """
-    wanted = name.replace("_", "-")
-    if wanted not in _STUDIES:
+    canonical = name.replace("_", "-")
+    if canonical not in _STUDIES:
         raise ValueError(checks.unknown("experiment", name, _STUDIES))
-    return Entry(wanted, _STUDIES[wanted][1])
+    return CatalogueEntry(canonical, _STUDIES[canonical][1])

@@ -1,36 +1,37 @@
-"""Errors beside the published ones: what is better than published is said to be so, with z."""
+"""Comparison of errors with published ones: consistent, lower or higher, with the z-score."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import pandas as pd
 
 from lfm_ppl.experiments.scores import SE
 
 ERRORS = 3.0
-"""Standard errors of a difference within which it is none."""
+"""Largest difference that counts as consistent, in standard errors of the difference."""
 
 BOUND = ERRORS * math.sqrt(2.0)
-"""Three standard errors of the difference, 4.2 of ours, where the published mean has an error as large as ours."""
+"""The same bound in standard errors of our mean, where the published mean is taken to have an equal standard error."""
 
 FEWEST = 5
-"""As many data sets make a standard error with which errors can be compared."""
+"""Smallest number of data sets whose standard error supports a comparison."""
 
 
-class Verdict(NamedTuple):
-    """How our error compares with the published one.
+@dataclass(frozen=True)
+class PublishedComparison:
+    """Comparison of an error with a published one.
 
-    Lower is better, and so counts as consistent, though it is no agreement: the text says which of the two it is.
+    An error below the published one counts as consistent; the text names it as lower.
 
     Attributes:
-        z: (ours - published) / standard error; NaN where there is none.
-        bound: of z, beyond which the two differ.
+        z: (ours - published) / standard error; NaN without a standard error.
+        bound: largest absolute value of z that shows no difference.
 
     Example:
-        >>> [str(Verdict(z)) for z in (1.2, -5.1, 5.1)]
+        >>> [str(PublishedComparison(z)) for z in (1.2, -5.1, 5.1)]
         ['consistent', 'lower than published (z = -5.1)', 'higher than published (z = 5.1)']
     """
 
@@ -38,72 +39,76 @@ class Verdict(NamedTuple):
     bound: float = BOUND
 
     @property
-    def known(self) -> bool:
-        """Whether there is a standard error to compare with."""
+    def has_standard_error(self) -> bool:
+        """Whether a standard error is available."""
         return not math.isnan(self.z)
 
     @property
-    def lower(self) -> bool:
-        """Whether our error is lower than published, beyond the bound."""
+    def is_lower(self) -> bool:
+        """Whether the error is lower than published, beyond the bound."""
         return self.z < -self.bound
 
     @property
-    def higher(self) -> bool:
-        """Whether our error is higher than published, beyond the bound."""
+    def is_higher(self) -> bool:
+        """Whether the error is higher than published, beyond the bound."""
         return self.z > self.bound
 
     @property
-    def consistent(self) -> bool:
-        """Whether the cell counts as consistent: our error is not higher than published."""
-        return self.known and not self.higher
+    def is_consistent(self) -> bool:
+        """Whether the error is not higher than published."""
+        return self.has_standard_error and not self.is_higher
 
     def __str__(self) -> str:
-        """Return the verdict, with z where it is beyond the bound."""
-        if not self.known:
+        """Return the verdict, with z beyond the bound."""
+        if not self.has_standard_error:
             return "-"
-        if not (self.lower or self.higher):
+        if not (self.is_lower or self.is_higher):
             return "consistent"
-        return f"{'lower' if self.lower else 'higher'} than published (z = {self.z:.1f})"
+        return f"{'lower' if self.is_lower else 'higher'} than published (z = {self.z:.1f})"
 
 
-def summary(found: Iterable[Verdict]) -> str:
-    """Return how many cells are consistent with the published table, and how many of them are lower.
+def summarize_comparisons(comparisons: Iterable[PublishedComparison]) -> str:
+    """Return a sentence with the numbers of consistent, lower and higher cells.
 
     Example:
-        >>> summary([Verdict(1.2), Verdict(-5.1), Verdict(5.1)])
+        >>> summarize_comparisons([PublishedComparison(1.2), PublishedComparison(-5.1), PublishedComparison(5.1)])
         '2 of 3 cells count as consistent with the published table, 1 of them lower than published; 1 higher.'
     """
-    known = [one for one in found if one.known]
-    consistent, lower, higher = (sum(getattr(one, name) for one in known) for name in ("consistent", "lower", "higher"))
-    return (f"{consistent} of {len(known)} cells count as consistent with the published table, {lower} of them lower "
+    valid = [comparison for comparison in comparisons if comparison.has_standard_error]
+    consistent = sum(comparison.is_consistent for comparison in valid)
+    lower = sum(comparison.is_lower for comparison in valid)
+    higher = sum(comparison.is_higher for comparison in valid)
+    return (f"{consistent} of {len(valid)} cells count as consistent with the published table, {lower} of them lower "
             f"than published; {higher} higher.")
 
 
-def beside(frame: pd.DataFrame, ours: str, published: str) -> dict[str, Verdict]:
-    """Return row -> verdict on our error, where a published one stands beside it; both have standard errors.
+def compare_with_published(frame: pd.DataFrame, ours: str, published: str) -> dict[str, PublishedComparison]:
+    """Return row name -> comparison, for the rows that have a published error.
 
     Args:
-        frame: a table with the columns ``ours``, ``published``, and with those of their standard errors.
-        ours: column of our error.
-        published: column of the published one.
+        frame: table with the columns ``ours`` and ``published`` and the columns of their standard errors.
+        ours: column of our errors.
+        published: column of the published errors.
 
     Example:
         >>> frame = pd.DataFrame({"RMSE": [1.0], "RMSE se": [0.3], "source": [4.0], "source se": [0.4]}, ["SQM"])
-        >>> {row: str(one) for row, one in beside(frame, "RMSE", "source").items()}
+        >>> {row: str(comparison) for row, comparison in compare_with_published(frame, "RMSE", "source").items()}
         {'SQM': 'lower than published (z = -6.0)'}
     """
     error = (frame[f"{ours}{SE}"] ** 2 + frame[f"{published}{SE}"] ** 2) ** 0.5
     z = (frame[ours] - frame[published]) / error
-    return {str(row): Verdict(float(one), ERRORS) for row, one in z[frame[published].notna()].items()}
+    return {str(row): PublishedComparison(float(value), ERRORS) for row, value in z[frame[published].notna()].items()}
 
 
-def said(what: str, verdicts: dict[str, Verdict]) -> str:
-    """Return one sentence on the verdicts: their numbers, and what each row is that differs from the published.
+def describe_comparisons(title: str, comparisons: dict[str, PublishedComparison]) -> str:
+    """Return a sentence with the numbers of consistent cells, and one for each row that differs from the published one.
 
     Example:
-        >>> print(said("RMSE", {"SQM": Verdict(-6.0), "CQM": Verdict(0.5)}))  # doctest: +NORMALIZE_WHITESPACE
+        >>> comparisons = {"SQM": PublishedComparison(-6.0), "CQM": PublishedComparison(0.5)}
+        >>> print(describe_comparisons("RMSE", comparisons))  # doctest: +NORMALIZE_WHITESPACE
         RMSE: 2 of 2 cells count as consistent with the published table, 1 of them lower than published; 0 higher.
         SQM: lower than published (z = -6.0).
     """
-    apart = [f" {row}: {one}." for row, one in verdicts.items() if one.lower or one.higher]
-    return f"{what}: {summary(verdicts.values())}{''.join(apart)}"
+    differences = [f" {row}: {comparison}." for row, comparison in comparisons.items()
+                   if comparison.is_lower or comparison.is_higher]
+    return f"{title}: {summarize_comparisons(comparisons.values())}{''.join(differences)}"

@@ -1,4 +1,13 @@
-"""How good estimates are: errors, coverage, intervals of densities on a grid, and their standard errors."""
+"""Scores of estimates, with standard errors.
+
+1. Means, rates and ratios over independent data sets are `Estimate` objects: a value with its standard error.
+2. A path with a band has a root mean squared error and a coverage (`score_path`).
+3. A chain has means, standard deviations, intervals, effective sample sizes and R-hat (`diagnose`), and a Monte Carlo
+   error of its standard deviations (`relative_errors_of_sd`).
+4. A log likelihood on a grid becomes a posterior (`GridPosterior`): interpolate it by a cubic spline on each run of
+   nodes with positive likelihood, exponentiate on a grid forty times as dense, and normalise by the trapezoidal rule.
+5. Cell densities of a grid filter become quantiles (`density_quantiles`).
+"""
 
 from __future__ import annotations
 
@@ -14,16 +23,16 @@ from lfm_ppl import checks
 from lfm_ppl.results import arviz_data
 
 Z = 1.959963984540054
-"""Half the width of a 95% interval, in standard deviations."""
+"""Half the width of a 95% interval of a normal distribution, in standard deviations."""
 
 SE = " se"
-"""What the column of a standard error ends with."""
+"""Suffix of a column with standard errors."""
 
 _FINER = 40
-"""Nodes of the fine grid for one of the given grid."""
+"""Intervals of the fine grid in each interval of the nodes."""
 
 _FLOOR = -700.0
-"""Log densities below the largest one by more than this are zero in double precision."""
+"""Log density, relative to the largest one, below which the density counts as zero (exp underflows near -745)."""
 
 
 class Estimate(NamedTuple):
@@ -31,14 +40,14 @@ class Estimate(NamedTuple):
 
     Attributes:
         value: the number; NaN where there is none.
-        error: its standard error; NaN where it cannot be told.
+        error: its standard error; NaN where it is unknown.
     """
 
     value: float
     error: float
 
     def __str__(self) -> str:
-        """Return ``value (error)`` with the digits that the error leaves."""
+        """Return ``value (error)``, rounded to two significant digits of the error."""
         if not np.isfinite(self.value):
             return "-"
         if not (np.isfinite(self.error) and self.error > 0):
@@ -47,13 +56,13 @@ class Estimate(NamedTuple):
         return f"{self.value:.{digits}f} ({self.error:.{digits}f})"
 
 
-def pair(name: str, estimate: Estimate) -> dict[str, float]:
-    """Return the entries ``name`` and ``name se`` of a row of a table."""
+def estimate_cells(name: str, estimate: Estimate) -> dict[str, float]:
+    """Return the cells ``name`` and ``name se`` of a table row."""
     return {name: estimate.value, f"{name}{SE}": estimate.error}
 
 
 def readable(frame: pd.DataFrame) -> pd.DataFrame:
-    """Return a table with each estimate and its standard error in one cell, ``0.91 (0.03)``; text stays as it is."""
+    """Return a table of text, with each estimate and its standard error in one cell such as ``0.91 (0.03)``."""
     columns: dict[str, list[str]] = {}
     for name in frame.columns:
         if name.endswith(SE):
@@ -67,31 +76,30 @@ def readable(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def mean_of(values: Any) -> Estimate:
-    """Return the mean of independent numbers with its standard error; NaN entries are left out.
+    """Return the mean of independent numbers with its standard error, without NaN entries.
 
     Example:
         >>> str(mean_of([1.0, 2.0, 3.0]))
         '2.00 (0.58)'
     """
-    known = np.asarray(values, float).ravel()
-    known = known[np.isfinite(known)]
-    if known.size == 0:
+    finite = np.asarray(values, float).ravel()
+    finite = finite[np.isfinite(finite)]
+    if finite.size == 0:
         return Estimate(np.nan, np.nan)
-    error = known.std(ddof=1) / np.sqrt(known.size) if known.size > 1 else np.nan
-    return Estimate(float(known.mean()), float(error))
+    error = finite.std(ddof=1) / np.sqrt(finite.size) if finite.size > 1 else np.nan
+    return Estimate(float(finite.mean()), float(error))
 
 
 def sd_of(values: Any) -> float:
-    """Return the standard deviation of independent numbers; NaN of a single one."""
-    known = np.asarray(values, float)  # xarray's own would leave NaN out
-    return float(known.std(ddof=1)) if known.size > 1 else np.nan
+    """Return the sample standard deviation of independent numbers; NaN for a single number."""
+    sample = np.asarray(values, float)  # xarray's std would skip NaN
+    return float(sample.std(ddof=1)) if sample.size > 1 else np.nan
 
 
 def rate_of(hits: Any) -> Estimate:
     """Return the share of True among independent outcomes with its binomial standard error sqrt(p (1 - p) / n).
 
-    Where all outcomes are the same, p in the error is (k + 1) / (n + 2), since none of n does not show that it never
-    happens.
+    Where all outcomes are equal, the error uses p = (k + 1) / (n + 2): k = 0 of n does not prove that p = 0.
 
     Example:
         >>> str(rate_of([True] * 20 + [False] * 80))
@@ -118,50 +126,50 @@ def paired_ratio(first: Any, second: Any) -> Estimate:
 
 
 def rmse(estimate: Any, truth: Any) -> Any:
-    """Return the root of the mean squared difference over the last axis."""
+    """Return the root mean squared error over the last axis."""
     return np.sqrt(np.mean((np.asarray(estimate) - np.asarray(truth)) ** 2, axis=-1))
 
 
-def covered(low: Any, high: Any, truth: Any) -> Any:
-    """Return the share of entries of ``truth`` along the last axis that lie between ``low`` and ``high``."""
+def interval_coverage(low: Any, high: Any, truth: Any) -> Any:
+    """Return the share of entries of ``truth`` between ``low`` and ``high``, along the last axis."""
     truth = np.asarray(truth)
     return np.mean((np.asarray(low) <= truth) & (truth <= np.asarray(high)), axis=-1)
 
 
 def interval(mean: Any, sd: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return the ends of the 95% interval of a normal distribution."""
+    """Return the bounds of the 95% interval of a normal distribution."""
     mean, reach = np.asarray(mean), Z * np.asarray(sd)
     return mean - reach, mean + reach
 
 
-def judged(what: str, mean: Any, band: tuple[Any, Any], truth: Any) -> dict[str, Any]:
-    """Return ``{what}_rmse`` and ``{what}_coverage`` of paths (..., T): of their mean, and of their band.
+def score_path(prefix: str, mean: Any, band: tuple[Any, Any], truth: Any) -> dict[str, Any]:
+    """Return the error ``{prefix}_rmse`` of a path's mean (..., T) and the coverage ``{prefix}_coverage`` of its band.
 
     Example:
-        >>> found = judged("smoother", [0.0, 1.0], interval([0.0, 1.0], [1.0, 1.0]), [0.0, 4.0])
-        >>> {name: round(float(value), 3) for name, value in found.items()}
+        >>> path_scores = score_path("smoother", [0.0, 1.0], interval([0.0, 1.0], [1.0, 1.0]), [0.0, 4.0])
+        >>> {name: round(float(value), 3) for name, value in path_scores.items()}
         {'smoother_rmse': 2.121, 'smoother_coverage': 0.5}
     """
-    return {f"{what}_rmse": rmse(mean, truth), f"{what}_coverage": covered(*band, truth)}
+    return {f"{prefix}_rmse": rmse(mean, truth), f"{prefix}_coverage": interval_coverage(*band, truth)}
 
 
-def spread(draws: np.ndarray, count: int) -> np.ndarray:
-    """Return ``count`` draws (count, P), spread evenly over draws (P, chains, draws)."""
+def thin_draws(draws: np.ndarray, count: int) -> np.ndarray:
+    """Return ``count`` draws (count, P) at equal distances among the draws (P, chains, draws)."""
     flat = draws.reshape(len(draws), -1)
     return flat[:, np.linspace(0, flat.shape[1] - 1, count).round().astype(int)].T
 
 
 def total_moments(mean: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and standard deviation (...) of a mixture of components with mean and variance (S, ...)."""
+    """Return mean and standard deviation (...) of an equal mixture of S components with mean and variance (S, ...)."""
     return mean.mean(axis=0), np.sqrt(variance.mean(axis=0) + mean.var(axis=0))
 
 
 def diagnose(names: Sequence[str], draws: np.ndarray) -> dict[str, np.ndarray]:
-    """Return ``mean``, ``sd``, 95% interval ``low`` and ``high``, bulk ``ess`` and ``r_hat`` of parameters.
+    """Return ``mean``, ``sd``, the 95% interval ``low`` and ``high``, bulk ``ess`` and ``r_hat`` of parameters.
 
     Args:
-        names: of the P parameters.
-        draws: (P, chains, draws).
+        names: names of the P parameters.
+        draws: draws (P, chains, draws).
 
     Returns:
         Name -> array (P,).
@@ -173,33 +181,33 @@ def diagnose(names: Sequence[str], draws: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def relative_errors_of_sd(draws: np.ndarray) -> np.ndarray:
-    """Return the Monte Carlo errors of standard deviations, as shares of them, (P,) of draws (P, chains, draws).
+    """Return the relative Monte Carlo errors (P,) of the standard deviations of draws (P, chains, draws).
 
-    The standard deviation s follows the mean of (x - m)^2, so that its error is s times that of the mean of
-    ((x - m)^2 / s^2 - 1) / 2: larger for heavy tails than for a normal distribution, and with the autocorrelation of
-    the squares. NaN where all draws of a parameter are equal.
+    By the delta method the relative error of s is the Monte Carlo error of the mean of ((x - m)^2 / s^2 - 1) / 2. It
+    accounts for heavy tails and for the autocorrelation of the squares. NaN where all draws of a parameter are equal.
     """
     mean, variance = draws.mean(axis=(1, 2), keepdims=True), draws.var(axis=(1, 2), keepdims=True)
     with np.errstate(divide="ignore", invalid="ignore"):
         squares = 0.5 * ((draws - mean) ** 2 / variance - 1.0)
-    return np.array([arviz_data.mcse_mean(one) for one in squares])
+    return np.array([arviz_data.mcse_mean(row) for row in squares])
 
 
 class GridPosterior:
     r"""Posterior of one parameter under a flat prior, from its log likelihood at the nodes of a grid.
 
-        p(theta | y) = exp(L(theta)) / integral of exp(L)   on the interval that the nodes span.
+        p(theta | y) = exp(L(theta)) / integral of exp(L)   on the interval spanned by the nodes.
 
-    Between the nodes L is a cubic spline, which is exact for a Gaussian likelihood; the integrals are trapezoidal
-    sums on nodes forty times as dense. Between a node where the likelihood is zero, or NaN, and its neighbours there is
-    no posterior. It counts as zero more than 700 below its peak: several nodes must lie where there is a posterior.
+    Between the nodes L is a cubic spline, which is exact for a Gaussian likelihood. Integrals use the trapezoidal rule
+    on a grid forty times as dense. The density is zero between a node with zero or NaN likelihood and its neighbours. A
+    likelihood counts as zero where L lies more than 700 below its maximum, so that the grid needs several nodes within
+    the bulk of the posterior.
 
     Args:
-        nodes: (G,), increasing; at least four.
-        log_likelihood: (G,); -inf where the likelihood is zero.
+        nodes: increasing nodes (G,), at least four.
+        log_likelihood: log likelihood (G,); -inf where the likelihood is zero.
 
     Raises:
-        ValueError: nodes that do not increase, shapes that do not fit, or no finite log likelihood.
+        ValueError: the nodes do not increase, the shapes differ, or no log likelihood is finite.
 
     Example:
         >>> nodes = np.linspace(-8.0, 10.0, 41)
@@ -216,17 +224,17 @@ class GridPosterior:
         if values.shape != nodes.shape:
             raise ValueError(f"log_likelihood must have the shape of nodes, {nodes.shape}, got {values.shape}.")
         if not np.isfinite(values).any():
-            raise ValueError("log_likelihood is nowhere finite: there is no posterior on these nodes.")
+            raise ValueError("log_likelihood is not finite at any node; choose nodes where the likelihood is positive.")
         relative = np.where(np.isnan(values), -np.inf, values) - np.max(values[np.isfinite(values)])
         self.x = np.unique(np.concatenate([np.linspace(a, b, _FINER + 1) for a, b in
                                            zip(nodes[:-1], nodes[1:], strict=True)]))
         log_density = np.full(self.x.size, -np.inf)
         possible = np.flatnonzero(relative > _FLOOR)
         for run in np.split(possible, np.flatnonzero(np.diff(possible) > 1) + 1):
-            # A spline across the edge of a run would overshoot beside it, by more than the peak is high.
+            # A spline across a jump to zero likelihood would overshoot by more than the height of the peak.
             spline = make_interp_spline(nodes[run], relative[run], min(3, len(run) - 1))
-            inside = (self.x >= nodes[run[0]]) & (self.x <= nodes[run[-1]])
-            log_density[inside] = spline(self.x[inside])
+            is_inside = (self.x >= nodes[run[0]]) & (self.x <= nodes[run[-1]])
+            log_density[is_inside] = spline(self.x[is_inside])
         density = np.exp(log_density - log_density.max())
         steps = 0.5 * np.diff(self.x) * (density[1:] + density[:-1])
         self.density = density / steps.sum()
@@ -243,29 +251,29 @@ class GridPosterior:
         return float(np.sqrt(np.trapezoid(self.density * (self.x - self.mean) ** 2, self.x)))
 
     def quantile(self, p: Any) -> Any:
-        """Return the value below which a share ``p`` of the posterior lies."""
+        """Return the quantile of probability ``p``."""
         return np.interp(p, self.distribution, self.x)
 
     def below(self, value: float) -> float:
         """Return the posterior probability of a value below ``value``."""
         return float(np.interp(value, self.x, self.distribution))
 
-    def cut(self, share: float = 0.01) -> bool:
-        """Return whether an end of the grid cuts the posterior off: its density there is over ``share`` of the peak."""
+    def is_cut_off(self, share: float = 0.01) -> bool:
+        """Return whether the grid truncates the posterior: the density at an end exceeds ``share`` of its maximum."""
         return bool(max(self.density[0], self.density[-1]) > share * self.density.max())
 
 
 def density_quantiles(x: Any, width: float, density: Any, p: Any) -> np.ndarray:
-    """Return quantiles of densities that are constant in the cells of a regular grid.
+    """Return quantiles of piecewise constant densities on a regular grid.
 
     Args:
-        x: (N,) cell centres.
-        width: of a cell.
-        density: (..., N).
-        p: (Q,) probabilities.
+        x: cell centres (N,).
+        width: cell width.
+        density: densities (..., N).
+        p: probabilities (Q,).
 
     Returns:
-        (Q, ...).
+        Quantiles (Q, ...).
 
     Example:
         >>> density_quantiles([0.5, 1.5], 1.0, [[0.5, 0.5]], [0.25, 0.5]).ravel().tolist()
@@ -274,7 +282,7 @@ def density_quantiles(x: Any, width: float, density: Any, p: Any) -> np.ndarray:
     x, density, p = np.asarray(x, float), np.asarray(density, float), np.atleast_1d(np.asarray(p, float))
     edges = np.append(x - 0.5 * width, x[-1] + 0.5 * width)
     mass = np.maximum(density, 0.0).reshape(-1, x.size)
-    below = np.concatenate([np.zeros((len(mass), 1)), np.cumsum(mass, axis=1)], axis=1)
-    below /= below[:, -1:]
-    found = np.array([np.interp(p, row, edges) for row in below])
-    return found.T.reshape(p.size, *density.shape[:-1])
+    distribution = np.concatenate([np.zeros((len(mass), 1)), np.cumsum(mass, axis=1)], axis=1)
+    distribution /= distribution[:, -1:]
+    quantiles = np.array([np.interp(p, row, edges) for row in distribution])
+    return quantiles.T.reshape(p.size, *density.shape[:-1])

@@ -1,37 +1,48 @@
 """A study as a declaration: settings, tasks, and the tables and figures that follow from their results.
 
-What a study adds to its problem is a module ``experiment.py`` in a folder of its own, with
+`Study.run` works as follows:
 
-- a frozen dataclass of `Settings`, each field made by `setting`, which are checked, and are the options of
-  ``lfm-ppl compare NAME``;
-- a function of the settings that returns the `lfm_ppl.engine.task.Task` objects;
-- for each kind of task how one is computed and which dimensions its results have (`Kind`): all of them become one
-  `xarray.Dataset`;
-- functions of the settings and these datasets that return the tables (`Table`) and the figures;
-- ``STUDY``, a `Study` of these;
+1. Check the settings; for example, that the data files exist.
+2. Build the tasks from the settings. Each task has a name, a random key and a kind.
+3. Compute the tasks whose results the folder does not hold yet, and store each result in a separate file.
+4. Build further tasks from these results, if the study declares `Study.follow_up_tasks`, and compute them likewise.
+5. Combine the results of each kind of task into one `xarray.Dataset` (`TaskKind.collect`).
+6. Derive tables and notes from the datasets.
 
-and a line in `lfm_ppl.experiments.catalogue`. `lfm_ppl.experiments.ballistic` shows one. Everything else is here: a run
-computes what its folder does not hold yet, writes every table as CSV and Markdown and every figure as PNG, and the
-command line prints the tables and puts them on one page.
+`Study.save` writes every table as CSV and Markdown and every figure as PNG. The command line prints the tables and
+collects them on one page.
+
+A study is a module ``experiment.py`` in a separate folder, with
+
+- a frozen subclass of `StudySettings`, each field declared by `setting`: the fields are checked, and become the options
+  of ``lfm-ppl compare NAME``;
+- a function that maps the settings to `lfm_ppl.engine.task.Task` objects;
+- for each kind of task a `TaskKind`: the function that computes one task, and the dimensions of its results;
+- functions that map the settings and the datasets to the tables (`StudyTable`) and to the figures;
+- ``STUDY``, a `Study` with these parts,
+
+and a line in `lfm_ppl.experiments.catalogue`. `lfm_ppl.experiments.ballistic` is an example.
 
     @dataclass(frozen=True)
-    class Settings(study.Settings):
+    class TrackingSettings(StudySettings):
         runs: int = setting(500, "simulated targets", quick=4, aliases=study.REALISATIONS)
 
-    def tasks(settings: Settings) -> list[Task]:
-        made = Tasks("made-up", settings.seed)
-        return in_order(one for rule in ("EKF", "CKF") for one in made.each(f"track/{rule}", settings.runs, rule=rule))
+    def tasks(settings: TrackingSettings) -> list[Task]:
+        factory = TaskFactory("tracking", settings.seed)
+        return sort_by_dataset(task for rule in ("EKF", "CKF")
+                               for task in factory.dataset_tasks(f"track/{rule}", settings.runs, rule=rule))
 
     def compute(task: Task) -> Result:
         return {"rmse": ...}
 
-    def tables(settings: Settings, data: Data) -> dict[str, Table]:
-        return {"errors": Table.of("Errors", rows(data["track"], "rule", {"RMSE": "rmse"}))}
+    def tables(settings: TrackingSettings, data: Data) -> dict[str, StudyTable]:
+        return {"errors": StudyTable.from_rows("Errors", rows(data["track"], "rule", {"RMSE": "rmse"}))}
 
-    def figures(settings: Settings, data: Data) -> dict[str, Figure]:
+    def figures(settings: TrackingSettings, data: Data) -> dict[str, Figure]:
         return {"errors": plot_errors(data["track"])}
 
-    STUDY = Study(Settings, tasks, {"track": Kind(compute, {"dataset": "rmse"}, by=("rule",))}, tables, figures)
+    KINDS = {"track": TaskKind(compute, {"dataset": "rmse"}, by=("rule",))}
+    STUDY = Study(TrackingSettings, tasks, KINDS, tables, figures)
 """
 
 from __future__ import annotations
@@ -41,8 +52,9 @@ import functools
 import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import pandas as pd
 import xarray as xr
@@ -53,46 +65,47 @@ from lfm_ppl.engine.cluster import Workers, started
 from lfm_ppl.engine.run import Reporter, run_tasks
 from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import scores
-from lfm_ppl.experiments.datasets import Kind
+from lfm_ppl.experiments.datasets import TaskKind
 from lfm_ppl.results.files import writing
 from lfm_ppl.results.plots import style
 from lfm_ppl.results.tables import write_csv, write_markdown
 
 Results = dict[str, Result]
-"""Name of a task -> its result."""
+"""Task name -> result."""
 
 Data = Mapping[str, xr.Dataset]
-"""Kind of task -> the results of all such tasks."""
+"""Kind of task -> results of all tasks of this kind."""
 
 TASKS = "tasks"
-"""The subfolder of a study's folder with a file for each task."""
+"""Subfolder of a study's folder, with one file for each task."""
 
 REALISATIONS = ("--realisations", "--datasets", "--runs")
-"""Options by any of which a user gives the number of data sets, whatever a study calls them."""
+"""Synonyms of the option that sets the number of data sets, accepted by every study with simulated data."""
 
 CHAINS = ("chains", "warm-up", "draws", "thinning")
-"""Parts of a setting that says how long a sampler runs; those of the first three serve where nothing is thinned."""
+"""Parts of a setting for the length of a sampler; samplers without thinning use the first three."""
 
-_KEPT: Any = object()
+_UNSET: Any = object()
 
 
-class Declared(NamedTuple):
-    """What a study says of a setting.
+@dataclass(frozen=True)
+class SettingDeclaration:
+    """Description of a setting, beside its default.
 
     Attributes:
-        help: what it is, for the command line; empty: no option is made of it.
-        quick: its value in the quick version; as the default where it is left out.
-        choices: what a text, or each of several, may be.
-        parts: what the whole numbers of a tuple of fixed length are.
-        metavar: what stands for the value in the help.
-        aliases: options that mean the same as the one of its name.
-        least: the least whole number.
-        per_seed: the largest number that one seed has data sets for.
-        increasing: whether several numbers must increase.
+        help: description for the command line; an empty text makes no option.
+        quick: value in the quick version; by default the same as in the full version.
+        choices: permitted texts, for a text or for each entry of a tuple of texts.
+        parts: names of the whole numbers in a tuple of fixed length.
+        metavar: placeholder for the value in the help.
+        aliases: further names of the option.
+        least: smallest permitted whole number.
+        per_seed: largest number of data sets that one seed provides.
+        increasing: whether the entries of a tuple of numbers must increase.
     """
 
     help: str
-    quick: Any = _KEPT
+    quick: Any = _UNSET
     choices: Sequence[str] | None = None
     parts: Sequence[str] | None = None
     metavar: str | None = None
@@ -102,123 +115,126 @@ class Declared(NamedTuple):
     increasing: bool = False
 
 
-def setting(default: Any, help: str, **about: Any) -> Any:
-    """Return a field of a study's `Settings`: its value, a tuple for several, and what else is `Declared` of it."""
-    return dataclasses.field(default=default, metadata={"declared": Declared(help, **about)})
+def setting(default: Any, help: str, **declaration: Any) -> Any:
+    """Return a dataclass field for `StudySettings`; keyword arguments as the attributes of `SettingDeclaration`."""
+    return dataclasses.field(default=default, metadata={"declaration": SettingDeclaration(help, **declaration)})
 
 
-class Option(NamedTuple):
-    """A setting that a user can give.
+@dataclass(frozen=True)
+class SettingOption:
+    """A setting as an option of the command line.
 
     Attributes:
-        name: of the field.
-        kind: int, float or str.
-        many: whether it is a tuple of any length of these.
-        optional: whether it may be None.
-        default: its value.
-        declared: what the study says of it.
+        name: name of the field.
+        value_type: int, float or str; the type of the entries if the value is a tuple.
+        is_sequence: whether the value is a tuple of any length.
+        is_optional: whether the value may be None.
+        default: default value.
+        declaration: description by the study.
     """
 
     name: str
-    kind: type
-    many: bool
-    optional: bool
+    value_type: type
+    is_sequence: bool
+    is_optional: bool
     default: Any
-    declared: Declared
+    declaration: SettingDeclaration
 
     @property
     def flags(self) -> list[str]:
-        """The options of the command line that give it."""
-        return list(dict.fromkeys([f"--{self.name.replace('_', '-')}", *self.declared.aliases]))
+        """Names of the option on the command line."""
+        return list(dict.fromkeys([f"--{self.name.replace('_', '-')}", *self.declaration.aliases]))
 
     def check(self, value: Any) -> None:
-        """Raise ValueError or TypeError, naming the setting, unless it may have this value."""
-        about = self.declared
-        if value is None and self.optional:
+        """Raise ValueError or TypeError, naming the setting, for a value that is not permitted."""
+        declaration = self.declaration
+        if value is None and self.is_optional:
             return
-        if about.parts:
-            checks.sizes(self.name, value, about.parts)
-        elif self.many:
-            self._check_several(value)
-        elif self.kind is int:
+        if declaration.parts:
+            checks.sizes(self.name, value, declaration.parts)
+        elif self.is_sequence:
+            self._check_sequence(value)
+        elif self.value_type is int:
             self._check_count(value)
-        elif self.kind is float:
+        elif self.value_type is float:
             checks.positive(self.name, value, f"See {self.flags[0]}.")
-        elif about.choices:
-            checks.one_of(self.name, value, about.choices)
+        elif declaration.choices:
+            checks.one_of(self.name, value, declaration.choices)
 
-    def _check_several(self, value: Any) -> None:
-        about, what = self.declared, "numbers" if self.kind is int else "labels"
-        known = isinstance(value, tuple) and len(value) > 0
-        if about.increasing and not (known and list(value) == sorted(set(value))):
+    def _check_sequence(self, value: Any) -> None:
+        declaration, entries = self.declaration, "numbers" if self.value_type is int else "labels"
+        is_nonempty = isinstance(value, tuple) and len(value) > 0
+        if declaration.increasing and not (is_nonempty and list(value) == sorted(set(value))):
             raise ValueError(f"{self.name} must be a tuple of increasing numbers, got {value!r}.")
-        if not known or (self.kind is int or about.choices) and len(set(value)) < len(value):
-            raise ValueError(f"{self.name} must be a tuple of different {what}, at least one, got {value!r}.")
-        for one in value:
-            if self.kind is int:
-                self._check_count(one)
-            elif about.choices:
-                checks.one_of(self.name, one, about.choices)
+        if not is_nonempty or (self.value_type is int or declaration.choices) and len(set(value)) < len(value):
+            raise ValueError(f"{self.name} must be a tuple of different {entries}, at least one, got {value!r}.")
+        for entry in value:
+            if self.value_type is int:
+                self._check_count(entry)
+            elif declaration.choices:
+                checks.one_of(self.name, entry, declaration.choices)
 
     def _check_count(self, value: Any) -> None:
-        about = self.declared
-        if about.least > 0 or not isinstance(value, int):
+        declaration = self.declaration
+        if declaration.least > 0 or not isinstance(value, int):
             checks.positive_integer(self.name, value)
-        if value < about.least:
-            raise ValueError(f"{self.name} must be at least {about.least}, got {value}.")
-        if about.per_seed is not None and value > about.per_seed:
-            raise ValueError(f"{self.name} is {value}, and one seed has {about.per_seed} records of a kind; use "
+        if value < declaration.least:
+            raise ValueError(f"{self.name} must be at least {declaration.least}, got {value}.")
+        if declaration.per_seed is not None and value > declaration.per_seed:
+            raise ValueError(f"{self.name} is {value}, but one seed has {declaration.per_seed} data sets; use "
                              "several seeds for more.")
 
 
-@dataclasses.dataclass(frozen=True)
-class Settings:
-    """How much is computed; the fields of a study's own subclass follow."""
+@dataclass(frozen=True)
+class StudySettings:
+    """Settings of any study; a study subclasses this and adds its fields."""
 
     seed: int = dataclasses.field(default=0, kw_only=True, metadata={
-        "declared": Declared("of everything random", metavar="N", least=0)})
+        "declaration": SettingDeclaration("of everything random", metavar="N", least=0)})
 
     def __post_init__(self) -> None:
-        """Check every setting by itself; a study that has more to check extends this."""
-        for one in options(type(self)):
-            one.check(getattr(self, one.name))
+        """Check every setting separately; a subclass adds checks that involve several settings."""
+        for option in options(type(self)):
+            option.check(getattr(self, option.name))
 
     @classmethod
-    def quick(cls, **given: Any) -> Self:
-        """Return settings that show in minutes that everything runs, and no more, but for those that are given."""
-        small = {one.name: one.metadata["declared"].quick for one in dataclasses.fields(cls) if one.metadata}
-        return cls(**{name: value for name, value in small.items() if value is not _KEPT} | given)
+    def quick(cls, **overrides: Any) -> Self:
+        """Return settings for a run of a few minutes, which shows that everything works; overrides take precedence."""
+        declared = {field.name: field.metadata["declaration"].quick for field in dataclasses.fields(cls)
+                    if field.metadata}
+        return cls(**{name: value for name, value in declared.items() if value is not _UNSET} | overrides)
 
     @classmethod
-    def chosen(cls, report: Reporter | None, quick: bool = False, **given: Any) -> Self:
-        """Return the settings that a user of the command line chose; a study that looks for data extends this."""
-        return cls.quick(**given) if quick else cls(**given)
+    def from_command_line(cls, report: Reporter | None, quick: bool = False, **values: Any) -> Self:
+        """Return the settings for the options of a command line; a study that searches for data overrides this."""
+        return cls.quick(**values) if quick else cls(**values)
 
 
-def options(settings: type[Settings]) -> tuple[Option, ...]:
-    """Return what a user can give, in the order of the fields."""
-    hints, found = typing.get_type_hints(settings), []
-    for one in dataclasses.fields(settings):
-        if (declared := one.metadata.get("declared")) is None or not declared.help:
+def options(settings: type[StudySettings]) -> tuple[SettingOption, ...]:
+    """Return the options of the command line, in the order of the fields, with the seed last."""
+    hints, settable = typing.get_type_hints(settings), []
+    for field in dataclasses.fields(settings):
+        if (declaration := field.metadata.get("declaration")) is None or not declaration.help:
             continue
-        kinds = [hints[one.name]]
-        if isinstance(hints[one.name], types.UnionType):
-            kinds = [kind for kind in typing.get_args(hints[one.name]) if kind is not types.NoneType]
-        many = typing.get_origin(kinds[0]) is tuple
-        kind = typing.get_args(kinds[0])[0] if many else kinds[0]
-        found.append(Option(one.name, kind, many and not declared.parts, hints[one.name] != kinds[0], one.default,
-                            declared))
-    return tuple(sorted(found, key=lambda one: one.name == "seed"))
+        annotations = [hints[field.name]]
+        if isinstance(hints[field.name], types.UnionType):
+            annotations = [hint for hint in typing.get_args(hints[field.name]) if hint is not types.NoneType]
+        is_tuple = typing.get_origin(annotations[0]) is tuple
+        value_type = typing.get_args(annotations[0])[0] if is_tuple else annotations[0]
+        settable.append(SettingOption(field.name, value_type, is_tuple and not declaration.parts,
+                                      hints[field.name] != annotations[0], field.default, declaration))
+    return tuple(sorted(settable, key=lambda option: option.name == "seed"))
 
 
-class Table(NamedTuple):
+@dataclass(frozen=True)
+class StudyTable:
     """A table of a study.
 
     Attributes:
-        title: printed above it; empty: it is written and not printed.
-        frame: one row a case; where a column ``name`` has standard errors they are the column ``name se``.
-        printed: what is printed of it; None: all, with standard errors in parentheses.
-        stored: whether it is written; else it is printed alone.
+        title: heading; a table without a title is written and not printed.
+        frame: one row for each case; the column ``name se`` holds the standard errors of the column ``name``.
+        printed: printed version of the table; by default ``frame`` with standard errors in parentheses.
+        stored: whether the table is written to files as well as printed.
     """
 
     title: str
@@ -227,132 +243,147 @@ class Table(NamedTuple):
     stored: bool = True
 
     @classmethod
-    def of(cls, title: str, rows: Mapping[str, Mapping[str, Any]]) -> Self:
-        """Return a table of rows by name, each a column -> value."""
+    def from_rows(cls, title: str, rows: Mapping[str, Mapping[str, Any]]) -> Self:
+        """Return a table with the given rows: row name -> column -> value."""
         return cls(title, pd.DataFrame.from_dict(rows, orient="index"))
 
 
-class Found(NamedTuple):
-    """What a study found.
+@dataclass(frozen=True)
+class StudyResult:
+    """Results of a study.
 
     Attributes:
-        settings: that it ran with.
-        results: of every task, by name.
-        data: the same as one dataset for each kind of task.
-        named: the tables, by the names of their files.
-        notes: what to know when reading them.
+        settings: settings of the run.
+        results: task name -> result.
+        data: results as one dataset for each kind of task.
+        study_tables: file name -> table.
+        notes: remarks on the tables.
     """
 
     settings: Any
     results: Results
     data: Data
-    named: dict[str, Table]
+    study_tables: dict[str, StudyTable]
     notes: tuple[str, ...] = ()
 
     @property
     def tables(self) -> dict[str, pd.DataFrame]:
-        """The tables that are written, by name."""
-        return {name: one.frame for name, one in self.named.items() if one.stored}
+        """File name -> table, for all tables that are written to files."""
+        return {name: table.frame for name, table in self.study_tables.items() if table.stored}
 
     @property
     def printed(self) -> dict[str, pd.DataFrame]:
-        """Title -> table as it is printed."""
-        return {one.title: scores.readable(one.frame) if one.printed is None else one.printed
-                for one in self.named.values() if one.title}
+        """Title -> printed version of the table."""
+        return {table.title: scores.readable(table.frame) if table.printed is None else table.printed
+                for table in self.study_tables.values() if table.title}
 
 
-@dataclasses.dataclass(frozen=True)
+def _no_notes(settings: Any, data: Data) -> tuple[str, ...]:
+    return ()
+
+
+def _accept(settings: Any, report: Reporter | None) -> None:
+    """Accept any settings."""
+
+
+def _kind_by_name(task: Task) -> str:
+    return task.settings.get("what", task.name.partition("/")[0])
+
+
+@dataclass(frozen=True)
 class Study:
     """A study.
 
     Attributes:
-        settings: the class of its settings.
-        tasks: from the settings to the tasks, in the order in which they are computed.
-        kinds: kind of task -> how it is computed, and what its results are.
-        tables: from settings and data to tables, by the names of their files.
-        figures: from settings and data to figures, by the names of their files.
-        coords: name -> dimension and values of a coordinate of the data.
-        label: header of the tables' first column, which holds the names of the rows.
-        notes: from settings and data to what is to be known when reading the tables.
-        then: from settings and the results of ``tasks`` to further tasks.
-        check: of the settings, before anything is computed, with what to do with a line of progress.
-        what: from a task to its kind; by default its setting ``what``, or what its name begins with.
+        settings: class of the settings.
+        tasks: map from settings to tasks, in the order of computation.
+        kinds: kind of task -> computation and layout of its results.
+        tables: map from settings and data to tables by file name.
+        figures: map from settings and data to figures by file name.
+        coords: coordinate of the datasets -> its dimension and values.
+        label: header of the first column of the tables, which holds the row names.
+        notes: map from settings and data to remarks on the tables.
+        follow_up_tasks: map from settings and the results of ``tasks`` to further tasks.
+        check: check of the settings before the computation; its second argument reports progress.
+        task_kind: map from a task to its kind; by default the task's setting ``what``, else the first part of its name.
     """
 
-    settings: type[Settings]
+    settings: type[StudySettings]
     tasks: Callable[[Any], list[Task]]
-    kinds: Mapping[str, Kind]
-    tables: Callable[[Any, Data], dict[str, Table]]
+    kinds: Mapping[str, TaskKind]
+    tables: Callable[[Any, Data], dict[str, StudyTable]]
     figures: Callable[[Any, Data], dict[str, Figure]]
     coords: Mapping[str, tuple[str, Sequence[Any]]] = dataclasses.field(default_factory=dict)
     label: str = "case"
-    notes: Callable[[Any, Data], tuple[str, ...]] = lambda settings, data: ()
-    then: Callable[[Any, Results], list[Task]] | None = None
-    check: Callable[[Any, Reporter | None], None] = lambda settings, report: None
-    what: Callable[[Task], str] = lambda task: task.settings.get("what", task.name.partition("/")[0])
+    notes: Callable[[Any, Data], tuple[str, ...]] = _no_notes
+    follow_up_tasks: Callable[[Any, Results], list[Task]] | None = None
+    check: Callable[[Any, Reporter | None], None] = _accept
+    task_kind: Callable[[Task], str] = _kind_by_name
 
     def run(self, settings: Any, folder: str | Path, *, overwrite: bool = False, report: Reporter | None = None,
-            workers: Workers = 1) -> Found:
-        """Compute what is not stored yet in ``folder``, and tabulate everything.
+            workers: Workers = 1) -> StudyResult:
+        """Compute all tasks that ``folder`` does not hold yet, and derive the tables.
 
         Args:
-            settings: how much.
-            folder: of the study; its subfolder ``tasks`` holds a file for each task.
-            overwrite: compute again what was stored with other settings.
-            report: what to do with a line of progress; None: nothing.
-            workers: what computes; see `run_tasks`.
+            settings: settings of the study.
+            folder: folder of the study; its subfolder ``tasks`` holds one file for each task.
+            overwrite: whether to recompute results that were stored with other settings.
+            report: function called with each line of progress.
+            workers: processes that compute; see `run_tasks`.
 
         Raises:
-            FileNotFoundError, ValueError: data that are not there or cannot be used; the folder holds results made
-                with other settings.
+            FileNotFoundError, ValueError: data are missing or cannot be used, or the folder holds results of other
+                settings.
         """
         self.check(settings, report)
-        computed = functools.partial(_computed, self.what, {what: kind.compute for what, kind in self.kinds.items()})
-        done = functools.partial(run_tasks, compute=computed, folder=Path(folder) / TASKS, overwrite=overwrite,
-                                 report=report)
+        compute = functools.partial(_compute, self.task_kind, {kind: self.kinds[kind].compute for kind in self.kinds})
+        run_all = functools.partial(run_tasks, compute=compute, folder=Path(folder) / TASKS, overwrite=overwrite,
+                                    report=report)
         tasks = self.tasks(settings)
-        if self.then is None:
-            return self.found(settings, done(tasks, workers=workers), tasks)
-        with started(workers) as running:  # once, for both rounds
-            results = done(tasks, workers=running or 1)
-            more = self.then(settings, results)
-            return self.found(settings, results | done(more, workers=running or 1), [*tasks, *more])
+        if self.follow_up_tasks is None:
+            return self.tabulate(settings, run_all(tasks, workers=workers), tasks)
+        with started(workers) as pool:  # starting workers takes seconds: both rounds share them
+            results = run_all(tasks, workers=pool or 1)
+            more_tasks = self.follow_up_tasks(settings, results)
+            return self.tabulate(settings, results | run_all(more_tasks, workers=pool or 1), [*tasks, *more_tasks])
 
-    def found(self, settings: Any, results: Results, tasks: Sequence[Task] | None = None) -> Found:
-        """Return what follows from the results of all tasks, which are asked for where they are not given."""
-        data = self.gathered(settings, results, tasks)
-        return Found(settings, results, data, self.tables(settings, data), self.notes(settings, data))
+    def tabulate(self, settings: Any, results: Results, tasks: Sequence[Task] | None = None) -> StudyResult:
+        """Return datasets, tables and notes for the results of all tasks; the tasks follow from the settings."""
+        data = self.collect(settings, results, tasks)
+        return StudyResult(settings, results, data, self.tables(settings, data), self.notes(settings, data))
 
-    def gathered(self, settings: Any, results: Results, tasks: Sequence[Task] | None = None) -> Data:
+    def collect(self, settings: Any, results: Results, tasks: Sequence[Task] | None = None) -> Data:
         """Return the results of all tasks as one dataset for each kind."""
         data = {}
-        for what, own in self.by_kind(settings, results, tasks).items():
-            one = self.kinds[what].gathered(own, results)
-            data[what] = one.assign_coords({name: (dim, list(values)) for name, (dim, values) in self.coords.items()
-                                            if dim in one.dims})
+        for kind, tasks_of_kind in self.tasks_by_kind(settings, results, tasks).items():
+            dataset = self.kinds[kind].collect(tasks_of_kind, results)
+            data[kind] = dataset.assign_coords({
+                name: (dim, list(values)) for name, (dim, values) in self.coords.items() if dim in dataset.dims})
         return data
 
-    def by_kind(self, settings: Any, results: Results, tasks: Sequence[Task] | None = None) -> dict[str, list[Task]]:
-        """Return the tasks of each kind of which there are any, in the order of the kinds."""
+    def tasks_by_kind(self, settings: Any, results: Results,
+                      tasks: Sequence[Task] | None = None) -> dict[str, list[Task]]:
+        """Return the tasks of each kind, in the order of the kinds, without kinds that have no tasks."""
         if tasks is None:
             tasks = self.tasks(settings)
-            if self.then is not None:
-                tasks = [*tasks, *self.then(settings, {task.name: results[task.name] for task in tasks})]
-        found = {what: [task for task in tasks if self.what(task) == what] for what in self.kinds}
-        return {what: own for what, own in found.items() if own}
+            if self.follow_up_tasks is not None:
+                tasks = [*tasks, *self.follow_up_tasks(settings, {task.name: results[task.name] for task in tasks})]
+        by_kind = {kind: [task for task in tasks if self.task_kind(task) == kind] for kind in self.kinds}
+        return {kind: tasks_of_kind for kind, tasks_of_kind in by_kind.items() if tasks_of_kind}
 
-    def save(self, found: Found, folder: str | Path) -> list[Path]:
-        """Write tables as CSV in full and as Markdown, and figures as PNG, replacing older ones; return their paths."""
+    def save(self, result: StudyResult, folder: str | Path) -> list[Path]:
+        """Write tables as CSV and as Markdown, and figures as PNG, over older ones; return the paths."""
         folder, written = Path(folder), []
-        for name, table in found.tables.items():
+        for name, table in result.tables.items():
             written.append(write_csv(table, folder / f"{name}.csv", True, index_label=self.label))
             written.append(write_markdown(scores.readable(table), folder / f"{name}.md", True))
-        for name, figure in self.figures(found.settings, found.data).items():
+        for name, figure in self.figures(result.settings, result.data).items():
             written.append(folder / f"{name}.png")
             with writing(written[-1], True) as temporary, style.in_style():
                 figure.savefig(temporary, format="png")
         return written
 
 
-def _computed(what: Callable[[Task], str], kinds: Mapping[str, Callable[[Task], Result]], task: Task) -> Result:
-    return kinds[what(task)](task)
+def _compute(task_kind: Callable[[Task], str], functions: Mapping[str, Callable[[Task], Result]], task: Task) -> Result:
+    """Return the result of a task; at the top level, so that processes can pickle it."""
+    return functions[task_kind(task)](task)

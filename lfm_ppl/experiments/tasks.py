@@ -1,4 +1,4 @@
-"""The tasks of a study: what they are called, of which data sets they are, and one result from those of several."""
+"""Tasks of a study: their names, their data sets, and the combination of several results into one."""
 
 from __future__ import annotations
 
@@ -12,98 +12,94 @@ from lfm_ppl.engine.task import Result, Task
 
 
 @dataclass(frozen=True)
-class Tasks:
-    """What makes the tasks of a study, whose names begin with what they are.
+class TaskFactory:
+    """Factory for the tasks of a study; the first part of a task's name is its kind.
 
     Attributes:
-        experiment: the study.
-        seed: of everything random.
-        digits: of the numbers of data sets in names.
+        experiment: name of the study.
+        seed: seed of the study.
+        digits: digits of data set numbers in task names.
 
     Example:
-        >>> tasks = Tasks("made-up", 0)
-        >>> [task.name for task in (*tasks.each("chains/NUTS", 2), *tasks.blocks("track", 5, 3, rule="EKF"))]
+        >>> factory = TaskFactory("tracking", 0)
+        >>> tasks = *factory.dataset_tasks("chains/NUTS", 2), *factory.block_tasks("track", 5, 3, rule="EKF")
+        >>> [task.name for task in tasks]
         ['chains/NUTS/0000', 'chains/NUTS/0001', 'track/0000-0002', 'track/0003-0004']
-        >>> tasks.blocks("track", 5, 3, rule="EKF")[-1].settings
-        {'experiment': 'made-up', 'what': 'track', 'rule': 'EKF', 'first': 3, 'last': 4}
+        >>> tasks[-1].settings
+        {'experiment': 'tracking', 'what': 'track', 'rule': 'EKF', 'first': 3, 'last': 4}
     """
 
     experiment: str
     seed: int
     digits: int = 4
 
-    def one(self, name: str, /, **settings: Any) -> Task:
-        """Return a task of this name, whose settings hold the study, and ``what`` it is.
+    def task(self, name: str, /, **settings: Any) -> Task:
+        """Return a task; its setting ``what`` is the first part of the name, unless ``settings`` sets it."""
+        return Task(name, self.seed, {"experiment": self.experiment, "what": name.partition("/")[0], **settings})
 
-        That is the first part of its name unless it is given.
-        """
-        own = {"experiment": self.experiment, "what": name.partition("/")[0], **settings}
-        return Task(name, self.seed, own)
+    def dataset_tasks(self, name: str, count: int, /, **settings: Any) -> list[Task]:
+        """Return one task for each of ``count`` data sets, with the setting ``index``."""
+        return [self.task(f"{name}/{index:0{self.digits}d}", **settings, index=index) for index in range(count)]
 
-    def each(self, name: str, count: int, /, **settings: Any) -> list[Task]:
-        """Return a task for each of ``count`` data sets, its setting ``index``."""
-        return [self.one(f"{name}/{index:0{self.digits}d}", **settings, index=index) for index in range(count)]
-
-    def blocks(self, name: str, count: int, size: int, /, **settings: Any) -> list[Task]:
-        """Return a task for each block of at most ``size`` data sets, its settings ``first`` and ``last``."""
-        return [self.one(f"{name}/{first:0{self.digits}d}-{last:0{self.digits}d}", **settings, first=first, last=last)
-                for first, last in blocks(count, size)]
+    def block_tasks(self, name: str, count: int, size: int, /, **settings: Any) -> list[Task]:
+        """Return one task for each block of at most ``size`` data sets, with the settings ``first`` and ``last``."""
+        return [self.task(f"{name}/{first:0{self.digits}d}-{last:0{self.digits}d}", **settings, first=first, last=last)
+                for first, last in dataset_blocks(count, size)]
 
 
-def in_order(tasks: Iterable[Task]) -> list[Task]:
-    """Return tasks of the first data sets first, so that the time left can be told."""
-    return sorted(tasks, key=lambda task: indices(task)[0])
+def sort_by_dataset(tasks: Iterable[Task]) -> list[Task]:
+    """Return tasks sorted by their first data set; the remaining time can then be estimated from all kinds of tasks."""
+    return sorted(tasks, key=lambda task: dataset_indices(task)[0])
 
 
-def indices(task: Task) -> range:
-    """Return the data sets of a task.
+def dataset_indices(task: Task) -> range:
+    """Return the indices of the data sets of a task.
 
-    They are its setting ``index``, those from ``first`` to ``last``, or ``count`` from ``first`` on.
+    The settings of the task are ``index``, or ``first`` and ``last``, or ``first`` and ``count``.
 
     Example:
-        >>> [indices(Task("a", 0, of)) for of in ({"index": 2}, {"first": 3, "last": 4}, {"first": 3, "count": 2})]
+        >>> settings = {"index": 2}, {"first": 3, "last": 4}, {"first": 3, "count": 2}
+        >>> [dataset_indices(Task("a", 0, entries)) for entries in settings]
         [range(2, 3), range(3, 5), range(3, 5)]
     """
-    given = task.settings
-    if "index" in given:
-        return range(given["index"], given["index"] + 1)
-    return range(given["first"], given["last"] + 1 if "last" in given else given["first"] + given["count"])
+    settings = task.settings
+    if "index" in settings:
+        return range(settings["index"], settings["index"] + 1)
+    first = settings["first"]
+    return range(first, settings["last"] + 1 if "last" in settings else first + settings["count"])
 
 
-def blocks(count: int, size: int) -> list[tuple[int, int]]:
-    """Return first and last index of each block of data sets that are computed in one go, and stored in one file.
+def dataset_blocks(count: int, size: int) -> list[tuple[int, int]]:
+    """Return the first and the last index of each block of data sets; a block is computed and stored as one task.
 
     Example:
-        >>> blocks(5, 2)
+        >>> dataset_blocks(5, 2)
         [(0, 1), (2, 3), (4, 4)]
     """
     return [(first, min(first + size, count) - 1) for first in range(0, count, size)]
 
 
-def stacked(rows: Sequence[Result], shown: Sequence[str] = ()) -> Result:
-    """Return the results of data sets, one row each, as one result.
+def stack_results(rows: Sequence[Result], first_only: Sequence[str] = ()) -> Result:
+    """Return the results of several data sets as one result, with the data sets along the first axis.
 
     Args:
-        rows: of the data sets.
-        shown: entries that are kept of the first one alone, for a figure.
-
-    Returns:
-        Entry -> array, a row for each data set.
+        rows: results of the data sets.
+        first_only: entries that are taken from the first data set alone, for example for a figure.
 
     Example:
-        >>> found = stacked([{"rmse": 1.0, "path": [0.0]}, {"rmse": 2.0, "path": [3.0]}], shown=["path"])
-        >>> found["rmse"].tolist(), found["path"].tolist()
+        >>> result = stack_results([{"rmse": 1.0, "path": [0.0]}, {"rmse": 2.0, "path": [3.0]}], first_only=["path"])
+        >>> result["rmse"].tolist(), result["path"].tolist()
         ([1.0, 2.0], [0.0])
     """
-    return {name: np.asarray(rows[0][name]) if name in shown else np.stack([np.asarray(row[name]) for row in rows])
+    return {name: np.asarray(rows[0][name]) if name in first_only else np.stack([np.asarray(row[name]) for row in rows])
             for name in rows[0]}
 
 
-def slug(label: str, dropped: str = "(),") -> str:
-    """Return a label as part of the name of a task or a file, without the characters that are dropped.
+def slug(label: str, removed: str = "(),") -> str:
+    """Return a label as part of a task or file name: dashes for blanks, without the ``removed`` characters.
 
     Example:
         >>> slug("cubature, whole state"), slug("GHKF(7)")
         ('cubature-whole-state', 'GHKF7')
     """
-    return "".join(one for one in label.replace(" ", "-") if one not in dropped)
+    return "".join(character for character in label.replace(" ", "-") if character not in removed)

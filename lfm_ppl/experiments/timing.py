@@ -1,4 +1,4 @@
-"""What a computation costs."""
+"""CPU time of a computation."""
 
 from __future__ import annotations
 
@@ -9,26 +9,26 @@ from typing import Any
 import jax
 
 
-def timed(run: Callable, *arguments: Any) -> tuple[float, Any]:
-    """Return how many seconds of CPU time, of all threads, a call takes, and its value.
+def time_call(run: Callable, *arguments: Any) -> tuple[float, Any]:
+    """Return the CPU seconds of a call, summed over all threads, and its value.
 
-    Other programs on the same machine do not change it, as they would the time on the wall.
+    Unlike wall-clock time, CPU time does not depend on other programs on the same machine.
     """
-    started = time.process_time()
-    found = run(*arguments)
-    jax.block_until_ready(jax.tree_util.tree_leaves(found))
-    return time.process_time() - started, found
+    start = time.process_time()
+    value = run(*arguments)
+    jax.block_until_ready(jax.tree_util.tree_leaves(value))
+    return time.process_time() - start, value
 
 
-def timed_again(label: str, run: Callable[[], Any]) -> tuple[float, Any]:
-    """Return the same of a call without arguments, which is made once before where none with this label was yet.
+def time_compiled_call(label: str, run: Callable[[], Any]) -> tuple[float, Any]:
+    """Return CPU seconds and value of a call, without compilation.
 
-    What it compiles is not counted then.
+    The first call with a label is made twice and timed the second time.
     """
-    if label not in _made:
-        timed(run)
-        _made.add(label)
-    return timed(run)
+    if label not in _compiled_labels:
+        time_call(run)
+        _compiled_labels.add(label)
+    return time_call(run)
 
 
-_made: set[str] = set()
+_compiled_labels: set[str] = set()

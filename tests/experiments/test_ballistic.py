@@ -15,7 +15,7 @@ from lfm_ppl.experiments.simulated import parameters, states
 from lfm_ppl.experiments.simulated.problem import MOST, posterior, record, true_likelihood, true_z
 from lfm_ppl.experiments.study import TASKS
 
-SMALL = experiment.Settings(
+SMALL = experiment.BallisticSettings(
     runs=2, particle_runs=1, particles=(2_000,), chain_runs=1, drawn_runs=1, draws=200, paths=5, nuts=(2, 10, 10, 1),
     ram=(2, 10, 10, 2))
 
@@ -146,11 +146,11 @@ def made_up(settings):
     return results
 
 
-MADE = experiment.Settings(runs=100, particle_runs=3, particles=(500, 1_000), chain_runs=2, drawn_runs=20)
+MADE = experiment.BallisticSettings(runs=100, particle_runs=3, particles=(500, 1_000), chain_runs=2, drawn_runs=20)
 
 
 def data_of(settings):
-    return experiment.STUDY.gathered(settings, made_up(settings))
+    return experiment.STUDY.collect(settings, made_up(settings))
 
 
 def test_the_tables_hold_what_was_found():
@@ -186,7 +186,7 @@ def test_a_chain_that_stands_still_shows():
     still = next(task.name for task in tasks_of("chains", MADE) if task.settings["sampler"] == "RAM")
     for name, value in (("ess", np.nan), ("r_hat", np.nan), ("sd", 0.0)):
         results[still][name][1] = value
-    row = experiment.agreement(experiment.STUDY.gathered(MADE, results))["RAM"]
+    row = experiment.agreement(experiment.STUDY.collect(MADE, results))["RAM"]
     assert row["least ESS"] == 0 and row["R-hat"] == np.inf and row["sd ratio"] == 0
 
 
@@ -218,7 +218,7 @@ def test_what_is_stored_is_tabulated_and_drawn_without_computing(tmp_path):
 
 
 def test_tasks_have_files_of_their_own():
-    found = experiment.all_tasks(experiment.Settings())
+    found = experiment.all_tasks(experiment.BallisticSettings())
     assert len({task.file for task in found}) == len(found) == 4 * 10 + 50 + 50 + 4 * 20 + 2 * 3 + 10
 
 
@@ -230,12 +230,12 @@ def test_mistakes():
             ({"particles": (0,)}, "particles must be at least 1"), ({"nuts": (2, 10, 10)}, "chains, warm-up, draws"),
             ({"ram": (0, 1, 1, 1)}, "ram: chains must be at least 1")):
         with pytest.raises(ValueError, match=message):
-            experiment.Settings(**wrong)
+            experiment.BallisticSettings(**wrong)
 
 
 @pytest.mark.slow
 def test_the_quick_version_runs_from_end_to_end(tmp_path):
-    found = experiment.STUDY.run(experiment.Settings.quick(runs=2), tmp_path)
+    found = experiment.STUDY.run(experiment.BallisticSettings.quick(runs=2), tmp_path)
     written = experiment.STUDY.save(found, tmp_path)
     assert len(written) == 12 and all(path.stat().st_size > 0 for path in written)
     assert len(found.printed) == 4

@@ -261,7 +261,7 @@ def made_up(settings):
     return results
 
 
-MADE = experiment.Settings(days=3, methods=("SQM", "periodic", "Matern"), integrated=("SQM",), nuts_days=2)
+MADE = experiment.CallCentreSettings(days=3, methods=("SQM", "periodic", "Matern"), integrated=("SQM",), nuts_days=2)
 
 
 def test_scores_are_those_of_the_log_normal_distribution():
@@ -282,7 +282,7 @@ def test_scores_are_those_of_the_log_normal_distribution():
 
 
 def data_of(settings):
-    return experiment.STUDY.gathered(settings, made_up(settings))
+    return experiment.STUDY.collect(settings, made_up(settings))
 
 
 def test_the_tables_hold_what_was_found():
@@ -341,11 +341,11 @@ def test_mistakes(tmp_path):
                            ({"integrated": "SQM"}, "a tuple of different labels, at least one"),
                            ({"weekday": "Thrusday"}, "Did you mean 'Thursday'"), ({"link": "log"}, "link")):
         with pytest.raises(ValueError, match=message):
-            experiment.Settings(**wrong)
+            experiment.CallCentreSettings(**wrong)
     with pytest.raises(ValueError, match="there are 31 test days that are Thursday, 40 are asked for"):
-        experiment.STUDY.run(experiment.Settings(days=40), tmp_path)
+        experiment.STUDY.run(experiment.CallCentreSettings(days=40), tmp_path)
     with pytest.raises(FileNotFoundError, match="there is no file"):
-        experiment.STUDY.run(experiment.Settings(data=str(tmp_path)), tmp_path)
+        experiment.STUDY.run(experiment.CallCentreSettings(data=str(tmp_path)), tmp_path)
 
 
 @pytest.mark.slow
@@ -376,13 +376,14 @@ def test_weighted_draws_are_those_of_a_long_chain():
 def test_the_quick_version_runs_from_end_to_end(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", counts.OverloadWarning)
-        found = experiment.STUDY.run(experiment.Settings.quick(days=1), tmp_path)
+        found = experiment.STUDY.run(experiment.CallCentreSettings.quick(days=1), tmp_path)
     written = experiment.STUDY.save(found, tmp_path)
     assert len(written) == 15 and all(path.stat().st_size > 0 for path in written)
     assert len(found.printed) == 5
 
 
-BOTH = experiment.Settings(days=4, methods=("SQM",), functions=5, draws=2_000, mixed=5, nuts_days=4, nuts=(2, 300, 700))
+BOTH = experiment.CallCentreSettings(days=4, methods=("SQM",), functions=5, draws=2_000, mixed=5, nuts_days=4,
+                                     nuts=(2, 300, 700))
 """Weighted draws and NUTS, on simulated days."""
 
 

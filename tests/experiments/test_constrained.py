@@ -166,7 +166,7 @@ def stored(folder, settings):
 
 
 def test_tables_and_figures_from_stored_results(tmp_path):
-    settings = experiment.Settings(runs=3, patients=4, targets=3, block=2)
+    settings = experiment.ConstrainedSettings(runs=3, patients=4, targets=3, block=2)
     stored(tmp_path, settings)
     found = experiment.STUDY.run(settings, tmp_path)
     assert found.tables["transcription"].loc["delayed MHE, 60 samples", "published"] == 0.0103
@@ -181,13 +181,13 @@ def test_tables_and_figures_from_stored_results(tmp_path):
 
 def test_settings_say_what_is_wrong():
     with pytest.raises(ValueError, match="shapes"):
-        experiment.Settings(shapes=("sine",))
+        experiment.ConstrainedSettings(shapes=("sine",))
     with pytest.raises(ValueError, match="Did you mean 'EP'"):
-        experiment.Settings(methods=("EPP",))
+        experiment.ConstrainedSettings(methods=("EPP",))
     with pytest.raises(ValueError, match="--methods must hold 'EP'"):
-        experiment.Settings(methods=("smoother", "full information"))
+        experiment.ConstrainedSettings(methods=("smoother", "full information"))
     with pytest.raises(ValueError, match="10000 records"):
-        experiment.Settings(runs=10_001)
+        experiment.ConstrainedSettings(runs=10_001)
     assert catalogue.experiment("constrained").study is experiment.STUDY
 
 
@@ -219,7 +219,7 @@ def test_a_window_starts_from_the_earlier_estimate():
 @pytest.mark.slow
 def test_a_little_of_everything(tmp_path):
     """The bounds of the experiment, on few records; the estimates are feasible to the last bit."""
-    found = experiment.STUDY.run(experiment.Settings.quick(), tmp_path)
+    found = experiment.STUDY.run(experiment.ConstrainedSettings.quick(), tmp_path)
     assert len(experiment.STUDY.save(found, tmp_path)) == 11
     assert found.tables["transcription"].loc[["full information", "EP"], "least"].min() >= 0.0
     assert found.tables["transcription"].loc["full information", "largest MSE"] < 0.0103

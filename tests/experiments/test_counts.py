@@ -32,19 +32,19 @@ def test_the_data_are_counted_as_they_are():
 
 def test_settings_are_checked_and_it_is_in_the_catalogue():
     with pytest.raises(ValueError, match="Did you mean 'coal'"):
-        experiment.Settings(problems=("coals",))
+        experiment.CountsSettings(problems=("coals",))
     with pytest.raises(ValueError, match="draws"):
-        experiment.Settings(draws=0)
+        experiment.CountsSettings(draws=0)
     with pytest.raises(FileNotFoundError, match="nowhere"):
         problem.problem(problem.CALLS[0], problem.Size(), 0, "nowhere")
     assert catalogue.experiment("counts").study is experiment.STUDY
     learnt = {f"{name}/parameters": {} for name in problem.NAMES}
-    assert len(experiment.comparing(experiment.Settings(), learnt)) == 7 * 4
+    assert len(experiment.comparing(experiment.CountsSettings(), learnt)) == 7 * 4
 
 
 def made_up(monkeypatch):
     """Settings of one problem, and results whose errors are known."""
-    settings = experiment.Settings(problems=("student-t",), size=problem.Size(rows=4))
+    settings = experiment.CountsSettings(problems=("student-t",), size=problem.Size(rows=4))
     truth = np.array([0.0, 0.1, 5.0, 0.0])
     one = problem.Problem(np.arange(4.0), truth[:, None], np.zeros(4, int), lambda: None, {}, {}, truth)
     monkeypatch.setattr(problem, "problem", lambda *arguments: one)
@@ -61,7 +61,7 @@ def made_up(monkeypatch):
 def test_tables_measure_against_the_reference(monkeypatch):
     """From results that are made up, and errors that are known."""
     settings, results = made_up(monkeypatch)
-    tables = experiment.tables(settings, experiment.STUDY.gathered(settings, results))
+    tables = experiment.tables(settings, experiment.STUDY.collect(settings, results))
     row = tables["accuracy"].frame.loc["student-t, EP"]
     assert row[["less reference", "mean", "sd", "covered"]].tolist() == pytest.approx([-0.5, 0.2, 0.1, 0.75])
     assert row["less reference se"] == 0.01 and np.isnan(row["log Z se"])
@@ -77,7 +77,7 @@ def test_sites_that_did_not_converge_show_and_shorter_data_do_not(monkeypatch):
     """Both are NaN; data of four rows stand beside those of another problem with six."""
     settings, results = made_up(monkeypatch)
     results["student-t/laplace"] |= {"mean": np.array([0.0, np.nan, 0.2, 0.0])}
-    data = dict(experiment.STUDY.gathered(settings, results))
+    data = dict(experiment.STUDY.collect(settings, results))
     data["comparison"] = data["comparison"].pad(dataset=(0, 2))
     table = experiment.tables(settings, data)["accuracy"].frame
     assert np.isnan(table.loc["student-t, Laplace", "mean"]) and table.loc["student-t, Laplace", "covered"] == 0.5

@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 
 from lfm_ppl.engine.task import Task
-from lfm_ppl.experiments.datasets import Kind, cell, part, row
+from lfm_ppl.experiments.datasets import TaskKind, cell, row, select_prefix
 from lfm_ppl.experiments.scores import Estimate, mean_of, rate_of
 
 ENTRIES = {"dataset": "rmse, held", "dataset path": "coverage", "path time": "mean", "": "count, name"}
@@ -24,8 +24,9 @@ def blocks(rule, *ends):
 
 
 def gathered(tasks, entries=ENTRIES, by=("rule",)):
-    kind = Kind(lambda task: made(task.settings["rule"], task.settings["first"], task.settings["last"]), entries, by)
-    return kind.gathered(tasks, {task.name: kind.compute(task) for task in tasks})
+    kind = TaskKind(lambda task: made(task.settings["rule"], task.settings["first"], task.settings["last"]),
+                    entries, by)
+    return kind.collect(tasks, {task.name: kind.compute(task) for task in tasks})
 
 
 def test_blocks_of_data_sets_follow_one_another():
@@ -43,18 +44,18 @@ def test_what_a_cell_lacks_is_missing():
     assert found["rmse"].sizes == {"rule": 2, "dataset": 5}
     assert np.isnan(found["rmse"].sel(rule="CKF").values).tolist() == [False, False, True, True, True]
     assert row(found.sel(rule="CKF"), {"RMSE": "rmse"})["RMSE"] == 100.5
-    kind = Kind(made, {"dataset": "rmse, k"}, ("rule",))
+    kind = TaskKind(made, {"dataset": "rmse, k"}, ("rule",))
     tasks = [Task(rule, 0, {"rule": rule, "index": 0}) for rule in ("EKF", "CKF")]
-    found = kind.gathered(tasks, {"EKF": {"rmse": 1.0}, "CKF": {"rmse": 2.0, "k": 0.5}})
+    found = kind.collect(tasks, {"EKF": {"rmse": 1.0}, "CKF": {"rmse": 2.0, "k": 0.5}})
     assert np.isnan(found.k.sel(rule="EKF")).all() and found.k.sel(rule="CKF").item() == 0.5
-    assert "k" not in kind.gathered(tasks[:1], {"EKF": {"rmse": 1.0}})
+    assert "k" not in kind.collect(tasks[:1], {"EKF": {"rmse": 1.0}})
 
 
 def test_what_is_no_number_is_filled_up_as_well():
     found = gathered([*blocks("EKF", (0, 1)), *blocks("CKF", (0, 0))], {"dataset": "held"})
     assert found["held"].sel(rule="EKF").values.tolist() == [1.0, 0.0] and np.isnan(found["held"].values[1, 1])
     tasks = [Task(rule, 0, {"rule": rule, "index": 0}) for rule in ("EKF", "CKF")]
-    found = Kind(made, {"": "why, k"}, ("rule",)).gathered(tasks, {"EKF": {"why": "a gap"}, "CKF": {"k": 1.0}})
+    found = TaskKind(made, {"": "why, k"}, ("rule",)).collect(tasks, {"EKF": {"why": "a gap"}, "CKF": {"k": 1.0}})
     assert found["why"].values.tolist() == ["a gap", ""]
 
 
@@ -63,24 +64,24 @@ def test_an_entry_that_some_tasks_of_a_cell_lack_is_an_error():
     for lacking in ("EKF/0", "EKF/1"):
         results = {task.name: {} if task.name == lacking else {"k": 1.0} for task in tasks}
         with pytest.raises(ValueError, match=f"'k' is missing in the result of {lacking}"):
-            Kind(made, {"dataset": "k"}, ("rule",)).gathered(tasks, results)
+            TaskKind(made, {"dataset": "k"}, ("rule",)).collect(tasks, results)
 
 
 def test_several_settings_become_dimensions():
     tasks = [Task(f"{store}/{rule}/{index}", 0, {"store": store, "rule": rule, "index": index})
              for index in range(3) for store, rule in (("one", "EKF"), ("one", "CKF"), ("two", "CKF"))]
     results = {task.name: {"rmse": float(task.settings["index"])} for task in tasks}
-    found = Kind(made, {"dataset": "rmse"}, ("store", "rule")).gathered(tasks, results)
+    found = TaskKind(made, {"dataset": "rmse"}, ("store", "rule")).collect(tasks, results)
     assert found["rmse"].sizes == {"store": 2, "rule": 2, "dataset": 3}
     assert found["rmse"].sel(store="two", rule="CKF").values.tolist() == [0.0, 1.0, 2.0]
     assert np.isnan(found["rmse"].sel(store="two", rule="EKF")).all()
-    alone = Kind(made, {"dataset": "rmse"}).gathered(tasks[:1], results)
+    alone = TaskKind(made, {"dataset": "rmse"}).collect(tasks[:1], results)
     assert alone["rmse"].sizes == {"dataset": 1}
 
 
 def test_a_part_has_the_names_without_what_they_begin_with():
     found = xr.Dataset({"filter_rmse": 1.0, "filter_sd": 2.0, "filters": 3.0, "smoother_rmse": 4.0})
-    assert {name: value.item() for name, value in part(found, "filter").items()} == {"rmse": 1.0, "sd": 2.0}
+    assert {name: value.item() for name, value in select_prefix(found, "filter").items()} == {"rmse": 1.0, "sd": 2.0}
 
 
 def test_a_row_has_means_shares_and_numbers():

@@ -9,7 +9,7 @@ from lfm_ppl.experiments.ginzburg_landau import experiment, figures, parameters,
 from lfm_ppl.experiments.study import TASKS
 from lfm_ppl.experiments.tasks import slug
 
-SMALL = experiment.Settings(
+SMALL = experiment.GinzburgLandauSettings(
     realisations=1, conditional=2, particles=200, smoother_particles=50, smoother_draws=20, conditional_particles=50,
     cells=96, draw_cells=48, nodes=5, paths=4, marginal_particles=20, marginal_steps=4, ram=(4, 6, 2), nuts=(4, 6, 1),
     pmmh=(4, 6, 1), tree_depth=2)
@@ -50,7 +50,7 @@ def test_every_method_has_conditional_posteriors(method):
     result = parameters.conditional(computed)
     values = result["log_likelihood"]
     assert values.shape == (2, 3, 5) and np.isfinite(values).mean() > 0.8
-    gathered = experiment.STUDY.kinds["conditional"].gathered([computed], {computed.name: result})
+    gathered = experiment.STUDY.kinds["conditional"].collect([computed], {computed.name: result})
     found = parameters.outcomes(gathered).sel({"method": method})
     assert found["outside"].shape == (2, 3)
     np.testing.assert_array_equal(found["outside"], np.abs(found["below"] - 0.5) > 0.495)
@@ -87,28 +87,28 @@ def test_the_law_of_total_variance():
 
 def test_draws_are_spread_over_all_chains():
     draws = np.arange(24.0).reshape(3, 2, 4)
-    chosen = scores.spread(draws, 2)
+    chosen = scores.thin_draws(draws, 2)
     np.testing.assert_array_equal(chosen, [[0.0, 8.0, 16.0], [7.0, 15.0, 23.0]])
 
 
 def test_names_of_tasks_and_files_differ():
-    found = experiment.all_tasks(experiment.Settings())
+    found = experiment.all_tasks(experiment.GinzburgLandauSettings())
     assert len({one.file for one in found}) == len(found) == 5 * 20 + 5 * 10 + 1 + 4 * 20
 
 
 def test_more_realisations_keep_the_tasks_of_fewer():
-    few = {one.name: one.record() for one in experiment.all_tasks(experiment.Settings(20, 100))}
-    many = {one.name: one.record() for one in experiment.all_tasks(experiment.Settings(30, 150))}
+    few = {one.name: one.record() for one in experiment.all_tasks(experiment.GinzburgLandauSettings(20, 100))}
+    many = {one.name: one.record() for one in experiment.all_tasks(experiment.GinzburgLandauSettings(30, 150))}
     assert all(many[name] == record for name, record in few.items())
 
 
 def test_settings_are_checked():
     with pytest.raises(ValueError, match="realisations must be at least 1"):
-        experiment.Settings(realisations=0)
+        experiment.GinzburgLandauSettings(realisations=0)
     with pytest.raises(ValueError, match="nodes must be at least 4"):
-        experiment.Settings(nodes=3)
+        experiment.GinzburgLandauSettings(nodes=3)
     with pytest.raises(ValueError, match="use several seeds"):
-        experiment.Settings(conditional=20_000)
+        experiment.GinzburgLandauSettings(conditional=20_000)
 
 
 def made_up(settings):
@@ -144,11 +144,11 @@ def made_up(settings):
     return results
 
 
-MADE = experiment.Settings(realisations=3, conditional=12, nodes=41)
+MADE = experiment.GinzburgLandauSettings(realisations=3, conditional=12, nodes=41)
 
 
 def data_of(settings):
-    return experiment.STUDY.gathered(settings, made_up(settings))
+    return experiment.STUDY.collect(settings, made_up(settings))
 
 
 def test_the_tables_count_what_was_found():
@@ -202,13 +202,13 @@ def test_a_folder_of_other_settings_is_refused(tmp_path):
     results = made_up(MADE)
     for one in experiment.all_tasks(MADE):
         write(one, results[one.name], tmp_path / TASKS)
-    other = experiment.Settings(realisations=3, conditional=12, nodes=41, seed=1)
+    other = experiment.GinzburgLandauSettings(realisations=3, conditional=12, nodes=41, seed=1)
     with pytest.raises(ValueError, match="seed is 0 there and 1 now"):
         experiment.STUDY.run(other, tmp_path)
 
 
 @pytest.mark.slow
 def test_the_quick_version_runs_from_end_to_end(tmp_path):
-    found = experiment.STUDY.run(experiment.Settings.quick(realisations=1, conditional=2), tmp_path)
+    found = experiment.STUDY.run(experiment.GinzburgLandauSettings.quick(realisations=1, conditional=2), tmp_path)
     assert found.tables["comparison"].loc["grid, true parameters", "RMSE smoother"] < 1.5
     assert len(experiment.STUDY.save(found, tmp_path)) == 11

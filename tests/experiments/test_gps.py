@@ -9,7 +9,7 @@ import pytest
 
 from lfm_ppl import orbits
 from lfm_ppl.experiments.gps import experiment, figures, problem, ways
-from lfm_ppl.experiments.study import Found
+from lfm_ppl.experiments.study import StudyResult
 from lfm_ppl.orbits import magnitudes, prediction
 from lfm_ppl.orbits.arc import Unusable
 
@@ -38,7 +38,7 @@ def learnt(value=0.0, orbit=range(8)):
 
 
 def compute(task):
-    return experiment.STUDY.kinds[experiment.STUDY.what(task)].compute(task)
+    return experiment.STUDY.kinds[experiment.STUDY.task_kind(task)].compute(task)
 
 
 @pytest.fixture
@@ -47,16 +47,16 @@ def gather(monkeypatch):
     def gather(predicted, others=None):
         positions, others = {name: np.ones((960, 3)) for name in predicted}, others or {}
         monkeypatch.setattr(problem, "arcs", lambda folder, seed=0: problem.Arcs(None, TIMES, positions, None))
-        settings = experiment.Settings(alternatives=sum(name.startswith("ways/") for name in others))
+        settings = experiment.GpsSettings(alternatives=sum(name.startswith("ways/") for name in others))
         results = {f"learn/{name}": learnt() for name in predicted}
         results |= {f"predict/{name}": one for name, one in predicted.items()}
-        return settings, experiment.STUDY.gathered(settings, results | others)
+        return settings, experiment.STUDY.collect(settings, results | others)
 
     return gather
 
 
 def test_each_satellite_is_learnt_then_predicted_with_what_all_have_in_common(data):
-    settings = experiment.Settings(data="folder", alternatives=2)
+    settings = experiment.GpsSettings(data="folder", alternatives=2)
     first = experiment.plan(settings)
     assert [task.name for task in first] == ["learn/G01", "learn/G02", "learn/G04"]
     assert first[0].settings["train_days"] == 3.0 and first[0].settings["positions"] == first[1].settings["positions"]
@@ -67,31 +67,31 @@ def test_each_satellite_is_learnt_then_predicted_with_what_all_have_in_common(da
     mean, sd = second[0].settings["prior"]
     assert (mean, sd) == tuple(values.tolist() for values in magnitudes.wide("DYB"))  # two do not say what is common
     assert np.allclose(second[-1].settings["windows"], [[5.0, 5.25], [7.0, 7.25]], atol=0.01)
-    few = experiment.plan(experiment.Settings(data="folder", satellites=("G02",), alternatives=0))
+    few = experiment.plan(experiment.GpsSettings(data="folder", satellites=("G02",), alternatives=0))
     assert [task.name for task in few] == ["learn/G02"]
 
 
 def test_other_positions_are_another_task(data):
-    before = experiment.plan(experiment.Settings(data="folder"))[0].settings["positions"]
+    before = experiment.plan(experiment.GpsSettings(data="folder"))[0].settings["positions"]
     data.positions["G01"][7, 1] += 1e-6
-    assert experiment.plan(experiment.Settings(data="folder"))[0].settings["positions"] != before
+    assert experiment.plan(experiment.GpsSettings(data="folder"))[0].settings["positions"] != before
 
 
 def test_what_is_asked_must_be_there(data):
     with pytest.raises(ValueError, match="unknown satellite 'G99'"):
-        experiment.plan(experiment.Settings(data="folder", satellites=("G99",)))
+        experiment.plan(experiment.GpsSettings(data="folder", satellites=("G99",)))
     with pytest.raises(ValueError, match=r"training takes 12 days, but the data have 10,.*take fewer \(--train-days\)"):
-        experiment.plan(experiment.Settings(data="folder", train_days=12.0))
+        experiment.plan(experiment.GpsSettings(data="folder", train_days=12.0))
     with pytest.raises(ValueError, match="half a day is the least"):
-        experiment.plan(experiment.Settings(data="folder", train_days=0.2))
+        experiment.plan(experiment.GpsSettings(data="folder", train_days=0.2))
     with pytest.raises(ValueError, match="each of them once"):
-        experiment.plan(experiment.Settings(data="folder", satellites=("G01", "G01")))
+        experiment.plan(experiment.GpsSettings(data="folder", satellites=("G01", "G01")))
     with pytest.raises(ValueError, match="axes"):
-        experiment.Settings(axes="XYZ")
-    few = experiment.plan(experiment.Settings.quick(data="folder"))
+        experiment.GpsSettings(axes="XYZ")
+    few = experiment.plan(experiment.GpsSettings.quick(data="folder"))
     assert [task.name for task in few] == ["learn/G01", "learn/G02"]
     with pytest.raises(ValueError, match="train_days"):
-        experiment.Settings(train_days=-1.0)
+        experiment.GpsSettings(train_days=-1.0)
 
 
 def test_a_satellite_without_positions_in_training_is_refused_with_the_reason(data):
@@ -99,7 +99,7 @@ def test_a_satellite_without_positions_in_training_is_refused_with_the_reason(da
         data.arc("G04", 3.0)
     one = data.arc("G01", 3.0)
     assert one.train == 288 and np.isnan(one.learnt()[288:]).all() and np.isfinite(one.learnt()[:288]).all()
-    task = experiment.plan(experiment.Settings(data="folder", satellites=("G04",)))[0]
+    task = experiment.plan(experiment.GpsSettings(data="folder", satellites=("G04",)))[0]
     assert "G04" in compute(task)["refused"]
 
 
@@ -110,14 +110,14 @@ def test_a_gap_at_the_end_of_training_refuses_one_satellite(data, monkeypatch):
     for module in (orbits, prediction):
         monkeypatch.setattr(module, "fit_orbit", lambda around, times, positions, solar=None: orbits.Orbit(
             0.0, orbits.deterministic.polynomial_state(times, positions)[0], 100.0, 0.0))
-    task = experiment.plan(experiment.Settings(data="folder", satellites=("G01",)))[0]
+    task = experiment.plan(experiment.GpsSettings(data="folder", satellites=("G01",)))[0]
     assert "G01: the start of an orbit is taken from its first 9 positions; there are 6" in str(
         compute(task)["refused"])
 
 
 def test_only_refused_satellites_are_an_error(data, tmp_path):
     with pytest.raises(ValueError, match="no satellite can be predicted. G04: 0%"):
-        experiment.STUDY.run(experiment.Settings(data="folder", satellites=("G04",)), tmp_path)
+        experiment.STUDY.run(experiment.GpsSettings(data="folder", satellites=("G04",)), tmp_path)
 
 
 def test_a_folder_without_files_says_so(tmp_path):
@@ -158,7 +158,7 @@ def test_an_orbit_that_is_too_low_is_refused(data, monkeypatch):
     low = orbits.Orbit(0.0, np.array([7_000.0, 0.0, 0.0, 0.0, 27_000.0, 0.0]), 100.0, 1e-3)
     for module in (orbits, prediction):
         monkeypatch.setattr(module, "fit_orbit", lambda environment, times, positions, solar=None: low)
-    task = experiment.plan(experiment.Settings(data="folder", satellites=("G01",)))[0]
+    task = experiment.plan(experiment.GpsSettings(data="folder", satellites=("G01",)))[0]
     assert "G01: it turns in 1.6 h; positions and steps are too far apart" in str(compute(task)["refused"])
 
 
@@ -203,7 +203,7 @@ def test_what_is_refused_is_left_out_and_said(gather):
 def test_tables_are_written_with_their_text(gather, tmp_path):
     settings, data = gather({"G01": result(10.0), "G02": result(20.0, eclipsed=True)})
     plain = dataclasses.replace(experiment.STUDY, figures=lambda settings, data: {})
-    plain.save(Found(settings, {}, data, experiment.tables(settings, data)), tmp_path)
+    plain.save(StudyResult(settings, {}, data, experiment.tables(settings, data)), tmp_path)
     assert "| yes " in (tmp_path / "satellites.md").read_text() and ",no," in (tmp_path / "satellites.csv").read_text()
 
 
@@ -238,7 +238,7 @@ def test_table_of_the_ways_to_learn(gather):
 def test_a_simulated_satellite_is_predicted_better_with_its_forces(tmp_path):
     """One satellite, all kinds of tasks; what is stored is not computed again."""
     pytest.importorskip("erfa", reason="needs the extra gps")
-    settings = experiment.Settings(satellites=(problem.SIMULATED[0],), alternatives=1)
+    settings = experiment.GpsSettings(satellites=(problem.SIMULATED[0],), alternatives=1)
     found = experiment.STUDY.run(settings, tmp_path)
     row = found.tables["satellites"].loc[problem.SIMULATED[0]]
     assert row["LFM"] < 0.3 * row["deterministic"] and 0.6 < row["coverage"] <= 1.0

@@ -72,7 +72,7 @@ def constellation(letter, count, radius, inclination, seed=0):
 
 
 def compute(task):
-    return experiment.STUDY.kinds[experiment.STUDY.what(task)].compute(task)
+    return experiment.STUDY.kinds[experiment.STUDY.task_kind(task)].compute(task)
 
 
 @pytest.mark.slow
@@ -82,14 +82,14 @@ def test_days_of_other_constellations_are_predicted_within_a_tenth_of_the_determ
         letter, radius, inclination, period, monkeypatch):
     data = constellation(letter, 6, radius, inclination)
     monkeypatch.setattr(problem, "arcs", lambda folder, seed=0: data)
-    settings = experiment.Settings(alternatives=0)
+    settings = experiment.GpsSettings(alternatives=0)
     results = {task.name: compute(task) for task in experiment.plan(settings)}
     for task in experiment.plan_predictions(settings, results):
         results[task.name] = compute(task)
         orbit = orbits.Orbit(0.0, np.array(task.settings["orbit"][:6]), *task.settings["orbit"][6:])
         near = orbits.Neighbourhood.of(data.environment, orbit, data.times[:96])
         assert float(near.period) == pytest.approx(period, abs=0.01)
-    found = experiment.STUDY.gathered(settings, results)
+    found = experiment.STUDY.collect(settings, results)
     each = experiment.satellites(found)
     assert list(each.index) == list(data.positions) and "left out" not in found
     assert (each["ratio"] < 0.1).all(), each[["deterministic", "LFM", "ratio"]].to_string()

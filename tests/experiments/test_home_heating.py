@@ -14,8 +14,8 @@ from lfm_ppl.experiments.home_heating import experiment, figures, prediction, pr
 from lfm_ppl.experiments.home_heating.problem import Model
 
 REAL = problem.data_folder()
-SMALL = experiment.Settings(homes=2, methods=("SQM", "none", "matern"), stores=("one store",), functions=3,
-                            particles=50)
+SMALL = experiment.HomeHeatingSettings(homes=2, methods=("SQM", "none", "matern"), stores=("one store",), functions=3,
+                                       particles=50)
 
 
 @pytest.fixture(scope="module")
@@ -146,7 +146,7 @@ def made_up(settings):
 
 
 def test_tables_of_simulated_homes(window):
-    data = experiment.STUDY.gathered(SMALL, made_up(SMALL))
+    data = experiment.STUDY.collect(SMALL, made_up(SMALL))
     found = experiment.tables(SMALL, data)
     assert [name for name, table in found.items() if table.stored] == ["homes-one-store"]
     table = found["homes-one-store"].frame
@@ -162,8 +162,8 @@ def test_tables_of_simulated_homes(window):
 
 @pytest.mark.skipif(REAL is None, reason="needs ../shared/data/house")
 def test_tables_and_figures_with_the_real_house(window, tmp_path):
-    settings = experiment.Settings(data=str(REAL), homes=2, windows=3, methods=SMALL.methods, every=2)
-    found = experiment.STUDY.found(settings, made_up(settings))
+    settings = experiment.HomeHeatingSettings(data=str(REAL), homes=2, windows=3, methods=SMALL.methods, every=2)
+    found = experiment.STUDY.tabulate(settings, made_up(settings))
     assert list(found.tables) == ["house-one-store", "homes-one-store", "posterior", "house-envelope",
                                   "homes-envelope"]
     integrated = found.tables["posterior"].loc["integrated out by NUTS"]
@@ -174,30 +174,31 @@ def test_tables_and_figures_with_the_real_house(window, tmp_path):
     assert np.isnan(envelope.loc["matern", "published RMSE ahead (K)"])
     assert scores.readable(one).loc["none", "RMSE below none (K)"] == "0"
     swapped = dataclasses.replace(settings, stores=("envelope", "one store"))
-    again = experiment.STUDY.found(swapped, made_up(swapped)).tables["house-one-store"]
+    again = experiment.STUDY.tabulate(swapped, made_up(swapped)).tables["house-one-store"]
     assert again.loc["none", "published ELL tracked"] == 31
     written = {path.name for path in experiment.STUDY.save(found, tmp_path)}
     assert {"house-ahead.png", "homes-ahead.png", "residual.png", "scores.png", "house-envelope.md"} <= written
-    assert "2 windows" in found.named["posterior"].title
-    assert "3 windows" in found.named["house-envelope"].title
+    assert "2 windows" in found.study_tables["posterior"].title
+    assert "3 windows" in found.study_tables["house-envelope"].title
 
 
 @pytest.mark.parametrize("given", [{"homes": 0}, {"windows": 0}, {"methods": ("ARX",)}, {"stores": ("two",)},
                                    {"integrated": "WQM", "methods": ("SQM",)}])
 def test_bad_settings(given):
     with pytest.raises(ValueError):
-        experiment.Settings(**given)
+        experiment.HomeHeatingSettings(**given)
 
 
 def test_a_residual_that_is_not_in_the_published_figure_is_drawn():
     settings = dataclasses.replace(SMALL, methods=("WQM",), integrated="WQM")
-    data = experiment.STUDY.gathered(settings, made_up(settings))
+    data = experiment.STUDY.collect(settings, made_up(settings))
     assert set(figures.draw(settings, data)) == {"homes-ahead", "scores"}
 
 
 @pytest.mark.slow
 def test_the_quick_version_runs_and_goes_on(tmp_path):
-    settings = experiment.Settings.quick(data=None if REAL is None else str(REAL), methods=("SQM", "none"), homes=1)
+    settings = experiment.HomeHeatingSettings.quick(
+        data=None if REAL is None else str(REAL), methods=("SQM", "none"), homes=1)
     first = experiment.STUDY.run(settings, tmp_path)
     lines: list[str] = []
     again = experiment.STUDY.run(settings, tmp_path, report=lines.append)

@@ -7,7 +7,7 @@ from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import catalogue
 from lfm_ppl.experiments.periodic_kernels import experiment, figures, methods, problem
 
-SMALL = experiment.Settings(runs=20, functions=(5, 22), draws=20, points=(20, 200))
+SMALL = experiment.PeriodicKernelSettings(runs=20, functions=(5, 22), draws=20, points=(20, 200))
 
 
 @pytest.fixture(scope="module")
@@ -61,10 +61,10 @@ def test_prediction_is_conditioning():
 
 def test_settings_are_checked():
     with pytest.raises(ValueError, match="increasing numbers"):
-        experiment.Settings(functions=(5, 3))
+        experiment.PeriodicKernelSettings(functions=(5, 3))
     with pytest.raises(ValueError, match="at most 200"):
-        experiment.Settings(functions=(500,))
-    assert experiment.Settings.quick(runs=3).runs == 3
+        experiment.PeriodicKernelSettings(functions=(500,))
+    assert experiment.PeriodicKernelSettings.quick(runs=3).runs == 3
 
 
 @pytest.mark.slow

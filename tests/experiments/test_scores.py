@@ -16,14 +16,14 @@ def test_a_gaussian_posterior_has_its_closed_form(nodes):
     np.testing.assert_allclose(posterior.quantile(p), stats.norm.ppf(p, mean, sd), atol=2e-4 * sd + 1e-3 * sd)
     np.testing.assert_allclose([posterior.mean, posterior.sd], [mean, sd], rtol=1e-4)
     np.testing.assert_allclose(posterior.below(mean + sd), stats.norm.cdf(1.0), atol=2e-4)
-    assert not posterior.cut()
+    assert not posterior.is_cut_off()
 
 
 def test_a_truncated_exponential_is_cut_and_right():
     nodes = np.linspace(0.0, 3.0, 25)
     posterior = scores.GridPosterior(nodes, -nodes)
     truth = stats.truncexpon(3.0)
-    assert posterior.cut()
+    assert posterior.is_cut_off()
     np.testing.assert_allclose(posterior.below(1.0), truth.cdf(1.0), atol=1e-5)
     np.testing.assert_allclose(posterior.mean, truth.mean(), atol=1e-5)
 
@@ -54,7 +54,7 @@ def test_what_is_no_posterior_is_refused():
         scores.GridPosterior([0.0, 1.0, 1.0, 2.0], np.zeros(4))
     with pytest.raises(ValueError, match="shape of nodes"):
         scores.GridPosterior(np.arange(5.0), np.zeros(4))
-    with pytest.raises(ValueError, match="nowhere finite"):
+    with pytest.raises(ValueError, match="not finite at any node"):
         scores.GridPosterior(np.arange(5.0), np.full(5, -np.inf))
 
 
@@ -89,9 +89,9 @@ def test_estimates_show_as_many_digits_as_the_error_leaves():
 
 def test_errors_and_coverage():
     assert scores.rmse([1.0, 3.0], [0.0, 0.0]) == pytest.approx(np.sqrt(5.0))
-    assert scores.covered([0.0, 0.0], [1.0, 1.0], [0.5, 2.0]) == 0.5
+    assert scores.interval_coverage([0.0, 0.0], [1.0, 1.0], [0.5, 2.0]) == 0.5
     mean, sd = np.array([[0.0, 1.0, 2.0], [1.0, 1.0, 1.0]]), np.array([[1.0, 1.0, 1.0], [0.1, 1.0, 1.0]])
-    found = scores.judged("smoother", mean, scores.interval(mean, sd), [1.0, 1.0, 5.0])
+    found = scores.score_path("smoother", mean, scores.interval(mean, sd), [1.0, 1.0, 5.0])
     np.testing.assert_allclose(found["smoother_rmse"], np.sqrt([10.0 / 3.0, 16.0 / 3.0]))
     np.testing.assert_allclose(found["smoother_coverage"], [2.0 / 3.0, 2.0 / 3.0])
 

@@ -9,14 +9,14 @@ import pytest
 
 from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import drawing, published, study, timing
-from lfm_ppl.experiments.datasets import Kind, row
+from lfm_ppl.experiments.datasets import TaskKind, row
 from lfm_ppl.experiments.scores import Estimate
-from lfm_ppl.experiments.study import Study, Table, setting
+from lfm_ppl.experiments.study import Study, StudyTable, setting
 from lfm_ppl.results.plots import style
 
 
 @dataclass(frozen=True)
-class Settings(study.Settings):
+class ExampleSettings(study.StudySettings):
     """One field of each kind."""
 
     runs: int = setting(5, "numbers", quick=2, aliases=study.REALISATIONS, per_seed=100)
@@ -41,9 +41,9 @@ def later(settings, results):
 
 def tabulated(settings, data):
     rows = {"all": row(data["square"], {"mean": "value", "sum": lambda squares: data["sum"]["value"]})}
-    frame = Table.of("Squares", rows).frame
-    return {"squares": Table("Squares", frame), "hidden": Table("", frame),
-            "only printed": Table("Left out", frame, frame, stored=False)}
+    frame = StudyTable.from_rows("Squares", rows).frame
+    return {"squares": StudyTable("Squares", frame), "hidden": StudyTable("", frame),
+            "only printed": StudyTable("Left out", frame, frame, stored=False)}
 
 
 @style.styled
@@ -58,15 +58,15 @@ def plot(*, width="column"):
 
 
 STUDY = Study(
-    Settings, tasks, {
-        "square": Kind(lambda task: {"value": task.settings["number"] ** 2}, {"dataset": "value"}),
-        "sum": Kind(lambda task: {"value": sum(task.settings["of"])}, {"": "value"})},
-    tabulated, lambda settings, data: {"squares": plot()}, {"number": ("dataset", range(4))}, then=later,
+    ExampleSettings, tasks, {
+        "square": TaskKind(lambda task: {"value": task.settings["number"] ** 2}, {"dataset": "value"}),
+        "sum": TaskKind(lambda task: {"value": sum(task.settings["of"])}, {"": "value"})},
+    tabulated, lambda settings, data: {"squares": plot()}, {"number": ("dataset", range(4))}, follow_up_tasks=later,
     notes=lambda settings, data: (f"{data['square'].sizes['dataset']} squares",))
 
 
 def test_a_run_computes_tabulates_and_draws_and_goes_on(tmp_path):
-    found = STUDY.run(Settings.quick(runs=4), tmp_path)
+    found = STUDY.run(ExampleSettings.quick(runs=4), tmp_path)
     assert found.tables["squares"].loc["all", ["mean", "sum"]].tolist() == [3.5, 14.0]
     assert list(found.tables) == ["squares", "hidden"] and list(found.printed) == ["Squares", "Left out"]
     assert found.printed["Squares"].loc["all", "mean"] == "3.5 (2.0)"  # of 0, 1, 4 and 9
@@ -76,11 +76,11 @@ def test_a_run_computes_tabulates_and_draws_and_goes_on(tmp_path):
     written = STUDY.save(found, tmp_path)
     assert [path.name for path in written] == ["squares.csv", "squares.md", "hidden.csv", "hidden.md", "squares.png"]
     lines = []
-    again = STUDY.run(Settings.quick(runs=4), tmp_path, report=lines.append)
+    again = STUDY.run(ExampleSettings.quick(runs=4), tmp_path, report=lines.append)
     assert lines == ["4 of 4 tasks are stored already", "1 of 1 tasks are stored already"]
     assert again.tables["squares"].equals(found.tables["squares"])
     with pytest.raises(ValueError, match="seed is 0 there and 1 now"):
-        STUDY.run(Settings.quick(runs=4, seed=1), tmp_path)
+        STUDY.run(ExampleSettings.quick(runs=4, seed=1), tmp_path)
 
 
 def test_what_is_checked_first_is_told_before_anything_is_computed(tmp_path):
@@ -88,28 +88,29 @@ def test_what_is_checked_first_is_told_before_anything_is_computed(tmp_path):
         raise FileNotFoundError("there are no data")
 
     with pytest.raises(FileNotFoundError, match="no data"):
-        dataclasses.replace(STUDY, check=check).run(Settings(), tmp_path)
+        dataclasses.replace(STUDY, check=check).run(ExampleSettings(), tmp_path)
     assert not list(tmp_path.iterdir())
 
 
 def test_the_quick_version_keeps_what_is_given():
-    assert Settings.quick() == Settings(runs=2, counts=(2,), size=2j)
-    assert Settings.quick(runs=7, seed=3) == Settings(runs=7, counts=(2,), size=2j, seed=3)
-    assert Settings.chosen(None, True, runs=7) == Settings.quick(runs=7) and Settings.chosen(None) == Settings()
+    assert ExampleSettings.quick() == ExampleSettings(runs=2, counts=(2,), size=2j)
+    assert ExampleSettings.quick(runs=7, seed=3) == ExampleSettings(runs=7, counts=(2,), size=2j, seed=3)
+    assert ExampleSettings.from_command_line(None, True, runs=7) == ExampleSettings.quick(runs=7)
+    assert ExampleSettings.from_command_line(None) == ExampleSettings()
 
 
 def test_the_options_are_the_fields():
-    found = {one.name: one for one in study.options(Settings)}
+    found = {one.name: one for one in study.options(ExampleSettings)}
     assert list(found) == ["runs", "left_out", "scale", "kind", "most", "names", "counts", "nuts", "data", "seed"]
     assert found["runs"].flags == ["--runs", "--realisations", "--datasets"]
     assert found["left_out"].flags == ["--left-out"]
-    assert (found["names"].kind, found["names"].many, found["names"].optional) == (str, True, False)
-    assert (found["nuts"].kind, found["nuts"].many) == (int, False)
-    assert (found["most"].kind, found["most"].optional, found["most"].default) == (int, True, None)
+    assert (found["names"].value_type, found["names"].is_sequence, found["names"].is_optional) == (str, True, False)
+    assert (found["nuts"].value_type, found["nuts"].is_sequence) == (int, False)
+    assert (found["most"].value_type, found["most"].is_optional, found["most"].default) == (int, True, None)
 
 
 @pytest.mark.parametrize("wrong, message", [
-    ({"runs": 0}, "runs must be at least 1"), ({"runs": 101}, "one seed has 100 records .* several seeds"),
+    ({"runs": 0}, "runs must be at least 1"), ({"runs": 101}, "one seed has 100 data sets; use several seeds"),
     ({"left_out": -1}, "left_out must be at least 0"), ({"scale": 0.0}, "scale must be finite and greater than zero"),
     ({"kind": "od"}, "Did you mean 'odd'"), ({"most": 0}, "most must be at least 1"),
     ({"names": ()}, "names must be a tuple of different labels"), ({"names": "ab"}, "a tuple of different labels"),
@@ -119,20 +120,20 @@ def test_the_options_are_the_fields():
     ({"seed": -1}, "seed must be at least 0")])
 def test_settings_say_what_is_wrong(wrong, message):
     with pytest.raises(ValueError, match=message):
-        Settings(**wrong)
+        ExampleSettings(**wrong)
 
 
 @pytest.mark.parametrize("wrong", [{"runs": 2.5}, {"runs": "2"}, {"left_out": 0.5}, {"counts": (1.5,)}])
 def test_what_is_no_whole_number_is_refused(wrong):
     with pytest.raises(TypeError, match="must be a whole number"):
-        Settings(**wrong)
+        ExampleSettings(**wrong)
 
 
 def test_what_is_compiled_at_the_first_call_is_not_timed():
     calls = []
     for label in ("a test", "another test", "a test"):
         calls.append(label)
-        seconds, found = timing.timed_again(label, lambda: calls.append("called") or len(calls))
+        seconds, found = timing.time_compiled_call(label, lambda: calls.append("called") or len(calls))
         assert seconds >= 0.0 and found == len(calls)
     assert calls == ["a test", "called", "called", "another test", "called", "called", "a test", "called"]
 
@@ -145,9 +146,9 @@ def test_a_legend_has_each_label_once():
 def test_published_errors_have_errors_of_their_own():
     frame = pd.DataFrame({"RMSE": [1.0, 2.0, 3.0, 4.0], "RMSE se": [0.3, 0.3, 0.3, np.nan],
                           "source": [4.0, 2.5, np.nan, 1.0], "source se": [0.4, 0.4, np.nan, 0.4]}, list("abcd"))
-    found = published.beside(frame, "RMSE", "source")
+    found = published.compare_with_published(frame, "RMSE", "source")
     assert {row: str(one) for row, one in found.items()} == {
         "a": "lower than published (z = -6.0)", "b": "consistent", "d": "-"}
-    assert published.said("RMSE", found) == (
+    assert published.describe_comparisons("RMSE", found) == (
         "RMSE: 2 of 2 cells count as consistent with the published table, 1 of them lower than published; 0 higher. a: "
         "lower than published (z = -6.0).")

@@ -14,13 +14,13 @@ from scipy.integrate import solve_ivp
 from lfm_ppl.engine.store import write
 from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import scores
-from lfm_ppl.experiments.published import Verdict
+from lfm_ppl.experiments.published import PublishedComparison
 from lfm_ppl.experiments.study import TASKS
 from lfm_ppl.experiments.transcription import experiment, figures, problem, slices
 from lfm_ppl.latent_grid.laplace import laplace
 
 SATURATION, EXPONENTIAL = problem.CONFIGURATIONS[1], problem.CONFIGURATIONS[6]
-FEW = experiment.Settings(datasets=12, draws=400, burn_in=40)
+FEW = experiment.TranscriptionSettings(datasets=12, draws=400, burn_in=40)
 
 
 def test_the_configurations_are_those_of_the_source_and_softplus():
@@ -198,7 +198,7 @@ def made_up(settings):
 
 
 def data_of(settings):
-    return experiment.STUDY.gathered(settings, made_up(settings))
+    return experiment.STUDY.collect(settings, made_up(settings))
 
 
 def test_the_tables_count_what_was_found():
@@ -227,9 +227,9 @@ def test_the_tables_count_what_was_found():
     (-4.3, "lower than published (z = -4.3)", True), (-31.0, "lower than published (z = -31.0)", True),
     (4.3, "higher than published (z = 4.3)", False), (np.nan, "-", False)])
 def test_a_verdict_is_two_sided_and_lower_is_consistent(z, text, consistent):
-    one = Verdict(z)
-    assert str(one) == text and one.consistent is consistent
-    assert one.lower == text.startswith("lower") and one.higher == text.startswith("higher")
+    one = PublishedComparison(z)
+    assert str(one) == text and one.is_consistent is consistent
+    assert one.is_lower == text.startswith("lower") and one.is_higher == text.startswith("higher")
 
 
 def test_each_published_cell_has_its_verdict():
@@ -262,8 +262,8 @@ def test_each_published_cell_has_its_verdict():
 def test_a_killed_run_ends_with_the_same_table(tmp_path, monkeypatch):
     """The experiment itself, stopped after three tasks and started again: the same tables but for the times."""
     monkeypatch.setattr(experiment, "METHODS", ("LA", "ESLS", "GFS"))
-    settings = experiment.Settings(datasets=2, draws=400, burn_in=40,
-                                   configurations=(SATURATION.label, EXPONENTIAL.label))
+    settings = experiment.TranscriptionSettings(datasets=2, draws=400, burn_in=40,
+                                                configurations=(SATURATION.label, EXPONENTIAL.label))
     whole = experiment.STUDY.run(settings, tmp_path / "whole")
     compute, done = experiment.compute, []
 
@@ -308,7 +308,7 @@ def test_what_is_stored_is_tabulated_and_drawn_without_computing(tmp_path):
 
 
 def test_the_report_says_how_many_cells_are_consistent_and_why_lower_ones_are_trusted(tmp_path):
-    settings = experiment.Settings(datasets=2, configurations=(EXPONENTIAL.label,))
+    settings = experiment.TranscriptionSettings(datasets=2, configurations=(EXPONENTIAL.label,))
     results = made_up(settings)
     for one in experiment.all_tasks(settings):
         results[one.name]["rmse"] = results[one.name]["rmse"] + [0.0, 1e-3]
@@ -329,18 +329,18 @@ def test_the_figures_are_labelled():
 
 
 def test_blocks_of_more_data_sets_hold_those_of_fewer():
-    few = {one.name: one.record() for one in experiment.all_tasks(experiment.Settings(datasets=20))}
-    many = {one.name: one.record() for one in experiment.all_tasks(experiment.Settings(datasets=40))}
+    few = {one.name: one.record() for one in experiment.all_tasks(experiment.TranscriptionSettings(datasets=20))}
+    many = {one.name: one.record() for one in experiment.all_tasks(experiment.TranscriptionSettings(datasets=40))}
     assert few.items() <= many.items() and len(few) == 2 * 8 * len(experiment.METHODS)
 
 
 def test_mistakes():
     with pytest.raises(ValueError, match="datasets must be at least 1"):
-        experiment.Settings(datasets=0)
+        experiment.TranscriptionSettings(datasets=0)
     with pytest.raises(ValueError, match="burn_in must lie in"):
-        experiment.Settings(draws=100, burn_in=200)
+        experiment.TranscriptionSettings(draws=100, burn_in=200)
     with pytest.raises(ValueError, match="must be a tuple of different labels"):
-        experiment.Settings(configurations="exponential")
+        experiment.TranscriptionSettings(configurations="exponential")
     with pytest.raises(ValueError, match="gamma, the saturation constant, must be positive"):
         problem.data_set(problem.Configuration("saturation", -0.1), 0)
     with pytest.raises(ValueError, match="link must be one of .*, got 'cubic'"):

@@ -13,7 +13,7 @@ from lfm_ppl.experiments.transcription import parameters, parameters_report, pro
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.results import arviz_data
 
-FEW = dataclasses.replace(parameters_report.Settings.quick(), links=tuple(parameters.LINKS))
+FEW = dataclasses.replace(parameters_report.TranscriptionParametersSettings.quick(), links=tuple(parameters.LINKS))
 SOFTPLUS = parameters.LINKS["softplus"]
 
 
@@ -63,7 +63,7 @@ def made_up(settings):
 
 def found_in(results, settings):
     """The comparison of made-up results."""
-    return parameters_report.STUDY.found(settings, results)
+    return parameters_report.STUDY.tabulate(settings, results)
 
 
 def test_the_table_measures_in_standard_deviations_of_the_reference():
@@ -92,7 +92,7 @@ def test_a_chain_that_stands_still_shows():
 
 
 def test_the_figures_are_labelled():
-    figures = parameters_report.draw(FEW, parameters_report.STUDY.gathered(FEW, made_up(FEW)))
+    figures = parameters_report.draw(FEW, parameters_report.STUDY.collect(FEW, made_up(FEW)))
     assert set(figures) == {"posteriors-softplus", "posteriors-saturation-0.5"}
     for figure in figures.values():
         upper, lower = figure.axes
@@ -102,17 +102,17 @@ def test_the_figures_are_labelled():
 
 def test_mistakes():
     with pytest.raises(ValueError, match="datasets must be at least 1"):
-        parameters_report.Settings(datasets=0)
+        parameters_report.TranscriptionParametersSettings(datasets=0)
     with pytest.raises(ValueError, match="unknown links 'cubic'"):
-        parameters_report.Settings(links=("cubic",))
+        parameters_report.TranscriptionParametersSettings(links=("cubic",))
     with pytest.raises(ValueError, match="a tuple of different labels"):
-        parameters_report.Settings(links=())
+        parameters_report.TranscriptionParametersSettings(links=())
     with pytest.raises(ValueError, match="chains, warm-up, draws and thinning"):
-        parameters_report.Settings(nuts=(2, 10, 10))
+        parameters_report.TranscriptionParametersSettings(nuts=(2, 10, 10))
     with pytest.raises(ValueError, match="ram: chains must be at least 1"):
-        parameters_report.Settings(ram=(0, 1, 1, 1))
+        parameters_report.TranscriptionParametersSettings(ram=(0, 1, 1, 1))
     with pytest.raises(ValueError, match="tree_depth must be at least 1"):
-        parameters_report.Settings(tree_depth=0)
+        parameters_report.TranscriptionParametersSettings(tree_depth=0)
 
 
 def settings_of(label, chains, warmup, draws, thin):

@@ -85,7 +85,7 @@ def test_the_posterior_covers_the_truth(file, functions, simulated):
         sd = np.array([np.asarray(s) for _, s in moments])
         mean, sd = scores.total_moments(mean, sd**2)
         truth = np.asarray(drawn.forces[functions["FORCE"]]) + np.log(theta[0])
-        of_rate.append(scores.covered(*scores.interval(mean, sd), truth))
+        of_rate.append(scores.interval_coverage(*scores.interval(mean, sd), truth))
     half = [0.25 < rank < 0.75 for rank in ranks]
     print("R0", scores.rate_of(of_r0), "half", scores.rate_of(half), "transmission", scores.mean_of(of_rate),
           "Pareto k", np.quantile(pareto, (0.5, 0.9, 1.0)).round(2))

@@ -13,12 +13,12 @@ from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import chains, study
 from lfm_ppl.experiments.ballistic import figures
 from lfm_ppl.experiments.ballistic.problem import TARGETS
-from lfm_ppl.experiments.datasets import Column, Kind, part, row, rows
+from lfm_ppl.experiments.datasets import Column, TaskKind, row, rows, select_prefix
 from lfm_ppl.experiments.scores import paired_ratio, sd_of
 from lfm_ppl.experiments.simulated import parameters, states
 from lfm_ppl.experiments.simulated.problem import MOST, true_z
-from lfm_ppl.experiments.study import Data, Study, Table, setting
-from lfm_ppl.experiments.tasks import Tasks, in_order, slug
+from lfm_ppl.experiments.study import Data, Study, StudyTable, setting
+from lfm_ppl.experiments.tasks import TaskFactory, slug, sort_by_dataset
 
 REACH = 1.5
 """Of the grid about the true log alpha: a dozen posterior standard deviations wide."""
@@ -28,7 +28,7 @@ ERRORS = {"RMSE {path} ({unit})": "rmse", "coverage {path}": "coverage", "CPU s"
 
 
 @dataclass(frozen=True)
-class Settings(study.Settings):
+class BallisticSettings(study.StudySettings):
     """How much is computed."""
 
     runs: int = setting(500, "simulated targets", quick=4, aliases=study.REALISATIONS, per_seed=MOST)
@@ -51,31 +51,32 @@ class Settings(study.Settings):
             raise ValueError(f"rules must hold {states.REPORTED!r}, got {self.rules!r}.")
 
 
-def all_tasks(settings: Settings) -> list[Task]:
+def all_tasks(settings: BallisticSettings) -> list[Task]:
     """Return every task."""
     few, chained = (min(settings.runs, count) for count in (settings.particle_runs, settings.chain_runs))
-    tasks, weighted = Tasks("ballistic", settings.seed), {"draws": settings.draws, "paths": settings.paths}
+    tasks, weighted = TaskFactory("ballistic", settings.seed), {"draws": settings.draws, "paths": settings.paths}
     found = [*(one for rule in settings.rules
-               for one in tasks.blocks(f"tracking/{slug(rule)}", settings.runs, 50, method=rule)),
-             *tasks.blocks("parameters", settings.runs, 10, **weighted),
+               for one in tasks.block_tasks(f"tracking/{slug(rule)}", settings.runs, 50, method=rule)),
+             *tasks.block_tasks("parameters", settings.runs, 10, **weighted),
              *(one for count in settings.particles
-               for one in tasks.each(f"particles/{count}", few, particles=count, steps=2, draws=4_000)),
-             *(one for sampler in parameters.SAMPLERS for one in tasks.each(
+               for one in tasks.dataset_tasks(f"particles/{count}", few, particles=count, steps=2, draws=4_000)),
+             *(one for sampler in parameters.SAMPLERS for one in tasks.dataset_tasks(
                  f"chains/{sampler}", chained, sampler=sampler,
                  **dict(zip(chains.LENGTHS, getattr(settings, sampler.lower()), strict=True)))),
-             *tasks.blocks("drawn", settings.drawn_runs, 10, **weighted),
-             *tasks.blocks("known", settings.runs, 50)]
-    return in_order(found)
+             *tasks.block_tasks("drawn", settings.drawn_runs, 10, **weighted),
+             *tasks.block_tasks("known", settings.runs, 50)]
+    return sort_by_dataset(found)
 
 
-def tables(settings: Settings, data: Data) -> dict[str, Table]:
+def tables(settings: BallisticSettings, data: Data) -> dict[str, StudyTable]:
     """Return the tables."""
     few, chained = (data[what].sizes["dataset"] for what in ("particles", "chains"))
-    return {"tracking": Table.of(f"Means over {settings.runs} targets (standard errors)", tracked(data)),
-            "particles": Table.of(f"Particles against the Gaussian filter and smoother, {few} targets",
-                                  against_particles(data)),
-            "parameters": Table.of(f"Parameters, in logarithms, {settings.runs} targets", of_parameters(data)),
-            "agreement": Table.of(f"Against NUTS, {chained} targets", agreement(data))}
+    return {"tracking": StudyTable.from_rows(f"Means over {settings.runs} targets (standard errors)", tracked(data)),
+            "particles": StudyTable.from_rows(f"Particles against the Gaussian filter and smoother, {few} targets",
+                                              against_particles(data)),
+            "parameters": StudyTable.from_rows(f"Parameters, in logarithms, {settings.runs} targets",
+                                               of_parameters(data)),
+            "agreement": StudyTable.from_rows(f"Against NUTS, {chained} targets", agreement(data))}
 
 
 def tracked(data: Data) -> dict[str, Any]:
@@ -83,10 +84,10 @@ def tracked(data: Data) -> dict[str, Any]:
 
     Where parameters are known the seconds are those of filter and smoother, else of searches and weights.
     """
-    found = rows(part(data["tracking"], "smoother"), "method", ERRORS)
+    found = rows(select_prefix(data["tracking"], "smoother"), "method", ERRORS)
     for what, ending in (("parameters", ""), ("drawn", "; parameters drawn from the prior")):
         for label, name in UNKNOWN.items():
-            errors = part(data[what], name).assign(seconds=data[what].seconds)
+            errors = select_prefix(data[what], name).assign(seconds=data[what].seconds)
             found[f"{states.REPORTED}, {label}{ending}"] = row(errors, ERRORS)
     return found
 
@@ -102,9 +103,9 @@ def against_particles(data: Data) -> dict[str, Any]:
     gaussian = data["tracking"].sel({"method": states.REPORTED}).isel(dataset=slice(particles.sizes["dataset"]))
     found: dict[str, Any] = {}
     for what, columns in (("filter", COMPARED), ("smoother", COMPARED | DISTINCT)):
-        exact = part(gaussian, what).assign(log_likelihood=gaussian.log_likelihood)
+        exact = select_prefix(gaussian, what).assign(log_likelihood=gaussian.log_likelihood)
         found[f"{what}, Gaussian"] = row(exact, {"RMSE {path} ({unit})": "rmse", "CPU s": "seconds"})
-        both = part(particles, what).assign(particles[["log_likelihood", "distinct"]]).assign(
+        both = select_prefix(particles, what).assign(particles[["log_likelihood", "distinct"]]).assign(
             {f"exact_{name}": exact[name] for name in ("rmse", "seconds", "log_likelihood")})
         found |= rows(both, "particles", columns, f"{what}, {{:,}} particles")
     return found
@@ -152,25 +153,26 @@ def agreement(data: Data) -> dict[str, Any]:
     """Return how NUTS, RAM and weighted draws agree, see `chains.agreement`; chains' times are with compilation."""
     found, weighted = data["chains"], data["parameters"]
     samplers = {name: found.sel(sampler=name) for name in parameters.SAMPLERS}
-    samplers["weighted draws"] = part(weighted, "posterior").assign(weighted[["k", "ess", "seconds"]]).isel(
+    samplers["weighted draws"] = select_prefix(weighted, "posterior").assign(weighted[["k", "ess", "seconds"]]).isel(
         dataset=slice(found.sizes["dataset"]))
-    return {name: chains.compared(one, None if name == "NUTS" else samplers["NUTS"]) for name, one in samplers.items()}
+    return {name: chains.compare_with_reference(one, None if name == "NUTS" else samplers["NUTS"])
+            for name, one in samplers.items()}
 
 
 STUDY = Study(
-    Settings, all_tasks,
-    {"tracking": Kind(partial(states.gaussian, TARGETS), {
+    BallisticSettings, all_tasks,
+    {"tracking": TaskKind(partial(states.gaussian, TARGETS), {
         "dataset path": "filter_rmse, smoother_rmse, smoother_coverage", "path time": "mean, sd",
         "dataset": "log_likelihood, filter_seconds, smoother_seconds"}, ("method",)),
-     "particles": Kind(partial(states.particles, TARGETS), {
+     "particles": TaskKind(partial(states.particles, TARGETS), {
          "dataset path": "filter_rmse, smoother_rmse, smoother_coverage", "dataset path time": "mean, sd",
          "dataset": "log_likelihood, filter_seconds, smoother_seconds", "dataset time": "distinct"}, ("particles",)),
-     **{what: Kind(partial(parameters.weighted, TARGETS, drawn=what == "drawn"), {
+     **{what: TaskKind(partial(parameters.weighted, TARGETS, drawn=what == "drawn"), {
          "dataset parameter": "likely, posterior_mean, posterior_sd, below", "dataset": "exists, k, ess, seconds",
          "dataset path": "likely_rmse, likely_coverage, posterior_rmse, posterior_coverage", "parameter draw": "draws"})
         for what in ("parameters", "drawn")},
-     "known": Kind(partial(parameters.alone, TARGETS, REACH), {"dataset": "below"}),
-     "chains": Kind(partial(parameters.by_chains, TARGETS), {
+     "known": TaskKind(partial(parameters.alone, TARGETS, REACH), {"dataset": "below"}),
+     "chains": TaskKind(partial(parameters.by_chains, TARGETS), {
          "dataset parameter": "mean, sd, ess, r_hat", "dataset": "seconds, divergences",
          "dataset parameter chain draw": "draws"}, ("sampler",))},
     tables, figures.draw, {"path": ("path", TARGETS.paths), "unit": ("path", TARGETS.units),

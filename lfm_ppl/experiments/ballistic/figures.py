@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from scipy import stats
 
 from lfm_ppl.experiments.ballistic.problem import TARGETS
-from lfm_ppl.experiments.datasets import part
+from lfm_ppl.experiments.datasets import select_prefix
 from lfm_ppl.experiments.drawing import SHADE, SPAN, TRUTH, band, bars, legend, line, patch
 from lfm_ppl.experiments.scores import Z, mean_of, paired_ratio, rate_of
 from lfm_ppl.experiments.simulated import parameters
@@ -66,8 +66,9 @@ def plot_particles(data: Data, *, width: str | float = "full") -> Figure:
              lw=1.0, label=path)
     left.axhline(1.0, color=style.BLACK, lw=0.8)
     for what, dash in (("filter", "--"), ("smoother", "-")):
-        right.plot(counts, part(found, what).seconds.mean("dataset"), color=style.ORANGE, ls=dash, marker="o", ms=3.0)
-        right.axhline(part(gaussian, what).seconds.mean(), color=style.BLUE, ls=dash, lw=1.0)
+        right.plot(counts, select_prefix(found, what).seconds.mean("dataset"), color=style.ORANGE, ls=dash, marker="o",
+                   ms=3.0)
+        right.axhline(select_prefix(gaussian, what).seconds.mean(), color=style.BLUE, ls=dash, lw=1.0)
     style.tidy(left, xscale="log", xlabel="particles",
                ylabel="RMSE of the particle smoother\nover the Gaussian smoother's")
     style.tidy(right, xscale="log", xlabel="particles", yscale="log", ylabel="CPU time for a target (s)")

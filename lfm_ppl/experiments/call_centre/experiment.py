@@ -14,8 +14,8 @@ from lfm_ppl.engine.run import Reporter
 from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import chains, published, study
 from lfm_ppl.experiments.call_centre import counts, figures, learning, problem, tracking
-from lfm_ppl.experiments.datasets import Column, Kind, cell, number, part, row
-from lfm_ppl.experiments.study import Data, Study, Table, setting
+from lfm_ppl.experiments.datasets import Column, TaskKind, cell, number, row, select_prefix
+from lfm_ppl.experiments.study import Data, Study, StudyTable, setting
 
 PUBLISHED = {
     "constant": {"SQM": (4.6, 2.2, -146, 22), "CQM": (4.4, 1.3, -142, 15), "WQM": (1.8, 0.2, -139, 20),
@@ -27,7 +27,7 @@ PUBLISHED = {
 
 
 @dataclass(frozen=True)
-class Settings(study.Settings):
+class CallCentreSettings(study.StudySettings):
     """How much is computed."""
 
     days: int = setting(11, "test days, from the fourth day of the weekday on", quick=2, aliases=study.REALISATIONS)
@@ -50,7 +50,7 @@ class Settings(study.Settings):
             raise ValueError(f"--integrated must be among --methods ({', '.join(self.methods)}), got {other[0]!r}.")
 
 
-def all_tasks(settings: Settings) -> list[Task]:
+def all_tasks(settings: CallCentreSettings) -> list[Task]:
     """Return every task: what is compiled for a method serves all windows, but for the chains."""
     shared = {"experiment": "call-centre", "link": settings.link, "functions": settings.functions,
               "starts": len(learning.STARTS), "data": settings.data and str(Path(settings.data).resolve()),
@@ -67,7 +67,7 @@ def all_tasks(settings: Settings) -> list[Task]:
               for index in range(min(settings.nuts_days, settings.days)))]
 
 
-def check(settings: Settings, report: Reporter | None) -> None:
+def check(settings: CallCentreSettings, report: Reporter | None) -> None:
     """Check that there are counts of so many days, and say what they are; errors as of `problem.days`.
 
     An `OverloadWarning` says on how many test days more customers come than are served, for hours.
@@ -88,15 +88,16 @@ def check(settings: Settings, report: Reporter | None) -> None:
                           counts.OverloadWarning, stacklevel=3)
 
 
-def tables(settings: Settings, data: Data) -> dict[str, Table]:
+def tables(settings: CallCentreSettings, data: Data) -> dict[str, StudyTable]:
     """Return the tables."""
     source = "simulated counts" if settings.data is None else f"counts in {settings.data}"
     days, chained = f"{settings.days} test days, {source}", data["nuts"].sizes["first"]
-    return {"constant": Table.of(f"Service rate 10 as in training, {days}", tracked(data, "constant")),
-            "changed": Table.of(f"Service rate 15, then 5, {days}", tracked(data, "changed")),
-            "gain": Table.of("Gain in the log density of a day by integrating the parameters out", gain(data)),
-            "agreement": Table.of(f"Weighted draws against NUTS, test days: {chained}", agreement(data)),
-            "learnt": Table.of("Most likely parameters (medians)", learnt(settings, data))}
+    return {"constant": StudyTable.from_rows(f"Service rate 10 as in training, {days}", tracked(data, "constant")),
+            "changed": StudyTable.from_rows(f"Service rate 15, then 5, {days}", tracked(data, "changed")),
+            "gain": StudyTable.from_rows("Gain in the log density of a day by integrating the parameters out",
+                                         gain(data)),
+            "agreement": StudyTable.from_rows(f"Weighted draws against NUTS, test days: {chained}", agreement(data)),
+            "learnt": StudyTable.from_rows("Most likely parameters (medians)", learnt(settings, data))}
 
 
 def tracked(data: Data, test: str) -> dict[str, Any]:
@@ -117,7 +118,7 @@ def tracked(data: Data, test: str) -> dict[str, Any]:
     for what, label in (("track", "{}"), ("posterior", "{}, parameters integrated out")):
         for method in data[what].method.values:
             name = label.format(method)
-            rows[name] = row(part(data[what].sel({"method": method}), test), columns) | dict(zip(
+            rows[name] = row(select_prefix(data[what].sel({"method": method}), test), columns) | dict(zip(
                 ("published RMSE", "published RMSE se", "published ELL", "published ELL se"),
                 map(float, PUBLISHED[test].get(name, (np.nan,) * 4)), strict=True))
     return rows
@@ -134,7 +135,7 @@ def gain(data: Data) -> dict[str, Any]:
     rows = {}
     for method, test in itertools.product(data["posterior"].method.values, problem.TESTED):
         likely, whole = (data[what].sel({"method": method}) for what in ("track", "posterior"))
-        before, after = part(likely, test), part(whole, test)
+        before, after = select_prefix(likely, test), select_prefix(whole, test)
         rows[f"{method}, {test}"] = cell("gain", after.ell - before.ell) | {
             "days": number(np.mean, after.ell > before.ell),
             "RMSE ratio": number(np.mean, after.rmse) / number(np.mean, before.rmse),
@@ -157,7 +158,7 @@ def agreement(data: Data) -> dict[str, Any]:
         nuts = data["nuts"].sel({"method": method}).rename(first="dataset").dropna("parameter", how="all")
         same = {name: slice(nuts.sizes[name]) for name in ("dataset", "parameter")}
         likely, weighted = (data[what].sel({"method": method}).isel(same) for what in ("track", "posterior"))
-        shift, ratio = chains.agreement(part(weighted, "posterior").assign(ess=weighted.ess), nuts)
+        shift, ratio = chains.agreement(select_prefix(weighted, "posterior").assign(ess=weighted.ess), nuts)
         rows[method] = {"windows": nuts.sizes["dataset"], "means apart (sd)": shift.value, "ratio of sds": ratio.value}
         for test, (name, sampler) in itertools.product(problem.TESTED, (("NUTS", nuts), ("weighted", weighted))):
             rows[method] |= cell(f"gain {test}, {name}", sampler[f"{test}_ell"] - likely[f"{test}_ell"])
@@ -166,7 +167,7 @@ def agreement(data: Data) -> dict[str, Any]:
     return rows
 
 
-def learnt(settings: Settings, data: Data) -> dict[str, Any]:
+def learnt(settings: CallCentreSettings, data: Data) -> dict[str, Any]:
     """Return the most likely parameters: medians over windows, the log likelihood, and what a window took.
 
     Evaluations and CPU seconds are those of all its searches.
@@ -181,14 +182,18 @@ def learnt(settings: Settings, data: Data) -> dict[str, Any]:
     return rows
 
 
-def notes(settings: Settings, data: Data) -> tuple[str, ...]:
+def notes(settings: CallCentreSettings, data: Data) -> tuple[str, ...]:
     """Return how the errors of the queue compare with the published ones, of Thursdays and the linear link."""
     real = settings.data is not None and settings.weekday == "Thursday" and settings.link == "linear"
     if not real or settings.days < published.FEWEST:
         return ()
     tests = {"constant": "RMSE of the queue, service rate 10", "changed": "RMSE of the queue, service rate 15, then 5"}
-    return tuple(published.said(what, published.beside(Table.of(what, tracked(data, test)).frame, "RMSE",
-                                                       "published RMSE")) for test, what in tests.items())
+    sentences = []
+    for test, title in tests.items():
+        frame = StudyTable.from_rows(title, tracked(data, test)).frame
+        comparisons = published.compare_with_published(frame, "RMSE", "published RMSE")
+        sentences.append(published.describe_comparisons(title, comparisons))
+    return tuple(sentences)
 
 
 SCORES = ", ".join(f"{test}_{score}" for test in problem.TESTED for score in (
@@ -196,13 +201,13 @@ SCORES = ", ".join(f"{test}_{score}" for test in problem.TESTED for score in (
 TRACKED = ", ".join(f"{test}_{name}" for test in problem.TESTED for name in tracking.Tracked._fields)
 
 STUDY = Study(
-    Settings, all_tasks,
-    {"track": Kind(tracking.most_likely, {
+    CallCentreSettings, all_tasks,
+    {"track": TaskKind(tracking.most_likely, {
         "dataset": f"log_likelihood, evaluations, seconds, {SCORES}", "dataset parameter": "z", "time": TRACKED},
-                   ("method",)),
-     "posterior": Kind(tracking.marginalised, {
+                       ("method",)),
+     "posterior": TaskKind(tracking.marginalised, {
          "dataset": f"k, ess, modes, beyond, {SCORES}", "dataset parameter": "posterior_mean, posterior_sd",
          "time": "shapes, shapes_sd"}, ("method",)),
-     "nuts": Kind(tracking.by_nuts, {"": f"divergences, seconds, {SCORES}", "parameter": "mean, sd, ess, r_hat"},
-                  ("method", "first"))},
+     "nuts": TaskKind(tracking.by_nuts, {"": f"divergences, seconds, {SCORES}", "parameter": "mean, sd, ess, r_hat"},
+                      ("method", "first"))},
     tables, figures.draw, label="method", notes=notes, check=check)

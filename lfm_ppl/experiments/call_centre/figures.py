@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from lfm_ppl.experiments.call_centre import problem
 from lfm_ppl.experiments.call_centre.problem import BIN, DAY, GRID, OPEN, TESTED, TRAIN, Window
 from lfm_ppl.experiments.call_centre.tracking import Tracked, customers
-from lfm_ppl.experiments.datasets import part
+from lfm_ppl.experiments.datasets import select_prefix
 from lfm_ppl.experiments.drawing import TRUTH, band, legend, line, patch
 from lfm_ppl.experiments.scores import Z, mean_of
 from lfm_ppl.experiments.study import Data
@@ -32,7 +32,7 @@ def draw(settings: Any, data: Data) -> dict[str, Figure]:
 
 def _by_method(width: str | float, data: Data, test: str, paint: Callable[[Axes, Tracked], None]) -> Figure:
     """Draw a panel for each method, in which its estimates of the first window are painted."""
-    found = part(data["track"], test)
+    found = select_prefix(data["track"], test)
     figure, panels = style.small_multiples(width, found.sizes["method"], 1.5)
     for axes, method in zip(panels, found.method.values, strict=True):
         paint(axes, Tracked(*(found[name].sel({"method": method}).values for name in Tracked._fields)))
@@ -115,7 +115,7 @@ def plot_errors(data: Data, *, width: str | float = "full") -> Figure:
         colour = _COLOURS[methods.index(method) % 6]
         look: dict[str, Any] = {"color": colour, "mfc": "white" if what == "posterior" else colour}
         for axes, test, shift, marker in zip(errors, TESTED, (-0.12, 0.12), "os", strict=True):
-            found = part(data[what].sel({"method": method}), test)
+            found = select_prefix(data[what].sel({"method": method}), test)
             axes.semilogy(np.full(found.rmse.size, place), found.rmse, ls="", marker=".", ms=4, mew=0.6, **look)
             axes.semilogy([place - 0.3, place + 0.3], [found.rmse.mean()] * 2, color=colour, lw=1.5)
             axes.set(title=f"{test} service rate", ylabel="RMSE of the queue (customers)")

@@ -25,7 +25,7 @@ from lfm_ppl.experiments import chains, scores
 from lfm_ppl.experiments.call_centre import problem
 from lfm_ppl.experiments.call_centre.learning import posterior, searches
 from lfm_ppl.experiments.call_centre.problem import FIRST, GRID, TESTED, Method, Window
-from lfm_ppl.experiments.tasks import indices, stacked
+from lfm_ppl.experiments.tasks import dataset_indices, stack_results
 from lfm_ppl.filtering.filter import filter
 from lfm_ppl.filtering.smoother import smooth
 from lfm_ppl.linalg import congruence, matmul
@@ -96,9 +96,10 @@ def judge(parts: Sequence[Tracked], window: Window, test: str) -> dict[str, floa
     # The density of L is that of x = log(1 + L) times dx/dL = exp(-x).
     x = np.log1p(queue)
     density = np.asarray(logarithms.log_density(x[:, None]))[:, 0] - x
-    return {"rmse": scores.rmse(middle, queue), "coverage": scores.covered(low, high, queue), "ell": density.sum(),
+    return {"rmse": scores.rmse(middle, queue), "coverage": scores.interval_coverage(low, high, queue),
+            "ell": density.sum(),
             "rate_rmse": scores.rmse(rate.mean(axis=1)[:, 0], arrivals),
-            "rate_coverage": scores.covered(rate_low, rate_high, arrivals)}
+            "rate_coverage": scores.interval_coverage(rate_low, rate_high, arrivals)}
 
 
 def method_of(task: Task) -> Method:
@@ -109,7 +110,7 @@ def method_of(task: Task) -> Method:
 def windows_of(task: Task) -> list[Window]:
     """Return the windows of a task."""
     data, weekday = task.settings["data"], task.settings["weekday"]
-    return [problem.window(data, weekday, index, task.seed) for index in indices(task)]
+    return [problem.window(data, weekday, index, task.seed) for index in dataset_indices(task)]
 
 
 def most_likely(task: Task) -> Result:
@@ -128,8 +129,8 @@ def most_likely(task: Task) -> Result:
         rows.append({"z": best.point, "log_likelihood": -best.value, "evaluations": evaluations, **scored, **largest,
                      "seconds": time.process_time() - began})
     tracked = {test: track(method, rows[0]["z"], windows[0].y[test], rates) for test, rates in TESTED.items()}
-    return stacked(rows) | {f"{test}_{name}": np.asarray(value) for test, path in tracked.items()
-                            for name, value in path._asdict().items()}
+    return stack_results(rows) | {f"{test}_{name}": np.asarray(value) for test, path in tracked.items()
+                                  for name, value in path._asdict().items()}
 
 
 def marginalised(task: Task) -> Result:
@@ -146,7 +147,7 @@ def marginalised(task: Task) -> Result:
                      **mixed(method, found.resampled(task.settings["mixed"], seed), window)})
     (best, *_), _ = searches(method, windows[0].training)
     path = track(method, best.point, windows[0].y["constant"], TESTED["constant"], smoothed=True)
-    return stacked(rows) | {"shapes": np.asarray(path.arrivals), "shapes_sd": np.asarray(path.arrivals_sd)}
+    return stack_results(rows) | {"shapes": np.asarray(path.arrivals), "shapes_sd": np.asarray(path.arrivals_sd)}
 
 
 def by_nuts(task: Task) -> Result:
@@ -160,9 +161,9 @@ def by_nuts(task: Task) -> Result:
     mcmc = chains.sampler(chains.nuts(model, target_accept_prob=task.settings["accepted"]), count, warmup, draws)
     start_key, run_key = jax.random.split(task.key)
     (near, *_), _ = searches(method, window.training, prior=1.0)
-    starts = chains.starts(method.names, near.point, count, start_key)
+    starts = chains.draw_starts(method.names, near.point, count, start_key)
     found = chains.sample(mcmc, method.names, run_key, window.training, init_params=starts)
-    return found | mixed(method, scores.spread(found["draws"], task.settings["mixed"]), window)
+    return found | mixed(method, scores.thin_draws(found["draws"], task.settings["mixed"]), window)
 
 
 def mixed(method: Method, several: np.ndarray, window: Window) -> dict[str, float]:

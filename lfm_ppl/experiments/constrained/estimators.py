@@ -18,8 +18,8 @@ from lfm_ppl.constrained.posterior import ConstrainedPosterior, constrained_post
 from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments.constrained import problem
 from lfm_ppl.experiments.constrained.problem import FACTOR, HORMONE, TIMES, WINDOW
-from lfm_ppl.experiments.scores import Z, covered, rmse
-from lfm_ppl.experiments.tasks import indices
+from lfm_ppl.experiments.scores import Z, interval_coverage, rmse
+from lfm_ppl.experiments.tasks import dataset_indices
 from lfm_ppl.filtering.smoother import smooth
 from lfm_ppl.inference.log_posterior import LogPosterior
 from lfm_ppl.inference.optimise import newton, quasi_newton
@@ -166,16 +166,16 @@ def transcription(task: Task) -> Result:
     ends of the band, and its ``truth`` (T,). ``hyperparameters/{kind}`` (N, P) begin with the lengthscale.
     """
     y, truth = map(np.stack, zip(*(problem.record(task.settings["shape"], index, task.seed)
-                                   for index in indices(task)), strict=True))
+                                   for index in dataset_indices(task)), strict=True))
     methods = {label: METHODS[label] for label in task.settings["methods"]}
     learnt = {kind: _learnt(kind, y) for kind in dict.fromkeys(method.learnt for method in methods.values())}
     result: Result = {f"hyperparameters/{kind}": values for kind, values in learnt.items()} | {"truth": truth[0]}
     for label, method in methods.items():
         estimate, low, high = map(np.asarray, _compiled(method.estimate)(learnt[method.learnt], y))
         exact, after = truth[:, :: method.every], slice(WINDOW // method.every, None)
-        covered = np.where(np.isfinite(low), (low <= exact) & (exact <= high), np.nan)
+        is_covered = np.where(np.isfinite(low), (low <= exact) & (exact <= high), np.nan)
         result |= {f"{label}/mse": ((estimate - exact)[:, after] ** 2).mean(axis=1),
-                   f"{label}/minimum": estimate.min(axis=1), f"{label}/coverage": covered[:, after].mean(axis=1),
+                   f"{label}/minimum": estimate.min(axis=1), f"{label}/coverage": is_covered[:, after].mean(axis=1),
                    f"{label}/first": np.stack([estimate[0], low[0], high[0]]),
                    f"{label}/failed": ~np.isfinite(estimate).all(axis=1) | np.isinf(low).any(axis=1)}
     return result
@@ -247,7 +247,7 @@ def _target(y: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 def ballistic(task: Task) -> Result:
     """Return ``rmse`` (N, 3) and ``converged`` (N,), and the first target's ``estimate`` and ``truth`` (3, T)."""
-    y, truth = map(np.stack, zip(*(problem.target(index, task.seed) for index in indices(task)), strict=True))
+    y, truth = map(np.stack, zip(*(problem.target(index, task.seed) for index in dataset_indices(task)), strict=True))
     paths, converged = map(np.asarray, _compiled(_target)(y))
     return {"rmse": rmse(paths, truth), "converged": converged, "estimate": paths[0],
             "truth": truth[0]}
@@ -286,10 +286,10 @@ def thyroid(task: Task) -> Result:
     (N, D, P) with their Pareto index ``k`` (N,); ``y`` (T, 3) of the first patient at the times ``measured`` (T,).
     """
     posterior = problem.thyroid_learning()
-    patients = [problem.patient(index, task.seed) for index in indices(task)]
+    patients = [problem.patient(index, task.seed) for index in dataset_indices(task)]
     y = np.stack([patient.y for patient in patients])
     z = np.stack([posterior_mode(posterior, values) for values in y])
-    seeds = [problem.MOST * task.seed + index for index in indices(task)]
+    seeds = [problem.MOST * task.seed + index for index in dataset_indices(task)]
     counts = task.settings["draws"], task.settings["weighted"]
     draws, k = map(np.stack, zip(*(drawn(posterior, *own, *counts) for own in zip(y, z, seeds, strict=True)),
                                  strict=True))
@@ -301,7 +301,8 @@ def thyroid(task: Task) -> Result:
     errors = [_apart(when(times, found["mode"]), when(times, truth)) for when in (peak, acrophase)]
     return found | {
         "times": times, "truth": truth, "z": z, "draws": draws, "k": k, "peak": np.stack(errors, axis=1),
-        "coverage": covered(found["low"], found["high"], truth), "rmse": rmse(found["mode"], truth), "y": y[0],
+        "coverage": interval_coverage(found["low"], found["high"], truth), "rmse": rmse(found["mode"], truth),
+        "y": y[0],
         "measured": patients[0].times}
 
 

@@ -12,15 +12,15 @@ from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import study
 from lfm_ppl.experiments.constrained import estimators, figures, problem
 from lfm_ppl.experiments.constrained.estimators import BANDS, FULL, METHODS, SMOOTHER
-from lfm_ppl.experiments.datasets import Column, Kind, in_one_row, row, rows
+from lfm_ppl.experiments.datasets import Column, TaskKind, merge_rows, row, rows
 from lfm_ppl.experiments.scores import SE, rate_of
-from lfm_ppl.experiments.study import Data, Study, Table, setting
-from lfm_ppl.experiments.tasks import blocks, slug
+from lfm_ppl.experiments.study import Data, Study, StudyTable, setting
+from lfm_ppl.experiments.tasks import dataset_blocks, slug
 from lfm_ppl.results.importance import LARGEST_K
 
 
 @dataclass(frozen=True)
-class Settings(study.Settings):
+class ConstrainedSettings(study.StudySettings):
     """How much is computed."""
 
     runs: int = setting(100, "records of each shape of the transcription factor", quick=2,
@@ -43,7 +43,7 @@ class Settings(study.Settings):
                                  f"{', '.join(self.methods)}.")
 
 
-def all_tasks(settings: Settings) -> list[Task]:
+def all_tasks(settings: ConstrainedSettings) -> list[Task]:
     """Return a task for each block of records of a shape, of targets and of patients."""
     kinds: list[tuple[str, str, int, dict[str, Any]]] = [
         ("ballistic", "", settings.targets, {}),
@@ -51,13 +51,13 @@ def all_tasks(settings: Settings) -> list[Task]:
         *(("transcription", shape, settings.runs, {"methods": list(settings.methods)}) for shape in settings.shapes)]
     return [Task("/".join(filter(None, [what, slug(shape), f"{first:04d}"])), settings.seed, {
         "experiment": "constrained", "what": what, "shape": shape, "first": first, "count": last - first + 1, **own})
-        for what, shape, count, own in kinds for first, last in blocks(count, settings.block)]
+        for what, shape, count, own in kinds for first, last in dataset_blocks(count, settings.block)]
 
 
-class ByMethod(Kind):
+class ByMethod(TaskKind):
     """Tasks with the entries ``{method}/{entry}`` of several estimators, which get the dimension ``method``."""
 
-    def gathered(self, tasks: Iterable[Task], results: Mapping[str, Result]) -> xr.Dataset:
+    def collect(self, tasks: Iterable[Task], results: Mapping[str, Result]) -> xr.Dataset:
         """Return the results of tasks, with the ``lengthscale`` that each estimator has of each record."""
         each, found = [], {}
         for task in tasks:
@@ -67,18 +67,20 @@ class ByMethod(Kind):
                 learnt = result[f"hyperparameters/{estimators.METHODS[method].learnt}"]
                 found[one.name] = result | {"lengthscale": learnt[:, 0]}
                 each.append(one)
-        return super().gathered(each, found)
+        return super().collect(each, found)
 
 
-def tables(settings: Settings, data: Data) -> dict[str, Table]:
+def tables(settings: ConstrainedSettings, data: Data) -> dict[str, StudyTable]:
     """Return the tables."""
     found = data["transcription"]
-    return {"transcription": Table.of(
+    return {"transcription": StudyTable.from_rows(
                 f"Transcription, {len(settings.shapes)} shapes of force by {settings.runs} records",
                 rows(found, "method", ERRORS)),
-            "shapes": Table.of("By the shape of the force",
-                               {method: by_shape(found.sel({"method": method})) for method in settings.methods}),
-            "others": Table.of(f"{settings.targets} targets on reentry and {settings.patients} patients", others(data))}
+            "shapes": StudyTable.from_rows(
+                "By the shape of the force",
+                {method: by_shape(found.sel({"method": method})) for method in settings.methods}),
+            "others": StudyTable.from_rows(
+                f"{settings.targets} targets on reentry and {settings.patients} patients", others(data))}
 
 
 ERRORS: dict[str, Column] = {
@@ -100,7 +102,7 @@ def by_shape(found: xr.Dataset) -> dict[str, Any]:
     """Return median MSE and coverage of one estimator for each shape of the force."""
     columns: dict[str, Column] = {"median MSE, {shape}": lambda of: of.mse.median(skipna=False),
                                   "coverage, {shape}": "coverage"}
-    return in_one_row(rows(found, "shape", columns))
+    return merge_rows(rows(found, "shape", columns))
 
 
 def others(data: Data) -> dict[str, Any]:
@@ -115,13 +117,13 @@ def others(data: Data) -> dict[str, Any]:
 
 
 STUDY = Study(
-    Settings, all_tasks,
+    ConstrainedSettings, all_tasks,
     {"transcription": ByMethod(estimators.transcription, {
         "dataset": "mse, minimum, coverage, failed, lengthscale", "curve time": "first", "time": "truth"},
         ("shape", "method")),
-     "ballistic": Kind(estimators.ballistic, {
+     "ballistic": TaskKind(estimators.ballistic, {
          "dataset path": "rmse", "dataset": "converged", "path time": "estimate, truth"}),
-     "thyroid": Kind(estimators.thyroid, {
+     "thyroid": TaskKind(estimators.thyroid, {
          "dataset": "rmse, coverage, lowest, k, converged, bands_converged", "dataset event": "peak",
          "dataset time": "truth, mode, mean, low, high", "time": "times", "dataset parameter": "z",
          "dataset draw parameter": "draws", "hour output": "y", "hour": "measured"})},

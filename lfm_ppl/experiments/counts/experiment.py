@@ -12,13 +12,13 @@ from lfm_ppl.engine.run import Reporter
 from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import study
 from lfm_ppl.experiments.counts import figures, methods, problem
-from lfm_ppl.experiments.datasets import Column, Kind, row
+from lfm_ppl.experiments.datasets import Column, TaskKind, row
 from lfm_ppl.experiments.scores import Estimate
-from lfm_ppl.experiments.study import Data, Results, Study, Table, setting
+from lfm_ppl.experiments.study import Data, Results, Study, StudyTable, setting
 
 
 @dataclass(frozen=True)
-class Settings(study.Settings):
+class CountsSettings(study.StudySettings):
     """How much is computed."""
 
     data: str | None = setting(None, "folder with the folders coal and calls (default: simulated counts)",
@@ -29,13 +29,13 @@ class Settings(study.Settings):
     draws: int = setting(5000, "of each of four chains of the reference", quick=500)
 
 
-def learning(settings: Settings) -> list[Task]:
+def learning(settings: CountsSettings) -> list[Task]:
     """Return a task for each problem, which finds its parameters."""
     return [Task(f"{name}/parameters", settings.seed,
                  {"problem": name, "size": list(settings.size), "data": settings.data}) for name in settings.problems]
 
 
-def comparing(settings: Settings, results: Results) -> list[Task]:
+def comparing(settings: CountsSettings, results: Results) -> list[Task]:
     """Return a task for each problem and method, which takes the parameters of the problem."""
     return [Task(f"{task.settings['problem']}/{method}", settings.seed,
                  {**task.settings, "method": method, "draws": settings.draws,
@@ -43,18 +43,18 @@ def comparing(settings: Settings, results: Results) -> list[Task]:
             for task in learning(settings) for method in methods.METHODS]
 
 
-def check(settings: Settings, report: Reporter | None) -> None:
+def check(settings: CountsSettings, report: Reporter | None) -> None:
     """Raise FileNotFoundError or ValueError where something is wrong with the data."""
     for name in settings.problems:
         problem.problem(name, settings.size, settings.seed, settings.data)
 
 
-def tables(settings: Settings, data: Data) -> dict[str, Table]:
+def tables(settings: CountsSettings, data: Data) -> dict[str, StudyTable]:
     """Return the tables."""
     every = {name: methods.compared(settings, data, name) for name in settings.problems}
-    return {"accuracy": Table.of("Posterior of the predictor (mean: largest error in sds; sd: largest relative error)",
-                                 rows(every, ACCURACY)),
-            "prediction": Table.of(f"Held-out data, {settings.size.folds} folds", rows(every, PREDICTION))}
+    accuracy = "Posterior of the predictor (mean: largest error in sds; sd: largest relative error)"
+    return {"accuracy": StudyTable.from_rows(accuracy, rows(every, ACCURACY)),
+            "prediction": StudyTable.from_rows(f"Held-out data, {settings.size.folds} folds", rows(every, PREDICTION))}
 
 
 ACCURACY: dict[str, Column] = {
@@ -80,7 +80,7 @@ def rows(every: Mapping[str, xr.Dataset], columns: Mapping[str, Column]) -> dict
     return found
 
 
-def notes(settings: Settings, data: Data) -> tuple[str, ...]:
+def notes(settings: CountsSettings, data: Data) -> tuple[str, ...]:
     """Return what there is to say about the reference and the parameters."""
     reference = data["comparison"].sel({"method": methods.REFERENCE})
     return (f"Reference: elliptical slices, at least {reference.ess.min():.0f} effective draws, R-hat at most "
@@ -91,11 +91,11 @@ def notes(settings: Settings, data: Data) -> tuple[str, ...]:
 
 
 STUDY = Study(
-    Settings, learning,
-    {"parameters": Kind(methods.learn, {"": "level, scale, lengthscale, daily_scale, daily_lengthscale, concentration, "
-                                            "noise"}, ("problem",)),
-     "comparison": Kind(methods.compute, {
+    CountsSettings, learning,
+    {"parameters": TaskKind(methods.learn, {
+        "": "level, scale, lengthscale, daily_scale, daily_lengthscale, concentration, noise"}, ("problem",)),
+     "comparison": TaskKind(methods.compute, {
          "dataset": "mean, sd, log density, low, high",
          "": "log evidence, log evidence error, share, ess, r_hat, seconds"}, ("problem", "method"))},
-    tables, figures.draw, notes=notes, then=comparing, check=check,
-    what=lambda task: "comparison" if "method" in task.settings else "parameters")
+    tables, figures.draw, notes=notes, follow_up_tasks=comparing, check=check,
+    task_kind=lambda task: "comparison" if "method" in task.settings else "parameters")

@@ -17,7 +17,7 @@ from lfm_ppl.experiments.counts import problem
 from lfm_ppl.experiments.counts.reference import CHAINS, Reference
 from lfm_ppl.experiments.datasets import DATASET
 from lfm_ppl.experiments.study import Data
-from lfm_ppl.experiments.timing import timed
+from lfm_ppl.experiments.timing import time_call
 from lfm_ppl.inference.map import map_estimate
 
 REFERENCE = "reference"
@@ -90,7 +90,7 @@ def _sites(task: Task, one: problem.Problem, theta: dict[str, float]) -> Result:
         return m + s * NODES, WEIGHTS / WEIGHTS.sum(), m + s * normal
 
     log_z = float(evidence(theta, one.y)[0])  # compiled here
-    seconds, _ = timed(lambda: [evidence(theta, one.y) for _ in range(REPEATS)])
+    seconds, _ = time_call(lambda: [evidence(theta, one.y) for _ in range(REPEATS)])
     mean, sd = moments(one.y)
     return {"log evidence": log_z, "mean": mean, "sd": sd, "seconds": seconds / REPEATS,
             **held_out(task, one, predicted)}
@@ -103,7 +103,7 @@ def _reference(task: Task, one: problem.Problem, theta: dict[str, float]) -> Res
     def sampled(key: jax.Array, y: np.ndarray, draws: int) -> np.ndarray:
         return np.asarray(reference.sample(key, y, reference.proposal(y), draws))
 
-    seconds, f = timed(sampled, key, one.y, draws)
+    seconds, f = time_call(sampled, key, one.y, draws)
     rows = np.unique(np.linspace(0, len(one.y) - 1, 40).astype(int))
     checked = scores.diagnose([str(row) for row in rows], np.moveaxis(f[..., rows], -1, 0))
     log_weight = np.asarray(reference.log_weights(jax.random.fold_in(key, 1), one.y, reference.proposal(one.y),

@@ -11,15 +11,15 @@ import xarray as xr
 from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import study
 from lfm_ppl.experiments.chains import LENGTHS
-from lfm_ppl.experiments.datasets import Column, Kind, in_one_row, rows
+from lfm_ppl.experiments.datasets import Column, TaskKind, merge_rows, rows
 from lfm_ppl.experiments.ginzburg_landau import figures, parameters, problem, states
 from lfm_ppl.experiments.scores import Estimate
-from lfm_ppl.experiments.study import CHAINS, Data, Study, Table, setting
-from lfm_ppl.experiments.tasks import Tasks, in_order, slug
+from lfm_ppl.experiments.study import CHAINS, Data, Study, StudyTable, setting
+from lfm_ppl.experiments.tasks import TaskFactory, slug, sort_by_dataset
 
 
 @dataclass(frozen=True)
-class Settings(study.Settings):
+class GinzburgLandauSettings(study.StudySettings):
     """How much is computed."""
 
     realisations: int = setting(20, "for states and for MCMC", quick=2, aliases=study.REALISATIONS,
@@ -48,12 +48,12 @@ class Settings(study.Settings):
         return problem.DEFAULT if min(self.realisations, self.conditional) > problem.DEFAULT else 0
 
 
-def all_tasks(settings: Settings) -> list[Task]:
+def all_tasks(settings: GinzburgLandauSettings) -> list[Task]:
     """Return every task: all methods on the first realisations, then on the next.
 
     The figure of the conditional posteriors has a task of its own, with as many particles as the source.
     """
-    tasks, count = Tasks("ginzburg-landau", settings.seed, digits=3), settings.realisations
+    tasks, count = TaskFactory("ginzburg-landau", settings.seed, digits=3), settings.realisations
     steps, particle_steps = {"steps": problem.STEPS}, {"steps": parameters.PARTICLE_STEPS}
     at_truth: dict[str, dict[str, Any]] = {
         problem.PARTICLES: {"particles": settings.particles, "smoother_particles": settings.smoother_particles,
@@ -63,28 +63,29 @@ def all_tasks(settings: Settings) -> list[Task]:
                    problem.GRID: {"cells": settings.cells}}
     priors = {name: list(ends) for name, ends in parameters.INTERVALS.items()}
     posterior: dict[str, Any] = {"what": "conditional", "nodes": settings.nodes, "intervals": priors}
-    found = [one for method in problem.METHODS for one in tasks.each(
+    found = [one for method in problem.METHODS for one in tasks.dataset_tasks(
         f"state/{slug(method)}", count, method=method, **at_truth.get(method, steps))]
-    found += [one for method in problem.METHODS for one in tasks.blocks(
+    found += [one for method in problem.METHODS for one in tasks.block_tasks(
         f"conditional/{slug(method)}", settings.conditional, 10, method=method, **posterior,
         **likelihoods.get(method, steps))]
-    found.append(tasks.one("conditional-figure/particle-filter", method=problem.PARTICLES, first=settings.figure,
-                           last=settings.figure, particles=settings.particles, **particle_steps, **posterior))
+    found.append(tasks.task("conditional-figure/particle-filter", method=problem.PARTICLES, first=settings.figure,
+                            last=settings.figure, particles=settings.particles, **particle_steps, **posterior))
     kernels = {"RAM": steps, "NUTS": steps | {"tree_depth": settings.tree_depth}, "PMMH": {
         "particles": settings.marginal_particles, "steps": settings.marginal_steps, "cells": settings.draw_cells}}
     for label, (kernel, _) in parameters.SAMPLERS.items():
         size = dict(zip(LENGTHS, (parameters.CHAINS, *getattr(settings, kernel.lower())), strict=True))
-        found += tasks.each(f"mcmc/{slug(label)}", count, sampler=label, paths=settings.paths, **size,
-                            **kernels[kernel])
-    return in_order(found)
+        found += tasks.dataset_tasks(f"mcmc/{slug(label)}", count, sampler=label, paths=settings.paths, **size,
+                                     **kernels[kernel])
+    return sort_by_dataset(found)
 
 
-def tables(settings: Settings, data: Data) -> dict[str, Table]:
+def tables(settings: GinzburgLandauSettings, data: Data) -> dict[str, StudyTable]:
     """Return the tables."""
     some, many = (f"{count} realisations" for count in (settings.realisations, settings.conditional))
-    return {"comparison": Table.of(f"Means over {some} (standard errors)", comparison(data)),
-            "rates": Table.of(f"Truth outside the 99% interval of a conditional posterior, {many}", rates(data)),
-            "parameters": Table.of(f"Posteriors of the parameters, {some}", posteriors(data))}
+    return {"comparison": StudyTable.from_rows(f"Means over {some} (standard errors)", comparison(data)),
+            "rates": StudyTable.from_rows(f"Truth outside the 99% interval of a conditional posterior, {many}",
+                                          rates(data)),
+            "parameters": StudyTable.from_rows(f"Posteriors of the parameters, {some}", posteriors(data))}
 
 
 def comparison(data: Data) -> dict[str, Any]:
@@ -125,7 +126,7 @@ def posteriors(data: Data) -> dict[str, Any]:
     """Return posterior means and standard deviations by MCMC, averaged over realisations, and the coverage of each."""
     found = data["mcmc"].assign(coverage=_covered(data["mcmc"]))
     columns = {f"{name} {{parameter}}": name for name in ("mean", "sd", "coverage")}
-    return {label: in_one_row(rows(found.sel(sampler=label), "parameter", columns))
+    return {label: merge_rows(rows(found.sel(sampler=label), "parameter", columns))
             | {"divergences": float(found.divergences.sel(sampler=label).mean())} for label in parameters.SAMPLERS}
 
 
@@ -134,17 +135,17 @@ def _covered(one: xr.Dataset) -> xr.DataArray:
 
 
 STUDY = Study(
-    Settings, all_tasks,
-    {"state": Kind(states.compute, {
+    GinzburgLandauSettings, all_tasks,
+    {"state": TaskKind(states.compute, {
         "dataset": "filter_rmse, filter_coverage, smoother_rmse, smoother_coverage, log_likelihood, seconds",
         "dataset time": "filter_mean, filter_low, filter_high, smoother_mean, smoother_low, smoother_high",
         "dataset cell": "x", "dataset mark": "marks", "dataset mark cell": "filter_density, smoother_density"},
         ("method",)),
-     "conditional": Kind(parameters.conditional, {"member parameter node": "log_likelihood", "": "seconds"},
-                         ("method", "first")),
-     "conditional-figure": Kind(parameters.conditional, {"member parameter node": "log_likelihood"}),
-     "mcmc": Kind(parameters.by_chains, {
+     "conditional": TaskKind(parameters.conditional, {"member parameter node": "log_likelihood", "": "seconds"},
+                             ("method", "first")),
+     "conditional-figure": TaskKind(parameters.conditional, {"member parameter node": "log_likelihood"}),
+     "mcmc": TaskKind(parameters.by_chains, {
          "dataset parameter": "mean, sd, low, high, ess, r_hat", "dataset": "divergences, seconds, smoother_rmse, "
          "smoother_coverage", "dataset time": "smoother_mean, smoother_low, smoother_high"}, ("sampler",))},
     tables, figures.draw, {"parameter": ("parameter", problem.NAMES), "truth": ("parameter", problem.TRUTH)},
-    label="method", what=lambda task: task.name.partition("/")[0])
+    label="method", task_kind=lambda task: task.name.partition("/")[0])

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from scipy import stats
 
-from lfm_ppl.experiments.datasets import part
+from lfm_ppl.experiments.datasets import select_prefix
 from lfm_ppl.experiments.drawing import SHADE, SPAN, bars, legend
 from lfm_ppl.experiments.ginzburg_landau import parameters, problem
 from lfm_ppl.experiments.scores import GridPosterior, Z, rate_of
@@ -43,7 +43,7 @@ def plot_states(truth: problem.Realisation, states: xr.Dataset, *, width: str | 
     figure, reach = style.new_figure(width, 4.6), 1.8 * float(np.abs(truth.path).max())
     for row, method in zip(figure.subplots(len(methods), 2, sharex=True, sharey=True), methods, strict=True):
         for axes, what in zip(row, ("filter", "smoother"), strict=True):
-            found = part(states.sel({"method": method}), what)
+            found = select_prefix(states.sel({"method": method}), what)
             name = "exact (grid)" if method == problem.GRID else method
             _draw_path(axes, truth, found, method, title=f"{name}, {what}, RMSE {found.rmse:.2f}", ylim=(-reach, reach))
             for time in states.marks.sel({"method": problem.GRID}):
@@ -68,7 +68,7 @@ def plot_marginals(truth: problem.Realisation, states: xr.Dataset, *, width: str
             sd = np.sqrt(np.average((cells - mean) ** 2, weights=density))
             axes.plot(x, stats.norm.pdf(x, mean, sd), color=style.BLACK, lw=0.9, zorder=2, label="its best Gaussian")
             for method in problem.GAUSSIAN:
-                found = part(states, what).sel({"method": method}).isel(time=index)
+                found = select_prefix(states, what).sel({"method": method}).isel(time=index)
                 normal = stats.norm(found["mean"].item(), (found.high - found["mean"]).item() / Z)
                 axes.plot(x, normal.pdf(x), color=COLOURS[method], **_DENSITIES[method], label=method)
             highest = max(density.max(), *(line.get_ydata().max() for line in axes.lines))
@@ -116,7 +116,7 @@ def plot_integrated(truth: problem.Realisation, chains: xr.Dataset, *, width: st
     figure = style.new_figure(width, 4.4)
     panels = figure.subplots(len(shown), 1, sharex=True, sharey=True)
     for axes, (label, like) in zip(panels, shown.items(), strict=True):
-        found, published = part(chains.sel(sampler=label), "smoother"), parameters.PUBLISHED.get(label)
+        found, published = select_prefix(chains.sel(sampler=label), "smoother"), parameters.PUBLISHED.get(label)
         beside = f" (published for another path: {published})" if published else ", exact smoother"
         _draw_path(axes, truth, found, like, title=f"{label}: RMSE {found.rmse:.3f}{beside}")
     legend(figure, *_bands(shown.values()))

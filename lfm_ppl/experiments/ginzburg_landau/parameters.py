@@ -19,8 +19,8 @@ from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.chains import nuts
 from lfm_ppl.experiments.ginzburg_landau import problem, states
-from lfm_ppl.experiments.tasks import indices
-from lfm_ppl.experiments.timing import timed
+from lfm_ppl.experiments.tasks import dataset_indices
+from lfm_ppl.experiments.timing import time_call
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.fokker_planck_grid import grid_filter
 from lfm_ppl.inference.handlers.settings import approximate
@@ -65,11 +65,11 @@ def nodes(name: str, count: int) -> np.ndarray:
 def conditional(task: Task) -> Result:
     """Return ``log_likelihood`` (realisations, 3, nodes), and CPU ``seconds`` for all of them, without compilation."""
     settings = task.settings
-    data = [problem.realisation(index, task.seed) for index in indices(task)]
+    data = [problem.realisation(index, task.seed) for index in dataset_indices(task)]
     run = _likelihoods(settings["method"], settings.get("particles", settings.get("cells")), settings.get("steps", 1),
                        tuple(data[0].times), len(data), settings["nodes"])
-    keys = jax.vmap(functools.partial(jax.random.fold_in, jax.random.key(task.seed)))(np.array(indices(task)))
-    seconds, values = timed(run, np.stack([one.y for one in data]), keys)
+    keys = jax.vmap(functools.partial(jax.random.fold_in, jax.random.key(task.seed)))(np.array(dataset_indices(task)))
+    seconds, values = time_call(run, np.stack([one.y for one in data]), keys)
     return {"log_likelihood": np.asarray(values).reshape(len(data), 3, -1), "seconds": seconds}
 
 
@@ -127,7 +127,7 @@ def outcomes(found: xr.Dataset) -> xr.Dataset:
     below, cut = xr.zeros_like(rows[..., 0]), xr.zeros_like(rows[..., 0], bool)
     for place in np.ndindex(below.shape):
         posterior = scores.GridPosterior(nodes(problem.NAMES[place[-1]], rows.sizes["node"]), rows.values[place])
-        below[place], cut[place] = posterior.below(problem.TRUTH[place[-1]]), posterior.cut()
+        below[place], cut[place] = posterior.below(problem.TRUTH[place[-1]]), posterior.is_cut_off()
     return xr.Dataset({"below": below, "outside": (below < OUTSIDE / 2) | (below > 1 - OUTSIDE / 2), "cut": cut,
                        "seconds": found.seconds.sum("first") / rows.sizes["dataset"]})
 
@@ -157,10 +157,10 @@ def by_chains(task: Task) -> Result:
     settings, data = task.settings, problem.realisation(task.settings["index"], task.seed)
     names = ("sampler", "warmup", "draws", "thin", "chains", "steps", "particles", "tree_depth")
     run = _chains(*(settings.get(name) for name in names), tuple(data.times))
-    seconds, (draws, divergences) = timed(run, task.key, data.y)
+    seconds, (draws, divergences) = time_call(run, task.key, data.y)
     draws = np.asarray(draws)
     mean, variance = map(np.asarray, _smoothed(
-        scores.spread(draws, settings["paths"]), data.sparse, SAMPLERS[settings["sampler"]][1],
+        scores.thin_draws(draws, settings["paths"]), data.sparse, SAMPLERS[settings["sampler"]][1],
         states.size_of(settings, data), tuple(data.fine)))
     paths = states.band("smoother", *scores.total_moments(mean, variance))
     return {"draws": draws, "divergences": int(divergences), "seconds": seconds,

@@ -13,7 +13,7 @@ import numpy as np
 from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.ginzburg_landau import problem
-from lfm_ppl.experiments.timing import timed, timed_again
+from lfm_ppl.experiments.timing import time_call, time_compiled_call
 from lfm_ppl.filtering.filter import filter as gaussian_filter
 from lfm_ppl.filtering.smoother import smooth
 from lfm_ppl.filtering.time_grid import build_time_grid
@@ -53,7 +53,7 @@ def compute(task: Task) -> Result:
 
 def judged(what: str, found: Result, path: np.ndarray) -> Result:
     """Return ``{what}_rmse``, and ``{what}_coverage``, the share of the path that lies in the 95% band."""
-    return scores.judged(what, found[f"{what}_mean"], (found[f"{what}_low"], found[f"{what}_high"]), path)
+    return scores.score_path(what, found[f"{what}_mean"], (found[f"{what}_low"], found[f"{what}_high"]), path)
 
 
 def band(what: str, mean: Any, sd: Any) -> Result:
@@ -100,7 +100,7 @@ def solved(method: str, theta: jax.Array, sparse: jax.Array, fine: np.ndarray, s
 
 def _by_program(task: Task, data: problem.Realisation) -> Result:
     method, size = task.settings["method"], size_of(task.settings, data)
-    seconds, (log_likelihood, *moments, masses) = timed(_program(method, size, tuple(data.fine)), data.sparse)
+    seconds, (log_likelihood, *moments, masses) = time_call(_program(method, size, tuple(data.fine)), data.sparse)
     result: Result = {"log_likelihood": float(log_likelihood), "seconds": seconds}
     for what, (mean, variance) in zip(("filter", "smoother"), moments, strict=True):
         result |= band(what, mean, np.sqrt(variance))
@@ -140,8 +140,8 @@ def _particles(task: Task, data: problem.Realisation) -> Result:
                                   steps=settings["steps"])
     smoothing = functools.partial(particle_smoother, keys[1], *given, particles=settings["smoother_particles"],
                                   draws=settings["smoother_draws"], steps=settings["smoother_steps"])
-    filter_s, filtered = timed_again(f"double well, {filtering.keywords}", filtering)
-    smoother_s, smoothed = timed_again(f"double well, {smoothing.keywords}", smoothing)
+    filter_s, filtered = time_compiled_call(f"double well, {filtering.keywords}", filtering)
+    smoother_s, smoothed = time_compiled_call(f"double well, {smoothing.keywords}", smoothing)
     draws = np.asarray(smoothed.draws)[:, :, 0]
     low, high = np.quantile(draws, _LEVELS, axis=0)
     return {**band("filter", filtered.mean[:, 0], np.sqrt(filtered.covariance[:, 0, 0])),

@@ -15,12 +15,12 @@ import xarray as xr
 from lfm_ppl import orbits
 from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import study
-from lfm_ppl.experiments.datasets import Kind
+from lfm_ppl.experiments.datasets import TaskKind
 from lfm_ppl.experiments.gps import figures, problem, satellite, ways
 from lfm_ppl.experiments.gps.figures import METRE, rms
 from lfm_ppl.experiments.gps.satellite import REFUSED, attempt
-from lfm_ppl.experiments.scores import mean_of, pair
-from lfm_ppl.experiments.study import Data, Results, Study, Table, setting
+from lfm_ppl.experiments.scores import estimate_cells, mean_of
+from lfm_ppl.experiments.study import Data, Results, Study, StudyTable, setting
 from lfm_ppl.orbits import learning, magnitudes
 from lfm_ppl.orbits.arc import NOISE, Unusable
 
@@ -32,7 +32,7 @@ _PRINTED = {"eclipsed": "{}", "fit": "{:.2f}", "deterministic": "{:.1f}", "lates
 
 
 @dataclass(frozen=True)
-class Settings(study.Settings):
+class GpsSettings(study.StudySettings):
     """What is asked of the comparison."""
 
     data: str | None = setting(None, "folder of SP3 files (default: simulated satellites)", metavar="FOLDER")
@@ -43,7 +43,7 @@ class Settings(study.Settings):
     most: int | None = setting(None, "satellites where none are named (default: all)", quick=2)
 
 
-def plan(settings: Settings) -> list[Task]:
+def plan(settings: GpsSettings) -> list[Task]:
     """Return the first tasks: each satellite is learnt by itself.
 
     Raises:
@@ -66,7 +66,7 @@ def plan(settings: Settings) -> list[Task]:
     return tasks
 
 
-def plan_predictions(settings: Settings, results: Results) -> list[Task]:
+def plan_predictions(settings: GpsSettings, results: Results) -> list[Task]:
     """Return the tasks that follow: the predictions, and the ways to learn on the first satellites.
 
     Raises:
@@ -109,16 +109,16 @@ def _none_left(results: Results) -> ValueError:
 class SatelliteStudy(Study):
     """A study of the satellites that can be predicted; its data say what groups have in common, and who is left out."""
 
-    def gathered(self, settings: Settings, results: Results, tasks: Sequence[Task] | None = None) -> Data:
+    def collect(self, settings: GpsSettings, results: Results, tasks: Sequence[Task] | None = None) -> Data:
         """Return the results by satellite, without those refused, the ``prior`` of each group, and who is ``left out``.
 
         Raises:
             ValueError: no satellite can be predicted.
         """
-        data, asked = {}, self.by_kind(settings, results, tasks)
+        data, asked = {}, self.tasks_by_kind(settings, results, tasks)
         for what, own in asked.items():
             if usable := [task for task in own if REFUSED not in results[task.name]]:
-                data[what] = self.kinds[what].gathered(usable, results)
+                data[what] = self.kinds[what].collect(usable, results)
         if "predict" not in data:
             raise _none_left(results)
         found = data["predict"]
@@ -134,20 +134,20 @@ class SatelliteStudy(Study):
         return data
 
 
-def tables(settings: Settings, data: Data) -> dict[str, Table]:
+def tables(settings: GpsSettings, data: Data) -> dict[str, StudyTable]:
     """Return the tables."""
     each = satellites(data)
-    found = {"pooled": Table.of("Errors after training (m), pooled over satellites, and 95% coverage",
-                                pooled(data["predict"], each)),
-             "satellites": Table("Each satellite: root mean square errors after training (m)", each, pd.DataFrame(
+    found = {"pooled": StudyTable.from_rows("Errors after training (m), pooled over satellites, and 95% coverage",
+                                            pooled(data["predict"], each)),
+             "satellites": StudyTable("Each satellite: root mean square errors after training (m)", each, pd.DataFrame(
                  {name: each[name].map(form.format) for name, form in _PRINTED.items()})),
-             "magnitudes": Table("", magnitudes_of(data))}
+             "magnitudes": StudyTable("", magnitudes_of(data))}
     if "ways" in data:
-        found["learning"] = Table.of("Ways to learn the magnitudes of the forces: error after training (m)",
-                                     ways.table(data["ways"]))
+        found["learning"] = StudyTable.from_rows("Ways to learn the magnitudes of the forces: error after training (m)",
+                                                 ways.table(data["ways"]))
     if "left out" in data:
         reasons = pd.DataFrame({"reason": data["left out"].reason.values}, data["left out"].satellite.values)
-        found["left out"] = Table("Left out", reasons, reasons, stored=False)
+        found["left out"] = StudyTable("Left out", reasons, reasons, stored=False)
     return found
 
 
@@ -190,7 +190,8 @@ def _together(own: pd.DataFrame) -> dict[str, Any]:
     errors = {name: float(np.sqrt((own[name] ** 2).mean())) for name in _POOLED}
     return {"satellites": len(own), "fit, median": own["fit"].median(), **errors, "median": own["LFM"].median(),
             "ratio": errors["LFM"] / errors["deterministic"], "ratio, latest": errors["LFM"] / errors["latest state"],
-            "improved": int((own["LFM"] < own["deterministic"]).sum()), **pair("coverage", mean_of(own["coverage"]))}
+            "improved": int((own["LFM"] < own["deterministic"]).sum()),
+            **estimate_cells("coverage", mean_of(own["coverage"]))}
 
 
 def magnitudes_of(data: Data) -> pd.DataFrame:
@@ -207,15 +208,15 @@ def magnitudes_of(data: Data) -> pd.DataFrame:
 
 _BY = ("satellite",)
 STUDY = SatelliteStudy(
-    Settings, plan,
-    {"learn": Kind(partial(attempt, satellite.learn), {
+    GpsSettings, plan,
+    {"learn": TaskKind(partial(attempt, satellite.learn), {
         "element": "orbit", "magnitude": "logarithms", "": "cpu_s"}, _BY),
-     "predict": Kind(partial(attempt, satellite.predict), {
+     "predict": TaskKind(partial(attempt, satellite.predict), {
          "time direction": "fitted, latest, lfm, sd", "time force": "forces, forces_sd, seen", "time": "times",
          "": "train, residual, solar, eclipsed, complete, coverage, cpu_s", "force": "force_names",
          "magnitude": "logarithms"}, _BY),
-     "ways": Kind(partial(attempt, ways.compare), {
+     "ways": TaskKind(partial(attempt, ways.compare), {
          "way": "error, coverage", "way magnitude": "logarithms", "": "cpu_s"}, _BY),
-     "online": Kind(partial(attempt, satellite.online), {
+     "online": TaskKind(partial(attempt, satellite.online), {
          "time direction": "lfm, sd, restarted", "time": "times, observed", "": "cpu_s"}, _BY)},
-    tables, figures.draw, label="", then=plan_predictions)
+    tables, figures.draw, label="", follow_up_tasks=plan_predictions)

@@ -13,10 +13,10 @@ import xarray as xr
 from lfm_ppl.engine.run import Reporter
 from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import chains, study
-from lfm_ppl.experiments.datasets import Column, Kind, cell, number, part, row
+from lfm_ppl.experiments.datasets import Column, TaskKind, cell, number, row, select_prefix
 from lfm_ppl.experiments.home_heating import figures, prediction, problem
-from lfm_ppl.experiments.scores import Estimate, pair
-from lfm_ppl.experiments.study import Data, Study, Table, setting
+from lfm_ppl.experiments.scores import Estimate, estimate_cells
+from lfm_ppl.experiments.study import Data, Study, StudyTable, setting
 from lfm_ppl.experiments.tasks import slug
 
 PUBLISHED = {
@@ -42,7 +42,7 @@ REFERENCES = ("none", "matern")
 
 
 @dataclass(frozen=True)
-class Settings(study.Settings):
+class HomeHeatingSettings(study.StudySettings):
     """How much is computed."""
 
     data: str | None = setting(None, f"folder of {problem.FILE} (default: $LFM_DATA/house or ../shared/data/house; "
@@ -67,15 +67,15 @@ class Settings(study.Settings):
                              f"{self.integrated!r}.")
 
     @classmethod
-    def chosen(cls, report: Reporter | None, quick: bool = False, **given: Any) -> Self:
+    def from_command_line(cls, report: Reporter | None, quick: bool = False, **given: Any) -> Self:
         """Return the settings that a user chose, with the folder of the real house where there is one."""
         folder = problem.data_folder(given.pop("data", None))
         if folder is None and report:
             report(f"no {problem.FILE} in $LFM_DATA/house or ../shared/data/house: simulated homes only")
-        return super().chosen(report, quick, data=None if folder is None else str(folder), **given)
+        return super().from_command_line(report, quick, data=None if folder is None else str(folder), **given)
 
 
-def tasks(settings: Settings) -> list[Task]:
+def tasks(settings: HomeHeatingSettings) -> list[Task]:
     """Return every task, those of a residual together, since they share what is compiled."""
     found = []
     for store, method in ((store, method) for store in settings.stores for method in settings.methods):
@@ -93,19 +93,19 @@ def tasks(settings: Settings) -> list[Task]:
     return found
 
 
-def tables(settings: Settings, data: Data) -> dict[str, Table]:
+def tables(settings: HomeHeatingSettings, data: Data) -> dict[str, StudyTable]:
     """Return the tables."""
     found = {}
     for store in settings.stores:
         for what in (what for what in ("house", "homes") if what in data):
-            found[f"{what}-{slug(store)}"] = Table.of(
+            found[f"{what}-{slug(store)}"] = StudyTable.from_rows(
                 TITLES[what].format(store, data[what].sizes["dataset"]), fifth_day(data[what].sel(store=store), what))
         if store == settings.stores[0] and "posterior" in data:
-            found["posterior"] = Table.of(TITLES["posterior"].format(store, data["posterior"].sizes["dataset"]),
-                                          marginalised(data["posterior"]))
+            found["posterior"] = StudyTable.from_rows(
+                TITLES["posterior"].format(store, data["posterior"].sizes["dataset"]), marginalised(data["posterior"]))
     if settings.data is None:
         reason = pd.DataFrame({"reason": [f"no {problem.FILE}; give its folder with --data"]}, ["real house"])
-        found["left out"] = Table("Left out", reason, reason, stored=False)
+        found["left out"] = StudyTable("Left out", reason, reason, stored=False)
     return found
 
 
@@ -116,7 +116,9 @@ def fifth_day(found: xr.Dataset, what: str) -> dict[str, Any]:
     log likelihoods rule the means, so the share of days with a higher one stands beside them.
     """
     rows, store, house = {}, found.store.item(), what == "house"
-    days = {"ahead": part(found, "ahead"), "tracked": part(found, "track")} if house else {"ahead": found}
+    days = {"ahead": found}
+    if house:
+        days = {"ahead": select_prefix(found, "ahead"), "tracked": select_prefix(found, "track")}
     for method in found.method.values:
         cells: dict[str, Any] = {}
         for name, day in days.items():
@@ -126,8 +128,8 @@ def fifth_day(found: xr.Dataset, what: str) -> dict[str, Any]:
             cells |= row(day.sel({"method": method}), columns)
             if (what, store, name) in SOURCES:
                 numbers = PUBLISHED[method].get(SOURCES[what, store, name], 4 * (np.nan,))
-                cells |= pair(f"published RMSE {name} (K)", Estimate(*numbers[:2]))
-                cells |= pair(f"published ELL {name}", Estimate(*numbers[2:]))
+                cells |= estimate_cells(f"published RMSE {name} (K)", Estimate(*numbers[:2]))
+                cells |= estimate_cells(f"published ELL {name}", Estimate(*numbers[2:]))
         if house:
             cells |= cell("RMSE ahead, weather unknown (K)", found.blind_rmse.sel({"method": method}))
         own = days["ahead"].sel({"method": method})
@@ -164,15 +166,15 @@ def marginalised(found: xr.Dataset) -> dict[str, Any]:
 
 _BY = ("store", "method")
 STUDY = Study(
-    Settings, tasks,
-    {"house": Kind(prediction.compute, {
+    HomeHeatingSettings, tasks,
+    {"house": TaskKind(prediction.compute, {
         "dataset": "ahead_rmse, ahead_ell, ahead_inside, track_rmse, track_ell, track_inside, blind_rmse, blind_ell, "
-                   "blind_inside, density", "dataset parameter": "z", "dataset hour": "mean, sd",
+                       "blind_inside, density", "dataset parameter": "z", "dataset hour": "mean, sd",
         "time": "residual, residual_sd", "": "cpu_s"}, _BY),
-     "homes": Kind(prediction.compute, {
+     "homes": TaskKind(prediction.compute, {
          "dataset": "rmse, ell, inside", "dataset parameter": "z", "dataset time": "mean, on",
          "probability time": "quantiles", "": "cpu_s"}, _BY),
-     "posterior": Kind(prediction.compute, {
+     "posterior": TaskKind(prediction.compute, {
          "dataset": "rmse, ell, point_rmse, point_ell, r_hat, ess, divergences, seconds",
          "dataset parameter": "mean, sd", "": "cpu_s"}, ("sampler",))},
     tables, figures.draw, label="residual")

@@ -9,7 +9,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lfm_ppl.experiments.datasets import part
+from lfm_ppl.experiments.datasets import select_prefix
 from lfm_ppl.experiments.drawing import TRUTH, band, bars, legend, line
 from lfm_ppl.experiments.home_heating import prediction, problem
 from lfm_ppl.experiments.scores import mean_of
@@ -66,7 +66,7 @@ def plot_house(settings: Any, data: Data, *, store: str | None = None, width: st
     shown = found.sizes["dataset"] // 2
     temperature, _, power = problem.house(settings.data)[shown].y[problem.TRAIN:].T
     found = found.isel(dataset=shown)
-    figure, panels = _panels(width, found.assign(part(found, "ahead")), "power")
+    figure, panels = _panels(width, found.assign(select_prefix(found, "ahead")), "power")
     for own, upper, lower in panels:
         upper.plot(hours, own["mean"], color=style.BLUE, label="predicted")
         band(upper, hours, own["mean"], own["sd"], color=_WIDE)
@@ -129,7 +129,7 @@ def plot_scores(data: Data, *, width: str | float = "full") -> Figure:
     """Draw day-ahead RMSE of every residual with two standard errors, and the quartiles of its log likelihood."""
     kinds = {"simulated homes": data["homes"]}
     if "house" in data:
-        kinds["real house"] = part(data["house"], "ahead")
+        kinds["real house"] = select_prefix(data["house"], "ahead")
     methods, stores = data["homes"].method.values, data["homes"].store.values
     figure, places = style.new_figure(width, 2.1 * len(kinds) + 0.3), np.arange(len(methods))
     for (title, found), (left, right) in zip(kinds.items(), figure.subplots(len(kinds), 2, squeeze=False), strict=True):

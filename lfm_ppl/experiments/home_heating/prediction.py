@@ -17,7 +17,7 @@ from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import chains, scores, timing
 from lfm_ppl.experiments.home_heating import problem
 from lfm_ppl.experiments.home_heating.problem import FINE, TIMES, TRAIN, Model, Window
-from lfm_ppl.experiments.tasks import stacked
+from lfm_ppl.experiments.tasks import stack_results
 from lfm_ppl.filtering.filter import FilterState
 from lfm_ppl.inference.bound_model import bind_arguments
 from lfm_ppl.inference.kernels.ram import RAM
@@ -42,7 +42,7 @@ def compute(task: Task) -> Result:
     """Return the result of a task, with the CPU time ``cpu_s`` that it took."""
     model = Model(*(task.settings[name] for name in Model._fields))
     run = {"house": _house, "homes": _homes, "posterior": _posterior}[task.name.split("/")[0]]
-    seconds, result = timing.timed(run, task, model)
+    seconds, result = timing.time_call(run, task, model)
     return {**result, "cpu_s": seconds}
 
 
@@ -62,7 +62,7 @@ def _house(task: Task, model: Model) -> Result:
         if index == task.settings["shown"] and model.method in RESIDUALS:
             mean, sd = smoothed(model, z, masked(window.y), window.outdoor)
             shown = {"residual": np.asarray(mean), "residual_sd": np.asarray(sd)}
-    return stacked(rows) | shown
+    return stack_results(rows) | shown
 
 
 def _homes(task: Task, model: Model) -> Result:
@@ -76,7 +76,7 @@ def _homes(task: Task, model: Model) -> Result:
         rows.append({**result, "z": z})
         if index == 0:
             rows[0]["quantiles"] = np.asarray(prediction.observed.quantiles(QUANTILES))[:, SCORED, 0]
-    return stacked(rows, shown=("quantiles",))
+    return stack_results(rows, first_only=("quantiles",))
 
 
 def _posterior(task: Task, model: Model) -> Result:
@@ -87,7 +87,7 @@ def _posterior(task: Task, model: Model) -> Result:
             continue
         sampled = posterior(task.settings["sampler"], model, window, z, jax.random.fold_in(task.key, index),
                             tuple(task.settings["chains"]))
-        draws = scores.spread(sampled["draws"], 100)
+        draws = scores.thin_draws(sampled["draws"], 100)
         moments = filtered_under_draws(model, draws, masked(window.y), window.outdoor)
         mean, variance = (np.asarray(moment)[:, AHEAD] for moment in moments[:2])
         truth, point = window.y[AHEAD, 0], known_heater(model, window, z)
@@ -96,7 +96,7 @@ def _posterior(task: Task, model: Model) -> Result:
                      "point_ell": point["ahead_ell"], "point_rmse": point["ahead_rmse"],
                      "r_hat": np.max(sampled["r_hat"]), "ess": np.min(sampled["ess"]),
                      **{name: sampled[name] for name in ("mean", "sd", "divergences", "seconds")}})
-    return stacked(rows)
+    return stack_results(rows)
 
 
 def most_likely(model: Model, window: Window, start: np.ndarray | None = None) -> tuple[np.ndarray, float]:
@@ -127,7 +127,7 @@ def posterior(sampler: str, model: Model, window: Window, near: np.ndarray, key:
     """
     start_key, run_key = jax.random.split(key)
     return chains.sample(_sampler(sampler, model, *size), model.names, run_key, window.learnt,
-                         init_params=chains.starts(model.names, near, size[0], start_key))
+                         init_params=chains.draw_starts(model.names, near, size[0], start_key))
 
 
 @functools.cache
@@ -208,7 +208,7 @@ def gaussian_scores(mean: np.ndarray, variance: np.ndarray, truth: np.ndarray) -
     """Return root mean squared error, sum of the log densities of all measurements, and share in 95% bands."""
     sd = np.sqrt(variance)
     return {"rmse": scores.rmse(mean, truth), "ell": float(norm.logpdf(truth, mean, sd).sum()),
-            "inside": scores.covered(*scores.interval(mean, sd), truth)}
+            "inside": scores.interval_coverage(*scores.interval(mean, sd), truth)}
 
 
 def thermostat_ahead(model: Model, window: Window, z: np.ndarray, particles: int,

@@ -9,18 +9,18 @@ import numpy as np
 
 from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import study
-from lfm_ppl.experiments.datasets import Column, Kind, row, rows
+from lfm_ppl.experiments.datasets import Column, TaskKind, row, rows
 from lfm_ppl.experiments.periodic_kernels import figures, methods, problem
 from lfm_ppl.experiments.periodic_kernels.methods import KPCA, SPARSE, SPARSE_4
-from lfm_ppl.experiments.scores import Estimate, mean_of, pair
-from lfm_ppl.experiments.study import Data, Study, Table, setting
+from lfm_ppl.experiments.scores import Estimate, estimate_cells, mean_of
+from lfm_ppl.experiments.study import Data, Study, StudyTable, setting
 
 PUBLISHED = {SPARSE: (0.36, 3.03, -6.9e4), SPARSE_4: (0.23, 2.74, -1.2e4), KPCA: (9.6e-5, 2.49, 75.0)}
 """Largest error of the covariance, error and expected log likelihood that the source publishes."""
 
 
 @dataclass(frozen=True)
-class Settings(study.Settings):
+class PeriodicKernelSettings(study.StudySettings):
     """How much is computed."""
 
     runs: int = setting(500, "functions that are drawn and predicted", quick=10, aliases=study.REALISATIONS)
@@ -37,7 +37,7 @@ class Settings(study.Settings):
             raise ValueError(f"functions must be at most 200, got {self.functions[-1]}.")
 
 
-def all_tasks(settings: Settings) -> list[Task]:
+def all_tasks(settings: PeriodicKernelSettings) -> list[Task]:
     """Return one task for each kernel, one for the quadrature grid, and one for each method of prediction."""
     def task(name: str, what: str, **given: Any) -> Task:
         return Task(name.replace(" ", "_").replace(",", ""), settings.seed, {"what": what, **given})
@@ -48,15 +48,17 @@ def all_tasks(settings: Settings) -> list[Task]:
             *(task(f"regression/{name}", "regression", method=name, runs=settings.runs) for name in methods.PREDICTING)]
 
 
-def tables(settings: Settings, data: Data) -> dict[str, Table]:
+def tables(settings: PeriodicKernelSettings, data: Data) -> dict[str, StudyTable]:
     """Return the tables."""
-    return {"covariance": Table.of("Largest error of the covariance, by the number of functions",
-                                   covariances(settings, data)),
-            "published": Table.of("Squared exponential of scale 10, on a window of 130", published(settings, data)),
-            "regression": Table.of(f"Means over {settings.runs} functions (standard errors)", predictions(data))}
+    return {"covariance": StudyTable.from_rows("Largest error of the covariance, by the number of functions",
+                                               covariances(settings, data)),
+            "published": StudyTable.from_rows("Squared exponential of scale 10, on a window of 130",
+                                              published(settings, data)),
+            "regression": StudyTable.from_rows(f"Means over {settings.runs} functions (standard errors)",
+                                               predictions(data))}
 
 
-def covariances(settings: Settings, data: Data) -> dict[str, Any]:
+def covariances(settings: PeriodicKernelSettings, data: Data) -> dict[str, Any]:
     """Return the largest error of the covariance for each kernel and method, in a column for each number of functions.
 
     The row ``left out`` is the mean variance that the eigenfunctions miss. ``significant`` is the number at the default
@@ -73,19 +75,21 @@ def covariances(settings: Settings, data: Data) -> dict[str, Any]:
     return every
 
 
-def published(settings: Settings, data: Data) -> dict[str, Any]:
+def published(settings: PeriodicKernelSettings, data: Data) -> dict[str, Any]:
     """Return the errors of 22 eigenfunctions by their quadrature points, and of random frequencies.
 
     ``error`` is that of the covariance, for random frequencies the mean over 100 draws, ``least`` of them, and
     ``published`` what the source has.
     """
     found = data["quadrature"]
-    every = {f"{min(22, points)} eigenfunctions, {points} points": pair("error", Estimate(float(error), np.nan))
+    every = {f"{min(22, points)} eigenfunctions, {points} points":
+             estimate_cells("error", Estimate(float(error), np.nan))
              for points, error in zip(settings.points, found.error, strict=True)}
     if settings.points[-1] >= 22:
         every[f"22 eigenfunctions, {settings.points[-1]} points"]["published"] = PUBLISHED[KPCA][0]
     for label, errors in ((SPARSE, found["sparse 22"]), (SPARSE_4, found["sparse 88"])):
-        every[label] = pair("error", mean_of(errors)) | {"least": float(errors.min()), "published": PUBLISHED[label][0]}
+        every[label] = estimate_cells("error", mean_of(errors)) | {
+            "least": float(errors.min()), "published": PUBLISHED[label][0]}
     return every
 
 
@@ -106,10 +110,10 @@ def predictions(data: Data) -> dict[str, Any]:
 
 
 STUDY = Study(
-    Settings, all_tasks,
-    {"covariance": Kind(methods.covariance_errors, {"functions": ", ".join((*methods.METHODS, "left out")),
-                                             "": "significant, at default"}, ("kernel",)),
-     "quadrature": Kind(methods.quadrature_errors, {"points": "error", "draw": "sparse 22, sparse 88"}),
-     "regression": Kind(methods.predictions, {"dataset": "rmse, log likelihood, coverage", "time": "mean, variance"},
-                        ("method",))},
+    PeriodicKernelSettings, all_tasks,
+    {"covariance": TaskKind(methods.covariance_errors, {
+        "functions": ", ".join((*methods.METHODS, "left out")), "": "significant, at default"}, ("kernel",)),
+     "quadrature": TaskKind(methods.quadrature_errors, {"points": "error", "draw": "sparse 22, sparse 88"}),
+     "regression": TaskKind(methods.predictions, {
+         "dataset": "rmse, log likelihood, coverage", "time": "mean, variance"}, ("method",))},
     tables, figures.draw)

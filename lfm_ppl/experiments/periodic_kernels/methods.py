@@ -14,7 +14,7 @@ from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.periodic_kernels import problem
 from lfm_ppl.experiments.periodic_kernels.problem import MEASURED, PREDICTED
-from lfm_ppl.experiments.tasks import stacked
+from lfm_ppl.experiments.tasks import stack_results
 from lfm_ppl.forces import Force, PeriodicCovariance, random_frequencies
 
 EIGENFUNCTIONS, RESONATORS, RANDOM = METHODS = ("eigenfunctions", "resonators", "sparse spectrum")
@@ -52,7 +52,7 @@ def covariance_errors(task: Task) -> Result:
         return found
 
     significant = forces.significant_functions(kernel)
-    return stacked([errors(fitting(kernel, count)) for count in task.settings["functions"]]) | {
+    return stack_results([errors(fitting(kernel, count)) for count in task.settings["functions"]]) | {
         "significant": significant, "at default": error(eigenfunctions(kernel, significant), at, exact)}
 
 
@@ -113,7 +113,7 @@ def predictions(task: Task) -> Result:
         predict(fixed or covariances(task, method, index), data[index]) for index in range(runs)), strict=True))
     density = norm.logpdf(truth, mean, np.sqrt(variance))
     return {"rmse": scores.rmse(mean, truth), "log likelihood": density.sum(axis=1),
-            "coverage": scores.covered(*scores.interval(mean, np.sqrt(variance)), truth),
+            "coverage": scores.interval_coverage(*scores.interval(mean, np.sqrt(variance)), truth),
             "mean": mean[0], "variance": variance[0]}
 
 

@@ -19,11 +19,11 @@ from numpyro.infer import init_to_uniform
 
 from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import chains
-from lfm_ppl.experiments.scores import GridPosterior, interval, judged, total_moments
+from lfm_ppl.experiments.scores import GridPosterior, interval, score_path, total_moments
 from lfm_ppl.experiments.simulated.problem import Problem, Record, drawn_record, model, posterior, record
 from lfm_ppl.experiments.simulated.states import paths_of
-from lfm_ppl.experiments.tasks import indices, stacked
-from lfm_ppl.experiments.timing import timed_again
+from lfm_ppl.experiments.tasks import dataset_indices, stack_results
+from lfm_ppl.experiments.timing import time_compiled_call
 from lfm_ppl.inference.kernels.ram import RAM
 from lfm_ppl.inference.optimise import Minimum, newton, quasi_newton
 from lfm_ppl.results.importance_at_modes import Weighted, weighted_posterior
@@ -39,10 +39,11 @@ none among plausible values."""
 
 def weighted(problem: Problem, task: Task, drawn: bool = False) -> Result:
     """Return what `estimate` finds of every data set, with the truth or one ``drawn``, and ``draws`` of the first."""
-    taken = drawn_record if drawn else record
-    return stacked([estimate(problem, taken(problem, index, task.seed), task.settings["draws"], task.settings["paths"],
-                             int(jax.random.bits(jax.random.fold_in(task.key, index)))) for index in indices(task)],
-                   shown=("draws",))
+    simulate_record = drawn_record if drawn else record
+    count, paths = task.settings["draws"], task.settings["paths"]
+    rows = [estimate(problem, simulate_record(problem, index, task.seed), count, paths,
+                     int(jax.random.bits(jax.random.fold_in(task.key, index)))) for index in dataset_indices(task)]
+    return stack_results(rows, first_only=("draws",))
 
 
 def estimate(problem: Problem, one: Record, count: int, paths: int, seed: int) -> Result:
@@ -68,7 +69,7 @@ def estimate(problem: Problem, one: Record, count: int, paths: int, seed: int) -
         mode, likely = (newton(each, quasi_newton(each, start, 200).point) for each in objectives)
         return likely, weighted_posterior(density, one.y, [mode], count, seed)
 
-    seconds, (likely, found) = timed_again(f"{problem}, {count} weighted draws", search)
+    seconds, (likely, found) = time_compiled_call(f"{problem}, {count} weighted draws", search)
     row = {**found.summary, "likely": likely.point, "seconds": seconds, "draws": found.resampled(count, seed).T,
            "below": found.weight @ (found.draws < one.z),
            "exists": likely.curvature is not None and likely.curvature.definite
@@ -76,7 +77,7 @@ def estimate(problem: Problem, one: Record, count: int, paths: int, seed: int) -
     for what, several in (("likely", likely.point[None]), ("posterior", found.resampled(paths, seed))):
         means, sds = map(np.asarray, _smoothing(problem)(several, one.y))
         mean, sd = total_moments(means, sds**2)
-        row |= judged(what, mean, interval(mean, sd), one.paths)
+        row |= score_path(what, mean, interval(mean, sd), one.paths)
     return row
 
 
@@ -98,7 +99,8 @@ def by_chains(problem: Problem, task: Task) -> Result:
 
 def alone(problem: Problem, reach: float, task: Task) -> Result:
     """Return ``below`` (N,), see `below`, of the data sets of a task."""
-    return {"below": np.array([below(problem, reach, record(problem, index, task.seed)) for index in indices(task)])}
+    return {"below": np.array([below(problem, reach, record(problem, index, task.seed))
+                               for index in dataset_indices(task)])}
 
 
 def below(problem: Problem, reach: float, one: Record, nodes: int = 121) -> float:

@@ -17,10 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.engine.task import Result, Task
-from lfm_ppl.experiments.scores import interval, judged, rmse
+from lfm_ppl.experiments.scores import interval, rmse, score_path
 from lfm_ppl.experiments.simulated.problem import Problem, default, record, true_likelihood
-from lfm_ppl.experiments.tasks import indices, stacked
-from lfm_ppl.experiments.timing import timed_again
+from lfm_ppl.experiments.tasks import dataset_indices, stack_results
+from lfm_ppl.experiments.timing import time_compiled_call
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.linearisation.sigma_points import Cubature, GaussHermite
 from lfm_ppl.linearisation.taylor import Taylor
@@ -38,8 +38,8 @@ def gaussian(problem: Problem, task: Task) -> Result:
     """Return what a rule finds of every data set of a task, see `_judged`, and ``mean`` and ``sd`` of the first."""
     rule = task.settings["method"]
     filtering, smoothing = _programs(problem, rule)
-    return stacked([_judged(problem, task, index, rule, filtering, smoothing)[0] for index in indices(task)],
-                   shown=("mean", "sd"))
+    rows = [_judged(problem, task, index, rule, filtering, smoothing)[0] for index in dataset_indices(task)]
+    return stack_results(rows, first_only=("mean", "sd"))
 
 
 @functools.cache
@@ -90,11 +90,11 @@ def _judged(problem: Problem, task: Task, index: int, label: str, filtering: Cal
         problem's paths; and the result of ``smoothing``, from which ``paths`` takes these.
     """
     one, label = record(problem, index, task.seed), f"{problem}, {label}"
-    filter_s, (joint, log_likelihood) = timed_again(f"{label}, filter", lambda: filtering(one.y))
-    smoother_s, found = timed_again(f"{label}, smoother", lambda: smoothing(one.y))
+    filter_s, (joint, log_likelihood) = time_compiled_call(f"{label}, filter", lambda: filtering(one.y))
+    smoother_s, found = time_compiled_call(f"{label}, smoother", lambda: smoothing(one.y))
     mean, sd = map(np.asarray, paths(found))
     return {"filter_rmse": rmse(_filtered(problem, joint), one.paths), "log_likelihood": float(log_likelihood.sum()),
-            **judged("smoother", mean, interval(mean, sd), one.paths), "mean": mean, "sd": sd,
+            **score_path("smoother", mean, interval(mean, sd), one.paths), "mean": mean, "sd": sd,
             "filter_seconds": filter_s, "smoother_seconds": smoother_s}, found
 
 

@@ -11,8 +11,8 @@ import jax
 import numpy as np
 
 from lfm_ppl.engine.task import Result
-from lfm_ppl.experiments.tasks import stacked
-from lfm_ppl.experiments.timing import timed, timed_again
+from lfm_ppl.experiments.tasks import stack_results
+from lfm_ppl.experiments.timing import time_call, time_compiled_call
 from lfm_ppl.experiments.transcription import problem
 from lfm_ppl.filtering.smoother import smooth
 from lfm_ppl.latent_grid import laplace
@@ -42,16 +42,16 @@ def compute(settings: Mapping[str, Any], data: list[problem.DataSet]) -> Result:
     gamma, *given = problem.inputs(settings, data)
     fixed = settings["method"], settings["link"], gamma
     if settings["method"] in SMOOTHERS:
-        timed(_smooth, *fixed, *given)  # compiles, and touches the memory for the first time
-        seconds, found = timed(_smooth, *fixed, *given)
+        time_call(_smooth, *fixed, *given)  # compiles, and touches the memory for the first time
+        seconds, found = time_call(_smooth, *fixed, *given)
         return {name: np.asarray(value) for name, value in found.items()} | {
             "seconds": np.full(len(data), seconds / len(data))}
     rows = []
     for index in range(len(data)):
         search = functools.partial(_search, *fixed, *problem.rows(given, index))
-        seconds, found = timed_again(f"transcription, {settings['method']}, {settings['link']}", search)
+        seconds, found = time_compiled_call(f"transcription, {settings['method']}, {settings['link']}", search)
         rows.append(found | {"seconds": seconds})
-    return stacked(rows)
+    return stack_results(rows)
 
 
 @eqx.filter_jit

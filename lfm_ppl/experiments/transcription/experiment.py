@@ -14,11 +14,11 @@ from scipy.stats import norm
 
 from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import published, scores, study
-from lfm_ppl.experiments.datasets import Column, Kind, cell, number, row
-from lfm_ppl.experiments.published import Verdict
+from lfm_ppl.experiments.datasets import Column, TaskKind, cell, number, row
+from lfm_ppl.experiments.published import PublishedComparison
 from lfm_ppl.experiments.scores import mean_of
-from lfm_ppl.experiments.study import Data, Study, Table, setting
-from lfm_ppl.experiments.tasks import blocks, indices
+from lfm_ppl.experiments.study import Data, Study, StudyTable, setting
+from lfm_ppl.experiments.tasks import dataset_blocks, dataset_indices
 from lfm_ppl.experiments.transcription import approximations, figures, problem, slices
 
 METHODS = ("LA", "ESLS", "GFS", "GHS(7)", "iterated GHS(7)", "LA, trust region")
@@ -36,7 +36,7 @@ _LABELS = tuple(one.label for one in problem.CONFIGURATIONS)
 
 
 @dataclass(frozen=True)
-class Settings(study.Settings):
+class TranscriptionSettings(study.StudySettings):
     """How much is computed."""
 
     datasets: int = setting(100, "for each configuration", quick=2, aliases=study.REALISATIONS)
@@ -52,13 +52,13 @@ class Settings(study.Settings):
             raise ValueError(f"burn_in must lie in [0, draws) = [0, {self.draws}), got {self.burn_in}.")
 
 
-def all_tasks(settings: Settings) -> list[Task]:
+def all_tasks(settings: TranscriptionSettings) -> list[Task]:
     """Return every task: all methods on the first data sets, then on the next, so that the time left can be told."""
     sampling = {"draws": settings.draws, "burn_in": settings.burn_in}
     return [Task(f"{problem.slug(configuration.label)}/{problem.slug(method)}/{first:03d}-{last:03d}", settings.seed,
                  {"experiment": "transcription", "method": method, **configuration._asdict(), "first": first,
                   "last": last, **(sampling if method == "ESLS" else {})})
-            for first, last in blocks(settings.datasets, BLOCK)
+            for first, last in dataset_blocks(settings.datasets, BLOCK)
             for configuration in problem.CONFIGURATIONS if configuration.label in settings.configurations
             for method in METHODS]
 
@@ -66,10 +66,10 @@ def all_tasks(settings: Settings) -> list[Task]:
 def compute(task: Task) -> Result:
     """Return what the method says of the force of each data set of the task, and how good it is."""
     settings, configuration = task.settings, problem.configuration(task)
-    data = [problem.data_set(configuration, index, task.seed) for index in indices(task)]
+    data = [problem.data_set(configuration, index, task.seed) for index in dataset_indices(task)]
     if settings["method"] == "ESLS":
         key = Task(f"{problem.slug(configuration.label)}/ESLS", task.seed).key
-        keys = jax.vmap(lambda index: jax.random.fold_in(key, index))(jnp.array(indices(task)))
+        keys = jax.vmap(lambda index: jax.random.fold_in(key, index))(jnp.array(dataset_indices(task)))
         found = slices.compute(settings, data, keys)
     else:
         found = approximations.compute(settings, data)
@@ -85,7 +85,7 @@ def judged(found: Result, truth: np.ndarray) -> Result:
     mean, sd = found["mean"], np.maximum(found["sd"], 1e-12)
     error = np.nan_to_num(scores.rmse(mean, truth), nan=np.inf, posinf=np.inf)
     stopped = np.asarray(found.get("stopped", True), bool)
-    return {"rmse": error, "coverage": scores.covered(*scores.interval(mean, sd), truth),
+    return {"rmse": error, "coverage": scores.interval_coverage(*scores.interval(mean, sd), truth),
             "nlpd": -norm.logpdf(truth, mean, sd).mean(axis=1), "diverged": ~(error <= problem.DIVERGED) | ~stopped}
 
 
@@ -125,9 +125,9 @@ def beside_published(data: Data) -> dict[str, Any]:
     """Return one row for each configuration: RMSE and divergences of the source's methods beside the published ones.
 
     ``z`` is the difference of the RMSE in standard errors of ours; the published mean over 100 data sets has an error
-    as large again. ``verdict`` says what that means, see `Verdict`. The source averages over the data sets on which no
-    method failed. What Newton's method counts as a failure there is not said in full; ``at modes`` is ``z`` over the
-    data sets on which ours ends at a mode, and ``no mode`` the number of others.
+    as large again. ``verdict`` says what that means, see `PublishedComparison`. The source averages over the data sets
+    on which no method failed. What Newton's method counts as a failure there is not said in full; ``at modes`` is ``z``
+    over the data sets on which ours ends at a mode, and ``no mode`` the number of others.
     """
     rows = {}
     for label in (label for label in problem.PUBLISHED if label in data):
@@ -139,7 +139,7 @@ def beside_published(data: Data) -> dict[str, Any]:
             means = mean_of(ours.rmse), mean_of(ours.rmse[at_mode])
             z, z_at_modes = ((mean.value - error) / mean.error for mean in means)
             cells |= {**cell(method, ours.rmse), f"{method} published": error, f"{method} z": z,
-                      f"{method} verdict": str(Verdict(z)), f"{method} div.": float(ours.diverged.sum()),
+                      f"{method} verdict": str(PublishedComparison(z)), f"{method} div.": float(ours.diverged.sum()),
                       f"{method} div. published": float(diverged), f"{method} z at modes": z_at_modes}
         rows[label] = cells
     return rows
@@ -163,24 +163,26 @@ def against_slices(data: Data) -> dict[str, Any]:
     return rows
 
 
-def tables(settings: Settings, data: Data) -> dict[str, Table]:
+def tables(settings: TranscriptionSettings, data: Data) -> dict[str, StudyTable]:
     """Return the tables."""
     count = settings.datasets
-    return {"published": Table.of(f"RMSE of the force and divergences, {count} data sets, beside the published table",
-                                  beside_published(data)),
-            "comparison": Table.of(f"Means over {count} data sets (standard errors)", comparison(data)),
-            "paired": Table.of("Against elliptical slice sampling on the same data sets", against_slices(data))}
+    return {"published": StudyTable.from_rows(
+                f"RMSE of the force and divergences, {count} data sets, beside the published table",
+                beside_published(data)),
+            "comparison": StudyTable.from_rows(f"Means over {count} data sets (standard errors)", comparison(data)),
+            "paired": StudyTable.from_rows("Against elliptical slice sampling on the same data sets",
+                                           against_slices(data))}
 
 
-def notes(settings: Settings, data: Data) -> tuple[str, ...]:
+def notes(settings: TranscriptionSettings, data: Data) -> tuple[str, ...]:
     """Return how many cells are consistent with the published table, and why lower ones are trusted."""
-    verdicts = [Verdict(z) for cells in beside_published(data).values() for name, z in cells.items()
+    verdicts = [PublishedComparison(z) for cells in beside_published(data).values() for name, z in cells.items()
                 if name.endswith(" z")]
-    return published.summary(verdicts), TRUST
+    return published.summarize_comparisons(verdicts), TRUST
 
 
-KIND = Kind(compute, {
+KIND = TaskKind(compute, {
     "dataset time": "mean, sd, low, high", "dataset": "rmse, coverage, nlpd, diverged, seconds, stopped, converged, "
     "iterations, change, r_hat, r_hat_first, ess, draws, seconds_more"}, ("method",))
-STUDY = Study(Settings, all_tasks, dict.fromkeys(_LABELS, KIND), tables, figures.draw, notes=notes,
-              what=lambda task: problem.configuration(task).label)
+STUDY = Study(TranscriptionSettings, all_tasks, dict.fromkeys(_LABELS, KIND), tables, figures.draw, notes=notes,
+              task_kind=lambda task: problem.configuration(task).label)

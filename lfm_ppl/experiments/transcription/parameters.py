@@ -14,7 +14,7 @@ from numpyro.infer import NUTS, init_to_uniform
 
 from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import chains, scores
-from lfm_ppl.experiments.timing import timed
+from lfm_ppl.experiments.timing import time_call
 from lfm_ppl.experiments.transcription import problem
 from lfm_ppl.inference.handlers.on_latent_grid import on_latent_grid
 from lfm_ppl.inference.kernels.ram import RAM
@@ -98,12 +98,12 @@ def compute(task: Task) -> Result:
         mcmc.run(task.key, problem.TIMES, data.y, **configuration._asdict())
         return mcmc.get_samples(group_by_chain=True)
 
-    seconds, samples = timed(run)
+    seconds, samples = time_call(run)
     draws = np.concatenate([*(np.moveaxis(np.asarray(samples[name]), -1, 0) for name in UNIFORM),
                             [samples[name] for name in LEVELS]])
     found: Result = {}
     if sampler.iterations:
-        more, (draws, found["k"]) = timed(lambda: _weighted(settings, sampler.iterations, data, draws))
+        more, (draws, found["k"]) = time_call(lambda: _weighted(settings, sampler.iterations, data, draws))
         seconds += more
     if sampler.latent:
         forces = np.asarray(samples["y_forces"]).reshape(-1, len(AT))
@@ -114,7 +114,7 @@ def compute(task: Task) -> Result:
     return {"draws": draws, **found, "divergences": int(np.sum(mcmc.get_extra_fields().get("diverging", 0))),
             "seconds": seconds, **scores.diagnose(NAMES, draws), "force_mean": mean, "force_sd": sd,
             "rmse": scores.rmse(mean, truth), "truth": true_values(data),
-            "coverage": scores.covered(*scores.interval(mean, sd), truth)}
+            "coverage": scores.interval_coverage(*scores.interval(mean, sd), truth)}
 
 
 def true_values(data: problem.DataSet) -> np.ndarray:
@@ -152,5 +152,5 @@ def _marginalised(settings: Mapping[str, Any], iterations: int, data: problem.Da
         force = likelihood.smooth(data.y, at=AT).force(problem.FACTOR)
         return force.mean, force.sd**2
 
-    chosen = jnp.asarray(scores.spread(draws, min(PATHS, draws[0].size)))
+    chosen = jnp.asarray(scores.thin_draws(draws, min(PATHS, draws[0].size)))
     return scores.total_moments(*map(np.asarray, jax.jit(jax.vmap(one))(chosen)))

@@ -10,15 +10,15 @@ from matplotlib.figure import Figure
 
 from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import chains, study
-from lfm_ppl.experiments.datasets import Column, Kind, number, row
-from lfm_ppl.experiments.scores import pair
-from lfm_ppl.experiments.study import Data, Study, Table, setting
+from lfm_ppl.experiments.datasets import Column, TaskKind, number, row
+from lfm_ppl.experiments.scores import estimate_cells
+from lfm_ppl.experiments.study import Data, Study, StudyTable, setting
 from lfm_ppl.experiments.transcription import figures, parameters, problem
 from lfm_ppl.experiments.transcription.parameters import LINKS, REFERENCE, SAMPLERS
 
 
 @dataclass(frozen=True)
-class Settings(study.Settings):
+class TranscriptionParametersSettings(study.StudySettings):
     """How much is computed."""
 
     datasets: int = setting(2, "for each link", quick=1, aliases=study.REALISATIONS)
@@ -31,7 +31,7 @@ class Settings(study.Settings):
     links: tuple[str, ...] = setting(tuple(LINKS), "how the factor acts", quick=("softplus",), choices=tuple(LINKS))
 
 
-def tasks(settings: Settings) -> list[Task]:
+def tasks(settings: TranscriptionParametersSettings) -> list[Task]:
     """Return one task for each link, data set and sampler."""
     def task(index: int, link: str, label: str, sampler: parameters.Sampler) -> Task:
         lengths = getattr(settings, "latent" if sampler.latent else sampler.kernel.lower())
@@ -52,7 +52,7 @@ COLUMNS: dict[str, Column] = {
     "divergences": lambda found: found.divergences.mean()}
 
 
-def agreement(settings: Settings, data: Data) -> dict[str, Any]:
+def agreement(settings: TranscriptionParametersSettings, data: Data) -> dict[str, Any]:
     """Return one row for each link and sampler.
 
     ``shift`` and ``sd ratio`` from the reference with their Monte Carlo errors, see `chains.agreement`; ``coverage`` of
@@ -69,24 +69,26 @@ def agreement(settings: Settings, data: Data) -> dict[str, Any]:
             shift, ratio = chains.agreement(found, reference)
             if sampler == REFERENCE:  # it is no estimate how it agrees with itself
                 shift, ratio = shift._replace(error=np.nan), ratio._replace(error=np.nan)
-            rows[f"{link}: {sampler}"] = pair("shift", shift) | pair("sd ratio", ratio) | row(found, COLUMNS)
+            rows[f"{link}: {sampler}"] = {**estimate_cells("shift", shift), **estimate_cells("sd ratio", ratio),
+                                          **row(found, COLUMNS)}
     return rows
 
 
-def tables(settings: Settings, data: Data) -> dict[str, Table]:
+def tables(settings: TranscriptionParametersSettings, data: Data) -> dict[str, StudyTable]:
     """Return the table."""
     title = f"Against {REFERENCE}, {settings.datasets} data set{'s' if settings.datasets > 1 else ''}"
-    return {"agreement": Table.of(title, agreement(settings, data))}
+    return {"agreement": StudyTable.from_rows(title, agreement(settings, data))}
 
 
-def draw(settings: Settings, data: Data) -> dict[str, Figure]:
+def draw(settings: TranscriptionParametersSettings, data: Data) -> dict[str, Figure]:
     """Return a figure of the first data set of each link."""
     return {f"posteriors-{problem.slug(link)}": figures.plot_posteriors(
         data[link], problem.data_set(LINKS[link], 0, settings.seed)) for link in settings.links}
 
 
-KIND = Kind(parameters.compute, {
+KIND = TaskKind(parameters.compute, {
     "dataset parameter": "mean, sd, low, high, truth, ess, r_hat", "dataset parameter chain draw": "draws",
     "dataset time": "force_mean, force_sd", "dataset": "rmse, coverage, seconds, divergences, k"}, ("sampler",))
-STUDY = Study(Settings, tasks, dict.fromkeys(LINKS, KIND), tables, draw, {"parameter": ("parameter", parameters.NAMES)},
-              what=lambda task: problem.configuration(task).label)
+STUDY = Study(TranscriptionParametersSettings, tasks, dict.fromkeys(LINKS, KIND), tables, draw,
+              {"parameter": ("parameter", parameters.NAMES)},
+              task_kind=lambda task: problem.configuration(task).label)

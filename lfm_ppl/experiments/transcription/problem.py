@@ -64,7 +64,7 @@ def configuration(task: Task) -> Configuration:
     return Configuration(task.settings["link"], task.settings["gamma"])
 
 
-slug = functools.partial(tasks.slug, dropped=",")
+slug = functools.partial(tasks.slug, removed=",")
 """Brackets stay, as in the names of stored tasks."""
 
 

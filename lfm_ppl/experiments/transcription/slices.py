@@ -19,8 +19,8 @@ import numpy as np
 
 from lfm_ppl.engine.task import Result
 from lfm_ppl.experiments import scores
-from lfm_ppl.experiments.tasks import stacked
-from lfm_ppl.experiments.timing import timed
+from lfm_ppl.experiments.tasks import stack_results
+from lfm_ppl.experiments.timing import time_call
 from lfm_ppl.experiments.transcription import problem
 from lfm_ppl.inference.kernels.elliptical_slice import SliceState, elliptical_slice_step
 from lfm_ppl.latent_grid.latent_grid import LatentGrid
@@ -140,16 +140,16 @@ def compute(settings: Mapping[str, Any], data: list[problem.DataSet], keys: jax.
     found = {name: np.zeros(len(data)) for name in ("draws", "seconds", "seconds_more")}
     for stage in range(_STAGES):
         fixed = gamma, *problem.rows(given, left), around
-        timed(_run, link, jnp.asarray(0), *fixed, *states)  # compiles
-        first, (states, _, _) = timed(_run, link, jnp.asarray(burn_in), *fixed, *states)
-        second, (states, kept, sums) = timed(_run, link, jnp.asarray(ahead), *fixed, *states)
+        time_call(_run, link, jnp.asarray(0), *fixed, *states)  # compiles
+        first, (states, _, _) = time_call(_run, link, jnp.asarray(burn_in), *fixed, *states)
+        second, (states, kept, sums) = time_call(_run, link, jnp.asarray(ahead), *fixed, *states)
         found["seconds_more" if stage else "seconds"][left] += (first + second) / len(left)
         found["draws"][left] += CHAINS * KEPT * (burn_in + ahead)
         kept, (mean, square) = np.asarray(kept), np.moveaxis(np.asarray(sums), 1, 0) / (CHAINS * KEPT * ahead)
         flat = kept.reshape(len(left), -1, problem.POINTS)
         low, high = np.quantile(flat, [0.025, 0.975], axis=1)
-        checked = stacked([scores.diagnose([*map(str, MONITORED)], np.moveaxis(draws[..., MONITORED], -1, 0))
-                           for draws in kept])
+        checked = stack_results([scores.diagnose([*map(str, MONITORED)], np.moveaxis(draws[..., MONITORED], -1, 0))
+                                 for draws in kept])
         r_hat = checked["r_hat"].max(axis=1)
         for name, value in {"mean": mean, "sd": np.sqrt(np.maximum(square - mean**2, 0.0)), "low": low, "high": high,
                             "r_hat": r_hat, "ess": checked["ess"].min(axis=1)}.items():
