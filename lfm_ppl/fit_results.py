@@ -31,7 +31,7 @@ from lfm_ppl.inference.interruption import was_interrupt
 from lfm_ppl.inference.posterior import evenly_spaced, scores, trajectories
 from lfm_ppl.inference.progress import Counter
 from lfm_ppl.inference.samplers import FILTERED
-from lfm_ppl.inference.site_failures import failures_at, paths_worth, site_failures
+from lfm_ppl.inference.site_failures import failures_at, path_ess, site_failures
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.approximation import approximation_warnings, resolution_warnings
@@ -131,7 +131,7 @@ def post_process(problem: FitProblem, draws: PosteriorDraws, store: Checkpoint |
     counter = Counter(is_shown=show_progress)
 
     def batch_options(name: str) -> dict[str, Any]:
-        return {"show": counter.restart(name), "parts": None if store is None else store.parts(name)}
+        return {"show": counter.restart(name), "store": None if store is None else store.parts(name)}
 
     try:
         processed.scores = best_effort(
@@ -170,7 +170,7 @@ def _site_attributes(bound: BoundModel, draws: PosteriorDraws, values: Mapping[s
     elif options.sampler == "map" and bound.site.example.constrained:
         reports[arviz_data.SITES] = best_effort("convergence of the sites", lambda: failures_at(bound, values), None)
     reports[arviz_data.WEIGHTS] = best_effort(
-        "weights under the constraints", lambda: paths_worth(bound, values), None)
+        "weights under the constraints", lambda: path_ess(bound, values), None)
     return {name: json.dumps(report) for name, report in reports.items() if report is not None}
 
 
@@ -187,7 +187,7 @@ def draw_paths(key: jax.Array, bound: BoundModel, values: Mapping[str, np.ndarra
         count: number of trajectories.
         particle_settings: of the particle smoother; None: the Gaussian smoother.
         particle_steps: integration steps of the particles.
-        **batch_options: ``show`` and ``parts`` of `lfm_ppl.inference.posterior.trajectories`.
+        **batch_options: ``show`` and ``store`` of `lfm_ppl.inference.posterior.trajectories`.
 
     Returns:
         The chosen draws of each chain; their trajectories (C, S, ...), None if there are none; the times, None for

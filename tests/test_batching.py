@@ -106,7 +106,7 @@ def test_an_interruption_between_two_batches_ends_the_others(two_cpus):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        scores(bound, {"noise": np.linspace(0.5, 0.8, count)}, parts=Kept())
+        scores(bound, {"noise": np.linspace(0.5, 0.8, count)}, store=Kept())
     assert list(kept) == [0] and not [one for one in threading.enumerate() if "side by side" in one.name]
 
 

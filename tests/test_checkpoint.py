@@ -287,13 +287,13 @@ def test_draws_are_computed_in_batches_to_the_same_numbers_and_parts_of_other_ba
             pass
 
     kept = Kept()
-    expected = scores(bound, draws, parts=kept)
+    expected = scores(bound, draws, store=kept)
     assert list(kept) == [0] and len(kept[0]["residual"]) == 12  # three batches of four in one program
     for name, value in expected.items():
         each = [scores(bound, {"noise": draws["noise"][k:k + 1]})[name][0] for k in range(count)]
         np.testing.assert_allclose(value, each, rtol=1e-12, atol=1e-12)
     other = Kept({0: {name: value[:3] for name, value in kept[0].items()}})
-    for name, value in scores(bound, draws, parts=other).items():
+    for name, value in scores(bound, draws, store=other).items():
         np.testing.assert_array_equal(value, expected[name])
 
 

@@ -27,7 +27,7 @@ SITES = "site_failures"
 """Attribute of a result: counts of `lfm_ppl.inference.site_failures`, as JSON."""
 
 WEIGHTS = "constraint_weights"
-"""Attribute of a result under constraints: what weighted trajectories are worth, `site_failures.PathsWorth` as JSON."""
+"""Attribute of a result under constraints: `site_failures.PathESS`, effective sample sizes, as JSON."""
 
 MODE = "mode"
 """Attribute of a result of sampler "map": name -> value at the posterior mode, as JSON."""

@@ -11,8 +11,8 @@ import numpy as np
 import xarray as xr
 
 from lfm_ppl.inference.bound_model import BoundModel
+from lfm_ppl.inference.map_draws import map_draws, map_series
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
-from lfm_ppl.inference.posterior import each, over_draws
 from lfm_ppl.model.observations.family import ObservationFamily
 
 _PATH, _VALUES, _TIMES = "path of the inputs", "held-out values", "times of the path"
@@ -57,11 +57,11 @@ def log_densities(bound: BoundModel, draws: Mapping[str, Any], predicted: xr.Dat
         distribution = bound.likelihood(values, data)
         if isinstance(distribution, Panel):
             times = jnp.broadcast_to(times, (y.shape[0], *times.shape))
-        return each(distribution, one, w, y, times)
+        return map_series(distribution, one, w, y, times)
 
-    found = over_draws(bound, ("log densities", y.shape), per_draw,
-                       {**draws, _PATH: w, _VALUES: np.broadcast_to(y, (count, *y.shape)),
-                        _TIMES: np.broadcast_to(times, (count, len(times)))}, jax.random.key(0))
+    found = map_draws(bound, ("log densities", y.shape), per_draw,
+                      {**draws, _PATH: w, _VALUES: np.broadcast_to(y, (count, *y.shape)),
+                       _TIMES: np.broadcast_to(times, (count, len(times)))}, jax.random.key(0))
     return np.where(np.isfinite(y), found, np.nan)
 
 

@@ -15,8 +15,8 @@ from lfm_ppl.filtering.problem import filter_problem, is_linear, is_observation_
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.fokker_planck_grid import fokker_planck
 from lfm_ppl.inference.bound_model import BoundModel
+from lfm_ppl.inference.map_draws import BatchStore, map_draws, map_series
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
-from lfm_ppl.inference.posterior import Parts, each, over_draws
 from lfm_ppl.inference.progress import Counter
 from lfm_ppl.model.observation_noise import check_noise
 from lfm_ppl.model.observations.family import ObservationFamily
@@ -45,9 +45,9 @@ class PosteriorDraws(NamedTuple):
 
     bound: BoundModel
     draws: Mapping[str, np.ndarray]
-    parts: Callable[[str], Parts] | None = None
+    parts: Callable[[str], BatchStore] | None = None
 
-    def kept(self, name: str) -> Parts | None:
+    def kept(self, name: str) -> BatchStore | None:
         """Return what keeps the batches of a computation."""
         return None if self.parts is None else self.parts(name)
 
@@ -105,8 +105,8 @@ def gaussian(problem: PosteriorDraws, name: str = "log likelihoods") -> np.ndarr
     def per_draw(values: Any, key: jax.Array, y: jax.Array) -> dict[str, jax.Array]:
         return {"total": bound.likelihood(values, y).log_prob(bound.data(y)).sum()}
 
-    return over_draws(bound, "log likelihoods", per_draw, problem.draws, jax.random.key(0), bound.times.size,
-                      parts=problem.kept(name))["total"]
+    return map_draws(bound, "log likelihoods", per_draw, problem.draws, jax.random.key(0), rows=bound.times.size,
+                     store=problem.kept(name))["total"]
 
 
 def recorded(problem: PosteriorDraws, log_likelihoods: np.ndarray) -> np.ndarray:
@@ -121,8 +121,8 @@ def recorded(problem: PosteriorDraws, log_likelihoods: np.ndarray) -> np.ndarray
     def per_draw(values: Any, key: jax.Array, y: jax.Array) -> jax.Array:
         return bound.likelihood(values, y).log_prob_per_observation(bound.data(y)).sum()
 
-    return over_draws(bound, "one step ahead", per_draw, problem.draws, jax.random.key(0), bound.times.size,
-                      parts=problem.kept("one-step-ahead terms"))
+    return map_draws(bound, "one step ahead", per_draw, problem.draws, jax.random.key(0), rows=bound.times.size,
+                     store=problem.kept("one-step-ahead terms"))
 
 
 def finer_tolerance(tolerance: float) -> float:
@@ -161,7 +161,7 @@ def on_grid(problem: PosteriorDraws, steps: int | None, progress: bool) -> Refer
         return fokker_planck.log_likelihood(distribution.ssm, time_grid, y, layout)
 
     def per_draw(values: Any, key: jax.Array, y: jax.Array) -> jax.Array:
-        return each(bound.likelihood(values, y), one, bound.data(y)).sum()
+        return map_series(bound.likelihood(values, y), one, bound.data(y)).sum()
 
     found = _one_by_one(problem, jax.random.key(0), ("grid", layout, steps), per_draw, "Fokker-Planck grid", progress)
     return Reference(found[:, None], f"Fokker-Planck equation on a grid of {layout.cells} cells")
@@ -241,7 +241,7 @@ def _particle_run(problem: PosteriorDraws, particles: int, replicates: int, step
 
         def replicate(key: jax.Array) -> jax.Array:
             keys = jax.random.split(key, series) if isinstance(distribution, Panel) else key
-            return each(distribution, one, y, keys).sum()
+            return map_series(distribution, one, y, keys).sum()
 
         return jax.lax.map(replicate, jax.random.split(key, replicates))
 
@@ -255,7 +255,7 @@ def _one_by_one(problem: PosteriorDraws, key: jax.Array, name: Hashable, per_dra
     """Map over draws, one after another, and say how far that is."""
     counter = Counter(label, is_shown=progress, at_once=True)
     try:
-        return over_draws(problem.bound, name, per_draw, problem.draws, key, show=counter, parts=problem.kept(label))
+        return map_draws(problem.bound, name, per_draw, problem.draws, key, show=counter, store=problem.kept(label))
     finally:
         counter.close()
 

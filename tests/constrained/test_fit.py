@@ -17,7 +17,7 @@ from systems import Linear, whole_state
 import lfm_ppl as lfm
 from lfm_ppl.cli import main
 from lfm_ppl.constrained.augmented import COARSE, build_rows
-from lfm_ppl.inference.site_failures import failures_at, paths_worth
+from lfm_ppl.inference.site_failures import failures_at, path_ess
 from lfm_ppl.results import arviz_data, convergence, tables
 
 TIMES = np.linspace(0.0, 3.0, 4)
@@ -100,7 +100,7 @@ def test_unconverged_sites_and_light_weights_are_counted():
     bound = lfm.bind(bounded, TIMES, Y, draws=2, grid=TIMES)
     values = {"lengthscale": np.array([0.5, 1.0, np.nan, 2.0])}
     assert failures_at(bound, values) == (4, 1, 1)
-    worth = paths_worth(bound, {"lengthscale": np.array([0.5, 1.0, 2.0])})
+    worth = path_ess(bound, {"lengthscale": np.array([0.5, 1.0, 2.0])})
     assert worth.trajectories == 2 and 1.0 <= worth.least <= worth.median <= 2.0
     # Weights by hand, of the data and without them.
     likelihood = lfm.MarginalLikelihood(system(), TIMES, lower={"factor": 0.0}, grid=TIMES, draws=64)
