@@ -36,9 +36,9 @@ def band(axes: Axes, x: Any, mean: Any, sd: Any, *, color: str = SHADE, label: s
 
 def bars(axes: Axes, x: Any, estimates: Sequence[Estimate], *, times: float = 2.0, **properties: Any) -> None:
     """Draw estimates with error bars of ``times`` standard errors, as points unless ``ls`` sets a line style."""
-    properties = {"ls": "", "ms": 3.0, "elinewidth": 0.8, "capsize": 1.5} | properties
+    defaults: dict[str, Any] = {"ls": "", "ms": 3.0, "elinewidth": 0.8, "capsize": 1.5}
     values, errors = [estimate.value for estimate in estimates], [estimate.error for estimate in estimates]
-    axes.errorbar(x, values, times * np.array(errors), **properties)
+    axes.errorbar(x, values, times * np.array(errors), **(defaults | properties))
 
 
 def line(label: str, color: str, ls: Any = "-", **properties: Any) -> Line2D:

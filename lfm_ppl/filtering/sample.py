@@ -117,5 +117,5 @@ def _sample_backwards(key: jax.Array, trace: FilterTrace, draws: int) -> jax.Arr
 
     inputs = (jax.tree.map(lambda a: a[:-1], trace.filtered), jax.tree.map(lambda a: a[1:], trace.predicted),
               trace.phi[1:], trace.process_cov[1:], standard[:-1])
-    _, deviations = jax.lax.scan(step, last, inputs, reverse=True)
+    deviations: jax.Array = jax.lax.scan(step, last, inputs, reverse=True)[1]
     return jnp.concatenate([deviations, last[None]])

@@ -91,7 +91,7 @@ def failures_at(bound: BoundModel, values: Mapping[str, Any], limit: int = POINT
         return map_series(bound.likelihood(values, y), evaluate, bound.data(y))
 
     def in_all_series(flags: Any) -> np.ndarray:
-        return np.asarray(flags).reshape(len(flags), -1).all(axis=1)
+        return np.all(np.asarray(flags).reshape(len(flags), -1), axis=1)
 
     converged, possible = map(in_all_series, map_draws(
         bound, "convergence of the sites", per_draw, _evenly_spaced(values, limit), jax.random.key(0),

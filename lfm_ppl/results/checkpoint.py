@@ -61,7 +61,7 @@ class Checkpoint:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.record: dict[str, Any] = {}
-        self.look = _no_look
+        self.look: Callable[[Mapping[str, np.ndarray]], None] = _no_look
         self._own = folder / CHECKPOINT
         self._lock: FolderLock | None = None
         self._written = 0

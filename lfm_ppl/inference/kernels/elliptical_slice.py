@@ -232,7 +232,9 @@ class EllipticalSlice(Kernel):
         return elliptical_slice(self._log_likelihood_at)
 
     def _log_likelihood_at(self, data: tuple[tuple, dict]) -> Callable[[Any], jax.Array]:
-        return partial(gaussian_prior.log_likelihood, self._model, *data)
+        model = self._model
+        assert model is not None
+        return partial(gaussian_prior.log_likelihood, model, *data)
 
     def starting_point(self, key: jax.Array, init_params: Any, args: tuple,
                        kwargs: dict) -> tuple[ParamInfo, dict[str, GaussianSite]]:
