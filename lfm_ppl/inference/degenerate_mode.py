@@ -51,7 +51,7 @@ def degenerate_entries(bound: BoundModel, mode: MAPResult, draws: Mapping[str, n
     offsets = np.concatenate([[0], np.cumsum(sizes)]).astype(int)
     suspected = _spread_without_data(bound, mode)
     is_below = mode.mode < bound.draw(jax.random.key(0), init_to_median)
-    found = {}
+    degenerate = {}
     for site, first, last in zip(sites, offsets[:-1], offsets[1:], strict=True):
         distribution = trace[site]["fn"]
         if not _is_positive(distribution.support):
@@ -67,8 +67,8 @@ def degenerate_entries(bound: BoundModel, mode: MAPResult, draws: Mapping[str, n
         runaway = is_below[first:last] & [name in mode.runaway for name in mode.coordinates[first:last]]
         is_degenerate = impossible | runaway | suspected[first:last]
         if is_degenerate.any():
-            found[site] = entries[is_degenerate].tolist()
-    return found
+            degenerate[site] = entries[is_degenerate].tolist()
+    return degenerate
 
 
 def _spread_without_data(bound: BoundModel, mode: MAPResult) -> np.ndarray:

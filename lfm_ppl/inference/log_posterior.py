@@ -53,9 +53,9 @@ class LogPosterior:
 
     def likelihood(self, z: Any, y: Any = None) -> MarginalLikelihood:
         """Return the likelihood with parameters exp(z), which may be traced."""
-        found = self.bound.likelihood(self.values(z), y)
-        assert isinstance(found, MarginalLikelihood)
-        return found
+        likelihood = self.bound.likelihood(self.values(z), y)
+        assert isinstance(likelihood, MarginalLikelihood)
+        return likelihood
 
     def log_densities(self, z: Any, y: Any) -> tuple[jax.Array, jax.Array]:
         """Return the log likelihood log p(y | z) and the log prior density of z (P,).

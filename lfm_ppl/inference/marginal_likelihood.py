@@ -153,13 +153,13 @@ class MarginalLikelihood(dist.Distribution):
             raise ValueError("sites are for an observation family such as lfm.PoissonObservation; the observation of "
                              "this model is Gaussian, whose filter needs none. Leave out sites.")
         model.check_at(self.time_grid.initial_time, np.shape(times)[0])
-        known = checks.concrete(times)
-        if known is not None:
-            model.check_span(float(known[0]), float(known[-1]))
+        concrete_times = checks.concrete(times)
+        if concrete_times is not None:
+            model.check_span(float(concrete_times[0]), float(concrete_times[-1]))
         warn_single_precision()
         super().__init__((), (np.shape(times)[0], self.ssm.output_dim), validate_args=False)
 
-    # Both follow from the fields above, and are made again in a copy that JAX rebuilds from other leaves.
+    # Both are functions of the fields above, and are computed again in a copy that JAX builds from other leaves.
     @functools.cached_property
     def ssm(self) -> StateSpaceModel:
         """The state-space model."""
@@ -184,7 +184,7 @@ class MarginalLikelihood(dist.Distribution):
 
     @property
     def is_affine(self) -> bool:
-        """Whether dynamics and observation are affine in states and forces, with noise that does not depend on them."""
+        """Whether dynamics and observation are affine in states and forces, with noise independent of them."""
         return is_linear(self.ssm) and not is_observation_nonlinear(self.ssm)
 
     @property
@@ -210,31 +210,30 @@ class MarginalLikelihood(dist.Distribution):
     @property
     def bounds(self) -> list[str]:
         """Each constraint in words, ``factor >= 0``."""
-        words = [f"{name} {sign} {_shown(value)}" for given, sign in ((self.lower, ">="), (self.upper, "<="))
-                 for name, value in (given or {}).items()]
-        return words + [f"{getattr(one, '__name__', type(one).__name__)} >= 0" for one in self.constraints]
+        bounds = [f"{name} {sign} {_number(value)}" for limits, sign in ((self.lower, ">="), (self.upper, "<="))
+                  for name, value in (limits or {}).items()]
+        return bounds + [f"{getattr(constraint, '__name__', type(constraint).__name__)} >= 0"
+                         for constraint in self.constraints]
 
     @property
     def constraints_in_words(self) -> str:
         """All constraints, and at how many times they hold."""
         return f"{', '.join(self.bounds)} at {len(self.bounded().rows.grid)} times"
 
-    def refuse_constraints(self, what: str) -> None:
-        """Raise where there are constraints, which ``what`` would pass over."""
+    def refuse_constraints(self, caller: str) -> None:
+        """Raise ValueError where there are constraints, which ``caller`` does not support."""
         if self.constrained:
-            raise ValueError(f"{what} knows no constraints, and the likelihood has some: "
-                             f"{', '.join(self.bounds)}. NUTS, RAM and MAP do; for anything else "
-                             "leave them out.")
+            raise ValueError(f"{caller} does not support constraints, and the likelihood has some: "
+                             f"{', '.join(self.bounds)}. Use NUTS, RAM or MAP, or leave the constraints out.")
 
     def _check_constraints(self) -> None:
         check_settings(self.model, 1.0, 1)
         for name in ("max_step", "tolerance"):
             if getattr(self, name) is not None:
-                raise ValueError(f"{name} is not to be had under constraints, which hold at rows of their own; raise "
-                                 "steps.")
+                raise ValueError(f"{name} is not supported under constraints, which add rows to the grid; raise steps.")
         if self.iterations:
-            raise ValueError("iterations are made under constraints by themselves: a model that is not linear is "
-                             "linearised about smoothed moments. Leave iterations out.")
+            raise ValueError("under constraints a non-linear model is always linearised about smoothed moments. Leave "
+                             "iterations out.")
         if self.draws != 0:
             checks.positive_integer("draws", self.draws)
             if self.draws % 2:
@@ -243,7 +242,7 @@ class MarginalLikelihood(dist.Distribution):
             check_linear(self.bounded(), self.draws)
 
     def bounded(self, at: Any = None) -> TruncatedPosterior:
-        """Return what the log density under constraints is made of.
+        """Return the truncated posterior, whose evidence is the density under constraints.
 
         Args:
             at: (K,) further times for trajectories, at which the constraints need not hold.
@@ -258,19 +257,19 @@ class MarginalLikelihood(dist.Distribution):
                                   check_variances(self.model, np.shape(self.times)[0]), SiteSettings())
 
     def with_times(self, times: Any) -> MarginalLikelihood:
-        """Return the same distribution for times that are known, where its own were traced."""
-        other = copy.copy(self)
-        other.__dict__.pop("time_grid", None)
-        other.times = times
-        return other
+        """Return the same distribution with concrete times instead of traced ones."""
+        likelihood = copy.copy(self)
+        likelihood.__dict__.pop("time_grid", None)
+        likelihood.times = times
+        return likelihood
 
     def log_prob_per_observation(self, value: Any) -> jax.Array:
         """Return (T,): log p(y_k | y_1:k-1) of the present entries of each observation.
 
-        Under constraints these are terms of the model without them, which do not sum to `log_prob`.
+        Under constraints these are terms of the unconstrained model, which do not sum to `log_prob`.
         """
         y = self._checked(value)
-        return self._said(y, finite_or_minus_infinity(self._one_step_ahead, y), alone=True)
+        return self._warn_of_breakdown(y, finite_or_minus_infinity(self._one_step_ahead, y), has_sites=False)
 
     def log_prob(self, value: Any) -> jax.Array:
         """Return the log marginal likelihood of ``value`` (T, D), NaN where missing; batch dimensions may lead."""
@@ -278,13 +277,13 @@ class MarginalLikelihood(dist.Distribution):
         if value.ndim > 2:
             return jax.vmap(self.log_prob)(value)
         check_resolution(self.model, self.times, value)
-        # One failure makes the sum -inf, and with it the derivatives of the other terms zero.
+        # One failure makes the sum -inf, and the derivatives of all other terms zero.
         y = self._checked(value)
         if self.constrained:
             return finite_or_minus_infinity(lambda y: self.bounded().log_likelihood(y, self.draws), y)
         if isinstance(self.model.observation, ObservationFamily):
-            return self._said(y, *finite_or_minus_infinity(self._evidence_and_convergence, y))
-        return self._said(y, finite_or_minus_infinity(lambda y: self._one_step_ahead(y).sum(), y))
+            return self._warn_of_breakdown(y, *finite_or_minus_infinity(self._evidence_and_convergence, y))
+        return self._warn_of_breakdown(y, finite_or_minus_infinity(lambda y: self._one_step_ahead(y).sum(), y))
 
     def _checked(self, y: Any) -> jax.Array:
         count, outputs = self.event_shape
@@ -292,17 +291,17 @@ class MarginalLikelihood(dist.Distribution):
 
     @property
     def site_settings(self) -> SiteSettings:
-        """How the sites of an observation family are refined."""
+        """Settings of the sites of an observation family."""
         return as_settings(self.sites, self.iterations)
 
     @property
     def sites_in_words(self) -> str:
-        """How an observation family is approximated; empty where the observation is Gaussian."""
+        """Approximation of an observation family; empty for a Gaussian observation."""
         if not isinstance(self.model.observation, ObservationFamily):
             return ""
         settings = self.site_settings
         linear = not (self.ssm.drift_structure.points or self.ssm.observation_structure.points)
-        return f"{settings.method}" + ("" if linear else f", linearised anew {settings.relinearisations} times at most")
+        return f"{settings.method}" + ("" if linear else f", linearised at most {settings.relinearisations} times")
 
     def evidence(self, y: jax.Array) -> Evidence:
         """Return the log evidence of an observation family and its parts; ``y`` (T, D) is not checked."""
@@ -315,17 +314,22 @@ class MarginalLikelihood(dist.Distribution):
         converged = result.refined.fixed_point.converged
         return jnp.stack([result.log_evidence, converged.astype(result.log_evidence.dtype)])
 
-    def _said(self, y: jax.Array, log_likelihood: jax.Array, converged: Any = True, alone: bool = False) -> jax.Array:
-        """Return the log likelihood; outside of compiled code say what breaks down if something does.
+    def _warn_of_breakdown(self, y: jax.Array, log_likelihood: jax.Array, converged: Any = True,
+                           has_sites: bool = True) -> jax.Array:
+        """Return the log likelihood, after a warning outside of compiled code if the filter breaks down.
 
-        Of a family, the filter ``alone`` was run or its sites were refined, which have ``converged`` or not.
+        Args:
+            y: (T, D).
+            log_likelihood: result of the filter.
+            converged: whether the sites of a family have converged.
+            has_sites: whether the sites of a family were refined; False for assumed density filtering.
         """
         warn_of_breakdown(self.ssm, self.rule, self.time_grid, y, None, log_likelihood,
-                          None if alone else self.site_settings, converged)
+                          self.site_settings if has_sites else None, converged)
         return log_likelihood
 
     def expand(self, batch_shape: tuple[int, ...]) -> dist.Distribution:
-        """Return as many independent series with the same parameters; in a ``numpyro.plate`` that is an error.
+        """Return independent series with the same parameters; in a ``numpyro.plate`` that is an error.
 
         Raises:
             ValueError: in a plate, where several series are an `lfm_ppl.panel`.
@@ -352,12 +356,15 @@ class MarginalLikelihood(dist.Distribution):
         represent it.
         """
         if self.constrained:
-            return repeated(self._constrained_sample, key, sample_shape)
+            return repeat_draw(self._constrained_sample, key, sample_shape)
         start = jnp.asarray(self.time_grid.initial_time, float)
         breakpoints = input_breakpoints(self.model, checks.concrete(self.times), self.time_grid.initial_time)
-        run = lambda k: simulate_on(self.ssm, k, jnp.asarray(self.times, float), start,  # noqa: E731
-                                    SIMULATION_STEPS * self.steps, breakpoints).y
-        return repeated(run, key, sample_shape)
+
+        def simulate(key: jax.Array) -> jax.Array:
+            return simulate_on(self.ssm, key, jnp.asarray(self.times, float), start, SIMULATION_STEPS * self.steps,
+                               breakpoints).y
+
+        return repeat_draw(simulate, key, sample_shape)
 
     def _constrained_sample(self, key: jax.Array) -> jax.Array:
         keys = jax.random.split(key)
@@ -380,9 +387,9 @@ class MarginalLikelihood(dist.Distribution):
         proposal = problem.proposal(y, problem.propagate_expectations(y))
         path = problem.sample_trajectories(key, proposal, 1, _CANDIDATES)[..., 0]
         # The last row of a time is the one at which the constraint holds.
-        wanted = np.asarray(self.times if at is None else at, float)
-        index = np.searchsorted(problem.rows.times, wanted, side="right") - 1
-        return path[index], jnp.asarray(wanted)
+        times = np.asarray(self.times if at is None else at, float)
+        index = np.searchsorted(problem.rows.times, times, side="right") - 1
+        return path[index], jnp.asarray(times)
 
     def constrained_leave_one_out(self, y: jax.Array) -> jax.Array:
         """Return (T,), log p(y_k | y_-k, c), by expectation propagation."""
@@ -400,20 +407,20 @@ class MarginalLikelihood(dist.Distribution):
         return jnp.where(fixed_point.converged, value, -jnp.inf)
 
     def filter(self, y: Any) -> FilterResult:
-        """Filter with this distribution's rule and steps; see `lfm_ppl.filter`. Constraints are of no account."""
+        """Filter with this distribution's rule and steps; see `lfm_ppl.filter`. Constraints are ignored."""
         y = self._checked(y)
         return filter_on(self.ssm, self.rule, self.time_grid, y, jnp.asarray(self.times, float))
 
     def smooth(self, y: Any, at: Any = None) -> SmootherResult:
-        """Smooth with this distribution's settings; see `lfm_ppl.smooth`. Constraints are of no account."""
+        """Smooth with this distribution's settings; see `lfm_ppl.smooth`. Constraints are ignored."""
         grid = build_time_grid(self.ssm, self.times, self.steps, self.max_step, at, tolerance=self.tolerance)
         y = self._checked(y)
         return smooth_on(self.ssm, self.rule, grid, y, self.iterations, self.damping, self.site_settings)
 
 
-def _shown(value: Any) -> str:
-    known = checks.concrete(value)
-    return "..." if known is None else f"{float(known):g}"
+def _number(value: Any) -> str:
+    concrete = checks.concrete(value)
+    return "..." if concrete is None else f"{float(concrete):g}"
 
 
 class Panel(dist.Distribution):
@@ -434,31 +441,31 @@ class Panel(dist.Distribution):
                              f"{shapes}. Repeat a shared parameter with jnp.broadcast_to, or close over it in build.")
         self.build, self.parameters, self.times, self.settings = build, parameters, times, settings
         (count,) = sizes
-        if self._series_times and np.shape(times)[0] != count:
+        if self._has_series_times and np.shape(times)[0] != count:
             raise ValueError(f"times has {np.shape(times)[0]} rows for {count} series; give one row a series, or one "
                              "vector for all.")
-        known = checks.concrete(times)
-        if self._series_times and settings.get("max_step") is not None:
-            raise ValueError("max_step cannot be had in a panel whose series have times of their own: all series share "
-                             "one number of rows. Raise steps, or give all series one vector of times.")
-        for series, row in enumerate(known) if self._series_times and known is not None else ():
+        concrete_times = checks.concrete(times)
+        if self._has_series_times and settings.get("max_step") is not None:
+            raise ValueError("max_step is not supported in a panel whose series have different times, because all "
+                             "series share one number of rows. Raise steps, or give all series one vector of times.")
+        for series, row in enumerate(concrete_times) if self._has_series_times and concrete_times is not None else ():
             try:
                 check_times(row, None)
             except ValueError as error:
                 raise ValueError(f"series {series}: {error}") from None
-        # Times that all series share stay known, since jumps of a force and longest steps are planned by them.
-        one = jax.eval_shape(lambda p, t: jnp.zeros(self._one(p, t if self._series_times else times).event_shape),
-                             jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf)[0], parameters),
-                             jnp.zeros(np.shape(times)[-1]))
-        if not self._series_times:
-            _ = self.first  # eager checks, where the values are concrete
-        super().__init__((count,), one.shape, validate_args=False)
+        # Times that all series share stay concrete, because jumps of a force and longest steps depend on them.
+        example = jax.eval_shape(
+            lambda p, t: jnp.zeros(self._likelihood(p, t if self._has_series_times else times).event_shape),
+            jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], parameters), jnp.zeros(np.shape(times)[-1]))
+        if not self._has_series_times:
+            _ = self.first  # eager checks of concrete values
+        super().__init__((count,), example.shape, validate_args=False)
 
     @property
-    def _series_times(self) -> bool:
+    def _has_series_times(self) -> bool:
         return np.ndim(self.times) == 2
 
-    def _one(self, parameters: Any, times: Any) -> MarginalLikelihood:
+    def _likelihood(self, parameters: Any, times: Any) -> MarginalLikelihood:
         return MarginalLikelihood(self.build(parameters), times, **self.settings)
 
     @property
@@ -468,41 +475,41 @@ class Panel(dist.Distribution):
 
     def series(self, index: int) -> MarginalLikelihood:
         """Return the distribution of one series."""
-        times = jnp.asarray(self.times, float)[index] if self._series_times else self.times
-        return self._one(jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf)[index], self.parameters), times)
+        times = jnp.asarray(self.times, float)[index] if self._has_series_times else self.times
+        return self._likelihood(jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf)[index], self.parameters), times)
 
     def with_times(self, times: Any) -> Panel:
-        """Return the same distribution for times that are known, where its own were traced."""
-        other = copy.copy(self)
-        other.times = times
-        return other
+        """Return the same distribution with concrete times instead of traced ones."""
+        panel = copy.copy(self)
+        panel.times = times
+        return panel
 
     def mapped(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Return ``function(distribution of a series, *its arguments)``, with the series as leading axis."""
-        times = jnp.asarray(self.times, float) if self._series_times else None
+        times = jnp.asarray(self.times, float) if self._has_series_times else None
         return mapped(
-            lambda p, t, *rest: function(self._one(p, self.times if t is None else t), *rest),
+            lambda p, t, *others: function(self._likelihood(p, self.times if t is None else t), *others),
             jax.tree_util.tree_map(jnp.asarray, self.parameters), times, *arguments)
 
     def log_prob_per_observation(self, value: Any) -> jax.Array:
         """Return (B, T): the one-step-ahead log densities of each series."""
-        return self.mapped(lambda one, y: one.log_prob_per_observation(y), self.checked(value))
+        return self.mapped(lambda series, y: series.log_prob_per_observation(y), self.checked(value))
 
     def log_prob(self, value: Any) -> jax.Array:
         """Return (B,): the log marginal likelihood of each series; zero where a series is all missing."""
         value = jnp.asarray(checks.unmask(value), float)
         if value.ndim > 3:
             return jax.vmap(self.log_prob)(value)
-        return self.mapped(lambda one, y: one.log_prob(y), self.checked(value))
+        return self.mapped(lambda series, y: series.log_prob(y), self.checked(value))
 
     def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
         """Simulate every series: (*sample_shape, B, T, D)."""
 
         def draw(key: jax.Array) -> jax.Array:
             keys = jax.random.split(key, self.batch_shape[0])
-            return self.mapped(lambda one, k: one.sample(k), keys)
+            return self.mapped(lambda series, key: series.sample(key), keys)
 
-        return repeated(draw, key, sample_shape)
+        return repeat_draw(draw, key, sample_shape)
 
     def checked(self, value: Any) -> jax.Array:
         """Return ``value`` as an array (B, T, D) after checking it."""
@@ -511,12 +518,12 @@ class Panel(dist.Distribution):
         if np.shape(value) != expected:
             raise ValueError(f"y must have shape {expected} (series, times, outputs), got {np.shape(value)}; pad a "
                              "shorter series with NaN.")
-        known = checks.concrete(value)
-        if known is not None and np.isinf(known).any():
+        concrete = checks.concrete(value)
+        if concrete is not None and np.isinf(concrete).any():
             raise ValueError("y has infinite entries; use NaN for a missing entry.")
-        if known is not None:
-            for index, rows in enumerate(known):
-                model = self.series(index).model if self._series_times else self.first.model
+        if concrete is not None:
+            for index, rows in enumerate(concrete):
+                model = self.series(index).model if self._has_series_times else self.first.model
                 if not isinstance(model.observation, ObservationFamily):
                     break
                 try:
@@ -526,7 +533,7 @@ class Panel(dist.Distribution):
         return jnp.asarray(value, float)
 
 
-def repeated(draw: Callable[[jax.Array], jax.Array], key: jax.Array, sample_shape: tuple[int, ...]) -> jax.Array:
+def repeat_draw(draw: Callable[[jax.Array], jax.Array], key: jax.Array, sample_shape: tuple[int, ...]) -> jax.Array:
     """Return independent draws (*sample_shape, ...) of ``draw(key)``; one draw where the shape is empty."""
     if not sample_shape:
         return draw(key)

@@ -50,10 +50,10 @@ class ParticleLikelihood(dist.Distribution):
         value = jnp.asarray(checks.unmask(value), float)
         if isinstance(self.base, Panel):
             keys = jax.random.split(self.key, self.base.batch_shape[0])
-            return self.base.mapped(lambda one, y, key: self._one(one, y, key), value, keys)
-        return self._one(self.base, value, self.key)
+            return self.base.mapped(lambda series, y, key: self._series_log_prob(series, y, key), value, keys)
+        return self._series_log_prob(self.base, value, self.key)
 
-    def _one(self, base: MarginalLikelihood, y: jax.Array, key: jax.Array) -> jax.Array:
+    def _series_log_prob(self, base: MarginalLikelihood, y: jax.Array, key: jax.Array) -> jax.Array:
         grid = build_time_grid(base.ssm, base.times, self.steps or base.steps, base.max_step)
         return log_likelihood(base.ssm, grid, y, key, self.settings)
 
@@ -90,15 +90,15 @@ class with_particles(LikelihoodHandler):  # noqa: N801 (an effect handler, named
         super().__init__(fn)
 
     def missing(self) -> str:
-        """Return what to say of a model without a likelihood that could be replaced."""
-        return ("the particle filter cannot stand in for the likelihood of this model: it needs a site "
+        """Return the error of a model without a likelihood that could be replaced."""
+        return ("the particle filter cannot replace the likelihood of this model: it needs a site "
                 "numpyro.sample(name, lfm.MarginalLikelihood(...), obs=y) without mask, expand or plate around it (or "
                 "an lfm.panel in its plate).")
 
     def replacement(self, likelihood: MarginalLikelihood | Panel, site: dict[str, Any]) -> Any:
         """Return the estimate."""
-        one = likelihood.first if isinstance(likelihood, Panel) else likelihood
-        one.refuse_constraints("a particle filter")
+        example = likelihood.first if isinstance(likelihood, Panel) else likelihood
+        example.refuse_constraints("a particle filter")
         return ParticleLikelihood(likelihood, self.key, self.settings, self.steps)
 
 
@@ -150,7 +150,7 @@ class ParticlePotential:
         Args:
             z: (d,) unconstrained parameters, as central in the posterior as they are known to be.
             key: a JAX random key.
-            target_sd: the standard deviation wanted.
+            target_sd: the standard deviation needed.
 
         Raises:
             ValueError: at ``z`` the estimates are not finite, or no number up to 200,000 is enough.
@@ -161,13 +161,13 @@ class ParticlePotential:
         particles = 200
         for attempt in range(8):
             sd = self.sd_of_estimates(z, jax.random.fold_in(key, attempt), particles)
-            wanted = int(np.ceil(particles * np.clip((sd / target_sd) ** 2, 1 / 64, 8.0)))
-            close = particles / 1.4 < wanted < particles * 1.4
-            if close or (particles == _FEWEST and wanted <= _FEWEST):
+            needed = int(np.ceil(particles * np.clip((sd / target_sd) ** 2, 1 / 64, 8.0)))
+            is_close = particles / 1.4 < needed < particles * 1.4
+            if is_close or (particles == _FEWEST and needed <= _FEWEST):
                 return Tuned(particles, sd)
-            if particles == _MOST and wanted > _MOST:
+            if particles == _MOST and needed > _MOST:
                 break
-            particles = int(np.clip(wanted, _FEWEST, _MOST))
+            particles = int(np.clip(needed, _FEWEST, _MOST))
         if np.isfinite(sd) and particles < _MOST:
             return Tuned(particles, sd)
         raise ValueError(f"the log likelihood estimate has a standard deviation of {sd:.3g} with {_MOST} particles; "

@@ -69,39 +69,39 @@ def support(constraint: Any) -> str:
 
 
 def assumptions(model: LatentForceModel) -> dict[str, str]:
-    """Return what a model says of its observations, forces and initial state, with the numbers that it holds.
+    """Describe the observations, forces and initial state of a model in words, with their numbers.
 
     Example:
         >>> import jax.numpy as jnp, lfm_ppl as lfm
         >>> noisy = lfm.LatentForceModel(lambda x, u, t: u - x, {"u": lfm.Matern(1.0, 2.0)},
         ...     lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.01])), lfm.Gaussian(jnp.zeros(1), jnp.ones(1)))
-        >>> for what, said in assumptions(noisy).items():
-        ...     print(f"{what} | {said}")
+        >>> for topic, description in assumptions(noisy).items():
+        ...     print(f"{topic} | {description}")
         observation | y0: Gaussian (sd 0.1)
         forces | u: Matern (scale 1, lengthscale 2, order 1)
         initial state | x0 = 0 (sd 1)
     """
-    forces = [f"{name}: {_with_numbers(type(force).__name__, force, _OF_FORCES)}"
+    forces = [f"{name}: {_with_numbers(type(force).__name__, force, _FORCE_ATTRIBUTES)}"
               for name, force in model.forces.items()]
     mean, sd = np.asarray(model.initial_state.mean), _sd(model.initial_state.covariance)
-    states = [f"{name} = {_number(one)} ({'known' if spread == 0 else f'sd {_number(spread)}'})"
-              for name, one, spread in zip(model.state_names, mean, sd, strict=True)]
+    states = [f"{name} = {_number(value)} ({'known' if spread == 0 else f'sd {_number(spread)}'})"
+              for name, value, spread in zip(model.state_names, mean, sd, strict=True)]
     return {"observation": "; ".join(_observation(model.observation, model.output_names)),
             "forces": "; ".join(forces) or "none", "initial state": "; ".join(states) or "none"}
 
 
-_OF_FORCES = ("scale", "lengthscale", "period", "order")
-"""What a force is described by, where it has it."""
+_FORCE_ATTRIBUTES = ("scale", "lengthscale", "period", "order")
+"""Attributes in the description of a force, where it has them."""
 
 
 def _observation(observation: Any, names: tuple[str, ...]) -> list[str]:
-    """Return the law of each output in words."""
+    """Describe the distribution of each output in words."""
     if hasattr(observation, "parts"):
-        found, first = [], 0
+        descriptions, first = [], 0
         for part, size in zip(observation.parts, observation.sizes, strict=True):
-            found += _observation(part, names[first:first + size])
+            descriptions += _observation(part, names[first:first + size])
             first += size
-        return found
+        return descriptions
     kind = type(observation).__name__.strip("_").removesuffix("Observation").removesuffix("Family") or "own law"
     covariance = getattr(observation, "covariance", None)
     if callable(covariance):
@@ -110,13 +110,12 @@ def _observation(observation: Any, names: tuple[str, ...]) -> list[str]:
         if np.ndim(covariance) == 3:
             return [f"{name}: {kind} (a covariance for each row)" for name in names]
         return [f"{name}: {kind} (sd {_number(sd)})" for name, sd in zip(names, _sd(covariance), strict=True)]
-    said = _with_numbers(kind, observation, (*observation.per_entry, "link"))
-    return [f"{', '.join(names)}: {said}"]
+    return [f"{', '.join(names)}: {_with_numbers(kind, observation, (*observation.per_entry, 'link'))}"]
 
 
 def _with_numbers(kind: str, part: Any, fields: tuple[str, ...]) -> str:
-    found = [(name, getattr(part, name, None)) for name in fields]
-    numbers = ", ".join(f"{name} {value if isinstance(value, str) else _number(value)}" for name, value in found
+    values = [(name, getattr(part, name, None)) for name in fields]
+    numbers = ", ".join(f"{name} {value if isinstance(value, str) else _number(value)}" for name, value in values
                         if value is not None and not callable(value))
     return f"{kind} ({numbers})" if numbers else kind
 
@@ -133,5 +132,5 @@ def _number(value: Any) -> str:
     flat = array.ravel()
     if flat.size and np.all(flat == flat[0]):
         return f"{flat[0]:.3g}"
-    shown = ", ".join(f"{one:.3g}" for one in flat[:_MOST_NUMBERS])
-    return f"[{shown}{', ...' if flat.size > _MOST_NUMBERS else ''}]"
+    numbers = ", ".join(f"{number:.3g}" for number in flat[:_MOST_NUMBERS])
+    return f"[{numbers}{', ...' if flat.size > _MOST_NUMBERS else ''}]"

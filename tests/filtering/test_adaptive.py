@@ -242,7 +242,7 @@ def test_what_a_tolerance_cannot_be():
     with pytest.raises(ValueError, match="tolerance must be finite and greater than zero"):
         double_well(SLOW_TO_STIFF[0], tolerance=0.0)
     model = double_well(SLOW_TO_STIFF[0]).model
-    with pytest.raises(ValueError, match="equal length.*leave out tolerance=0.001 or iterations"):
+    with pytest.raises(ValueError, match="equal integration steps.*leave out tolerance=0.001 or iterations"):
         lfm.MarginalLikelihood(model, TIMES, iterations=3, tolerance=1e-3)
-    with pytest.raises(ValueError, match="equal length.*leave out tolerance=0.001 or iterations"):
+    with pytest.raises(ValueError, match="equal integration steps.*leave out tolerance=0.001 or iterations"):
         lfm.smooth(model, TIMES, Y, iterations=3, tolerance=1e-3)

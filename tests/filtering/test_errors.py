@@ -76,7 +76,7 @@ def test_where_a_filter_may_start():
     first = lfm.filter(MODEL, TIMES, Y)
     with pytest.raises(TypeError, match="start must be the state of an earlier.*got FilterResult. Pass result.state"):
         lfm.filter(MODEL, TIMES + 9.0, Y, start=first)
-    with pytest.raises(ValueError, match=r"times\[0\] = 0 lies before 3, where `start` stands"):
+    with pytest.raises(ValueError, match=r"times\[0\] = 0 lies before 3, the time of `start`"):
         lfm.filter(MODEL, TIMES - TIMES[0], Y, start=first.state)
     other = lfm.filter(motif(genes=2), TIMES, np.ones((3, 2)))
     with pytest.raises(ValueError, match="start has 4 entries, but the joint state of this model has 1"):

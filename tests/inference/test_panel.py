@@ -232,7 +232,7 @@ def test_errors(y):
         panel(RATES, LENGTHSCALE).log_prob(np.where(np.isnan(y), np.inf, y))
     with pytest.raises(ValueError, match="times"):
         panel(RATES, LENGTHSCALE, TIMES[::-1])
-    with pytest.raises(ValueError, match="max_step cannot be had in a panel whose series have times of their own"):
+    with pytest.raises(ValueError, match="max_step is not supported in a panel whose series have different times"):
         lfm.panel(lambda p: build(p, 1.0), RATES, np.stack([TIMES, TIMES, TIMES]), max_step=0.1)
     with pytest.raises(TypeError, match="rule must be"):
         lfm.panel(lambda p: build(p, 1.0), RATES, TIMES, rule="cubature")

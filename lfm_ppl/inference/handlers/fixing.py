@@ -83,7 +83,7 @@ class fix(Handler):  # noqa: N801 (an effect handler, named as NumPyro names its
         if name in self.whole:
             shape = msg["fn"].batch_shape + msg["fn"].event_shape
             value = _broadcast(name, self.whole[name], shape)
-            _inside(name, msg["fn"].support, value)
+            _check_support(name, msg["fn"].support, value)
             msg["value"] = value
             msg["is_observed"] = True
         elif name in self.elements:
@@ -114,38 +114,38 @@ def pin(
             f"Fix it as a whole, as in {name}=VALUE."
         )
     elementwise(name, base.support)
-    known = [str(label) for label in labels] if len(labels) == shape[0] else []
-    known = known or [str(index) for index in range(shape[0])]
-    indices = {_index(name, label, known): value for label, value in elements.items()}
+    element_labels = [str(label) for label in labels] if len(labels) == shape[0] else []
+    element_labels = element_labels or [str(index) for index in range(shape[0])]
+    indices = {_index(name, label, element_labels): value for label, value in elements.items()}
     order = sorted(indices)
     pinned = Pinned(base, tuple(order), jnp.array([float(indices[i]) for i in order]),
-                    tuple(known[index] for index in order))
-    _inside(name, base.support, pinned.insert(base.support.feasible_like(jnp.zeros(shape))))
+                    tuple(element_labels[index] for index in order))
+    _check_support(name, base.support, pinned.insert(base.support.feasible_like(jnp.zeros(shape))))
     return pinned
 
 
 def _split(fixed: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, dict[str, float]]]:
     """Sort ``fixed`` into whole sites and single elements."""
-    whole: dict[str, Any] = {}
+    sites: dict[str, Any] = {}
     elements: dict[str, dict[str, float]] = {}
     for name, value in fixed.items():
         match = _ELEMENT.match(name)
         if match:
             elements.setdefault(match["site"], {})[match["label"].strip()] = value
         else:
-            whole[name] = value
-    both = sorted(set(whole) & set(elements))
-    if both:
-        raise ValueError(f"{both[0]} is fixed as a whole and by element; give one of the two.")
-    return whole, elements
+            sites[name] = value
+    duplicates = sorted(set(sites) & set(elements))
+    if duplicates:
+        raise ValueError(f"{duplicates[0]} is fixed as a whole and by element; give one of the two.")
+    return sites, elements
 
 
-def _index(name: str, label: str, known: list[str]) -> int:
-    if label in known:
-        return known.index(label)
-    if re.fullmatch(r"\d+", label) and int(label) < len(known):
+def _index(name: str, label: str, labels: list[str]) -> int:
+    if label in labels:
+        return labels.index(label)
+    if re.fullmatch(r"\d+", label) and int(label) < len(labels):
         return int(label)
-    raise ValueError(checks.unknown(f"element of {name}", label, known))
+    raise ValueError(checks.unknown(f"element of {name}", label, labels))
 
 
 def _broadcast(name: str, value: Any, shape: tuple[int, ...]) -> jax.Array:
@@ -157,10 +157,10 @@ def _broadcast(name: str, value: Any, shape: tuple[int, ...]) -> jax.Array:
     return jnp.broadcast_to(value, shape) if value.size == 1 else value.reshape(shape)
 
 
-def _inside(name: str, support: Any, value: jax.Array) -> None:
-    """Raise unless ``value`` lies in ``support``; traced bounds are left to the log density."""
-    inside = checks.concrete(support(value))
-    if inside is not None and not np.all(inside):
+def _check_support(name: str, support: Any, value: jax.Array) -> None:
+    """Raise ValueError unless ``value`` lies in ``support``; traced bounds are left to the log density."""
+    is_inside = checks.concrete(support(value))
+    if is_inside is not None and not np.all(is_inside):
         raise ValueError(
             f"{name} cannot be fixed at {np.asarray(value)}: its prior allows {in_words(support)}."
         )

@@ -14,7 +14,7 @@ from numpyro.distributions import constraints
 
 from lfm_ppl import checks
 from lfm_ppl.inference.handlers.likelihood_handler import LikelihoodHandler
-from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel, repeated
+from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel, repeat_draw
 from lfm_ppl.latent_grid.latent_grid import RULES, LatentGrid
 
 
@@ -40,7 +40,7 @@ class GridLikelihood(dist.Distribution):
 
     def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
         """Draw observations given the forces: (*sample_shape, T, D)."""
-        return repeated(lambda k: self.latent.observe(k, self.u, self.start), key, sample_shape)
+        return repeat_draw(lambda k: self.latent.observe(k, self.u, self.start), key, sample_shape)
 
 
 class on_latent_grid(LikelihoodHandler):  # noqa: N801 (an effect handler, named as NumPyro names its handlers)

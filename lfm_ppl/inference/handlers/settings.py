@@ -49,7 +49,7 @@ class approximate(LikelihoodHandler):  # noqa: N801 (an effect handler, named as
         super().__init__(fn)
 
     def missing(self) -> str:
-        """Return what to say of a model without a likelihood whose settings could be changed."""
+        """Return the error of a model without a likelihood whose settings could be changed."""
         if not self.settings:
             return ""
         return (
@@ -66,8 +66,8 @@ class approximate(LikelihoodHandler):  # noqa: N801 (an effect handler, named as
         settings = self._merged({name: getattr(likelihood, name) for name in NAMES})
         return MarginalLikelihood(likelihood.model, likelihood.times, **settings)
 
-    def _merged(self, own: dict[str, Any]) -> dict[str, Any]:
+    def _merged(self, previous: dict[str, Any]) -> dict[str, Any]:
         equal = "steps" in self.settings or self.settings.get("iterations", 0) > 0
         single = any(self.settings.get(name) for name in ("tolerance", "lower", "upper", "constraints"))
-        return {**own, **({"tolerance": None} if equal else {}), **({"iterations": 0} if single else {}),
+        return {**previous, **({"tolerance": None} if equal else {}), **({"iterations": 0} if single else {}),
                 **self.settings}
