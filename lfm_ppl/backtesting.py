@@ -51,16 +51,18 @@ class Backtest(NamedTuple):
             Rows: outputs and "all"; columns ``origins``, ``rmse``, ``crps``, ``log_score``, NaN where there is no such
             score.
         """
-        own, reference = (self.scores.isel(forecaster=index) for index in (0, 1))
+        model_scores, reference = (self.scores.isel(forecaster=index) for index in (0, 1))
         rows = {}
-        for name in [*(str(one) for one in self.scores["output"].values), ALL]:
-            ours, theirs = (_by_origin(one if name == ALL else one.sel(output=name)) for one in (own, reference))
-            both = np.isfinite(ours["rmse"]) & np.isfinite(theirs["rmse"])
+        for name in [*(str(output) for output in self.scores["output"].values), ALL]:
+            ours, theirs = (_by_origin(forecaster if name == ALL else forecaster.sel(output=name))
+                            for forecaster in (model_scores, reference))
+            is_comparable = np.isfinite(ours["rmse"]) & np.isfinite(theirs["rmse"])
             better = {label: (ours[label] > theirs[label]) if label == "log_score" else ours[label] < theirs[label]
                       for label in _SCORES}
-            known = {label: bool((np.isfinite(ours[label]) & np.isfinite(theirs[label])).any()) for label in _SCORES}
-            rows[name] = {"origins": int(both.sum()), **{
-                label: int(hit[both].sum()) if known[label] else np.nan for label, hit in better.items()}}
+            has_score = {label: bool((np.isfinite(ours[label]) & np.isfinite(theirs[label])).any())
+                         for label in _SCORES}
+            rows[name] = {"origins": int(is_comparable.sum()), **{
+                label: int(hit[is_comparable].sum()) if has_score[label] else np.nan for label, hit in better.items()}}
         return pd.DataFrame.from_dict(rows, orient="index")
 
 
@@ -141,10 +143,11 @@ def backtest(numpyro_model: Callable, times: Any, y: Any = None, *, horizon: int
     if times.ndim != 1 or y.ndim != 2:
         raise ValueError(f"backtest takes one series, times (T,) and y (T, D), got shapes {times.shape} and {y.shape}; "
                          "of a panel, one series after another.")
-    again = np.flatnonzero(np.diff(times) == 0)
-    if again.size:
-        raise ValueError(f"rows {again[0]} and {again[0] + 1} have the same time {times[again[0]]:g}, but horizon and "
-                         "season count rows; put replicates into columns, or take their means.")
+    duplicates = np.flatnonzero(np.diff(times) == 0)
+    if duplicates.size:
+        row = duplicates[0]
+        raise ValueError(f"rows {row} and {row + 1} have the same time {times[row]:g}, but horizon and season count "
+                         "rows; put replicates into columns, or take their means.")
     origins = _origins(len(times), horizon, every, first)
     options = {"samples": draws if sampler == "map" else 1000, **options}
     bound, data, _ = bind_dates(numpyro_model, times, y, data, options.get("model_kwargs"))
@@ -158,28 +161,28 @@ def backtest(numpyro_model: Callable, times: Any, y: Any = None, *, horizon: int
     reference = "persistence" if season is None else "seasonal-naive"
     forecasts, naive, messages = [], [], []
     for origin in origins:
-        known = np.where(np.arange(len(times))[:, None] <= origin, y, np.nan)
-        ahead = slice(origin + 1, origin + 1 + horizon)
+        past = np.where(np.arange(len(times))[:, None] <= origin, y, np.nan)
+        future = slice(origin + 1, origin + 1 + horizon)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             try:
-                result = fit(numpyro_model, times, known, sampler=sampler, seed=seed, at=times, trajectory_draws=draws,
+                result = fit(numpyro_model, times, past, sampler=sampler, seed=seed, at=times, trajectory_draws=draws,
                              progress=False, **options)
-                predicted = arviz_data.group(result, GROUP).isel(time=ahead)
+                predicted = arviz_data.group(result, GROUP).isel(time=future)
             except Exception as error:
                 raise type(error)(f"at the origin {times[origin]:g} (row {origin}): {error}") from error
-            drawn = _flat(observed_variable(predicted))
+            draws_of_y = _flat(observed_variable(predicted))
             # An observation family has no normal distribution at each draw.
             mean, sd = (_flat(predicted[name]) if name in predicted else None for name in (MEAN, SD))
-            densities = None if mean is not None else _of_family(bound, result, predicted, y[ahead])
-            found = scores(drawn, y[ahead], mean, sd, level, angular, densities)
-        messages += [f"origin {times[origin]:g}: {one.message}" for one in caught]
-        forecasts.append(((drawn if mean is None else mean).mean(axis=0), found))
-        mean, sd = _naive(known[:origin + 1], horizon, season or 1, angular)
-        target = np.where(angular, mean + _wrapped(y[ahead] - mean), y[ahead])
+            densities = None if mean is not None else _of_family(bound, result, predicted, y[future])
+            origin_scores = scores(draws_of_y, y[future], mean, sd, level, angular, densities)
+        messages += [f"origin {times[origin]:g}: {warning.message}" for warning in caught]
+        forecasts.append(((draws_of_y if mean is None else mean).mean(axis=0), origin_scores))
+        mean, sd = _naive(past[:origin + 1], horizon, season or 1, angular)
+        target = np.where(angular, mean + _wrapped(y[future] - mean), y[future])
         naive.append((mean, gaussian_scores(mean, sd, target, level)))
         if progress:
-            print(f"origin {times[origin]:g}: RMSE {summary(found, level)['rmse']:.4g}, {reference} "
+            print(f"origin {times[origin]:g}: RMSE {summary(origin_scores, level)['rmse']:.4g}, {reference} "
                   f"{summary(naive[-1][1], level)['rmse']:.4g}", flush=True)
     if messages:
         checks.warn(f"{len(messages)} warnings at the origins, the first of them at {messages[0]}", ConvergenceWarning)
@@ -192,7 +195,8 @@ def _of_family(bound: BoundModel, result: Any, predicted: xr.Dataset, y: np.ndar
     """Return the log densities (S, H, D) of an observation family along the predicted paths."""
     posterior = arviz_data.group(result, "posterior").isel(draw=predicted["draw"].values)
     draws = {site: posterior[site.replace("/", ".")].transpose("chain", "draw", ...).values for site in bound.sites}
-    return log_densities(bound, {site: one.reshape(-1, *one.shape[2:]) for site, one in draws.items()}, predicted, y)
+    flat = {site: value.reshape(-1, *value.shape[2:]) for site, value in draws.items()}
+    return log_densities(bound, flat, predicted, y)
 
 
 def _origins(rows: int, horizon: int, every: int, first: int | None) -> list[int]:
@@ -200,25 +204,25 @@ def _origins(rows: int, horizon: int, every: int, first: int | None) -> list[int
     if first is None:
         first = max(rows // 2, _LEAST_ROWS)
     checks.positive_integer("first", first)
-    found = list(range(first - 1, rows - horizon, every))
-    if first < _LEAST_ROWS or not found:
+    origins = list(range(first - 1, rows - horizon, every))
+    if first < _LEAST_ROWS or not origins:
         raise ValueError(f"there is no origin: of {rows} rows the first fit is to know {first} (at least "
                          f"{_LEAST_ROWS}) and {horizon} more are to be predicted. Take a smaller first or horizon.")
-    return found
+    return origins
 
 
 def _naive(y: np.ndarray, horizon: int, season: int, angular: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return mean and sd (H, D) of the reference given the rows (k + 1, D) so far; see `backtest`."""
-    known, outputs = y.shape
+    rows, outputs = y.shape
     mean, sd = np.full((2, horizon, outputs), np.nan)
     for lead in range(1, horizon + 1):
         for output in range(outputs):
             lag = season * -(-lead // season)
-            while lag - lead < known and not np.isfinite(y[known - 1 + lead - lag, output]):
+            while lag - lead < rows and not np.isfinite(y[rows - 1 + lead - lag, output]):
                 lag += season
-            if lag - lead >= known:
+            if lag - lead >= rows:
                 continue
-            mean[lead - 1, output] = y[known - 1 + lead - lag, output]
+            mean[lead - 1, output] = y[rows - 1 + lead - lag, output]
             change = y[lag:, output] - y[:-lag, output]
             change = _wrapped(change) if angular[output] else change
             change = change[np.isfinite(change)]
@@ -240,12 +244,13 @@ def _flat(variable: xr.DataArray) -> np.ndarray:
 def _dataset(forecasters: tuple, reference: str, times: np.ndarray, origins: list[int], horizon: int,
              outputs: Sequence[str]) -> xr.Dataset:
     dims = ("forecaster", "origin", "horizon", "output")
-    ahead = np.array(origins)[:, None] + np.arange(1, horizon + 1)
-    variables: dict[str, Any] = {"mean": (dims, np.array([[mean for mean, _ in one] for one in forecasters]))}
+    steps_ahead = np.array(origins)[:, None] + np.arange(1, horizon + 1)
+    variables: dict[str, Any] = {"mean": (dims, np.array([[mean for mean, _ in pairs] for pairs in forecasters]))}
     for name in Scores._fields:
-        variables[name] = (dims, np.array([[getattr(found, name) for _, found in one] for one in forecasters]))
+        values = [[getattr(origin_scores, name) for _, origin_scores in pairs] for pairs in forecasters]
+        variables[name] = (dims, np.array(values))
     coords = {"forecaster": [MODEL, reference], "origin": times[origins], "horizon": np.arange(1, horizon + 1),
-              "output": list(outputs), "time": (("origin", "horizon"), times[ahead])}
+              "output": list(outputs), "time": (("origin", "horizon"), times[steps_ahead])}
     return xr.Dataset(variables, coords)
 
 
@@ -263,7 +268,7 @@ def _table(dataset: xr.Dataset, level: float) -> pd.DataFrame:
     for index, forecaster in enumerate(dataset["forecaster"].values):
         picked = dataset.isel(forecaster=index)
         for name in [*outputs, ALL]:
-            chosen = picked if name == ALL else picked.sel(output=name)
-            rows[(str(forecaster), name)] = summary(_scores_of(chosen), level)
-    found = pd.DataFrame.from_dict(rows, orient="index")
-    return found.set_index(pd.MultiIndex.from_tuples(rows, names=["forecaster", "output"]))
+            selected = picked if name == ALL else picked.sel(output=name)
+            rows[(str(forecaster), name)] = summary(_scores_of(selected), level)
+    table = pd.DataFrame.from_dict(rows, orient="index")
+    return table.set_index(pd.MultiIndex.from_tuples(rows, names=["forecaster", "output"]))

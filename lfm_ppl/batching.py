@@ -44,8 +44,8 @@ def mapped(function: Callable[..., Any], *arguments: Any, batch_size: int = 1) -
         return jax.lax.map(lambda entry: function(*entry), arguments)
     # The batches of `jax.lax.map` itself fail where a result has no entries.
     batches = jax.tree_util.tree_map(lambda x: x.reshape(count // batch_size, batch_size, *x.shape[1:]), arguments)
-    found = jax.lax.map(lambda batch: jax.vmap(function)(*batch), batches)
-    return jax.tree_util.tree_map(lambda x: x.reshape(count, *x.shape[2:]), found)
+    results = jax.lax.map(lambda batch: jax.vmap(function)(*batch), batches)
+    return jax.tree_util.tree_map(lambda x: x.reshape(count, *x.shape[2:]), results)
 
 
 def threads() -> int:
@@ -55,8 +55,8 @@ def threads() -> int:
     """
     if not on_cpu() or compilation.one_thread() or (count := compilation.cpus()) == 1:
         return 1
-    with ThreadPoolExecutor(1) as other:
-        return count if other.submit(_double).result() == _double() else 1
+    with ThreadPoolExecutor(1) as executor:
+        return count if executor.submit(_double).result() == _double() else 1
 
 
 def side_by_side(program: Callable[..., Any], arguments: Sequence[tuple], count: int) -> Generator[Any, None, None]:
@@ -72,16 +72,16 @@ def side_by_side(program: Callable[..., Any], arguments: Sequence[tuple], count:
         [6, 20]
     """
     if min(count, len(arguments)) <= 1:
-        for one in arguments:
-            yield program(*one)
+        for call in arguments:
+            yield program(*call)
         return
     with ThreadPoolExecutor(count, "side by side") as pool:
-        begun = deque(pool.submit(program, *one) for one in arguments)
+        futures = deque(pool.submit(program, *call) for call in arguments)
         try:
-            while begun:
-                yield begun.popleft().result()
+            while futures:
+                yield futures.popleft().result()
         finally:  # after Ctrl-C what has not begun never does
-            for later in begun:
+            for later in futures:
                 later.cancel()
 
 

@@ -114,15 +114,15 @@ def dates_of(name: str, values: Any) -> tuple[list[datetime], tuple[int, ...]]:
     cells = (array.astype("M8[us]") if array.dtype.kind == "M" else array).ravel().tolist()
     stamps = []
     for index, cell in enumerate(cells):
-        place = f"{name}[{index}]" if array.ndim else name
+        location = f"{name}[{index}]" if array.ndim else name
         if cell is None or cell != cell:  # NaT
-            raise ValueError(f"{place} is missing (NaT); leave out the rows without a time.")
+            raise ValueError(f"{location} is missing (NaT); leave out the rows without a time.")
         try:
             stamps.append(parse(cell))
         except ValueError:
-            raise ValueError(f"{place} must be a date, year first, as the first entry is, got {cell!r}.") from None
+            raise ValueError(f"{location} must be a date, year first, as the first entry is, got {cell!r}.") from None
         if (stamps[-1].tzinfo is None) != (stamps[0].tzinfo is None):
-            raise ValueError(f"{name} must have an offset from UTC in all of its dates or in none; {place} is "
+            raise ValueError(f"{name} must have an offset from UTC in all of its dates or in none; {location} is "
                              f"{cell!s}, and the first is {cells[0]!s}.")
     return stamps, array.shape
 
@@ -294,8 +294,8 @@ def named(time: float) -> str:
         >>> named(36.0)
         '36'
     """
-    known = _CLOCK.get()
-    return f"{time:g}" if known is None else clock(time, *known, sep="T")
+    origin_and_unit = _CLOCK.get()
+    return f"{time:g}" if origin_and_unit is None else clock(time, *origin_and_unit, sep="T")
 
 
 def days_of(times: Any, origin: str, unit: str) -> np.ndarray:

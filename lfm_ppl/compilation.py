@@ -55,13 +55,13 @@ def fast_loops() -> None:
     words = os.environ.get("XLA_FLAGS", "").split()
     if any(_OPTION in word for word in words):
         return
-    own = f"{_OPTION}={_BYTES}"
+    option = f"{_OPTION}={_BYTES}"
     for index, word in enumerate(words):
         if word.startswith(_FLAG):
-            words[index] = f"{word},{own}"  # the flag takes one list
+            words[index] = f"{word},{option}"  # the flag takes one list
             break
     else:
-        words.append(_FLAG + own)
+        words.append(_FLAG + option)
     os.environ["XLA_FLAGS"] = " ".join(words)
 
 

@@ -93,9 +93,9 @@ def to_arviz(mcmc: Any, numpyro_model: Callable, times: Any, y: Any, *, at: Any 
     chains, samples = next(iter(draws.values())).shape[:2]
     flat = {site: draws[site].reshape(-1, *draws[site].shape[2:]) for site in bound.sites}
     rated = best_effort("scores of the observations", lambda: scores(bound, flat), None)
-    chosen, paths, grid = best_effort("trajectories", lambda: draw_paths(
+    draw_index, paths, grid = best_effort("trajectories", lambda: draw_paths(
         jax.random.key(seed), bound, draws, at, trajectory_draws), (None, None, None))
-    groups = lay_out(bound, draws, stats, rated, paths, chosen, grid, truth, labels)
+    groups = lay_out(bound, draws, stats, rated, paths, draw_index, grid, truth, labels)
     example = bound.site.example
     kernel = getattr(mcmc, "sampler", None)
     attrs = {
@@ -145,7 +145,7 @@ def _checked(bound: BoundModel, draws: dict[str, np.ndarray]) -> dict[str, np.nd
     """
     shapes = {name: np.shape(value) for name, value in bound.constrain(np.zeros(bound.size)).items()}
     lead = {value.shape[:2] for value in draws.values()}
-    if len(lead) != 1 or any(len(one) != 2 for one in lead):
+    if len(lead) != 1 or any(len(shape) != 2 for shape in lead):
         raise ValueError("every parameter needs as many draws, (chains, draws, ...), as the others; got "
                          f"{', '.join(f'{name} {value.shape}' for name, value in draws.items()) or 'none'}.")
     for name in bound.sites:
@@ -155,11 +155,11 @@ def _checked(bound: BoundModel, draws: dict[str, np.ndarray]) -> dict[str, np.nd
         if draws[name].shape[2:] != shapes[name]:
             raise ValueError(f"{name!r} has shape {shapes[name]} in the model, and draws of shape "
                              f"{draws[name].shape[2:]}; give the model that was run, with its arguments.")
-    found = {name: draws[name] for name in shapes if name in draws}
-    if len(found) < len(shapes):
+    site_values = {name: draws[name] for name in shapes if name in draws}
+    if len(site_values) < len(shapes):
         points = {name: draws[name].reshape(-1, *draws[name].shape[2:]) for name in bound.sites}
         (count,) = lead
         z = jax.vmap(bound.unconstrain)(points)
         computed = bound.constrain_draws(np.asarray(z).reshape(*count, -1))
-        found = {name: found.get(name, computed[name]) for name in shapes}
-    return found
+        site_values = {name: site_values.get(name, computed[name]) for name in shapes}
+    return site_values

@@ -92,7 +92,7 @@ class Data:
         object.__setattr__(self, "times", np.asarray(checks.unmask(self.times), dtype=float))
         object.__setattr__(self, "y", np.asarray(checks.unmask(self.y), dtype=float))
         object.__setattr__(self, "outputs", tuple(self.outputs))
-        object.__setattr__(self, "inputs", {name: self._table_of(name, given) for name, given in self.inputs.items()})
+        object.__setattr__(self, "inputs", {name: self._table_of(name, table) for name, table in self.inputs.items()})
         expected = (len(self.times), len(self.outputs))
         if self.times.ndim != 1 or self.y.shape != expected:
             raise ValueError(
@@ -119,18 +119,18 @@ class Data:
         object.__setattr__(self, "origin", origin)
         object.__setattr__(self, "units", {**self.units, "time": unit})
 
-    def _table_of(self, name: str, given: Any) -> InputTable:
+    def _table_of(self, name: str, value: Any) -> InputTable:
         """Return a known input as it is kept.
 
         Raises:
             TypeError: neither a tuple of times and values nor an `lfm.Input`.
         """
-        if all(hasattr(given, part) for part in InputTable._fields):  # an Input
-            given = tuple(getattr(given, part) for part in InputTable._fields)
-        if not (isinstance(given, tuple) and 2 <= len(given) <= 3):
+        if all(hasattr(value, part) for part in InputTable._fields):  # an Input
+            value = tuple(getattr(value, part) for part in InputTable._fields)
+        if not (isinstance(value, tuple) and 2 <= len(value) <= 3):
             raise TypeError(f"the known input {name!r} must be (times, values), (times, values, interpolation) or an "
-                            f"lfm.Input, got {type(given).__name__}.")
-        times, values, *way = given
+                            f"lfm.Input, got {type(value).__name__}.")
+        times, values, *way = value
         label = f"times of the known input {name!r}"
         checks.refuse_durations(label, times)
         times = calendar_time.positions(label, times, self.origin, self.units.get("time", ""))
@@ -246,9 +246,9 @@ def as_inputs(tables: Mapping[str, InputTable]) -> dict[str, Input]:
     return {name: Input(*table, name=name) for name, table in tables.items()}
 
 
-def model_keywords(tables: Mapping[str, InputTable], given: Mapping[str, Any] | None) -> dict[str, Any]:
+def model_keywords(tables: Mapping[str, InputTable], model_kwargs: Mapping[str, Any] | None) -> dict[str, Any]:
     """Return the keyword arguments of a model: those given, and ``inputs`` where there are known inputs."""
-    return {**({"inputs": as_inputs(tables)} if tables else {}), **(given or {})}
+    return {**({"inputs": as_inputs(tables)} if tables else {}), **(model_kwargs or {})}
 
 
 def as_data(data: Any) -> Data:
@@ -265,19 +265,19 @@ def as_data(data: Any) -> Data:
                     f"{type(data).__name__}. Pass times and y.")
 
 
-def on_clock_of(data: Data, other: Data) -> Data:
+def on_clock_of(data: Data, reference: Data) -> Data:
     """Return data with their times counted from the origin of other data, in their unit.
 
     Raises:
         ValueError: the times of one are dates and of the other plain numbers, or only one has an offset from UTC.
     """
-    if data.origin is None and other.origin is None:
+    if data.origin is None and reference.origin is None:
         return data
-    if data.origin is None or other.origin is None:
+    if data.origin is None or reference.origin is None:
         dated, plain = ("first", "others") if data.origin else ("others", "first")
         raise ValueError(f"the times of two tables cannot be compared: those of the {dated} are dates, those of the "
                          f"{plain} plain numbers.")
-    return at_origin(data, other.origin, other.units["time"])
+    return at_origin(data, reference.origin, reference.units["time"])
 
 
 def at_origin(data: Data, origin: str, unit: str) -> Data:
@@ -349,11 +349,11 @@ def write_csv(data: Data, path: str | Path) -> None:
     """
     unit = data.units.get("time", "")
     time_name = f"time_{unit}" if unit in calendar_time.SECONDS else "time"
-    known = [function(data.times) for function in data.known_inputs().values()]
+    values = [function(data.times) for function in data.known_inputs().values()]
     with open(path, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow([time_name, *data.outputs, *data.inputs])
-        for time, row in zip(data.times, np.column_stack([data.y, *known]), strict=True):
+        for time, row in zip(data.times, np.column_stack([data.y, *values]), strict=True):
             cells = ["" if math.isnan(value) else repr(float(value)) for value in row]
             writer.writerow([repr(float(time)), *cells])
 
@@ -399,15 +399,15 @@ def check_truth(truth: Mapping[str, Any]) -> None:
     """
     for name in truth:
         checks.one_of("entry", name, TRUTH)
-    known = {name: value for name, value in truth.items() if value is not None}
+    entries = {name: value for name, value in truth.items() if value is not None}
     for kind in (*_TRUE_PATHS, "parameters"):
-        if not isinstance(known.get(kind, {}), Mapping):
-            raise ValueError(f'"{kind}" must be a mapping of names to values, got a {type(known[kind]).__name__}.')
-    paths = {f'"{name}" of "{kind}"': value for kind in _TRUE_PATHS for name, value in known.get(kind, {}).items()}
-    paths |= {'"state"': known["state"]} if "state" in known else {}
-    if paths and "times" not in known:
+        if not isinstance(entries.get(kind, {}), Mapping):
+            raise ValueError(f'"{kind}" must be a mapping of names to values, got a {type(entries[kind]).__name__}.')
+    paths = {f'"{name}" of "{kind}"': value for kind in _TRUE_PATHS for name, value in entries.get(kind, {}).items()}
+    paths |= {'"state"': entries["state"]} if "state" in entries else {}
+    if paths and "times" not in entries:
         raise ValueError(f'{next(iter(paths))} needs "times", at which it was.')
-    times = _numbers('"times"', known.get("times", []))
+    times = _numbers('"times"', entries.get("times", []))
     if times.ndim != 1 or not np.all(np.isfinite(times)):
         raise ValueError(f'"times" must be finite numbers, one after the other, got shape {times.shape}.')
     for name, value in paths.items():
@@ -415,7 +415,7 @@ def check_truth(truth: Mapping[str, Any]) -> None:
         if size[:1] != times.shape or len(size) != 1 + state:
             raise ValueError(f'{name} must hold {len(times)} {"rows of states" if state else "values"}, one for each '
                              f'of "times", got shape {size}.')
-    for name, value in known.get("parameters", {}).items():
+    for name, value in entries.get("parameters", {}).items():
         _numbers(f'"{name}" of "parameters"', value)
 
 
@@ -434,17 +434,17 @@ def _read(source: Table, outputs: Sequence[str] | None, time_column: str | None,
         checks.one_of("time_unit", time_unit, calendar_time.SECONDS)
     if isinstance(inputs, str):
         raise TypeError(f"inputs must be a sequence of column names, such as [{inputs!r}], got the text {inputs!r}.")
-    wanted = dict(inputs) if isinstance(inputs, Mapping) else dict.fromkeys(inputs, "previous")
+    options = dict(inputs) if isinstance(inputs, Mapping) else dict.fromkeys(inputs, "previous")
     time_name = _find_time(source, time_column)
-    others = [name for name in source.columns if name != time_name]
-    for name in wanted:
-        if name not in others:
-            raise ValueError(f"{source.label}: {checks.unknown('input column', name, others)} --inputs A,B "
+    columns = [name for name in source.columns if name != time_name]
+    for name in options:
+        if name not in columns:
+            raise ValueError(f"{source.label}: {checks.unknown('input column', name, columns)} --inputs A,B "
                              "(inputs=) names the columns, in the order of the model's inputs.")
-    names = _find_outputs(source, [name for name in others if name not in wanted], time_name, outputs)
-    if both := sorted(set(names) & set(wanted)):
-        raise ValueError(f"the column {both[0]!r} is named as an output and as an input; it can be one of them.")
-    free = [name for name in others if name not in wanted and (outputs is None or name not in names)]
+    names = _find_outputs(source, [name for name in columns if name not in options], time_name, outputs)
+    if duplicates := sorted(set(names) & set(options)):
+        raise ValueError(f"the column {duplicates[0]!r} is named as an output and as an input; it can be one of them.")
+    free = [name for name in columns if name not in options and (outputs is None or name not in names)]
     times, unit, origin = _times(source, time_name, time_unit, usual_unit, () if part else free)
     y = np.array([[_value(source, row, name) for name in names] for row in range(len(times))])
     if observed and np.all(np.isnan(y)):
@@ -453,7 +453,7 @@ def _read(source: Table, outputs: Sequence[str] | None, time_column: str | None,
     for name, column in zip(names, y.T, strict=True):
         _warn_of_codes(source, name, column)
     return Data(times, y, tuple(names), units={"time": unit} if unit else {}, origin=origin,
-                inputs={name: _input(source, name, way, times) for name, way in wanted.items()})
+                inputs={name: _input(source, name, way, times) for name, way in options.items()})
 
 
 _INTEGER_LIMITS = tuple(float(sign * (2**bits - shift)) for bits in (15, 16, 31, 32, 63) for sign in (1, -1)
@@ -477,14 +477,14 @@ def _looks_like_code(value: float) -> bool:
             return False
         if mantissa == "1" and int(exponent or 0) >= 10:
             return True
-        whole, _, decimals = mantissa.partition(".")
-        figures = set(whole + decimals)
+        integer_part, _, decimals = mantissa.partition(".")
+        figures = set(integer_part + decimals)
         # 9 and 9.9 are too usual as measurements; -9 and 9.99 are codes of fixed-width formats.
-        if figures == {"9"} and (value < 0 or len(whole) > 1 or len(decimals) > 1):
+        if figures == {"9"} and (value < 0 or len(integer_part) > 1 or len(decimals) > 1):
             return True
-        if figures in ({"7"}, {"8"}) and len(whole) > (1 if value < 0 else 2):
+        if figures in ({"7"}, {"8"}) and len(integer_part) > (1 if value < 0 else 2):
             return True
-        if whole in ("999", "9999", "99999") and decimals == "25":  # of well logs
+        if integer_part in ("999", "9999", "99999") and decimals == "25":  # of well logs
             return True
     return False
 
@@ -504,12 +504,12 @@ def _codes(column: np.ndarray) -> list[float]:
     is_candidate[first:last] = False
     with np.errstate(over="ignore"):  # differences of the largest numbers
         while is_candidate.any() and not is_candidate.all():
-            rest = values[~is_candidate]
-            reach, gap = np.ptp(rest), np.diff(rest).max(initial=0.0)
-            distance = np.maximum(rest[0] - values, values - rest[-1])
+            other_values = values[~is_candidate]
+            reach, gap = np.ptp(other_values), np.diff(other_values).max(initial=0.0)
+            distance = np.maximum(other_values[0] - values, values - other_values[-1])
             is_far = (distance > _FAR_RANGES * reach) | ((distance > reach) & (distance > _FAR_GAPS * gap))
             # -999 among flows of 0 to 5,000 is less than their range away from them, but negative.
-            is_far |= (values <= -99) & (rest[0] >= 0) & (distance > gap)
+            is_far |= (values <= -99) & (other_values[0] >= 0) & (distance > gap)
             if not (is_candidate & ~is_far).any():
                 return values[is_candidate].tolist()
             is_candidate &= is_far
@@ -521,8 +521,8 @@ def _warn_of_codes(source: Table, name: str, column: np.ndarray) -> None:
     for code in _codes(column):
         if np.isfinite(column).sum() - np.sum(column == code) < 2:
             continue
-        place, count = source.place(int(np.argmax(column == code)), name), int((column == code).sum())
-        checks.warn(f"{place}: {code:g}, far from all other values of the column, is taken as a measurement "
+        location, count = source.place(int(np.argmax(column == code)), name), int((column == code).sum())
+        checks.warn(f"{location}: {code:g}, far from all other values of the column, is taken as a measurement "
                     f"({count} of them). If it stands for a missing value, leave the cell empty.")
 
 
@@ -538,31 +538,31 @@ def _find_time(source: Table, time_column: str | None) -> str:
         lambda name: name.lower() in _DATE_NAMES,
         lambda name: calendar_time.is_date(next((cell for cell in source.columns[name] if not _missing(cell)), None)),
     ):
-        found = [name for name in header if test(name)]
-        if len(found) > 1:
-            raise ValueError(f"{source.label} has several time columns: {', '.join(found)}. Name one with "
+        candidates = [name for name in header if test(name)]
+        if len(candidates) > 1:
+            raise ValueError(f"{source.label} has several time columns: {', '.join(candidates)}. Name one with "
                              "--time-column (time_column=).")
-        if found:
-            return found[0]
+        if candidates:
+            return candidates[0]
     raise ValueError(f"{source.label} has no time column; expected `time`, `t`, `time_h`, or one of dates, got the "
                      f"columns {', '.join(header)}. Name it with --time-column (time_column=).")
 
 
-def _find_outputs(source: Table, others: Sequence[str], time_name: str, outputs: Sequence[str] | None) -> list[str]:
+def _find_outputs(source: Table, columns: Sequence[str], time_name: str, outputs: Sequence[str] | None) -> list[str]:
     if outputs is None:
-        names = [name for name in others if name and name.lower() != "replicate"]
+        names = [name for name in columns if name and name.lower() != "replicate"]
         if not names:
             raise ValueError(f"{source.label} has no column beside the time {time_name!r}"
-                             f"{' and the inputs' if len(source.columns) > len(others) + 1 else ''}.")
+                             f"{' and the inputs' if len(source.columns) > len(columns) + 1 else ''}.")
         return names
     if isinstance(outputs, str):
         raise TypeError(f"outputs must be a sequence of column names, such as [{outputs!r}], got the text {outputs!r}.")
     if not len(outputs) or len(set(outputs)) < len(outputs):
         raise ValueError(f"outputs must name at least one column, and each of them once; got {list(outputs)}.")
-    known = [name for name in source.columns if name != time_name]
+    columns = [name for name in source.columns if name != time_name]
     for name in outputs:
-        if name not in known:
-            raise ValueError(f"{source.label}: {checks.unknown('output column', name, known)} Name the columns "
+        if name not in columns:
+            raise ValueError(f"{source.label}: {checks.unknown('output column', name, columns)} Name the columns "
                              "with --outputs (outputs=); what was not measured is an empty column.")
     return list(outputs)
 
@@ -588,14 +588,14 @@ def _times(source: Table, name: str, unit: str | None, usual: str | None,
     if missing := [row for row, cell in enumerate(cells) if _missing(cell)]:
         raise ValueError(f"{source.place(missing[0], name)}: the time is missing.")
     if not calendar_time.is_date(cells[0]):
-        wanted = "expected a number, or a date, year first, such as 2026-03-31 in every row, got {}."
-        times = np.array([_value(source, row, name, wanted) for row in range(len(cells))])
+        requirement = "expected a number, or a date, year first, such as 2026-03-31 in every row, got {}."
+        times = np.array([_value(source, row, name, requirement) for row in range(len(cells))])
         _check_order(source, times, [f"{time:g}" for time in times], free)
-        own = _unit_of(name)
-        if own is not None and unit not in (None, own):
-            raise ValueError(f"{source.label}: the column {name!r} says that its unit is {own}, and --time-unit "
-                             f"(time_unit=) says {unit}.")
-        return times, own or unit, None
+        unit_in_name = _unit_of(name)
+        if unit_in_name is not None and unit not in (None, unit_in_name):
+            raise ValueError(f"{source.label}: the column {name!r} says that its unit is {unit_in_name}, and "
+                             f"--time-unit (time_unit=) says {unit}.")
+        return times, unit_in_name or unit, None
     stamps = []
     for row, cell in enumerate(cells):
         try:
@@ -606,9 +606,9 @@ def _times(source: Table, name: str, unit: str | None, usual: str | None,
         if (stamps[-1].tzinfo is None) != (stamps[0].tzinfo is None):
             raise ValueError(f"{source.place(row, name)}: some dates have an offset from UTC and others have none: "
                              f"{cells[0]!s} and {cell!s}. Write it in all of them, or in none.")
-    back = " A clock that is set back for winter needs offsets from UTC." if stamps[0].tzinfo is None else ""
+    clock_hint = " A clock that is set back for winter needs offsets from UTC." if stamps[0].tzinfo is None else ""
     times, origin, unit = calendar_time.since_midnight(stamps, unit or _unit_of(name) or usual)
-    _check_order(source, times, [str(cell) for cell in cells], free, back)
+    _check_order(source, times, [str(cell) for cell in cells], free, clock_hint)
     return times, unit, origin
 
 
@@ -620,20 +620,20 @@ def _input(source: Table, name: str, interpolation: str, times: np.ndarray) -> I
     """
     checks.one_of(f"interpolation of {name}", interpolation, INTERPOLATIONS)
     values = np.array([_value(source, row, name) for row in range(len(times))])
-    known = np.flatnonzero(np.isfinite(values))
-    if interpolation != "zero" and (not known.size or times[known[0]] > times[0]):
+    finite_rows = np.flatnonzero(np.isfinite(values))
+    if interpolation != "zero" and (not finite_rows.size or times[finite_rows[0]] > times[0]):
         raise ValueError(f"{source.place(0, name)}: the known input has no value at the first time; fill the cell, or "
                          f"read empty cells as zero: {_zero_option(name)}.")
     _warn_of_codes(source, name, values)
     values = _read_blanks(f"{source.label}, column {name!r}", _zero_option(name), times, values, interpolation)
-    known = np.flatnonzero(np.isfinite(values))
-    kept, first = np.unique(times[known], return_index=True)
-    for row in map(int, known):
-        before = values[known[first[np.searchsorted(kept, times[row])]]]
-        if values[row] != before:
-            raise ValueError(f"{source.place(row, name)}: the known input is {values[row]:g} here and {before:g} in "
-                             "another row of the same time.")
-    return InputTable(kept, values[known[first]], _kept_interpolation(interpolation))
+    finite_rows = np.flatnonzero(np.isfinite(values))
+    unique_times, first = np.unique(times[finite_rows], return_index=True)
+    for row in map(int, finite_rows):
+        previous_value = values[finite_rows[first[np.searchsorted(unique_times, times[row])]]]
+        if values[row] != previous_value:
+            raise ValueError(f"{source.place(row, name)}: the known input is {values[row]:g} here and "
+                             f"{previous_value:g} in another row of the same time.")
+    return InputTable(unique_times, values[finite_rows[first]], _kept_interpolation(interpolation))
 
 
 def _zero_option(name: str) -> str:
@@ -679,7 +679,7 @@ _WANTED = ("expected a number or an empty cell, got {}. If the model does not ta
            "outputs and inputs.")
 
 
-def _value(source: Table, row: int, name: str, wanted: str = _WANTED) -> float:
+def _value(source: Table, row: int, name: str, requirement: str = _WANTED) -> float:
     """Return the number in a cell; ``wanted`` is what to say, with the place of the cell, of one that holds none."""
     cell = source.columns[name][row]
     try:
@@ -691,7 +691,7 @@ def _value(source: Table, row: int, name: str, wanted: str = _WANTED) -> float:
     except (TypeError, ValueError):  # a TypeError is pandas' NA, or a cell that is no scalar
         if type(cell).__name__ == "NAType":
             return math.nan
-        raise ValueError(f"{source.place(row, name)}: {wanted.format(_shown(cell))}{_meant(cell)}") from None
+        raise ValueError(f"{source.place(row, name)}: {requirement.format(_shown(cell))}{_meant(cell)}") from None
     if not math.isfinite(value):
         raise ValueError(f"{source.place(row, name)}: expected a finite number, got {_shown(cell)}. Leave the cell of "
                          "a missing value empty.")
@@ -715,27 +715,28 @@ def _shown(cell: Any) -> str:
     return text if len(text) <= 60 else f"{text[:50]}... ({len(text)} characters)"
 
 
-def _check_order(source: Table, times: np.ndarray, said: Sequence[str], free: Sequence[str], more: str = "") -> None:
+def _check_order(source: Table, times: np.ndarray, time_texts: Sequence[str], free: Sequence[str],
+                 more: str = "") -> None:
     """Raise ValueError where the time goes back, and name the column of series where there seems to be one.
 
     Args:
         source: the table.
         times: (T,).
-        said: (T,), the times as the user wrote them.
+        time_texts: (T,), the times as the user wrote them.
         free: columns that are neither the time nor named as outputs or inputs.
-        more: to be said besides.
+        more: further text of the message.
     """
-    back = np.flatnonzero(np.diff(times) < 0)
-    if not back.size:
+    decreases = np.flatnonzero(np.diff(times) < 0)
+    if not decreases.size:
         return
-    k = int(back[0]) + 1
-    place = f"{source.label}, row {source.rows[k]}: the time goes back from {said[k - 1]} to {said[k]}"
+    k = int(decreases[0]) + 1
+    location = f"{source.label}, row {source.rows[k]}: the time goes back from {time_texts[k - 1]} to {time_texts[k]}"
     if (column := _series_column(source, times, free)) is not None:
         cells = source.columns[column]
-        raise ValueError(f"{place}, where the column {column!r} changes from {cells[k - 1]} to {cells[k]}. If it "
+        raise ValueError(f"{location}, where the column {column!r} changes from {cells[k - 1]} to {cells[k]}. If it "
                          f"names several series, fit each by itself: --series {column} (lfm.data.read_series(path, "
                          f"{column!r}), or lfm.read_table of each part of a DataFrame).")
-    raise ValueError(f"{place}. Sort the rows by time; replicates are rows with the same time.{more}")
+    raise ValueError(f"{location}. Sort the rows by time; replicates are rows with the same time.{more}")
 
 
 _SERIES_NAMES = ("id", "subject", "patient", "series", "individual", "animal", "unit", "group", "name")

@@ -100,32 +100,32 @@ def _forecast(result: Any, numpyro_model: Callable, times: np.ndarray, inputs: M
     check_possible(bound, times)
     posterior = arviz_data.group(result, "posterior")
     chains = posterior.sizes["chain"]
-    chosen, rows = evenly_spaced(chains, posterior.sizes["draw"], draws)
+    draw_index, rows = evenly_spaced(chains, posterior.sizes["draw"], draws)
     attrs = arviz_data.attributes(result)
     settings = None
     if str(attrs.get("sampler", "")).startswith("pmmh") and "particles" in attrs:
         settings = ParticleSettings(int(attrs["particles"]))
     counter = Counter("forecast", is_shown=progress, at_once=True)
     # That of an observation family, by its sites, depends on the times of the forecast in its last digits.
-    known = not isinstance(bound.site.example.ssm.model.observation, ObservationFamily)
+    has_log_likelihood = not isinstance(bound.site.example.ssm.model.observation, ObservationFamily)
     try:
         paths = trajectories(jax.random.key(seed), bound, problem.at(rows).draws, times, settings,
-                             log_likelihood=known, show=counter)
+                             log_likelihood=has_log_likelihood, show=counter)
     finally:
         counter.close()
-    split = {name: value.reshape(chains, len(chosen), *value.shape[1:]) for name, value in paths.items()}
+    split = {name: value.reshape(chains, len(draw_index), *value.shape[1:]) for name, value in paths.items()}
     if "log_likelihood" in split:
-        total = split["log_likelihood"].reshape(chains, len(chosen), -1).sum(axis=-1)
-        rebuilding.check_likelihood(result, total, chosen)
+        total = split["log_likelihood"].reshape(chains, len(draw_index), -1).sum(axis=-1)
+        rebuilding.check_likelihood(result, total, draw_index)
     # Data that an earlier forecast was compared with are not those of this one.
     groups = {name: arviz_data.group(result, name) for name in arviz_data.groups(result) if name not in (
         HELD_OUT, known_inputs.FORECAST)}
-    labels = posterior["draw"].values[chosen] if "draw" in posterior.coords else chosen
+    labels = posterior["draw"].values[draw_index] if "draw" in posterior.coords else draw_index
     observed = groups["observed_data"]
     names = {name: observed[name].values.tolist() for name in ("output", "series") if name in observed.coords}
     groups[GROUP] = predictions(bound, split, labels, times, names)
-    if continued := {name: InputTable(np.asarray(one.times), np.asarray(one.values), one.interpolation)
-                     for name, one in (inputs or {}).items() if isinstance(one, Input)}:
+    if continued := {name: InputTable(np.asarray(value.times), np.asarray(value.values), value.interpolation)
+                     for name, value in (inputs or {}).items() if isinstance(value, Input)}:
         groups[known_inputs.FORECAST] = known_inputs.to_dataset(continued)
     return arviz_data.build(groups, attrs)
 

@@ -122,23 +122,23 @@ class ModelFile:
         if self._anchors is None:
             return {}
         _check_call(self.path, "anchors", self._anchors, "the data", data)
-        found = self._anchors(data)
-        if not isinstance(found, Mapping):
+        anchors = self._anchors(data)
+        if not isinstance(anchors, Mapping):
             raise TypeError(f"anchors in {self.path} must return a mapping of names of parameters to values, got "
-                            f"{_type(found)}.")
-        return dict(found)
+                            f"{_type(anchors)}.")
+        return dict(anchors)
 
     def keywords(self, data: Data, options: Mapping[str, Any]) -> dict[str, Any]:
         """Return the keyword arguments of ``model`` for this data and these options."""
         keywords = {name: default for name, (default, _, _) in self.options.items()} | dict(options)
-        taken = inspect.signature(self.model).parameters
-        told = {"outputs": data.outputs, "units": dict(data.units), "inputs": data.known_inputs()}
-        if data.inputs and "inputs" not in taken:
+        parameters = inspect.signature(self.model).parameters
+        from_data = {"outputs": data.outputs, "units": dict(data.units), "inputs": data.known_inputs()}
+        if data.inputs and "inputs" not in parameters:
             raise ValueError(f"{self.path}: the data have the known input {next(iter(data.inputs))!r}, and model(...) "
                              "has no argument `inputs` to take it by.")
         if lacking := [name for name in self.inputs if name not in data.inputs]:
             raise ValueError(f"{self.name} needs the known input {lacking[0]!r}, which the data do not have.")
-        return keywords | {name: value for name, value in told.items() if name in taken}
+        return keywords | {name: value for name, value in from_data.items() if name in parameters}
 
     def option(self, name: str, text: str) -> Any:
         """Return the value of option ``name`` that ``text`` stands for.
@@ -150,10 +150,10 @@ class ModelFile:
             raise ValueError(checks.unknown(f"option of {self.name}", name, self.options))
         _, accepted, _ = self.options[name]
         if isinstance(accepted, tuple):
-            known = {str(choice): choice for choice in accepted}
-            if text not in known:
-                raise ValueError(checks.unknown(f"value of option {name}", text, known))
-            return known[text]
+            choices = {str(choice): choice for choice in accepted}
+            if text not in choices:
+                raise ValueError(checks.unknown(f"value of option {name}", text, choices))
+            return choices[text]
         try:
             return _convert(accepted, text)
         except ValueError:
@@ -207,13 +207,13 @@ def load(name: str) -> ModelFile:
             raise ValueError(f"there is no model file {name}.")
         return _checked(path.resolve(), _execute(path.resolve()))
     shipped = available()
-    wanted = name.replace("_", "-")
-    if wanted not in shipped and Path(f"{name}.py").is_file():
+    normalized = name.replace("_", "-")
+    if normalized not in shipped and Path(f"{name}.py").is_file():
         raise ValueError(f"unknown model {name!r}. Did you mean the file {name}.py?")
-    if wanted not in shipped:
+    if normalized not in shipped:
         message = checks.unknown("model", name, shipped)
         raise ValueError(f"{message} A model of your own is given by its path, as in ./{name}.py.")
-    return _checked(shipped[wanted], _execute(shipped[wanted]))
+    return _checked(shipped[normalized], _execute(shipped[normalized]))
 
 
 def _execute(path: Path) -> ModuleType:
@@ -275,10 +275,10 @@ def _checked(path: Path, module: ModuleType) -> ModelFile:
         _anchors=getattr(module, "anchors", None),
         _names=vars(module),
     )
-    taken = inspect.signature(loaded.model).parameters
-    told = {name: None for name in ("outputs", "units", "inputs") if name in taken}
+    parameters = inspect.signature(loaded.model).parameters
+    keywords = {name: None for name in ("outputs", "units", "inputs") if name in parameters}
     _check_call(path, "model", loaded.model, "(times, y=None) and the names in OPTIONS", None, None,
-                **{name: None for name in loaded.options}, **told)
+                **{name: None for name in loaded.options}, **keywords)
     return loaded
 
 
@@ -314,10 +314,10 @@ def _checked_inputs(path: Path, inputs: Any) -> dict[str, str]:
 
 def _convert(kind: type, text: str) -> Any:
     if kind is bool:
-        known = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
-        if text.lower() not in known:
+        booleans = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
+        if text.lower() not in booleans:
             raise ValueError(text)
-        return known[text.lower()]
+        return booleans[text.lower()]
     return kind(text)
 
 
@@ -337,18 +337,18 @@ class Place(NamedTuple):
 
 def place_in_model(error: BaseException) -> Place | None:
     """Return the last line of a model file that led to an error, or to its cause; None where none did."""
-    found = None
+    place = None
     cause: BaseException | None = error
     while cause is not None:
         for frame, line in traceback.walk_tb(cause.__traceback__):
             module = str(frame.f_globals.get("__name__", ""))
             if module.startswith(_MODULE):
                 file = frame.f_code.co_filename
-                found = Place(file, line, Path(file).parent == models_folder())
+                place = Place(file, line, Path(file).parent == models_folder())
             elif module.startswith("lfm_ppl.inference.handlers."):  # what a user asks of a site is not the file's fault
-                found = None
+                place = None
         cause = cause.__cause__
-    return found
+    return place
 
 
 def known_inputs(error: KeyError) -> tuple[str, ...] | None:
@@ -365,8 +365,8 @@ def _where(error: BaseException, path: Path) -> str:
     """Return the error in one line, with the last line of ``path`` that led to it."""
     lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == str(path)]
     line = error.lineno if isinstance(error, SyntaxError) else (lines[-1] if lines else None)
-    place = f"line {line}: " if line else ""
-    return f"{place}{type(error).__name__}: {error}"
+    location = f"line {line}: " if line else ""
+    return f"{location}{type(error).__name__}: {error}"
 
 
 def _name(path: Path) -> str:

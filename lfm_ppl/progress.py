@@ -39,10 +39,10 @@ class Clock:
 
     def due(self) -> bool:
         """Whether `EVERY_S` have passed since it last was."""
-        now = time.perf_counter()
-        if now - self._said < EVERY_S:
+        current_time = time.perf_counter()
+        if current_time - self._said < EVERY_S:
             return False
-        self._said = now
+        self._said = current_time
         return True
 
 
@@ -54,11 +54,11 @@ class Waiting:
     """
 
     def __init__(self, text: str) -> None:
-        self._over, began = threading.Event(), time.perf_counter()
+        self._over, start_time = threading.Event(), time.perf_counter()
 
         def tell() -> None:
             while not self._over.wait(max(EVERY_S, _SHORTEST_S)):
-                print(f"{text} ({duration(time.perf_counter() - began)} so far)", file=sys.stderr, flush=True)
+                print(f"{text} ({duration(time.perf_counter() - start_time)} so far)", file=sys.stderr, flush=True)
 
         threading.Thread(target=tell, daemon=True).start()
 
@@ -68,17 +68,17 @@ class Waiting:
 
 
 @contextlib.contextmanager
-def waiting(text: str, shown: bool) -> Iterator[None]:
+def waiting(text: str, is_shown: bool) -> Iterator[None]:
     """Say what begins, and as long as it lasts that it goes on; nothing where that is not ``shown``."""
-    if not shown:
+    if not is_shown:
         yield
         return
     print(text, file=sys.stderr, flush=True)
-    told = Waiting(text)
+    display = Waiting(text)
     try:
         yield
     finally:
-        told.stop()
+        display.stop()
 
 
 def duration(seconds: float) -> str:

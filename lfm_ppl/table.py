@@ -152,6 +152,6 @@ def _is_number(cell: str) -> bool:
 def _check_names(where: str, header: Sequence[str]) -> None:
     repeated = sorted({name for name in header if list(header).count(name) > 1})
     if repeated:
-        places = [i + 1 for i, name in enumerate(header) if name == repeated[0]]
-        raise ValueError(f"{where}: the column name {repeated[0]!r} stands {len(places)} times (columns "
-                         f"{', '.join(map(str, places))}). Give each column its own name.")
+        positions = [i + 1 for i, name in enumerate(header) if name == repeated[0]]
+        raise ValueError(f"{where}: the column name {repeated[0]!r} stands {len(positions)} times (columns "
+                         f"{', '.join(map(str, positions))}). Give each column its own name.")

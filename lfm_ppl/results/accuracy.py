@@ -99,48 +99,49 @@ def check_accuracy(result: Any, numpyro_model: Callable, times: Any = None, y: A
     if replicates < 2:
         raise ValueError("replicates must be at least 2: the noise of the particle filter is told from their spread.")
     _check_sampler(result)
-    whole = rebuilding.problem(result, numpyro_model, times, y, model_kwargs)
-    whole.example.refuse_constraints("a check of the Gaussian filter's accuracy")
-    ssm = whole.example.ssm
+    full_problem = rebuilding.problem(result, numpyro_model, times, y, model_kwargs)
+    full_problem.example.refuse_constraints("a check of the Gaussian filter's accuracy")
+    ssm = full_problem.example.ssm
     kind = _kind(reference, ssm)
     posterior = arviz_data.group(result, "posterior")
-    chosen, rows = evenly_spaced(posterior.sizes["chain"], posterior.sizes["draw"], draws)
-    kept = None
+    draw_index, rows = evenly_spaced(posterior.sizes["chain"], posterior.sizes["draw"], draws)
+    run = None
     if checkpoint is not None:
-        kept = checkpoints.begin_or_resume(checkpoint, {
+        run = checkpoints.begin_or_resume(checkpoint, {
             "reference": reference, "draws": draws, "particles": particles, "replicates": replicates, "steps": steps,
-            "seed": seed, "model": checkpoints.digest(model_digest(whole.bound)), "data": checkpoints.digest(whole.y),
-            "draws of the result": checkpoints.digest(*whole.draws.values()), "versions": checkpoints.versions(),
+            "seed": seed, "model": checkpoints.digest(model_digest(full_problem.bound)),
+            "data": checkpoints.digest(full_problem.y), "versions": checkpoints.versions(),
+            "draws of the result": checkpoints.digest(*full_problem.draws.values()),
         }, resume)  # fmt: skip
-    with checkpoints.closing(kept):
-        problem = whole.at(rows)._replace(parts=None if kept is None else kept.parts)
-        report = _report(result, problem, chosen, kind, particles, replicates, steps, seed, progress)
+    with checkpoints.closing(run):
+        problem = full_problem.at(rows)._replace(parts=None if run is None else run.parts)
+        report = _report(result, problem, draw_index, kind, particles, replicates, steps, seed, progress)
     arviz_data.add_group(result, GROUP, report.to_dataset())
     return report
 
 
-def _report(result: Any, problem: PosteriorDraws, chosen: np.ndarray, kind: str, particles: int | None,
+def _report(result: Any, problem: PosteriorDraws, draw_index: np.ndarray, kind: str, particles: int | None,
             replicates: int, steps: int | None, seed: int, progress: bool) -> AccuracyReport:
     posterior = arviz_data.group(result, "posterior")
-    shape = (posterior.sizes["chain"], len(chosen))
+    shape = (posterior.sizes["chain"], len(draw_index))
     filtered = likelihoods.gaussian(problem).reshape(shape)
-    rebuilding.check_likelihood(result, likelihoods.recorded(problem, filtered.ravel()).reshape(shape), chosen)
+    rebuilding.check_likelihood(result, likelihoods.recorded(problem, filtered.ravel()).reshape(shape), draw_index)
     doubled = likelihoods.gaussian_with_finer_steps(problem).reshape(shape)
     iterated = None
     if (refinement := more_iterations(problem.example)) is not None:
         refined = problem._replace(bound=problem.bound.approximate(**refinement.settings))
         iterated = likelihoods.gaussian(refined, "log likelihoods with more iterations").reshape(shape)
-    found = _reference(kind, problem, filtered, particles, replicates, steps, seed, progress)
-    return assess(result, chosen, filtered, doubled, found, problem, iterated)
+    reference_values = _reference(kind, problem, filtered, particles, replicates, steps, seed, progress)
+    return assess(result, draw_index, filtered, doubled, reference_values, problem, iterated)
 
 
-def assess(result: Any, chosen: np.ndarray, filtered: np.ndarray, doubled: np.ndarray, reference: Reference,
+def assess(result: Any, draw_index: np.ndarray, filtered: np.ndarray, doubled: np.ndarray, reference: Reference,
            problem: PosteriorDraws, iterated: np.ndarray | None = None) -> AccuracyReport:
     """Return the report from log likelihoods at draws.
 
     Args:
         result: with the posterior.
-        chosen: (S,), which draws of each chain.
+        draw_index: (S,), draws of each chain.
         filtered: (C, S), log likelihoods of the Gaussian filter.
         doubled: (C, S), with twice as many steps.
         reference: log likelihoods of the reference.
@@ -154,7 +155,7 @@ def assess(result: Any, chosen: np.ndarray, filtered: np.ndarray, doubled: np.nd
     weights = importance.smooth(ratio, efficiency)
     all_draws = scalar_draws(posterior)
     varying = {label: all_draws[label] for label in choose(all_draws, None)}
-    table = importance.corrected_moments(varying, chosen, weights.log_weight)
+    table = importance.corrected_moments(varying, draw_index, weights.log_weight)
     noisy = reference.estimates.shape[-1] > 1
     noise_sd = noise(averaged) if noisy else 0.0
     change = doubled - filtered
@@ -179,7 +180,7 @@ def assess(result: Any, chosen: np.ndarray, filtered: np.ndarray, doubled: np.nd
         **{name: ("parameter", table[name].to_numpy()) for name in table.columns},
     }
     coords = {"chain": posterior["chain"].values if "chain" in posterior.coords else np.arange(filtered.shape[0]),
-              "draw": posterior["draw"].values[chosen] if "draw" in posterior.coords else chosen,
+              "draw": posterior["draw"].values[draw_index] if "draw" in posterior.coords else draw_index,
               "parameter": list(table.index)}
     return AccuracyReport(xr.Dataset(variables, coords, {
         "reference": reference.description, "pareto_k": weights.k, "threshold": weights.threshold,
@@ -198,8 +199,8 @@ def _finite_sd(values: np.ndarray) -> float:
 
 def noise(averaged: importance.Averaged) -> float:
     """Return the root mean square, over draws, of the noise sd of averaged log likelihoods."""
-    known = averaged.variance[~np.isnan(averaged.variance)]
-    return float(np.sqrt(np.minimum(known, _LARGEST_VARIANCE).mean())) if known.size else np.inf
+    variances = averaged.variance[~np.isnan(averaged.variance)]
+    return float(np.sqrt(np.minimum(variances, _LARGEST_VARIANCE).mean())) if variances.size else np.inf
 
 
 def _share(noise_sd: float, ratio: np.ndarray) -> float:
@@ -220,7 +221,7 @@ def _refit(attrs: Mapping[str, Any]) -> str:
     words += ["--rule", rule] if rule else []
     for flag, stored in (("--option", "options"), ("--set", "fixed")):
         for name, value in json.loads(attrs.get(stored) or "{}").items():
-            text = ",".join(f"{one:.12g}" for one in value) if isinstance(value, list) else str(value)
+            text = ",".join(f"{number:.12g}" for number in value) if isinstance(value, list) else str(value)
             words += [flag, f"{name}={text}"]
     return shlex.join(words)
 

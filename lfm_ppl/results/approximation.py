@@ -95,8 +95,8 @@ def approximation_warnings(bound: BoundModel, draws: Mapping[str, np.ndarray],
     problem = PosteriorDraws(bound, draws).at(rows)
     fitted = likelihoods.gaussian(problem) if log_likelihood is None else log_likelihood[rows]
 
-    def change(*chosen: Refinement) -> float:
-        settings = {name: value for refinement in chosen for name, value in refinement.settings.items()}
+    def change(*selected: Refinement) -> float:
+        settings = {name: value for refinement in selected for name, value in refinement.settings.items()}
         refined = likelihoods.gaussian(problem._replace(bound=bound.approximate(**settings)))
         difference = refined - fitted
         return float(difference.std()) if np.isfinite(difference).all() else np.inf
@@ -105,11 +105,11 @@ def approximation_warnings(bound: BoundModel, draws: Mapping[str, np.ndarray],
     if total <= LARGEST_CHANGE:
         return []
     changes = [total] if len(refinements) == 1 else [change(refinement) for refinement in refinements]
-    needed = [(refinement, size) for refinement, size in zip(refinements, changes, strict=True)
+    remedies = [(refinement, size) for refinement, size in zip(refinements, changes, strict=True)
               if size > LARGEST_CHANGE]
-    if not needed:  # only both together
-        needed = [(refinement, total) for refinement in refinements]
-    return [_message(refinement, size, len(rows)) for refinement, size in needed]
+    if not remedies:  # only both together
+        remedies = [(refinement, total) for refinement in refinements]
+    return [_message(refinement, size, len(rows)) for refinement, size in remedies]
 
 
 def resolution_warnings(bound: BoundModel, draws: Mapping[str, np.ndarray]) -> list[str]:

@@ -72,12 +72,12 @@ def build(groups: Mapping[str, xr.Dataset], attrs: Mapping[str, Any] | None = No
         >>> groups(result)
         ('posterior',)
     """
-    kept = {name: _checked(name, dataset) for name, dataset in groups.items()}
-    kept = {name: dataset for name, dataset in kept.items() if dataset.data_vars}
+    checked_groups = {name: _checked(name, dataset) for name, dataset in groups.items()}
+    checked_groups = {name: dataset for name, dataset in checked_groups.items() if dataset.data_vars}
     attrs = {"inference_library": LIBRARY, **(attrs or {})}
     if not _uses_datatree():
-        return load_arviz().InferenceData(attrs=attrs, **kept)
-    tree = xr.DataTree.from_dict({f"/{name}": dataset for name, dataset in kept.items()})
+        return load_arviz().InferenceData(attrs=attrs, **checked_groups)
+    tree = xr.DataTree.from_dict({f"/{name}": dataset for name, dataset in checked_groups.items()})
     tree.attrs = attrs
     return tree
 
@@ -110,8 +110,8 @@ def group(result: Any, name: str) -> xr.Dataset:
             f"the result has no group {name!r}; it has {', '.join(groups(result)) or 'none'}."
             + (f" {name!r} comes from {remedy}." if remedy else "")
         )
-    found = result[name]
-    return found.to_dataset() if isinstance(found, xr.DataTree) else found
+    dataset = result[name]
+    return dataset.to_dataset() if isinstance(dataset, xr.DataTree) else dataset
 
 
 def add_group(result: Any, name: str, dataset: xr.Dataset) -> Any:
@@ -325,9 +325,9 @@ def convergence_warnings(result: Any, table: pd.DataFrame | None = None) -> list
     sizes = group(result, "posterior").sizes
     stats = group(result, "sample_stats") if has_group(result, "sample_stats") else {}
     divergences = int(stats["diverging"].sum()) if "diverging" in stats else 0
-    found = convergence.messages(summary(result) if table is None else table, sizes["chain"], sizes["draw"],
+    messages = convergence.messages(summary(result) if table is None else table, sizes["chain"], sizes["draw"],
                                  divergences)
-    return found + of_sites
+    return messages + of_sites
 
 
 def mcse_mean(values: np.ndarray) -> float:
@@ -373,9 +373,9 @@ def psis(log_ratio: np.ndarray, relative_efficiency: float = 1.0) -> tuple[np.nd
 
 def _mode(result: Any) -> dict[str, dict[str, float]]:
     """Return the column of a summary that holds the posterior mode; none where the result does not tell it."""
-    known = json.loads(str(attributes(result).get(MODE, "{}")))
+    mode = json.loads(str(attributes(result).get(MODE, "{}")))
     posterior = group(result, "posterior")
-    values = {name.replace("/", "."): np.asarray(value, float) for name, value in known.items()}
+    values = {name.replace("/", "."): np.asarray(value, float) for name, value in mode.items()}
     named = {name: (posterior[name].dims[2:], value) for name, value in values.items() if name in posterior}
     modes = xr.Dataset(named, {dim: posterior[dim] for dims, _ in named.values() for dim in dims if dim in posterior})
     return {"mode": scalar_truth(posterior, modes)} if named else {}

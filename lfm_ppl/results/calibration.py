@@ -105,15 +105,15 @@ def calibrate(key: jax.Array, model: Callable, times: Any, kernel: Callable, *, 
         checks.one_of("method", method, METHODS)
     compute = _Ranks(model, np.asarray(times, float), kernel, draws, thin, warmup, batch, method)
     compute.check()
-    truth_keys, chain_keys = (np.asarray(jax.random.key_data(jax.random.split(one, data_sets)))
-                              for one in jax.random.split(key))
+    truth_keys, chain_keys = (np.asarray(jax.random.key_data(jax.random.split(subkey, data_sets)))
+                              for subkey in jax.random.split(key))
     settings = {"key": np.asarray(jax.random.key_data(key)).ravel().tolist(), "times": compute.times.tolist(),
                 "model": _name(model), "kernel": _name(kernel), "draws": draws, "thin": thin, "warmup": warmup}
     tasks = [Task(f"data-sets/{first:05d}-{min(first + batch, data_sets) - 1:05d}", 0, settings,
                   (truth_keys[first:first + batch], chain_keys[first:first + batch], str(jax.random.key_impl(key))))
              for first in range(0, data_sets, batch)]
-    found = run_tasks(tasks, compute, folder, overwrite=overwrite, report=report, workers=workers)
-    parts = [found[task.name] for task in tasks]
+    outcomes = run_tasks(tasks, compute, folder, overwrite=overwrite, report=report, workers=workers)
+    parts = [outcomes[task.name] for task in tasks]
     return Calibration({name: np.concatenate([part[name] for part in parts]) for name in parts[0]}, draws)
 
 
@@ -163,8 +163,8 @@ class _Ranks:
     def __call__(self, task: Task) -> dict[str, np.ndarray]:
         """Return name of a scalar -> ranks."""
         *keys, kind = task.data
-        found = self.program(tuple(jax.random.wrap_key_data(jnp.asarray(one), impl=kind) for one in keys))
-        return _scalars({name: np.asarray(value) for name, value in found.items()})
+        results = self.program(tuple(jax.random.wrap_key_data(jnp.asarray(key_data), impl=kind) for key_data in keys))
+        return _scalars({name: np.asarray(value) for name, value in results.items()})
 
 
 def _name(function: Callable) -> str:
@@ -183,9 +183,9 @@ def _chain(kernel: Any, arguments: tuple, key: jax.Array, draws: int, thin: int,
     return jax.vmap(kernel.postprocess_fn(arguments, {}))(collected)
 
 
-def _scalars(found: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+def _scalars(values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     flat = {}
-    for name, value in found.items():
+    for name, value in values.items():
         for index in np.ndindex(value.shape[1:]):
             flat[f"{name}[{','.join(map(str, index))}]" if index else name] = value[(slice(None), *index)]
     return flat
@@ -226,13 +226,13 @@ def p_values(rank: np.ndarray, draws: int, bins: int = 16) -> dict[str, float]:
         True
     """
     null = np.random.default_rng(0).integers(0, draws + 1, (_SIMULATIONS, len(rank)))
-    found = {}
+    results = {}
     for name, statistic in (("chi-square", lambda r: chi_square(r, draws, bins)),
                             ("ecdf", lambda r: ecdf_distance(r, draws))):
         simulated = np.array([statistic(row) for row in null])
         # The observed one counts among the simulated, so that no p-value is zero.
-        found[name] = float((1 + (simulated >= statistic(rank) - 1e-12).sum()) / (_SIMULATIONS + 1))
-    return found
+        results[name] = float((1 + (simulated >= statistic(rank) - 1e-12).sum()) / (_SIMULATIONS + 1))
+    return results
 
 
 def save(calibration: Calibration, path: str | Path, overwrite: bool = False) -> Path:
@@ -245,6 +245,6 @@ def save(calibration: Calibration, path: str | Path, overwrite: bool = False) ->
 
 def load(path: str | Path) -> Calibration:
     """Read ranks that ``save`` wrote."""
-    with np.load(path) as kept:
-        ranks = {name: kept[name] for name in kept.files}
+    with np.load(path) as file:
+        ranks = {name: file[name] for name in file.files}
     return Calibration(ranks, int(ranks.pop("draws")))

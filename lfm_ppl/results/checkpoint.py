@@ -103,8 +103,8 @@ class Checkpoint:
         check_same(folder, checkpoint.record, record)
         checkpoint._earlier_s = checkpoint._of_state("seconds") or 0.0
         checkpoint._hold()
-        for left in Path(folder).glob(".*.part*"):  # by a process that was killed
-            left.unlink(missing_ok=True)
+        for partial_file in Path(folder).glob(".*.part*"):  # by a process that was killed
+            partial_file.unlink(missing_ok=True)
         return checkpoint
 
     @property
@@ -158,9 +158,9 @@ class Checkpoint:
             if not path.exists() or not self.started:  # before the first state a file may be cut off
                 np.lib.format.open_memmap(path, "w+", values.dtype, values.shape).flush()
             if draws > self._written:
-                kept = np.load(path, mmap_mode="r+")
-                kept[:, self._written : draws] = values[:, self._written : draws]
-                kept.flush()
+                stored = np.load(path, mmap_mode="r+")
+                stored[:, self._written : draws] = values[:, self._written : draws]
+                stored.flush()
         arrays: dict[str, Any] = {f"leaf{index}": leaf for index, leaf in enumerate(saved.leaves)}
         with writing(self._own / _STATE, overwrite=True) as temporary, temporary.open("wb") as file:
             np.savez(file, done=saved.done, draws=draws, leaves=len(saved.leaves), names=list(saved.rows),
@@ -285,14 +285,14 @@ def digest(*values: Any) -> str:
         >>> digest(np.arange(3.0)) == digest(np.arange(3.0)), digest([1, 2]) == digest([2, 1])
         (True, False)
     """
-    found = hashlib.sha256()
+    sha = hashlib.sha256()
     for value in values:
         if isinstance(value, (np.ndarray, np.generic, jax.Array)):
             array = np.asarray(value)
-            found.update(f"{array.shape}{array.dtype}".encode() + array.tobytes())
+            sha.update(f"{array.shape}{array.dtype}".encode() + array.tobytes())
         else:
-            found.update(re.sub(r"0x[0-9a-f]+", "", repr(value)).encode())
-    return _DIGEST + found.hexdigest()
+            sha.update(re.sub(r"0x[0-9a-f]+", "", repr(value)).encode())
+    return _DIGEST + sha.hexdigest()
 
 
 _DIGEST = "sha256:"
@@ -303,19 +303,19 @@ _OF_MODEL = ("rule", "steps", "max_step", "iterations", "tolerance", "constraint
 
 def versions() -> dict[str, str]:
     """Return the versions of all that numbers depend on, and their precision."""
-    found = {"python": sys.version.split()[0], "precision": str(np.dtype(jnp.result_type(float)))}
+    packages = {"python": sys.version.split()[0], "precision": str(np.dtype(jnp.result_type(float)))}
     for name in ("lfm_ppl", "jax", "jaxlib", "numpyro", "numpy", "equinox"):
         try:
-            found[name] = metadata.version(name)
+            packages[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+            packages[name] = "not installed"
+    return packages
 
 
-def check_same(folder: str | Path, kept: Mapping[str, Any], record: Mapping[str, Any]) -> None:
+def check_same(folder: str | Path, stored: Mapping[str, Any], record: Mapping[str, Any]) -> None:
     """Raise ValueError where two records differ, with all in which they do."""
     record = _plain(record)
-    differences = list(_differences(kept, record))
+    differences = list(_differences(stored, record))
     if any(part.partition(" ")[0] in _OF_MODEL for part in differences):
         # The digest of the model depends on these, too.
         differences = [part for part in differences if part != "model differs"]
@@ -352,9 +352,9 @@ def _readable(path: Path) -> Iterator[None]:
                          "with overwrite=True (--overwrite), or in another folder.") from None
 
 
-def _differences(kept: Mapping[str, Any], record: Mapping[str, Any]) -> Iterator[str]:
-    for name in dict.fromkeys([*kept, *record]):
-        old, new = kept.get(name), record.get(name)
+def _differences(stored: Mapping[str, Any], record: Mapping[str, Any]) -> Iterator[str]:
+    for name in dict.fromkeys([*stored, *record]):
+        old, new = stored.get(name), record.get(name)
         if old == new:
             continue
         if str(old).startswith(_DIGEST) or str(new).startswith(_DIGEST):
@@ -394,13 +394,13 @@ def check_folder(folder: str | Path, resume: bool, overwrite: bool) -> None:
     folder = Path(folder)
     if folder.exists() and not folder.is_dir():
         raise FileExistsError(f"{folder} is a file; expected the name of a folder for the run.")
-    kept = is_kept(folder)
-    if resume and not kept and not (folder / POSTERIOR).is_file() and folder.is_dir() and any(folder.iterdir()):
+    is_stored = is_kept(folder)
+    if resume and not is_stored and not (folder / POSTERIOR).is_file() and folder.is_dir() and any(folder.iterdir()):
         raise FileNotFoundError(f"{folder} holds files, but no run to go on with. Name the folder in which it was "
                                 "begun.")
-    if not resume and not overwrite and (kept or (folder / POSTERIOR).is_file()):
-        raise FileExistsError(f"{folder} holds {'an unfinished run' if kept else 'a result'}, which is kept. "
-                              + ("Go on with it with resume=True (--resume), name" if kept else "Name")
+    if not resume and not overwrite and (is_stored or (folder / POSTERIOR).is_file()):
+        raise FileExistsError(f"{folder} holds {'an unfinished run' if is_stored else 'a result'}, which is kept. "
+                              + ("Go on with it with resume=True (--resume), name" if is_stored else "Name")
                               + " another folder, or replace it with overwrite=True (--overwrite).")
 
 
@@ -431,11 +431,11 @@ def finished(folder: str | Path, record: Mapping[str, Any]) -> Any:
     if not is_finished(folder):
         return None
     result = arviz_data.load(path)
-    kept = arviz_data.attributes(result).get("run")
-    if not isinstance(kept, Mapping):
+    run = arviz_data.attributes(result).get("run")
+    if not isinstance(run, Mapping):
         raise ValueError(f"{path} does not say which run it is from: there is nothing to go on with. Begin a new run "
                          "in another folder.")
-    check_same(folder, kept, record)
+    check_same(folder, run, record)
     return result
 
 

@@ -37,37 +37,37 @@ def messages(summary: pd.DataFrame, chains: int, draws: int, divergences: int) -
     varying = summary[summary["sd"] != 0.0]
     broken = varying.index[~np.isfinite(varying["mean"])]
     sound = varying.drop(broken)
-    found = []
+    warnings_found = []
     if len(broken):
-        found.append(
+        warnings_found.append(
             f"draws are not finite for {_listed(list(broken))}: nothing computed from them "
             "holds. Tighten the priors, or choose starting values where the model is finite."
         )
     if chains < 2:
-        found.append(
+        warnings_found.append(
             "R-hat needs at least two chains and there is one: agreement between chains was not "
             "checked. Run with chains=4."
         )
     elif draws < 4:
-        found.append(f"{draws} draws per chain are too few for R-hat and ESS. Raise samples.")
+        warnings_found.append(f"{draws} draws per chain are too few for R-hat and ESS. Raise samples.")
     high = sound["r_hat"][sound["r_hat"] > MAX_R_HAT].sort_values(ascending=False)
     if len(high):
-        found.append(
+        warnings_found.append(
             f"R-hat is above {MAX_R_HAT} for {_listed(_with_values(high, '.3f'))}: the chains have "
             "not reached the same distribution. Run longer (warmup, samples); if it stays, look "
             "at the trace plot for several modes and for parameters that the data do not identify."
         )
-    for column, what in (("ess_bulk", "centre"), ("ess_tail", "tails")):
-        found += _low_ess(sound[column], column.removeprefix("ess_"), what, chains)
+    for column, part in (("ess_bulk", "centre"), ("ess_tail", "tails")):
+        warnings_found += _low_ess(sound[column], column.removeprefix("ess_"), part, chains)
     if divergences:
         share = 100.0 * divergences / (chains * draws)
-        found.append(
+        warnings_found.append(
             f"{divergences} of {chains * draws} transitions diverged ({share:.2g}%): draws may "
             "miss a narrow region. Raise target_accept_prob to 0.95 or 0.99 (--target-accept), take "
             "more steps where the integration breaks down, or reparameterise where the pairs plot "
             "marks them."
         )
-    return found
+    return warnings_found
 
 
 def of_sites(points: int, unconverged: int, impossible: int, *, constrained: bool = False,
@@ -85,11 +85,11 @@ def of_sites(points: int, unconverged: int, impossible: int, *, constrained: boo
         return []
     which, remedy = (("constraints", _OF_CONSTRAINTS) if constrained else ("observation family", _OF_FAMILY))
     where = "draws of the Laplace approximation" if from_mode else "points a step away from the draws"
-    said = (f"the sites of the {which} do not converge at {unconverged} of {points} {where} "
+    message = (f"the sites of the {which} do not converge at {unconverged} of {points} {where} "
             f"({100.0 * unconverged / points:.3g}%), ")
     if not impossible:
-        return [f"{said}where the likelihood is that of assumed density filtering, which is rougher. {remedy}"]
-    return [f"{said}and the likelihood is zero at {impossible} of the {points}"
+        return [f"{message}where the likelihood is that of assumed density filtering, which is rougher. {remedy}"]
+    return [f"{message}and the likelihood is zero at {impossible} of the {points}"
             f"{'' if from_mode else ': draws may miss these parameters'}. {remedy}"]
 
 
@@ -146,15 +146,15 @@ def log_mean_error(worth: float, count: int) -> float:
     return math.sqrt(max(count / worth - 1.0, 0.0) / (count - 1)) if count > 1 else math.nan
 
 
-def _low_ess(ess: pd.Series, kind: str, what: str, chains: int) -> list[str]:
-    needed = MIN_ESS_PER_CHAIN * chains
-    low = ess[ess < needed].sort_values()
+def _low_ess(ess: pd.Series, kind: str, part: str, chains: int) -> list[str]:
+    minimum = MIN_ESS_PER_CHAIN * chains
+    low = ess[ess < minimum].sort_values()
     if not len(low):
         return []
-    factor = math.ceil(needed / max(low.iloc[0], 1.0))
+    factor = math.ceil(minimum / max(low.iloc[0], 1.0))
     return [
-        f"{kind} effective sample size is below {needed} ({MIN_ESS_PER_CHAIN} per chain) for "
-        f"{_listed(_with_values(low, '.0f'))}: too little is known of the {what} of the posterior. "
+        f"{kind} effective sample size is below {minimum} ({MIN_ESS_PER_CHAIN} per chain) for "
+        f"{_listed(_with_values(low, '.0f'))}: too little is known of the {part} of the posterior. "
         f"Raise samples (or thin) about {factor}-fold, or lower the correlation between parameters."
     ]
 

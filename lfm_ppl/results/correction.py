@@ -55,8 +55,8 @@ def correct_posterior(result: Any, numpyro_model: Callable, times: Any = None, y
                          'lfm.fit(..., sampler="pmmh").')
     posterior = arviz_data.group(result, "posterior").transpose("chain", "draw", ...)
     chains, size = report.log_weight.shape
-    chosen = np.searchsorted(posterior["draw"].values, report.dataset["draw"].values)
-    of_all = (np.arange(chains)[:, None] * posterior.sizes["draw"] + chosen).ravel()
+    draw_index = np.searchsorted(posterior["draw"].values, report.dataset["draw"].values)
+    of_all = (np.arange(chains)[:, None] * posterior.sizes["draw"] + draw_index).ravel()
     picked = of_all[importance.resample(report.log_weight, chains * size, seed)].reshape(chains, size)
     groups = {"posterior": _taken(posterior, picked)}
     groups |= {name: arviz_data.group(result, name) for name in _KEPT if arviz_data.has_group(result, name)}
@@ -74,9 +74,9 @@ def _taken(posterior: xr.Dataset, picked: np.ndarray) -> xr.Dataset:
     chain, draw = np.divmod(picked, posterior.sizes["draw"])
     index = {"chain": xr.DataArray(chain, dims=("to_chain", "to_draw")),
              "draw": xr.DataArray(draw, dims=("to_chain", "to_draw"))}
-    taken = posterior.isel(index).drop_vars(["chain", "draw"], errors="ignore")
-    taken = taken.rename({"to_chain": "chain", "to_draw": "draw"}).transpose("chain", "draw", ...)
-    return taken.assign_coords(chain=np.arange(picked.shape[0]), draw=np.arange(picked.shape[1]))
+    selected = posterior.isel(index).drop_vars(["chain", "draw"], errors="ignore")
+    selected = selected.rename({"to_chain": "chain", "to_draw": "draw"}).transpose("chain", "draw", ...)
+    return selected.assign_coords(chain=np.arange(picked.shape[0]), draw=np.arange(picked.shape[1]))
 
 
 def _paths(result: Any, numpyro_model: Callable, times: Any, y: Any, model_kwargs: Mapping[str, Any] | None,
@@ -84,11 +84,11 @@ def _paths(result: Any, numpyro_model: Callable, times: Any, y: Any, model_kwarg
     """Draw trajectories at some of the picked draws, laid out as those of ``result``."""
     templates = {name: arviz_data.group(result, name) for name in _DRAWN if arviz_data.has_group(result, name)}
     template = templates["trajectories"]
-    at = template["at"].values if "at" in template.coords else None
-    chosen, rows = evenly_spaced(picked.shape[0], picked.shape[1], count)
+    path_times = template["at"].values if "at" in template.coords else None
+    draw_index, rows = evenly_spaced(picked.shape[0], picked.shape[1], count)
     problem = rebuilding.problem(result, numpyro_model, times, y, model_kwargs).at(picked.ravel()[rows])
-    found = {label: values.reshape(picked.shape[0], len(chosen), *values.shape[1:]) for label, values in
-             trajectories(jax.random.key(seed), problem.bound, problem.draws, at).items()}
+    paths = {label: values.reshape(picked.shape[0], len(draw_index), *values.shape[1:]) for label, values in
+             trajectories(jax.random.key(seed), problem.bound, problem.draws, path_times).items()}
     groups = {}
     for name, old in templates.items():
         variables = {}
@@ -96,15 +96,15 @@ def _paths(result: Any, numpyro_model: Callable, times: Any, y: Any, model_kwarg
             if "draw" not in variable.dims or label == "deterministics":  # made anew below
                 continue
             kind = _KINDS[str(label)] if name == "trajectories" else "y"
-            variables[label] = (variable.transpose("chain", "draw", ...).dims, found[kind], variable.attrs)
+            variables[label] = (variable.transpose("chain", "draw", ...).dims, paths[kind], variable.attrs)
         coords = {key: value for key, value in old.coords.items() if key not in ("chain", "draw", "statistic")}
-        groups[name] = xr.Dataset(variables, coords | {"chain": np.arange(picked.shape[0]), "draw": chosen})
+        groups[name] = xr.Dataset(variables, coords | {"chain": np.arange(picked.shape[0]), "draw": draw_index})
     # The model may have other deterministics than when it was fitted.
     names, new = list(problem.bound.site.example.ssm.model.deterministic_names), groups["trajectories"]
     new = new.drop_vars("deterministic", errors="ignore")
     if names:
         dims = [*new["outputs"].dims[:-1], "deterministic"]
         attrs = template["deterministics"].attrs if "deterministics" in template else {}
-        new = new.assign(deterministics=(dims, found["deterministic"], attrs)).assign_coords(deterministic=names)
-    groups["trajectories"] = with_summaries(new, found)
+        new = new.assign(deterministics=(dims, paths["deterministic"], attrs)).assign_coords(deterministic=names)
+    groups["trajectories"] = with_summaries(new, paths)
     return groups

@@ -59,10 +59,10 @@ def log_densities(bound: BoundModel, draws: Mapping[str, Any], predicted: xr.Dat
             times = jnp.broadcast_to(times, (y.shape[0], *times.shape))
         return map_series(distribution, one, w, y, times)
 
-    found = map_draws(bound, ("log densities", y.shape), per_draw,
+    log_densities = map_draws(bound, ("log densities", y.shape), per_draw,
                       {**draws, _PATH: w, _VALUES: np.broadcast_to(y, (count, *y.shape)),
                        _TIMES: np.broadcast_to(times, (count, len(times)))}, jax.random.key(0))
-    return np.where(np.isfinite(y), found, np.nan)
+    return np.where(np.isfinite(y), log_densities, np.nan)
 
 
 def _inputs(predicted: xr.Dataset, rows: tuple[int, ...]) -> np.ndarray:

@@ -131,49 +131,49 @@ def save_report(result: Any, path: str | Path, overwrite: bool = False, *, figur
 
 def _state(result: Any, attrs: Mapping[str, Any]) -> str:
     """Say in a glance what there is: whether it is whole, and what is wrong with it."""
-    shown = ""
+    html = ""
     if (partial := attrs.get("partial")) is not None:
-        shown += web_page.warnings([f"This result is partial: {partial}."])
-    found = arviz_data.convergence_warnings(result)
-    shown += web_page.warnings([*found, *misfit(result)])
-    if not found:
-        shown += web_page.paragraph("The draws are of a Laplace approximation at the posterior mode, not of chains."
+        html += web_page.warnings([f"This result is partial: {partial}."])
+    messages = arviz_data.convergence_warnings(result)
+    html += web_page.warnings([*messages, *misfit(result)])
+    if not messages:
+        html += web_page.paragraph("The draws are of a Laplace approximation at the posterior mode, not of chains."
                                     if arviz_data.of_mode(result) else
                                     "The draws are weighted ones; how many they are worth stands in the table."
                                     if "effective_draws" in attrs else
                                     "The chains agree, and are long enough: the draws are those of the posterior of "
                                     "this model. Whether the model fits the data, the residuals tell.")
     if arviz_data.has_group(result, report.GROUP):
-        shown += web_page.paragraph(f"Accuracy: {report.AccuracyReport.of(result).verdict.word}.")
-    return shown
+        html += web_page.paragraph(f"Accuracy: {report.AccuracyReport.of(result).verdict.word}.")
+    return html
 
 
 def _model(attrs: Mapping[str, Any], description: str) -> str:
     file = str(attrs.get("model_file", ""))
     name = str(attrs.get("model", "model"))
-    shown = web_page.facts([("name", name), *([("file", file)] if file not in ("", name) else [])])
-    shown += (web_page.prose(description) if description else web_page.paragraph(
+    html = web_page.facts([("name", name), *([("file", file)] if file not in ("", name) else [])])
+    html += (web_page.prose(description) if description else web_page.paragraph(
         "The model has no docstring; what stands in one would be shown here.", "note"))
     if assumed := json.loads(str(attrs.get(ASSUMPTIONS, "{}"))):
-        shown += web_page.heading("Assumptions") + web_page.facts(list(assumed.items())) + web_page.paragraph(
+        html += web_page.heading("Assumptions") + web_page.facts(list(assumed.items())) + web_page.paragraph(
             "Numbers that depend on parameters are those of one set of values typical of the prior, not of the "
             "posterior.", "note")
     priors = json.loads(str(attrs.get(PRIORS, "{}")))
     if not priors:
-        return shown
+        return html
     meanings = json.loads(str(attrs.get(MEANINGS, "{}")))
     table = pd.DataFrame({"prior": priors} | ({"meaning": {name: meanings.get(name, "") for name in priors}}
                                                if any(meanings.get(name) for name in priors) else {}))
-    shown += web_page.heading("Priors") + web_page.paragraph(
+    html += web_page.heading("Priors") + web_page.paragraph(
         "Where a prior depends on another parameter, its numbers are those at one value of it.", "note")
-    return shown + tables.html_table(table, index_label="parameter")
+    return html + tables.html_table(table, index_label="parameter")
 
 
 def _data(result: Any, attrs: Mapping[str, Any]) -> str:
     if not arviz_data.has_group(result, "observed_data"):
         return web_page.paragraph("The result holds no data.", "note")
     dataset = arviz_data.group(result, "observed_data")
-    name = next(str(one) for one in dataset.data_vars if one != "times")
+    name = next(str(label) for label in dataset.data_vars if label != "times")
     variable = dataset[name]
     times = np.asarray((dataset["times"] if "times" in dataset else dataset["time"]).values, float)
     lines = [("source", str(attrs["data"]))] if "data" in attrs else []
@@ -186,19 +186,19 @@ def _data(result: Any, attrs: Mapping[str, Any]) -> str:
         lines.append(("time 0", calendar_time.clock(0.0, origin, time_unit(result))))
     if attrs.get("note"):
         lines.append(("note", str(attrs["note"])))
-    shown = web_page.facts(lines)
-    names = [str(one) for one in variable["output"].values] if "output" in variable.coords else [name]
+    html = web_page.facts(lines)
+    names = [str(output) for output in variable["output"].values] if "output" in variable.coords else [name]
     columns = np.asarray(variable.values, float).reshape(-1, len(names))
-    shown += tables.html_table(pd.DataFrame([_described(column, unit_of(variable, one)) for one, column in zip(
+    html += tables.html_table(pd.DataFrame([_described(column, unit_of(variable, output)) for output, column in zip(
         names, columns.T, strict=True)], names), index_label="output")
     inputs = inputs_of(result)
     if inputs:
         rows = [{"interpolation": table.interpolation, "times": _span(np.asarray(table.times), result),
                  **_described(np.asarray(table.values, float), input_unit(result, name))}
                 for name, table in inputs.items()]
-        shown += web_page.heading("Known inputs") + tables.html_table(
+        html += web_page.heading("Known inputs") + tables.html_table(
             pd.DataFrame(rows, list(inputs)), index_label="input")
-    return shown
+    return html
 
 
 def _described(values: np.ndarray, unit: str) -> dict[str, Any]:
@@ -230,12 +230,13 @@ def _summary(result: Any) -> str:
     if table.empty:
         return web_page.paragraph("The model has no parameters that are sampled.", "note")
     kind = tables.annotated(table, result)["kind"]
-    found = {label: arviz_data.convergence_warnings(result, table.loc[[label]]) for label in table.index}
+    messages = {label: arviz_data.convergence_warnings(result, table.loc[[label]]) for label in table.index}
     # What concerns all of them, and what to do about it, stands at the top of the page.
-    shared = set.intersection(*map(set, found.values()))
-    own = ["; ".join(message.partition(": ")[0] for message in found[label] if message not in shared)
-           for label in table.index]
-    table = table.drop(columns="partial", errors="ignore").assign(kind=kind, **({"warnings": own} if any(own) else {}))
+    shared = set.intersection(*map(set, messages.values()))
+    row_messages = ["; ".join(message.partition(": ")[0] for message in messages[label] if message not in shared)
+                    for label in table.index]
+    columns = {"warnings": row_messages} if any(row_messages) else {}
+    table = table.drop(columns="partial", errors="ignore").assign(kind=kind, **columns)
     return tables.html_table(table, index_label="parameter")
 
 
@@ -259,48 +260,49 @@ def _accuracy(result: Any, folder: Path) -> str:
 
 
 def _forecast(result: Any, more: Mapping[str, pd.DataFrame]) -> str:
-    shown = ""
+    html = ""
     if arviz_data.has_group(result, predictions.GROUP):
         dataset = arviz_data.group(result, predictions.GROUP)
         if "series" in dataset.dims:
             for index in range(min(dataset.sizes["series"], _MOST_SERIES)):
-                one = dataset.isel(series=index)
-                label = one["series"].item() if "series" in one.coords else index
-                shown += web_page.heading(f"Series {label}") + _forecast_of(one, result)
+                series = dataset.isel(series=index)
+                label = series["series"].item() if "series" in series.coords else index
+                html += web_page.heading(f"Series {label}") + _forecast_of(series, result)
             if dataset.sizes["series"] > _MOST_SERIES:
-                shown += web_page.paragraph(f"The first {_MOST_SERIES} of {dataset.sizes['series']} series.", "note")
+                html += web_page.paragraph(f"The first {_MOST_SERIES} of {dataset.sizes['series']} series.", "note")
         else:
-            shown = _forecast_of(dataset, result)
-    return shown + "".join(web_page.heading(title) + tables.html_table(table) for title, table in more.items())
+            html = _forecast_of(dataset, result)
+    return html + "".join(web_page.heading(title) + tables.html_table(table) for title, table in more.items())
 
 
 def _forecast_of(dataset: xr.Dataset, result: Any) -> str:
     """Return the table of what is predicted, after the data where any of it is."""
     times = np.asarray(dataset["time"].values, float)
     later = np.flatnonzero(times > dataset.attrs.get("last_observation", np.inf))
-    chosen = later if later.size else np.arange(times.size)
-    thinned = chosen[np.unique(np.linspace(0, chosen.size - 1, _MOST_TIMES).round().astype(int))]
+    index = later if later.size else np.arange(times.size)
+    thinned = index[np.unique(np.linspace(0, index.size - 1, _MOST_TIMES).round().astype(int))]
     table = predictions.summary(dataset.isel(time=thinned))
     unit, origin = time_unit(result), _origin(result)
     labels = [calendar_time.clock(float(time), origin, unit) if origin else f"{time:.10g}" for time in table.index]
-    shown = tables.html_table(table.set_axis(labels), index_label=f"time ({unit})" if unit and not origin else "time")
-    what = "after the last observation" if later.size else "of the prediction"
-    some = f"{thinned.size} of {chosen.size} times" if thinned.size < chosen.size else "All times"
-    return shown + web_page.paragraph(f"{some} {what}. Mean, sd and quantiles (in percent) are of new data, with their "
-                                      f"noise; beside them those of the {predictions.NOISE_FREE}.", "note")
+    html = tables.html_table(table.set_axis(labels), index_label=f"time ({unit})" if unit and not origin else "time")
+    period = "after the last observation" if later.size else "of the prediction"
+    shown_times = f"{thinned.size} of {index.size} times" if thinned.size < index.size else "All times"
+    return html + web_page.paragraph(
+        f"{shown_times} {period}. Mean, sd and quantiles (in percent) are of new data, with their noise, and then of "
+        f"the {predictions.NOISE_FREE}.", "note")
 
 
 def _drawn(result: Any) -> str:
-    shown, failed = [], []
+    figures, failed = [], []
     for name, draw, names in saving.pages_of(result, "full"):
         try:
             figure = draw(result, names, width="full")
             with style.in_style(), io.BytesIO() as buffer:
                 figure.savefig(buffer, format="png")
-                shown.append(web_page.picture(buffer.getvalue(), _caption(name)))
+                figures.append(web_page.picture(buffer.getvalue(), _caption(name)))
         except Exception as error:  # the page is worth having without it
             failed.append(f"The figure {name} could not be drawn: {error}")
-    return web_page.warnings(failed) + "\n".join(shown)
+    return web_page.warnings(failed) + "\n".join(figures)
 
 
 def _read(figures: Sequence[str | Path]) -> str:
@@ -332,7 +334,7 @@ def _plain(value: Any) -> str:
         except json.JSONDecodeError:
             return value
     if isinstance(value, Mapping):
-        return ", ".join(f"{name} {_plain(one)}" for name, one in value.items())
+        return ", ".join(f"{name} {_plain(item)}" for name, item in value.items())
     if value is None or isinstance(value, (list, tuple)) and not value:
         return ""
     return tables.format_number(value, 4)
@@ -342,17 +344,17 @@ def _repeat(result: Any, attrs: Mapping[str, Any]) -> str:
     """Return what to type for the same numbers, in the order in which it was typed."""
     commands = [str(attrs[COMMAND])] if COMMAND in attrs else []
     groups = [name for name in (report.GROUP, predictions.GROUP) if arviz_data.has_group(result, name)]
-    made = [arviz_data.group(result, name).attrs.get(COMMAND) for name in groups]
-    commands += [str(command) for command in made if command]
-    shown = web_page.preformatted("\n".join(commands)) if commands else ""
+    group_commands = [arviz_data.group(result, name).attrs.get(COMMAND) for name in groups]
+    commands += [str(command) for command in group_commands if command]
+    html = web_page.preformatted("\n".join(commands)) if commands else ""
     if CALL in attrs and COMMAND not in attrs:
         lines = [str(attrs[CALL])]
         if "effective_draws" in attrs:
             lines += ["lfm.check_accuracy(result, model)", "result = lfm.correct_posterior(result, model)"]
-        shown = web_page.preformatted("\n".join(lines)) + shown
-    if not shown:
+        html = web_page.preformatted("\n".join(lines)) + html
+    if not html:
         return web_page.paragraph("The result does not say how it was made.", "note")
-    return shown + web_page.paragraph("The seed makes the draws the same in the same environment: data, machine and "
+    return html + web_page.paragraph("The seed makes the draws the same in the same environment: data, machine and "
                                       "versions (see Settings). A folder that holds a result is kept; name another "
                                       "one, or add --overwrite.", "note")
 
@@ -360,7 +362,7 @@ def _repeat(result: Any, attrs: Mapping[str, Any]) -> str:
 def _files(path: Path) -> str:
     if not path.parent.is_dir():
         return ""
-    names = sorted(one.name for one in path.parent.iterdir() if one.is_file() and _FILES.fullmatch(one.name)
-                   and one.name != path.name and not one.name.startswith("."))
+    names = sorted(entry.name for entry in path.parent.iterdir() if entry.is_file() and _FILES.fullmatch(entry.name)
+                   and entry.name != path.name and not entry.name.startswith("."))
     corrected = f"corrected/{NAME}"  # where `lfm-ppl check --correct` writes
     return web_page.file_list([*names, *([corrected] if (path.parent / corrected).is_file() else [])])

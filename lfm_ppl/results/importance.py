@@ -119,7 +119,7 @@ def _log_mean(logs: np.ndarray) -> np.ndarray:
         return np.log(np.exp(logs - largest).mean(axis=-1)) + largest[..., 0]
 
 
-def corrected_moments(draws: Mapping[str, np.ndarray], chosen: np.ndarray, log_weight: np.ndarray) -> pd.DataFrame:
+def corrected_moments(draws: Mapping[str, np.ndarray], draw_index: np.ndarray, log_weight: np.ndarray) -> pd.DataFrame:
     """Return mean and sd of every scalar before and after weighting, with Monte Carlo standard errors.
 
     Ratios w_i are known for a subset of the draws x_i. What they change is estimated on the subset alone and added to
@@ -137,7 +137,7 @@ def corrected_moments(draws: Mapping[str, np.ndarray], chosen: np.ndarray, log_w
 
     Args:
         draws: label -> (C, N), all draws of scalars.
-        chosen: (S,), which draws of each chain have weights.
+        draw_index: (S,), draws of each chain that have weights.
         log_weight: (C, S), normalised.
 
     Returns:
@@ -147,17 +147,17 @@ def corrected_moments(draws: Mapping[str, np.ndarray], chosen: np.ndarray, log_w
     Source: Owen (2013), Monte Carlo theory, methods and examples, section 9.2, for the delta method.
     """
     weight = np.exp(log_weight) * log_weight.size
-    rows = {label: _corrected(np.asarray(values, float), chosen, weight) for label, values in draws.items()}
+    rows = {label: _corrected(np.asarray(values, float), draw_index, weight) for label, values in draws.items()}
     return pd.DataFrame.from_dict(rows, orient="index", columns=list(COLUMNS), dtype=float)
 
 
-def _corrected(values: np.ndarray, chosen: np.ndarray, weight: np.ndarray) -> tuple[float, ...]:
+def _corrected(values: np.ndarray, draw_index: np.ndarray, weight: np.ndarray) -> tuple[float, ...]:
     mean, sd = float(values.mean()), float(values.std(ddof=1)) if values.size > 1 else 0.0
     if np.ptp(values) == 0.0:  # fixed, or derived from what is fixed
         return mean, 0.0, mean, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0
     if np.ptp(weight) == 0.0:
         return mean, sd, mean, sd, 0.0, 0.0, 1.0, 0.0, arviz_data.mcse_mean(values)
-    x = values[:, chosen]
+    x = values[:, draw_index]
     m, v = x.mean(), x.var()
     m_w = (weight * x).mean()
     v_w = (weight * (x - m_w) ** 2).mean()
@@ -188,6 +188,6 @@ def resample(log_weight: np.ndarray, count: int, seed: int = 0) -> np.ndarray:
     """
     generator = np.random.default_rng(seed)
     cumulative = np.cumsum(np.exp(np.ravel(log_weight)))
-    places = (np.arange(count) + generator.uniform()) / count
-    index = np.searchsorted(cumulative / cumulative[-1], places)
+    positions = (np.arange(count) + generator.uniform()) / count
+    index = np.searchsorted(cumulative / cumulative[-1], positions)
     return generator.permutation(index)

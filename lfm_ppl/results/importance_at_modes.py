@@ -100,7 +100,7 @@ def weighted(log_density: Callable[[np.ndarray], np.ndarray], modes: Sequence[Mi
         log_ratio = log_density(draws) - special.logsumexp(log_t, axis=0, b=(sizes / sizes.sum())[:, None])
         weights = importance.smooth(np.where(np.isfinite(log_ratio), log_ratio, -np.inf)[None])
         mass, belongs = _mixture_weights(np.exp(weights.log_weight[0]), log_t)
-        about = [_next(draws, own, *one) for own, one in zip(belongs, about, strict=True)]
+        about = [_next(draws, members, *component) for members, component in zip(belongs, about, strict=True)]
         share = np.maximum(mass, LEAST_SHARE)
         sizes = _shared_out(count, share / share.sum())
     return Weighted(draws, weights, mass)

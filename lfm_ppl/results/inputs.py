@@ -36,9 +36,9 @@ def inputs_of(result: Any, group: str = GROUP) -> dict[str, InputTable]:
     if not arviz_data.has_group(result, group):
         return {}
     stored = arviz_data.group(result, group)
-    return {str(name): InputTable(np.asarray(stored[f"{name}_time"].values, float), np.asarray(one.values, float),
-                                  str(one.attrs.get("interpolation", "previous")))
-            for name, one in stored.data_vars.items()}
+    return {str(name): InputTable(np.asarray(stored[f"{name}_time"].values, float), np.asarray(variable.values, float),
+                                  str(variable.attrs.get("interpolation", "previous")))
+            for name, variable in stored.data_vars.items()}
 
 
 def input_unit(result: Any, name: str) -> str:
@@ -46,9 +46,9 @@ def input_unit(result: Any, name: str) -> str:
     return unit_of(arviz_data.group(result, GROUP)[name]) if name in inputs_of(result) else ""
 
 
-def keywords(result: Any, given: Mapping[str, Any] | None) -> dict[str, Any]:
+def keywords(result: Any, overrides: Mapping[str, Any] | None) -> dict[str, Any]:
     """Return the keyword arguments of the model of a result: those given, and its known inputs."""
-    return model_keywords(inputs_of(result), given)
+    return model_keywords(inputs_of(result), overrides)
 
 
 def remember(groups: dict[str, xr.Dataset], data: Data | None, origin: str | None, unit: str) -> dict[str, Any]:
@@ -75,8 +75,8 @@ def remember(groups: dict[str, xr.Dataset], data: Data | None, origin: str | Non
 def time_unit(result: Any) -> str:
     """Return the unit of time, empty where the result does not know it."""
     for name, coordinate in (("observed_data", "time"), ("trajectories", "at")):
-        if arviz_data.has_group(result, name) and coordinate in (found := arviz_data.group(result, name)).coords:
-            if unit := unit_of(found[coordinate]):
+        if arviz_data.has_group(result, name) and coordinate in (dataset := arviz_data.group(result, name)).coords:
+            if unit := unit_of(dataset[coordinate]):
                 return unit
     return ""
 

@@ -55,24 +55,24 @@ class Labels(NamedTuple):
         site = bound.site
         plates = [frame.name for frame in trace[site.name].get("cond_indep_stack", ())]
         renamed = {plates[0]: SERIES} if np.ndim(bound.y) == 3 and len(plates) == 1 else {}
-        found: dict[str, tuple[str | None, ...]] = {}
+        dimensions: dict[str, tuple[str | None, ...]] = {}
         derived = set()
-        for name, one in trace.items():
-            if name == site.name or one["type"] not in ("sample", "deterministic"):
+        for name, site_trace in trace.items():
+            if name == site.name or site_trace["type"] not in ("sample", "deterministic"):
                 continue
-            derived |= {name} if one["type"] == "deterministic" else set()
-            found[name] = _axes(one, renamed)
-        for name, given in (dims or {}).items():
-            names: list[str] = [given] if isinstance(given, str) else list(given)
-            if name not in found:
-                raise ValueError(f"dims: {checks.unknown('parameter', name, found)}")
-            if len(names) != len(found[name]):
-                raise ValueError(f"dims: {name!r} has {len(found[name])} dimensions, of shape "
+            derived |= {name} if site_trace["type"] == "deterministic" else set()
+            dimensions[name] = _axes(site_trace, renamed)
+        for name, requested_dims in (dims or {}).items():
+            names: list[str] = [requested_dims] if isinstance(requested_dims, str) else list(requested_dims)
+            if name not in dimensions:
+                raise ValueError(f"dims: {checks.unknown('parameter', name, dimensions)}")
+            if len(names) != len(dimensions[name]):
+                raise ValueError(f"dims: {name!r} has {len(dimensions[name])} dimensions, of shape "
                                  f"{np.shape(trace[name]['value'])}, and {len(names)} names: {', '.join(names)}.")
-            found[name] = tuple(str(text) for text in names)
+            dimensions[name] = tuple(str(text) for text in names)
         sizes = {OUTPUT: len(site.example.ssm.model.output_names)}
         sizes |= {SERIES: np.shape(bound.y)[0]} if np.ndim(bound.y) == 3 else {}
-        for name, axes in found.items():
+        for name, axes in dimensions.items():
             for text, size in zip(axes, np.shape(trace[name]["value"]), strict=True):
                 if text is not None and sizes.setdefault(text, size) != size:
                     raise ValueError(f"the dimension {text!r} has {sizes[text]} entries elsewhere and {size} in "
@@ -86,7 +86,7 @@ class Labels(NamedTuple):
             if len(values) != sizes[text] or len(set(values)) < len(values):
                 raise ValueError(f"coords: the dimension {text!r} needs {sizes[text]} labels, each of them once; got "
                                  f"{len(values)}: {', '.join(map(str, values))}.")
-        return cls(found, labels, frozenset(derived))
+        return cls(dimensions, labels, frozenset(derived))
 
 
 def _axes(site: Mapping[str, Any], renamed: Mapping[str, str]) -> tuple[str | None, ...]:
@@ -94,9 +94,9 @@ def _axes(site: Mapping[str, Any], renamed: Mapping[str, str]) -> tuple[str | No
     ndim = np.ndim(site["value"])
     events = site["fn"].event_dim if site["type"] == "sample" else 0
     names: list[str | None] = [None] * ndim
-    given = tuple((site.get("infer") or {}).get("event_dims", ()))
-    if given:
-        names[ndim - len(given):] = [str(text) for text in given]
+    event_dims = tuple((site.get("infer") or {}).get("event_dims", ()))
+    if event_dims:
+        names[ndim - len(event_dims):] = [str(text) for text in event_dims]
     frames = site.get("cond_indep_stack") or ()
     if site["type"] == "sample" or len(frames) == ndim:
         for frame in frames:
@@ -106,7 +106,7 @@ def _axes(site: Mapping[str, Any], renamed: Mapping[str, str]) -> tuple[str | No
     return tuple(names)
 
 
-def lay_out(bound: BoundModel, draws: dict, stats: dict, rated: dict | None, paths: dict | None, chosen: Any,
+def lay_out(bound: BoundModel, draws: dict, stats: dict, rated: dict | None, paths: dict | None, draw_index: Any,
             grid: np.ndarray | None, truth: Mapping[str, Any] | None,
             labels: Labels | None = None) -> dict[str, xr.Dataset]:
     """Return the groups of a result.
@@ -117,7 +117,7 @@ def lay_out(bound: BoundModel, draws: dict, stats: dict, rated: dict | None, pat
         stats: statistic of the sampler -> (C, N).
         rated: `lfm_ppl.inference.posterior.scores` of all draws, one chain after another; None: without.
         paths: `lfm_ppl.inference.posterior.trajectories`, (C, S, ...); None: without.
-        chosen: (S,) which draws of each chain have trajectories.
+        draw_index: (S,), draws of each chain that have trajectories.
         grid: (K,) times of the trajectories; None: those of the data.
         truth: of simulated data.
         labels: names of axes; None: those of the model.
@@ -160,26 +160,27 @@ def lay_out(bound: BoundModel, draws: dict, stats: dict, rated: dict | None, pat
             {"log_density": variable(sample, split["one_step_ahead"]),
              "residual": variable((*sample, "output"), split["residual"])}, {**coords, **observed_coords})
     if paths is not None:
-        thinned = {"chain": np.arange(chains), "draw": chosen}
+        thinned = {"chain": np.arange(chains), "draw": draw_index}
         groups["posterior_predictive"] = xr.Dataset(
             {site.name: variable((*sample, "output"), paths["y"], named["output"])}, {**thinned, **observed_coords})
-        place = ("chain", "draw", *panel, "at")
-        at = {} if grid is None else {"at": ("at", grid, units_attribute(["time"], units))}
+        dimensions = ("chain", "draw", *panel, "at")
+        at_coords = {} if grid is None else {"at": ("at", grid, units_attribute(["time"], units))}
         groups["trajectories"] = xr.Dataset(
-            {f"{kind}s": variable((*place, kind), paths[kind], named[kind]) for kind in named if paths[kind].shape[-1]},
-            {**thinned, **at, **which, **{kind: named[kind] for kind in named if named[kind]}})
+            {f"{kind}s": variable((*dimensions, kind), paths[kind], named[kind])
+             for kind in named if paths[kind].shape[-1]},
+            {**thinned, **at_coords, **which, **{kind: named[kind] for kind in named if named[kind]}})
         groups["trajectories"]["outputs"].attrs["long_name"] = NOISE_FREE
         groups["trajectories"] = with_summaries(groups["trajectories"], paths)
         if "prediction" in paths and grid is not None:
-            groups[GROUP] = predictions(bound, paths, chosen, grid, labels.coords)
+            groups[GROUP] = predictions(bound, paths, draw_index, grid, labels.coords)
     if truth:
         groups["truth"] = _truth(truth, named, units, groups["posterior"])
         for kind, values in _true_functions(bound, truth, draws).items():
             new = {f"{kind}s": variable(("at_truth", kind), values, named[kind])}
-            told = groups["truth"]
-            if f"{kind}s" in told:  # some of them, by the user
-                told = told.drop_dims(kind)
-            groups["truth"] = told.assign(new).assign_coords({kind: named[kind]})
+            truth_group = groups["truth"]
+            if f"{kind}s" in truth_group:  # some of them, by the user
+                truth_group = truth_group.drop_dims(kind)
+            groups["truth"] = truth_group.assign(new).assign_coords({kind: named[kind]})
     return groups
 
 
@@ -199,7 +200,7 @@ def with_summaries(trajectories: xr.Dataset, paths: Mapping[str, np.ndarray]) ->
         (noise-free) and ``new_data_summary`` (with the noise) are added, with the dimension ``statistic``: mean, q2.5,
         q97.5. Those of which nothing but draws is known are left out.
     """
-    found = {}
+    datasets = {}
     for name, (mean, sd) in {"states": ("state_mean", "state_sd"), "forces": ("force_mean", "force_sd"),
                              "deterministics": ("deterministic_points", None),
                              "outputs": ("predictive_mean", "output_sd"),
@@ -217,11 +218,11 @@ def with_summaries(trajectories: xr.Dataset, paths: Mapping[str, np.ndarray]) ->
             return (np.moveaxis(values, -3, 2) if label.endswith("_points") else values).reshape(-1, *shape)
 
         means = flat(mean)
-        ends = (np.quantile(means, INTERVAL, axis=0) if sd is None
+        bounds = (np.quantile(means, INTERVAL, axis=0) if sd is None
                 else mixture_quantiles(means, flat(sd), INTERVAL, _TOLERANCE))
         attrs = {"units": like.attrs["units"]} if "units" in like.attrs else {}
-        found[f"{name}_summary"] = (("statistic", *dims), np.concatenate([means.mean(axis=0)[None], ends]), attrs)
-    return trajectories.assign(found).assign_coords(statistic=list(STATISTICS)) if found else trajectories
+        datasets[f"{name}_summary"] = (("statistic", *dims), np.concatenate([means.mean(axis=0)[None], bounds]), attrs)
+    return trajectories.assign(datasets).assign_coords(statistic=list(STATISTICS)) if datasets else trajectories
 
 
 _TOLERANCE = 1e-4
@@ -237,14 +238,14 @@ def _posterior(draws: dict, coords: dict, named: Mapping[str, list], labels: Lab
     # What is sampled comes before what is derived from it.
     for label, value in sorted(draws.items(), key=lambda item: item[0] in labels.derived):
         shape = value.shape[2:]
-        known = labels.dims.get(label, (None,) * len(shape))
-        known = known if len(known) == len(shape) else (None,) * len(shape)
-        if known == (None,) and shape[0] == len(named[OUTPUT]) > 1:
-            known = (OUTPUT,)
-        dims = [name or f"{label}_dim_{axis}" for axis, name in enumerate(known)]
+        site_dims = labels.dims.get(label, (None,) * len(shape))
+        site_dims = site_dims if len(site_dims) == len(shape) else (None,) * len(shape)
+        if site_dims == (None,) and shape[0] == len(named[OUTPUT]) > 1:
+            site_dims = (OUTPUT,)
+        dims = [name or f"{label}_dim_{axis}" for axis, name in enumerate(site_dims)]
         for name, size in zip(dims, shape, strict=True):
             ticks = labels.coords.get(name, named.get(name, ()))
-            if not len(ticks) and known == (name,) and size > 1:
+            if not len(ticks) and site_dims == (name,) and size > 1:
                 ticks = named[OUTPUT]  # of a plate with an entry for each output
             extra[name] = list(ticks) if len(ticks) == size else np.arange(size)
         variables[label] = (("chain", "draw", *dims), value, {DERIVED: 1} if label in labels.derived else {})
@@ -275,14 +276,14 @@ def _true_functions(bound: BoundModel, truth: Mapping[str, Any],
                   for name in bound.sites}
         ssm = bound.likelihood(values).ssm
         w = jnp.asarray(np.column_stack(parts))
-        found = {OUTPUT: np.asarray(jax.vmap(lambda one, t: expected_observation(ssm, one, t))(w, times))}
+        series = {OUTPUT: np.asarray(jax.vmap(lambda one, t: expected_observation(ssm, one, t))(w, times))}
     except Exception:
         return {}
     try:
         more = {"deterministic": np.asarray(jax.vmap(ssm.deterministics)(w, times))}
     except Exception:
-        return found
-    return found | (more if model.deterministic_names else {})
+        return series
+    return series | (more if model.deterministic_names else {})
 
 
 def _held_elsewhere(draws: np.ndarray, truth: Any) -> bool:
@@ -307,34 +308,34 @@ def checked_truth(bound: BoundModel, truth: Mapping[str, Any] | None, labels: La
     """
     if not truth:
         return {}
-    given = dict(truth)
-    for name in [name for name in given if name not in TRUTH]:
+    entries = dict(truth)
+    for name in [name for name in entries if name not in TRUTH]:
         checks.warn(f"{checks.unknown('entry of the truth', name, TRUTH)} It is left out.")
-        del given[name]
-    if np.ndim(bound.y) != 2 and set(given) - {"parameters"}:
+        del entries[name]
+    if np.ndim(bound.y) != 2 and set(entries) - {"parameters"}:
         checks.warn("of the truth of several series only parameters are drawn; states and forces are left out.")
-        given = {name: value for name, value in given.items() if name == "parameters"}
+        entries = {name: value for name, value in entries.items() if name == "parameters"}
     try:
-        check_truth(given)
+        check_truth(entries)
     except ValueError as error:
         raise ValueError(f"the truth does not fit together: {error}") from None
-    for message in unplaced(bound, given, labels):
+    for message in unplaced(bound, entries, labels):
         checks.warn(message)
-    return given
+    return entries
 
 
 def unplaced(bound: BoundModel, truth: Mapping[str, Any], labels: Labels) -> list[str]:
     """Return what a truth says of something that the model does not have, a message each."""
     model = bound.site.example.ssm.model
-    known = {"force": model.force_names, "deterministic": model.deterministic_names,
+    expected_names = {"force": model.force_names, "deterministic": model.deterministic_names,
              "parameter": (*bound.sites, *sorted(labels.derived))}
-    found = [checks.unknown(f"{kind} in the truth", name, names) for kind, names in known.items()
+    errors = [checks.unknown(f"{kind} in the truth", name, names) for kind, names in expected_names.items()
              for name in truth.get(f"{kind}s") or {} if name not in names]
     columns = _true_states(truth).shape[1:]
     if columns and columns != (len(model.state_names),):
-        found.append(f"the truth has {columns[0]} states, the model {len(model.state_names)}: "
+        errors.append(f"the truth has {columns[0]} states, the model {len(model.state_names)}: "
                      f"{', '.join(model.state_names) or 'none'}.")
-    return [f"{message} It is left out of the figures." for message in found]
+    return [f"{message} It is left out of the figures." for message in errors]
 
 
 def _truth(truth: Mapping[str, Any], named: dict, units: Mapping[str, str],
@@ -345,11 +346,12 @@ def _truth(truth: Mapping[str, Any], named: dict, units: Mapping[str, str],
         coords["at_truth"] = ("at_truth", np.asarray(truth["times"], float), units_attribute(["time"], units))
     for kind in ("force", "deterministic"):
         paths = truth.get(f"{kind}s") or {}
-        known = [label for label in named[kind] if label in paths]
-        if known:
-            coords[kind] = known
-            variables[f"{kind}s"] = (("at_truth", kind), np.stack([np.asarray(paths[n]) for n in known], axis=1),
-                                     units_attribute(known, units))
+        stored_labels = [label for label in named[kind] if label in paths]
+        if stored_labels:
+            coords[kind] = stored_labels
+            values = np.stack([np.asarray(paths[label]) for label in stored_labels], axis=1)
+            variables[f"{kind}s"] = (("at_truth", kind), values,
+                                     units_attribute(stored_labels, units))
     if _true_states(truth).shape[1:] == (len(named["state"]),):
         coords["state"] = named["state"]
         variables["states"] = (("at_truth", "state"), np.asarray(truth["state"]),

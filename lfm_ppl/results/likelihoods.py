@@ -163,8 +163,9 @@ def on_grid(problem: PosteriorDraws, steps: int | None, progress: bool) -> Refer
     def per_draw(values: Any, key: jax.Array, y: jax.Array) -> jax.Array:
         return map_series(bound.likelihood(values, y), one, bound.data(y)).sum()
 
-    found = _one_by_one(problem, jax.random.key(0), ("grid", layout, steps), per_draw, "Fokker-Planck grid", progress)
-    return Reference(found[:, None], f"Fokker-Planck equation on a grid of {layout.cells} cells")
+    log_likelihoods = _one_by_one(problem, jax.random.key(0), ("grid", layout, steps), per_draw, "Fokker-Planck grid",
+                                  progress)
+    return Reference(log_likelihoods[:, None], f"Fokker-Planck equation on a grid of {layout.cells} cells")
 
 
 def takes_smoother_draws(ssm: StateSpaceModel) -> bool:
@@ -193,25 +194,25 @@ def by_particles(problem: PosteriorDraws, particles: int | None, replicates: int
     example = problem.example
     pilot_key, key = jax.random.split(key)
     limited = False
-    chosen = particles or _FIRST_PARTICLES
-    run = _particle_run(problem, chosen, replicates, steps, progress)
+    count = particles or _FIRST_PARTICLES
+    run = _particle_run(problem, count, replicates, steps, progress)
     if particles is None:
         rows = np.unique(np.linspace(0, problem.size - 1, _PILOT).round().astype(int))
         keep = problem.parts
         pilot = None if keep is None else lambda name: keep(f"pilot {name}")
         sd = noise(run(problem.at(rows)._replace(parts=pilot), pilot_key))
-        wanted = chosen * (sd / target) ** 2 * _SAFETY if np.isfinite(sd) else np.inf
+        needed = count * (sd / target) ** 2 * _SAFETY if np.isfinite(sd) else np.inf
         time_grid = build_time_grid(example.ssm, example.times, steps or example.steps, example.max_step)
         steps_made = np.shape(time_grid.intervals.length)[0] * time_grid.steps
         each_particle = problem.size * replicates * problem.series * steps_made
-        most = max(chosen, most_work / each_particle)
-        limited = wanted > most
-        if wanted > chosen and most > chosen:
-            chosen = int(np.ceil(min(wanted, most) / 500) * 500)
-            run = _particle_run(problem, chosen, replicates, steps, progress)
-    method = (f"importance sampling, {replicates} runs of {chosen:,} draws of the smoother" if takes_smoother_draws(
-        example.ssm) else f"particle filter, {replicates} runs of {chosen:,} particles")
-    return Reference(run(problem, key), f"{method} a draw", chosen, limited)
+        most = max(count, most_work / each_particle)
+        limited = needed > most
+        if needed > count and most > count:
+            count = int(np.ceil(min(needed, most) / 500) * 500)
+            run = _particle_run(problem, count, replicates, steps, progress)
+    method = (f"importance sampling, {replicates} runs of {count:,} draws of the smoother" if takes_smoother_draws(
+        example.ssm) else f"particle filter, {replicates} runs of {count:,} particles")
+    return Reference(run(problem, key), f"{method} a draw", count, limited)
 
 
 _FIRST_PARTICLES = 1000
@@ -221,9 +222,9 @@ _SAFETY = 1.2
 
 def _particle_run(problem: PosteriorDraws, particles: int, replicates: int, steps: int | None,
                   progress: bool) -> Callable:
-    known = problem.example
-    check_noise(known.ssm, known.time_grid.initial_time)
-    settings = particle_filter.check_settings(known.ssm, ParticleSettings(particles))
+    example = problem.example
+    check_noise(example.ssm, example.time_grid.initial_time)
+    settings = particle_filter.check_settings(example.ssm, ParticleSettings(particles))
 
     def one(distribution: MarginalLikelihood, y: jax.Array, key: jax.Array) -> jax.Array:
         time_grid = build_time_grid(distribution.ssm, distribution.times, steps or distribution.steps,
@@ -266,14 +267,14 @@ def _scouted(problem: PosteriorDraws) -> list[Any]:
     extreme = np.concatenate([flat.argmin(axis=0), flat.argmax(axis=0)])
     even = np.linspace(0, problem.size - 1, min(_SCOUTS, problem.size)).round().astype(int)
     rows = list(dict.fromkeys([*extreme, *even]))[: max(_SCOUTS, len(extreme))]
-    found = []
+    models = []
     for row in rows:
         parameters = {name: jnp.asarray(value[row]) for name, value in problem.draws.items()}
         distribution = problem.bound.likelihood(parameters)
         if isinstance(distribution, Panel):
             leaves = [jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf)[b], distribution.parameters)  # noqa: B023
                       for b in range(problem.series)]
-            found += [distribution.build(one) for one in leaves]
+            models += [distribution.build(leaf) for leaf in leaves]
         else:
-            found.append(distribution.model)
-    return found
+            models.append(distribution.model)
+    return models

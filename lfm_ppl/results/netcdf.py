@@ -63,8 +63,8 @@ def read(path: str | Path) -> tuple[dict[str, xr.Dataset], dict[str, Any]]:
     """
     path = Path(path)
     if not path.is_file():
-        what = "is a folder" if path.is_dir() else "does not exist"
-        raise FileNotFoundError(f"{path} {what}; expected a netCDF file such as posterior.nc.")
+        problem = "is a folder" if path.is_dir() else "does not exist"
+        raise FileNotFoundError(f"{path} {problem}; expected a netCDF file such as posterior.nc.")
     import h5netcdf
 
     try:

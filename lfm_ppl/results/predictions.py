@@ -31,14 +31,14 @@ MEAN, SD, FREE_SD = "y_mean", "y_sd", "outputs_sd"
 """Mean of the normal distribution that y has at each draw, its sd, and its sd without the noise."""
 
 
-def predictions(bound: BoundModel, paths: Mapping[str, np.ndarray], chosen: np.ndarray, times: np.ndarray,
+def predictions(bound: BoundModel, paths: Mapping[str, np.ndarray], draw_index: np.ndarray, times: np.ndarray,
                 labels: Mapping[str, Any] | None = None) -> xr.Dataset:
     """Lay out new observations, and the paths that they were drawn along.
 
     Args:
         bound: the model and its data.
         paths: what `lfm_ppl.inference.posterior.trajectories` drew, each (C, S, ..., K, size).
-        chosen: (S,) which draws of each chain.
+        draw_index: (S,), draws of each chain.
         times: (K,).
         labels: dimension -> names of "output" and "series", where they are not the model's.
 
@@ -57,10 +57,10 @@ def predictions(bound: BoundModel, paths: Mapping[str, np.ndarray], chosen: np.n
     units = {**model.units, **units}
     named = {"output": outputs, "state": list(model.state_names), "force": list(model.force_names),
              "deterministic": list(model.deterministic_names)}
-    place = ("chain", "draw", *panel, "time")
+    dimensions = ("chain", "draw", *panel, "time")
 
-    def variable(kind: str, values: np.ndarray, what: str) -> tuple:
-        return (*place, kind), values, {"long_name": what, **units_attribute(named[kind], units)}
+    def variable(kind: str, values: np.ndarray, description: str) -> tuple:
+        return (*dimensions, kind), values, {"long_name": description, **units_attribute(named[kind], units)}
 
     variables = {site.name: variable("output", paths["prediction"], "new observation, with noise")}
     if "predictive_mean" in paths:  # not of an observation family, whose law is not normal
@@ -73,7 +73,7 @@ def predictions(bound: BoundModel, paths: Mapping[str, np.ndarray], chosen: np.n
     variables |= {f"{kind}s": variable(kind, paths[kind], word) for kind, word in words.items()
                   if paths[kind].shape[-1]}
     clock = {"time": ("time", times, units_attribute(["time"], units))}
-    coords = {"chain": np.arange(paths["prediction"].shape[0]), "draw": chosen, **clock}
+    coords = {"chain": np.arange(paths["prediction"].shape[0]), "draw": draw_index, **clock}
     coords |= {"series": labels["series"]} if panel and "series" in labels else {}
     attrs = {"observed": site.name, "last_observation": float(last_observation(bound.times, np.asarray(bound.y)))}
     return xr.Dataset(variables, {**coords, **{kind: names for kind, names in named.items() if names}}, attrs)
@@ -151,9 +151,11 @@ def quantiles(draws: np.ndarray, p: Any) -> np.ndarray:
         (1.0, 0.75)
     """
     draws = np.asarray(draws)
-    whole = np.all(draws == np.round(draws), axis=tuple(range(draws.ndim - 1)) if draws.ndim > 1 else None)
+    is_integer = np.all(draws == np.round(draws), axis=tuple(range(draws.ndim - 1)) if draws.ndim > 1 else None)
     linear = np.quantile(draws, p, axis=0)
-    return np.where(whole, np.quantile(draws, p, axis=0, method="inverted_cdf"), linear) if np.any(whole) else linear
+    if not np.any(is_integer):
+        return linear
+    return np.where(is_integer, np.quantile(draws, p, axis=0, method="inverted_cdf"), linear)
 
 
 def noise_free_interval(dataset: xr.Dataset) -> np.ndarray:
@@ -177,22 +179,23 @@ def mixture_quantiles(mean: np.ndarray, sd: np.ndarray, p: Any, tolerance: float
         p: (Q,) probabilities.
         tolerance: of a quantile, as a share of the usual spread, that of the median sd and of half of the means.
     """
-    found = []
+    quantiles_found = []
     low, high = np.quantile(mean, (0.25, 0.75), axis=0)
     spread = np.median(sd, axis=0) + high - low
     with np.errstate(divide="ignore", invalid="ignore"):
-        for one in np.atleast_1d(np.asarray(p, float)):
-            ends = mean + sd * special.ndtri(one)  # the quantile of the mixture lies between those of its parts
-            low, high = ends.min(axis=0), ends.max(axis=0)
+        for probability in np.atleast_1d(np.asarray(p, float)):
+            # The quantile of the mixture lies between the quantiles of its parts.
+            bounds = mean + sd * special.ndtri(probability)
+            low, high = bounds.min(axis=0), bounds.max(axis=0)
             limit = tolerance * np.where(spread > 0, spread, high - low)
             for _ in range(_MOST_HALVINGS):
                 if not np.any(high - low > limit):
                     break
                 middle = 0.5 * (low + high)
                 share = np.where(sd > 0, special.ndtr((middle - mean) / sd), middle >= mean).mean(axis=0)
-                low, high = np.where(share < one, middle, low), np.where(share < one, high, middle)
-            found.append(0.5 * (low + high))
-    return np.array(found)
+                low, high = np.where(share < probability, middle, low), np.where(share < probability, high, middle)
+            quantiles_found.append(0.5 * (low + high))
+    return np.array(quantiles_found)
 
 
 _MOST_HALVINGS = 100

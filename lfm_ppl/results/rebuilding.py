@@ -36,12 +36,12 @@ def observations(result: Any) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(times.values, float), np.asarray(data[names[0]].values, float)
 
 
-def keywords(result: Any, later: Mapping[str, Any] | None, given: Mapping[str, Any] | None) -> dict[str, Any]:
+def keywords(result: Any, later: Mapping[str, Any] | None, overrides: Mapping[str, Any] | None) -> dict[str, Any]:
     """Return the keyword arguments of a result's model with known inputs that reach further; see `lfm_ppl.forecast`."""
-    found, stored = inputs.keywords(result, given), inputs.inputs_of(result)
-    for name, one in (later or {}).items():
-        found |= {"inputs": {**found["inputs"], name: one}} if name in stored else {name: one}
-    return found
+    arguments, stored = inputs.keywords(result, overrides), inputs.inputs_of(result)
+    for name, value in (later or {}).items():
+        arguments |= {"inputs": {**arguments["inputs"], name: value}} if name in stored else {name: value}
+    return arguments
 
 
 def problem(result: Any, numpyro_model: Callable, times: Any = None, y: Any = None,
@@ -63,7 +63,7 @@ def problem(result: Any, numpyro_model: Callable, times: Any = None, y: Any = No
     return PosteriorDraws(bound, _latent(bound, posterior))
 
 
-def check_likelihood(result: Any, log_likelihood: np.ndarray, chosen: np.ndarray) -> None:
+def check_likelihood(result: Any, log_likelihood: np.ndarray, draw_index: np.ndarray) -> None:
     """Compare log likelihoods (C, S) at draws ``chosen`` (S,) of each chain with those that the result records.
 
     Raises:
@@ -72,7 +72,7 @@ def check_likelihood(result: Any, log_likelihood: np.ndarray, chosen: np.ndarray
     if not arviz_data.has_group(result, "one_step_ahead"):
         return
     recorded = arviz_data.group(result, "one_step_ahead")["log_density"].transpose("chain", "draw", ...)
-    recorded = recorded.isel(draw=chosen).values.reshape(*log_likelihood.shape, -1).sum(axis=-1)
+    recorded = recorded.isel(draw=draw_index).values.reshape(*log_likelihood.shape, -1).sum(axis=-1)
     difference = np.abs(recorded - log_likelihood)
     if np.any(difference > _TOLERANCE * (1.0 + np.abs(recorded))):
         raise ValueError(f"the model gives other log likelihoods than the result records, by up to {difference.max():g}"
@@ -82,18 +82,18 @@ def check_likelihood(result: Any, log_likelihood: np.ndarray, chosen: np.ndarray
 
 def _check_settings(site: LikelihoodSite, attrs: Mapping[str, Any]) -> None:
     example = site.example
-    own = {"rule": example.rule.name, "steps": example.steps, "max_step": example.max_step,
+    settings = {"rule": example.rule.name, "steps": example.steps, "max_step": example.max_step,
            "iterations": example.iterations, "tolerance": example.tolerance,
            "constraints": example.constraints_in_words if example.constrained else None}
-    if not set(own) & set(attrs):
+    if not set(settings) & set(attrs):
         return  # not made by `fit`
     if example.constrained and " at " not in str(attrs.get("constraints")):  # of a version that stored no number
-        own["constraints"] = ", ".join(example.bounds)
-    for name in own:
+        settings["constraints"] = ", ".join(example.bounds)
+    for name in settings:
         # What is None is not stored.
-        if attrs.get(name) != own[name]:
+        if attrs.get(name) != settings[name]:
             raise ValueError(f"the result was made with {name} = {attrs.get(name)}, but the model has {name} = "
-                             f"{own[name]}; give the model as it was fitted.")
+                             f"{settings[name]}; give the model as it was fitted.")
 
 
 def _latent(bound: BoundModel, posterior: xr.Dataset) -> dict:
@@ -103,8 +103,8 @@ def _latent(bound: BoundModel, posterior: xr.Dataset) -> dict:
     for name in bound.sites:
         stored = name.replace("/", ".")
         if stored not in posterior:
-            known = ", ".join(map(str, posterior.data_vars))
-            raise ValueError(f"the model samples {name!r}, of which the result has no draws (it has {known}); it is "
+            names = ", ".join(map(str, posterior.data_vars))
+            raise ValueError(f"the model samples {name!r}, of which the result has no draws (it has {names}); it is "
                              "not the model that the result was made with. Give the one that was.")
         values = posterior[stored].transpose("chain", "draw", ...).values
         if values.shape[2:] != shapes[name]:

@@ -129,13 +129,13 @@ class AccuracyReport:
         width = width or shutil.get_terminal_size().columns
         table = tables.text_table(self.table[list(SHOWN)], width=width)
         word, reason, following, remedies = self.verdict
-        after = [("verdict", f"{word}: {reason}")]
+        entries_after = [("verdict", f"{word}: {reason}")]
         if len(remedies) > 1:
-            after += [(f"remedy {number}", remedy.replace("RESULT", result))
+            entries_after += [(f"remedy {number}", remedy.replace("RESULT", result))
                       for number, remedy in enumerate(remedies, start=1)]
         if command and following:
-            after.append(("next", following.replace("RESULT", result)))
-        return f"{_labelled(self.numbers(), width)}\n\n{table}\n\n{_labelled(after, width)}"
+            entries_after.append(("next", following.replace("RESULT", result)))
+        return f"{_labelled(self.numbers(), width)}\n\n{table}\n\n{_labelled(entries_after, width)}"
 
     def __str__(self) -> str:
         """Return the report as text."""

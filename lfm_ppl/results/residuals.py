@@ -47,9 +47,9 @@ def autocorrelation(residual: np.ndarray, lags: int) -> tuple[np.ndarray, np.nda
         rho and the number of pairs, both of shape (lags,), for lags 1, 2, ...; rho is NaN for a
         lag without pairs.
     """
-    there = np.isfinite(residual)
-    if there.mean() < 0.5:
-        residual = residual[there]
+    is_finite = np.isfinite(residual)
+    if is_finite.mean() < 0.5:
+        residual = residual[is_finite]
     centred = residual - np.nanmean(residual)
     variance = np.nanmean(centred**2)
     rho, pairs = np.full(lags, np.nan), np.zeros(lags, int)
@@ -74,11 +74,11 @@ def ljung_box(residual: np.ndarray, lags: int) -> float:
     """
     rho, pairs = autocorrelation(residual, lags)
     count = np.isfinite(residual).sum()
-    there = np.isfinite(rho)
-    if not there.any():
+    is_finite = np.isfinite(rho)
+    if not is_finite.any():
         return float("nan")
-    statistic = (count + 2) / count * np.sum(pairs[there] * rho[there] ** 2)
-    return float(stats.chi2.sf(statistic, there.sum()))
+    statistic = (count + 2) / count * np.sum(pairs[is_finite] * rho[is_finite] ** 2)
+    return float(stats.chi2.sf(statistic, is_finite.sum()))
 
 
 def residual_tests(result: Any) -> pd.DataFrame:
@@ -99,15 +99,15 @@ def residual_tests(result: Any) -> pd.DataFrame:
     rows = {}
     for name in residual["output"].values:
         series = residual.sel(output=name).values
-        there = series[np.isfinite(series)]
-        count = len(there)
+        finite = series[np.isfinite(series)]
+        count = len(finite)
         lags = default_lags(count)
         enough = count >= MIN_OBSERVATIONS
         rows[str(name)] = {
             "count": count,
-            "mean": there.mean() if count else np.nan,
-            "sd": there.std(ddof=1) if count > 1 else np.nan,
-            "ks_p": stats.kstest(there, "norm").pvalue if enough else np.nan,
+            "mean": finite.mean() if count else np.nan,
+            "sd": finite.std(ddof=1) if count > 1 else np.nan,
+            "ks_p": stats.kstest(finite, "norm").pvalue if enough else np.nan,
             "ljung_box_p": ljung_box(series, lags) if enough else np.nan,
             "lags": lags,
         }
@@ -123,12 +123,12 @@ def misfit(result: Any) -> list[str]:
     of another filter than its posterior: under constraints, and by a particle filter.
     """
     attrs = attributes(result)
-    other = "constraints" in attrs or str(attrs.get("sampler", "")).startswith("pmmh")
-    if other or not has_group(result, "one_step_ahead") or (
+    is_approximate = "constraints" in attrs or str(attrs.get("sampler", "")).startswith("pmmh")
+    if is_approximate or not has_group(result, "one_step_ahead") or (
             "series" in group(result, "one_step_ahead")["residual"].dims):
         return []
     remedy = "" if "sites" in attrs else " (lfm.StudentTObservation)"
-    found, residual, tests = [], mean_residuals(result), residual_tests(result)
+    messages, residual, tests = [], mean_residuals(result), residual_tests(result)
     for index in range(residual.sizes["output"]):
         name, test = tests.index[index], tests.iloc[index]
         series = residual.isel(output=index).values
@@ -136,15 +136,15 @@ def misfit(result: Any) -> list[str]:
         count, beyond = len(series), int((np.abs(series) > _FAR).sum())
         share = 2.0 * stats.norm.sf(_FAR)
         if count >= MIN_OBSERVATIONS and beyond > 1 and stats.binom.sf(beyond - 1, count, share) < _RARE:
-            found.append(f"{beyond} of {count} residuals of {name} lie beyond {_FAR:g} sd, where {count * share:.2g} "
-                         f"are expected: gross errors{remedy}, or what the model does not know. See residuals.png.")
+            messages.append(f"{beyond} of {count} residuals of {name} lie beyond {_FAR:g} sd, where "
+                            f"{count * share:.2g} are expected: gross errors{remedy}, or a missing effect. See residuals.png.")
         elif test["ks_p"] < _RARE:
-            found.append(f"the residuals of {name} are not standard normal (KS p = {test['ks_p']:.1g}): the bands of "
-                         "new data are too wide or too narrow. See residuals.png.")
+            messages.append(f"the residuals of {name} are not standard normal (KS p = {test['ks_p']:.1g}): the bands "
+                            "of new data are too wide or too narrow. See residuals.png.")
         if test["ljung_box_p"] < _RARE:
-            found.append(f"the residuals of {name} follow from one another (Ljung-Box p = {test['ljung_box_p']:.1g}): "
-                         "the model misses something that lasts. See residuals.png.")
-    return found
+            messages.append(f"the residuals of {name} are autocorrelated (Ljung-Box p = {test['ljung_box_p']:.1g}): "
+                            "the model misses something that lasts. See residuals.png.")
+    return messages
 
 
 def default_lags(count: int) -> int:

@@ -52,14 +52,14 @@ def choose(draws: Mapping[str, np.ndarray], names: str | Sequence[str] | None) -
     """
     if names is None:
         return [label for label, values in draws.items() if np.ptp(values) != 0.0]
-    chosen: dict[str, None] = {}
+    selected: dict[str, None] = {}
     for name in [names] if isinstance(names, str) else names:
-        found = [label for label in draws if label == name or label.partition("[")[0] == name]
-        if not found:
+        labels = [label for label in draws if label == name or label.partition("[")[0] == name]
+        if not labels:
             sites = dict.fromkeys(label.partition("[")[0] for label in draws)
             raise ValueError(unknown("parameter", name, [*sites, *(d for d in draws if "[" in d)]))
-        chosen.update(dict.fromkeys(found))
-    return list(chosen)
+        selected.update(dict.fromkeys(labels))
+    return list(selected)
 
 
 def sampled(posterior: xr.Dataset) -> list[str]:
@@ -75,14 +75,14 @@ def scalar_truth(posterior: xr.Dataset, truth: xr.Dataset) -> dict[str, float]:
         if name not in truth.data_vars or not set(SAMPLE_DIMS) <= set(variable.dims):
             continue
         labels = _labels(str(name), variable)
-        known = truth[name]
-        if known.size == 1:  # one value for every entry of a vector
-            values.update(dict.fromkeys(labels, known.item()))
-        elif set(known.dims) <= set(known.coords):
-            named = zip(_labels(str(name), known), known.values.ravel(), strict=True)
+        value = truth[name]
+        if value.size == 1:  # one value for every entry of a vector
+            values.update(dict.fromkeys(labels, value.item()))
+        elif set(value.dims) <= set(value.coords):
+            named = zip(_labels(str(name), value), value.values.ravel(), strict=True)
             values.update({label: float(v) for label, v in named if label in labels})
-        elif known.size == len(labels):
-            values.update(zip(labels, map(float, known.values.ravel()), strict=True))
+        elif value.size == len(labels):
+            values.update(zip(labels, map(float, value.values.ravel()), strict=True))
     return values
 
 
@@ -102,12 +102,12 @@ def units_attribute(names: Sequence[str], units: Mapping[str, str] | str | None)
     """
     if isinstance(units, str):
         return {"units": units} if units else {}
-    known = {name: units[name] for name in names if units.get(name)} if units else {}
-    if not known:
+    known_units = {name: units[name] for name in names if units.get(name)} if units else {}
+    if not known_units:
         return {}
-    if set(known) == set(names) and len(set(known.values())) == 1:
-        return {"units": next(iter(known.values()))}
-    return {"units": json.dumps(known)}
+    if set(known_units) == set(names) and len(set(known_units.values())) == 1:
+        return {"units": next(iter(known_units.values()))}
+    return {"units": json.dumps(known_units)}
 
 
 def unit_of(variable: xr.DataArray, name: str | None = None) -> str:

@@ -112,12 +112,12 @@ def score(result: Any, held_out: Any, level: float = 0.95, *, numpyro_model: Cal
     if numpyro_model is not None:
         # A family's law is that of all its outputs, in the model's order; those not held out are missing.
         columns = [outputs.index(str(name)) for name in predicted["output"].values]
-        every = np.full((*y.shape[:-1], len(outputs)), np.nan)
-        every[..., columns] = y
-        densities = _family_densities(result, numpyro_model, predicted, every, inputs, model_kwargs)[..., columns]
-    found = scores(_stacked(variable.transpose(*order)), y, flat(MEAN), flat(SD), level,
+        full = np.full((*y.shape[:-1], len(outputs)), np.nan)
+        full[..., columns] = y
+        densities = _family_densities(result, numpyro_model, predicted, full, inputs, model_kwargs)[..., columns]
+    series_scores = scores(_stacked(variable.transpose(*order)), y, flat(MEAN), flat(SD), level,
                    _angles(variable, predicted), densities)
-    return table(found, [str(name) for name in predicted["output"].values], level)
+    return table(series_scores, [str(name) for name in predicted["output"].values], level)
 
 
 def scores(draws: np.ndarray, y: np.ndarray, mean: np.ndarray | None = None, sd: np.ndarray | None = None,
@@ -173,8 +173,8 @@ def _family_densities(result: Any, numpyro_model: Callable, predicted: xr.Datase
     problem = rebuilding.problem(result, numpyro_model, model_kwargs=rebuilding.keywords(result, inputs, model_kwargs))
     posterior = arviz_data.group(result, "posterior")
     labels = posterior["draw"].values if "draw" in posterior.coords else np.arange(posterior.sizes["draw"])
-    chosen = np.searchsorted(labels, predicted["draw"].values)
-    rows = (np.arange(posterior.sizes["chain"])[:, None] * len(labels) + chosen).ravel()
+    draw_index = np.searchsorted(labels, predicted["draw"].values)
+    rows = (np.arange(posterior.sizes["chain"])[:, None] * len(labels) + draw_index).ravel()
     return log_densities(problem.bound, problem.at(rows).draws, predicted, y)
 
 
@@ -200,25 +200,25 @@ def gaussian_scores(mean: np.ndarray, sd: np.ndarray, y: np.ndarray, level: floa
     """
     z = (y - mean) / sd
     ranked = sd * (z * (2 * stats.norm.cdf(z) - 1) + 2 * stats.norm.pdf(z) - 1 / np.sqrt(np.pi))
-    inside = np.where(np.isfinite(z), np.abs(z) <= stats.norm.ppf(0.5 + 0.5 * level), np.nan)
-    return Scores(y - mean, ranked, stats.norm.logpdf(z) - np.log(sd), inside)
+    is_inside = np.where(np.isfinite(z), np.abs(z) <= stats.norm.ppf(0.5 + 0.5 * level), np.nan)
+    return Scores(y - mean, ranked, stats.norm.logpdf(z) - np.log(sd), is_inside)
 
 
-def table(found: Scores, outputs: list[str], level: float = 0.95) -> pd.DataFrame:
+def table(scores: Scores, outputs: list[str], level: float = 0.95) -> pd.DataFrame:
     """Return the mean scores by output (the last axis) and of all; see `score`."""
     rows = {}
     entries: list[tuple[Any, str]] = [*enumerate(outputs), (slice(None), ALL)]
     for index, name in entries:
-        rows[name] = summary(Scores(*(value[..., index] for value in found)), level)
+        rows[name] = summary(Scores(*(value[..., index] for value in scores)), level)
     return pd.DataFrame.from_dict(rows, orient="index")
 
 
-def summary(found: Scores, level: float = 0.95) -> dict[str, float]:
+def summary(scores: Scores, level: float = 0.95) -> dict[str, float]:
     """Return the mean scores of the entries that were measured."""
-    present = np.isfinite(found.error)
+    present = np.isfinite(scores.error)
     mean = lambda values: float(np.mean(values[present])) if present.any() else np.nan  # noqa: E731
-    return {"n": int(present.sum()), "rmse": float(np.sqrt(mean(found.error**2))), "crps": mean(found.crps),
-            "log_score": mean(found.log_score), f"coverage_{100 * level:g}": mean(found.covered)}
+    return {"n": int(present.sum()), "rmse": float(np.sqrt(mean(scores.error**2))), "crps": mean(scores.crps),
+            "log_score": mean(scores.log_score), f"coverage_{100 * level:g}": mean(scores.covered)}
 
 
 def aligned(predicted: xr.Dataset, variable: xr.DataArray, held_out: Any,

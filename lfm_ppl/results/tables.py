@@ -66,11 +66,11 @@ def text_table(frame: pd.DataFrame, width: int = 80, digits: int = 3) -> str:
     """
     body = _formatted(frame, digits)
     names = [str(name) for name in frame.index]
-    whole = {name: [str(name)] for name in frame.columns}
+    columns = {name: [str(name)] for name in frame.columns}
     split = {name: _broken(str(name), body[name]) for name in frame.columns}
     label = max([len(name) for name in names], default=0)
     # Two spaces are easier to read than one; either is better than a second block.
-    for headers, gap in ((whole, 2), (split, 2), (split, 1)):
+    for headers, gap in ((columns, 2), (split, 2), (split, 1)):
         widths = {name: gap + max(map(len, [*headers[name], *body[name]])) for name in body}
         if label + sum(widths.values()) <= width:
             break
@@ -79,11 +79,11 @@ def text_table(frame: pd.DataFrame, width: int = 80, digits: int = 3) -> str:
     for name, header in headers.items():
         padded = [""] * (height - len(header)) + header
         cells[name] = _aligned(frame[name], padded, body[name], widths[name])
-    left = [row.ljust(label) for row in [""] * height + names]
+    row_labels = [row.ljust(label) for row in [""] * height + names]
     return "\n\n".join(
         "\n".join(
             (first + "".join(cells[name][row] for name in block)).rstrip()
-            for row, first in enumerate(left)
+            for row, first in enumerate(row_labels)
         )
         for block in _blocks(widths, width - label)
     )
@@ -163,12 +163,12 @@ def annotated(table: pd.DataFrame, result: Any) -> pd.DataFrame:
     """
     posterior = arviz_data.group(result, "posterior")
     derived = {str(name) for name, variable in posterior.data_vars.items() if variable.attrs.get("derived")}
-    kinds, found = [], []
+    kinds, indices = [], []
     for label in table.index:
         fixed = "fixed" if table.loc[label, "sd"] == 0.0 else "sampled"
         kinds.append("derived" if label.partition("[")[0] in derived else fixed)
-        found.append(" ".join(arviz_data.convergence_warnings(result, table.loc[[label]])))
-    return table.assign(kind=kinds, warnings=found)
+        indices.append(" ".join(arviz_data.convergence_warnings(result, table.loc[[label]])))
+    return table.assign(kind=kinds, warnings=indices)
 
 
 def write_csv(

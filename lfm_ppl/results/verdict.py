@@ -93,7 +93,7 @@ class Verdict(NamedTuple):
     remedies: tuple[str, ...] = ()
 
 
-def judge(found: Findings) -> Verdict:
+def judge(findings: Findings) -> Verdict:
     """Return the verdict on a Gaussian-filter posterior.
 
     - "re-run" where the integration steps are too long, or the importance ratios too uneven to correct with;
@@ -101,10 +101,10 @@ def judge(found: Findings) -> Verdict:
     - "trust" otherwise: every mean within 0.1 sd and every sd within 10% of the corrected one, or within two Monte
       Carlo standard errors.
     """
-    word, reason, command = _judged(found)
-    notes = _notes(found)
+    word, reason, command = _judged(findings)
+    notes = _notes(findings)
     remedies = {command: _cost(command)} if command else {}
-    refit = _refit_with_iterations(found)
+    refit = _refit_with_iterations(findings)
     if word == "corrected":
         remedies |= refit
     elif command == CORRECT:
@@ -112,9 +112,9 @@ def judge(found: Findings) -> Verdict:
         remedies = refit | remedies
         command = next(iter(remedies))
         if refit:
-            reason += (f" With {found.iterations} iterations of posterior linearisation the log likelihood differs "
-                       f"from the exact one by {found.iterated_ratio_sd:.2g} (sd over the draws) in place of "
-                       f"{found.ratio_sd:.2g}.")
+            reason += (f" With {findings.iterations} iterations of posterior linearisation the log likelihood differs "
+                       f"from the exact one by {findings.iterated_ratio_sd:.2g} (sd over the draws) in place of "
+                       f"{findings.ratio_sd:.2g}.")
     costs = tuple(f"{line} ({cost})" for line, cost in remedies.items())
     return Verdict(word, " ".join([reason, *notes]), command, costs)
 
@@ -128,72 +128,72 @@ def _cost(command: str) -> str:
     return "minutes" if command.startswith("lfm-ppl check") else "a second fit"
 
 
-def _refit_with_iterations(found: Findings) -> dict[str, str]:
+def _refit_with_iterations(findings: Findings) -> dict[str, str]:
     """Return the command of a fit with more iterations and its cost, where they bring the likelihood closer."""
-    if not found.iterations or not found.iterated_ratio_sd < _CLOSER * found.ratio_sd:
+    if not findings.iterations or not findings.iterated_ratio_sd < _CLOSER * findings.ratio_sd:
         return {}
-    command = f"{found.refit} --iterations {found.iterations}" if found.refit else (
-        f"lfm.fit of the model with iterations={found.iterations}")
+    command = f"{findings.refit} --iterations {findings.iterations}" if findings.refit else (
+        f"lfm.fit of the model with iterations={findings.iterations}")
     return {command: "a second fit, some four times as long"}
 
 
-def _judged(found: Findings) -> tuple[str, str, str]:
-    if not found.step_change_sd <= STEP_CHANGE:
-        if found.tolerance is None:
-            finer, advice = f"--steps {2 * found.steps}", f"with {2 * found.steps} steps"
+def _judged(findings: Findings) -> tuple[str, str, str]:
+    if not findings.step_change_sd <= STEP_CHANGE:
+        if findings.tolerance is None:
+            finer, advice = f"--steps {2 * findings.steps}", f"with {2 * findings.steps} steps"
         else:
-            tighter = finer_tolerance(found.tolerance)
-            finer = f"--steps {2 * found.steps} --tolerance {tighter:g}"
-            advice = f"with a tolerance of {tighter:g} and {2 * found.steps} steps"
-        if found.max_step is not None:
-            finer += f" --max-step {found.max_step / 2:g}"
+            tighter = finer_tolerance(findings.tolerance)
+            finer = f"--steps {2 * findings.steps} --tolerance {tighter:g}"
+            advice = f"with a tolerance of {tighter:g} and {2 * findings.steps} steps"
+        if findings.max_step is not None:
+            finer += f" --max-step {findings.max_step / 2:g}"
         reason = (f"the integration steps are too long: twice as many change the log likelihood by amounts that vary "
-                  f"by {found.step_change_sd:.2g} (sd) over the posterior, more than {STEP_CHANGE}.")
-        if not found.refit:
+                  f"by {findings.step_change_sd:.2g} (sd) over the posterior, more than {STEP_CHANGE}.")
+        if not findings.refit:
             return "re-run", f"{reason} Fit again {advice}.", ""
-        return "re-run", reason, f"{found.refit} {finer}"
-    if found.exact:
+        return "re-run", reason, f"{findings.refit} {finer}"
+    if findings.exact:
         return "trust", "the model is linear with Gaussian noise, for which the filter is exact.", ""
-    if not found.k < found.threshold:
-        return "re-run", *_unreliable(found)
-    shifted = _changed(found.table)
+    if not findings.k < findings.threshold:
+        return "re-run", *_unreliable(findings)
+    shifted = _changed(findings.table)
     if shifted:
         reason = (f"the Gaussian filter has moved {_listed(shifted)}; the importance weights can be relied on "
-                  f"(k = {found.k:.2f}, below {found.threshold:.2f}), and so can the corrected mean and sd.")
+                  f"(k = {findings.k:.2f}, below {findings.threshold:.2f}), and so can the corrected mean and sd.")
         return "corrected", reason, "lfm-ppl check RESULT --correct --overwrite"
     reason = (f"no mean is off by more than {SHIFT} sd and no sd by more than {WIDTH:.0%}, beyond Monte Carlo error "
-              f"(k = {found.k:.2f}, below {found.threshold:.2f}).")
-    unseen = _SIGMAS * float(np.nanmax(found.table["shift_se"], initial=0.0))
+              f"(k = {findings.k:.2f}, below {findings.threshold:.2f}).")
+    unseen = _SIGMAS * float(np.nanmax(findings.table["shift_se"], initial=0.0))
     if unseen <= 2.0 * SHIFT:
         return "trust", reason, ""
-    more = min(math.ceil(found.checked * (unseen / (2.0 * SHIFT)) ** 2 / 100) * 100, found.available)
-    reason += f" Shifts up to {unseen:.2f} sd cannot be told from Monte Carlo error with {found.checked} draws."
-    return "trust", reason, f"lfm-ppl check RESULT --draws {more} --overwrite" if more > found.checked else ""
+    more = min(math.ceil(findings.checked * (unseen / (2.0 * SHIFT)) ** 2 / 100) * 100, findings.available)
+    reason += f" Shifts up to {unseen:.2f} sd cannot be told from Monte Carlo error with {findings.checked} draws."
+    return "trust", reason, f"lfm-ppl check RESULT --draws {more} --overwrite" if more > findings.checked else ""
 
 
-def _unreliable(found: Findings) -> tuple[str, str]:
-    if not math.isfinite(found.k) and found.checked < min(LEAST_DRAWS, found.available):
-        return (f"{found.checked} draws are too few for a Pareto k.",
-                f"lfm-ppl check RESULT --draws {min(200, found.available)} --overwrite")
-    digits = 2 if f"{found.k:.2f}" != f"{found.threshold:.2f}" else 4
-    start = (f"k = {found.k:.{digits}f} is not below {found.threshold:.{digits}f}, so that the importance weights "
-             "cannot be relied on")
-    if found.noise_share > 0.5:
-        reason = (f"{start}; {found.noise_share:.0%} of the variance of the log ratios is noise of the particle "
+def _unreliable(findings: Findings) -> tuple[str, str]:
+    if not math.isfinite(findings.k) and findings.checked < min(LEAST_DRAWS, findings.available):
+        return (f"{findings.checked} draws are too few for a Pareto k.",
+                f"lfm-ppl check RESULT --draws {min(200, findings.available)} --overwrite")
+    digits = 2 if f"{findings.k:.2f}" != f"{findings.threshold:.2f}" else 4
+    start = (f"k = {findings.k:.{digits}f} is not below {findings.threshold:.{digits}f}, so that the importance "
+             "weights cannot be relied on")
+    if findings.noise_share > 0.5:
+        reason = (f"{start}; {findings.noise_share:.0%} of the variance of the log ratios is noise of the particle "
                   "filter, which makes k larger.")
-        return reason, f"lfm-ppl check RESULT --particles {4 * found.particles} --overwrite"
+        return reason, f"lfm-ppl check RESULT --particles {4 * findings.particles} --overwrite"
     # The threshold rises with the number of draws.
-    needed = math.ceil(10.0 ** (1.0 / (1.0 - found.k))) if 0.0 < found.k < LARGEST_K else math.inf
-    if found.checked < needed <= found.available:
-        more = min(2 * int(needed), found.available)  # a margin, because k itself is an estimate
-        return f"{start} with {found.checked} draws.", f"lfm-ppl check RESULT --draws {more} --overwrite"
+    draws_needed = math.ceil(10.0 ** (1.0 / (1.0 - findings.k))) if 0.0 < findings.k < LARGEST_K else math.inf
+    if findings.checked < draws_needed <= findings.available:
+        more = min(2 * int(draws_needed), findings.available)  # a margin, because k itself is an estimate
+        return f"{start} with {findings.checked} draws.", f"lfm-ppl check RESULT --draws {more} --overwrite"
     return (f"{start}: the posterior of the Gaussian filter is too far from the exact one. One command samples the "
             "exact one, with the likelihood of a particle filter.", CORRECT)
 
 
 def _changed(table: pd.DataFrame) -> list[str]:
     """Name the parameters whose mean or sd is off, the worst first."""
-    found = []
+    changes = []
     for label, row in table.iterrows():
         shift, width = abs(row["shift"]), abs(row["sd_ratio"] - 1.0)
         parts = []
@@ -201,20 +201,20 @@ def _changed(table: pd.DataFrame) -> list[str]:
             parts.append(f"the mean of {label} (by {-row['shift']:+.2f} +- {row['shift_se']:.2f} sd)")
         if width > max(WIDTH, _SIGMAS * row["sd_ratio_se"]):
             parts.append(f"the sd of {label} (to {1.0 / row['sd_ratio']:.2f} times the exact one)")
-        found += [(max(shift, width), part) for part in parts]
-    return [part for _, part in sorted(found, reverse=True)]
+        changes += [(max(shift, width), part) for part in parts]
+    return [part for _, part in sorted(changes, reverse=True)]
 
 
-def _notes(found: Findings) -> list[str]:
+def _notes(findings: Findings) -> list[str]:
     notes = []
-    if found.sampler == "map" and not found.exact:
+    if findings.sampler == "map" and not findings.exact:
         notes.append("The draws come from a Laplace approximation at the mode, whose own error is not seen here.")
-    if found.noise_sd > NOISE_SD:
-        notes.append(f"The noise of the particle filter (sd {found.noise_sd:.2f} of a log ratio) is above {NOISE_SD}; "
-                     "it is part of the Monte Carlo errors, which more --particles lower.")
-    if found.impossible:
-        notes.append(f"The reference finds the data impossible at {found.impossible} of {found.checked} draws; they "
-                     "have weight zero.")
+    if findings.noise_sd > NOISE_SD:
+        notes.append(f"The noise of the particle filter (sd {findings.noise_sd:.2f} of a log ratio) is above "
+                     f"{NOISE_SD}; it is part of the Monte Carlo errors, which more --particles lower.")
+    if findings.impossible:
+        notes.append(f"The reference finds the data impossible at {findings.impossible} of {findings.checked} draws; "
+                     "they have weight zero.")
     return notes
 
 

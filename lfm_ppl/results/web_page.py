@@ -91,12 +91,12 @@ def render(title: str, lead: str, sections: Sequence[Section]) -> str:
         >>> "<h1>spring</h1>" in page, "A mass &amp; a spring" in page, "http://" in page
         (True, True, False)
     """
-    kept = [section for section in sections if section.body]
+    shown_sections = [section for section in sections if section.body]
     head = f"{_HEAD}<title>{escape(title)}</title>\n{_STYLE}</head>\n<body>\n<header>\n<h1>{escape(title)}</h1>\n"
     head += paragraph(lead, "lead") if lead else ""
-    links = "\n".join(f'<a href="#{escape(one.anchor)}">{escape(one.title)}</a>' for one in kept)
-    body = "\n".join(f'<section id="{escape(one.anchor)}">\n<h2>{escape(one.title)}</h2>\n{one.body}\n</section>'
-                     for one in kept)
+    links = "\n".join(f'<a href="#{escape(section.anchor)}">{escape(section.title)}</a>' for section in shown_sections)
+    body = "\n".join(f'<section id="{escape(section.anchor)}">\n<h2>{escape(section.title)}</h2>\n'
+                     f"{section.body}\n</section>" for section in shown_sections)
     return f"{head}\n<nav>\n{links}\n</nav>\n</header>\n<main>\n{body}\n</main>\n</body>\n</html>\n"
 
 
@@ -114,11 +114,11 @@ def write(page: str, path: str | Path, overwrite: bool = False) -> Path:
 def refuse_foreign(path: str | Path, overwrite: bool) -> None:
     """Raise FileExistsError where a page would replace a file that is none of ours, and may not."""
     path = Path(path)
-    own = False
+    is_generated = False
     if path.is_file():
         with contextlib.suppress(OSError), path.open(encoding="utf-8", errors="replace") as file:
-            own = _GENERATOR in file.read(len(_HEAD))
-    refuse_existing(path, overwrite or own)
+            is_generated = _GENERATOR in file.read(len(_HEAD))
+    refuse_existing(path, overwrite or is_generated)
 
 
 def paragraph(text: str, kind: str = "") -> str:
@@ -169,8 +169,8 @@ def facts(pairs: Iterable[tuple[str, str]]) -> str:
 def picture(png: bytes, caption: str) -> str:
     """Return a PNG picture, held in the page itself."""
     data = base64.b64encode(png).decode("ascii")
-    shown = escape(caption)
-    return f'<figure><img alt="{shown}" src="data:image/png;base64,{data}"><figcaption>{shown}</figcaption></figure>'
+    text = escape(caption)
+    return f'<figure><img alt="{text}" src="data:image/png;base64,{data}"><figcaption>{text}</figcaption></figure>'
 
 
 def file_list(names: Iterable[str]) -> str:

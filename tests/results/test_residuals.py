@@ -71,7 +71,7 @@ def test_a_misfit_is_said_and_a_fit_is_not():
     (message,) = misfit(result_with(gross))
     assert message.startswith("3 of 60 residuals of y0 lie beyond 3 sd") and "lfm.StudentTObservation" in message
     slow = np.convolve(rng.normal(size=69), np.ones(10), mode="valid")[:, None] / np.sqrt(10.0)
-    assert any("follow from one another" in one for one in misfit(result_with(slow)))
+    assert any("are autocorrelated" in one for one in misfit(result_with(slow)))
     (message,) = misfit(result_with(0.3 * right))
     assert "are not standard normal" in message and "too wide" in message
 

@@ -79,18 +79,18 @@ def plot_trace(
 
 
 def parameters_to_draw(
-    result: Any, wanted: Sequence[str] | None, limit: int
+    result: Any, names: Sequence[str] | None, limit: int
 ) -> tuple[dict[str, np.ndarray], list[str], str]:
     """Return all scalar draws, the labels to draw, and a remark where some are left out."""
     posterior = group(result, "posterior")
     draws = scalar_draws(posterior)
-    chosen = sampled(posterior) if wanted is None else choose(draws, wanted)
-    if not chosen:
+    selected = sampled(posterior) if names is None else choose(draws, names)
+    if not selected:
         raise ValueError(
             "no parameter varies in the posterior, so there is nothing to draw; "
             f"known: {', '.join(draws) or 'none'}."
         )
-    return draws, *style.first_of(chosen, wanted, limit, "parameters")
+    return draws, *style.first_of(selected, names, limit, "parameters")
 
 
 def known_truth(result: Any) -> dict[str, float]:
@@ -131,10 +131,10 @@ def _draw_trace(axes: Axes, draws: np.ndarray, diverging: np.ndarray, truth: flo
     chains, count = draws.shape
     for values, colour in zip(draws, _colours(chains), strict=True):
         axes.plot(values, color=colour, lw=0.4, alpha=0.8, rasterized=draws.size > 2000)
-    at = np.flatnonzero(diverging.any(axis=0))
-    if len(at):
+    positions = np.flatnonzero(diverging.any(axis=0))
+    if len(positions):
         axes.plot(
-            at, np.full(len(at), 0.05), ls="", transform=axes.get_xaxis_transform(), **_DIVERGENT
+            positions, np.full(len(positions), 0.05), ls="", transform=axes.get_xaxis_transform(), **_DIVERGENT
         )
     if truth is not None:
         axes.axhline(truth, color=style.BLACK, lw=0.9, ls=(0, (4, 2)))

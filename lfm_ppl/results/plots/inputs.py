@@ -43,25 +43,25 @@ def plot_inputs(result: Any, inputs: Sequence[str] | None = None, *, width: str 
         >>> [axes.get_ylabel() for axes in plot_inputs(build({GROUP: to_dataset({"heater": heater})})).axes]
         ['heater']
     """
-    known = {**inputs_of(result), **inputs_of(result, FORECAST)}
-    if not known:
+    tables = {**inputs_of(result), **inputs_of(result, FORECAST)}
+    if not tables:
         raise ValueError("the result holds no known inputs. Give those of a model as columns of its data file, or in "
                          "lfm.Data(..., inputs=...).")
-    wanted = list(known) if inputs is None else [inputs] if isinstance(inputs, str) else list(inputs)
-    for name in wanted:
-        if name not in known:
-            raise ValueError(unknown("input", name, list(known)))
-    names, note = style.first_of(wanted, inputs, MAX_PANELS, "inputs")
+    selected = list(tables) if inputs is None else [inputs] if isinstance(inputs, str) else list(inputs)
+    for name in selected:
+        if name not in tables:
+            raise ValueError(unknown("input", name, list(tables)))
+    names, note = style.first_of(selected, inputs, MAX_PANELS, "inputs")
     figure, panels = style.small_multiples(width, len(names), 1.25)
     line: dict[str, Any] = {"color": style.PURPLE, "mew": 0}
     held: dict[str, Any] = {"color": style.PURPLE, "ls": "--"}
     last, end = forecast_span(result)
     drawn_on = False
     for axes, name in zip(panels, names, strict=True):
-        table = known[name]
-        drawn = "steps-post" if table.interpolation == "previous" else "default"
-        axes.plot(table.times, table.values, drawstyle=drawn, marker="o" if len(table.times) <= _MANY else "", ms=2.2,
-                  **line)
+        table = tables[name]
+        draw_style = "steps-post" if table.interpolation == "previous" else "default"
+        marker = "o" if len(table.times) <= _MANY else ""
+        axes.plot(table.times, table.values, drawstyle=draw_style, marker=marker, ms=2.2, **line)
         if table.times[-1] < end:
             axes.plot([table.times[-1], end], np.repeat(table.values[-1], 2), **held)
             drawn_on = True

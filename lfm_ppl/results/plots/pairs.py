@@ -80,10 +80,10 @@ def plot_pairs(
                 lines = truth.get(labels[column]), truth.get(labels[row])
                 _draw_pair(axes, flat[column], flat[row], diverging, lines)
     for index, label in enumerate(labels):
-        bottom, left = grid[count - 1, index], grid[index, 0]
+        bottom, left_axes = grid[count - 1, index], grid[index, 0]
         _name_axis(bottom.xaxis, label, units.get(label, ""), panel)
         if index:
-            _name_axis(left.yaxis, label, units.get(label, ""), panel)
+            _name_axis(left_axes.yaxis, label, units.get(label, ""), panel)
     figure.align_labels()
     _legend(figure, bool(diverging.any()), any(label in truth for label in labels))
     if note:
@@ -125,9 +125,9 @@ def _draw_pair(
     truth: tuple[float | None, float | None],
 ) -> None:
     # Evenly thinned draws look like all of them; divergences are rare and are all drawn.
-    kept = slice(None, None, -(-x.size // MAX_POINTS))
+    thinned = slice(None, None, -(-x.size // MAX_POINTS))
     axes.plot(
-        x[kept], y[kept], color=style.BLUE, ls="", marker="o", ms=1.6, mew=0, alpha=0.35,
+        x[thinned], y[thinned], color=style.BLUE, ls="", marker="o", ms=1.6, mew=0, alpha=0.35,
         rasterized=True,
     )  # fmt: skip
     if diverging.any():

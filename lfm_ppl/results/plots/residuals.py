@@ -93,12 +93,12 @@ def _panels(width: str | float, count: int) -> tuple[Figure, list[tuple[Axes, Ax
     rows = []
     if narrow:
         grid = figure.add_gridspec(2 * count, 2, height_ratios=[1.0, 1.15] * count)
-        places = [(grid[2 * k, :], grid[2 * k + 1, 0], grid[2 * k + 1, 1]) for k in range(count)]
+        panels = [(grid[2 * k, :], grid[2 * k + 1, 0], grid[2 * k + 1, 1]) for k in range(count)]
     else:
         grid = figure.add_gridspec(count, 3, width_ratios=[1.7, 1.0, 1.0])
-        places = [(grid[k, 0], grid[k, 1], grid[k, 2]) for k in range(count)]
-    for number, place in enumerate(places):
-        over_time, quantiles, lags = (figure.add_subplot(cell) for cell in place)
+        panels = [(grid[k, 0], grid[k, 1], grid[k, 2]) for k in range(count)]
+    for number, panel in enumerate(panels):
+        over_time, quantiles, lags = (figure.add_subplot(cell) for cell in panel)
         for axes in (over_time, quantiles, lags):
             style.tidy(axes)
         over_time.tick_params(labelbottom=narrow or number == count - 1)
@@ -112,9 +112,9 @@ def _draw_over_time(axes: Axes, series: xr.DataArray, draws: xr.DataArray) -> No
     axes.axhline(0.0, color=style.GREY, lw=0.6, zorder=1)
     reach = max(3.0, 1.1 * np.nanmax(np.abs(series.values), initial=0.0))
     if len(times) <= 200:
-        ends = np.quantile(draws.values, (0.025, 0.975), axis=(0, 1))
-        axes.vlines(times, *ends, color=style.SKY, lw=0.8, zorder=2)
-        reach = max(reach, 1.05 * np.nanmax(np.abs(ends), initial=0.0))
+        bounds = np.quantile(draws.values, (0.025, 0.975), axis=(0, 1))
+        axes.vlines(times, *bounds, color=style.SKY, lw=0.8, zorder=2)
+        reach = max(reach, 1.05 * np.nanmax(np.abs(bounds), initial=0.0))
     size = 2.6 if len(times) <= 150 else 1.2
     axes.plot(times, series, color=style.BLUE, ls="", marker="o", ms=size, mew=0, zorder=3)
     pad = 0.03 * (times[-1] - times[0]) or 0.5

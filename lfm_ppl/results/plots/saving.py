@@ -62,10 +62,10 @@ def save_figures(
     """
     formats = [formats] if isinstance(formats, str) else list(formats)
     formats = [ending.lower().removeprefix(".") for ending in formats]
-    known = FigureCanvasBase.get_supported_filetypes()
+    supported = FigureCanvasBase.get_supported_filetypes()
     for ending in formats:
-        if ending not in known:
-            raise ValueError(f"unknown figure format {ending!r}; known: {', '.join(known)}.")
+        if ending not in supported:
+            raise ValueError(f"unknown figure format {ending!r}; known: {', '.join(supported)}.")
     pages = list(pages_of(result, width))
     paths = [Path(folder) / f"{name}.{ending}" for name, _, _ in pages for ending in formats]
     for path in paths:
@@ -93,8 +93,8 @@ def pages_of(result: Any, width: str | float) -> Iterator[tuple[str, Draw, list[
             continue
         title = "fit" if kind == "output" else f"{kind}s"
         yield from _numbered(title, draw, names, trajectories.MAX_PANELS)
-        if kind == "output" and (known := list(inputs_of(result))):
-            yield from _numbered("inputs", inputs.plot_inputs, known, trajectories.MAX_PANELS)
+        if kind == "output" and (input_names := list(inputs_of(result))):
+            yield from _numbered("inputs", inputs.plot_inputs, input_names, trajectories.MAX_PANELS)
     if has_group(result, "posterior"):
         labels = sampled(group(result, "posterior"))
         if not of_mode(result):  # independent draws have no chains to look at

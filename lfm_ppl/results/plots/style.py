@@ -213,8 +213,8 @@ class Dates(Formatter):
 
     def common(self, ticks: Sequence[float]) -> str:
         """Return what all ticks share and their labels leave out: the year, the month, the day."""
-        shown = [num2date(day) for day in self.days(ticks)]
-        return next((kinds.pop() for form in _SHARED if len(kinds := {day.strftime(form) for day in shown}) == 1), "")
+        dates = [num2date(day) for day in self.days(ticks)]
+        return next((kinds.pop() for form in _SHARED if len(kinds := {day.strftime(form) for day in dates}) == 1), "")
 
     def __call__(self, x: float, pos: int | None = None) -> str:
         """Return the label of one time by itself, as under the mouse."""
@@ -233,8 +233,8 @@ class DateTicks(Locator):
         self.inner = AutoDateLocator(minticks=3, maxticks=ticks)
         # Less than three of a unit, and so many of the next smaller one that none of its intervals keeps to the number
         # of ticks, is two and a half days, say, at 12 hours: ticks then stand at the larger unit after all.
-        for frequency, whole in ((MONTHLY, 12), (HOURLY, 24), (MINUTELY, 60), (SECONDLY, 60)):
-            self.inner.intervald[frequency] = [*self.inner.intervald[frequency], whole]
+        for frequency, divisor in ((MONTHLY, 12), (HOURLY, 24), (MINUTELY, 60), (SECONDLY, 60)):
+            self.inner.intervald[frequency] = [*self.inner.intervald[frequency], divisor]
 
     def __call__(self) -> Any:
         """Return the ticks of the interval that the axis shows."""
@@ -264,8 +264,8 @@ def label_time(panels: Sequence[Axes], unit: str, origin: str = "") -> None:
             axes.xaxis.set_major_locator(ticks)
             if axes.xaxis.get_tick_params()["labelbottom"]:
                 low, high = axes.get_xlim()
-                shown = [tick for tick in ticks.tick_values(low, high) if low <= tick <= high]
-                axes.set_xlabel(with_unit("time", dates.common(shown), 40))
+                visible = [tick for tick in ticks.tick_values(low, high) if low <= tick <= high]
+                axes.set_xlabel(with_unit("time", dates.common(visible), 40))
             continue
         power = scale(axes.xaxis)
         if axes.xaxis.get_tick_params()["labelbottom"]:
@@ -311,14 +311,14 @@ def wrapped(name: str, room: int) -> list[str]:
 
 
 def first_of(
-    names: Sequence[str], wanted: Sequence[str] | None, limit: int, argument: str
+    names: Sequence[str], selection: Sequence[str] | None, limit: int, argument: str
 ) -> tuple[list[str], str]:
     """Cut ``names`` to ``limit`` unless the caller chose them, and say what was left out.
 
     Returns:
         The names to draw, and a remark for the figure (empty where nothing is left out).
     """
-    if wanted is not None or len(names) <= limit:
+    if selection is not None or len(names) <= limit:
         return list(names), ""
     return list(names[:limit]), (
         f"The first {limit} of {len(names)} {argument}; choose others with {argument}=[...]."

@@ -78,7 +78,7 @@ def plot_fit(
     new = None if noise_free is None else _summary(result, "new_data")
     later = group(result, HELD_OUT)["y"] if has_group(result, HELD_OUT) else None
     truth = _true(result, "output")
-    known, (last, end) = False, forecast_span(result)
+    has_truth, (last, end) = False, forecast_span(result)
     names, note = style.first_of(pick(observed, "output", outputs), outputs, MAX_PANELS, "outputs")
     figure, panels = style.small_multiples(width, len(names), 1.35)
     for axes, name in zip(panels, names, strict=True):
@@ -104,7 +104,7 @@ def plot_fit(
                                (time[-1], mean[-1], *wide, low[-1], high[-1]))
         if last < end:
             axes.axvline(last, **END)
-        known |= _draw_truth(axes, truth, "output", name)
+        has_truth |= _draw_truth(axes, truth, "output", name)
         _draw_data(axes, data)
         if later is not None:
             axes.plot(later["time"], later.sel(output=name), **_HELD_OUT)
@@ -117,7 +117,7 @@ def plot_fit(
     handles += [Patch(color=_NOISE_FREE, label="95%, noise-free")]
     if new is not None or predictive is not None or predicted is not None:
         handles += [Patch(color=_PREDICTIVE, label="95%, new data")]
-    if known:
+    if has_truth:
         handles += [Line2D([], [], label="truth", **_TRUTH)]
     if last < end:
         handles += [Line2D([], [], label="last observation", **END)]
@@ -221,54 +221,54 @@ def trajectory_names(result: Any, kind: str) -> list[str]:
     return [str(name) for name in group(result, "trajectories")[kind].values]
 
 
-def pick(variable: xr.DataArray, kind: str, wanted: Sequence[str] | None) -> list[str]:
+def pick(variable: xr.DataArray, kind: str, selection: Sequence[str] | None) -> list[str]:
     """Return the names along ``kind`` to draw: those wanted, or all; refuse unknown ones."""
-    known = [str(name) for name in variable[kind].values]
-    if wanted is None:
-        return known
-    wanted = [wanted] if isinstance(wanted, str) else list(wanted)
-    for name in wanted:
-        if name not in known:
-            raise ValueError(unknown(kind, name, known))
-    if not wanted:
-        raise ValueError(f"{kind}s is empty; name at least one of {', '.join(known)}.")
-    return wanted
+    available = [str(name) for name in variable[kind].values]
+    if selection is None:
+        return available
+    selection = [selection] if isinstance(selection, str) else list(selection)
+    for name in selection:
+        if name not in available:
+            raise ValueError(unknown(kind, name, available))
+    if not selection:
+        raise ValueError(f"{kind}s is empty; name at least one of {', '.join(available)}.")
+    return selection
 
 
 def _panels(
     result: Any,
     kind: str,
-    wanted: Sequence[str] | None,
+    selection: Sequence[str] | None,
     width: str | float,
     colours: tuple[str, str],
 ) -> Figure:
     draws = _trajectories(result, kind)
     truth = _true(result, kind)
-    names, note = style.first_of(pick(draws, kind, wanted), wanted, MAX_PANELS, f"{kind}s")
+    names, note = style.first_of(pick(draws, kind, selection), selection, MAX_PANELS, f"{kind}s")
     figure, panels = style.small_multiples(width, len(names), 1.25)
     line, tint = colours
-    known = False
+    has_truth = False
     predicted = _predicted(result)
-    ahead = None if predicted is None else predicted.get(f"{kind}s")
+    forecast = None if predicted is None else predicted.get(f"{kind}s")
     last, end = forecast_span(result)
-    later = ahead is not None and last < end
+    later = forecast is not None and last < end
     for axes, name in zip(panels, names, strict=True):
         time, mean, low, high = _band(result, kind, name)
         axes.fill_between(time, low, high, color=tint, lw=0, zorder=1)
         axes.plot(time, mean, color=line, zorder=2)
-        if ahead is not None and later:
-            paths = ahead.sel({kind: name, "time": ahead["time"] >= time[-1]}).transpose("chain", "draw", "time")
+        if forecast is not None and later:
+            paths = forecast.sel({kind: name, "time": forecast["time"] >= time[-1]}).transpose("chain", "draw", "time")
             if paths.sizes["time"]:
                 flat = paths.values.reshape(-1, paths.sizes["time"])
                 curves = (paths["time"].values, flat.mean(axis=0), *np.quantile(flat, INTERVAL, axis=0))
                 _draw_ahead(axes, curves, line, (tint,), (time[-1], mean[-1], low[-1], high[-1]))
             axes.axvline(last, **END)
-        known |= _draw_truth(axes, truth, kind, name)
+        has_truth |= _draw_truth(axes, truth, kind, name)
         style.label_values(axes, name, unit_of(draws, name))
     style.label_time(panels, time_unit(result), time_origin(result))
     figure.align_ylabels(panels)
     handles = [Line2D([], [], color=line, label="posterior mean"), Patch(color=tint, label="95%")]
-    if known:
+    if has_truth:
         handles += [Line2D([], [], label="truth", **_TRUTH)]
     if later:
         handles += [Line2D([], [], label="last observation", **END)]
@@ -327,9 +327,9 @@ def forecast_span(result: Any) -> tuple[float, float]:
     return float(predicted.attrs.get("last_observation", end)), end
 
 
-def _covers(times: np.ndarray, at: np.ndarray) -> bool:
+def _covers(times: np.ndarray, requested: np.ndarray) -> bool:
     """Whether there are predictions all along the trajectories."""
-    return len(times) >= _BARS and bool(set(at.tolist()) <= set(times.tolist()))
+    return len(times) >= _BARS and bool(set(requested.tolist()) <= set(times.tolist()))
 
 
 def _noisy_band(predicted: xr.Dataset) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -361,8 +361,8 @@ def _draw_ahead(axes: Axes, curves: Sequence[np.ndarray], line: str, tints: Sequ
     filled = len(curves[0]) >= _BARS
     if filled and start and start[0] < curves[0][0]:
         curves = [np.append(first, curve) for first, curve in zip(start, curves, strict=True)]
-    time, mean, *ends = curves
-    for order, (low, high, tint) in enumerate(zip(ends[::2], ends[1::2], tints, strict=True), start=1):
+    time, mean, *bounds = curves
+    for order, (low, high, tint) in enumerate(zip(bounds[::2], bounds[1::2], tints, strict=True), start=1):
         if filled:
             axes.fill_between(time, low, high, color=tint, lw=0, zorder=order)
         else:
@@ -384,24 +384,24 @@ def _band(result: Any, kind: str, name: str) -> tuple[np.ndarray, np.ndarray, np
 
 def _summary(result: Any, name: str) -> xr.DataArray | None:
     """Return the summary (statistic, at, ...) of trajectories; None where there are draws alone."""
-    found = group(result, "trajectories").get(f"{name}_summary")
-    return None if found is None or "series" in found.dims else found.transpose("statistic", "at", ...)
+    summary = group(result, "trajectories").get(f"{name}_summary")
+    return None if summary is None or "series" in summary.dims else summary.transpose("statistic", "at", ...)
 
 
 def _widened(
-    predictive: xr.DataArray, at: np.ndarray, low: np.ndarray, high: np.ndarray
+    predictive: xr.DataArray, positions: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return times from the first to the last measurement and the predictive interval there."""
     measured, which = np.unique(predictive["time"].values, return_inverse=True)
     draws = predictive.values.reshape(-1, predictive.sizes["time"])
-    ends = np.array([quantiles(draws[:, which == k].ravel(), INTERVAL) for k in range(len(measured))])
-    below = ends[:, 0] - np.interp(measured, at, low)
-    above = ends[:, 1] - np.interp(measured, at, high)
-    grid = np.union1d(measured, at[(at >= measured[0]) & (at <= measured[-1])])
+    bounds = np.array([quantiles(draws[:, which == k].ravel(), INTERVAL) for k in range(len(measured))])
+    below = bounds[:, 0] - np.interp(measured, positions, low)
+    above = bounds[:, 1] - np.interp(measured, positions, high)
+    grid = np.union1d(measured, positions[(positions >= measured[0]) & (positions <= measured[-1])])
     return (
         grid,
-        np.interp(grid, at, low) + np.interp(grid, measured, below),
-        np.interp(grid, at, high) + np.interp(grid, measured, above),
+        np.interp(grid, positions, low) + np.interp(grid, measured, below),
+        np.interp(grid, positions, high) + np.interp(grid, measured, above),
     )
 
 
