@@ -30,7 +30,7 @@ from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.interruption import was_interrupt
 from lfm_ppl.inference.posterior import evenly_spaced, scores, trajectories
 from lfm_ppl.inference.progress import Counter
-from lfm_ppl.inference.samplers import FILTERED
+from lfm_ppl.inference.samplers import GAUSSIAN_FILTER_SAMPLERS
 from lfm_ppl.inference.site_failures import failures_at, path_ess, site_failures
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.results import arviz_data
@@ -63,7 +63,7 @@ class FitProblem:
         clock: calendar time of t = 0 (None where times are plain numbers), and unit of time.
         truth: of simulated data.
         description: attributes of the result that do not depend on the draws.
-        user_attributes: further attributes, which replace those of the same name.
+        user_attributes: further attributes; they replace others of the same name.
         start_time: of `time.perf_counter`.
     """
 
@@ -138,7 +138,7 @@ def post_process(problem: FitProblem, draws: PosteriorDraws, store: Checkpoint |
             "scores of the observations", lambda: scores(bound, values, **batch_options("scores")), None)
         processed.attributes = _site_attributes(bound, draws, values, options)
         processed.warnings += best_effort("resolution of the forces", lambda: resolution_warnings(bound, values), [])
-        if options.sampler in FILTERED:
+        if options.sampler in GAUSSIAN_FILTER_SAMPLERS:
             processed.warnings += best_effort("error of the likelihood", lambda: approximation_warnings(
                 bound, values, _log_likelihood(bound, processed.scores)), [])
         processed.trajectories = best_effort("trajectories", lambda: draw_paths(
@@ -164,7 +164,7 @@ def _site_attributes(bound: BoundModel, draws: PosteriorDraws, values: Mapping[s
                      options: FitOptions) -> dict[str, str]:
     """Return attributes on the convergence of the sites and on the weights of constrained trajectories."""
     reports, z = {}, draws.z
-    if options.sampler in FILTERED and z is not None:
+    if options.sampler in GAUSSIAN_FILTER_SAMPLERS and z is not None:
         reports[arviz_data.SITES] = best_effort(
             "convergence of the sites", lambda: site_failures(bound, z, options.seed), None)
     elif options.sampler == "map" and bound.site.example.constrained:
@@ -190,8 +190,8 @@ def draw_paths(key: jax.Array, bound: BoundModel, values: Mapping[str, np.ndarra
         **batch_options: ``show`` and ``store`` of `lfm_ppl.inference.posterior.trajectories`.
 
     Returns:
-        The chosen draws of each chain; their trajectories (C, S, ...), None if there are none; the times, None for
-        those of the data.
+        The chosen draws of each chain; their trajectories (C, S, ...), None if there are none; the times, None for the
+        times of the data.
     """
     chains, samples = values[bound.sites[0]].shape[:2]
     draw_indices, rows = evenly_spaced(chains, samples, count)

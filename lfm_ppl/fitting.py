@@ -65,7 +65,7 @@ _MODE = "mode"
 """Name of the mode and its draws in the folder of a run."""
 
 _MODE_SEARCH = "posterior mode: compiling and searching"
-_START_SEARCH = "start: compiling, and looking for where chains begin"
+_START_SEARCH = "start: compiling and searching for starting points"
 
 
 def fit(
@@ -101,85 +101,86 @@ def fit(
     Args:
         numpyro_model: ``model(times, y=None, **model_kwargs)`` with one site
             ``numpyro.sample(name, lfm.MarginalLikelihood(...), obs=y)``, or a `lfm.panel` in a plate.
-        times: (T,), non-decreasing. Or, without ``y``, the whole data: `lfm.Data`, a DataFrame of pandas or polars or
-            an xarray Dataset (see `lfm.read_table`); the model then gets the known inputs as its argument ``inputs``.
-            Dates (``datetime64``, a DatetimeIndex, ...) become numbers since the midnight before the first of them, in
-            the unit that the model names (``units={"time": "h"}``), else in that of the time between rows.
+        times: (T,), non-decreasing. Or, without ``y``, times and observations together: `lfm.Data`, a DataFrame of
+            pandas or polars or an xarray Dataset (see `lfm.read_table`); the model then gets the known inputs as its
+            argument ``inputs``. Dates (``datetime64``, a DatetimeIndex, ...) become numbers that count from the
+            midnight before the first date, in the unit that the model names (``units={"time": "h"}``), else in the unit
+            of the time between rows.
         y: (T, D), NaN or masked where missing; (B, T, D) for a panel.
         sampler: "nuts", "ram" (robust adaptive Metropolis), "pmmh" (particle-marginal RAM: a particle filter estimates
             the likelihood, and the posterior is exact up to its integration steps), or "map" (posterior mode; the draws
             come from its Laplace approximation).
         chains: number of chains.
-        warmup: number of warm-up steps in each; by default 1000, and 300 for NUTS from the Laplace approximation.
-        samples: number of draws in each, by default 1000; for "map", in all, by default 400.
-        thin: steps of the chain that make one draw, in the warm-up too. By default 1 for NUTS, 5 for each parameter
-            for RAM, whose steps are cheap and short, and 2 for each parameter for particle-marginal RAM.
-        seed: of everything random.
+        warmup: warm-up draws of each chain; by default 1000, and 300 for NUTS from the Laplace approximation.
+        samples: draws of each chain, by default 1000; for "map", draws in all, by default 400.
+        thin: steps of one draw, also in the warm-up. By default 1 for NUTS, 5 for each parameter for RAM, whose steps
+            are cheap and short, and 2 for each parameter for particle-marginal RAM.
+        seed: seed of all random numbers.
         at: times of the trajectories, and of new observations; by default a grid over the data. Times after the last
-            observation are forecasts, see `forecast`. Dates where the times of the data are dates; numbers count in
-            the unit of the `lfm.Data`, or else of the model.
-        trajectory_draws: number of posterior draws, spread over the chains, for which trajectories are drawn; 0: none.
+            observation are forecasts, see `forecast`. Dates where the times of the data are dates; numbers are in the
+            unit of the `lfm.Data`, or else of the model.
+        trajectory_draws: number of posterior draws, spread over the chains, that get a trajectory; 0: none.
         model_kwargs: keyword arguments of the model.
-        fixed: parameters that are not learnt: name -> value, ``{"decay": 0.8}`` or ``{"decay[CDKN1A]": 0.8}``.
+        fixed: fixed parameters: name -> value, ``{"decay": 0.8}`` or ``{"decay[CDKN1A]": 0.8}``.
         init: starting points. By default, or with "map", draws about the posterior mode. For NUTS they come from the
-            Laplace approximation N(mode, C) widened to twice its standard deviations, and C, the inverse Hessian, is
-            the (dense) inverse mass matrix with which the warm-up begins and towards which its estimates are
-            regularised. Where the Laplace approximation is not usable (a flat direction, a Hessian that is not positive
-            definite, several modes of similar height, more than 100 parameters) NUTS starts as with "median", the prior
-            median and a unit mass matrix, and one line says why. Or a NumPyro strategy.
+            Laplace approximation N(mode, C) widened to twice its standard deviations. C, the inverse Hessian, is the
+            (dense) inverse mass matrix at the start of the warm-up, and its estimates are regularised towards C. Where
+            the Laplace approximation is not usable (a flat direction, a Hessian that is not positive definite, several
+            modes of similar height, more than 100 parameters), NUTS starts as with "median", at the prior median with a
+            unit mass matrix, and prints one line with the reason. Or a NumPyro strategy.
         sampler_options: further arguments of NUTS, `RAM` or `ParticleMarginalRAM`, for example
             ``{"target_accept_prob": 0.95}`` or ``{"particles": 500, "delayed": True}``.
         chain_method: "parallel", "vectorized" or "sequential"; by default parallel where there are as many devices as
             chains (``numpyro.set_host_device_count(chains)`` before JAX starts), sequential otherwise.
-        progress: show on standard error how far it is: a bar, or a line every 30 s where there is no terminal.
-        truth: of simulated data (``lfm.Data.truth``), stored beside the results for plots.
-        name: of the model, for the record.
-        checkpoint: a folder to keep the run in while it goes on: the state of the chains and their draws, written at
-            least every few seconds, and a ``posterior.nc`` with the draws so far, in the end with the whole result.
-            A process that is killed loses the last block of draws.
-        resume: go on with the run in ``checkpoint``, to the same draws as if it had not been stopped. Everything must
-            be as it was: model, data, settings and versions. A run that is finished is read and returned; in a folder
-            that is empty or does not exist a new one begins.
+        progress: show the progress on standard error: a bar, or a line every 30 s where there is no terminal.
+        truth: true values of simulated data (``lfm.Data.truth``), stored in the result for plots.
+        name: name of the model in the result.
+        checkpoint: folder that stores the run: the state of the chains and their draws, written every few seconds, and
+            ``posterior.nc`` with the draws so far and at the end with the complete result. A killed process loses the
+            last block of draws.
+        resume: continue the run in ``checkpoint``; its draws are those of an uninterrupted run. Model, data, settings
+            and versions must be the same. A finished run is read and returned; in an empty or missing folder a new run
+            starts.
         overwrite: replace a result or an unfinished run in ``checkpoint``.
         attributes: further attributes of the result.
-        dims: parameter -> names of its dimensions, ``{"decay": ["gene"]}``. By default the plates that it stands in,
-            ``event_dims`` of NumPyro's ``infer``, "output" for a vector with an entry for each output.
-        coords: dimension -> labels, ``{"gene": ["CDKN1A", "SESN1"]}``; of "output", the names of the columns of y, and
-            of "series", those of a panel, too. By default columns of a data frame keep their names.
+        dims: parameter -> names of its dimensions, ``{"decay": ["gene"]}``. By default the plates around it,
+            ``event_dims`` of NumPyro's ``infer``, and "output" for a vector with one entry for each output.
+        coords: dimension -> labels, ``{"gene": ["CDKN1A", "SESN1"]}``, also of the dimensions "output" (columns of y)
+            and "series" (series of a panel). By default the column names of a data frame are the labels of "output".
 
-    Ctrl-C ends the sampling after the present block of steps, some two seconds. With a ``checkpoint`` the draws so far
-    are returned, with an attribute ``partial`` and a warning; without one they are the attribute ``result`` of the
-    KeyboardInterrupt that is raised. A second Ctrl-C ends it at once.
+    Ctrl-C ends the sampling after the present block of steps, about two seconds. With a ``checkpoint`` the finished
+    draws are returned, with an attribute ``partial`` and a warning; without one they are the attribute ``result`` of
+    the KeyboardInterrupt. A second Ctrl-C ends the run at once.
 
     Returns:
         An ArviZ object (``InferenceData`` on ArviZ 0.23, ``xarray.DataTree`` on 1.x) with the groups
 
-        - ``posterior``: parameters, with coordinates; what ``numpyro.deterministic`` computes of them has the attribute
+        - ``posterior``: parameters, with coordinates; sites of ``numpyro.deterministic`` have the attribute
           ``derived``;
         - ``sample_stats``;
         - ``log_likelihood``: the Gaussian filter's leave-one-out conditionals log p(y_k | y_-k, theta), which make
           ``az.loo`` right for dependent data;
         - ``one_step_ahead``: log p(y_k | y_1:k-1, theta) and standardised residuals;
-        - ``trajectories``: forces, states, deterministics of these and noise-free outputs at ``at``, given the data;
-          from the Gaussian smoother, and for "pmmh" from the particle smoother. Where densities are known, mean and 95%
-          interval of each, ``forces_summary`` and so on, and of new data, ``new_data_summary``;
+        - ``trajectories``: forces, states, deterministics and noise-free outputs at ``at``, given the data; from the
+          Gaussian smoother, and for "pmmh" from the particle smoother. Where densities are known, mean and 95% interval
+          of each (``forces_summary`` and so on) and of new data (``new_data_summary``);
         - ``posterior_predictive``: replicated data along these trajectories. (``numpyro.infer.Predictive`` with the
           same draws simulates NEW forces instead.)
-        - ``predictions``: with ``at``, new observations at these times, with their noise; see `forecast`;
-        - ``observed_data``, and ``truth`` and ``constant_data`` (known inputs) where there are any.
+        - ``predictions``: with ``at``, new observations at these times, with noise; see `forecast`;
+        - ``observed_data``, and ``truth`` and ``constant_data`` (known inputs) if there are any.
 
     Raises:
-        ValueError, TypeError: unknown sampler, wrong shapes, parameters to fix that do not exist, and so on; a run to
-            go on with that was of something else; no point to start from, with the part of the log density that is
-            not finite at the prior median.
-        FileExistsError, FileNotFoundError: the folder holds a result or a run; no run to go on with.
-        KeyboardInterrupt: Ctrl-C before there was a draw, without a checkpoint, or for the second time.
+        ValueError, TypeError: unknown sampler, wrong shapes, unknown parameters in ``fixed``, and so on; other model,
+            data or settings than those of the resumed run; no starting point of finite density (the message names the
+            part of the log density that is not finite at the prior median).
+        FileExistsError, FileNotFoundError: the folder holds a result or a run; there is no run to resume.
+        KeyboardInterrupt: Ctrl-C before the first draw, without a checkpoint, or for the second time.
 
     Warns:
         UserWarning: the result is partial.
         ConvergenceWarning: R-hat above 1.01, fewer than 100 effective draws a chain, divergences, a degenerate
             posterior mode; each with a remedy.
-        ApproximationWarning: more iterations, shorter steps or a shorter longest step would move the posterior.
+        ApproximationWarning: more iterations, shorter steps or a smaller ``max_step`` would change the posterior.
 
     Example:
         >>> import jax.numpy as jnp, numpyro, numpyro.distributions as dist, lfm_ppl as lfm
@@ -227,7 +228,7 @@ def fit(
     if sampler == "map":
         chains, warmup, thin, chain_method = 1, 0, None, None
     else:
-        thin = thin or SAMPLERS[sampler].steps_a_draw * bound.size or 1
+        thin = thin or SAMPLERS[sampler].steps_per_draw * bound.size or 1
         chain_method = sampling.available_method(chain_method, chains)
     options = FitOptions(sampler, chains, warmup, samples, thin, seed, dict(fixed or {}), at, trajectory_draws, init,
                          dict(sampler_options or {}), chain_method)

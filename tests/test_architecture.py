@@ -29,7 +29,7 @@ LAYERS = (
     ("orbits.training", "orbits.learning", "orbits.prediction"),
     ("results", "engine"),
     ("data_binding", "fit_options", "fit_starts", "fit_results", "fitting", "forecasting"),
-    ("backtesting", "conversion", "fitting_many"),
+    ("backtesting", "conversion", "fit_tasks", "fitting_many"),
     ("loading",),
     ("experiments",),
     ("cli", "__main__"),

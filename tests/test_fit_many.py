@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 
 import lfm_ppl as lfm
-from lfm_ppl import fitting_many
+from lfm_ppl import fit_tasks
 from lfm_ppl.cli import main
 from lfm_ppl.results import arviz_data
 from tests.inference import linear_motif as motif
@@ -48,7 +48,7 @@ def folder(tmp_path_factory):
 def test_each_result_is_that_of_a_fit(folder):
     _, fits, yielded = folder
     assert [one.name for one in yielded] == ["plant 0", "plant 1", "plant 2"] and len(fits) == 3
-    own = lfm.fit(motif.model, *data_sets()["plant 2"], seed=fitting_many.seed_of("plant 2"), progress=False, **OPTIONS)
+    own = lfm.fit(motif.model, *data_sets()["plant 2"], seed=fit_tasks.seed_of("plant 2"), progress=False, **OPTIONS)
     found = yielded[2].result
     assert arviz_data.groups(found) == arviz_data.groups(own)
     for name in arviz_data.groups(own):
@@ -86,8 +86,8 @@ def test_one_table_and_one_file_over_all(folder):
 
 def test_what_is_stored_is_not_fitted_again(folder, monkeypatch):
     out, _, yielded = folder
-    fitted, own = [], fitting_many._Fit.__call__
-    monkeypatch.setattr(fitting_many._Fit, "__call__", lambda self, task: fitted.append(task.name) or own(self, task))
+    fitted, call = [], fit_tasks.FitDataSet.__call__
+    monkeypatch.setattr(fit_tasks.FitDataSet, "__call__", lambda fit, task: fitted.append(task.name) or call(fit, task))
     again = list(lfm.fit_many(motif.model, data_sets(), out=out, **OPTIONS))
     assert [one.stored for one in again] == [True, True, False] and again[2].name == "plant 1" and len(fitted) == 1
     for name, values in draws(yielded[2].result).items():
@@ -136,7 +136,7 @@ def test_bad_arguments(sets, options, message):
 
 def test_names_become_files_that_differ():
     names = ["a/b", "a b", "a_b", "ä", "..", "x" * 200, "x" * 201]
-    files = [fitting_many.file_name(name) for name in names]
+    files = [fit_tasks.file_name(name) for name in names]
     assert len(set(files)) == len(files) and files[2] == "a_b" and max(map(len, files)) < 100
 
 
@@ -161,7 +161,7 @@ def model(times, y=None):
 def line(tmp_path, monkeypatch, capsys, folder):
     """Run the command in an empty folder, where a fit takes no time; return (exit code, output, errors)."""
     _, _, (one, *_) = folder
-    monkeypatch.setattr(fitting_many, "fit", functools.wraps(lfm.fit)(lambda *given, **named: one.result))
+    monkeypatch.setattr(fit_tasks, "fit", functools.wraps(lfm.fit)(lambda *given, **named: one.result))
     return command(tmp_path, monkeypatch, capsys)
 
 

@@ -76,7 +76,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _write(one: Any, folder: Path, attributes: dict[str, Any]) -> None:
     """Write the result of a data set as that of a single fit, but for its figures, which `lfm-ppl plot` draws."""
-    from lfm_ppl.fitting_many import file_name
+    from lfm_ppl.fit_tasks import file_name
     from lfm_ppl.results import arviz_data, files, html_report, tables
 
     target = folder / file_name(one.name)

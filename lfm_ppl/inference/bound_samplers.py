@@ -31,7 +31,7 @@ class BoundSampler:
 
     Attributes:
         bound: the model and its data.
-        algorithm: the Markov chain; its data are those of ``bound``.
+        algorithm: the Markov chain; its data are ``bound.argument``.
         identity: key of the compiled programs; it holds everything that the algorithm depends on besides the model.
         evaluate: from z (d,) to the log density and, if the algorithm uses it, the gradient (d,), else zeros.
         tuning: arrays for ``algorithm.init``, an argument of the compiled program.
@@ -57,7 +57,7 @@ def nuts_sampler(bound: BoundModel, num_warmup: int, options: Mapping[str, Any],
         num_warmup: warm-up steps of each chain.
         options: arguments of NUTS.
         laplace: approximation of the posterior. Its covariance is the initial inverse mass matrix, which is dense, and
-            regularises those of the warm-up. None: the warm-up starts with the identity.
+            regularises the estimates of the warm-up. None: the warm-up starts with the identity.
     """
     completed = nuts_options(bound, options, laplace)
     gradient = bound.gradient(bool(completed["forward_mode_differentiation"]))

@@ -1,4 +1,4 @@
-"""Ctrl-C while chains run: the block of draws that is under way ends first."""
+"""Ctrl-C while chains run: the present block of draws ends first."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from typing import Any
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 LISTENERS: list[Callable[[], None]] = []
-"""Called when a request is taken: the main thread runs, and will end by itself."""
+"""Functions that are called when Ctrl-C becomes a request: the main thread is running and will stop soon."""
 
 
 class Interruption:
-    """Within this context Ctrl-C is a request, once `defer` was called; a second one raises KeyboardInterrupt.
+    """Context in which Ctrl-C is a request to stop after a call of `defer`; a second one raises KeyboardInterrupt.
 
-    It takes the place of Python's own handler alone (``signal.default_int_handler``), in the main thread: whoever has
-    set another one wants something else. The command line sets Python's handler for SIGTERM, too.
+    It replaces only Python's own handler (``signal.default_int_handler``), in the main thread: any other handler is the
+    user's choice. The command line sets Python's handler for SIGTERM, too.
 
     Attributes:
-        requests: how often somebody has asked to stop. Counted also where KeyboardInterrupt is raised, because that may
-            be lost: Python ignores what is raised within a callback of the garbage collector, of which JAX has one.
+        requests: number of signals. Signals that raise KeyboardInterrupt count, too, because Python drops an exception
+            that is raised within a callback of the garbage collector, and JAX has such a callback.
     """
 
     def __init__(self) -> None:
@@ -44,28 +44,31 @@ class Interruption:
             signal.signal(number, signal.default_int_handler)
 
     def defer(self) -> None:
-        """From now on there is something to lose: let the present block end before all stops."""
+        """Let the present block end before the run stops, from now on."""
         self._deferring = True
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         self.requests += 1
         if self.requests > 1 or not self._deferring:
             raise KeyboardInterrupt
-        for heard in LISTENERS:
-            heard()
+        for notify in LISTENERS:
+            notify()
         print("\nstopping after this block of draws; once more to stop at once", file=sys.stderr, flush=True)
 
 
 def was_interrupt(error: BaseException | None) -> bool:
-    """Whether an error is Ctrl-C, or what a library made of it, as JAX does where two keys of a cache are compared.
+    """Return whether an error is Ctrl-C or was caused by it.
+
+    JAX raises an error of its own, with the name of the exception in its text, where Ctrl-C comes while it compares
+    two keys of a cache.
 
     Example:
         >>> was_interrupt(KeyboardInterrupt()), was_interrupt(ValueError("x is negative"))
         (True, False)
     """
-    seen: set[int] = set()  # a chain of errors may be a ring
-    while error is not None and id(error) not in seen:
-        seen.add(id(error))
+    visited: set[int] = set()  # a chain of errors may be a ring
+    while error is not None and id(error) not in visited:
+        visited.add(id(error))
         if isinstance(error, KeyboardInterrupt) or "KeyboardInterrupt" in str(error):
             return True
         error = error.__cause__ or error.__context__

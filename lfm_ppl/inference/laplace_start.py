@@ -4,8 +4,8 @@
 2. The Laplace approximation N(mode, C) is usable where the search converged, the Hessian is positive definite, and no
    other start ended in a second mode of similar height.
 3. Each chain starts at a draw of the approximation widened to `_WIDENING` standard deviations, so that the chains are
-   overdispersed and R-hat compares chains that came from different places. Draws far outside of the posterior, as
-   beyond the edge of a skewed posterior, are pulled towards the mode.
+   overdispersed, which R-hat requires. Draws far outside of the posterior, as beyond the edge of a skewed posterior,
+   are pulled towards the mode.
 4. C is the initial inverse mass matrix, and it regularises the matrices that NUTS estimates in its warm-up.
 
 Source: Stan Development Team, Stan reference manual, "HMC algorithm parameters" (windows and regularisation of the
@@ -24,7 +24,7 @@ from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.map import MAPResult, mode_of
 
 MAX_PARAMETERS = 100
-"""Most unconstrained parameters for a dense mass matrix: a step costs d^2, and its estimate needs some d draws."""
+"""Largest number of parameters with a dense mass matrix: a step costs d^2, and the estimate needs about d draws."""
 
 _WIDENING = 2.0
 """Standard deviations of the starting points, in units of the Laplace approximation's."""
@@ -36,7 +36,7 @@ _SEPARATION = 3.0
 """Distance in standard deviations from which two ends of the search are two modes."""
 
 _PULLS = 6
-"""Number of times that the distance of a starting point to the mode is halved before the mode itself is taken."""
+"""Number of halvings of the distance of a starting point to the mode, before the mode itself is the start."""
 
 
 class Laplace(eqx.Module):

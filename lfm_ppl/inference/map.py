@@ -1,4 +1,13 @@
-"""The posterior mode of a NumPyro model, and the Gaussian (Laplace) approximation around it."""
+"""The posterior mode of a NumPyro model, and the Gaussian (Laplace) approximation around it.
+
+1. Search from the prior median, or from a given point, and from prior draws with L-BFGS.
+2. Polish the best end point by Newton's method.
+3. Decompose the Hessian there: the covariance is its inverse, and flat directions are reported.
+4. Report why the point is not a minimum: derivatives that are not finite, a saddle point, a coordinate that runs away,
+   or a remaining slope.
+
+Source: Tierney and Kadane (1986), Journal of the American Statistical Association 81, 82-86.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +30,7 @@ from lfm_ppl.inference.optimise import End, Minimum, Objective, newton, quasi_ne
 _HESSIANS = ("autodiff", "finite-differences")
 _ATTEMPTS = 20
 _SEARCH = {"maxcor": 40, "ftol": 1e-9, "gtol": 1e-7}
-"""Of L-BFGS, which ends where a step gains less than 1e-9 of the log density; Newton's method goes on from there."""
+"""Options of L-BFGS: it ends where a step gains less than 1e-9 of the log density, and Newton's method continues."""
 _REMEDY = (
     "Try more restarts, a starting point of your own (init={'site': value}), more max_iterations, "
     "or a prior that says more about these parameters."
@@ -37,8 +46,7 @@ class MAPResult:
         deterministic: name of a deterministic site -> value at the mode.
         unconstrained: site name -> unconstrained value; ``init_params`` for ``MCMC.run``.
         mode: the unconstrained parameters as one vector, (d,), in flat order.
-        coordinates: names of the entries of ``mode``, in flat order: sites sorted by name, each in
-            C order.
+        coordinates: names of the entries of ``mode``, in flat order: sites sorted by name, each in C order.
         covariance: inverse Hessian of minus the log density at the mode, (d, d), unconstrained, in
             flat order; positive definite; NaN where no finite Hessian exists.
         log_density: log joint density at the mode: of the unconstrained parameters (with the
@@ -47,13 +55,12 @@ class MAPResult:
             is Gaussian in the space whose mode this is.
         converged: whether the search ended at a minimum.
         message: how the search ended.
-        unidentified: coordinates along which the density is flat; their variances stand for "large"
-            and have no other meaning.
-        runaway: coordinates along which the search went on and on, to the edge of the support or to infinity.
-        restart_log_densities: log density reached from each start, (restarts,); -inf where no
-            possible starting point was found. Differences above 1e-6 of the value mean several modes.
-        restart_ends: where the search from each start ended, (restarts, d); NaN where there was no start.
-        evaluations: number of gradients that were computed.
+        unidentified: coordinates along which the density is flat; their variances are arbitrary large numbers.
+        runaway: coordinates along which the search diverged, to the edge of the support or to infinity.
+        restart_log_densities: log density at the end of each search, (restarts,); -inf where no starting point has a
+            finite density. Differences above 1e-6 of the value mean several modes.
+        restart_ends: end point of each search, (restarts, d); NaN where there is no starting point.
+        evaluations: number of computed gradients.
     """
 
     parameters: dict[str, np.ndarray]
@@ -116,27 +123,25 @@ def map_estimate(
         log p(y, T(z)) + log |dT/dz|     (jacobian=True, the default)
         log p(y, theta)                  (jacobian=False)
 
-    The first is the mode of the density that MCMC explores. It is NOT the mode of the density of
-    ``theta``, which depends on the parametrisation; the second is. The covariance is the inverse
-    Hessian over ``z`` of minus the maximised function. Several starts go through L-BFGS; the best
-    end point is polished by Newton's method.
+    The first is the mode of the density that MCMC explores. The mode depends on the parametrisation: only the second
+    is the mode of the density of ``theta``. The covariance is the inverse Hessian over ``z`` of minus the maximised
+    function. L-BFGS searches from several starts, and Newton's method polishes the best end point.
 
     Args:
         model: a NumPyro model whose latent sites are continuous.
         *args: its positional arguments, data included.
-        init: where the first start lies: a NumPyro strategy, or site name -> constrained value (the
-            prior median elsewhere); by default ``init_to_median``. The other starts are prior
-            draws.
+        init: the first start: a NumPyro strategy, or site name -> constrained value (the prior median for other
+            sites); by default ``init_to_median``. The other starts are prior draws.
         restarts: number of starts, at least one.
         seed: seed of the starts, a whole number.
         model_kwargs: keyword arguments of the model.
-        jacobian: which mode, see above.
+        jacobian: the kind of mode, see above.
         hessian: ``"autodiff"``, or ``"finite-differences"`` of the gradient: about 9 digits instead
             of 15, no second derivatives, and for a latent force model less than half the time to
-            compile. By default differences where the model has a filter, and ``"autodiff"`` elsewhere.
-        forward_mode: take derivatives in forward mode, which is the only one where the model loops
-            with ``jax.lax.while_loop``; by default with up to ten parameters, where it is faster.
-        max_iterations: of L-BFGS, for each start.
+            compile. By default differences for a model with a filter, and ``"autodiff"`` for others.
+        forward_mode: take derivatives in forward mode, the only possible one for a model with a
+            ``jax.lax.while_loop``; by default with up to ten parameters, where it is faster.
+        max_iterations: largest number of iterations of L-BFGS for each start.
 
     Returns:
         The mode, with ``parameters``, ``covariance``, ``log_evidence``, ``sample(key, n)``.
@@ -183,21 +188,21 @@ def mode_of(bound: BoundModel, *, init: Any = None, restarts: int = 4, seed: int
     """Return the posterior mode of a bound model; arguments as in `map_estimate`."""
     objective = bound.objective(jacobian, forward_mode, exact_hessian)
     starts = _starts(bound, jax.random.key(seed), objective.value, init, restarts)
-    nowhere = End(np.full(bound.size, np.nan), np.inf)
-    ends = [nowhere if start is None else quasi_newton(objective, start, max_iterations, options=_SEARCH)
-            for start in starts]
-    minimum = newton(objective, min(ends, key=lambda end: end.value).point)
-    return _result(bound, objective, minimum, ends, jacobian)
+    no_end = End(np.full(bound.size, np.nan), np.inf)
+    search_ends = [no_end if start is None else quasi_newton(objective, start, max_iterations, options=_SEARCH)
+                   for start in starts]
+    minimum = newton(objective, min(search_ends, key=lambda end: end.value).point)
+    return _result(bound, objective, minimum, search_ends, jacobian)
 
 
 def _starts(
     model: BoundModel, key: jax.Array, value: Callable, init: Any, restarts: int
 ) -> list[np.ndarray | None]:
-    """Return one vector (d,) of finite density for each start, None where there is none."""
+    """Return one vector (d,) of finite density for each start; None where there is none."""
     first, attempts = init or init_to_median, _ATTEMPTS
     check_sites(model, init)
     if isinstance(init, Mapping):
-        first, attempts = partial(_init_to_given, init), 1
+        first, attempts = partial(_init_to_values, init), 1
     first_key, *keys = jax.random.split(key, restarts)
     start = _possible_start(model, value, first_key, first, attempts)
     if isinstance(init, Mapping) and start is None:
@@ -205,15 +210,14 @@ def _starts(
             f"the density is zero or not finite at init={dict(init)!r}. Give values inside the "
             "support of their priors at which the model can produce the data."
         )
-    found = [start]
-    found += [_possible_start(model, value, k, init_to_sample, _ATTEMPTS) for k in keys]
-    if all(start is None for start in found):
+    starts = [start, *(_possible_start(model, value, k, init_to_sample, _ATTEMPTS) for k in keys)]
+    if all(start is None for start in starts):
         raise ValueError(
             f"found no point of finite density in {restarts} x {_ATTEMPTS} draws from the prior. "
             "Give a starting point, init={'site': value}, or check the model: its log density is "
             "-inf or NaN."
         )
-    return found
+    return starts
 
 
 def check_sites(model: BoundModel, init: Any) -> None:
@@ -233,7 +237,7 @@ def _possible_start(
     return None
 
 
-def _init_to_given(values: Mapping[str, Any], site: dict) -> Any:
+def _init_to_values(values: Mapping[str, Any], site: dict) -> Any:
     if site["type"] != "sample" or site["is_observed"] or site["name"] not in values:
         return init_to_median(site)
     shape = tuple(site["kwargs"].get("sample_shape") or ()) + tuple(site["fn"].shape())
@@ -247,7 +251,7 @@ def _init_to_given(values: Mapping[str, Any], site: dict) -> Any:
 
 
 def _result(
-    bound: BoundModel, objective: Objective, minimum: Minimum, ends: list[End], jacobian: bool
+    bound: BoundModel, objective: Objective, minimum: Minimum, search_ends: list[End], jacobian: bool
 ) -> MAPResult:
     point, curvature, names = minimum.point, minimum.curvature, bound.names
     unconstrained = {k: np.asarray(v) for k, v in bound.unravel(point).items()}
@@ -266,7 +270,7 @@ def _result(
             "informative prior, or fix one of them.",
             stacklevel=4,
         )
-    # The Jacobian belongs to the evidence whichever mode was asked for: the Hessian is over z.
+    # The evidence includes the Jacobian for either kind of mode, since the Hessian is over z.
     energy = minimum.value if jacobian else -float(bound.log_density(point))
     return MAPResult(
         parameters={k: v for k, v in values.items() if k in unconstrained},
@@ -281,8 +285,8 @@ def _result(
         message=message or "converged",
         unidentified=unidentified,
         runaway=tuple(np.array(names)[_runaway(minimum)]),
-        restart_log_densities=np.array([-end.value for end in ends]),
-        restart_ends=np.stack([end.point for end in ends]),
+        restart_log_densities=np.array([-end.value for end in search_ends]),
+        restart_ends=np.stack([end.point for end in search_ends]),
         evaluations=objective.evaluations,
         _factor=factor,
         _constrain=bound.constrain_draws,
@@ -290,7 +294,7 @@ def _result(
 
 
 def _verdict(minimum: Minimum, names: tuple[str, ...]) -> str:
-    """Return why the point is not a minimum, an empty string if it is one."""
+    """Return why the point is not a minimum; an empty string if it is one."""
     curvature = minimum.curvature
     if curvature is None:
         return "the derivatives are not finite at the end of the search."
@@ -298,17 +302,17 @@ def _verdict(minimum: Minimum, names: tuple[str, ...]) -> str:
     if np.any(negative):
         where = ", ".join(names[i] for i in curvature.coordinates(negative))
         return f"the search ended at a saddle point, in a direction of {where}."
-    away = _runaway(minimum)
-    if np.any(away):
-        where = ", ".join(np.array(names)[away])
+    is_runaway = _runaway(minimum)
+    if np.any(is_runaway):
+        where = ", ".join(np.array(names)[is_runaway])
         return f"{where} runs away; the mode may lie at the edge of the support or at infinity."
     tolerance = 1e-6 if jnp.result_type(float) == jnp.float64 else 1e-3
-    left = max(minimum.decrement, curvature.flat_slope(minimum.gradient))
-    if left > tolerance:
-        return f"the log density still rises by about {left:.1e} within one step."
+    increase = max(minimum.decrement, curvature.flat_slope(minimum.gradient))
+    if increase > tolerance:
+        return f"the log density still rises by about {increase:.1e} within one step."
     return ""
 
 
 def _runaway(minimum: Minimum) -> np.ndarray:
-    """Return along which coordinates (d,) Newton's step is long where the search ended."""
+    """Return whether Newton's step is long along each coordinate (d,) at the end of the search."""
     return np.abs(minimum.step) > 1e-3 * (1.0 + np.abs(minimum.point))

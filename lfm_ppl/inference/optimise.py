@@ -1,10 +1,17 @@
-"""Minimisation of a smooth function that may be infinite somewhere: L-BFGS, then Newton."""
+"""Minimisation of a smooth function that may be infinite at some points.
+
+1. L-BFGS from a starting point; the lowest point of its path is kept (`quasi_newton`).
+2. Newton's method with backtracking, on the scaled Hessian without its flat and negative directions, down to rounding
+   (`newton`).
+
+Source: Nocedal and Wright (2006), Numerical Optimization, chapters 3 and 7.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,32 +22,32 @@ from lfm_ppl.inference.curvature import Curvature, decompose, finite_difference_
 
 _NEWTON_STEPS = 20
 _NEGLIGIBLE = 1e-16
-"""Decrease of minus a log density that ends the search: the step is 1e-8 standard deviations."""
+"""Predicted decrease of minus a log density that ends the search: a step of 1e-8 standard deviations."""
 _STRICT = {"maxcor": 20, "ftol": 1e-14, "gtol": 1e-7}
 _EXACT_NOISE, _DIFFERENCE_NOISE = 1e-12, 1e-7
-"""Error of a Hessian scaled to a unit diagonal: differentiated twice, and by differences."""
+"""Error of a Hessian scaled to a unit diagonal: by automatic differentiation, and by finite differences."""
 
 
 def value_and_gradient(function: Callable[..., jax.Array], forward_mode: bool) -> Callable[..., tuple]:
-    """Return the function that gives value and gradient of ``function(z, ...)`` with respect to z."""
+    """Return the function from z and further arguments to the value and the gradient with respect to z."""
     if not forward_mode:
         return jax.value_and_grad(function)
 
-    def twice(*arguments: Any) -> tuple[jax.Array, jax.Array]:
+    def value_with_copy(*arguments: Any) -> tuple[jax.Array, jax.Array]:
         value = function(*arguments)
         return value, value
 
-    return lambda *arguments: jax.jacfwd(twice, has_aux=True)(*arguments)[::-1]
+    return lambda *arguments: jax.jacfwd(value_with_copy, has_aux=True)(*arguments)[::-1]
 
 
 @dataclass
 class Objective:
-    """A function of a vector with its derivatives, each of them compiled, in NumPy's terms.
+    """A function of a vector with its compiled derivatives, from and to NumPy arrays.
 
     Attributes:
         program: from a vector (d,) to the value and the gradient (d,).
         hessian: from a vector (d,) to the Hessian (d, d); None: differences of the gradient.
-        evaluations: number of values and gradients computed so far.
+        evaluations: number of computed values with gradients.
     """
 
     program: Callable[[Any], tuple[Any, Any]]
@@ -63,28 +70,30 @@ class Objective:
         value, gradient = self.program(jnp.asarray(point))
         return float(value), np.asarray(gradient, float)
 
+    def _gradient(self, point: np.ndarray) -> np.ndarray:
+        return self.value_and_gradient(point)[1]
+
     def curvature(self, point: np.ndarray) -> Curvature | None:
-        """Return the curvature, None where no finite Hessian is to be had."""
+        """Return the curvature; None where the Hessian is not finite."""
         hessian, noise = None, _EXACT_NOISE
         if self.hessian is not None:
             hessian = np.asarray(self.hessian(jnp.asarray(point)), float)
         if hessian is None or not np.all(np.isfinite(hessian)):
-            gradient = lambda x: self.value_and_gradient(x)[1]  # noqa: E731
-            hessian, noise = finite_difference_hessian(gradient, point), _DIFFERENCE_NOISE
+            hessian, noise = finite_difference_hessian(self._gradient, point), _DIFFERENCE_NOISE
         return decompose(hessian, noise) if np.all(np.isfinite(hessian)) else None
 
 
 @dataclass(frozen=True, eq=False)
 class Minimum:
-    """Where the search ended.
+    """The end of a search by Newton's method.
 
     Attributes:
-        point: shape (d,).
-        value: of the objective.
-        curvature: there; None where the Hessian is not finite.
-        decrement: decrease that the quadratic model still promises.
-        step: the Newton step still to be taken, shape (d,).
-        gradient: shape (d,).
+        point: (d,).
+        value: value of the objective.
+        curvature: curvature at the point; None where the Hessian is not finite.
+        decrement: predicted decrease of a further Newton step.
+        step: the further Newton step (d,).
+        gradient: (d,).
     """
 
     point: np.ndarray
@@ -95,12 +104,13 @@ class Minimum:
     gradient: np.ndarray
 
 
-class End(NamedTuple):
-    """The best point that a search met.
+@dataclass(frozen=True, eq=False)
+class End:
+    """The lowest point on the path of a search.
 
     Attributes:
-        point: shape (d,).
-        value: of the objective; infinite if it was finite nowhere.
+        point: (d,).
+        value: value of the objective; infinite if it is finite nowhere on the path.
     """
 
     point: np.ndarray
@@ -110,17 +120,17 @@ class End(NamedTuple):
 def quasi_newton(objective: Objective, start: np.ndarray, max_iterations: int = 1000, *,
                  bounds: np.ndarray | None = None,
                  options: Mapping[str, float] | None = None) -> End:
-    """Return the lowest point that L-BFGS meets on its way from ``start``.
+    """Return the lowest point on the path of L-BFGS from ``start``.
 
-    Where the objective or its gradient is not finite the line search sees a moderate penalty, because
-    interpolation through an enormous one would shorten the step to nothing.
+    Where the objective or its gradient is not finite, the line search gets a moderate penalty, because interpolation
+    through a huge value would shorten the step to zero.
 
     Args:
-        objective: what is minimised; it is evaluated nowhere but where the search asks for it.
+        objective: the function; it is evaluated at the points of the search only.
         start: (d,).
-        max_iterations: where the search ends at the latest.
+        max_iterations: largest number of iterations.
         bounds: (d, 2), least and largest value of each coordinate; None: there are none.
-        options: of SciPy's L-BFGS-B, in place of strict ones.
+        options: options of SciPy's L-BFGS-B; None: strict tolerances.
     """
     best = End(np.asarray(start, float), np.inf)
     highest = -np.inf
@@ -132,7 +142,7 @@ def quasi_newton(objective: Objective, start: np.ndarray, max_iterations: int = 
         if usable or best.value == np.inf and np.isfinite(value):
             best = min(best, End(point.copy(), value), key=lambda end: end.value)
         if not usable:
-            # Without a finite value there is nothing to turn back to: the search ends where the gradient is zero.
+            # Without any finite value the search cannot return to one; it ends, since the gradient is zero.
             penalty = highest + 10.0 * (1.0 + abs(highest - best.value)) if np.isfinite(highest) else 0.0
             return penalty, np.zeros_like(point)
         highest = max(highest, value)
@@ -152,10 +162,10 @@ def newton(objective: Objective, point: np.ndarray) -> Minimum:
             return Minimum(point, value, None, np.inf, np.zeros_like(point), gradient)
         step = curvature.newton_step(gradient)
         decrement = -0.5 * float(gradient @ step)
-        taken = _backtrack(objective, point, step, value) if remaining else None
-        if taken is None or decrement < _NEGLIGIBLE:
+        next_point = _backtrack(objective, point, step, value) if remaining else None
+        if next_point is None or decrement < _NEGLIGIBLE:
             break
-        point = taken
+        point = next_point
     return Minimum(point, value, curvature, decrement, step, gradient)
 
 

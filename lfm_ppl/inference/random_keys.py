@@ -9,25 +9,25 @@ import jax
 import numpy as np
 
 _FEWEST = 64
-"""Smallest number of keys that is made: one program serves chains, attempts and short runs."""
+"""Smallest number of split keys, so that one program serves chains, attempts and short runs."""
 
 
 def split_keys(key: jax.Array, count: int) -> Callable[[Any], jax.Array]:
-    """Return the function that picks from ``count`` new keys, by any index of NumPy's.
+    """Return a function from an index, as NumPy takes it, to the keys of ``jax.random.split(key, count)``.
 
-    They are those of `jax.random.split`. JAX compiles a program for each number of keys, so they are split into a power
-    of two, which begins with the same keys, and picked by NumPy.
+    JAX compiles a program for each number of keys. The key is therefore split into a power of two, whose first keys
+    are the same, and NumPy selects from them.
 
     Example:
-        >>> picked = split_keys(jax.random.key(0), 3)
-        >>> bool((picked(1) == jax.random.split(jax.random.key(0), 3)[1]).all())
+        >>> keys = split_keys(jax.random.key(0), 3)
+        >>> bool((keys(1) == jax.random.split(jax.random.key(0), 3)[1]).all())
         True
     """
     kind = jax.random.key_impl(key)
-    # Each key is then a function of its own index alone.
-    by_index = (jax.config.jax_threefry_partitionable  # type: ignore[attr-defined]
-                and str(kind) == "threefry2x32")
+    # With partitionable keys, each key depends on its index only.
+    is_partitionable = (jax.config.jax_threefry_partitionable  # type: ignore[attr-defined]
+                        and str(kind) == "threefry2x32")
     count = int(count)  # NumPy's integers have no bit_length
-    made = max(_FEWEST, 1 << (count - 1).bit_length()) if by_index else count
-    data = np.asarray(jax.random.key_data(jax.random.split(key, made)))[:count]
+    split_count = max(_FEWEST, 1 << (count - 1).bit_length()) if is_partitionable else count
+    data = np.asarray(jax.random.key_data(jax.random.split(key, split_count)))[:count]
     return lambda index: jax.random.wrap_key_data(data[index], impl=kind)

@@ -1,32 +1,34 @@
 """The samplers of `lfm_ppl.fit` by name: one list for `fit`, the command line and the check of a result.
 
-Their arguments are in `lfm_ppl.inference.kernels.options`, their steps in `lfm_ppl.inference.sampling`, and where their
-chains start in `lfm_ppl.fitting`.
+Their arguments are in `lfm_ppl.inference.kernels.options`, their algorithms in `lfm_ppl.inference.bound_samplers`, and
+their starting points in `lfm_ppl.fit_starts`.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 
-class Sampler(NamedTuple):
-    """What is asked of a sampler by its name.
+@dataclass(frozen=True)
+class Sampler:
+    """Properties of a sampler.
 
     Attributes:
-        steps_a_draw: steps for each parameter that make one draw; 0: every step is a draw.
-        filtered: whether its posterior is that of the Gaussian filter, and not of a particle filter.
+        steps_per_draw: steps of one draw, for each parameter; 0: every step is a draw.
+        has_gaussian_filter: whether its likelihood is that of the Gaussian filter, not of a particle filter.
     """
 
-    steps_a_draw: int = 0
-    filtered: bool = True
+    steps_per_draw: int = 0
+    has_gaussian_filter: bool = True
 
 
-# A random walk in d dimensions forgets in some multiple of d. A step of particle-marginal RAM takes some hundred times
-# as long as one of RAM, so that it makes fewer: of the double well, 4,000 draws of one step a parameter were worth 350.
+# The autocorrelation time of a random walk in d dimensions is proportional to d. A step of particle-marginal RAM takes
+# about a hundred times as long as one of RAM, so that it makes fewer: 4,000 draws of the double well with one step for
+# each parameter had 350 effective draws.
 SAMPLERS = {
     "nuts": Sampler(),
-    "ram": Sampler(steps_a_draw=5),
-    "pmmh": Sampler(steps_a_draw=2, filtered=False),
+    "ram": Sampler(steps_per_draw=5),
+    "pmmh": Sampler(steps_per_draw=2, has_gaussian_filter=False),
     "map": Sampler(),
 }
-FILTERED = tuple(name for name, sampler in SAMPLERS.items() if sampler.filtered)
+GAUSSIAN_FILTER_SAMPLERS = tuple(name for name, sampler in SAMPLERS.items() if sampler.has_gaussian_filter)

@@ -17,7 +17,7 @@ from lfm_ppl.model.observations.family import ObservationFamily
 
 
 def start_failure(bound: BoundModel) -> str:
-    """Return in one sentence which part of the log density, or of its gradient, is not finite at the prior median."""
+    """Return a sentence on the part of the log density, or of its gradient, that is not finite at the prior median."""
     z = bound.draw(jax.random.key(0), init_to_median)
     value, gradient = (np.asarray(part) for part in bound.log_density_gradient(z))
     if np.isfinite(value) and np.isfinite(gradient).all():
@@ -33,13 +33,14 @@ def start_failure(bound: BoundModel) -> str:
 
 
 def _site_failure(bound: BoundModel) -> str | None:
-    """Return which prior, factor or further observed site has a log density that is not finite."""
+    """Return a sentence on the prior, factor or further observed site whose log density is not finite."""
     for name, site in bound.trace().items():
         law = site.get("fn")
         if site["type"] != "sample" or _is_likelihood(law):
             continue
         if not site["is_observed"] and not np.isfinite(np.asarray(site["value"], float)).all():
-            return f"the value of {name!r} is not finite ({_shown(site['value'])}): check the parameters of its prior."
+            return (f"the value of {name!r} is not finite ({_format_array(site['value'])}): check the parameters of "
+                    "its prior.")
         total = float(jnp.sum(law.log_prob(site["value"])))
         if not np.isfinite(total):
             kind = "site" if site["is_observed"] else "prior of"
@@ -53,12 +54,12 @@ def _is_likelihood(law: Any) -> bool:
     return isinstance(law, (MarginalLikelihood, Panel))
 
 
-def _shown(value: Any) -> str:
+def _format_array(value: Any) -> str:
     return np.array2string(np.asarray(value, float), threshold=5, separator=", ").replace("\n", "")
 
 
 def _likelihood_failure(bound: BoundModel, z: Any) -> str | None:
-    """Return at which row of which series the likelihood fails, and how."""
+    """Return a sentence on the series and the row at which the likelihood fails."""
     distribution = bound.likelihood(z)
     is_panel = isinstance(distribution, Panel)
     for index in range(distribution.batch_shape[0] if is_panel else 1):

@@ -15,7 +15,7 @@ import xarray as xr
 from lfm_ppl import checks
 from lfm_ppl.inference.model_digest import model_digest
 from lfm_ppl.inference.posterior import evenly_spaced
-from lfm_ppl.inference.samplers import FILTERED, SAMPLERS
+from lfm_ppl.inference.samplers import GAUSSIAN_FILTER_SAMPLERS, SAMPLERS
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.results import arviz_data, importance, likelihoods, rebuilding
@@ -236,11 +236,11 @@ def _relative_efficiency(log_likelihood: np.ndarray) -> float:
 
 def _check_sampler(result: Any) -> None:
     sampler = str(arviz_data.attributes(result).get("sampler", ""))
-    if sampler not in ("", *FILTERED):
+    if sampler not in ("", *GAUSSIAN_FILTER_SAMPLERS):
         exact = sampler in SAMPLERS or "+" in sampler  # after a "+": how the draws were corrected
         which = ", which samples the exact posterior already" if exact else ""
         raise ValueError(f"the draws of this result come from {sampler}{which}; the check is for posteriors of the "
-                         f"Gaussian filter (samplers {', '.join(FILTERED)}).")
+                         f"Gaussian filter (samplers {', '.join(GAUSSIAN_FILTER_SAMPLERS)}).")
 
 
 def _kind(reference: str, ssm: StateSpaceModel) -> str:

@@ -137,7 +137,8 @@ def misfit(result: Any) -> list[str]:
         share = 2.0 * stats.norm.sf(_FAR)
         if count >= MIN_OBSERVATIONS and beyond > 1 and stats.binom.sf(beyond - 1, count, share) < _RARE:
             messages.append(f"{beyond} of {count} residuals of {name} lie beyond {_FAR:g} sd, where "
-                            f"{count * share:.2g} are expected: gross errors{remedy}, or a missing effect. See residuals.png.")
+                            f"{count * share:.2g} are expected: gross errors{remedy}, or a missing effect. See "
+                            "residuals.png.")
         elif test["ks_p"] < _RARE:
             messages.append(f"the residuals of {name} are not standard normal (KS p = {test['ks_p']:.1g}): the bands "
                             "of new data are too wide or too narrow. See residuals.png.")

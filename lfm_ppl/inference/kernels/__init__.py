@@ -1,5 +1,5 @@
 """Kernels of numpyro.infer.MCMC.
 
-`lfm_ppl.fit` does not run MCMC: it takes the settings of a kernel and moves chains by the transitions of
-`lfm_ppl.inference.sampling`, in programs that have the data as an argument.
+Each sampler is a `SamplingAlgorithm`, and the kernels are one adapter over it. `lfm_ppl.fit` does not run MCMC:
+`lfm_ppl.inference.sampling` runs the same algorithms in programs that have the data as an argument.
 """

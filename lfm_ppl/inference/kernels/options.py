@@ -13,9 +13,9 @@ from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalRAM
 from lfm_ppl.inference.kernels.ram import RAM
 
 KERNELS: dict[str, Any] = {"nuts": NUTS, "ram": RAM, "pmmh": ParticleMarginalRAM}
-"""Sampler of `lfm_ppl.fit` -> the kernel whose arguments ``sampler_options`` are; "map" has none."""
+"""Sampler of `lfm_ppl.fit` -> kernel that takes ``sampler_options`` as arguments; "map" has none."""
 
-_ELSEWHERE = {
+_ARGUMENTS_OF_FIT = {
     "model": "the model is the first argument of fit",
     "potential_fn": "the model is the first argument of fit",
     "init_strategy": "pass it as init",
@@ -44,7 +44,8 @@ def check_options(sampler: str, options: Mapping[str, Any] | None) -> None:
         raise ValueError(f"sampler_options are for the samplers {', '.join(KERNELS)}; {sampler!r} takes none, got "
                          f"{', '.join(map(repr, options))}.")
     for name in options:
-        if name in _ELSEWHERE:
-            raise ValueError(f"sampler_options cannot hold {name!r}: {_ELSEWHERE[name]}.")
-        known = [option for option in inspect.signature(KERNELS[sampler]).parameters if option not in _ELSEWHERE]
-        checks.one_of(f"option of the sampler {sampler!r} in sampler_options:", name, known)
+        if name in _ARGUMENTS_OF_FIT:
+            raise ValueError(f"sampler_options cannot hold {name!r}: {_ARGUMENTS_OF_FIT[name]}.")
+        parameters = inspect.signature(KERNELS[sampler]).parameters
+        accepted = [option for option in parameters if option not in _ARGUMENTS_OF_FIT]
+        checks.one_of(f"option of the sampler {sampler!r} in sampler_options:", name, accepted)
