@@ -1,4 +1,13 @@
-"""Counts of calls, read from a file or simulated, and the queue that follows from them."""
+"""Counts of calls, read from a file or simulated, and the queue that follows from them.
+
+1. Read counts of five minutes from a CSV file, and check that each day has all counts from 7:00 to 21:00 (`read`).
+2. Without a file, simulate Poisson counts. Their log rate is a daily profile plus harmonics whose amplitudes follow a
+   first-order autoregression from week to week (`simulate`).
+3. Integrate the fluid approximation of a queue with one server, dL/dt = -Omega L / (1 + L) + zeta, by classical
+   Runge-Kutta steps within each count (`queue`).
+
+Source of the equation: Reece and others (2014), JMLR 15, section 8.
+"""
 
 from __future__ import annotations
 

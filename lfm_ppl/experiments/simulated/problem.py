@@ -1,7 +1,12 @@
 """Data simulated from a shipped model, and the densities of the model's parameters.
 
-The model takes no known inputs. Parameters that the model file fixes by default have these values in the simulation,
-too. Programs are compiled once for a problem and serve all its data sets.
+1. Simulate data sets from the model file, at its true parameters or at parameters drawn from the prior.
+2. Reduce states and forces to the paths of interest at the measurement times.
+3. Bind the NumPyro model, with the file's default parameters fixed, to data; its posterior is a function of the
+   logarithms z of the remaining parameters.
+
+The model takes no known inputs. Programs are compiled once for a problem and serve all its data sets, for which the
+functions are cached. Data set ``index`` is the one that ``lfm-ppl simulate`` writes for a seed that follows from it.
 """
 
 from __future__ import annotations
