@@ -344,7 +344,7 @@ def test_mistakes(tmp_path):
                            ({"weekday": "Thrusday"}, "Did you mean 'Thursday'"), ({"link": "log"}, "link")):
         with pytest.raises(ValueError, match=message):
             experiment.CallCentreSettings(**wrong)
-    with pytest.raises(ValueError, match="there are 31 test days that are Thursday, 40 are asked for"):
+    with pytest.raises(ValueError, match="there are 31 test days on a Thursday, but 40 are requested"):
         experiment.STUDY.run(experiment.CallCentreSettings(days=40), tmp_path)
     with pytest.raises(FileNotFoundError, match="there is no file"):
         experiment.STUDY.run(experiment.CallCentreSettings(data=str(tmp_path)), tmp_path)

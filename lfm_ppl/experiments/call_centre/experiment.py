@@ -86,8 +86,8 @@ def check(settings: CallCentreSettings, report: Reporter | None) -> None:
     days, rate = problem.load_days(settings.data, settings.weekday, settings.seed)
     arrivals = rate * days.calls[problem.TRAINING_DAYS:]
     if settings.days > len(arrivals):
-        raise ValueError(f"there are {len(arrivals)} test days that are {settings.weekday}, {settings.days} are asked "
-                         "for; take fewer (--realisations).")
+        raise ValueError(f"there are {len(arrivals)} test days on a {settings.weekday}, but {settings.days} are "
+                         "requested; reduce --realisations.")
     if report is not None and settings.data is None:
         report("the counts are simulated; give the folder of real ones with --data")
     for test, rates in problem.TEST_RATES.items():

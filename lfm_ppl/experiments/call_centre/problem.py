@@ -83,8 +83,8 @@ def load_days(data: str | None, weekday: str, seed: int) -> tuple[CallCounts, fl
     all_days = counts.simulate(34, seed) if data is None else counts.read(data)
     days = all_days if data is None else all_days.select_weekday(weekday)
     if len(days.dates) <= TRAINING_DAYS:
-        raise ValueError(f"there are {len(days.dates)} days that are {weekday}; {TRAINING_DAYS} to learn from and one "
-                         "to track are needed.")
+        raise ValueError(f"the counts have {len(days.dates)} days on a {weekday}; at least {TRAINING_DAYS + 1} are "
+                         f"needed, {TRAINING_DAYS} for training and one for the test.")
     return days, UTILISATION * SERVICE_RATE / float(all_days.calls.mean())
 
 
