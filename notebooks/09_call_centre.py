@@ -54,7 +54,7 @@ folder = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/call-centre"))
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", counts.OverloadWarning)
     found = experiment.STUDY.run(settings, folder)
-first = problem.window(settings.data, settings.weekday, 0, settings.seed)
+first = problem.build_window(settings.data, settings.weekday, 0, settings.seed)
 print("real calls" if data else "simulated calls")
 
 # %% [markdown]

@@ -12,7 +12,7 @@ from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.ballistic import experiment, figures
 from lfm_ppl.experiments.ballistic.problem import TARGETS
 from lfm_ppl.experiments.simulated import parameters, states
-from lfm_ppl.experiments.simulated.problem import MOST, posterior, record, true_likelihood, true_z
+from lfm_ppl.experiments.simulated.problem import RECORDS_PER_SEED, posterior, simulate_record, true_likelihood, true_z
 from lfm_ppl.experiments.study import TASKS
 
 SMALL = experiment.BallisticSettings(
@@ -26,8 +26,8 @@ def tasks_of(what, settings):
 
 @pytest.mark.slow
 def test_the_targets_are_those_of_the_model_file():
-    data = loading.load("ballistic").simulate(seed=MOST + 3)
-    target = record(TARGETS, 3, seed=1)
+    data = loading.load("ballistic").simulate(seed=RECORDS_PER_SEED + 3)
+    target = simulate_record(TARGETS, 3, seed=1)
     np.testing.assert_array_equal(target.y, data.y)
     at = np.isin(data.truth["times"], target.times)
     np.testing.assert_array_equal(target.paths[0], np.asarray(data.truth["state"])[at, 0])
@@ -40,7 +40,7 @@ def test_the_targets_are_those_of_the_model_file():
 def test_the_densities_are_those_of_the_model():
     """The prior against scipy's, and the likelihood against that of the system built by hand."""
     z = true_z(TARGETS) + np.array([0.3, -0.2, 0.1])
-    target = record(TARGETS, 0)
+    target = simulate_record(TARGETS, 0)
     log_likelihood, log_prior = posterior(TARGETS).log_densities(z, target.y)
     expected = stats.norm([np.log(5e-4), np.log(30.0), np.log(5.0)], [1.0, 1.0, 0.7]).logpdf(z).sum()
     # The levels of the noise are fixed at the medians of their priors, whose densities there belong to it.
@@ -53,8 +53,8 @@ def test_the_densities_are_those_of_the_model():
 def test_a_gaussian_smoother_tracks():
     """Its errors are those of its own mean, and its band is honest about them."""
     (task,) = [one for one in tasks_of("tracking", SMALL) if one.settings["method"] == "Taylor"]
-    found = states.gaussian(TARGETS, task)
-    target = record(TARGETS, 0)
+    found = states.run_gaussian(TARGETS, task)
+    target = simulate_record(TARGETS, 0)
     assert found["smoother_rmse"].shape == found["smoother_coverage"].shape == (2, 3)
     np.testing.assert_allclose(found["smoother_rmse"][0], np.sqrt(np.mean((found["mean"] - target.paths) ** 2, axis=1)))
     assert (found["smoother_rmse"] < found["filter_rmse"]).all()
@@ -65,10 +65,10 @@ def test_a_gaussian_smoother_tracks():
 @pytest.mark.slow
 def test_particles_agree_with_the_gaussian_smoother_where_it_is_nearly_exact():
     (task,) = tasks_of("particles", SMALL)
-    found = states.particles(TARGETS, task)
+    found = states.run_particles(TARGETS, task)
     given = true_likelihood(TARGETS)
-    target = record(TARGETS, 0)
-    mean, sd = map(np.asarray, states.paths_of(TARGETS, given.smooth(target.y)))
+    target = simulate_record(TARGETS, 0)
+    mean, sd = map(np.asarray, states.smoothed_paths(TARGETS, given.smooth(target.y)))
     # 2,000 particles leave an error of the log likelihood of about 1, and many different paths at the end alone.
     assert abs(found["log_likelihood"] - float(given.log_prob(target.y))) < 4.0
     assert found["distinct"][0] < found["distinct"][-1] <= 2_000
@@ -82,7 +82,7 @@ def test_particles_agree_with_the_gaussian_smoother_where_it_is_nearly_exact():
 @pytest.mark.slow
 def test_the_posterior_is_that_of_a_grid():
     """Mean and standard deviation of each parameter against a sum over a grid of all three."""
-    target = record(TARGETS, 0)
+    target = simulate_record(TARGETS, 0)
     found = parameters.estimate(TARGETS, target, 1_000, 5, 0)
     assert found["k"] < 0.7 and found["exists"]
     axes = [np.linspace(m - 5 * s, m + 5 * s, 25)
@@ -128,7 +128,7 @@ def made_up(settings):
             found = {"filter_rmse": np.full((count, 3), 2.0), "smoother_rmse": np.tile([50.0, 30.0, 20.0], (count, 1)),
                      "smoother_coverage": np.full((count, 3), 0.95), "log_likelihood": np.full(count, -601.0),
                      "filter_seconds": np.full(count, 1e-3), "smoother_seconds": np.full(count, 2e-3),
-                     "mean": record(TARGETS, 0).paths, "sd": np.ones((3, 120))}
+                     "mean": simulate_record(TARGETS, 0).paths, "sd": np.ones((3, 120))}
         else:
             total = settings.drawn_runs if given["what"] == "drawn" else settings.runs
             below = (np.arange(given["first"], given["last"] + 1)[:, None] + 0.5) / total * np.ones(3)
@@ -244,11 +244,11 @@ def test_the_quick_version_runs_from_end_to_end(tmp_path):
 @pytest.mark.slow
 def test_the_drag_alone_is_integrated_right():
     """With the force's parameters known, on another grid and equally spaced in the drag."""
-    target = record(TARGETS, 0)
+    target = simulate_record(TARGETS, 0)
     z = np.log(np.linspace(*np.exp(target.z[0] + np.array([-1.0, 1.0])), 400))  # equally spaced in alpha
     points = np.stack([z, np.full(400, target.z[1]), np.full(400, target.z[2])], axis=1)
     log_likelihood, _ = posterior(TARGETS).log_densities_of(points, target.y, batch=20)
     density = np.exp(log_likelihood - log_likelihood.max())
     cells = 0.5 * (density[1:] + density[:-1]) * np.diff(z)
     expected = cells[z[1:] <= target.z[0]].sum() / cells.sum()
-    assert parameters.below(TARGETS, experiment.REACH, target) == pytest.approx(expected, abs=0.02)
+    assert parameters.rank_first_parameter(TARGETS, experiment.REACH, target) == pytest.approx(expected, abs=0.02)

@@ -24,7 +24,7 @@ real = pytest.mark.skipif(not DATA.is_dir(), reason="the counts of real calls ar
 
 
 def window(index=0, data=None):
-    return problem.window(data, "Thursday", index)
+    return problem.build_window(data, "Thursday", index)
 
 
 def tasks_of(what, settings):
@@ -45,7 +45,8 @@ def test_counts_are_read_day_by_day(tmp_path):
     found = counts.read(written(tmp_path / counts.FILE))
     assert found.dates.astype(str).tolist() == ["2003-03-06", "2003-03-13"]
     np.testing.assert_array_equal(found.calls, [np.arange(168), 169 + np.arange(168)])
-    assert len(counts.read(tmp_path).on("Thursday").dates) == 2 and len(found.on("Friday").dates) == 0
+    assert len(counts.read(tmp_path).select_weekday("Thursday").dates) == 2
+    assert len(found.select_weekday("Friday").dates) == 0
 
 
 def set_cell(row, column, value):
@@ -95,18 +96,18 @@ def test_rates_must_not_be_negative():
 @real
 def test_real_days_have_the_stated_utilisation():
     everything = counts.read(DATA)
-    own, rate = problem.days(str(DATA), "Thursday", 0)
+    own, rate = problem.load_days(str(DATA), "Thursday", 0)
     assert everything.calls.shape == (164, 168) and len(own.dates) == 34
     assert rate * everything.calls.mean() == pytest.approx(7.0)
-    assert len(own.dates) - problem.TRAIN == 31
+    assert len(own.dates) - problem.TRAINING_DAYS == 31
 
 
 def test_a_window_has_its_readings_where_they_belong():
     one = window(1)
     assert one.arrivals.shape == (672,) and one.training.shape == (63, 1)
-    test = one.y["changed"][problem.FIRST:, 0]
-    np.testing.assert_array_equal(problem.GRID[problem.FIRST:][np.isfinite(test)], 2520.0 + 180.0 * np.arange(5))
-    np.testing.assert_array_equal(one.y["constant"][:problem.FIRST], one.y["changed"][:problem.FIRST])
+    test = one.y["changed"][problem.TEST_START:, 0]
+    np.testing.assert_array_equal(problem.GRID[problem.TEST_START:][np.isfinite(test)], 2520.0 + 180.0 * np.arange(5))
+    np.testing.assert_array_equal(one.y["constant"][:problem.TEST_START], one.y["changed"][:problem.TEST_START])
     read = np.isfinite(one.y["constant"][:, 0])
     error = np.expm1(one.y["constant"][read, 0]) - one.queues["constant"][read]
     assert 0.3 < np.std(error) < 0.7
@@ -119,9 +120,9 @@ def test_the_bound_on_settling_matters_little():
     fastest = sys.modules[problem.model_file().model.__module__].FASTEST
     for index in (0, 10):
         one = window(index, str(DATA))
-        for name, tested in problem.TESTED.items():
+        for name, tested in problem.TEST_RATES.items():
             x, path, h = 0.0, [0.0], 0.25
-            for zeta, omega in zip(one.arrivals, problem.service(tested), strict=True):
+            for zeta, omega in zip(one.arrivals, problem.service_rates(tested), strict=True):
                 for _ in range(20):
                     def slope(x, zeta=zeta, omega=omega):
                         free = np.exp(-x)
@@ -142,28 +143,28 @@ def test_the_bound_on_settling_matters_little():
 @pytest.mark.slow
 def test_the_densities_are_those_of_the_model():
     """The prior against scipy's, the likelihood against that of the model built by hand."""
-    method, one = problem.Method("matern"), window()
+    method, one = problem.ArrivalModel("matern"), window()
     assert method.names == ("mean", "scale", "lengthscale", "noise_sd")
     z = np.log([6.5, 2.0, 100.0, 0.6])
     log_likelihood, log_prior = problem.posterior(method).log_densities(z, one.training)
     medians, spread = np.log([6.0, 2.0, 168.0, 0.5]), np.array([0.5, 0.7, 0.7, 0.7])
     assert log_prior == pytest.approx(stats.norm(medians, spread).logpdf(z).sum(), rel=1e-9)
     m = sys.modules[problem.model_file().model.__module__]
-    system = m.build(6.5, 2.0, 0.6, 100.0, force="matern", service=problem.SERVICE)
-    given = lfm.MarginalLikelihood(system, problem.TRAINING, steps=m.STEPS)
+    system = m.build(6.5, 2.0, 0.6, 100.0, force="matern", service=problem.SERVICE_RATE)
+    given = lfm.MarginalLikelihood(system, problem.TRAINING_TIMES, steps=m.STEPS)
     assert log_likelihood == pytest.approx(float(given.log_prob(one.training)), rel=1e-9)
 
 
 @pytest.mark.slow
 def test_the_gradient_is_that_of_finite_differences():
-    method, one = problem.Method("matern"), window()
+    method, one = problem.ArrivalModel("matern"), window()
     objective = problem.posterior(method).objective(one.training)
     z = np.log([6.5, 2.0, 150.0, 0.8])
     _, gradient = objective.value_and_gradient(z)
     steps = 1e-5 * np.eye(4)
     expected = [(objective.value(z + step) - objective.value(z - step)) / 2e-5 for step in steps]
     np.testing.assert_allclose(gradient, expected, rtol=1e-5, atol=1e-5)
-    (best, *_), _ = learning.searches(method, one.training)
+    (best, *_), _ = learning.run_searches(method, one.training)
     assert best.value < problem.posterior(method).objective(one.training, 0.0).value(z)
 
 
@@ -180,7 +181,7 @@ def searched(monkeypatch, value_and_gradient):
 @pytest.mark.slow
 def test_searches_from_several_starts_find_several_modes(monkeypatch):
     """Three wells, one of them far higher than the others."""
-    method = problem.Method("sqm")
+    method = problem.ArrivalModel("sqm")
     starts = np.log([[start[name] for name in method.names] for start in learning.STARTS])
     wells, depth, evaluated = starts + 0.05, np.array([3.0, -2.0, 30.0]), []
 
@@ -190,24 +191,24 @@ def test_searches_from_several_starts_find_several_modes(monkeypatch):
         return 20 * ((z - wells[k]) ** 2).sum() + depth[k] + prior, 40 * (z - wells[k])
 
     searched(monkeypatch, value_and_gradient)
-    found = learning.modes(method, np.zeros((63, 1)))
+    found = learning.find_modes(method, np.zeros((63, 1)))
     np.testing.assert_allclose([mode.point for mode in found], wells[[1, 0]], atol=1e-4)
     assert [-mode.value for mode in found] == pytest.approx([1.0, -4.0])
     evaluated.clear()
-    (best, *_), evaluations = learning.searches(method, np.zeros((63, 1)))
+    (best, *_), evaluations = learning.run_searches(method, np.zeros((63, 1)))
     np.testing.assert_array_equal(best.point, found[0].point)
     assert -best.value == pytest.approx(2.0)
     assert set(evaluated) == {0, 1, 2} and evaluations == len(evaluated)
     depth[:], wells[:] = 0.0, wells[0]
-    assert len(learning.modes(method, np.zeros((63, 1)))) == 1
+    assert len(learning.find_modes(method, np.zeros((63, 1)))) == 1
     searched(monkeypatch, lambda z, prior: (np.inf, np.zeros(len(method.names))))
-    with pytest.raises(ValueError, match="not finite wherever a search for the parameters of sqm starts"):
-        learning.searches(method, np.zeros((63, 1)))
+    with pytest.raises(ValueError, match="not finite at any start of the searches for sqm"):
+        learning.run_searches(method, np.zeros((63, 1)))
 
 
 def test_a_lower_mode_without_curvature_is_none(monkeypatch):
     """The second of three lies on a saddle; where the gradient about the third is not a number, it is left out, too."""
-    method = problem.Method("matern")
+    method = problem.ArrivalModel("matern")
     points = [np.full(4, value) for value in (0.0, 3.0, 6.0)]
 
     def value_and_gradient(z, prior):
@@ -217,9 +218,9 @@ def test_a_lower_mode_without_curvature_is_none(monkeypatch):
 
     searched(monkeypatch, value_and_gradient)
     for order, kept in (([0, 1, 2], [0]), ([1, 0, 2], [1, 0])):
-        monkeypatch.setattr(learning, "searches", lambda *_, order=order, **__: (
+        monkeypatch.setattr(learning, "run_searches", lambda *_, order=order, **__: (
             [End(points[k], 0.0) for k in order], 3))
-        found = learning.modes(method, np.zeros((63, 1)))
+        found = learning.find_modes(method, np.zeros((63, 1)))
         np.testing.assert_array_equal([mode.point for mode in found], [points[k] for k in kept])
     np.testing.assert_allclose(found[1].curvature.factor @ found[1].curvature.factor.T, np.eye(4), atol=1e-6)
 
@@ -227,18 +228,18 @@ def test_a_lower_mode_without_curvature_is_none(monkeypatch):
 def made_up(settings):
     """Results of every task: bands that hold all, and errors that follow from the method."""
     one, results = window(), {}
-    test = slice(problem.FIRST + 1, None)
+    test = slice(problem.TEST_START + 1, None)
     for task in experiment.all_tasks(settings):
         method = task.settings["method"]
-        names = tracking.method_of(task).names
+        names = tracking.arrival_model_of(task).names
         worse = {"SQM": 1.0, "Matern": 3.0}.get(method, 2.0) * (0.9 if task.settings["what"] == "posterior" else 1.0)
         found = {}
         if task.settings["what"] == "nuts":
-            results[task.name] = {f"{name}_ell": -70.0 for name in problem.TESTED} | {
+            results[task.name] = {f"{name}_ell": -70.0 for name in problem.TEST_RATES} | {
                 "mean": np.full(len(names), 0.1), "sd": np.full(len(names), 0.8), "ess": np.full(len(names), 150.0),
                 "r_hat": np.full(len(names), 1.004), "divergences": 0, "seconds": 60.0}
             continue
-        for name in problem.TESTED:
+        for name in problem.TEST_RATES:
             rmse = worse * (1.0 + 0.1 * np.arange(settings.days))
             found |= {f"{name}_rmse": rmse, f"{name}_ell": -100.0 * rmse, f"{name}_rate_rmse": 0.1 * rmse,
                       f"{name}_coverage": np.full(settings.days, 0.94),
@@ -267,15 +268,16 @@ MADE = experiment.CallCentreSettings(days=3, methods=("SQM", "periodic", "Matern
 def test_scores_are_those_of_the_log_normal_distribution():
     one = window()
     x = np.log1p(one.queues["constant"])
-    found = tracking.Tracked(x + 0.1, np.full(x.shape, 0.1), np.append(0, one.arrivals) + 0.2, np.full(x.shape, 0.05))
-    judged = tracking.judge([found], one, "constant")
+    found = tracking.QueueEstimate(x + 0.1, np.full(x.shape, 0.1), np.append(0, one.arrivals) + 0.2,
+                                   np.full(x.shape, 0.05))
+    judged = tracking.score_mixture([found], one, "constant")
     queue = one.queues["constant"][505:]
     assert judged["rmse"] == pytest.approx(np.sqrt(np.mean(((1 + queue) * (np.exp(0.1) - 1)) ** 2)))
     expected = stats.lognorm(0.1, scale=(1 + queue) * np.exp(0.1)).logpdf(1 + queue).sum()
     assert judged["ell"] == pytest.approx(expected)
     assert judged["coverage"] == 1.0 and judged["rate_coverage"] == 0.0
     assert judged["rate_rmse"] == pytest.approx(0.2)
-    mixed = tracking.judge([found, found], one, "constant")
+    mixed = tracking.score_mixture([found, found], one, "constant")
     assert mixed.keys() == judged.keys()
     for key, value in mixed.items():
         assert value == pytest.approx(judged[key], rel=1e-9), key
@@ -342,7 +344,7 @@ def test_mistakes(tmp_path):
                            ({"weekday": "Thrusday"}, "Did you mean 'Thursday'"), ({"link": "log"}, "link")):
         with pytest.raises(ValueError, match=message):
             experiment.CallCentreSettings(**wrong)
-    with pytest.raises(ValueError, match="there are 31 test days that are Thursday, 40 are asked for"):
+    with pytest.raises(ValueError, match="there are 31 test days on a Thursday, but 40 are requested"):
         experiment.STUDY.run(experiment.CallCentreSettings(days=40), tmp_path)
     with pytest.raises(FileNotFoundError, match="there is no file"):
         experiment.STUDY.run(experiment.CallCentreSettings(data=str(tmp_path)), tmp_path)
@@ -351,8 +353,8 @@ def test_mistakes(tmp_path):
 @pytest.mark.slow
 def test_weighted_draws_are_those_of_a_long_chain():
     """The posterior of one window against random-walk Metropolis with the same density."""
-    method, one = problem.Method("sqm", functions=5), window()
-    draws, weights, _ = learning.posterior(method, one.training, 1_000, 0)
+    method, one = problem.ArrivalModel("sqm", functions=5), window()
+    draws, weights, _ = learning.sample_posterior(method, one.training, 1_000, 0)
     weight = np.exp(weights.log_weight[0])
     mean = weight @ draws
     sd = np.sqrt(weight @ (draws - mean) ** 2)
@@ -391,11 +393,11 @@ BOTH = experiment.CallCentreSettings(days=4, methods=("SQM",), functions=5, draw
 def test_nuts_and_weighted_draws_have_the_same_posterior():
     """Two samplers that share the density and the modes about which they start, on the fourth window, which has one."""
     task = tasks_of("nuts", BOTH)[3]
-    method, (one,) = tracking.method_of(task), tracking.windows_of(task)
-    draws, weights, mass = learning.posterior(method, one.training, BOTH.draws, BOTH.seed)
+    method, (one,) = tracking.arrival_model_of(task), tracking.windows_of(task)
+    draws, weights, mass = learning.sample_posterior(method, one.training, BOTH.draws, BOTH.seed)
     assert len(mass) == 1 and weights.reliable
     mean, covariance = importance_at_modes.moments(draws, np.exp(weights.log_weight[0]))
-    found = tracking.by_nuts(task)
+    found = tracking.track_by_nuts(task)
     assert found["divergences"] == 0 and found["r_hat"].max() < 1.02
     error = np.sqrt(1 / found["ess"] + 1 / weights.ess)
     assert error.max() < 0.1
@@ -410,10 +412,10 @@ NOISE = 4
 def with_two_modes(count):
     """Return method, training, weighted draws and modes of the first window; the second mode is one of small noises."""
     task = tasks_of("nuts", BOTH)[0]
-    method, (one,) = tracking.method_of(task), tracking.windows_of(task)
-    draws, weights, mass = learning.posterior(method, one.training, count, BOTH.seed)
+    method, (one,) = tracking.arrival_model_of(task), tracking.windows_of(task)
+    draws, weights, mass = learning.sample_posterior(method, one.training, count, BOTH.seed)
     assert len(mass) == 2 and weights.reliable and method.names[NOISE] == "noise_sd"
-    return method, one.training, draws, np.exp(weights.log_weight[0]), learning.modes(method, one.training)
+    return method, one.training, draws, np.exp(weights.log_weight[0]), learning.find_modes(method, one.training)
 
 
 @pytest.mark.slow
@@ -446,7 +448,7 @@ def test_nuts_and_weighted_draws_agree_about_the_first_mode():
     own = weight[above] / weight[above].sum()
     mean, covariance = importance_at_modes.moments(draws[above], own)
     sd = np.sqrt(np.diag(covariance))
-    found = tracking.by_nuts(tasks_of("nuts", BOTH)[0])
+    found = tracking.track_by_nuts(tasks_of("nuts", BOTH)[0])
     elsewhere = found["draws"][NOISE] < edge
     assert elsewhere.mean() < 0.5
     chain = found["draws"][:, ~elsewhere]

@@ -19,10 +19,10 @@ needs_data = pytest.mark.skipif(not (DATA / problem.EVENTS).is_file(),
 
 @needs_data
 def test_the_data_are_counted_as_they_are():
-    coal = problem.problem(problem.COAL, problem.Size(), 0, str(DATA))
+    coal = problem.build_problem(problem.COAL, problem.ProblemSize(), 0, str(DATA))
     assert coal.y.sum() == 191 and coal.y.shape == (333, 1)
     assert np.bincount(coal.folds).tolist() == [34, 34, 34, 33, 33, 33, 33, 33, 33, 33]
-    calls = [problem.problem(name, problem.Size(), 0, str(DATA)) for name in problem.CALLS]
+    calls = [problem.build_problem(name, problem.ProblemSize(), 0, str(DATA)) for name in problem.CALLS]
     assert calls[0].y.shape == (8 * 42, 1) and calls[0].y[0, 0] == 111 + 113 + 76 + 82
     for one in calls:
         np.testing.assert_array_equal(one.folds, calls[0].folds)
@@ -36,18 +36,18 @@ def test_settings_are_checked_and_it_is_in_the_catalogue():
     with pytest.raises(ValueError, match="draws"):
         experiment.CountsSettings(draws=0)
     with pytest.raises(FileNotFoundError, match="nowhere"):
-        problem.problem(problem.CALLS[0], problem.Size(), 0, "nowhere")
+        problem.build_problem(problem.CALLS[0], problem.ProblemSize(), 0, "nowhere")
     assert catalogue.experiment("counts").study is experiment.STUDY
     learnt = {f"{name}/parameters": {} for name in problem.NAMES}
-    assert len(experiment.comparing(experiment.CountsSettings(), learnt)) == 7 * 4
+    assert len(experiment.comparison_tasks(experiment.CountsSettings(), learnt)) == 7 * 4
 
 
 def made_up(monkeypatch):
     """Settings of one problem, and results whose errors are known."""
-    settings = experiment.CountsSettings(problems=("student-t",), size=problem.Size(rows=4))
+    settings = experiment.CountsSettings(problems=("student-t",), size=problem.ProblemSize(rows=4))
     truth = np.array([0.0, 0.1, 5.0, 0.0])
-    one = problem.Problem(np.arange(4.0), truth[:, None], np.zeros(4, int), lambda: None, {}, {}, truth)
-    monkeypatch.setattr(problem, "problem", lambda *arguments: one)
+    one = problem.CountsProblem(np.arange(4.0), truth[:, None], np.zeros(4, int), lambda: None, {}, {}, truth)
+    monkeypatch.setattr(methods, "build_problem", lambda *arguments: one)
     exact = {"log evidence": -10.0, "log evidence error": 0.01, "mean": np.zeros(4), "sd": np.ones(4), "seconds": 3.0,
              "log density": -np.arange(4.0), "low": -np.ones(4), "high": np.ones(4)}
     rough = exact | {"log evidence": -10.5, "mean": np.array([0, 0, 0.2, 0]), "sd": np.full(4, 0.9),
@@ -89,9 +89,9 @@ def test_sites_that_did_not_converge_show_and_shorter_data_do_not(monkeypatch):
 @pytest.mark.parametrize("name", problem.SIMULATED)
 def test_moments_of_the_simulated_data_are_exact_but_for_the_mark(name):
     """200 rows, of which 20 are off by 20 scales for Student-t: means within 0.05 sd, sds within 3% of exact draws."""
-    one = problem.problem(name, problem.Size(), 0, None)
-    model = one.build(**one.given)
-    posterior = reference.Reference(model, one.times, one.sites)
+    one = problem.build_problem(name, problem.ProblemSize(), 0, None)
+    model = one.build_model(**one.true_parameters)
+    posterior = reference.MonteCarloReference(model, one.times, one.sites)
     drawn = posterior.sample(jax.random.key(0), one.y, posterior.proposal(one.y), 20_000)
     mean, sd = lfm.smooth(model, one.times, one.y, sites=one.sites).force("u")
     exact, spread = drawn.mean((0, 1)), drawn.std((0, 1))

@@ -1,4 +1,4 @@
-"""Paths with their bands, errors and times against particles, the posterior of the drag, and coverage."""
+"""Figures of the study: smoothed paths, errors and CPU times of particles, posteriors of the drag, and coverage."""
 
 from __future__ import annotations
 
@@ -13,15 +13,17 @@ from lfm_ppl.experiments.datasets import select_prefix
 from lfm_ppl.experiments.drawing import SHADE, SPAN, TRUTH, band, bars, legend, line, patch
 from lfm_ppl.experiments.scores import Z, mean_of, paired_ratio, rate_of
 from lfm_ppl.experiments.simulated import parameters
-from lfm_ppl.experiments.simulated.problem import record, true_z
-from lfm_ppl.experiments.simulated.states import REPORTED
+from lfm_ppl.experiments.simulated.problem import simulate_record, true_z
+from lfm_ppl.experiments.simulated.states import DEFAULT_RULE
 from lfm_ppl.experiments.study import Data
 from lfm_ppl.results.plots import style
 
 COLOURS, MARKERS, LINES = (style.BLUE, style.VERMILLION, style.GREEN), "os^", ("-", "--", "-.")
 _SCALES = ((1e-3, "km"), (1e-3, "km/s"), (1.0, "m/s^2"))
-_SHOWN = 40
-"""Targets whose posteriors of the drag are drawn one by one."""
+"""Factor and unit of each path."""
+
+_MAX_INTERVALS = 40
+"""Largest number of targets whose posterior interval of the drag is drawn."""
 
 
 def draw(settings: Any, data: Data) -> dict[str, Figure]:
@@ -32,12 +34,12 @@ def draw(settings: Any, data: Data) -> dict[str, Figure]:
 
 @style.styled
 def plot_paths(data: Data, seed: int = 0, *, width: str | float = "full") -> Figure:
-    """Draw the first target: smoothed paths with 95% bands (figure 1 a to c of the source), and their errors."""
-    target, own = record(TARGETS, 0, seed), data["tracking"].sel({"method": REPORTED})
+    """Draw smoothed paths of the first target with 95% bands (figure 1 a to c of the source), and their errors."""
+    target, smoothed = simulate_record(TARGETS, 0, seed), data["tracking"].sel({"method": DEFAULT_RULE})
     particles = data["particles"].isel(dataset=0).sortby("particles").isel(particles=-1)
     figure = style.new_figure(width, 3.8)
     for index, (upper, lower) in enumerate(figure.subplots(2, len(TARGETS.paths), sharex=True).T):
-        mean, sd, truth = own["mean"][index], own["sd"][index], target.paths[index]
+        mean, sd, truth = smoothed["mean"][index], smoothed["sd"][index], target.paths[index]
         (factor, unit), path = _SCALES[index], TARGETS.paths[index]
         upper.plot(target.times, factor * mean, color=style.BLUE, label="Gaussian smoother")
         band(upper, target.times, factor * mean, factor * sd, label="its 95% band")
@@ -55,57 +57,64 @@ def plot_paths(data: Data, seed: int = 0, *, width: str | float = "full") -> Fig
 
 @style.styled
 def plot_particles(data: Data, *, width: str | float = "full") -> Figure:
-    """Draw RMSE relative to the Gaussian smoother's, and CPU time, against the number of particles."""
-    found = data["particles"].sortby("particles")
-    counts, few = found.particles.values, found.sizes["dataset"]
-    gaussian = data["tracking"].sel({"method": REPORTED}).isel(dataset=slice(few))
-    figure, (left, right) = style.in_a_row(width, 2, 2.5)
+    """Draw the RMSE relative to that of the Gaussian smoother, and the CPU time, against the number of particles."""
+    particles = data["particles"].sortby("particles")
+    counts, targets = particles.particles.values, particles.sizes["dataset"]
+    gaussian = data["tracking"].sel({"method": DEFAULT_RULE}).isel(dataset=slice(targets))
+    figure, (ratio_axes, time_axes) = style.in_a_row(width, 2, 2.5)
     for index, path in enumerate(TARGETS.paths):
-        ratios = [paired_ratio(one[:, index], gaussian.smoother_rmse[:, index]) for one in found.smoother_rmse]
-        bars(left, counts * 1.06 ** (index - 1), ratios, color=COLOURS[index], ls=LINES[index], marker=MARKERS[index],
-             lw=1.0, label=path)
-    left.axhline(1.0, color=style.BLACK, lw=0.8)
-    for what, dash in (("filter", "--"), ("smoother", "-")):
-        right.plot(counts, select_prefix(found, what).seconds.mean("dataset"), color=style.ORANGE, ls=dash, marker="o",
-                   ms=3.0)
-        right.axhline(select_prefix(gaussian, what).seconds.mean(), color=style.BLUE, ls=dash, lw=1.0)
-    style.tidy(left, xscale="log", xlabel="particles",
+        ratios = [paired_ratio(rmse[:, index], gaussian.smoother_rmse[:, index]) for rmse in particles.smoother_rmse]
+        bars(ratio_axes, counts * 1.06 ** (index - 1), ratios, color=COLOURS[index], ls=LINES[index],
+             marker=MARKERS[index], lw=1.0, label=path)
+    ratio_axes.axhline(1.0, color=style.BLACK, lw=0.8)
+    for kind, dash in (("filter", "--"), ("smoother", "-")):
+        time_axes.plot(counts, select_prefix(particles, kind).seconds.mean("dataset"), color=style.ORANGE, ls=dash,
+                       marker="o", ms=3.0)
+        time_axes.axhline(select_prefix(gaussian, kind).seconds.mean(), color=style.BLUE, ls=dash, lw=1.0)
+    style.tidy(ratio_axes, xscale="log", xlabel="particles",
                ylabel="RMSE of the particle smoother\nover the Gaussian smoother's")
-    style.tidy(right, xscale="log", xlabel="particles", yscale="log", ylabel="CPU time for a target (s)")
+    style.tidy(time_axes, xscale="log", xlabel="particles", yscale="log", ylabel="CPU time for a target (s)")
     legend(figure, line("particles", style.ORANGE, marker="o", ms=3.0), line("Gaussian", style.BLUE),
            line("smoother", style.GREY), line("filter", style.GREY, "--"))
-    style.note_below(figure, f"Means over {few} targets; error bars are two standard errors of paired differences.")
+    style.note_below(figure, f"Means over {targets} targets; error bars are two standard errors of paired differences.")
     return figure
 
 
 @style.styled
 def plot_drag(data: Data, *, width: str | float = "full") -> Figure:
-    """Draw the posterior of log alpha of one target (figure 1 d of the source), of several, and ranks of the truth."""
-    truth, (found, drawn) = true_z(TARGETS)[0], (data[name].isel(parameter=0) for name in ("parameters", "drawn"))
-    figure, (first, several, ranks) = style.in_a_row(width, 3, 2.5)
+    """Draw posteriors of log alpha, and the distribution of the posterior rank of the truth over targets.
+
+    The first panel is figure 1 d of the source.
+    """
+    truth = true_z(TARGETS)[0]
+    estimates, prior_estimates = (data[kind].isel(parameter=0) for kind in ("parameters", "drawn"))
+    figure, (density_axes, target_axes, rank_axes) = style.in_a_row(width, 3, 2.5)
     chain = data["chains"].draws.sel(sampler="NUTS").isel(dataset=0, parameter=0).values.ravel()
-    both = found.draws.values, chain[np.isfinite(chain)]
-    low, high = np.quantile(np.concatenate(both), [0.0005, 0.9995])
-    places = np.linspace(low, high, 200)
-    first.fill_between(places, stats.gaussian_kde(both[0])(places), color=SHADE, lw=0, label="weighted draws")
-    first.plot(places, stats.gaussian_kde(both[1])(places), color=style.VERMILLION, ls="--", label="NUTS")
-    count = min(_SHOWN, runs := found.sizes["dataset"])
-    mean, sd, outside = (one[:count].values for one in (
-        found.posterior_mean, found.posterior_sd, np.abs(found.below - 0.5) > 0.475))
-    for held, colour in ((~outside, style.BLUE), (outside, style.ORANGE)):
-        several.errorbar(np.flatnonzero(held), mean[held], Z * sd[held], color=colour, ls="", marker="o", ms=2.0,
-                         elinewidth=0.8)
+    samples = estimates.draws.values, chain[np.isfinite(chain)]
+    low, high = np.quantile(np.concatenate(samples), [0.0005, 0.9995])
+    grid = np.linspace(low, high, 200)
+    density_axes.fill_between(grid, stats.gaussian_kde(samples[0])(grid), color=SHADE, lw=0, label="weighted draws")
+    density_axes.plot(grid, stats.gaussian_kde(samples[1])(grid), color=style.VERMILLION, ls="--", label="NUTS")
+    count = min(_MAX_INTERVALS, runs := estimates.sizes["dataset"])
+    mean, sd, is_outside = (variable[:count].values for variable in (
+        estimates.posterior_mean, estimates.posterior_sd, np.abs(estimates.below - 0.5) > 0.475))
+    for selection, colour in ((~is_outside, style.BLUE), (is_outside, style.ORANGE)):
+        target_axes.errorbar(np.flatnonzero(selection), mean[selection], Z * sd[selection], color=colour, ls="",
+                             marker="o", ms=2.0, elinewidth=0.8)
     cells = 10 if runs >= 100 else 5
-    ranks.axhspan(*stats.binom(runs, 1 / cells).ppf([0.025, 0.975]) / runs, color=SPAN, lw=0, label="95% of shares")
-    shares = [ranks.hist(given, cells, range=(0.0, 1.0), weights=np.full(given.size, 1 / given.size), histtype="step",
-                         color=colour, ls=dash)[0]
-              for given, colour, dash in ((found.below, style.BLUE, "-"), (drawn.below, style.GREEN, "--"))]
-    for mark, place in ((first.axvline, truth), (several.axhline, truth), (ranks.axhline, 1 / cells)):
-        mark(place, color=style.BLACK, lw=0.9)
-    style.tidy(first, xlabel="log alpha (alpha in 1/m)", ylabel="posterior density", title="first target",
+    rank_axes.axhspan(*stats.binom(runs, 1 / cells).ppf([0.025, 0.975]) / runs, color=SPAN, lw=0, label="95% of shares")
+    shares = []
+    for ranks, colour, dash in ((estimates.below, style.BLUE, "-"), (prior_estimates.below, style.GREEN, "--")):
+        weights = np.full(ranks.size, 1 / ranks.size)
+        shares.append(rank_axes.hist(ranks, cells, range=(0.0, 1.0), weights=weights, histtype="step", color=colour,
+                                     ls=dash)[0])
+    density_axes.axvline(truth, color=style.BLACK, lw=0.9)
+    target_axes.axhline(truth, color=style.BLACK, lw=0.9)
+    rank_axes.axhline(1 / cells, color=style.BLACK, lw=0.9)
+    style.tidy(density_axes, xlabel="log alpha (alpha in 1/m)", ylabel="posterior density", title="first target",
                ylim=(0.0, None))
-    style.tidy(several, xlabel="target", ylabel="log alpha, mean and 1.96 sd", title=f"{count} targets")
-    style.tidy(ranks, xlabel="posterior probability\nof less than the truth", ylabel="share of targets",
+    style.tidy(target_axes, xlabel="target", ylabel="log alpha, mean and 1.96 sd", title=f"{count} targets")
+    style.tidy(rank_axes, xlabel="posterior probability\nof less than the truth", ylabel="share of targets",
                ylim=(0.0, max(1.8 / cells, 1.1 * float(np.max(shares)))), title=f"{runs} targets")
     legend(figure, line("truth, and what is expected", style.BLACK, lw=0.9),
            line("95% interval without the truth", style.ORANGE, marker="o", ms=2.0),
@@ -115,26 +124,27 @@ def plot_drag(data: Data, *, width: str | float = "full") -> Figure:
 
 @style.styled
 def plot_coverage(data: Data, *, width: str | float = "full") -> Figure:
-    """Draw the coverage of the 95% bands of paths, and of the posterior intervals of parameters."""
-    found, levels = data["parameters"], np.array(parameters.LEVELS)
-    rows = {"truth": data["tracking"].smoother_coverage.sel({"method": REPORTED}),
-            "most\nlikely": found.likely_coverage, "integrated\nout": found.posterior_coverage}
-    figure, (left, right) = style.in_a_row(width, 2, 2.5)
-    left.axhspan(0.93, 0.97, color=SPAN, lw=0)
-    left.axhline(0.95, color=style.BLACK, lw=0.8)
-    right.plot([0.4, 1.0], [0.4, 1.0], color=style.BLACK, lw=0.8)
+    """Draw the coverage of the 95% bands of paths and of the posterior intervals of parameters."""
+    estimates, levels = data["parameters"], np.array(parameters.LEVELS)
+    smoothers = {"truth": data["tracking"].smoother_coverage.sel({"method": DEFAULT_RULE}),
+                 "most\nlikely": estimates.likely_coverage, "integrated\nout": estimates.posterior_coverage}
+    figure, (path_axes, parameter_axes) = style.in_a_row(width, 2, 2.5)
+    path_axes.axhspan(0.93, 0.97, color=SPAN, lw=0)
+    path_axes.axhline(0.95, color=style.BLACK, lw=0.8)
+    parameter_axes.plot([0.4, 1.0], [0.4, 1.0], color=style.BLACK, lw=0.8)
     for index, name in enumerate(TARGETS.names):
-        bars(left, np.arange(len(rows)) + 0.12 * (index - 1), [mean_of(one[:, index]) for one in rows.values()],
+        bars(path_axes, np.arange(len(smoothers)) + 0.12 * (index - 1),
+             [mean_of(coverage[:, index]) for coverage in smoothers.values()],
              color=COLOURS[index], marker=MARKERS[index])
-        inside = np.abs(found.below[:, index] - 0.5)
-        bars(right, levels + 0.006 * (index - 1), [rate_of(inside <= level / 2) for level in levels],
+        distance = np.abs(estimates.below[:, index] - 0.5)
+        bars(parameter_axes, levels + 0.006 * (index - 1), [rate_of(distance <= level / 2) for level in levels],
              color=style.CHAIN_COLOURS[3 + index], marker=MARKERS[index], label=f"log {name}")
-    style.tidy(left, xlabel="parameters of the smoother", ylabel="coverage of the 95% bands")
-    left.set_xticks(range(len(rows)), list(rows))
-    style.tidy(right, xlabel="probability of the posterior interval", ylabel="intervals that hold the truth")
-    right.legend(loc="lower right")
+    style.tidy(path_axes, xlabel="parameters of the smoother", ylabel="coverage of the 95% bands")
+    path_axes.set_xticks(range(len(smoothers)), list(smoothers))
+    style.tidy(parameter_axes, xlabel="probability of the posterior interval", ylabel="intervals that hold the truth")
+    parameter_axes.legend(loc="lower right")
     style.legend_above(figure, [
         *(line(path, COLOURS[index], "", marker=MARKERS[index], ms=3.0) for index, path in enumerate(TARGETS.paths)),
         line("nominal", style.BLACK, lw=0.8), patch("93% to 97%", SPAN)])
-    style.note_below(figure, f"{found.sizes['dataset']} targets; error bars are two standard errors.")
+    style.note_below(figure, f"{estimates.sizes['dataset']} targets; error bars are two standard errors.")
     return figure

@@ -1,11 +1,12 @@
-"""The problem: a target on reentry, seen by a radar.
+"""The problem: a target on reentry, observed by a radar.
 
-It starts at the means of the smoothers' prior, 65 km and 3 km/s, as in the source, whose filter takes cubature points
-of the whole state.
+The target starts at the mean of the smoothers' prior, 65 km and 3 km/s, as in the source, whose filter uses cubature
+points of the whole state.
 """
 
-from lfm_ppl.experiments.simulated.problem import Problem
+from lfm_ppl.experiments.simulated.problem import SimulationProblem
 
-TARGETS = Problem("ballistic", ("alpha", "scale", "lengthscale"), ("altitude", "speed", "u"), ("m", "m/s", "m/s^2"),
-                  medians=(5e-4, 30.0, 5.0), steps=5)
-"""Altitude, speed and acceleration from distances (m), with unknown drag, and scale and lengthscale of the force."""
+TARGETS = SimulationProblem("ballistic", ("alpha", "scale", "lengthscale"), ("altitude", "speed", "u"),
+                            ("m", "m/s", "m/s^2"), medians=(5e-4, 30.0, 5.0), steps=5)
+"""Estimate altitude, speed and acceleration from distances (m), with unknown drag and unknown scale and lengthscale of
+the force."""

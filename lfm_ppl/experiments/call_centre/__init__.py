@@ -1,4 +1,4 @@
-"""Queues of a call centre, tracked through days whose arrivals nearly repeat.
+"""Queues of a call centre, tracked through days with similar patterns of arrivals.
 
-S. Reece and others, Efficient state-space inference of periodic latent force models, JMLR 15 (2014), section 8.
+Source: S. Reece and others, Efficient state-space inference of periodic latent force models, JMLR 15 (2014), section 8.
 """

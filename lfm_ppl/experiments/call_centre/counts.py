@@ -1,4 +1,13 @@
-"""Counts of calls: read from a file or simulated, and the queue that they make."""
+"""Counts of calls, read from a file or simulated, and the queue that follows from them.
+
+1. Read counts of five minutes from a CSV file, and check that each day has all counts from 7:00 to 21:00 (`read`).
+2. Without a file, simulate Poisson counts. Their log rate is a daily profile plus harmonics whose amplitudes follow a
+   first-order autoregression from week to week (`simulate`).
+3. Integrate the fluid approximation of a queue with one server, dL/dt = -Omega L / (1 + L) + zeta, by classical
+   Runge-Kutta steps within each count (`queue`).
+
+Source of the equation: Reece and others (2014), JMLR 15, section 8.
+"""
 
 from __future__ import annotations
 
@@ -14,50 +23,55 @@ from lfm_ppl import checks
 FILE = "bank_calls.csv.gz"
 WEEKDAYS = ("Monday", "Tuesday", "Wednesday", "Thursday", "Friday")
 BIN = 5.0
-"""Minutes of one count."""
+"""Length of a count (min)."""
 
-OPEN = 168
-"""Counts of a day: 7:00 to 21:00. A last count, of the five minutes after closing, is left out."""
+COUNTS_PER_DAY = 168
+"""Number of counts in a day, from 7:00 to 21:00. The count of the five minutes after closing is dropped."""
 
-DAY = BIN * OPEN
-"""Minutes of a day: opening hours, joined to those of the day before."""
+DAY = BIN * COUNTS_PER_DAY
+"""Length of a day (min). Days are concatenated without the nights."""
 
-_STEPS = 200
-"""Runge-Kutta steps for one count: the queue is right to 1e-6 customers at a service rate of 15 per minute."""
+_STEPS_PER_COUNT = 200
+"""Runge-Kutta steps in one count; the error of the queue is below 1e-6 customers at a service rate of 15 per minute."""
 
-WARNED = 2.0
-"""Hours for which more customers may come than are served before a warning says so."""
+OVERLOAD_HOURS = 2.0
+"""Duration of overload (h), more arrivals than service, above which a warning is issued."""
 
 
 class OverloadWarning(UserWarning):
-    """More customers come than are served, for hours."""
+    """More customers arrive than are served, for hours."""
 
 
-class Counts(NamedTuple):
-    """Days of the call centre: ``dates`` (N,) datetime64[D], increasing, and ``calls`` (N, `OPEN`) by five minutes."""
+class CallCounts(NamedTuple):
+    """Days of the call centre.
+
+    Attributes:
+        dates: increasing dates (N,), datetime64[D].
+        calls: number of calls (N, `COUNTS_PER_DAY`) in each five minutes.
+    """
 
     dates: np.ndarray
     calls: np.ndarray
 
-    def on(self, weekday: str) -> Counts:
-        """Return the days that are a certain weekday, one of `WEEKDAYS`; ValueError for another."""
+    def select_weekday(self, weekday: str) -> CallCounts:
+        """Return the days of one weekday in `WEEKDAYS`; ValueError for another name."""
         checks.one_of("weekday", weekday, WEEKDAYS)
-        # 1 January 1970 was a Thursday.
-        chosen = (self.dates.astype(int) + 3) % 7 == WEEKDAYS.index(weekday)
-        return Counts(self.dates[chosen], self.calls[chosen])
+        # Days count from 1 January 1970, a Thursday.
+        selection = (self.dates.astype(int) + 3) % 7 == WEEKDAYS.index(weekday)
+        return CallCounts(self.dates[selection], self.calls[selection])
 
 
-def read(path: str | Path) -> Counts:
-    """Read five-minute counts of whole days.
+def read(path: str | Path) -> CallCounts:
+    """Read five-minute counts of complete days.
 
     Args:
-        path: a CSV file, perhaps gzipped, with the columns DateTime (as 2003-03-03T07:00:00Z) and Calls; or a folder
-            with one of the name `FILE`.
+        path: CSV file, optionally gzipped, with the columns DateTime (as 2003-03-03T07:00:00Z) and Calls, or a folder
+            with such a file, named `FILE`.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: a column is missing, a count is not a number or negative, a time cannot be read or is not in order,
-            or a day does not have the counts of 7:00 to 21:00; with the row as an editor counts it.
+        FileNotFoundError: the file does not exist.
+        ValueError: a column is missing, a count is negative or not a number, a time cannot be read or is not later than
+            the previous one, or a day lacks counts between 7:00 and 21:00. The message names the row of the file.
     """
     path = Path(path, FILE) if Path(path).is_dir() else Path(path)
     if not path.is_file():
@@ -70,52 +84,55 @@ def read(path: str | Path) -> Counts:
     times = pd.to_datetime(table["DateTime"], errors="coerce", utc=True).dt.tz_localize(None).to_numpy()
     calls = pd.to_numeric(table["Calls"], errors="coerce").to_numpy(float)
     unordered = np.append(False, np.diff(times) <= np.timedelta64(0, "ns"))
-    for column, wrong, expected in (("DateTime", np.isnat(times), "a time such as 2003-03-03T07:00:00Z"),
-                                    ("Calls", ~(np.isfinite(calls) & (calls >= 0)), "a number of calls, zero or more"),
-                                    ("DateTime", unordered, "a later time than before")):
-        if wrong.any():
-            index = int(np.argmax(wrong))
+    for column, is_invalid, expected in (
+            ("DateTime", np.isnat(times), "a time such as 2003-03-03T07:00:00Z"),
+            ("Calls", ~(np.isfinite(calls) & (calls >= 0)), "a number of calls, zero or more"),
+            ("DateTime", unordered, "a later time than before")):
+        if is_invalid.any():
+            index = int(np.argmax(is_invalid))
             raise ValueError(f"{path}, row {index + 2}, column {column!r}: expected {expected}, got "
                              f"{table[column][index]!r}.")
     days = times.astype("datetime64[D]")
-    place = (times - days) / np.timedelta64(1, "m") / BIN - 7 * 60 / BIN
-    opened = (place >= 0) & (place < OPEN)
-    dates, sizes = np.unique(days[opened], return_counts=True)
-    short, between = sizes != OPEN, place[opened] != np.round(place[opened])
-    if short.any() or between.any() or not len(dates):
-        what = f"{dates[short][0]} has {sizes[short][0]}" if short.any() else "some are at other times or missing"
-        raise ValueError(f"{path}: every day needs {OPEN} counts, one for each five minutes from 7:00 to 21:00; "
-                         f"{what}.")
-    return Counts(dates, calls[opened].reshape(len(dates), OPEN))
+    slots = (times - days) / np.timedelta64(1, "m") / BIN - 7 * 60 / BIN
+    is_open = (slots >= 0) & (slots < COUNTS_PER_DAY)
+    dates, sizes = np.unique(days[is_open], return_counts=True)
+    is_incomplete, is_off_grid = sizes != COUNTS_PER_DAY, slots[is_open] != np.round(slots[is_open])
+    if is_incomplete.any() or is_off_grid.any() or not len(dates):
+        reason = "some are at other times or missing"
+        if is_incomplete.any():
+            reason = f"{dates[is_incomplete][0]} has {sizes[is_incomplete][0]}"
+        raise ValueError(f"{path}: every day needs {COUNTS_PER_DAY} counts, one for each five minutes from 7:00 to "
+                         f"21:00; {reason}.")
+    return CallCounts(dates, calls[is_open].reshape(len(dates), COUNTS_PER_DAY))
 
 
-def simulated(days: int, seed: int = 0) -> Counts:
-    """Simulate Thursdays that look like those of a bank: Poisson counts about a profile that wanders."""
+def simulate(days: int, seed: int = 0) -> CallCounts:
+    """Simulate Thursdays of a bank: Poisson counts about a daily profile that varies from week to week."""
     checks.positive_integer("days", days)
     generator = np.random.default_rng(seed)
-    hours = 7.0 + BIN / 60.0 * (np.arange(OPEN) + 0.5)
-    shape = 14.0 + 42.0 / (1.0 + np.exp(-2.5 * (hours - 8.2))) / (1.0 + np.exp(0.8 * (hours - 17.0)))
-    harmonics = np.arange(1, 5)[:, None] * 2 * np.pi * np.arange(OPEN) / OPEN
-    waves = np.concatenate([np.ones((1, OPEN)), np.sin(harmonics), np.cos(harmonics)])
-    wander, change = np.zeros(len(waves)), []
-    for _ in range(days):  # a shape that keeps eight tenths of what it was a week before
-        wander = 0.8 * wander + 0.6 * 0.03 * generator.normal(size=len(waves))
-        change.append(wander @ waves)
-    calls = generator.poisson(BIN * shape * np.exp(np.array(change)))
-    return Counts(np.datetime64("2003-03-06") + 7 * np.arange(days), calls.astype(float))
+    hours = 7.0 + BIN / 60.0 * (np.arange(COUNTS_PER_DAY) + 0.5)
+    profile = 14.0 + 42.0 / (1.0 + np.exp(-2.5 * (hours - 8.2))) / (1.0 + np.exp(0.8 * (hours - 17.0)))
+    phases = np.arange(1, 5)[:, None] * 2 * np.pi * np.arange(COUNTS_PER_DAY) / COUNTS_PER_DAY
+    harmonics = np.concatenate([np.ones((1, COUNTS_PER_DAY)), np.sin(phases), np.cos(phases)])
+    amplitudes, log_changes = np.zeros(len(harmonics)), []
+    for _ in range(days):  # an autoregression from week to week, with the coefficient 0.8
+        amplitudes = 0.8 * amplitudes + 0.6 * 0.03 * generator.normal(size=len(harmonics))
+        log_changes.append(amplitudes @ harmonics)
+    calls = generator.poisson(BIN * profile * np.exp(np.array(log_changes)))
+    return CallCounts(np.datetime64("2003-03-06") + 7 * np.arange(days), calls.astype(float))
 
 
 def overload(arrivals: np.ndarray, service: np.ndarray) -> float:
-    """Return the hours in which more customers come than are served."""
+    """Return the time (h) during which more customers arrive than are served."""
     return BIN / 60.0 * float((arrivals > service).sum())
 
 
 def queue(arrivals: Any, service: Any, start: float = 0.0) -> np.ndarray:
-    """Return the mean number of customers (N + 1,), the truth: at the start and at the ends of N counts.
+    """Return the true mean number of customers (N + 1,), at the start and at the ends of N counts.
 
-    The equation dL/dt = -Omega L / (1 + L) + zeta is integrated finely, with arrivals zeta (N,) and the service rate
-    Omega, a number or (N,), in customers/min, both constant within a count. Negative rates are refused (ValueError);
-    an `OverloadWarning` says that more customers come than are served for over two hours, all in all.
+    The queue L solves dL/dt = -Omega L / (1 + L) + zeta, with arrivals zeta (N,) and the service rate Omega, a number
+    or (N,), both in customers/min and constant within a count. Classical Runge-Kutta steps integrate the equation.
+    Negative rates raise a ValueError, and overload for more than `OVERLOAD_HOURS` in total causes an `OverloadWarning`.
 
     Example:
         >>> f"{queue(np.full(60, 5.0), 10.0)[-1]:.4f}"
@@ -127,13 +144,13 @@ def queue(arrivals: Any, service: Any, start: float = 0.0) -> np.ndarray:
         checks.finite(name, values)
         if np.min(values, initial=0.0) < 0:
             raise ValueError(f"{name} must not be negative, got {np.min(values):g}.")
-    if (over := overload(zeta, omega)) > WARNED:
-        warnings.warn(f"more customers come than are served for {over:.1f} h; the queue grows meanwhile.",
+    if (hours := overload(zeta, omega)) > OVERLOAD_HOURS:
+        warnings.warn(f"more customers come than are served for {hours:.1f} h; the queue grows meanwhile.",
                       OverloadWarning, stacklevel=2)
-    h, path = BIN / _STEPS, [float(start)]
+    h, path = BIN / _STEPS_PER_COUNT, [float(start)]
     length = path[0]
     for a, b in zip(zeta.tolist(), omega.tolist(), strict=True):
-        for _ in range(_STEPS):
+        for _ in range(_STEPS_PER_COUNT):
             k1 = a - b * length / (1.0 + length)
             x = length + 0.5 * h * k1
             k2 = a - b * x / (1.0 + x)

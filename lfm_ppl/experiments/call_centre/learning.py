@@ -1,7 +1,7 @@
-"""The parameters of a method given three days: the most likely ones, and their posterior.
+"""Parameters of a model of the arrivals, given three days: the most likely ones, and their posterior.
 
-The posterior is that of the logarithms z under the model's priors, by importance samples about all modes that are
-found, see `lfm_ppl.results.importance_at_modes`.
+The posterior of the logarithms z under the model's priors is represented by importance samples about all modes that
+searches find, see `lfm_ppl.results.importance_at_modes`.
 """
 
 from __future__ import annotations
@@ -9,68 +9,76 @@ from __future__ import annotations
 import numpy as np
 
 from lfm_ppl.experiments.call_centre import problem
-from lfm_ppl.experiments.call_centre.problem import Method
+from lfm_ppl.experiments.call_centre.problem import ArrivalModel
 from lfm_ppl.inference.optimise import End, Minimum, quasi_newton
 from lfm_ppl.results.importance_at_modes import Weighted, weighted_posterior
 
 LIMITS = {"mean": (1.0, 30.0), "scale": (0.1, 30.0), "lengthscale": (10.0, 10_000.0), "memory": (0.2, 10_000.0),
           "noise_sd": (0.01, 5.0)}
-"""Parameter -> least and largest value."""
+"""Parameter -> smallest and largest value."""
 
 STARTS = (
     {"mean": 6.0, "scale": 2.0, "lengthscale": 150.0, "memory": 10.0, "noise_sd": 2.0},
     {"mean": 4.0, "scale": 3.5, "lengthscale": 220.0, "memory": 1.0, "noise_sd": 1.5},
     {"mean": 7.0, "scale": 1.3, "lengthscale": 110.0, "memory": 60.0, "noise_sd": 1.0},
 )
-"""Where searches start: cycles somewhat alike, hardly alike, and nearly the same. From a small noise a search gets lost
-where cycles differ more than a model allows."""
+"""Starts of the searches: moderately similar, dissimilar and nearly equal cycles. With a small noise a search would
+fail where the cycles differ by more than the model permits."""
 
-SAME = 0.1
-"""Ends of searches that differ by less than this in every logarithm are the same mode."""
+MODE_TOLERANCE = 0.1
+"""Largest difference of z, in every component, between ends of searches that belong to one mode."""
 
-FAR = 7.0
-"""Modes that are so much lower in log density than the highest are left out: below a thousandth of it. Unless they are
-much wider, they hold next to nothing."""
+MODE_GAP = 7.0
+"""Largest difference in log density from the highest mode: lower modes have less than a thousandth of its density, and
+a negligible share of the posterior unless they are much wider."""
 
 _SEARCH = {"ftol": 1e-7, "gtol": 1e-3, "maxfun": 60}
 
 
-def searches(method: Method, y: np.ndarray, prior: float = 0.0) -> tuple[list[End], int]:
-    """Return where searches from `STARTS` end within `LIMITS`, the most likely end first, and all evaluations.
+def run_searches(arrival_model: ArrivalModel, y: np.ndarray, prior: float = 0.0) -> tuple[list[End], int]:
+    """Return the ends of searches from `STARTS` within `LIMITS`, and the number of evaluations.
 
-    The readings y (63, 1) are those of the training as logarithms; the prior is 0 for maxima of the likelihood, 1 for
-    those of the posterior density of z. Values are minus the log density; where no search finds a finite one it is a
-    ValueError.
+    Args:
+        arrival_model: model of the arrivals.
+        y: training readings (63, 1) as logarithms.
+        prior: 0 to maximise the likelihood, 1 to maximise the posterior density of z.
+
+    Returns:
+        The ends, with the highest density first, whose values are minus the log density; and the number of evaluations.
+
+    Raises:
+        ValueError: no search finds a finite density.
     """
-    objective = problem.posterior(method).objective(y, prior)
-    bounds, *starts = (np.log([given[name] for name in method.names]) for given in (LIMITS, *STARTS))
+    objective = problem.posterior(arrival_model).objective(y, prior)
+    bounds, *starts = (np.log([values[name] for name in arrival_model.names]) for values in (LIMITS, *STARTS))
     ends = [quasi_newton(objective, start, bounds=bounds, options=_SEARCH) for start in starts]
     if not any(np.isfinite(end.value) for end in ends):
-        raise ValueError(f"the likelihood is not finite wherever a search for the parameters of {method.force} starts; "
-                         "are there readings that no queue can have?")
+        raise ValueError(f"the likelihood is not finite at any start of the searches for {arrival_model.force}; check "
+                         "the counts for values that no queue can reach.")
     return sorted((end for end in ends if np.isfinite(end.value)), key=lambda end: end.value), objective.evaluations
 
 
-def posterior(method: Method, y: np.ndarray, count: int, seed: int) -> Weighted:
-    """Return ``count`` importance samples of z about all modes; method and readings as for `searches`."""
-    return weighted_posterior(problem.posterior(method), y, modes(method, y), count, seed)
+def sample_posterior(arrival_model: ArrivalModel, y: np.ndarray, count: int, seed: int) -> Weighted:
+    """Return ``count`` importance samples of z about all modes; model and readings as in `run_searches`."""
+    return weighted_posterior(problem.posterior(arrival_model), y, find_modes(arrival_model, y), count, seed)
 
 
-def modes(method: Method, y: np.ndarray) -> list[Minimum]:
-    """Return the different modes of the posterior with their curvature, the highest first; arguments as `searches`.
+def find_modes(arrival_model: ArrivalModel, y: np.ndarray) -> list[Minimum]:
+    """Return the distinct modes of the posterior with their curvature, the highest first; arguments as `run_searches`.
 
-    A lower one without a positive definite curvature is none, but the edge of what is allowed or of a search.
+    A lower mode without a positive definite curvature is dropped: it lies at a bound, or its search did not converge.
     """
-    ends, _ = searches(method, y, prior=1.0)
-    objective = problem.posterior(method).objective(y)
-    different: list[End] = []
+    ends, _ = run_searches(arrival_model, y, prior=1.0)
+    objective = problem.posterior(arrival_model).objective(y)
+    distinct: list[End] = []
     for end in ends:
-        if end.value - ends[0].value < FAR and all(np.abs(end.point - one.point).max() > SAME for one in different):
-            different.append(end)
+        is_high = end.value - ends[0].value < MODE_GAP
+        if is_high and all(np.abs(end.point - mode.point).max() > MODE_TOLERANCE for mode in distinct):
+            distinct.append(end)
 
     def with_curvature(point: np.ndarray) -> Minimum:
         value, gradient = objective.value_and_gradient(point)
         return Minimum(point, value, objective.curvature(point), 0.0, np.zeros_like(point), gradient)
 
-    highest, *lower = [with_curvature(end.point) for end in different]
+    highest, *lower = [with_curvature(end.point) for end in distinct]
     return [highest, *(mode for mode in lower if mode.curvature is not None and mode.curvature.definite)]

@@ -1,12 +1,14 @@
-"""Track the fourth day, with the parameters that are most likely given the first three, or marginalised.
+"""Track the test day, with the parameters that are most likely given three days of training, or marginalised.
 
-Tracking is filtering: at every five minutes of the test day the queue and the rate of arrivals are estimated from the
-readings up to then, so that the longest prediction is one of three hours. The model's state is x = log(1 + L) with the
-queue L, so that L has a shifted log-normal distribution: its median is the estimate, its quantiles are the bands.
+1. Tracking is filtering: at every five minutes of the test day the queue and the rate of arrivals are estimated from
+   the readings so far. The longest prediction is three hours ahead.
+2. The state of the model is x = log(1 + L) for the queue L, which is Gaussian. L then has a shifted log-normal
+   distribution: its median is the estimate, and its quantiles are the bands.
+3. Marginalised parameters: filter the test day for every posterior draw, and mix the estimates with equal weights.
+4. The draws are importance samples. In the first windows NUTS draws are used as well; the two must agree where the
+   posterior has one mode. Chains of this length cannot determine the shares of several modes.
 
-Where parameters are marginalised, draws of them track the test day, and the estimates of all, mixed, stand for the
-prediction. The draws are importance samples, and in the first windows those of NUTS, too, which they must agree with
-where there is one mode (chains are far too short to tell how much of the posterior is about each of several).
+Source: Reece and others (2014), JMLR 15, section 8.
 """
 
 from __future__ import annotations
@@ -23,8 +25,8 @@ import numpy as np
 from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import chains, scores
 from lfm_ppl.experiments.call_centre import problem
-from lfm_ppl.experiments.call_centre.learning import posterior, searches
-from lfm_ppl.experiments.call_centre.problem import FIRST, GRID, TESTED, Method, Window
+from lfm_ppl.experiments.call_centre.learning import run_searches, sample_posterior
+from lfm_ppl.experiments.call_centre.problem import GRID, TEST_RATES, TEST_START, ArrivalModel, CallWindow
 from lfm_ppl.experiments.tasks import dataset_indices, stack_results
 from lfm_ppl.filtering.filter import filter
 from lfm_ppl.filtering.smoother import smooth
@@ -33,15 +35,22 @@ from lfm_ppl.model.state_space import state_space
 from lfm_ppl.switching.mixture import Mixture
 
 STEPS = 3
-"""Integration steps in five minutes, about as long as those of the model file."""
+"""Integration steps in five minutes; their length is close to that of the model file."""
 
-ACCEPTED = 0.95
-"""Acceptance that NUTS aims at: steps fine enough for the walls of the posterior, where arrivals exceed what is served
-and the log density falls by hundreds within a few standard deviations."""
+TARGET_ACCEPTANCE = 0.95
+"""Acceptance probability that NUTS aims at. Its steps must be short near the boundary of the posterior, where arrivals
+exceed service and the log density falls by hundreds within a few standard deviations."""
 
 
-class Tracked(NamedTuple):
-    """Means and standard deviations (T,) on `GRID`: of log(1 + customers), and of the rate of arrivals (1/min)."""
+class QueueEstimate(NamedTuple):
+    """Estimates on `GRID`.
+
+    Attributes:
+        log_queue: means (T,) of log(1 + customers).
+        log_queue_sd: their standard deviations.
+        arrivals: means (T,) of the rate of arrivals (1/min).
+        arrivals_sd: their standard deviations.
+    """
 
     log_queue: Any
     log_queue_sd: Any
@@ -50,19 +59,24 @@ class Tracked(NamedTuple):
 
 
 def customers(log_queue: Any) -> Any:
-    """Return the queue from x = log(1 + customers), which a band may take below zero."""
+    """Return the queue for x = log(1 + customers); bands may extend to negative x, where the queue is zero."""
     return np.expm1(np.maximum(log_queue, 0.0))
 
 
-@functools.partial(jax.jit, static_argnames=("method", "smoothed"))
-def track(method: Method, z: Any, y: Any, tested: Any, smoothed: bool = False) -> Tracked:
-    """Filter a window, or smooth it, with parameters exp(z) and service rates ``tested`` in the halves of the test day.
+@functools.partial(jax.jit, static_argnames=("arrival_model", "is_smoothed"))
+def track(arrival_model: ArrivalModel, z: Any, y: Any, test_rates: Any, is_smoothed: bool = False) -> QueueEstimate:
+    """Filter or smooth a window.
 
-    The readings y (673, 1) are logarithms on `GRID`, NaN where there is none.
+    Args:
+        arrival_model: model of the arrivals.
+        z: logarithms of its parameters.
+        y: readings (673, 1) on `GRID` as logarithms, NaN where there is none.
+        test_rates: service rates in the two halves of the test day.
+        is_smoothed: whether to smooth instead of filter.
     """
-    model = problem.system(method, z, jnp.array(tested))
-    path: Any = (smooth if smoothed else filter)(model, GRID, y, steps=STEPS)
-    states = (path.mean, path.covariance) if smoothed else (path.filtered_mean, path.filtered_covariance)
+    model = problem.build_model(arrival_model, z, jnp.array(test_rates))
+    path: Any = (smooth if is_smoothed else filter)(model, GRID, y, steps=STEPS)
+    states = (path.mean, path.covariance) if is_smoothed else (path.filtered_mean, path.filtered_covariance)
     ssm = state_space(model)
 
     def queue_and_arrivals(t: jax.Array, m: jax.Array, p: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -72,104 +86,110 @@ def track(method: Method, z: Any, y: Any, tested: Any, smoothed: bool = False) -
     mean, covariance = jax.vmap(queue_and_arrivals)(jnp.asarray(GRID), *states)
     sd = jnp.sqrt(jnp.maximum(jnp.diagonal(covariance, axis1=1, axis2=2), 0.0))
     rate, rate_sd = mean[:, 1], sd[:, 1]
-    if method.link == "softplus":
+    if arrival_model.link == "softplus":
         nodes, weights = np.polynomial.hermite_e.hermegauss(20)
         values = jax.nn.softplus(rate[:, None] + rate_sd[:, None] * nodes)
         rate = values @ (weights / weights.sum())
         rate_sd = jnp.sqrt((values - rate[:, None]) ** 2 @ (weights / weights.sum()))
-    return Tracked(mean[:, 0], sd[:, 0], rate, rate_sd)
+    return QueueEstimate(mean[:, 0], sd[:, 0], rate, rate_sd)
 
 
-def judge(parts: Sequence[Tracked], window: Window, test: str) -> dict[str, float]:
-    """Return how good an equal mixture of estimates of the test day is, at the ends of its five-minute counts.
+def score_mixture(estimates: Sequence[QueueEstimate], window: CallWindow, test: str) -> dict[str, float]:
+    """Return the scores of an equal mixture of estimates on the test day, at the ends of its five-minute counts.
 
-    These are ``rmse`` of the median and ``coverage`` of the 95% bands of the queue, ``ell``, the log density of the
-    true queue, summed over these times, and ``rate_rmse`` of the mean and ``rate_coverage`` of the arrivals.
+    Returns:
+        For the queue ``rmse`` of the median, ``coverage`` of the 95% bands, and ``ell``, the sum of the log
+        densities of the true queue; for the arrivals ``rate_rmse`` of the mean and ``rate_coverage`` of the 95% bands.
     """
-    ends = slice(FIRST + 1, None)
-    queue, arrivals = window.queues[test][ends], window.arrivals[FIRST:]
-    mean, sd, rate, rate_sd = (jnp.stack(entry, axis=1)[ends, :, None] for entry in zip(*parts, strict=True))
-    even = jnp.full(mean.shape[:2], -np.log(len(parts)))
-    logarithms, rates = Mixture(mean, sd**2, even), Mixture(rate, rate_sd**2, even)
-    low, middle, high = customers(np.asarray(logarithms.quantiles([0.025, 0.5, 0.975]))[:, :, 0])
+    test_day = slice(TEST_START + 1, None)
+    queue, arrivals = window.queues[test][test_day], window.arrivals[TEST_START:]
+    mean, sd, rate, rate_sd = (jnp.stack(entry, axis=1)[test_day, :, None] for entry in zip(*estimates, strict=True))
+    log_weights = jnp.full(mean.shape[:2], -np.log(len(estimates)))
+    log_queues, rates = Mixture(mean, sd**2, log_weights), Mixture(rate, rate_sd**2, log_weights)
+    low, median, high = customers(np.asarray(log_queues.quantiles([0.025, 0.5, 0.975]))[:, :, 0])
     rate_low, rate_high = np.asarray(rates.quantiles([0.025, 0.975]))[:, :, 0]
     # The density of L is that of x = log(1 + L) times dx/dL = exp(-x).
     x = np.log1p(queue)
-    density = np.asarray(logarithms.log_density(x[:, None]))[:, 0] - x
-    return {"rmse": scores.rmse(middle, queue), "coverage": scores.interval_coverage(low, high, queue),
+    density = np.asarray(log_queues.log_density(x[:, None]))[:, 0] - x
+    return {"rmse": scores.rmse(median, queue), "coverage": scores.interval_coverage(low, high, queue),
             "ell": density.sum(),
             "rate_rmse": scores.rmse(rate.mean(axis=1)[:, 0], arrivals),
             "rate_coverage": scores.interval_coverage(rate_low, rate_high, arrivals)}
 
 
-def method_of(task: Task) -> Method:
-    """Return the method of a task."""
-    return Method(task.settings["method"].lower(), task.settings["link"], task.settings["functions"])
+def arrival_model_of(task: Task) -> ArrivalModel:
+    """Return the model of the arrivals for a task."""
+    return ArrivalModel(task.settings["method"].lower(), task.settings["link"], task.settings["functions"])
 
 
-def windows_of(task: Task) -> list[Window]:
+def windows_of(task: Task) -> list[CallWindow]:
     """Return the windows of a task."""
     data, weekday = task.settings["data"], task.settings["weekday"]
-    return [problem.window(data, weekday, index, task.seed) for index in dataset_indices(task)]
+    return [problem.build_window(data, weekday, index, task.seed) for index in dataset_indices(task)]
 
 
-def most_likely(task: Task) -> Result:
-    """Return what a method finds of all windows with its most likely parameters.
+def track_most_likely(task: Task) -> Result:
+    """Return the results of a method with its most likely parameters, for all windows.
 
-    These are z, the log likelihood, and the evaluations of it, the entries of `mixed`, and ``largest``, the longest
-    true queue, by test; CPU ``seconds``, the first with compilation; the entries of `Tracked` of the first window, by
-    test.
+    Returns:
+        ``z``, the log likelihood, and its number of ``evaluations``; the entries of `score_draws`; ``{test}_largest``,
+        the longest true queue; CPU ``seconds``, for the first window with compilation; and the entries of
+        `QueueEstimate` for the first window, with the prefix ``{test}_``.
     """
-    method, windows, rows = method_of(task), windows_of(task), []
+    arrival_model, windows, rows = arrival_model_of(task), windows_of(task), []
     for window in windows:
-        began = time.process_time()
-        (best, *_), evaluations = searches(method, window.training)
-        scored = mixed(method, best.point[None], window)
-        largest = {f"{test}_largest": queue[FIRST + 1:].max() for test, queue in window.queues.items()}
-        rows.append({"z": best.point, "log_likelihood": -best.value, "evaluations": evaluations, **scored, **largest,
-                     "seconds": time.process_time() - began})
-    tracked = {test: track(method, rows[0]["z"], windows[0].y[test], rates) for test, rates in TESTED.items()}
-    return stack_results(rows) | {f"{test}_{name}": np.asarray(value) for test, path in tracked.items()
-                                  for name, value in path._asdict().items()}
+        start = time.process_time()
+        (best, *_), evaluations = run_searches(arrival_model, window.training)
+        window_scores = score_draws(arrival_model, best.point[None], window)
+        largest = {f"{test}_largest": queue[TEST_START + 1:].max() for test, queue in window.queues.items()}
+        rows.append({"z": best.point, "log_likelihood": -best.value, "evaluations": evaluations, **window_scores,
+                     **largest, "seconds": time.process_time() - start})
+    estimates = {test: track(arrival_model, rows[0]["z"], windows[0].y[test], rates)
+                 for test, rates in TEST_RATES.items()}
+    return stack_results(rows) | {f"{test}_{name}": np.asarray(value) for test, estimate in estimates.items()
+                                  for name, value in estimate._asdict().items()}
 
 
-def marginalised(task: Task) -> Result:
-    """Return what the posterior says of all windows, and the entries of `mixed`.
+def track_marginalised(task: Task) -> Result:
+    """Return the results of a method with marginalised parameters, for all windows.
 
-    Of the importance samples these are the Pareto index ``k`` and ``ess``, the number of ``modes`` and the share of the
-    posterior ``beyond`` the highest of them (N,), ``posterior_mean`` and ``posterior_sd`` of z (N, P); of the first
-    window the arrivals ``shapes`` and ``shapes_sd`` (673,), smoothed at the most likely parameters.
+    Returns:
+        The Pareto index ``k`` and the effective sample size ``ess`` of the importance samples (N,), the number of
+        ``modes`` and the posterior share ``beyond`` the highest mode (N,), ``posterior_mean`` and ``posterior_sd`` of z
+        (N, P), and the entries of `score_draws`; for the first window the smoothed arrivals ``shapes`` and
+        ``shapes_sd`` (673,) at the most likely parameters.
     """
-    method, windows, rows = method_of(task), windows_of(task), []
+    arrival_model, windows, rows = arrival_model_of(task), windows_of(task), []
     for seed, window in enumerate(windows, task.seed):
-        found = posterior(method, window.training, task.settings["draws"], seed)
-        rows.append({**found.summary, "modes": len(found.mixture_weights), "beyond": found.mixture_weights[1:].sum(),
-                     **mixed(method, found.resampled(task.settings["mixed"], seed), window)})
-    (best, *_), _ = searches(method, windows[0].training)
-    path = track(method, best.point, windows[0].y["constant"], TESTED["constant"], smoothed=True)
+        weighted = sample_posterior(arrival_model, window.training, task.settings["draws"], seed)
+        draws = weighted.resampled(task.settings["mixed"], seed)
+        rows.append({**weighted.summary, "modes": len(weighted.mixture_weights),
+                     "beyond": weighted.mixture_weights[1:].sum(), **score_draws(arrival_model, draws, window)})
+    (best, *_), _ = run_searches(arrival_model, windows[0].training)
+    path = track(arrival_model, best.point, windows[0].y["constant"], TEST_RATES["constant"], is_smoothed=True)
     return stack_results(rows) | {"shapes": np.asarray(path.arrivals), "shapes_sd": np.asarray(path.arrivals_sd)}
 
 
-def by_nuts(task: Task) -> Result:
-    """Return the entries of `mixed` of one window, and those of `chains.sample`."""
-    method, (window,) = method_of(task), windows_of(task)
+def track_by_nuts(task: Task) -> Result:
+    """Return the entries of `score_draws` and of `chains.sample` for one window."""
+    arrival_model, (window,) = arrival_model_of(task), windows_of(task)
     count, warmup, draws = task.settings["chains"]
 
     def model(y: np.ndarray) -> None:
-        problem.model_file().model(problem.TRAINING, y, **method._asdict())
+        problem.model_file().model(problem.TRAINING_TIMES, y, **arrival_model._asdict())
 
     mcmc = chains.sampler(chains.nuts(model, target_accept_prob=task.settings["accepted"]), count, warmup, draws)
     start_key, run_key = jax.random.split(task.key)
-    (near, *_), _ = searches(method, window.training, prior=1.0)
-    starts = chains.draw_starts(method.names, near.point, count, start_key)
-    found = chains.sample(mcmc, method.names, run_key, window.training, init_params=starts)
-    return found | mixed(method, scores.thin_draws(found["draws"], task.settings["mixed"]), window)
+    (mode, *_), _ = run_searches(arrival_model, window.training, prior=1.0)
+    starts = chains.draw_starts(arrival_model.names, mode.point, count, start_key)
+    sample = chains.sample(mcmc, arrival_model.names, run_key, window.training, init_params=starts)
+    return sample | score_draws(arrival_model, scores.thin_draws(sample["draws"], task.settings["mixed"]), window)
 
 
-def mixed(method: Method, several: np.ndarray, window: Window) -> dict[str, float]:
-    """Return the entries of `judge` of several z (S, P), mixed, by test: with its name before theirs."""
+def score_draws(arrival_model: ArrivalModel, draws: np.ndarray, window: CallWindow) -> dict[str, float]:
+    """Return the entries of `score_mixture` for the mixture over draws of z (S, P), with the prefix ``{test}_``."""
     row: dict[str, float] = {}
-    for test, rates in TESTED.items():
-        parts = [track(method, z, window.y[test], rates) for z in several]
-        row |= {f"{test}_{name}": value for name, value in judge(parts, window, test).items()}
+    for test, rates in TEST_RATES.items():
+        estimates = [track(arrival_model, z, window.y[test], rates) for z in draws]
+        row |= {f"{test}_{name}": value for name, value in score_mixture(estimates, window, test).items()}
     return row

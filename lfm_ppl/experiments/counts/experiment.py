@@ -1,4 +1,4 @@
-"""The study: its settings, tasks and tables."""
+"""The study of counts, outliers and binary data: settings, tasks and tables."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ import xarray as xr
 from lfm_ppl.engine.run import Reporter
 from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import study
-from lfm_ppl.experiments.counts import figures, methods, problem
+from lfm_ppl.experiments.counts import figures, methods
+from lfm_ppl.experiments.counts.problem import COAL, NAMES, ProblemSize, build_problem
 from lfm_ppl.experiments.datasets import Column, TaskKind, row
 from lfm_ppl.experiments.scores import Estimate
 from lfm_ppl.experiments.study import Data, Results, Study, StudyTable, setting
@@ -19,69 +20,69 @@ from lfm_ppl.experiments.study import Data, Results, Study, StudyTable, setting
 
 @dataclass(frozen=True)
 class CountsSettings(study.StudySettings):
-    """How much is computed."""
+    """Sizes of the study."""
 
     data: str | None = setting(None, "folder with the folders coal and calls (default: simulated counts)",
                                metavar="FOLDER")
-    problems: tuple[str, ...] = setting(problem.NAMES, "data and their families", quick=(problem.COAL,),
-                                        choices=problem.NAMES)
-    size: problem.Size = setting(problem.Size(), "", quick=problem.Size(bins=56, folds=2))
-    draws: int = setting(5000, "of each of four chains of the reference", quick=500)
+    problems: tuple[str, ...] = setting(NAMES, "data and their families", quick=(COAL,), choices=NAMES)
+    size: ProblemSize = setting(ProblemSize(), "", quick=ProblemSize(bins=56, folds=2))
+    draws: int = setting(5000, "draws of each of the reference's four chains", quick=500)
 
 
-def learning(settings: CountsSettings) -> list[Task]:
-    """Return a task for each problem, which finds its parameters."""
+def parameter_tasks(settings: CountsSettings) -> list[Task]:
+    """Return one task for each problem, which learns its parameters."""
     return [Task(f"{name}/parameters", settings.seed,
                  {"problem": name, "size": list(settings.size), "data": settings.data}) for name in settings.problems]
 
 
-def comparing(settings: CountsSettings, results: Results) -> list[Task]:
-    """Return a task for each problem and method, which takes the parameters of the problem."""
+def comparison_tasks(settings: CountsSettings, results: Results) -> list[Task]:
+    """Return one task for each problem and method, with the parameters of the problem."""
     return [Task(f"{task.settings['problem']}/{method}", settings.seed,
                  {**task.settings, "method": method, "draws": settings.draws,
                   "parameters": {name: float(value) for name, value in results[task.name].items()}})
-            for task in learning(settings) for method in methods.METHODS]
+            for task in parameter_tasks(settings) for method in methods.METHODS]
 
 
 def check(settings: CountsSettings, report: Reporter | None) -> None:
-    """Raise FileNotFoundError or ValueError where something is wrong with the data."""
+    """Raise FileNotFoundError or ValueError for missing or invalid data."""
     for name in settings.problems:
-        problem.problem(name, settings.size, settings.seed, settings.data)
+        build_problem(name, settings.size, settings.seed, settings.data)
 
 
 def tables(settings: CountsSettings, data: Data) -> dict[str, StudyTable]:
     """Return the tables."""
-    every = {name: methods.compared(settings, data, name) for name in settings.problems}
+    comparisons = {name: methods.compare_methods(settings, data, name) for name in settings.problems}
     accuracy = "Posterior of the predictor (mean: largest error in sds; sd: largest relative error)"
-    return {"accuracy": StudyTable.from_rows(accuracy, rows(every, ACCURACY)),
-            "prediction": StudyTable.from_rows(f"Held-out data, {settings.size.folds} folds", rows(every, PREDICTION))}
+    return {"accuracy": StudyTable.from_rows(accuracy, rows(comparisons, ACCURACY)),
+            "prediction": StudyTable.from_rows(f"Held-out data, {settings.size.folds} folds",
+                                               rows(comparisons, PREDICTION))}
 
 
 ACCURACY: dict[str, Column] = {
-    "log Z": lambda one: Estimate(float(one["log evidence"]), float(one["log evidence error"])),
-    "less reference": lambda one: Estimate(float(one["excess"]), float(one["excess error"])),
+    "log Z": lambda results: Estimate(float(results["log evidence"]), float(results["log evidence error"])),
+    "less reference": lambda results: Estimate(float(results["excess"]), float(results["excess error"])),
     "mean": "mean error", "sd": "sd error", "covered": "covered", "seconds": "seconds"}
-"""Of the predictor's posterior, see `methods.compared`; log Z of the reference has the standard error of importance
-sampling. ``seconds`` of CPU time are those of an evidence with its gradient, or of all draws."""
+"""Columns for the predictor's posterior, see `methods.compare_methods`. The standard error of the reference's log Z is
+that of importance sampling. ``seconds`` is the CPU time of one evidence with its gradient, or of all draws."""
 
-PREDICTION: dict[str, Column] = {"NLPD": lambda one: -one["log density"], "less reference": "excess NLPD",
+PREDICTION: dict[str, Column] = {"NLPD": lambda results: -results["log density"], "less reference": "excess NLPD",
                                  "covered": "inside"}
-"""Means over all data, each held out with its fold: the negative log predictive density, by how much it exceeds the
-reference's, and the share of data in their 95% predictive intervals."""
+"""Means over all data, each held out with its fold: negative log predictive density, its excess over the reference, and
+coverage of the 95% predictive intervals."""
 
 
-def rows(every: Mapping[str, xr.Dataset], columns: Mapping[str, Column]) -> dict[str, Any]:
-    """Return one row for each problem, see `methods.compared`, and method; columns of what it lacks are left out."""
-    found = {}
-    for name, compared in every.items():
-        known = {title: column for title, column in columns.items() if callable(column) or column in compared}
+def rows(comparisons: Mapping[str, xr.Dataset], columns: Mapping[str, Column]) -> dict[str, Any]:
+    """Return one row for each problem and method, without the columns that a problem lacks."""
+    table = {}
+    for name, comparison in comparisons.items():
+        available = {title: column for title, column in columns.items() if callable(column) or column in comparison}
         for method, label in methods.METHODS.items():
-            found[f"{name}, {label}"] = row(compared.sel({"method": method}), known)
-    return found
+            table[f"{name}, {label}"] = row(comparison.sel({"method": method}), available)
+    return table
 
 
 def notes(settings: CountsSettings, data: Data) -> tuple[str, ...]:
-    """Return what there is to say about the reference and the parameters."""
+    """Return remarks on the reference and on the parameters."""
     reference = data["comparison"].sel({"method": methods.REFERENCE})
     return (f"Reference: elliptical slices, at least {reference.ess.min():.0f} effective draws, R-hat at most "
             f"{reference.r_hat.max():.3f}; log Z by importance sampling, effective share of the draws at least "
@@ -90,12 +91,17 @@ def notes(settings: CountsSettings, data: Data) -> tuple[str, ...]:
             "all methods take the same.")
 
 
-STUDY = Study(
-    CountsSettings, learning,
-    {"parameters": TaskKind(methods.learn, {
+def _task_kind(task: Task) -> str:
+    return "comparison" if "method" in task.settings else "parameters"
+
+
+KINDS = {
+    "parameters": TaskKind(methods.learn_parameters, {
         "": "level, scale, lengthscale, daily_scale, daily_lengthscale, concentration, noise"}, ("problem",)),
-     "comparison": TaskKind(methods.compute, {
-         "dataset": "mean, sd, log density, low, high",
-         "": "log evidence, log evidence error, share, ess, r_hat, seconds"}, ("problem", "method"))},
-    tables, figures.draw, notes=notes, follow_up_tasks=comparing, check=check,
-    task_kind=lambda task: "comparison" if "method" in task.settings else "parameters")
+    "comparison": TaskKind(methods.apply_method, {
+        "dataset": "mean, sd, log density, low, high",
+        "": "log evidence, log evidence error, share, ess, r_hat, seconds"}, ("problem", "method")),
+}
+
+STUDY = Study(CountsSettings, parameter_tasks, KINDS, tables, figures.draw, notes=notes,
+              follow_up_tasks=comparison_tasks, check=check, task_kind=_task_kind)

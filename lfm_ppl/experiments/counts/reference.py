@@ -1,4 +1,4 @@
-"""The exact posterior by Monte Carlo, with the process as its values at the data: dense algebra, no filter in it."""
+"""Exact posterior by Monte Carlo, with the process as its values at the data: dense algebra without a filter."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ from lfm_ppl.model.state_space import state_space
 CHAINS = 4
 
 WARMUP = 100
-"""Steps that are left out; chains start near the posterior already."""
+"""Discarded steps of each chain; few suffice, since chains start close to the posterior."""
 
 
-class Reference:
-    r"""The predictor at the data as f = m + L w with w standard normal, L L' its prior covariance.
+class MonteCarloReference:
+    r"""Exact posterior of the predictor f = m + L w at the data, with w standard normal and L L' the prior covariance.
 
-    Both samplers propose from N(w; a, P^-1), the posterior with the sites of expectation propagation in the place of
-    the data, and both are exact whatever these are: importance sampling for the evidence; elliptical slices of the
-    posterior over this normal, taken as the prior (generalised elliptical slice sampling), for everything else.
+    Two samplers use N(w; a, P^-1), the posterior in which the sites of expectation propagation replace the likelihood.
+    Importance sampling from it gives the evidence. Elliptical slice sampling with it as the prior (generalised
+    elliptical slice sampling) gives the posterior. Both are exact for any sites.
 
     Args:
-        model: forces that are observed themselves, through a predictor that is a level plus their sum.
-        times: (T,).
-        sites: how they are refined.
+        model: model without dynamics, whose predictor is a level plus the sum of the forces.
+        times: times (T,).
+        sites: site settings.
 
     Source: Nishihara, Murray and Adams (2014), Journal of Machine Learning Research 15.
     """
@@ -47,15 +47,15 @@ class Reference:
     def __init__(self, model: LatentForceModel, times: np.ndarray, sites: SiteSettings) -> None:
         assert isinstance(model.observation, ObservationFamily)
         self.ssm, self.times, self.settings, self.family = state_space(model), times, sites, model.observation
-        t, nothing = jnp.asarray(times), jnp.zeros(len(model.force_names))
-        self.mean = model.observation.function(jnp.zeros(0), nothing, t[0])[0]
+        t, zero_forces = jnp.asarray(times), jnp.zeros(len(model.force_names))
+        self.mean = model.observation.function(jnp.zeros(0), zero_forces, t[0])[0]
         covariance: Any = sum(force.covariance_in_model(t[:, None], t, t[0]) for force in self.ssm.stack.forces)
         jitter = JITTER * jnp.max(jnp.diagonal(covariance)) * jnp.eye(len(times))
         self.root = jnp.linalg.cholesky(covariance + jitter)
 
     @partial(jax.jit, static_argnums=0)
     def proposal(self, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return a (T,) and the factor R of P = R R' given data (T, 1)."""
+        """Return the mean a (T,) and the factor R of the precision P = R R' for data (T, 1)."""
         problem = filter_problem(self.ssm, as_rule(None), build_time_grid(self.ssm, self.times, 1))
         sites = evidence(problem, FamilyTerms(self.family, y), self.settings).refined.fixed_point.sites
         nu, tau = (jnp.where(jnp.isfinite(y), a, 0.0)[:, 0] for a in (sites.nu, sites.tau))
@@ -64,15 +64,15 @@ class Reference:
 
     @partial(jax.jit, static_argnums=(0, 4))
     def log_weights(self, key: jax.Array, y: jax.Array, proposal: tuple, draws: int) -> jax.Array:
-        """Return log weights (draws,) of importance samples, whose exponentials have p(y) of data (T, 1) as mean."""
-        _, log_weight = self._whitened(y, *proposal)
+        """Return log importance weights (draws,); the mean of their exponentials estimates p(y) of data (T, 1)."""
+        _, log_weight = self._whiten(y, *proposal)
         return jax.lax.map(lambda key: log_weight(jax.random.normal(key, (len(y),))), jax.random.split(key, draws),
                            batch_size=200)
 
     @partial(jax.jit, static_argnums=(0, 4))
     def sample(self, key: jax.Array, y: jax.Array, proposal: tuple, draws: int) -> jax.Array:
-        """Return draws of the predictor (chains, draws, T) given data (T, 1), by elliptical slices."""
-        predictor, log_weight = self._whitened(y, *proposal)
+        """Return draws of the predictor (chains, draws, T) for data (T, 1), by elliptical slice sampling."""
+        predictor, log_weight = self._whiten(y, *proposal)
 
         def step(state: SliceState, key: jax.Array) -> tuple[SliceState, jax.Array]:
             draw_key, step_key = jax.random.split(key)
@@ -81,23 +81,25 @@ class Reference:
 
         def chain(key: jax.Array) -> jax.Array:
             start_key, key = jax.random.split(key)
-            first: Any = jax.random.normal(start_key, (len(y),))
+            start: Any = jax.random.normal(start_key, (len(y),))
             keys = jax.random.split(key, WARMUP + draws)
-            return jax.lax.scan(step, SliceState(first, log_weight(first)), keys)[1][WARMUP:]
+            return jax.lax.scan(step, SliceState(start, log_weight(start)), keys)[1][WARMUP:]
 
         return jax.lax.map(chain, jax.random.split(key, CHAINS))
 
-    def _whitened(self, y: jax.Array, mean: jax.Array, root: jax.Array) -> tuple[Callable, Callable]:
-        """Return the predictor and the log weight as functions of R' (w - a), standard normal under the proposal."""
-        back = solve_triangular(root, jnp.eye(len(y)), lower=True).T
-        middle, forward = self.mean + self.root @ mean, solve_triangular(root, self.root.T, lower=True).T
+    def _whiten(self, y: jax.Array, mean: jax.Array, root: jax.Array) -> tuple[Callable, Callable]:
+        """Return predictor and log weight as functions of z = R' (w - a), standard normal under the proposal."""
+        inverse_root = solve_triangular(root, jnp.eye(len(y)), lower=True).T
+        proposal_mean = self.mean + self.root @ mean
+        predictor_root = solve_triangular(root, self.root.T, lower=True).T
         log_determinant = jnp.log(jnp.diagonal(root)).sum()
 
         def predictor(z: jax.Array) -> jax.Array:
-            return middle + forward @ z
+            return proposal_mean + predictor_root @ z
 
         def log_weight(z: jax.Array) -> jax.Array:
-            w, log_likelihood = mean + back @ z, FamilyTerms(self.family, y).log_prob(predictor(z)[:, None]).sum()
+            w = mean + inverse_root @ z
+            log_likelihood = FamilyTerms(self.family, y).log_prob(predictor(z)[:, None]).sum()
             return log_likelihood - 0.5 * w @ w + 0.5 * z @ z - log_determinant
 
         return predictor, log_weight

@@ -1,5 +1,6 @@
-"""Data simulated from a model: what filters, smoothers and samplers find of paths and parameters whose truth is known.
+"""Studies of simulated data: filters, smoothers and samplers against known paths and parameters.
 
-A study of such data has a problem (`lfm_ppl.experiments.simulated.problem.Problem`), makes its tasks of the functions
-here, each of which takes the problem and a task, and adds tables and figures; `lfm_ppl.experiments.ballistic` is one.
+Such a study defines a `lfm_ppl.experiments.simulated.problem.SimulationProblem`, computes its tasks with the functions
+of ``states`` and ``parameters``, which take the problem and a task, and adds tables and figures;
+`lfm_ppl.experiments.ballistic` is an example.
 """

@@ -1,10 +1,13 @@
 """Parameters from the measurements alone: the maximum of the likelihood, and the posterior.
 
-The posterior is that of the model with its priors and the Gaussian filter's likelihood, in the logarithms z of the
-parameters, by importance samples about its mode, whose Pareto index says whether they are good enough; NUTS and RAM
-must agree with them on a few data sets. How often it covers one and the same truth depends on how far the prior pulls.
-Where all parameters but one are known it hardly pulls: the posterior of that one, by quadrature, covers the truth about
-as often as it says if the filter's likelihood is right.
+1. Maximise the Gaussian filter's likelihood, and its product with the prior, over the logarithms z of the parameters.
+2. Draw importance samples about the posterior mode. Their Pareto index shows whether the weights are reliable, and NUTS
+   and RAM must agree with them on a few data sets.
+3. Smooth the paths at the maximum of the likelihood, and averaged over posterior draws.
+
+The coverage of the posterior for a fixed truth depends on the prior. With all parameters but one known the prior hardly
+matters: if the filter's likelihood is right, the posterior of the remaining parameter, by quadrature, has the nominal
+coverage (`rank_first_parameter`).
 """
 
 from __future__ import annotations
@@ -20,8 +23,15 @@ from numpyro.infer import init_to_uniform
 from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import chains
 from lfm_ppl.experiments.scores import GridPosterior, interval, score_path, total_moments
-from lfm_ppl.experiments.simulated.problem import Problem, Record, drawn_record, model, posterior, record
-from lfm_ppl.experiments.simulated.states import paths_of
+from lfm_ppl.experiments.simulated.problem import (
+    SimulatedRecord,
+    SimulationProblem,
+    model,
+    posterior,
+    simulate_record,
+    simulate_record_from_prior,
+)
+from lfm_ppl.experiments.simulated.states import smoothed_paths
 from lfm_ppl.experiments.tasks import dataset_indices, stack_results
 from lfm_ppl.experiments.timing import time_compiled_call
 from lfm_ppl.inference.kernels.ram import RAM
@@ -32,84 +42,87 @@ SAMPLERS = ("NUTS", "RAM")
 LEVELS = (0.5, 0.8, 0.95)
 """Probabilities of the central intervals whose coverage is reported."""
 
-FURTHEST = 3.0
-"""A maximum of the likelihood further than this from where searches start, in logarithms, lies at the edge: there is
-none among plausible values."""
+MAX_DISTANCE = 3.0
+"""Largest distance of the maximum of the likelihood from the prior medians, in every logarithm. A search that ends
+further away has no maximum among plausible values."""
 
 
-def weighted(problem: Problem, task: Task, drawn: bool = False) -> Result:
-    """Return what `estimate` finds of every data set, with the truth or one ``drawn``, and ``draws`` of the first."""
-    simulate_record = drawn_record if drawn else record
+def estimate_all(problem: SimulationProblem, task: Task, from_prior: bool = False) -> Result:
+    """Return the entries of `estimate` for every data set of a task, and ``draws`` of the first.
+
+    The data sets have the true parameters or, with ``from_prior``, parameters drawn from the prior.
+    """
+    simulate = simulate_record_from_prior if from_prior else simulate_record
     count, paths = task.settings["draws"], task.settings["paths"]
-    rows = [estimate(problem, simulate_record(problem, index, task.seed), count, paths,
+    rows = [estimate(problem, simulate(problem, index, task.seed), count, paths,
                      int(jax.random.bits(jax.random.fold_in(task.key, index)))) for index in dataset_indices(task)]
     return stack_results(rows, first_only=("draws",))
 
 
-def estimate(problem: Problem, one: Record, count: int, paths: int, seed: int) -> Result:
-    """Return maximum and posterior of a data set.
+def estimate(problem: SimulationProblem, record: SimulatedRecord, count: int, paths: int, seed: int) -> Result:
+    """Return maximum of the likelihood and posterior for a data set.
 
     Args:
-        problem: what is simulated.
-        one: the data set.
-        count: importance samples.
-        paths: draws over which the smoothed paths are averaged.
-        seed: of the draws.
+        problem: the problem.
+        record: the data set.
+        count: number of importance samples.
+        paths: number of draws over which smoothed paths are averaged.
+        seed: seed of the draws.
 
     Returns:
-        ``likely`` (P,), the maximum of the likelihood, and whether it ``exists``; of the posterior the entries of
-        `Weighted.summary`, and ``below`` (P,), the probability of less than the true value; RMSE and coverage (K,) of
-        the paths smoothed at the maximum (``likely_``), and with the parameters marginalised (``posterior_``); CPU
+        ``likely`` (P,), the maximum of the likelihood, and whether it ``exists``; the posterior's entries of
+        `Weighted.summary`; ``below`` (P,), the posterior probability of values below the truth; RMSE and coverage (K,)
+        of the paths smoothed at the maximum (``likely_``) and with the parameters marginalised (``posterior_``); CPU
         ``seconds`` of searches and weights; ``draws`` (P, count).
     """
     density, start = posterior(problem), np.log(problem.medians)
 
     def search() -> tuple[Minimum, Weighted]:
-        objectives = [density.objective(one.y, prior) for prior in (1.0, 0.0)]
-        mode, likely = (newton(each, quasi_newton(each, start, 200).point) for each in objectives)
-        return likely, weighted_posterior(density, one.y, [mode], count, seed)
+        objectives = [density.objective(record.y, prior) for prior in (1.0, 0.0)]
+        mode, likely = (newton(objective, quasi_newton(objective, start, 200).point) for objective in objectives)
+        return likely, weighted_posterior(density, record.y, [mode], count, seed)
 
-    seconds, (likely, found) = time_compiled_call(f"{problem}, {count} weighted draws", search)
-    row = {**found.summary, "likely": likely.point, "seconds": seconds, "draws": found.resampled(count, seed).T,
-           "below": found.weight @ (found.draws < one.z),
+    seconds, (likely, weighted) = time_compiled_call(f"{problem}, {count} weighted draws", search)
+    row = {**weighted.summary, "likely": likely.point, "seconds": seconds, "draws": weighted.resampled(count, seed).T,
+           "below": weighted.weight @ (weighted.draws < record.z),
            "exists": likely.curvature is not None and likely.curvature.definite
-           and bool(np.all(np.abs(likely.point - start) < FURTHEST))}
-    for what, several in (("likely", likely.point[None]), ("posterior", found.resampled(paths, seed))):
-        means, sds = map(np.asarray, _smoothing(problem)(several, one.y))
+           and bool(np.all(np.abs(likely.point - start) < MAX_DISTANCE))}
+    for prefix, draws in (("likely", likely.point[None]), ("posterior", weighted.resampled(paths, seed))):
+        means, sds = map(np.asarray, _compiled_smoother(problem)(draws, record.y))
         mean, sd = total_moments(means, sds**2)
-        row |= score_path(what, mean, interval(mean, sd), one.paths)
+        row |= score_path(prefix, mean, interval(mean, sd), record.paths)
     return row
 
 
 @functools.cache
-def _smoothing(problem: Problem) -> Callable:
-    """Return what smooths paths for several z (S, P), compiled once for all data sets."""
-    return jax.jit(lambda several, y: jax.lax.map(
-        lambda z: paths_of(problem, posterior(problem).likelihood(z).smooth(y)), several, batch_size=10))
+def _compiled_smoother(problem: SimulationProblem) -> Callable:
+    """Return the map from draws of z (S, P) and data to smoothed paths, compiled once for all data sets."""
+    return jax.jit(lambda draws, y: jax.lax.map(
+        lambda z: smoothed_paths(problem, posterior(problem).likelihood(z).smooth(y)), draws, batch_size=10))
 
 
-def by_chains(problem: Problem, task: Task) -> Result:
-    """Return what `lfm_ppl.experiments.chains.sample` does, of z (P, chains, draws) of a data set."""
-    one = record(problem, task.settings["index"], task.seed)
-    start = init_to_uniform(radius=1.0)  # chains start apart, or R-hat would say nothing
+def sample_chains(problem: SimulationProblem, task: Task) -> Result:
+    """Return the entries of `lfm_ppl.experiments.chains.sample` for z (P, chains, draws) of a data set."""
+    record = simulate_record(problem, task.settings["index"], task.seed)
+    start = init_to_uniform(radius=1.0)  # R-hat detects nothing unless the chains start at different points
     kernel: Any = (RAM if task.settings["sampler"] == "RAM" else chains.nuts)(model(problem), init_strategy=start)
     mcmc = chains.sampler(kernel, *(task.settings[name] for name in chains.LENGTHS))
-    return chains.sample(mcmc, problem.names, task.key, one.times, one.y)
+    return chains.sample(mcmc, problem.names, task.key, record.times, record.y)
 
 
-def alone(problem: Problem, reach: float, task: Task) -> Result:
-    """Return ``below`` (N,), see `below`, of the data sets of a task."""
-    return {"below": np.array([below(problem, reach, record(problem, index, task.seed))
+def rank_all(problem: SimulationProblem, reach: float, task: Task) -> Result:
+    """Return ``below`` (N,), the entries of `rank_first_parameter` for the data sets of a task."""
+    return {"below": np.array([rank_first_parameter(problem, reach, simulate_record(problem, index, task.seed))
                                for index in dataset_indices(task)])}
 
 
-def below(problem: Problem, reach: float, one: Record, nodes: int = 121) -> float:
-    """Return the posterior probability that the first parameter is less than it is, the others known, by quadrature.
+def rank_first_parameter(problem: SimulationProblem, reach: float, record: SimulatedRecord, nodes: int = 121) -> float:
+    """Return the posterior probability that the first parameter is below its true value, with the others known.
 
-    The prior of its logarithm is flat within ``reach`` of the truth, where the nodes are: several posterior standard
-    deviations on either side, a few nodes in each.
+    The posterior is computed by quadrature. The prior of the logarithm is flat within ``reach`` of the truth, the range
+    of the nodes: it must be several posterior standard deviations on either side, with a few nodes in each.
     """
-    points = np.tile(one.z, (nodes, 1))
+    points = np.tile(record.z, (nodes, 1))
     points[:, 0] += reach * np.linspace(-1.0, 1.0, nodes)
-    log_likelihood, _ = posterior(problem).log_densities_of(points, one.y, batch=11)
-    return GridPosterior(points[:, 0], log_likelihood).below(one.z[0])
+    log_likelihood, _ = posterior(problem).log_densities_of(points, record.y, batch=11)
+    return GridPosterior(points[:, 0], log_likelihood).below(record.z[0])

@@ -1,7 +1,12 @@
-"""What is simulated from a shipped model, and the densities of its parameters.
+"""Data simulated from a shipped model, and the densities of the model's parameters.
 
-Everything that is compiled for a problem serves all its data sets. The model takes no known inputs, and its data are
-simulated with the values at which some of its parameters are fixed.
+1. Simulate data sets from the model file, at its true parameters or at parameters drawn from the prior.
+2. Reduce states and forces to the paths of interest at the measurement times.
+3. Bind the NumPyro model, with the file's default parameters fixed, to data; its posterior is a function of the
+   logarithms z of the remaining parameters.
+
+The model takes no known inputs. Programs are compiled once for a problem and serve all its data sets, for which the
+functions are cached. Data set ``index`` is the one that ``lfm-ppl simulate`` writes for a seed that follows from it.
 """
 
 from __future__ import annotations
@@ -23,22 +28,22 @@ from lfm_ppl.inference.log_posterior import LogPosterior
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.model.simulate import simulate
 
-MOST = 10_000
-"""Data sets for one seed of a study."""
+RECORDS_PER_SEED = 10_000
+"""Number of data sets for one seed of a study."""
 
 
 @dataclass(frozen=True)
-class Problem:
-    """Data simulated from a shipped model, and what is estimated.
+class SimulationProblem:
+    """A shipped model that simulates data, and the quantities that are estimated from them.
 
     Attributes:
-        file: the name of the model.
-        names: of its P unknown parameters, positive numbers; everything is in their logarithms z. Others are fixed by
-            default.
-        paths: the K states and forces that are estimated, in the order of the rows of every array of paths.
-        units: theirs.
-        medians: of the priors of the parameters, where searches start.
-        steps: of the simulation between two times of the model file's truth.
+        file: name of the model.
+        names: names of the P unknown parameters. They are positive; all computations use their logarithms z. Other
+            parameters have their default values.
+        paths: names of the K estimated states and forces, in the order of the rows of every array of paths.
+        units: units of the paths.
+        medians: prior medians of the parameters, where searches start.
+        steps: integration steps of the simulation between two times of the model file's truth.
     """
 
     file: str
@@ -49,14 +54,14 @@ class Problem:
     steps: int
 
 
-class Record(NamedTuple):
+class SimulatedRecord(NamedTuple):
     """One simulated data set.
 
     Attributes:
-        times: (T,) of the measurements.
-        y: (T, D) measurements.
-        paths: (K, T) the problem's true paths at these times.
-        z: (P,) logarithms of the true parameters.
+        times: times (T,) of the measurements.
+        y: measurements (T, D).
+        paths: true paths (K, T) at these times.
+        z: logarithms (P,) of the true parameters.
     """
 
     times: np.ndarray
@@ -66,84 +71,89 @@ class Record(NamedTuple):
 
 
 @functools.lru_cache(maxsize=1024)
-def record(problem: Problem, index: int, seed: int = 0) -> Record:
-    """Return data set ``index``: what ``lfm-ppl simulate`` writes of the model for the seed 10000 seed + index."""
-    data = model_file(problem.file).simulate(seed=MOST * seed + index)
+def simulate_record(problem: SimulationProblem, index: int, seed: int = 0) -> SimulatedRecord:
+    """Return data set ``index`` at the true parameters, as ``lfm-ppl simulate`` with the seed 10000 seed + index."""
+    data = model_file(problem.file).simulate(seed=RECORDS_PER_SEED * seed + index)
     truth: Any = data.truth
-    return _record(problem, data.times, data.y, truth["times"], truth["state"], truth["forces"], true_z(problem))
+    paths = _true_paths(problem, data.times, truth["times"], truth["state"], truth["forces"])
+    return SimulatedRecord(data.times, np.asarray(data.y), paths, np.asarray(true_z(problem)))
 
 
 @functools.lru_cache(maxsize=1024)
-def drawn_record(problem: Problem, index: int, seed: int = 0) -> Record:
-    """Return a data set whose parameters and start are drawn from their priors, too."""
-    z, found = _drawing(problem)(jax.random.fold_in(jax.random.key(seed), index))
-    times = default(problem).times
-    at = np.searchsorted(np.asarray(found.times), times - 1e-9)
-    return _record(problem, times, np.asarray(found.y)[at], found.times, found.state, found.forces, z)
+def simulate_record_from_prior(problem: SimulationProblem, index: int, seed: int = 0) -> SimulatedRecord:
+    """Return data set ``index`` whose parameters and initial state are drawn from their priors."""
+    z, simulation = _prior_simulator(problem)(jax.random.fold_in(jax.random.key(seed), index))
+    times = default_data(problem).times
+    rows = np.searchsorted(np.asarray(simulation.times), times - 1e-9)
+    paths = _true_paths(problem, times, simulation.times, simulation.state, simulation.forces)
+    return SimulatedRecord(times, np.asarray(simulation.y)[rows], paths, np.asarray(z))
 
 
-def _record(problem: Problem, times: np.ndarray, y: Any, fine: Any, state: Any, forces: Any, z: Any) -> Record:
-    names, at = true_likelihood(problem).model.state_names, np.searchsorted(np.asarray(fine), times - 1e-9)
+def _true_paths(problem: SimulationProblem, times: np.ndarray, fine_times: Any, state: Any, forces: Any) -> np.ndarray:
+    """Return the true paths (K, T) at the measurement times, from states and forces at finer times."""
+    names = true_likelihood(problem).model.state_names
+    rows = np.searchsorted(np.asarray(fine_times), times - 1e-9)
     for name in problem.paths:
         checks.one_of("path", name, (*names, *forces))
     paths = [state[:, names.index(name)] if name in names else forces[name] for name in problem.paths]
-    return Record(times, np.asarray(y), np.stack([np.asarray(path)[at] for path in paths]), np.asarray(z))
+    return np.stack([np.asarray(path)[rows] for path in paths])
 
 
 @functools.cache
-def _drawing(problem: Problem) -> Any:
-    """Return what draws parameters and simulates, compiled once."""
-    truth: Any = default(problem).truth
+def _prior_simulator(problem: SimulationProblem) -> Any:
+    """Return the compiled map from a random key to log parameters drawn from the prior and a simulation."""
+    truth: Any = default_data(problem).truth
 
     def draw(key: jax.Array) -> tuple[jax.Array, Any]:
         keys = jax.random.split(key)
-        trace = handlers.trace(handlers.seed(model(problem), keys[0])).get_trace(default(problem).times)
+        trace = handlers.trace(handlers.seed(model(problem), keys[0])).get_trace(default_data(problem).times)
         z = jnp.log(jnp.stack([trace[name]["value"] for name in problem.names]))
-        given = posterior(problem).likelihood(z).model
-        return z, simulate(keys[1], given, np.asarray(truth["times"]), steps=problem.steps)
+        latent_force_model = posterior(problem).likelihood(z).model
+        return z, simulate(keys[1], latent_force_model, np.asarray(truth["times"]), steps=problem.steps)
 
     return jax.jit(draw)
 
 
 @functools.cache
 def model_file(name: str) -> loading.ModelFile:
-    """Return a shipped model, loaded once, so that its simulator is compiled once."""
+    """Return a shipped model; the cache keeps its compiled simulator."""
     return loading.load(name)
 
 
 @functools.cache
-def default(problem: Problem) -> Data:
+def default_data(problem: SimulationProblem) -> Data:
     """Return the model's default data."""
     with jax.ensure_compile_time_eval():
         return model_file(problem.file).simulate()
 
 
-def true_z(problem: Problem) -> np.ndarray:
+def true_z(problem: SimulationProblem) -> np.ndarray:
     """Return the logarithms of the true parameters (P,)."""
-    truth: Any = default(problem).truth
-    known = {name: value for name, value in truth["parameters"].items() if np.ndim(value) == 0}
+    truth: Any = default_data(problem).truth
+    scalars = {name: value for name, value in truth["parameters"].items() if np.ndim(value) == 0}
     for name in problem.names:
-        checks.one_of("parameter", name, known)
-    return np.log([known[name] for name in problem.names])
+        checks.one_of("parameter", name, scalars)
+    return np.log([scalars[name] for name in problem.names])
 
 
 @functools.cache
-def model(problem: Problem) -> Any:
-    """Return the NumPyro model with what is fixed by default."""
-    file, data = model_file(problem.file), default(problem)
+def model(problem: SimulationProblem) -> Any:
+    """Return the NumPyro model with its default parameters fixed."""
+    file, data = model_file(problem.file), default_data(problem)
     with jax.ensure_compile_time_eval():
         return fix(file.model, dict(file.anchors(data)))
 
 
 @functools.cache
-def posterior(problem: Problem) -> LogPosterior:
-    """Return the posterior of z given a data set."""
+def posterior(problem: SimulationProblem) -> LogPosterior:
+    """Return the posterior of z, as a function of the data."""
+    data = default_data(problem)
     with jax.ensure_compile_time_eval():
-        return LogPosterior(bind(model(problem), default(problem).times, default(problem).y), problem.names)
+        return LogPosterior(bind(model(problem), data.times, data.y), problem.names)
 
 
 @functools.cache
-def true_likelihood(problem: Problem) -> MarginalLikelihood:
-    """Return the likelihood at the truth: one object, so that what is compiled for it serves all data sets."""
+def true_likelihood(problem: SimulationProblem) -> MarginalLikelihood:
+    """Return the likelihood at the true parameters; the cache keeps its compiled programs for all data sets."""
     with jax.ensure_compile_time_eval():
         return posterior(problem).likelihood(true_z(problem))

@@ -1,8 +1,8 @@
 """States and forces at the true parameters: Gaussian filters and smoothers, and particles.
 
-Particle paths are traced through their ancestors. Backward simulation, the usual remedy where traced paths meet in few
-particles, is none for a smooth force: the state of a Matern-5/2 force hardly has noise over a short step, so that a
-particle's own ancestor is nearly the only one that it can have.
+The particle smoother traces ancestors. Backward simulation, the usual remedy where traced paths meet in few particles,
+does not help with a smooth force: the state of a Matern-5/2 force has almost no noise over a short step, so that only a
+particle's ancestor has a transition density to it that is not negligible.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 
 from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments.scores import interval, rmse, score_path
-from lfm_ppl.experiments.simulated.problem import Problem, default, record, true_likelihood
+from lfm_ppl.experiments.simulated.problem import SimulationProblem, default_data, simulate_record, true_likelihood
 from lfm_ppl.experiments.tasks import dataset_indices, stack_results
 from lfm_ppl.experiments.timing import time_compiled_call
 from lfm_ppl.linearisation.rule import Rule
@@ -29,78 +29,91 @@ from lfm_ppl.particles.particle_smoother import TRACING, ParticleSmootherResult,
 
 RULES: dict[str, Rule] = {"cubature": Cubature(), "Taylor": Taylor(), "Gauss-Hermite (5)": GaussHermite(5),
                           "cubature, whole state": Cubature(full_state=True)}
-"""Ways to linearise dynamics, that of most models first."""
+"""Linearisation rules by name; the first is the default of most models."""
 
-REPORTED = next(iter(RULES))
+DEFAULT_RULE = next(iter(RULES))
 
 
-def gaussian(problem: Problem, task: Task) -> Result:
-    """Return what a rule finds of every data set of a task, see `_judged`, and ``mean`` and ``sd`` of the first."""
+def run_gaussian(problem: SimulationProblem, task: Task) -> Result:
+    """Return the scores of a rule on every data set of a task, see `_score`, and ``mean`` and ``sd`` of the first."""
     rule = task.settings["method"]
-    filtering, smoothing = _programs(problem, rule)
-    rows = [_judged(problem, task, index, rule, filtering, smoothing)[0] for index in dataset_indices(task)]
+    filtering, smoothing = _gaussian_programs(problem, rule)
+    rows = [_score(problem, task, index, rule, filtering, smoothing)[0] for index in dataset_indices(task)]
     return stack_results(rows, first_only=("mean", "sd"))
 
 
 @functools.cache
-def _programs(problem: Problem, rule: str) -> tuple[Callable, Callable]:
+def _gaussian_programs(problem: SimulationProblem, rule: str) -> tuple[Callable, Callable]:
     """Return filter and smoother with the likelihood's steps, iterations and sites, compiled for all data sets."""
-    given = copy.copy(true_likelihood(problem))
-    given.rule = RULES[rule]
+    likelihood = copy.copy(true_likelihood(problem))
+    likelihood.rule = RULES[rule]
 
     def filtering(y: jax.Array) -> tuple[jax.Array, jax.Array]:
-        found = given.filter(y)
-        return found.filtered_mean, found.log_likelihood
+        result = likelihood.filter(y)
+        return result.filtered_mean, result.log_likelihood
 
-    return jax.jit(filtering), jax.jit(lambda y: paths_of(problem, given.smooth(y)))
+    return jax.jit(filtering), jax.jit(lambda y: smoothed_paths(problem, likelihood.smooth(y)))
 
 
-def particles(problem: Problem, task: Task) -> Result:
-    """Return what particles find of one data set, see `_judged`, and how many ``distinct`` ones (T,) the paths pass."""
-    given, times = true_likelihood(problem).model, default(problem).times
+def run_particles(problem: SimulationProblem, task: Task) -> Result:
+    """Return the scores of particles on one data set, see `_score`.
+
+    ``distinct`` (T,) is the number of distinct particles on the smoothed paths.
+    """
+    model, times = true_likelihood(problem).model, default_data(problem).times
     filter_key, smoother_key = jax.random.split(task.key)
     options = {"particles": task.settings["particles"], "steps": task.settings["steps"]}
 
     def filtering(y: np.ndarray) -> tuple[jax.Array, jax.Array]:
-        found = particle_filter(filter_key, given, times, y, **options)
-        return found.mean, found.log_likelihood
+        result = particle_filter(filter_key, model, times, y, **options)
+        return result.mean, result.log_likelihood
 
     def smoothing(y: np.ndarray) -> ParticleSmootherResult:
-        return particle_smoother(smoother_key, given, times, y, draws=task.settings["draws"], method=TRACING, **options)
+        return particle_smoother(smoother_key, model, times, y, draws=task.settings["draws"], method=TRACING, **options)
 
-    result, found = _judged(problem, task, task.settings["index"], str(options), filtering, smoothing,
-                            functools.partial(paths_of, problem))
-    return result | {"distinct": np.asarray(found.distinct)}
+    scores, smoothed = _score(problem, task, task.settings["index"], str(options), filtering, smoothing,
+                              functools.partial(smoothed_paths, problem))
+    return scores | {"distinct": np.asarray(smoothed.distinct)}
 
 
-def paths_of(problem: Problem, found: Any) -> tuple[jax.Array, jax.Array]:
-    """Return means and standard deviations (K, T) of the problem's paths from the result of a smoother."""
+def smoothed_paths(problem: SimulationProblem, result: Any) -> tuple[jax.Array, jax.Array]:
+    """Return means and standard deviations (K, T) of the problem's paths from a smoother's result."""
     states = true_likelihood(problem).model.state_names
-    paths = [found.state(name) if name in states else found.force(name) for name in problem.paths]
+    paths = [result.state(name) if name in states else result.force(name) for name in problem.paths]
     return jnp.stack([path.mean for path in paths]), jnp.stack([path.sd for path in paths])
 
 
-def _judged(problem: Problem, task: Task, index: int, label: str, filtering: Callable, smoothing: Callable,
-            paths: Callable[[Any], tuple] = lambda found: found) -> tuple[Result, Any]:
-    """Filter and smooth a data set; what is compiled in the first call with this label takes no time.
+def _score(problem: SimulationProblem, task: Task, index: int, label: str, filtering: Callable, smoothing: Callable,
+           paths: Callable[[Any], tuple] = tuple) -> tuple[Result, Any]:
+    """Filter and smooth a data set; CPU times exclude compilation, which the first call with a label takes.
+
+    Args:
+        problem: the problem.
+        task: task with the seed of the data.
+        index: index of the data set.
+        label: label of the compiled programs.
+        filtering: map from data to means of the joint state and terms of the log likelihood.
+        smoothing: map from data to a smoother's result.
+        paths: map from this result to means and standard deviations (K, T) of the paths.
 
     Returns:
-        ``filter_rmse``, ``smoother_rmse`` and ``smoother_coverage`` (K,), the filter's ``log_likelihood``, CPU times
-        ``filter_seconds`` and ``smoother_seconds``, which has its own filter's in it, ``mean`` and ``sd`` (K, T) of the
-        problem's paths; and the result of ``smoothing``, from which ``paths`` takes these.
+        A result and the smoother's result. The first has ``filter_rmse``, ``smoother_rmse`` and ``smoother_coverage``
+        (K,), the filter's ``log_likelihood``, the CPU times ``filter_seconds`` and ``smoother_seconds`` (which includes
+        the filter pass of the smoother), and ``mean`` and ``sd`` (K, T) of the paths.
     """
-    one, label = record(problem, index, task.seed), f"{problem}, {label}"
-    filter_s, (joint, log_likelihood) = time_compiled_call(f"{label}, filter", lambda: filtering(one.y))
-    smoother_s, found = time_compiled_call(f"{label}, smoother", lambda: smoothing(one.y))
-    mean, sd = map(np.asarray, paths(found))
-    return {"filter_rmse": rmse(_filtered(problem, joint), one.paths), "log_likelihood": float(log_likelihood.sum()),
-            **score_path("smoother", mean, interval(mean, sd), one.paths), "mean": mean, "sd": sd,
-            "filter_seconds": filter_s, "smoother_seconds": smoother_s}, found
+    record, label = simulate_record(problem, index, task.seed), f"{problem}, {label}"
+    filter_s, (joint, log_likelihood) = time_compiled_call(f"{label}, filter", lambda: filtering(record.y))
+    smoother_s, smoothed = time_compiled_call(f"{label}, smoother", lambda: smoothing(record.y))
+    mean, sd = map(np.asarray, paths(smoothed))
+    return {"filter_rmse": rmse(_filtered_paths(problem, joint), record.paths),
+            "log_likelihood": float(log_likelihood.sum()),
+            **score_path("smoother", mean, interval(mean, sd), record.paths), "mean": mean, "sd": sd,
+            "filter_seconds": filter_s, "smoother_seconds": smoother_s}, smoothed
 
 
-def _filtered(problem: Problem, joint: jax.Array) -> jax.Array:
-    """Return filtered means (K, T) of the problem's paths from those (T, n) of the joint state."""
-    given = true_likelihood(problem)
-    names = (*given.model.state_names, *given.model.force_names)
-    inputs = jax.vmap(given.ssm.inputs)(jnp.asarray(joint), jnp.asarray(default(problem).times))
+def _filtered_paths(problem: SimulationProblem, joint: jax.Array) -> jax.Array:
+    """Return filtered means (K, T) of the problem's paths from means (T, n) of the joint state."""
+    likelihood = true_likelihood(problem)
+    names = (*likelihood.model.state_names, *likelihood.model.force_names)
+    inputs = jax.vmap(likelihood.ssm.inputs)(jnp.asarray(joint), jnp.asarray(default_data(problem).times))
     return inputs.T[np.array([names.index(name) for name in problem.paths])]
