@@ -10,7 +10,7 @@ import pytest
 
 import lfm_ppl as lfm
 from lfm_ppl import batching, compilation
-from lfm_ppl.inference import posterior
+from lfm_ppl.inference import map_draws
 from lfm_ppl.inference.posterior import scores, trajectories
 from tests import systems
 
@@ -120,12 +120,12 @@ def test_an_accelerator_has_larger_batches_and_what_is_large_by_itself_has_nothi
         return len(shown)
 
     numbers = 4 * 1**2 * 6  # of one draw: four rows, one state
-    monkeypatch.setattr(posterior, "_BATCH_NUMBERS", 100 * numbers)
+    monkeypatch.setattr(map_draws, "_LARGEST_BATCH_SIZE", 100 * numbers)
     assert batches() == 8  # of fifty each, for two threads
-    monkeypatch.setattr(posterior, "_BATCH_NUMBERS", 10 * numbers)
+    monkeypatch.setattr(map_draws, "_LARGEST_BATCH_SIZE", 10 * numbers)
     assert batches() == 50  # of eight
     monkeypatch.setattr(batching, "on_cpu", lambda: False)
-    monkeypatch.setattr(posterior, "on_cpu", lambda: False)
+    monkeypatch.setattr(map_draws, "on_cpu", lambda: False)
     assert batches() == 2
 
 

@@ -302,7 +302,7 @@ def test_draws_are_computed_in_batches_to_the_same_numbers_and_parts_of_other_ba
 
 def test_a_check_goes_on_where_it_was_stopped(whole, tmp_path, monkeypatch):
     result = whole("map")
-    monkeypatch.setattr("lfm_ppl.inference.posterior._BATCH", 2)
+    monkeypatch.setattr("lfm_ppl.inference.map_draws._SEQUENTIAL_BATCH", 2)
     check = lambda **more: lfm.check_accuracy(  # noqa: E731
         result, well, reference="particles", particles=20, draws=6, progress=False, **more).dataset
     expected = check()

@@ -480,7 +480,7 @@ MODELS = {
     noise = numpyro.sample("noise", dist.LogNormal(-0.5, 0.3))
     numpyro.sample("y", lfm.MarginalLikelihood(system(noise), times, steps=1), obs=y)
     numpyro.sample("z", lfm.MarginalLikelihood(system(noise), times, steps=1), obs=y)\n''')}),
-    "one name twice": Case("fit bad.py", ("bad.py, line 27", "two sites", "called 'noise'"), {"bad.py": with_model(
+    "one name twice": Case("fit bad.py", ("bad.py, line 27", "two sites", "the name 'noise'"), {"bad.py": with_model(
         '''def model(times, y=None, **options):
     noise = numpyro.sample("noise", dist.LogNormal(-0.5, 0.3))
     noise = numpyro.sample("noise", dist.LogNormal(-0.5, 0.3))

@@ -31,7 +31,7 @@ def test_files_and_names_in_them_that_the_page_for_contributors_names_exist():
     assert len(paths) > 20 and [path for path in paths if not (ROOT / path).exists()] == []
     names = re.findall(r"`([A-Z_]+|_[a-z]+)`", text.replace("`TYPE_CHECKING`", ""))
     sources = "\n".join((ROOT / path).read_text(encoding="utf-8") for path in paths if path.endswith(".py"))
-    assert {"FORCES", "RULES", "_transition"} <= set(names)
+    assert {"FORCES", "RULES"} <= set(names)
     for name in names:
         assert re.search(rf"^(?:def )?{name}\b", sources, re.MULTILINE), name
 

@@ -186,7 +186,7 @@ def test_settings_say_what_is_wrong():
         experiment.ConstrainedSettings(methods=("EPP",))
     with pytest.raises(ValueError, match="--methods must hold 'EP'"):
         experiment.ConstrainedSettings(methods=("smoother", "full information"))
-    with pytest.raises(ValueError, match="10000 records"):
+    with pytest.raises(ValueError, match="10000 data sets"):
         experiment.ConstrainedSettings(runs=10_001)
     assert catalogue.experiment("constrained").study is experiment.STUDY
 
