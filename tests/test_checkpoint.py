@@ -370,13 +370,13 @@ def test_whoever_waits_for_a_long_warm_up_is_told_once_what_helps(capfd, monkeyp
 def test_what_tells_nothing_itself_is_told_of_as_long_as_it_lasts(capfd, monkeypatch):
     monkeypatch.setattr("lfm_ppl.progress.EVERY_S", 0.0)
     monkeypatch.setattr("lfm_ppl.progress._SHORTEST_S", 0.02)
-    with waiting("compiling", shown=True):
+    with waiting("compiling", is_shown=True):
         time.sleep(0.2)
     time.sleep(0.1)
     lines = capfd.readouterr().err.splitlines()
     assert lines[0] == "compiling" and lines[-1].startswith("compiling (0.") and lines[-1].endswith(" s so far)")
     time.sleep(0.1)
-    with waiting("compiling", shown=False):
+    with waiting("compiling", is_shown=False):
         time.sleep(0.1)
     assert capfd.readouterr().err == ""
 

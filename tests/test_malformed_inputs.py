@@ -317,7 +317,7 @@ BOUNDS = {
     "nothing between": Case("fit model.py --lower x0=1 --upper x0=0",
                             ("leave nothing between them: lower=1, upper=0",)),
     "iterations": Case("fit model.py --lower x0=-3 --iterations 2", ("Leave iterations out",)),
-    "a tolerance": Case("fit model.py --lower x0=-3 --tolerance 0.1", ("tolerance is not to be had", "raise steps")),
+    "a tolerance": Case("fit model.py --lower x0=-3 --tolerance 0.1", ("tolerance is not supported", "raise steps")),
     "particles": Case("fit model.py --lower x0=-3 --sampler pmmh", ("--lower and --upper are for the samplers",)),
     "rows of nothing": Case("fit model.py --grid 20", ("--grid says at how many times --lower and --upper hold",)),
     **{f"rows: {value}": Case(f"fit model.py --lower x0=-3 --grid {value}", (

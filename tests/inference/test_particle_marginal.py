@@ -180,7 +180,7 @@ def test_a_likelihood_that_cannot_be_replaced_is_an_error(wrap):
         numpyro.sample("y", wrap(lfm.MarginalLikelihood(build(rate), times)), obs=y[None] if shape is None else y)
 
     y = Y if wrap(dist.Normal(0.0, 1.0)).event_shape == () else Y[None]
-    with pytest.raises(ValueError, match="cannot stand in"):
+    with pytest.raises(ValueError, match="cannot replace"):
         lfm.ParticleMarginalRAM(wrapped, particles=5).init(jax.random.key(0), 10, None, (TIMES, y), {})
 
 
