@@ -47,9 +47,22 @@ def model_digest(bound: BoundModel) -> str | None:
         for leaf in jax.tree.leaves(evaluate(z, bound.argument)):
             is_key = jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
             array = np.asarray(jax.random.key_data(leaf) if is_key else leaf)
-            digest.update(f"{array.shape}{array.dtype}".encode() + array.tobytes())
+            digest.update(f"{array.shape}{array.dtype}".encode() + _rounded(array))
     digest.update(re.sub(r"0x[0-9a-f]+", "", recorder.settings).encode())  # addresses differ between processes
     return digest.hexdigest()
+
+
+def _rounded(array: np.ndarray) -> bytes:
+    """Return the bytes of an array, floating-point numbers to ten digits.
+
+    XLA may order operations in another way in another process, which changes the last digits.
+    """
+    if array.dtype.kind != "f":
+        return array.tobytes()
+    finite = np.where(np.isfinite(array), array, 0.0)
+    size = np.max(np.abs(finite), initial=0.0)
+    fraction, exponent = np.frexp(np.where(np.abs(finite) > 1e-12 * size, array, 0.0))
+    return np.round(np.asarray(fraction) * 2.0**33).tobytes() + np.asarray(exponent).tobytes()
 
 
 class _record_values(LikelihoodHandler):  # noqa: N801 (an effect handler, named as NumPyro names its handlers)
@@ -85,7 +98,9 @@ class _record_values(LikelihoodHandler):  # noqa: N801 (an effect handler, named
                 values.append(model.observation.at(0).log_prob(f, f))
             return values
 
-        arrays = [jnp.asarray(leaf) for leaf in jax.tree.leaves((likelihood, distribution.rule))
+        # Not the leaves of the distribution itself: NumPyro orders its fields by their hashes.
+        fields = [getattr(likelihood, name) for name in type(likelihood).pytree_data_fields]
+        arrays = [jnp.asarray(leaf) for leaf in jax.tree.leaves((fields, distribution.rule))
                   if eqx.is_array_like(leaf)]
         self.values += [*arrays, ssm.initial(), ssm.stack.feedback(), ssm.stack.dispersion(),
                         ssm.stack.jump_table(), jax.vmap(functions)(self.times)]

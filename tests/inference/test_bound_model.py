@@ -2,6 +2,9 @@
 
 import contextlib
 import logging
+import os
+import subprocess
+import sys
 from unittest.mock import Mock
 
 import jax
@@ -485,3 +488,20 @@ def test_data_of_another_type_are_taken(bound):
 def test_other_data_must_have_the_same_shape(bound):
     with pytest.raises(ValueError, match=r"shape that was bound, \(5, 2\), got \(3, 2\)"):
         bound.with_data(Y[:3])
+
+
+@pytest.mark.slow
+def test_a_digest_is_equal_in_processes_that_hash_differently():
+    code = """
+import jax, numpy as np
+jax.config.update("jax_enable_x64", True)
+import lfm_ppl as lfm
+from lfm_ppl import loading
+from lfm_ppl.inference.model_digest import model_digest
+file = loading.load("spring")
+data = file.simulate(seed=0)
+print(model_digest(lfm.bind(file.model, data.times, data.y, **file.keywords(data, {}))))
+"""
+    digests = {subprocess.run([sys.executable, "-c", code], env={**os.environ, "PYTHONHASHSEED": seed}, check=True,
+                              capture_output=True, text=True).stdout for seed in ("0", "2")}
+    assert len(digests) == 1 and len(digests.pop().strip()) == 64
