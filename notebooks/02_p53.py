@@ -36,7 +36,7 @@ import numpy as np
 import pandas as pd
 
 import lfm_ppl as lfm
-from lfm_ppl import loading
+from lfm_ppl.io import loading
 from lfm_ppl.results import plots, tables
 from lfm_ppl.results.arviz_data import convergence_warnings, group, summary
 

@@ -37,10 +37,10 @@ import jax
 import numpy as np
 import pandas as pd
 
-from lfm_ppl import loading
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.ballistic import experiment, figures
 from lfm_ppl.inference.bound_model import likelihood_site
+from lfm_ppl.io import loading
 
 quick = bool(os.environ.get("LFM_QUICK"))
 pd.set_option("display.width", 160, "display.max_columns", 30)

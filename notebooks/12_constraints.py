@@ -34,9 +34,9 @@ import pandas as pd
 from matplotlib import pyplot as plt
 
 import lfm_ppl as lfm
-from lfm_ppl import loading
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.constrained import estimators, experiment, figures, problem
+from lfm_ppl.io import loading
 
 quick = bool(os.environ.get("LFM_QUICK"))
 pd.set_option("display.width", 160, "display.max_columns", 30)

@@ -28,7 +28,7 @@ import jupytext
 import nbformat
 from nbclient import NotebookClient
 
-from lfm_ppl.compilation import fast_loops, quick_compilation
+from lfm_ppl.utils.compilation import fast_loops, quick_compilation
 
 FOLDER = Path(__file__).resolve().parent
 CELL_TIMEOUT_S = 3600

@@ -11,7 +11,7 @@ from pathlib import Path
 import jax
 import pytest
 
-from lfm_ppl.compilation import quick_compilation
+from lfm_ppl.utils.compilation import quick_compilation
 
 # ArviZ 0.23 writes the date of an announcement when it is first imported on a day, which two workers cannot do at once:
 # the process that starts them does it before.

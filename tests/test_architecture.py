@@ -1,6 +1,7 @@
 """Imports point one way, models use the public API alone, and importing has no side effects."""
 
 import ast
+import graphlib
 import re
 import subprocess
 import sys
@@ -16,21 +17,19 @@ PACKAGE = ROOT / "lfm_ppl"
 # Lower layers first. A module belongs to the longest name here that is a prefix of its own, and may
 # import from its own layer and from the layers below.
 LAYERS = (
-    ("checks", "compilation", "batching", "linalg", "gaussian_residuals", "selection_matrices", "gradients",
-     "calendar_time", "table", "progress"),
+    ("utils", "io.table"),
     ("forces",),
     ("linearisation",),
     ("model",),
-    ("orbits", "data"),
+    ("orbits", "io"),
     ("filtering",),
     ("particles", "fokker_planck_grid", "latent_grid", "constrained"),
     ("switching",),
     ("inference",),
     ("orbits.training", "orbits.learning", "orbits.prediction"),
     ("results", "engine"),
-    ("data_binding", "fit_options", "fit_starts", "fit_results", "fitting", "forecasting"),
-    ("backtesting", "conversion", "fit_tasks", "fitting_many"),
-    ("loading",),
+    ("workflows",),
+    ("io.loading",),
     ("experiments",),
     ("cli", "__main__"),
 )
@@ -86,7 +85,7 @@ def test_imports_point_down(module):
     for line, imported in imports(path):
         where = f"lfm_ppl/{path.relative_to(PACKAGE)}:{line} imports {imported}"
         if imported == PUBLIC:
-            assert rank(module) >= RANK["loading"], (
+            assert rank(module) >= RANK["io.loading"], (
                 f"{where}: the library never imports its own API"
             )
             continue
@@ -94,31 +93,22 @@ def test_imports_point_down(module):
         assert rank(below) <= rank(module), f"{where}: imports point down only"
 
 
+def test_no_circles_of_imports():
+    """Modules can be sorted so that each imports earlier ones only; imports inside functions count."""
+    names = modules()
+    graph = {name: {imported.removeprefix(f"{PUBLIC}.") for _, imported in imports(path)} & set(names) - {name}
+             for name, path in names.items()}
+    try:
+        list(graphlib.TopologicalSorter(graph).static_order())
+    except graphlib.CycleError as error:
+        pytest.fail(f"imports in a circle: {error.args[1]}")
+
+
 def test_the_package_itself_is_the_public_api_and_nothing_else():
-    tree = ast.parse((PACKAGE / "__init__.py").read_text(encoding="utf-8"))
-    allowed = (ast.Import, ast.ImportFrom, ast.Assign, ast.AnnAssign)
-    for node in tree.body:
-        docstring = isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
-        lazy = isinstance(node, ast.If) and all(
-            isinstance(inner, ast.ImportFrom) or isinstance(inner, ast.FunctionDef) and inner.name == "__getattr__"
-            for inner in node.body)
-        listing = isinstance(node, ast.FunctionDef) and node.name == "__dir__"
-        assert docstring or lazy or listing or isinstance(node, allowed), f"line {node.lineno}: only imports go here"
-
-
-def test_type_checkers_see_the_names_that_are_imported_when_asked_for():
-    """The imports under TYPE_CHECKING are those that `__getattr__` makes, and each is exported (``as``)."""
-    tree = ast.parse((PACKAGE / "__init__.py").read_text(encoding="utf-8"))
-    typing, _ = (node for node in tree.body if isinstance(node, ast.If))
-    seen = {alias.asname: (node.module, alias.name) for node in typing.body for alias in node.names}
-    found = {name: (f"lfm_ppl.{module}", name) for name, module in lfm_ppl._MODULES.items()}
-    found |= {name: ("lfm_ppl", name) for name in lfm_ppl._PACKAGES}
-    assert seen == found, "_NAMES and the imports under TYPE_CHECKING in lfm_ppl/__init__.py differ"
-
-
-def test_no_module_takes_the_place_of_a_public_name():
-    """Importing lfm_ppl.fit, were there such a module, would make a module of the function `lfm.fit`."""
-    assert not set(modules()) & set(lfm_ppl._MODULES)
+    assert [name for name in lfm_ppl.__all__ if not hasattr(lfm_ppl, name)] == []
+    stub = ast.parse((PACKAGE / "__init__.pyi").read_text(encoding="utf-8"))
+    aliases = [alias for node in stub.body if isinstance(node, ast.ImportFrom) for alias in node.names]
+    assert [alias.name for alias in aliases if alias.asname != alias.name] == [], "export names as `name as name`"
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "models").glob("*.py")), ids=lambda path: path.stem)
@@ -204,11 +194,11 @@ import lfm_ppl as lfm
 assert smooth is lfm.smooth and fit is lfm.fit and orbits is lfm.orbits
 force = lfm.Matern(1.0, 2.0)
 assert isinstance(pickle.loads(pickle.dumps(force)), lfm.Force) and pickle.loads(pickle.dumps(lfm.Matern)) is lfm.Matern
-assert set(lfm.__all__) <= set(dir(lfm)) and "__version__" in dir(lfm)
+assert set(lfm.__all__) <= set(dir(lfm))
 assert lfm.forces.CQM.__module__ == "lfm_ppl.forces.weights" and lfm.orbits.read_sp3
 try:
     lfm.matern
 except AttributeError as error:
     print(error)
 """
-    assert run(code) == "module 'lfm_ppl' has no attribute 'matern'"
+    assert "matern" in run(code)

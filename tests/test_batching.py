@@ -9,9 +9,9 @@ import numpyro.distributions as dist
 import pytest
 
 import lfm_ppl as lfm
-from lfm_ppl import batching, compilation
 from lfm_ppl.inference import map_draws
 from lfm_ppl.inference.posterior import scores, trajectories
+from lfm_ppl.utils import batching, compilation
 from tests import systems
 
 

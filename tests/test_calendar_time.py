@@ -11,9 +11,9 @@ import pandas as pd
 import pytest
 
 import lfm_ppl as lfm
-from lfm_ppl import calendar_time
-from lfm_ppl.data import Data, read_csv
+from lfm_ppl.io.data import Data, read_csv
 from lfm_ppl.results.plots import style
+from lfm_ppl.utils import calendar_time
 
 
 @pytest.mark.parametrize(("gap", "unit"), [

@@ -29,10 +29,10 @@ from lfm_ppl.inference.posterior import scores
 from lfm_ppl.inference.progress import ChainProgress
 from lfm_ppl.inference.samplers import SAMPLERS
 from lfm_ppl.inference.schedule import Schedule
-from lfm_ppl.progress import waiting
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results import checkpoint as checkpoints
 from lfm_ppl.results.checkpoint import Checkpoint
+from lfm_ppl.utils.progress import waiting
 from tests.processes import ROOT
 
 TIMES = np.arange(4.0)
@@ -136,7 +136,7 @@ def test_a_stop_after_sampling_costs_no_draw(sampler, whole, tmp_path, monkeypat
         raise ValueError("what cannot be compiled ahead changes nothing")
 
     with monkeypatch.context() as patch:
-        patch.setattr("lfm_ppl.fit_results.trajectories", stop)
+        patch.setattr("lfm_ppl.workflows.fit_results.trajectories", stop)
         partial = fit(sampler, checkpoint=tmp_path)
     said = arviz_data.attributes(partial)["partial"]
     assert said == "all draws and their scores, without trajectories"
@@ -269,7 +269,7 @@ def test_nothing_is_left_where_nothing_was_sampled(tmp_path, monkeypatch):
     def stop(*arguments, **keywords):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("lfm_ppl.fit_starts.mode_of", stop)
+    monkeypatch.setattr("lfm_ppl.workflows.fit_starts.mode_of", stop)
     with pytest.raises(KeyboardInterrupt):
         fit("ram", checkpoint=tmp_path)
     assert not list(tmp_path.iterdir())
@@ -329,7 +329,7 @@ def test_a_check_goes_on_where_it_was_stopped(whole, tmp_path, monkeypatch):
 
 
 def test_where_there_is_no_terminal_lines_say_how_far_it_is(capfd, monkeypatch):
-    monkeypatch.setattr("lfm_ppl.progress.EVERY_S", 0.0)
+    monkeypatch.setattr("lfm_ppl.utils.progress.EVERY_S", 0.0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         lfm.fit(well, TIMES, Y, sampler="nuts", **SIZES)
@@ -343,7 +343,7 @@ def test_where_there_is_no_terminal_lines_say_how_far_it_is(capfd, monkeypatch):
 def test_the_time_left_is_that_at_the_pace_of_the_last_minute(capfd, monkeypatch):
     clock = [0.0]
     monkeypatch.setattr("time.perf_counter", lambda: clock[0])
-    monkeypatch.setattr("lfm_ppl.progress.EVERY_S", 0.0)
+    monkeypatch.setattr("lfm_ppl.utils.progress.EVERY_S", 0.0)
     with ChainProgress(Schedule(100, 900), 0, is_shown=True) as display:
         for done in range(1, 1001):
             clock[0] += 10.0 if done <= 100 else 1.0
@@ -368,8 +368,8 @@ def test_whoever_waits_for_a_long_warm_up_is_told_once_what_helps(capfd, monkeyp
 
 
 def test_what_tells_nothing_itself_is_told_of_as_long_as_it_lasts(capfd, monkeypatch):
-    monkeypatch.setattr("lfm_ppl.progress.EVERY_S", 0.0)
-    monkeypatch.setattr("lfm_ppl.progress._SHORTEST_S", 0.02)
+    monkeypatch.setattr("lfm_ppl.utils.progress.EVERY_S", 0.0)
+    monkeypatch.setattr("lfm_ppl.utils.progress._SHORTEST_S", 0.02)
     with waiting("compiling", is_shown=True):
         time.sleep(0.2)
     time.sleep(0.1)

@@ -12,8 +12,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from lfm_ppl import cli, loading
+from lfm_ppl import cli
 from lfm_ppl.cli import choices, main, results
+from lfm_ppl.io import loading
 from lfm_ppl.results import arviz_data
 
 FIGURES = {"fit.png", "forces.png", "deterministics.png", "states.png", "trace.png", "pairs.png", "residuals.png"}

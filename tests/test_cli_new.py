@@ -6,8 +6,8 @@ import shlex
 import numpy as np
 import pytest
 
-from lfm_ppl import loading
 from lfm_ppl.cli import main
+from lfm_ppl.io import loading
 from lfm_ppl.results import arviz_data
 
 

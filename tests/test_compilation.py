@@ -6,7 +6,7 @@ import jaxlib.version
 import pytest
 
 import lfm_ppl as lfm
-from lfm_ppl.compilation import quick_compilation
+from lfm_ppl.utils.compilation import quick_compilation
 
 OPTION = "xla_cpu_small_while_loop_byte_threshold"
 

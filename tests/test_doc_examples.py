@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from lfm_ppl import loading
+from lfm_ppl.io import loading
 
 ROOT = Path(__file__).resolve().parent.parent
 EXAMPLES = ROOT / "docs" / "examples"

@@ -478,7 +478,7 @@ def test_what_fails_after_sampling_does_not_cost_the_draws(y, monkeypatch):
     def broken(*arguments, **keywords):
         raise TypeError("no such thing")
 
-    monkeypatch.setattr("lfm_ppl.fit_results.scores", broken)
+    monkeypatch.setattr("lfm_ppl.workflows.fit_results.scores", broken)
     with pytest.warns(UserWarning, match="scores of the observations could not be computed.*TypeError: no such thing"):
         result = lfm.fit(one_parameter, TIMES, y, sampler="map", samples=5, trajectory_draws=0)
     assert group(result, "posterior")["decay"].shape == (1, 5)

@@ -13,9 +13,9 @@ import pandas as pd
 import pytest
 
 import lfm_ppl as lfm
-from lfm_ppl import fit_tasks
 from lfm_ppl.cli import main
 from lfm_ppl.results import arviz_data
+from lfm_ppl.workflows import fit_tasks
 from tests.inference import linear_motif as motif
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lfm_ppl.gradients import finite_or_minus_infinity
+from lfm_ppl.utils.gradients import finite_or_minus_infinity
 
 
 def explosive(x):

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from lfm_ppl.gaussian_residuals import log_density, masked
-from lfm_ppl.linalg import (
+from lfm_ppl.utils.gaussian_residuals import log_density, masked
+from lfm_ppl.utils.linalg import (
     cholesky,
     congruence,
     matmul,

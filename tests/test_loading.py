@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from lfm_ppl import loading
-from lfm_ppl.data import Data
+from lfm_ppl.io import loading
+from lfm_ppl.io.data import Data
 
 COMPLETE = '''"""A line: y = slope * t.
 
 More words.
 """
-from lfm_ppl.data import Data
+from lfm_ppl.io.data import Data
 
 OUTPUTS = ("y",)
 UNITS = {"time": "s", "y": "m"}

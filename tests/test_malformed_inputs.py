@@ -694,9 +694,9 @@ def there(tmp_path, monkeypatch, result_file):
         raise AssertionError("it has begun to compute")
 
     monkeypatch.setattr("lfm_ppl.inference.sampling.run_chains", compute)
-    monkeypatch.setattr("lfm_ppl.fitting.mode_of", compute)
-    monkeypatch.setattr("lfm_ppl.fit_starts.mode_of", compute)
-    monkeypatch.setattr("lfm_ppl.fit_results.draw_paths", compute)
+    monkeypatch.setattr("lfm_ppl.workflows.fit.mode_of", compute)
+    monkeypatch.setattr("lfm_ppl.workflows.fit_starts.mode_of", compute)
+    monkeypatch.setattr("lfm_ppl.workflows.fit_results.draw_paths", compute)
     return tmp_path
 
 

@@ -8,7 +8,7 @@ import numpyro.distributions as dist
 import pytest
 
 import lfm_ppl as lfm
-from lfm_ppl import checks
+from lfm_ppl.utils import checks
 
 TIMES = np.arange(12.0)
 MODEL = lfm.LatentForceModel(

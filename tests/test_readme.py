@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import lfm_ppl as lfm
-from lfm_ppl import loading
+from lfm_ppl.io import loading
 
 ROOT = Path(__file__).resolve().parent.parent
 TEXT = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -9,10 +9,11 @@ import sys
 import warnings
 from collections.abc import Sequence
 
-from lfm_ppl import checks, loading
 from lfm_ppl.cli.arguments import parsed
 from lfm_ppl.cli.interruption import INTERRUPTED, watched
 from lfm_ppl.engine.errors import EngineError
+from lfm_ppl.io import loading
+from lfm_ppl.utils import checks
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
 import lfm_ppl
-from lfm_ppl import calendar_time, checks
 from lfm_ppl.cli import (
     check,
     compare,
@@ -27,6 +26,7 @@ from lfm_ppl.cli import (
 from lfm_ppl.cli.choices import REFERENCES, RULES
 from lfm_ppl.experiments import catalogue
 from lfm_ppl.inference.samplers import SAMPLERS
+from lfm_ppl.utils import calendar_time, checks
 
 MODEL_HELP = "a shipped model (see `lfm-ppl models`) or the path of a Python file"
 OPTION_HELP = "a choice that the model offers, see `lfm-ppl models MODEL`; may be repeated"

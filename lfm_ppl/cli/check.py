@@ -13,9 +13,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lfm_ppl import checks, data, loading
 from lfm_ppl.cli import choices, fit, page, results, session
 from lfm_ppl.cli.interruption import INTERRUPTED, Watch, watched
+from lfm_ppl.io import data, loading
+from lfm_ppl.utils import checks
 
 TABLE = "accuracy.csv"
 FIGURE = "accuracy.png"

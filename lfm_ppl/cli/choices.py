@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from lfm_ppl import checks
-from lfm_ppl.loading import ModelFile
+from lfm_ppl.io.loading import ModelFile
+from lfm_ppl.utils import checks
 
 # word on the command line -> name in lfm_ppl; its defaults are what the word stands for
 RULES = {

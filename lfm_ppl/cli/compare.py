@@ -26,8 +26,8 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"{listed('')}\n\n`lfm-ppl compare NAME` runs one; `--quick` shows in a few minutes that it runs.")
         return 0
     from lfm_ppl.engine.progress import Console
-    from lfm_ppl.progress import duration
     from lfm_ppl.results import tables, web_page
+    from lfm_ppl.utils.progress import duration
 
     report = None if arguments.quiet else Console()
     workers, study = choices.workers(arguments.jobs, arguments.scheduler), chosen.study

@@ -15,10 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from lfm_ppl import calendar_time, checks, data, loading
 from lfm_ppl.cli import choices, fit_many, forecast, page, results, session
 from lfm_ppl.cli.interruption import INTERRUPTED, watched
-from lfm_ppl.progress import duration
+from lfm_ppl.io import data, loading
+from lfm_ppl.utils import calendar_time, checks
+from lfm_ppl.utils.progress import duration
 
 SETTINGS = ("rule", "steps", "max_step", "iterations", "tolerance")
 """Flags of the approximation; None where the user leaves one to the model."""

@@ -12,8 +12,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from lfm_ppl import data, loading
 from lfm_ppl.cli import choices, results, session
+from lfm_ppl.io import data, loading
 
 RESULTS = "results"
 """Folder with a folder for each data set, as `lfm-ppl fit` writes one: ``lfm-ppl check OUT/results/NAME``."""
@@ -27,8 +27,8 @@ def run(arguments: argparse.Namespace) -> int:
     from lfm_ppl import fit_many
     from lfm_ppl.cli import fit
     from lfm_ppl.engine.progress import Console
-    from lfm_ppl.progress import duration
     from lfm_ppl.results import tables
+    from lfm_ppl.utils.progress import duration
 
     workers = choices.workers(arguments.jobs, arguments.scheduler)
     session.start(1, not arguments.no_cache, one_thread=True)
@@ -76,8 +76,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _write(one: Any, folder: Path, attributes: dict[str, Any]) -> None:
     """Write the result of a data set as that of a single fit, but for its figures, which `lfm-ppl plot` draws."""
-    from lfm_ppl.fit_tasks import file_name
     from lfm_ppl.results import arviz_data, files, html_report, tables
+    from lfm_ppl.workflows.fit_tasks import file_name
 
     target = folder / file_name(one.name)
     if one.stored and (target / html_report.NAME).is_file():

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from lfm_ppl import calendar_time, checks, data
 from lfm_ppl.cli import check, choices, page, results, session
+from lfm_ppl.io import data
+from lfm_ppl.utils import calendar_time, checks
 
 TABLE = "forecast.csv"
 FIGURE = "forecast.png"

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from lfm_ppl import loading
 from lfm_ppl.cli import description
+from lfm_ppl.io import loading
 
 
 def run(arguments: argparse.Namespace) -> int:

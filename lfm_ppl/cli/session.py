@@ -9,7 +9,7 @@ import platform
 import warnings
 from pathlib import Path
 
-from lfm_ppl.compilation import ONE_THREAD, fast_loops
+from lfm_ppl.utils.compilation import ONE_THREAD, fast_loops
 
 _MOST_DEVICES = 64
 

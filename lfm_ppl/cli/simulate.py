@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 import shlex
 
-from lfm_ppl import data, loading
 from lfm_ppl.cli import choices, results, session
+from lfm_ppl.io import data, loading
 from lfm_ppl.results import files
 
 

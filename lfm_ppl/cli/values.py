@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Callable
 from typing import Any
 
-from lfm_ppl import checks
+from lfm_ppl.utils import checks
 
 
 def one_of(kind: str, choices: Any, **likeness: float) -> Callable[[str], str]:

@@ -17,12 +17,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl import checks
 from lfm_ppl.constrained.boxes import Boxes
 from lfm_ppl.constrained.constraints import Constraints
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation import GaussianObservation
 from lfm_ppl.model.state_space import StateSpaceModel, check_times, state_space
+from lfm_ppl.utils import checks
 
 _TIME_TOLERANCE = 1e-9
 """Share of the record's length below which the distance of a grid time from an observation counts as rounding."""

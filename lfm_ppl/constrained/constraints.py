@@ -17,9 +17,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl import checks
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.user_functions import trace
+from lfm_ppl.utils import checks
 
 
 class Constraints(eqx.Module):

@@ -24,7 +24,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl import checks
 from lfm_ppl.constrained.augmented import Rows, augmented_observations
 from lfm_ppl.constrained.boxes import BoundedTerms, Boxes
 from lfm_ppl.constrained.feasible_paths import FeasiblePaths, sample_feasible_paths
@@ -35,11 +34,12 @@ from lfm_ppl.filtering.intervals import TimeGrid
 from lfm_ppl.filtering.moments import Record
 from lfm_ppl.filtering.problem import FilterProblem, filter_problem
 from lfm_ppl.filtering.update import Sites, SiteUpdate
-from lfm_ppl.linalg import matmul
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.model.structure import pattern
+from lfm_ppl.utils import checks
+from lfm_ppl.utils.linalg import matmul
 
 _LOG_2PI = 1.8378770664093453
 

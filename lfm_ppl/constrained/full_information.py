@@ -19,7 +19,6 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from lfm_ppl import checks
 from lfm_ppl.constrained.augmented import augmented_model, build_rows
 from lfm_ppl.constrained.constraints import Constraints, build_constraints
 from lfm_ppl.constrained.gauss_newton import solve_nonlinear
@@ -27,11 +26,12 @@ from lfm_ppl.constrained.interior_point import RESPECTED, ConstrainedProblem, So
 from lfm_ppl.filtering.arguments import check_observations, warn_single_precision
 from lfm_ppl.filtering.moments import Moments
 from lfm_ppl.filtering.time_grid import build_time_grid
-from lfm_ppl.linalg import matmul
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation import GaussianObservation
 from lfm_ppl.model.observation_noise import check_noise
 from lfm_ppl.model.state_space import StateSpaceModel
+from lfm_ppl.utils import checks
+from lfm_ppl.utils.linalg import matmul
 
 
 class ConstrainedEstimate(eqx.Module):

@@ -58,9 +58,9 @@ from lfm_ppl.filtering.intervals import as_arrays
 from lfm_ppl.filtering.moments import Moments, Record
 from lfm_ppl.filtering.problem import filter_problem
 from lfm_ppl.filtering.update import GaussianUpdate
-from lfm_ppl.gaussian_residuals import masked, wrapped
-from lfm_ppl.linalg import cholesky, matmul, solve_lower
 from lfm_ppl.linearisation.taylor import Taylor
+from lfm_ppl.utils.gaussian_residuals import masked, wrapped
+from lfm_ppl.utils.linalg import cholesky, matmul, solve_lower
 
 _HALVINGS = 8
 """Largest number of halvings of a step."""

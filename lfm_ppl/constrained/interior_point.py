@@ -35,9 +35,9 @@ from lfm_ppl.filtering.intervals import TimeGrid
 from lfm_ppl.filtering.moments import Moments, Record
 from lfm_ppl.filtering.problem import filter_problem
 from lfm_ppl.filtering.update import GaussianUpdate
-from lfm_ppl.linalg import congruence, diagonal, matmul, safe_sqrt, solve_lower, solve_upper
 from lfm_ppl.linearisation.taylor import Taylor
 from lfm_ppl.model.state_space import StateSpaceModel
+from lfm_ppl.utils.linalg import congruence, diagonal, matmul, safe_sqrt, solve_lower, solve_upper
 
 CENTRING = 0.1
 """Ratio of mu to the mean of s lambda."""

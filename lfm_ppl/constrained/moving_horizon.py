@@ -25,7 +25,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl import checks
 from lfm_ppl.constrained.augmented import Rows, augmented_model
 from lfm_ppl.constrained.constraints import Constraints, build_constraints
 from lfm_ppl.constrained.full_information import ConstrainedEstimate, check_settings, is_linear, solve_problem
@@ -42,6 +41,7 @@ from lfm_ppl.model.inputs import breakpoints_within
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation_noise import check_noise
 from lfm_ppl.model.state_space import StateSpaceModel, check_times, state_space
+from lfm_ppl.utils import checks
 
 
 class HorizonState(NamedTuple):

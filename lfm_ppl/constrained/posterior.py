@@ -22,7 +22,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.stats import norm
 
-from lfm_ppl import checks
 from lfm_ppl.constrained.augmented import build_rows, stacked_model
 from lfm_ppl.constrained.boxes import Boxes, build_boxes
 from lfm_ppl.constrained.constraints import build_constraints
@@ -38,9 +37,10 @@ from lfm_ppl.filtering.moments import Record
 from lfm_ppl.filtering.problem import at_intervals
 from lfm_ppl.filtering.smoother import Trajectories
 from lfm_ppl.filtering.time_grid import build_time_grid
-from lfm_ppl.linalg import congruence, diagonal, matmul, safe_sqrt
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.utils import checks
+from lfm_ppl.utils.linalg import congruence, diagonal, matmul, safe_sqrt
 
 _CANDIDATES = 32
 """Number of weighted trajectories from which one draw is chosen."""

@@ -19,11 +19,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from lfm_ppl import checks, compilation
-from lfm_ppl.compilation import ONE_THREAD
 from lfm_ppl.engine import worker
 from lfm_ppl.engine.errors import ClusterError
 from lfm_ppl.engine.task import Task
+from lfm_ppl.utils import checks, compilation
+from lfm_ppl.utils.compilation import ONE_THREAD
 
 _ANSWER_S = 15
 """Seconds in which a scheduler must answer."""

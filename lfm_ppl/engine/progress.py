@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from typing import TextIO
 
-from lfm_ppl.progress import Clock, bar, duration, on_terminal
+from lfm_ppl.utils.progress import Clock, bar, duration, on_terminal
 
 
 class Console:

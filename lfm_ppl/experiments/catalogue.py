@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, NamedTuple
 
-from lfm_ppl import checks
+from lfm_ppl.utils import checks
 
 if TYPE_CHECKING:  # the import takes a second
     from lfm_ppl.experiments.study import Study

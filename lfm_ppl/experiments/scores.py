@@ -19,8 +19,8 @@ import pandas as pd
 import xarray as xr
 from scipy.interpolate import make_interp_spline
 
-from lfm_ppl import checks
 from lfm_ppl.results import arviz_data
+from lfm_ppl.utils import checks
 
 Z = 1.959963984540054
 """Half the width of a 95% interval of a normal distribution, in standard deviations."""

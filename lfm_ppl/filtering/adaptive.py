@@ -25,8 +25,8 @@ from lfm_ppl.filtering.moments import Moments, Prediction, Record, compose
 from lfm_ppl.filtering.predict import identity_prediction
 from lfm_ppl.filtering.runge_kutta import FourthStage, runge_kutta_step
 from lfm_ppl.filtering.transition import integrating_factor
-from lfm_ppl.linalg import matmul
 from lfm_ppl.model.state_space import Span
+from lfm_ppl.utils.linalg import matmul
 
 _INITIAL_FRACTION = 1 / 8
 """First trial length, as a fraction of the interval."""

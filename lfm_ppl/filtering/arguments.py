@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl import checks
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.linearisation.sigma_points import Cubature
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observations.family import ObservationFamily
+from lfm_ppl.utils import checks
 
 
 def check_observations(y: Any, count: int, outputs: int, empty: bool = False,

@@ -25,8 +25,8 @@ from lfm_ppl.filtering.moments import Moments, matvec
 from lfm_ppl.filtering.problem import FilterProblem
 from lfm_ppl.filtering.smoothing_kernel import smoothed_moments, smoothing_kernel
 from lfm_ppl.filtering.update import Update
-from lfm_ppl.gaussian_residuals import log_density
-from lfm_ppl.linalg import cholesky, congruence, diagonal, matmul, outer_square, solve_lower, symmetric
+from lfm_ppl.utils.gaussian_residuals import log_density
+from lfm_ppl.utils.linalg import cholesky, congruence, diagonal, matmul, outer_square, solve_lower, symmetric
 
 _ROUNDING, _LARGE_ROUNDING = 8.0, 1e4
 """Variances of a sum of states, in units of eps times the states' own, that are rounding errors: in general, and where

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl import checks
 from lfm_ppl.filtering.ep.evidence import refine
 from lfm_ppl.filtering.ep.fixed_point import FixedPoint
 from lfm_ppl.filtering.ep.moment_matching import assumed_density_filter
@@ -23,6 +22,7 @@ from lfm_ppl.filtering.update import GaussianUpdate
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel
+from lfm_ppl.utils import checks
 
 _NEGATIVE = 1e-8
 """Share of the largest variance so far by which one must be negative to be no rounding error."""

@@ -12,11 +12,11 @@ from jax.ad_checkpoint import checkpoint_name
 
 from lfm_ppl.filtering.moments import Moments, matvec
 from lfm_ppl.filtering.transition import IntegratingFactor, LinearPart
-from lfm_ppl.linalg import congruence, diagonal, matmul, outer_square
 from lfm_ppl.linearisation.rule import AffineMap, Function, Inputs, Rule, selection
 from lfm_ppl.linearisation.sigma_points import SigmaPointRule
 from lfm_ppl.linearisation.structure import InputStructure
 from lfm_ppl.model.state_space import StateSpaceModel
+from lfm_ppl.utils.linalg import congruence, diagonal, matmul, outer_square
 
 MINIMUM_SD = "lfm_ppl: minimum standard deviation"
 """Name under which `minimum_sd` is stored for the derivative of an interval instead of being computed again."""

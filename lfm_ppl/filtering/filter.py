@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl import checks
 from lfm_ppl.filtering.arguments import as_rule, check_observations, warn_single_precision
 from lfm_ppl.filtering.breakdown import warn_of_breakdown
 from lfm_ppl.filtering.ep.moment_matching import assumed_density_filter, quantile_residuals
@@ -19,12 +18,13 @@ from lfm_ppl.filtering.moments import Moments, Record
 from lfm_ppl.filtering.problem import at_intervals, filter_problem
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.filtering.update import GaussianUpdate
-from lfm_ppl.linalg import solve_lower
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.resolution import check_resolution
 from lfm_ppl.model.state_space import StateSpaceModel, state_space
+from lfm_ppl.utils import checks
+from lfm_ppl.utils.linalg import solve_lower
 
 
 class FilterState(NamedTuple):

@@ -42,7 +42,7 @@ from lfm_ppl.filtering.update import (
     Updater,
     linearize_observation,
 )
-from lfm_ppl.linalg import matmul
+from lfm_ppl.utils.linalg import matmul
 
 _STORED = jax.checkpoint_policies.save_only_these_names(MINIMUM_SD, UPDATE_FAILED, INNOVATION_FACTOR)
 """What the derivative of an interval stores besides its inputs."""

@@ -26,7 +26,7 @@ from lfm_ppl.filtering.forward import FilterTrace, LinearizationPoints, NodeReco
 from lfm_ppl.filtering.moments import Moments, Record, matvec
 from lfm_ppl.filtering.problem import FilterProblem, is_observation_nonlinear
 from lfm_ppl.filtering.update import Updater
-from lfm_ppl.linalg import congruence, safe_sqrt
+from lfm_ppl.utils.linalg import congruence, safe_sqrt
 
 _NEGLIGIBLE_STEP = 1e-8
 """Square of a step, in standard deviations, below which the secant method has no information."""

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 
-from lfm_ppl.linalg import congruence, matmul
+from lfm_ppl.utils.linalg import congruence, matmul
 
 
 class Moments(NamedTuple):

@@ -22,9 +22,9 @@ from lfm_ppl.filtering.moments import Moments, Prediction, Record, compose, matv
 from lfm_ppl.filtering.runge_kutta import runge_kutta_step
 from lfm_ppl.filtering.simpson import apply_step_map, insert_midpoints, step_maps
 from lfm_ppl.filtering.transition import Exact, IntegratingFactor, LinearPart, integrating_factor
-from lfm_ppl.linalg import matmul
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.state_space import Span, StateSpaceModel
+from lfm_ppl.utils.linalg import matmul
 
 _LARGEST_TABULATED = 8
 """Largest number of force states whose transitions to all nodes of an interval are tabulated; others are chained."""

@@ -27,8 +27,8 @@ import numpy as np
 from lfm_ppl.filtering.dynamics import Congruence, DriftLinearization, Dynamics, covariance_of, linearize_drift
 from lfm_ppl.filtering.moments import Moments, Prediction
 from lfm_ppl.filtering.transition import IntegratingFactor
-from lfm_ppl.linalg import congruence, matmul, outer_square, safe_sqrt, symmetric
 from lfm_ppl.model.state_space import Span
+from lfm_ppl.utils.linalg import congruence, matmul, outer_square, safe_sqrt, symmetric
 
 WEIGHTS = np.array([1 / 6, 1 / 3, 1 / 3, 1 / 6])
 """Weights of the four stages, in units of the step."""

@@ -26,8 +26,8 @@ import jax.numpy as jnp
 from lfm_ppl.filtering.forward import FilterTrace
 from lfm_ppl.filtering.moments import Moments
 from lfm_ppl.filtering.smoothing_kernel import smoothing_kernel
-from lfm_ppl.gaussian_residuals import masked
-from lfm_ppl.linalg import (
+from lfm_ppl.utils.gaussian_residuals import masked
+from lfm_ppl.utils.linalg import (
     cholesky,
     congruence,
     matmul,

@@ -22,8 +22,8 @@ from lfm_ppl.filtering.moments import Moments, Prediction, matvec, transform
 from lfm_ppl.filtering.runge_kutta import WEIGHTS, process_cov_at, stack_diffusions
 from lfm_ppl.filtering.transition import IntegratingFactor
 from lfm_ppl.forces.sde import block_diagonal
-from lfm_ppl.linalg import congruence, matmul
 from lfm_ppl.model.state_space import Span
+from lfm_ppl.utils.linalg import congruence, matmul
 
 _FIRST_MIDDLE_LAST = slice(None, -2, 2), slice(1, None, 2), slice(2, None, 2)
 """First, middle and last node of each of J steps, among the 2 J + 1 nodes."""

@@ -17,7 +17,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl import checks
 from lfm_ppl.filtering.arguments import as_rule, check_iterations, check_observations, warn_single_precision
 from lfm_ppl.filtering.backward import SmootherTrace, backward
 from lfm_ppl.filtering.breakdown import warn_of_breakdown
@@ -34,12 +33,13 @@ from lfm_ppl.filtering.problem import FilterProblem, at_intervals, filter_proble
 from lfm_ppl.filtering.sample import sample_errors
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.filtering.update import GaussianUpdate
-from lfm_ppl.linalg import congruence, matmul, safe_sqrt
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.resolution import check_resolution
 from lfm_ppl.model.state_space import StateSpaceModel, state_space
+from lfm_ppl.utils import checks
+from lfm_ppl.utils.linalg import congruence, matmul, safe_sqrt
 
 
 class MeanSd(NamedTuple):

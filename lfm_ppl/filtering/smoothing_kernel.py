@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from lfm_ppl.filtering.moments import Moments, matvec
-from lfm_ppl.linalg import congruence, factorise_semidefinite, matmul
+from lfm_ppl.utils.linalg import congruence, factorise_semidefinite, matmul
 
 
 class SmoothingKernel(NamedTuple):

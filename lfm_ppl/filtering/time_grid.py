@@ -18,10 +18,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl import checks
 from lfm_ppl.filtering.intervals import TimeGrid, intervals_between
 from lfm_ppl.model.inputs import InputRead, breakpoints_within
 from lfm_ppl.model.state_space import StateSpaceModel, check_times, inset
+from lfm_ppl.utils import checks
 
 _LARGEST_TABLE = 1024
 """Largest number of interval lengths whose transitions are tabulated."""

@@ -17,10 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.forces.discretise import discretise
-from lfm_ppl.linalg import congruence, diagonal, matmul, safe_sqrt, solve_semidefinite
 from lfm_ppl.linearisation.rule import Function, partial_jacobian, selection
 from lfm_ppl.linearisation.structure import InputStructure
 from lfm_ppl.model.state_space import StateSpaceModel
+from lfm_ppl.utils.linalg import congruence, diagonal, matmul, safe_sqrt, solve_semidefinite
 
 
 class LinearPart(NamedTuple):

@@ -21,8 +21,11 @@ from jax.ad_checkpoint import checkpoint_name
 
 from lfm_ppl.filtering.dynamics import covariance_of, linearize
 from lfm_ppl.filtering.moments import Moments, matvec
-from lfm_ppl.gaussian_residuals import log_density, masked, wrapped
-from lfm_ppl.linalg import (
+from lfm_ppl.linearisation.rule import Rule
+from lfm_ppl.linearisation.sigma_points import SigmaPointRule
+from lfm_ppl.model.state_space import StateSpaceModel
+from lfm_ppl.utils.gaussian_residuals import log_density, masked, wrapped
+from lfm_ppl.utils.linalg import (
     cholesky,
     congruence,
     diagonal,
@@ -31,9 +34,6 @@ from lfm_ppl.linalg import (
     safe_sqrt,
     symmetric,
 )
-from lfm_ppl.linearisation.rule import Rule
-from lfm_ppl.linearisation.sigma_points import SigmaPointRule
-from lfm_ppl.model.state_space import StateSpaceModel
 
 if TYPE_CHECKING:
     from lfm_ppl.filtering.problem import FilterProblem

@@ -22,7 +22,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl import checks
 from lfm_ppl.filtering.arguments import check_observations, warn_single_precision
 from lfm_ppl.filtering.intervals import TimeGrid
 from lfm_ppl.filtering.time_grid import build_time_grid
@@ -30,10 +29,11 @@ from lfm_ppl.fokker_planck_grid.finite_volume import Grid
 from lfm_ppl.fokker_planck_grid.grid_choice import PADDED_CELLS, GridProblem, choose, half_grid, second_order_error
 from lfm_ppl.fokker_planck_grid.grid_filter import backward, build_transition, forward, log_likelihood
 from lfm_ppl.fokker_planck_grid.grid_model import Cells, on_grid, varies_with_time
-from lfm_ppl.linalg import safe_sqrt
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation_noise import check_noise, require_gaussian
 from lfm_ppl.model.state_space import StateSpaceModel, state_space
+from lfm_ppl.utils import checks
+from lfm_ppl.utils.linalg import safe_sqrt
 
 __all__ = ["FokkerPlanckResult", "Grid", "choose_grid", "fokker_planck", "log_likelihood"]
 

@@ -23,8 +23,8 @@ from lfm_ppl.filtering.intervals import TimeGrid
 from lfm_ppl.fokker_planck_grid.finite_volume import Grid
 from lfm_ppl.fokker_planck_grid.grid_filter import log_likelihood_and_reach
 from lfm_ppl.fokker_planck_grid.grid_model import Cells, drift_and_diffusion, on_grid
-from lfm_ppl.gaussian_residuals import wrapped
 from lfm_ppl.model.state_space import StateSpaceModel
+from lfm_ppl.utils.gaussian_residuals import wrapped
 
 _COARSE_CELLS = 256
 """Number of cells of the grids on which the bounds are chosen."""

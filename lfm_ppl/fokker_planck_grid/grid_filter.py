@@ -24,9 +24,9 @@ import numpy as np
 from lfm_ppl.filtering.intervals import Intervals, TimeGrid, as_arrays, with_observations
 from lfm_ppl.fokker_planck_grid.finite_volume import BirthDeathProcess, Grid, propagate, transition
 from lfm_ppl.fokker_planck_grid.grid_model import WEIGHTS, Cells, on_grid
-from lfm_ppl.gaussian_residuals import log_density, masked, wrapped
-from lfm_ppl.linalg import cholesky, solve_lower
 from lfm_ppl.model.state_space import StateSpaceModel
+from lfm_ppl.utils.gaussian_residuals import log_density, masked, wrapped
+from lfm_ppl.utils.linalg import cholesky, solve_lower
 
 _LARGEST_TABLE = 2**25
 """Largest number of entries of the tabulated transition matrices (256 MiB); without a table, the masses are propagated

@@ -23,10 +23,10 @@ import numpy as np
 from jax.typing import ArrayLike
 from scipy.special import roots_legendre
 
-from lfm_ppl import checks
 from lfm_ppl.forces.eigenspace import leading_eigenvectors
 from lfm_ppl.forces.periodic_kernels import PeriodicCovariance
-from lfm_ppl.linalg import matmul, semidefinite_root, solve_lower
+from lfm_ppl.utils import checks
+from lfm_ppl.utils.linalg import matmul, semidefinite_root, solve_lower
 
 _NEGATIVE = 1e-8
 """Negative eigenvalues up to this share of the sum of all eigenvalues are attributed to rounding."""

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from lfm_ppl.linalg import matmul
+from lfm_ppl.utils.linalg import matmul
 
 SUBSTEP = 0.5
 """Largest size of F h on a substep; 13 terms of the power series are then exact to rounding."""

@@ -27,7 +27,7 @@ from jax.typing import ArrayLike
 
 from lfm_ppl.forces.discretise import gauss_legendre, powers, step_tangent
 from lfm_ppl.forces.stretched import Stretched, covariance_of_derivatives
-from lfm_ppl.linalg import matmul
+from lfm_ppl.utils.linalg import matmul
 
 _LONGEST_STEP = 750.0
 """Number of e-folds x beyond which exp(-x) underflows to zero in float64."""

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl import checks
+from lfm_ppl.utils import checks
 
 
 def positive_parameter(name: str, value: Any) -> jax.Array:

@@ -24,13 +24,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from lfm_ppl import checks
 from lfm_ppl.forces.basis import Basis, Eigenfunctions, Waves, cycle_points, spectrum, waves
 from lfm_ppl.forces.constant import Constant
 from lfm_ppl.forces.parameters import mean_parameter
 from lfm_ppl.forces.periodic_kernels import PeriodicCovariance
 from lfm_ppl.forces.sde import ApproximationWarning, Force
-from lfm_ppl.linalg import safe_sqrt
+from lfm_ppl.utils import checks
+from lfm_ppl.utils.linalg import safe_sqrt
 
 _POINTS = 100
 """Default number of points of Nystrom's method in a cycle."""

@@ -6,7 +6,6 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from lfm_ppl import checks
 from lfm_ppl.forces.basis import Waves
 from lfm_ppl.forces.constant import Constant
 from lfm_ppl.forces.parameters import standard_deviation_parameter
@@ -14,7 +13,8 @@ from lfm_ppl.forces.periodic_kernels import PeriodicCovariance
 from lfm_ppl.forces.quasi_periodic import EXPLAINED_VARIANCE, stationary_basis, warn_of_lost_variance
 from lfm_ppl.forces.resonator import Resonator
 from lfm_ppl.forces.sde import Sum
-from lfm_ppl.linalg import safe_sqrt
+from lfm_ppl.utils import checks
+from lfm_ppl.utils.linalg import safe_sqrt
 
 
 def resonators(kernel: PeriodicCovariance, functions: int | None = None, gamma: float = 0.01, noise: Any = 0.0,

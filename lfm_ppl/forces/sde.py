@@ -25,7 +25,7 @@ import scipy.linalg
 from jax.typing import ArrayLike
 
 from lfm_ppl.forces.discretise import discretise_dispersion
-from lfm_ppl.linalg import semidefinite_root
+from lfm_ppl.utils.linalg import semidefinite_root
 
 
 class ApproximationWarning(UserWarning):
@@ -94,7 +94,7 @@ class Force(eqx.Module):
     def measurement(self, t: ArrayLike) -> jax.Array | np.ndarray:
         """Return H(t) (n,), by default the row that reads the first state.
 
-        Return a NumPy array where H is constant: products with it then become slices, see `lfm_ppl.linalg.matmul`.
+        Return a NumPy array where H is constant: products with it then become slices (`lfm_ppl.utils.linalg.matmul`).
         """
         return np.eye(self.state_dim)[0]
 

@@ -21,10 +21,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from lfm_ppl import checks
 from lfm_ppl.forces.matern import Matern
 from lfm_ppl.forces.parameters import positive_parameter, scalar_parameter, standard_deviation_parameter
 from lfm_ppl.forces.sde import Force
+from lfm_ppl.utils import checks
 
 
 class CQM(Matern):

@@ -17,7 +17,6 @@ import jax.numpy as jnp
 import numpy as np
 from numpyro.infer import init_to_median
 
-from lfm_ppl import checks
 from lfm_ppl.filtering.arguments import check_observations
 from lfm_ppl.filtering.filter import FilterResult
 from lfm_ppl.filtering.smoother import SmootherResult
@@ -28,6 +27,7 @@ from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
 from lfm_ppl.inference.optimise import Objective, value_and_gradient
 from lfm_ppl.inference.random_keys import split_keys
 from lfm_ppl.inference.traced_model import TracedModel, signature, traced_model
+from lfm_ppl.utils import checks
 
 FORWARD_MODE_LIMIT = 10
 """Largest number of unconstrained parameters for which forward-mode gradients are faster."""

@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import jax
 from numpyro import handlers
 
-from lfm_ppl import checks
 from lfm_ppl.inference.handlers.likelihood_handler import LikelihoodHandler
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
+from lfm_ppl.utils import checks
 
 
 class LikelihoodSite(NamedTuple):

@@ -23,9 +23,9 @@ import jax.numpy as jnp
 import numpy as np
 from numpyro.infer import init_to_median, init_to_sample
 
-from lfm_ppl import checks
 from lfm_ppl.inference.bound_model import BoundModel, bind_arguments
 from lfm_ppl.inference.optimise import End, Minimum, Objective, newton, quasi_newton
+from lfm_ppl.utils import checks
 
 _HESSIANS = ("autodiff", "finite-differences")
 _ATTEMPTS = 20

@@ -3,8 +3,8 @@
 1. A batch is a block of draws of one size; the last batch repeats the last draw.
 2. The size of a batch follows from the numbers that the smoother holds for a draw. Several batches run side by side in
    threads, so many that all threads end together.
-3. On a CPU the draws of a batch go in fours, which is faster than all at once (`lfm_ppl.batching`). Draws whose number
-   of steps follows a tolerance go one after another: side by side, each would take as many steps as the slowest.
+3. On a CPU the draws of a batch go in fours, which is faster than all at once (`lfm_ppl.utils.batching`). Draws whose
+   number of steps follows a tolerance go one after another: side by side, each would take as many steps as the slowest.
 4. Batches are stored when they are complete, and read again by a resumed run.
 """
 
@@ -17,10 +17,10 @@ from typing import Any, Protocol, cast
 import jax
 import numpy as np
 
-from lfm_ppl.batching import BATCH_SIZE, mapped, on_cpu, side_by_side, threads
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
 from lfm_ppl.inference.random_keys import split_keys
+from lfm_ppl.utils.batching import BATCH_SIZE, mapped, on_cpu, side_by_side, threads
 
 _SEQUENTIAL_BATCH = 8
 """Draws in a batch of draws that go one after another."""

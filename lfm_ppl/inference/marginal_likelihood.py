@@ -15,8 +15,6 @@ import numpyro.distributions as dist
 from numpyro.distributions import constraints
 from numpyro.primitives import _PYRO_STACK
 
-from lfm_ppl import checks
-from lfm_ppl.batching import mapped
 from lfm_ppl.constrained.augmented import COARSE, add_times, build_rows, is_count, stacked_model
 from lfm_ppl.constrained.boxes import build_boxes
 from lfm_ppl.constrained.constraints import build_constraints
@@ -38,7 +36,6 @@ from lfm_ppl.filtering.problem import FilterProblem, at_intervals, filter_proble
 from lfm_ppl.filtering.smoother import SmootherResult, smooth_on
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.filtering.update import GaussianUpdate, Sites
-from lfm_ppl.gradients import finite_or_minus_infinity
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation_noise import noisy_observation
@@ -46,6 +43,9 @@ from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.resolution import check_resolution
 from lfm_ppl.model.simulate import input_breakpoints, simulate_on
 from lfm_ppl.model.state_space import StateSpaceModel, check_times, state_space
+from lfm_ppl.utils import checks
+from lfm_ppl.utils.batching import mapped
+from lfm_ppl.utils.gradients import finite_or_minus_infinity
 
 SIMULATION_STEPS = 5
 """Steps of the simulator for one integration step of the filter: its paths are rougher than moments."""

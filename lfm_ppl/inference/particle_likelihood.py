@@ -11,13 +11,13 @@ import numpy as np
 import numpyro.distributions as dist
 from numpyro.distributions import constraints
 
-from lfm_ppl import checks
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.handlers.likelihood_handler import LikelihoodHandler
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
 from lfm_ppl.model.observation_noise import check_noise
 from lfm_ppl.particles.particle_filter import ParticleSettings, check_settings, log_likelihood
+from lfm_ppl.utils import checks
 
 _REPLICATES = 64
 """Filters whose log likelihoods give the standard deviation of one; that is known to a tenth of itself then."""

@@ -17,20 +17,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl import checks
 from lfm_ppl.filtering.smoother import SmootherResult
 from lfm_ppl.filtering.time_grid import LONGEST_FORECAST, build_time_grid
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.map_draws import BatchStore, Progress, map_draws, map_series
 from lfm_ppl.inference.marginal_likelihood import SIMULATION_STEPS, MarginalLikelihood, Panel
 from lfm_ppl.inference.traced_model import signature
-from lfm_ppl.linalg import semidefinite_root
 from lfm_ppl.model.observation_noise import expected_observation, noisy_observation, with_noise
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.simulate import input_breakpoints, simulate_missing_states
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.particles.particle_filter import ParticleSettings
 from lfm_ppl.particles.particle_smoother import TRACING, draw_trajectories
+from lfm_ppl.utils import checks
+from lfm_ppl.utils.linalg import semidefinite_root
 
 _FILTERS = 4
 """Number of particle filters from which the path of one draw is chosen."""

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from typing import Any
 
 from lfm_ppl.inference.schedule import Schedule
-from lfm_ppl.progress import Clock, Waiting, bar, duration, on_terminal
+from lfm_ppl.utils.progress import Clock, Waiting, bar, duration, on_terminal
 
 SURE_S = 60.0
 """Seconds of sampling before a warm-up counts as slow: the length of its first steps is not tuned yet."""

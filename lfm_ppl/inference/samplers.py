@@ -1,7 +1,7 @@
 """The samplers of `lfm_ppl.fit` by name: one list for `fit`, the command line and the check of a result.
 
 Their arguments are in `lfm_ppl.inference.kernels.options`, their algorithms in `lfm_ppl.inference.bound_samplers`, and
-their starting points in `lfm_ppl.fit_starts`.
+their starting points in `lfm_ppl.workflows.fit_starts`.
 """
 
 from __future__ import annotations

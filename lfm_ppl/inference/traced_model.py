@@ -31,7 +31,6 @@ from numpyro.infer import init_to_median, init_to_sample
 from numpyro.infer.util import constrain_fn, potential_energy
 from numpyro.infer.util import log_density as constrained_log_density
 
-from lfm_ppl import checks
 from lfm_ppl.inference.likelihood_site import (
     LikelihoodSite,
     likelihood_sites,
@@ -40,6 +39,7 @@ from lfm_ppl.inference.likelihood_site import (
     single_site,
 )
 from lfm_ppl.inference.unconstrained import check_latent, coordinate_names, latent_sites
+from lfm_ppl.utils import checks
 
 _CACHED_MODELS = 8
 """Models whose compiled functions are kept for the next data set."""

@@ -20,9 +20,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from lfm_ppl import checks
 from lfm_ppl.latent_grid.latent_grid import LatentGrid
 from lfm_ppl.model.observation_noise import require_gaussian
+from lfm_ppl.utils import checks
 
 METHODS = ("trust-region", "newton")
 

@@ -23,7 +23,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl import checks
 from lfm_ppl.filtering.arguments import check_observations, warn_single_precision
 from lfm_ppl.filtering.transition import linear_part
 from lfm_ppl.forces.sde import Force
@@ -34,11 +33,12 @@ from lfm_ppl.latent_grid.quadrature_weights import (
     quadrature_weights,
     scalar_integrals,
 )
-from lfm_ppl.linalg import semidefinite_root
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation_noise import check_noise, log_density, noisy_observation
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel, check_times, state_space
+from lfm_ppl.utils import checks
+from lfm_ppl.utils.linalg import semidefinite_root
 
 RULES = ("riemann", "trapezoid", "linear")
 

@@ -29,10 +29,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl import checks
-from lfm_ppl.linalg import CholeskyFactor, cholesky, congruence, matmul, outer_square
 from lfm_ppl.linearisation.rule import AffineMap, Function, Inputs, Rule, partial_jacobian, selection
 from lfm_ppl.linearisation.structure import InputStructure
+from lfm_ppl.utils import checks
+from lfm_ppl.utils.linalg import CholeskyFactor, cholesky, congruence, matmul, outer_square
 
 
 class UnitPoints(NamedTuple):

@@ -5,9 +5,9 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from lfm_ppl.linalg import matmul
 from lfm_ppl.linearisation.rule import AffineMap, Function, Inputs, Rule, partial_jacobian, selection
 from lfm_ppl.linearisation.structure import InputStructure
+from lfm_ppl.utils.linalg import matmul
 
 
 class Taylor(Rule):

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from lfm_ppl import checks
+from lfm_ppl.utils import checks
 
 
 class Gaussian(eqx.Module):

@@ -27,9 +27,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl import checks
-from lfm_ppl.calendar_time import named
 from lfm_ppl.model.user_functions import TracedFunction
+from lfm_ppl.utils import checks
+from lfm_ppl.utils.calendar_time import named
 
 
 class Input(eqx.Module):

@@ -21,13 +21,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl import checks
 from lfm_ppl.forces.sde import Force
 from lfm_ppl.model.gaussian import Gaussian
 from lfm_ppl.model.inputs import InputRead, check_reads, has_inputs, has_limited_inputs, input_reads
 from lfm_ppl.model.observation import GaussianObservation
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.user_functions import TracedFunction, trace
+from lfm_ppl.utils import checks
 
 
 class LatentForceModel(eqx.Module):

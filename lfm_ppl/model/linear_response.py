@@ -23,10 +23,10 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import expm
 
-from lfm_ppl import checks
 from lfm_ppl.forces.sde import Force, Sum
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observations.family import ObservationFamily
+from lfm_ppl.utils import checks
 
 TOLERANCE = 0.1
 """Error of the log likelihood above which a warning is given."""

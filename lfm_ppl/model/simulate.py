@@ -21,12 +21,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl import checks
-from lfm_ppl.linalg import matmul, semidefinite_root
 from lfm_ppl.model.inputs import breakpoints_within
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation_noise import noisy_observation
 from lfm_ppl.model.state_space import Span, StateSpaceModel, check_times, state_space
+from lfm_ppl.utils import checks
+from lfm_ppl.utils.linalg import matmul, semidefinite_root
 
 
 class Simulation(NamedTuple):

@@ -22,12 +22,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl import checks
 from lfm_ppl.forces.sde import Stack, block_diagonal
-from lfm_ppl.linalg import matmul
 from lfm_ppl.linearisation.structure import InputStructure
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.structure import Pattern, pattern
+from lfm_ppl.utils import checks
+from lfm_ppl.utils.linalg import matmul
 
 
 class StateSpaceModel(eqx.Module):

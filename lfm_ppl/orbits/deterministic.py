@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl import checks
 from lfm_ppl.orbits.environment import Environment
 from lfm_ppl.orbits.satellite import SOLAR_PRESSURE, polynomial_state
+from lfm_ppl.utils import checks
 
 STEP = 1.0 / 120.0
 """Longest step of the Runge-Kutta method, in hours; its error is 5 cm after ten days of a GPS orbit."""

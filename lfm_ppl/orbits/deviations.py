@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl import checks
 from lfm_ppl.forces import Force
 from lfm_ppl.model.gaussian import Gaussian
 from lfm_ppl.model.latent_force_model import LatentForceModel
@@ -19,6 +18,7 @@ from lfm_ppl.orbits.deterministic import Orbit, propagate
 from lfm_ppl.orbits.environment import Environment
 from lfm_ppl.orbits.satellite import Motion, period_of, pushed, wide_start
 from lfm_ppl.orbits.table import Table
+from lfm_ppl.utils import checks
 
 _FINEST = 1 / 120
 """Spacing of the points on the orbit over which means are taken (h): 30 s, half as long as a penumbra lasts."""

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lfm_ppl import checks
+from lfm_ppl.utils import checks
 
 DAY = 86400.0
 _ORIGIN = datetime(1980, 1, 6)

@@ -10,10 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import norm
 
-from lfm_ppl import checks
 from lfm_ppl.filtering.filter import FilterState, filter
 from lfm_ppl.filtering.smoother import smooth
-from lfm_ppl.linalg import congruence, matmul
 from lfm_ppl.linearisation.taylor import Taylor
 from lfm_ppl.model.gaussian import Gaussian
 from lfm_ppl.model.state_space import state_space
@@ -23,6 +21,8 @@ from lfm_ppl.orbits.deterministic import STEP, Orbit, fit_orbit, propagate
 from lfm_ppl.orbits.deviations import Neighbourhood
 from lfm_ppl.orbits.environment import Environment
 from lfm_ppl.orbits.satellite import period_of, satellite, wide_start
+from lfm_ppl.utils import checks
+from lfm_ppl.utils.linalg import congruence, matmul
 
 LATEST = 6.0
 """Hours before the end of training that determine the latest state."""

@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl import checks
 from lfm_ppl.forces import Constant, Force, RandomWalk, Resonator
 from lfm_ppl.model.gaussian import Gaussian
 from lfm_ppl.model.latent_force_model import LatentForceModel
@@ -18,6 +17,7 @@ from lfm_ppl.model.observation import GaussianObservation
 from lfm_ppl.orbits import frames
 from lfm_ppl.orbits.environment import NANO, Environment
 from lfm_ppl.orbits.geopotential import GM
+from lfm_ppl.utils import checks
 
 SOLAR_PRESSURE = 100.0
 """Acceleration of a GPS satellite by sunlight, in nm/s^2, before anything is known of the satellite."""

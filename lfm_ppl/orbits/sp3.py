@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from lfm_ppl import checks
 from lfm_ppl.orbits.ephemerides import Ephemerides, calendar, check_satellites
 from lfm_ppl.orbits.sp3_file import Sp3File, read_file
+from lfm_ppl.utils import checks
 
 _NAME = re.compile(r".+\.sp3(\.gz|\.z)?", re.IGNORECASE)
 

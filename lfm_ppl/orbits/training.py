@@ -21,7 +21,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import solve_triangular
 
-from lfm_ppl import gaussian_residuals
 from lfm_ppl.filtering.forward import forward
 from lfm_ppl.filtering.moments import Record, compose
 from lfm_ppl.filtering.problem import filter_problem
@@ -29,8 +28,6 @@ from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.filtering.update import GaussianUpdate
 from lfm_ppl.forces import Force, RandomWalk, Resonator
 from lfm_ppl.forces.sde import Sum
-from lfm_ppl.gaussian_residuals import masked
-from lfm_ppl.linalg import matmul, solve_lower
 from lfm_ppl.linearisation.taylor import Taylor
 from lfm_ppl.model.gaussian import Gaussian
 from lfm_ppl.model.latent_force_model import LatentForceModel
@@ -42,6 +39,9 @@ from lfm_ppl.orbits.deterministic import Orbit
 from lfm_ppl.orbits.deviations import Neighbourhood, departure
 from lfm_ppl.orbits.environment import NANO
 from lfm_ppl.orbits.satellite import START_SD
+from lfm_ppl.utils import gaussian_residuals
+from lfm_ppl.utils.gaussian_residuals import masked
+from lfm_ppl.utils.linalg import matmul, solve_lower
 
 _LONGEST = 0.5
 """Hours from one position to the next in learning; closer ones say the same."""

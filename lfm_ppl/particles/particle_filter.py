@@ -22,7 +22,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl import checks
 from lfm_ppl.filtering.arguments import check_observations, warn_single_precision
 from lfm_ppl.filtering.intervals import Intervals, TimeGrid, with_observations
 from lfm_ppl.filtering.time_grid import build_time_grid
@@ -31,6 +30,7 @@ from lfm_ppl.model.observation_noise import check_noise, log_density
 from lfm_ppl.model.state_space import StateSpaceModel, state_space
 from lfm_ppl.particles.resampling import RESAMPLING, effective_sample_size, resample, reweight
 from lfm_ppl.particles.stochastic_steps import ParticleTransition, StepConstants, choose_scheme, initial_particles
+from lfm_ppl.utils import checks
 
 
 class ParticleSettings(NamedTuple):

@@ -21,12 +21,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl import checks
 from lfm_ppl.filtering.intervals import Intervals, TimeGrid, as_arrays
 from lfm_ppl.filtering.predict import exact_offset
 from lfm_ppl.filtering.transition import exact
-from lfm_ppl.gaussian_residuals import log_density
-from lfm_ppl.linalg import cholesky, matmul, solve_lower
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.state_space import StateSpaceModel, state_space
 from lfm_ppl.particles.particle_filter import (
@@ -37,6 +34,9 @@ from lfm_ppl.particles.particle_filter import (
     filter_particles,
 )
 from lfm_ppl.particles.stochastic_steps import choose_scheme
+from lfm_ppl.utils import checks
+from lfm_ppl.utils.gaussian_residuals import log_density
+from lfm_ppl.utils.linalg import cholesky, matmul, solve_lower
 
 BACKWARD, TRACING = "backward simulation", "ancestor tracing"
 METHODS = (BACKWARD, TRACING)

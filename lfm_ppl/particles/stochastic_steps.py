@@ -25,15 +25,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl import checks
 from lfm_ppl.filtering.intervals import Intervals, TimeGrid, by_length
 from lfm_ppl.filtering.predict import exact_offset
 from lfm_ppl.filtering.transition import Exact, exact
 from lfm_ppl.forces.discretise import discretise
-from lfm_ppl.linalg import matmul, semidefinite_root
 from lfm_ppl.model.state_space import Span, StateSpaceModel
 from lfm_ppl.model.structure import pattern
 from lfm_ppl.particles.normals import normals
+from lfm_ppl.utils import checks
+from lfm_ppl.utils.linalg import matmul, semidefinite_root
 
 SCHEMES = ("exact", "srk", "milstein", "euler")
 

@@ -12,7 +12,6 @@ import jax
 import numpy as np
 import xarray as xr
 
-from lfm_ppl import checks
 from lfm_ppl.inference.model_digest import model_digest
 from lfm_ppl.inference.posterior import evenly_spaced
 from lfm_ppl.inference.samplers import GAUSSIAN_FILTER_SAMPLERS, SAMPLERS
@@ -25,6 +24,7 @@ from lfm_ppl.results.likelihoods import PosteriorDraws, Reference
 from lfm_ppl.results.report import EXACT, GROUP, AccuracyReport
 from lfm_ppl.results.scalars import choose, scalar_draws
 from lfm_ppl.results.verdict import NOISE_SD, Findings, judge
+from lfm_ppl.utils import checks
 
 REFERENCES = ("auto", "grid", "particles")
 

@@ -20,7 +20,6 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from lfm_ppl import checks
 from lfm_ppl.forces.stretched import Stretched
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.marginal_likelihood import DEFAULT_ITERATIONS, MarginalLikelihood, Panel
@@ -29,6 +28,7 @@ from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.resolution import resolution_messages
 from lfm_ppl.results import likelihoods
 from lfm_ppl.results.likelihoods import PosteriorDraws
+from lfm_ppl.utils import checks
 
 _DRAWS = 20
 """Posterior draws at which the log likelihood is refined."""

@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from numpyro import handlers
 
-from lfm_ppl import checks
 from lfm_ppl.engine.cluster import Workers
 from lfm_ppl.engine.run import Reporter, run_tasks
 from lfm_ppl.engine.task import Task
@@ -22,6 +21,7 @@ from lfm_ppl.inference.likelihood_site import likelihood_site
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.results.files import writing
+from lfm_ppl.utils import checks
 
 LOG_LIKELIHOOD = "log likelihood"
 METHODS = ("vectorized", "sequential")

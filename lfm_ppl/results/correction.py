@@ -10,11 +10,11 @@ import jax
 import numpy as np
 import xarray as xr
 
-from lfm_ppl import checks
 from lfm_ppl.inference.posterior import evenly_spaced, trajectories
 from lfm_ppl.results import arviz_data, importance, rebuilding
 from lfm_ppl.results.layout import with_summaries
 from lfm_ppl.results.report import AccuracyReport
+from lfm_ppl.utils import checks
 
 _KEPT = ("observed_data", "truth")
 _DRAWN = ("trajectories", "posterior_predictive")

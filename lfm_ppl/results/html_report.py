@@ -14,7 +14,6 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from lfm_ppl import calendar_time
 from lfm_ppl.results import arviz_data, predictions, report, tables, web_page
 from lfm_ppl.results.files import POSTERIOR
 from lfm_ppl.results.inputs import ORIGIN, input_unit, inputs_of, time_origin, time_unit
@@ -22,6 +21,7 @@ from lfm_ppl.results.plots import saving, style
 from lfm_ppl.results.residuals import misfit
 from lfm_ppl.results.scalars import unit_of
 from lfm_ppl.results.web_page import Section
+from lfm_ppl.utils import calendar_time
 
 NAME = "report.html"
 

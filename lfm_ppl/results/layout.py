@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from lfm_ppl import checks
-from lfm_ppl.data import TRUTH, check_truth
+from lfm_ppl.io.data import TRUTH, check_truth
 from lfm_ppl.model.observation_noise import expected_observation
 from lfm_ppl.results.predictions import GROUP, INTERVAL, NOISE_FREE, mixture_quantiles, predictions
 from lfm_ppl.results.scalars import DERIVED, units_attribute
+from lfm_ppl.utils import checks
 
 if TYPE_CHECKING:
     from lfm_ppl.inference.bound_model import BoundModel

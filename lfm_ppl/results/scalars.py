@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import xarray as xr
 
-from lfm_ppl.checks import unknown
+from lfm_ppl.utils.checks import unknown
 
 SAMPLE_DIMS = ("chain", "draw")
 

@@ -12,11 +12,11 @@ import xarray as xr
 from scipy import stats
 from scipy.special import logsumexp
 
-from lfm_ppl import calendar_time, checks
-from lfm_ppl.data import Data, at_origin
+from lfm_ppl.io.data import Data, at_origin
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.inputs import clock_of
 from lfm_ppl.results.predictions import MEAN, SD, observed_variable, of_result, quantiles
+from lfm_ppl.utils import calendar_time, checks
 
 ALL = "all"
 """The row of a table of scores for all outputs together."""

@@ -11,7 +11,7 @@ import numpy as np
 from jax.scipy.special import logsumexp, ndtr
 from jax.scipy.stats import norm
 
-from lfm_ppl import checks
+from lfm_ppl.utils import checks
 
 _HALVINGS = 60
 """Bisection steps of a quantile; each halves the bracket."""

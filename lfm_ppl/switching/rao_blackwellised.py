@@ -29,13 +29,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl import checks
 from lfm_ppl.filtering.arguments import check_observations, warn_single_precision
 from lfm_ppl.filtering.filter import FilterState
 from lfm_ppl.filtering.intervals import Intervals, with_observations
 from lfm_ppl.filtering.moments import Moments
 from lfm_ppl.filtering.update import LinearizedObservation, Update, condition
-from lfm_ppl.linalg import congruence, matmul, semidefinite_root, solve_semidefinite
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.particles.normals import normals
 from lfm_ppl.particles.resampling import RESAMPLING, effective_sample_size, resample, reweight
@@ -53,6 +51,8 @@ from lfm_ppl.switching.switched_model import (
     is_input_additive,
     make_interval_map,
 )
+from lfm_ppl.utils import checks
+from lfm_ppl.utils.linalg import congruence, matmul, semidefinite_root, solve_semidefinite
 
 
 class RaoBlackwellisedResult(eqx.Module):

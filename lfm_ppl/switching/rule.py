@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl import checks
+from lfm_ppl.utils import checks
 
 
 class SwitchingRule(eqx.Module):

@@ -19,7 +19,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl import checks
 from lfm_ppl.filtering.filter import FilterState
 from lfm_ppl.filtering.forward import predict
 from lfm_ppl.filtering.intervals import Intervals, TimeGrid
@@ -32,6 +31,7 @@ from lfm_ppl.model.observation_noise import require_gaussian
 from lfm_ppl.model.state_space import StateSpaceModel, state_space
 from lfm_ppl.model.structure import pattern
 from lfm_ppl.switching.rule import SwitchingRule
+from lfm_ppl.utils import checks
 
 Build = Callable[[Any], LatentForceModel]
 """Function from a value of the discrete input to the model that holds while the input has this value."""

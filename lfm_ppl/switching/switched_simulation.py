@@ -8,10 +8,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from lfm_ppl import checks
 from lfm_ppl.filtering.filter import FilterState
 from lfm_ppl.filtering.intervals import Intervals, as_arrays
-from lfm_ppl.linalg import semidefinite_root
 from lfm_ppl.model.observation_noise import noisy_observation
 from lfm_ppl.particles.normals import normals
 from lfm_ppl.particles.stochastic_steps import ParticleTransition, choose_scheme, initial_particles
@@ -24,6 +22,8 @@ from lfm_ppl.switching.switched_model import (
     initial_indices,
     initial_moments,
 )
+from lfm_ppl.utils import checks
+from lfm_ppl.utils.linalg import semidefinite_root
 
 
 class SwitchedSimulation(eqx.Module):

@@ -20,7 +20,7 @@ from lfm_ppl.engine.run import outcomes, run_tasks
 from lfm_ppl.engine.store import read, write
 from lfm_ppl.engine.task import Task
 from lfm_ppl.engine.worker import return_memory
-from lfm_ppl.progress import duration
+from lfm_ppl.utils.progress import duration
 
 ROOT = Path(__file__).resolve().parents[2]
 

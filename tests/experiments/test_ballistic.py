@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from lfm_ppl import loading
 from lfm_ppl.engine.store import write
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.ballistic import experiment, figures
@@ -14,6 +13,7 @@ from lfm_ppl.experiments.ballistic.problem import TARGETS
 from lfm_ppl.experiments.simulated import parameters, states
 from lfm_ppl.experiments.simulated.problem import RECORDS_PER_SEED, posterior, simulate_record, true_likelihood, true_z
 from lfm_ppl.experiments.study import TASKS
+from lfm_ppl.io import loading
 
 SMALL = experiment.BallisticSettings(
     runs=2, particle_runs=1, particles=(2_000,), chain_runs=1, drawn_runs=1, draws=200, paths=5, nuts=(2, 10, 10, 1),

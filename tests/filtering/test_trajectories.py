@@ -12,13 +12,13 @@ from numpyro.handlers import condition, seed, trace
 from systems import identity, motif, softplus
 
 import lfm_ppl as lfm
-from lfm_ppl import loading
 from lfm_ppl.filtering.forward import forward
 from lfm_ppl.filtering.iterated import posterior_linearisation
 from lfm_ppl.filtering.moments import Moments, Record
 from lfm_ppl.filtering.problem import filter_problem
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.filtering.update import GaussianUpdate
+from lfm_ppl.io import loading
 from lfm_ppl.model.state_space import state_space
 
 TIMES = np.array([0.0, 0.0, 2.0, 4.0, 4.0, 6.0, 12.0, 14.0])  # replicates and a gap

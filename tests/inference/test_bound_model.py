@@ -242,7 +242,7 @@ def test_chains_from_the_mode_begin_with_the_covariance_there(monkeypatch):
 
 
 def test_thinning_and_blocks_keep_the_last_step_of_each_draw(capfd, monkeypatch):
-    monkeypatch.setattr("lfm_ppl.progress.EVERY_S", 0.0)
+    monkeypatch.setattr("lfm_ppl.utils.progress.EVERY_S", 0.0)
     bound = lfm.bind(small, TIMES, Y)
     kernel = lfm.RAM(small, initial_scale=0.1)
     starts = np.stack([bound.unconstrain({"decay": 0.8})] * 2)
@@ -496,7 +496,7 @@ def test_a_digest_is_equal_in_processes_that_hash_differently():
 import jax, numpy as np
 jax.config.update("jax_enable_x64", True)
 import lfm_ppl as lfm
-from lfm_ppl import loading
+from lfm_ppl.io import loading
 from lfm_ppl.inference.model_digest import model_digest
 file = loading.load("spring")
 data = file.simulate(seed=0)

@@ -9,7 +9,7 @@ from numpyro.infer import Predictive
 from numpyro.infer.util import log_density
 
 import lfm_ppl as lfm
-from lfm_ppl.batching import mapped
+from lfm_ppl.utils.batching import mapped
 
 TIMES = np.array([0.0, 0.5, 1.5, 2.0, 3.5])
 RATES = np.array([0.4, 0.9, 1.6])
@@ -95,18 +95,18 @@ def test_many_series_go_one_after_another_on_a_cpu(y, monkeypatch, own_times):
         total = lambda rates, lengthscale: panel(rates, lengthscale, times).log_prob(several).sum()  # noqa: E731
         return jax.jit(jax.value_and_grad(total, argnums=(0, 1)))
 
-    monkeypatch.setattr("lfm_ppl.batching.on_cpu", lambda: True)
+    monkeypatch.setattr("lfm_ppl.utils.batching.on_cpu", lambda: True)
     loops = lambda: str(jax.make_jaxpr(evaluate())(rates, LENGTHSCALE)).count(f"length={count}")  # noqa: E731
     assert loops()
     one_by_one = evaluate()(rates, LENGTHSCALE)
-    monkeypatch.setattr("lfm_ppl.batching.on_cpu", lambda: False)
+    monkeypatch.setattr("lfm_ppl.utils.batching.on_cpu", lambda: False)
     assert not loops()
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-12), one_by_one,
                  evaluate()(rates, LENGTHSCALE))
 
 
 def test_batches_of_results_without_entries(monkeypatch):
-    monkeypatch.setattr("lfm_ppl.batching.on_cpu", lambda: True)
+    monkeypatch.setattr("lfm_ppl.utils.batching.on_cpu", lambda: True)
     x = jnp.arange(24.0).reshape(12, 2)
     total, empty = mapped(lambda row: (row.sum(), row[:0]), x, batch_size=4)
     np.testing.assert_array_equal(total, x.sum(1))

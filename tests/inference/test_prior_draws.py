@@ -9,8 +9,8 @@ from numpyro.distributions import biject_to
 from numpyro.infer import Predictive
 from numpyro.infer.util import log_density, potential_energy
 
-from lfm_ppl import loading
 from lfm_ppl.inference.handlers import settings
+from lfm_ppl.io import loading
 
 DRAWS = 1000
 FEW = 100

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import lfm_ppl as lfm
-from lfm_ppl import loading
 from lfm_ppl.inference.likelihood_site import likelihood_site
+from lfm_ppl.io import loading
 
 
 def module(name):

@@ -7,11 +7,11 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import lfm_ppl as lfm
-from lfm_ppl import loading
 from lfm_ppl.experiments import scores
 from lfm_ppl.inference.bound_model import bind
 from lfm_ppl.inference.log_posterior import LogPosterior
 from lfm_ppl.inference.optimise import newton, quasi_newton
+from lfm_ppl.io import loading
 from lfm_ppl.results.importance_at_modes import weighted_posterior
 
 EPIDEMICS = 100

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 import lfm_ppl as lfm
-from lfm_ppl import loading
 from lfm_ppl.inference.bound_model import bind
 from lfm_ppl.inference.optimise import newton, quasi_newton
+from lfm_ppl.io import loading
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 P53 = Path(os.environ.get("LFM_DATA", ROOT.parent / "shared" / "data")) / "p53" / "p53_targets.csv"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lfm_ppl as lfm
-from lfm_ppl import loading
+from lfm_ppl.io import loading
 from lfm_ppl.results.arviz_data import group, summary
 
 MODELS = sorted(loading.available())

@@ -10,7 +10,7 @@ import pytest
 from reference_map import Transcribed
 
 import lfm_ppl as lfm
-from lfm_ppl import loading
+from lfm_ppl.io import loading
 
 
 def module():

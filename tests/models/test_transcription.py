@@ -14,11 +14,11 @@ from numpyro.handlers import condition, trace
 from numpyro.infer import MCMC, NUTS, init_to_median
 
 import lfm_ppl as lfm
-from lfm_ppl import loading
 from lfm_ppl.inference.bound_model import bind
 from lfm_ppl.inference.handlers.fixing import fix
 from lfm_ppl.inference.handlers.settings import approximate
 from lfm_ppl.inference.optimise import newton, quasi_newton
+from lfm_ppl.io import loading
 from lfm_ppl.results.arviz_data import group, summary
 
 ROOT = Path(__file__).resolve().parent.parent.parent

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from lfm_ppl import checks
+from lfm_ppl.utils import checks
 
 FILE = "bank_calls.csv.gz"
 WEEKDAYS = ("Monday", "Tuesday", "Wednesday", "Thursday", "Friday")

@@ -30,9 +30,9 @@ from lfm_ppl.experiments.call_centre.problem import GRID, TEST_RATES, TEST_START
 from lfm_ppl.experiments.tasks import dataset_indices, stack_results
 from lfm_ppl.filtering.filter import filter
 from lfm_ppl.filtering.smoother import smooth
-from lfm_ppl.linalg import congruence, matmul
 from lfm_ppl.model.state_space import state_space
 from lfm_ppl.switching.mixture import Mixture
+from lfm_ppl.utils.linalg import congruence, matmul
 
 STEPS = 3
 """Integration steps in five minutes; their length is close to that of the model file."""

@@ -13,12 +13,12 @@ import numpyro
 import numpyro.distributions as dist
 from scipy.signal import lfilter
 
-from lfm_ppl import loading
 from lfm_ppl.forces import Matern
 from lfm_ppl.inference.bound_model import bind
 from lfm_ppl.inference.likelihood_site import likelihood_site
 from lfm_ppl.inference.log_posterior import LogPosterior
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
+from lfm_ppl.io import loading
 from lfm_ppl.linearisation.sigma_points import Cubature, GaussHermite
 from lfm_ppl.model.gaussian import Gaussian
 from lfm_ppl.model.latent_force_model import LatentForceModel

@@ -25,9 +25,9 @@ import numpyro.distributions as dist
 import pandas as pd
 
 import lfm_ppl as lfm
-from lfm_ppl import loading
 from lfm_ppl.experiments.call_centre import counts
 from lfm_ppl.forces import Force, PeriodicSquaredExponential
+from lfm_ppl.io import loading
 
 COAL = "coal"
 CALLS = ("calls-poisson", "calls-poisson-daily", "calls-negative-binomial", "calls-negative-binomial-daily")

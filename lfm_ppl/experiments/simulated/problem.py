@@ -20,13 +20,14 @@ import jax.numpy as jnp
 import numpy as np
 from numpyro import handlers
 
-from lfm_ppl import checks, loading
-from lfm_ppl.data import Data
 from lfm_ppl.inference.bound_model import bind
 from lfm_ppl.inference.handlers.fixing import fix
 from lfm_ppl.inference.log_posterior import LogPosterior
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
+from lfm_ppl.io import loading
+from lfm_ppl.io.data import Data
 from lfm_ppl.model.simulate import simulate
+from lfm_ppl.utils import checks
 
 RECORDS_PER_SEED = 10_000
 """Number of data sets for one seed of a study."""

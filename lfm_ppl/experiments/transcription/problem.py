@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl import loading
 from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import tasks
+from lfm_ppl.io import loading
 from lfm_ppl.latent_grid.latent_grid import LatentGrid
 from lfm_ppl.model.latent_force_model import LatentForceModel
 

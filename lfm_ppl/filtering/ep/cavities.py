@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from lfm_ppl.filtering.backward import SmoothedPredictor
 from lfm_ppl.filtering.ep.quadrature import MeanVariance
 from lfm_ppl.filtering.update import Sites
-from lfm_ppl.linalg import diagonal
+from lfm_ppl.utils.linalg import diagonal
 
 _DOMINANT_SITE = 0.5
 """Share of the marginal's precision from its own site, above which the cavity is taken from leave-one-out terms."""

@@ -54,7 +54,7 @@ from lfm_ppl.filtering.iterated import smoothed_points
 from lfm_ppl.filtering.moments import Moments, Record, matvec
 from lfm_ppl.filtering.problem import FilterProblem, at_intervals, is_linear
 from lfm_ppl.filtering.update import Sites, SiteUpdate, Updater
-from lfm_ppl.linalg import diagonal, inverse_and_log_det, matmul
+from lfm_ppl.utils.linalg import diagonal, inverse_and_log_det, matmul
 
 
 class RefinedSites(NamedTuple):

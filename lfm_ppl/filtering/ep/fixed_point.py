@@ -22,7 +22,7 @@ from lfm_ppl.filtering.ep.cavities import SiteMarginals, clip_to_proper
 from lfm_ppl.filtering.ep.quadrature import MeanVariance
 from lfm_ppl.filtering.ep.settings import FixedPointOptions
 from lfm_ppl.filtering.update import Sites
-from lfm_ppl.linalg import matmul, solve_semidefinite
+from lfm_ppl.utils.linalg import matmul, solve_semidefinite
 
 _OPTIONS = FixedPointOptions()
 

@@ -38,8 +38,8 @@ from lfm_ppl.filtering.update import (
     multiply_by_sites,
     predictor_variance,
 )
-from lfm_ppl.linalg import diagonal
 from lfm_ppl.model.observations.family import ObservationFamily
+from lfm_ppl.utils.linalg import diagonal
 
 _NEWTON_STEPS, _UNROLLED_STEPS, _NEWTON_TOLERANCE = 12, 3, 0.1
 """Largest and least number of steps of the search for a mode, and its last step in standard deviations."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from lfm_ppl import checks
+from lfm_ppl.utils import checks
 
 METHODS = ("ep", "variational", "laplace")
 

@@ -17,10 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
 
-from lfm_ppl import checks
 from lfm_ppl.inference.handlers.likelihood_handler import Handler
 from lfm_ppl.inference.handlers.pinned import Pinned, elementwise
 from lfm_ppl.inference.priors import support as in_words
+from lfm_ppl.utils import checks
 
 _ELEMENT = re.compile(r"^(?P<site>[^\[\]]+)\[(?P<label>[^\[\]]+)\]$")
 

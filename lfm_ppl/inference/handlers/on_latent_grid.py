@@ -12,10 +12,10 @@ import numpyro
 import numpyro.distributions as dist
 from numpyro.distributions import constraints
 
-from lfm_ppl import checks
 from lfm_ppl.inference.handlers.likelihood_handler import LikelihoodHandler
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel, repeat_draw
 from lfm_ppl.latent_grid.latent_grid import RULES, LatentGrid
+from lfm_ppl.utils import checks
 
 
 class GridLikelihood(dist.Distribution):

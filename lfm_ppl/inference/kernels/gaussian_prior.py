@@ -19,7 +19,7 @@ import numpyro.distributions as dist
 from numpyro import handlers
 from numpyro.infer import init_to_uniform
 
-from lfm_ppl import checks
+from lfm_ppl.utils import checks
 
 _GAUSSIAN = (dist.Normal, dist.MultivariateNormal, dist.LowRankMultivariateNormal)
 

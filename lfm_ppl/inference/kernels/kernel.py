@@ -13,8 +13,8 @@ from numpyro.infer.mcmc import MCMCKernel
 from numpyro.infer.util import ParamInfo
 from numpyro.util import identity, is_prng_key
 
-from lfm_ppl import checks
 from lfm_ppl.inference.kernels.algorithm import SamplingAlgorithm
+from lfm_ppl.utils import checks
 
 
 class Kernel(MCMCKernel):

@@ -8,9 +8,9 @@ from typing import Any
 
 from numpyro.infer import NUTS
 
-from lfm_ppl import checks
 from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalRAM
 from lfm_ppl.inference.kernels.ram import RAM
+from lfm_ppl.utils import checks
 
 KERNELS: dict[str, Any] = {"nuts": NUTS, "ram": RAM, "pmmh": ParticleMarginalRAM}
 """Sampler of `lfm_ppl.fit` -> kernel that takes ``sampler_options`` as arguments; "map" has none."""

@@ -24,7 +24,6 @@ from numpyro.infer import init_to_median
 from numpyro.infer.util import ParamInfo
 from numpyro.util import is_prng_key
 
-from lfm_ppl import checks
 from lfm_ppl.inference.bound_model import BoundModel, bind_arguments
 from lfm_ppl.inference.kernels.algorithm import SamplingAlgorithm
 from lfm_ppl.inference.kernels.ram import RAM
@@ -40,6 +39,7 @@ from lfm_ppl.inference.kernels.robust_metropolis import (
 )
 from lfm_ppl.inference.particle_likelihood import ParticlePotential, Tuned
 from lfm_ppl.particles.particle_filter import ParticleSettings
+from lfm_ppl.utils import checks
 
 _TARGET, _TARGET_ONE = 0.12, 0.21
 """Target acceptance in several dimensions and in one: half of RAM's, since noise of sd one in the log likelihood halves

@@ -13,11 +13,11 @@ from numpyro.infer import init_to_median
 from numpyro.infer.util import ParamInfo, initialize_model
 from numpyro.util import identity, is_prng_key
 
-from lfm_ppl import checks
 from lfm_ppl.inference.kernels.algorithm import SamplingAlgorithm
 from lfm_ppl.inference.kernels.kernel import Kernel, as_floating_point, check_start, map_chains
 from lfm_ppl.inference.kernels.robust_metropolis import RAMState, finite_or_infinity, robust_metropolis
 from lfm_ppl.inference.unconstrained import check_latent_sites
+from lfm_ppl.utils import checks
 
 _ADAPTATIONS = ("warmup", "throughout")
 _OPTIMAL_SCALE = 2.38

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.stats import norm
 
-from lfm_ppl import checks
 from lfm_ppl.model.observations.family import ObservationFamily, as_parameter
+from lfm_ppl.utils import checks
 
 
 class CensoredObservation(ObservationFamily):

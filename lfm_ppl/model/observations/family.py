@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl import checks
+from lfm_ppl.utils import checks
 
 
 class ObservationFamily(eqx.Module):

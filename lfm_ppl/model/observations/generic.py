@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
 
-from lfm_ppl import checks
 from lfm_ppl.model.observations.family import ObservationFamily
+from lfm_ppl.utils import checks
 
 
 class Observation(ObservationFamily):

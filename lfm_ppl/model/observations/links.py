@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from lfm_ppl import checks
+from lfm_ppl.utils import checks
 
 Link = tuple[Callable[[jax.Array], jax.Array], Callable[[jax.Array], jax.Array]]
 """Two functions of the predictor: (rate, log rate), or (log probability, log complement)."""

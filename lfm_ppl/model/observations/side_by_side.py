@@ -19,9 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.stats import norm
 
-from lfm_ppl import checks
 from lfm_ppl.model.observation import GaussianObservation
 from lfm_ppl.model.observations.family import ObservationFamily
+from lfm_ppl.utils import checks
 
 
 class _GaussianFamily(ObservationFamily):

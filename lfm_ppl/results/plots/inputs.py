@@ -9,10 +9,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from lfm_ppl.checks import unknown
 from lfm_ppl.results.inputs import FORECAST, input_unit, inputs_of, time_origin, time_unit
 from lfm_ppl.results.plots import style
 from lfm_ppl.results.plots.trajectories import END, MAX_PANELS, forecast_span
+from lfm_ppl.utils.checks import unknown
 
 _MANY = 150  # values, from which they have no marks
 
@@ -36,7 +36,7 @@ def plot_inputs(result: Any, inputs: Sequence[str] | None = None, *, width: str 
 
     Example:
         >>> import numpy as np
-        >>> from lfm_ppl.data import InputTable
+        >>> from lfm_ppl.io.data import InputTable
         >>> from lfm_ppl.results.arviz_data import build
         >>> from lfm_ppl.results.inputs import GROUP, to_dataset
         >>> heater = InputTable(np.array([0.0, 6.0, 22.0]), np.array([0.0, 1.0, 0.0]), "previous")

@@ -19,7 +19,7 @@ from matplotlib.dates import HOURLY, MINUTELY, MONTHLY, SECONDLY, AutoDateLocato
 from matplotlib.figure import Figure
 from matplotlib.ticker import Formatter, Locator, MaxNLocator
 
-from lfm_ppl import calendar_time
+from lfm_ppl.utils import calendar_time
 
 WIDTHS = {"column": 3.4, "full": 7.0}  # inches: one column of a two-column paper, and both
 

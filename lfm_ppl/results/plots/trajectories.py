@@ -13,12 +13,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from lfm_ppl.checks import unknown
 from lfm_ppl.results.arviz_data import group, has_group
 from lfm_ppl.results.inputs import time_origin, time_unit
 from lfm_ppl.results.plots import style
 from lfm_ppl.results.predictions import GROUP, HELD_OUT, INTERVAL, MEAN, interval, noise_free_interval, quantiles
 from lfm_ppl.results.scalars import unit_of
+from lfm_ppl.utils.checks import unknown
 
 MAX_PANELS = 12
 _MANY = 150  # measurements

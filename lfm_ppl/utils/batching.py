@@ -14,7 +14,7 @@ from typing import Any
 
 import jax
 
-from lfm_ppl import compilation
+from lfm_ppl.utils import compilation
 
 BATCH_SIZE = 4
 """Draws that a CPU computes in one batch."""

@@ -26,7 +26,7 @@ import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 from jax.custom_derivatives import SymbolicZero
 
-from lfm_ppl.selection_matrices import select, selected_columns
+from lfm_ppl.utils.selection_matrices import select, selected_columns
 
 _FUSED_SIZE = 8
 """Largest dimension of products by broadcasting, and of unrolled factorisations and solves.

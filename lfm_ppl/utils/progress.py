@@ -9,7 +9,7 @@ import time
 from collections.abc import Iterator
 from typing import Any, TextIO
 
-from lfm_ppl import checks
+from lfm_ppl.utils import checks
 
 EVERY_S = 30.0
 """Between two lines, where no terminal redraws one."""

@@ -19,14 +19,14 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from lfm_ppl import checks
 from lfm_ppl.engine.cluster import Workers, check_workers
 from lfm_ppl.engine.run import Reporter, outcomes
 from lfm_ppl.engine.task import Task, check_distinct
-from lfm_ppl.fit_tasks import FitDataSet, fit_task
-from lfm_ppl.fitting import fit
 from lfm_ppl.results import arviz_data, tables
 from lfm_ppl.results.packing import unpack_result
+from lfm_ppl.utils import checks
+from lfm_ppl.workflows.fit import fit
+from lfm_ppl.workflows.fit_tasks import FitDataSet, fit_task
 
 FITS, SUMMARY, POSTERIORS, FAILED = "fits", "summary.csv", "posteriors.nc", "failed.csv"
 """Contents of a folder of results: one file for each data set, and over all of them a table, draws and failures."""

@@ -18,8 +18,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from lfm_ppl import calendar_time, checks, table
-from lfm_ppl.table import Table
+from lfm_ppl.io import table
+from lfm_ppl.io.table import Table
+from lfm_ppl.utils import calendar_time, checks
 
 if TYPE_CHECKING:
     from lfm_ppl.model.inputs import Input

@@ -10,17 +10,17 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from lfm_ppl import checks
-from lfm_ppl.data import as_data, model_keywords
-from lfm_ppl.data_binding import bind_dates
-from lfm_ppl.fit_results import ConvergenceWarning
-from lfm_ppl.fitting import fit
-from lfm_ppl.forecasting import check_possible
 from lfm_ppl.inference.bound_model import BoundModel
+from lfm_ppl.io.data import as_data, model_keywords
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.family_scores import log_densities
 from lfm_ppl.results.predictions import GROUP, MEAN, SD, observed_variable
 from lfm_ppl.results.scoring import ALL, Scores, gaussian_scores, scores, summary
+from lfm_ppl.utils import checks
+from lfm_ppl.workflows.data_binding import bind_dates
+from lfm_ppl.workflows.fit import fit
+from lfm_ppl.workflows.fit_results import ConvergenceWarning
+from lfm_ppl.workflows.forecast import check_possible
 
 MODEL = "model"
 """The forecaster that is not the reference."""

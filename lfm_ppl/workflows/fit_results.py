@@ -23,15 +23,13 @@ from typing import Any
 import jax
 import numpy as np
 
-from lfm_ppl import checks
-from lfm_ppl.data import Data
-from lfm_ppl.fit_options import FitOptions, versions
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.interruption import was_interrupt
 from lfm_ppl.inference.posterior import evenly_spaced, scores, trajectories
 from lfm_ppl.inference.progress import Counter
 from lfm_ppl.inference.samplers import GAUSSIAN_FILTER_SAMPLERS
 from lfm_ppl.inference.site_failures import failures_at, path_ess, site_failures
+from lfm_ppl.io.data import Data
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.approximation import approximation_warnings, resolution_warnings
@@ -39,6 +37,8 @@ from lfm_ppl.results.checkpoint import Checkpoint
 from lfm_ppl.results.files import POSTERIOR
 from lfm_ppl.results.inputs import remember
 from lfm_ppl.results.layout import Labels, lay_out
+from lfm_ppl.utils import checks
+from lfm_ppl.workflows.fit_options import FitOptions, versions
 
 ONLY_DRAWS = "all draws, without scores and trajectories"
 """Attribute ``partial`` of a result without any post-processing."""

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.linalg import diagonal
+from lfm_ppl.utils.linalg import diagonal
 
 _LOG_2PI = float(np.log(2.0 * np.pi))
 

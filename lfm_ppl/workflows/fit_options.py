@@ -12,11 +12,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from lfm_ppl import checks
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.priors import assumptions, prior
 from lfm_ppl.inference.samplers import SAMPLERS
 from lfm_ppl.results import checkpoint as checkpoints
+from lfm_ppl.utils import checks
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,6 @@ import jax
 import numpy as np
 from numpyro.infer import init_to_median, init_to_value
 
-from lfm_ppl import checks
-from lfm_ppl.fit_options import FitOptions
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.bound_samplers import BoundSampler, nuts_sampler, particle_marginal_sampler, ram_sampler
 from lfm_ppl.inference.kernels.options import KERNELS
@@ -32,6 +30,8 @@ from lfm_ppl.inference.kernels.ram import RAM
 from lfm_ppl.inference.laplace_start import Laplace, UnusableModeError, laplace_approximation, starting_points
 from lfm_ppl.inference.map import MAPResult, mode_of
 from lfm_ppl.inference.random_keys import split_keys
+from lfm_ppl.utils import checks
+from lfm_ppl.workflows.fit_options import FitOptions
 
 FALLBACK = "init_fallback"
 """Attribute of a result: the reason why NUTS did not start from the Laplace approximation."""

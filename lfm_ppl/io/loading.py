@@ -34,8 +34,8 @@ from pathlib import Path
 from types import MappingProxyType, ModuleType
 from typing import Any, NamedTuple
 
-from lfm_ppl import checks
-from lfm_ppl.data import INTERPOLATIONS, Data
+from lfm_ppl.io.data import INTERPOLATIONS, Data
+from lfm_ppl.utils import checks
 
 _MODULE = "_lfm_ppl_model_"
 """Begins the names of the modules that model files become."""
@@ -172,7 +172,7 @@ class ModelFile:
 
 def models_folder() -> Path:
     """Return the folder of the shipped model files: in a wheel, or in the checkout."""
-    package = Path(__file__).resolve().parent
+    package = Path(__file__).resolve().parent.parent
     installed = package / "_models"
     return installed if installed.is_dir() else package.parent / "models"
 

@@ -21,7 +21,7 @@ import jax
 import numpy as np
 from numpyro.util import is_prng_key
 
-from lfm_ppl import calendar_time
+from lfm_ppl.utils import calendar_time
 
 _LIKENESS = 0.4
 """Default similarity above which `unknown` suggests a name, on the scale of difflib from 0 to 1."""

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from lfm_ppl import calendar_time, checks
-from lfm_ppl.data import Data, at_origin, model_keywords
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.bound_model import BoundModel, bind
+from lfm_ppl.io.data import Data, at_origin, model_keywords
+from lfm_ppl.utils import calendar_time, checks
 
 
 def bind_dates(numpyro_model: Callable, times: Any, y: Any, data: Data | None,

@@ -1,9 +1,9 @@
 """From a NumPyro model and data to a posterior in one call.
 
 1. Bind the model to its data, and check every argument.
-2. Find the sampler and the starting points (`lfm_ppl.fit_starts`).
+2. Find the sampler and the starting points (`lfm_ppl.workflows.fit_starts`).
 3. Run the chains (`lfm_ppl.inference.sampling`), or find the posterior mode and draw from its Laplace approximation.
-4. Compute scores, diagnostics and trajectories from the draws (`lfm_ppl.fit_results`).
+4. Compute scores, diagnostics and trajectories from the draws (`lfm_ppl.workflows.fit_results`).
 5. Build the result, store it, and raise its warnings.
 
 With a folder, a `Checkpoint` stores the chains after each second and the batches of step 4, so that a stopped run can
@@ -23,28 +23,6 @@ from typing import Any
 
 import numpy as np
 
-from lfm_ppl import calendar_time, checks
-from lfm_ppl.data import Data, as_data, model_keywords
-from lfm_ppl.data_binding import bind_dates, check_requested_times
-from lfm_ppl.fit_options import (
-    FitOptions,
-    check_sizes,
-    describe_assumptions,
-    describe_priors,
-    model_docstring,
-)
-from lfm_ppl.fit_results import (
-    FitProblem,
-    PosteriorDraws,
-    PostProcessing,
-    best_effort,
-    build_result,
-    note_warnings,
-    post_process,
-    warn_of_convergence,
-    write_result,
-)
-from lfm_ppl.fit_starts import FALLBACK, check_init, find_start
 from lfm_ppl.forces.sde import ApproximationWarning
 from lfm_ppl.inference import sampling
 from lfm_ppl.inference.bound_model import BoundModel
@@ -55,11 +33,33 @@ from lfm_ppl.inference.model_digest import model_digest
 from lfm_ppl.inference.samplers import SAMPLERS
 from lfm_ppl.inference.schedule import Schedule
 from lfm_ppl.inference.start_failure import start_failure
-from lfm_ppl.progress import waiting
+from lfm_ppl.io.data import Data, as_data, model_keywords
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results import checkpoint as checkpoints
 from lfm_ppl.results.checkpoint import Checkpoint
 from lfm_ppl.results.layout import Labels, checked_truth
+from lfm_ppl.utils import calendar_time, checks
+from lfm_ppl.utils.progress import waiting
+from lfm_ppl.workflows.data_binding import bind_dates, check_requested_times
+from lfm_ppl.workflows.fit_options import (
+    FitOptions,
+    check_sizes,
+    describe_assumptions,
+    describe_priors,
+    model_docstring,
+)
+from lfm_ppl.workflows.fit_results import (
+    FitProblem,
+    PosteriorDraws,
+    PostProcessing,
+    best_effort,
+    build_result,
+    note_warnings,
+    post_process,
+    warn_of_convergence,
+    write_result,
+)
+from lfm_ppl.workflows.fit_starts import FALLBACK, check_init, find_start
 
 _MODE = "mode"
 """Name of the mode and its draws in the folder of a run."""

@@ -10,14 +10,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from lfm_ppl import checks
-from lfm_ppl.data_binding import check_requested_times
-from lfm_ppl.fit_options import model_docstring, versions
-from lfm_ppl.fit_results import best_effort, draw_paths, note_warnings, warn_of_convergence
 from lfm_ppl.inference.bound_model import BoundModel, bind
 from lfm_ppl.inference.posterior import scores
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.layout import Labels, checked_truth, lay_out
+from lfm_ppl.utils import checks
+from lfm_ppl.workflows.data_binding import check_requested_times
+from lfm_ppl.workflows.fit_options import model_docstring, versions
+from lfm_ppl.workflows.fit_results import best_effort, draw_paths, note_warnings, warn_of_convergence
 
 _STATISTICS = {"diverging": "diverging", "accept_prob": "acceptance_rate", "num_steps": "n_steps", "energy": "energy",
                "adapt_state.step_size": "step_size", "potential_energy": "lp"}

@@ -8,17 +8,17 @@ from typing import Any
 import jax
 import numpy as np
 
-from lfm_ppl import calendar_time, checks
-from lfm_ppl.data import InputTable
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.posterior import evenly_spaced, noise_of_rows, trajectories
 from lfm_ppl.inference.progress import Counter
+from lfm_ppl.io.data import InputTable
 from lfm_ppl.model.inputs import Input
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.particles.particle_filter import ParticleSettings
 from lfm_ppl.results import arviz_data, rebuilding
 from lfm_ppl.results import inputs as known_inputs
 from lfm_ppl.results.predictions import GROUP, HELD_OUT, predictions
+from lfm_ppl.utils import calendar_time, checks
 
 
 def forecast(result: Any, numpyro_model: Callable, times: Any, *, inputs: Mapping[str, Any] | None = None,

@@ -1,0 +1,3 @@
+"""Data files and model files."""
+
+from lfm_ppl.io import data as data

@@ -1,0 +1,1 @@
+"""Workflows: fit a model, fit many data sets, forecast, backtest, export to ArviZ."""
