@@ -30,7 +30,7 @@ from .inference.kernels.particle_marginal import ParticleMarginalRAM as Particle
 from .inference.kernels.ram import RAM as RAM
 from .inference.map import map_estimate as map_estimate
 from .inference.marginal_likelihood import MarginalLikelihood as MarginalLikelihood
-from .inference.marginal_likelihood import panel as panel
+from .inference.panel import panel as panel
 from .io import data as data
 from .io.data import Data as Data
 from .io.data import read_csv as read_csv

@@ -20,16 +20,18 @@ def test_models_and_extras_that_it_names_exist():
     assert "ginzburg-landau" in models and models <= set(loading.available())
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     assert set(re.findall(r'"\.\[(\w+)\]"', TEXT)) <= set(extras)
-    for name in re.findall(r"^ {4,6}([\w./]+/?) {2,}", TEXT, re.MULTILINE):
-        top = name.startswith((".", "CONTRIBUTING", "lfm_ppl", "models", "notebooks", "docs", "tests"))
-        assert ((ROOT if top else ROOT / "lfm_ppl") / name).exists(), name
+    for name in re.findall(r"\]\(([\w./]+)(?:#[\w-]+)?\)", TEXT):
+        assert (ROOT / name).exists(), name
 
 
 def test_files_and_names_in_them_that_the_page_for_contributors_names_exist():
     text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    for name in re.findall(r"^ {4,6}([\w./]+/?) {2,}", text, re.MULTILINE):
+        top = name.startswith((".", "lfm_ppl", "models", "notebooks", "docs", "tests"))
+        assert ((ROOT if top else ROOT / "lfm_ppl") / name).exists(), name
     paths = set(re.findall(r"`((?:lfm_ppl|tests|docs)/[\w./]*|[A-Z]+\.md)`", text))
     assert len(paths) > 20 and [path for path in paths if not (ROOT / path).exists()] == []
-    names = re.findall(r"`([A-Z_]+|_[a-z]+)`", text.replace("`TYPE_CHECKING`", ""))
+    names = re.findall(r"`([A-Z_]+|_[a-z]+)`", text)
     sources = "\n".join((ROOT / path).read_text(encoding="utf-8") for path in paths if path.endswith(".py"))
     assert {"FORCES", "RULES"} <= set(names)
     for name in names:

@@ -99,11 +99,11 @@ class BoundedTerms(eqx.Module):
         """Whether an entry has a factor, (K, D + B)."""
         return jnp.concatenate([jnp.isfinite(self.y), self.is_constrained], axis=1)
 
-    def tilted(self, cavity: MeanVariance, near: MeanVariance, power: float) -> TiltedMoments:
+    def tilted(self, cavity: MeanVariance, _quadrature_point: MeanVariance, power: float) -> TiltedMoments:
         """Return the tilted moments in closed form.
 
-        Any power of an indicator is the indicator itself; ``power`` must be 1 for the data. ``near``, a point for
-        quadratures of other families, is not used.
+        Any power of an indicator is the indicator itself; ``power`` must be 1 for the data. ``_quadrature_point``
+        is for other families.
         """
         outputs = self.y.shape[1]
         gaussian = _gaussian_tilted(MeanVariance(*(a[:, :outputs] for a in cavity)), self.y, self.variance)

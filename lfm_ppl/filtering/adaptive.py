@@ -91,7 +91,7 @@ def predict_interval_adaptively(dynamics: Dynamics, steps: int, tolerance: float
         trial = stop(jnp.minimum(position.trial, _STABILITY_LIMIT / _fastest_rate(position.stage.jacobian)))
         is_last = trial >= position.remaining
         h = jnp.where(is_last, position.remaining, trial)
-        rest_of_span = span.after(length - position.remaining)
+        rest_of_span = span.shifted(length - position.remaining)
         factor = integrating_factor(ssm, dynamics.linear, h)
         previous = position.prediction
         step, stage4 = runge_kutta_step(dynamics, factor, rest_of_span, h, previous.moments, min_sd,
@@ -111,7 +111,10 @@ def predict_interval_adaptively(dynamics: Dynamics, steps: int, tolerance: float
         return jax.lax.cond(is_accepted, lambda: accepted, lambda: rejected)
 
     def unless_finished(body):
-        return lambda position, _: (jax.lax.cond(position.remaining > 0, body, lambda same: same, position), None)
+        def step(position, _):
+            return jax.lax.cond(position.remaining > 0, body, lambda finished: finished, position), None
+
+        return step
 
     def block(position: _Position) -> _Position:
         return jax.lax.scan(unless_finished(attempt), position, None, length=_BLOCK)[0]

@@ -108,9 +108,9 @@ def backward(problem: FilterProblem, trace: FilterTrace, adjoint_only: bool = Fa
     last = Moments(trace.filtered.mean[-1], trace.filtered.covariance[-1])
     carry = last, jnp.zeros(size), jnp.zeros((size, size))
     rows = start, trace._replace(initial=None, nodes=None, predictor=None), is_empty
-    (first, _, _), (ends, left_out, adjoint, predictor) = jax.lax.scan(
+    (first, _, _), (smoothed_ends, left_out, adjoint, predictor) = jax.lax.scan(
         jax.checkpoint(step, prevent_cse=False), carry, rows, reverse=True)
-    moments = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, ends)
+    moments = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, smoothed_ends)
     return SmootherTrace(moments, left_out, adjoint, predictor)
 
 

@@ -67,7 +67,7 @@ def _integrated_offset(ssm: StateSpaceModel, transition: Exact, steps: int, span
         return jnp.zeros((ssm.state_dim, 1)).at[:size, 0].set(ssm.drift(ssm.input_map(t)[1], t))
 
     def step(offset: jax.Array, index: jax.Array) -> tuple[jax.Array, None]:
-        rest_of_span = span.after(index * h)
+        rest_of_span = span.shifted(index * h)
         first = matmul(transition.full, offset + h / 6 * additive_terms(rest_of_span.time()))
         last = additive_terms(rest_of_span.time(h))
         middle = matmul(transition.half, additive_terms(rest_of_span.time(0.5 * h)))
@@ -120,7 +120,7 @@ def predict_interval(dynamics: Dynamics, factor: IntegratingFactor, steps: int, 
 
     def runge_kutta(previous: Prediction, inputs: tuple) -> tuple[Prediction, StepRecord | None]:
         index, points = inputs
-        step, _ = runge_kutta_step(dynamics, factor, span.after(index * h), h, previous.moments, min_sd, points)
+        step, _ = runge_kutta_step(dynamics, factor, span.shifted(index * h), h, previous.moments, min_sd, points)
         return advance(previous, step)
 
     points = jax.tree.map(lambda nodes: _by_steps(insert_midpoints(nodes)), about)

@@ -42,8 +42,8 @@ _MOST_STEPS = 20.0
 """Bound on the number of steps with the default longest step, as a multiple of the number without one."""
 
 
-def build_time_grid(ssm: StateSpaceModel, times: Any, steps: int, max_step: float | None = None, at: Any = None,
-                    initial_time: Any = None, interval_per_step: bool = False,
+def build_time_grid(ssm: StateSpaceModel, times: Any, steps: int, max_step: float | None = None,
+                    requested_times: Any = None, initial_time: Any = None, interval_per_step: bool = False,
                     tolerance: float | None = None) -> TimeGrid:
     """Lay out the intervals of the scan.
 
@@ -53,7 +53,7 @@ def build_time_grid(ssm: StateSpaceModel, times: Any, steps: int, max_step: floa
         steps: integration steps between two consecutive times.
         max_step: longest step; a longer interval gets more steps, in intervals of ``steps`` each. None: see
             `longest_step`.
-        at: (K,) requested times, in any order; None: the observation times.
+        requested_times: (K,), in any order; None: the observation times.
         initial_time: overrides that of the model (when the scan starts from a filter's state).
         interval_per_step: make every integration step an interval, for a particle smoother.
         tolerance: of the error of a step, see `TimeGrid`.
@@ -63,7 +63,7 @@ def build_time_grid(ssm: StateSpaceModel, times: Any, steps: int, max_step: floa
             time before the initial time; traced times where concrete ones are needed.
     """
     checks.positive_integer("steps", steps, "It is the number of integration steps between two times.")
-    checks.refuse_dates("at", at)
+    checks.refuse_dates("at", requested_times)
     if max_step is not None:
         checks.positive("max_step", max_step)
     if tolerance is not None:
@@ -74,19 +74,21 @@ def build_time_grid(ssm: StateSpaceModel, times: Any, steps: int, max_step: floa
     origin = None if start is None else checks.concrete(start)
     is_adaptive = tolerance is not None
     if concrete_times is None or origin is None:
-        grid = _traced_grid(ssm, times, initial_time, at, Division(steps, max_step, interval_per_step, is_adaptive))
+        division = Division(steps, max_step, interval_per_step, is_adaptive)
+        grid = _traced_grid(ssm, times, initial_time, requested_times, division)
     else:
         longest = max_step
         if max_step is None and not is_adaptive:
             longest = longest_step(ssm, concrete_times, float(origin), steps)
         division = Division(steps, longest, interval_per_step, is_adaptive)
-        grid = _concrete_grid(ssm, concrete_times, float(origin), at, division)
+        grid = _concrete_grid(ssm, concrete_times, float(origin), requested_times, division)
     return grid if tolerance is None else grid._replace(tolerance=float(tolerance))
 
 
-def _concrete_grid(ssm: StateSpaceModel, times: np.ndarray, origin: float, at: Any, division: Division) -> TimeGrid:
+def _concrete_grid(ssm: StateSpaceModel, times: np.ndarray, origin: float, requested_times: Any,
+                   division: Division) -> TimeGrid:
     """Return the time grid for times that are known before compilation."""
-    requested = None if at is None else _requested_times(at, origin)
+    requested = None if requested_times is None else _requested_times(requested_times, origin)
     end = float(times[-1] if requested is None else requested.max(initial=times[-1]))
     ssm.model.check_inputs(origin, end)
     reads = ssm.model.input_reads(origin, end)
@@ -99,7 +101,8 @@ def _concrete_grid(ssm: StateSpaceModel, times: np.ndarray, origin: float, at: A
     return _insert_traced_breakpoints(grid, traced_breakpoints, division.scale)
 
 
-def _traced_grid(ssm: StateSpaceModel, times: Any, initial_time: Any, at: Any, division: Division) -> TimeGrid:
+def _traced_grid(ssm: StateSpaceModel, times: Any, initial_time: Any, requested_times: Any,
+                 division: Division) -> TimeGrid:
     """Return the time grid for times, or an initial time, that are traced."""
     concrete_times = check_times(times, initial_time)
     span = (0.0, 1.0) if concrete_times is None else (float(concrete_times[0]), float(concrete_times[-1]))
@@ -107,10 +110,10 @@ def _traced_grid(ssm: StateSpaceModel, times: Any, initial_time: Any, at: Any, d
     breakpoints = jnp.concatenate([jnp.zeros(0), *(jnp.asarray(read.breakpoints(), float) for read in reads)])
     division = division._replace(traced_breakpoints=len(breakpoints), scale=_time_scale(reads))
     jumps, steps = ssm.stack.jump_times, division.steps
-    if concrete_times is not None and jumps and division.max_step is None and at is None:
+    if concrete_times is not None and jumps and division.max_step is None and requested_times is None:
         grid = _grid_from_traced_origin(concrete_times, initial_time, jumps, steps, division.interval_per_step)
     else:
-        if division.max_step is not None or at is not None or jumps:
+        if division.max_step is not None or requested_times is not None or jumps:
             raise ValueError("max_step, requested times and forces with jumps need times (the first two also an "
                              "initial_time or `start`) that are known before compilation; pass NumPy arrays rather "
                              "than traced values, and do not convert them with jnp inside the model.")
@@ -275,7 +278,7 @@ def _grid_from_traced_origin(times: np.ndarray, origin: Any, jumps: tuple[float,
     return TimeGrid(intervals, None, observed, observed, times, steps, origin, since=begin - origin)
 
 
-def _divide_times(times: np.ndarray, origin: float, jumps: tuple[float, ...], at: np.ndarray | None,
+def _divide_times(times: np.ndarray, origin: float, jumps: tuple[float, ...], requested_times: np.ndarray | None,
                   division: Division) -> TimeGrid:
     """Return the intervals between concrete times.
 
@@ -283,7 +286,7 @@ def _divide_times(times: np.ndarray, origin: float, jumps: tuple[float, ...], at
     2. Breakpoints of known inputs and requested times divide these intervals, and their steps with them.
     3. Each part gets as many intervals of equal length as its steps need.
     """
-    requested = times if at is None else at
+    requested = times if requested_times is None else requested_times
     extra = np.setdiff1d(requested, times)
     end = max(times[-1], requested.max(initial=-np.inf))
     jump_index = [index for index, jump in enumerate(jumps) if origin < jump <= end]
@@ -301,7 +304,7 @@ def _divide_times(times: np.ndarray, origin: float, jumps: tuple[float, ...], at
     jump[rank == 1] = jump_index
     order = np.lexsort((observation, rank, time))
     time, observation, jump = time[order], observation[order], jump[order]
-    whole = np.diff(time, prepend=origin)
+    whole_lengths = np.diff(time, prepend=origin)
     separate = _separate_breakpoints(division.breakpoints, np.sort(np.concatenate([[origin], time, extra])),
                                      division.scale)
     cut = np.union1d(separate, extra)
@@ -310,13 +313,13 @@ def _divide_times(times: np.ndarray, origin: float, jumps: tuple[float, ...], at
         index = np.searchsorted(time, cut)
         cuts = np.bincount(index, minlength=len(time) + 1)
         # After the last observation a whole interval is as long as the usual distance of two observations.
-        whole = np.append(whole, _forecast_interval(times, float(cut[-1] - time[-1])))
-        time, observation, jump, whole, cuts = (np.insert(a, index, b) for a, b in (
-            (time, cut), (observation, -1), (jump, -1), (whole, whole[index]), (cuts, cuts[index])))
-        whole, cuts = whole[:len(time)], cuts[:len(time)]
+        whole_lengths = np.append(whole_lengths, _forecast_interval(times, float(cut[-1] - time[-1])))
+        time, observation, jump, whole_lengths, cuts = (np.insert(a, index, b) for a, b in (
+            (time, cut), (observation, -1), (jump, -1), (whole_lengths, whole_lengths[index]), (cuts, cuts[index])))
+        whole_lengths, cuts = whole_lengths[:len(time)], cuts[:len(time)]
     begin = np.append(origin, time[:-1])
     length = time - begin
-    count = division.steps_needed(length, whole, cuts)
+    count = division.steps_needed(length, whole_lengths, cuts)
     steps = division.steps_per_interval(count)
     pieces = np.where((length > 0) | (not division.interval_per_step), -(-count // steps), 1)
     event = np.repeat(np.arange(len(time)), pieces)
@@ -331,7 +334,9 @@ def _divide_times(times: np.ndarray, origin: float, jumps: tuple[float, ...], at
     row_of_event = np.flatnonzero(last)
     observed = np.empty(len(times), int)
     observed[observation[observation >= 0]] = row_of_event[observation >= 0]
-    interval = observed if at is None else row_of_event[np.searchsorted(time, requested, side="right") - 1]
+    interval = observed
+    if requested_times is not None:
+        interval = row_of_event[np.searchsorted(time, requested, side="right") - 1]
     replicated = bool(np.mean(width == 0) >= _REPLICATED)
     return TimeGrid(intervals, lengths, observed, interval, requested, steps, np.asarray(origin), replicated,
                     since=(begin - origin)[event] + piece * width)
@@ -357,8 +362,9 @@ def _separate_breakpoints(breakpoints: np.ndarray, times: np.ndarray, scale: Any
     return separate[np.diff(separate, prepend=-np.inf) > rounding]
 
 
-def _requested_times(at: Any, origin: float) -> np.ndarray:
-    return checks.time_vector("at", at, origin, remedy="; set the model's initial_time earlier to look further back")
+def _requested_times(requested_times: Any, origin: float) -> np.ndarray:
+    return checks.time_vector("at", requested_times, origin,
+                              remedy="; set the model's initial_time earlier to look further back")
 
 
 def _group_lengths(length: np.ndarray) -> tuple[np.ndarray | None, np.ndarray]:

@@ -174,9 +174,9 @@ def _regressions(columns: tuple[jax.Array, ...], force_cov_half: jax.Array,
     # Side by side: one factorisation in the program.
     sides[0] = jnp.pad(sides[0], ((0, 0), (0, sides[1].shape[1] - sides[0].shape[1])))
     solved = jax.vmap(solve_semidefinite)(jnp.stack([force_cov_half, force_cov_full]), jnp.stack(sides)).mT
-    ends = np.cumsum(widths[:2]), np.cumsum(widths[2:])
+    column_ends = np.cumsum(widths[:2]), np.cumsum(widths[2:])
     return tuple(solved[side, end - width:end] for side in (0, 1)
-                 for end, width in zip(ends[side], widths[2 * side:2 * side + 2], strict=True))
+                 for end, width in zip(column_ends[side], widths[2 * side:2 * side + 2], strict=True))
 
 
 def _half_step(ssm: StateSpaceModel, linear: LinearPart, dt: jax.Array, forces: jax.Array) -> jax.Array:
@@ -185,10 +185,10 @@ def _half_step(ssm: StateSpaceModel, linear: LinearPart, dt: jax.Array, forces: 
     pattern = np.array(ssm.drift_structure.jacobian, bool).reshape(size, ssm.input_dim).copy()
     pattern[:, [j for j in range(ssm.input_dim) if j not in ssm.drift_structure.constant]] = False
     coupled = pattern[:, size:].any() and ssm.constant_measurement
-    inside = pattern[:, :size]
-    if coupled or inside[~np.eye(size, dtype=bool)].any():
+    state_pattern = pattern[:, :size]
+    if coupled or state_pattern[~np.eye(size, dtype=bool)].any():
         lin = feedback(ssm, linear)
         phi, _ = discretise(lin, jnp.zeros_like(lin), dt)
         return phi.at[size:, size:].set(forces)
-    decay = jnp.exp(diagonal(linear.rows[:, :size]) * dt) if inside.any() else jnp.ones(size)
+    decay = jnp.exp(diagonal(linear.rows[:, :size]) * dt) if state_pattern.any() else jnp.ones(size)
     return jax.scipy.linalg.block_diag(jnp.diag(decay), forces)

@@ -126,7 +126,7 @@ def fokker_planck(model: LatentForceModel, times: Any, y: Any, *, at: Any = None
     """
     ssm = _checked_ssm(model)
     checks.positive("tolerance", tolerance)
-    time_grid = build_time_grid(ssm, times, steps, at=at)
+    time_grid = build_time_grid(ssm, times, steps, requested_times=at)
     y = _observations(ssm, time_grid, y)
     grid = choose_grid(model, times, y, cells=cells, bounds=bounds, steps=steps, tolerance=tolerance)
     cells_on_grid = on_grid(ssm, time_grid, grid, padded_cells=PADDED_CELLS)

@@ -23,9 +23,10 @@ from lfm_ppl.filtering.smoother import SmootherResult
 from lfm_ppl.inference.handlers.fixing import fix
 from lfm_ppl.inference.handlers.settings import approximate
 from lfm_ppl.inference.likelihood_site import LikelihoodSite, likelihood_site, remove_likelihood
-from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
 from lfm_ppl.inference.optimise import Objective, value_and_gradient
+from lfm_ppl.inference.panel import Panel
 from lfm_ppl.inference.random_keys import split_keys
+from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.inference.traced_model import TracedModel, signature, traced_model
 from lfm_ppl.utils import checks
 
@@ -326,7 +327,7 @@ class BoundModel:
 
     # --- the filter and the smoother
 
-    def likelihood(self, z: Any, y: Any = None) -> MarginalLikelihood | Panel:
+    def likelihood(self, z: Any, y: Any = None) -> SeriesLikelihood | Panel:
         """Return the likelihood at parameters, in compiled code too.
 
         Args:

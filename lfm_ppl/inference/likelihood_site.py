@@ -9,7 +9,8 @@ import jax
 from numpyro import handlers
 
 from lfm_ppl.inference.handlers.likelihood_handler import LikelihoodHandler
-from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
+from lfm_ppl.inference.panel import Panel
+from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.utils import checks
 
 
@@ -23,11 +24,11 @@ class LikelihoodSite(NamedTuple):
     """
 
     name: str
-    distribution: MarginalLikelihood | Panel
+    distribution: SeriesLikelihood | Panel
     observed: Any = None
 
     @property
-    def example(self) -> MarginalLikelihood:
+    def example(self) -> SeriesLikelihood:
         """The distribution of one series."""
         if isinstance(self.distribution, Panel):
             return self.distribution.first
@@ -51,9 +52,9 @@ def likelihood_sites(trace: Mapping[str, Any]) -> list[LikelihoodSite]:
     for name, site in trace.items():
         distribution = site.get("fn")
         # Masks and expansions wrap the distribution.
-        while hasattr(distribution, "base_dist") and not isinstance(distribution, (MarginalLikelihood, Panel)):
+        while hasattr(distribution, "base_dist") and not isinstance(distribution, (SeriesLikelihood, Panel)):
             distribution = distribution.base_dist
-        if isinstance(distribution, (MarginalLikelihood, Panel)):
+        if isinstance(distribution, (SeriesLikelihood, Panel)):
             sites.append(LikelihoodSite(name, distribution, site["value"]))
     return sites
 
@@ -83,7 +84,7 @@ class replace_times(LikelihoodHandler):  # noqa: N801 (an effect handler, named 
         self.times = times
         super().__init__(fn)
 
-    def replacement(self, likelihood: MarginalLikelihood | Panel, site: dict[str, Any]) -> Any:
+    def replacement(self, likelihood: SeriesLikelihood | Panel, site: dict[str, Any]) -> Any:
         """Return the likelihood at the concrete times."""
         return likelihood.with_times(self.times) if checks.traced(likelihood.times) else likelihood
 
@@ -101,7 +102,7 @@ class record_times(LikelihoodHandler):  # noqa: N801 (an effect handler, see abo
 
     times: Any = None
 
-    def replacement(self, likelihood: MarginalLikelihood | Panel, site: dict[str, Any]) -> Any:
+    def replacement(self, likelihood: SeriesLikelihood | Panel, site: dict[str, Any]) -> Any:
         """Store the times of the likelihood and return an improper distribution."""
         self.times = likelihood.times
         return super().replacement(likelihood, site)

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.inference.optimise import Objective, value_and_gradient
+from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 
 
 class LogPosterior:
@@ -51,10 +51,10 @@ class LogPosterior:
         """Return every parameter by name; z (P,) may be traced."""
         return dict(zip(self.names, jnp.exp(jnp.asarray(z)), strict=True))
 
-    def likelihood(self, z: Any, y: Any = None) -> MarginalLikelihood:
+    def likelihood(self, z: Any, y: Any = None) -> SeriesLikelihood:
         """Return the likelihood with parameters exp(z), which may be traced."""
         likelihood = self.bound.likelihood(self.values(z), y)
-        assert isinstance(likelihood, MarginalLikelihood)
+        assert isinstance(likelihood, SeriesLikelihood)
         return likelihood
 
     def log_densities(self, z: Any, y: Any) -> tuple[jax.Array, jax.Array]:

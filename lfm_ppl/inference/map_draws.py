@@ -18,8 +18,9 @@ import jax
 import numpy as np
 
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
+from lfm_ppl.inference.panel import Panel
 from lfm_ppl.inference.random_keys import split_keys
+from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.utils.batching import BATCH_SIZE, mapped, on_cpu, side_by_side, threads
 
 _SEQUENTIAL_BATCH = 8
@@ -51,7 +52,7 @@ class BatchStore(Protocol):
         """Write all stored batches."""
 
 
-def map_series(distribution: MarginalLikelihood | Panel, function: Callable, *arguments: Any) -> Any:
+def map_series(distribution: SeriesLikelihood | Panel, function: Callable, *arguments: Any) -> Any:
     """Return ``function(distribution, *arguments)``; for a panel, for each series, with the series as leading axis."""
     if isinstance(distribution, Panel):
         return distribution.mapped(function, *arguments)

@@ -13,8 +13,10 @@ import numpy as np
 from numpyro.infer.util import potential_energy
 
 from lfm_ppl.inference.bound_model import BoundModel
+from lfm_ppl.inference.constrained_likelihood import ConstrainedLikelihood
 from lfm_ppl.inference.handlers.likelihood_handler import LikelihoodHandler
-from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
+from lfm_ppl.inference.panel import Panel
+from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.model.observations.family import ObservationFamily
 
 _TIMES = 16
@@ -84,7 +86,7 @@ class _record_values(LikelihoodHandler):  # noqa: N801 (an effect handler, named
         super().begin()
         self.values, self.settings = [], ""
 
-    def replacement(self, likelihood: MarginalLikelihood | Panel, site: dict[str, Any]) -> Any:
+    def replacement(self, likelihood: SeriesLikelihood | Panel, site: dict[str, Any]) -> Any:
         """Evaluate the model of the likelihood, of its first series for a panel."""
         distribution = likelihood.first if isinstance(likelihood, Panel) else likelihood
         ssm, model = distribution.ssm, distribution.model
@@ -95,22 +97,25 @@ class _record_values(LikelihoodHandler):  # noqa: N801 (an effect handler, named
                       ssm.deterministics(w, t)]
             if isinstance(model.observation, ObservationFamily):
                 f = ssm.observe(w, t)
-                values.append(model.observation.at(0).log_prob(f, f))
+                values.append(model.observation.select_row(0).log_prob(f, f))
             return values
 
         # Not the leaves of the distribution itself: NumPyro orders its fields by their hashes.
-        fields = [getattr(likelihood, name) for name in type(likelihood).pytree_data_fields]
+        names = sorted(set(type(likelihood).gather_pytree_data_fields()))
+        fields = [getattr(likelihood, name) for name in names]
         arrays = [jnp.asarray(leaf) for leaf in jax.tree.leaves((fields, distribution.rule))
                   if eqx.is_array_like(leaf)]
         self.values += [*arrays, ssm.initial(), ssm.stack.feedback(), ssm.stack.dispersion(),
                         ssm.stack.jump_table(), jax.vmap(functions)(self.times)]
         self.settings += repr((
-            site["name"], distribution.rule, distribution.steps, distribution.max_step, distribution.iterations,
-            distribution.damping, distribution.tolerance, distribution.sites, model.state_names, model.output_names,
+            site["name"], distribution.rule, distribution.steps, model.state_names, model.output_names,
             model.force_names, model.units, model.nonlinear_inputs, model.observation.angular,
             model.deterministic_names, ssm.stack.jump_times))
-        if distribution.constrained:
-            problem = distribution.bounded()
-            self.values.append(problem.boxes(*ssm.split(w), self.times[0]))
-            self.settings += repr((problem.boxes.constraints.labels, distribution.grid, distribution.draws))
+        if isinstance(distribution, ConstrainedLikelihood):
+            boxes = distribution.truncated_posterior().boxes
+            self.values.append(boxes(*ssm.split(w), self.times[0]))
+            self.settings += repr((boxes.constraints.labels, distribution.grid, distribution.draws))
+        else:
+            self.settings += repr((distribution.max_step, distribution.iterations, distribution.damping,
+                                   distribution.tolerance, distribution.sites))
         return super().replacement(likelihood, site)

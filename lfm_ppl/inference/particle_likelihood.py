@@ -14,7 +14,8 @@ from numpyro.distributions import constraints
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.handlers.likelihood_handler import LikelihoodHandler
-from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
+from lfm_ppl.inference.panel import Panel
+from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.model.observation_noise import check_noise
 from lfm_ppl.particles.particle_filter import ParticleSettings, check_settings, log_likelihood
 from lfm_ppl.utils import checks
@@ -40,7 +41,7 @@ class ParticleLikelihood(dist.Distribution):
     pytree_data_fields = ("base", "key")
     pytree_aux_fields = ("settings", "steps")
 
-    def __init__(self, base: MarginalLikelihood | Panel, key: jax.Array, settings: ParticleSettings,
+    def __init__(self, base: SeriesLikelihood | Panel, key: jax.Array, settings: ParticleSettings,
                  steps: int | None = None) -> None:
         self.base, self.key, self.settings, self.steps = base, key, settings, steps
         super().__init__(base.batch_shape, base.event_shape, validate_args=False)
@@ -53,7 +54,7 @@ class ParticleLikelihood(dist.Distribution):
             return self.base.mapped(lambda series, y, key: self._series_log_prob(series, y, key), value, keys)
         return self._series_log_prob(self.base, value, self.key)
 
-    def _series_log_prob(self, base: MarginalLikelihood, y: jax.Array, key: jax.Array) -> jax.Array:
+    def _series_log_prob(self, base: SeriesLikelihood, y: jax.Array, key: jax.Array) -> jax.Array:
         grid = build_time_grid(base.ssm, base.times, self.steps or base.steps, base.max_step)
         return log_likelihood(base.ssm, grid, y, key, self.settings)
 
@@ -84,6 +85,8 @@ class with_particles(LikelihoodHandler):  # noqa: N801 (an effect handler, named
         'ParticleLikelihood'
     """
 
+    supports_constraints = False
+
     def __init__(self, fn: Callable[..., Any] | None, key: jax.Array, settings: ParticleSettings,
                  steps: int | None = None) -> None:
         self.key, self.settings, self.steps = key, settings, steps
@@ -92,13 +95,11 @@ class with_particles(LikelihoodHandler):  # noqa: N801 (an effect handler, named
     def missing(self) -> str:
         """Return the error of a model without a likelihood that could be replaced."""
         return ("the particle filter cannot replace the likelihood of this model: it needs a site "
-                "numpyro.sample(name, lfm.MarginalLikelihood(...), obs=y) without mask, expand or plate around it (or "
-                "an lfm.panel in its plate).")
+                "numpyro.sample(name, lfm.MarginalLikelihood(...), obs=y) without constraints, mask, expand or plate "
+                "(or an lfm.panel in its plate).")
 
-    def replacement(self, likelihood: MarginalLikelihood | Panel, site: dict[str, Any]) -> Any:
+    def replacement(self, likelihood: SeriesLikelihood | Panel, site: dict[str, Any]) -> Any:
         """Return the estimate."""
-        example = likelihood.first if isinstance(likelihood, Panel) else likelihood
-        example.refuse_constraints("a particle filter")
         return ParticleLikelihood(likelihood, self.key, self.settings, self.steps)
 
 
@@ -161,13 +162,13 @@ class ParticlePotential:
         particles = 200
         for attempt in range(8):
             sd = self.sd_of_estimates(z, jax.random.fold_in(key, attempt), particles)
-            needed = int(np.ceil(particles * np.clip((sd / target_sd) ** 2, 1 / 64, 8.0)))
-            is_close = particles / 1.4 < needed < particles * 1.4
-            if is_close or (particles == _FEWEST and needed <= _FEWEST):
+            needed_particles = int(np.ceil(particles * np.clip((sd / target_sd) ** 2, 1 / 64, 8.0)))
+            is_close = particles / 1.4 < needed_particles < particles * 1.4
+            if is_close or (particles == _FEWEST and needed_particles <= _FEWEST):
                 return Tuned(particles, sd)
-            if particles == _MOST and needed > _MOST:
+            if particles == _MOST and needed_particles > _MOST:
                 break
-            particles = int(np.clip(needed, _FEWEST, _MOST))
+            particles = int(np.clip(needed_particles, _FEWEST, _MOST))
         if np.isfinite(sd) and particles < _MOST:
             return Tuned(particles, sd)
         raise ValueError(f"the log likelihood estimate has a standard deviation of {sd:.3g} with {_MOST} particles; "

@@ -20,8 +20,11 @@ import numpy as np
 from lfm_ppl.filtering.smoother import SmootherResult
 from lfm_ppl.filtering.time_grid import LONGEST_FORECAST, build_time_grid
 from lfm_ppl.inference.bound_model import BoundModel
+from lfm_ppl.inference.constrained_likelihood import ConstrainedLikelihood
 from lfm_ppl.inference.map_draws import BatchStore, Progress, map_draws, map_series
-from lfm_ppl.inference.marginal_likelihood import SIMULATION_STEPS, MarginalLikelihood, Panel
+from lfm_ppl.inference.marginal_likelihood import SIMULATION_STEPS
+from lfm_ppl.inference.panel import Panel
+from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.inference.traced_model import signature
 from lfm_ppl.model.observation_noise import expected_observation, noisy_observation, with_noise
 from lfm_ppl.model.observations.family import ObservationFamily
@@ -57,10 +60,9 @@ def scores(bound: BoundModel, draws: Mapping[str, Any], *,
         panel come after the draws. Under constraints the last two ignore the constraints.
     """
 
-    def score_series(distribution: MarginalLikelihood, y: jax.Array) -> dict[str, jax.Array]:
+    def score_series(distribution: SeriesLikelihood, y: jax.Array) -> dict[str, jax.Array]:
         result = distribution.smooth(y)
-        left_out = distribution.constrained_leave_one_out(y) if distribution.constrained else result.leave_one_out
-        return {"leave_one_out": left_out, "one_step_ahead": result.log_likelihood,
+        return {"leave_one_out": distribution.leave_one_out(y, result), "one_step_ahead": result.log_likelihood,
                 "residual": result.whitened_innovation}
 
     def per_draw(values: Any, key: jax.Array, y: Any) -> dict[str, jax.Array]:
@@ -108,16 +110,16 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
         at = None
     example = bound.site.example
     is_forecast = None
-    if particles is None and not example.constrained and example.ssm.drift_structure.points:
+    if particles is None and not isinstance(example, ConstrainedLikelihood) and example.ssm.drift_structure.points:
         is_forecast = _has_forecast(bound, at)
     plan = _plan(bound, at, particles is not None or is_forecast is not None,
                  _first_simulated_time(bound) if is_forecast else -np.inf)
 
-    def draw_series(distribution: MarginalLikelihood, y: jax.Array, key: jax.Array) -> dict[str, jax.Array]:
+    def draw_series(distribution: SeriesLikelihood, y: jax.Array, key: jax.Array) -> dict[str, jax.Array]:
         ssm = distribution.ssm
         path_key, noise_key = jax.random.split(key)
         results: dict[str, jax.Array] = {}
-        if distribution.constrained:
+        if isinstance(distribution, ConstrainedLikelihood):
             smoothed = None
             w, when = distribution.feasible_path(path_key, y, plan.times)
         elif particles is None:
@@ -220,7 +222,7 @@ class _Plan(NamedTuple):
         return len(self.data) if self.times is None else len(self.times)
 
 
-def _plan(bound: BoundModel, at: np.ndarray | None, simulated: bool, since: float) -> _Plan:
+def _plan(bound: BoundModel, requested_times: np.ndarray | None, simulated: bool, since: float) -> _Plan:
     """Return the rows, of which rows after ``since`` are simulated, if any are.
 
     After the data, rows are at most as far apart as the data usually are where a simulation or the known inputs of a
@@ -234,24 +236,26 @@ def _plan(bound: BoundModel, at: np.ndarray | None, simulated: bool, since: floa
         base = max(base, int(np.ceil(gaps.max(initial=0.0) / example.max_step * (1 - 1e-12))))
     fine = SIMULATION_STEPS * base * (1 if example.tolerance is None else _ADAPTIVE_FACTOR)
     rows = np.arange(times.shape[-1])
-    if at is None:
+    if requested_times is None:
         return _Plan(None, rows, rows, fine)
     beyond = np.array([])
     needs_steps = simulated or not example.ssm.mean_invariant
-    if needs_steps and at.max() > times[-1] and (gaps > 0).any():
+    if needs_steps and requested_times.max() > times[-1] and (gaps > 0).any():
         gap = np.median(gaps[gaps > 0])
-        count = min(int(np.ceil((at.max() - times[-1]) / gap * (1 - 1e-12))), LONGEST_FORECAST)
-        beyond = np.linspace(times[-1], at.max(), count + 1)[1:-1]
-    path_times = np.concatenate([at, beyond])
+        count = min(int(np.ceil((requested_times.max() - times[-1]) / gap * (1 - 1e-12))), LONGEST_FORECAST)
+        beyond = np.linspace(times[-1], requested_times.max(), count + 1)[1:-1]
+    path_times = np.concatenate([requested_times, beyond])
     steps = _steps_per_interval(example.ssm, times, path_times, fine, since) if simulated else fine
     first = len(path_times)
-    return _Plan(np.concatenate([path_times, times]), np.arange(len(at)), first + rows, steps)
+    return _Plan(np.concatenate([path_times, times]), np.arange(len(requested_times)), first + rows, steps)
 
 
-def _has_forecast(bound: BoundModel, at: np.ndarray | None) -> bool:
+def _has_forecast(bound: BoundModel, requested_times: np.ndarray | None) -> bool:
     """Return whether a time of the trajectories lies after the last observation of a series."""
     is_observed = np.isfinite(np.asarray(bound.y)).any(axis=-1)
-    return not bool(np.all(is_observed[..., -1])) or (at is not None and bool(at.max() > bound.times.max()))
+    if requested_times is not None and requested_times.max() > bound.times.max():
+        return True
+    return not bool(np.all(is_observed[..., -1]))
 
 
 def _first_simulated_time(bound: BoundModel) -> float:
@@ -265,7 +269,7 @@ def _last_observed(y: jax.Array, when: jax.Array, plan: _Plan) -> jax.Array:
     return jnp.max(jnp.where(jnp.isfinite(y).any(axis=-1), when[plan.data], -jnp.inf))
 
 
-def _simulate_forecast(distribution: MarginalLikelihood, states: jax.Array, when: jax.Array, is_smoothed: jax.Array,
+def _simulate_forecast(distribution: SeriesLikelihood, states: jax.Array, when: jax.Array, is_smoothed: jax.Array,
                        plan: _Plan, key: jax.Array) -> jax.Array:
     """Return the joint states (L, n), simulated after the last smoothed one; ``is_smoothed`` is (L,)."""
     order = np.arange(plan.rows) if plan.times is None else np.argsort(plan.times, kind="stable")
@@ -324,7 +328,7 @@ def evenly_spaced(chains: int, samples: int, count: int) -> tuple[np.ndarray, np
     return index, (np.arange(chains)[:, None] * samples + index).ravel()
 
 
-def noise_of_rows(distribution: MarginalLikelihood) -> bool:
+def noise_of_rows(distribution: SeriesLikelihood) -> bool:
     """Return whether the noise is specified for each row of the data, so that other rows have none."""
     observation = distribution.ssm.model.observation
     if isinstance(observation, ObservationFamily):
@@ -338,7 +342,7 @@ def _normal_outputs(ssm: StateSpaceModel) -> bool:
     return not (ssm.observation_structure.points or observation.varies_with_state or observation.angular)
 
 
-def _particle_path(distribution: MarginalLikelihood, y: jax.Array, at: Any, key: jax.Array,
+def _particle_path(distribution: SeriesLikelihood, y: jax.Array, requested_times: Any, key: jax.Array,
                    particles: ParticleSettings, steps: int) -> tuple[jax.Array, jax.Array]:
     """Return a path (L, M + R) of one of several particle filters, by ancestor tracing, and its times (L,).
 
@@ -346,7 +350,7 @@ def _particle_path(distribution: MarginalLikelihood, y: jax.Array, at: Any, key:
     proportion to its estimate of the likelihood, the error also decreases with the number of filters.
     """
     ssm, times = distribution.ssm, distribution.times
-    grid = build_time_grid(ssm, times, steps, distribution.max_step, at)
+    grid = build_time_grid(ssm, times, steps, distribution.max_step, requested_times)
     path_keys, choice = jax.random.split(key, _FILTERS + 1)[:-1], jax.random.fold_in(key, _FILTERS)
     states, _, total = jax.lax.map(lambda k: draw_trajectories(ssm, grid, y, k, particles, 1, TRACING), path_keys)
     best = jax.random.categorical(choice, jnp.where(jnp.isneginf(total).all(), 0.0, total))
@@ -354,12 +358,13 @@ def _particle_path(distribution: MarginalLikelihood, y: jax.Array, at: Any, key:
     return jax.vmap(ssm.inputs)(states[best][:, 0], when), when
 
 
-def _steps_per_interval(ssm: StateSpaceModel, times: Any, at: Any, steps: int, since: float = -np.inf) -> int:
+def _steps_per_interval(ssm: StateSpaceModel, times: Any, requested_times: Any, steps: int,
+                        since: float = -np.inf) -> int:
     """Return the number of steps of rows after ``since`` with which no step is longer than between two observations."""
     concrete_times = checks.concrete(times)
-    if at is None or concrete_times is None:
+    if requested_times is None or concrete_times is None:
         return steps
-    grid = build_time_grid(ssm, concrete_times, 1, sys.float_info.max, at)
+    grid = build_time_grid(ssm, concrete_times, 1, sys.float_info.max, requested_times)
     if checks.traced(grid.since):  # breakpoints of a known input that are read at a lag
         return steps
     rows, origin = grid.intervals, np.asarray(grid.initial_time)

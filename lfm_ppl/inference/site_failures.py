@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.inference.bound_model import BoundModel
+from lfm_ppl.inference.constrained_likelihood import ConstrainedLikelihood
 from lfm_ppl.inference.map_draws import map_draws, map_series
-from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
-from lfm_ppl.model.observations.family import ObservationFamily
+from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 
 POINTS = 100
 """Points at which the likelihood is evaluated."""
@@ -52,9 +51,8 @@ class PathESS(NamedTuple):
 def site_failures(bound: BoundModel, z: np.ndarray, seed: int = 0, points: int = POINTS) -> SiteFailures | None:
     """Evaluate the likelihood at proposals of a sampler: draws plus scaled differences of two other draws.
 
-    At draws themselves the likelihood is never zero, because a sampler rejects such points, and sites that do not
-    converge at a draw often do not converge near it. The differences are those of differential evolution,
-    z_i + 2.38 / sqrt(2 d) (z_j - z_k), which have the shape of the posterior.
+    At draws themselves the likelihood is never zero, because a sampler rejects such points. The proposals of
+    differential evolution, z_i + 2.38 / sqrt(2 d) (z_j - z_k), have the shape of the posterior.
 
     Args:
         bound: the model and its data.
@@ -67,7 +65,7 @@ def site_failures(bound: BoundModel, z: np.ndarray, seed: int = 0, points: int =
 
     Source: ter Braak (2006), Statistics and Computing 16.
     """
-    if not _has_sites(bound) or not z.size:
+    if not bound.site.example.has_sites or not z.size:
         return None
     flat = z.reshape(-1, z.shape[-1])
     first, second, third = np.random.default_rng(seed).integers(len(flat), size=(3, points))
@@ -77,15 +75,11 @@ def site_failures(bound: BoundModel, z: np.ndarray, seed: int = 0, points: int =
 
 def failures_at(bound: BoundModel, values: Mapping[str, Any], limit: int = POINTS) -> SiteFailures | None:
     """Evaluate the likelihood at values of the sites, name -> (S, ...), or at ``limit`` of them; None as above."""
-    if not _has_sites(bound):
+    if not bound.site.example.has_sites:
         return None
 
-    def evaluate(distribution: MarginalLikelihood, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-        if distribution.constrained:
-            problem = distribution.bounded()
-            return problem.converged(y), jnp.isfinite(problem.log_likelihood(y, distribution.draws))
-        result = distribution.evidence(y)
-        return result.refined.fixed_point.converged, jnp.isfinite(result.log_evidence)
+    def evaluate(distribution: SeriesLikelihood, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return distribution.convergence(y)
 
     def per_draw(values: Any, key: jax.Array, y: Any) -> tuple[jax.Array, jax.Array]:
         return map_series(bound.likelihood(values, y), evaluate, bound.data(y))
@@ -105,21 +99,16 @@ def path_ess(bound: BoundModel, values: Mapping[str, Any], limit: int = _WEIGHT_
     It is None without constraints, and where expectation propagation alone gives the evidence under constraints.
     """
     example = bound.site.example
-    if not example.constrained or not example.draws:
+    if not isinstance(example, ConstrainedLikelihood) or not example.draws:
         return None
 
     def per_draw(values: Any, key: jax.Array, y: Any) -> jax.Array:
-        distribution = bound.likelihood(values, y)
-        return distribution.bounded().effective_sample_size(bound.data(y), distribution.draws)
+        distribution = cast(ConstrainedLikelihood, bound.likelihood(values, y))
+        return distribution.truncated_posterior().effective_sample_size(bound.data(y), distribution.draws)
 
     sizes = map_draws(bound, "weights of trajectories", per_draw, _evenly_spaced(values, limit), jax.random.key(0),
                       rows=bound.times.size)
     return PathESS(example.draws, float(np.median(sizes)), float(sizes.min()))
-
-
-def _has_sites(bound: BoundModel) -> bool:
-    example = bound.site.example
-    return example.constrained or isinstance(example.ssm.model.observation, ObservationFamily)
 
 
 def _evenly_spaced(values: Mapping[str, Any], limit: int) -> dict[str, np.ndarray]:

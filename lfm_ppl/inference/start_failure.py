@@ -12,8 +12,9 @@ from numpyro.infer import init_to_median
 
 from lfm_ppl.filtering.breakdown import breakdown, family_breakdown
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
-from lfm_ppl.model.observations.family import ObservationFamily
+from lfm_ppl.inference.constrained_likelihood import ConstrainedLikelihood
+from lfm_ppl.inference.panel import Panel
+from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 
 
 def start_failure(bound: BoundModel) -> str:
@@ -49,9 +50,9 @@ def _site_failure(bound: BoundModel) -> str | None:
 
 
 def _is_likelihood(law: Any) -> bool:
-    while hasattr(law, "base_dist") and not isinstance(law, (MarginalLikelihood, Panel)):
+    while hasattr(law, "base_dist") and not isinstance(law, (SeriesLikelihood, Panel)):
         law = law.base_dist
-    return isinstance(law, (MarginalLikelihood, Panel))
+    return isinstance(law, (SeriesLikelihood, Panel))
 
 
 def _format_array(value: Any) -> str:
@@ -73,10 +74,10 @@ def _likelihood_failure(bound: BoundModel, z: Any) -> str | None:
     return None
 
 
-def _series_failure(member: MarginalLikelihood, y: Any) -> str:
-    if member.constrained:
+def _series_failure(member: SeriesLikelihood, y: Any) -> str:
+    if isinstance(member, ConstrainedLikelihood):
         return "the likelihood under constraints is not finite: they may be impossible together with the data."
-    if isinstance(member.model.observation, ObservationFamily):
+    if member.is_family:
         return family_breakdown(member.ssm, member.rule, member.time_grid, y, member.site_settings)
     return breakdown(member.ssm, member.rule, member.time_grid, y) or (
         "the likelihood is not finite, though the filter does not break down without posterior linearisation: try "

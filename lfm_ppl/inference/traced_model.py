@@ -259,9 +259,9 @@ class _Identity:
     def __init__(self, value: Any) -> None:
         self.value = value
 
-    def __eq__(self, other: object) -> bool:
+    def __eq__(self, candidate: object) -> bool:
         """Whether both refer to the same object."""
-        return isinstance(other, _Identity) and other.value is self.value
+        return isinstance(candidate, _Identity) and candidate.value is self.value
 
     def __hash__(self) -> int:
         """Return the hash of the identity."""

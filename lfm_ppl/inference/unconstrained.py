@@ -32,8 +32,8 @@ def check_latent_sites(
         ValueError: a latent site is discrete, or no latent site is left to sample.
     """
     # init_to_uniform also serves improper priors, from which nothing can be drawn
-    drawn = handlers.substitute(handlers.seed(model, rng_key), substitute_fn=init_to_uniform)
-    check_latent(latent_sites(handlers.trace(drawn).get_trace(*args, **kwargs)), user)
+    seeded_model = handlers.substitute(handlers.seed(model, rng_key), substitute_fn=init_to_uniform)
+    check_latent(latent_sites(handlers.trace(seeded_model).get_trace(*args, **kwargs)), user)
 
 
 def check_latent(sites: Mapping[str, Any], user: str) -> None:

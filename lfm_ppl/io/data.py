@@ -333,7 +333,7 @@ def read_series(path: str | Path, column: str, outputs: Sequence[str] | None = N
     parts: dict[str, list[int]] = {}
     for row, name in enumerate(source.columns[column]):
         if not name:
-            raise ValueError(f"{source.place(row, column)}: the identifier of the series is missing.")
+            raise ValueError(f"{source.cell_location(row, column)}: the identifier of the series is missing.")
         parts.setdefault(name, []).append(row)
     return {name: _read(source.part(rows, without=column), outputs, time_column, inputs, time_unit,
                         usual_unit, f" of series {name!r}") for name, rows in parts.items()}
@@ -522,7 +522,7 @@ def _warn_of_codes(source: Table, name: str, column: np.ndarray) -> None:
     for code in _codes(column):
         if np.isfinite(column).sum() - np.sum(column == code) < 2:
             continue
-        location, count = source.place(int(np.argmax(column == code)), name), int((column == code).sum())
+        location, count = source.cell_location(int(np.argmax(column == code)), name), int((column == code).sum())
         checks.warn(f"{location}: {code:g}, far from all other values of the column, is taken as a measurement "
                     f"({count} of them). If it stands for a missing value, leave the cell empty.")
 
@@ -587,7 +587,7 @@ def _times(source: Table, name: str, unit: str | None, usual: str | None,
     """
     cells = source.columns[name]
     if missing := [row for row, cell in enumerate(cells) if _missing(cell)]:
-        raise ValueError(f"{source.place(missing[0], name)}: the time is missing.")
+        raise ValueError(f"{source.cell_location(missing[0], name)}: the time is missing.")
     if not calendar_time.is_date(cells[0]):
         requirement = "expected a number, or a date, year first, such as 2026-03-31 in every row, got {}."
         times = np.array([_value(source, row, name, requirement) for row in range(len(cells))])
@@ -602,11 +602,11 @@ def _times(source: Table, name: str, unit: str | None, usual: str | None,
         try:
             stamps.append(calendar_time.parse(cell))
         except ValueError:
-            raise ValueError(f"{source.place(row, name)}: expected a date, year first, such as 2026-03-31 or "
+            raise ValueError(f"{source.cell_location(row, name)}: expected a date, year first, such as 2026-03-31 or "
                              f"2026-03-31T18:00, got {cell!r}.") from None
         if (stamps[-1].tzinfo is None) != (stamps[0].tzinfo is None):
-            raise ValueError(f"{source.place(row, name)}: some dates have an offset from UTC and others have none: "
-                             f"{cells[0]!s} and {cell!s}. Write it in all of them, or in none.")
+            raise ValueError(f"{source.cell_location(row, name)}: some dates have an offset from UTC and others have "
+                             f"none: {cells[0]!s} and {cell!s}. Write it in all of them, or in none.")
     clock_hint = " A clock that is set back for winter needs offsets from UTC." if stamps[0].tzinfo is None else ""
     times, origin, unit = calendar_time.since_midnight(stamps, unit or _unit_of(name) or usual)
     _check_order(source, times, [str(cell) for cell in cells], free, clock_hint)
@@ -623,8 +623,8 @@ def _input(source: Table, name: str, interpolation: str, times: np.ndarray) -> I
     values = np.array([_value(source, row, name) for row in range(len(times))])
     finite_rows = np.flatnonzero(np.isfinite(values))
     if interpolation != "zero" and (not finite_rows.size or times[finite_rows[0]] > times[0]):
-        raise ValueError(f"{source.place(0, name)}: the known input has no value at the first time; fill the cell, or "
-                         f"read empty cells as zero: {_zero_option(name)}.")
+        raise ValueError(f"{source.cell_location(0, name)}: the known input has no value at the first time; fill the "
+                         f"cell, or read empty cells as zero: {_zero_option(name)}.")
     _warn_of_codes(source, name, values)
     values = _read_blanks(f"{source.label}, column {name!r}", _zero_option(name), times, values, interpolation)
     finite_rows = np.flatnonzero(np.isfinite(values))
@@ -632,7 +632,7 @@ def _input(source: Table, name: str, interpolation: str, times: np.ndarray) -> I
     for row in map(int, finite_rows):
         previous_value = values[finite_rows[first[np.searchsorted(unique_times, times[row])]]]
         if values[row] != previous_value:
-            raise ValueError(f"{source.place(row, name)}: the known input is {values[row]:g} here and "
+            raise ValueError(f"{source.cell_location(row, name)}: the known input is {values[row]:g} here and "
                              f"{previous_value:g} in another row of the same time.")
     return InputTable(unique_times, values[finite_rows[first]], _kept_interpolation(interpolation))
 
@@ -692,10 +692,11 @@ def _value(source: Table, row: int, name: str, requirement: str = _WANTED) -> fl
     except (TypeError, ValueError):  # a TypeError is pandas' NA, or a cell that is no scalar
         if type(cell).__name__ == "NAType":
             return math.nan
-        raise ValueError(f"{source.place(row, name)}: {requirement.format(_shown(cell))}{_meant(cell)}") from None
+        location = source.cell_location(row, name)
+        raise ValueError(f"{location}: {requirement.format(_quote_cell(cell))}{_meant(cell)}") from None
     if not math.isfinite(value):
-        raise ValueError(f"{source.place(row, name)}: expected a finite number, got {_shown(cell)}. Leave the cell of "
-                         "a missing value empty.")
+        raise ValueError(f"{source.cell_location(row, name)}: expected a finite number, got {_quote_cell(cell)}. "
+                         "Leave the cell of a missing value empty.")
     return value
 
 
@@ -710,7 +711,7 @@ def _meant(cell: Any) -> str:
     return ""
 
 
-def _shown(cell: Any) -> str:
+def _quote_cell(cell: Any) -> str:
     """Return a cell as messages show it."""
     text = repr(cell)
     return text if len(text) <= 60 else f"{text[:50]}... ({len(text)} characters)"

@@ -321,7 +321,7 @@ def _convert(kind: type, text: str) -> Any:
     return kind(text)
 
 
-class Place(NamedTuple):
+class SourceLocation(NamedTuple):
     """A line of a model file.
 
     Attributes:
@@ -335,20 +335,20 @@ class Place(NamedTuple):
     shipped: bool
 
 
-def place_in_model(error: BaseException) -> Place | None:
+def place_in_model(error: BaseException) -> SourceLocation | None:
     """Return the last line of a model file that led to an error, or to its cause; None where none did."""
-    place = None
+    location = None
     cause: BaseException | None = error
     while cause is not None:
         for frame, line in traceback.walk_tb(cause.__traceback__):
             module = str(frame.f_globals.get("__name__", ""))
             if module.startswith(_MODULE):
                 file = frame.f_code.co_filename
-                place = Place(file, line, Path(file).parent == models_folder())
-            elif module.startswith("lfm_ppl.inference.handlers."):  # what a user asks of a site is not the file's fault
-                place = None
+                location = SourceLocation(file, line, Path(file).parent == models_folder())
+            elif module.startswith("lfm_ppl.inference.handlers."):  # an option of the user is at fault
+                location = None
         cause = cause.__cause__
-    return place
+    return location
 
 
 def known_inputs(error: KeyError) -> tuple[str, ...] | None:
@@ -365,8 +365,8 @@ def _where(error: BaseException, path: Path) -> str:
     """Return the error in one line, with the last line of ``path`` that led to it."""
     lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == str(path)]
     line = error.lineno if isinstance(error, SyntaxError) else (lines[-1] if lines else None)
-    location = f"line {line}: " if line else ""
-    return f"{location}{type(error).__name__}: {error}"
+    prefix = f"line {line}: " if line else ""
+    return f"{prefix}{type(error).__name__}: {error}"
 
 
 def _name(path: Path) -> str:

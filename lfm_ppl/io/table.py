@@ -25,7 +25,7 @@ class Table:
     columns: Mapping[str, Sequence[Any]]
     rows: Sequence[Any]
 
-    def place(self, row: int, column: str) -> str:
+    def cell_location(self, row: int, column: str) -> str:
         """Return where a cell is."""
         return f"{self.label}, row {self.rows[row]}, column {column!r}"
 

@@ -49,7 +49,7 @@ def entry_log_prob(ssm: StateSpaceModel, w: jax.Array, t: jax.Array, row: Any, y
     assert isinstance(family, ObservationFamily)
     predictor = ssm.observe(w, t)
     # The masked branch must have a finite derivative, too: replace a missing entry by a value in the support.
-    value = family.at(row).log_prob(predictor, jnp.where(present, y, family.possible(predictor)))
+    value = family.select_row(row).log_prob(predictor, jnp.where(present, y, family.possible(predictor)))
     return jnp.where(present, value, 0.0)
 
 
@@ -57,7 +57,7 @@ def noisy_observation(ssm: StateSpaceModel, w: jax.Array, t: jax.Array, key: jax
     """Draw an observation (D,) at inputs w (M + R,) and time t, with the noise of a row (None: of no row)."""
     family, predictor = ssm.model.observation, ssm.observe(w, t)
     if isinstance(family, ObservationFamily):
-        return (family.typical() if row is None else family.at(row)).sample(key, predictor)
+        return (family.typical() if row is None else family.select_row(row)).sample(key, predictor)
     return with_noise(key, predictor, ssm.obs_cov(w, t, row))
 
 

@@ -216,7 +216,7 @@ def _interval_integrator(ssm: StateSpaceModel, steps: int) -> Callable[..., jax.
 
         def step(state: jax.Array, index: jax.Array) -> tuple[jax.Array, None]:
             step_key = jax.random.fold_in(interval_key, index)
-            state = _simulation_step(ssm, state, span.after(index * h), h, transition, root, step_key)
+            state = _simulation_step(ssm, state, span.shifted(index * h), h, transition, root, step_key)
             # The last step must end exactly at the end of the interval, so that a jump there is crossed once.
             step_end = jnp.where(index == steps - 1, end, start + (index + 1) * h)
             return _cross_jumps(ssm, jumps, state, start + index * h, step_end, step_key), None

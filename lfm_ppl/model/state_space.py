@@ -262,7 +262,7 @@ class Span(NamedTuple):
         t = self.start + offset
         return t + jax.lax.stop_gradient(jnp.clip(t, self.lower, self.upper) - t)
 
-    def after(self, offset: Any) -> Span:
+    def shifted(self, offset: Any) -> Span:
         """Return the span that starts at an offset from the start of this one."""
         return self._replace(start=self.start + offset)
 

@@ -177,7 +177,7 @@ class ParticleTransition:
             first_step, step_key = inputs
             noise = normals(step_key, steps_per_draw * normals_per_step, count)
             for index in range(steps_per_draw):
-                state = integrate_step(state, span.after((first_step + index) * h),
+                state = integrate_step(state, span.shifted((first_step + index) * h),
                                        noise[index * normals_per_step:(index + 1) * normals_per_step])
             return state, None
 

@@ -100,7 +100,9 @@ def check_accuracy(result: Any, numpyro_model: Callable, times: Any = None, y: A
         raise ValueError("replicates must be at least 2: the noise of the particle filter is told from their spread.")
     _check_sampler(result)
     full_problem = rebuilding.problem(result, numpyro_model, times, y, model_kwargs)
-    full_problem.example.refuse_constraints("a check of the Gaussian filter's accuracy")
+    if full_problem.example.constraints_in_words:
+        raise ValueError("a check of the Gaussian filter's accuracy does not support constraints, and the likelihood "
+                         f"has some: {full_problem.example.constraints_in_words}. Leave them out.")
     ssm = full_problem.example.ssm
     kind = _kind(reference, ssm)
     posterior = arviz_data.group(result, "posterior")

@@ -22,9 +22,11 @@ import numpy as np
 
 from lfm_ppl.forces.stretched import Stretched
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.marginal_likelihood import DEFAULT_ITERATIONS, MarginalLikelihood, Panel
+from lfm_ppl.inference.constrained_likelihood import ConstrainedLikelihood
+from lfm_ppl.inference.marginal_likelihood import DEFAULT_ITERATIONS
+from lfm_ppl.inference.panel import Panel
 from lfm_ppl.inference.posterior import evenly_spaced
-from lfm_ppl.model.observations.family import ObservationFamily
+from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.model.resolution import resolution_messages
 from lfm_ppl.results import likelihoods
 from lfm_ppl.results.likelihoods import PosteriorDraws
@@ -54,10 +56,9 @@ class Refinement(NamedTuple):
     remedy: str
 
 
-def more_iterations(example: MarginalLikelihood) -> Refinement | None:
+def more_iterations(example: SeriesLikelihood) -> Refinement | None:
     """Return more iterations of posterior linearisation; None where the likelihood takes none."""
-    is_family = isinstance(example.model.observation, ObservationFamily)
-    if is_family or example.constrained or example.is_affine:
+    if example.has_sites or example.is_affine:
         return None
     current = example.iterations
     count = DEFAULT_ITERATIONS if current < DEFAULT_ITERATIONS else max(_MANY_ITERATIONS, 2 * current)
@@ -65,9 +66,9 @@ def more_iterations(example: MarginalLikelihood) -> Refinement | None:
                       f"iterations={count} (--iterations {count})")
 
 
-def shorter_steps(example: MarginalLikelihood) -> Refinement | None:
+def shorter_steps(example: SeriesLikelihood) -> Refinement | None:
     """Return half the integration step; None where nothing is integrated, or where constraints fix the steps."""
-    if example.constrained or example.ssm.mean_invariant:
+    if isinstance(example, ConstrainedLikelihood) or example.ssm.mean_invariant:
         return None
     settings = likelihoods.finer_steps(example)
     arguments = ", ".join(f"{name}={value:g}" for name, value in settings.items())
@@ -126,7 +127,7 @@ def resolution_warnings(bound: BoundModel, draws: Mapping[str, np.ndarray]) -> l
     return [*_long_steps(likelihood), *resolution_messages(likelihood.model, likelihood.times, y)]
 
 
-def _long_steps(likelihood: MarginalLikelihood) -> list[str]:
+def _long_steps(likelihood: SeriesLikelihood) -> list[str]:
     """Return a message where an integration step is longer than half the lengthscale of a force."""
     grid = likelihood.time_grid
     length = checks.concrete(grid.intervals.length)

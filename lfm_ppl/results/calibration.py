@@ -18,8 +18,7 @@ from lfm_ppl.engine.run import Reporter, run_tasks
 from lfm_ppl.engine.task import Task
 from lfm_ppl.inference.bound_model import bind
 from lfm_ppl.inference.likelihood_site import likelihood_site
-from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
-from lfm_ppl.model.observations.family import ObservationFamily
+from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.results.files import writing
 from lfm_ppl.utils import checks
 
@@ -155,10 +154,9 @@ class _Ranks:
         side_by_side = self.batch > 1 and self._method(site.example) == "vectorized"
         return jax.jit(lambda keys: jax.lax.map(one, keys, batch_size=self.batch if side_by_side else None))
 
-    def _method(self, likelihood: MarginalLikelihood) -> str:
+    def _method(self, likelihood: SeriesLikelihood) -> str:
         """Return how the data sets of a task run: a search that ends when it has converged is one by one."""
-        searches = likelihood.constrained or isinstance(likelihood.model.observation, ObservationFamily)
-        return self.method or ("sequential" if searches else "vectorized")
+        return self.method or ("sequential" if likelihood.has_sites else "vectorized")
 
     def __call__(self, task: Task) -> dict[str, np.ndarray]:
         """Return name of a scalar -> ranks."""

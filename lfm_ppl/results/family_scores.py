@@ -12,7 +12,8 @@ import xarray as xr
 
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.map_draws import map_draws, map_series
-from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
+from lfm_ppl.inference.panel import Panel
+from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.model.observations.family import ObservationFamily
 
 _PATH, _VALUES, _TIMES = "path of the inputs", "held-out values", "times of the path"
@@ -39,7 +40,7 @@ def log_densities(bound: BoundModel, draws: Mapping[str, Any], predicted: xr.Dat
     w = _inputs(predicted, y.shape[:-1])
     count = len(w)
 
-    def one(distribution: MarginalLikelihood, w: jax.Array, y: jax.Array, times: jax.Array) -> jax.Array:
+    def one(distribution: SeriesLikelihood, w: jax.Array, y: jax.Array, times: jax.Array) -> jax.Array:
         ssm = distribution.ssm
         family = ssm.model.observation
         assert isinstance(family, ObservationFamily)

@@ -16,8 +16,9 @@ from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.fokker_planck_grid import fokker_planck
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.map_draws import BatchStore, map_draws, map_series
-from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
+from lfm_ppl.inference.panel import Panel
 from lfm_ppl.inference.progress import Counter
+from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.model.observation_noise import check_noise
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel
@@ -52,7 +53,7 @@ class PosteriorDraws(NamedTuple):
         return None if self.parts is None else self.parts(name)
 
     @property
-    def example(self) -> MarginalLikelihood:
+    def example(self) -> SeriesLikelihood:
         """The likelihood of one series at parameters from the prior."""
         return self.bound.site.example
 
@@ -130,7 +131,7 @@ def finer_tolerance(tolerance: float) -> float:
     return tolerance / 16
 
 
-def finer_steps(example: MarginalLikelihood) -> dict[str, Any]:
+def finer_steps(example: SeriesLikelihood) -> dict[str, Any]:
     """Return the settings of a likelihood with about twice as many integration steps."""
     settings: dict[str, Any] = {"steps": 2 * example.steps}
     if example.max_step is not None:
@@ -155,7 +156,7 @@ def on_grid(problem: PosteriorDraws, steps: int | None, progress: bool) -> Refer
     layout = fokker_planck.choose_grid(_scouted(problem), problem.example.times, problem.y, tolerance=GRID_ERROR)
     bound = problem.bound
 
-    def one(distribution: MarginalLikelihood, y: jax.Array) -> jax.Array:
+    def one(distribution: SeriesLikelihood, y: jax.Array) -> jax.Array:
         time_grid = build_time_grid(distribution.ssm, distribution.times, steps or distribution.steps,
                                     distribution.max_step)
         return fokker_planck.log_likelihood(distribution.ssm, time_grid, y, layout)
@@ -226,7 +227,7 @@ def _particle_run(problem: PosteriorDraws, particles: int, replicates: int, step
     check_noise(example.ssm, example.time_grid.initial_time)
     settings = particle_filter.check_settings(example.ssm, ParticleSettings(particles))
 
-    def one(distribution: MarginalLikelihood, y: jax.Array, key: jax.Array) -> jax.Array:
+    def one(distribution: SeriesLikelihood, y: jax.Array, key: jax.Array) -> jax.Array:
         time_grid = build_time_grid(distribution.ssm, distribution.times, steps or distribution.steps,
                                     distribution.max_step)
         if takes_smoother_draws(distribution.ssm):

@@ -84,11 +84,9 @@ def _check_settings(site: LikelihoodSite, attrs: Mapping[str, Any]) -> None:
     example = site.example
     settings = {"rule": example.rule.name, "steps": example.steps, "max_step": example.max_step,
            "iterations": example.iterations, "tolerance": example.tolerance,
-           "constraints": example.constraints_in_words if example.constrained else None}
+           "constraints": example.constraints_in_words or None}
     if not set(settings) & set(attrs):
         return  # not made by `fit`
-    if example.constrained and " at " not in str(attrs.get("constraints")):  # of a version that stored no number
-        settings["constraints"] = ", ".join(example.bounds)
     for name in settings:
         # What is None is not stored.
         if attrs.get(name) != settings[name]:

@@ -105,7 +105,7 @@ def build_models(build: Build, rule: SwitchingRule) -> tuple[StateSpaceModel, ..
 def decision_grid(ssm: StateSpaceModel, times: Any, decisions: Any, start: FilterState | None, steps: int,
                   max_step: float | None) -> tuple[TimeGrid, np.ndarray]:
     """Return the time grid, and whether each of its K rows ends with a decision, (K,)."""
-    grid = build_time_grid(ssm, times, steps, max_step, at=times if decisions is None else decisions,
+    grid = build_time_grid(ssm, times, steps, max_step, times if decisions is None else decisions,
                            initial_time=None if start is None else start.time)
     if checks.traced(grid.since):
         raise ValueError("a known input is read at t minus a traced value (a lag), but decisions need intervals that "

@@ -199,12 +199,12 @@ def _of_family(bound: BoundModel, result: Any, predicted: xr.Dataset, y: np.ndar
     return log_densities(bound, flat, predicted, y)
 
 
-def _origins(rows: int, horizon: int, every: int, first: int | None) -> list[int]:
+def _origins(rows: int, horizon: int, stride: int, first: int | None) -> list[int]:
     """Return the last known row of each fit."""
     if first is None:
         first = max(rows // 2, _LEAST_ROWS)
     checks.positive_integer("first", first)
-    origins = list(range(first - 1, rows - horizon, every))
+    origins = list(range(first - 1, rows - horizon, stride))
     if first < _LEAST_ROWS or not origins:
         raise ValueError(f"there is no origin: of {rows} rows the first fit is to know {first} (at least "
                          f"{_LEAST_ROWS}) and {horizon} more are to be predicted. Take a smaller first or horizon.")

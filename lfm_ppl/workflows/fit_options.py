@@ -80,7 +80,7 @@ class FitOptions:
             "seed": self.seed, "chains": self.chains, "warmup": self.warmup, "samples": self.samples,
             "fixed": json.dumps({k: np.asarray(v).tolist() for k, v in self.fixed.items()}),
             **({"sites": example.sites_in_words} if example.sites_in_words else {}),
-            **({"constraints": example.constraints_in_words} if example.constrained else {}),
+            **({"constraints": example.constraints_in_words} if example.constraints_in_words else {}),
         }  # fmt: skip
 
     def record(self, bound: BoundModel, model_digest: Any) -> dict[str, Any]:

@@ -167,7 +167,7 @@ def _site_attributes(bound: BoundModel, draws: PosteriorDraws, values: Mapping[s
     if options.sampler in GAUSSIAN_FILTER_SAMPLERS and z is not None:
         reports[arviz_data.SITES] = best_effort(
             "convergence of the sites", lambda: site_failures(bound, z, options.seed), None)
-    elif options.sampler == "map" and bound.site.example.constrained:
+    elif options.sampler == "map" and bound.site.example.constraints_in_words:
         reports[arviz_data.SITES] = best_effort("convergence of the sites", lambda: failures_at(bound, values), None)
     reports[arviz_data.WEIGHTS] = best_effort(
         "weights under the constraints", lambda: path_ess(bound, values), None)

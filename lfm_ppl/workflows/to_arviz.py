@@ -105,7 +105,7 @@ def to_arviz(mcmc: Any, numpyro_model: Callable, times: Any, y: Any, *, at: Any 
         "tolerance": example.tolerance, "sampler": "draws" if kernel is None else type(kernel).__name__.lower(),
         "chains": chains, "samples": samples, "fixed": "{}", "versions": json.dumps(versions()),
         "created_at": datetime.now(UTC).isoformat(timespec="seconds"),
-        "constraints": ", ".join(example.bounds) if example.constrained else None,
+        "constraints": example.constraints_in_words or None,
     }
     if kernel is not None:
         attrs |= {"warmup": int(mcmc.num_warmup), "thin": int(mcmc.thinning)}

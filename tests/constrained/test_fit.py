@@ -104,7 +104,7 @@ def test_unconverged_sites_and_light_weights_are_counted():
     assert worth.trajectories == 2 and 1.0 <= worth.least <= worth.median <= 2.0
     # Weights by hand, of the data and without them.
     likelihood = lfm.MarginalLikelihood(system(), TIMES, lower={"factor": 0.0}, grid=TIMES, draws=64)
-    problem = likelihood.bounded()
+    problem = likelihood.truncated_posterior()
     by_hand = []
     for y in (jnp.asarray(Y), jnp.full_like(Y, jnp.nan)):
         weights = np.exp(problem.log_weights(jax.random.key(0), y, 64))

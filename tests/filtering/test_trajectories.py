@@ -116,7 +116,7 @@ def test_nodes_after_a_known_start_are_those_of_dense_algebra():
     ssm = lfm.state_space(model)
     distinct = np.unique(TIMES)
     ends = (distinct[:-1, None] + np.diff(distinct)[:, None] * np.array([1.0, 2.0, 3.0]) / 3).ravel()
-    grid = build_time_grid(ssm, TIMES, 3, max_step=10.0, at=ends)
+    grid = build_time_grid(ssm, TIMES, 3, max_step=10.0, requested_times=ends)
     assert grid.steps == 1
     y = jnp.asarray(observed(5, softplus))
     start = Moments(*ssm.initial())

@@ -224,7 +224,7 @@ def quantile_residuals(family: ObservationFamily, prediction: MeanVariance, y: j
     """
 
     def row(index: jax.Array, prediction: MeanVariance, y: jax.Array, v: jax.Array) -> jax.Array:
-        row_family, present = family.at(index), jnp.isfinite(y)
+        row_family, present = family.select_row(index), jnp.isfinite(y)
         filled = jnp.where(present, y, row_family.possible(prediction.mean))
 
         def probability(f: jax.Array) -> jax.Array:

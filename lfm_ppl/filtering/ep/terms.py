@@ -63,4 +63,4 @@ def row_log_prob(family: ObservationFamily, row: Any, f: jax.Array, y: jax.Array
     """Return log p(y_d | f_d) (D,) of a row, zero where missing."""
     present = jnp.isfinite(y)
     # A missing entry must not put NaN into a derivative.
-    return jnp.where(present, family.at(row).log_prob(f, jnp.where(present, y, family.possible(f))), 0.0)
+    return jnp.where(present, family.select_row(row).log_prob(f, jnp.where(present, y, family.possible(f))), 0.0)

@@ -8,7 +8,9 @@ from typing import Any
 import numpyro.distributions as dist
 from numpyro.primitives import Messenger
 
-from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
+from lfm_ppl.inference.constrained_likelihood import ConstrainedLikelihood
+from lfm_ppl.inference.panel import Panel
+from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 
 
 class Handler(Messenger):
@@ -41,11 +43,13 @@ class LikelihoodHandler(Handler):
         fn: a NumPyro model; None where the handler is used as a context.
     """
 
+    supports_constraints = True
+
     def __init__(self, fn: Callable[..., Any] | None = None) -> None:
-        self.found = False
+        self.has_site = False
         super().__init__(fn)
 
-    def replacement(self, likelihood: MarginalLikelihood | Panel, site: dict[str, Any]) -> Any:
+    def replacement(self, likelihood: SeriesLikelihood | Panel, site: dict[str, Any]) -> Any:
         """Return the distribution that takes the place of the likelihood of a site; by default a likelihood of one."""
         shape = likelihood.batch_shape + likelihood.event_shape
         return dist.ImproperUniform(dist.constraints.real, (), shape).mask(False)
@@ -56,15 +60,18 @@ class LikelihoodHandler(Handler):
 
     def begin(self) -> None:
         """Forget the sites of the run before."""
-        self.found = False
+        self.has_site = False
 
     def complaint(self) -> str:
         """Return what is wrong where no site was found."""
-        return "" if self.found else self.missing()
+        return "" if self.has_site else self.missing()
 
     def process_message(self, msg: dict[str, Any]) -> None:
         """Replace the distribution of the site."""
         fn = msg.get("fn")
-        if msg["type"] == "sample" and isinstance(fn, (MarginalLikelihood, Panel)):
-            self.found = True
+        if msg["type"] == "sample" and isinstance(fn, (SeriesLikelihood, Panel)):
+            series = fn.first if isinstance(fn, Panel) else fn
+            if isinstance(series, ConstrainedLikelihood) and not self.supports_constraints:
+                return
+            self.has_site = True
             msg["fn"] = self.replacement(fn, msg)

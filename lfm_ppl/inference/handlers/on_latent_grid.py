@@ -13,7 +13,8 @@ import numpyro.distributions as dist
 from numpyro.distributions import constraints
 
 from lfm_ppl.inference.handlers.likelihood_handler import LikelihoodHandler
-from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel, repeat_draw
+from lfm_ppl.inference.panel import Panel
+from lfm_ppl.inference.series_likelihood import SeriesLikelihood, repeat_draw
 from lfm_ppl.latent_grid.latent_grid import RULES, LatentGrid
 from lfm_ppl.utils import checks
 
@@ -75,21 +76,22 @@ class on_latent_grid(LikelihoodHandler):  # noqa: N801 (an effect handler, named
         (1, 21)
     """
 
+    supports_constraints = False
+
     def __init__(self, fn: Callable[..., Any] | None = None, points: Any = 363, rule: str = "linear") -> None:
         checks.one_of("rule", rule, RULES)
         self.points, self.rule = points, rule
         super().__init__(fn)
 
     def missing(self) -> str:
-        """Return what to say of a model without forces that could be put on a grid."""
-        return ("the model has no site numpyro.sample(name, lfm.MarginalLikelihood(...), obs=y) without mask, expand "
-                "or plate around it, whose forces could be put on a grid.")
+        """Return the error of a model without forces that could be put on a grid."""
+        return ("the model has no site numpyro.sample(name, lfm.MarginalLikelihood(...), obs=y) without constraints, "
+                "mask, expand or plate, whose forces could be put on a grid.")
 
-    def replacement(self, likelihood: MarginalLikelihood | Panel, site: dict[str, Any]) -> GridLikelihood:
+    def replacement(self, likelihood: SeriesLikelihood | Panel, site: dict[str, Any]) -> GridLikelihood:
         """Sample the forces, and return the distribution of the observations given them."""
         if isinstance(likelihood, Panel):
             raise ValueError(f"the site {site['name']!r} is a panel; put one series at a time on a grid.")
-        likelihood.refuse_constraints("a grid of latent values")
         if checks.traced(likelihood.times):
             raise ValueError("times must be known when the grid is built, but they are traced; run with "
                              "jit_model_args=False.")

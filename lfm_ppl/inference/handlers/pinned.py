@@ -44,8 +44,8 @@ class Pinned(dist.Distribution):
     @property
     def support(self) -> constraints.Constraint:
         """The part of the base support where the fixed elements have their values."""
-        each = elementwise("a pinned site", self.base.support)
-        return _Pinned(each, self.indices, self.values, self.shape()[0], self.event_dim)
+        entry_constraint = elementwise("a pinned site", self.base.support)
+        return _Pinned(entry_constraint, self.indices, self.values, self.shape()[0], self.event_dim)
 
     def insert(self, vector: jax.Array) -> jax.Array:
         """Return ``vector`` (..., n) with the fixed elements in place."""
@@ -64,15 +64,15 @@ class Pinned(dist.Distribution):
 
 
 class _Pinned(constraints.Constraint):
-    """The vectors whose elements satisfy ``each`` and whose fixed elements have their values.
+    """The vectors whose elements satisfy ``entry_constraint`` and whose fixed elements have their values.
 
     The vector is one event (``event_dim`` 1) or a batch of scalar ones (0), as inside a plate.
     """
 
     def __init__(
-        self, each: Any, indices: tuple[int, ...], values: Any, size: int, event_dim: int
+        self, entry_constraint: Any, indices: tuple[int, ...], values: Any, size: int, event_dim: int
     ) -> None:
-        self.each, self.indices, self.values = each, indices, values
+        self.entry_constraint, self.indices, self.values = entry_constraint, indices, values
         self.size, self.event_dim = size, event_dim
 
     def insert(self, vector: Any) -> Any:
@@ -80,17 +80,17 @@ class _Pinned(constraints.Constraint):
         return vector.at[..., jnp.array(self.indices)].set(self.values)
 
     def __call__(self, x: Any) -> Any:
-        valid = self.each(x) & (x == self.insert(jnp.asarray(x)))
+        valid = self.entry_constraint(x) & (x == self.insert(jnp.asarray(x)))
         return jnp.all(valid, axis=-1) if self.event_dim else valid
 
     def feasible_like(self, prototype: Any) -> Any:
         """Return a vector of the shape of ``prototype`` that satisfies the constraint."""
-        return self.insert(jnp.asarray(self.each.feasible_like(prototype)))
+        return self.insert(jnp.asarray(self.entry_constraint.feasible_like(prototype)))
 
     def tree_flatten(self) -> Any:
         """Split into arrays and static fields."""
         static = {"indices": self.indices, "size": self.size, "event_dim": self.event_dim}
-        return (self.each, self.values), (("each", "values"), static)
+        return (self.entry_constraint, self.values), (("entry_constraint", "values"), static)
 
 
 class _PinnedTransform(Transform):
@@ -114,17 +114,17 @@ class _PinnedTransform(Transform):
         return jnp.zeros(shape, jnp.result_type(x)).at[..., self._free()].set(x)
 
     def __call__(self, x: jax.Array) -> jax.Array:
-        return self.constraint.insert(biject_to(self.constraint.each)(self._full(x)))
+        return self.constraint.insert(biject_to(self.constraint.entry_constraint)(self._full(x)))
 
     def _inverse(self, y: jax.Array) -> jax.Array:
-        return biject_to(self.constraint.each)._inverse(y)[..., self._free()]
+        return biject_to(self.constraint.entry_constraint)._inverse(y)[..., self._free()]
 
     def log_abs_det_jacobian(
         self, x: jax.Array, y: jax.Array, intermediates: Any = None
     ) -> jax.Array:
         """Return the log derivatives of the free elements: summed for an event, else one by one."""
         full = self._full(x)
-        transform = biject_to(self.constraint.each)
+        transform = biject_to(self.constraint.entry_constraint)
         log_derivatives = transform.log_abs_det_jacobian(full, transform(full))
         free = jnp.zeros(self.constraint.size).at[self._free()].set(1.0)
         log_derivatives = jnp.where(free > 0, log_derivatives, 0.0)

@@ -6,7 +6,8 @@ from collections.abc import Callable
 from typing import Any
 
 from lfm_ppl.inference.handlers.likelihood_handler import LikelihoodHandler
-from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood, Panel
+from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
+from lfm_ppl.inference.panel import Panel
 
 NAMES = ("rule", "steps", "max_step", "iterations", "damping", "tolerance", "sites", "lower", "upper", "constraints",
          "grid", "draws")
@@ -63,7 +64,7 @@ class approximate(LikelihoodHandler):  # noqa: N801 (an effect handler, named as
         if isinstance(likelihood, Panel):
             settings = self._merged(likelihood.settings)
             return Panel(likelihood.build, likelihood.parameters, likelihood.times, settings)
-        settings = self._merged({name: getattr(likelihood, name) for name in NAMES})
+        settings = self._merged(likelihood.settings)
         return MarginalLikelihood(likelihood.model, likelihood.times, **settings)
 
     def _merged(self, previous: dict[str, Any]) -> dict[str, Any]:

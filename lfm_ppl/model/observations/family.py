@@ -98,7 +98,7 @@ class ObservationFamily(eqx.Module):
         """Return the family with its numbers of outputs; ``output_size`` maps a predictor function to its number."""
         return self
 
-    def at(self, row: Any) -> ObservationFamily:
+    def select_row(self, row: Any) -> ObservationFamily:
         """Return the family for one row of the data: parameters (T, D) become (D,)."""
         rows = {name: getattr(self, name)[row] for name in self.per_entry if np.ndim(getattr(self, name)) == 2}
         if not rows:
@@ -159,7 +159,7 @@ class ObservationFamily(eqx.Module):
 
     def check_predictor(self, predictor: np.ndarray, where: str, names: Sequence[str]) -> None:
         """Raise ValueError if the distribution of an entry is not finite at a predictor (D,)."""
-        overflow = np.atleast_1d(self.at(0).overflows(predictor))
+        overflow = np.atleast_1d(self.select_row(0).overflows(predictor))
         if overflow.any():
             index = int(np.argmax(overflow))
             raise ValueError(f"the law of the output {names[index]!r} is not finite {where}, where its predictor is "

@@ -124,9 +124,9 @@ class Observations(ObservationFamily):
         """Return the observations with parameters averaged over the rows."""
         return eqx.tree_at(lambda family: family.parts, self, tuple(part.typical() for part in self.parts))
 
-    def at(self, row: Any) -> Observations:
+    def select_row(self, row: Any) -> Observations:
         """Return the observations for one row of the data."""
-        return eqx.tree_at(lambda family: family.parts, self, tuple(part.at(row) for part in self.parts))
+        return eqx.tree_at(lambda family: family.parts, self, tuple(part.select_row(row) for part in self.parts))
 
     def check_shapes(self, outputs: int) -> None:
         """Check the parameters of the parts."""

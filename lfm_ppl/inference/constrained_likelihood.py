@@ -1,0 +1,204 @@
+"""The likelihood of a latent force model under constraints on states, forces and outputs.
+
+1. Constraints become boxes 0 <= c <= width at the rows of a grid (`lfm_ppl.constrained.boxes`).
+2. Expectation propagation with truncated normal sites gives log Z(y, c) and log Z(c); their difference is the log
+   density of the data given that the constraints hold (`lfm_ppl.constrained.evidence`).
+3. Weighted trajectories that respect all constraints correct both for the error of the sites. Their random numbers are
+   the same for all parameters, so that the density has no noise.
+4. Samples and posterior trajectories are chosen by their weights among such trajectories.
+
+Source: Cunningham, Hennig and Lacoste-Julien (2011), Gaussian probabilities and expectation propagation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lfm_ppl.constrained.augmented import COARSE, add_times, build_rows, is_count, stacked_model
+from lfm_ppl.constrained.boxes import build_boxes
+from lfm_ppl.constrained.constraints import build_constraints
+from lfm_ppl.constrained.evidence import TruncatedPosterior, check_linear, check_variances
+from lfm_ppl.constrained.full_information import check_settings
+from lfm_ppl.filtering.backward import backward
+from lfm_ppl.filtering.ep.evidence import leave_one_out
+from lfm_ppl.filtering.ep.settings import SiteSettings
+from lfm_ppl.filtering.moments import Record
+from lfm_ppl.filtering.problem import at_intervals
+from lfm_ppl.filtering.smoother import SmootherResult
+from lfm_ppl.filtering.time_grid import build_time_grid
+from lfm_ppl.filtering.update import Sites
+from lfm_ppl.inference.series_likelihood import SeriesLikelihood, repeat_draw
+from lfm_ppl.linearisation.rule import Rule
+from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.observation_noise import noisy_observation
+from lfm_ppl.model.resolution import check_resolution
+from lfm_ppl.utils import checks
+from lfm_ppl.utils.gradients import finite_or_minus_infinity
+
+_CANDIDATES = 64
+"""Number of weighted trajectories from which one draw is chosen."""
+
+
+class ConstrainedLikelihood(SeriesLikelihood):
+    """Distribution of a sequence of observations given that states and forces respect constraints.
+
+        log p(y | c) = log Z(y, c) - log Z(c),
+
+    by expectation propagation, corrected by weighted trajectories. It is -inf where expectation propagation does not
+    converge. `lfm_ppl.MarginalLikelihood` returns it for ``lower``, ``upper`` or ``constraints``, and documents the
+    arguments.
+
+    Args:
+        model: the latent force model, with Gaussian observations.
+        times: (T,), non-decreasing.
+        rule: linearisation rule; `Cubature()` by default.
+        steps: integration steps between two rows of the grid or the data.
+        lower: name of a state, force or output -> its lower bound.
+        upper: the same for upper bounds.
+        constraints: functions c(x, u, t), feasible where >= 0.
+        grid: times at which the constraints hold, or their number.
+        draws: even number of trajectories; 0: expectation propagation alone.
+
+    Raises:
+        ValueError, TypeError: as `lfm_ppl.MarginalLikelihood`.
+
+    Example:
+        >>> import jax.numpy as jnp, lfm_ppl as lfm
+        >>> model = lfm.LatentForceModel(
+        ...     lambda x, u, t: u - x, {"u": lfm.Matern(1.0, 1.0)},
+        ...     lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
+        >>> lfm.MarginalLikelihood(model, jnp.arange(3.0), lower={"u": 0.0}).constraints_in_words
+        'u >= 0 at 21 times'
+    """
+
+    pytree_data_fields = ("lower", "upper")
+    pytree_aux_fields = ("constraints", "grid", "draws")
+
+    def __init__(self, model: LatentForceModel, times: Any, rule: Rule | None = None, steps: int = 10, *,
+                 lower: Mapping[str, Any] | None = None, upper: Mapping[str, Any] | None = None,
+                 constraints: Callable[..., Any] | Sequence[Callable[..., Any]] = (), grid: Any = None,
+                 draws: int = 256):
+        self.lower, self.upper = (None if bounds is None else dict(bounds) for bounds in (lower, upper))
+        self.constraints = (constraints,) if callable(constraints) else tuple(constraints or ())
+        self.grid = grid if grid is None or is_count(grid) else tuple(np.atleast_1d(np.asarray(grid, float)).tolist())
+        self.draws = draws
+        check_settings(model, 1.0, 1)
+        if draws != 0:
+            checks.positive_integer("draws", draws)
+            if draws % 2:
+                raise ValueError(f"draws must be even, half of them mirror the other half; got {draws}.")
+        super().__init__(model, times, rule, steps)
+        if checks.concrete(times) is not None:
+            check_linear(self.truncated_posterior(), draws)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Arguments of `lfm_ppl.MarginalLikelihood` besides model and times."""
+        return {name: getattr(self, name) for name in ("rule", "steps", "lower", "upper", "constraints", "grid",
+                                                       "draws")}
+
+    @property
+    def has_sites(self) -> bool:
+        """Whether Gaussian sites approximate factors of the density."""
+        return True
+
+    @property
+    def description(self) -> str:
+        """How the likelihood is computed."""
+        return f"approximate (constraints by expectation propagation and {self.draws} trajectories)"
+
+    @property
+    def constraints_in_words(self) -> str:
+        """All constraints, and at how many times they hold."""
+        bounds = [f"{name} {sign} {_format_bound(value)}" for limits, sign in ((self.lower, ">="), (self.upper, "<="))
+                  for name, value in (limits or {}).items()]
+        functions = [f"{getattr(constraint, '__name__', type(constraint).__name__)} >= 0"
+                     for constraint in self.constraints]
+        return f"{', '.join(bounds + functions)} at {len(self.truncated_posterior().rows.grid)} times"
+
+    def truncated_posterior(self, at: Any = None) -> TruncatedPosterior:
+        """Return the truncated posterior, whose evidence is the density under constraints.
+
+        Args:
+            at: (K,) further times for trajectories, at which the constraints need not hold.
+        """
+        boxes = build_boxes(build_constraints(self.model, self.lower, self.upper, self.constraints))
+        rows = build_rows(self.model, self.times, np.asarray(self.grid) if isinstance(self.grid, tuple) else self.grid,
+                          COARSE)
+        if at is not None:
+            rows = add_times(rows, np.asarray(at, float))
+        ssm = stacked_model(self.model, boxes)
+        return TruncatedPosterior(ssm, self.rule, build_time_grid(ssm, rows.times, self.steps), rows, boxes,
+                                  check_variances(self.model, np.shape(self.times)[0]), SiteSettings())
+
+    def log_prob(self, value: Any) -> jax.Array:
+        """Return log p(value | c), NaN where missing; batch dimensions may lead."""
+        value = jnp.asarray(checks.unmask(value), float)
+        if value.ndim > 2:
+            return jax.vmap(self.log_prob)(value)
+        check_resolution(self.model, self.times, value)
+        return finite_or_minus_infinity(lambda y: self.truncated_posterior().log_likelihood(y, self.draws),
+                                        self.checked(value))
+
+    def convergence(self, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return whether the sites converge, and whether the log density is finite."""
+        posterior = self.truncated_posterior()
+        return posterior.converged(y), jnp.isfinite(posterior.log_likelihood(y, self.draws))
+
+    def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
+        """Simulate observations along trajectories that respect the constraints: (*sample_shape, T, D).
+
+        The trajectories are those of the (linearised) model, as far as 64 candidates represent it.
+        """
+
+        def draw(key: jax.Array) -> jax.Array:
+            path_key, noise_key = jax.random.split(key)
+            w, times = self.feasible_path(path_key, jnp.full(self.event_shape, jnp.nan))
+            return jax.vmap(lambda w, t, key, row: noisy_observation(self.ssm, w, t, key, row))(
+                w, times, jax.random.split(noise_key, len(times)), jnp.arange(len(times)))
+
+        return repeat_draw(draw, key, sample_shape)
+
+    def feasible_path(self, key: jax.Array, y: jax.Array, at: Any = None) -> tuple[jax.Array, jax.Array]:
+        """Draw a trajectory under the constraints, chosen by its weight among 64.
+
+        Args:
+            key: a JAX random key.
+            y: (T, D), NaN where missing.
+            at: (L,) times; None: the times of the data.
+
+        Returns:
+            (x, u) (L, M + R), and the times (L,).
+        """
+        posterior = self.truncated_posterior(at)
+        proposal = posterior.proposal(y, posterior.propagate_expectations(y))
+        path = posterior.sample_trajectories(key, proposal, 1, _CANDIDATES)[..., 0]
+        # The last row of a time is the one at which the constraint holds.
+        times = np.asarray(self.times if at is None else at, float)
+        index = np.searchsorted(posterior.rows.times, times, side="right") - 1
+        return path[index], jnp.asarray(times)
+
+    def leave_one_out(self, y: jax.Array, smoothed: SmootherResult) -> jax.Array:
+        """Return (T,), log p(y_k | y_-k, c), by expectation propagation."""
+        posterior = self.truncated_posterior()
+        propagated = posterior.propagate_expectations(y, Record.SMOOTHER)
+        predictor = backward(posterior.problem, propagated.trace).predictor
+        assert predictor is not None
+        data, outputs = jnp.asarray(posterior.rows.data), y.shape[1]
+        at_data = jax.tree.map(lambda a: at_intervals(a, posterior.grid.observed)[data], predictor)
+        at_data = at_data._replace(mean=at_data.mean[:, :outputs],
+                                   covariance=at_data.covariance[:, :outputs, :outputs])
+        fixed_point = propagated.refined.fixed_point
+        sites = Sites(*(a[data, :outputs] for a in fixed_point.sites))
+        value = leave_one_out(at_data, sites, propagated.entries[data, :outputs])
+        return jnp.where(fixed_point.converged, value, -jnp.inf)
+
+
+def _format_bound(value: Any) -> str:
+    concrete = checks.concrete(value)
+    return "..." if concrete is None else f"{float(concrete):g}"

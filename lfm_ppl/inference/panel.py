@@ -1,0 +1,177 @@
+"""Independent series with shared parameters as one NumPyro distribution with a batch shape.
+
+1. A function builds the latent force model of one series from its parameters.
+2. Each series has a `MarginalLikelihood`. `jax.vmap` maps it over parameters, data and, where they differ, times.
+3. Inside ``numpyro.plate`` the panel is one site whose log density has one entry for each series.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro.distributions as dist
+from numpyro.distributions import constraints
+
+from lfm_ppl.filtering.arguments import as_rule
+from lfm_ppl.filtering.ep.settings import SiteSettings
+from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
+from lfm_ppl.inference.series_likelihood import SeriesLikelihood, repeat_draw
+from lfm_ppl.linearisation.rule import Rule
+from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.observations.family import ObservationFamily
+from lfm_ppl.model.state_space import check_times
+from lfm_ppl.utils import checks
+from lfm_ppl.utils.batching import mapped
+
+
+class Panel(dist.Distribution):
+    """Many independent series as one distribution with a batch shape; made by `panel`."""
+
+    support = constraints.real_matrix
+    pytree_data_fields = ("parameters", "times")
+    pytree_aux_fields = ("build", "settings")
+
+    def __init__(self, build: Callable[..., LatentForceModel], parameters: Any, times: Any, settings: dict[str, Any]):
+        leaves = jax.tree_util.tree_leaves(parameters)
+        if not leaves:
+            raise ValueError("parameters must hold at least one array with a leading axis for the series.")
+        sizes = {np.shape(leaf)[0] if np.ndim(leaf) else None for leaf in leaves}
+        if len(sizes) > 1 or None in sizes:
+            shapes = [np.shape(leaf) for leaf in leaves]
+            raise ValueError("every array in parameters needs the same leading axis, one entry a series; got "
+                             f"{shapes}. Repeat a shared parameter with jnp.broadcast_to, or close over it in build.")
+        self.build, self.parameters, self.times, self.settings = build, parameters, times, settings
+        (count,) = sizes
+        if self._has_series_times and np.shape(times)[0] != count:
+            raise ValueError(f"times has {np.shape(times)[0]} rows for {count} series; give one row a series, or one "
+                             "vector for all.")
+        concrete_times = checks.concrete(times)
+        if self._has_series_times and settings.get("max_step") is not None:
+            raise ValueError("max_step is not supported in a panel whose series have different times, because all "
+                             "series share one number of rows. Raise steps, or give all series one vector of times.")
+        for series, row in enumerate(concrete_times) if self._has_series_times and concrete_times is not None else ():
+            try:
+                check_times(row, None)
+            except ValueError as error:
+                raise ValueError(f"series {series}: {error}") from None
+        # Times that all series share stay concrete, because jumps of a force and longest steps depend on them.
+        example = jax.eval_shape(
+            lambda p, t: jnp.zeros(self._likelihood(p, t if self._has_series_times else times).event_shape),
+            jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], parameters), jnp.zeros(np.shape(times)[-1]))
+        if not self._has_series_times:
+            _ = self.first  # eager checks of concrete values
+        super().__init__((count,), example.shape, validate_args=False)
+
+    @property
+    def _has_series_times(self) -> bool:
+        return np.ndim(self.times) == 2
+
+    def _likelihood(self, parameters: Any, times: Any) -> SeriesLikelihood:
+        return MarginalLikelihood(self.build(parameters), times, **self.settings)
+
+    @property
+    def first(self) -> SeriesLikelihood:
+        """The distribution of the first series."""
+        return self.series(0)
+
+    def series(self, index: int) -> SeriesLikelihood:
+        """Return the distribution of one series."""
+        times = jnp.asarray(self.times, float)[index] if self._has_series_times else self.times
+        return self._likelihood(jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf)[index], self.parameters), times)
+
+    def with_times(self, times: Any) -> Panel:
+        """Return the same distribution with concrete times instead of traced ones."""
+        panel = copy.copy(self)
+        panel.times = times
+        return panel
+
+    def mapped(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Return ``function(distribution of a series, *its arguments)``, with the series as leading axis."""
+        times = jnp.asarray(self.times, float) if self._has_series_times else None
+        return mapped(
+            lambda p, t, *values: function(self._likelihood(p, self.times if t is None else t), *values),
+            jax.tree_util.tree_map(jnp.asarray, self.parameters), times, *arguments)
+
+    def log_prob_per_observation(self, value: Any) -> jax.Array:
+        """Return (B, T): the one-step-ahead log densities of each series."""
+        return self.mapped(lambda series, y: series.log_prob_per_observation(y), self.checked(value))
+
+    def log_prob(self, value: Any) -> jax.Array:
+        """Return (B,): the log marginal likelihood of each series; zero where a series is all missing."""
+        value = jnp.asarray(checks.unmask(value), float)
+        if value.ndim > 3:
+            return jax.vmap(self.log_prob)(value)
+        return self.mapped(lambda series, y: series.log_prob(y), self.checked(value))
+
+    def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
+        """Simulate every series: (*sample_shape, B, T, D)."""
+
+        def draw(key: jax.Array) -> jax.Array:
+            keys = jax.random.split(key, self.batch_shape[0])
+            return self.mapped(lambda series, key: series.sample(key), keys)
+
+        return repeat_draw(draw, key, sample_shape)
+
+    def checked(self, value: Any) -> jax.Array:
+        """Return ``value`` as an array (B, T, D) after checking it."""
+        value = checks.unmask(value)
+        expected = (*self.batch_shape, *self.event_shape)
+        if np.shape(value) != expected:
+            raise ValueError(f"y must have shape {expected} (series, times, outputs), got {np.shape(value)}; pad a "
+                             "shorter series with NaN.")
+        concrete = checks.concrete(value)
+        if concrete is not None and np.isinf(concrete).any():
+            raise ValueError("y has infinite entries; use NaN for a missing entry.")
+        if concrete is not None:
+            for index, rows in enumerate(concrete):
+                model = self.series(index).model if self._has_series_times else self.first.model
+                if not isinstance(model.observation, ObservationFamily):
+                    break
+                try:
+                    model.observation.check_data(rows, names=model.output_names)
+                except ValueError as error:
+                    raise ValueError(f"series {index}: {error}") from None
+        return jnp.asarray(value, float)
+
+
+def panel(build: Callable[..., LatentForceModel], parameters: Any, times: Any, rule: Rule | None = None,
+          steps: int = 10, max_step: float | None = None, iterations: int | None = None, damping: float = 0.7,
+          tolerance: float | None = None, sites: SiteSettings | str | None = None) -> Panel:
+    """Return many independent series as one distribution, for use inside ``numpyro.plate``.
+
+    Args:
+        build: maps the parameters of ONE series to its `LatentForceModel`; it may close over shared parameters.
+        parameters: pytree of arrays with a leading axis (B,), one entry a series.
+        times: (T,) for all, or (B, T); ragged series are padded: NaN in y, and times that repeat the last one.
+        rule: as in `MarginalLikelihood`, and so are the next six.
+        steps: integration steps between two consecutive times.
+        max_step: longest step.
+        iterations: of posterior linearisation; by default 3 for models that are not linear, see `MarginalLikelihood`.
+        damping: largest share of each new iterate that is taken; less where the iterates turn back.
+        tolerance: largest error of an integration step, in standard deviations; None for equal steps.
+        sites: of an observation family.
+
+    Returns:
+        A distribution with batch shape (B,) and event shape (T, D).
+
+    Raises:
+        ValueError: arrays without a common leading axis; a wrong number of rows of times.
+
+    Example:
+        >>> import jax.numpy as jnp, lfm_ppl as lfm
+        >>> def build(p):
+        ...     return lfm.LatentForceModel(
+        ...         lambda x, u, t: u - p["rate"] * x, {"u": lfm.Matern(1.0, 1.0)},
+        ...         lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        ...         lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
+        >>> lfm.panel(build, {"rate": jnp.array([0.5, 1.0])}, jnp.arange(3.0)).batch_shape
+        (2,)
+    """
+    settings = {"rule": as_rule(rule), "steps": steps, "max_step": max_step, "iterations": iterations,
+                "damping": damping, "tolerance": tolerance, "sites": sites}
+    return Panel(build, parameters, times, settings)

@@ -1,0 +1,195 @@
+"""The likelihood of one series of observations: what distributions with and without constraints share.
+
+1. The latent force model becomes a state-space model, its times a time grid (both computed when first used).
+2. `filter` and `smooth` run on that grid with the settings of the distribution.
+3. Subclasses define the log density and its samples: `MarginalLikelihood` and `ConstrainedLikelihood`.
+"""
+
+from __future__ import annotations
+
+import copy
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+from numpyro.distributions import constraints
+from numpyro.primitives import _PYRO_STACK
+
+from lfm_ppl.filtering.arguments import as_rule, check_observations, warn_single_precision
+from lfm_ppl.filtering.breakdown import warn_of_breakdown
+from lfm_ppl.filtering.ep.moment_matching import assumed_density_filter
+from lfm_ppl.filtering.ep.settings import SiteSettings
+from lfm_ppl.filtering.filter import FilterResult, filter_on
+from lfm_ppl.filtering.forward import forward
+from lfm_ppl.filtering.intervals import TimeGrid
+from lfm_ppl.filtering.iterated import posterior_linearisation
+from lfm_ppl.filtering.problem import FilterProblem, at_intervals, filter_problem, is_linear, is_observation_nonlinear
+from lfm_ppl.filtering.smoother import SmootherResult, smooth_on
+from lfm_ppl.filtering.time_grid import build_time_grid
+from lfm_ppl.filtering.update import GaussianUpdate
+from lfm_ppl.linearisation.rule import Rule
+from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.observations.family import ObservationFamily
+from lfm_ppl.model.state_space import StateSpaceModel, state_space
+from lfm_ppl.utils import checks
+from lfm_ppl.utils.gradients import finite_or_minus_infinity
+
+
+class SeriesLikelihood(dist.Distribution):
+    """Distribution of the observations of one series, with state and forces integrated out.
+
+    Args:
+        model: the latent force model; it may hold traced parameters.
+        times: (T,), non-decreasing.
+        rule: linearisation rule; `Cubature()` by default.
+        steps: integration steps between two consecutive times.
+    """
+
+    support = constraints.real_matrix
+    pytree_data_fields: tuple[str, ...] = ("model", "times")
+    pytree_aux_fields: tuple[str, ...] = ("rule", "steps")
+    max_step: float | None = None
+    iterations: int = 0
+    damping: float = 0.7
+    tolerance: float | None = None
+    sites: SiteSettings | None = None
+
+    def __init__(self, model: LatentForceModel, times: Any, rule: Rule | None, steps: int) -> None:
+        self.model, self.times, self.rule, self.steps = model, times, as_rule(rule), steps
+        model.check_at(self.time_grid.initial_time, np.shape(times)[0])
+        concrete_times = checks.concrete(times)
+        if concrete_times is not None:
+            model.check_span(float(concrete_times[0]), float(concrete_times[-1]))
+        warn_single_precision()
+        super().__init__((), (np.shape(times)[0], self.ssm.output_dim), validate_args=False)
+
+    # Both are functions of the fields above, and are computed again in a copy that JAX builds from other leaves.
+    @functools.cached_property
+    def ssm(self) -> StateSpaceModel:
+        """The state-space model."""
+        return state_space(self.model)
+
+    @functools.cached_property
+    def time_grid(self) -> TimeGrid:
+        """The time grid of the scan."""
+        return build_time_grid(self.ssm, self.times, self.steps, self.max_step, tolerance=self.tolerance)
+
+    @property
+    def problem(self) -> FilterProblem:
+        """The filter problem: model, rule and time grid, with what all intervals share."""
+        return filter_problem(self.ssm, self.rule, self.time_grid)
+
+    @property
+    def is_affine(self) -> bool:
+        """Whether dynamics and observation are affine in states and forces, with noise independent of them."""
+        return is_linear(self.ssm) and not is_observation_nonlinear(self.ssm)
+
+    @property
+    def is_family(self) -> bool:
+        """Whether the observation is a family such as `lfm_ppl.PoissonObservation`, and not Gaussian."""
+        return isinstance(self.model.observation, ObservationFamily)
+
+    @property
+    def has_sites(self) -> bool:
+        """Whether Gaussian sites approximate factors of the density."""
+        return self.is_family
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Arguments of `lfm_ppl.MarginalLikelihood` besides model and times."""
+        raise NotImplementedError
+
+    @property
+    def description(self) -> str:
+        """How the likelihood is computed: exact or by which approximation."""
+        raise NotImplementedError
+
+    @property
+    def site_settings(self) -> SiteSettings:
+        """Settings of the sites of an observation family."""
+        return SiteSettings()
+
+    @property
+    def sites_in_words(self) -> str:
+        """Approximation of an observation family; empty for a Gaussian observation."""
+        return ""
+
+    @property
+    def constraints_in_words(self) -> str:
+        """All constraints, and at how many times they hold; empty without constraints."""
+        return ""
+
+    def with_times(self, times: Any) -> SeriesLikelihood:
+        """Return the same distribution with concrete times instead of traced ones."""
+        likelihood = copy.copy(self)
+        likelihood.__dict__.pop("time_grid", None)
+        likelihood.times = times
+        return likelihood
+
+    def expand(self, batch_shape: tuple[int, ...]) -> dist.Distribution:
+        """Return independent series with the same parameters; in a ``numpyro.plate`` that is an error.
+
+        Raises:
+            ValueError: in a plate, where several series are an `lfm_ppl.panel`.
+        """
+        if tuple(batch_shape) and any(isinstance(handler, numpyro.plate) for handler in _PYRO_STACK):
+            raise ValueError("an lfm.MarginalLikelihood is the distribution of one series, and cannot be repeated to "
+                             f"the batch shape {tuple(batch_shape)} of a numpyro.plate. For several series take "
+                             "lfm.panel(build, parameters, times) in the plate, with a leading axis of its size in "
+                             "parameters; for one series put the site outside of the plate.")
+        return super().expand(batch_shape)
+
+    def filter(self, y: Any) -> FilterResult:
+        """Filter with this distribution's rule and steps; see `lfm_ppl.filter`. Constraints are ignored."""
+        y = self.checked(y)
+        return filter_on(self.ssm, self.rule, self.time_grid, y, jnp.asarray(self.times, float))
+
+    def smooth(self, y: Any, at: Any = None) -> SmootherResult:
+        """Smooth with this distribution's settings; see `lfm_ppl.smooth`. Constraints are ignored."""
+        grid = build_time_grid(self.ssm, self.times, self.steps, self.max_step, at, tolerance=self.tolerance)
+        y = self.checked(y)
+        return smooth_on(self.ssm, self.rule, grid, y, self.iterations, self.damping, self.site_settings)
+
+    def log_prob_per_observation(self, value: Any) -> jax.Array:
+        """Return (T,): log p(y_k | y_1:k-1) of the present entries of each observation.
+
+        Under constraints these are terms of the unconstrained model, which do not sum to `log_prob`.
+        """
+        y = self.checked(value)
+        log_likelihood = finite_or_minus_infinity(self._one_step_ahead, y)
+        warn_of_breakdown(self.ssm, self.rule, self.time_grid, y, None, log_likelihood, None, True)
+        return log_likelihood
+
+    def leave_one_out(self, y: jax.Array, smoothed: SmootherResult) -> jax.Array:
+        """Return (T,), log p(y_k | y_-k), given the result of `smooth`."""
+        return smoothed.leave_one_out
+
+    def convergence(self, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return whether the sites converge, and whether the log density is finite."""
+        raise NotImplementedError
+
+    def checked(self, y: Any) -> jax.Array:
+        """Return the observations (T, D) as an array after checking them."""
+        count, outputs = self.event_shape
+        return check_observations(y, count, outputs, model=self.model)
+
+    def _one_step_ahead(self, y: jax.Array) -> jax.Array:
+        problem, updater, points = self.problem, GaussianUpdate(y), None
+        if self.is_family:
+            return assumed_density_filter(problem, y).log_likelihood
+        if self.iterations:
+            points = posterior_linearisation(problem, updater, self.iterations, self.damping).points
+        return at_intervals(forward(problem, updater, about=points).log_likelihood, self.time_grid.observed)
+
+
+def repeat_draw(draw: Callable[[jax.Array], jax.Array], key: jax.Array, sample_shape: tuple[int, ...]) -> jax.Array:
+    """Return independent draws (*sample_shape, ...) of ``draw(key)``; one draw where the shape is empty."""
+    if not sample_shape:
+        return draw(key)
+    draws = jax.vmap(draw)(jax.random.split(key, int(np.prod(sample_shape))))
+    return draws.reshape(*sample_shape, *draws.shape[1:])
