@@ -23,16 +23,14 @@ import xarray as xr
 import lfm_ppl as lfm
 from lfm_ppl.cli import main
 from lfm_ppl.cli.interruption import watched
-from lfm_ppl.inference import progress, sampling
+from lfm_ppl.inference import sampling
 from lfm_ppl.inference.handlers.settings import approximate
 from lfm_ppl.inference.posterior import scores
-from lfm_ppl.inference.progress import ChainProgress
 from lfm_ppl.inference.samplers import SAMPLERS
-from lfm_ppl.inference.schedule import Schedule
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results import checkpoint as checkpoints
 from lfm_ppl.results.checkpoint import Checkpoint
-from lfm_ppl.utils.progress import waiting
+from lfm_ppl.utils.progress import Progress, waiting
 from tests.processes import ROOT
 
 TIMES = np.arange(4.0)
@@ -142,7 +140,7 @@ def test_a_stop_after_sampling_costs_no_draw(sampler, whole, tmp_path, monkeypat
     assert said == "all draws and their scores, without trajectories"
     assert "log_likelihood" in arviz_data.groups(partial) and "trajectories" not in arviz_data.groups(partial)
     xr.testing.assert_identical(arviz_data.group(partial, "posterior"), arviz_data.group(whole(sampler), "posterior"))
-    for module in ("fitting", "fit_starts", "inference.laplace_start"):  # nothing is searched or sampled again
+    for module in ("workflows.fit", "workflows.fit_starts", "inference.laplace_start"):  # nothing is searched or sampled again
         monkeypatch.setattr(f"lfm_ppl.{module}.mode_of", stop)
     assert_same(fit(sampler, checkpoint=tmp_path, resume=True), whole(sampler))
 
@@ -307,12 +305,12 @@ def test_a_check_goes_on_where_it_was_stopped(whole, tmp_path, monkeypatch):
         result, well, reference="particles", particles=20, draws=6, progress=False, **more).dataset
     expected = check()
 
-    def stopping(self, done, count):
-        if done >= 4:
+    def stopping(self, done):
+        if done >= 4 and self._label.startswith("particle filter"):
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(progress.Counter, "__call__", stopping)
+        patch.setattr(Progress, "advance", stopping)
         with pytest.raises(KeyboardInterrupt):
             check(checkpoint=tmp_path)
     assert {path.name for path in (tmp_path / "checkpoint").iterdir() if path.is_dir()} == {
@@ -333,32 +331,34 @@ def test_where_there_is_no_terminal_lines_say_how_far_it_is(capfd, monkeypatch):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         lfm.fit(well, TIMES, Y, sampler="nuts", **SIZES)
-    lines = [line for line in capfd.readouterr().err.splitlines() if line.startswith("sampling")]
-    assert lines[0].startswith("sampling 1 of 14 steps, 0 of 6 draws a chain, ")
-    assert lines[-1].startswith("sampling 14 of 14 steps, 6 of 6 draws a chain, ") and lines[-1].endswith(" left")
+    lines = [line for line in capfd.readouterr().err.splitlines()
+             if line.startswith("sampling: ") and "compiling" not in line]
+    assert lines[0].startswith("sampling: 1 of 14 steps, 0 of 6 draws a chain, ")
+    assert lines[-1].startswith("sampling: 14 of 14 steps, 6 of 6 draws a chain, ")
     assert any(line.endswith("left at the pace of the warm-up so far") for line in lines[:-1])
     assert "acceptance" in lines[-1] and "step size" in lines[-1]
 
 
-def test_the_time_left_is_that_at_the_pace_of_the_last_minute(capfd, monkeypatch):
+def test_the_time_left_is_that_at_the_pace_of_the_last_minute(monkeypatch):
     clock = [0.0]
     monkeypatch.setattr("time.perf_counter", lambda: clock[0])
     monkeypatch.setattr("lfm_ppl.utils.progress.EVERY_S", 0.0)
-    with ChainProgress(Schedule(100, 900), 0, is_shown=True) as display:
+    lines: list[str] = []
+    with Progress(lines.append, 1000, "steps", "sampling") as progress:
+        progress.compile("compiling")
         for done in range(1, 1001):
             clock[0] += 10.0 if done <= 100 else 1.0
-            display.advance(done, lambda: "words")
-    lines = capfd.readouterr().err.splitlines()
-    assert lines[0].endswith("words")  # the first step comes with the compilation, and says nothing of the pace
-    assert lines[99 - 1].endswith("; about 2.5 h left at the pace of the warm-up so far")  # 901 steps of 10 s
+            progress.advance(done, "words")
+    assert lines[0].endswith("words")  # the first step includes the compilation, which is not part of the pace
+    assert lines[99 - 1].endswith("; about 2.5 h left")  # 901 steps of 10 s
     assert lines[200 - 1].endswith("; about 13 min left")  # 800 steps of 1 s: the slow ones are forgotten
 
 
 def test_whoever_waits_for_a_long_warm_up_is_told_once_what_helps(capfd, monkeypatch):
     said = []
     for seconds, init in ((0.0, "median"), (1e9, "median"), (0.0, None)):
-        monkeypatch.setattr("lfm_ppl.inference.progress.SURE_S", 0.0)
-        monkeypatch.setattr("lfm_ppl.inference.progress.LONG_S", seconds)
+        monkeypatch.setattr("lfm_ppl.inference.sampling.SURE_S", 0.0)
+        monkeypatch.setattr("lfm_ppl.inference.sampling.LONG_S", seconds)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             lfm.fit(well, TIMES, Y, sampler="nuts", init=init, **SIZES)

@@ -25,9 +25,8 @@ def run(arguments: argparse.Namespace) -> int:
     if chosen is None:
         print(f"{listed('')}\n\n`lfm-ppl compare NAME` runs one; `--quick` shows in a few minutes that it runs.")
         return 0
-    from lfm_ppl.engine.progress import Console
     from lfm_ppl.results import tables, web_page
-    from lfm_ppl.utils.progress import duration
+    from lfm_ppl.utils.progress import Console, duration
 
     report = None if arguments.quiet else Console()
     workers, study = choices.workers(arguments.jobs, arguments.scheduler), chosen.study

@@ -26,9 +26,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Fit every data set that the folder does not hold yet; return 1 where some failed."""
     from lfm_ppl import fit_many
     from lfm_ppl.cli import fit
-    from lfm_ppl.engine.progress import Console
     from lfm_ppl.results import tables
-    from lfm_ppl.utils.progress import duration
+    from lfm_ppl.utils.progress import Console, duration
 
     workers = choices.workers(arguments.jobs, arguments.scheduler)
     session.start(1, not arguments.no_cache, one_thread=True)

@@ -10,12 +10,9 @@ from typing import Any, NamedTuple
 from lfm_ppl.engine import store
 from lfm_ppl.engine.cluster import Workers, check_workers, started
 from lfm_ppl.engine.errors import TasksFailedError
-from lfm_ppl.engine.progress import Console, Progress
 from lfm_ppl.engine.task import Result, Task, check_distinct
 from lfm_ppl.engine.worker import computed
-
-Reporter = Callable[[str], None] | Console
-"""What to do with a line of progress: `Console` draws a bar in a terminal."""
+from lfm_ppl.utils.progress import Progress, Reporter
 
 
 class Outcome(NamedTuple):
@@ -54,7 +51,7 @@ def run_tasks(tasks: Iterable[Task], compute: Callable[[Task], Mapping[str, Any]
             be pickled (by cloudpickle); a script that starts them needs ``if __name__ == "__main__":``.
         folder: of the files; made where it does not exist, and held by one run at a time. None: nothing is stored.
         overwrite: compute again what was stored with other settings, which is an error otherwise.
-        report: what to do with a line of progress, such as ``print`` or `Console`; None: nothing.
+        report: function of each line of progress, or a `lfm_ppl.utils.progress.Console`; None: nothing is shown.
         workers: what computes: 1, this process; more, so many others of this machine; ``"tcp://host:port"``, those of
             that scheduler of Dask; workers that were `started`. A task whose worker dies is given to another.
 
@@ -113,22 +110,24 @@ def outcomes(tasks: Iterable[Task], compute: Callable[[Task], Mapping[str, Any]]
         # All are looked at before any is computed: that one has other settings should be known now.
         found = {} if folder is None else {task.name: store.stored(task, folder, overwrite) for task in tasks}
         missing = [task for task in tasks if found.get(task.name) is None]
-        counts = len(tasks), len(tasks) - len(missing)
-        progress = report.begin(*counts) if isinstance(report, Console) else Progress(*counts, report)
-        stack.callback(progress.close)
+        done = len(tasks) - len(missing)
+        progress = stack.enter_context(Progress(report, len(tasks), "tasks", "computed", done))
+        if done:
+            progress.write(f"{done} of {len(tasks)} tasks are stored already")
         for task in tasks:
             if (result := found.pop(task.name, None)) is not None:
                 yield Outcome(task, result, stored=True)
         for task, new in _computed(stack, missing, compute, workers, alike, progress):
             if isinstance(new, Exception):
                 one = Outcome(task, None, new)
-                progress.say(f"failed: {task.name}: {one.reason}")
+                progress.write(f"failed: {task.name}: {one.reason}")
             elif folder is None:
                 one = Outcome(task, store.values(new))
             else:
                 store.write(task, new, folder, overwrite=True)
                 one = Outcome(task, store.read(task, folder))
-            progress.done(task.name)
+            done += 1
+            progress.advance(done, task.name)
             yield one
 
 
@@ -140,11 +139,11 @@ def _computed(stack: contextlib.ExitStack, tasks: list[Task], compute: Callable[
     cluster = stack.enter_context(started(workers, most=len(tasks)))
     if cluster is not None:
         if cluster.dashboard:
-            progress.say(f"dashboard {cluster.dashboard}")
-        progress.begin()
+            progress.write(f"dashboard {cluster.dashboard}")
+        progress.start()
         yield from cluster.computed(tasks, compute, alike)
         return
-    progress.begin()
+    progress.start()
     for task in tasks:
         try:
             new: Any = computed(compute, task)

@@ -61,7 +61,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from lfm_ppl.engine.cluster import Workers, started
-from lfm_ppl.engine.run import Reporter, run_tasks
+from lfm_ppl.engine.run import run_tasks
 from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.datasets import TaskKind
@@ -69,6 +69,7 @@ from lfm_ppl.results.files import writing
 from lfm_ppl.results.plots import style
 from lfm_ppl.results.tables import write_csv, write_markdown
 from lfm_ppl.utils import checks
+from lfm_ppl.utils.progress import Reporter
 
 Results = dict[str, Result]
 """Task name -> result."""

@@ -22,6 +22,7 @@ from lfm_ppl.inference.panel import Panel
 from lfm_ppl.inference.random_keys import split_keys
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.utils.batching import BATCH_SIZE, mapped, on_cpu, side_by_side, threads
+from lfm_ppl.utils.progress import Progress, Reporter
 
 _SEQUENTIAL_BATCH = 8
 """Draws in a batch of draws that go one after another."""
@@ -34,9 +35,6 @@ _LARGEST_BATCH_SIZE, _ACCELERATOR_FACTOR = 2_000_000, 25
 
 More draws go one batch after another. Trajectories of 512 draws took 76 ms in one batch on a GPU, 300 ms in nine.
 """
-
-Progress = Callable[[int, int], None]
-"""Called before each batch with the number of finished draws and the number of all draws."""
 
 
 class BatchStore(Protocol):
@@ -60,7 +58,8 @@ def map_series(distribution: SeriesLikelihood | Panel, function: Callable, *argu
 
 
 def map_draws(bound: BoundModel, name: Hashable, per_draw: Callable, draws: Mapping[str, Any], key: jax.Array, *,
-              rows: int | None = None, show: Progress | None = None, store: BatchStore | None = None) -> Any:
+              rows: int | None = None, label: str = "", report: Reporter | None = None,
+              store: BatchStore | None = None) -> Any:
     """Return ``per_draw(values, key, y)`` for all draws (S, ...).
 
     Args:
@@ -70,7 +69,8 @@ def map_draws(bound: BoundModel, name: Hashable, per_draw: Callable, draws: Mapp
         draws: site name -> (S, ...).
         key: a JAX random key.
         rows: rows of the scan over time, which decide the size of a batch; None: one draw after another.
-        show: progress.
+        label: name of the computation in lines of progress.
+        report: target of the progress.
         store: stores the batches.
     """
     draws = {site: np.asarray(value) for site, value in draws.items()}
@@ -101,14 +101,15 @@ def map_draws(bound: BoundModel, name: Hashable, per_draw: Callable, draws: Mapp
     if len(arguments) > 1 and parallel > 1:
         run = cast(Any, run).lower(*arguments[0]).compile()
     computed = side_by_side(lambda *batch: jax.tree.map(np.asarray, run(*batch)), arguments, parallel)
-    with contextlib.closing(computed) as new:
+    with contextlib.closing(computed) as new, Progress(report, count, "draws", label) as progress:
+        progress.start()
+        progress.compile(f"compiling, and the first of {count:,} draws")
         for start in starts:
-            if show is not None:
-                show(start, count)
             if start not in results:
                 results[start] = next(new)
                 if store is not None:
                     store.put(start, results[start])
+            progress.advance(min(start + batch, count))
     if store is not None:
         store.flush()
     return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *(results[start] for start in starts))

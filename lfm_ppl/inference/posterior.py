@@ -21,7 +21,7 @@ from lfm_ppl.filtering.smoother import SmootherResult
 from lfm_ppl.filtering.time_grid import LONGEST_FORECAST, build_time_grid
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.constrained_likelihood import ConstrainedLikelihood
-from lfm_ppl.inference.map_draws import BatchStore, Progress, map_draws, map_series
+from lfm_ppl.inference.map_draws import BatchStore, map_draws, map_series
 from lfm_ppl.inference.marginal_likelihood import SIMULATION_STEPS
 from lfm_ppl.inference.panel import Panel
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood
@@ -34,6 +34,7 @@ from lfm_ppl.particles.particle_filter import ParticleSettings
 from lfm_ppl.particles.particle_smoother import TRACING, draw_trajectories
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.linalg import semidefinite_root
+from lfm_ppl.utils.progress import Reporter
 
 _FILTERS = 4
 """Number of particle filters from which the path of one draw is chosen."""
@@ -46,13 +47,13 @@ _ADAPTIVE_FACTOR = 5
 
 
 def scores(bound: BoundModel, draws: Mapping[str, Any], *,
-           show: Progress | None = None, store: BatchStore | None = None) -> Any:
+           report: Reporter | None = None, store: BatchStore | None = None) -> Any:
     """Score the observations under each draw.
 
     Args:
         bound: the model and its data.
         draws: site name -> (S, ...).
-        show: as in `map_draws`.
+        report: as in `map_draws`.
         store: as in `map_draws`.
 
     Returns:
@@ -68,14 +69,14 @@ def scores(bound: BoundModel, draws: Mapping[str, Any], *,
     def per_draw(values: Any, key: jax.Array, y: Any) -> dict[str, jax.Array]:
         return map_series(bound.likelihood(values, y), score_series, bound.data(y))
 
-    return map_draws(bound, "scores", per_draw, draws, jax.random.key(0), rows=bound.times.size, show=show,
-                     store=store)
+    return map_draws(bound, "scores", per_draw, draws, jax.random.key(0), rows=bound.times.size, label="scores",
+                     report=report, store=store)
 
 
 def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at: Any,
                  particles: ParticleSettings | None = None, particle_steps: int | None = None, *,
                  log_likelihood: bool = False,
-                 show: Progress | None = None, store: BatchStore | None = None) -> Any:
+                 report: Reporter | None = None, store: BatchStore | None = None) -> Any:
     """Draw one trajectory for each draw of the parameters, given the data, and new data along it.
 
     Up to the last observation the path is a draw of the smoother. After it, non-linear dynamics are simulated: see
@@ -89,7 +90,7 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
         particles: settings of the particle smoother; None: the Gaussian smoother.
         particle_steps: integration steps of the particles between two observations; None: the model's.
         log_likelihood: whether to return that of the Gaussian filter, (S, ...), unless there are particles.
-        show: as in `map_draws`.
+        report: as in `map_draws`.
         store: as in `map_draws`.
 
     Returns:
@@ -183,7 +184,8 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
     rows = plan.rows
     width = 1 if particles is None else particles.particles
     name = ("trajectories", signature(at), particles, particle_steps, is_forecast, log_likelihood)
-    return map_draws(bound, name, per_draw, draws, key, rows=rows * width, show=show, store=store)
+    return map_draws(bound, name, per_draw, draws, key, rows=rows * width, label="trajectories", report=report,
+                     store=store)
 
 
 def _of_family(ssm: StateSpaceModel, key: jax.Array, w: jax.Array, when: jax.Array,

@@ -26,10 +26,10 @@ from numpyro.infer.util import ParamInfo
 
 from lfm_ppl.inference.bound_samplers import BoundSampler
 from lfm_ppl.inference.interruption import Interruption, was_interrupt
-from lfm_ppl.inference.progress import ChainProgress
 from lfm_ppl.inference.random_keys import split_keys
 from lfm_ppl.inference.schedule import Schedule
 from lfm_ppl.utils import checks
+from lfm_ppl.utils.progress import Console, Progress
 
 CHAIN_METHODS = ("parallel", "vectorized", "sequential")
 
@@ -38,6 +38,12 @@ BLOCK_S = 2.0
 
 _CHAIN_AXIS = PartitionSpec("chains")
 """Layout of arrays whose first axis is split over the devices, one chain on each."""
+
+SURE_S = 60.0
+"""Seconds of sampling before a warm-up counts as slow: the length of its first steps is not tuned yet."""
+
+LONG_S = 1200.0
+"""Remaining seconds from which on a slow warm-up prints advice."""
 
 _LARGEST_GROWTH = 8
 """Largest ratio of the lengths of two successive blocks: steps of the warm-up differ in cost."""
@@ -123,8 +129,10 @@ def run_chains(key: jax.Array, sampler: BoundSampler, starts: np.ndarray | None,
             arrays = jax.tree_util.tree_map(np.asarray, rows)
             store.save(Saved(done, _to_host(state), arrays), schedule.draws_after(done))
 
-    hint = sampler.slow_warmup_hint
-    with ChainProgress(schedule, saved.done, show_progress, hint) as display, Interruption() as interruption:
+    report = Console() if show_progress else None
+    with (Progress(report, total, "steps", "sampling", saved.done) as progress, Interruption() as interruption):
+        advice = _WarmupAdvice(sampler.slow_warmup_hint)
+        progress.compile("compiling the sampler, and its first step")
         try:
             while current[-1] < total and not interruption.requests:
                 state, rows, done = current
@@ -136,8 +144,13 @@ def run_chains(key: jax.Array, sampler: BoundSampler, starts: np.ndarray | None,
                 if store is not None and block_end < total and store.due():
                     save(*current)
                     stored_steps = block_end
-                display.advance(block_end, lambda: (  # noqa: B023 (called at once)
-                    _divergences(rows, schedule.draws_after(block_end)) + sampler.describe(state)))  # noqa: B023
+                if report is not None:
+                    draws, is_warmup = schedule.draws_after(block_end), block_end < schedule.warmup
+                    progress.advance(block_end, f"{draws:,} of {schedule.samples:,} draws a chain, "
+                                     + _divergences(rows, draws) + sampler.describe(state),
+                                     " at the pace of the warm-up so far" if is_warmup else "")
+                    if is_warmup:
+                        advice.write(progress)
         except (KeyboardInterrupt, Exception) as error:
             if interruption.requests > 1 or not was_interrupt(error):
                 raise
@@ -145,6 +158,26 @@ def run_chains(key: jax.Array, sampler: BoundSampler, starts: np.ndarray | None,
             save(*current)
     _, rows, done = current
     return _draws(jax.tree_util.tree_map(np.asarray, rows), schedule.draws_after(done), done, total)
+
+
+class _WarmupAdvice:
+    """Advice on a warm-up that takes long, written once.
+
+    Args:
+        text: the advice; empty: none.
+    """
+
+    def __init__(self, text: str) -> None:
+        self._text, self._start_time = text, time.perf_counter()
+
+    def write(self, progress: Progress) -> None:
+        """Write the advice if the pace is known and much time is left."""
+        seconds_left = progress.seconds_left()
+        if not self._text or seconds_left is None or seconds_left < LONG_S:
+            return
+        if time.perf_counter() - self._start_time > SURE_S:
+            progress.write(f"note     {self._text}")
+            self._text = ""
 
 
 class _BlockLength:

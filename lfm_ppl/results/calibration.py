@@ -14,13 +14,14 @@ import numpy as np
 from numpyro import handlers
 
 from lfm_ppl.engine.cluster import Workers
-from lfm_ppl.engine.run import Reporter, run_tasks
+from lfm_ppl.engine.run import run_tasks
 from lfm_ppl.engine.task import Task
 from lfm_ppl.inference.bound_model import bind
 from lfm_ppl.inference.likelihood_site import likelihood_site
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.results.files import writing
 from lfm_ppl.utils import checks
+from lfm_ppl.utils.progress import Reporter
 
 LOG_LIKELIHOOD = "log likelihood"
 METHODS = ("vectorized", "sequential")

@@ -17,13 +17,13 @@ from lfm_ppl.fokker_planck_grid import fokker_planck
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.map_draws import BatchStore, map_draws, map_series
 from lfm_ppl.inference.panel import Panel
-from lfm_ppl.inference.progress import Counter
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.model.observation_noise import check_noise
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.particles import particle_filter
 from lfm_ppl.particles.particle_filter import ParticleSettings
+from lfm_ppl.utils.progress import Console
 
 _PILOT = 8
 """Draws that the pilot run takes."""
@@ -255,11 +255,8 @@ def _particle_run(problem: PosteriorDraws, particles: int, replicates: int, step
 def _one_by_one(problem: PosteriorDraws, key: jax.Array, name: Hashable, per_draw: Callable, label: str,
                 progress: bool) -> np.ndarray:
     """Map over draws, one after another, and say how far that is."""
-    counter = Counter(label, is_shown=progress, at_once=True)
-    try:
-        return map_draws(problem.bound, name, per_draw, problem.draws, key, show=counter, store=problem.kept(label))
-    finally:
-        counter.close()
+    return map_draws(problem.bound, name, per_draw, problem.draws, key, label=label,
+                     report=Console() if progress else None, store=problem.kept(label))
 
 
 def _scouted(problem: PosteriorDraws) -> list[Any]:

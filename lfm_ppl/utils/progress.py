@@ -1,4 +1,10 @@
-"""How far a computation is, on standard error: a bar where a line can be redrawn, a line every 30 s elsewhere."""
+"""Progress of chains, draws and tasks: one display for all.
+
+1. A `Console` shows a bar of tqdm on a terminal or in a notebook. Elsewhere it gets a line every 30 s.
+2. While a program compiles, which cannot report its progress, the line is repeated with the time so far.
+3. The time left is extrapolated from the pace of the last minute, since the steps of a warm-up may cost much more or
+   less than later ones.
+"""
 
 from __future__ import annotations
 
@@ -6,83 +12,179 @@ import contextlib
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Iterator
 from typing import Any, TextIO
 
 from lfm_ppl.utils import checks
 
 EVERY_S = 30.0
-"""Between two lines, where no terminal redraws one."""
-
+"""Seconds between two lines, where no terminal redraws one."""
 
 _SHORTEST_S = 1.0
 """Least time between two lines of a thread, whatever `EVERY_S` is set to."""
 
-
-def on_terminal(file: TextIO | None = None) -> bool:
-    """Whether a line can be redrawn: on a terminal, or in a notebook."""
-    return (file or sys.stderr).isatty() or (file is None and "ipykernel" in sys.modules)
+_PACE_S = 60.0
+"""Seconds over which the pace is measured."""
 
 
-def bar(total: int, done: int, file: TextIO | None = None, **options: Any) -> Any:
-    """Return a bar of tqdm, ``done`` of ``total`` of which are there already."""
-    from tqdm.auto import tqdm
+class Console:
+    """Standard error as the target of a `Progress`.
 
-    return tqdm(total=total, initial=done, file=file or sys.stderr, **options)
+    Args:
+        file: another stream.
+    """
+
+    def __init__(self, file: TextIO | None = None) -> None:
+        self.file = file
+
+    def __call__(self, line: str) -> None:
+        """Write a line."""
+        print(line, file=self.file or sys.stderr, flush=True)
+
+    @property
+    def is_terminal(self) -> bool:
+        """Whether a line can be redrawn: on a terminal, or in a notebook."""
+        return (self.file or sys.stderr).isatty() or (self.file is None and "ipykernel" in sys.modules)
 
 
-class Clock:
-    """Says when the next line is due."""
+Reporter = Callable[[str], None] | Console
+"""Function that is called with each line of progress. A `Console` shows a bar on a terminal."""
 
-    def __init__(self, at_once: bool = False) -> None:
-        self._said = -float("inf") if at_once else time.perf_counter()
 
-    def due(self) -> bool:
-        """Whether `EVERY_S` have passed since it last was."""
-        current_time = time.perf_counter()
-        if current_time - self._said < EVERY_S:
+class Progress:
+    """Display of a number that grows to a total; a context manager.
+
+    Args:
+        report: target of the lines; None: nothing is shown.
+        total: number of steps, draws or tasks.
+        unit: plural of what is counted.
+        label: name of the computation.
+        done: number that an earlier run finished.
+    """
+
+    def __init__(self, report: Reporter | None, total: int, unit: str, label: str, done: int = 0) -> None:
+        self._report, self._total, self._unit, self._label, self._done = report, total, unit, label, done
+        self._records: deque[tuple[float, int]] = deque()
+        self._includes_compilation = False
+        self._last_line = -float("inf")
+        self._compilation: _RepeatedLine | None = None
+        self._bar: Any = None
+        if isinstance(report, Console) and report.is_terminal and done < total:
+            from tqdm.auto import tqdm
+
+            self._bar = tqdm(total=total, initial=done, desc=label, unit=f" {unit}", file=report.file or sys.stderr,
+                             dynamic_ncols=True)
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        if self._compilation is not None:
+            self._compilation.stop()
+        if self._bar is not None:
+            self._bar.close()
+
+    def start(self) -> None:
+        """Measure the pace from now."""
+        self._records.append((time.perf_counter(), self._done))
+        if self._bar is not None:
+            self._bar.unpause()
+
+    def compile(self, text: str) -> None:
+        """Show that a program is being compiled, until the next call of `advance`."""
+        self._includes_compilation = True
+        if self._bar is not None:
+            self._bar.set_postfix_str("compiling")
+        elif isinstance(self._report, Console):
+            self._compilation = _RepeatedLine(f"{self._label}: {text}", self._report)
+
+    def advance(self, done: int, text: str = "", qualifier: str = "") -> None:
+        """Show the number that is done.
+
+        Args:
+            done: the number.
+            text: state of the computation.
+            qualifier: added to the time left.
+        """
+        if self._compilation is not None:
+            self._compilation.stop()
+        self._records.append((time.perf_counter(), done))
+        while len(self._records) > 2 and self._records[1][0] <= self._records[-1][0] - _PACE_S:
+            self._records.popleft()
+        if self._bar is not None:
+            self._bar.set_postfix_str(text, refresh=False)
+            self._bar.update(done - self._done)
+        elif self._report is not None and (self._is_due() or done == self._total):
+            if self._includes_compilation and len(self._records) > 1:
+                qualifier = " at most"
+            self._report(f"{self._label}: {done:,} of {self._total:,} {self._unit}" + (f", {text}" if text else "")
+                         + self._time_left(qualifier))
+        if self._includes_compilation:
+            self._includes_compilation = False
+            self._records = deque([self._records[-1]])
+        self._done = done
+
+    def write(self, line: str) -> None:
+        """Write a line that is not about progress, such as a task that failed."""
+        if self._bar is not None:
+            self._bar.write(line, file=self._bar.fp)
+        elif self._report is not None:
+            self._report(line)
+
+    def seconds_left(self) -> float | None:
+        """Return the seconds left; None before two records."""
+        if len(self._records) < 2 or self._records[-1][1] <= self._records[0][1]:
+            return None
+        (first_time, first_done), (last_time, last_done) = self._records[0], self._records[-1]
+        return (last_time - first_time) / (last_done - first_done) * (self._total - last_done)
+
+    def _time_left(self, qualifier: str) -> str:
+        seconds = self.seconds_left()
+        return f"; about {duration(seconds)} left{qualifier}" if seconds else ""
+
+    def _is_due(self) -> bool:
+        clock_time = time.perf_counter()
+        if clock_time - self._last_line < EVERY_S:
             return False
-        self._said = current_time
+        self._last_line = clock_time
         return True
 
 
-class Waiting:
-    """Says every `EVERY_S`, until it is stopped, how long something has taken that tells nothing itself, a compilation.
+class _RepeatedLine:
+    """A line that is written again every `EVERY_S`, with the time so far, until it is stopped."""
 
-    Args:
-        text: what goes on.
-    """
+    def __init__(self, text: str, report: Reporter) -> None:
+        self._stopped, start_time = threading.Event(), time.perf_counter()
 
-    def __init__(self, text: str) -> None:
-        self._over, start_time = threading.Event(), time.perf_counter()
+        def repeat() -> None:
+            while not self._stopped.wait(max(EVERY_S, _SHORTEST_S)):
+                report(f"{text} ({duration(time.perf_counter() - start_time)} so far)")
 
-        def tell() -> None:
-            while not self._over.wait(max(EVERY_S, _SHORTEST_S)):
-                print(f"{text} ({duration(time.perf_counter() - start_time)} so far)", file=sys.stderr, flush=True)
-
-        threading.Thread(target=tell, daemon=True).start()
+        threading.Thread(target=repeat, daemon=True).start()
 
     def stop(self) -> None:
-        """Say nothing more."""
-        self._over.set()
+        """Write nothing more."""
+        self._stopped.set()
 
 
 @contextlib.contextmanager
 def waiting(text: str, is_shown: bool) -> Iterator[None]:
-    """Say what begins, and as long as it lasts that it goes on; nothing where that is not ``shown``."""
+    """Write a line, and repeat it with the time so far until the block ends."""
     if not is_shown:
         yield
         return
-    print(text, file=sys.stderr, flush=True)
-    display = Waiting(text)
+    console = Console()
+    console(text)
+    line = _RepeatedLine(text, console)
     try:
         yield
     finally:
-        display.stop()
+        line.stop()
 
 
 def duration(seconds: float) -> str:
-    """Return a length of time in the words of a person.
+    """Return a duration as text.
 
     Example:
         >>> [duration(s) for s in (0.4, 42.0, 400.0, 8000.0)]

@@ -20,11 +20,12 @@ import pandas as pd
 import xarray as xr
 
 from lfm_ppl.engine.cluster import Workers, check_workers
-from lfm_ppl.engine.run import Reporter, outcomes
+from lfm_ppl.engine.run import outcomes
 from lfm_ppl.engine.task import Task, check_distinct
 from lfm_ppl.results import arviz_data, tables
 from lfm_ppl.results.packing import unpack_result
 from lfm_ppl.utils import checks
+from lfm_ppl.utils.progress import Reporter
 from lfm_ppl.workflows.fit import fit
 from lfm_ppl.workflows.fit_tasks import FitDataSet, fit_task
 

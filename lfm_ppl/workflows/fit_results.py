@@ -26,7 +26,6 @@ import numpy as np
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.interruption import was_interrupt
 from lfm_ppl.inference.posterior import evenly_spaced, scores, trajectories
-from lfm_ppl.inference.progress import Counter
 from lfm_ppl.inference.samplers import GAUSSIAN_FILTER_SAMPLERS
 from lfm_ppl.inference.site_failures import failures_at, path_ess, site_failures
 from lfm_ppl.io.data import Data
@@ -38,6 +37,7 @@ from lfm_ppl.results.files import POSTERIOR
 from lfm_ppl.results.inputs import remember
 from lfm_ppl.results.layout import Labels, lay_out
 from lfm_ppl.utils import checks
+from lfm_ppl.utils.progress import Console
 from lfm_ppl.workflows.fit_options import FitOptions, versions
 
 ONLY_DRAWS = "all draws, without scores and trajectories"
@@ -128,10 +128,9 @@ def post_process(problem: FitProblem, draws: PosteriorDraws, store: Checkpoint |
         write_result(store, build_result(problem, draws, processed, store, ONLY_DRAWS))
     bound, options = problem.bound, problem.options
     values = {site: draws.values[site].reshape(-1, *draws.values[site].shape[2:]) for site in bound.sites}
-    counter = Counter(is_shown=show_progress)
 
     def batch_options(name: str) -> dict[str, Any]:
-        return {"show": counter.restart(name), "store": None if store is None else store.parts(name)}
+        return {"report": Console() if show_progress else None, "store": None if store is None else store.parts(name)}
 
     try:
         processed.scores = best_effort(
@@ -147,8 +146,6 @@ def post_process(problem: FitProblem, draws: PosteriorDraws, store: Checkpoint |
     except KeyboardInterrupt:
         processed.partial = (ONLY_DRAWS if processed.scores is None
                              else "all draws and their scores, without trajectories")
-    finally:
-        counter.close()
     return processed
 
 
@@ -187,7 +184,7 @@ def draw_paths(key: jax.Array, bound: BoundModel, values: Mapping[str, np.ndarra
         count: number of trajectories.
         particle_settings: of the particle smoother; None: the Gaussian smoother.
         particle_steps: integration steps of the particles.
-        **batch_options: ``show`` and ``store`` of `lfm_ppl.inference.posterior.trajectories`.
+        **batch_options: ``report`` and ``store`` of `lfm_ppl.inference.posterior.trajectories`.
 
     Returns:
         The chosen draws of each chain; their trajectories (C, S, ...), None if there are none; the times, None for the

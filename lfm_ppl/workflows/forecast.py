@@ -10,7 +10,6 @@ import numpy as np
 
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.posterior import evenly_spaced, noise_of_rows, trajectories
-from lfm_ppl.inference.progress import Counter
 from lfm_ppl.io.data import InputTable
 from lfm_ppl.model.inputs import Input
 from lfm_ppl.model.observations.family import ObservationFamily
@@ -19,6 +18,7 @@ from lfm_ppl.results import arviz_data, rebuilding
 from lfm_ppl.results import inputs as known_inputs
 from lfm_ppl.results.predictions import GROUP, HELD_OUT, predictions
 from lfm_ppl.utils import calendar_time, checks
+from lfm_ppl.utils.progress import Console
 
 
 def forecast(result: Any, numpyro_model: Callable, times: Any, *, inputs: Mapping[str, Any] | None = None,
@@ -105,14 +105,10 @@ def _forecast(result: Any, numpyro_model: Callable, times: np.ndarray, inputs: M
     settings = None
     if str(attrs.get("sampler", "")).startswith("pmmh") and "particles" in attrs:
         settings = ParticleSettings(int(attrs["particles"]))
-    counter = Counter("forecast", is_shown=progress, at_once=True)
     # That of an observation family, by its sites, depends on the times of the forecast in its last digits.
     has_log_likelihood = not isinstance(bound.site.example.ssm.model.observation, ObservationFamily)
-    try:
-        paths = trajectories(jax.random.key(seed), bound, problem.at(rows).draws, times, settings,
-                             log_likelihood=has_log_likelihood, show=counter)
-    finally:
-        counter.close()
+    paths = trajectories(jax.random.key(seed), bound, problem.at(rows).draws, times, settings,
+                         log_likelihood=has_log_likelihood, report=Console() if progress else None)
     split = {name: value.reshape(chains, len(draw_index), *value.shape[1:]) for name, value in paths.items()}
     if "log_likelihood" in split:
         total = split["log_likelihood"].reshape(chains, len(draw_index), -1).sum(axis=-1)

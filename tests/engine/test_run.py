@@ -13,14 +13,14 @@ import jax
 import numpy as np
 import pytest
 
-from lfm_ppl.engine import cluster, progress
+from lfm_ppl.engine import cluster
 from lfm_ppl.engine.cluster import Cluster, started
 from lfm_ppl.engine.errors import ClusterError, FolderInUseError, TasksFailedError
 from lfm_ppl.engine.run import outcomes, run_tasks
 from lfm_ppl.engine.store import read, write
 from lfm_ppl.engine.task import Task
 from lfm_ppl.engine.worker import return_memory
-from lfm_ppl.utils.progress import duration
+from lfm_ppl.utils.progress import Console, duration
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -78,7 +78,7 @@ def test_several_processes_find_the_same_numbers(tmp_path, workers):
     alone = run_tasks(tasks(), noise, tmp_path / "alone")
     lines = []
     same(alone, run_tasks(tasks(), noise, tmp_path / "together", workers=workers, report=lines.append))
-    assert lines[-1].startswith("4/4")
+    assert lines[-1].startswith("computed: 4 of 4 tasks")
     same(alone, run_tasks(tasks(), noise, None, workers=workers))
     with pytest.raises(ValueError, match="workers"):
         run_tasks(tasks(), noise, tmp_path, workers=0)
@@ -454,10 +454,10 @@ def test_progress_says_how_far_it_is(tmp_path):
     run_tasks(tasks(2), noise, tmp_path)
     run_tasks(tasks(3), noise, tmp_path, report=lines.append)
     assert lines[0] == "2 of 3 tasks are stored already"
-    assert lines[-1].startswith("3/3 noise/02")
+    assert lines[-1].startswith("computed: 3 of 3 tasks, noise/02")
     lines.clear()
     run_tasks(tasks(5), noise, None, report=lines.append)
-    assert [line.split()[0] for line in lines] == ["1/5", "5/5"] and lines[0].endswith("left")  # nothing for 30 s
+    assert [line.split()[1] for line in lines] == ["1", "5"] and lines[0].endswith("left")  # nothing for 30 s
 
 
 class Terminal(io.StringIO):
@@ -469,12 +469,12 @@ def test_a_terminal_has_a_bar_with_the_time_left(tmp_path):
     run_tasks(tasks(2), noise, tmp_path)
     screen, log = Terminal(), io.StringIO()
     with pytest.raises(TasksFailedError):
-        run_tasks(tasks(4), lambda task: {"x": object()}, tmp_path, report=progress.Console(screen))
+        run_tasks(tasks(4), lambda task: {"x": object()}, tmp_path, report=Console(screen))
     shown = screen.getvalue()
     assert "2 of 4 tasks are stored already" in shown and "failed: noise/02: ValueError" in shown
     assert "4/4" in shown and "noise/03" in shown and "<" in shown
-    run_tasks(tasks(4), noise, tmp_path, report=progress.Console(log))
-    assert log.getvalue().splitlines()[-1].startswith("4/4 noise/03")
+    run_tasks(tasks(4), noise, tmp_path, report=Console(log))
+    assert log.getvalue().splitlines()[-1].startswith("computed: 4 of 4 tasks, noise/03")
 
 
 def test_durations():

@@ -20,12 +20,12 @@ from typing import Any
 
 import numpy as np
 
-from lfm_ppl.engine.run import Reporter
 from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import chains, published, study
 from lfm_ppl.experiments.call_centre import counts, figures, learning, problem, tracking
 from lfm_ppl.experiments.datasets import Column, TaskKind, cell, number, row, select_prefix
 from lfm_ppl.experiments.study import Data, Study, StudyTable, setting
+from lfm_ppl.utils.progress import Reporter
 
 PUBLISHED = {
     "constant": {"SQM": (4.6, 2.2, -146, 22), "CQM": (4.4, 1.3, -142, 15), "WQM": (1.8, 0.2, -139, 20),

@@ -8,7 +8,6 @@ from typing import Any
 
 import xarray as xr
 
-from lfm_ppl.engine.run import Reporter
 from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import study
 from lfm_ppl.experiments.counts import figures, methods
@@ -16,6 +15,7 @@ from lfm_ppl.experiments.counts.problem import COAL, NAMES, ProblemSize, build_p
 from lfm_ppl.experiments.datasets import Column, TaskKind, row
 from lfm_ppl.experiments.scores import Estimate
 from lfm_ppl.experiments.study import Data, Results, Study, StudyTable, setting
+from lfm_ppl.utils.progress import Reporter
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,6 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from lfm_ppl.engine.run import Reporter
 from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments import chains, study
 from lfm_ppl.experiments.datasets import Column, TaskKind, cell, number, row, select_prefix
@@ -18,6 +17,7 @@ from lfm_ppl.experiments.home_heating import figures, prediction, problem
 from lfm_ppl.experiments.scores import Estimate, estimate_cells
 from lfm_ppl.experiments.study import Data, Study, StudyTable, setting
 from lfm_ppl.experiments.tasks import slug
+from lfm_ppl.utils.progress import Reporter
 
 PUBLISHED = {
     "SQM": {5: (0.67, 0.13, -116, 15), 6: (0.22, 0.02, 56, 15), 7: (1.00, 0.16, -190, 28), 8: (0.22, 0.02, 51, 14)},
