@@ -20,7 +20,7 @@ def face(sun, normal, area, specular, diffuse):
     return -PRESSURE * area * cosine * ((1 - specular) * sun + 2 * (diffuse / 3 + specular * cosine) * normal)
 
 
-def push(environment, r, t, own):
+def push(environment, r, t, body):
     """Acceleration (km/h^2) by light, on a body and on panels that nearly point to the Sun, and by a thrust."""
     # Areas are about those of a Galileo satellite, whose body is longer than wide.
     light = jnp.linalg.norm(environment.solar_pressure(r, t))  # of one nm/s^2, zero in the shadow
@@ -30,11 +30,11 @@ def push(environment, r, t, own):
     y = jnp.cross(down, sun)
     y = y / jnp.linalg.norm(y)
     x = jnp.cross(y, down)
-    panel = sun + own["tilt"] * y + own["lag"] * x
+    panel = sun + body["tilt"] * y + body["lag"] * x
     total = face(sun, panel / jnp.linalg.norm(panel), 10.8, 0.2, 0.05)
     for normal, area, specular in ((down, 3.0, 0.2), (-down, 3.0, 0.25), (x, 1.3, 0.3), (-x, 1.3, 0.3)):
-        total = total + face(sun, normal, area * own["body"], specular, 0.3)
-    return light * own["scale"] * total - orbits.NANO * own["thrust"] * down
+        total = total + face(sun, normal, area * body["body"], specular, 0.3)
+    return light * body["scale"] * total - orbits.NANO * body["thrust"] * down
 
 
 def constellation(letter, count, radius, inclination, seed=0):
@@ -44,15 +44,15 @@ def constellation(letter, count, radius, inclination, seed=0):
     h = 0.25 / STEPS
 
     @jax.jit
-    def path(start, own):
+    def path(start, body):
         def slope(x, t):
-            return jnp.concatenate([x[3:], environment.acceleration(x[:3], t) + push(environment, x[:3], t, own)])
+            return jnp.concatenate([x[3:], environment.acceleration(x[:3], t) + push(environment, x[:3], t, body)])
 
         def step(x, t):
-            def stage(carry, of):
+            def stage(carry, row):
                 last, total = carry
-                last = slope(x + of[0] * h * last, t + of[0] * h)
-                return (last, total + of[1] * last), None
+                last = slope(x + row[0] * h * last, t + row[0] * h)
+                return (last, total + row[1] * last), None
 
             (_, total), _ = jax.lax.scan(stage, (jnp.zeros(6), jnp.zeros(6)), RUNGE_KUTTA)
             return x + h * total, None
@@ -60,15 +60,15 @@ def constellation(letter, count, radius, inclination, seed=0):
         return jax.lax.scan(lambda x, t: (jax.lax.scan(step, x, t + h * jnp.arange(STEPS))[0], x[:3]), start,
                             jnp.asarray(times))[1]
 
-    found = {}
+    positions = {}
     for number in range(count):
         node, along = 2 * np.pi * (number % 3) / 3 + random.uniform(0, 0.1), random.uniform(0, 2 * np.pi)
         start = problem.circular(node, along, radius, inclination)
-        own = {"tilt": random.normal(0, 0.01), "lag": random.normal(0, 0.01), "body": random.uniform(0.8, 1.2),
+        body = {"tilt": random.normal(0, 0.01), "lag": random.normal(0, 0.01), "body": random.uniform(0.8, 1.2),
                "scale": random.uniform(0.95, 1.05), "thrust": random.uniform(0.8, 1.5)}
-        found[f"{letter}{number + 1:02d}"] = (np.asarray(path(jnp.asarray(start), own))
+        positions[f"{letter}{number + 1:02d}"] = (np.asarray(path(jnp.asarray(start), body))
                                               + NOISE * random.normal(size=(len(times), 3)))
-    return problem.Arcs(environment, times, found, None)
+    return problem.Arcs(environment, times, positions, None)
 
 
 def compute(task):
@@ -83,13 +83,13 @@ def test_days_of_other_constellations_are_predicted_within_a_tenth_of_the_determ
     data = constellation(letter, 6, radius, inclination)
     monkeypatch.setattr(problem, "arcs", lambda folder, seed=0: data)
     settings = experiment.GpsSettings(alternatives=0)
-    results = {task.name: compute(task) for task in experiment.plan(settings)}
-    for task in experiment.plan_predictions(settings, results):
+    results = {task.name: compute(task) for task in experiment.learning_tasks(settings)}
+    for task in experiment.prediction_tasks(settings, results):
         results[task.name] = compute(task)
         orbit = orbits.Orbit(0.0, np.array(task.settings["orbit"][:6]), *task.settings["orbit"][6:])
-        near = orbits.Neighbourhood.of(data.environment, orbit, data.times[:96])
-        assert float(near.period) == pytest.approx(period, abs=0.01)
-    found = experiment.STUDY.collect(settings, results)
-    each = experiment.satellites(found)
-    assert list(each.index) == list(data.positions) and "left out" not in found
-    assert (each["ratio"] < 0.1).all(), each[["deterministic", "LFM", "ratio"]].to_string()
+        neighbourhood = orbits.Neighbourhood.of(data.environment, orbit, data.times[:96])
+        assert float(neighbourhood.period) == pytest.approx(period, abs=0.01)
+    data_sets = experiment.STUDY.collect(settings, results)
+    table = experiment.satellite_table(data_sets)
+    assert list(table.index) == list(data.positions) and "left out" not in data_sets
+    assert (table["ratio"] < 0.1).all(), table[["deterministic", "LFM", "ratio"]].to_string()

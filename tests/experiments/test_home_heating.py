@@ -1,4 +1,4 @@
-"""Home heating as an experiment: its data, a little of every part, its tables and figures."""
+"""Home heating study: data, small runs of every part, tables and figures."""
 
 import dataclasses
 import os
@@ -25,12 +25,12 @@ def window():
 
 
 @pytest.mark.slow
-def test_a_simulated_home_is_under_its_thermostat(window):
+def test_simulated_home_follows_its_thermostat(window):
     assert window.y.shape == (120, 3) and window.fine.shape == (149, 3) and problem.FINE.shape == (149,)
     points = window.set_points[problem.FINE.astype(int)]
-    away = window.fine[:, 0] - points
+    difference = window.fine[:, 0] - points
     # Measurements have an error of 0.05 K.
-    assert (window.fine[away < -0.3, 2] == 1.0).all() and (window.fine[away > 0.3, 2] == 0.0).all()
+    assert (window.fine[difference < -0.3, 2] == 1.0).all() and (window.fine[difference > 0.3, 2] == 0.0).all()
     assert (window.set_points[:24] != window.set_points[96:]).any(), "the last day has other set points"
     np.testing.assert_array_equal(window.set_points[:24], window.set_points[72:96])
     shares = window.fine[5:, 2].reshape(-1, 6).mean(axis=1)
@@ -43,15 +43,15 @@ def test_the_real_house_has_29_windows():
     windows = problem.house(str(REAL))
     assert len(windows) == 29
     np.testing.assert_array_equal(windows[0].y[24:], windows[1].y[:96])
-    assert all(np.isfinite(one.y).all() and one.set_points is None for one in windows)
-    assert 0.5 < max(one.y[:, 2].max() for one in windows) < 2.0
+    assert all(np.isfinite(window.y).all() and window.set_points is None for window in windows)
+    assert 0.5 < max(window.y[:, 2].max() for window in windows) < 2.0
 
 
 @pytest.mark.parametrize(("text", "message"), [
     (",Ti,Ta\n2020-01-01 00:00,1,1\n", "no column 'Ph'"),
     (",Ti,Ta,Ph\n2020-01-01 00:00,1,1,1\n2020-01-01 02:00,1,1,1\n", "a row an hour"),
     (",Ti,Ta,Ph\n2020-01-01 00:00,1,1,1\n2020-01-01 01:00,1,1,1\n", "five whole days")])
-def test_files_that_cannot_be_used(tmp_path, text, message):
+def test_invalid_files(tmp_path, text, message):
     (tmp_path / problem.FILE).write_text(text)
     with pytest.raises(ValueError, match=message):
         problem.house(str(tmp_path))
@@ -71,23 +71,23 @@ def test_a_window_without_set_points_cannot_be_predicted_under_a_thermostat():
         prediction.thermostat_ahead(Model("SQM", "one store", 3), window, np.zeros(6), 10, jax.random.key(0))
 
 
-def test_what_is_hidden():
+def test_mask_of_the_fifth_day():
     y = np.ones((120, 3))
-    hidden = np.isnan(prediction.masked(y))
+    hidden = np.isnan(prediction.mask_fifth_day(y))
     assert hidden[96:, 0].all() and hidden.sum() == 24
-    some = np.isnan(prediction.masked(y, tracked=True))[:, 0]
-    assert (np.flatnonzero(~some[96:]) == [3, 6, 9, 12, 15, 18, 21]).all() and not some[:96].any()
-    assert np.isnan(prediction.masked(y, weather=False))[96:, :2].all()
+    is_hidden = np.isnan(prediction.mask_fifth_day(y, tracked=True))[:, 0]
+    assert (np.flatnonzero(~is_hidden[96:]) == [3, 6, 9, 12, 15, 18, 21]).all() and not is_hidden[:96].any()
+    assert np.isnan(prediction.mask_fifth_day(y, weather=False))[96:, :2].all()
 
 
 def test_gaussian_scores_against_scipy():
     generator = np.random.default_rng(0)
     mean, sd, truth = generator.normal(size=24), generator.uniform(0.5, 2.0, 24), generator.normal(size=24)
-    found = prediction.gaussian_scores(mean, sd**2, truth)
+    result = prediction.gaussian_scores(mean, sd**2, truth)
     low, high = stats.norm(mean, sd).interval(0.95)
-    assert found["ell"] == pytest.approx(stats.norm(mean, sd).logpdf(truth).sum())
-    assert found["rmse"] == pytest.approx(np.sqrt(np.mean((mean - truth) ** 2)))
-    assert found["inside"] == np.mean((low <= truth) & (truth <= high))
+    assert result["ell"] == pytest.approx(stats.norm(mean, sd).logpdf(truth).sum())
+    assert result["rmse"] == pytest.approx(np.sqrt(np.mean((mean - truth) ** 2)))
+    assert result["inside"] == np.mean((low <= truth) & (truth <= high))
 
 
 @pytest.mark.slow
@@ -108,103 +108,103 @@ def test_the_most_likely_parameters(window):
 def test_both_predictions(window):
     model = Model("none", "one store", 3)
     z, _ = prediction.most_likely(model, window)
-    known = prediction.known_heater(model, window, z)
-    assert known["ahead_rmse"] < 1.5 and known["mean"].shape == (24,)
-    found, whole = prediction.thermostat_ahead(model, window, z, 200, jax.random.key(0))
-    assert found["rmse"] < 1.5 and found["mean"].shape == found["on"].shape == (144,)
+    tracked = prediction.known_heater(model, window, z)
+    assert tracked["ahead_rmse"] < 1.5 and tracked["mean"].shape == (24,)
+    result, forecast = prediction.thermostat_ahead(model, window, z, 200, jax.random.key(0))
+    assert result["rmse"] < 1.5 and result["mean"].shape == result["on"].shape == (144,)
     truth = window.fine[prediction.SCORED, 0]
-    density = whole.observed.log_density(window.fine[:, :2])[prediction.SCORED, 0]
-    assert found["ell"] == pytest.approx(float(density.sum()))
-    assert found["rmse"] == pytest.approx(scores.rmse(found["mean"], truth))
-    assert ((found["on"] >= 0) & (found["on"] <= 1 + 1e-12)).all()
+    density = forecast.observed.log_density(window.fine[:, :2])[prediction.SCORED, 0]
+    assert result["ell"] == pytest.approx(float(density.sum()))
+    assert result["rmse"] == pytest.approx(scores.rmse(result["mean"], truth))
+    assert ((result["on"] >= 0) & (result["on"] <= 1 + 1e-12)).all()
 
 
-def made_up(settings):
+def synthetic_results(settings):
     """Results of every task."""
     generator, results = np.random.default_rng(0), {}
     for index, task in enumerate(experiment.tasks(settings)):
-        what = task.name.split("/")[0]
-        if what == "homes":
+        kind = task.name.split("/")[0]
+        if kind == "homes":
             rmse = 0.5 + 0.1 * index + 0.01 * np.arange(settings.homes)
-            found = {"rmse": rmse, "ell": -100 * rmse, "inside": np.full(settings.homes, 0.9),
+            result = {"rmse": rmse, "ell": -100 * rmse, "inside": np.full(settings.homes, 0.9),
                      "mean": np.full((settings.homes, 144), 18.0), "on": generator.uniform(size=(settings.homes, 144)),
                      "quantiles": 18.0 + np.linspace(-1, 1, 5)[:, None] * np.ones(144)}
-        elif what == "house":
+        elif kind == "house":
             count = task.settings["windows"]
             rmse = 0.3 + 0.1 * index + 0.01 * np.arange(count)
-            found = {f"{kind}_{name}": value for kind in ("ahead", "track", "blind")
+            result = {f"{prediction_kind}_{name}": value for prediction_kind in ("ahead", "track", "blind")
                      for name, value in (("rmse", rmse), ("ell", -20 * rmse), ("inside", np.full(count, 0.95)))}
-            found |= {"mean": np.full((count, 24), 19.0), "sd": np.ones((count, 24)),
+            result |= {"mean": np.full((count, 24), 19.0), "sd": np.ones((count, 24)),
                       "residual": generator.normal(size=120), "residual_sd": np.ones(120)}
         else:
-            found = {"ell": np.array([-4.0, -8.0]), "point_ell": np.array([-5.0, -11.0]), "rmse": np.ones(2),
+            result = {"ell": np.array([-4.0, -8.0]), "point_ell": np.array([-5.0, -11.0]), "rmse": np.ones(2),
                      "point_rmse": np.ones(2), "r_hat": np.full(2, 1.01), "ess": np.full(2, 300.0),
                      "mean": np.full((2, 6), 0.1 if task.settings["sampler"] == "NUTS" else 0.0),
                      "sd": np.full((2, 6), 0.5), "divergences": np.ones(2), "seconds": np.full(2, 7.0)}
-        results[task.name] = {**found, "cpu_s": 2.0}
+        results[task.name] = {**result, "cpu_s": 2.0}
     return results
 
 
 def test_tables_of_simulated_homes(window):
-    data = experiment.STUDY.collect(SMALL, made_up(SMALL))
-    found = experiment.tables(SMALL, data)
-    assert [name for name, table in found.items() if table.stored] == ["homes-one-store"]
-    table = found["homes-one-store"].frame
+    data = experiment.STUDY.collect(SMALL, synthetic_results(SMALL))
+    tables = experiment.tables(SMALL, data)
+    assert [name for name, table in tables.items() if table.stored] == ["homes-one-store"]
+    table = tables["homes-one-store"].frame
     assert list(table.index) == ["SQM", "none", "matern"]
     assert table.loc["SQM", "RMSE ahead (K)"] == pytest.approx(0.505)
     assert table.loc["SQM", "published RMSE ahead (K)"] == 1.0
     assert table.loc["SQM", "RMSE below none (K)"] == pytest.approx(0.1)
     assert table.loc["SQM", "ELL above matern"] == pytest.approx(20.0)
-    drawn = figures.draw(SMALL, data)
-    assert set(drawn) == {"homes-ahead", "scores"}
-    assert "means over 2 homes" in found["homes-one-store"].title
+    all_figures = figures.draw(SMALL, data)
+    assert set(all_figures) == {"homes-ahead", "scores"}
+    assert "means over 2 homes" in tables["homes-one-store"].title
 
 
 @pytest.mark.skipif(REAL is None, reason="needs ../shared/data/house")
 def test_tables_and_figures_with_the_real_house(window, tmp_path):
     settings = experiment.HomeHeatingSettings(data=str(REAL), homes=2, windows=3, methods=SMALL.methods, every=2)
-    found = experiment.STUDY.tabulate(settings, made_up(settings))
-    assert list(found.tables) == ["house-one-store", "homes-one-store", "posterior", "house-envelope",
+    results = experiment.STUDY.tabulate(settings, synthetic_results(settings))
+    assert list(results.tables) == ["house-one-store", "homes-one-store", "posterior", "house-envelope",
                                   "homes-envelope"]
-    integrated = found.tables["posterior"].loc["integrated out by NUTS"]
+    integrated = results.tables["posterior"].loc["integrated out by NUTS"]
     assert integrated["gain in ELL"] == pytest.approx(2.0) and integrated["divergences"] == 2
     assert integrated["means from RAM (sd)"] == pytest.approx(0.2)
-    one, envelope = found.tables["house-one-store"], found.tables["house-envelope"]
-    assert one.loc["none", "published ELL tracked"] == 31 and envelope.loc["SQM", "published RMSE ahead (K)"] == 0.22
+    table, envelope = results.tables["house-one-store"], results.tables["house-envelope"]
+    assert table.loc["none", "published ELL tracked"] == 31 and envelope.loc["SQM", "published RMSE ahead (K)"] == 0.22
     assert np.isnan(envelope.loc["matern", "published RMSE ahead (K)"])
-    assert scores.readable(one).loc["none", "RMSE below none (K)"] == "0"
+    assert scores.readable(table).loc["none", "RMSE below none (K)"] == "0"
     swapped = dataclasses.replace(settings, stores=("envelope", "one store"))
-    again = experiment.STUDY.tabulate(swapped, made_up(swapped)).tables["house-one-store"]
-    assert again.loc["none", "published ELL tracked"] == 31
-    written = {path.name for path in experiment.STUDY.save(found, tmp_path)}
+    swapped_table = experiment.STUDY.tabulate(swapped, synthetic_results(swapped)).tables["house-one-store"]
+    assert swapped_table.loc["none", "published ELL tracked"] == 31
+    written = {path.name for path in experiment.STUDY.save(results, tmp_path)}
     assert {"house-ahead.png", "homes-ahead.png", "residual.png", "scores.png", "house-envelope.md"} <= written
-    assert "2 windows" in found.study_tables["posterior"].title
-    assert "3 windows" in found.study_tables["house-envelope"].title
+    assert "2 windows" in results.study_tables["posterior"].title
+    assert "3 windows" in results.study_tables["house-envelope"].title
 
 
-@pytest.mark.parametrize("given", [{"homes": 0}, {"windows": 0}, {"methods": ("ARX",)}, {"stores": ("two",)},
+@pytest.mark.parametrize("values", [{"homes": 0}, {"windows": 0}, {"methods": ("ARX",)}, {"stores": ("two",)},
                                    {"integrated": "WQM", "methods": ("SQM",)}])
-def test_bad_settings(given):
+def test_bad_settings(values):
     with pytest.raises(ValueError):
-        experiment.HomeHeatingSettings(**given)
+        experiment.HomeHeatingSettings(**values)
 
 
 def test_a_residual_that_is_not_in_the_published_figure_is_drawn():
     settings = dataclasses.replace(SMALL, methods=("WQM",), integrated="WQM")
-    data = experiment.STUDY.collect(settings, made_up(settings))
+    data = experiment.STUDY.collect(settings, synthetic_results(settings))
     assert set(figures.draw(settings, data)) == {"homes-ahead", "scores"}
 
 
 @pytest.mark.slow
-def test_the_quick_version_runs_and_goes_on(tmp_path):
+def test_quick_version_resumes(tmp_path):
     settings = experiment.HomeHeatingSettings.quick(
         data=None if REAL is None else str(REAL), methods=("SQM", "none"), homes=1)
     first = experiment.STUDY.run(settings, tmp_path)
     lines: list[str] = []
-    again = experiment.STUDY.run(settings, tmp_path, report=lines.append)
+    resumed = experiment.STUDY.run(settings, tmp_path, report=lines.append)
     assert "stored already" in lines[0]
     for name, table in first.tables.items():
-        assert table.equals(again.tables[name])
+        assert table.equals(resumed.tables[name])
     assert os.listdir(tmp_path / "tasks") and Path(tmp_path).is_dir()
 
 

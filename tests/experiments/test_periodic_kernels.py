@@ -1,4 +1,4 @@
-"""Periodic kernels as an experiment: a little of every part, tables and figures, and what they must satisfy."""
+"""Periodic kernels study: a small run, its tables and figures, and properties of the approximations."""
 
 import numpy as np
 import pytest
@@ -11,31 +11,31 @@ SMALL = experiment.PeriodicKernelSettings(runs=20, functions=(5, 22), draws=20, 
 
 
 @pytest.fixture(scope="module")
-def found(tmp_path_factory):
+def results(tmp_path_factory):
     return experiment.STUDY.run(SMALL, tmp_path_factory.mktemp("kernels"))
 
 
 @pytest.mark.slow
-def test_the_published_comparison(found):
+def test_the_published_comparison(results):
     """Below 1e-4 with 22 eigenfunctions, above 0.1 with random frequencies, and not with 20 points."""
-    error = found.tables["published"]["error"]
+    error = results.tables["published"]["error"]
     assert error["22 eigenfunctions, 200 points"] < 1e-4 and error["20 eigenfunctions, 20 points"] > 5e-3
     assert error[methods.SPARSE] > error[methods.SPARSE_4] > 0.1
 
 
 @pytest.mark.slow
-def test_the_order_of_the_published_table_holds(found):
-    rmse, density = found.tables["regression"]["RMSE"], found.tables["regression"]["log likelihood"]
+def test_the_order_of_the_published_table_holds(results):
+    rmse, density = results.tables["regression"]["RMSE"], results.tables["regression"]["log likelihood"]
     assert rmse[methods.SPARSE] > rmse[methods.SPARSE_4] > rmse[methods.KPCA]
     assert density[methods.SPARSE] < density[methods.SPARSE_4] < density[methods.KPCA]
     assert rmse[methods.KPCA] == pytest.approx(rmse[methods.EXACT], rel=1e-2)
-    coverage = found.tables["regression"].loc[methods.EXACT]
+    coverage = results.tables["regression"].loc[methods.EXACT]
     assert abs(coverage["coverage"] - 0.95) < 4 * coverage["coverage se"]
 
 
 @pytest.mark.slow
-def test_errors_fall_with_the_number_of_functions(found):
-    table = found.tables["covariance"]
+def test_errors_fall_with_the_number_of_functions(results):
+    table = results.tables["covariance"]
     for row in table.index[table.index.str.endswith("eigenfunctions")]:
         assert table.loc[row, "22"] < table.loc[row, "5"]
         name = row.removesuffix(", eigenfunctions")
@@ -49,9 +49,9 @@ def test_errors_fall_with_the_number_of_functions(found):
 def test_prediction_is_conditioning():
     """Against the conditional of one joint normal, by its precision matrix."""
     task = Task("x", 0, {})
-    prior = methods.covariances(task, methods.EXACT, 0)
+    prior = methods.prior_covariances(task, methods.EXACT, 0)
     data = np.cos(np.arange(len(problem.MEASURED)))
-    mean, variance = methods.predict(prior, data)
+    mean, variance = methods.condition(prior, data)
     times = np.append(problem.MEASURED, problem.PREDICTED[40])
     joint = np.exp(-0.5 * ((times[:, None] - times) / 10.0) ** 2) + 1e-8 * np.eye(len(times))
     precision = np.linalg.inv(joint)
@@ -68,14 +68,14 @@ def test_settings_are_checked():
 
 
 @pytest.mark.slow
-def test_files_and_figures(found, tmp_path):
-    written = {path.name for path in experiment.STUDY.save(found, tmp_path)}
+def test_files_and_figures(results, tmp_path):
+    written = {path.name for path in experiment.STUDY.save(results, tmp_path)}
     expected = {f"{name}.{kind}" for name in ("covariance", "published", "regression") for kind in ("csv", "md")}
     assert written == expected | {f"{name}.png" for name in
                                   ("errors", "covariances", "eigenfunctions", "draws", "prediction")}
-    assert len(figures.plot_errors(SMALL, found.data).axes) == len(problem.kernels())
+    assert len(figures.plot_errors(SMALL, results.data).axes) == len(problem.kernels())
 
 
-def test_it_is_in_the_catalogue():
+def test_catalogue_has_the_study():
     assert catalogue.experiment("periodic_kernels").name == "periodic-kernels"
     assert [task.settings["what"] for task in experiment.all_tasks(SMALL)].count("covariance") == 6

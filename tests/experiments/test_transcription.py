@@ -1,4 +1,4 @@
-"""The experiment of the transcription factors: its data, its methods on a few of them, its tables and figures."""
+"""Transcription study: data, methods on small examples, tables and figures."""
 
 import dataclasses
 
@@ -24,7 +24,7 @@ FEW = experiment.TranscriptionSettings(datasets=12, draws=400, burn_in=40)
 
 
 def test_the_configurations_are_those_of_the_source_and_softplus():
-    assert [one.label for one in problem.CONFIGURATIONS] == [*problem.PUBLISHED, "softplus"]
+    assert [configuration.label for configuration in problem.CONFIGURATIONS] == [*problem.PUBLISHED, "softplus"]
 
 
 def test_the_data_solve_the_equation():
@@ -37,12 +37,12 @@ def test_the_data_solve_the_equation():
         active = 1 / (1 + 0.5 * np.exp(-np.interp(t, problem.GRID, data.u)))
         return data.rates.basal + data.rates.sensitivity * active - data.rates.decay * x
 
-    found = solve_ivp(slope, (0.0, problem.END), data.rates.start, t_eval=problem.TIMES, rtol=1e-8, max_step=0.05)
-    at = np.searchsorted(data.fine, problem.TIMES - 1e-9)
-    assert np.allclose(data.fine[at], problem.TIMES)
+    solution = solve_ivp(slope, (0.0, problem.END), data.rates.start, t_eval=problem.TIMES, rtol=1e-8, max_step=0.05)
+    indices = np.searchsorted(data.fine, problem.TIMES - 1e-9)
+    assert np.allclose(data.fine[indices], problem.TIMES)
     # The force between the points of the grid is rougher than the line through them.
-    assert np.allclose(found.y.T, data.state[at], atol=5e-3)
-    noise = np.concatenate([(problem.data_set(SATURATION, index).y - problem.data_set(SATURATION, index).state[at])
+    assert np.allclose(solution.y.T, data.state[indices], atol=5e-3)
+    noise = np.concatenate([(problem.data_set(SATURATION, index).y - problem.data_set(SATURATION, index).state[indices])
                             for index in range(20)]) / problem.NOISE
     assert abs(noise.mean()) < 4 / np.sqrt(noise.size) and abs(noise.std() - 1) < 4 / np.sqrt(2 * noise.size)
 
@@ -67,15 +67,15 @@ def test_every_method_finds_the_force(method):
                 "last": 1}
     if method == "ESLS":
         settings |= {"draws": 4000, "burn_in": 400}
-    found = experiment.compute(Task(f"saturation/{problem.slug(method)}", 0, settings))
-    assert found["mean"].shape == found["sd"].shape == (2, problem.POINTS)
-    assert (found["sd"] > 0).all() and (found["seconds"] > 0).all()
+    result = experiment.compute(Task(f"saturation/{problem.slug(method)}", 0, settings))
+    assert result["mean"].shape == result["sd"].shape == (2, problem.POINTS)
+    assert (result["sd"] > 0).all() and (result["seconds"] > 0).all()
     if method == "LA":  # Newton's method is known to fail, and then to say so
-        assert (found["diverged"] | found["stopped"]).all() and np.isfinite(found["rmse"]).all()
+        assert (result["diverged"] | result["stopped"]).all() and np.isfinite(result["rmse"]).all()
         return
-    assert not found["diverged"].any() and (found["rmse"] < 0.9).all()
+    assert not result["diverged"].any() and (result["rmse"] < 0.9).all()
     if method == "ESLS":
-        assert (found["draws"] >= 4000).all() and (found["low"] < found["mean"]).all()
+        assert (result["draws"] >= 4000).all() and (result["low"] < result["mean"]).all()
 
 
 def linear():
@@ -90,36 +90,37 @@ def test_the_gaussian_of_the_ellipses_is_the_posterior_of_a_linear_link():
     data, latent = linear()
     exact = laplace(latent, data.y)
     draws = jax.vmap(latent.force)(jax.random.normal(jax.random.key(0), (50, 1, problem.POINTS)))[:, 0]
-    found = slices.resembling(latent, data.y, draws)
-    assert np.allclose(found.mean, exact.mode[0], atol=1e-7)
-    own = slices.ellipses(latent, data.y, found)
-    some = jax.vmap(own.draw)(jax.random.split(jax.random.key(1), 4000))
-    assert np.all(np.abs(np.asarray(some.force).std(axis=0) / exact.sd[0] - 1) < 5 / np.sqrt(2 * 4000))
-    assert np.abs(some.force.mean(axis=0) - exact.mode[0]).max() < 4.5 * float(jnp.max(exact.sd)) / np.sqrt(4000)
-    assert np.ptp(jax.vmap(own.log_ratio)(some)) < 1e-6
-    assert np.allclose(own.point(some.force[0]).linear, some.linear[0]) and np.allclose(own.mean.force, found.mean)
+    gaussian = slices.linearize_posterior(latent, data.y, draws)
+    assert np.allclose(gaussian.mean, exact.mode[0], atol=1e-7)
+    ellipses = slices.ellipses(latent, data.y, gaussian)
+    points = jax.vmap(ellipses.draw)(jax.random.split(jax.random.key(1), 4000))
+    assert np.all(np.abs(np.asarray(points.force).std(axis=0) / exact.sd[0] - 1) < 5 / np.sqrt(2 * 4000))
+    assert np.abs(points.force.mean(axis=0) - exact.mode[0]).max() < 4.5 * float(jnp.max(exact.sd)) / np.sqrt(4000)
+    assert np.ptp(jax.vmap(ellipses.log_ratio)(points)) < 1e-6
+    assert np.allclose(ellipses.point(points.force[0]).linear, points.linear[0])
+    assert np.allclose(ellipses.mean.force, gaussian.mean)
 
 
 @pytest.mark.slow
-def test_chains_that_have_not_mixed_go_on_and_mix():
+def test_unmixed_chains_continue_until_they_mix():
     """A data set on which ellipses of the prior hardly move."""
     data = [problem.data_set(EXPONENTIAL, 2)]
-    given = {"link": "exponential", "gamma": None, "draws": 30_000, "burn_in": 2_500}
-    found = slices.compute(given, data, jax.random.split(jax.random.key(0), 1))
-    assert found["draws"][0] >= 60_000 and found["r_hat_first"][0] > 1.05
-    assert found["r_hat"][0] <= 1.01 and found["ess"][0] > 400  # 100 for each chain, as ArviZ asks
-    assert (found["seconds"] > 0).all() and (found["seconds_more"] > 0).all()
+    settings = {"link": "exponential", "gamma": None, "draws": 30_000, "burn_in": 2_500}
+    result = slices.compute(settings, data, jax.random.split(jax.random.key(0), 1))
+    assert result["draws"][0] >= 60_000 and result["r_hat_first"][0] > 1.05
+    assert result["r_hat"][0] <= 1.01 and result["ess"][0] > 400  # 100 for each chain, as ArviZ asks
+    assert (result["seconds"] > 0).all() and (result["seconds_more"] > 0).all()
 
 
 @pytest.mark.slow
 def test_both_kinds_of_ellipses_have_the_same_posterior(monkeypatch):
     """On a non-linear link on which chains on ellipses of the prior mix."""
     data = [problem.data_set(SATURATION, 2)]
-    given = {"link": "saturation", "gamma": 0.5, "draws": 100_000, "burn_in": 5_000}
-    first = slices.compute(given, data, jax.random.split(jax.random.key(0), 1))
+    settings = {"link": "saturation", "gamma": 0.5, "draws": 100_000, "burn_in": 5_000}
+    first = slices.compute(settings, data, jax.random.split(jax.random.key(0), 1))
     monkeypatch.setattr(slices, "R_HAT", 0.0)
     monkeypatch.setattr(slices, "_STAGES", 2)
-    second = slices.compute(given, data, jax.random.split(jax.random.key(1), 1))
+    second = slices.compute(settings, data, jax.random.split(jax.random.key(1), 1))
     assert first["r_hat"][0] <= 1.01 and first["draws"][0] == 100_000 and second["draws"][0] == 200_000
     error = 4.5 * first["sd"][0] * np.sqrt(1 / first["ess"][0] + 1 / second["ess"][0])
     assert np.all(np.abs(first["mean"][0] - second["mean"][0]) < error)
@@ -130,13 +131,13 @@ def test_both_kinds_of_ellipses_have_the_same_posterior(monkeypatch):
 def test_slices_of_a_linear_link_have_the_exact_posterior():
     """The experiment's own sampler on u itself as activity, against dense algebra on the grid."""
     data, latent = linear()
-    found = slices.compute({"link": "linear", "gamma": None, "draws": 40_000, "burn_in": 2_000}, [data],
+    result = slices.compute({"link": "linear", "gamma": None, "draws": 40_000, "burn_in": 2_000}, [data],
                            jax.random.split(jax.random.key(1), 1))
     exact = laplace(latent, data.y)
-    error = 4.5 * np.asarray(exact.sd[0]) / np.sqrt(found["ess"][0])
-    assert found["ess"][0] > 200
-    assert np.all(np.abs(found["mean"][0] - exact.mode[0]) < error)
-    assert np.all(np.abs(found["sd"][0] - exact.sd[0]) < error)
+    error = 4.5 * np.asarray(exact.sd[0]) / np.sqrt(result["ess"][0])
+    assert result["ess"][0] > 200
+    assert np.all(np.abs(result["mean"][0] - exact.mode[0]) < error)
+    assert np.all(np.abs(result["sd"][0] - exact.sd[0]) < error)
 
 
 @pytest.mark.slow
@@ -146,63 +147,64 @@ def test_the_slices_agree_with_blackjax(configuration, index):
     """Five data sets, three links: means and standard deviations at some points, in standard errors of both."""
     blackjax = pytest.importorskip("blackjax")
     data = problem.data_set(configuration, index)
-    found = slices.compute({"link": configuration.link, "gamma": configuration.gamma, "draws": 100_000,
+    result = slices.compute({"link": configuration.link, "gamma": configuration.gamma, "draws": 100_000,
                             "burn_in": 5_000}, [data], jax.random.split(jax.random.key(0), 1))
     latent = problem.on_grid(configuration.link, configuration.gamma or 1.0, data.rates)
     algorithm = blackjax.elliptical_slice(lambda u: latent.log_likelihood(u[None], jnp.asarray(data.y)),
                                           mean=jnp.zeros(problem.POINTS), cov=latent.root[0] @ latent.root[0].T)
-    at = slices.MONITORED
+    indices = slices.MONITORED
 
     def chain(key):
         def step(state, key):
             state, _ = algorithm.step(key, state)
-            return state, state.position[at]
+            return state, state.position[indices]
 
-        def kept(state, key):
+        def record(state, key):
             state, _ = jax.lax.scan(step, state, jax.random.split(key, 40))
-            return state, state.position[at]
+            return state, state.position[indices]
 
-        first, rest = jax.random.split(key)
-        state = algorithm.init(latent.root[0] @ jax.random.normal(first, (problem.POINTS,)))
-        return jax.lax.scan(kept, state, jax.random.split(rest, 2500))[1][250:]
+        start_key, step_key = jax.random.split(key)
+        state = algorithm.init(latent.root[0] @ jax.random.normal(start_key, (problem.POINTS,)))
+        return jax.lax.scan(record, state, jax.random.split(step_key, 2500))[1][250:]
 
     draws = np.asarray(jax.jit(jax.vmap(chain))(jax.random.split(jax.random.key(1), 4)))
-    theirs = {name: np.array([float(az.ess(draws[..., place], method=name)) for place in range(len(at))])
-              for name in ("mean", "sd")}
-    assert found["r_hat"][0] <= 1.01 and min(theirs["mean"].min(), theirs["sd"].min()) > 150
-    flat = draws.reshape(-1, len(at))
+    ess = {name: np.array([float(az.ess(draws[..., point], method=name)) for point in range(len(indices))])
+           for name in ("mean", "sd")}
+    assert result["r_hat"][0] <= 1.01 and min(ess["mean"].min(), ess["sd"].min()) > 150
+    flat = draws.reshape(-1, len(indices))
     for name, values in (("mean", flat.mean(axis=0)), ("sd", flat.std(axis=0))):
-        error = flat.std(axis=0) * np.sqrt(1 / theirs[name] + 1 / found["ess"][0])
-        assert np.all(np.abs(values - found[name][0][at]) < 4 * error), (name, values - found[name][0][at], error)
+        error = flat.std(axis=0) * np.sqrt(1 / ess[name] + 1 / result["ess"][0])
+        difference = values - result[name][0][indices]
+        assert np.all(np.abs(difference) < 4 * error), (name, difference, error)
 
 
-def made_up(settings):
+def synthetic_results(settings):
     """Results of every task: errors of 0.3, and of 0.6 for GFS; the second data set of LA has diverged."""
     results = {}
     for task in experiment.all_tasks(settings):
         count = task.settings["last"] - task.settings["first"] + 1
         truth = np.stack([problem.data_set(SATURATION, index).u for index in range(count)])
         shift = 0.6 if task.settings["method"] == "GFS" else 0.3
-        found = {"mean": truth + shift, "sd": np.full(truth.shape, 0.25), "seconds": np.full(count, 2.0)}
+        result = {"mean": truth + shift, "sd": np.full(truth.shape, 0.25), "seconds": np.full(count, 2.0)}
         if task.settings["method"] == "LA":
-            found["stopped"] = np.arange(count) != 1
+            result["stopped"] = np.arange(count) != 1
         if "LA" in task.settings["method"]:
-            found["converged"] = np.arange(count) != 1
+            result["converged"] = np.arange(count) != 1
         if "iterated" in task.settings["method"]:
-            found["change"] = np.full(count, 1e-3)
+            result["change"] = np.full(count, 1e-3)
         if task.settings["method"] == "ESLS":
-            found |= {"r_hat": np.full(count, 1.005), "r_hat_first": np.full(count, 1.02), "ess": np.full(count, 50.0),
+            result |= {"r_hat": np.full(count, 1.005), "r_hat_first": np.full(count, 1.02), "ess": np.full(count, 50.0),
                       "seconds": np.full(count, 400.0), "seconds_more": np.full(count, 50.0)}
-        results[task.name] = found | experiment.judged(found, truth)
+        results[task.name] = result | experiment.score_force(result, truth)
     return results
 
 
-def data_of(settings):
-    return experiment.STUDY.collect(settings, made_up(settings))
+def synthetic_data(settings):
+    return experiment.STUDY.collect(settings, synthetic_results(settings))
 
 
-def test_the_tables_count_what_was_found():
-    tables = {name: table.frame for name, table in experiment.tables(FEW, data_of(FEW)).items()}
+def test_tables_count_outcomes():
+    tables = {name: table.frame for name, table in experiment.tables(FEW, synthetic_data(FEW)).items()}
     table = tables["comparison"]
     assert table.loc["exponential: LA", "divergences"] == 2  # one in each of two blocks
     assert table.loc["exponential: LA", "RMSE"] == pytest.approx(0.3)
@@ -227,9 +229,9 @@ def test_the_tables_count_what_was_found():
     (-4.3, "lower than published (z = -4.3)", True), (-31.0, "lower than published (z = -31.0)", True),
     (4.3, "higher than published (z = 4.3)", False), (np.nan, "-", False)])
 def test_a_verdict_is_two_sided_and_lower_is_consistent(z, text, consistent):
-    one = PublishedComparison(z)
-    assert str(one) == text and one.is_consistent is consistent
-    assert one.is_lower == text.startswith("lower") and one.is_higher == text.startswith("higher")
+    comparison = PublishedComparison(z)
+    assert str(comparison) == text and comparison.is_consistent is consistent
+    assert comparison.is_lower == text.startswith("lower") and comparison.is_higher == text.startswith("higher")
 
 
 def test_each_published_cell_has_its_verdict():
@@ -240,15 +242,15 @@ def test_each_published_cell_has_its_verdict():
         spread = np.where(np.arange(count) % 2, 1.0, -1.0)  # of standard error 0.01, once it is scaled
         return 0.01 * (spread * np.sqrt(count - 1) + z)
 
-    def found(rmse):
+    def dataset(rmse):
         return xr.Dataset({"rmse": (("method", "dataset"), np.array(list(rmse.values()))),
                            "diverged": (("method", "dataset"), np.zeros((3, len(rmse["LA"])), bool)),
                            "converged": (("method", "dataset"), np.ones((3, len(rmse["LA"]))))}, {"method": list(rmse)})
 
-    data = {"repression 1": found({"LA": [np.nan], "ESLS": [0.4], "GFS": [np.nan]}),
-            "exponential": found({method: published[method][0] + errors(z)
+    data = {"repression 1": dataset({"LA": [np.nan], "ESLS": [0.4], "GFS": [np.nan]}),
+            "exponential": dataset({method: published[method][0] + errors(z)
                                   for method, z in (("LA", 5.0), ("ESLS", -6.0), ("GFS", -2.0))})}
-    table = pd.DataFrame.from_dict(experiment.beside_published(data), orient="index")
+    table = pd.DataFrame.from_dict(experiment.published_rows(data), orient="index")
     assert table.loc["exponential", [f"{method} z" for method in published]].tolist() == pytest.approx([5, -6, -2])
     assert table.loc["exponential", [f"{method} verdict" for method in published]].tolist() == [
         "higher than published (z = 5.0)", "lower than published (z = -6.0)", "consistent"]
@@ -264,7 +266,7 @@ def test_a_killed_run_ends_with_the_same_table(tmp_path, monkeypatch):
     monkeypatch.setattr(experiment, "METHODS", ("LA", "ESLS", "GFS"))
     settings = experiment.TranscriptionSettings(datasets=2, draws=400, burn_in=40,
                                                 configurations=(SATURATION.label, EXPONENTIAL.label))
-    whole = experiment.STUDY.run(settings, tmp_path / "whole")
+    uninterrupted = experiment.STUDY.run(settings, tmp_path / "whole")
     compute, done = experiment.compute, []
 
     def killed(task):
@@ -276,27 +278,27 @@ def test_a_killed_run_ends_with_the_same_table(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         kinds = {label: kind._replace(compute=killed) for label, kind in experiment.STUDY.kinds.items()}
         dataclasses.replace(experiment.STUDY, kinds=kinds).run(settings, tmp_path / "half")
-    again = experiment.STUDY.run(settings, tmp_path / "half")
+    resumed = experiment.STUDY.run(settings, tmp_path / "half")
     for name in ("comparison", "published"):
-        first, second = whole.tables[name], again.tables[name]
+        first, second = uninterrupted.tables[name], resumed.tables[name]
         timeless = [name for name in first if "CPU" not in name]
         pd.testing.assert_frame_equal(first[timeless], second[timeless], check_exact=True)
 
 
-def test_what_is_not_finite_has_diverged():
+def test_infinite_errors_count_as_divergence():
     mean = np.zeros((3, problem.POINTS))
     mean[0, 5], mean[1] = np.nan, 4.0
-    found = experiment.judged({"mean": mean, "sd": np.ones(mean.shape)}, np.zeros(mean.shape))
-    assert found["diverged"].tolist() == [True, True, False] and found["rmse"][0] == np.inf
+    result = experiment.score_force({"mean": mean, "sd": np.ones(mean.shape)}, np.zeros(mean.shape))
+    assert result["diverged"].tolist() == [True, True, False] and result["rmse"][0] == np.inf
 
 
 @pytest.mark.slow
-def test_what_is_stored_is_tabulated_and_drawn_without_computing(tmp_path):
-    results = made_up(FEW)
-    for one in experiment.all_tasks(FEW):
-        write(one, results[one.name], tmp_path / TASKS)
-    found = experiment.STUDY.run(FEW, tmp_path)
-    written = experiment.STUDY.save(found, tmp_path)
+def test_stored_results_are_tabulated_without_computing(tmp_path):
+    results = synthetic_results(FEW)
+    for task in experiment.all_tasks(FEW):
+        write(task, results[task.name], tmp_path / TASKS)
+    study_result = experiment.STUDY.run(FEW, tmp_path)
+    written = experiment.STUDY.save(study_result, tmp_path)
     assert {path.name for path in written} == {
         "comparison.csv", "comparison.md", "published.csv", "published.md", "paired.csv", "paired.md", "errors.png",
         "force-repression-0.1.png", "force-exponential.png"}
@@ -307,30 +309,30 @@ def test_what_is_stored_is_tabulated_and_drawn_without_computing(tmp_path):
         experiment.STUDY.run(dataclasses.replace(FEW, draws=800), tmp_path)
 
 
-def test_the_report_says_how_many_cells_are_consistent_and_why_lower_ones_are_trusted(tmp_path):
+def test_notes_count_consistent_cells(tmp_path):
     settings = experiment.TranscriptionSettings(datasets=2, configurations=(EXPONENTIAL.label,))
-    results = made_up(settings)
-    for one in experiment.all_tasks(settings):
-        results[one.name]["rmse"] = results[one.name]["rmse"] + [0.0, 1e-3]
-        write(one, results[one.name], tmp_path / TASKS)
-    found = experiment.STUDY.run(settings, tmp_path)
-    experiment.STUDY.save(found, tmp_path)
-    assert found.notes == (  # LA has one sound data set alone, ESLS 0.3005 (0.0005) for 0.290, GFS 0.6 for 0.358
+    results = synthetic_results(settings)
+    for task in experiment.all_tasks(settings):
+        results[task.name]["rmse"] = results[task.name]["rmse"] + [0.0, 1e-3]
+        write(task, results[task.name], tmp_path / TASKS)
+    study_result = experiment.STUDY.run(settings, tmp_path)
+    experiment.STUDY.save(study_result, tmp_path)
+    assert study_result.notes == (  # LA has one sound data set alone, ESLS 0.3005 (0.0005) for 0.290, GFS 0.6 for 0.358
         "0 of 2 cells count as consistent with the published table, 0 of them lower than published; 2 higher.",
         experiment.TRUST)
     assert "higher than published" in (tmp_path / "published.md").read_text()
 
 
 def test_the_figures_are_labelled():
-    for figure in figures.draw(FEW, data_of(FEW)).values():
+    for figure in figures.draw(FEW, synthetic_data(FEW)).values():
         assert figure.get_figwidth() == 7.0 and figure.legends
         for axes in figure.axes:
             assert not axes.axison or (axes.get_xlabel() and axes.get_ylabel())
 
 
 def test_blocks_of_more_data_sets_hold_those_of_fewer():
-    few = {one.name: one.record() for one in experiment.all_tasks(experiment.TranscriptionSettings(datasets=20))}
-    many = {one.name: one.record() for one in experiment.all_tasks(experiment.TranscriptionSettings(datasets=40))}
+    few = {task.name: task.record() for task in experiment.all_tasks(experiment.TranscriptionSettings(datasets=20))}
+    many = {task.name: task.record() for task in experiment.all_tasks(experiment.TranscriptionSettings(datasets=40))}
     assert few.items() <= many.items() and len(few) == 2 * 8 * len(experiment.METHODS)
 
 

@@ -1,4 +1,4 @@
-"""The problem: realisations of the double well, its true parameters, and the methods that are compared."""
+"""Realisations of the double well, its true parameters, and the methods of the study."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ GAUSSIAN: dict[str, Rule] = {"EKF": Taylor(), "CKF": Cubature(), "GHKF(7)": Gaus
 PARTICLES, GRID = "particle filter", "grid"
 METHODS = (*GAUSSIAN, PARTICLES, GRID)
 STEPS = 60
-"""Integration steps of the Gaussian filters between two observations, those of the model."""
+"""Integration steps of the Gaussian filters between two observations, as in the model file."""
 
 DEFAULT = 2
-"""The realisation that the model simulates by default, for seed 0; the one of the figures."""
+"""Index of the realisation that the model file simulates by default, for seed 0."""
 
-MOST = 10_000
-"""Realisations for one seed of the experiment."""
+MAX_REALISATIONS = 10_000
+"""Largest number of realisations for one seed of the study."""
 
 
 class Realisation(NamedTuple):
-    """One simulated path and its observations.
+    """A simulated path and its observations.
 
     Attributes:
         times: (T,) observation times.
-        y: (T, 1).
-        fine: (K,) times of the path, among them the observation times.
-        path: (K,) the state.
+        y: (T, 1) observations.
+        fine: (K,) times of the path, including the observation times.
+        path: (K,) states.
     """
 
     times: np.ndarray
@@ -62,12 +62,12 @@ def model_file() -> loading.ModelFile:
 
 @functools.lru_cache(maxsize=256)
 def realisation(index: int, seed: int = 0) -> Realisation:
-    """Return realisation ``index`` of the experiment with this seed.
+    """Return realisation ``index`` of the study with this seed.
 
-    It is what ``lfm-ppl simulate ginzburg-landau --seed N`` writes for N = 10000 seed + index: the path starts in the
-    right well, at sqrt(10), while the filters' prior is N(0, 10). With seed 0, number 2 is the model's default data.
+    ``lfm-ppl simulate ginzburg-landau --seed N`` writes the same data for N = 10000 seed + index. The path starts in
+    the right well, at sqrt(10); the filters' prior is N(0, 10). With seed 0, number 2 is the model's default data.
     """
-    data = model_file().simulate(seed=MOST * seed + index)
+    data = model_file().simulate(seed=MAX_REALISATIONS * seed + index)
     truth: Any = data.truth
     return Realisation(data.times, data.y, np.asarray(truth["times"]), np.asarray(truth["state"])[:, 0])
 
@@ -76,11 +76,11 @@ def system(theta: Any) -> LatentForceModel:
     """Return the double well with parameters (alpha, beta, sigma); they may be traced."""
     alpha, beta, sigma = theta
     sites = {"sigma": sigma, "linear": alpha / sigma**2, "cubic": beta / sigma**2}
-    given = likelihood_site(model_file().model, (np.arange(0.0, 51.0, 2.0),), {}, jax.random.key(0), sites)
-    return given.distribution.model
+    site = likelihood_site(model_file().model, (np.arange(0.0, 51.0, 2.0),), {}, jax.random.key(0), sites)
+    return site.distribution.model
 
 
 @functools.cache
 def true_system() -> LatentForceModel:
-    """Return the double well at the truth: one object, so that what is compiled for it serves all realisations."""
+    """Return the double well at the true parameters; one object, so that all realisations share compiled programs."""
     return system(jnp.asarray(TRUTH))

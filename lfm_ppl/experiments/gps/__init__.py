@@ -1,1 +1,1 @@
-"""Orbits of GPS and other satellites: predicted with and without forces that nobody measured."""
+"""Prediction of satellite orbits with and without unmeasured forces."""

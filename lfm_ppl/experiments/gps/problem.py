@@ -1,4 +1,4 @@
-"""The problem: positions of satellites, from files or simulated."""
+"""Positions of satellites, from files or simulated."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from lfm_ppl.orbits.arc import Arc
 from lfm_ppl.orbits.prediction import LATEST
 
 SIMULATED = tuple(f"S{number:02d}" for number in range(1, 13))
-_HIDDEN: dict[str, Any] = {"amplitude": 0.5, "wander": 0.02, "drift": 0.005}
-_HIDDEN_WHITE, _HIDDEN_NOISE = 0.03, 5e-5
+_TRUE_FORCES: dict[str, Any] = {"amplitude": 0.5, "wander": 0.02, "drift": 0.005}
+_TRUE_WHITE, _TRUE_NOISE = 0.03, 5e-5
 _DAYS, _INTERVAL = 10, 900.0
 SYSTEMS = {"G": "GPS", "R": "GLONASS", "E": "Galileo", "C": "BeiDou", "J": "QZSS", "I": "NavIC"}
 """First letter of a satellite's name -> constellation."""
 
 
 class Arcs(NamedTuple):
-    """Positions in axes that do not turn.
+    """Positions in celestial axes.
 
     Attributes:
-        environment: Earth, Moon and Sun over these days.
+        environment: Earth, Moon and Sun during the data.
         times: (T,) hours after the first epoch.
         positions: satellite -> (T, 3) km, NaN where missing.
-        published: what was read; None for simulated satellites.
+        published: contents of the files; None for simulated satellites.
     """
 
     environment: orbits.Environment
@@ -40,20 +40,20 @@ class Arcs(NamedTuple):
     published: orbits.Ephemerides | None
 
     def arc(self, satellite: str, train_days: float) -> Arc:
-        """Return the arc of a satellite, all epochs of the data.
+        """Return the arc of a satellite with all epochs of the data.
 
         Raises:
-            Unusable: too few positions to learn from, or none to judge by.
-            ValueError: the training is longer than the data.
+            Unusable: there are too few positions in training, or none after it.
+            ValueError: the training period is too short, or longer than the data.
         """
         days = float(self.times[-1] - self.times[0] + np.median(np.diff(self.times))) / 24.0
         train = int(np.searchsorted(self.times, 24.0 * train_days - 1e-9))
         if 24.0 * train_days < 2 * LATEST:
-            raise ValueError(f"training takes {train_days:g} days; half a day is the least (--train-days).")
+            raise ValueError(f"the training period has {train_days:g} days; use at least half a day (--train-days).")
         if train >= len(self.times):
-            raise ValueError(f"training takes {train_days:g} days, but the data have {days:g}, the last position "
-                             f"{self.times[-1] / 24.0:.6g} days after the first; take fewer (--train-days), so that "
-                             "days are left to judge by.")
+            raise ValueError(f"the training period has {train_days:g} days, but the data have {days:g}, with the last "
+                             f"position {self.times[-1] / 24.0:.6g} days after the first; use fewer (--train-days), so "
+                             "that days remain for the evaluation.")
         arc = Arc(self.environment, self.times, self.positions[satellite], train)
         arc.check(satellite, "" if self.published is None else "; ".join(map(str, self.published.gaps(satellite))))
         return arc
@@ -69,32 +69,32 @@ def system(satellite: str) -> str:
     return SYSTEMS.get(satellite[:1], satellite[:1])
 
 
-def _place(satellite: str) -> tuple[int, str]:
-    """GPS first, as in `SYSTEMS`."""
+def _sort_key(satellite: str) -> tuple[int, str]:
+    """Return a sort key with the constellations in the order of `SYSTEMS`."""
     letters = [*SYSTEMS, satellite[:1]]
     return letters.index(satellite[:1]), satellite
 
 
 @functools.lru_cache(maxsize=2)
 def arcs(folder: str | None, seed: int = 0) -> Arcs:
-    """Return the positions of all satellites in a folder of SP3 files, or of twelve simulated ones like those of GPS.
+    """Return positions of all satellites in a folder of SP3 files, or of twelve simulated satellites on GPS orbits.
 
     Args:
-        folder: of SP3 files; their satellites are ordered by constellation, GPS first. None: simulate ten days.
-        seed: of the simulation.
+        folder: folder of SP3 files; their satellites are ordered by constellation, GPS first. None simulates ten days.
+        seed: seed of the simulation.
 
     Raises:
-        FileNotFoundError, ValueError: no files, or files that cannot be read; the message has file and line.
+        FileNotFoundError, ValueError: there are no files, or a file is invalid; the message has file and line.
     """
     if folder is None:
         return _simulated(seed)
-    published = orbits.read_sp3(Path(folder))
-    environment = orbits.Environment.over(published.epochs[0], 24.0 * published.days)
-    positions = environment.celestial(published)
-    times = (published.epochs - published.epochs[0]) / 3600.0
-    found = {name: positions[:, published.satellites.index(name)]
-             for name in sorted(published.satellites, key=_place)}
-    return Arcs(environment, times, found, published)
+    ephemerides = orbits.read_sp3(Path(folder))
+    environment = orbits.Environment.over(ephemerides.epochs[0], 24.0 * ephemerides.days)
+    positions = environment.celestial(ephemerides)
+    times = (ephemerides.epochs - ephemerides.epochs[0]) / 3600.0
+    by_satellite = {name: positions[:, ephemerides.satellites.index(name)]
+                    for name in sorted(ephemerides.satellites, key=_sort_key)}
+    return Arcs(environment, times, by_satellite, ephemerides)
 
 
 def _simulated(seed: int) -> Arcs:
@@ -102,24 +102,24 @@ def _simulated(seed: int) -> Arcs:
     environment = orbits.Environment.over(epoch, 24.0 * _DAYS)
     times = _INTERVAL / 3600.0 * np.arange(int(_DAYS * 86_400 / _INTERVAL))
     random = np.random.default_rng(seed)
-    turns = 2 * np.pi * np.stack([np.arange(len(SIMULATED)) % 6 / 6, random.uniform(size=len(SIMULATED))], axis=1)
+    angles = 2 * np.pi * np.stack([np.arange(len(SIMULATED)) % 6 / 6, random.uniform(size=len(SIMULATED))], axis=1)
 
     @jax.jit
     def draw(key: jax.Array, start: jax.Array) -> jax.Array:
-        system = orbits.satellite(environment, Gaussian(start, jnp.zeros((6, 6))), orbits.small_forces(**_HIDDEN),
-                                  white=_HIDDEN_WHITE, noise_sd=_HIDDEN_NOISE)
+        system = orbits.satellite(environment, Gaussian(start, jnp.zeros((6, 6))), orbits.small_forces(**_TRUE_FORCES),
+                                  white=_TRUE_WHITE, noise_sd=_TRUE_NOISE)
         return simulate(key, system, times, steps=int(_INTERVAL / 30)).y
 
     keys = jax.random.split(jax.random.key(seed), len(SIMULATED))
-    found = {name: np.asarray(draw(key, jnp.asarray(circular(*turn))))
-             for name, key, turn in zip(SIMULATED, keys, turns, strict=True)}
-    return Arcs(environment, times, found, None)
+    by_satellite = {name: np.asarray(draw(key, jnp.asarray(circular(*angle))))
+                    for name, key, angle in zip(SIMULATED, keys, angles, strict=True)}
+    return Arcs(environment, times, by_satellite, None)
 
 
 def circular(node: float, along: float, radius: float = 26_560.0, degrees: float = 55.0) -> np.ndarray:
-    """Return a state (6,) on a circular orbit: angles in radians, radius in km, by default of half a sidereal day."""
-    slant, speed = np.radians(degrees), 3600.0 * np.sqrt(orbits.GM / radius)
+    """Return a state (6,) on a circular orbit with angles in radians; the default radius (km) is that of GPS."""
+    inclination, speed = np.radians(degrees), 3600.0 * np.sqrt(orbits.GM / radius)
     first = np.array([np.cos(node), np.sin(node), 0.0])
-    second = np.array([-np.sin(node) * np.cos(slant), np.cos(node) * np.cos(slant), np.sin(slant)])
+    second = np.array([-np.sin(node) * np.cos(inclination), np.cos(node) * np.cos(inclination), np.sin(inclination)])
     return np.concatenate([radius * (np.cos(along) * first + np.sin(along) * second),
                            speed * (np.cos(along) * second - np.sin(along) * first)])

@@ -1,4 +1,11 @@
-"""The study: its settings, tasks and tables."""
+"""The study of home heating: settings, tasks and tables.
+
+1. A window has four days of training and a fifth day. Windows come from a real house, or from simulated homes.
+2. For each residual and heat store, find the most likely parameters of every window, and predict the fifth day: with a
+   known heater in the real house (kind ``house``), under a thermostat in simulated homes (kind ``homes``).
+3. For one residual, also marginalise the parameters by MCMC (kind ``posterior``).
+4. Compare errors and log likelihoods with the published ones and with two reference residuals, paired by day.
+"""
 
 from __future__ import annotations
 
@@ -28,139 +35,143 @@ PUBLISHED = {
     "none": {5: (0.61, 0.06, -142, 25), 6: (0.25, 0.02, 31, 14), 7: (1.66, 0.26, -367, 77), 8: (0.27, 0.04, 19, 18)},
     "matern": {5: (0.92, 0.12, -162, 16), 6: (0.23, 0.02, 55, 14), 7: (1.43, 0.19, -279, 54)},
     "resonator": {5: (1.15, 0.22, -1373, 1027), 6: (0.82, 0.24, -251, 101), 7: (1.43, 0.19, -279, 54)}}
-"""By tables of the source: RMSE (K) and expected log likelihood with what it gives after them, over both its homes."""
+"""Residual -> table of the source -> RMSE (K) and expected log likelihood (ELL), each with the published spread."""
 
 SOURCES = {("house", "one store", "ahead"): 5, ("house", "one store", "tracked"): 6,
            ("homes", "one store", "ahead"): 7, ("house", "envelope", "ahead"): 8}
-"""Its tables of what the tables here are of."""
+"""Kind of task, heat store and prediction -> table of the source."""
 
 TITLES = {"house": "Real house, {}: the fifth day, means over {} windows (standard errors)",
           "homes": "Simulated homes under a thermostat, {}: the fifth day, means over {} homes (standard errors)",
           "posterior": "Real house, {}: what it gains to integrate the parameters out, {} windows"}
 REFERENCES = ("none", "matern")
-"""What a residual that repeats is compared with, day by day."""
+"""Residuals with which the others are compared, paired by day."""
 
 
 @dataclass(frozen=True)
 class HomeHeatingSettings(study.StudySettings):
-    """How much is computed."""
+    """Data and sizes of the study."""
 
     data: str | None = setting(None, f"folder of {problem.FILE} (default: $LFM_DATA/house or ../shared/data/house; "
-                               "without one there are simulated homes only)", metavar="FOLDER")
+                               "without it, simulated homes only)", metavar="FOLDER")
     homes: int = setting(10, "simulated homes", quick=2, aliases=study.REALISATIONS)
-    windows: int | None = setting(None, "of the real house, the first so many (default: all)", quick=2)
+    windows: int | None = setting(None, "number of windows of the real house (default: all)", quick=2)
     methods: tuple[str, ...] = setting(problem.METHODS, "residuals", quick=("SQM", "none", "matern"),
                                        choices=problem.METHODS)
-    stores: tuple[str, ...] = setting(problem.STORES, "of heat", quick=problem.STORES[:1], choices=problem.STORES)
+    stores: tuple[str, ...] = setting(problem.STORES, "heat stores", quick=problem.STORES[:1], choices=problem.STORES)
     functions: int = setting(15, "eigenfunctions", quick=5)
-    particles: int = setting(1000, "of a prediction under a thermostat", quick=200)
-    integrated: str = setting("SQM", "residual whose parameters are integrated out, too", choices=problem.METHODS)
-    every: int = setting(7, "in every so many windows")
+    particles: int = setting(1000, "particles of a prediction under a thermostat", quick=200)
+    integrated: str = setting("SQM", "residual whose parameters are also integrated out", choices=problem.METHODS)
+    every: int = setting(7, "distance of the windows in which they are integrated out")
     ram: tuple[int, int, int] = setting((4, 1000, 3000), "RAM", quick=(2, 50, 50), parts=study.CHAINS[:3])
     nuts: tuple[int, int, int] = setting((2, 120, 180), "NUTS", quick=(2, 8, 8), parts=study.CHAINS[:3])
 
     def __post_init__(self) -> None:
-        """Check what a user gives."""
+        """Check the settings."""
         super().__post_init__()
         if self.integrated not in self.methods:
             raise ValueError(f"--integrated must be one of --methods ({', '.join(self.methods)}), got "
                              f"{self.integrated!r}.")
 
     @classmethod
-    def from_command_line(cls, report: Reporter | None, quick: bool = False, **given: Any) -> Self:
-        """Return the settings that a user chose, with the folder of the real house where there is one."""
-        folder = problem.data_folder(given.pop("data", None))
+    def from_command_line(cls, report: Reporter | None, quick: bool = False, **values: Any) -> Self:
+        """Return the settings for the options, with the folder of the real house if it exists."""
+        folder = problem.data_folder(values.pop("data", None))
         if folder is None and report:
             report(f"no {problem.FILE} in $LFM_DATA/house or ../shared/data/house: simulated homes only")
-        return super().from_command_line(report, quick, data=None if folder is None else str(folder), **given)
+        return super().from_command_line(report, quick, data=None if folder is None else str(folder), **values)
 
 
 def tasks(settings: HomeHeatingSettings) -> list[Task]:
-    """Return every task, those of a residual together, since they share what is compiled."""
-    found = []
+    """Return all tasks, ordered by residual, since the tasks of a residual share compiled programs."""
+    study_tasks = []
     for store, method in ((store, method) for store in settings.stores for method in settings.methods):
         model = {"experiment": "home-heating", "functions": settings.functions, "store": store, "method": method}
         name, seed = f"{slug(store)}/{method}", settings.seed
         if settings.data is not None:
             count = len(problem.house(settings.data)[:settings.windows])
             house = {**model, "data": str(Path(settings.data).resolve()), "windows": count}
-            found.append(Task(f"house/{name}", seed, {**house, "shown": count // 2}))
+            study_tasks.append(Task(f"house/{name}", seed, {**house, "shown": count // 2}))
             if (store, method) == (settings.stores[0], settings.integrated):
-                found += [Task(f"posterior/{sampler}/{name}", seed, {
+                study_tasks += [Task(f"posterior/{sampler}/{name}", seed, {
                     **house, "sampler": sampler, "every": settings.every,
                     "chains": list(getattr(settings, sampler.lower()))}) for sampler in prediction.SAMPLERS]
-        found.append(Task(f"homes/{name}", seed, {**model, "homes": settings.homes, "particles": settings.particles}))
-    return found
+        size = {"homes": settings.homes, "particles": settings.particles}
+        study_tasks.append(Task(f"homes/{name}", seed, model | size))
+    return study_tasks
 
 
 def tables(settings: HomeHeatingSettings, data: Data) -> dict[str, StudyTable]:
     """Return the tables."""
-    found = {}
+    result = {}
     for store in settings.stores:
-        for what in (what for what in ("house", "homes") if what in data):
-            found[f"{what}-{slug(store)}"] = StudyTable.from_rows(
-                TITLES[what].format(store, data[what].sizes["dataset"]), fifth_day(data[what].sel(store=store), what))
+        for kind in (kind for kind in ("house", "homes") if kind in data):
+            dataset = data[kind].sel(store=store)
+            result[f"{kind}-{slug(store)}"] = StudyTable.from_rows(
+                TITLES[kind].format(store, dataset.sizes["dataset"]), fifth_day_rows(dataset, kind))
         if store == settings.stores[0] and "posterior" in data:
-            found["posterior"] = StudyTable.from_rows(
-                TITLES["posterior"].format(store, data["posterior"].sizes["dataset"]), marginalised(data["posterior"]))
+            result["posterior"] = StudyTable.from_rows(
+                TITLES["posterior"].format(store, data["posterior"].sizes["dataset"]), marginal_rows(data["posterior"]))
     if settings.data is None:
-        reason = pd.DataFrame({"reason": [f"no {problem.FILE}; give its folder with --data"]}, ["real house"])
-        found["left out"] = StudyTable("Left out", reason, reason, stored=False)
-    return found
+        reason = pd.DataFrame({"reason": [f"no {problem.FILE}; set its folder with --data"]}, ["real house"])
+        result["left out"] = StudyTable("Left out", reason, reason, stored=False)
+    return result
 
 
-def fifth_day(found: xr.Dataset, what: str) -> dict[str, Any]:
-    """Return a row for each residual: the fifth day of the real house, or of simulated homes under their thermostats.
+def fifth_day_rows(dataset: xr.Dataset, kind: str) -> dict[str, Any]:
+    """Return a row for each residual: scores of the fifth day in the real house or in simulated homes.
 
-    Differences from the references are paired, and positive where the row's residual is better. A few days with tiny
-    log likelihoods rule the means, so the share of days with a higher one stands beside them.
+    Differences from the references are paired, and positive if the row's residual is better. A few days with very low
+    log likelihoods dominate the means, so that the row also has the share of days with a higher one.
     """
-    rows, store, house = {}, found.store.item(), what == "house"
-    days = {"ahead": found}
+    rows, store, house = {}, dataset.store.item(), kind == "house"
+    days = {"ahead": dataset}
     if house:
-        days = {"ahead": select_prefix(found, "ahead"), "tracked": select_prefix(found, "track")}
-    for method in found.method.values:
+        days = {"ahead": select_prefix(dataset, "ahead"), "tracked": select_prefix(dataset, "track")}
+    for method in dataset.method.values:
         cells: dict[str, Any] = {}
         for name, day in days.items():
             columns: dict[str, Column] = {f"RMSE {name} (K)": "rmse", f"ELL {name}": "ell"}
             if name == "ahead":
-                columns |= {"median ELL ahead": lambda own: number(np.median, own.ell), "coverage ahead": "inside"}
+                columns |= {"median ELL ahead": lambda scores: number(np.median, scores.ell),
+                            "coverage ahead": "inside"}
             cells |= row(day.sel({"method": method}), columns)
-            if (what, store, name) in SOURCES:
-                numbers = PUBLISHED[method].get(SOURCES[what, store, name], 4 * (np.nan,))
+            if (kind, store, name) in SOURCES:
+                numbers = PUBLISHED[method].get(SOURCES[kind, store, name], 4 * (np.nan,))
                 cells |= estimate_cells(f"published RMSE {name} (K)", Estimate(*numbers[:2]))
                 cells |= estimate_cells(f"published ELL {name}", Estimate(*numbers[2:]))
         if house:
-            cells |= cell("RMSE ahead, weather unknown (K)", found.blind_rmse.sel({"method": method}))
-        own = days["ahead"].sel({"method": method})
-        for reference in (name for name in REFERENCES if name in found.method):
-            other = days["ahead"].sel({"method": reference})
-            cells |= cell(f"RMSE below {reference} (K)", other.rmse - own.rmse)
-            cells |= cell(f"ELL above {reference}", own.ell - other.ell)
+            cells |= cell("RMSE ahead, weather unknown (K)", dataset.blind_rmse.sel({"method": method}))
+        residual = days["ahead"].sel({"method": method})
+        for reference in (name for name in REFERENCES if name in dataset.method):
+            comparator = days["ahead"].sel({"method": reference})
+            cells |= cell(f"RMSE below {reference} (K)", comparator.rmse - residual.rmse)
+            cells |= cell(f"ELL above {reference}", residual.ell - comparator.ell)
             if reference != method:
-                cells |= cell(f"share of days above {reference}", own.ell > other.ell)
-        rows[method] = cells | {"CPU time (s)": float(found.cpu_s.sel({"method": method})) / found.sizes["dataset"]}
+                cells |= cell(f"share of days above {reference}", residual.ell > comparator.ell)
+        rows[method] = cells | {"CPU time (s)": float(dataset.cpu_s.sel({"method": method})) / dataset.sizes["dataset"]}
     return rows
 
 
-def marginalised(found: xr.Dataset) -> dict[str, Any]:
-    """Return what is gained where the parameters are integrated out, over some windows of the real house.
+def marginal_rows(dataset: xr.Dataset) -> dict[str, Any]:
+    """Return scores with the parameters integrated out, and their gains, over some windows of the real house.
 
-    How far a sampler's posterior is from that of RAM: the largest distance of two means in standard deviations of RAM,
-    over parameters and windows.
+    The distance of a sampler's posterior from that of RAM is the largest difference of means over parameters and
+    windows, in standard deviations of RAM.
     """
     first = prediction.SAMPLERS[0]
-    reference = found.sel(sampler=first)
+    reference = dataset.sel(sampler=first)
     rows = {"most likely parameters": row(reference, {"RMSE ahead (K)": "point_rmse", "ELL ahead": "point_ell"})}
     for sampler in prediction.SAMPLERS:
-        own = found.sel(sampler=sampler)
-        gain, away = own.ell - own.point_ell, np.abs(own["mean"] - reference["mean"]) / reference["sd"]
+        posterior = dataset.sel(sampler=sampler)
+        gain = posterior.ell - posterior.point_ell
+        shift = np.abs(posterior["mean"] - reference["mean"]) / reference["sd"]
         rows[f"integrated out by {sampler}"] = {
-            **row(own, {"RMSE ahead (K)": "rmse", "ELL ahead": "ell"}), **cell("gain in ELL", gain),
+            **row(posterior, {"RMSE ahead (K)": "rmse", "ELL ahead": "ell"}), **cell("gain in ELL", gain),
             "median gain": number(np.median, gain),
-            f"means from {first} (sd)": np.nan if sampler == first else number(np.max, away),
-            "largest R-hat": chains.largest_r_hat(own), "smallest ESS": chains.least_ess(own),
-            "divergences": float(own.divergences.sum()), "CPU time (s)": number(np.mean, own.seconds)}
+            f"means from {first} (sd)": np.nan if sampler == first else number(np.max, shift),
+            "largest R-hat": chains.largest_r_hat(posterior), "smallest ESS": chains.least_ess(posterior),
+            "divergences": float(posterior.divergences.sum()), "CPU time (s)": number(np.mean, posterior.seconds)}
     return rows
 
 

@@ -1,4 +1,13 @@
-"""What is learnt from four days, and the fifth: predicted or tracked with a known heater, or under a thermostat."""
+"""Learning from four days of a home, and predictions of the fifth day.
+
+1. Find the most likely parameters, in logarithms z, given four days of temperatures and heater (`most_likely`), or
+   sample their posterior (`posterior`).
+2. In the real house the heater of the fifth day is known. Filter the five days with the fifth day's indoor temperatures
+   hidden; their predictive moments give the scores (`known_heater`).
+3. In a simulated home the heater follows a thermostat. Start a Rao-Blackwellised particle filter at the last
+   measurement, and predict temperatures and heater jointly (`thermostat_ahead`).
+4. With the posterior, average the predictive densities over its draws (`_posterior`).
+"""
 
 from __future__ import annotations
 
@@ -28,18 +37,18 @@ from lfm_ppl.switching.rao_blackwellised import RaoBlackwellisedResult, rao_blac
 
 SAMPLERS = ("RAM", "NUTS")
 RESIDUALS = ("SQM", "matern")
-"""Residuals whose force is drawn."""
+"""Residuals in the figure of smoothed forces."""
 
 QUANTILES = (0.025, 0.25, 0.5, 0.75, 0.975)
 EVERY = 3
-"""Hours between two measurements where a day is tracked; the source has 100 minutes."""
+"""Hours between two measurements of a tracked day; the source has 100 minutes."""
 
 SCORED, AHEAD, TRACKED = FINE >= TRAIN, TIMES >= TRAIN, (TIMES > TRAIN) & (TIMES % EVERY == 0)
-"""Which times of `FINE` (149,) and `TIMES` (120,) are of the fifth day; and which are measured where it is tracked."""
+"""Masks of the fifth day in `FINE` (149,) and in `TIMES` (120,), and of the measurements of a tracked fifth day."""
 
 
 def compute(task: Task) -> Result:
-    """Return the result of a task, with the CPU time ``cpu_s`` that it took."""
+    """Return the result of a task, with its CPU time ``cpu_s``."""
     model = Model(*(task.settings[name] for name in Model._fields))
     run = {"house": _house, "homes": _homes, "posterior": _posterior}[task.name.split("/")[0]]
     seconds, result = timing.time_call(run, task, model)
@@ -47,7 +56,7 @@ def compute(task: Task) -> Result:
 
 
 def _windows(task: Task, model: Model) -> Iterator[tuple[Window, np.ndarray, float]]:
-    """Yield every window with its most likely parameters and their log density; searches begin where the last ended."""
+    """Yield every window with its most likely parameters and their log density; each search starts at the last mode."""
     z = None
     for window in problem.house(task.settings["data"])[:task.settings["windows"]]:
         z, density = most_likely(model, window, z)
@@ -55,14 +64,14 @@ def _windows(task: Task, model: Model) -> Iterator[tuple[Window, np.ndarray, flo
 
 
 def _house(task: Task, model: Model) -> Result:
-    """Return scores and paths of every window, and the residual (120,) of the one that is drawn."""
-    rows, shown = [], {}
+    """Return scores and paths of every window, and the residual (120,) of the window in the figure."""
+    rows, residual = [], {}
     for index, (window, z, density) in enumerate(_windows(task, model)):
         rows.append({**known_heater(model, window, z), "z": z, "density": density})
         if index == task.settings["shown"] and model.method in RESIDUALS:
-            mean, sd = smoothed(model, z, masked(window.y), window.outdoor)
-            shown = {"residual": np.asarray(mean), "residual_sd": np.asarray(sd)}
-    return stack_results(rows) | shown
+            mean, sd = smooth_residual(model, z, mask_fifth_day(window.y), window.outdoor)
+            residual = {"residual": np.asarray(mean), "residual_sd": np.asarray(sd)}
+    return stack_results(rows) | residual
 
 
 def _homes(task: Task, model: Model) -> Result:
@@ -80,7 +89,7 @@ def _homes(task: Task, model: Model) -> Result:
 
 
 def _posterior(task: Task, model: Model) -> Result:
-    """Return scores of some windows with the most likely parameters and with the posterior of all of them."""
+    """Return scores of some windows with the most likely parameters and with their posterior."""
     rows = []
     for index, (window, z, _) in enumerate(_windows(task, model)):
         if index % task.settings["every"]:
@@ -88,7 +97,7 @@ def _posterior(task: Task, model: Model) -> Result:
         sampled = posterior(task.settings["sampler"], model, window, z, jax.random.fold_in(task.key, index),
                             tuple(task.settings["chains"]))
         draws = scores.thin_draws(sampled["draws"], 100)
-        moments = filtered_under_draws(model, draws, masked(window.y), window.outdoor)
+        moments = filter_under_draws(model, draws, mask_fifth_day(window.y), window.outdoor)
         mean, variance = (np.asarray(moment)[:, AHEAD] for moment in moments[:2])
         truth, point = window.y[AHEAD, 0], known_heater(model, window, z)
         densities = logsumexp(norm.logpdf(truth, mean, np.sqrt(variance)), axis=0) - np.log(len(draws))
@@ -102,46 +111,47 @@ def _posterior(task: Task, model: Model) -> Result:
 def most_likely(model: Model, window: Window, start: np.ndarray | None = None) -> tuple[np.ndarray, float]:
     """Return the most likely logarithms z (P,) of the parameters given the first four days, and their log density.
 
-    The priors are the model file's, with standard deviations of 0.7 to 1 in the logarithm: without them some of the
-    scales run away where four days say nothing of them. The prior of what is known of the weather adds a constant to
-    the log density. The search begins at ``start``, or at the prior medians.
+    The priors are those in the model file, with standard deviations of 0.7 to 1 in the logarithm. Without priors some
+    scales diverge, since four days do not determine them. The prior of the weather parameters adds a constant to the
+    log density. The search starts at ``start``, or at the prior medians.
     """
     objective = _log_posterior(model).objective(window.learnt)
-    found = quasi_newton(objective, model.medians if start is None else start, 60)
-    return found.point, -found.value
+    minimum = quasi_newton(objective, model.medians if start is None else start, 60)
+    return minimum.point, -minimum.value
 
 
 @functools.cache
 def _log_posterior(model: Model) -> LogPosterior:
-    """Return the posterior given the first four days; what is compiled for it serves all windows."""
+    """Return the posterior given the first four days; all windows share its compiled programs."""
     with jax.ensure_compile_time_eval():
         example = jnp.zeros((TRAIN, 3)), dict.fromkeys(problem.OUTDOOR, jnp.ones(()))
         return LogPosterior(bind_arguments(model.program, (example,), {}), model.names)
 
 
-def posterior(sampler: str, model: Model, window: Window, near: np.ndarray, key: jax.Array,
+def posterior(sampler: str, model: Model, window: Window, mode: np.ndarray, key: jax.Array,
               size: tuple[int, int, int]) -> Result:
-    """Return draws of z and what is known of them, see `chains.sample`.
+    """Return draws of z and their diagnostics, see `chains.sample`.
 
-    Chains start around the mode ``near`` (P,); ``size`` is their number, and warm-up and draws of each.
+    Chains start around ``mode`` (P,); ``size`` has the number of chains, the warm-up and the draws of each.
     """
     start_key, run_key = jax.random.split(key)
     return chains.sample(_sampler(sampler, model, *size), model.names, run_key, window.learnt,
-                         init_params=chains.draw_starts(model.names, near, size[0], start_key))
+                         init_params=chains.draw_starts(model.names, mode, size[0], start_key))
 
 
 @functools.cache
 def _sampler(sampler: str, model: Model, count: int, warmup: int, draws: int) -> MCMC:
-    """Return the sampler of a model: one, so that its programs are compiled once for all windows."""
+    """Return the sampler of a model; one object, so that all windows share its compiled programs."""
     kernel: Any = (RAM(model.program, initial_scale=0.3, initial_covariance=np.eye(len(model.names)))
                    if sampler == "RAM" else chains.nuts(model.program))
     return chains.sampler(kernel, count, warmup, draws, jit_model_args=True)
 
 
-def masked(y: np.ndarray, tracked: bool = False, weather: bool = True) -> np.ndarray:
-    """Return measurements (120, 3) without those inside on the fifth day, but for one in `EVERY` hours if ``tracked``.
+def mask_fifth_day(y: np.ndarray, tracked: bool = False, weather: bool = True) -> np.ndarray:
+    """Return measurements (120, 3) without the indoor temperatures of the fifth day.
 
-    With ``weather`` the temperature outside is known on the fifth day, a perfect forecast.
+    If ``tracked``, one in `EVERY` hours remains. With ``weather`` the outdoor temperatures of the fifth day remain, as
+    a perfect forecast.
     """
     y = y.copy()
     y[AHEAD & ~TRACKED if tracked else AHEAD, 0] = np.nan
@@ -151,61 +161,64 @@ def masked(y: np.ndarray, tracked: bool = False, weather: bool = True) -> np.nda
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def filtered(model: Model, z: Any, y: Any, outdoor: dict[str, Any]) -> tuple[jax.Array, ...]:
+def filter_window(model: Model, z: Any, y: Any, outdoor: dict[str, Any]) -> tuple[jax.Array, ...]:
     """Filter measurements y (120, 3) with parameters exp(z).
 
-    Mean and variance (120,) of a measurement inside at every hour, given all so far, are returned with mean (n,) and
-    covariance (n, n) of the joint state at the last hour of learning.
+    Returns:
+        Mean and variance (120,) of an indoor measurement given all earlier and simultaneous ones; mean (n,) and
+        covariance (n, n) of the joint state at the last hour of training.
     """
     values = model.values(z, outdoor)
-    found = model.likelihood(values, y[:, 2]).filter(y[:, :2])
-    mean, covariance = found.filtered_mean, found.filtered_covariance
+    result = model.likelihood(values, y[:, 2]).filter(y[:, :2])
+    mean, covariance = result.filtered_mean, result.filtered_covariance
     return mean[:, 0], covariance[:, 0, 0] + values["noise_sd"] ** 2, mean[TRAIN - 1], covariance[TRAIN - 1]
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def filtered_under_draws(model: Model, draws: Any, y: Any, outdoor: dict[str, Any]) -> tuple[jax.Array, ...]:
-    """Return the same for several z (S, P)."""
-    return jax.lax.map(lambda z: filtered(model, z, y, outdoor), draws)
+def filter_under_draws(model: Model, draws: Any, y: Any, outdoor: dict[str, Any]) -> tuple[jax.Array, ...]:
+    """Return the results of `filter_window` for several z (S, P)."""
+    return jax.lax.map(lambda z: filter_window(model, z, y, outdoor), draws)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def smoothed(model: Model, z: Any, y: Any, outdoor: dict[str, Any]) -> tuple[jax.Array, jax.Array]:
+def smooth_residual(model: Model, z: Any, y: Any, outdoor: dict[str, Any]) -> tuple[jax.Array, jax.Array]:
     """Return mean and standard deviation (120,) in K/h of the smoothed residual."""
     residual = model.likelihood(model.values(z, outdoor), y[:, 2]).smooth(y[:, :2]).force("residual")
     return residual.mean, residual.sd
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
-def under_thermostat(model: Model, particles: int, key: jax.Array, z: Any, outdoor: dict[str, Any], mean: jax.Array,
-                     covariance: jax.Array, weather: Any, set_points: Any, on: Any) -> RaoBlackwellisedResult:
-    """Predict from the filter's state at the last measurement, and its heater, to the end of the fifth day."""
-    values, y = model.values(z, outdoor), jnp.full((len(FINE), 2), jnp.nan).at[:, 1].set(weather)
+def under_thermostat(model: Model, particles: int, key: jax.Array, z: Any, window: Window, mean: jax.Array,
+                     covariance: jax.Array) -> RaoBlackwellisedResult:
+    """Predict a window from the state and the heater at the last measurement to the end of the fifth day."""
+    assert window.fine is not None
+    values, outdoor = model.values(z, window.outdoor), jnp.asarray(window.fine)[:, 1]
+    y = jnp.stack([jnp.full(len(FINE), jnp.nan), jnp.where(np.isclose(FINE % 1.0, 0.0), outdoor, jnp.nan)], axis=1)
     return rao_blackwellised(
-        key, lambda heater: model.likelihood(values, heater).model, problem.thermostat(set_points), FINE, y=y,
-        initial=on, start=FilterState(np.asarray(TRAIN - 1.0), mean, covariance), particles=particles, steps=1)
+        key, lambda heater: model.likelihood(values, heater).model, problem.thermostat(window.set_points), FINE, y=y,
+        initial=window.on, start=FilterState(np.asarray(TRAIN - 1.0), mean, covariance), particles=particles, steps=1)
 
 
 def known_heater(model: Model, window: Window, z: np.ndarray) -> Result:
-    """Return scores and paths of the fifth day with its heater known.
+    """Return scores and paths of the fifth day with a known heater.
 
-    ``{what}_rmse``, ``{what}_ell`` and ``{what}_inside`` are of what is predicted ("ahead"), tracked ("track"), and
-    predicted without the weather ("blind"); ``mean`` and ``sd`` (24,) of the day ahead.
+    ``{kind}_rmse``, ``{kind}_ell`` and ``{kind}_inside`` are the scores of the day ahead ("ahead"), of a tracked day
+    ("track") and of the day ahead without weather ("blind"); ``mean`` and ``sd`` (24,) belong to the day ahead.
     """
     result: Result = {}
-    for what, y, hours in (("ahead", masked(window.y), AHEAD),
-                           ("track", masked(window.y, tracked=True), AHEAD & ~TRACKED),
-                           ("blind", masked(window.y, weather=False), AHEAD)):
-        mean, variance = (np.asarray(moment)[hours] for moment in filtered(model, z, y, window.outdoor)[:2])
-        result |= {f"{what}_{name}": value
+    for kind, y, hours in (("ahead", mask_fifth_day(window.y), AHEAD),
+                           ("track", mask_fifth_day(window.y, tracked=True), AHEAD & ~TRACKED),
+                           ("blind", mask_fifth_day(window.y, weather=False), AHEAD)):
+        mean, variance = (np.asarray(moment)[hours] for moment in filter_window(model, z, y, window.outdoor)[:2])
+        result |= {f"{kind}_{name}": value
                    for name, value in gaussian_scores(mean, variance, window.y[hours, 0]).items()}
-        if what == "ahead":
+        if kind == "ahead":
             result |= {"mean": mean, "sd": np.sqrt(variance)}
     return result
 
 
 def gaussian_scores(mean: np.ndarray, variance: np.ndarray, truth: np.ndarray) -> Result:
-    """Return root mean squared error, sum of the log densities of all measurements, and share in 95% bands."""
+    """Return the root mean squared error, the sum of the log densities of measurements, and the coverage."""
     sd = np.sqrt(variance)
     return {"rmse": scores.rmse(mean, truth), "ell": float(norm.logpdf(truth, mean, sd).sum()),
             "inside": scores.interval_coverage(*scores.interval(mean, sd), truth)}
@@ -213,20 +226,21 @@ def gaussian_scores(mean: np.ndarray, variance: np.ndarray, truth: np.ndarray) -
 
 def thermostat_ahead(model: Model, window: Window, z: np.ndarray, particles: int,
                      key: jax.Array) -> tuple[Result, RaoBlackwellisedResult]:
-    """Return scores of the fifth day under its thermostat, every ten minutes, and the prediction itself.
+    """Return scores of the fifth day under the thermostat, every ten minutes, and the prediction.
 
-    The temperature outside is known at every full hour. A ValueError says that nobody recorded the set points.
+    The outdoor temperature is known at every full hour.
+
+    Raises:
+        ValueError: the window has no set points.
     """
     problem.thermostat(window.set_points)
     assert window.fine is not None
-    weather = np.where(np.isclose(FINE % 1.0, 0.0), window.fine[:, 1], np.nan)
-    found = under_thermostat(model, particles, key, z, window.outdoor,
-                             *filtered(model, z, masked(window.y), window.outdoor)[2:], weather, window.set_points,
-                             window.on)
-    day: Mixture = jax.tree.map(lambda part: part[SCORED], found.observed)
+    state = filter_window(model, z, mask_fifth_day(window.y), window.outdoor)[2:]
+    forecast = under_thermostat(model, particles, key, z, window, *state)
+    day: Mixture = jax.tree.map(lambda part: part[SCORED], forecast.observed)
     indoor, truth = Mixture(day.mean[:, :, :1], day.variance[:, :, :1], day.log_weights), window.fine[SCORED, :1]
-    mean, away = indoor.moments()[0], (truth[:, None] - indoor.mean) / jnp.sqrt(indoor.variance)
-    below = (np.exp(day.log_weights) * ndtr(away)[:, :, 0]).sum(axis=1)
+    mean, z_scores = indoor.moments()[0], (truth[:, None] - indoor.mean) / jnp.sqrt(indoor.variance)
+    below = (np.exp(day.log_weights) * ndtr(z_scores)[:, :, 0]).sum(axis=1)
     return {"rmse": scores.rmse(mean[:, 0], truth[:, 0]), "ell": float(indoor.log_density(truth).sum()),
             "inside": float(np.mean(np.abs(below - 0.5) <= 0.475)), "mean": np.asarray(mean)[:, 0],
-            "on": np.asarray(found.input_mean)[SCORED]}, found
+            "on": np.asarray(forecast.input_mean)[SCORED]}, forecast

@@ -1,4 +1,11 @@
-"""The problem: a real house whose heating power was recorded, simulated homes under a thermostat, and their models."""
+"""A real house with recorded heating power, simulated homes under a thermostat, and their models.
+
+1. A window has hourly temperatures, indoor and outdoor, and the heater: four days of training and the fifth day.
+2. The real house provides one window for each day (`house`).
+3. A simulated home has random rates and set points. Its residual comes from the SQM model, and its heater from the
+   switched simulation of temperature and thermostat (`home`).
+4. A model is a residual, a heat store and a number of eigenfunctions (`Model`); the model file has the equations.
+"""
 
 from __future__ import annotations
 
@@ -31,18 +38,18 @@ FILE = "house_hourly.csv"
 TRAIN_DAYS, DAY = 4, 24
 TRAIN = TRAIN_DAYS * DAY
 TIMES = np.arange(TRAIN + DAY, dtype=float)
-"""Hours from the midnight at which a window begins: four days to learn from, one to predict."""
+"""Hours after the midnight at which a window begins: four days of training and one day to predict."""
 
 PER_HOUR = 6
 FINE = TRAIN - 1 + np.arange(1, (DAY + 1) * PER_HOUR) / PER_HOUR
-"""Times of a prediction under a thermostat from the last measurement on: every ten minutes, as in the source."""
+"""Times of a prediction under a thermostat after the last measurement: every ten minutes, as in the source."""
 
 _POWER = 100.0
 """Unit of the recorded heating power, so that full power is about one."""
 
 _HOME = {"alpha": 0.1, "beta": 2.5, "scale": 0.3, "lengthscale": 0.5, "memory": 5.0, "noise_sd": 0.05,
          "outdoor_mean": 6.0, "outdoor_scale": 3.0, "outdoor_lengthscale": 10.0, "gamma": 0.05, "psi": 0.05}
-"""The simulated home, that of the model file's default data and its walls."""
+"""Parameters of the simulated home: those of the model file's default data, and of walls."""
 
 _VARIED = ("alpha", "beta", "scale", "gamma", "psi")
 _METER_ERROR, _FUNCTIONS = 1e-3, 15
@@ -52,11 +59,11 @@ class Window(NamedTuple):
     """Five days of a home.
 
     Attributes:
-        y: (120, 3), indoor and outdoor temperature (degC) and heater, from each hour to the next.
-        outdoor: what is known of the temperature outside from the first four days, name -> value.
-        set_points: (120,) degC, from each hour to the next; None where nobody recorded them.
-        fine: (149, 3), the same as ``y`` at the times `FINE`; None for the real house.
-        on: whether the heater is on at the last measurement of the first four days.
+        y: (120, 3) indoor and outdoor temperature (degC) at every hour, and heater until the next hour.
+        outdoor: parameters of the outdoor temperature, estimated from the first four days.
+        set_points: (120,) set points (degC), from each hour to the next; None if they were not recorded.
+        fine: (149, 3) entries of ``y`` at the times `FINE`; None for the real house.
+        on: 1 if the heater is on at the last measurement of the first four days, else 0.
     """
 
     y: np.ndarray
@@ -67,12 +74,12 @@ class Window(NamedTuple):
 
     @property
     def learnt(self) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """Measurements (96, 3) of the first four days, and what is known of the weather."""
+        """Measurements (96, 3) of the first four days, and the parameters of the outdoor temperature."""
         return jnp.asarray(self.y[:TRAIN]), {name: jnp.asarray(self.outdoor[name]) for name in OUTDOOR}
 
 
 class Model(NamedTuple):
-    """What is compared: a residual of `METHODS`, one of the `STORES` of heat, and the number of eigenfunctions."""
+    """A model: a residual of `METHODS`, a heat store of `STORES`, and the number of eigenfunctions."""
 
     method: str
     store: str
@@ -80,21 +87,21 @@ class Model(NamedTuple):
 
     @property
     def keywords(self) -> dict[str, Any]:
-        """The options of the model file."""
+        """Options of the model file."""
         return {"residual": self.method, "envelope": self.store == STORES[1], "functions": self.functions}
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the P parameters that are learnt."""
+        """Names of the P learnt parameters."""
         return tuple(name for name in _priors(self) if name not in OUTDOOR)
 
     @property
     def medians(self) -> np.ndarray:
-        """Logarithms (P,) of their prior medians."""
+        """Logarithms (P,) of the prior medians."""
         return np.array([float(_priors(self)[name].loc) for name in self.names])
 
     def program(self, learnt: tuple[jax.Array, dict[str, jax.Array]]) -> None:
-        """Run the NumPyro model of what is ``learnt`` from in a window."""
+        """Run the NumPyro model of a window's training data, see `Window.learnt`."""
         (y, outdoor), times = learnt, TIMES[:TRAIN]
         fix(model_file().model, outdoor)(times, y[:, :2], inputs={"heater": Input(times, y[:, 2])}, **self.keywords)
 
@@ -123,22 +130,26 @@ def _priors(model: Model) -> dict[str, Any]:
     return {name: site["fn"] for name, site in trace.items() if site["type"] == "sample" and not site["is_observed"]}
 
 
-def data_folder(given: str | None = None) -> Path | None:
-    """Return the folder of the real house: the given one, which must have it, that in LFM_DATA, or ../shared/data."""
-    folder = Path(os.environ.get("LFM_DATA", "../shared/data")) / "house" if given is None else Path(given)
+def data_folder(folder_name: str | None = None) -> Path | None:
+    """Return the folder of the real house: ``folder_name``, which must exist, or the one in LFM_DATA or ../shared/data.
+
+    Returns:
+        The folder; None if there is no default folder.
+    """
+    folder = Path(os.environ.get("LFM_DATA", "../shared/data")) / "house" if folder_name is None else Path(folder_name)
     if (folder / FILE).is_file():
         return folder
-    if given is not None:
-        raise FileNotFoundError(f"{given} has no file {FILE}; leave --data out for simulated homes only.")
+    if folder_name is not None:
+        raise FileNotFoundError(f"{folder_name} has no file {FILE}; leave --data out for simulated homes only.")
     return None
 
 
 @functools.cache
 def house(folder: str) -> tuple[Window, ...]:
-    """Return every window of the real house: four days and the one after them.
+    """Return every window of the real house.
 
     Raises:
-        ValueError: a file without the columns, with gaps, or with fewer than five days.
+        ValueError: the file lacks columns, has gaps, or has fewer than five days.
     """
     path = Path(folder) / FILE
     frame = pd.read_csv(path, index_col=0, parse_dates=True)
@@ -161,15 +172,16 @@ def _window(y: np.ndarray, **more: Any) -> Window:
 
 @functools.lru_cache(maxsize=256)
 def home(index: int, store: str, seed: int = 0) -> Window:
-    """Return a simulated home with a residual drawn from SQM, under a thermostat with its own set points.
+    """Return a simulated home with a residual drawn from SQM, under a thermostat with random set points.
 
-    Rates vary by a fifth from home to home. Set points are those of a night and a day, the same every day but the last.
+    Rates vary by a fifth between homes. There is one set point for the night and one for the day. The hours of the day
+    are equal on the first four days and differ on the last.
     """
     generator, hours = np.random.default_rng([seed, index, STORES.index(store)]), np.arange(DAY)
     night, day, wake, sleep = 16.0 + generator.normal(), 20.0, generator.integers(5, 8), generator.integers(21, 24)
     usual = np.where((hours >= wake) & (hours < sleep), day, night)
-    away = (hours >= 10) & (hours < 15)
-    last_day = np.where(away, night, usual + generator.choice([-1.0, 1.0]) * (usual == day))
+    is_away = (hours >= 10) & (hours < 15)
+    last_day = np.where(is_away, night, usual + generator.choice([-1.0, 1.0]) * (usual == day))
     set_points = np.concatenate([*[usual] * TRAIN_DAYS, last_day])
     values = {name: _HOME[name] * np.exp(0.2 * generator.normal()) if name in _VARIED else _HOME[name]
               for name in _HOME if store == STORES[1] or name not in ("gamma", "psi")}
@@ -187,19 +199,19 @@ def _simulator(store: str) -> Any:
 
     def draw(key: jax.Array, values: dict[str, Any], set_points: jax.Array) -> tuple[jax.Array, jax.Array]:
         def metered(heater: Any) -> LatentForceModel:
-            """A meter of the heater is a third output: the errors of the simulated homes are drawn for three."""
+            # The heater's meter, the third output, is part of the stored simulations' random numbers.
             home = model.likelihood(values, heater).model
             observation = GaussianObservation(lambda x, u, t: jnp.append(home.observation.function(x, u, t), heater),
                                               jnp.append(home.observation.covariance, _METER_ERROR**2))
             return LatentForceModel(home.dynamics, home.forces, observation, home.initial_state,
                                     state_names=home.state_names)
 
-        found = simulate_switched(key, metered, thermostat(set_points), times, steps=1)
-        return found.y[:, 0], found.inputs[:, 0]
+        simulation = simulate_switched(key, metered, thermostat(set_points), times, steps=1)
+        return simulation.y[:, 0], simulation.inputs[:, 0]
 
     return jax.jit(draw)
 
 
 def thermostat(set_points: Any) -> Thermostat:
-    """Return the thermostat of a home; a ValueError says that nobody recorded its set points."""
+    """Return the thermostat of a home; raise ValueError if there are no set points."""
     return Thermostat(None if set_points is None else Input(TIMES, set_points))

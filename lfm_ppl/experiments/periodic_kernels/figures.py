@@ -1,4 +1,4 @@
-"""Covariance functions, eigenfunctions, draws, errors by the number of functions, and a predicted function."""
+"""Figures of the study: covariance functions and errors, eigenfunctions, draws, and a predicted function."""
 
 from __future__ import annotations
 
@@ -51,13 +51,13 @@ def plot_errors(settings: Any, data: Data, *, width: str | float = "full") -> Fi
 
 @style.styled
 def plot_covariances(settings: Any, *, width: str | float = "full") -> Figure:
-    """Draw the squared exponential of scale 10 and what 22 functions, or 22 and 88 frequencies, make of it."""
-    at, prior = problem.on_grid(problem.window_kernel())[0], problem.window_prior()
+    """Draw the squared exponential of scale 10, and its approximations by 22 functions and by 22 and 88 frequencies."""
+    times, prior = problem.covariance_on_grid(problem.window_kernel())[0], problem.window_prior()
     figure, panels = style.in_a_row(width, 3, 2.4, sharey=True)
     for axes, method in zip(panels, (methods.KPCA, methods.SPARSE, methods.SPARSE_4), strict=True):
-        key = jax.random.fold_in(jax.random.key(settings.seed), methods.PREDICTING[method])
-        axes.plot(at, prior.covariance(at), color=style.BLACK, lw=0.8, label="squared exponential, scale 10")
-        axes.plot(at, methods.approximation(method, key).sde_covariance(at, 0.0), "--", color=style.BLUE,
+        key = jax.random.fold_in(jax.random.key(settings.seed), methods.PREDICTORS[method])
+        axes.plot(times, prior.covariance(times), color=style.BLACK, lw=0.8, label="squared exponential, scale 10")
+        axes.plot(times, methods.approximation(method, key).sde_covariance(times, 0.0), "--", color=style.BLUE,
                   label="approximation")
         _tidy(axes, method, xlabel="distance in time")
     panels[0].set_ylabel("covariance")
@@ -67,13 +67,13 @@ def plot_covariances(settings: Any, *, width: str | float = "full") -> Figure:
 
 @style.styled
 def plot_eigenfunctions(*, width: str | float = "full") -> Figure:
-    """Draw the first eigenfunctions of a stationary kernel and of one that is not (figure 2 of the source)."""
+    """Draw the first eigenfunctions of a stationary and of a non-stationary kernel (figure 2 of the source)."""
     figure, panels = style.in_a_row(width, 2, 2.4, sharey=True)
     t = np.linspace(0.0, 2 * problem.PERIOD, 401)
-    looks = ((style.BLUE, "-", "first"), (style.VERMILLION, "--", "second"), (style.GREEN, "-.", "third"))
+    styles = ((style.BLUE, "-", "first"), (style.VERMILLION, "--", "second"), (style.GREEN, "-.", "third"))
     for axes, name in zip(panels, ("periodic Matern-3_2", "moderated periodic Matern-3_2"), strict=True):
         force = forces.Periodic(problem.kernels()[name], functions=3, explained_variance=0.0)
-        for values, (colour, line, label) in zip(np.asarray(force.eigenfunctions(t)).T, looks, strict=True):
+        for values, (colour, line, label) in zip(np.asarray(force.eigenfunctions(t)).T, styles, strict=True):
             axes.plot(t, values * np.sign(values[20] + 1e-9), color=colour, ls=line, label=label)
         _tidy(axes, name.replace("_", "/"), xlabel="time (period 10)")
     panels[0].set_ylabel("eigenfunction")
@@ -83,24 +83,24 @@ def plot_eigenfunctions(*, width: str | float = "full") -> Figure:
 
 @style.styled
 def plot_draws(settings: Any, *, width: str | float = "full") -> Figure:
-    """Draw covariance functions and a force of each way in which weights may change (figure 5 of the source)."""
+    """Draw covariance functions and sample paths of forces with varying weights (figure 5 of the source)."""
     kernel = forces.PeriodicSquaredExponential(1.0, 1.0, problem.PERIOD)
     steps = forces.change_points(problem.PERIOD, 0.0, 60.0)
-    chosen = {"CQM, lengthscale 20": forces.CQM(20.0), "SQM, lengthscale 2": forces.SQM(2.0, steps),
+    evolutions = {"CQM, lengthscale 20": forces.CQM(20.0), "SQM, lengthscale 2": forces.SQM(2.0, steps),
               "WQM, growth 0.5": forces.WQM(0.5, steps)}
     t, generator = np.linspace(0.0, 60.0, 301), np.random.default_rng(settings.seed)
     figure = style.new_figure(width, 4.2)
     grid = figure.subplots(3, 2, sharex=True)
-    for (left, right), (label, evolution) in zip(grid, chosen.items(), strict=True):
+    for (covariance_axes, draw_axes), (label, evolution) in zip(grid, evolutions.items(), strict=True):
         force = forces.QuasiPeriodic(kernel, evolution, gamma=1e-6)
-        left.plot(t, force.covariance(t, 5.0), color=style.BLACK, lw=0.8, label="product of the kernels")
-        left.plot(t, force.sde_covariance(t, 5.0), "--", color=style.BLUE, label="state-space form")
+        covariance_axes.plot(t, force.covariance(t, 5.0), color=style.BLACK, lw=0.8, label="product of the kernels")
+        covariance_axes.plot(t, force.sde_covariance(t, 5.0), "--", color=style.BLUE, label="state-space form")
         values, vectors = np.linalg.eigh(np.asarray(force.sde_covariance(t[:, None], t)))
         root = vectors * np.sqrt(np.maximum(values, 0.0))
         for colour, line in ((style.BLUE, "-"), (style.VERMILLION, "--")):
-            right.plot(t, root @ generator.normal(size=len(t)), color=colour, ls=line)
-        _tidy(left, f"{label}: with the force at time 5", ylabel="covariance")
-        _tidy(right, f"{label}: two draws", ylabel="force")
+            draw_axes.plot(t, root @ generator.normal(size=len(t)), color=colour, ls=line)
+        _tidy(covariance_axes, f"{label}: with the force at time 5", ylabel="covariance")
+        _tidy(draw_axes, f"{label}: two draws", ylabel="force")
     for axes in grid[-1]:
         axes.set_xlabel("time (period 10)")
     legend(figure)
@@ -109,14 +109,14 @@ def plot_draws(settings: Any, *, width: str | float = "full") -> Figure:
 
 @style.styled
 def plot_prediction(settings: Any, data: Data, *, width: str | float = "full") -> Figure:
-    """Draw the first function, its measurements, and how each approximation predicts it (figure 4 of the source)."""
-    measured, truth = np.split(methods.functions(settings.seed, settings.runs)[0], [len(problem.MEASURED)])
+    """Draw the first function, its measurements, and its prediction by each method (figure 4 of the source)."""
+    measured, truth = np.split(methods.draw_functions(settings.seed, settings.runs)[0], [len(problem.MEASURED)])
     figure = style.new_figure(width, 3.6)
     panels = figure.subplots(2, 2, sharex=True, sharey=True).ravel()
     for axes, method in zip(panels, (methods.SPARSE, methods.SPARSE_4, methods.KPCA, methods.EXACT), strict=True):
-        found = data["regression"].sel({"method": method})
-        band(axes, problem.PREDICTED, found["mean"], np.sqrt(found["variance"]))
-        axes.plot(problem.PREDICTED, found["mean"], color=style.BLUE, label="mean")
+        prediction = data["regression"].sel({"method": method})
+        band(axes, problem.PREDICTED, prediction["mean"], np.sqrt(prediction["variance"]))
+        axes.plot(problem.PREDICTED, prediction["mean"], color=style.BLUE, label="mean")
         axes.plot(problem.PREDICTED, truth, **TRUTH)
         axes.plot(problem.MEASURED, measured, "o", color=style.BLACK, ms=3, label="measured")
         _tidy(axes, method, xlabel="time (lengthscale 10)", ylabel="function")

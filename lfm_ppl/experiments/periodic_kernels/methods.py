@@ -1,4 +1,4 @@
-"""Approximations of kernels: errors of their covariance functions, and predictions of functions that are drawn."""
+"""Approximations of kernels: errors of their covariance functions, and predictions of random functions."""
 
 from __future__ import annotations
 
@@ -18,99 +18,100 @@ from lfm_ppl.experiments.tasks import stack_results
 from lfm_ppl.forces import Force, PeriodicCovariance, random_frequencies
 
 EIGENFUNCTIONS, RESONATORS, RANDOM = METHODS = ("eigenfunctions", "resonators", "sparse spectrum")
-"""Whose covariance functions are compared, by the number of functions."""
+"""Methods whose covariance functions are compared for each number of functions."""
 
 EXACT, KPCA, COARSE = "exact", "22 eigenfunctions", "20 eigenfunctions on 20 points"
 SPARSE, SPARSE_4 = "sparse spectrum, 22 frequencies", "sparse spectrum, 88 frequencies"
-PREDICTING = {EXACT: 0, SPARSE: 22, SPARSE_4: 88, KPCA: 22, COARSE: 20}
-"""What predicts functions of the squared exponential -> its number of eigenfunctions or frequencies."""
+PREDICTORS = {EXACT: 0, SPARSE: 22, SPARSE_4: 88, KPCA: 22, COARSE: 20}
+"""Approximation of the squared exponential -> number of eigenfunctions or frequencies."""
 
 
 def covariance_errors(task: Task) -> Result:
-    """Return the largest error of each method for each number of functions; NaN where there is none such.
+    """Return the largest covariance error of each method for each number of functions; NaN if it does not apply.
 
-    Those of the sparse spectrum are means over draws of its frequencies, of which two functions, a cosine and a sine,
-    come from each; ``left out`` is the variance that the eigenfunctions do not have, and ``significant`` their number
-    at the default gamma, with its error.
+    Errors of the sparse spectrum are means over draws of its frequencies; each frequency gives two functions, a cosine
+    and a sine. ``left out`` is the mean variance outside the eigenfunctions. ``significant`` is the number of
+    eigenfunctions at the default gamma, and ``at default`` their error.
     """
     name, draws = task.settings["kernel"], task.settings["draws"]
     kernel = problem.kernels()[name]
-    at, exact = problem.on_grid(kernel)
+    times, exact = problem.covariance_on_grid(kernel)
     spectrum = problem.window_prior() if name == problem.NOT_PERIODIC else kernel if kernel.stationary else None
 
     def errors(count: int) -> Result:
         force, size = eigenfunctions(kernel, count), max(1, count // 2)
-        found = {EIGENFUNCTIONS: error(force, at, exact), RESONATORS: np.nan, RANDOM: np.nan,
-                 "left out": np.mean(np.diag(exact) - force.sde_covariance(at, at))}
+        row = {EIGENFUNCTIONS: covariance_error(force, times, exact), RESONATORS: np.nan, RANDOM: np.nan,
+                 "left out": np.mean(np.diag(exact) - force.sde_covariance(times, times))}
         if kernel.stationary:
             # Without noise and damping a resonator's covariance depends on the distance in time alone.
-            covariance = forces.resonators(kernel, count, explained_variance=0.0).covariance(at)
-            found[RESONATORS] = np.abs(covariance - exact[:, 0]).max()
+            covariance = forces.resonators(kernel, count, explained_variance=0.0).covariance(times)
+            row[RESONATORS] = np.abs(covariance - exact[:, 0]).max()
         if spectrum is not None:
             frequencies = random_frequencies(jax.random.fold_in(task.key, count), spectrum, size * draws)
-            found[RANDOM] = _of_random(np.reshape(frequencies, (draws, size)), at, exact).mean()
-        return found
+            row[RANDOM] = _random_frequency_errors(np.reshape(frequencies, (draws, size)), times, exact).mean()
+        return row
 
     significant = forces.significant_functions(kernel)
-    return stack_results([errors(fitting(kernel, count)) for count in task.settings["functions"]]) | {
-        "significant": significant, "at default": error(eigenfunctions(kernel, significant), at, exact)}
+    return stack_results([errors(feasible_count(kernel, count)) for count in task.settings["functions"]]) | {
+        "significant": significant, "at default": covariance_error(eigenfunctions(kernel, significant), times, exact)}
 
 
 def quadrature_errors(task: Task) -> Result:
-    """Return the ``error`` of 22 eigenfunctions on the window, or as many as there are, by the number of points.
+    """Return the ``error`` of at most 22 eigenfunctions on the window for each number of quadrature points.
 
-    ``sparse 22`` and ``sparse 88`` (100,) are the errors of draws of so many frequencies.
+    ``sparse 22`` and ``sparse 88`` (100,) are the errors of draws of 22 and 88 frequencies.
     """
     kernel = problem.window_kernel()
-    at, exact = problem.on_grid(kernel)
-    found = {"error": np.asarray([error(eigenfunctions(kernel, min(22, points), points), at, exact)
+    times, exact = problem.covariance_on_grid(kernel)
+    result = {"error": np.asarray([covariance_error(eigenfunctions(kernel, min(22, points), points), times, exact)
                                   for points in task.settings["points"]])}
     for count in (22, 88):
         key = jax.random.fold_in(task.key, count)
         frequencies = np.stack([random_frequencies(jax.random.fold_in(key, index), problem.window_prior(), count)
                                 for index in range(100)])
-        found[f"sparse {count}"] = _of_random(frequencies, at, exact)
-    return found
+        result[f"sparse {count}"] = _random_frequency_errors(frequencies, times, exact)
+    return result
 
 
-def fitting(kernel: PeriodicCovariance, count: int) -> int:
-    """Return the number of functions; of a stationary kernel, which has pairs, one less if even."""
+def feasible_count(kernel: PeriodicCovariance, count: int) -> int:
+    """Return the number of functions, odd for a stationary kernel: a constant, and pairs of a cosine and a sine."""
     return count - (count + 1) % 2 if kernel.stationary else count
 
 
 def eigenfunctions(kernel: PeriodicCovariance, count: int, points: int = 200) -> forces.Periodic:
-    """Return the force of so many eigenfunctions, as far as the kernel has them."""
-    return forces.Periodic(kernel, functions=fitting(kernel, count), points=points, explained_variance=0.0)
+    """Return the force with ``count`` eigenfunctions, or with all if the kernel has fewer."""
+    return forces.Periodic(kernel, functions=feasible_count(kernel, count), points=points, explained_variance=0.0)
 
 
-def error(force: Force, at: np.ndarray, exact: np.ndarray) -> float:
+def covariance_error(force: Force, times: np.ndarray, exact: np.ndarray) -> float:
     """Return the largest difference between the covariance of a force with eigenfunctions and the exact one."""
-    return float(np.abs(np.asarray(force.sde_covariance(at[:, None], at)) - exact).max())
+    return float(np.abs(np.asarray(force.sde_covariance(times[:, None], times)) - exact).max())
 
 
-def _of_random(frequencies: np.ndarray, at: np.ndarray, exact: np.ndarray) -> np.ndarray:
+def _random_frequency_errors(frequencies: np.ndarray, times: np.ndarray, exact: np.ndarray) -> np.ndarray:
     """Return the largest error (D,) of each of D draws of frequencies (D, S), whose covariance is a mean of cosines."""
-    return np.abs(np.cos(at[:, None, None] * frequencies).mean(axis=-1) - exact[:, :1]).max(axis=0)
+    return np.abs(np.cos(times[:, None, None] * frequencies).mean(axis=-1) - exact[:, :1]).max(axis=0)
 
 
-def functions(seed: int, runs: int) -> np.ndarray:
-    """Return values (runs, n + K) of functions at the measured and the predicted times."""
+def draw_functions(seed: int, runs: int) -> np.ndarray:
+    """Return values (runs, n + K) of random functions at the measured and the predicted times."""
     times = np.concatenate([MEASURED, PREDICTED])
-    values, vectors = np.linalg.eigh(_exact(times[:, None], times))
+    values, vectors = np.linalg.eigh(_squared_exponential(times[:, None], times))
     draws = np.random.default_rng((seed, 5)).normal(size=(runs, len(times)))
     return (draws * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
 
 
-def predictions(task: Task) -> Result:
+def predict_functions(task: Task) -> Result:
     """Return the root mean squared error, log likelihood and coverage of every function, and the first prediction.
 
     The log likelihood is the sum of the log densities of the predicted points.
     """
     method, runs = task.settings["method"], task.settings["runs"]
-    data, truth = np.split(functions(task.seed, runs), [len(MEASURED)], axis=1)
-    fixed = None if "sparse" in method else covariances(task, method, 0)
-    mean, variance = (np.stack(rows) for rows in zip(*(
-        predict(fixed or covariances(task, method, index), data[index]) for index in range(runs)), strict=True))
+    data, truth = np.split(draw_functions(task.seed, runs), [len(MEASURED)], axis=1)
+    fixed_prior = None if "sparse" in method else prior_covariances(task, method, 0)
+    posteriors = [condition(fixed_prior or prior_covariances(task, method, index), data[index])
+                  for index in range(runs)]
+    mean, variance = map(np.stack, zip(*posteriors, strict=True))
     density = norm.logpdf(truth, mean, np.sqrt(variance))
     return {"rmse": scores.rmse(mean, truth), "log likelihood": density.sum(axis=1),
             "coverage": scores.interval_coverage(*scores.interval(mean, np.sqrt(variance)), truth),
@@ -118,31 +119,31 @@ def predictions(task: Task) -> Result:
 
 
 def approximation(method: str, key: jax.Array) -> Force:
-    """Return the force of a method; the frequencies of a sparse spectrum are drawn."""
+    """Return the force of a method; a sparse spectrum has random frequencies."""
     if "sparse" in method:
-        return forces.SparseSpectrum(1.0, random_frequencies(key, problem.window_prior(), PREDICTING[method]))
-    return eigenfunctions(problem.window_kernel(), PREDICTING[method], 20 if method == COARSE else 200)
+        return forces.SparseSpectrum(1.0, random_frequencies(key, problem.window_prior(), PREDICTORS[method]))
+    return eigenfunctions(problem.window_kernel(), PREDICTORS[method], 20 if method == COARSE else 200)
 
 
-def covariances(task: Task, method: str, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the prior covariances: of the measured times, of predicted and measured ones, and variances.
+def prior_covariances(task: Task, method: str, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the covariance at the measured times, the cross-covariance (K, n) and the variances at predicted times.
 
-    Frequencies are drawn anew for each function ``index``.
+    A sparse spectrum has new frequencies for each function ``index``.
     """
-    between: Callable[..., Any] = _exact
+    covariance: Callable[..., Any] = _squared_exponential
     if method != EXACT:
         force = approximation(method, jax.random.fold_in(task.key, index))
-        between = force.covariance if "sparse" in method else force.sde_covariance
-    return (np.asarray(between(MEASURED[:, None], MEASURED)), np.asarray(between(PREDICTED[:, None], MEASURED)),
-            np.asarray(between(PREDICTED, PREDICTED)))
+        covariance = force.covariance if "sparse" in method else force.sde_covariance
+    return (np.asarray(covariance(MEASURED[:, None], MEASURED)), np.asarray(covariance(PREDICTED[:, None], MEASURED)),
+            np.asarray(covariance(PREDICTED, PREDICTED)))
 
 
-def predict(prior: tuple[np.ndarray, np.ndarray, np.ndarray], data: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def condition(prior: tuple[np.ndarray, np.ndarray, np.ndarray], data: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return mean and variance (K,) at the predicted times given measurements (n,)."""
     measured, cross, variance = prior
     gain = np.linalg.solve(measured + problem.NUGGET * np.eye(len(measured)), cross.T).T
     return gain @ data, np.maximum(variance - (gain * cross).sum(axis=1), 0.0) + problem.NUGGET
 
 
-def _exact(t: np.ndarray, s: np.ndarray) -> np.ndarray:
+def _squared_exponential(t: np.ndarray, s: np.ndarray) -> np.ndarray:
     return np.exp(-0.5 * ((t - s) / problem.LENGTHSCALE) ** 2)

@@ -1,4 +1,11 @@
-"""Full posteriors with all rates unknown: the marginal likelihood against the force as latent sites."""
+"""Full posteriors with all rates unknown, with the force marginalised or as latent sites.
+
+1. The model has uniform priors of the rates and starts of three genes, and log-normal priors of noise and lengthscale.
+2. Sample it by NUTS with the force as latent sites on a grid; by NUTS and RAM on the marginal likelihood of a
+   Gauss-Hermite filter.
+3. For an iterated likelihood, weight RAM's draws by the Pareto-smoothed likelihood ratio, and resample each chain.
+4. Summarise the force from the latent sites, or mix smoothed forces at evenly spaced draws.
+"""
 
 from __future__ import annotations
 
@@ -23,25 +30,27 @@ from lfm_ppl.linearisation.sigma_points import GaussHermite
 from lfm_ppl.results import importance
 
 RULE, STEPS = GaussHermite(7), 6
-AT = np.linspace(0.0, problem.END, 61)
-"""The latent grid, with the exact weights for a production that is linear between its points; the force is reported
-there."""
+FORCE_TIMES = np.linspace(0.0, problem.END, 61)
+"""Times of the latent grid and of the reported force. The grid's weights are exact for a production that is linear
+between its points."""
 
 BATCH, PATHS = 200, 100
-"""Draws whose iterated likelihoods are computed at a time, and draws over which the smoothed force is averaged."""
+"""Batch size of the iterated likelihoods, and number of draws in the average of the smoothed force."""
 
-LINKS = {one.label: one for one in (problem.Configuration("softplus"), problem.Configuration("saturation", 0.5))}
+LINKS = {entry.label: entry for entry in (problem.Configuration("softplus"), problem.Configuration("saturation", 0.5))}
 UNIFORM = {"basal": (0.0, 0.1), "decay": (0.0, 2.0), "sensitivity": (0.0, 1.0), "away": (-0.1, 0.1)}
 LEVELS = {"noise_sd": problem.NOISE, "lengthscale": problem.LENGTHSCALE}
 NAMES = (*(f"{name}[{gene + 1}]" for name in UNIFORM for gene in range(problem.GENES)), *LEVELS)
 
 
-class Sampler(NamedTuple):
-    """A kernel, "NUTS" or "RAM", and the model that it samples.
+class SamplerConfiguration(NamedTuple):
+    """A kernel and its model.
 
-    The force is a ``latent`` site on a grid, or it is filtered out. The draws are weighted to a likelihood with so many
-    ``iterations`` of posterior linearisation. They come from the likelihood without, which is several times as fast and
-    close enough for importance weights.
+    Attributes:
+        kernel: "NUTS" or "RAM".
+        latent: whether the force is a latent site on a grid; the marginal likelihood has no force.
+        iterations: iterations of posterior linearisation in the target likelihood. Draws come from the likelihood
+            without iterations, which is several times as fast, and are weighted.
     """
 
     kernel: str
@@ -49,17 +58,18 @@ class Sampler(NamedTuple):
     iterations: int = 0
 
 
-SAMPLERS = {"NUTS, latent grid": Sampler("NUTS", latent=True), "NUTS, marginal": Sampler("NUTS"),
-            "RAM, marginal": Sampler("RAM"), "RAM, iterated marginal": Sampler("RAM", iterations=5)}
+SAMPLERS = {"NUTS, latent grid": SamplerConfiguration("NUTS", latent=True),
+            "NUTS, marginal": SamplerConfiguration("NUTS"), "RAM, marginal": SamplerConfiguration("RAM"),
+            "RAM, iterated marginal": SamplerConfiguration("RAM", iterations=5)}
 REFERENCE = "NUTS, latent grid"
 
 
 def model(times: Any, y: Any = None, link: str = "softplus", gamma: float | None = None) -> None:
     """Sample rates, start, noise and lengthscale, and score expression.
 
-    B ~ U(0, 0.1), D ~ U(0, 2), S ~ U(0, 1) and A ~ U(-0.1, 0.1) with x(0) = A + B/D, the distributions that made the
-    data, whose draws the source knew. The standard deviation of the noise and the lengthscale are the same in all data,
-    and log-normal here about these values.
+    B ~ U(0, 0.1), D ~ U(0, 2), S ~ U(0, 1) and A ~ U(-0.1, 0.1) with x(0) = A + B/D, as in the simulation of the data.
+    In the source these values are known. The standard deviation of the noise and the lengthscale are constant in all
+    data, and have log-normal priors with these medians.
     """
     rates = [numpyro.sample(name, dist.Uniform(low, high).expand([problem.GENES]).to_event(1))
              for name, (low, high) in UNIFORM.items()]
@@ -70,28 +80,27 @@ def model(times: Any, y: Any = None, link: str = "softplus", gamma: float | None
 def _likelihood(theta: jax.Array, link: str, gamma: float | None, iterations: int = 0, times: Any = problem.TIMES
                 ) -> MarginalLikelihood:
     """Return the likelihood of parameters (P,) in the order of `NAMES`."""
-    basal, decay, sensitivity, away = theta[:12].reshape(4, problem.GENES)
-    rates = problem.Rates(basal, sensitivity, decay, away + basal / decay)
+    basal, decay, sensitivity, excess = theta[:12].reshape(4, problem.GENES)
+    rates = problem.Rates(basal, sensitivity, decay, excess + basal / decay)
     return MarginalLikelihood(problem.system(link, gamma, rates, theta[12], theta[13]), times, rule=RULE, steps=STEPS,
                               iterations=iterations)
 
 
 def compute(task: Task) -> Result:
-    """Return draws (parameters, chains, draws), their diagnostics, and the force at `AT`.
+    """Return draws (parameters, chains, draws), their diagnostics, and the force at `FORCE_TIMES`.
 
-    ``k`` is the Pareto index of the weights, where draws are weighted; the diagnostics are then those of as many draws,
-    taken from each chain by weight. Every chain keeps its share of the draws: where the weights of one are lower than
-    those of others, R-hat shows it.
+    Weighted draws have the Pareto index ``k`` of their weights, and are resampled within each chain before the
+    diagnostics. Every chain keeps its number of draws, so that R-hat detects chains with lower weights.
     """
-    # The programs of one task serve no other, and would stay: half a gigabyte each.
+    # Programs of one task, half a gigabyte each, are of no use to other tasks.
     jax.clear_caches()
     settings, configuration = task.settings, problem.configuration(task)
     sampler = SAMPLERS[settings["sampler"]]
     data = problem.data_set(configuration, settings["index"], task.seed)
-    start = init_to_uniform(radius=1.0)  # chains start apart, or R-hat would say nothing
+    start = init_to_uniform(radius=1.0)  # R-hat needs different starts
     kernel: Any = RAM(model, init_strategy=start) if sampler.kernel == "RAM" else NUTS(
-        on_latent_grid(model, AT) if sampler.latent else model, init_strategy=start, dense_mass=not sampler.latent,
-        max_tree_depth=settings["tree_depth"])
+        on_latent_grid(model, FORCE_TIMES) if sampler.latent else model, init_strategy=start,
+        dense_mass=not sampler.latent, max_tree_depth=settings["tree_depth"])
     mcmc = chains.sampler(kernel, *(settings[name] for name in chains.LENGTHS))
 
     def run() -> dict[str, jax.Array]:
@@ -101,17 +110,17 @@ def compute(task: Task) -> Result:
     seconds, samples = time_call(run)
     draws = np.concatenate([*(np.moveaxis(np.asarray(samples[name]), -1, 0) for name in UNIFORM),
                             [samples[name] for name in LEVELS]])
-    found: Result = {}
+    weights: Result = {}
     if sampler.iterations:
-        more, (draws, found["k"]) = time_call(lambda: _weighted(settings, sampler.iterations, data, draws))
+        more, (draws, weights["k"]) = time_call(lambda: _weighted(settings, sampler.iterations, data, draws))
         seconds += more
     if sampler.latent:
-        forces = np.asarray(samples["y_forces"]).reshape(-1, len(AT))
+        forces = np.asarray(samples["y_forces"]).reshape(-1, len(FORCE_TIMES))
         mean, sd = forces.mean(axis=0), forces.std(axis=0)
     else:
         mean, sd = _marginalised(settings, sampler.iterations, data, draws)
-    truth = np.interp(AT, problem.GRID, data.u)
-    return {"draws": draws, **found, "divergences": int(np.sum(mcmc.get_extra_fields().get("diverging", 0))),
+    truth = np.interp(FORCE_TIMES, problem.GRID, data.u)
+    return {"draws": draws, **weights, "divergences": int(np.sum(mcmc.get_extra_fields().get("diverging", 0))),
             "seconds": seconds, **scores.diagnose(NAMES, draws), "force_mean": mean, "force_sd": sd,
             "rmse": scores.rmse(mean, truth), "truth": true_values(data),
             "coverage": scores.interval_coverage(*scores.interval(mean, sd), truth)}
@@ -126,7 +135,7 @@ def true_values(data: problem.DataSet) -> np.ndarray:
 
 def _weighted(settings: Mapping[str, Any], iterations: int, data: problem.DataSet, draws: np.ndarray
               ) -> tuple[np.ndarray, float]:
-    """Return as many draws of the posterior with the iterated likelihood, and the Pareto index of their weights."""
+    """Return draws resampled to the posterior with the iterated likelihood, and the Pareto index of the weights."""
     def log_ratio(theta: jax.Array) -> jax.Array:
         iterated, plain = (_likelihood(theta, settings["link"], settings["gamma"], n).log_prob(data.y)
                            for n in (iterations, 0))
@@ -134,23 +143,23 @@ def _weighted(settings: Mapping[str, Any], iterations: int, data: problem.DataSe
 
     flat = jnp.asarray(draws.reshape(len(draws), -1).T)
     ratios = jax.jit(lambda all_: jax.lax.map(log_ratio, all_, batch_size=min(BATCH, len(all_))))(flat)
-    found = importance.smooth(np.asarray(ratios).reshape(draws.shape[1:]))
-    if not np.isfinite(found.log_weight).any(axis=1).all():
-        raise ValueError("the iterated likelihood is zero at all draws of a chain; no weights make it a chain of that "
-                         "posterior.")
-    # In the order of the chain, whose effective sample size would seem larger otherwise.
-    taken = [np.sort(importance.resample(weights, len(weights), chain))
-             for chain, weights in enumerate(found.log_weight)]
-    return np.stack([draws[:, chain, index] for chain, index in enumerate(taken)], axis=1), found.k
+    smoothed = importance.smooth(np.asarray(ratios).reshape(draws.shape[1:]))
+    if not np.isfinite(smoothed.log_weight).any(axis=1).all():
+        raise ValueError("the iterated likelihood is zero at all draws of a chain, which cannot be weighted; use more "
+                         "draws or no iterations.")
+    # Another order than that of the chain would overstate the effective sample size.
+    indices = [np.sort(importance.resample(weights, len(weights), chain))
+             for chain, weights in enumerate(smoothed.log_weight)]
+    return np.stack([draws[:, chain, index] for chain, index in enumerate(indices)], axis=1), smoothed.k
 
 
 def _marginalised(settings: Mapping[str, Any], iterations: int, data: problem.DataSet, draws: np.ndarray
                   ) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and standard deviation of the force at `AT`, the parameters marginalised."""
-    def one(theta: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return mean and standard deviation of the force at `FORCE_TIMES` with the parameters marginalised."""
+    def smooth_force(theta: jax.Array) -> tuple[jax.Array, jax.Array]:
         likelihood = _likelihood(theta, settings["link"], settings["gamma"], iterations)
-        force = likelihood.smooth(data.y, at=AT).force(problem.FACTOR)
+        force = likelihood.smooth(data.y, at=FORCE_TIMES).force(problem.FACTOR)
         return force.mean, force.sd**2
 
-    chosen = jnp.asarray(scores.thin_draws(draws, min(PATHS, draws[0].size)))
-    return scores.total_moments(*map(np.asarray, jax.jit(jax.vmap(one))(chosen)))
+    thinned = jnp.asarray(scores.thin_draws(draws, min(PATHS, draws[0].size)))
+    return scores.total_moments(*map(np.asarray, jax.jit(jax.vmap(smooth_force))(thinned)))

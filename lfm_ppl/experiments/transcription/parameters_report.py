@@ -1,4 +1,4 @@
-"""The study of full posteriors: its settings, tasks, table and figures."""
+"""The study of full posteriors of transcription factors: settings, tasks, table and figures."""
 
 from __future__ import annotations
 
@@ -19,58 +19,57 @@ from lfm_ppl.experiments.transcription.parameters import LINKS, REFERENCE, SAMPL
 
 @dataclass(frozen=True)
 class TranscriptionParametersSettings(study.StudySettings):
-    """How much is computed."""
+    """Sizes of the study."""
 
-    datasets: int = setting(2, "for each link", quick=1, aliases=study.REALISATIONS)
+    datasets: int = setting(2, "data sets for each link", quick=1, aliases=study.REALISATIONS)
     latent: tuple[int, int, int, int] = setting((2, 500, 1000, 1), "NUTS on the latent grid", quick=(2, 20, 20, 1),
                                                 parts=study.CHAINS)
     nuts: tuple[int, int, int, int] = setting((2, 500, 1000, 1), "NUTS on the marginal likelihood",
                                               quick=(2, 20, 20, 1), parts=study.CHAINS)
     ram: tuple[int, int, int, int] = setting((4, 250, 1000, 200), "RAM", quick=(2, 50, 50, 5), parts=study.CHAINS)
-    tree_depth: int = setting(10, "largest of NUTS", quick=4)
-    links: tuple[str, ...] = setting(tuple(LINKS), "how the factor acts", quick=("softplus",), choices=tuple(LINKS))
+    tree_depth: int = setting(10, "largest tree depth of NUTS", quick=4)
+    links: tuple[str, ...] = setting(tuple(LINKS), "links of the factor", quick=("softplus",), choices=tuple(LINKS))
 
 
 def tasks(settings: TranscriptionParametersSettings) -> list[Task]:
     """Return one task for each link, data set and sampler."""
-    def task(index: int, link: str, label: str, sampler: parameters.Sampler) -> Task:
+    def task(index: int, link: str, label: str, sampler: parameters.SamplerConfiguration) -> Task:
         lengths = getattr(settings, "latent" if sampler.latent else sampler.kernel.lower())
         return Task(f"parameters/{problem.slug(f'{link} {label}')}/{index:03d}", settings.seed, {
             "experiment": "transcription-parameters", "sampler": label, **LINKS[link]._asdict(), "index": index,
             **dict(zip(chains.LENGTHS, lengths, strict=True)), "tree_depth": settings.tree_depth,
             **({"iterations": sampler.iterations} if sampler.iterations else {})})
 
-    return [task(index, link, *one) for index in range(settings.datasets) for link in settings.links
-            for one in SAMPLERS.items()]
+    return [task(index, link, *entry) for index in range(settings.datasets) for link in settings.links
+            for entry in SAMPLERS.items()]
 
 
 COLUMNS: dict[str, Column] = {
-    "coverage": lambda found: ((found.low <= found.truth) & (found.truth <= found.high)).mean("parameter"),
+    "coverage": lambda chain: ((chain.low <= chain.truth) & (chain.truth <= chain.high)).mean("parameter"),
     "RMSE": "rmse", "coverage force": "coverage",
-    "ESS/CPU s": lambda found: found.ess.fillna(0.0).min("parameter") / found.seconds,
-    "least ESS": chains.least_ess, "R-hat": chains.largest_r_hat, "k": lambda found: number(np.max, found.k),
-    "divergences": lambda found: found.divergences.mean()}
+    "ESS/CPU s": lambda chain: chain.ess.fillna(0.0).min("parameter") / chain.seconds,
+    "least ESS": chains.least_ess, "R-hat": chains.largest_r_hat, "k": lambda chain: number(np.max, chain.k),
+    "divergences": lambda chain: chain.divergences.mean()}
 
 
 def agreement(settings: TranscriptionParametersSettings, data: Data) -> dict[str, Any]:
     """Return one row for each link and sampler.
 
-    ``shift`` and ``sd ratio`` from the reference with their Monte Carlo errors, see `chains.agreement`; ``coverage`` of
-    the true parameters by 95% intervals, of which noise and lengthscale lie at the centre of their priors; ``RMSE`` of
-    the force and ``coverage force``; ``least ESS``, the smallest bulk effective sample size of a parameter, and
-    ``ESS/CPU s``, the same for a second of CPU time of warm-up and draws, compilation included, which takes more of it
-    where several CPUs share the work of one process; the largest ``R-hat``, and Pareto index ``k`` where draws are
-    weighted; ``divergences`` of one run.
+    ``shift`` and ``sd ratio`` relative to the reference have Monte Carlo errors, see `chains.agreement`. ``coverage``
+    is that of the true parameters by 95% intervals; the true noise and lengthscale are the medians of their priors. The
+    force has ``RMSE`` and ``coverage force``. ``least ESS`` is the smallest bulk effective sample size of a parameter,
+    and ``ESS/CPU s`` its ratio to the CPU time of compilation, warm-up and draws. Further columns are the largest
+    ``R-hat``, the Pareto index ``k`` of weighted draws, and ``divergences`` of one run.
     """
     rows: dict[str, Any] = {}
     for link in settings.links:
         for sampler in SAMPLERS:
-            found, reference = (data[link].sel(sampler=label) for label in (sampler, REFERENCE))
-            shift, ratio = chains.agreement(found, reference)
-            if sampler == REFERENCE:  # it is no estimate how it agrees with itself
+            posteriors, reference = (data[link].sel(sampler=label) for label in (sampler, REFERENCE))
+            shift, ratio = chains.agreement(posteriors, reference)
+            if sampler == REFERENCE:  # the agreement with itself is exact
                 shift, ratio = shift._replace(error=np.nan), ratio._replace(error=np.nan)
             rows[f"{link}: {sampler}"] = {**estimate_cells("shift", shift), **estimate_cells("sd ratio", ratio),
-                                          **row(found, COLUMNS)}
+                                          **row(posteriors, COLUMNS)}
     return rows
 
 

@@ -1,4 +1,9 @@
-"""The problem: three genes, one unseen factor, eight ways in which it acts, and what was published."""
+"""Data sets and models of three genes and one unmeasured factor, and the published errors.
+
+1. A configuration is a link between the factor's force u and its activity, with a parameter gamma.
+2. Draw rates and starts of the genes from uniform distributions, and u from its exact transition on a fine grid.
+3. Integrate the expression exactly, with the production linear within each cell; add noise at 13 times (`data_set`).
+"""
 
 from __future__ import annotations
 
@@ -22,17 +27,17 @@ FACTOR = "transcription factor"
 TIMES = np.linspace(0.0, END, OBSERVED)
 GRID = np.linspace(0.0, END, POINTS)
 DIVERGED = 3.0 * SCALE
-"""A root mean squared error above this counts as divergence, as in the source."""
+"""Root mean squared error above which an estimate has diverged, as in the source."""
 
 _REFINED = 6
-"""Cells of the simulation in one of the grid. Six of them make observation times part of it, too."""
+"""Cells of the simulation in each cell of the grid. With six, the observation times are on the fine grid."""
 
 
 class Configuration(NamedTuple):
-    """How the factor acts.
+    """Activity of the factor as a function of the force u.
 
-    "saturation" e^u / (gamma + e^u), "repression" 1 / (gamma + e^u), "exponential" e^u, "softplus" log(1 + e^u), or
-    "linear" u, whose posterior is known exactly.
+    The links are "saturation" e^u / (gamma + e^u), "repression" 1 / (gamma + e^u), "exponential" e^u, "softplus"
+    log(1 + e^u), and "linear" u, which has a Gaussian posterior.
     """
 
     link: str
@@ -60,16 +65,16 @@ PUBLISHED = {
 
 
 def configuration(task: Task) -> Configuration:
-    """Return the configuration of a task of either study."""
+    """Return the configuration of a task of the force or parameter study."""
     return Configuration(task.settings["link"], task.settings["gamma"])
 
 
 slug = functools.partial(tasks.slug, removed=",")
-"""Brackets stay, as in the names of stored tasks."""
+"""Part of a task name for a label; names of stored tasks have parentheses."""
 
 
 class Rates(NamedTuple):
-    """What is known of a data set besides the observations: B, S, D and x(0), each (3,)."""
+    """Known rates and start of a data set: B, S, D and x(0), (3,) each."""
 
     basal: Any
     sensitivity: Any
@@ -97,10 +102,14 @@ def on_grid(link: str, gamma: Any, rates: Rates, rule: str = "riemann") -> Laten
 
 
 class DataSet(NamedTuple):
-    """One simulated data set.
+    """A simulated data set.
 
-    All methods know its ``rates``; ``y`` (13, 3) is observed at TIMES, ``u`` (363,) the force on GRID, and ``state``
-    (K, 3) the expression at the times ``fine`` (K,) of the simulation.
+    Attributes:
+        rates: rates and start, known to all methods.
+        y: (13, 3) observations at TIMES.
+        u: (363,) force on GRID.
+        fine: (K,) times of the simulation.
+        state: (K, 3) expression at these times.
     """
 
     rates: Rates
@@ -114,16 +123,16 @@ class DataSet(NamedTuple):
 def data_set(configuration: Configuration, index: int, seed: int = 0) -> DataSet:
     """Return data set ``index``; rates, force and noise are the same for all configurations.
 
-    B ~ U(0, 0.1), D ~ U(0, 2), A ~ U(-0.1, 0.1), S ~ U(0, 1), x(0) = A + B/D. The force is drawn from its exact
-    transition on cells of 15/2172; within a cell the production is taken as linear, and integrated exactly.
+    B ~ U(0, 0.1), D ~ U(0, 2), A ~ U(-0.1, 0.1), S ~ U(0, 1), x(0) = A + B/D. The force has its exact transition on
+    cells of 15/2172; within a cell the production is linear, and is integrated exactly.
     """
     random = np.random.default_rng([seed, index])
     basal, decay = random.uniform(0.0, 0.1, GENES), random.uniform(0.0, 2.0, GENES)
-    away, sensitivity = random.uniform(-0.1, 0.1, GENES), random.uniform(0.0, 1.0, GENES)
+    excess, sensitivity = random.uniform(-0.1, 0.1, GENES), random.uniform(0.0, 1.0, GENES)
     fine = np.linspace(0.0, END, _REFINED * (POINTS - 1) + 1)
     h, rate = fine[1], np.sqrt(3.0) / LENGTHSCALE
     white = random.normal(size=(len(fine), 2))
-    # Matern-3/2: u and its derivative, from their stationary distribution on.
+    # Matern-3/2: u and its derivative start from the stationary distribution.
     transition = np.exp(-rate * h) * np.array([[1 + rate * h, h], [-(rate**2) * h, 1 - rate * h]])
     stationary = SCALE**2 * np.diag([1.0, rate**2])
     root = np.linalg.cholesky(stationary - transition @ stationary @ transition.T)
@@ -133,11 +142,11 @@ def data_set(configuration: Configuration, index: int, seed: int = 0) -> DataSet
     u = np.stack(path)[:, 0]
     with jax.ensure_compile_time_eval():
         active = np.asarray(shipped()["activity"](jnp.asarray(u), *configuration))
-    made, z = basal + sensitivity * active[:, None], -decay * h
+    production, z = basal + sensitivity * active[:, None], -decay * h
     first = np.expm1(z) / z
     second = (first - 1.0) / z
-    states = [away + basal / decay]
-    for gained in h * (first * made[:-1] + second * np.diff(made, axis=0)):
+    states = [excess + basal / decay]
+    for gained in h * (first * production[:-1] + second * np.diff(production, axis=0)):
         states.append(np.exp(z) * states[-1] + gained)
     state = np.stack(states)
     observed = np.arange(OBSERVED) * (len(fine) - 1) // (OBSERVED - 1)
@@ -146,11 +155,11 @@ def data_set(configuration: Configuration, index: int, seed: int = 0) -> DataSet
 
 
 def inputs(settings: Mapping[str, Any], data: Sequence[DataSet]) -> tuple[jax.Array, Rates, jax.Array]:
-    """Return gamma, any number where the link has none, and rates (N, 3) and observations (N, 13, 3) of data sets."""
+    """Return gamma (1 for links without gamma), and rates (N, 3) and observations (N, 13, 3) of data sets."""
     gamma = jnp.asarray(1.0 if settings["gamma"] is None else settings["gamma"])
-    return gamma, *jax.tree_util.tree_map(lambda *arrays: jnp.stack(arrays), *((one.rates, one.y) for one in data))
+    return gamma, *jax.tree.map(lambda *arrays: jnp.stack(arrays), *((entry.rates, entry.y) for entry in data))
 
 
 def rows(tree: Any, index: Any) -> Any:
     """Return rows of every array of a tree."""
-    return jax.tree_util.tree_map(lambda array: array[index], tree)
+    return jax.tree.map(lambda array: array[index], tree)

@@ -1,4 +1,4 @@
-"""Ways to learn the magnitudes of the small forces, compared on the same satellite with the same prior."""
+"""Comparison of methods that learn the magnitudes of the small forces, on one satellite with one prior."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import chains
 from lfm_ppl.experiments.datasets import DATASET, Column, number, row
 from lfm_ppl.experiments.gps.figures import METRE
-from lfm_ppl.experiments.gps.satellite import given
+from lfm_ppl.experiments.gps.satellite import restore_training
 from lfm_ppl.inference.kernels.ram import RAM
 from lfm_ppl.orbits import learning, prediction, training
 from lfm_ppl.orbits.arc import Arc
@@ -26,16 +26,16 @@ from lfm_ppl.orbits.learning import DRAWS
 from lfm_ppl.orbits.magnitudes import Prior
 from lfm_ppl.orbits.training import Regression, Training
 
-WAYS = ("held out, averaged", "held out, mode", "marginal likelihood, mode", "marginal likelihood, posterior",
+METHODS = ("held out, averaged", "held out, mode", "marginal likelihood, mode", "marginal likelihood, posterior",
         "smoothed forces, mode")
 _WARMUP, _SAMPLES = 1_000, 1_000
 
 
 def compare(arc: Arc, task: Task) -> Result:
-    """Return error (km) after training and coverage of every way, each (W,)."""
-    orbit, data, prior = given(arc, task)
+    """Return error (km) after training and coverage of every method, (W,) each, and logarithms of magnitudes."""
+    orbit, data, prior = restore_training(arc, task)
     directions = rtn_along(orbits.propagate(arc.environment, orbit, arc.times))
-    near = prediction.surroundings(arc, orbit, data.axes)
+    neighbourhood = prediction.surroundings(arc, orbit, data.axes)
     target = learning.held_out(data, prior)
     mode = target.mode()
     likelihood = learning.likelihood(data, prior).mode()
@@ -44,7 +44,7 @@ def compare(arc: Arc, task: Task) -> Result:
                _posterior(data, prior, likelihood, task.key), smoothed[None])
     errors, coverage = [], []
     for vector in vectors:
-        error, _, covered = prediction.judge(arc, prediction.predict(arc, near, vector), directions)
+        error, _, covered = prediction.judge(arc, prediction.predict(arc, neighbourhood, vector), directions)
         errors.append(np.sqrt(np.nanmean((error[arc.train:] ** 2).sum(axis=1))))
         coverage.append(covered.mean())
     return {"error": np.array(errors), "coverage": np.array(coverage),
@@ -52,10 +52,10 @@ def compare(arc: Arc, task: Task) -> Result:
 
 
 def _posterior(data: Training, prior: Prior, start: np.ndarray, key: jax.Array) -> np.ndarray:
-    """Return draws (DRAWS, d) of the posterior of the logarithms given all positions of training, by RAM."""
-    def model(known: Regression) -> None:
+    """Return draws (DRAWS, d) from the posterior of the logarithms given all training positions, by RAM."""
+    def model(regression: Regression) -> None:
         logarithms = numpyro.sample("logarithms", dist.Normal(prior.mean, prior.sd).to_event(1))
-        numpyro.factor("positions", training.log_likelihood(logarithms, known, data.axes))
+        numpyro.factor("positions", training.log_likelihood(logarithms, regression, data.axes))
 
     strategy = init_to_value(values={"logarithms": jnp.asarray(start)})
     kernel = RAM(model, initial_covariance=(0.1 * prior.sd) ** 2, init_strategy=strategy)
@@ -64,9 +64,10 @@ def _posterior(data: Training, prior: Prior, start: np.ndarray, key: jax.Array) 
     return np.asarray(chain.get_samples()["logarithms"])[::_SAMPLES // DRAWS][:DRAWS]
 
 
-def table(found: xr.Dataset) -> dict[str, Any]:
-    """Return one row a way to learn: means over satellites of error (m) and coverage."""
+def method_rows(dataset: xr.Dataset) -> dict[str, Any]:
+    """Return one row for each learning method: means over satellites of error (m) and coverage."""
     columns: dict[str, Column] = {
-        "satellites": lambda one: one.sizes[DATASET], "error": lambda one: one.error / METRE,
-        "median": lambda one: number(np.median, one.error / METRE), "coverage": "coverage"}
-    return {way: row(found.isel(way=index).rename(satellite=DATASET), columns) for index, way in enumerate(WAYS)}
+        "satellites": lambda results: results.sizes[DATASET], "error": lambda results: results.error / METRE,
+        "median": lambda results: number(np.median, results.error / METRE), "coverage": "coverage"}
+    dataset = dataset.rename(satellite=DATASET)
+    return {method: row(dataset.isel(method=index), columns) for index, method in enumerate(METHODS)}
