@@ -140,7 +140,8 @@ def test_a_stop_after_sampling_costs_no_draw(sampler, whole, tmp_path, monkeypat
     assert said == "all draws and their scores, without trajectories"
     assert "log_likelihood" in arviz_data.groups(partial) and "trajectories" not in arviz_data.groups(partial)
     xr.testing.assert_identical(arviz_data.group(partial, "posterior"), arviz_data.group(whole(sampler), "posterior"))
-    for module in ("workflows.fit", "workflows.fit_starts", "inference.laplace_start"):  # nothing is searched or sampled again
+    # Nothing is searched or sampled again.
+    for module in ("workflows.fit", "workflows.fit_starts", "inference.laplace_start"):
         monkeypatch.setattr(f"lfm_ppl.{module}.mode_of", stop)
     assert_same(fit(sampler, checkpoint=tmp_path, resume=True), whole(sampler))
 
