@@ -1,4 +1,4 @@
-"""``lfm-ppl check``: how wrong is a saved posterior, and the corrected one."""
+"""``lfm-ppl check``: the error of the Gaussian filter in a saved posterior, and the corrected posterior."""
 
 from __future__ import annotations
 
@@ -9,37 +9,24 @@ import shlex
 import sys
 import time
 import warnings
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-from lfm_ppl.cli import choices, fit, page, results, session
+from lfm_ppl.cli import fit, page, results, session
 from lfm_ppl.cli.interruption import INTERRUPTED, Watch, watched
-from lfm_ppl.io import data, loading
-from lfm_ppl.utils import checks
+from lfm_ppl.cli.stored_fit import StoredFit, rebuild_fit
 
 TABLE = "accuracy.csv"
 FIGURE = "accuracy.png"
 CORRECTED = "corrected"
 UNFINISHED = "unfinished-check"
-"""Folder beside the result in which log likelihoods are kept until the check is done."""
+"""Folder beside the result that stores log likelihoods until the check is complete."""
 
 _DRAWS, _DRAWS_TO_CORRECT = 200, 1000
 _CHAINS, _WARMUP, _SAMPLES = 4, 500, 500
-"""Of the chains that correct a result from the posterior mode, which has none itself."""
+"""Settings of the chains that correct a result of the sampler map, which has no chains."""
 
 _RECORD = ("model_file", "settings", "options", "data", "note", "time_origin", "description")
-
-
-class Check(NamedTuple):
-    """What is checked: the result, its model and the keyword arguments of that; the data, and the model's file."""
-
-    posterior: Any
-    name: str
-    model: Callable
-    keywords: dict[str, Any]
-    observed: data.Data
-    file: loading.ModelFile
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -50,9 +37,9 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.out is not None:
             raise ValueError("--out names the folder of the corrected result; add --correct.")
         if arguments.delayed:
-            raise ValueError("--delayed says how the corrected result is sampled; add --correct.")
+            raise ValueError("--delayed is a setting of the corrected result; add --correct.")
     if arguments.resume and arguments.overwrite:
-        raise ValueError("--resume goes on with a check that was stopped, --overwrite begins another one; choose one.")
+        raise ValueError("--resume continues a check, --overwrite starts a new one; give one of them.")
     path = files.locate(arguments.result)
     posterior = arviz_data.load(path)
     settled = _settled(posterior, arguments)
@@ -62,15 +49,15 @@ def run(arguments: argparse.Namespace) -> int:
     page.refuse_foreign(path.parent, arguments.overwrite)
     results.writable(path.parent)
     session.start(int(arviz_data.attributes(posterior).get("chains", 1)), not arguments.no_cache)
-    task = rebuilt(posterior, arguments.model, path)
+    task = rebuild_fit(posterior, arguments.model, path)
     with contextlib.ExitStack() as stack:
         folder = None
         if arguments.correct:
             out = arguments.out or str(path.parent / CORRECTED)
             folder = stack.enter_context(results.folder(task.name, out, arguments.overwrite, arguments.resume))
             checkpoint.check_folder(folder, arguments.resume, arguments.overwrite)
-        go_on = f"go on with: {_again(arguments)}"
-        watch = stack.enter_context(watched(lambda: go_on))
+        resume_hint = f"resume with: {_resume_command(arguments)}"
+        watch = stack.enter_context(watched(lambda: resume_hint))
         try:
             report = settled or _checked(task, arguments, path.parent / UNFINISHED)
             for message in arviz_data.convergence_warnings(posterior):
@@ -96,17 +83,17 @@ def run(arguments: argparse.Namespace) -> int:
                 # Last, where it is seen.
                 print(f"next     {command.replace('RESULT', shlex.quote(arguments.result))}")
         except KeyboardInterrupt as error:
-            print(f"\nlfm-ppl: {str(error) or 'stopped'}; {go_on}", file=sys.stderr)
+            print(f"\nlfm-ppl: {str(error) or 'stopped'}; {resume_hint}", file=sys.stderr)
             return INTERRUPTED
         if status == INTERRUPTED:
-            print(f"resume   {_again(arguments)}")
+            print(f"resume   {_resume_command(arguments)}")
         else:
             checkpoint.forget(path.parent / UNFINISHED)
         return status
 
 
 def _settled(posterior: Any, arguments: argparse.Namespace) -> Any:
-    """Return the stored report where it says that new chains are needed, so that more draws would be a waste."""
+    """Return the stored report if it requires new chains, so that a new check would be wasted; else None."""
     from lfm_ppl.results import arviz_data
     from lfm_ppl.results.report import GROUP, AccuracyReport
     from lfm_ppl.results.verdict import CORRECT
@@ -119,87 +106,26 @@ def _settled(posterior: Any, arguments: argparse.Namespace) -> Any:
     return report if not report.reliable and is_chains else None
 
 
-def _refuse_other(task: Check) -> None:
-    """Raise ValueError where the model gives other log likelihoods than the result records, at a draw of each chain."""
+def _refuse_other(task: StoredFit) -> None:
+    """Raise ValueError if the log likelihood at a draw of each chain differs from the stored one."""
     from lfm_ppl.inference.posterior import evenly_spaced
     from lfm_ppl.results import arviz_data, likelihoods, rebuilding
 
     posterior = arviz_data.group(task.posterior, "posterior")
     chains = posterior.sizes["chain"]
-    chosen, rows = evenly_spaced(chains, posterior.sizes["draw"], 1)
+    draw_indices, rows = evenly_spaced(chains, posterior.sizes["draw"], 1)
     problem = rebuilding.problem(task.posterior, task.model, model_kwargs=task.keywords).at(rows)
-    found = likelihoods.recorded(problem, likelihoods.gaussian(problem))
-    rebuilding.check_likelihood(task.posterior, found.reshape(chains, len(chosen)), chosen)
+    log_likelihoods = likelihoods.recorded(problem, likelihoods.gaussian(problem))
+    rebuilding.check_likelihood(task.posterior, log_likelihoods.reshape(chains, len(draw_indices)), draw_indices)
 
 
-def _again(arguments: argparse.Namespace) -> str:
-    """Return the command that goes on with this check."""
+def _resume_command(arguments: argparse.Namespace) -> str:
+    """Return the command that resumes this check."""
     return shlex.join(["lfm-ppl", *(word for word in arguments.line if word not in ("--overwrite", "--resume")),
                        "--resume"])
 
 
-def rebuilt(posterior: Any, model_file: str | None, path: Path) -> Check:
-    """Rebuild the model from what the result in a file remembers of it."""
-    from lfm_ppl.inference.handlers.settings import approximate
-    from lfm_ppl.results import arviz_data, rebuilding
-    from lfm_ppl.results.inputs import ORIGIN, inputs_of
-    from lfm_ppl.results.scalars import unit_of
-
-    attrs = arviz_data.attributes(posterior)
-    chosen = model_file or attrs.get("model_file")
-    if not chosen:
-        raise ValueError(f"{path} does not say which file its model {attrs.get('model', '')!r} comes from, as of one "
-                         "that lfm.fit made. Name the file with --model FILE, or call lfm.check_accuracy(result, "
-                         "model) in Python.")
-    try:
-        model = loading.load(chosen)
-    except ValueError as error:
-        remedy = "" if model_file else " The result was made with this file; if it has moved, name it with --model."
-        raise ValueError(f"{error}{remedy}") from error
-    try:
-        times, y = rebuilding.observations(posterior)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
-    if y.ndim != 2 or times.ndim != 1:
-        raise ValueError(f"{path} is of a panel of series; use lfm.check_accuracy or lfm.forecast in Python.")
-    group = arviz_data.group(posterior, "observed_data")
-    outputs = tuple(str(name) for name in group["output"].values)
-    if model.outputs is not None and model.outputs != outputs:
-        raise ValueError(f"{path} is of the outputs {', '.join(outputs)}; {model.path} has "
-                         f"{', '.join(model.outputs)}. Give the file that it was made with.")
-    (variable,) = (group[name] for name in group.data_vars)
-    units = {name: unit for name in outputs if (unit := unit_of(variable, name))}
-    if clock := unit_of(group["time"]):
-        units["time"] = clock
-    observed = data.Data(times, y, outputs, units={**model.units, **units}, inputs=inputs_of(posterior),
-                         origin=attrs.get(ORIGIN))
-    options = _stored(attrs, "options", path)
-    unknown = sorted(set(options) - set(model.options))
-    if unknown:
-        raise ValueError(f"{path} was made with the option {unknown[0]!r}, which {model.path} no longer has. Give the "
-                         "file as it was then, with --model.")
-    settings = _stored(attrs, "settings", path)
-    if settings.get("rule") not in (None, *choices.RULES):
-        raise ValueError(f"{path}, attribute settings: {checks.unknown('rule', settings['rule'], choices.RULES)}")
-    settings["rule"] = choices.rule(settings.get("rule"))
-    numpyro_model = approximate(model.model, **settings)
-    return Check(posterior, model.name, numpyro_model, model.keywords(observed, options), observed, model)
-
-
-def _stored(attrs: dict[str, Any], name: str, path: Path) -> dict[str, Any]:
-    """Return what an attribute of a result holds as JSON."""
-    try:
-        found = json.loads(attrs.get(name) or "{}")
-    except ValueError as error:
-        raise ValueError(f"{path}: its attribute {name} cannot be read ({error}); the file was changed since `lfm-ppl "
-                         "fit` wrote it.") from None
-    if not isinstance(found, dict):
-        raise ValueError(f"{path}: its attribute {name} is no mapping; the file was changed since `lfm-ppl fit` wrote "
-                         "it.")
-    return found
-
-
-def _checked(task: Check, arguments: argparse.Namespace, folder: Path) -> Any:
+def _checked(task: StoredFit, arguments: argparse.Namespace, folder: Path) -> Any:
     from lfm_ppl.results.accuracy import check_accuracy
 
     return check_accuracy(
@@ -222,9 +148,9 @@ def _write(report: Any, posterior: Any, path: Path, command_line: str) -> int:
     from lfm_ppl.results.plots import plot_accuracy
     from lfm_ppl.results.report import GROUP
 
-    # The file again, not what was read before the computation: somebody may have added to it.
-    made = report.to_dataset().assign_attrs(command_line=command_line)
-    stored = arviz_data.add_group(arviz_data.load(path), GROUP, made)
+    # Load the file again: another process may have added to it.
+    report_group = report.to_dataset().assign_attrs(command_line=command_line)
+    stored = arviz_data.add_group(arviz_data.load(path), GROUP, report_group)
     print(f"wrote    {arviz_data.save(stored, path, overwrite=True)} (group {GROUP})")
     print(f"wrote    {tables.write_csv(report.table, path.parent / TABLE, overwrite=True)}")
     try:
@@ -238,7 +164,7 @@ def _write(report: Any, posterior: Any, path: Path, command_line: str) -> int:
     return page.update(stored, path.parent)
 
 
-def _correct(task: Check, report: Any, arguments: argparse.Namespace, folder: Path, watch: Watch | None) -> int:
+def _correct(task: StoredFit, report: Any, arguments: argparse.Namespace, folder: Path, watch: Watch | None) -> int:
     """Write the corrected result: by resampling where the weights are reliable, else by new chains."""
     from lfm_ppl.results import arviz_data
     from lfm_ppl.results.correction import correct_posterior
@@ -262,7 +188,7 @@ def _correct(task: Check, report: Any, arguments: argparse.Namespace, folder: Pa
     return INTERRUPTED
 
 
-def _exact_chains(task: Check, arguments: argparse.Namespace, folder: Path) -> Any:
+def _exact_chains(task: StoredFit, arguments: argparse.Namespace, folder: Path) -> Any:
     """Sample the exact posterior by particle-marginal RAM.
 
     Where the weights fail, the filter's likelihood is too small in a part of the posterior, and delayed acceptance,
@@ -277,9 +203,9 @@ def _exact_chains(task: Check, arguments: argparse.Namespace, folder: Path) -> A
                                (int(attrs[name]) for name in ("chains", "warmup", "samples")))
     if attrs.get("init") == "laplace":  # the short warm-up of NUTS is too short for a random walk
         warmup = max(warmup, _WARMUP)
-    at = None
+    trajectory_times = None
     if arviz_data.has_group(task.posterior, "trajectories"):
-        at = arviz_data.group(task.posterior, "trajectories")["at"].values
+        trajectory_times = arviz_data.group(task.posterior, "trajectories")["at"].values
     kind = ", delayed acceptance" if arguments.delayed else ""
     print(f"correct  particle-marginal RAM{kind}, {chains} chains of {warmup} warm-up and {samples} kept draws",
           flush=True)
@@ -288,7 +214,8 @@ def _exact_chains(task: Check, arguments: argparse.Namespace, folder: Path) -> A
         options["particles"] = arguments.particles
     corrected = lfm_ppl.fit(
         task.model, task.observed, sampler="pmmh", sampler_options=options, chains=chains, warmup=warmup,
-        samples=samples, seed=arguments.seed, at=at, trajectory_draws=0 if at is None else 400,
+        samples=samples, seed=arguments.seed, at=trajectory_times,
+        trajectory_draws=0 if trajectory_times is None else 400,
         model_kwargs=task.keywords,
         fixed=json.loads(attrs.get("fixed") or "{}"), name=task.name, progress=not arguments.quiet,
         checkpoint=folder, resume=arguments.resume, overwrite=arguments.overwrite,

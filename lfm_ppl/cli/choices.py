@@ -1,4 +1,4 @@
-"""What the user's words stand for: rules, samplers, fixed parameters, options."""
+"""Values of options: rules, fixed parameters, bounds, known inputs, workers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from lfm_ppl.io.loading import ModelFile
 from lfm_ppl.utils import checks
 
-# word on the command line -> name in lfm_ppl; its defaults are what the word stands for
+# Value of --rule -> class in lfm_ppl, which is used with its defaults.
 RULES = {
     "cubature": "Cubature",
     "taylor": "Taylor",
@@ -22,79 +22,81 @@ RULES = {
 REFERENCES = ("auto", "grid", "particles")
 FREE = "free"
 MOST_JOBS = 4
-"""Processes that compute where nothing else is asked for; each takes one or two GiB."""
+"""Default largest number of processes; each takes one or two GiB."""
 
 
-def options(model: ModelFile, given: Sequence[str]) -> dict[str, Any]:
-    """Return the values of ``--option NAME=VALUE``, checked against what the model offers."""
-    pairs = [_pair("--option", text) for text in given]
+def options(model: ModelFile, texts: Sequence[str]) -> dict[str, Any]:
+    """Return the values of ``--option NAME=VALUE``, checked against the options of the model."""
+    pairs = [_pair("--option", text) for text in texts]
     return {name: model.option(name, value) for name, value in pairs}
 
 
-def fixed(given: Sequence[str], anchors: Mapping[str, float], options: Collection[str] = ()) -> dict[str, Any]:
+def fixed(texts: Sequence[str], anchors: Mapping[str, float], options: Collection[str] = ()) -> dict[str, Any]:
     """Return the parameters to fix: name -> value.
 
     Args:
-        given: ``NAME=VALUE``, ``NAME[ELEMENT]=VALUE``, ``NAME=V1,V2,...`` or ``NAME=free``.
-        anchors: what the model fixes for this data. What the user says of an element replaces the
-            anchor of that element, what the user says of a whole parameter all anchors of it.
-        options: of the model, which are no parameters.
+        texts: ``NAME=VALUE``, ``NAME[ELEMENT]=VALUE``, ``NAME=V1,V2,...`` or ``NAME=free``.
+        anchors: values that the model fixes for this data. A value of an element replaces the anchor of that element,
+            a value of a parameter all its anchors.
+        options: names of the model's options, which are no parameters.
 
     Raises:
-        ValueError: for what does not have one of these forms, and for an option.
+        ValueError: a text of another form, or an option.
     """
-    chosen = dict(anchors)
-    for text in given:
+    values_by_name = dict(anchors)
+    for text in texts:
         name, value = _pair("--set", text)
         if (option := name.partition("[")[0]) in options:
-            chosen_by = f"--option {option}={'VALUE' if value == FREE else value}"
-            raise ValueError(f"--set {text}: {option} is an option of the model, and no parameter: {chosen_by}.")
-        for anchor in list(chosen):
+            option_flag = f"--option {option}={'VALUE' if value == FREE else value}"
+            raise ValueError(f"--set {text}: {option} is an option of the model, not a parameter: {option_flag}.")
+        for anchor in list(values_by_name):
             if anchor == name or anchor.partition("[")[0] == name:
-                del chosen[anchor]
+                del values_by_name[anchor]
         if value != FREE:
-            chosen[name] = _number(name, value)
+            values_by_name[name] = _number(name, value)
         elif not any(anchor == name or anchor.partition("[")[0] == name for anchor in anchors):
-            known = ", ".join(anchors) or "none"
-            raise ValueError(f"--set {text}: the model does not fix {name}; it fixes: {known}.")
-    return chosen
+            anchor_names = ", ".join(anchors) or "none"
+            raise ValueError(f"--set {text}: the model does not fix {name}; it fixes: {anchor_names}.")
+    return values_by_name
 
 
-def bounds(flag: str, given: Sequence[str]) -> dict[str, float] | None:
+def bounds(flag: str, texts: Sequence[str]) -> dict[str, float] | None:
     """Return the bounds ``NAME=VALUE`` of a flag, name -> bound; None without any."""
-    found: dict[str, float] = {}
-    for text in given:
+    bounds_by_name: dict[str, float] = {}
+    for text in texts:
         name, value = _pair(flag, text)
-        if name in found:
-            raise ValueError(f"{flag} gives {name} two bounds, {found[name]:g} and {value}.")
+        if name in bounds_by_name:
+            raise ValueError(f"{flag} gives {name} two bounds, {bounds_by_name[name]:g} and {value}.")
         try:
-            found[name] = float(value)
+            bounds_by_name[name] = float(value)
         except ValueError:
             raise ValueError(f"{flag} takes NAME=NUMBER, got {text!r}.") from None
-    return found or None
+    return bounds_by_name or None
 
 
-def inputs(given: str | None, model: ModelFile) -> dict[str, tuple[str, str]]:
+def inputs(columns_text: str | None, model: ModelFile) -> dict[str, tuple[str, str]]:
     """Return the known inputs to read: name -> column of the file, interpolation.
 
     Args:
-        given: ``A,B:linear,C:zero``, columns in the order of the model's inputs; None: columns of these names.
-        model: what takes them.
+        columns_text: ``A,B:linear,C:zero``, columns in the order of the model's inputs; None: columns of these names.
+        model: the model file.
     """
-    if given is None:
+    if columns_text is None:
         return {name: (name, way) for name, way in model.inputs.items()}
-    columns = [tuple(part.strip() for part in text.partition(":")[::2]) for text in given.split(",")]
+    columns = [tuple(part.strip() for part in text.partition(":")[::2]) for text in columns_text.split(",")]
     names = list(model.inputs) or [column for column, _ in columns]
     if len(names) != len(columns) or len(set(columns)) < len(columns):
-        known = ", ".join(names)
-        raise ValueError(f"{model.name} takes {checks.counted(len(names), 'known input')} ({known}); --inputs names "
-                         f"{checks.counted(len(columns), 'column')}, which must be as many, each of them once.")
+        input_names = ", ".join(names)
+        raise ValueError(
+            f"{model.name} takes {checks.counted(len(names), 'known input')} ({input_names}); --inputs names "
+            f"{checks.counted(len(columns), 'column')}, which must be as many, each of them once."
+        )
     return {name: (column, way or model.inputs.get(name, "previous"))
             for name, (column, way) in zip(names, columns, strict=True)}
 
 
 def rule(word: str | None) -> Any:
-    """Return the linearisation rule that a word stands for; None: the model's own."""
+    """Return the linearisation rule of a name; None: the rule of the model."""
     import lfm_ppl
 
     return None if word is None else getattr(lfm_ppl, RULES[word])()
@@ -119,7 +121,7 @@ def _number(name: str, text: str) -> Any:
 
 
 def workers(jobs: int | None, scheduler: str | None) -> int | str:
-    """Return what computes, as `lfm_ppl.engine.run.run_tasks` takes it, for ``--jobs`` and ``--scheduler``.
+    """Return the workers of ``--jobs`` and ``--scheduler``, an argument of `lfm_ppl.engine.run.run_tasks`.
 
     Raises:
         ValueError: both are given.

@@ -1,4 +1,4 @@
-"""``lfm-ppl compare``: a published experiment, run again, with tables and figures."""
+"""``lfm-ppl compare``: a published study with its tables and figures."""
 
 from __future__ import annotations
 
@@ -20,56 +20,56 @@ PAGE = "index.html"
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """List the experiments, or run one: what its folder holds already is not computed again."""
-    chosen = arguments.study
-    if chosen is None:
-        print(f"{listed('')}\n\n`lfm-ppl compare NAME` runs one; `--quick` shows in a few minutes that it runs.")
+    """List the studies, or run one; stored results are not computed again."""
+    entry = arguments.study
+    if entry is None:
+        print(f"{listed('')}\n\n`lfm-ppl compare NAME` runs a study; `--quick` is a short run of a few minutes.")
         return 0
     from lfm_ppl.results import tables, web_page
     from lfm_ppl.utils.progress import Console, duration
 
     report = None if arguments.quiet else Console()
-    workers, study = choices.workers(arguments.jobs, arguments.scheduler), chosen.study
-    settings = study.settings.from_command_line(report, arguments.quick, **study_options.given(arguments))
-    default = Path("lfm-results") / "compare" / (f"{chosen.name}-quick" if arguments.quick else chosen.name)
+    workers, study = choices.workers(arguments.jobs, arguments.scheduler), entry.study
+    settings = study.settings.from_command_line(report, arguments.quick, **study_options.given_settings(arguments))
+    default = Path("lfm-results") / "compare" / (f"{entry.name}-quick" if arguments.quick else entry.name)
     with results.lasting(default, arguments.out) as folder:
         web_page.refuse_foreign(folder / PAGE, arguments.overwrite)
-        began = time.perf_counter()
-        found = study.run(settings, folder, overwrite=arguments.overwrite, report=report, workers=workers)
-        written = study.save(found, folder)
+        start_time = time.perf_counter()
+        study_result = study.run(settings, folder, overwrite=arguments.overwrite, report=report, workers=workers)
+        written = study.save(study_result, folder)
     width = shutil.get_terminal_size().columns
-    for title, table in found.printed.items():
+    for title, table in study_result.printed.items():
         print(f"\n{title}\n{tables.text_table(table, width=width)}")
-    for note in found.notes:
+    for note in study_result.notes:
         print(f"\n{textwrap.fill(note, width)}")
-    print(f"\ntime     {duration(time.perf_counter() - began)}")
+    print(f"\ntime     {duration(time.perf_counter() - start_time)}")
     for path in written:
         print(f"wrote    {path}")
-    return page.attempted(lambda: _index(folder, chosen, found, written, page.command_line(arguments)))
+    return page.attempted(lambda: _index(folder, entry, study_result, written, page.command_line(arguments)))
 
 
-def _index(folder: Path, chosen: CatalogueEntry, found: StudyResult, written: list[Path], command: str) -> Path:
-    """Write the tables and figures of an experiment as one page."""
+def _index(folder: Path, entry: CatalogueEntry, study_result: StudyResult, written: list[Path], command: str) -> Path:
+    """Write the tables and figures of a study as one page."""
     from lfm_ppl.results import tables, web_page
     from lfm_ppl.results.web_page import Section
 
-    there = [path for path in written if path.is_file()]
-    inside = [path.relative_to(folder).as_posix() for path in there if path.is_relative_to(folder)]
+    existing_files = [path for path in written if path.is_file()]
+    relative_paths = [path.relative_to(folder).as_posix() for path in existing_files if path.is_relative_to(folder)]
     sections = [
         Section("tables", "Tables", "\n".join(web_page.heading(title) + tables.html_table(table)
-                                              for title, table in found.printed.items())),
-        Section("notes", "Notes", "\n".join(web_page.paragraph(note) for note in found.notes)),
+                                              for title, table in study_result.printed.items())),
+        Section("notes", "Notes", "\n".join(web_page.paragraph(note) for note in study_result.notes)),
         Section("figures", "Figures", "\n".join(web_page.picture(path.read_bytes(), path.stem)
-                                                for path in there if path.suffix == ".png")),
+                                                for path in existing_files if path.suffix == ".png")),
         Section("repeat", "How to repeat it", web_page.preformatted(command) + web_page.paragraph(
-            "What the folder holds already is not computed again; in another one, --out, everything is.", "note")),
-        Section("files", "Files", web_page.file_list(inside)),
+            "Stored results of the folder are not computed again; in another folder (--out) everything is.", "note")),
+        Section("files", "Files", web_page.file_list(relative_paths)),
     ]
-    return web_page.write(web_page.render(chosen.name, chosen.summary, sections), folder / PAGE, overwrite=True)
+    return web_page.write(web_page.render(entry.name, entry.summary, sections), folder / PAGE, overwrite=True)
 
 
 def listed(indent: str = "  ") -> str:
-    """Return a line on each study."""
-    shown = [catalogue.experiment(name) for name in catalogue.names()]
-    width = max(len(one.name) for one in shown)
-    return "\n".join(f"{indent}{one.name:<{width}}  {one.summary}" for one in shown)
+    """Return one line per study."""
+    entries = [catalogue.experiment(name) for name in catalogue.names()]
+    width = max(len(entry.name) for entry in entries)
+    return "\n".join(f"{indent}{entry.name:<{width}}  {entry.summary}" for entry in entries)

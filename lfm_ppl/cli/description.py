@@ -1,4 +1,4 @@
-"""What a model file holds, found by running its model once: parameters with their priors, forces, states, outputs."""
+"""The description of a model file, from one run of its model: parameters with priors, forces, states, outputs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lfm_ppl.io.data import Data, InputTable
 
 
 class Parameter(NamedTuple):
-    """A parameter of a model: name, shape, prior and support in words, and what the file says of it."""
+    """A parameter of a model: name, shape, prior and support as text, and the help text of the file."""
 
     name: str
     shape: str
@@ -22,16 +22,16 @@ class Parameter(NamedTuple):
 
 
 class Description(NamedTuple):
-    """What a run of the model showed.
+    """The description of a model.
 
     Attributes:
-        parameters: that are sampled.
-        derived: names of what is computed from them, with their shapes.
+        parameters: sampled parameters.
+        derived: deterministic sites and their shapes.
         forces: name -> kind and unit.
         states: name -> unit.
         deterministics: name -> unit.
         approximation: the likelihood's settings.
-        strange: table of the file (UNITS, PARAMETERS) -> its names that are those of nothing, at the options' defaults.
+        unknown_names: table of the file (UNITS, PARAMETERS) -> names that the model does not have, at default options.
     """
 
     parameters: list[Parameter]
@@ -40,31 +40,31 @@ class Description(NamedTuple):
     states: dict[str, str]
     deterministics: dict[str, str]
     approximation: str
-    strange: dict[str, list[str]]
+    unknown_names: dict[str, list[str]]
 
 
 def describe(model: loading.ModelFile) -> Description:
-    """Run the model at the medians of its priors, and read off what it sampled.
+    """Run the model at the medians of its priors, and describe its sites.
 
     Raises:
-        ValueError, TypeError: whatever a fit of it would say.
+        ValueError, TypeError: as a fit of the model.
     """
     from lfm_ppl.inference.bound_model import bind
     from lfm_ppl.inference.priors import prior, support
 
-    data = model.simulate() if model.can_simulate else _made_up(model)
+    data = model.simulate() if model.can_simulate else _placeholder_data(model)
     bound = bind(model.model, data.times, data.y, **model.keywords(data, {}))
     site = bound.site
     system = site.example.ssm.model
     units: Mapping[str, str] = {**model.units, **system.units}
     parameters, derived = [], []
-    for name, one in bound.trace().items():
-        shape = np.shape(one["value"]) if one["type"] in ("sample", "deterministic") else ()
+    for name, entry in bound.trace().items():
+        shape = np.shape(entry["value"]) if entry["type"] in ("sample", "deterministic") else ()
         text = " x ".join(map(str, shape)) or "number"
-        if one["type"] == "sample" and name in bound.sites:
-            parameters.append(Parameter(name, text, prior(one["fn"]), support(one["fn"].support),
+        if entry["type"] == "sample" and name in bound.sites:
+            parameters.append(Parameter(name, text, prior(entry["fn"]), support(entry["fn"].support),
                                         model.parameters.get(name, "")))
-        elif one["type"] == "deterministic":
+        elif entry["type"] == "deterministic":
             derived.append((name, text))
     example = site.example
     approximation = ("exact: the model is linear" if _exact(example) else
@@ -82,8 +82,8 @@ def describe(model: loading.ModelFile) -> Description:
          "PARAMETERS": [name for name in model.parameters if name not in bound.trace()]})
 
 
-def _made_up(model: loading.ModelFile) -> Data:
-    """Return data of the right shape, where the file has none."""
+def _placeholder_data(model: loading.ModelFile) -> Data:
+    """Return data of the right shape for a model without simulated data."""
     outputs = model.outputs or ("y",)
     times = np.arange(3.0)
     inputs = {name: InputTable(times, np.ones(3), way) for name, way in model.inputs.items()}

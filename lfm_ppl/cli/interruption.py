@@ -96,7 +96,7 @@ def watched(last_words: Callable[[], str]) -> Iterator[Watch | None]:
     terminate = signal.getsignal(signal.SIGTERM)
     if terminate is signal.SIG_DFL:
         signal.signal(signal.SIGTERM, signal.default_int_handler)
-    before = signal.set_wakeup_fd(watch.wakeup, warn_on_full_buffer=False)
+    previous_wakeup = signal.set_wakeup_fd(watch.wakeup, warn_on_full_buffer=False)
     watch.start()
     LISTENERS.append(watch.answered)
     try:
@@ -107,6 +107,6 @@ def watched(last_words: Callable[[], str]) -> Iterator[Watch | None]:
         raise
     finally:
         LISTENERS.remove(watch.answered)
-        signal.set_wakeup_fd(before)
+        signal.set_wakeup_fd(previous_wakeup)
         signal.signal(signal.SIGTERM, terminate)
         watch.stop()

@@ -38,21 +38,25 @@ def _describe(model: loading.ModelFile) -> None:
         print(f"time: in {unit}")
     print()
     try:
-        found = description.describe(model)
-    except Exception:  # a model that does not run can still be described by what its file says
+        model_description = description.describe(model)
+    except Exception:  # the constants of the file describe a model that does not run
         _table("parameters (fix one with --set NAME=VALUE)", list(model.parameters.items()))
         _print_options(model)
         print("The model itself could not be run.")
         raise
     else:
-        _print_parameters(found)
-        more = (("of states and forces (deterministics)", found.deterministics),) if found.deterministics else ()
-        for title, entries in (("forces", found.forces), ("states", found.states), *more):
+        _print_parameters(model_description)
+        more = (
+            (("of states and forces (deterministics)", model_description.deterministics),)
+            if model_description.deterministics
+            else ()
+        )
+        for title, entries in (("forces", model_description.forces), ("states", model_description.states), *more):
             _table(title, [(name, text) for name, text in entries.items()])
-        print(f"likelihood: {found.approximation}\n")
-        for table, names in found.strange.items():
-            if names and not model.options:  # which may change what there is
-                print(f"{table} has {', '.join(names)}, of which the model has nothing; correct the name.\n")
+        print(f"likelihood: {model_description.approximation}\n")
+        for table, names in model_description.unknown_names.items():
+            if names and not model.options:  # options may change the sites
+                print(f"{table} has {', '.join(names)}, which the model does not have; correct the name.\n")
     _print_options(model)
 
 
@@ -61,16 +65,16 @@ def _print_options(model: loading.ModelFile) -> None:
     _table("options (choose with --option NAME=VALUE)", rows)
 
 
-def _print_parameters(found: description.Description) -> None:
+def _print_parameters(model_description: description.Description) -> None:
     print("parameters (fix one with --set NAME=VALUE):")
-    rows = [("name", "shape", "prior", "support", ""), *found.parameters]
+    rows = [("name", "shape", "prior", "support", ""), *model_description.parameters]
     widths = [max(len(row[column]) for row in rows) for column in range(4)]
     for row in rows:
         cells = [f"{cell:<{width}}" for cell, width in zip(row[:4], widths, strict=True)]
         print("  " + "  ".join([*cells, row[4]]).rstrip())
     print()
-    if found.derived:
-        _table("derived from them", found.derived)
+    if model_description.derived:
+        _table("derived from them", model_description.derived)
 
 
 def _outputs(model: loading.ModelFile) -> str:

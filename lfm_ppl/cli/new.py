@@ -11,15 +11,15 @@ from lfm_ppl.cli import results
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Write the file, and say what to do with it; a file that exists is kept, whatever is asked."""
+    """Write the file and print the next commands; an existing file is an error."""
     path = Path(arguments.file)
     if path.suffix != ".py" or not path.stem.isidentifier():
         raise ValueError(f"a model file is a Python file that can be imported, such as my_model.py, got {path.name!r}.")
     if path.exists():
-        raise FileExistsError(f"{path} exists already and is kept; choose another name.")
+        raise FileExistsError(f"{path} already exists; choose another name.")
     results.writable(path.parent)
     text = resources.files("lfm_ppl.cli").joinpath("template.py").read_text(encoding="utf-8")
-    with open(path, "x", encoding="utf-8") as file:  # fails where another process has just made it
+    with open(path, "x", encoding="utf-8") as file:  # fails if another process has made it meanwhile
         file.write(text)
     name = shlex.quote(str(path))
     print(f"wrote {path}\n\n"

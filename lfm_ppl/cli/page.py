@@ -1,4 +1,4 @@
-"""The page beside a result, ``report.html``, as the commands write it: nothing is lost where it cannot be."""
+"""The report beside a result, ``report.html``; a failure does not affect the result."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ import pandas as pd
 
 
 def command_line(arguments: argparse.Namespace) -> str:
-    """Return the command that does the same again, in a folder of its own."""
+    """Return the command that repeats the run in a new folder."""
     return shlex.join(["lfm-ppl", *(word for word in arguments.line if word not in ("--overwrite", "--resume"))])
 
 
 def refuse_foreign(folder: Path, overwrite: bool) -> None:
-    """Raise FileExistsError where another program's ``report.html`` stands in the way; ours is brought up to date."""
+    """Raise FileExistsError for a ``report.html`` of another program; a report of lfm_ppl is replaced."""
     from lfm_ppl.results import html_report, web_page
 
     web_page.refuse_foreign(folder / html_report.NAME, overwrite)
@@ -33,12 +33,12 @@ def exists(folder: Path) -> bool:
 
 def save(result: Any, folder: Path, overwrite: bool, figures: Sequence[Path],
          more: Mapping[str, pd.DataFrame] | None = None) -> int:
-    """Write the page and say so; return 1 where it could not be written.
+    """Write the report and print its path; return 1 if that fails.
 
     Args:
         result: an ArviZ object.
-        folder: of the result.
-        overwrite: replace a page that exists.
+        folder: folder of the result.
+        overwrite: replace an existing report.
         figures: PNG files to show.
         more: further tables, see `lfm_ppl.save_report`.
     """
@@ -50,28 +50,29 @@ def save(result: Any, folder: Path, overwrite: bool, figures: Sequence[Path],
 
 def update(result: Any, folder: Path, figures: Sequence[Path] = (),
            more: Mapping[str, pd.DataFrame] | None = None) -> int:
-    """Write the page of a result that another command has added to; return 1 where it could not be written.
+    """Write the report of an extended result; return 1 if that fails.
 
     Args:
         result: an ArviZ object.
-        folder: of the result, with the figures that were drawn of it.
-        figures: further ones.
+        folder: folder of the result and its figures.
+        figures: further figures.
         more: further tables, see `lfm_ppl.save_report`.
     """
     def write() -> Path:
         from lfm_ppl.results import html_report
         from lfm_ppl.results.plots.saving import pages_of
 
-        # By name, since the folder may hold figures of a result that was replaced.
-        drawn = [path for name, _, _ in pages_of(result, "full") if (path := folder / f"{name}.png").is_file()]
-        return html_report.save_report(result, folder / html_report.NAME, overwrite=True, figures=[*drawn, *figures],
-                                       more=more)
+        # By name: the folder may hold figures of a replaced result.
+        figure_paths = [path for name, _, _ in pages_of(result, "full") if (path := folder / f"{name}.png").is_file()]
+        return html_report.save_report(
+            result, folder / html_report.NAME, overwrite=True, figures=[*figure_paths, *figures], more=more
+        )
 
     return attempted(write)
 
 
 def attempted(write: Callable[[], Path]) -> int:
-    """Write a page and say where; where it fails, which costs no result, say why and return 1."""
+    """Write a report and print its path; print the reason of a failure and return 1."""
     try:
         path = write()
     except Exception as error:

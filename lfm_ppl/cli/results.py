@@ -15,13 +15,13 @@ _REMEDY = "Nothing was computed; name a folder that you may write with --out."
 
 @contextlib.contextmanager
 def folder(name: str, out: str | None, overwrite: bool, resume: bool = False) -> Iterator[Path]:
-    """Make the folder for the results, and remove it again where it is new and nothing was put into it.
+    """Make the folder of the results; remove a new folder that stays empty.
 
     Args:
-        name: of the model.
-        out: the folder that the user wants; None: the next of ``lfm-results/NAME-001``, ...
-        overwrite: whether ``out`` may hold files already.
-        resume: whether ``out`` holds a run to go on with.
+        name: name of the model.
+        out: --out; None: the next of ``lfm-results/NAME-001``, ...
+        overwrite: whether ``out`` may hold files.
+        resume: whether ``out`` holds a run to resume.
 
     Yields:
         The folder, which exists.
@@ -31,23 +31,23 @@ def folder(name: str, out: str | None, overwrite: bool, resume: bool = False) ->
         OSError: the folder cannot be made or written.
     """
     with _emptied(FOLDER if out is None else Path(out)) as new:
-        chosen = _fresh(name) if out is None else _named(Path(out), overwrite or resume)
+        result_folder = _fresh(name) if out is None else _named(Path(out), overwrite or resume)
         if out is None:
-            new.insert(0, chosen)
-        writable(chosen)
-        yield chosen
+            new.insert(0, result_folder)
+        writable(result_folder)
+        yield result_folder
 
 
 @contextlib.contextmanager
 def lasting(default: Path, out: str | None) -> Iterator[Path]:
-    """Make the folder of what can go on: the same one for the same command; it may hold results already.
+    """Make the folder of resumable tasks, the same for the same command; it may hold results.
 
     Args:
-        default: the folder where none is named.
-        out: the folder that the user wants.
+        default: the folder without --out.
+        out: --out.
 
     Yields:
-        The folder, which exists; it is removed again where it is new and nothing was put into it.
+        The folder; a new folder that stays empty is removed.
 
     Raises:
         FileExistsError: a file has its name.
@@ -63,7 +63,7 @@ def lasting(default: Path, out: str | None) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def _emptied(folder: Path) -> Iterator[list[Path]]:
-    """Remove what did not exist before, a folder and those above it, as far as they are empty afterwards."""
+    """Remove a folder and its parents that did not exist before, if they are empty afterwards."""
     new = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         yield new
@@ -74,7 +74,7 @@ def _emptied(folder: Path) -> Iterator[list[Path]]:
 
 
 def writable(folder: Path) -> None:
-    """Raise OSError where files cannot be written into a folder, which is made where it does not exist.
+    """Raise OSError if files cannot be written into a folder, which is made if necessary.
 
     The command line calls it before anything is computed: a file is written there and removed again.
     """
@@ -110,7 +110,7 @@ def _named(path: Path, overwrite: bool) -> Path:
         raise FileExistsError(f"{path} is a file; expected the name of a folder for the results.")
     if path.is_dir() and not overwrite and any(path.iterdir()):
         raise FileExistsError(
-            f"the folder {path} exists and holds files, which are kept. Name another one with "
+            f"the folder {path} exists and holds files. Name another folder with "
             "--out, or replace them with --overwrite."
         )
     return path

@@ -14,25 +14,25 @@ from lfm_ppl.utils.compilation import ONE_THREAD, fast_loops
 _MOST_DEVICES = 64
 
 SWITCH = "LFM_PPL_CACHE"
-"""Environment variable that keeps no compiled programs where it is "off"."""
+"""Environment variable that switches the cache of compiled programs off with the value "off"."""
 
 _SHORTEST_S = 0.2
-"""Programs that compile in less are not kept: a run makes dozens of them, which together save half a second."""
+"""Shortest compilation that is cached: dozens of shorter ones together save half a second."""
 
 _LARGEST = 2**30
-"""Bytes that the kept programs may take; a fit makes one to five million of them."""
+"""Largest size of the cache in bytes; a fit adds one to five million."""
 
 
 def start(chains: int, keep_programs: bool = True, one_thread: bool = False) -> None:
-    """Enable float64 and fast loops, make one device for each chain, and keep compiled programs for the next run.
+    """Enable float64, fast loops, one device per chain and the cache of compiled programs.
 
-    JAX counts its devices once, when the first array is made; after that the number is fixed. With
-    fewer cores than chains the devices share them, which still beats one chain after another.
+    JAX fixes the number of devices with the first array. Devices share cores if there are fewer cores than chains,
+    which is still faster than one chain after another.
 
     Args:
-        chains: that are to run side by side.
+        chains: number of parallel chains.
         keep_programs: see `cache_folder`.
-        one_thread: compute with one, as the workers of a cluster do.
+        one_thread: compute with one thread, as the workers of a cluster.
     """
     if one_thread:
         os.environ.update(ONE_THREAD)
@@ -50,7 +50,7 @@ def start(chains: int, keep_programs: bool = True, one_thread: bool = False) -> 
 
 
 def cache_folder() -> Path | None:
-    """Return where compiled programs are kept; None where they are not.
+    """Return the folder of compiled programs; None: no cache.
 
     The folder is ``$XDG_CACHE_HOME/lfm_ppl``, or ``~/.cache/lfm_ppl``, and in it one for each kind of CPU: programs
     hold its instructions, and a home may be shared by several machines. The environment variable ``LFM_PPL_CACHE=off``
@@ -59,16 +59,16 @@ def cache_folder() -> Path | None:
     if os.environ.get(SWITCH, "").lower() in ("off", "0", "no", "false"):
         return None
     base = os.environ.get("XDG_CACHE_HOME", "")
-    if not os.path.isabs(base):  # by the XDG specification, relative ones do not count
+    if not os.path.isabs(base):  # the XDG specification ignores relative paths
         try:
             base = str(Path.home() / ".cache")
-        except RuntimeError:  # nobody's home is known
+        except RuntimeError:  # no home directory
             return None
     return Path(base) / "lfm_ppl" / hashlib.sha256(_cpu().encode()).hexdigest()[:12]
 
 
 def _cpu() -> str:
-    """Return what the CPU can do, as far as the system says."""
+    """Return the features of the CPU."""
     with contextlib.suppress(OSError), open("/proc/cpuinfo", encoding="utf-8", errors="replace") as lines:
         for line in lines:
             if line.lower().startswith(("flags", "features")):
@@ -77,7 +77,7 @@ def _cpu() -> str:
 
 
 def _ready(folder: Path) -> bool:
-    """Make the folder, for its owner alone since what is in it will be run, and keep it small; or say why not."""
+    """Make the folder, writable by its owner only since its programs are executed, and prune it; warn on failure."""
     try:
         folder.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         folder.mkdir(mode=0o700, exist_ok=True)
@@ -85,9 +85,9 @@ def _ready(folder: Path) -> bool:
             raise PermissionError(f"no permission to write to {folder}")
         status = folder.stat()
         if hasattr(os, "getuid") and (status.st_uid != os.getuid() or status.st_mode & 0o022):
-            raise PermissionError(f"others may write to {folder}, and what is in it will be run")
+            raise PermissionError(f"others may write to {folder}, whose programs are executed")
     except OSError as error:
-        warnings.warn(f"compiled programs are not kept for the next run: {error}. {SWITCH}=off or --no-cache silences "
+        warnings.warn(f"compiled programs are not cached: {error}. {SWITCH}=off or --no-cache silences "
                       "this.", stacklevel=3)
         return False
     prune(folder.parent, _LARGEST)
@@ -95,17 +95,17 @@ def _ready(folder: Path) -> bool:
 
 
 def prune(folder: Path, largest: int) -> None:
-    """Remove the programs that were not used for longest until those in ``folder`` take at most ``largest`` bytes.
+    """Remove the least recently used programs until ``folder`` takes at most ``largest`` bytes.
 
     (JAX can bound its cache itself, but with another dependency and a lock around every access.)
     """
-    found = []
+    programs = []
     for path in folder.glob("*/*-cache"):
         with contextlib.suppress(OSError):  # another process may have removed it
             status = path.stat()
-            found.append((max(status.st_atime, status.st_mtime), status.st_size, path))
-    total = sum(size for _, size, _ in found)
-    for _, size, path in sorted(found):
+            programs.append((max(status.st_atime, status.st_mtime), status.st_size, path))
+    total = sum(size for _, size, _ in programs)
+    for _, size, path in sorted(programs):
         if total <= largest:
             break
         with contextlib.suppress(OSError):

@@ -15,7 +15,7 @@ def run(arguments: argparse.Namespace) -> int:
     model = loading.load(arguments.model)
     options = choices.options(model, arguments.option)
     table = files.refuse_existing(arguments.out or f"{model.name}.csv", arguments.overwrite)
-    beside = files.refuse_existing(table.with_suffix(".truth.json"), arguments.overwrite)
+    truth_file = files.refuse_existing(table.with_suffix(".truth.json"), arguments.overwrite)
     results.writable(table.parent)
     session.start(1, not arguments.no_cache)
     simulated = model.simulate(seed=arguments.seed, **options)
@@ -24,10 +24,10 @@ def run(arguments: argparse.Namespace) -> int:
     print(f"wrote {table}: {len(simulated.times)} times of {', '.join(simulated.outputs)}")
     words = ["lfm-ppl", "fit", arguments.model, "--data", str(table)]
     if simulated.truth is not None:
-        with files.writing(beside, arguments.overwrite) as temporary:
+        with files.writing(truth_file, arguments.overwrite) as temporary:
             data.write_truth(simulated, temporary)
-        print(f"wrote {beside}: what it was simulated from")
-        words += ["--truth", str(beside)]
+        print(f"wrote {truth_file}: what it was simulated from")
+        words += ["--truth", str(truth_file)]
     for option in arguments.option:
         words += ["--option", option]
     print(f"infer it back with: {shlex.join(words)}")

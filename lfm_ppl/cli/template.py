@@ -1,10 +1,9 @@
-"""A room warmed by something unseen: change this file into your own model.
+"""A room with an unmeasured heat source: change this file into your own model.
 
     dx/dt = heat(t) - loss (x - outside),        y_k = x(t_k) + e_k,    e_k ~ N(0, noise_sd^2)
 
-x is the temperature of a room, `loss` says how fast it cools, and `heat` is a force that nobody measured: a Gaussian
-process. Its posterior is found along with those of the parameters. The first line of this text is what `lfm-ppl models`
-shows.
+x is the temperature of a room, `loss` its rate of cooling, and `heat` an unmeasured force with a Gaussian process
+prior. Its posterior is computed together with the posterior of the parameters. `lfm-ppl models` shows the first line.
 """
 
 import jax
@@ -86,11 +85,11 @@ def simulate(seed=0):
     truth = {"loss": 0.3, "scale": 1.5, "lengthscale": 4.0, "noise_sd": 0.3}
     grid = np.linspace(0.0, 48.0, 385)
     observed = np.arange(0, 385, 8)  # once an hour
-    drawn = lfm.simulate(jax.random.key(seed), build(**truth), grid)
+    simulation = lfm.simulate(jax.random.key(seed), build(**truth), grid)
     return lfm.Data(
         times=grid[observed],
-        y=np.asarray(drawn.y)[observed],
+        y=np.asarray(simulation.y)[observed],
         outputs=OUTPUTS,
         units=UNITS,
-        truth={"times": grid, "forces": drawn.forces, "state": drawn.state, "parameters": truth},
+        truth={"times": grid, "forces": simulation.forces, "state": simulation.state, "parameters": truth},
     )

@@ -1,4 +1,4 @@
-"""From a word of the command line to a value; an error that is raised is the end of a line which names the option."""
+"""Types of options, as argparse calls them; the message of an error follows the name of the option."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from lfm_ppl.utils import checks
 
 
 def one_of(kind: str, choices: Any, **likeness: float) -> Callable[[str], str]:
-    """Return what takes one of the choices; for ``likeness`` see `checks.unknown`."""
+    """Return the type of an option with choices; for ``likeness`` see `checks.unknown`."""
     def convert(text: str) -> str:
         if text not in choices:
             raise argparse.ArgumentTypeError(checks.unknown(kind, text, choices, **likeness))
@@ -19,8 +19,8 @@ def one_of(kind: str, choices: Any, **likeness: float) -> Callable[[str], str]:
     return convert
 
 
-def whole(least: int) -> Callable[[str], int]:
-    """Return what takes a whole number from ``least`` on."""
+def integer(least: int) -> Callable[[str], int]:
+    """Return the type of a whole number of at least ``least``."""
     def convert(text: str) -> int:
         if not text.isascii() or not text.isdigit() or int(text) < least:
             message = f"expected a whole number of at least {least}, got {text!r}"

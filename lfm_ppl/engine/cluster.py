@@ -1,4 +1,4 @@
-"""Workers: processes of this machine, or those of a scheduler, by Dask. Nothing here imports Dask before it is used."""
+"""Workers by Dask: processes of this machine, or the workers of a scheduler. Dask is imported when it is used."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _WORKER_S = 60
 """Seconds in which a scheduler must have a worker."""
 
 _ALONE_S = 60.0
-"""Seconds for which tasks that are alike wait for the first one, which compiles for all."""
+"""Seconds for which similar tasks wait for the first one, which compiles for all."""
 
 _RESERVE = "XLA_PYTHON_CLIENT_PREALLOCATE"
 """Environment variable: whether JAX takes three quarters of an accelerator's memory at its first computation."""
@@ -41,43 +41,43 @@ _COUNT_S = 1.0
 """Seconds after which workers are counted again."""
 
 _LOST_S = 0.1
-"""Seconds after which it is looked again whether a lost result is there."""
+"""Seconds between two checks for a lost result."""
 
 _RESTART_S = 20.0
 """Seconds in which Dask must have started a dead worker again, or another takes its place."""
 
 _DEATHS = 4
-"""Workers that may die over a task before it has failed; with one thread each, only the task itself can be why."""
+"""Number of workers that may die during a task before it fails."""
 
 _REMEDY = ("Start one with `dask scheduler`, and workers with `dask worker tcp://HOST:PORT --nthreads 1 --nworkers N` "
            "(in the same environment as here).")
 
 
 class Cluster:
-    """Workers that run; made by `started`.
+    """Running workers; made by `started`.
 
     Attributes:
-        dashboard: address of Dask's dashboard; None where there is none.
+        dashboard: address of Dask's dashboard; None without one.
     """
 
     def __init__(self, client: Any, setup: worker.Setup, dashboard: str | None, local: Any = None,
-                 wanted: int = 1) -> None:
+                 worker_count: int = 1) -> None:
         self._client, self._setup, self.dashboard = client, setup, dashboard
-        # Dask starts a dead worker again, but gives up one that dies while it starts.
-        self._local, self._wanted, self._complete = local, wanted, time.monotonic()
+        # Dask restarts a dead worker, but not one that dies while it starts.
+        self._local, self._wanted, self._complete = local, worker_count, time.monotonic()
 
     def computed(self, tasks: Iterable[Task], compute: Callable[[Task], Mapping[str, Any]], alike: bool = False
                  ) -> Iterator[tuple[Task, dict[str, np.ndarray] | Exception]]:
-        """Yield each task when it is computed, with its arrays or with the error that it ended with.
+        """Yield each task when it ends, with its arrays or its error.
 
-        A task whose worker dies is computed by another one. There are never more tasks under way than there are
-        workers: so a dead worker leaves no doubt over which task it died, and what waits for the client is little.
+        A task whose worker dies is computed by another one. At most one task per worker is submitted, so that the task
+        of a dead worker is known and few results wait for the client.
 
         Args:
             tasks: the tasks.
-            compute: from a task to its result.
-            alike: whether they run the same programs. On this machine others then wait for the first one that is
-                computed, a minute at most, and find what it compiled.
+            compute: function from a task to its result.
+            alike: whether the tasks run the same programs. On this machine they then wait for the first one, a minute
+                at most, and use its compiled programs.
 
         Raises:
             ClusterError: the scheduler is lost, or a worker has other versions.
@@ -87,14 +87,14 @@ class Cluster:
 
         program, waiting = cloudpickle.dumps(compute), iter(tasks)
         running: dict[Any, Task] = {}
-        counted, workers, begun = -np.inf, 1, time.monotonic()
+        counted, workers, start_time = -np.inf, 1, time.monotonic()
         first = alike and self._local is not None
 
         def submit() -> None:
             nonlocal counted, workers
             if time.monotonic() - counted > _COUNT_S:
                 counted, workers = time.monotonic(), max(self._count(), 1)
-            most = 1 if first and time.monotonic() - begun < _ALONE_S else workers
+            most = 1 if first and time.monotonic() - start_time < _ALONE_S else workers
             for task in itertools.islice(waiting, max(most - len(running), 0)):
                 future = self._client.submit(worker.work, self._setup, program, pickle.dumps(task), pure=False,
                                              key=f"{task.name}-{uuid.uuid4().hex}")
@@ -103,7 +103,7 @@ class Cluster:
         ready: list[Any] = []
         try:
             for address in self._client.nthreads() if first else ():
-                # While the first task compiles, the others import what tasks need.
+                # While the first task compiles, the other workers import modules.
                 ready.append(self._client.submit(worker.get_ready, self._setup, program, pure=False, workers=[address],
                                                  allow_other_workers=True))
             submit()
@@ -114,31 +114,31 @@ class Cluster:
                     submit()
                     continue
                 for future in ended:
-                    if future.status == "lost":  # its worker died with the result: Dask computes it again
+                    if future.status == "lost":  # its worker died: Dask computes it again
                         time.sleep(_LOST_S)
                         continue
                     task = running.pop(future)
-                    found = self._outcome(future)
-                    first = first and isinstance(found, Exception)
+                    outcome = self._outcome(future)
+                    first = first and isinstance(outcome, Exception)
                     submit()
-                    yield task, found
-                del future, ended  # results need not stay with the workers
-        except (OSError, TimeoutError, CancelledError) as error:  # of Dask's own communication
+                    yield task, outcome
+                del future, ended  # workers may free the results
+        except (OSError, TimeoutError, CancelledError) as error:  # of Dask's communication
             raise ClusterError(self._lost()) from error
         finally:
             with contextlib.suppress(Exception):
                 self._client.cancel([*running, *ready], asynchronous=False)
 
     def _count(self) -> int:
-        """Return the number of workers; where one was started here and stays away, start another in its place."""
-        found = len(self._client.nthreads())
-        if self._local is not None and found < self._wanted:
+        """Return the number of workers, and replace a local worker that does not come back."""
+        running_count = len(self._client.nthreads())
+        if self._local is not None and running_count < self._wanted:
             if time.monotonic() - self._complete > _RESTART_S:
-                self._local.scale(len(self._local.worker_spec) + self._wanted - found)
+                self._local.scale(len(self._local.worker_spec) + self._wanted - running_count)
                 self._complete = time.monotonic()
         else:
             self._complete = time.monotonic()
-        return found
+        return running_count
 
     def _outcome(self, future: Any) -> dict[str, np.ndarray] | Exception:
         from distributed import KilledWorker
@@ -149,22 +149,24 @@ class Cluster:
             raise ClusterError(self._lost())
         error = future.exception()
         if isinstance(error, KilledWorker):
-            return ClusterError(f"{_DEATHS} workers died over it, most likely for want of memory; take fewer (--jobs).")
+            return ClusterError(
+                f"{_DEATHS} workers died during this task, probably for lack of memory; use fewer workers (--jobs)."
+            )
         if isinstance(error, ClusterError):
             raise error
         return error if isinstance(error, Exception) else RuntimeError(f"{type(error).__name__}: {error}")
 
     def _lost(self) -> str:
-        return ("the connection to the scheduler is lost. What is stored stays; the same call or command computes the "
-                "rest.")
+        return ("the connection to the scheduler is lost. Stored results are kept; the same call or command computes "
+                "the rest.")
 
 
 Workers = int | str | Cluster
-"""What computes: so many processes of this machine, the address of a scheduler, or workers that run already."""
+"""Number of processes of this machine, address of a scheduler, or running workers."""
 
 
 def check_workers(workers: Workers) -> None:
-    """Raise where ``workers`` is neither a positive number, nor an address, nor a cluster.
+    """Raise ValueError unless ``workers`` is a positive number, an address or a cluster.
 
     Example:
         >>> check_workers("localhost")
@@ -182,21 +184,21 @@ def check_workers(workers: Workers) -> None:
 
 
 def available() -> int:
-    """Return how many processes there are CPUs for; 1 where Dask, which starts them, is not installed."""
+    """Return the number of CPUs; 1 if Dask, which starts processes, is not installed."""
     return 1 if importlib.util.find_spec("distributed") is None else compilation.cpus()
 
 
 @contextlib.contextmanager
 def started(workers: Workers, most: int | None = None) -> Iterator[Cluster | None]:
-    """Start workers, or find those of a scheduler, and end what was started; None where this process is to compute.
+    """Start workers, or connect to a scheduler, and stop started workers at the end; None for this process.
 
     Args:
-        workers: 1: this process; more: so many processes of this machine, with one thread each, that listen to this
-            machine alone; ``"tcp://host:port"``: those of a scheduler; a cluster: itself.
-        most: processes that are started at the most.
+        workers: 1: this process; a larger number: processes of this machine, with one thread each and local
+            connections; ``"tcp://host:port"``: the workers of a scheduler; a cluster: itself.
+        most: largest number of processes.
 
     Raises:
-        ClusterError: Dask is not installed; the scheduler does not answer, has no workers, or some that do not fit.
+        ClusterError: Dask is not installed; the scheduler does not answer, or has no workers, or unsuitable ones.
     """
     check_workers(workers)
     if isinstance(workers, Cluster):
@@ -204,16 +206,24 @@ def started(workers: Workers, most: int | None = None) -> Iterator[Cluster | Non
     elif workers == 1:
         yield None
     elif importlib.util.find_spec("distributed") is None:
-        raise ClusterError("several processes need Dask: pip install 'lfm_ppl[cluster]', or take one (--jobs 1).")
+        raise ClusterError(
+            "several processes need Dask: pip install 'lfm_ppl[cluster]', or use one process (--jobs 1)."
+        )
     elif isinstance(workers, str):
         with _connected(workers) as client:
-            setup = worker.Setup.here(None)
+            setup = worker.Setup.of_this_process(None)
             check_fit(client, setup)
             yield Cluster(client, setup, _dashboard(client))
     else:
-        wanted = workers if most is None else min(workers, most)
-        with _embedded(wanted) as client:
-            yield Cluster(client, worker.Setup.here(programs_folder()), _dashboard(client), client.cluster, wanted)
+        worker_count = workers if most is None else min(workers, most)
+        with _embedded(worker_count) as client:
+            yield Cluster(
+                client,
+                worker.Setup.of_this_process(programs_folder()),
+                _dashboard(client),
+                client.cluster,
+                worker_count,
+            )
 
 
 @contextlib.contextmanager
@@ -222,19 +232,19 @@ def _embedded(workers: int) -> Iterator[Any]:
     from distributed import Client, LocalCluster
 
     # Two processes cannot each take most of an accelerator's memory.
-    own = {"JAX_ENABLE_X64": str(int(jax.config.read("jax_enable_x64"))),
+    jax_environment = {"JAX_ENABLE_X64": str(int(jax.config.read("jax_enable_x64"))),
            _RESERVE: os.environ.get(_RESERVE, "false")}
     settings = {
         "distributed.worker.multiprocessing-method": "spawn",
-        "distributed.nanny.pre-spawn-environ": {**_nanny_environment(), **ONE_THREAD, **own},
+        "distributed.nanny.pre-spawn-environ": {**_nanny_environment(), **ONE_THREAD, **jax_environment},
         "distributed.scheduler.allowed-failures": _DEATHS - 1,
         "distributed.scheduler.work-stealing": False,
-        # It looks at the stack of a task every hundredth of a second, for a page of the dashboard.
+        # The profiler of the dashboard samples the stack every hundredth of a second.
         "distributed.worker.profile.enabled": False,
     }
     with contextlib.ExitStack() as stack:
         stack.enter_context(dask.config.set(settings))
-        # JAX keeps memory of its own, so that a bound would stop a worker for good where the system can still help.
+        # JAX keeps freed memory, so that a memory limit would pause workers for good.
         local = stack.enter_context(LocalCluster(
             n_workers=workers, threads_per_worker=1, processes=True, host="127.0.0.1", memory_limit=0,
             dashboard_address="127.0.0.1:0" if _has_dashboard() else None, silence_logs=logging.CRITICAL))
@@ -264,17 +274,19 @@ def _connected(address: str) -> Iterator[Any]:
 
 
 def check_fit(client: Any, setup: worker.Setup) -> None:
-    """Raise ClusterError where a worker has several threads or other versions."""
+    """Raise ClusterError if a worker has several threads or other versions."""
     threads = {address: count for address, count in client.nthreads().items() if count != 1}
     if threads:
         address, count = next(iter(threads.items()))
         raise ClusterError(f"the worker {address} has {count} threads, but models are traced by one at a time. Start "
                            "it with `dask worker ... --nthreads 1 --nworkers N`.")
-    for address, found in client.run(worker.versions, on_error="return").items():
-        if isinstance(found, BaseException):
-            raise ClusterError(f"the worker {address} cannot run lfm_ppl {setup.versions['lfm_ppl']} "
-                               f"({type(found).__name__}: {found}). Install the same versions on all machines.")
-        worker.check_versions(found, setup.versions, address)
+    for address, worker_versions in client.run(worker.versions, on_error="return").items():
+        if isinstance(worker_versions, BaseException):
+            raise ClusterError(
+                f"the worker {address} cannot run lfm_ppl {setup.versions['lfm_ppl']} "
+                f"({type(worker_versions).__name__}: {worker_versions}). Install the same versions on all machines."
+            )
+        worker.check_versions(worker_versions, setup.versions, address)
 
 
 def _dashboard(client: Any) -> str | None:
@@ -286,7 +298,7 @@ def _has_dashboard() -> bool:
 
 
 def programs_folder() -> str:
-    """Return where processes find what others have compiled: this process's folder, or one that goes with it."""
+    """Return the shared folder of compiled programs: the cache of this process, or a temporary folder."""
     return jax.config.jax_compilation_cache_dir or _temporary().name  # type: ignore[attr-defined]
 
 

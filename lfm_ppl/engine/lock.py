@@ -1,4 +1,4 @@
-"""One run at a time in a folder; the system lets the next one in when a process ends, however it ends."""
+"""A lock on a folder, which the system releases when a process ends."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ FILE, HOLDER = ".lock", ".held-by"
 
 
 class FolderLock:
-    """Keeps other runs out of a folder, which exists, until `release`.
+    """Lock of an existing folder, held until `release`.
 
     Args:
-        folder: the folder. On a file system without locks nobody is kept out.
-        what: what a message calls it; None: its path.
+        folder: the folder. A file system without locks locks nothing.
+        label: its name in messages; None: its path.
 
     Raises:
         FolderInUseError: another run holds it.
     """
 
-    def __init__(self, folder: Path, what: str | None = None) -> None:
+    def __init__(self, folder: Path, label: str | None = None) -> None:
         self._holder = folder / HOLDER
         self._lock: filelock.BaseFileLock | None = filelock.FileLock(folder / FILE, thread_local=False)
         try:
@@ -34,7 +34,7 @@ class FolderLock:
             holder = "another run"
             with contextlib.suppress(OSError):
                 holder += f" ({self._holder.read_text(encoding='utf-8').strip()})"
-            raise FolderInUseError(f"{what or folder} is in use by {holder}. Wait until that ends, or choose another "
+            raise FolderInUseError(f"{label or folder} is in use by {holder}. Wait until it ends, or choose another "
                                    "folder.") from None
         except (NotImplementedError, OSError):
             self._lock = None
@@ -42,7 +42,7 @@ class FolderLock:
             self._holder.write_text(f"process {os.getpid()} on {socket.gethostname()}\n", encoding="utf-8")
 
     def release(self) -> None:
-        """Let others in."""
+        """Release the lock."""
         with contextlib.suppress(OSError):
             self._holder.unlink(missing_ok=True)
         if self._lock is not None:

@@ -1,4 +1,4 @@
-"""Results of tasks in a folder: a file for each, whole or not at all, written by one run at a time."""
+"""Results of tasks in a folder: one atomic file per task, written by one run at a time."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class OtherSettingsError(ValueError):
 
 
 @contextlib.contextmanager
-def held(folder: str | Path) -> Iterator[Path]:
-    """Make the folder and keep other runs out of it; the system frees it when this process ends, however it ends.
+def locked(folder: str | Path) -> Iterator[Path]:
+    """Make and lock a folder; the system releases the lock when the process ends.
 
     Raises:
         FolderInUseError: another run holds it.
@@ -39,7 +39,7 @@ def held(folder: str | Path) -> Iterator[Path]:
         lock.release()
 
 
-def arrays(task: Task, result: Mapping[str, Any]) -> dict[str, np.ndarray]:
+def as_arrays(task: Task, result: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """Return a result as NumPy arrays.
 
     Raises:
@@ -49,29 +49,29 @@ def arrays(task: Task, result: Mapping[str, Any]) -> dict[str, np.ndarray]:
     if not isinstance(result, Mapping):
         raise TypeError(f"the result of task {task.name} must be a dictionary of numbers, arrays and text, got "
                         f"{type(result).__name__}.")
-    found = {name: np.asarray(value) for name, value in result.items()}
-    for name, value in found.items():
+    result_arrays = {name: np.asarray(value) for name, value in result.items()}
+    for name, value in result_arrays.items():
         if value.dtype.kind not in "biufU" or name == _TASK:
             raise ValueError(f"the result of task {task.name} has an entry {name!r} that is not a number, an array of "
                              f"numbers or text, but {type(result[name]).__name__}.")
-    return found
+    return result_arrays
 
 
-def values(found: Mapping[str, np.ndarray]) -> Result:
-    """Return a result with plain numbers and text in the place of arrays without dimensions."""
-    return {name: value.item() if value.ndim == 0 else value for name, value in found.items()}
+def plain_values(result_arrays: Mapping[str, np.ndarray]) -> Result:
+    """Return a result with arrays of no dimension as numbers and text."""
+    return {name: value.item() if value.ndim == 0 else value for name, value in result_arrays.items()}
 
 
 def write(task: Task, result: Mapping[str, Any], folder: str | Path, overwrite: bool = False) -> Path:
-    """Write the result of a task to its file in ``folder``, whole or not at all.
+    """Write the result of a task to its file in ``folder``, atomically.
 
     Raises:
         ValueError: an entry of the result is not a number, an array or text.
     """
-    found = arrays(task, result)
+    result_arrays = as_arrays(task, result)
     path = Path(folder) / task.file
     with writing(path, overwrite) as temporary:
-        np.savez(temporary, **{_TASK: np.asarray(json.dumps(task.record()))}, **found)  # type: ignore[arg-type]
+        np.savez(temporary, **{_TASK: np.asarray(json.dumps(task.record()))}, **result_arrays)  # type: ignore[arg-type]
     return path
 
 
@@ -84,18 +84,19 @@ def read(task: Task, folder: str | Path) -> Result:
         OSError, KeyError, zipfile.BadZipFile: the file is damaged.
     """
     path = Path(folder) / task.file
-    with np.load(path) as kept:
-        found = {name: kept[name] for name in kept.files}
-    record, wanted = json.loads(str(found.pop(_TASK))), task.record()
-    if record != wanted:
+    with np.load(path) as file:
+        result_arrays = {name: file[name] for name in file.files}
+    record, task_record = json.loads(str(result_arrays.pop(_TASK))), task.record()
+    if record != task_record:
         raise OtherSettingsError(
-            f"{path} holds a result that was made with other settings: {_difference(record, wanted)}. Choose another "
-            "folder, or replace it with overwrite=True (--overwrite on the command line).")
-    return values(found)
+            f"{path} holds a result with other settings: {_difference(record, task_record)}. Choose another folder, "
+            "or replace it with overwrite=True (--overwrite on the command line)."
+        )
+    return plain_values(result_arrays)
 
 
-def stored(task: Task, folder: str | Path, overwrite: bool) -> Result | None:
-    """Return the result of a task; None where there is none, or one that is to be replaced.
+def stored_result(task: Task, folder: str | Path, overwrite: bool) -> Result | None:
+    """Return the stored result of a task; None if there is none, or if it is to be replaced.
 
     Raises:
         OtherSettingsError: it was made with other settings, and ``overwrite`` is False.
@@ -117,9 +118,9 @@ def stored(task: Task, folder: str | Path, overwrite: bool) -> Result | None:
         return None
 
 
-def _difference(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
+def _difference(stored_record: Mapping[str, Any], task_record: Mapping[str, Any]) -> str:
     """Name the first few settings that differ, as ``name stored -> wanted``."""
     flat = [{"name": record.get("name"), "seed": record.get("seed"), **record.get("settings", {})}
-            for record in (found, wanted)]
+            for record in (stored_record, task_record)]
     names = [name for name in {**flat[0], **flat[1]} if flat[0].get(name) != flat[1].get(name)]
     return ", ".join(f"{name} is {flat[0].get(name)!r} there and {flat[1].get(name)!r} now" for name in names[:3])

@@ -1,4 +1,4 @@
-"""What happens where a task is computed: the process is prepared once, then a result is arrays."""
+"""Workers: prepare the process once, then compute tasks."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ _LIBRARIES = ("lfm_ppl", "jax", "jaxlib", "numpyro", "numpy")
 
 
 class Setup(NamedTuple):
-    """What a process must be like to find the numbers of the one that asks.
+    """Settings of a process that reproduces the numbers of the client.
 
     Attributes:
         versions: library -> version.
         environment: variables that XLA reads at its first computation.
         double: whether JAX computes in double precision.
-        programs: folder of compiled programs; None: the worker's own.
-        shortest: seconds of compilation from which on a program is kept there.
+        programs: folder of compiled programs; None: the folder of the worker.
+        shortest: shortest compilation in seconds that is cached there.
     """
 
     versions: Mapping[str, str]
@@ -41,28 +41,31 @@ class Setup(NamedTuple):
     shortest: float = 1.0
 
     @classmethod
-    def here(cls, programs: str | None) -> Setup:
-        """Return that of this process, with one thread."""
+    def of_this_process(cls, programs: str | None) -> Setup:
+        """Return the settings of this process, with one thread."""
         environment = dict(ONE_THREAD)
         if "XLA_FLAGS" in os.environ:
             environment["XLA_FLAGS"] = os.environ["XLA_FLAGS"]
-        kept = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
-        shortest = jax.config.jax_persistent_cache_min_compile_time_secs if kept else 0.0  # type: ignore[attr-defined]
+        cache_folder = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
+        shortest = jax.config.jax_persistent_cache_min_compile_time_secs if cache_folder else 0.0  # type: ignore[attr-defined]
         return cls(versions(), environment, bool(jax.config.read("jax_enable_x64")), programs, shortest)
 
 
 def versions() -> dict[str, str]:
-    """Return what the numbers of this process depend on."""
+    """Return the versions that numbers depend on."""
     return {"python": ".".join(platform.python_version_tuple()[:2])} | {
         name: metadata.version(name) for name in _LIBRARIES}
 
 
-def check_versions(found: Mapping[str, str], wanted: Mapping[str, str], where: str = "") -> None:
-    """Raise ClusterError where they differ."""
-    other = [f"{name} {found.get(name, 'missing')} (here {version})" for name, version in wanted.items()
-             if found.get(name) != version]
-    if other:
-        raise ClusterError(f"the worker {where or platform.node()} has {', '.join(other)}; its numbers would be "
+def check_versions(worker_versions: Mapping[str, str], expected_versions: Mapping[str, str], where: str = "") -> None:
+    """Raise ClusterError if versions differ."""
+    differences = [
+        f"{name} {worker_versions.get(name, 'missing')} (here {version})"
+        for name, version in expected_versions.items()
+        if worker_versions.get(name) != version
+    ]
+    if differences:
+        raise ClusterError(f"the worker {where or platform.node()} has {', '.join(differences)}; its numbers would be "
                            "others. Install the same versions on all machines.")
 
 
@@ -70,7 +73,7 @@ _prepared: list[Setup] = []
 
 
 def prepare(setup: Setup) -> None:
-    """Give this process the settings of the one that asks, before JAX computes anything in it.
+    """Apply the settings of the client, before the first computation of JAX in this process.
 
     Raises:
         ClusterError: it has other versions.
@@ -87,32 +90,32 @@ def prepare(setup: Setup) -> None:
 
 
 def work(setup: Setup, program: bytes, task: bytes) -> dict[str, np.ndarray]:
-    """Compute a task in a worker; both are pickled, so that nothing of them is imported before the preparation."""
+    """Compute a task in a worker; function and task are pickled, so that nothing is imported before `prepare`."""
     prepare(setup)
     return computed(_loaded(program), pickle.loads(task))
 
 
 def get_ready(setup: Setup, program: bytes) -> None:
-    """Prepare a worker, and import what the tasks of a run need, before it is given the first one."""
+    """Prepare a worker, and import the modules of its tasks."""
     prepare(setup)
     _loaded(program)
 
 
 @functools.lru_cache(maxsize=4)
 def _loaded(program: bytes) -> Callable[[Task], Mapping[str, Any]]:
-    """Return the function of a run, the same one for all its tasks: what was compiled for it is found by it."""
+    """Return the function of a run, one object for all tasks, since compiled programs are cached by it."""
     return pickle.loads(program)
 
 
 def computed(compute: Callable[[Task], Mapping[str, Any]], task: Task) -> dict[str, np.ndarray]:
-    """Compute a task; a result that cannot be stored is an error here already."""
+    """Compute a task, and convert its result to arrays."""
     try:
-        return store.arrays(task, compute(task))
+        return store.as_arrays(task, compute(task))
     finally:
         return_memory()
 
 
 def return_memory() -> None:
-    """Give freed memory back to the system: the C library keeps it, over half a gigabyte after a few compilations."""
-    with contextlib.suppress(OSError, AttributeError):  # neither on macOS nor on Windows, nor with another C library
+    """Return freed memory to the system; the C library keeps over half a gigabyte after a few compilations."""
+    with contextlib.suppress(OSError, AttributeError):  # only with the GNU C library
         ctypes.CDLL("libc.so.6").malloc_trim(0)

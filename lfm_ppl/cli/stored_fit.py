@@ -1,0 +1,84 @@
+"""The model and the data of a stored result, rebuilt from its attributes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from lfm_ppl.cli import choices
+from lfm_ppl.io import data, loading
+from lfm_ppl.utils import checks
+
+
+class StoredFit(NamedTuple):
+    """A stored result, its model with keyword arguments, its data and its model file."""
+
+    posterior: Any
+    name: str
+    model: Callable
+    keywords: dict[str, Any]
+    observed: data.Data
+    file: loading.ModelFile
+
+
+def rebuild_fit(posterior: Any, model_file: str | None, path: Path) -> StoredFit:
+    """Rebuild the model from what the result in a file remembers of it."""
+    from lfm_ppl.inference.handlers.settings import approximate
+    from lfm_ppl.results import arviz_data, rebuilding
+    from lfm_ppl.results.inputs import ORIGIN, inputs_of
+    from lfm_ppl.results.scalars import unit_of
+
+    attrs = arviz_data.attributes(posterior)
+    model_path = model_file or attrs.get("model_file")
+    if not model_path:
+        raise ValueError(f"{path} does not say which file its model {attrs.get('model', '')!r} comes from, as of one "
+                         "that lfm.fit made. Name the file with --model FILE, or call lfm.check_accuracy(result, "
+                         "model) in Python.")
+    try:
+        model = loading.load(model_path)
+    except ValueError as error:
+        remedy = "" if model_file else " The result was made with this file; if it has moved, name it with --model."
+        raise ValueError(f"{error}{remedy}") from error
+    try:
+        times, y = rebuilding.observations(posterior)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    if y.ndim != 2 or times.ndim != 1:
+        raise ValueError(f"{path} is of a panel of series; use lfm.check_accuracy or lfm.forecast in Python.")
+    group = arviz_data.group(posterior, "observed_data")
+    outputs = tuple(str(name) for name in group["output"].values)
+    if model.outputs is not None and model.outputs != outputs:
+        raise ValueError(f"{path} is of the outputs {', '.join(outputs)}; {model.path} has "
+                         f"{', '.join(model.outputs)}. Give the file that it was made with.")
+    (variable,) = (group[name] for name in group.data_vars)
+    units = {name: unit for name in outputs if (unit := unit_of(variable, name))}
+    if clock := unit_of(group["time"]):
+        units["time"] = clock
+    observed = data.Data(times, y, outputs, units={**model.units, **units}, inputs=inputs_of(posterior),
+                         origin=attrs.get(ORIGIN))
+    options = _json_attribute(attrs, "options", path)
+    unknown = sorted(set(options) - set(model.options))
+    if unknown:
+        raise ValueError(f"{path} was made with the option {unknown[0]!r}, which {model.path} no longer has. Give the "
+                         "file as it was then, with --model.")
+    settings = _json_attribute(attrs, "settings", path)
+    if settings.get("rule") not in (None, *choices.RULES):
+        raise ValueError(f"{path}, attribute settings: {checks.unknown('rule', settings['rule'], choices.RULES)}")
+    settings["rule"] = choices.rule(settings.get("rule"))
+    numpyro_model = approximate(model.model, **settings)
+    return StoredFit(posterior, model.name, numpyro_model, model.keywords(observed, options), observed, model)
+
+
+def _json_attribute(attrs: dict[str, Any], name: str, path: Path) -> dict[str, Any]:
+    """Return what an attribute of a result holds as JSON."""
+    try:
+        value = json.loads(attrs.get(name) or "{}")
+    except ValueError as error:
+        raise ValueError(f"{path}: its attribute {name} cannot be read ({error}); the file was changed since `lfm-ppl "
+                         "fit` wrote it.") from None
+    if not isinstance(value, dict):
+        raise ValueError(f"{path}: its attribute {name} is no mapping; the file was changed since `lfm-ppl fit` wrote "
+                         "it.")
+    return value
