@@ -27,7 +27,7 @@ LAYERS = (
     ("switching",),
     ("inference",),
     ("orbits.training", "orbits.learning", "orbits.prediction"),
-    ("results", "engine"),
+    ("results", "parallel"),
     ("workflows",),
     ("io.loading",),
     ("experiments",),
@@ -181,7 +181,7 @@ def test_a_model_and_its_filter_import_no_satellites_figures_or_experiments():
     )
     found = run(code)
     assert found.endswith("False False") and "lfm_ppl.filtering" in found
-    for part in ("orbits", "particles", "fokker_planck_grid", "results", "engine", "experiments", "switching", "cli"):
+    for part in ("orbits", "particles", "fokker_planck_grid", "results", "parallel", "experiments", "switching", "cli"):
         assert f"lfm_ppl.{part}" not in found
 
 

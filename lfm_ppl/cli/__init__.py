@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from lfm_ppl.cli.arguments import parsed
 from lfm_ppl.cli.interruption import INTERRUPTED, watched
-from lfm_ppl.engine.errors import EngineError
+from lfm_ppl.parallel.errors import EngineError
 from lfm_ppl.io import loading
 from lfm_ppl.utils import checks
 

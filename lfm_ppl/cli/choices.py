@@ -121,12 +121,12 @@ def _number(name: str, text: str) -> Any:
 
 
 def workers(jobs: int | None, scheduler: str | None) -> int | str:
-    """Return the workers of ``--jobs`` and ``--scheduler``, an argument of `lfm_ppl.engine.run.run_tasks`.
+    """Return the workers of ``--jobs`` and ``--scheduler``, an argument of `lfm_ppl.parallel.run.run_tasks`.
 
     Raises:
         ValueError: both are given.
     """
-    from lfm_ppl.engine.cluster import available, check_workers
+    from lfm_ppl.parallel.cluster import available, check_workers
 
     if scheduler is None:
         return jobs or min(available(), MOST_JOBS)

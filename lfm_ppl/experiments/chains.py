@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 from numpyro.infer import MCMC, NUTS
 
-from lfm_ppl.engine.task import Result
+from lfm_ppl.parallel.task import Result
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.datasets import cell, number
 from lfm_ppl.experiments.timing import time_call

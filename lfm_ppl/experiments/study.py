@@ -16,7 +16,7 @@ A study is a module ``experiment.py`` in a separate folder, with
 
 - a frozen subclass of `StudySettings`, each field declared by `setting`: the fields are checked, and become the options
   of ``lfm-ppl compare NAME``;
-- a function that maps the settings to `lfm_ppl.engine.task.Task` objects;
+- a function that maps the settings to `lfm_ppl.parallel.task.Task` objects;
 - for each kind of task a `TaskKind`: the function that computes one task, and the dimensions of its results;
 - functions that map the settings and the datasets to the tables (`StudyTable`) and to the figures;
 - ``STUDY``, a `Study` with these parts,
@@ -60,9 +60,9 @@ import pandas as pd
 import xarray as xr
 from matplotlib.figure import Figure
 
-from lfm_ppl.engine.cluster import Workers, started
-from lfm_ppl.engine.run import run_tasks
-from lfm_ppl.engine.task import Result, Task
+from lfm_ppl.parallel.cluster import Workers, started
+from lfm_ppl.parallel.run import run_tasks
+from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.datasets import TaskKind
 from lfm_ppl.results.files import writing

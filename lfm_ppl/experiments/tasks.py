@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lfm_ppl.engine.task import Result, Task
+from lfm_ppl.parallel.task import Result, Task
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from numpyro import handlers
 
-from lfm_ppl.engine.cluster import Workers
-from lfm_ppl.engine.run import run_tasks
-from lfm_ppl.engine.task import Task
+from lfm_ppl.parallel.cluster import Workers
+from lfm_ppl.parallel.run import run_tasks
+from lfm_ppl.parallel.task import Task
 from lfm_ppl.inference.bound_model import bind
 from lfm_ppl.inference.likelihood_site import likelihood_site
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood
@@ -70,7 +70,7 @@ def calibrate(key: jax.Array, model: Callable, times: Any, kernel: Callable, *, 
         folder: where the ranks of each task are stored, so that a run that was stopped goes on; None: nowhere.
         overwrite: compute again what was stored with other settings.
         report: what to do with a line of progress; None: nothing.
-        workers: what computes; see `lfm_ppl.engine.run.run_tasks`.
+        workers: what computes; see `lfm_ppl.parallel.run.run_tasks`.
 
     Returns:
         The ranks.

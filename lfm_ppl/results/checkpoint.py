@@ -31,8 +31,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.engine import lock
-from lfm_ppl.engine.lock import FolderLock
+from lfm_ppl.parallel import lock
+from lfm_ppl.parallel.lock import FolderLock
 from lfm_ppl.inference.sampling import Saved
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.files import CHECKPOINT, POSTERIOR, writing

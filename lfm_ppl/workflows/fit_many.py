@@ -19,9 +19,9 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from lfm_ppl.engine.cluster import Workers, check_workers
-from lfm_ppl.engine.run import outcomes
-from lfm_ppl.engine.task import Task, check_distinct
+from lfm_ppl.parallel.cluster import Workers, check_workers
+from lfm_ppl.parallel.run import outcomes
+from lfm_ppl.parallel.task import Task, check_distinct
 from lfm_ppl.results import arviz_data, tables
 from lfm_ppl.results.packing import unpack_result
 from lfm_ppl.utils import checks

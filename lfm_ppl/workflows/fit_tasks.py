@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from lfm_ppl.engine.task import Task
+from lfm_ppl.parallel.task import Task
 from lfm_ppl.inference.bound_model import bind
 from lfm_ppl.inference.model_digest import model_digest
 from lfm_ppl.io.data import Data, model_keywords

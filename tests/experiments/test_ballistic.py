@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from lfm_ppl.engine.store import write
+from lfm_ppl.parallel.store import write
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.ballistic import experiment, figures
 from lfm_ppl.experiments.ballistic.problem import TARGETS

@@ -12,7 +12,7 @@ import pytest
 from scipy import integrate, special, stats
 
 import lfm_ppl as lfm
-from lfm_ppl.engine.store import write
+from lfm_ppl.parallel.store import write
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.call_centre import counts, experiment, figures, learning, problem, tracking
 from lfm_ppl.experiments.study import TASKS

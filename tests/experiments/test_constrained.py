@@ -11,7 +11,7 @@ from scipy.optimize import minimize_scalar
 from scipy.stats import truncnorm
 
 import lfm_ppl as lfm
-from lfm_ppl.engine.store import write
+from lfm_ppl.parallel.store import write
 from lfm_ppl.experiments import catalogue
 from lfm_ppl.experiments.constrained import estimators, experiment, figures, problem
 from lfm_ppl.experiments.study import TASKS

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lfm_ppl.engine.task import Task
+from lfm_ppl.parallel.task import Task
 from lfm_ppl.experiments.datasets import TaskKind, cell, row, select_prefix
 from lfm_ppl.experiments.scores import Estimate, mean_of, rate_of
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lfm_ppl.engine.store import write
+from lfm_ppl.parallel.store import write
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.ginzburg_landau import experiment, figures, parameters, problem, states
 from lfm_ppl.experiments.study import TASKS

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lfm_ppl.engine.task import Task
+from lfm_ppl.parallel.task import Task
 from lfm_ppl.experiments import catalogue
 from lfm_ppl.experiments.periodic_kernels import experiment, figures, methods, problem
 

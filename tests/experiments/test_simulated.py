@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lfm_ppl.engine.task import Task
+from lfm_ppl.parallel.task import Task
 from lfm_ppl.experiments.ballistic import experiment
 from lfm_ppl.experiments.ballistic.problem import TARGETS
 from lfm_ppl.experiments.scores import Z

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from lfm_ppl.engine.task import Task
+from lfm_ppl.parallel.task import Task
 from lfm_ppl.experiments import drawing, published, study, timing
 from lfm_ppl.experiments.datasets import TaskKind, row
 from lfm_ppl.experiments.scores import Estimate

@@ -11,8 +11,8 @@ import pytest
 import xarray as xr
 from scipy.integrate import solve_ivp
 
-from lfm_ppl.engine.store import write
-from lfm_ppl.engine.task import Task
+from lfm_ppl.parallel.store import write
+from lfm_ppl.parallel.task import Task
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.published import PublishedComparison
 from lfm_ppl.experiments.study import TASKS

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from lfm_ppl.engine.task import Task
+from lfm_ppl.parallel.task import Task
 from lfm_ppl.experiments import chains, study
 from lfm_ppl.experiments.ballistic import figures
 from lfm_ppl.experiments.ballistic.problem import TARGETS

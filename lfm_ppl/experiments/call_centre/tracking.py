@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.engine.task import Result, Task
+from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.experiments import chains, scores
 from lfm_ppl.experiments.call_centre import problem
 from lfm_ppl.experiments.call_centre.learning import run_searches, sample_posterior

@@ -15,7 +15,7 @@ from scipy.optimize import minimize_scalar
 
 from lfm_ppl.constrained.full_information import ConstrainedEstimate, full_information
 from lfm_ppl.constrained.posterior import ConstrainedPosterior, constrained_posterior
-from lfm_ppl.engine.task import Result, Task
+from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.experiments.constrained import problem
 from lfm_ppl.experiments.constrained.problem import FACTOR, HORMONE, TIMES, WINDOW
 from lfm_ppl.experiments.scores import Z, interval_coverage, rmse

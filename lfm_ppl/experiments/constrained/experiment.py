@@ -8,7 +8,7 @@ from typing import Any
 
 import xarray as xr
 
-from lfm_ppl.engine.task import Result, Task
+from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.experiments import study
 from lfm_ppl.experiments.constrained import estimators, figures, problem
 from lfm_ppl.experiments.constrained.estimators import BANDS, FULL, METHODS, SMOOTHER

@@ -8,7 +8,7 @@ from typing import Any
 
 import xarray as xr
 
-from lfm_ppl.engine.task import Task
+from lfm_ppl.parallel.task import Task
 from lfm_ppl.experiments import study
 from lfm_ppl.experiments.counts import figures, methods
 from lfm_ppl.experiments.counts.problem import COAL, NAMES, ProblemSize, build_problem

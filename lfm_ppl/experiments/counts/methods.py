@@ -21,7 +21,7 @@ import numpy as np
 import xarray as xr
 
 import lfm_ppl as lfm
-from lfm_ppl.engine.task import Result, Task
+from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.counts.problem import CountsProblem, ProblemSize, build_problem
 from lfm_ppl.experiments.counts.reference import CHAINS, MonteCarloReference

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from lfm_ppl.engine.task import Task
+from lfm_ppl.parallel.task import Task
 from lfm_ppl.experiments import study
 from lfm_ppl.experiments.chains import LENGTHS
 from lfm_ppl.experiments.datasets import Column, TaskKind, merge_rows, rows

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from lfm_ppl.engine.task import Result, Task
+from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.chains import LENGTHS, nuts
 from lfm_ppl.experiments.ginzburg_landau import problem, states

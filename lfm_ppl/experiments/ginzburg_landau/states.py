@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.engine.task import Result, Task
+from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.ginzburg_landau import problem
 from lfm_ppl.experiments.timing import time_call, time_compiled_call

@@ -21,7 +21,7 @@ import pandas as pd
 import xarray as xr
 
 from lfm_ppl import orbits
-from lfm_ppl.engine.task import Task
+from lfm_ppl.parallel.task import Task
 from lfm_ppl.experiments import study
 from lfm_ppl.experiments.datasets import TaskKind
 from lfm_ppl.experiments.gps import figures, learning_methods, problem, satellite

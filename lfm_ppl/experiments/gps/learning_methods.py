@@ -13,7 +13,7 @@ import xarray as xr
 from numpyro.infer import init_to_value
 
 from lfm_ppl import orbits
-from lfm_ppl.engine.task import Result, Task
+from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.experiments import chains
 from lfm_ppl.experiments.datasets import DATASET, Column, number, row
 from lfm_ppl.experiments.gps.figures import METRE

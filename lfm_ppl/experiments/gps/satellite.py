@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from lfm_ppl import orbits
-from lfm_ppl.engine.task import Result, Task
+from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.experiments.gps import problem
 from lfm_ppl.orbits import learning, magnitudes, prediction
 from lfm_ppl.orbits.arc import NOISE, Arc, Unusable

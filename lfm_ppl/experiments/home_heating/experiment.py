@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from lfm_ppl.engine.task import Task
+from lfm_ppl.parallel.task import Task
 from lfm_ppl.experiments import chains, study
 from lfm_ppl.experiments.datasets import Column, TaskKind, cell, number, row, select_prefix
 from lfm_ppl.experiments.home_heating import figures, prediction, problem

@@ -22,7 +22,7 @@ from numpyro.infer import MCMC
 from scipy.special import logsumexp, ndtr
 from scipy.stats import norm
 
-from lfm_ppl.engine.task import Result, Task
+from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.experiments import chains, scores, timing
 from lfm_ppl.experiments.home_heating import problem
 from lfm_ppl.experiments.home_heating.problem import FINE, TIMES, TRAIN, Model, Window

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lfm_ppl.engine.task import Task
+from lfm_ppl.parallel.task import Task
 from lfm_ppl.experiments import study
 from lfm_ppl.experiments.datasets import Column, TaskKind, row, rows
 from lfm_ppl.experiments.periodic_kernels import figures, methods, problem

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.stats import norm
 
 from lfm_ppl import forces
-from lfm_ppl.engine.task import Result, Task
+from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.periodic_kernels import problem
 from lfm_ppl.experiments.periodic_kernels.problem import MEASURED, PREDICTED

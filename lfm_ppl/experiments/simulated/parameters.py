@@ -20,7 +20,7 @@ import jax
 import numpy as np
 from numpyro.infer import init_to_uniform
 
-from lfm_ppl.engine.task import Result, Task
+from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.experiments import chains
 from lfm_ppl.experiments.scores import GridPosterior, interval, score_path, total_moments
 from lfm_ppl.experiments.simulated.problem import (

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.engine.task import Result, Task
+from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.experiments.scores import interval, rmse, score_path
 from lfm_ppl.experiments.simulated.problem import SimulationProblem, default_data, simulate_record, true_likelihood
 from lfm_ppl.experiments.tasks import dataset_indices, stack_results

@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from lfm_ppl.engine.task import Result
+from lfm_ppl.parallel.task import Result
 from lfm_ppl.experiments.tasks import stack_results
 from lfm_ppl.experiments.timing import time_call, time_compiled_call
 from lfm_ppl.experiments.transcription import problem

@@ -18,7 +18,7 @@ import numpy as np
 import xarray as xr
 from scipy.stats import norm
 
-from lfm_ppl.engine.task import Result, Task
+from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.experiments import published, scores, study
 from lfm_ppl.experiments.datasets import Column, TaskKind, cell, number, row
 from lfm_ppl.experiments.published import PublishedComparison

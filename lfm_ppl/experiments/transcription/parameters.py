@@ -19,7 +19,7 @@ import numpyro
 import numpyro.distributions as dist
 from numpyro.infer import NUTS, init_to_uniform
 
-from lfm_ppl.engine.task import Result, Task
+from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.experiments import chains, scores
 from lfm_ppl.experiments.timing import time_call
 from lfm_ppl.experiments.transcription import problem

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from lfm_ppl.engine.task import Task
+from lfm_ppl.parallel.task import Task
 from lfm_ppl.experiments import chains, study
 from lfm_ppl.experiments.datasets import Column, TaskKind, number, row
 from lfm_ppl.experiments.scores import estimate_cells

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.engine.task import Task
+from lfm_ppl.parallel.task import Task
 from lfm_ppl.experiments import tasks
 from lfm_ppl.io import loading
 from lfm_ppl.latent_grid.latent_grid import LatentGrid

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.engine.task import Result
+from lfm_ppl.parallel.task import Result
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.tasks import stack_results
 from lfm_ppl.experiments.timing import time_call

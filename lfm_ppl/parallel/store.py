@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from lfm_ppl.engine.lock import FolderLock
-from lfm_ppl.engine.task import Result, Task
+from lfm_ppl.parallel.lock import FolderLock
+from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.results.files import writing
 
 _TASK = "__task__"

@@ -7,11 +7,11 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lfm_ppl.engine import store
-from lfm_ppl.engine.cluster import Workers, check_workers, started
-from lfm_ppl.engine.errors import TasksFailedError
-from lfm_ppl.engine.task import Result, Task, check_distinct
-from lfm_ppl.engine.worker import computed
+from lfm_ppl.parallel import store
+from lfm_ppl.parallel.cluster import Workers, check_workers, started
+from lfm_ppl.parallel.errors import TasksFailedError
+from lfm_ppl.parallel.task import Result, Task, check_distinct
+from lfm_ppl.parallel.worker import computed
 from lfm_ppl.utils.progress import Progress, Reporter
 
 

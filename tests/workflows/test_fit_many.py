@@ -18,7 +18,7 @@ from lfm_ppl.results import arviz_data
 from lfm_ppl.workflows import fit_tasks
 from tests.inference import linear_motif as motif
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 TIMES = motif.TIMES
 OPTIONS = {"sampler": "map", "samples": 20, "trajectory_draws": 4}
 

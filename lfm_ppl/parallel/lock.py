@@ -9,7 +9,7 @@ from pathlib import Path
 
 import filelock
 
-from lfm_ppl.engine.errors import FolderInUseError
+from lfm_ppl.parallel.errors import FolderInUseError
 
 FILE, HOLDER = ".lock", ".held-by"
 

@@ -16,7 +16,7 @@ import lfm_ppl as lfm
 from lfm_ppl.cli import main, session
 from lfm_ppl.results import arviz_data
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parent.parent.parent
 
 
 @pytest.fixture

@@ -13,13 +13,13 @@ import jax
 import numpy as np
 import pytest
 
-from lfm_ppl.engine import cluster
-from lfm_ppl.engine.cluster import Cluster, started
-from lfm_ppl.engine.errors import ClusterError, FolderInUseError, TasksFailedError
-from lfm_ppl.engine.run import outcomes, run_tasks
-from lfm_ppl.engine.store import read, write
-from lfm_ppl.engine.task import Task
-from lfm_ppl.engine.worker import return_memory
+from lfm_ppl.parallel import cluster
+from lfm_ppl.parallel.cluster import Cluster, started
+from lfm_ppl.parallel.errors import ClusterError, FolderInUseError, TasksFailedError
+from lfm_ppl.parallel.run import outcomes, run_tasks
+from lfm_ppl.parallel.store import read, write
+from lfm_ppl.parallel.task import Task
+from lfm_ppl.parallel.worker import return_memory
 from lfm_ppl.utils.progress import Console, duration
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -192,8 +192,8 @@ def slow_tasks(count, seconds, log):
 CLIENT = """
 import sys
 sys.path.insert(0, {root!r})
-from tests.engine import test_run
-from lfm_ppl.engine.run import run_tasks
+from tests.parallel import test_run
+from lfm_ppl.parallel.run import run_tasks
 if __name__ == "__main__":
     import jax
     jax.config.update("jax_enable_x64", True)
@@ -355,8 +355,8 @@ def test_without_dask_several_processes_are_refused(tmp_path, monkeypatch):
 def test_one_process_imports_no_dask(tmp_path):
     code = f"""
 import sys
-from lfm_ppl.engine.run import run_tasks
-from lfm_ppl.engine.task import Task
+from lfm_ppl.parallel.run import run_tasks
+from lfm_ppl.parallel.task import Task
 print(run_tasks([Task("a", 0)], lambda task: {{"x": 1.0}}, {str(tmp_path)!r}),
       [name for name in sys.modules if name.split(".")[0] in ("dask", "distributed")])
 """

@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from lfm_ppl.engine import store
-from lfm_ppl.engine.errors import ClusterError
-from lfm_ppl.engine.task import Task
+from lfm_ppl.parallel import store
+from lfm_ppl.parallel.errors import ClusterError
+from lfm_ppl.parallel.task import Task
 from lfm_ppl.utils.compilation import ONE_THREAD
 
 _LIBRARIES = ("lfm_ppl", "jax", "jaxlib", "numpyro", "numpy")

@@ -19,9 +19,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from lfm_ppl.engine import worker
-from lfm_ppl.engine.errors import ClusterError
-from lfm_ppl.engine.task import Task
+from lfm_ppl.parallel import worker
+from lfm_ppl.parallel.errors import ClusterError
+from lfm_ppl.parallel.task import Task
 from lfm_ppl.utils import checks, compilation
 from lfm_ppl.utils.compilation import ONE_THREAD
 
