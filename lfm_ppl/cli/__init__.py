@@ -11,9 +11,9 @@ from collections.abc import Sequence
 
 from lfm_ppl.cli.arguments import parsed
 from lfm_ppl.cli.interruption import INTERRUPTED, watched
-from lfm_ppl.parallel.errors import EngineError
 from lfm_ppl.io import loading
 from lfm_ppl.utils import checks
+from lfm_ppl.utils.errors import RunError
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -72,7 +72,7 @@ def _one_line(error: Exception) -> str:
         return f"there is no file {error.filename}."
     if isinstance(error, OSError) and error.filename and error.strerror:
         return f"{error.filename}: {error.strerror}."
-    if isinstance(error, (ValueError, TypeError, OSError, EngineError)):
+    if isinstance(error, (ValueError, TypeError, OSError, RunError)):
         return text
     return f"{type(error).__name__}: {text} (--debug shows where)"
 

@@ -15,6 +15,7 @@ from typing import Any
 from lfm_ppl.cli import fit, page, results, session
 from lfm_ppl.cli.interruption import INTERRUPTED, Watch, watched
 from lfm_ppl.cli.stored_fit import StoredFit, rebuild_fit
+from lfm_ppl.utils import atomic_files
 
 TABLE = "accuracy.csv"
 FIGURE = "accuracy.png"
@@ -45,7 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
     settled = _settled(posterior, arguments)
     if settled is None:
         for name in (TABLE, FIGURE):
-            files.refuse_existing(path.parent / name, arguments.overwrite or arguments.resume)
+            atomic_files.refuse_existing(path.parent / name, arguments.overwrite or arguments.resume)
     page.refuse_foreign(path.parent, arguments.overwrite)
     results.writable(path.parent)
     session.start(int(arviz_data.attributes(posterior).get("chains", 1)), not arguments.no_cache)
@@ -88,7 +89,7 @@ def run(arguments: argparse.Namespace) -> int:
         if status == INTERRUPTED:
             print(f"resume   {_resume_command(arguments)}")
         else:
-            checkpoint.forget(path.parent / UNFINISHED)
+            checkpoint.remove_run(path.parent / UNFINISHED)
         return status
 
 
@@ -144,7 +145,7 @@ def _checked(task: StoredFit, arguments: argparse.Namespace, folder: Path) -> An
 
 def _write(report: Any, posterior: Any, path: Path, command_line: str) -> int:
     """Store the report in the result and beside it; return 1 where figure or page could not be made."""
-    from lfm_ppl.results import arviz_data, files, tables
+    from lfm_ppl.results import arviz_data, tables
     from lfm_ppl.results.plots import plot_accuracy
     from lfm_ppl.results.report import GROUP
 
@@ -155,7 +156,7 @@ def _write(report: Any, posterior: Any, path: Path, command_line: str) -> int:
     print(f"wrote    {tables.write_csv(report.table, path.parent / TABLE, overwrite=True)}")
     try:
         figure = plot_accuracy(posterior, width="full")
-        with files.writing(path.parent / FIGURE, overwrite=True) as temporary:
+        with atomic_files.atomic_write(path.parent / FIGURE, overwrite=True) as temporary:
             figure.savefig(temporary, format="png")
     except Exception as error:  # the numbers are safe
         print(f"lfm-ppl: the figure could not be drawn: {error}", file=sys.stderr)

@@ -48,20 +48,20 @@ def run(arguments: argparse.Namespace) -> int:
         checkpoint.check_folder(arguments.out, arguments.resume, arguments.overwrite)
     with results.folder(model.name, arguments.out, arguments.overwrite, arguments.resume) as folder:
         finished = arguments.resume and checkpoint.is_finished(folder)
-        if arguments.resume and not finished and not checkpoint.is_kept(folder):
+        if arguments.resume and not finished and not checkpoint.has_run(folder):
             print(f"resume   no run to resume in {folder}: this is a new run")
         if arguments.set:  # an unknown name must not be printed as fixed
             _check_fixed(numpyro_model, observed, model.keywords(observed, options), fixed)
         _print_task(arguments, model, observed, options, fixed)
         started = time.perf_counter()
         resume_hint = f"resume with: {_resume_command(arguments, folder)}"
-        with watched(lambda: resume_hint if checkpoint.is_kept(folder) else _nothing_left(folder)) as watch:
+        with watched(lambda: resume_hint if checkpoint.has_run(folder) else _nothing_left(folder)) as watch:
             try:
                 posterior = sample(arguments, model, numpyro_model, observed, options, fixed, folder, requested_times)
             except KeyboardInterrupt as error:
                 reason = str(error) or "stopped before there were draws"
                 print(
-                    f"\nlfm-ppl: {reason}" + (f"; {resume_hint}" if checkpoint.is_kept(folder) else ""), file=sys.stderr
+                    f"\nlfm-ppl: {reason}" + (f"; {resume_hint}" if checkpoint.has_run(folder) else ""), file=sys.stderr
                 )
                 return INTERRUPTED
             partial = arviz_data.attributes(posterior).get("partial")

@@ -18,7 +18,7 @@ from lfm_ppl.cli import choices, page, results, session
 from lfm_ppl.cli.requested_times import requested_times
 from lfm_ppl.cli.stored_fit import StoredFit, rebuild_fit
 from lfm_ppl.io import data
-from lfm_ppl.utils import calendar_time, checks
+from lfm_ppl.utils import atomic_files, calendar_time, checks
 
 TABLE = "forecast.csv"
 FIGURE = "forecast.png"
@@ -45,7 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
     path = files.locate(arguments.result)
     if not arguments.out:
         for name in (TABLE, FIGURE, *MORE_FIGURES.values(), *([SCORES] if arguments.held_out else [])):
-            files.refuse_existing(path.parent / name, arguments.overwrite)
+            atomic_files.refuse_existing(path.parent / name, arguments.overwrite)
         page.refuse_foreign(path.parent, arguments.overwrite)
     posterior = arviz_data.load(path)
     if not arguments.out and not arguments.overwrite and arviz_data.has_group(posterior, GROUP):
@@ -172,7 +172,7 @@ def _write(forecast: Any, score: Callable, held_out: data.Data | None, task: Sto
     try:
         for name, draw in _figures(forecast):
             figure = draw(forecast, width="full")
-            with files.writing(folder / name, arguments.overwrite) as temporary:
+            with atomic_files.atomic_write(folder / name, arguments.overwrite) as temporary:
                 figure.savefig(temporary, format="png")
             figure_paths.append(folder / name)
             print(f"wrote    {folder / name}")

@@ -11,11 +11,11 @@ import numpy as np
 import xarray as xr
 from numpyro.infer import MCMC, NUTS
 
-from lfm_ppl.parallel.task import Result
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.datasets import cell, number
 from lfm_ppl.experiments.timing import time_call
 from lfm_ppl.inference.kernels.ram import RAM
+from lfm_ppl.parallel.task import Result
 
 LENGTHS = ("chains", "warmup", "draws", "thin")
 """Task settings with the number and the length of chains; arguments of `sampler`."""

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.experiments.scores import Estimate, estimate_cells, mean_of, rate_of
+from lfm_ppl.parallel.task import Result, Task
 
 DATASET = "dataset"
 """Dimension of the independent replicates: simulated or measured records, targets, days, satellites."""

@@ -60,15 +60,15 @@ import pandas as pd
 import xarray as xr
 from matplotlib.figure import Figure
 
+from lfm_ppl.experiments import scores
+from lfm_ppl.experiments.datasets import TaskKind
 from lfm_ppl.parallel.cluster import Workers, started
 from lfm_ppl.parallel.run import run_tasks
 from lfm_ppl.parallel.task import Result, Task
-from lfm_ppl.experiments import scores
-from lfm_ppl.experiments.datasets import TaskKind
-from lfm_ppl.results.files import writing
 from lfm_ppl.results.plots import style
 from lfm_ppl.results.tables import write_csv, write_markdown
 from lfm_ppl.utils import checks
+from lfm_ppl.utils.atomic_files import atomic_write
 from lfm_ppl.utils.progress import Reporter
 
 Results = dict[str, Result]
@@ -380,7 +380,7 @@ class Study:
             written.append(write_markdown(scores.readable(table), folder / f"{name}.md", True))
         for name, figure in self.figures(result.settings, result.data).items():
             written.append(folder / f"{name}.png")
-            with writing(written[-1], True) as temporary, style.in_style():
+            with atomic_write(written[-1], True) as temporary, style.in_style():
                 figure.savefig(temporary, format="png")
         return written
 

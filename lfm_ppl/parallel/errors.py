@@ -4,23 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from lfm_ppl.utils.errors import RunError
+
 _SHOWN = 5
 """Number of failed tasks whose reasons a message names."""
 
 
-class EngineError(RuntimeError):
-    """A run of tasks has failed, wholly or in part."""
-
-
-class ClusterError(EngineError):
+class ClusterError(RunError):
     """No workers: no Dask, no scheduler, other versions, or a lost connection."""
 
 
-class FolderInUseError(EngineError):
-    """Another run writes to the folder."""
-
-
-class TasksFailedError(EngineError):
+class TasksFailedError(RunError):
     """Some tasks failed; all others are computed and stored.
 
     Attributes:

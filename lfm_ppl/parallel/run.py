@@ -7,12 +7,13 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lfm_ppl.parallel import store
 from lfm_ppl.parallel.cluster import Workers, check_workers, started
 from lfm_ppl.parallel.errors import TasksFailedError
+from lfm_ppl.parallel.store import plain_values, read_result, write_result
 from lfm_ppl.parallel.task import Result, Task, check_distinct
 from lfm_ppl.parallel.worker import computed
 from lfm_ppl.utils.progress import Progress, Reporter
+from lfm_ppl.utils.run_store import RunStore
 
 
 class Outcome(NamedTuple):
@@ -105,29 +106,25 @@ def outcomes(tasks: Iterable[Task], compute: Callable[[Task], Mapping[str, Any]]
     tasks = list(tasks)
     check_distinct(tasks)
     with contextlib.ExitStack() as stack:
-        if folder is not None:
-            stack.enter_context(store.locked(folder))
+        run_store = None if folder is None else stack.enter_context(RunStore(folder))
         # Other settings of a stored result are an error before anything is computed.
-        stored_results = (
-            {} if folder is None else {task.name: store.stored_result(task, folder, overwrite) for task in tasks}
-        )
-        missing = [task for task in tasks if stored_results.get(task.name) is None]
+        stored = {} if run_store is None else {task.name: read_result(task, run_store, overwrite) for task in tasks}
+        missing = [task for task in tasks if stored.get(task.name) is None]
         done = len(tasks) - len(missing)
         progress = stack.enter_context(Progress(report, len(tasks), "tasks", "computed", done))
         if done:
             progress.write(f"{done} of {len(tasks)} tasks are stored already")
         for task in tasks:
-            if (result := stored_results.pop(task.name, None)) is not None:
+            if (result := stored.pop(task.name, None)) is not None:
                 yield Outcome(task, result, stored=True)
-        for task, new in _computed(stack, missing, compute, workers, alike, progress):
-            if isinstance(new, Exception):
-                outcome = Outcome(task, None, new)
+        for task, computed_result in _computed(stack, missing, compute, workers, alike, progress):
+            if isinstance(computed_result, Exception):
+                outcome = Outcome(task, None, computed_result)
                 progress.write(f"failed: {task.name}: {outcome.reason}")
-            elif folder is None:
-                outcome = Outcome(task, store.plain_values(new))
             else:
-                store.write(task, new, folder, overwrite=True)
-                outcome = Outcome(task, store.read(task, folder))
+                if run_store is not None:
+                    write_result(task, computed_result, run_store)
+                outcome = Outcome(task, plain_values(computed_result))
             done += 1
             progress.advance(done, task.name)
             yield outcome
@@ -148,7 +145,7 @@ def _computed(stack: contextlib.ExitStack, tasks: list[Task], compute: Callable[
     progress.start()
     for task in tasks:
         try:
-            new: Any = computed(compute, task)
+            result: Any = computed(compute, task)
         except Exception as error:
-            new = error
-        yield task, new
+            result = error
+        yield task, result

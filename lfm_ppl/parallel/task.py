@@ -29,8 +29,8 @@ class Task:
 
     Example:
         >>> task = Task("state/EKF/007", 0, {"model": "ginzburg-landau", "steps": 60})
-        >>> task.file
-        'state-EKF-007.npz'
+        >>> task.stem
+        'state-EKF-007'
     """
 
     name: str
@@ -48,9 +48,9 @@ class Task:
             raise TypeError(f"the settings of task {self.name} must be storable as JSON: {error}.") from None
 
     @property
-    def file(self) -> str:
-        """Name of the file that holds the result."""
-        return f"{self.name.replace('/', '-')}.npz"
+    def stem(self) -> str:
+        """Name of the result in a store: the file without its suffix."""
+        return self.name.replace("/", "-")
 
     @property
     def key(self) -> jax.Array:
@@ -74,7 +74,7 @@ def check_distinct(tasks: Iterable[Task]) -> None:
     """
     seen: dict[str, str] = {}
     for task in tasks:
-        if task.file in seen:
-            raise ValueError(f"the tasks {seen[task.file]!r} and {task.name!r} share the file {task.file}; use "
+        if task.stem in seen:
+            raise ValueError(f"the tasks {seen[task.stem]!r} and {task.name!r} share the file {task.stem}.npz; use "
                              "unique names.")
-        seen[task.file] = task.name
+        seen[task.stem] = task.name

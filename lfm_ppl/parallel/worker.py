@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from lfm_ppl.parallel import store
 from lfm_ppl.parallel.errors import ClusterError
+from lfm_ppl.parallel.store import as_arrays
 from lfm_ppl.parallel.task import Task
 from lfm_ppl.utils.compilation import ONE_THREAD
 
@@ -110,7 +110,7 @@ def _loaded(program: bytes) -> Callable[[Task], Mapping[str, Any]]:
 def computed(compute: Callable[[Task], Mapping[str, Any]], task: Task) -> dict[str, np.ndarray]:
     """Compute a task, and convert its result to arrays."""
     try:
-        return store.as_arrays(task, compute(task))
+        return as_arrays(task, compute(task))
     finally:
         return_memory()
 

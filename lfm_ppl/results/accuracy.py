@@ -17,7 +17,7 @@ from lfm_ppl.inference.posterior import evenly_spaced
 from lfm_ppl.inference.samplers import GAUSSIAN_FILTER_SAMPLERS, SAMPLERS
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel
-from lfm_ppl.results import arviz_data, importance, likelihoods, rebuilding
+from lfm_ppl.results import arviz_data, importance, likelihoods, rebuilding, run_record
 from lfm_ppl.results import checkpoint as checkpoints
 from lfm_ppl.results.approximation import more_iterations
 from lfm_ppl.results.likelihoods import PosteriorDraws, Reference
@@ -111,12 +111,12 @@ def check_accuracy(result: Any, numpyro_model: Callable, times: Any = None, y: A
     if checkpoint is not None:
         run = checkpoints.begin_or_resume(checkpoint, {
             "reference": reference, "draws": draws, "particles": particles, "replicates": replicates, "steps": steps,
-            "seed": seed, "model": checkpoints.digest(model_digest(full_problem.bound)),
-            "data": checkpoints.digest(full_problem.y), "versions": checkpoints.versions(),
-            "draws of the result": checkpoints.digest(*full_problem.draws.values()),
+            "seed": seed, "model": run_record.digest(model_digest(full_problem.bound)),
+            "data": run_record.digest(full_problem.y), "versions": run_record.versions(),
+            "draws of the result": run_record.digest(*full_problem.draws.values()),
         }, resume)  # fmt: skip
     with checkpoints.closing(run):
-        problem = full_problem.at(rows)._replace(parts=None if run is None else run.parts)
+        problem = full_problem.at(rows)._replace(parts=None if run is None else run.batches)
         report = _report(result, problem, draw_index, kind, particles, replicates, steps, seed, progress)
     arviz_data.add_group(result, GROUP, report.to_dataset())
     return report

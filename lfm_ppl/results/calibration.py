@@ -13,14 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 from numpyro import handlers
 
-from lfm_ppl.parallel.cluster import Workers
-from lfm_ppl.parallel.run import run_tasks
-from lfm_ppl.parallel.task import Task
 from lfm_ppl.inference.bound_model import bind
 from lfm_ppl.inference.likelihood_site import likelihood_site
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood
-from lfm_ppl.results.files import writing
+from lfm_ppl.parallel.cluster import Workers
+from lfm_ppl.parallel.run import run_tasks
+from lfm_ppl.parallel.task import Task
 from lfm_ppl.utils import checks
+from lfm_ppl.utils.atomic_files import atomic_write
 from lfm_ppl.utils.progress import Reporter
 
 LOG_LIKELIHOOD = "log likelihood"
@@ -237,7 +237,7 @@ def p_values(rank: np.ndarray, draws: int, bins: int = 16) -> dict[str, float]:
 def save(calibration: Calibration, path: str | Path, overwrite: bool = False) -> Path:
     """Write ranks to an .npz file, whole or not at all, and return its path; an existing file is kept unless said."""
     path = Path(path).with_suffix(".npz")
-    with writing(path, overwrite) as temporary:
+    with atomic_write(path, overwrite) as temporary:
         np.savez(temporary, draws=np.asarray(calibration.draws), **calibration.ranks)  # type: ignore[arg-type]
     return path
 

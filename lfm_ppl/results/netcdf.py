@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from lfm_ppl.results.files import writing
+from lfm_ppl.utils.atomic_files import atomic_write
 
 _JSON = "json:"
 
@@ -38,7 +38,7 @@ def write(
     Raises:
         FileExistsError: ``path`` exists and ``overwrite`` is False.
     """
-    with writing(path, overwrite) as temporary:
+    with atomic_write(path, overwrite) as temporary:
         root = xr.Dataset(attrs=_encoded(attributes))
         root.to_netcdf(temporary, mode="w", engine="h5netcdf")
         for name, dataset in groups.items():

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from lfm_ppl.results import arviz_data
-from lfm_ppl.results.files import writing
+from lfm_ppl.utils.atomic_files import atomic_write
 
 # How a column of the summary table reads best; others get significant digits.
 _FORMATS = {"r_hat": "{:.3f}", "ess_bulk": "{:.0f}", "ess_tail": "{:.0f}"}
@@ -188,7 +188,7 @@ def write_csv(
     Raises:
         FileExistsError: ``path`` exists and ``overwrite`` is False.
     """
-    with writing(path, overwrite) as temporary:
+    with atomic_write(path, overwrite) as temporary:
         frame.to_csv(temporary, index_label=index_label)
     return Path(path)
 
@@ -197,7 +197,7 @@ def write_markdown(
     frame: pd.DataFrame, path: str | Path, overwrite: bool = False, digits: int = 3
 ) -> Path:
     """Write ``frame`` to a Markdown file, through a temporary name; see ``markdown_table``."""
-    with writing(path, overwrite) as temporary:
+    with atomic_write(path, overwrite) as temporary:
         temporary.write_text(markdown_table(frame, digits) + "\n", encoding="utf-8")
     return Path(path)
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import quote
 
-from lfm_ppl.results.files import refuse_existing, writing
+from lfm_ppl.utils.atomic_files import atomic_write, refuse_existing
 
 _GENERATOR = '<meta name="generator" content="lfm_ppl">'
 
@@ -106,7 +106,7 @@ def write(page: str, path: str | Path, overwrite: bool = False) -> Path:
     Raises:
         FileExistsError: ``path`` exists and ``overwrite`` is False.
     """
-    with writing(path, overwrite) as temporary:
+    with atomic_write(path, overwrite) as temporary:
         temporary.write_text(page, encoding="utf-8")
     return Path(path)
 

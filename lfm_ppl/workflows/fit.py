@@ -243,7 +243,7 @@ def fit(
     store = None
     if checkpoint is not None:
         record = options.record(bound, digest)
-        if resume and (finished := checkpoints.finished(checkpoint, record)) is not None:
+        if resume and (finished := checkpoints.finished_result(checkpoint, record)) is not None:
             return finished
         store = checkpoints.begin_or_resume(checkpoint, record, resume)
     if progress:
@@ -305,7 +305,7 @@ def _sample(problem: FitProblem, store: Checkpoint | None, show_progress: bool) 
     """
     bound, options = problem.bound, problem.options
     assert options.thin is not None
-    setup = store.setup if store is not None and store.started else None
+    setup = store.setup if store is not None and store.has_state else None
     text = _MODE_SEARCH if options.init in (None, "map") else _START_SEARCH
     with waiting(text, show_progress and setup is None):
         start = find_start(bound, options, setup)
@@ -315,7 +315,7 @@ def _sample(problem: FitProblem, store: Checkpoint | None, show_progress: bool) 
     if store is not None:
         if setup is None:
             store.setup = start.setup
-        store.look = _partial_result_writer(problem, attributes, store)
+        store.write_partial = _partial_result_writer(problem, attributes, store)
     schedule = Schedule(start.attributes["warmup"] * options.thin, options.samples, options.thin, options.chain_method)
     chains = sampling.run_chains(options.chain_key, start.sampler, start.points, schedule, store, show_progress)
     count = chains.z.shape[1]
@@ -377,8 +377,8 @@ def _draw_about_mode(problem: FitProblem, store: Checkpoint | None, show_progres
         attributes |= {arviz_data.DEGENERATE: json.dumps(degenerate)} if degenerate else {}
         return {"": np.asarray(json.dumps(attributes)), **draws}
 
-    with waiting(_MODE_SEARCH, show_progress and not (store is not None and store.holds(_MODE))):
-        arrays = compute() if store is None else store.once(_MODE, compute)
+    with waiting(_MODE_SEARCH, show_progress and not (store is not None and store.has(_MODE))):
+        arrays = compute() if store is None else store.get_or_compute(_MODE, compute)
     attributes = json.loads(str(arrays.pop("")))
     values = {name: np.asarray(value)[None] for name, value in arrays.items()}
     return PosteriorDraws(values, {}, None, attributes)

@@ -15,7 +15,7 @@ import numpy as np
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.priors import assumptions, prior
 from lfm_ppl.inference.samplers import SAMPLERS
-from lfm_ppl.results import checkpoint as checkpoints
+from lfm_ppl.results import run_record
 from lfm_ppl.utils import checks
 
 
@@ -89,10 +89,10 @@ class FitOptions:
         return {
             **self.description(bound), "thin": self.thin, "chain_method": self.chain_method, "init": self.init,
             "sampler_options": self.sampler_options, "trajectory_draws": self.trajectory_draws,
-            "parameters": bound.names, "model": checkpoints.digest(model_digest),
-            "times": checkpoints.digest(bound.times), "data": checkpoints.digest(bound.y),
-            "times of the trajectories": None if times is None else checkpoints.digest(np.asarray(times, float)),
-            "versions": checkpoints.versions(),
+            "parameters": bound.names, "model": run_record.digest(model_digest),
+            "times": run_record.digest(bound.times), "data": run_record.digest(bound.y),
+            "times of the trajectories": None if times is None else run_record.digest(np.asarray(times, float)),
+            "versions": run_record.versions(),
         }  # fmt: skip
 
     def call(self, model: str, data: str, model_kwargs: Mapping[str, Any] | None) -> str:
@@ -141,4 +141,4 @@ def model_docstring(numpyro_model: Any) -> str | None:
 
 def versions() -> dict[str, str]:
     """Return the versions of the packages that produced a result."""
-    return checkpoints.versions() | {"arviz": metadata.version("arviz")}
+    return run_record.versions() | {"arviz": metadata.version("arviz")}

@@ -130,7 +130,7 @@ def post_process(problem: FitProblem, draws: PosteriorDraws, store: Checkpoint |
     values = {site: draws.values[site].reshape(-1, *draws.values[site].shape[2:]) for site in bound.sites}
 
     def batch_options(name: str) -> dict[str, Any]:
-        return {"report": Console() if show_progress else None, "store": None if store is None else store.parts(name)}
+        return {"report": Console() if show_progress else None, "store": None if store is None else store.batches(name)}
 
     try:
         processed.scores = best_effort(

@@ -238,7 +238,7 @@ def test_plot_draws_a_saved_result_again(run, fitted, tmp_path):
     assert {path.name for path in (tmp_path / "again").iterdir()} == expected
     assert "wrote again/fit.pdf" in out
     code, _, err = run(f"plot {fitted / 'posterior.nc'}")
-    assert code == 2 and "exists already and is kept" in err
+    assert code == 2 and "already exists" in err
     assert run(f"plot {fitted} --overwrite")[0] == 0
 
 

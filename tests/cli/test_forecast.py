@@ -6,11 +6,11 @@ import shutil
 import numpy as np
 import pandas as pd
 import pytest
+from tests.test_cli_check import WELL
 
 import lfm_ppl as lfm
 from lfm_ppl.cli import main
 from lfm_ppl.results import arviz_data
-from tests.test_cli_check import WELL
 
 
 def run(line, capsys=None):
@@ -94,7 +94,7 @@ def test_predictions_that_exist_are_replaced_only_if_asked(result, capsys):
     before = arviz_data.group(arviz_data.load(result), "predictions")
     code, _, err = run(f"forecast {result} --at 9", capsys)
     assert code == 2
-    assert "holds predictions already, which are kept" in err
+    assert "already holds predictions" in err
     assert arviz_data.group(arviz_data.load(result), "predictions").equals(before)
     assert not (result / "forecast.csv").exists()
     code, _, err = run(f"forecast {result} --at 6,7,7.5 --overwrite --draws 30", capsys)

@@ -49,7 +49,7 @@ def test_a_file_that_exists_is_kept(tmp_path, capsys):
     path.write_text("precious")
     code, _, err = run(f"new {path}", capsys)
     assert code == 2
-    assert "exists already and is kept" in err
+    assert "already exists" in err
     assert path.read_text() == "precious"
 
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from lfm_ppl.parallel.store import write
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.ballistic import experiment, figures
 from lfm_ppl.experiments.ballistic.problem import TARGETS
@@ -14,6 +13,8 @@ from lfm_ppl.experiments.simulated import parameters, states
 from lfm_ppl.experiments.simulated.problem import RECORDS_PER_SEED, posterior, simulate_record, true_likelihood, true_z
 from lfm_ppl.experiments.study import TASKS
 from lfm_ppl.io import loading
+from lfm_ppl.parallel.store import write_result
+from lfm_ppl.utils.run_store import RunStore
 
 SMALL = experiment.BallisticSettings(
     runs=2, particle_runs=1, particles=(2_000,), chain_runs=1, drawn_runs=1, draws=200, paths=5, nuts=(2, 10, 10, 1),
@@ -203,7 +204,7 @@ def test_the_figures_are_drawn_and_labelled():
 def test_what_is_stored_is_tabulated_and_drawn_without_computing(tmp_path):
     results = made_up(MADE)
     for task in experiment.all_tasks(MADE):
-        write(task, results[task.name], tmp_path / TASKS)
+        write_result(task, results[task.name], RunStore(tmp_path / TASKS))
     lines = []
     found = experiment.STUDY.run(MADE, tmp_path, report=lines.append)
     count = len(results)
@@ -219,7 +220,7 @@ def test_what_is_stored_is_tabulated_and_drawn_without_computing(tmp_path):
 
 def test_tasks_have_files_of_their_own():
     found = experiment.all_tasks(experiment.BallisticSettings())
-    assert len({task.file for task in found}) == len(found) == 4 * 10 + 50 + 50 + 4 * 20 + 2 * 3 + 10
+    assert len({task.stem for task in found}) == len(found) == 4 * 10 + 50 + 50 + 4 * 20 + 2 * 3 + 10
 
 
 def test_mistakes():

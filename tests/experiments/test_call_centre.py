@@ -12,12 +12,13 @@ import pytest
 from scipy import integrate, special, stats
 
 import lfm_ppl as lfm
-from lfm_ppl.parallel.store import write
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.call_centre import counts, experiment, figures, learning, problem, tracking
 from lfm_ppl.experiments.study import TASKS
 from lfm_ppl.inference.optimise import End, Objective
+from lfm_ppl.parallel.store import write_result
 from lfm_ppl.results import importance_at_modes
+from lfm_ppl.utils.run_store import RunStore
 
 DATA = Path(os.environ.get("LFM_DATA", "../shared/data")) / "calls"
 real = pytest.mark.skipif(not DATA.is_dir(), reason="the counts of real calls are not there (LFM_DATA)")
@@ -320,7 +321,7 @@ def test_the_figures_are_drawn_and_labelled():
 def test_what_is_stored_is_tabulated_and_drawn_without_computing(tmp_path):
     results = made_up(MADE)
     for task in experiment.all_tasks(MADE):
-        write(task, results[task.name], tmp_path / TASKS)
+        write_result(task, results[task.name], RunStore(tmp_path / TASKS))
     lines = []
     with pytest.warns(counts.OverloadWarning, match="changed service rate: on 3 of 3 test days"):
         found = experiment.STUDY.run(MADE, tmp_path, report=lines.append)

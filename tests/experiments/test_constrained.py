@@ -11,11 +11,12 @@ from scipy.optimize import minimize_scalar
 from scipy.stats import truncnorm
 
 import lfm_ppl as lfm
-from lfm_ppl.parallel.store import write
 from lfm_ppl.experiments import catalogue
 from lfm_ppl.experiments.constrained import estimators, experiment, figures, problem
 from lfm_ppl.experiments.study import TASKS
 from lfm_ppl.inference.optimise import Objective
+from lfm_ppl.parallel.store import write_result
+from lfm_ppl.utils.run_store import RunStore
 
 
 @pytest.mark.parametrize("shape", problem.SHAPES)
@@ -162,7 +163,7 @@ def stored(folder, settings):
                      "k": np.where(np.arange(count) == 0, np.inf, 0.2),
                      "converged": np.ones(count, bool), "bands_converged": np.ones(count, bool),
                      "y": random.normal(size=(25, 3)), "measured": hours}
-        write(task, found, Path(folder) / TASKS, overwrite=False)
+        write_result(task, found, RunStore(Path(folder) / TASKS))
 
 
 def test_tables_and_figures_from_stored_results(tmp_path):

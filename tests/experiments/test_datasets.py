@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lfm_ppl.parallel.task import Task
 from lfm_ppl.experiments.datasets import TaskKind, cell, row, select_prefix
 from lfm_ppl.experiments.scores import Estimate, mean_of, rate_of
+from lfm_ppl.parallel.task import Task
 
 ENTRIES = {"dataset": "rmse, held", "dataset path": "coverage", "path time": "mean", "": "count, name"}
 

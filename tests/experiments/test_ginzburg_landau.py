@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
-from lfm_ppl.parallel.store import write
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.ginzburg_landau import experiment, figures, parameters, problem, states
 from lfm_ppl.experiments.study import TASKS
 from lfm_ppl.experiments.tasks import slug
+from lfm_ppl.parallel.store import write_result
+from lfm_ppl.utils.run_store import RunStore
 
 SMALL = experiment.GinzburgLandauSettings(
     realisations=1, conditional=2, particles=200, smoother_particles=50, smoother_draws=20, conditional_particles=50,
@@ -94,7 +95,7 @@ def test_draws_are_spread_over_all_chains():
 
 def test_names_of_tasks_and_files_differ():
     tasks = experiment.all_tasks(experiment.GinzburgLandauSettings())
-    assert len({task.file for task in tasks}) == len(tasks) == 5 * 20 + 5 * 10 + 1 + 4 * 20
+    assert len({task.stem for task in tasks}) == len(tasks) == 5 * 20 + 5 * 10 + 1 + 4 * 20
 
 
 def test_more_realisations_keep_the_tasks_of_fewer():
@@ -184,7 +185,7 @@ def test_the_figures_are_drawn_and_labelled():
 def test_stored_results_are_tabulated_without_computing(tmp_path):
     results = synthetic_results(SYNTHETIC)
     for study_task in experiment.all_tasks(SYNTHETIC):
-        write(study_task, results[study_task.name], tmp_path / TASKS)
+        write_result(study_task, results[study_task.name], RunStore(tmp_path / TASKS))
     lines = []
     result = experiment.STUDY.run(SYNTHETIC, tmp_path, report=lines.append)
     count = len(experiment.all_tasks(SYNTHETIC))
@@ -202,7 +203,7 @@ def test_stored_results_are_tabulated_without_computing(tmp_path):
 def test_a_folder_of_other_settings_is_refused(tmp_path):
     results = synthetic_results(SYNTHETIC)
     for study_task in experiment.all_tasks(SYNTHETIC):
-        write(study_task, results[study_task.name], tmp_path / TASKS)
+        write_result(study_task, results[study_task.name], RunStore(tmp_path / TASKS))
     other_settings = experiment.GinzburgLandauSettings(realisations=3, conditional=12, nodes=41, seed=1)
     with pytest.raises(ValueError, match="seed is 0 there and 1 now"):
         experiment.STUDY.run(other_settings, tmp_path)

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from lfm_ppl.parallel.task import Task
 from lfm_ppl.experiments import catalogue
 from lfm_ppl.experiments.periodic_kernels import experiment, figures, methods, problem
+from lfm_ppl.parallel.task import Task
 
 SMALL = experiment.PeriodicKernelSettings(runs=20, functions=(5, 22), draws=20, points=(20, 200))
 

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lfm_ppl.parallel.task import Task
 from lfm_ppl.experiments.ballistic import experiment
 from lfm_ppl.experiments.ballistic.problem import TARGETS
 from lfm_ppl.experiments.scores import Z
@@ -21,6 +20,7 @@ from lfm_ppl.experiments.simulated.problem import (
     true_z,
 )
 from lfm_ppl.io import loading
+from lfm_ppl.parallel.task import Task
 
 EPIDEMICS = SimulationProblem("epidemic", ("r0", "scale", "lengthscale", "concentration"), ("log transmission",), ("",),
                     medians=(2.0, 0.3, 15.0, 10.0), steps=10)

@@ -7,11 +7,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from lfm_ppl.parallel.task import Task
 from lfm_ppl.experiments import drawing, published, study, timing
 from lfm_ppl.experiments.datasets import TaskKind, row
 from lfm_ppl.experiments.scores import Estimate
 from lfm_ppl.experiments.study import Study, StudyTable, setting
+from lfm_ppl.parallel.task import Task
 from lfm_ppl.results.plots import style
 
 

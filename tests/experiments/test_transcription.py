@@ -11,13 +11,14 @@ import pytest
 import xarray as xr
 from scipy.integrate import solve_ivp
 
-from lfm_ppl.parallel.store import write
-from lfm_ppl.parallel.task import Task
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.published import PublishedComparison
 from lfm_ppl.experiments.study import TASKS
 from lfm_ppl.experiments.transcription import experiment, figures, problem, slices
 from lfm_ppl.latent_grid.laplace import laplace
+from lfm_ppl.parallel.store import write_result
+from lfm_ppl.parallel.task import Task
+from lfm_ppl.utils.run_store import RunStore
 
 SATURATION, EXPONENTIAL = problem.CONFIGURATIONS[1], problem.CONFIGURATIONS[6]
 FEW = experiment.TranscriptionSettings(datasets=12, draws=400, burn_in=40)
@@ -296,7 +297,7 @@ def test_infinite_errors_count_as_divergence():
 def test_stored_results_are_tabulated_without_computing(tmp_path):
     results = synthetic_results(FEW)
     for task in experiment.all_tasks(FEW):
-        write(task, results[task.name], tmp_path / TASKS)
+        write_result(task, results[task.name], RunStore(tmp_path / TASKS))
     study_result = experiment.STUDY.run(FEW, tmp_path)
     written = experiment.STUDY.save(study_result, tmp_path)
     assert {path.name for path in written} == {
@@ -314,7 +315,7 @@ def test_notes_count_consistent_cells(tmp_path):
     results = synthetic_results(settings)
     for task in experiment.all_tasks(settings):
         results[task.name]["rmse"] = results[task.name]["rmse"] + [0.0, 1e-3]
-        write(task, results[task.name], tmp_path / TASKS)
+        write_result(task, results[task.name], RunStore(tmp_path / TASKS))
     study_result = experiment.STUDY.run(settings, tmp_path)
     experiment.STUDY.save(study_result, tmp_path)
     assert study_result.notes == (  # LA has one sound data set alone, ESLS 0.3005 (0.0005) for 0.290, GFS 0.6 for 0.358

@@ -8,9 +8,9 @@ import numpy as np
 import numpyro
 import pytest
 
-from lfm_ppl.parallel.task import Task
 from lfm_ppl.experiments.transcription import parameters, parameters_report, problem
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
+from lfm_ppl.parallel.task import Task
 from lfm_ppl.results import arviz_data
 
 FEW = dataclasses.replace(parameters_report.TranscriptionParametersSettings.quick(), links=tuple(parameters.LINKS))

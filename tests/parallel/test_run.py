@@ -15,12 +15,14 @@ import pytest
 
 from lfm_ppl.parallel import cluster
 from lfm_ppl.parallel.cluster import Cluster, started
-from lfm_ppl.parallel.errors import ClusterError, FolderInUseError, TasksFailedError
+from lfm_ppl.parallel.errors import ClusterError, TasksFailedError
 from lfm_ppl.parallel.run import outcomes, run_tasks
-from lfm_ppl.parallel.store import read, write
+from lfm_ppl.parallel.store import read_result, write_result
 from lfm_ppl.parallel.task import Task
 from lfm_ppl.parallel.worker import return_memory
+from lfm_ppl.utils.errors import FolderInUseError
 from lfm_ppl.utils.progress import Console, duration
+from lfm_ppl.utils.run_store import RunStore
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -153,7 +155,7 @@ def test_processes_share_a_folder_of_programs_where_there_is_none():
 def dies(task):
     """Die as often as the settings say, once for each file that is not there yet."""
     for count in range(task.settings["deaths"]):
-        marker = Path(task.settings["folder"]) / f"{task.file}-{count}"
+        marker = Path(task.settings["folder"]) / f"{task.stem}-{count}"
         if not marker.exists():
             marker.touch()
             os._exit(9)
@@ -259,7 +261,7 @@ def test_fifty_workers_killed_at_random_moments_and_the_client_too(tmp_path):
     assert running.returncode == 0 or client(tmp_path, count, 0.4).wait() == 0
     own = slow_tasks(count, 0.4, tmp_path / "log")
     same(run_tasks([Task(task.name, task.seed, {"size": 3}) for task in own], noise, None),
-         {task.name: read(task, tmp_path / "out") for task in own})
+         {task.name: read_result(task, RunStore(tmp_path / "out")) for task in own})
     # A worker that dies takes with it what it computes, and at most one result that the client has not fetched yet.
     assert len(begun(tmp_path)) <= count + 2 * kills + 2 * (clients + 1)
 
@@ -432,15 +434,16 @@ def test_a_damaged_file_is_computed_again_with_a_warning(tmp_path, damage):
 
 def test_values_come_back_as_they_were(tmp_path):
     task = Task("a", 0)
-    write(task, {"number": 0.1, "whole": 3, "flag": True, "text": "ok", "array": np.arange(3.0)}, tmp_path)
-    found = read(task, tmp_path)
+    values = {"number": 0.1, "whole": 3, "flag": True, "text": "ok", "array": np.arange(3.0)}
+    write_result(task, values, RunStore(tmp_path))
+    found = read_result(task, RunStore(tmp_path))
     assert (found["number"], found["whole"], found["flag"], found["text"]) == (0.1, 3, True, "ok")
     np.testing.assert_array_equal(found["array"], np.arange(3.0))
 
 
 def test_what_cannot_be_stored_is_refused(tmp_path):
     with pytest.raises(ValueError, match="entry 'model' that is not a number"):
-        write(Task("a", 0), {"model": object()}, tmp_path)
+        write_result(Task("a", 0), {"model": object()}, RunStore(tmp_path))
     with pytest.raises(TypeError, match="must be what JSON can store"):
         Task("a", 0, {"model": object()})
     with pytest.raises(ValueError, match="name of a task"):

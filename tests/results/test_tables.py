@@ -8,7 +8,6 @@ import pandas as pd
 import pytest
 
 from lfm_ppl.results import arviz_data
-from lfm_ppl.results.files import writing
 from lfm_ppl.results.tables import (
     format_number,
     markdown_table,
@@ -16,6 +15,7 @@ from lfm_ppl.results.tables import (
     write_csv,
     write_markdown,
 )
+from lfm_ppl.utils.atomic_files import atomic_write
 
 COLUMNS = ["mean", "sd", "q2.5", "q97.5", "mcse_mean", "ess_bulk", "ess_tail", "r_hat"]
 
@@ -142,7 +142,7 @@ def test_markdown_file(tmp_path, frame):
 def test_a_killed_write_leaves_the_old_file(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text("old")
-    with pytest.raises(KeyboardInterrupt), writing(path, overwrite=True) as temporary:
+    with pytest.raises(KeyboardInterrupt), atomic_write(path, overwrite=True) as temporary:
         temporary.write_text("half")
         assert temporary.parent == path.parent and temporary.suffix == ".csv"
         raise KeyboardInterrupt
@@ -152,7 +152,7 @@ def test_a_killed_write_leaves_the_old_file(tmp_path):
 
 def test_a_file_that_appears_meanwhile_is_kept(tmp_path):
     path = tmp_path / "a.csv"
-    with pytest.raises(FileExistsError), writing(path) as temporary:
+    with pytest.raises(FileExistsError), atomic_write(path) as temporary:
         temporary.write_text("ours")
         path.write_text("theirs")
     assert path.read_text() == "theirs"

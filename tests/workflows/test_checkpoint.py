@@ -27,7 +27,7 @@ from lfm_ppl.inference import sampling
 from lfm_ppl.inference.handlers.settings import approximate
 from lfm_ppl.inference.posterior import scores
 from lfm_ppl.inference.samplers import SAMPLERS
-from lfm_ppl.results import arviz_data
+from lfm_ppl.results import arviz_data, run_record
 from lfm_ppl.results import checkpoint as checkpoints
 from lfm_ppl.results.checkpoint import Checkpoint
 from lfm_ppl.utils.progress import Progress, waiting
@@ -225,8 +225,8 @@ def test_another_run_is_not_gone_on_with(unfinished, changes, message):
 
 
 def test_other_versions_do_not_go_on(unfinished, monkeypatch):
-    versions = checkpoints.versions() | {"jax": "0.1"}
-    monkeypatch.setattr(checkpoints, "versions", lambda: versions)
+    versions = run_record.versions() | {"jax": "0.1"}
+    monkeypatch.setattr(run_record, "versions", lambda: versions)
     with pytest.raises(ValueError, match=r"versions jax was \S+ and is 0.1\."):
         fit("ram", checkpoint=unfinished, resume=True)
 
@@ -317,9 +317,14 @@ def test_a_check_goes_on_where_it_was_stopped(whole, tmp_path, monkeypatch):
     assert {path.name for path in (tmp_path / "checkpoint").iterdir() if path.is_dir()} == {
         "log-likelihoods", "log-likelihoods-with-finer-steps", "log-likelihoods-with-more-iterations",
         "particle-filter-20-particles"}
-    put = checkpoints.Parts.put
+    put = checkpoints.Batches.put
     again = []
-    monkeypatch.setattr(checkpoints.Parts, "put", lambda self, at, part: again.append(at) or put(self, at, part))
+
+    def record_and_put(self, start, batch):
+        again.append(start)
+        put(self, start, batch)
+
+    monkeypatch.setattr(checkpoints.Batches, "put", record_and_put)
     xr.testing.assert_identical(check(checkpoint=tmp_path, resume=True), expected)
     assert again == [4], "the first draws were not worked again"
 

@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from lfm_ppl.parallel.task import Task
 from lfm_ppl.experiments import chains, study
 from lfm_ppl.experiments.ballistic import figures
 from lfm_ppl.experiments.ballistic.problem import TARGETS
@@ -29,6 +28,7 @@ from lfm_ppl.experiments.simulated import parameters, states
 from lfm_ppl.experiments.simulated.problem import RECORDS_PER_SEED, true_z
 from lfm_ppl.experiments.study import Data, Study, StudyTable, setting
 from lfm_ppl.experiments.tasks import TaskFactory, slug, sort_by_dataset
+from lfm_ppl.parallel.task import Task
 
 REACH = 1.5
 """Half the width of the grid about the true log alpha, about six posterior standard deviations."""

@@ -20,11 +20,11 @@ from typing import Any
 
 import numpy as np
 
-from lfm_ppl.parallel.task import Task
 from lfm_ppl.experiments import chains, published, study
 from lfm_ppl.experiments.call_centre import counts, figures, learning, problem, tracking
 from lfm_ppl.experiments.datasets import Column, TaskKind, cell, number, row, select_prefix
 from lfm_ppl.experiments.study import Data, Study, StudyTable, setting
+from lfm_ppl.parallel.task import Task
 from lfm_ppl.utils.progress import Reporter
 
 PUBLISHED = {

@@ -22,7 +22,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.experiments import chains, scores
 from lfm_ppl.experiments.call_centre import problem
 from lfm_ppl.experiments.call_centre.learning import run_searches, sample_posterior
@@ -31,6 +30,7 @@ from lfm_ppl.experiments.tasks import dataset_indices, stack_results
 from lfm_ppl.filtering.filter import filter
 from lfm_ppl.filtering.smoother import smooth
 from lfm_ppl.model.state_space import state_space
+from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.switching.mixture import Mixture
 from lfm_ppl.utils.linalg import congruence, matmul
 

@@ -15,7 +15,6 @@ from scipy.optimize import minimize_scalar
 
 from lfm_ppl.constrained.full_information import ConstrainedEstimate, full_information
 from lfm_ppl.constrained.posterior import ConstrainedPosterior, constrained_posterior
-from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.experiments.constrained import problem
 from lfm_ppl.experiments.constrained.problem import FACTOR, HORMONE, TIMES, WINDOW
 from lfm_ppl.experiments.scores import Z, interval_coverage, rmse
@@ -24,6 +23,7 @@ from lfm_ppl.filtering.smoother import smooth
 from lfm_ppl.inference.log_posterior import LogPosterior
 from lfm_ppl.inference.optimise import newton, quasi_newton
 from lfm_ppl.linearisation.sigma_points import GaussHermite
+from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.results.importance_at_modes import weighted_posterior
 
 NEAR = 1.0

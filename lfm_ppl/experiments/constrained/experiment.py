@@ -8,7 +8,6 @@ from typing import Any
 
 import xarray as xr
 
-from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.experiments import study
 from lfm_ppl.experiments.constrained import estimators, figures, problem
 from lfm_ppl.experiments.constrained.estimators import BANDS, FULL, METHODS, SMOOTHER
@@ -16,6 +15,7 @@ from lfm_ppl.experiments.datasets import Column, TaskKind, merge_rows, row, rows
 from lfm_ppl.experiments.scores import SE, rate_of
 from lfm_ppl.experiments.study import Data, Study, StudyTable, setting
 from lfm_ppl.experiments.tasks import dataset_blocks, slug
+from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.results.importance import LARGEST_K
 
 

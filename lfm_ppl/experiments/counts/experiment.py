@@ -8,13 +8,13 @@ from typing import Any
 
 import xarray as xr
 
-from lfm_ppl.parallel.task import Task
 from lfm_ppl.experiments import study
 from lfm_ppl.experiments.counts import figures, methods
 from lfm_ppl.experiments.counts.problem import COAL, NAMES, ProblemSize, build_problem
 from lfm_ppl.experiments.datasets import Column, TaskKind, row
 from lfm_ppl.experiments.scores import Estimate
 from lfm_ppl.experiments.study import Data, Results, Study, StudyTable, setting
+from lfm_ppl.parallel.task import Task
 from lfm_ppl.utils.progress import Reporter
 
 

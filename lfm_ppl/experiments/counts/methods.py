@@ -21,7 +21,6 @@ import numpy as np
 import xarray as xr
 
 import lfm_ppl as lfm
-from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.counts.problem import CountsProblem, ProblemSize, build_problem
 from lfm_ppl.experiments.counts.reference import CHAINS, MonteCarloReference
@@ -29,6 +28,7 @@ from lfm_ppl.experiments.datasets import DATASET
 from lfm_ppl.experiments.study import Data
 from lfm_ppl.experiments.timing import time_call
 from lfm_ppl.inference.map import map_estimate
+from lfm_ppl.parallel.task import Result, Task
 
 REFERENCE = "reference"
 

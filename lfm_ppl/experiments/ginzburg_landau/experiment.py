@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from lfm_ppl.parallel.task import Task
 from lfm_ppl.experiments import study
 from lfm_ppl.experiments.chains import LENGTHS
 from lfm_ppl.experiments.datasets import Column, TaskKind, merge_rows, rows
@@ -22,6 +21,7 @@ from lfm_ppl.experiments.ginzburg_landau import figures, parameters, problem, st
 from lfm_ppl.experiments.scores import Estimate
 from lfm_ppl.experiments.study import CHAINS, Data, Study, StudyTable, setting
 from lfm_ppl.experiments.tasks import TaskFactory, slug, sort_by_dataset
+from lfm_ppl.parallel.task import Task
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,6 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.chains import LENGTHS, nuts
 from lfm_ppl.experiments.ginzburg_landau import problem, states
@@ -33,6 +32,7 @@ from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalRAM
 from lfm_ppl.inference.kernels.ram import RAM
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.model.state_space import state_space
+from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.particles import particle_filter
 
 INTERVALS = {"alpha": (-2.0, 1.5), "beta": (0.04, 1.5), "sigma": (1.0, 16.0)}

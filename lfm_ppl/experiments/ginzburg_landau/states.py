@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.ginzburg_landau import problem
 from lfm_ppl.experiments.timing import time_call, time_compiled_call
@@ -20,6 +19,7 @@ from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.fokker_planck_grid import grid_filter
 from lfm_ppl.fokker_planck_grid.finite_volume import Grid
 from lfm_ppl.model.state_space import state_space
+from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.particles.particle_filter import particle_filter
 from lfm_ppl.particles.particle_smoother import particle_smoother
 

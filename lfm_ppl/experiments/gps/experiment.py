@@ -21,7 +21,6 @@ import pandas as pd
 import xarray as xr
 
 from lfm_ppl import orbits
-from lfm_ppl.parallel.task import Task
 from lfm_ppl.experiments import study
 from lfm_ppl.experiments.datasets import TaskKind
 from lfm_ppl.experiments.gps import figures, learning_methods, problem, satellite
@@ -31,6 +30,7 @@ from lfm_ppl.experiments.scores import estimate_cells, mean_of
 from lfm_ppl.experiments.study import Data, Results, Study, StudyTable, setting
 from lfm_ppl.orbits import learning, magnitudes
 from lfm_ppl.orbits.arc import NOISE, Unusable
+from lfm_ppl.parallel.task import Task
 
 _WINDOW = 0.25
 """Length in days of a window with observations after training."""

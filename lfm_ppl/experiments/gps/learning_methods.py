@@ -13,7 +13,6 @@ import xarray as xr
 from numpyro.infer import init_to_value
 
 from lfm_ppl import orbits
-from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.experiments import chains
 from lfm_ppl.experiments.datasets import DATASET, Column, number, row
 from lfm_ppl.experiments.gps.figures import METRE
@@ -25,6 +24,7 @@ from lfm_ppl.orbits.frames import rtn_along
 from lfm_ppl.orbits.learning import DRAWS
 from lfm_ppl.orbits.magnitudes import Prior
 from lfm_ppl.orbits.training import Regression, Training
+from lfm_ppl.parallel.task import Result, Task
 
 METHODS = ("held out, averaged", "held out, mode", "marginal likelihood, mode", "marginal likelihood, posterior",
         "smoothed forces, mode")

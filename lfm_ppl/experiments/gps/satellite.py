@@ -8,12 +8,12 @@ from collections.abc import Callable
 import numpy as np
 
 from lfm_ppl import orbits
-from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.experiments.gps import problem
 from lfm_ppl.orbits import learning, magnitudes, prediction
 from lfm_ppl.orbits.arc import NOISE, Arc, Unusable
 from lfm_ppl.orbits.frames import rtn_along
 from lfm_ppl.orbits.training import Training
+from lfm_ppl.parallel.task import Result, Task
 
 REFUSED = "refused"
 """Only entry of the result of a satellite that the study leaves out: the reason."""

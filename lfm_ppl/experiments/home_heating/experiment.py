@@ -17,13 +17,13 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from lfm_ppl.parallel.task import Task
 from lfm_ppl.experiments import chains, study
 from lfm_ppl.experiments.datasets import Column, TaskKind, cell, number, row, select_prefix
 from lfm_ppl.experiments.home_heating import figures, prediction, problem
 from lfm_ppl.experiments.scores import Estimate, estimate_cells
 from lfm_ppl.experiments.study import Data, Study, StudyTable, setting
 from lfm_ppl.experiments.tasks import slug
+from lfm_ppl.parallel.task import Task
 from lfm_ppl.utils.progress import Reporter
 
 PUBLISHED = {

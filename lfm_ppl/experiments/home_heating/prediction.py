@@ -22,7 +22,6 @@ from numpyro.infer import MCMC
 from scipy.special import logsumexp, ndtr
 from scipy.stats import norm
 
-from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.experiments import chains, scores, timing
 from lfm_ppl.experiments.home_heating import problem
 from lfm_ppl.experiments.home_heating.problem import FINE, TIMES, TRAIN, Model, Window
@@ -32,6 +31,7 @@ from lfm_ppl.inference.bound_model import bind_arguments
 from lfm_ppl.inference.kernels.ram import RAM
 from lfm_ppl.inference.log_posterior import LogPosterior
 from lfm_ppl.inference.optimise import quasi_newton
+from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.switching.mixture import Mixture
 from lfm_ppl.switching.rao_blackwellised import RaoBlackwellisedResult, rao_blackwellised
 

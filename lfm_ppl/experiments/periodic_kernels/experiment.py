@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from lfm_ppl.parallel.task import Task
 from lfm_ppl.experiments import study
 from lfm_ppl.experiments.datasets import Column, TaskKind, row, rows
 from lfm_ppl.experiments.periodic_kernels import figures, methods, problem
 from lfm_ppl.experiments.periodic_kernels.methods import KPCA, SPARSE, SPARSE_4
 from lfm_ppl.experiments.scores import Estimate, estimate_cells, mean_of
 from lfm_ppl.experiments.study import Data, Study, StudyTable, setting
+from lfm_ppl.parallel.task import Task
 
 PUBLISHED = {SPARSE: (0.36, 3.03, -6.9e4), SPARSE_4: (0.23, 2.74, -1.2e4), KPCA: (9.6e-5, 2.49, 75.0)}
 """Published largest error of the covariance, RMSE, and expected log likelihood."""

@@ -10,12 +10,12 @@ import numpy as np
 from scipy.stats import norm
 
 from lfm_ppl import forces
-from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.periodic_kernels import problem
 from lfm_ppl.experiments.periodic_kernels.problem import MEASURED, PREDICTED
 from lfm_ppl.experiments.tasks import stack_results
 from lfm_ppl.forces import Force, PeriodicCovariance, random_frequencies
+from lfm_ppl.parallel.task import Result, Task
 
 EIGENFUNCTIONS, RESONATORS, RANDOM = METHODS = ("eigenfunctions", "resonators", "sparse spectrum")
 """Methods whose covariance functions are compared for each number of functions."""

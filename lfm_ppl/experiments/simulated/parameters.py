@@ -20,7 +20,6 @@ import jax
 import numpy as np
 from numpyro.infer import init_to_uniform
 
-from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.experiments import chains
 from lfm_ppl.experiments.scores import GridPosterior, interval, score_path, total_moments
 from lfm_ppl.experiments.simulated.problem import (
@@ -36,6 +35,7 @@ from lfm_ppl.experiments.tasks import dataset_indices, stack_results
 from lfm_ppl.experiments.timing import time_compiled_call
 from lfm_ppl.inference.kernels.ram import RAM
 from lfm_ppl.inference.optimise import Minimum, newton, quasi_newton
+from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.results.importance_at_modes import Weighted, weighted_posterior
 
 SAMPLERS = ("NUTS", "RAM")

@@ -16,7 +16,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.experiments.scores import interval, rmse, score_path
 from lfm_ppl.experiments.simulated.problem import SimulationProblem, default_data, simulate_record, true_likelihood
 from lfm_ppl.experiments.tasks import dataset_indices, stack_results
@@ -24,6 +23,7 @@ from lfm_ppl.experiments.timing import time_compiled_call
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.linearisation.sigma_points import Cubature, GaussHermite
 from lfm_ppl.linearisation.taylor import Taylor
+from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.particles.particle_filter import particle_filter
 from lfm_ppl.particles.particle_smoother import TRACING, ParticleSmootherResult, particle_smoother
 

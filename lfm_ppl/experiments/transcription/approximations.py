@@ -10,7 +10,6 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from lfm_ppl.parallel.task import Result
 from lfm_ppl.experiments.tasks import stack_results
 from lfm_ppl.experiments.timing import time_call, time_compiled_call
 from lfm_ppl.experiments.transcription import problem
@@ -18,6 +17,7 @@ from lfm_ppl.filtering.smoother import smooth
 from lfm_ppl.latent_grid import laplace
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.linearisation.sigma_points import Cubature, GaussHermite
+from lfm_ppl.parallel.task import Result
 
 SEARCHES = {"LA": ("newton", "riemann"), "LA, trust region": ("trust-region", "linear")}
 """Method -> search for the mode, and integration rule of the grid: the source's, and a robust search."""

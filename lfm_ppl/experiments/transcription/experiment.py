@@ -18,7 +18,6 @@ import numpy as np
 import xarray as xr
 from scipy.stats import norm
 
-from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.experiments import published, scores, study
 from lfm_ppl.experiments.datasets import Column, TaskKind, cell, number, row
 from lfm_ppl.experiments.published import PublishedComparison
@@ -26,6 +25,7 @@ from lfm_ppl.experiments.scores import mean_of
 from lfm_ppl.experiments.study import Data, Study, StudyTable, setting
 from lfm_ppl.experiments.tasks import dataset_blocks, dataset_indices
 from lfm_ppl.experiments.transcription import approximations, figures, problem, slices
+from lfm_ppl.parallel.task import Result, Task
 
 METHODS = ("LA", "ESLS", "GFS", "GHS(7)", "iterated GHS(7)", "LA, trust region")
 BLOCK = 10

@@ -19,7 +19,6 @@ import numpyro
 import numpyro.distributions as dist
 from numpyro.infer import NUTS, init_to_uniform
 
-from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.experiments import chains, scores
 from lfm_ppl.experiments.timing import time_call
 from lfm_ppl.experiments.transcription import problem
@@ -27,6 +26,7 @@ from lfm_ppl.inference.handlers.on_latent_grid import on_latent_grid
 from lfm_ppl.inference.kernels.ram import RAM
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.linearisation.sigma_points import GaussHermite
+from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.results import importance
 
 RULE, STEPS = GaussHermite(7), 6

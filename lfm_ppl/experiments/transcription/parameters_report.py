@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from lfm_ppl.parallel.task import Task
 from lfm_ppl.experiments import chains, study
 from lfm_ppl.experiments.datasets import Column, TaskKind, number, row
 from lfm_ppl.experiments.scores import estimate_cells
 from lfm_ppl.experiments.study import Data, Study, StudyTable, setting
 from lfm_ppl.experiments.transcription import figures, parameters, problem
 from lfm_ppl.experiments.transcription.parameters import LINKS, REFERENCE, SAMPLERS
+from lfm_ppl.parallel.task import Task
 
 
 @dataclass(frozen=True)

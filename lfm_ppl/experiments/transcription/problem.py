@@ -15,11 +15,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.parallel.task import Task
 from lfm_ppl.experiments import tasks
 from lfm_ppl.io import loading
 from lfm_ppl.latent_grid.latent_grid import LatentGrid
 from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.parallel.task import Task
 
 GENES, END, OBSERVED, POINTS = 3, 15.0, 13, 363
 SCALE, LENGTHSCALE, NOISE = 1.0, 2.0, 0.1

@@ -20,13 +20,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.parallel.task import Result
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.tasks import stack_results
 from lfm_ppl.experiments.timing import time_call
 from lfm_ppl.experiments.transcription import problem
 from lfm_ppl.inference.kernels.elliptical_slice import SliceState, elliptical_slice_step
 from lfm_ppl.latent_grid.latent_grid import LatentGrid
+from lfm_ppl.parallel.task import Result
 from lfm_ppl.particles.normals import normals
 
 CHAINS = 4

@@ -12,10 +12,10 @@ from matplotlib.backend_bases import FigureCanvasBase
 from matplotlib.figure import Figure
 
 from lfm_ppl.results.arviz_data import group, has_group, of_mode
-from lfm_ppl.results.files import refuse_existing, writing
 from lfm_ppl.results.inputs import inputs_of
 from lfm_ppl.results.plots import accuracy, chains, inputs, pairs, residuals, style, trajectories
 from lfm_ppl.results.scalars import sampled
+from lfm_ppl.utils.atomic_files import atomic_write, refuse_existing
 
 MAX_PAGES = 5
 Draw = Callable[..., Figure]
@@ -74,7 +74,7 @@ def save_figures(
         figure = draw(result, names, width=width)
         figure.set_layout_engine("none")  # laid out already; each format would do it again
         for ending in formats:
-            with writing(Path(folder) / f"{name}.{ending}", overwrite) as temporary:
+            with atomic_write(Path(folder) / f"{name}.{ending}", overwrite) as temporary:
                 with style.in_style():
                     figure.savefig(temporary, format=ending)
     return paths
