@@ -207,10 +207,10 @@ def wider(times, y=None):
 @pytest.mark.parametrize(("changes", "message"), [
     ({"seed": 3}, "seed was 0 and is 3"),
     ({"samples": 7, "thin": 2}, "samples was 6 and is 7; thin was 5 and is 2"),
-    ({"y": Y + 1.0}, "another one: data differ"),
+    ({"y": Y + 1.0}, "this one: data differ"),
     ({"times": TIMES + 0.5}, "times differ"),
-    ({"model": wider}, "another one: model differs"),
-    ({"at": [0.5, 4.5]}, "another one: times of the trajectories differ"),
+    ({"model": wider}, "this one: model differs"),
+    ({"at": [0.5, 4.5]}, "this one: times of the trajectories differ"),
     ({"sampler_options": {"target_accept_prob": 0.5}}, "sampler_options target_accept_prob was not given and is 0.5"),
     ({"chain_method": "sequential"}, "chain_method was vectorized and is sequential"),
     ({"init": "map"}, "init was not given and is map"),
@@ -218,7 +218,7 @@ def wider(times, y=None):
 ])
 def test_another_run_is_not_gone_on_with(unfinished, changes, message):
     before = {path: path.read_bytes() for path in unfinished.rglob("*") if path.is_file()}
-    with pytest.raises(ValueError, match="cannot go on with the run in .*run, which was another one: ") as raised:
+    with pytest.raises(ValueError, match="cannot resume the run in .*run, which differs from this one: ") as raised:
         fit("ram", checkpoint=unfinished, resume=True, **changes)
     assert message in str(raised.value) and "Repeat what it was begun with" in str(raised.value)
     assert {path: path.read_bytes() for path in unfinished.rglob("*") if path.is_file()} == before
@@ -247,17 +247,17 @@ def test_a_finished_run_is_read(whole, tmp_path, monkeypatch):
     assert (tmp_path / "posterior.nc").stat().st_mtime_ns == before.st_mtime_ns
     with pytest.raises(ValueError, match="seed was 0 and is 1"):
         fit("ram", checkpoint=tmp_path, resume=True, seed=1)
-    with pytest.raises(FileExistsError, match="holds a result, which is kept. Name another folder, or replace it with"):
+    with pytest.raises(FileExistsError, match="holds a result. Name another folder, or replace it with"):
         fit("ram", checkpoint=tmp_path)
 
 
 def test_folders_that_cannot_be_used(unfinished, tmp_path):
     with pytest.raises(ValueError, match="resume continues a run that is stored in a folder; name the folder"):
         fit("ram", resume=True)
-    with pytest.raises(FileExistsError, match="holds an unfinished run, which is kept. Go on with it with resume=True"):
+    with pytest.raises(FileExistsError, match="holds an unfinished run. Resume it with resume=True"):
         fit("ram", checkpoint=unfinished)
     (tmp_path / "mine.txt").write_text("keep")
-    with pytest.raises(FileNotFoundError, match="holds files, but no run to go on with"):
+    with pytest.raises(FileNotFoundError, match="holds files, but no run to resume"):
         fit("ram", checkpoint=tmp_path, resume=True)
     with pytest.raises(FileExistsError, match="mine.txt is a file; expected the name of a folder"):
         fit("ram", checkpoint=tmp_path / "mine.txt")
@@ -531,8 +531,8 @@ def test_a_finished_run_says_so(tmp_path, monkeypatch, capsys):
     assert "the run in run is finished; nothing was changed" in capsys.readouterr().out
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "run").iterdir()} == before
     assert main([*line, "--resume", "--seed", "2"]) == 2
-    assert "cannot go on with the run in run, which was another one: seed was 0 and is 2" in capsys.readouterr().err
-    for words, message in ((["--resume", "--overwrite"], "choose one"), ([], "run holds a result, which is kept")):
+    assert "cannot resume the run in run, which differs from this one: seed was 0 and is 2" in capsys.readouterr().err
+    for words, message in ((["--resume", "--overwrite"], "give one of them"), ([], "run holds a result.")):
         assert main([*line, *words]) == 2
         assert message in capsys.readouterr().err
     assert main([*line[:-2], "--resume"]) == 2
