@@ -10,10 +10,10 @@ import warnings
 from collections.abc import Sequence
 
 from lfm_ppl.cli.arguments import parsed
-from lfm_ppl.cli.interruption import INTERRUPTED, watched
 from lfm_ppl.io import loading
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.errors import RunError
+from lfm_ppl.utils.interruption import INTERRUPTED, watched
 
 
 def main(argv: Sequence[str] | None = None) -> int:

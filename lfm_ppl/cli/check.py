@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from lfm_ppl.cli import fit, page, results, session
-from lfm_ppl.cli.interruption import INTERRUPTED, Watch, watched
 from lfm_ppl.cli.stored_fit import StoredFit, rebuild_fit
 from lfm_ppl.utils import atomic_files
+from lfm_ppl.utils.interruption import INTERRUPTED, Watch, watched
 
 TABLE = "accuracy.csv"
 FIGURE = "accuracy.png"
@@ -179,7 +179,7 @@ def _correct(task: StoredFit, report: Any, arguments: argparse.Namespace, folder
         corrected = _exact_chains(task, arguments, folder)
     partial = arviz_data.attributes(corrected).get("partial")
     if partial is not None and watch is not None:
-        watch.answered()
+        watch.dismiss()
     first = arviz_data.attributes(task.posterior).get("command_line")
     corrected.attrs["command_line"] = "\n".join([*([first] if first else []), page.command_line(arguments)])
     status = fit.report(corrected, folder, time.perf_counter() - started, arguments.overwrite or arguments.resume)

@@ -17,10 +17,10 @@ import numpy as np
 from lfm_ppl.cli import choices, fit_many, page, results, session
 from lfm_ppl.cli.data_file import read_data
 from lfm_ppl.cli.fit_arguments import approximated_model, check_sampler, result_attributes, sampling_arguments
-from lfm_ppl.cli.interruption import INTERRUPTED, watched
 from lfm_ppl.cli.requested_times import trajectory_times
 from lfm_ppl.io import data, loading
 from lfm_ppl.utils import calendar_time
+from lfm_ppl.utils.interruption import INTERRUPTED, watched
 from lfm_ppl.utils.progress import duration
 
 
@@ -66,7 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
                 return INTERRUPTED
             partial = arviz_data.attributes(posterior).get("partial")
             if watch is not None and partial is not None:
-                watch.answered()
+                watch.dismiss()
             # The report is written last: without it the run was killed while it drew its figures.
             if finished and partial is None and page.exists(folder):
                 print(f"\nthe run in {folder} is complete; nothing was changed")

@@ -24,7 +24,6 @@ import jax
 import numpy as np
 
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.interruption import was_interrupt
 from lfm_ppl.inference.posterior import evenly_spaced, scores, trajectories
 from lfm_ppl.inference.samplers import GAUSSIAN_FILTER_SAMPLERS
 from lfm_ppl.inference.site_failures import failures_at, path_ess, site_failures
@@ -37,6 +36,7 @@ from lfm_ppl.results.files import POSTERIOR
 from lfm_ppl.results.inputs import remember
 from lfm_ppl.results.layout import Labels, lay_out
 from lfm_ppl.utils import checks
+from lfm_ppl.utils.interruption import was_interrupt
 from lfm_ppl.utils.progress import Console
 from lfm_ppl.workflows.fit_options import FitOptions, versions
 

@@ -22,7 +22,6 @@ import xarray as xr
 
 import lfm_ppl as lfm
 from lfm_ppl.cli import main
-from lfm_ppl.cli.interruption import watched
 from lfm_ppl.inference import sampling
 from lfm_ppl.inference.handlers.settings import approximate
 from lfm_ppl.inference.posterior import scores
@@ -30,6 +29,7 @@ from lfm_ppl.inference.samplers import SAMPLERS
 from lfm_ppl.results import arviz_data, run_record
 from lfm_ppl.results import checkpoint as checkpoints
 from lfm_ppl.results.checkpoint import Checkpoint
+from lfm_ppl.utils.interruption import watched
 from lfm_ppl.utils.progress import Progress, waiting
 from tests.processes import ROOT
 
@@ -484,7 +484,7 @@ def test_ctrl_c_leaves_a_usable_result(tmp_path, monkeypatch, capsys):
 def test_the_process_ends_though_compiled_code_runs_on():
     code = """
 import hashlib, signal, threading, os, time
-from lfm_ppl.cli import interruption
+from lfm_ppl.utils import interruption
 interruption._PATIENCE_S = 0.3
 threading.Timer(0.3, lambda: os.kill(os.getpid(), signal.SIGTERM)).start()
 with interruption.watched(lambda: "it is safe"):
@@ -506,7 +506,8 @@ def test_an_error_that_a_library_makes_of_an_interruption_is_one():
 def test_the_process_ends_though_the_interruption_is_swallowed():
     code = """
 import contextlib, signal, sys, time
-from lfm_ppl.cli import interruption, main, version
+from lfm_ppl.cli import main, version
+from lfm_ppl.utils import interruption
 interruption._PATIENCE_S = 0.3
 def run(arguments):
     with contextlib.suppress(KeyboardInterrupt):
@@ -528,7 +529,7 @@ def test_a_finished_run_says_so(tmp_path, monkeypatch, capsys):
     assert main(line) == 0
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "run").iterdir()}
     assert main([*line, "--resume"]) == 0
-    assert "the run in run is finished; nothing was changed" in capsys.readouterr().out
+    assert "the run in run is complete; nothing was changed" in capsys.readouterr().out
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "run").iterdir()} == before
     assert main([*line, "--resume", "--seed", "2"]) == 2
     assert "cannot resume the run in run, which differs from this one: seed was 0 and is 2" in capsys.readouterr().err
