@@ -15,7 +15,8 @@ import lfm_ppl as lfm
 from lfm_ppl.cli import description
 from lfm_ppl.cli import fit as command
 from lfm_ppl.io import loading
-from lfm_ppl.io.data import Data, InputTable, write_csv
+from lfm_ppl.io.data import write_csv
+from lfm_ppl.io.data_set import Data, InputTable
 from lfm_ppl.results import arviz_data, rebuilding
 from lfm_ppl.results.inputs import FORECAST, inputs_of
 

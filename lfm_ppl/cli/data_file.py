@@ -7,6 +7,7 @@ import dataclasses
 
 from lfm_ppl.cli import choices
 from lfm_ppl.io import data, loading
+from lfm_ppl.io.data_set import Data
 from lfm_ppl.utils import calendar_time, checks
 
 
@@ -23,7 +24,7 @@ def output_columns(arguments: argparse.Namespace, model: loading.ModelFile) -> t
     return names
 
 
-def read_data(path: str, model: loading.ModelFile, arguments: argparse.Namespace) -> data.Data:
+def read_data(path: str, model: loading.ModelFile, arguments: argparse.Namespace) -> Data:
     """Return the observations in a file, under the model's names of its outputs and inputs."""
     inputs = choices.inputs(arguments.inputs, model)
     observed = data.read_csv(path, output_columns(arguments, model), arguments.time_column, dict(inputs.values()),
@@ -32,7 +33,7 @@ def read_data(path: str, model: loading.ModelFile, arguments: argparse.Namespace
     return with_model_names(model, inputs, observed)
 
 
-def check_time_unit(model: loading.ModelFile, observed: data.Data, path: str, arguments: argparse.Namespace) -> None:
+def check_time_unit(model: loading.ModelFile, observed: Data, path: str, arguments: argparse.Namespace) -> None:
     """Raise ValueError where the dates of a file cannot be counted in the unit that the model says."""
     unit = model.units.get("time")
     if observed.origin is not None and unit and model_time_unit(model) is None and not arguments.time_unit:
@@ -46,7 +47,7 @@ def model_time_unit(model: loading.ModelFile) -> str | None:
     return unit if unit in calendar_time.SECONDS else None
 
 
-def with_model_names(model: loading.ModelFile, inputs: dict[str, tuple[str, str]], observed: data.Data) -> data.Data:
+def with_model_names(model: loading.ModelFile, inputs: dict[str, tuple[str, str]], observed: Data) -> Data:
     """Return observations under the model's names of its outputs and inputs.
 
     Args:

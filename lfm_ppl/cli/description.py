@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lfm_ppl.io import loading
-from lfm_ppl.io.data import Data, InputTable
+from lfm_ppl.io.data_set import Data, InputTable
 
 
 class Parameter(NamedTuple):

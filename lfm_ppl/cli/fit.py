@@ -18,7 +18,9 @@ from lfm_ppl.cli import choices, fit_many, page, results, session
 from lfm_ppl.cli.data_file import read_data
 from lfm_ppl.cli.fit_arguments import approximated_model, check_sampler, result_attributes, sampling_arguments
 from lfm_ppl.cli.requested_times import trajectory_times
-from lfm_ppl.io import data, loading
+from lfm_ppl.io import loading
+from lfm_ppl.io.data_set import Data
+from lfm_ppl.io.truth import read_truth
 from lfm_ppl.utils import calendar_time
 from lfm_ppl.utils.interruption import INTERRUPTED, watched
 from lfm_ppl.utils.progress import duration
@@ -97,7 +99,7 @@ def _nothing_left(folder: Path) -> str:
     return "nothing was sampled yet"
 
 
-def _observed(arguments: argparse.Namespace, model: loading.ModelFile, options: dict[str, Any]) -> data.Data:
+def _observed(arguments: argparse.Namespace, model: loading.ModelFile, options: dict[str, Any]) -> Data:
     """Return the data of --data as the model takes them, or simulated data."""
     if arguments.data is None:
         for flag in ("outputs", "inputs", "time_column", "time_unit", "truth"):
@@ -107,14 +109,14 @@ def _observed(arguments: argparse.Namespace, model: loading.ModelFile, options: 
         return model.simulate(**options)
     observed = read_data(arguments.data, model, arguments)
     if arguments.truth is not None:
-        observed = dataclasses.replace(observed, truth=data.read_truth(arguments.truth))
+        observed = dataclasses.replace(observed, truth=read_truth(arguments.truth))
     return model.prepare(observed)
 
 
 def _print_task(
     arguments: argparse.Namespace,
     model: loading.ModelFile,
-    observed: data.Data,
+    observed: Data,
     options: dict[str, Any],
     fixed: dict[str, Any],
 ) -> None:
@@ -153,7 +155,7 @@ def _print_task(
     sys.stdout.flush()
 
 
-def _check_fixed(numpyro_model: Any, observed: data.Data, keywords: dict[str, Any], fixed: dict[str, Any]) -> None:
+def _check_fixed(numpyro_model: Any, observed: Data, keywords: dict[str, Any], fixed: dict[str, Any]) -> None:
     from lfm_ppl.inference.bound_model import bind
 
     with calendar_time.in_messages(observed.origin, observed.units.get("time", "")):
@@ -164,7 +166,7 @@ def sample(
     arguments: argparse.Namespace,
     model: loading.ModelFile,
     numpyro_model: Any,
-    observed: data.Data,
+    observed: Data,
     options: dict[str, Any],
     fixed: dict[str, Any],
     folder: Path,

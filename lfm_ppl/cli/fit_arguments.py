@@ -7,7 +7,8 @@ import json
 from typing import Any
 
 from lfm_ppl.cli import choices, page
-from lfm_ppl.io import data, loading
+from lfm_ppl.io import loading
+from lfm_ppl.io.data_set import Data
 
 SETTINGS = ("rule", "steps", "max_step", "iterations", "tolerance")
 """Options of the approximation; None: the model's setting."""
@@ -73,7 +74,7 @@ def sampling_arguments(arguments: argparse.Namespace, model: loading.ModelFile) 
     }
 
 
-def result_attributes(arguments: argparse.Namespace, model: loading.ModelFile, observed: data.Data,
+def result_attributes(arguments: argparse.Namespace, model: loading.ModelFile, observed: Data,
                options: dict[str, Any]) -> dict[str, Any]:
     """Return the attributes of a result that `lfm-ppl check` and `forecast` read."""
     return {

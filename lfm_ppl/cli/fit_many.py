@@ -17,6 +17,7 @@ from lfm_ppl.cli.data_file import check_time_unit, model_time_unit, output_colum
 from lfm_ppl.cli.fit_arguments import approximated_model, check_sampler, result_attributes, sampling_arguments
 from lfm_ppl.cli.requested_times import trajectory_times
 from lfm_ppl.io import data, loading
+from lfm_ppl.io.data_set import Data
 
 RESULTS = "results"
 """Folder of the results, one folder per data set as of `lfm-ppl fit`: ``lfm-ppl check OUT/results/NAME``."""
@@ -113,7 +114,7 @@ def _report(fits: Any, folder: Path, spent: str, tables: Any) -> int:
     return 1 if fits.failed else 0
 
 
-def _read_files(arguments: argparse.Namespace, model: loading.ModelFile) -> tuple[dict[str, data.Data], dict[str, str]]:
+def _read_files(arguments: argparse.Namespace, model: loading.ModelFile) -> tuple[dict[str, Data], dict[str, str]]:
     """Return name -> observations, and name -> reason of a file that cannot be used.
 
     Raises:
@@ -124,7 +125,7 @@ def _read_files(arguments: argparse.Namespace, model: loading.ModelFile) -> tupl
         hint = f" {arguments.data} is a folder; its files are '{arguments.data.rstrip('/')}/*.csv'." \
             if os.path.isdir(arguments.data) else ""
         raise ValueError(f"no file matches --data {arguments.data!r}.{hint}")
-    data_sets: dict[str, data.Data] = {}
+    data_sets: dict[str, Data] = {}
     failed: dict[str, str] = {}
     for name, path in zip(_names(paths), paths, strict=True):
         try:
@@ -153,7 +154,7 @@ def _names(paths: list[str]) -> list[str]:
     return short if len(set(short)) == len(short) else relative_paths
 
 
-def _read_series(arguments: argparse.Namespace, model: loading.ModelFile) -> dict[str, data.Data]:
+def _read_series(arguments: argparse.Namespace, model: loading.ModelFile) -> dict[str, Data]:
 
     inputs = choices.inputs(arguments.inputs, model)
     read = data.read_series(
@@ -171,7 +172,7 @@ def _read_series(arguments: argparse.Namespace, model: loading.ModelFile) -> dic
     return {name: with_model_names(model, inputs, observed) for name, observed in read.items()}
 
 
-def _check_units(data_sets: dict[str, data.Data]) -> None:
+def _check_units(data_sets: dict[str, Data]) -> None:
     """Raise ValueError if dates of data sets are counted in different units, since tables of all have one unit."""
     first = next(iter(data_sets), "")
     for name, observed in data_sets.items():

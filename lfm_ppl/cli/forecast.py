@@ -18,6 +18,7 @@ from lfm_ppl.cli import choices, page, results, session
 from lfm_ppl.cli.requested_times import requested_times
 from lfm_ppl.cli.stored_fit import StoredFit, rebuild_fit
 from lfm_ppl.io import data
+from lfm_ppl.io.data_set import Data, InputTable, on_clock_of
 from lfm_ppl.utils import atomic_files, calendar_time, checks
 
 TABLE = "forecast.csv"
@@ -64,7 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
         return _write(forecast, score, held_out, task, path, folder, arguments)
 
 
-def _forecast(arguments: argparse.Namespace, task: StoredFit, held_out: data.Data | None) -> tuple:
+def _forecast(arguments: argparse.Namespace, task: StoredFit, held_out: Data | None) -> tuple:
     """Return the forecast and the function that scores it."""
     import lfm_ppl
     from lfm_ppl.model.inputs import Input
@@ -85,17 +86,17 @@ def _forecast(arguments: argparse.Namespace, task: StoredFit, held_out: data.Dat
     return forecast, lambda: lfm_ppl.score(forecast, held_out, **model_arguments)
 
 
-def joined(earlier: data.InputTable, later: data.InputTable) -> data.InputTable:
+def joined(earlier: InputTable, later: InputTable) -> InputTable:
     """Return a known input followed by later values."""
     is_earlier = earlier.times < later.times[0]
-    return data.InputTable(
+    return InputTable(
         np.append(earlier.times[is_earlier], later.times),
         np.append(earlier.values[is_earlier], later.values),
         earlier.interpolation,
     )
 
 
-def _held_out(arguments: argparse.Namespace, task: StoredFit) -> data.Data:
+def _held_out(arguments: argparse.Namespace, task: StoredFit) -> Data:
     outputs = task.observed.outputs
     columns = outputs
     if arguments.outputs is not None:
@@ -122,7 +123,7 @@ def _held_out(arguments: argparse.Namespace, task: StoredFit) -> data.Data:
         kinds = ("plain numbers", "dates") if read.origin is None else ("dates", "plain numbers")
         raise ValueError(f"{arguments.held_out}: its times are {kinds[0]}, the times of the result {kinds[1]}; use "
                          "the same form.")
-    read = data.on_clock_of(read, task.observed)
+    read = on_clock_of(read, task.observed)
     if repeated_rows := int(np.isin(read.times, task.observed.times).sum()):
         print(f"note     {repeated_rows} of {len(read.times)} rows of {arguments.held_out} are at times of the fitted "
               "data: if they are the same data, their scores are not scores of a forecast")
@@ -135,7 +136,7 @@ def _held_out(arguments: argparse.Namespace, task: StoredFit) -> data.Data:
     return read
 
 
-def _write(forecast: Any, score: Callable, held_out: data.Data | None, task: StoredFit, path: Path, folder: Path,
+def _write(forecast: Any, score: Callable, held_out: Data | None, task: StoredFit, path: Path, folder: Path,
            arguments: argparse.Namespace) -> int:
     from lfm_ppl.results import arviz_data, files, inputs, tables
     from lfm_ppl.results.predictions import GROUP, HELD_OUT, held_out_data, summary

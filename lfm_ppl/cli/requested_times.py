@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from lfm_ppl.io import data
+from lfm_ppl.io.data_set import Data
 from lfm_ppl.utils import calendar_time
 
 _TRAJECTORY_TIMES = 241
 """Number of times of the trajectories between the first and the last one: enough for a smooth line."""
 
 
-def trajectory_times(observed: data.Data, until: str | None, at: str | None) -> np.ndarray | None:
+def trajectory_times(observed: Data, until: str | None, at: str | None) -> np.ndarray | None:
     """Return the times of the trajectories; None without --until and --at, for the library's grid."""
     if until is None and at is None:
         return None
@@ -20,7 +20,7 @@ def trajectory_times(observed: data.Data, until: str | None, at: str | None) -> 
     return np.union1d(np.linspace(times[0], max(time_requests[-1], times[-1]), _TRAJECTORY_TIMES), time_requests)
 
 
-def requested_times(observed: data.Data, until: str | None, at: str | None, grid: int,
+def requested_times(observed: Data, until: str | None, at: str | None, grid: int,
                     further: np.ndarray) -> np.ndarray:
     """Return the times of --until and --at, numbers or dates, and ``further`` times, sorted.
 
@@ -44,7 +44,7 @@ def requested_times(observed: data.Data, until: str | None, at: str | None, grid
     return np.unique(np.concatenate(groups))
 
 
-def _parse_time(flag: str, text: str, observed: data.Data, hint: str = "") -> float:
+def _parse_time(flag: str, text: str, observed: Data, hint: str = "") -> float:
     try:
         return calendar_time.position(text, observed.origin, observed.units.get("time", ""))
     except ValueError as error:

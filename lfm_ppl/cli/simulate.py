@@ -7,6 +7,7 @@ import shlex
 
 from lfm_ppl.cli import choices, results, session
 from lfm_ppl.io import data, loading
+from lfm_ppl.io.truth import write_truth
 from lfm_ppl.utils import atomic_files
 
 
@@ -25,7 +26,7 @@ def run(arguments: argparse.Namespace) -> int:
     words = ["lfm-ppl", "fit", arguments.model, "--data", str(table)]
     if simulated.truth is not None:
         with atomic_files.atomic_write(truth_file, arguments.overwrite) as temporary:
-            data.write_truth(simulated, temporary)
+            write_truth(simulated, temporary)
         print(f"wrote {truth_file}: what it was simulated from")
         words += ["--truth", str(truth_file)]
     for option in arguments.option:

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from lfm_ppl.cli import choices
-from lfm_ppl.io import data, loading
+from lfm_ppl.io import loading
+from lfm_ppl.io.data_set import Data
 from lfm_ppl.utils import checks
 
 
@@ -19,7 +20,7 @@ class StoredFit(NamedTuple):
     name: str
     model: Callable
     keywords: dict[str, Any]
-    observed: data.Data
+    observed: Data
     file: loading.ModelFile
 
 
@@ -56,7 +57,7 @@ def rebuild_fit(posterior: Any, model_file: str | None, path: Path) -> StoredFit
     units = {name: unit for name in outputs if (unit := unit_of(variable, name))}
     if clock := unit_of(group["time"]):
         units["time"] = clock
-    observed = data.Data(times, y, outputs, units={**model.units, **units}, inputs=inputs_of(posterior),
+    observed = Data(times, y, outputs, units={**model.units, **units}, inputs=inputs_of(posterior),
                          origin=attrs.get(ORIGIN))
     options = _json_attribute(attrs, "options", path)
     unknown = sorted(set(options) - set(model.options))

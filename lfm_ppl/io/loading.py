@@ -34,7 +34,7 @@ from pathlib import Path
 from types import MappingProxyType, ModuleType
 from typing import Any, NamedTuple
 
-from lfm_ppl.io.data import INTERPOLATIONS, Data
+from lfm_ppl.io.data_set import INTERPOLATIONS, Data
 from lfm_ppl.utils import checks
 
 _MODULE = "_lfm_ppl_model_"

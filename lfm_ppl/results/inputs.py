@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from lfm_ppl.io.data import Data, InputTable, model_keywords
+from lfm_ppl.io.data_set import Data, InputTable, model_keywords
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.scalars import unit_of, units_attribute
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from lfm_ppl.io.data import TRUTH, check_truth
+from lfm_ppl.io.truth import TRUTH, check_truth
 from lfm_ppl.model.observation_noise import expected_observation
 from lfm_ppl.results.predictions import GROUP, INTERVAL, NOISE_FREE, mixture_quantiles, predictions
 from lfm_ppl.results.scalars import DERIVED, units_attribute

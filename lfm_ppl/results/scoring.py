@@ -12,7 +12,7 @@ import xarray as xr
 from scipy import stats
 from scipy.special import logsumexp
 
-from lfm_ppl.io.data import Data, at_origin
+from lfm_ppl.io.data_set import Data, at_origin
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.inputs import clock_of
 from lfm_ppl.results.predictions import MEAN, SD, observed_variable, of_result, quantiles

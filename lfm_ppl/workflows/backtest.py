@@ -11,7 +11,8 @@ import pandas as pd
 import xarray as xr
 
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.io.data import as_data, model_keywords
+from lfm_ppl.io.data import as_data
+from lfm_ppl.io.data_set import model_keywords
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.family_scores import log_densities
 from lfm_ppl.results.predictions import GROUP, MEAN, SD, observed_variable

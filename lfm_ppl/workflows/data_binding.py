@@ -10,7 +10,7 @@ import numpy as np
 
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.bound_model import BoundModel, bind
-from lfm_ppl.io.data import Data, at_origin, model_keywords
+from lfm_ppl.io.data_set import Data, at_origin, model_keywords
 from lfm_ppl.utils import calendar_time, checks
 
 

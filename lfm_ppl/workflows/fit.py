@@ -33,7 +33,8 @@ from lfm_ppl.inference.model_digest import model_digest
 from lfm_ppl.inference.samplers import SAMPLERS
 from lfm_ppl.inference.schedule import Schedule
 from lfm_ppl.inference.start_failure import start_failure
-from lfm_ppl.io.data import Data, as_data, model_keywords
+from lfm_ppl.io.data import as_data
+from lfm_ppl.io.data_set import Data, model_keywords
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results import checkpoint as checkpoints
 from lfm_ppl.results.checkpoint import Checkpoint

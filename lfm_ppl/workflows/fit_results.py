@@ -27,7 +27,7 @@ from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.posterior import evenly_spaced, scores, trajectories
 from lfm_ppl.inference.samplers import GAUSSIAN_FILTER_SAMPLERS
 from lfm_ppl.inference.site_failures import failures_at, path_ess, site_failures
-from lfm_ppl.io.data import Data
+from lfm_ppl.io.data_set import Data
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.approximation import approximation_warnings, resolution_warnings

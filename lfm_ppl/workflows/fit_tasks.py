@@ -15,7 +15,7 @@ import numpy as np
 
 from lfm_ppl.inference.bound_model import bind
 from lfm_ppl.inference.model_digest import model_digest
-from lfm_ppl.io.data import Data, model_keywords
+from lfm_ppl.io.data_set import Data, model_keywords
 from lfm_ppl.parallel.task import Task
 from lfm_ppl.results.packing import pack_result
 from lfm_ppl.results.run_record import digest

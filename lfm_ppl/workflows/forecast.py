@@ -10,7 +10,7 @@ import numpy as np
 
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.posterior import evenly_spaced, noise_of_rows, trajectories
-from lfm_ppl.io.data import InputTable
+from lfm_ppl.io.data_set import InputTable
 from lfm_ppl.model.inputs import Input
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.particles.particle_filter import ParticleSettings

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from lfm_ppl.io import loading
-from lfm_ppl.io.data import Data
+from lfm_ppl.io.data_set import Data
 
 COMPLETE = '''"""A line: y = slope * t.
 
 More words.
 """
-from lfm_ppl.io.data import Data
+from lfm_ppl.io.data_set import Data
 
 OUTPUTS = ("y",)
 UNITS = {"time": "s", "y": "m"}

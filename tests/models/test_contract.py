@@ -15,7 +15,8 @@ from numpyro.infer.util import log_density
 from lfm_ppl.filtering.arguments import check_observations
 from lfm_ppl.inference.likelihood_site import likelihood_site
 from lfm_ppl.io import loading
-from lfm_ppl.io.data import Data, read_csv, write_csv
+from lfm_ppl.io.data import read_csv, write_csv
+from lfm_ppl.io.data_set import Data
 
 MODELS = sorted(loading.available())
 

@@ -9,7 +9,7 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_hex
 from scipy import stats
 
-from lfm_ppl.io.data import InputTable
+from lfm_ppl.io.data_set import InputTable
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.inputs import to_dataset
 from lfm_ppl.results.plots import (

@@ -11,7 +11,8 @@ import pandas as pd
 import pytest
 
 import lfm_ppl as lfm
-from lfm_ppl.io.data import Data, read_csv
+from lfm_ppl.io.data import read_csv
+from lfm_ppl.io.data_set import Data
 from lfm_ppl.results.plots import style
 from lfm_ppl.utils import calendar_time
 

@@ -25,7 +25,7 @@ from lfm_ppl.inference.handlers.fixing import fix
 from lfm_ppl.inference.log_posterior import LogPosterior
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.io import loading
-from lfm_ppl.io.data import Data
+from lfm_ppl.io.data_set import Data
 from lfm_ppl.model.simulate import simulate
 from lfm_ppl.utils import checks
 
