@@ -21,8 +21,8 @@ from .forces import QuasiPeriodic as QuasiPeriodic
 from .forces import Resonator as Resonator
 from .forces import SquaredExponential as SquaredExponential
 from .forces import WienerVelocity as WienerVelocity
+from .inference.bind import bind as bind
 from .inference.bound_model import BoundModel as BoundModel
-from .inference.bound_model import bind as bind
 from .inference.handlers.fixing import fix as fix
 from .inference.handlers.on_latent_grid import on_latent_grid as on_latent_grid
 from .inference.kernels.elliptical_slice import EllipticalSlice as EllipticalSlice
@@ -32,9 +32,9 @@ from .inference.map import map_estimate as map_estimate
 from .inference.marginal_likelihood import MarginalLikelihood as MarginalLikelihood
 from .inference.panel import panel as panel
 from .io import data as data
-from .io.data import Data as Data
 from .io.data import read_csv as read_csv
 from .io.data import read_table as read_table
+from .io.data_set import Data as Data
 from .latent_grid.laplace import laplace as laplace
 from .latent_grid.latent_grid import LatentGrid as LatentGrid
 from .linearisation.rule import Rule as Rule

@@ -49,7 +49,7 @@ def describe(model: loading.ModelFile) -> Description:
     Raises:
         ValueError, TypeError: as a fit of the model.
     """
-    from lfm_ppl.inference.bound_model import bind
+    from lfm_ppl.inference.bind import bind
     from lfm_ppl.inference.priors import prior, support
 
     data = model.simulate() if model.can_simulate else _placeholder_data(model)

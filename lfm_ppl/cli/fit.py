@@ -156,7 +156,7 @@ def _print_task(
 
 
 def _check_fixed(numpyro_model: Any, observed: Data, keywords: dict[str, Any], fixed: dict[str, Any]) -> None:
-    from lfm_ppl.inference.bound_model import bind
+    from lfm_ppl.inference.bind import bind
 
     with calendar_time.in_messages(observed.origin, observed.units.get("time", "")):
         bind(numpyro_model, observed.times, observed.y, **keywords).fix(fixed)

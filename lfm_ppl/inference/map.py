@@ -23,7 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 from numpyro.infer import init_to_median, init_to_sample
 
-from lfm_ppl.inference.bound_model import BoundModel, bind_arguments
+from lfm_ppl.inference.bind import bind_arguments
+from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.optimise import End, Minimum, Objective, newton, quasi_newton
 from lfm_ppl.utils import checks
 

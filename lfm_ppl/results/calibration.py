@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpyro import handlers
 
-from lfm_ppl.inference.bound_model import bind
+from lfm_ppl.inference.bind import bind
 from lfm_ppl.inference.likelihood_site import likelihood_site
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.parallel.cluster import Workers

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from lfm_ppl.inference.bound_model import BoundModel, bind
+from lfm_ppl.inference.bind import bind
+from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.likelihood_site import LikelihoodSite
 from lfm_ppl.results import arviz_data, inputs
 from lfm_ppl.results.likelihoods import PosteriorDraws

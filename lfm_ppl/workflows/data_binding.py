@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from lfm_ppl.filtering.time_grid import build_time_grid
-from lfm_ppl.inference.bound_model import BoundModel, bind
+from lfm_ppl.inference.bind import bind
+from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.io.data_set import Data, at_origin, model_keywords
 from lfm_ppl.utils import calendar_time, checks
 

@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from lfm_ppl.inference.bound_model import bind
+from lfm_ppl.inference.bind import bind
 from lfm_ppl.inference.model_digest import model_digest
 from lfm_ppl.io.data_set import Data, model_keywords
 from lfm_ppl.parallel.task import Task

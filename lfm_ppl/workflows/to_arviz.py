@@ -10,7 +10,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from lfm_ppl.inference.bound_model import BoundModel, bind
+from lfm_ppl.inference.bind import bind
+from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.posterior import scores
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.layout import Labels, checked_truth, lay_out

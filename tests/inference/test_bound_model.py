@@ -18,7 +18,8 @@ from numpyro.infer import NUTS
 from numpyro.infer.util import ParamInfo, potential_energy
 
 import lfm_ppl as lfm
-from lfm_ppl.inference import bound_model, sampling, traced_model
+from lfm_ppl.inference import sampling, traced_model
+from lfm_ppl.inference.bind import bind_arguments
 from lfm_ppl.inference.bound_samplers import nuts_sampler, ram_sampler
 from lfm_ppl.inference.laplace_start import Laplace
 from lfm_ppl.inference.model_digest import model_digest
@@ -381,7 +382,7 @@ def test_times_may_follow_from_parameters_or_data():
 
     for times in (TIMES, 2.0 * TIMES):
         data = {"times": jnp.asarray(times), "y": jnp.asarray(Y)}
-        found = bound_model.bind_arguments(packed, (data,), {}).log_density(np.array([0.1]))
+        found = bind_arguments(packed, (data,), {}).log_density(np.array([0.1]))
         expected = -potential_energy(packed, (data,), {}, {"decay": 0.1})
         assert float(found) == pytest.approx(float(expected), rel=1e-12)
 

@@ -15,7 +15,7 @@ from numpyro.distributions import biject_to
 from numpyro.infer import NUTS, Predictive
 
 import lfm_ppl as lfm
-from lfm_ppl.inference.bound_model import bind
+from lfm_ppl.inference.bind import bind
 from lfm_ppl.io import loading
 from lfm_ppl.results import calibration
 

@@ -11,7 +11,7 @@ from numpyro.infer.hmc import HMCState
 from numpyro.infer.hmc_util import HMCAdaptState, welford_covariance
 
 from lfm_ppl.inference import nuts
-from lfm_ppl.inference.bound_model import bind_arguments
+from lfm_ppl.inference.bind import bind_arguments
 from lfm_ppl.inference.laplace_start import (
     MAX_PARAMETERS,
     Laplace,

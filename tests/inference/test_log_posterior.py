@@ -10,7 +10,7 @@ import systems
 from scipy import stats
 
 import lfm_ppl as lfm
-from lfm_ppl.inference.bound_model import bind_arguments
+from lfm_ppl.inference.bind import bind_arguments
 from lfm_ppl.inference.log_posterior import LogPosterior
 
 TIMES = np.array([0.0, 0.7, 1.1, 2.0])

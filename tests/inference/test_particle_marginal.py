@@ -12,7 +12,7 @@ from numpyro.infer import MCMC
 
 import lfm_ppl as lfm
 from lfm_ppl.inference import particle_likelihood
-from lfm_ppl.inference.bound_model import bind
+from lfm_ppl.inference.bind import bind
 from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalState, particle_marginal_step
 from lfm_ppl.inference.kernels.robust_metropolis import initial_state
 from lfm_ppl.inference.particle_likelihood import ParticlePotential

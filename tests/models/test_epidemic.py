@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 
 import lfm_ppl as lfm
 from lfm_ppl.experiments import scores
-from lfm_ppl.inference.bound_model import bind
+from lfm_ppl.inference.bind import bind
 from lfm_ppl.inference.log_posterior import LogPosterior
 from lfm_ppl.inference.optimise import newton, quasi_newton
 from lfm_ppl.io import loading

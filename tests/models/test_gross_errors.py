@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import lfm_ppl as lfm
-from lfm_ppl.inference.bound_model import bind
+from lfm_ppl.inference.bind import bind
 from lfm_ppl.inference.optimise import newton, quasi_newton
 from lfm_ppl.io import loading
 

@@ -14,7 +14,7 @@ from numpyro.handlers import condition, trace
 from numpyro.infer import MCMC, NUTS, init_to_median
 
 import lfm_ppl as lfm
-from lfm_ppl.inference.bound_model import bind
+from lfm_ppl.inference.bind import bind
 from lfm_ppl.inference.handlers.fixing import fix
 from lfm_ppl.inference.handlers.settings import approximate
 from lfm_ppl.inference.optimise import newton, quasi_newton

@@ -14,7 +14,7 @@ import numpyro.distributions as dist
 from scipy.signal import lfilter
 
 from lfm_ppl.forces import Matern
-from lfm_ppl.inference.bound_model import bind
+from lfm_ppl.inference.bind import bind
 from lfm_ppl.inference.likelihood_site import likelihood_site
 from lfm_ppl.inference.log_posterior import LogPosterior
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood

@@ -27,7 +27,7 @@ from lfm_ppl.experiments.home_heating import problem
 from lfm_ppl.experiments.home_heating.problem import FINE, TIMES, TRAIN, Model, Window
 from lfm_ppl.experiments.tasks import stack_results
 from lfm_ppl.filtering.filter import FilterState
-from lfm_ppl.inference.bound_model import bind_arguments
+from lfm_ppl.inference.bind import bind_arguments
 from lfm_ppl.inference.kernels.ram import RAM
 from lfm_ppl.inference.log_posterior import LogPosterior
 from lfm_ppl.inference.optimise import quasi_newton

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpyro import handlers
 
-from lfm_ppl.inference.bound_model import bind
+from lfm_ppl.inference.bind import bind
 from lfm_ppl.inference.handlers.fixing import fix
 from lfm_ppl.inference.log_posterior import LogPosterior
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood

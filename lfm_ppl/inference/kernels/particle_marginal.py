@@ -24,7 +24,8 @@ from numpyro.infer import init_to_median
 from numpyro.infer.util import ParamInfo
 from numpyro.util import is_prng_key
 
-from lfm_ppl.inference.bound_model import BoundModel, bind_arguments
+from lfm_ppl.inference.bind import bind_arguments
+from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.kernels.algorithm import SamplingAlgorithm
 from lfm_ppl.inference.kernels.ram import RAM
 from lfm_ppl.inference.kernels.robust_metropolis import (
