@@ -131,8 +131,8 @@ def test_a_model_of_known_inputs_is_described_without_data():
     ({"inputs": "heater,outside:cubic"}, "unknown interpolation of outside 'cubic'"),
     ({"inputs": "heater,indoor"}, "'indoor' is named as an output and as an input"),
     ({"inputs": None}, "unknown input column 'power'"),
-    ({"data": None}, "--outputs says how to read a data file"),
-    ({"data": None, "outputs": None}, "--inputs says how to read a data file"),
+    ({"data": None}, "--outputs is about a data file"),
+    ({"data": None, "outputs": None}, "--inputs is about a data file"),
 ])
 def test_wrong_inputs_are_named(folder, changed, message):
     with pytest.raises(ValueError, match=message):

@@ -70,7 +70,7 @@ def check_distinct(tasks: Iterable[Task]) -> None:
         >>> check_distinct([Task("a/b", 0), Task("a-b", 0)])
         Traceback (most recent call last):
             ...
-        ValueError: the tasks 'a/b' and 'a-b' share the file a-b.npz; give every task a name of its own.
+        ValueError: the tasks 'a/b' and 'a-b' share the file a-b.npz; use unique names.
     """
     seen: dict[str, str] = {}
     for task in tasks:

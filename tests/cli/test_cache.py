@@ -109,7 +109,7 @@ def test_a_folder_that_cannot_be_written_is_a_warning(home, monkeypatch, why):
         home.write_text("")
     else:
         monkeypatch.setattr(os, "access", lambda *asked: False)
-    with pytest.warns(UserWarning, match="compiled programs are not kept for the next run: .*LFM_PPL_CACHE=off"):
+    with pytest.warns(UserWarning, match="compiled programs are not cached: .*LFM_PPL_CACHE=off"):
         session.start(1)
     assert jax.config.jax_compilation_cache_dir is None
     with warnings.catch_warnings():

@@ -170,7 +170,7 @@ def test_exact_chains_where_the_weights_are_not_reliable(run, fitted, monkeypatc
         ("check RESULT --draws 0", "expected a whole number of at least 1, got '0'"),
         ("check RESULT --particles 0", "expected a whole number of at least 1, got '0'"),
         ("check RESULT --out there", "--out names the folder of the corrected result; add --correct"),
-        ("check RESULT --delayed", "--delayed says how the corrected result is sampled; add --correct"),
+        ("check RESULT --delayed", "--delayed is a setting of the corrected result; add --correct"),
         ("check RESULT --model nothing.py", "there is no model file nothing.py"),
         ("check RESULT --model ginzburg-landau", "made with the option 'noise', which"),
     ],

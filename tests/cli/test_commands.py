@@ -323,13 +323,13 @@ def test_the_default_folder_must_be_one(run, tmp_path, monkeypatch):
         ("fit MOTIF --target-accept 1.5", "expected a number between 0 and 1, got '1.5'"),
         ("fit MOTIF --target-accept 0.9 --sampler map", "--target-accept is for the samplers nuts, ram and pmmh"),
         ("fit MOTIF --until 3", "--until takes a time after the last observation, at 7, got 3"),
-        ("fit MOTIF --until 9 --trajectory-draws 0", "--until and --at ask for trajectories, of which"),
+        ("fit MOTIF --until 9 --trajectory-draws 0", "--until and --at need trajectories"),
         ("fit MOTIF --until nan", "--until takes a time after the last observation, at 7, got nan"),
         ("fit MOTIF --data absent.csv", "there is no file absent.csv"),
         ("fit MOTIF --data empty.csv", "empty.csv is empty"),
         ("fit MOTIF --data other.csv", "unknown output column 'a'"),
         ("fit MOTIF --data other.csv --outputs q", "has 2 outputs (a, b); --outputs names 1"),
-        ("fit MOTIF --truth t.json", "--truth says how to read a data file; give one with --data"),
+        ("fit MOTIF --truth t.json", "--truth is about a data file; give one with --data"),
         ("fit MOTIF --option ordr=1", "unknown option of motif 'ordr'. Did you mean 'order'"),
         ("fit MOTIF --option order=2", "unknown value of option order '2'"),
         ("fit MOTIF --option order", "--option takes NAME=VALUE, got 'order'"),
@@ -401,7 +401,7 @@ def test_what_the_user_fixes_wins_over_the_anchors(given, expected):
 
 
 def test_an_option_is_no_parameter():
-    with pytest.raises(ValueError, match="--set df=4: df is an option of the model, and no parameter: --option df=4"):
+    with pytest.raises(ValueError, match="--set df=4: df is an option of the model, not a parameter: --option df=4"):
         choices.fixed(["df=4"], {}, {"df", "link"})
     with pytest.raises(ValueError, match=r"--set link\[a\]=free: link is an option of the model.*--option link=VALUE"):
         choices.fixed(["link[a]=free"], {}, {"df", "link"})

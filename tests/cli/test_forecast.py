@@ -6,7 +6,7 @@ import shutil
 import numpy as np
 import pandas as pd
 import pytest
-from tests.test_cli_check import WELL
+from tests.cli.test_check import WELL
 
 import lfm_ppl as lfm
 from lfm_ppl.cli import main
@@ -107,7 +107,7 @@ def test_predictions_that_exist_are_replaced_only_if_asked(result, capsys):
 @pytest.mark.parametrize(("flags", "message"), [
     ("", "say what to forecast"), ("--until 3", "after the last observation, at 5"),
     ("--at soon", "Separate times by commas"), ("--at 7,inf", "finite times, separated by commas"),
-    ("--at 7 --outputs x", "--outputs says how to read a data file"), ("--held-out none.csv", "none.csv"),
+    ("--at 7 --outputs x", "--outputs is about a data file"), ("--held-out none.csv", "none.csv"),
     ("--at -4", "initial time"),
 ])
 def test_what_cannot_be_forecast(result, tmp_path, capsys, flags, message):

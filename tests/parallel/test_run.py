@@ -350,7 +350,7 @@ def test_without_dask_several_processes_are_refused(tmp_path, monkeypatch):
     find = cluster.importlib.util.find_spec
     monkeypatch.setattr(cluster.importlib.util, "find_spec", lambda name: None if name == "distributed" else find(name))
     assert cluster.available() == 1
-    with pytest.raises(ClusterError, match=r"pip install 'lfm_ppl\[cluster\]', or take one \(--jobs 1\)"):
+    with pytest.raises(ClusterError, match=r"pip install 'lfm_ppl\[cluster\]', or use one process \(--jobs 1\)"):
         run_tasks(tasks(), noise, tmp_path, workers=2)
 
 
@@ -444,7 +444,7 @@ def test_values_come_back_as_they_were(tmp_path):
 def test_what_cannot_be_stored_is_refused(tmp_path):
     with pytest.raises(ValueError, match="entry 'model' that is not a number"):
         write_result(Task("a", 0), {"model": object()}, RunStore(tmp_path))
-    with pytest.raises(TypeError, match="must be what JSON can store"):
+    with pytest.raises(TypeError, match="must be storable as JSON"):
         Task("a", 0, {"model": object()})
     with pytest.raises(ValueError, match="name of a task"):
         Task("a b", 0)

@@ -126,7 +126,7 @@ def test_ranks_survive_a_file_and_are_not_overwritten(tmp_path):
     assert found.draws == 7 and set(found.ranks) == set(made.ranks)
     for name in made.ranks:
         np.testing.assert_array_equal(found.ranks[name], made.ranks[name])
-    with pytest.raises(FileExistsError, match="exists already and is kept"):
+    with pytest.raises(FileExistsError, match="already exists"):
         calibration.save(made, path)
     assert calibration.save(made, path, overwrite=True) == path
 

@@ -217,7 +217,7 @@ def test_figures_are_drawn_and_one_that_fails_is_named(groups, tmp_path, monkeyp
 def test_nothing_is_overwritten_silently(groups, attrs, tmp_path):
     path = save(groups, attrs, tmp_path)
     before = path.read_bytes()
-    with pytest.raises(FileExistsError, match="report.html exists already and is kept"):
+    with pytest.raises(FileExistsError, match="report.html already exists"):
         save(groups, {**attrs, "model": "other"}, path)
     assert path.read_bytes() == before
     save(groups, {**attrs, "model": "other"}, path, overwrite=True)
@@ -228,7 +228,7 @@ def test_only_a_page_of_ours_is_brought_up_to_date(groups, attrs, tmp_path):
     path = save(groups, attrs, tmp_path)
     web_page.refuse_foreign(path, overwrite=False)
     path.write_text("<html><p>my diary</p></html>")
-    with pytest.raises(FileExistsError, match="exists already and is kept"):
+    with pytest.raises(FileExistsError, match="already exists"):
         cli_page.refuse_foreign(tmp_path, False)
     cli_page.refuse_foreign(tmp_path, True)
 

@@ -110,14 +110,30 @@ def test_an_interruption_between_two_batches_ends_the_others(two_cpus):
     assert list(kept) == [0] and not [one for one in threading.enumerate() if "side by side" in one.name]
 
 
+class Recorder:
+    """Store that records the first draw of each batch."""
+
+    def __init__(self):
+        self.starts = []
+
+    def get(self, start):
+        return None
+
+    def put(self, start, batch):
+        self.starts.append(start)
+
+    def flush(self):
+        pass
+
+
 def test_an_accelerator_has_larger_batches_and_what_is_large_by_itself_has_nothing_beside_it(two_cpus, monkeypatch):
     bound, count = lfm.bind(well, np.arange(4.0), np.array([[0.3], [0.9], [np.nan], [-0.8]])), 400
     draws = {"noise": np.linspace(0.5, 0.8, count)}
 
     def batches():
-        shown = []
-        scores(bound, draws, show=lambda done, of: shown.append(done))
-        return len(shown)
+        recorder = Recorder()
+        scores(bound, draws, store=recorder)
+        return len(recorder.starts)
 
     numbers = 4 * 1**2 * 6  # of one draw: four rows, one state
     monkeypatch.setattr(map_draws, "_LARGEST_BATCH_SIZE", 100 * numbers)
@@ -132,11 +148,11 @@ def test_an_accelerator_has_larger_batches_and_what_is_large_by_itself_has_nothi
 def test_draws_are_shared_out_to_the_threads_with_the_same_numbers(two_cpus, monkeypatch):
     bound, count = lfm.bind(well, np.arange(4.0), np.array([[0.3], [0.9], [np.nan], [-0.8]])), 70
     draws = {"noise": np.linspace(0.5, 0.8, count)}
-    shown = []
+    recorder = Recorder()
     compute = {"scores": lambda **more: scores(bound, draws, **more),
                "trajectories": lambda **more: trajectories(jax.random.key(0), bound, draws, None, **more)}
-    several = {name: run(show=lambda done, of: shown.append((done, of))) for name, run in compute.items()}
-    assert shown == [(start, count) for start in (0, 20, 40, 60)] * 2  # full batches of fours
+    several = {name: run(store=recorder) for name, run in compute.items()}
+    assert recorder.starts == [0, 20, 40, 60] * 2  # full batches of fours
     monkeypatch.setattr(compilation, "cpus", lambda: 1)
     for name, run in compute.items():
         alone = run()

@@ -194,7 +194,7 @@ def test_each_of_many_files_and_one_that_cannot_be_read(line, tmp_path):
         csv(tmp_path / "patients" / f"{k}.csv", rows(k))
     csv(tmp_path / "patients" / "bad.csv", [(0, 1, 2), (1, "oops", 2)])
     code, out, err = line("--data patients/*.csv --each --out many")
-    assert code == 1 and "3 data sets" in out and "noise_sd" in out and "1/2 0" in err
+    assert code == 1 and "3 data sets" in out and "noise_sd" in out and "1 of 2 tasks, 0" in err
     assert "failed: bad: patients/bad.csv, row 3, column 'a': expected a number" in err and "1 of 3 data sets" in err
     assert list(pd.read_csv(tmp_path / "many" / "failed.csv")["data set"]) == ["bad"]
     written = tmp_path / "many" / "results"
@@ -250,7 +250,7 @@ def test_series_in_one_file(line, tmp_path):
     ("--data some --each", "some is a folder; its files are 'some/*.csv'"),
     ("--data some/*.csv --each", "has the columns a, c, but 1 has a, b. Name those to use with --outputs"),
     ("--data some/1.csv --series who", "unknown column of series 'who'"),
-    ("--each", "give a pattern of files"),
+    ("--each", "a pattern of files"),
     ("--data some/1.csv", "--jobs and --scheduler are for many data sets"),
     ("--data some/1.csv --each --scheduler tcp://a:1", "Give one of --jobs and --scheduler"),
     ("--data some/1.csv --each --truth x", "--truth is for one data set"),
