@@ -49,7 +49,7 @@ def collect(monkeypatch):
         monkeypatch.setattr(problem, "arcs", lambda folder, seed=0: problem.Arcs(None, TIMES, positions, None))
         settings = experiment.GpsSettings(alternatives=sum(name.startswith("ways/") for name in other_results))
         results = {f"learn/{name}": learning_result() for name in predictions}
-        results |= {f"predict/{name}": one for name, one in predictions.items()}
+        results |= {f"predict/{name}": prediction for name, prediction in predictions.items()}
         return settings, experiment.STUDY.collect(settings, results | other_results)
 
     return collect

@@ -62,10 +62,10 @@ def test_quantiles_of_cell_densities_are_those_of_the_distribution():
     edges = np.linspace(-8.0, 8.0, 321)
     x, width = 0.5 * (edges[1:] + edges[:-1]), edges[1] - edges[0]
     density = np.stack([np.diff(stats.norm.cdf(edges, m, s)) / width for m, s in ((0.0, 1.0), (1.0, 0.5))])
-    found = scores.density_quantiles(x, width, density, [0.025, 0.975])
-    assert found.shape == (2, 2)
+    quantiles = scores.density_quantiles(x, width, density, [0.025, 0.975])
+    assert quantiles.shape == (2, 2)
     # Linear interpolation within a cell: an error of order density' width^2 / density.
-    np.testing.assert_allclose(found[0], [stats.norm.ppf(0.025), stats.norm.ppf(0.025, 1.0, 0.5)], atol=2e-3)
+    np.testing.assert_allclose(quantiles[0], [stats.norm.ppf(0.025), stats.norm.ppf(0.025, 1.0, 0.5)], atol=2e-3)
 
 
 def test_rates_and_their_errors():
@@ -76,8 +76,8 @@ def test_rates_and_their_errors():
 
 
 def test_means_leave_out_what_is_missing():
-    found = scores.mean_of([1.0, np.nan, 3.0])
-    assert found == scores.Estimate(2.0, 1.0)
+    estimate = scores.mean_of([1.0, np.nan, 3.0])
+    assert estimate == scores.Estimate(2.0, 1.0)
     assert np.isnan(scores.mean_of([5.0]).error)
 
 
@@ -91,16 +91,16 @@ def test_errors_and_coverage():
     assert scores.rmse([1.0, 3.0], [0.0, 0.0]) == pytest.approx(np.sqrt(5.0))
     assert scores.interval_coverage([0.0, 0.0], [1.0, 1.0], [0.5, 2.0]) == 0.5
     mean, sd = np.array([[0.0, 1.0, 2.0], [1.0, 1.0, 1.0]]), np.array([[1.0, 1.0, 1.0], [0.1, 1.0, 1.0]])
-    found = scores.score_path("smoother", mean, scores.interval(mean, sd), [1.0, 1.0, 5.0])
-    np.testing.assert_allclose(found["smoother_rmse"], np.sqrt([10.0 / 3.0, 16.0 / 3.0]))
-    np.testing.assert_allclose(found["smoother_coverage"], [2.0 / 3.0, 2.0 / 3.0])
+    path_scores = scores.score_path("smoother", mean, scores.interval(mean, sd), [1.0, 1.0, 5.0])
+    np.testing.assert_allclose(path_scores["smoother_rmse"], np.sqrt([10.0 / 3.0, 16.0 / 3.0]))
+    np.testing.assert_allclose(path_scores["smoother_coverage"], [2.0 / 3.0, 2.0 / 3.0])
 
 
 def test_the_error_of_a_standard_deviation_follows_from_the_fourth_moment():
     """sd of s is s sqrt((kurtosis - 1) / (4 n)) for independent draws; squares that repeat count once."""
     generator = np.random.default_rng(3)
     heavy, normal = generator.laplace(size=(4, 5000)), generator.normal(size=(4, 5000))
-    found = scores.relative_errors_of_sd(np.stack([heavy, normal, np.repeat(normal[:, :1250], 4, axis=1)]))
+    errors = scores.relative_errors_of_sd(np.stack([heavy, normal, np.repeat(normal[:, :1250], 4, axis=1)]))
     expected = np.sqrt(np.array([6.0, 3.0, 3.0]) - 1) / np.sqrt(4 * np.array([20_000, 20_000, 5_000]))
-    np.testing.assert_allclose(found, expected, rtol=0.12)
+    np.testing.assert_allclose(errors, expected, rtol=0.12)
     assert np.isnan(scores.relative_errors_of_sd(np.ones((1, 2, 50)))).all()
